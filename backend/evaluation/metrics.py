@@ -1,0 +1,198 @@
+"""How good renders and object IDs are: PSNR and SSIM, IoU, boundary IoU, Dice and pixel accuracy."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+BOUNDARY_FRACTION = 0.02
+"""Width of the boundary band of mBIoU, as a part of the image diagonal."""
+
+
+def _as_float(image: NDArray) -> NDArray[np.float64]:
+    if image.dtype == np.uint8:
+        return image.astype(np.float64) / 255.0
+    return image.astype(np.float64)
+
+
+def _pair(a: NDArray, b: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    if a.shape != b.shape or a.ndim != 3:
+        raise ValueError(f"two images (h, w, channels) of one size were expected, not {a.shape} and {b.shape}")
+    return _as_float(a), _as_float(b)
+
+
+def psnr(a: NDArray, b: NDArray) -> float:
+    """Peak signal-to-noise ratio in dB of two images (h, w, 3), float in [0, 1] or uint8; infinite for equal ones."""
+    a, b = _pair(a, b)
+    error = float(np.mean((a - b) ** 2))
+    return math.inf if error == 0.0 else -10.0 * math.log10(error)
+
+
+def ssim(a: NDArray, b: NDArray) -> float:
+    """Structural similarity of two images (h, w, 3), float in [0, 1] or uint8; 1 when they are equal.
+
+    As in Wang et al. 2004 and as splat papers report it: Gaussian window of 11 x 11 with sigma 1.5, C1 = 0.01^2,
+    C2 = 0.03^2, zeros beyond the image border, the mean over all pixels and channels.
+    """
+    a, b = _pair(a, b)
+    offsets = np.arange(-5, 6)
+    window = np.exp(-(offsets**2) / (2 * 1.5**2))
+    window /= window.sum()
+
+    def blur(image: NDArray) -> NDArray:
+        rows = ndimage.correlate1d(image, window, axis=0, mode="constant")
+        return ndimage.correlate1d(rows, window, axis=1, mode="constant")
+
+    mean_a, mean_b = blur(a), blur(b)
+    var_a = blur(a * a) - mean_a**2
+    var_b = blur(b * b) - mean_b**2
+    covariance = blur(a * b) - mean_a * mean_b
+    c1, c2 = 0.01**2, 0.03**2
+    numerator = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
+    return float(np.mean(numerator / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))))
+
+
+def boundary_distance(height: int, width: int) -> int:
+    """Width in pixels of the boundary band of an image: 2% of its diagonal, at least 1."""
+    return max(1, round(BOUNDARY_FRACTION * math.hypot(height, width)))
+
+
+def boundaries(labels: NDArray, distance: int) -> NDArray[np.bool_]:
+    """(h, w) bool: the pixels that lie in the boundary band of the mask of their own label.
+
+    The band of a mask is the mask minus its erosion by a square of 2 `distance` + 1 pixels; beyond the image border
+    counts as outside of the mask, so that a mask has a band there too (both as Cheng et al. 2021 publish it). A pixel
+    is outside of the erosion of its own mask exactly when another label, or the border, lies in the square
+    around it: so a minimum and a maximum filter find the bands of all masks at once, however many there are.
+    """
+    size = 2 * distance + 1
+    _, compact = np.unique(labels, return_inverse=True)
+    compact = compact.reshape(labels.shape).astype(np.int32)
+    lowest = ndimage.minimum_filter(compact, size, mode="constant", cval=-1)
+    highest = ndimage.maximum_filter(compact, size, mode="constant", cval=-1)
+    return lowest != highest
+
+
+class IdScores:
+    """Adds up how well predicted object IDs agree with true ones, view by view.
+
+    Pixels whose true ID is 0 are unlabelled: they count nowhere, whatever is predicted there (unless `zero_is_class`,
+    which makes 0 an object like the others). For each object, intersections and unions are summed over the pixels of
+    all views together and divided once; miou, mbiou and dice are then the plain means over the objects that occur in
+    the truth (a predicted ID that never occurs there has no score of its own, but its pixels are misses of the objects
+    it covers). For boundary IoU, what is predicted on unlabelled pixels is replaced by "unlabelled", as in the truth,
+    before the bands are taken. accuracy is the part of all labelled pixels whose ID is right.
+    """
+
+    _COLUMNS = ("intersection", "predicted", "truth", "band_intersection", "band_predicted", "band_truth")
+
+    def __init__(self, zero_is_class: bool = False) -> None:
+        self.zero_is_class = zero_is_class
+        self._ids = np.zeros(0, np.int64)
+        self._sums = np.zeros((0, len(self._COLUMNS)), np.int64)
+
+    def add(self, predicted: NDArray, truth: NDArray) -> None:
+        """Count one view; both (h, w), any integer IDs."""
+        if predicted.shape != truth.shape or predicted.ndim != 2:
+            raise ValueError(f"two ID images (h, w) of one size were expected, not {predicted.shape} and {truth.shape}")
+        if predicted.dtype.kind not in "iub" or truth.dtype.kind not in "iub":
+            raise ValueError(f"integer IDs were expected, not {predicted.dtype} and {truth.dtype}")
+        both = np.stack([predicted.astype(np.int64), truth.astype(np.int64)])
+        ids, compact = np.unique(both, return_inverse=True)
+        found, true = compact.reshape(both.shape)
+        if self.zero_is_class:
+            counted = np.ones(truth.shape, bool)
+        else:
+            counted = both[1] != 0
+            found = np.where(counted, found, -1)
+            true = np.where(counted, true, -1)
+        distance = boundary_distance(*truth.shape)
+        found_band = counted & boundaries(found, distance)
+        true_band = counted & boundaries(true, distance)
+        right = counted & (found == true)
+
+        def count(labels: NDArray, where: NDArray) -> NDArray:
+            return np.bincount(labels[where], minlength=len(ids))
+
+        columns = [
+            count(true, right),
+            count(found, counted),
+            count(true, counted),
+            count(true, right & found_band & true_band),
+            count(found, found_band),
+            count(true, true_band),
+        ]
+        self._add_sums(ids, np.stack(columns, axis=1))
+
+    def merge(self, other: IdScores) -> None:
+        """Add what another one has counted."""
+        if other.zero_is_class != self.zero_is_class:
+            raise ValueError("scores with and without 0 as a class cannot be added up")
+        self._add_sums(other._ids, other._sums)
+
+    def _add_sums(self, ids: NDArray, sums: NDArray) -> None:
+        merged = np.union1d(self._ids, ids)
+        total = np.zeros((len(merged), sums.shape[1]), np.int64)
+        total[np.searchsorted(merged, self._ids)] = self._sums
+        total[np.searchsorted(merged, ids)] += sums
+        self._ids, self._sums = merged, total
+
+    def table(self) -> list[dict[str, Any]]:
+        """For each object that occurs in the truth, by ID: id, iou, biou, dice, pixels (true ones, all views)."""
+        rows = []
+        for i, sums in zip(self._ids.tolist(), self._sums.tolist()):
+            same, predicted, truth, band_same, band_predicted, band_truth = sums
+            if truth == 0:
+                continue
+            rows.append(
+                {
+                    "id": i,
+                    "iou": same / (predicted + truth - same),
+                    "biou": band_same / (band_predicted + band_truth - band_same),
+                    "dice": 2 * same / (predicted + truth),
+                    "pixels": truth,
+                }
+            )
+        return rows
+
+    def result(self) -> dict[str, Any]:
+        """miou, mbiou, dice, accuracy in 0 .. 1 and objects {id: iou}; None for a number if nothing was labelled."""
+        rows = self.table()
+        labelled = sum(row["pixels"] for row in rows)
+        right = int(self._sums[:, 0].sum())
+
+        def mean(key: str) -> float | None:
+            return math.fsum(row[key] for row in rows) / len(rows) if rows else None
+
+        return {
+            "miou": mean("iou"),
+            "mbiou": mean("biou"),
+            "dice": mean("dice"),
+            "accuracy": right / labelled if labelled else None,
+            "objects": {row["id"]: row["iou"] for row in rows},
+        }
+
+
+class ImageScores:
+    """Means of PSNR and SSIM over views, each view counting once."""
+
+    def __init__(self) -> None:
+        self._psnr: list[float] = []
+        self._ssim: list[float] = []
+
+    def add(self, render: NDArray, truth: NDArray) -> tuple[float, float]:
+        """Count one view, both (h, w, 3); returns its own (psnr in dB, ssim). The render is clipped to [0, 1]."""
+        render = np.clip(_as_float(render), 0.0, 1.0)
+        self._psnr.append(psnr(render, truth))
+        self._ssim.append(ssim(render, truth))
+        return self._psnr[-1], self._ssim[-1]
+
+    def result(self) -> dict[str, float | None]:
+        """psnr in dB and ssim; None if there was no view."""
+        if not self._psnr:
+            return {"psnr": None, "ssim": None}
+        return {"psnr": float(np.mean(self._psnr)), "ssim": float(np.mean(self._ssim))}

@@ -1,0 +1,72 @@
+"""What is measured on which views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..protocol import Reporter
+from .metrics import IdScores, ImageScores
+
+
+class _View(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+class EvaluatedCapture(Protocol):
+    """What of a capture is needed here."""
+
+    @property
+    def views(self) -> Sequence[_View]: ...
+
+    @property
+    def names(self) -> Mapping[int, str]: ...
+
+    def image(self, i: int) -> NDArray:
+        """(h, w, 3) uint8."""
+
+    def mask(self, i: int) -> NDArray | None:
+        """(h, w) int64 object IDs, or None where there is no mask."""
+
+
+def evaluate(
+    capture: EvaluatedCapture,
+    render: Callable[[int], tuple[NDArray, NDArray]],
+    indices: Sequence[int],
+    reporter: Reporter | None = None,
+    zero_is_class: bool = False,
+) -> dict[str, Any]:
+    """Compare renders of the views `indices` (held-out ones, for figures that are to be published) with the capture.
+
+    `render(i)` gives the image (h, w, 3) float in [0, 1] and the object IDs (h, w) int64. Returns {"quality": {psnr,
+    ssim, lpips, miou, mbiou, dice, accuracy}, "objects": [{id, name, iou, biou, dice, pixels}], "views": [{name, psnr,
+    ssim, miou}]}. Without masks, or where no pixel is labelled, the ID scores are None; lpips is not measured: None.
+    """
+    reporter = reporter or Reporter()
+    images = ImageScores()
+    ids = IdScores(zero_is_class)
+    views = []
+    for done, i in enumerate(indices):
+        image, found = render(i)
+        name = capture.views[i].name
+        if not np.isfinite(image).all():
+            reporter.warning(f"The render of {name} holds NaN or Inf.")
+        psnr, ssim = images.add(image, capture.image(i))
+        truth = capture.mask(i)
+        miou = None
+        if truth is not None:
+            view_ids = IdScores(zero_is_class)
+            view_ids.add(found, truth)
+            ids.merge(view_ids)
+            miou = view_ids.result()["miou"]
+        views.append({"name": name, "psnr": psnr, "ssim": ssim, "miou": miou})
+        reporter.progress(done + 1, len(indices), psnr=psnr, miou=miou)
+
+    quality: dict[str, Any] = {**images.result(), "lpips": None, **ids.result()}
+    del quality["objects"]
+    objects = [{"id": row["id"], "name": capture.names.get(row["id"], str(row["id"])), **row} for row in ids.table()]
+    return {"quality": quality, "objects": objects, "views": views}
