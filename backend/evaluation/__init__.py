@@ -1,6 +1,19 @@
 """How good a reconstruction is, on views it has not seen, and the report that says so."""
 
 from .metrics import IdScores, ImageScores, psnr, ssim
+from .pictures import comparison, contact_sheet, id_picture, save_picture
 from .protocols import evaluate
+from .report import write_report
 
-__all__ = ["IdScores", "ImageScores", "evaluate", "psnr", "ssim"]
+__all__ = [
+    "IdScores",
+    "ImageScores",
+    "comparison",
+    "contact_sheet",
+    "evaluate",
+    "id_picture",
+    "psnr",
+    "save_picture",
+    "ssim",
+    "write_report",
+]

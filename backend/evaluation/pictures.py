@@ -1,0 +1,196 @@
+"""Pictures for reports and previews: renders beside the truth, object IDs in colour, contact sheets."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from ..palette import colours_of, object_colours
+from ..protocol import write_atomic
+
+__all__ = ["comparison", "contact_sheet", "id_picture", "object_colours", "save_picture"]
+
+Colours = Mapping[int, Sequence[int]]
+
+PANEL_WIDTH = 480
+CELL_WIDTH = 320
+MARGIN = 16
+GAP = 10
+LEGEND_ENTRIES = 18
+PAPER = (255, 255, 255)
+INK = (38, 38, 42)
+FAINT_INK = (118, 118, 124)
+RULE = (214, 214, 218)
+
+
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size=size)
+
+
+def as_bytes(image: NDArray) -> NDArray[np.uint8]:
+    """(h, w, 3) float in [0, 1], or uint8 -> uint8; what is not finite is black."""
+    if image.dtype == np.uint8:
+        return image
+    return np.rint(255.0 * np.clip(np.nan_to_num(image, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)).astype(np.uint8)
+
+
+def id_picture(ids: NDArray, colours: Colours | None = None) -> NDArray[np.uint8]:
+    """(h, w) object IDs -> (h, w, 3) uint8; IDs without an entry in `colours` get the palette's colour."""
+    found, inverse = np.unique(ids, return_inverse=True)
+    table = colours_of(found)
+    if colours:
+        for row, i in enumerate(found.tolist()):
+            table[row] = colours.get(i, table[row])
+    return table[inverse.reshape(ids.shape)]
+
+
+def comparison(
+    truth: NDArray,
+    render: NDArray,
+    true_ids: NDArray | None,
+    ids: NDArray,
+    colours: Colours | None = None,
+    names: Mapping[int, str] | None = None,
+    title: str = "",
+) -> Image.Image:
+    """Photo, render, rendered IDs and (where there are any) the mask's IDs side by side, with a legend of the objects.
+
+    truth, render (h, w, 3) uint8 or float in [0, 1]; true_ids, ids (h, w) integers.
+    """
+    size = _fit(truth.shape[1], truth.shape[0])
+    panels = [
+        ("Photo", _resized(as_bytes(truth), size, Image.Resampling.LANCZOS)),
+        ("Render", _resized(as_bytes(render), size, Image.Resampling.LANCZOS)),
+        ("Rendered IDs", _resized(id_picture(ids, colours), size, Image.Resampling.NEAREST)),
+    ]
+    if true_ids is not None:
+        panels.append(("Mask IDs", _resized(id_picture(true_ids, colours), size, Image.Resampling.NEAREST)))
+    legend = _legend_entries(ids if true_ids is None else np.concatenate([ids, true_ids]), colours, names)
+    return _sheet(panels, len(panels), title, legend)
+
+
+def contact_sheet(images: Sequence[NDArray | Image.Image], titles: Sequence[str], columns: int = 4) -> Image.Image:
+    """Pictures in rows of `columns`, each with its title above; all are fitted into cells of the first one's size."""
+    if not images:
+        raise ValueError("a contact sheet needs at least one picture")
+    pictures = [
+        image.convert("RGB") if isinstance(image, Image.Image) else Image.fromarray(as_bytes(image)) for image in images
+    ]
+    size = _fit(*pictures[0].size, CELL_WIDTH)
+    cells = []
+    for picture, title in zip(pictures, titles):
+        scale = min(size[0] / picture.width, size[1] / picture.height)
+        fitted = (max(1, round(picture.width * scale)), max(1, round(picture.height * scale)))
+        cells.append((title, picture.resize(fitted, Image.Resampling.LANCZOS)))
+    return _sheet(cells, min(columns, len(cells)), "", [])
+
+
+def save_picture(image: Image.Image, path: Path, limit: int = 300_000) -> Path:
+    """Write `image` atomically as PNG, or, where that takes more than `limit` bytes, as JPEG; returns the path written."""
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG", optimize=True)
+    if buffer.tell() > limit:
+        path = path.with_suffix(".jpg")
+        for quality in (92, 86, 78, 68):
+            buffer = io.BytesIO()
+            image.convert("RGB").save(buffer, "JPEG", quality=quality, subsampling=0, optimize=True)
+            if buffer.tell() <= limit:
+                break
+    write_atomic(path, buffer.getvalue())
+    return path
+
+
+def _fit(width: int, height: int, longest: int = PANEL_WIDTH) -> tuple[int, int]:
+    """The size of a panel: as large as the image, up to `longest` pixels on the longer side."""
+    scale = min(1.0, longest / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def _resized(pixels: NDArray[np.uint8], size: tuple[int, int], how: Image.Resampling) -> Image.Image:
+    image = Image.fromarray(pixels)
+    return image if image.size == size else image.resize(size, how)
+
+
+_Legend = list[tuple[tuple[int, int, int] | None, str]]
+
+
+def _legend_entries(ids: NDArray, colours: Colours | None, names: Mapping[int, str] | None) -> _Legend:
+    """(colour, name) of the objects in view, the largest first, then how many were left out, then "no object"."""
+    found, counts = np.unique(ids, return_counts=True)
+    order = np.argsort(-counts, kind="stable")
+    shown = [int(i) for i in found[order] if i != 0]
+    entries: _Legend = []
+    for i in shown[:LEGEND_ENTRIES]:
+        r, g, b = id_picture(np.array([[i]]), colours)[0, 0].tolist()
+        entries.append(((r, g, b), (names or {}).get(i) or f"object {i}"))
+    if len(shown) > LEGEND_ENTRIES:
+        entries.append((None, f"and {len(shown) - LEGEND_ENTRIES} more"))
+    if len(shown) < len(found):
+        entries.append((object_colours([0])[0], "no object"))
+    return entries
+
+
+def _sheet(cells: Sequence[tuple[str, Image.Image]], columns: int, title: str, legend: _Legend) -> Image.Image:
+    """Cells in a grid under their titles, with a heading and a legend."""
+    size = cells[0][1].size
+    label_size = 14 if size[0] >= 200 else 11
+    label, heading = _font(label_size), _font(label_size + 3)
+    label_height = label_size + 9
+    rows = -(-len(cells) // columns)
+    width = 2 * MARGIN + columns * size[0] + (columns - 1) * GAP
+    top = MARGIN + (label_size + 15 if title else 0)
+    bottom = top + rows * (label_height + size[1]) + (rows - 1) * GAP
+    lines = _legend_lines(legend, label, width - 2 * MARGIN, label_size)
+    line_height = label_size + 10
+    height = bottom + (GAP + 2 + len(lines) * line_height - 8 if lines else 0) + MARGIN
+
+    sheet = Image.new("RGB", (width, height), PAPER)
+    draw = ImageDraw.Draw(sheet)
+    if title:
+        draw.text((MARGIN, MARGIN - 2), _shortened(title, heading, width - 2 * MARGIN), INK, heading)
+    for i, (text, picture) in enumerate(cells):
+        x = MARGIN + (i % columns) * (size[0] + GAP)
+        y = top + (i // columns) * (label_height + size[1] + GAP)
+        draw.text((x, y), _shortened(text, label, size[0]), FAINT_INK, label)
+        sheet.paste(picture, (x + (size[0] - picture.width) // 2, y + label_height))
+    swatch = label_size - 2
+    y = bottom + GAP + 2
+    for line in lines:
+        for x, colour, text in line:
+            left = MARGIN + x
+            if colour is not None:
+                draw.rounded_rectangle((left, y + 2, left + swatch, y + 2 + swatch), 3, colour, RULE)
+                left += swatch + 6
+            draw.text((left, y), text, INK if colour is not None else FAINT_INK, label)
+        y += line_height
+    return sheet
+
+
+def _legend_lines(legend: _Legend, font, width: int, size: int) -> list[list[tuple[int, tuple | None, str]]]:
+    """Legend entries broken into lines no wider than `width`: (x, colour, text) each."""
+    lines: list[list[tuple[int, tuple | None, str]]] = []
+    x = width + 1
+    for colour, text in legend:
+        text = _shortened(text, font, 220)
+        needed = round(font.getlength(text)) + (size + 4 if colour is not None else 0)
+        if x + needed > width:
+            lines.append([])
+            x = 0
+        lines[-1].append((x, colour, text))
+        x += needed + 20
+    return lines
+
+
+def _shortened(text: str, font, width: float) -> str:
+    """`text` cut with an ellipsis so that it is no wider than `width` pixels."""
+    text = "".join(c if c.isprintable() else " " for c in text)
+    if font.getlength(text) <= width:
+        return text
+    while text and font.getlength(text + "...") > width:
+        text = text[:-1]
+    return text + "..."
