@@ -1,0 +1,299 @@
+"""Finds and reads a capture's files: images, ID masks in every accepted format, and the labels' names."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import unicodedata
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image as PilImage
+
+from ..protocol import InputError, write_atomic
+
+IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm", ".pgm"}
+MASK_SUFFIXES = (".png", ".npy", ".npz", ".tif", ".tiff", ".bmp")
+LOSSY_SUFFIXES = (".jpg", ".jpeg")
+_LARGEST_ID = 2**32 - 1
+_OPENING_ERRORS = (OSError, ValueError, SyntaxError, EOFError, MemoryError, PilImage.DecompressionBombError)
+
+
+class Files:
+    """The files under a folder, found by the name that a COLMAP model gives them.
+
+    A name is looked up exactly, then with Unicode composed (macOS writes it decomposed), then with backslashes as
+    separators (models made on Windows), then without regard to case; only an unambiguous match counts.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.paths: list[str] = []
+        for parent, folders, names in os.walk(folder):
+            folders.sort()
+            within = Path(parent).relative_to(folder)
+            self.paths += [(within / name).as_posix() for name in sorted(names) if not name.startswith(".")]
+        self._levels: list[dict[str, list[str]]] = []
+        for level in range(4):
+            index: dict[str, list[str]] = {}
+            for path in self.paths:
+                index.setdefault(_folded(path, level), []).append(path)
+            self._levels.append(index)
+
+    def find(self, name: str) -> Path | None:
+        """The file that `name` means, or None."""
+        for level, index in enumerate(self._levels):
+            matches = index.get(_folded(name, level), [])
+            if len(matches) == 1:
+                return self.folder / matches[0]
+            if matches:
+                return None
+        return None
+
+    def first(self, names: Iterable[str]) -> Path | None:
+        """The first of `names` that there is."""
+        return next((path for name in names if (path := self.find(name)) is not None), None)
+
+
+def _folded(name: str, level: int) -> str:
+    if level >= 1:
+        name = unicodedata.normalize("NFC", name)
+    if level >= 2:
+        name = name.replace("\\", "/")
+    return name.casefold() if level >= 3 else name
+
+
+def mask_names(image_name: str) -> tuple[list[str], list[str]]:
+    """Where the mask of an image may lie below masks/: accepted names, and names that are lossy and refused."""
+    stem = re.sub(r"\.[^./\\]*$", "", image_name)
+    accepted = [image_name + suffix for suffix in MASK_SUFFIXES] + [stem + suffix for suffix in MASK_SUFFIXES]
+    return accepted, [name + suffix for name in (image_name, stem) for suffix in LOSSY_SUFFIXES]
+
+
+# Images
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height from an image's header; raises InputError that names the file."""
+    with _opened(path) as image:
+        return image.size
+
+
+def read_image(path: Path) -> PilImage.Image:
+    """An image as 8-bit RGB: alpha is dropped, grey and 16-bit converted; orientation tags ignored, as in COLMAP."""
+    with _opened(path) as image:
+        try:
+            image.load()
+            if image.mode in ("I", "I;16", "I;16B", "I;16L"):
+                values = np.asarray(image).astype(np.int64)
+                image = PilImage.fromarray((np.clip(values, 0, 65535) // 257).astype(np.uint8))
+            elif image.mode == "F":
+                raise InputError(f"{path} holds floating-point pixels; save it as an 8- or 16-bit image.")
+            if image.mode == "P" and "transparency" in image.info:
+                return image.convert("RGBA").convert("RGB")
+            if image.mode in ("RGBA", "RGBX"):
+                # Not convert(): in some versions that treats colours below alpha 0 as black.
+                return PilImage.merge("RGB", image.split()[:3])
+            return image.convert("RGB")
+        except _OPENING_ERRORS as error:
+            raise _unreadable(path, error) from error
+
+
+def _opened(path: Path) -> PilImage.Image:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PilImage.DecompressionBombWarning)
+            return PilImage.open(path)
+    except _OPENING_ERRORS as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: BaseException) -> InputError:
+    why = f" ({error})" if isinstance(error, PilImage.DecompressionBombError) else ""
+    return InputError(f"{path} cannot be read as an image{why}: it is damaged or of an unknown format; replace it.")
+
+
+# Masks
+
+
+def is_colour_mask(path: Path) -> bool:
+    """Whether a mask file has three channels that differ, so that its IDs are coded in red, green and blue."""
+    if path.suffix.lower() in (".npy", ".npz"):
+        return False
+    with _opened(path) as image:
+        if image.mode not in ("RGB", "RGBA"):
+            return False
+        try:
+            planes = np.asarray(image)
+        except _OPENING_ERRORS as error:
+            raise _unreadable(path, error) from error
+        return bool((planes[..., 0] != planes[..., 1]).any() or (planes[..., 0] != planes[..., 2]).any())
+
+
+def is_three_channel(path: Path) -> bool:
+    """Whether a mask file has three channels, so that it may be grey or colour-coded."""
+    if path.suffix.lower() in (".npy", ".npz"):
+        return False
+    with _opened(path) as image:
+        return image.mode in ("RGB", "RGBA")
+
+
+def read_mask(path: Path, colour: bool | None = None) -> np.ndarray:
+    """An ID map (h, w) as uint8, uint16 or uint32.
+
+    8/16-bit grey: the value is the ID. Palette: the index is the ID. Three channels: where they are equal in the whole
+    capture the grey value is the ID, else R + 256 G + 65536 B (alpha is ignored); `colour` says which, None looks at
+    this file alone. .npy and .npz (its only array, or the one named `ids`, `mask` or `masks`): integers, or floats that
+    are integers. Raises InputError that names the file.
+    """
+    suffix = path.suffix.lower()
+    if suffix in LOSSY_SUFFIXES:
+        raise InputError(f"{path} is a JPEG, whose compression changes IDs; save the mask as PNG.")
+    ids = _array_mask(path) if suffix in (".npy", ".npz") else _image_mask(path, colour)
+    return compact(ids)
+
+
+def compact(ids: np.ndarray) -> np.ndarray:
+    """The same IDs in the smallest unsigned type."""
+    largest = int(ids.max()) if ids.size else 0
+    return ids.astype(np.uint8 if largest < 256 else np.uint16 if largest < 65536 else np.uint32, copy=False)
+
+
+def _array_mask(path: Path) -> np.ndarray:
+    try:
+        loaded: Any = np.load(path, allow_pickle=False)
+        if isinstance(loaded, np.lib.npyio.NpzFile):
+            with loaded:
+                names = [n for n in ("ids", "mask", "masks") if n in loaded.files] or loaded.files
+                if len(names) != 1:
+                    raise InputError(f"{path} holds the arrays {', '.join(names) or '(none)'}; expected one named ids.")
+                loaded = loaded[names[0]]
+    except InputError:
+        raise
+    except Exception as error:  # NumPy and zipfile raise many kinds on damaged files
+        raise InputError(f"{path} cannot be read as a NumPy array: it is damaged or not one; replace it.") from error
+    ids = np.asarray(loaded)
+    if ids.ndim == 3 and 1 in (ids.shape[0], ids.shape[2]):
+        ids = ids[0] if ids.shape[0] == 1 else ids[..., 0]
+    if ids.ndim != 2 or ids.size == 0:
+        raise _not_ids(path, f"its array has the shape {ids.shape}, expected height x width")
+    if ids.dtype.kind not in "buif":
+        raise _not_ids(path, f"its values are of type {ids.dtype}")
+    if ids.dtype.kind == "f":
+        with np.errstate(invalid="ignore"):
+            if not (np.isfinite(ids).all() and (ids == np.rint(ids)).all()):
+                raise _not_ids(path, "its values are not whole numbers")
+    if ids.min() < 0 or ids.max() > _LARGEST_ID:
+        raise _not_ids(path, f"its values lie outside 0 to {_LARGEST_ID}")
+    return ids.astype(np.uint32)
+
+
+def _image_mask(path: Path, colour: bool | None) -> np.ndarray:
+    with _opened(path) as image:
+        tile = getattr(image, "tile", None)
+        raw_mode = str(tile[0][3]) if tile else ""
+        if image.format == "JPEG":
+            raise InputError(f"{path} is a JPEG, whose compression changes IDs; save the mask as PNG.")
+        try:
+            values = np.asarray(image)
+        except _OPENING_ERRORS as error:
+            raise _unreadable(path, error) from error
+        mode = image.mode
+    if mode in ("L", "P", "1", "I;16", "I;16B", "I;16L", "I"):
+        if mode == "L" and image.format == "PNG" and ("L;2" in raw_mode or "L;4" in raw_mode):
+            # Pillow stretches 2- and 4-bit grey to the full range.
+            values = values // (85 if "L;2" in raw_mode else 17)
+        if mode == "I" and int(values.min()) < 0:
+            raise _not_ids(path, "it holds negative values")
+        return values.astype(np.uint32)
+    if mode == "LA":
+        return values[..., 0].astype(np.uint32)
+    if mode in ("RGB", "RGBA"):
+        if "16" in raw_mode:
+            raise _not_ids(path, "it has 16 bits for each of three channels")
+        red, green, blue = (values[..., channel].astype(np.uint32) for channel in range(3))
+        if colour is None:
+            colour = bool((red != green).any() or (red != blue).any())
+        if not colour:
+            return red
+        ids = red + (green << 8) + (blue << 16)
+        if ids.size > 4096 and (ids[:, 1:] == ids[:, :-1]).mean() < 0.3:
+            raise _not_ids(path, "hardly any neighbouring pixels are equal, so it looks like a picture")
+        return ids
+    raise _not_ids(path, f"its pixels are of Pillow's mode {mode}")
+
+
+def _not_ids(path: Path, why: str) -> InputError:
+    return InputError(f"{path} is not an ID map: {why}; expected one whole number a pixel, 0 where unlabelled.")
+
+
+def encode_mask(ids: np.ndarray) -> tuple[str, bytes]:
+    """The suffix and the bytes of a file that `read_mask` reads back: PNG up to 16 bits, else .npz."""
+    ids = compact(ids)
+    buffer = io.BytesIO()
+    if ids.dtype == np.uint32:
+        np.savez_compressed(buffer, ids=ids)
+        return ".npz", buffer.getvalue()
+    PilImage.fromarray(ids).save(buffer, "PNG", compress_level=3)
+    return ".png", buffer.getvalue()
+
+
+def write_image(path: Path, image: PilImage.Image) -> None:
+    """Write a PNG atomically."""
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG", compress_level=1)
+    write_atomic(path, buffer.getvalue())
+
+
+# Names
+
+
+def read_names(folder: Path) -> dict[int, str]:
+    """Names of the IDs, without 0: from labels.json ({"1": "mug"}, {"mug": 1} or [{"id": 1, "name": "mug"}]) or
+    labels.txt (lines `1 mug`, `1: mug` or `1,mug`); empty where there is neither."""
+    as_json, as_text = folder / "labels.json", folder / "labels.txt"
+    try:
+        if as_json.is_file():
+            pairs = _json_names(json.loads(as_json.read_text(encoding="utf-8-sig")))
+            path = as_json
+        elif as_text.is_file():
+            pairs = _text_names(as_text.read_text(encoding="utf-8-sig"))
+            path = as_text
+        else:
+            return {}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        path = as_json if as_json.is_file() else as_text
+        raise InputError(
+            f'{path} is not a list of labels; expected {{"1": "mug", "2": "box"}} in JSON or lines like "1 mug".'
+        ) from error
+    names = dict(pairs)
+    outside = [key for key in names if not 0 <= key <= _LARGEST_ID]
+    if outside:
+        raise InputError(f"{path} names the ID {outside[0]}, which lies outside 0 to {_LARGEST_ID}.")
+    names.pop(0, None)
+    return dict(sorted(names.items()))
+
+
+def _json_names(value: Any) -> list[tuple[int, str]]:
+    if isinstance(value, list):
+        return [(int(item["id"]), str(item["name"])) for item in value]
+    if value and all(isinstance(v, int) and not isinstance(v, bool) for v in value.values()):
+        return [(number, str(name)) for name, number in value.items()]
+    return [(int(number), str(v["name"]) if isinstance(v, dict) else str(v)) for number, v in value.items()]
+
+
+def _text_names(text: str) -> list[tuple[int, str]]:
+    pairs = []
+    for line in text.splitlines():
+        line = line.strip()
+        if line and not line.startswith("#"):
+            match = re.fullmatch(r"(\d+)\s*[\s:,;=]\s*(.+)", line)
+            if not match:
+                raise ValueError(line)
+            pairs.append((int(match[1]), match[2].strip()))
+    return pairs

@@ -1,0 +1,243 @@
+"""Turns any COLMAP camera into a pinhole camera: the target's intrinsics, and the resampling onto it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from PIL import Image as PilImage
+from scipy.ndimage import map_coordinates
+
+from ..protocol import InputError
+from .colmap import Camera
+
+MAX_TAN = math.tan(math.radians(60.0))
+"""A pinhole view reaches at most 60 degrees to each side: beyond, pixels stretch without bound."""
+
+_POLYNOMIAL = {"SIMPLE_RADIAL": 3, "RADIAL": 3, "OPENCV": 4, "FULL_OPENCV": 4}
+_STRIP = 1 << 18
+_STEP = 1e-5
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """A pinhole camera: K (3,3) float64 in pixels, the first pixel's centre at (0.5, 0.5)."""
+
+    K: np.ndarray
+    width: int
+    height: int
+
+
+def is_pinhole(camera: Camera) -> bool:
+    """Whether images of this camera need no undistortion."""
+    if camera.model in ("SIMPLE_PINHOLE", "PINHOLE"):
+        return True
+    return camera.model in _POLYNOMIAL and not any(camera.params[_POLYNOMIAL[camera.model] :])
+
+
+def to_pycolmap(camera: Camera) -> pycolmap.Camera:
+    """The same camera as pycolmap's; parameters must have been validated."""
+    return pycolmap.Camera(
+        camera_id=camera.id,
+        model=getattr(pycolmap.CameraModelId, camera.model),
+        width=camera.width,
+        height=camera.height,
+        params=list(camera.params),
+    )
+
+
+def distort(camera: pycolmap.Camera, xy: np.ndarray) -> np.ndarray:
+    """Normalised pinhole coordinates (n,2) to the camera's pixels (n,2); NaN where the model has no answer."""
+    rays = np.column_stack([xy, np.ones(len(xy))])
+    return np.asarray(camera.img_from_cam(rays), np.float64).reshape(-1, 2)
+
+
+def undistort(camera: pycolmap.Camera, pixels: np.ndarray, tolerance: float = 0.1) -> np.ndarray:
+    """Pixels (n,2) to normalised pinhole coordinates (n,2); NaN where the inverse does not project back.
+
+    The inverse is iterative and can end on a wrong root or nowhere, so it is checked to `tolerance` pixels.
+    """
+    if len(pixels) == 0:
+        return np.zeros((0, 2))
+    xy = np.asarray(camera.cam_from_img(np.ascontiguousarray(pixels, np.float64)), np.float64).reshape(-1, 2)
+    with np.errstate(invalid="ignore", over="ignore"):
+        off = np.abs(distort(camera, np.nan_to_num(xy, nan=0.0, posinf=0.0, neginf=0.0)) - pixels).max(1)
+        xy[~(off <= tolerance)] = np.nan
+    return xy
+
+
+def pinhole_for(camera: Camera, file: Path, max_size: int) -> Pinhole:
+    """The pinhole camera that replaces `camera`: the largest upright rectangle without blank pixels.
+
+    The focal lengths are kept, then everything is reduced to `max_size` pixels on the longer side (0 keeps it).
+    Raises InputError that names `file` when the camera's parameters cannot be a real lens.
+    """
+    who = f"{file} gives camera {camera.id} ({camera.model})"
+    if camera.model == "EQUIRECTANGULAR":
+        raise InputError(
+            f"{who} a full panorama, which no pinhole view can hold; cut it into perspective images first."
+        )
+    lens = to_pycolmap(camera)
+    fx, fy, cx, cy = lens.focal_length_x, lens.focal_length_y, lens.principal_point_x, lens.principal_point_y
+    longest = max(camera.width, camera.height)
+    degenerate = "the model is degenerate: run COLMAP anew with more images or a simpler camera model"
+    if not (0.02 * longest < min(fx, fy) and max(fx, fy) < 1000 * longest):
+        raise InputError(
+            f"{who} a focal length of {fx:.4g} pixels for an image of {camera.width}x{camera.height}; {degenerate}."
+        )
+    if not (-longest < cx < 2 * longest and -longest < cy < 2 * longest):
+        raise InputError(f"{who} a principal point of ({cx:.4g}, {cy:.4g}), far outside the image; {degenerate}.")
+    if is_pinhole(camera):
+        return _limited(
+            np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64), camera.width, camera.height, max_size
+        )
+
+    box = _inner_box(lens, camera.width, camera.height, fx, fy)
+    if box is None:
+        raise InputError(f"{who} a distortion that folds over at the middle of the image; {degenerate}.")
+    x0, y0, x1, y1 = box
+    width, height = math.floor((x1 - x0) * fx + 1e-6), math.floor((y1 - y0) * fy + 1e-6)
+    if width < 0.2 * camera.width or height < 0.2 * camera.height or _covered(lens, box, camera) < 0.1:
+        raise InputError(
+            f"{who} a distortion that no real lens has (of {camera.width}x{camera.height} pixels {max(width, 0)}x"
+            f"{max(height, 0)} would remain); {degenerate}."
+        )
+    # What the floor took away is taken from both ends, so that the rectangle stays inside.
+    cx, cy = -x0 * fx - ((x1 - x0) * fx - width) / 2, -y0 * fy - ((y1 - y0) * fy - height) / 2
+    return _limited(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64), width, height, max_size)
+
+
+def _limited(K: np.ndarray, width: int, height: int, max_size: int) -> Pinhole:
+    if max_size <= 0 or max(width, height) <= max_size:
+        return Pinhole(K, width, height)
+    scale = max_size / max(width, height)
+    w, h = max(1, round(width * scale)), max(1, round(height * scale))
+    return Pinhole(np.diag([w / width, h / height, 1.0]) @ K, w, h)
+
+
+def _inner_box(lens: pycolmap.Camera, width: int, height: int, fx: float, fy: float) -> tuple[float, ...] | None:
+    """The rectangle (x0, y0, x1, y1), in normalised coordinates, in which every ray meets the image.
+
+    Rays are followed outwards from the image's centre until they leave the image or the projection folds over
+    (its Jacobian's determinant is no longer positive): what lies beyond the fold lands in the image a second time.
+    """
+    middle = undistort(lens, np.array([[width / 2, height / 2]]))[0]
+    if not np.isfinite(middle).all() or np.abs(middle).max() > MAX_TAN:
+        return None
+    directions = 8 * 64
+    angle = np.arange(directions) * (2 * math.pi / directions)
+    ray = np.stack([np.cos(angle), np.sin(angle)], 1)
+    reach = MAX_TAN * math.sqrt(2) + float(np.abs(middle).max())
+    fine = min(reach, 4 * math.hypot(width / fx, height / fy) / 2)
+    t = np.unique(np.concatenate([np.linspace(0, reach, 257), np.linspace(0, fine, 257)]))
+    good = _valid(lens, middle + t[:, None, None] * ray, width, height, fx, fy)
+    if not good[0].all():
+        return None
+    first_bad = np.where(good.all(0), len(t) - 1, np.argmin(good, 0))
+    low, high = t[np.maximum(first_bad - 1, 0)], t[first_bad]
+    low = np.where(good.all(0), high, low)
+    for _ in range(24):
+        between = (low + high) / 2
+        inside = _valid(lens, middle + between[:, None] * ray, width, height, fx, fy)
+        low, high = np.where(inside, between, low), np.where(inside, high, between)
+    edge = middle + low[:, None] * ray
+    pixel = distort(lens, edge)
+    near = 1e-3 * max(width, height)
+    # Each side is where the rays that leave through it are nearest; a side that no ray reaches is bound by the limit.
+    x0 = max([-MAX_TAN, *edge[pixel[:, 0] < near, 0]])
+    x1 = min([MAX_TAN, *edge[pixel[:, 0] > width - near, 0]])
+    y0 = max([-MAX_TAN, *edge[pixel[:, 1] < near, 1]])
+    y1 = min([MAX_TAN, *edge[pixel[:, 1] > height - near, 1]])
+    if not (x0 < middle[0] < x1 and y0 < middle[1] < y1):
+        return None
+    # Where rays end at a fold instead of a side, the rectangle shrinks about the middle until none ends inside it.
+    sides = np.where(edge > middle, [x1, y1], [x0, y0]) - middle
+    shrink = min(1.0, float(np.max((edge - middle) / sides, 1).min()))
+    mx, my = float(middle[0]), float(middle[1])
+    return tuple(float(m + (side - m) * shrink) for side, m in ((x0, mx), (y0, my), (x1, mx), (y1, my)))
+
+
+def _valid(lens: pycolmap.Camera, xy: np.ndarray, width: int, height: int, fx: float, fy: float) -> np.ndarray:
+    """Which normalised coordinates (..., 2) land in the image without a fold."""
+    shape, flat = xy.shape[:-1], xy.reshape(-1, 2)
+    right, down = np.array([_STEP, 0.0]), np.array([0.0, _STEP])
+    with np.errstate(invalid="ignore", over="ignore"):
+        at = distort(lens, flat)
+        dx = (distort(lens, flat + right) - at) / _STEP
+        dy = (distort(lens, flat + down) - at) / _STEP
+        determinant = (dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0]) / (fx * fy)
+        # 1% of the area at the axis: rays this dense are the rim of a fold.
+        good = (determinant > 0.01) & (at >= 0).all(1) & (at <= [width, height]).all(1)
+    return good.reshape(shape)
+
+
+def _covered(lens: pycolmap.Camera, box: tuple[float, ...], camera: Camera) -> float:
+    """The share of the image's area that the rectangle `box` takes."""
+    x0, y0, x1, y1 = box
+    s = np.linspace(0, 1, 65)[:-1]
+    x = np.concatenate([x0 + (x1 - x0) * s, np.full(64, x1), x1 - (x1 - x0) * s, np.full(64, x0)])
+    y = np.concatenate([np.full(64, y0), y0 + (y1 - y0) * s, np.full(64, y1), y1 - (y1 - y0) * s])
+    p = distort(lens, np.stack([x, y], 1))
+    area = 0.5 * abs(float(np.sum(p[:, 0] * np.roll(p[:, 1], -1) - p[:, 1] * np.roll(p[:, 0], -1))))
+    return area / (camera.width * camera.height) if math.isfinite(area) else 0.0
+
+
+def source_pixels(camera: Camera, target: Pinhole, supersample: int = 1) -> np.ndarray:
+    """Where each target pixel's centre lies in the camera's image: (2, h, w) float32, rows (y) first, in pixels.
+
+    `supersample` n asks for n times n samples a pixel: (2, n h, n w).
+    """
+    lens = to_pycolmap(camera)
+    width, height = target.width * supersample, target.height * supersample
+    fx, fy = target.K[0, 0] * supersample, target.K[1, 1] * supersample
+    x = (np.arange(width) + 0.5 - target.K[0, 2] * supersample) / fx
+    y = (np.arange(height) + 0.5 - target.K[1, 2] * supersample) / fy
+    result = np.empty((2, height, width), np.float32)
+    rows = max(1, _STRIP // width)
+    for first in range(0, height, rows):
+        part = y[first : first + rows]
+        xy = np.stack(np.broadcast_arrays(x[None, :], part[:, None]), -1).reshape(-1, 2)
+        pixel = distort(lens, xy).reshape(len(part), width, 2)
+        result[0, first : first + rows] = pixel[..., 1]
+        result[1, first : first + rows] = pixel[..., 0]
+    return np.nan_to_num(result, copy=False, nan=-1.0)
+
+
+def resample_image(image: PilImage.Image, camera: Camera, target: Pinhole) -> PilImage.Image:
+    """An RGB image of `camera` as `target` sees it; bilinear, averaged where the target is coarser."""
+    if is_pinhole(camera):
+        return image.resize((target.width, target.height), PilImage.Resampling.HAMMING)
+    # Coarser than the source: first average whole blocks, then 2x2 samples a pixel for what is left.
+    fx = to_pycolmap(camera).focal_length_x
+    ratio = fx / target.K[0, 0]
+    block = max(1, math.floor(ratio + 1e-6))
+    supersample = 2 if ratio / block > 1.2 else 1
+    source = image.reduce(block) if block > 1 else image
+    # Sample positions in pixel edges' coordinates; an array's index i is the centre i + 0.5.
+    at = source_pixels(camera, target, supersample) / np.float32(block) - np.float32(0.5)
+    planes = np.asarray(source)
+    out = np.empty((*at.shape[1:], 3), np.uint8)
+    for channel in range(3):
+        values = map_coordinates(planes[..., channel], at, np.float32, order=1, mode="nearest", prefilter=False)
+        out[..., channel] = np.clip(np.rint(values), 0, 255)
+    result = PilImage.fromarray(out)
+    return result.reduce(supersample) if supersample > 1 else result
+
+
+def resample_mask(mask: np.ndarray, camera: Camera, target: Pinhole) -> np.ndarray:
+    """An ID map (h, w) of `camera` as `target` sees it: nearest, so that no ID is invented.
+
+    The map may have any size of the camera's aspect ratio; the result has the target's size.
+    """
+    rows, columns = mask.shape
+    if is_pinhole(camera):
+        y = ((np.arange(target.height) + 0.5) * (rows / target.height)).astype(np.int64)
+        x = ((np.arange(target.width) + 0.5) * (columns / target.width)).astype(np.int64)
+        return mask[np.minimum(y, rows - 1)[:, None], np.minimum(x, columns - 1)[None, :]]
+    at = source_pixels(camera, target)
+    y = np.clip((at[0] * (rows / camera.height)).astype(np.int64), 0, rows - 1)
+    x = np.clip((at[1] * (columns / camera.width)).astype(np.int64), 0, columns - 1)
+    return mask[y, x]

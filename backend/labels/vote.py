@@ -1,0 +1,207 @@
+"""Gives each point of the cloud an object ID by letting the views' masks vote (ObjectGS, three strategies).
+
+Two differences from the published code: a point behind the camera or outside the image does not vote there, and label
+0 (unlabelled) counts only where nothing else voted. Held-out views do not vote, so that quality stays measured on
+views whose masks nothing has seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from scipy.ndimage import minimum_filter
+
+from ..capture import Capture
+from ..protocol import Reporter
+
+Strategy = Literal["majority", "probability", "correspondence"]
+
+FEW_POINTS = 20
+"""Fewer points than this make an object worth a warning."""
+
+_SLOTS = 6
+_MERGE_AT = 1 << 23
+
+
+@dataclass(frozen=True)
+class Votes:
+    """ids (M,) int64 object of each point, 0 where nobody voted for one; margins (M,) float32 in [0, 1]: the chosen
+    ID's share of the votes other than 0, less the share of the best other ID; counts: points of each object; visible
+    (M,) int32: how many views voted on the point, with 0 or another ID."""
+
+    ids: np.ndarray
+    margins: np.ndarray
+    counts: dict[int, int]
+    visible: np.ndarray
+    warnings: list[str] = field(default_factory=list)
+
+
+def vote(
+    capture: Capture,
+    strategy: Strategy = "majority",
+    seed: int = 0,
+    occlusion: bool = False,
+    reporter: Reporter | None = None,
+) -> Votes:
+    """Label the capture's points from its masks.
+
+    majority: each view in which the point lies votes with the ID at its pixel, the most frequent wins, ties go to the
+    smallest. probability: the ID is drawn in proportion to those votes, from `seed`. correspondence: only views in
+    which COLMAP observed the point vote, at the observed pixel. `occlusion` drops views in which nearer points hide
+    the point (it has no effect on correspondence, whose points were seen).
+    """
+    if strategy not in ("majority", "probability", "correspondence"):
+        raise ValueError(f"unknown strategy {strategy!r}")
+    reporter = reporter or Reporter()
+    object_ids = capture.object_ids
+    ballots = _Ballots(len(capture.points.xyz), len(object_ids))
+    indices = [i for i in capture.train_indices if capture.views[i].mask_file is not None]
+    reporter.status("Voting")
+    for done, index in enumerate(indices, 1):
+        mask = capture.mask(index)
+        assert mask is not None
+        if strategy == "correspondence":
+            points, x, y = _observed(capture, index)
+        else:
+            points, x, y = _projected(capture, index, occlusion)
+        seen = mask[y, x]
+        ballots.add(points, np.where(seen == 0, -1, np.searchsorted(object_ids, seen)))
+        reporter.progress(done, len(indices), what="views")
+    chosen, margins = ballots.count(np.random.default_rng(seed) if strategy == "probability" else None)
+    ids = np.where(chosen < 0, 0, object_ids[chosen] if len(object_ids) else 0).astype(np.int64)
+    won = np.bincount(chosen[chosen >= 0], minlength=len(object_ids))
+    counts = {int(i): int(n) for i, n in zip(object_ids, won)}
+    warnings = _warnings(capture, counts, int((ids == 0).sum()) if len(object_ids) else 0)
+    for sentence in warnings:
+        reporter.warning(sentence)
+    return Votes(ids, margins, counts, ballots.visible, warnings)
+
+
+def _warnings(capture: Capture, counts: dict[int, int], unlabelled: int) -> list[str]:
+    def listed(ids: list[int]) -> str:
+        named = [f"{i} ({capture.names[i]})" if i in capture.names else str(i) for i in ids[:10]]
+        return ", ".join(named) + (f" and {len(ids) - 10} more" if len(ids) > 10 else "")
+
+    none = [i for i, count in counts.items() if count == 0]
+    few = [i for i, count in counts.items() if 0 < count < FEW_POINTS]
+    warnings = []
+    if none:
+        warnings.append(f"No point was labelled as object {listed(none)}, so training starts without it.")
+    if few:
+        warnings.append(f"Fewer than {FEW_POINTS} points were labelled as object {listed(few)}.")
+    if 2 * unlabelled > len(capture.points.xyz):
+        warnings.append(f"{unlabelled} of {len(capture.points.xyz)} points were labelled as no object.")
+    return warnings
+
+
+def _projected(capture: Capture, index: int, occlusion: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The points in front of a view and inside it: their indices (n,), and their pixels' columns and rows (n,)."""
+    view = capture.views[index]
+    camera = capture.points.xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    z = camera[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        x = camera[:, 0] / z * view.K[0, 0] + view.K[0, 2]
+        y = camera[:, 1] / z * view.K[1, 1] + view.K[1, 2]
+        points = np.flatnonzero((z > 0) & (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height))
+    x, y, z = x[points], y[points], z[points]
+    if occlusion and len(points):
+        shown = _unhidden(x, y, z, view.width, view.height)
+        points, x, y = points[shown], x[shown], y[shown]
+    return points, x.astype(np.int64), y.astype(np.int64)
+
+
+def _unhidden(x: np.ndarray, y: np.ndarray, z: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Which points no nearer point hides: (n,) bool.
+
+    The points are too sparse to make a surface, so each stands for a square about as wide as the distance between
+    points; hidden is what lies clearly behind the nearest square that covers it.
+    """
+    cell = max(2.0, 0.5 * float(np.sqrt(width * height / len(z))))
+    columns, rows = int(np.ceil(width / cell)), int(np.ceil(height / cell))
+    at = (y / cell).astype(np.int64) * columns + (x / cell).astype(np.int64)
+    nearest = np.full(rows * columns, np.inf)
+    np.minimum.at(nearest, at, z)
+    nearest = minimum_filter(nearest.reshape(rows, columns), 3, mode="nearest").ravel()
+    return z <= nearest[at] * 1.05
+
+
+def _observed(capture: Capture, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The points that COLMAP observed inside a view, as `_projected` gives them."""
+    view, keypoints = capture.views[index], capture.keypoints(index)
+    x, y = keypoints.xy[:, 0], keypoints.xy[:, 1]
+    inside = (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height)
+    # A point observed twice in one image is a wrong match; one of its observations votes.
+    points, first = np.unique(keypoints.point_index[inside], return_index=True)
+    return points, x[inside][first].astype(np.int64), y[inside][first].astype(np.int64)
+
+
+class _Ballots:
+    """How often each ID was voted for at each point, sparsely.
+
+    Few IDs meet at a point, so each point has a few slots of (ID, count); what finds no slot goes to a list of
+    (point, ID) keys that is merged now and then. Memory grows with the points, not with views or IDs.
+    """
+
+    def __init__(self, points: int, objects: int) -> None:
+        self.points, self.objects = points, max(objects, 1)
+        self.visible = np.zeros(points, np.int32)
+        self._ids = np.full((_SLOTS, points), -1, np.int32)
+        self._counts = np.zeros((_SLOTS, points), np.int32)
+        self._overflow: list[np.ndarray] = []
+        self._waiting = 0
+        self._merged = (np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+    def add(self, points: np.ndarray, ids: np.ndarray) -> None:
+        """One view's votes: distinct point indices (n,), IDs (n,) from 0, -1 for unlabelled."""
+        self.visible[points] += 1
+        labelled = ids >= 0
+        points, ids = points[labelled], ids[labelled]
+        for slot in range(_SLOTS):
+            if len(points) == 0:
+                return
+            held = self._ids[slot, points]
+            mine = (held == ids) | (held < 0)
+            self._ids[slot, points[mine]] = ids[mine]
+            self._counts[slot, points[mine]] += 1
+            points, ids = points[~mine], ids[~mine]
+        self._overflow.append(points * self.objects + ids)
+        self._waiting += len(points)
+        if self._waiting > _MERGE_AT:
+            self._merge()
+
+    def _merge(self) -> None:
+        keys, counts = self._merged
+        weights = np.concatenate([counts, np.ones(self._waiting, np.int64)])
+        keys, which = np.unique(np.concatenate([keys, *self._overflow]), return_inverse=True)
+        self._merged = (keys, np.bincount(which, weights, len(keys)).astype(np.int64))
+        self._overflow, self._waiting = [], 0
+
+    def count(self, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
+        """The chosen ID (M,) from 0, -1 where none was voted for, and its margin (M,); drawn when `rng` is given."""
+        self._merge()
+        slot, point = np.nonzero(self._ids >= 0)
+        points = np.concatenate([point, self._merged[0] // self.objects])
+        ids = np.concatenate([self._ids[slot, point].astype(np.int64), self._merged[0] % self.objects])
+        counts = np.concatenate([self._counts[slot, point].astype(np.int64), self._merged[1]])
+        chosen, margins = np.full(self.points, -1, np.int64), np.zeros(self.points, np.float32)
+        if len(points) == 0:
+            return chosen, margins
+        # The votes of a point stand together, the most frequent first, among equals the smallest ID.
+        order = np.lexsort((ids, -counts, points))
+        points, ids, counts = points[order], ids[order], counts[order]
+        voted, first, length = np.unique(points, return_index=True, return_counts=True)
+        below = np.concatenate([[0], np.cumsum(counts)])
+        total = below[first + length] - below[first]
+        most = counts[first]
+        second = np.where(length > 1, counts[np.minimum(first + 1, len(counts) - 1)], 0)
+        if rng is None:
+            pick, others = first, second
+        else:
+            drawn = below[first] + np.floor(rng.random(len(voted)) * total).astype(np.int64)
+            pick = np.searchsorted(below, drawn, side="right") - 1
+            others = np.where(pick == first, second, most)
+        chosen[voted] = ids[pick]
+        margins[voted] = np.maximum(counts[pick] - others, 0) / total
+        return chosen, margins
