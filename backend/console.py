@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -45,7 +46,6 @@ class ConsoleReporter(Reporter):
         self.errors = errors or sys.stderr
         self.on_terminal = self.stream.isatty()
         self._bar: tqdm | None = None
-        self._label = ""
         self._started = time.monotonic()
         self._last_line = -SECONDS_BETWEEN_LINES
         self._kept: dict[str, Any] = {}
@@ -54,7 +54,6 @@ class ConsoleReporter(Reporter):
     def status(self, message: str) -> None:
         """Say what is being done now; progress that follows belongs to it."""
         self.close()
-        self._label = message
         self._print(message, self.stream)
 
     def progress(self, done: float, total: float, **fields: Any) -> None:
@@ -77,15 +76,13 @@ class ConsoleReporter(Reporter):
     def _move_bar(self, done: float, total: float, text: str) -> None:
         if self._bar is not None and self._bar.total != total:
             self._close_bar()
+        columns, rows = shutil.get_terminal_size()
+        width = min(30, max(5, columns - 12 - len(text)))
+        form = f"  {{percentage:3.0f}}% |{{bar:{width}}}| {{desc}}"
         if self._bar is None:
-            self._bar = tqdm(
-                total=total,
-                file=self.stream,
-                leave=True,
-                dynamic_ncols=True,
-                bar_format="  {percentage:3.0f}% |{bar:30}| {postfix}",
-            )
-        self._bar.set_postfix_str(text, refresh=False)
+            self._bar = tqdm(total=total, file=self.stream, leave=True, nrows=rows, bar_format=form)
+        self._bar.ncols, self._bar.bar_format = columns - 1, form
+        self._bar.set_description_str(text, refresh=False)
         self._bar.update(done - self._bar.n)
         if done >= total:
             self._close_bar()

@@ -91,7 +91,7 @@ def contact_sheet(images: Sequence[NDArray | Image.Image], titles: Sequence[str]
 
 
 def save_picture(image: Image.Image, path: Path, limit: int = 300_000) -> Path:
-    """Write `image` atomically as PNG, or, where that takes more than `limit` bytes, as JPEG; returns the path written."""
+    """Write `image` atomically as PNG, or as JPEG where that takes over `limit` bytes; returns the path written."""
     buffer = io.BytesIO()
     image.save(buffer, "PNG", optimize=True)
     if buffer.tell() > limit:
