@@ -1,0 +1,85 @@
+"""One interface to every renderer: Gaussians, a camera and what is wanted -> what was wanted, differentiable."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from . import cpu
+from .camera import Camera
+
+__all__ = ["Camera", "Rendered", "object_map", "rasterize"]
+
+
+class Rendered(NamedTuple):
+    """color (3, H, W) premultiplied, without background; alpha (H, W); weight (H, W): probability of the pixel's label;
+    depth (H, W): expected depth times alpha; frame: the renderer's own record, for `object_map` and growth."""
+
+    color: torch.Tensor
+    alpha: torch.Tensor
+    weight: torch.Tensor | None
+    depth: torch.Tensor | None
+    frame: cpu.Frame
+
+
+def _array(tensor: torch.Tensor) -> np.ndarray:
+    return np.ascontiguousarray(tensor.detach().numpy(), np.float32)
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, means, quats, scales, opacities, sh, ids, camera, labels, want_depth, holder):
+        gaussians = cpu.Gaussians(
+            _array(means), _array(quats), _array(scales), _array(opacities), _array(sh),
+            np.ascontiguousarray(ids.numpy(), np.int32),
+        )  # fmt: skip
+        frame = cpu.forward(gaussians, camera, None if labels is None else labels.numpy(), want_depth)
+        ctx.frame = frame
+        holder.append(frame)
+        outputs = [torch.from_numpy(frame.color), torch.from_numpy(1.0 - frame.transmittance)]
+        if frame.weight is not None:
+            outputs.append(torch.from_numpy(frame.weight))
+        if frame.depth is not None:
+            outputs.append(torch.from_numpy(frame.depth))
+        return tuple(outputs)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients):
+        frame = ctx.frame
+        planes = [_array(g) for g in gradients]
+        g_weight = planes[2] if frame.weight is not None else None
+        g_depth = planes[-1] if frame.depth is not None else None
+        out = cpu.backward(frame, planes[0], planes[1], g_weight, g_depth)
+        arrays = (out.means, out.quats, out.scales, out.opacities, out.sh)
+        return (*(torch.from_numpy(a) for a in arrays), None, None, None, None, None)
+
+
+def rasterize(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    sh: torch.Tensor,
+    ids: torch.Tensor,
+    camera: Camera,
+    labels: torch.Tensor | None = None,
+    want_depth: bool = False,
+) -> Rendered:
+    """Draw 3D Gaussians (Kerbl et al. 2023), differentiable in the first five arguments.
+
+    means (N, 3), quats (N, 4) wxyz of any length, scales (N, 3) linear, opacities (N,) in (0, 1), sh (N, K, 3) with
+    K = 1, 4, 9 or 16 (colour = 0.5 + SH, clamped at 0): float32. ids (N,) int32. labels (H, W) int32: also return the
+    probability that each pixel shows its label (the paper's P at the label); nothing is computed that is not asked for.
+    """
+    holder: list[cpu.Frame] = []
+    outputs = _Rasterize.apply(means, quats, scales, opacities, sh, ids, camera, labels, want_depth, holder)
+    weight = outputs[2] if labels is not None else None
+    depth = outputs[-1] if want_depth else None
+    return Rendered(outputs[0], outputs[1], weight, depth, holder[0])
+
+
+def object_map(rendered: Rendered) -> tuple[np.ndarray, np.ndarray]:
+    """The most probable ID (H, W) int32 (-1 where nothing is drawn) and its probability (H, W) float32."""
+    return cpu.object_map(rendered.frame)

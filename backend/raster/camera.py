@@ -1,0 +1,34 @@
+"""A pinhole camera as the renderers take it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .settings import NEAR
+
+
+@dataclass(frozen=True)
+class Camera:
+    """viewmat (4, 4) float64 world to camera with OpenCV axes; K (3, 3) float64 in pixels, the first pixel's centre at
+    (0.5, 0.5); width and height in pixels; near: nearest drawn depth in scene units."""
+
+    viewmat: np.ndarray
+    K: np.ndarray
+    width: int
+    height: int
+    near: float = NEAR
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """viewmat (4, 4) and (fx, fy, cx, cy), contiguous float64."""
+        K = self.K
+        return (
+            np.ascontiguousarray(self.viewmat, np.float64),
+            np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], np.float64),
+        )
+
+    @property
+    def centre(self) -> np.ndarray:
+        """(3,) float64: where the camera stands in the world."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]

@@ -1,0 +1,126 @@
+"""The most probable object of every pixel, exactly, at a cost that does not grow with the number of objects.
+
+P_i(x) sums the blending weights of the splats with ID i. The weights are computed once, in depth order, and kept
+for the tile; a second pass adds them up object by object, over that object's box alone, and keeps the largest.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from . import simd
+from .cpu_bin import TILE_H, TILE_W
+from .cpu_project import HALF_H, HALF_W, A, V
+from .cpu_tiles import STRIDE, live_rows, row_span
+from .settings import ALPHA_MAX, ALPHA_MIN, STOP
+
+_LOG2_CUT = np.float32(math.log2(ALPHA_MIN))
+_ALPHA_MAX = np.float32(ALPHA_MAX)
+_STOP = np.float32(STOP)
+_ONE = np.float32(1.0)
+_CHECK_EVERY = 32
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def most_probable(splats, ids, tiles, members, best_id, best_weight):
+    """Write best_id (H, W) int32 and best_weight (H, W) float32 = max_i P_i; ID -1 and weight 0 where nothing is drawn.
+
+    Of objects with equal weight the smallest ID wins.
+    """
+    height, width = best_id.shape
+    columns = (width + TILE_W - 1) // TILE_W
+    plane = TILE_H * STRIDE
+    for tile in prange(tiles.size - 1):
+        tile_x = (tile % columns) * TILE_W
+        tile_y = (tile // columns) * TILE_H
+        rows = min(TILE_H, height - tile_y)
+        cols = min(TILE_W, width - tile_x)
+        first = tiles[tile]
+        count = tiles[tile + 1] - first
+        T = np.zeros(plane, np.float32)
+        current = np.zeros(plane, np.float32)
+        winner_weight = np.zeros(plane, np.float32)
+        winner = np.full(plane, -1, np.int32)
+        live = np.zeros(TILE_H, np.bool_)
+        for row in range(rows):
+            live[row] = True
+            for x in range(cols):
+                T[row * STRIDE + x] = 1.0
+        room = 0
+        for k in range(count):
+            n = members[first + k]
+            across = min(int(2 * splats[n, HALF_W]) + 2, TILE_W) + simd.LANES
+            down = min(int(2 * splats[n, HALF_H]) + 2, TILE_H)
+            room += across * down
+        kept = np.empty(room, np.float32)
+        begin = np.empty(count + 1, np.int64)
+        cut = simd.splat(_LOG2_CUT)
+        stop_at = simd.splat(_STOP)
+        alpha_max = simd.splat(_ALPHA_MAX)
+        one = simd.splat(_ONE)
+        used = 0
+        for k in range(count):
+            begin[k] = used
+            if k % _CHECK_EVERY == _CHECK_EVERY - 1 and not live_rows(T, live):
+                count = k
+                break
+            n = members[first + k]
+            y0 = max(int(math.floor(splats[n, V] - splats[n, HALF_H])), tile_y) - tile_y
+            y1 = min(int(math.floor(splats[n, V] + splats[n, HALF_H])) + 1, tile_y + rows) - tile_y
+            quad = simd.splat(-splats[n, A])
+            for row in range(y0, y1):
+                start, stop, _dy, top, centre = row_span(splats, n, tile_x, tile_y + row)
+                row_top = simd.splat(top)
+                for x in range(start, stop, simd.LANES):
+                    at = row * STRIDE + x
+                    d = simd.ramp(np.float32(tile_x + x) + np.float32(0.5) - centre)
+                    exponent = quad * d * d + row_top
+                    alpha = simd.minimum(simd.exp2(exponent), alpha_max)
+                    t = simd.load(T, at)
+                    alpha = simd.keep(simd.both(simd.at_least(exponent, cut), simd.at_least(t, stop_at)), alpha)
+                    simd.store(kept, used, alpha * t)
+                    simd.store(T, at, t * (one - alpha))
+                    used += simd.LANES
+        owners = np.empty(count, np.int32)
+        for k in range(count):
+            owners[k] = ids[members[first + k]]
+        grouped = np.argsort(owners, kind="mergesort")
+        group = 0
+        while group < count:
+            owner = owners[grouped[group]]
+            left, right, low, high = TILE_W, 0, TILE_H, 0
+            while group < count and owners[grouped[group]] == owner:
+                k = grouped[group]
+                n = members[first + k]
+                y0 = max(int(math.floor(splats[n, V] - splats[n, HALF_H])), tile_y) - tile_y
+                y1 = min(int(math.floor(splats[n, V] + splats[n, HALF_H])) + 1, tile_y + rows) - tile_y
+                low = min(low, y0)
+                high = max(high, y1)
+                at_kept = begin[k]
+                for row in range(y0, y1):
+                    start, stop, _dy, _top, _centre = row_span(splats, n, tile_x, tile_y + row)
+                    if start < stop:
+                        left = min(left, start)
+                    for x in range(start, stop, simd.LANES):
+                        at = row * STRIDE + x
+                        simd.store(current, at, simd.load(current, at) + simd.load(kept, at_kept))
+                        at_kept += simd.LANES
+                        right = max(right, min(x + simd.LANES, TILE_W))
+                group += 1
+            mine = simd.splat_i(owner)
+            for row in range(low, high):
+                for x in range(left, right, simd.LANES):
+                    at = row * STRIDE + x
+                    here = simd.load(current, at)
+                    best = simd.load(winner_weight, at)
+                    wins = simd.above(here, best)
+                    simd.store(winner_weight, at, simd.where(wins, here, best))
+                    simd.store(winner, at, simd.where_i(wins, mine, simd.load_i(winner, at)))
+                    simd.store(current, at, simd.splat(np.float32(0.0)))
+        for row in range(rows):
+            for x in range(cols):
+                best_id[tile_y + row, tile_x + x] = winner[row * STRIDE + x]
+                best_weight[tile_y + row, tile_x + x] = winner_weight[row * STRIDE + x]

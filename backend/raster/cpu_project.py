@@ -1,0 +1,378 @@
+"""3D Gaussians to screen splats and back (EWA splatting, Zwicker et al. 2001), on the CPU.
+
+A screen splat is stored so that a pixel row needs no cancelling terms: with the projected covariance
+[[a, b], [b, c]] (blur included) and dy = y - v,
+
+    log2 alpha(x, y) = lop - A (x - u - s dy)^2 - C dy^2,
+    s = b / c,  A = k / (a - b^2 / c),  C = k / c,  k = log2(e) / 2,
+
+which equals the usual quadratic form but stays exact for long diagonal needles. Inputs and outputs are float32,
+the arithmetic between them float64: this stage is a small share of the time and where determinants underflow.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from .settings import ALPHA_MIN, BLUR, MAX_SH_COEFFICIENTS, MIN_QUAT_NORM2, TAN_MARGIN
+
+# Columns of a screen splat.
+U, V, SLOPE, A, C, LOP, RED, GREEN, BLUE, DEPTH, HALF_W, HALF_H = range(12)
+SPLAT_COLUMNS = 12
+# Columns of a gradient row: moments of dL/d(log2 alpha) over the splat's pixels, then colour and depth.
+M0, MY, MYY, MX, MXY, MXX, G_RED, G_GREEN, G_BLUE, G_DEPTH = range(10)
+GRADIENT_COLUMNS = 10
+
+_HALF_LOG2E = 0.5 / math.log(2.0)
+_LN2 = math.log(2.0)
+_LOG2_CUT = math.log2(ALPHA_MIN)
+
+_C0 = 0.28209479177387814
+_C1 = 0.4886025119029199
+_C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
+_C3 = (
+    -0.5900435899266435,
+    2.890611442640554,
+    -0.4570457994644658,
+    0.3731763325901154,
+    -0.4570457994644658,
+    1.445305721320277,
+    -0.5900435899266435,
+)
+
+
+@njit(cache=True, error_model="numpy")
+def sh_basis(x, y, z, count, out):
+    """Real spherical harmonics of degree 0-3 at the unit direction (x, y, z); `count` = 1, 4, 9 or 16."""
+    out[0] = _C0
+    if count > 1:
+        out[1] = -_C1 * y
+        out[2] = _C1 * z
+        out[3] = -_C1 * x
+    if count > 4:
+        xx, yy, zz = x * x, y * y, z * z
+        out[4] = _C2[0] * x * y
+        out[5] = _C2[1] * y * z
+        out[6] = _C2[2] * (2.0 * zz - xx - yy)
+        out[7] = _C2[3] * x * z
+        out[8] = _C2[4] * (xx - yy)
+        if count > 9:
+            out[9] = _C3[0] * y * (3.0 * xx - yy)
+            out[10] = _C3[1] * x * y * z
+            out[11] = _C3[2] * y * (4.0 * zz - xx - yy)
+            out[12] = _C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy)
+            out[13] = _C3[4] * x * (4.0 * zz - xx - yy)
+            out[14] = _C3[5] * z * (xx - yy)
+            out[15] = _C3[6] * x * (xx - 3.0 * yy)
+
+
+@njit(cache=True, error_model="numpy")
+def sh_gradient(x, y, z, count, g):
+    """Gradient of sum_k g[k] Y_k(x, y, z) with respect to the direction, before its normalisation."""
+    gx = gy = gz = 0.0
+    if count > 1:
+        gy -= _C1 * g[1]
+        gz += _C1 * g[2]
+        gx -= _C1 * g[3]
+    if count > 4:
+        gx += _C2[0] * y * g[4] + _C2[2] * -2.0 * x * g[6] + _C2[3] * z * g[7] + _C2[4] * 2.0 * x * g[8]
+        gy += _C2[0] * x * g[4] + _C2[1] * z * g[5] + _C2[2] * -2.0 * y * g[6] - _C2[4] * 2.0 * y * g[8]
+        gz += _C2[1] * y * g[5] + _C2[2] * 4.0 * z * g[6] + _C2[3] * x * g[7]
+    if count > 9:
+        xx, yy, zz = x * x, y * y, z * z
+        gx += (
+            _C3[0] * 6.0 * x * y * g[9]
+            + _C3[1] * y * z * g[10]
+            + _C3[2] * -2.0 * x * y * g[11]
+            + _C3[3] * -6.0 * x * z * g[12]
+            + _C3[4] * (4.0 * zz - 3.0 * xx - yy) * g[13]
+            + _C3[5] * 2.0 * x * z * g[14]
+            + _C3[6] * (3.0 * xx - 3.0 * yy) * g[15]
+        )
+        gy += (
+            _C3[0] * (3.0 * xx - 3.0 * yy) * g[9]
+            + _C3[1] * x * z * g[10]
+            + _C3[2] * (4.0 * zz - xx - 3.0 * yy) * g[11]
+            + _C3[3] * -6.0 * y * z * g[12]
+            + _C3[4] * -2.0 * x * y * g[13]
+            + _C3[5] * -2.0 * y * z * g[14]
+            + _C3[6] * -6.0 * x * y * g[15]
+        )
+        gz += (
+            _C3[1] * x * y * g[10]
+            + _C3[2] * 8.0 * y * z * g[11]
+            + _C3[3] * (6.0 * zz - 3.0 * xx - 3.0 * yy) * g[12]
+            + _C3[4] * 8.0 * x * z * g[13]
+            + _C3[5] * (xx - yy) * g[14]
+        )
+    return gx, gy, gz
+
+
+@njit(cache=True, error_model="numpy")
+def _rotation(qw, qx, qy, qz, R):
+    R[0, 0] = 1.0 - 2.0 * (qy * qy + qz * qz)
+    R[0, 1] = 2.0 * (qx * qy - qw * qz)
+    R[0, 2] = 2.0 * (qx * qz + qw * qy)
+    R[1, 0] = 2.0 * (qx * qy + qw * qz)
+    R[1, 1] = 1.0 - 2.0 * (qx * qx + qz * qz)
+    R[1, 2] = 2.0 * (qy * qz - qw * qx)
+    R[2, 0] = 2.0 * (qx * qz - qw * qy)
+    R[2, 1] = 2.0 * (qy * qz + qw * qx)
+    R[2, 2] = 1.0 - 2.0 * (qx * qx + qy * qy)
+
+
+@njit(cache=True, error_model="numpy")
+def _jacobian(px, py, pz, fx, fy, tan_limits, T, W):
+    """T = J W, with the ray's tangents clamped so that far off-screen splats keep a bounded footprint."""
+    tx = min(max(px / pz, tan_limits[0]), tan_limits[1])
+    ty = min(max(py / pz, tan_limits[2]), tan_limits[3])
+    for i in range(3):
+        T[0, i] = fx / pz * (W[0, i] - tx * W[2, i])
+        T[1, i] = fy / pz * (W[1, i] - ty * W[2, i])
+    return tx, ty
+
+
+@njit(cache=True, error_model="numpy")
+def tangent_limits(fx, fy, cx, cy, width, height):
+    """Clamp limits of x/z and y/z: the field of view with a margin on every side."""
+    limits = np.empty(4)
+    limits[0] = -cx / fx - TAN_MARGIN * 0.5 * width / fx
+    limits[1] = (width - cx) / fx + TAN_MARGIN * 0.5 * width / fx
+    limits[2] = -cy / fy - TAN_MARGIN * 0.5 * height / fy
+    limits[3] = (height - cy) / fy + TAN_MARGIN * 0.5 * height / fy
+    return limits
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def project(means, quats, scales, opacities, sh, viewmat, intrinsics, width, height, near, splats):
+    """Fill `splats` (N, 12) float32; HALF_H < 0 marks a splat that cannot be seen.
+
+    means (N, 3), quats (N, 4) wxyz of any length, scales (N, 3), opacities (N,), sh (N, K, 3): float32.
+    viewmat (4, 4) and intrinsics (fx, fy, cx, cy): float64.
+    """
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    limits = tangent_limits(fx, fy, cx, cy, width, height)
+    W = viewmat[:3, :3].copy()
+    t = viewmat[:3, 3].copy()
+    eye = -(W.T @ t)
+    count = sh.shape[1]
+    chunks = (means.shape[0] + 255) // 256
+    for chunk in prange(chunks):
+        R = np.empty((3, 3))
+        T = np.empty((2, 3))
+        basis = np.empty(MAX_SH_COEFFICIENTS)
+        for n in range(chunk * 256, min(chunk * 256 + 256, means.shape[0])):
+            splats[n, HALF_H] = -1.0
+            opacity = float(opacities[n])
+            if not opacity > ALPHA_MIN:
+                continue
+            mx, my, mz = float(means[n, 0]), float(means[n, 1]), float(means[n, 2])
+            px = W[0, 0] * mx + W[0, 1] * my + W[0, 2] * mz + t[0]
+            py = W[1, 0] * mx + W[1, 1] * my + W[1, 2] * mz + t[1]
+            pz = W[2, 0] * mx + W[2, 1] * my + W[2, 2] * mz + t[2]
+            if not pz > near:
+                continue
+            qw, qx, qy, qz = float(quats[n, 0]), float(quats[n, 1]), float(quats[n, 2]), float(quats[n, 3])
+            norm2 = qw * qw + qx * qx + qy * qy + qz * qz
+            if not norm2 > MIN_QUAT_NORM2:
+                continue
+            inverse = 1.0 / math.sqrt(norm2)
+            _rotation(qw * inverse, qx * inverse, qy * inverse, qz * inverse, R)
+            _jacobian(px, py, pz, fx, fy, limits, T, W)
+            a = BLUR
+            b = 0.0
+            c = BLUR
+            for j in range(3):
+                scale = float(scales[n, j])
+                v0 = (T[0, 0] * R[0, j] + T[0, 1] * R[1, j] + T[0, 2] * R[2, j]) * scale
+                v1 = (T[1, 0] * R[0, j] + T[1, 1] * R[1, j] + T[1, 2] * R[2, j]) * scale
+                a += v0 * v0
+                b += v0 * v1
+                c += v1 * v1
+            conditional = max(a - b * b / c, BLUR)
+            u = fx * px / pz + cx
+            v = fy * py / pz + cy
+            lop = math.log2(opacity)
+            reach = lop - _LOG2_CUT
+            half_w = math.sqrt(reach * a / _HALF_LOG2E)
+            half_h = math.sqrt(reach * c / _HALF_LOG2E)
+            # Written so that a NaN or an infinity fails every test.
+            if not (u + half_w > 0.0 and u - half_w < width and v + half_h > 0.0 and v - half_h < height):
+                continue
+            if not (half_w < 1e9 and half_h < 1e9):
+                continue
+            dx, dy, dz = mx - eye[0], my - eye[1], mz - eye[2]
+            length = math.sqrt(dx * dx + dy * dy + dz * dz)
+            sh_basis(dx / length, dy / length, dz / length, count, basis)
+            for channel in range(3):
+                value = 0.5
+                for k in range(count):
+                    value += basis[k] * sh[n, k, channel]
+                splats[n, RED + channel] = max(value, 0.0)
+            splats[n, U] = u
+            splats[n, V] = v
+            splats[n, SLOPE] = b / c
+            splats[n, A] = _HALF_LOG2E / conditional
+            splats[n, C] = _HALF_LOG2E / c
+            splats[n, LOP] = lop
+            splats[n, DEPTH] = pz
+            splats[n, HALF_W] = half_w
+            splats[n, HALF_H] = half_h
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def project_backward(
+    means, quats, scales, opacities, sh, viewmat, intrinsics, width, height, splats, slots, rows,
+    g_means, g_quats, g_scales, g_opacities, g_sh, g_screen,
+):  # fmt: skip
+    """Sum each splat's gradient rows in slot order and carry them to the Gaussian's parameters.
+
+    slots (N + 1,): splat n owns rows[slots[n]:slots[n + 1]]. g_* are written for every n (0 where unseen);
+    g_screen (N, 2) receives dL/du and dL/dv in pixels, the statistic that growth follows.
+    """
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    limits = tangent_limits(fx, fy, cx, cy, width, height)
+    W = viewmat[:3, :3].copy()
+    t = viewmat[:3, 3].copy()
+    eye = -(W.T @ t)
+    count = sh.shape[1]
+    chunks = (means.shape[0] + 255) // 256
+    for chunk in prange(chunks):
+        R = np.empty((3, 3))
+        T = np.empty((2, 3))
+        basis = np.empty(MAX_SH_COEFFICIENTS)
+        weights = np.empty(MAX_SH_COEFFICIENTS)
+        g_color = np.empty(3)
+        g = np.empty(GRADIENT_COLUMNS)
+        V0 = np.empty(3)
+        V1 = np.empty(3)
+        gR = np.empty((3, 3))
+        gT = np.empty((2, 3))
+        for n in range(chunk * 256, min(chunk * 256 + 256, means.shape[0])):
+            for i in range(3):
+                g_means[n, i] = 0.0
+                g_scales[n, i] = 0.0
+                for k in range(count):
+                    g_sh[n, k, i] = 0.0
+            for i in range(4):
+                g_quats[n, i] = 0.0
+            g_opacities[n] = 0.0
+            g_screen[n, 0] = 0.0
+            g_screen[n, 1] = 0.0
+            if slots[n] == slots[n + 1]:
+                continue
+            for i in range(GRADIENT_COLUMNS):
+                g[i] = 0.0
+            for slot in range(slots[n], slots[n + 1]):
+                for i in range(GRADIENT_COLUMNS):
+                    g[i] += rows[slot, i]
+
+            mx, my, mz = float(means[n, 0]), float(means[n, 1]), float(means[n, 2])
+            px = W[0, 0] * mx + W[0, 1] * my + W[0, 2] * mz + t[0]
+            py = W[1, 0] * mx + W[1, 1] * my + W[1, 2] * mz + t[1]
+            pz = W[2, 0] * mx + W[2, 1] * my + W[2, 2] * mz + t[2]
+            qw, qx, qy, qz = float(quats[n, 0]), float(quats[n, 1]), float(quats[n, 2]), float(quats[n, 3])
+            inverse = 1.0 / math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
+            qw, qx, qy, qz = qw * inverse, qx * inverse, qy * inverse, qz * inverse
+            _rotation(qw, qx, qy, qz, R)
+            tx, ty = _jacobian(px, py, pz, fx, fy, limits, T, W)
+            a = BLUR
+            b = 0.0
+            c = BLUR
+            for j in range(3):
+                scale = float(scales[n, j])
+                V0[j] = (T[0, 0] * R[0, j] + T[0, 1] * R[1, j] + T[0, 2] * R[2, j]) * scale
+                V1[j] = (T[1, 0] * R[0, j] + T[1, 1] * R[1, j] + T[1, 2] * R[2, j]) * scale
+                a += V0[j] * V0[j]
+                b += V0[j] * V1[j]
+                c += V1[j] * V1[j]
+            conditional = max(a - b * b / c, BLUR)
+            slope = b / c
+            quad_a = _HALF_LOG2E / conditional
+            quad_c = _HALF_LOG2E / c
+
+            g_u = 2.0 * quad_a * g[MX]
+            g_v = 2.0 * quad_c * g[MY] - 2.0 * quad_a * slope * g[MX]
+            g_slope = 2.0 * quad_a * g[MXY]
+            g_conditional = g[MXX] * quad_a / conditional
+            g_a = g_conditional
+            g_b = -2.0 * slope * g_conditional + g_slope / c
+            g_c = slope * slope * g_conditional - g_slope * slope / c + g[MYY] * quad_c / c
+            g_screen[n, 0] = g_u
+            g_screen[n, 1] = g_v
+            g_opacities[n] = g[M0] / (_LN2 * float(opacities[n]))
+
+            # Covariance to V = T R diag(scale), then to its three factors.
+            for i in range(2):
+                for j in range(3):
+                    gT[i, j] = 0.0
+            for j in range(3):
+                scale = float(scales[n, j])
+                gV0 = 2.0 * g_a * V0[j] + g_b * V1[j]
+                gV1 = 2.0 * g_c * V1[j] + g_b * V0[j]
+                g_scale = 0.0
+                for i in range(3):
+                    gM = T[0, i] * gV0 + T[1, i] * gV1
+                    g_scale += R[i, j] * gM
+                    gR[i, j] = gM * scale
+                    gT[0, i] += gV0 * R[i, j] * scale
+                    gT[1, i] += gV1 * R[i, j] * scale
+                g_scales[n, j] = g_scale
+
+            # Quaternion, tangent to the unit sphere.
+            gw = 2.0 * (qz * (gR[1, 0] - gR[0, 1]) + qy * (gR[0, 2] - gR[2, 0]) + qx * (gR[2, 1] - gR[1, 2]))
+            gx = 2.0 * (
+                qy * (gR[0, 1] + gR[1, 0]) + qz * (gR[0, 2] + gR[2, 0]) + qw * (gR[2, 1] - gR[1, 2])
+                - 2.0 * qx * (gR[1, 1] + gR[2, 2])
+            )  # fmt: skip
+            gy = 2.0 * (
+                qx * (gR[0, 1] + gR[1, 0]) + qz * (gR[1, 2] + gR[2, 1]) + qw * (gR[0, 2] - gR[2, 0])
+                - 2.0 * qy * (gR[0, 0] + gR[2, 2])
+            )  # fmt: skip
+            gz = 2.0 * (
+                qx * (gR[0, 2] + gR[2, 0]) + qy * (gR[1, 2] + gR[2, 1]) + qw * (gR[1, 0] - gR[0, 1])
+                - 2.0 * qz * (gR[0, 0] + gR[1, 1])
+            )  # fmt: skip
+            along = gw * qw + gx * qx + gy * qy + gz * qz
+            g_quats[n, 0] = (gw - along * qw) * inverse
+            g_quats[n, 1] = (gx - along * qx) * inverse
+            g_quats[n, 2] = (gy - along * qy) * inverse
+            g_quats[n, 3] = (gz - along * qz) * inverse
+
+            # Camera-space position: through the centre, the depth and the Jacobian.
+            g_px = g_u * fx / pz
+            g_py = g_v * fy / pz
+            g_pz = -(g_px * px + g_py * py) / pz + g[G_DEPTH]
+            g_tx = 0.0
+            g_ty = 0.0
+            for i in range(3):
+                g_tx -= gT[0, i] * fx / pz * W[2, i]
+                g_ty -= gT[1, i] * fy / pz * W[2, i]
+                g_pz -= (gT[0, i] * T[0, i] + gT[1, i] * T[1, i]) / pz
+            if limits[0] <= px / pz <= limits[1]:
+                g_px += g_tx / pz
+                g_pz -= g_tx * tx / pz
+            if limits[2] <= py / pz <= limits[3]:
+                g_py += g_ty / pz
+                g_pz -= g_ty * ty / pz
+
+            # Colour: through the SH coefficients and the viewing direction.
+            dx, dy, dz = mx - eye[0], my - eye[1], mz - eye[2]
+            length = math.sqrt(dx * dx + dy * dy + dz * dz)
+            dx, dy, dz = dx / length, dy / length, dz / length
+            sh_basis(dx, dy, dz, count, basis)
+            for channel in range(3):
+                g_color[channel] = g[G_RED + channel] if splats[n, RED + channel] > 0.0 else 0.0
+            for k in range(count):
+                weights[k] = 0.0
+                for channel in range(3):
+                    g_sh[n, k, channel] = basis[k] * g_color[channel]
+                    weights[k] += g_color[channel] * sh[n, k, channel]
+            sx, sy, sz = sh_gradient(dx, dy, dz, count, weights)
+            radial = sx * dx + sy * dy + sz * dz
+            g_means[n, 0] = W[0, 0] * g_px + W[1, 0] * g_py + W[2, 0] * g_pz + (sx - radial * dx) / length
+            g_means[n, 1] = W[0, 1] * g_px + W[1, 1] * g_py + W[2, 1] * g_pz + (sy - radial * dy) / length
+            g_means[n, 2] = W[0, 2] * g_px + W[1, 2] * g_py + W[2, 2] * g_pz + (sz - radial * dz) / length

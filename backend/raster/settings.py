@@ -1,0 +1,26 @@
+"""Guards shared by every renderer, so that all of them draw the same picture."""
+
+ALPHA_MAX = 0.99
+"""No splat is more opaque than this, so that what lies behind keeps a gradient."""
+
+ALPHA_MIN = 1.0 / 255.0
+"""A splat's contribution to a pixel below this is dropped; it also bounds the splat's extent."""
+
+STOP = 1e-4
+"""A pixel takes no further splats once the light that reaches them falls below this. The splat that crosses
+the limit is still drawn, so no combination of ALPHA_MAX and STOP can make an opaque splat vanish."""
+
+BLUR = 0.3
+"""Variance in square pixels added to every splat's footprint (low-pass filter of 3D Gaussian splatting)."""
+
+NEAR = 0.01
+"""Near plane, in scene units after normalisation."""
+
+TAN_MARGIN = 0.3
+"""How far beyond the field of view, as a share of its half width, the projection's Jacobian still follows."""
+
+MIN_QUAT_NORM2 = 1e-8
+"""Quaternions shorter than the square root of this have no direction; their splats are dropped."""
+
+MAX_SH_COEFFICIENTS = 16
+"""Spherical harmonics up to degree 3."""

@@ -1,0 +1,305 @@
+"""Sixteen float32 lanes as one value inside numba kernels.
+
+numba's own vectoriser keeps a tile's planes in memory and cannot vectorise a loop whose trip count is a splat's
+pixel span. These types lower to LLVM vectors instead, which every target LLVM knows (AVX, AVX-512, NEON, plain
+scalars) accepts, so a kernel says exactly what is in a register and no compiler is needed on the user's machine.
+
+Lanes: `Floats` (float), `Ints` (int), `Mask` (bool). Arithmetic operators work between equal lane types;
+a scalar is widened with `splat` (float32) or `splat_i` (int32).
+"""
+
+from __future__ import annotations
+
+import operator
+
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic, models, overload, register_model
+
+LANES = 16
+"""One AVX-512 register, two of AVX or four of NEON; wider than most splats, so a row is one step."""
+
+_FLOATS = ir.VectorType(ir.FloatType(), LANES)
+_INTS = ir.VectorType(ir.IntType(32), LANES)
+_BOOLS = ir.VectorType(ir.IntType(1), LANES)
+_FLAGS = ("contract", "nsz")
+
+
+class _Lanes(types.Type):
+    def __init__(self, name: str, vector: ir.VectorType) -> None:
+        self.vector = vector
+        super().__init__(name)
+
+
+class _FloatLanes(_Lanes): ...
+
+
+class _IntLanes(_Lanes): ...
+
+
+class _BoolLanes(_Lanes): ...
+
+
+Floats = _FloatLanes("lanes_f32", _FLOATS)
+Ints = _IntLanes("lanes_i32", _INTS)
+Mask = _BoolLanes("lanes_bool", _BOOLS)
+
+
+@register_model(_FloatLanes)
+@register_model(_IntLanes)
+@register_model(_BoolLanes)
+class _LanesModel(models.PrimitiveModel):
+    def __init__(self, dmm, fe_type):
+        super().__init__(dmm, fe_type, fe_type.vector)
+
+
+def _constant(value: float) -> ir.Constant:
+    return ir.Constant(_FLOATS, [value] * LANES)
+
+
+def _broadcast(builder, value, vector):
+    undefined = ir.Constant(vector, ir.Undefined)
+    first = builder.insert_element(undefined, value, ir.Constant(ir.IntType(32), 0))
+    zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+    return builder.shuffle_vector(first, undefined, zeros)
+
+
+@intrinsic
+def splat(typingctx, value):
+    """All lanes equal to a float32."""
+
+    def codegen(context, builder, signature, args):
+        return _broadcast(builder, context.cast(builder, args[0], signature.args[0], types.float32), _FLOATS)
+
+    return Floats(types.float32), codegen
+
+
+@intrinsic
+def splat_i(typingctx, value):
+    """All lanes equal to an int32."""
+
+    def codegen(context, builder, signature, args):
+        return _broadcast(builder, args[0], _INTS)
+
+    return Ints(types.int32), codegen
+
+
+@intrinsic
+def ramp(typingctx, start):
+    """Lanes start, start + 1, ..., start + LANES - 1."""
+
+    def codegen(context, builder, signature, args):
+        steps = ir.Constant(_FLOATS, [float(i) for i in range(LANES)])
+        return builder.fadd(_broadcast(builder, args[0], _FLOATS), steps)
+
+    return Floats(types.float32), codegen
+
+
+def _address(context, builder, array_type, array, index, vector):
+    view = context.make_array(array_type)(context, builder, array)
+    pointer = builder.gep(view.data, [index])
+    return builder.bitcast(pointer, vector.as_pointer())
+
+
+@intrinsic
+def load(typingctx, array, index):
+    """LANES neighbours of a contiguous float32 array, from `index` on; no bounds check."""
+
+    def codegen(context, builder, signature, args):
+        pointer = _address(context, builder, signature.args[0], args[0], args[1], _FLOATS)
+        return builder.load(pointer, align=4)
+
+    return Floats(array, types.intp), codegen
+
+
+@intrinsic
+def load_i(typingctx, array, index):
+    """LANES neighbours of a contiguous int32 array, from `index` on; no bounds check."""
+
+    def codegen(context, builder, signature, args):
+        pointer = _address(context, builder, signature.args[0], args[0], args[1], _INTS)
+        return builder.load(pointer, align=4)
+
+    return Ints(array, types.intp), codegen
+
+
+@intrinsic
+def store(typingctx, array, index, value):
+    """Write LANES neighbours of a contiguous float32 or int32 array, from `index` on; no bounds check."""
+
+    def codegen(context, builder, signature, args):
+        pointer = _address(context, builder, signature.args[0], args[0], args[1], signature.args[2].vector)
+        builder.store(args[2], pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, value), codegen
+
+
+def _binary(name):
+    @intrinsic
+    def operation(typingctx, a, b):
+        def codegen(context, builder, signature, args):
+            return getattr(builder, name)(args[0], args[1], flags=_FLAGS)
+
+        return Floats(Floats, Floats), codegen
+
+    return operation
+
+
+_add, _sub, _mul, _div = _binary("fadd"), _binary("fsub"), _binary("fmul"), _binary("fdiv")
+
+
+def _overload_operator(symbol, implementation):
+    @overload(symbol)
+    def lanes_operator(a, b):
+        if a is Floats and b is Floats:
+            return lambda a, b: implementation(a, b)
+        return None
+
+
+for _symbol, _implementation in (
+    (operator.add, _add),
+    (operator.sub, _sub),
+    (operator.mul, _mul),
+    (operator.truediv, _div),
+    (operator.iadd, _add),
+    (operator.isub, _sub),
+    (operator.imul, _mul),
+):
+    _overload_operator(_symbol, _implementation)
+
+
+@intrinsic
+def at_least(typingctx, a, b):
+    """a >= b, lane by lane (false for NaN)."""
+
+    def codegen(context, builder, signature, args):
+        return builder.fcmp_ordered(">=", args[0], args[1])
+
+    return Mask(Floats, Floats), codegen
+
+
+@intrinsic
+def above(typingctx, a, b):
+    """a > b, lane by lane (false for NaN)."""
+
+    def codegen(context, builder, signature, args):
+        return builder.fcmp_ordered(">", args[0], args[1])
+
+    return Mask(Floats, Floats), codegen
+
+
+@intrinsic
+def equal_i(typingctx, a, b):
+    """a == b for integer lanes."""
+
+    def codegen(context, builder, signature, args):
+        return builder.icmp_signed("==", args[0], args[1])
+
+    return Mask(Ints, Ints), codegen
+
+
+@intrinsic
+def both(typingctx, a, b):
+    """Logical and of two masks."""
+
+    def codegen(context, builder, signature, args):
+        return builder.and_(args[0], args[1])
+
+    return Mask(Mask, Mask), codegen
+
+
+@intrinsic
+def where(typingctx, mask, a, b):
+    """a where the mask holds, else b."""
+
+    def codegen(context, builder, signature, args):
+        return builder.select(args[0], args[1], args[2])
+
+    return Floats(Mask, Floats, Floats), codegen
+
+
+@intrinsic
+def where_i(typingctx, mask, a, b):
+    """Integer lanes: a where the mask holds, else b."""
+
+    def codegen(context, builder, signature, args):
+        return builder.select(args[0], args[1], args[2])
+
+    return Ints(Mask, Ints, Ints), codegen
+
+
+@intrinsic
+def keep(typingctx, mask, a):
+    """a where the mask holds, else 0."""
+
+    def codegen(context, builder, signature, args):
+        return builder.select(args[0], args[1], _constant(0.0))
+
+    return Floats(Mask, Floats), codegen
+
+
+@intrinsic
+def any_lane(typingctx, mask):
+    """Whether the mask holds in some lane."""
+
+    def codegen(context, builder, signature, args):
+        bits = builder.bitcast(args[0], ir.IntType(LANES))
+        return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
+
+    return types.boolean(Mask), codegen
+
+
+def _minmax(symbol):
+    @intrinsic
+    def operation(typingctx, a, b):
+        def codegen(context, builder, signature, args):
+            return builder.select(builder.fcmp_ordered(symbol, args[0], args[1]), args[0], args[1])
+
+        return Floats(Floats, Floats), codegen
+
+    return operation
+
+
+minimum = _minmax("<")
+maximum = _minmax(">")
+
+
+@intrinsic
+def total(typingctx, a):
+    """Sum of the lanes as a float32, in a fixed tree order."""
+
+    def codegen(context, builder, signature, args):
+        value = args[0]
+        undefined = ir.Constant(_FLOATS, ir.Undefined)
+        for half in (LANES >> s for s in range(1, LANES.bit_length())):
+            index = [(i + half) % LANES for i in range(LANES)]
+            picks = ir.Constant(ir.VectorType(ir.IntType(32), LANES), index)
+            value = builder.fadd(value, builder.shuffle_vector(value, undefined, picks))
+        return builder.extract_element(value, ir.Constant(ir.IntType(32), 0))
+
+    return types.float32(Floats), codegen
+
+
+# 2**f on [-1/2, 1/2]: minimax polynomial of degree 5, largest relative error 7.5e-8 before rounding.
+_EXP2 = (1.3276461277e-3, 9.6755411419e-3, 5.5507133056e-2, 2.4022119729e-1, 6.9314696705e-1, 1.0000000717)
+
+
+@intrinsic
+def exp2(typingctx, a):
+    """2**a for a in [-126, 127]; smaller a are taken as -126. Relative error below 3e-7."""
+
+    def codegen(context, builder, signature, args):
+        low = _constant(-126.0)
+        x = builder.select(builder.fcmp_ordered(">", args[0], low), args[0], low)
+        # Adding 1.5 * 2**23 leaves round(x) in the low bits of the significand.
+        magic = _constant(12582912.0)
+        shifted = builder.fadd(x, magic)
+        fraction = builder.fsub(x, builder.fsub(shifted, magic))
+        result = _constant(_EXP2[0])
+        for coefficient in _EXP2[1:]:
+            result = builder.fadd(builder.fmul(result, fraction, flags=_FLAGS), _constant(coefficient), flags=_FLAGS)
+        exponent = builder.shl(builder.bitcast(shifted, _INTS), ir.Constant(_INTS, [23] * LANES))
+        return builder.bitcast(builder.add(builder.bitcast(result, _INTS), exponent), _FLOATS)
+
+    return Floats(Floats), codegen
