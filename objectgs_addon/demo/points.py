@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Sparse points with tracks as structure-from-motion finds them, from pictures and true depth.  No bpy here.
+
+Detections are drawn at pixels with texture, and a track goes to the other views that see the same spot unhidden
+(tested against their depth), from a similar direction, and by chance.  Observations get Gaussian noise, and the
+points are triangulated from them, so that their noise in space is what the noise in the pictures makes of it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+NOISE = .5  # pixels, standard deviation of an observation
+TOLERANCE = .008  # metres of depth within which a spot counts as seen
+ANGLE = 38.0  # degrees between two views of one spot up to which it is recognised
+OUTLIERS = .03  # fraction of points that are wrong matches
+
+
+@dataclass
+class Cloud:
+    """`observations`: for each view (xy (K, 2), point ids (K,)); `points` as `files.write_colmap` takes them.
+
+    For checks: `outlier` (P,) bool and `object_id` (P,) of the surface that each point was drawn from."""
+
+    observations: list
+    points: dict
+    outlier: np.ndarray
+    object_id: np.ndarray
+
+
+def project(points: np.ndarray, view, intrinsics) -> tuple[np.ndarray, np.ndarray]:
+    """Pixel positions (N, 2) and depth (N,) in metres of world points (N, 3) in a view."""
+    local = points @ view.rotation.T + view.translation
+    fx, fy, cx, cy = intrinsics
+    depth = local[:, 2]
+    safe = np.where(depth > 1e-6, depth, 1.0)
+    return np.stack([fx * local[:, 0] / safe + cx, fy * local[:, 1] / safe + cy], 1), depth
+
+
+def _lift(xy, depth, view, intrinsics) -> np.ndarray:
+    fx, fy, cx, cy = intrinsics
+    local = np.stack([(xy[:, 0] - cx) / fx * depth, (xy[:, 1] - cy) / fy * depth, depth], 1)
+    return (local - view.translation) @ view.rotation
+
+
+def _seeds(picture, depth, count, rng) -> np.ndarray:
+    """(count, 2) pixel rows and columns, drawn where there is texture and away from steps in depth."""
+    grey = picture.astype(np.float32).mean(2)
+    gy, gx = np.gradient(grey)
+    weight = np.hypot(gx, gy) + 1.0
+    step = np.maximum(*[np.abs(g) for g in np.gradient(depth)])
+    weight[step > .03] = 0
+    weight[:2], weight[-2:], weight[:, :2], weight[:, -2:] = 0, 0, 0, 0
+    weight = np.minimum(weight, 40.0).ravel()
+    # Gumbel's trick draws without replacement, weighted
+    with np.errstate(divide="ignore"):
+        keys = np.log(weight) + rng.gumbel(size=weight.size)
+    keep = np.argpartition(-keys, count)[:count]
+    keep = keep[weight[keep] > 0]
+    return np.stack(np.unravel_index(keep, grey.shape), 1)
+
+
+def make(views, intrinsics, pictures, depths, ids, rng, target: int = 13_500) -> Cloud:
+    """About `target` points (fewer from few or small views) for `views` with their pictures, depths (metres), ID maps."""
+    height, width = depths[0].shape
+    target = min(target, len(views) * height * width // 40)
+    per_view = max(1, int(np.ceil(target * 1.8 / len(views))))
+    spots, source, label = [], [], []
+    for v, view in enumerate(views):
+        at = _seeds(pictures[v], depths[v], min(per_view, height * width - 1), rng)
+        xy = at[:, ::-1] + .5
+        spots.append(_lift(xy, depths[v][at[:, 0], at[:, 1]].astype(float), view, intrinsics))
+        source.append(np.full(len(at), v))
+        label.append(ids[v][at[:, 0], at[:, 1]])
+    spots, source, label = np.concatenate(spots), np.concatenate(source), np.concatenate(label)
+    seen = _seen(spots, source, label, views, intrinsics, depths, ids)
+    luck = rng.random(len(spots))[:, None] * .5 + .35  # some spots are found again easily, others not
+    seen &= rng.random(seen.shape) < luck
+    seen[np.arange(len(spots)), source] = True
+    cap = max(8, int(3.2 * target * 2.2 / len(views)))
+    for v in range(len(views)):
+        found = np.flatnonzero(seen[:, v])
+        if len(found) > cap:
+            seen[rng.choice(found, len(found) - cap, replace=False), v] = False
+    good = np.flatnonzero(seen.sum(1) >= 3)
+    if len(good) > target:
+        good = np.sort(rng.choice(good, target, replace=False))
+    spots, seen, label = spots[good], seen[good], label[good]
+    point, view_of = np.nonzero(seen)
+
+    outlier = rng.random(len(spots)) < OUTLIERS
+    wrong = spots.copy()
+    first = np.array([v.centre for v in views])[seen.argmax(1)]
+    along = spots - first
+    shift = rng.choice([-1, 1], len(spots)) * rng.uniform(.02, .15, len(spots)) / np.linalg.norm(along, axis=1)
+    wrong[outlier] += (along * shift[:, None])[outlier]
+    noise = np.where(outlier, 3 * NOISE, NOISE)[point, None]
+    xy = np.empty((len(point), 2))
+    for v, view in enumerate(views):
+        rows = view_of == v
+        xy[rows] = project(wrong[point[rows]], view, intrinsics)[0]
+    inside = (xy > 2).all(1) & (xy < [width - 2, height - 2]).all(1)
+    xy += rng.normal(size=xy.shape) * noise
+    keep = inside & (np.bincount(point[inside], minlength=len(spots))[point] >= 3)
+    xyz, error = _triangulate(wrong, point[keep], view_of[keep], xy[keep], views, intrinsics)
+    # what a real reconstruction filters too: points that the observations do not fix
+    bad = ~np.isfinite(error) | (error > 4.0) | (np.linalg.norm(xyz - wrong, axis=1) > .05)
+    kept = np.flatnonzero(~bad & (np.bincount(point[keep], minlength=len(spots)) >= 3))
+    return _pack(kept, point[keep], view_of[keep], xy[keep], xyz, error, outlier, label, views, pictures, rng)
+
+
+def _seen(spots, source, label, views, intrinsics, depths, ids):
+    """(N, V) bool: which views see which spots."""
+    height, width = depths[0].shape
+    centres = np.array([v.centre for v in views])
+    rays = spots[:, None, :] - centres[None]
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    similar = np.einsum("nvc,nc->nv", rays, rays[np.arange(len(spots)), source]) > np.cos(np.radians(ANGLE))
+    seen = np.zeros((len(spots), len(views)), bool)
+    for v, view in enumerate(views):
+        xy, depth = project(spots, view, intrinsics)
+        inside = (depth > .01) & (xy > 2).all(1) & (xy < [width - 2, height - 2]).all(1)
+        col, row = np.where(inside[:, None], xy, 0).astype(int).T
+        seen[:, v] = inside & (np.abs(depths[v][row, col] - depth) < TOLERANCE) & (ids[v][row, col] == label)
+    return seen & similar
+
+
+def _triangulate(start, point, view_of, xy, views, intrinsics, rounds: int = 4):
+    """Least-squares points (P, 3) from observations, and their mean reprojection error in pixels."""
+    fx, fy, cx, cy = intrinsics
+    rotation = np.stack([v.rotation for v in views])[view_of]
+    translation = np.stack([v.translation for v in views])[view_of]
+    count = np.maximum(np.bincount(point, minlength=len(start)), 1)
+    xyz = start.copy()
+    for i in range(rounds + 1):
+        local = np.einsum("nij,nj->ni", rotation, xyz[point]) + translation
+        z = np.where(np.abs(local[:, 2]) < 1e-3, 1e-3, local[:, 2])
+        rest = xy - np.stack([fx * local[:, 0] / z + cx, fy * local[:, 1] / z + cy], 1)
+        if i == rounds:
+            return xyz, np.bincount(point, np.linalg.norm(rest, axis=1), len(start)) / count
+        flat = np.zeros((len(point), 2, 3))
+        flat[:, 0, 0], flat[:, 0, 2] = fx / z, -fx * local[:, 0] / z**2
+        flat[:, 1, 1], flat[:, 1, 2] = fy / z, -fy * local[:, 1] / z**2
+        jacobian = flat @ rotation
+        normal = np.zeros((len(start), 3, 3))
+        right = np.zeros((len(start), 3))
+        np.add.at(normal, point, np.swapaxes(jacobian, 1, 2) @ jacobian)
+        np.add.at(right, point, np.einsum("nij,ni->nj", jacobian, rest))
+        normal += 1e-6 * np.eye(3) * (1 + np.trace(normal, axis1=1, axis2=2))[:, None, None]
+        xyz += np.linalg.solve(normal, right[..., None])[..., 0]
+    raise AssertionError("unreachable")
+
+
+def _pack(kept, point, view_of, xy, xyz, error, outlier, label, views, pictures, rng) -> Cloud:
+    number = np.full(len(xyz), -1)
+    number[kept] = np.arange(len(kept))
+    rows = number[point] >= 0
+    point, view_of, xy = number[point[rows]], view_of[rows], xy[rows]
+    height, width = pictures[0].shape[:2]
+    colour = np.zeros((len(kept), 3))
+    slot = np.zeros(len(point), int)
+    observations = []
+    for v in range(len(views)):
+        here = np.flatnonzero(view_of == v)
+        loose = len(here) // 4  # detections that were never matched
+        places = np.concatenate([xy[here], rng.uniform([2, 2], [width - 2, height - 2], (loose, 2))])
+        ids = np.concatenate([point[here] + 1, np.full(loose, -1)])
+        order = rng.permutation(len(ids))
+        observations.append((places[order], ids[order]))
+        back = np.empty(len(order), int)
+        back[order] = np.arange(len(order))
+        slot[here] = back[: len(here)]
+        col = np.clip(xy[here, 0].astype(int), 0, width - 1)
+        row = np.clip(xy[here, 1].astype(int), 0, height - 1)
+        np.add.at(colour, point[here], pictures[v][row, col].astype(float))
+    count = np.bincount(point, minlength=len(kept))
+    rgb = np.round(colour / np.maximum(count, 1)[:, None]).astype(np.uint8)
+    order = np.argsort(point, kind="stable")
+    pairs = np.stack([view_of + 1, slot], 1)[order]
+    tracks = np.split(pairs, np.cumsum(count)[:-1]) if len(kept) else []
+    points = {"xyz": xyz[kept], "rgb": rgb, "error": error[kept], "track": tracks}
+    return Cloud(observations, points, outlier[kept], label[kept])

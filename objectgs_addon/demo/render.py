@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Rendering with Cycles on the CPU: pictures, and exact IDs and depth at pixel centres."""
+
+import contextlib
+import os
+import sys
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from .scene import FOCAL, View
+
+
+class Cancelled(Exception):
+    """The user stopped the rendering."""
+
+
+@contextlib.contextmanager
+def _quiet():
+    """Blender prints lines for every picture; keep them out of a terminal's progress."""
+    if not bpy.app.background:
+        yield
+        return
+    sys.stdout.flush()
+    try:
+        kept = os.dup(1)
+    except OSError:
+        yield
+        return
+    sink = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(sink, 1)
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(sink)
+
+
+class Renderer:
+    """Renders views of a scene through files in `folder`, which must exist."""
+
+    def __init__(self, scene, width: int, height: int, samples: int, seed: int, folder: Path):
+        self.scene, self.folder, self.samples, self.seed = scene, folder, samples, seed
+        render = scene.render
+        render.engine = "CYCLES"
+        render.resolution_x, render.resolution_y, render.resolution_percentage = width, height, 100
+        render.pixel_aspect_x = render.pixel_aspect_y = 1.0
+        render.use_persistent_data = True
+        render.use_compositing = render.use_sequencer = False
+        render.use_motion_blur = render.use_border = False
+        render.image_settings.file_format = "OPEN_EXR"
+        render.image_settings.color_mode, render.image_settings.color_depth = "RGB", "32"
+        cycles = scene.cycles
+        cycles.device = "CPU"
+        cycles.use_adaptive_sampling = False
+        cycles.max_bounces, cycles.diffuse_bounces, cycles.glossy_bounces = 3, 2, 2
+        cycles.transmission_bounces = cycles.volume_bounces = cycles.transparent_max_bounces = 0
+        cycles.caustics_reflective = cycles.caustics_refractive = False
+        cycles.sample_clamp_indirect = 4.0
+        data = bpy.data.cameras.new("demo")
+        data.sensor_fit, data.sensor_width, data.lens = "HORIZONTAL", 36.0, 36.0 * FOCAL
+        data.clip_start, data.clip_end = .01, 100.0
+        self.camera = bpy.data.objects.new("demo camera", data)
+        scene.collection.objects.link(self.camera)
+        scene.camera = self.camera
+        self.override = _id_and_depth()
+
+    def close(self) -> None:
+        """Free what was made for rendering beside the scene's own objects."""
+        bpy.data.materials.remove(self.override)
+
+    def for_pictures(self) -> None:
+        """Settings for `picture`."""
+        self.scene.view_layers[0].material_override = None
+        cycles = self.scene.cycles
+        cycles.samples, cycles.seed = self.samples, self.seed
+        cycles.pixel_filter_type, cycles.filter_width = "BLACKMAN_HARRIS", 1.5
+        cycles.use_denoising, cycles.denoiser = True, "OPENIMAGEDENOISE"
+        cycles.denoising_input_passes, cycles.denoising_prefilter = "RGB_ALBEDO_NORMAL", "FAST"
+
+    def for_truth(self) -> None:
+        """Settings for `truth`: one ray through the centre of each pixel (Cycles ignores the width of its box filter)."""
+        self.scene.view_layers[0].material_override = self.override
+        cycles = self.scene.cycles
+        cycles.samples, cycles.seed = 1, 0
+        cycles.pixel_filter_type, cycles.filter_width = "GAUSSIAN", .01
+        cycles.use_denoising = False
+
+    def picture(self, view: View) -> np.ndarray:
+        """(H, W, 3) uint8 sRGB, as the view transform "Standard" without dithering gives."""
+        linear = np.clip(self._render(view), 0, 1)
+        encoded = np.where(linear <= .0031308, 12.92 * linear, 1.055 * np.power(linear, 1 / 2.4) - .055)
+        return np.round(encoded * 255).astype(np.uint8)
+
+    def truth(self, view: View) -> tuple[np.ndarray, np.ndarray]:
+        """(H, W) uint16 IDs and (H, W) float32 depth along the camera's axis in metres."""
+        values = self._render(view)
+        return np.round(values[..., 0]).astype(np.uint16), np.ascontiguousarray(values[..., 1])
+
+    def _render(self, view: View) -> np.ndarray:
+        pose = np.eye(4)
+        pose[:3, :3] = view.rotation.T * [1, -1, -1]  # OpenCV's axes to Blender's
+        pose[:3, 3] = view.centre
+        self.camera.matrix_world = Matrix(pose.tolist())
+        path = self.folder / "view.exr"
+        path.unlink(missing_ok=True)
+        self.scene.render.filepath = str(path)
+        with _quiet():
+            result = bpy.ops.render.render(write_still=True, scene=self.scene.name)
+        if "FINISHED" not in result:
+            raise Cancelled
+        if not path.exists():
+            raise OSError(f"Blender did not write its rendering to {path}.")
+        image = bpy.data.images.load(str(path), check_existing=False)
+        try:
+            image.colorspace_settings.name = "Non-Color"
+            width, height = image.size
+            pixels = np.empty(width * height * image.channels, np.float32)
+            image.pixels.foreach_get(pixels)
+            return pixels.reshape(height, width, image.channels)[::-1, :, :3]
+        finally:
+            bpy.data.images.remove(image)
+            path.unlink()
+
+
+def _id_and_depth() -> bpy.types.Material:
+    """A material that glows with (object index, depth along the camera's axis, 0)."""
+    material = bpy.data.materials.new("demo id and depth")
+    if material.node_tree is None:
+        material.use_nodes = True
+    tree = material.node_tree
+    tree.nodes.clear()
+    index = tree.nodes.new("ShaderNodeObjectInfo").outputs["Object Index"]
+    depth = tree.nodes.new("ShaderNodeCameraData").outputs["View Z Depth"]
+    colour = tree.nodes.new("ShaderNodeCombineXYZ")
+    glow, output = tree.nodes.new("ShaderNodeEmission"), tree.nodes.new("ShaderNodeOutputMaterial")
+    tree.links.new(index, colour.inputs[0])
+    tree.links.new(depth, colour.inputs[1])
+    tree.links.new(colour.outputs[0], glow.inputs["Color"])
+    tree.links.new(glow.outputs[0], output.inputs["Surface"])
+    return material
