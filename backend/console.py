@@ -80,7 +80,7 @@ class ConsoleReporter(Reporter):
         width = min(30, max(5, columns - 12 - len(text)))
         form = f"  {{percentage:3.0f}}% |{{bar:{width}}}| {{desc}}"
         if self._bar is None:
-            self._bar = tqdm(total=total, file=self.stream, leave=True, nrows=rows, bar_format=form)
+            self._bar = tqdm(desc=text, total=total, file=self.stream, leave=True, nrows=rows, bar_format=form)
         self._bar.ncols, self._bar.bar_format = columns - 1, form
         self._bar.set_description_str(text, refresh=False)
         self._bar.update(done - self._bar.n)

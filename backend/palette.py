@@ -14,7 +14,7 @@ UNLABELLED = (58, 58, 62)
 """Dark grey, for ID 0: belongs to no object."""
 
 _FIRST = (
-    "3b7dd8 f28e2b 3fa34d e0454f 9a63d6 f2c230 22b8c2 f078b8 9c6b3f a8d04a 00806e "
+    "3b7dd8 f07f1c 3fa34d e0454f 9a63d6 f6d236 22b8c2 f078b8 9c6b3f a8d04a 00806e "
     "b9b0f5 8f2f6b ffb08a 7b8d1e 4a4fb8 8fe3b0 c2502a d94fd0 8ecbf5 e3d79a b0576f"
 )
 _FIRST_RGB = np.array([tuple(bytes.fromhex(word)) for word in _FIRST.split()], np.uint8)

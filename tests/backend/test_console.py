@@ -1,0 +1,135 @@
+"""What a person sees in a terminal, and what a log file gets."""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+
+import pytest
+
+from backend import console
+from backend.console import ConsoleReporter, clock
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.fixture
+def now(monkeypatch):
+    """A clock that the test turns."""
+    time = [100.0]
+    monkeypatch.setattr(console.time, "monotonic", lambda: time[0])
+    return time
+
+
+def reporter(stream=None):
+    return ConsoleReporter(stream or io.StringIO(), io.StringIO())
+
+
+def test_clock():
+    assert [clock(s) for s in (0, 9.4, 59.6, 754, 3600, 3725)] == [
+        "0:00",
+        "0:09",
+        "1:00",
+        "12:34",
+        "1:00:00",
+        "1:02:05",
+    ]
+
+
+def test_a_log_file_gets_few_plain_lines(now):
+    out = reporter()
+    out.status("Training")
+    for i in range(1000):
+        now[0] += 0.02
+        out.progress(i + 1, 1000, loss=0.5, splats=12_345, seconds_left=90)
+    out.done()
+    text = out.stream.getvalue()
+    lines = text.splitlines()
+    assert "\r" not in text and "\x1b" not in text
+    assert lines[0] == "Training" and lines[-1] == "Done."
+    assert 4 <= len(lines) - 2 <= 6
+    assert lines[1] == "    0%  1:30 left, loss 0.5000, 12,345 splats"
+    assert lines[-2] == "  100%  loss 0.5000, 12,345 splats"
+
+
+def test_time_left_is_estimated_where_it_is_not_given(now):
+    out = reporter()
+    out.status("Evaluating")
+    now[0] += 10
+    out.progress(1, 4)
+    assert "25%  0:30 left" in out.stream.getvalue()
+
+
+def test_figures_that_come_now_and_then_stay_on_show(now):
+    out = reporter()
+    out.status("Training")
+    for fields in ({"psnr": 30.04, "miou": 0.9}, {"psnr": None}, {"loss": 0.1}):
+        now[0] += 6
+        out.progress(1, 10, seconds_left=5, **fields)
+    assert out.stream.getvalue().splitlines()[-1] == "   10%  0:05 left, loss 0.1000, PSNR 30.0 dB, mIoU 0.900"
+    out.status("Meshing")
+    out.progress(1, 10, seconds_left=5)
+    assert out.stream.getvalue().splitlines()[-1] == "   10%  0:05 left"
+
+
+def test_warnings_and_errors_go_to_their_own_stream():
+    out = reporter()
+    out.warning("2 images have no pose.")
+    out.error("a.png does not exist.")
+    assert out.stream.getvalue() == ""
+    assert out.errors.getvalue() == "warning: 2 images have no pose.\nerror: a.png does not exist.\n"
+
+
+def test_done_says_the_figures_and_the_files():
+    out = reporter()
+    out.done(psnr=31.24, miou=0.97, ssim=None, report=Path("out/report.md"))
+    assert out.stream.getvalue().splitlines() == [
+        "Done: PSNR 31.2 dB, mIoU 0.970",
+        f"  report: {Path('out/report.md')}",
+    ]
+
+
+def test_previews_name_their_folder_once():
+    out = reporter()
+    for i in range(5):
+        out.preview(Path("out/previews") / f"{i}.png")
+    assert out.stream.getvalue().splitlines() == [f"  previews in {Path('out/previews')}"]
+
+
+def test_nothing_to_do_is_no_division_by_zero():
+    out = reporter()
+    out.progress(0, 0)
+    out.done()
+    assert out.stream.getvalue().splitlines()[-1] == "Done."
+
+
+def test_a_terminal_gets_a_bar_that_fits_its_width(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")
+    out = reporter(Terminal())
+    out.status("Training")
+    for i in range(5):
+        out.progress(i, 4, loss=0.25, splats=1000, seconds_left=61 - i)
+    out.warning("careful")
+    out.done()
+    text = out.stream.getvalue()
+    drawn = text.replace("\n", "\r").split("\r")
+    assert any(line.startswith("    0% |") and "1:01 left, loss 0.2500, 1,000 splats" in line for line in drawn)
+    assert any(re.fullmatch(r"  100% \|[█#]+\| loss 0.2500, 1,000 splats *", line) for line in drawn)
+    assert all(len(line) <= 60 for line in drawn)
+    assert text.endswith("\nDone.\n")
+    assert out.errors.getvalue() == "warning: careful\n"
+
+
+def test_a_warning_amid_the_bar_starts_on_a_line_of_its_own(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    stream = Terminal()
+    out = ConsoleReporter(stream, stream)
+    out.progress(1, 4)
+    out.warning("careful")
+    out.progress(4, 4)
+    before = stream.getvalue().split("warning: careful\n")[0]
+    assert before.endswith("\r") or before.endswith("\n")

@@ -1,0 +1,266 @@
+"""The report: names that other programs read, null for what was not measured, and pictures that show what they say."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from backend.evaluation import comparison, contact_sheet, id_picture, save_picture, write_report
+from backend.evaluation.report import complete, curve_plot, duration, objects_plot
+from backend.palette import UNLABELLED, colours_of, object_colours, to_linear
+from backend.protocol import Reconstruction
+
+
+def a_report():
+    return {
+        "capture": {"name": "table | top", "images": np.int64(48)},
+        "settings": {"minutes": 2.5, "seed": 0, "steps": None},
+        "machine": {"cores": 2},
+        "left_out": [{"what": "2 images", "why": "not in the COLMAP model"}],
+        "stages": [{"name": "train", "seconds": np.float32(150.0), "peak_rss_mb": 1800}],
+        "curve": [
+            {"seconds": 60.0, "step": 900, "psnr": 30.0, "miou": 0.9},
+            {"seconds": 30.0, "step": 400, "psnr": 28.0, "miou": math.nan},
+        ],
+        "model": {"anchors": 9000, "gaussians": 60_000, "bytes": 5_000_000},
+        "quality": {"psnr": np.float64(31.25), "ssim": 0.93, "lpips": math.nan, "miou": 0.97, "mbiou": math.inf},
+        "objects": [
+            {"id": 70_000, "name": "mug", "iou": 0.96, "anchors": 100},
+            {"id": 2, "name": "tea|pot", "iou": None},
+        ],
+        "views": [{"name": "a.png", "psnr": 31.0}],
+    }
+
+
+@pytest.fixture
+def reconstruction(tmp_path):
+    return Reconstruction(tmp_path / "out").create()
+
+
+def strictly(text):
+    """JSON as the standard has it, without NaN or Infinity."""
+
+    def refuse(word):
+        raise AssertionError(f"{word} in JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_report_json_holds_every_name_and_null_for_what_was_not_measured(reconstruction):
+    returned = write_report(reconstruction, a_report())
+    report = strictly(reconstruction.report_json.read_text(encoding="utf-8"))
+    assert report == returned
+    assert report["quality"] == {
+        "psnr": 31.25,
+        "ssim": 0.93,
+        "lpips": None,
+        "miou": 0.97,
+        "mbiou": None,
+        "dice": None,
+        "accuracy": None,
+    }
+    assert report["stages"] == [{"name": "train", "seconds": 150.0, "peak_rss_mb": 1800}]
+    assert report["objects"][1]["iou"] is None and report["objects"][1]["anchors"] is None
+    unmeasured = dict.fromkeys(("vertices", "faces", "watertight", "chamfer", "precision", "recall", "f1"))
+    assert report["objects"][0]["mesh"] == unmeasured
+    assert [point["seconds"] for point in report["curve"]] == [30.0, 60.0]
+    assert report["curve"][0]["miou"] is None
+    assert report["views"] == [{"name": "a.png", "psnr": 31.0}]
+    assert report["capture"]["images"] == 48
+
+
+def test_an_empty_report_is_all_null(reconstruction):
+    report = write_report(reconstruction, {})
+    assert set(report["quality"].values()) == {None}
+    assert report["model"] == {"anchors": None, "gaussians": None, "bytes": None}
+    assert [report[name] for name in ("left_out", "stages", "curve", "objects")] == [[]] * 4
+    assert [report[name] for name in ("capture", "settings", "machine")] == [{}] * 3
+    text = reconstruction.report_md.read_text(encoding="utf-8")
+    assert "0.00" not in text and "![" not in text
+    assert not list(reconstruction.pictures.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("change", "where"),
+    [
+        ({"quality": {"psnr": "31"}}, "quality.psnr"),
+        ({"quality": {"miou": True}}, "quality.miou"),
+        ({"quality": [1]}, "report.quality"),
+        ({"stages": {"name": "train"}}, "report.stages"),
+        ({"stages": [{"seconds": 1.0}]}, r"stages\[0\] has no name"),
+        ({"curve": [{"psnr": 1.0}]}, r"curve\[0\] has no seconds"),
+        ({"curve": [{"seconds": math.nan}]}, r"curve\[0\] has no seconds"),
+        ({"objects": [{"name": "mug"}]}, r"objects\[0\] has no id"),
+        ({"objects": [{"id": 1, "iou": "good"}]}, r"objects\[0\].iou"),
+        ({"objects": [{"id": 1, "mesh": 3}]}, r"objects\[0\].mesh"),
+        ({"left_out": [{"what": "x"}]}, "has no why"),
+        ({"capture": {"x": {1, 2}}}, "report.capture.x"),
+        ({"model": {"anchors": "many"}}, "model.anchors"),
+    ],
+)
+def test_a_wrong_entry_is_named_and_nothing_is_written(reconstruction, change, where):
+    with pytest.raises(ValueError, match=where):
+        write_report(reconstruction, {**a_report(), **change})
+    assert not reconstruction.report_json.exists() and not reconstruction.report_md.exists()
+
+
+def test_report_md_shows_figures_pictures_and_what_was_left_out(reconstruction):
+    grey = Image.new("RGB", (40, 30), (128, 128, 128))
+    write_report(reconstruction, a_report(), [("View a.png", grey), ("View ../b", grey)], title="Demo")
+    text = reconstruction.report_md.read_text(encoding="utf-8")
+    for wanted in (
+        "# Demo",
+        "31.25 dB",
+        "0.9700",
+        "2 min 30 s",
+        "1,800 MB",
+        "not in the COLMAP model",
+        "60,000",
+        "70000",
+    ):
+        assert wanted in text, wanted
+    assert "| LPIPS | — |" in text
+    links = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text)
+    assert len(links) == 2 + 2 + 2
+    for link in links:
+        path = reconstruction.folder / link
+        assert path.parent in (reconstruction.pictures, reconstruction.pictures / "swatches")
+        Image.open(path).load()
+    left_over = [path.name for path in reconstruction.folder.rglob("*.part")]
+    assert left_over == []
+
+
+def test_names_cannot_break_the_tables(reconstruction):
+    write_report(reconstruction, a_report())
+    lines = reconstruction.report_md.read_text(encoding="utf-8").splitlines()
+    row = next(line for line in lines if "tea" in line and line.startswith("|"))
+    assert r"tea\|pot" in row
+    assert len(re.findall(r"(?<!\\)\|", row)) == 6
+
+
+def test_a_swatch_has_the_colour_of_its_object(reconstruction):
+    write_report(reconstruction, a_report(), colours={2: (1, 2, 3)})
+    swatches = reconstruction.pictures / "swatches"
+    assert Image.open(swatches / "2.png").getpixel((4, 4)) == (1, 2, 3)
+    assert Image.open(swatches / "70000.png").getpixel((4, 4)) == object_colours([70_000])[70_000]
+
+
+def test_of_many_objects_the_worst_are_shown_and_the_rest_counted(reconstruction):
+    objects = [{"id": i, "name": f"thing {i}", "iou": i / 1000} for i in range(1, 501)]
+    report = write_report(reconstruction, {"objects": objects})
+    text = reconstruction.report_md.read_text(encoding="utf-8")
+    assert len(report["objects"]) == 500
+    assert "the other 460 are in `report.json`" in text
+    assert "thing 40 " in text and "thing 41 " not in text
+    assert len(list((reconstruction.pictures / "swatches").iterdir())) == 40
+
+
+def test_the_plot_over_run_time_has_a_panel_for_each_measure():
+    curve = complete(a_report())["curve"]
+    both = curve_plot(curve)
+    one = curve_plot([{**point, "miou": None} for point in curve])
+    assert both is not None and one is not None
+    assert both.width > 1.8 * one.width
+    for colour in ((0x3B, 0x7D, 0xD8), (0xD9, 0x73, 0x1A)):
+        assert (np.asarray(both) == colour).all(-1).sum() > 100, colour
+    assert curve_plot([]) is None
+    assert curve_plot([{"seconds": 1.0, "psnr": None, "miou": None}]) is None
+
+
+def test_the_objects_plot_has_bars_as_long_as_the_iou():
+    objects = [
+        {"id": 1, "name": "a", "iou": 0.8},
+        {"id": 2, "name": "$b$", "iou": 0.2},
+        {"id": 3, "name": "c", "iou": None},
+    ]
+    picture = np.asarray(objects_plot(objects, {1: (255, 0, 0), 2: (0, 0, 255), 3: (0, 255, 0)}))
+    red, blue, green = (
+        (picture == np.array(colour)).all(-1).any(0).sum() for colour in ((255, 0, 0), (0, 0, 255), (0, 255, 0))
+    )
+    assert red / blue == pytest.approx(4.0, rel=0.05)
+    assert green == 0
+    assert objects_plot([objects[2]], {}) is None
+
+
+def test_durations():
+    assert [duration(s) for s in (0.04, 9.9, 9.96, 59.4, 59.6, 150, 3599.6, 3900)] == [
+        "0.0 s", "9.9 s", "10 s", "59 s", "1 min 00 s", "2 min 30 s", "1 h 00 min", "1 h 05 min",
+    ]  # fmt: skip
+
+
+def test_colours_depend_on_the_id_alone_and_differ():
+    few, many = object_colours([0, 5, 2**32 - 1]), object_colours(range(2000))
+    assert few[0] == UNLABELLED and few[5] == many[5]
+    assert all(isinstance(channel, int) for colour in few.values() for channel in colour)
+    first = np.array([many[i] for i in range(13)], int)
+    apart = np.abs(first[:, None] - first[None]).sum(-1) + 999 * np.eye(13, dtype=int)
+    assert apart.min() > 60
+    later = np.array([many[i] for i in range(30, 2000)], int)
+    assert (np.abs(np.diff(later, axis=0)).sum(1) > 30).mean() > 0.99
+    assert len({tuple(colour) for colour in later.tolist()}) > 1950
+    assert colours_of([]).shape == (0, 3)
+
+
+def test_colours_for_blender_are_linear():
+    assert to_linear((0, 255, 188)) == pytest.approx((0.0, 1.0, 0.5029), abs=1e-4)
+
+
+def test_id_pictures_use_given_colours_and_the_palette_elsewhere():
+    ids = np.array([[0, 7], [2**32 - 1, 7]])
+    picture = id_picture(ids, {7: (9, 8, 7)})
+    palette = object_colours([0, 2**32 - 1])
+    assert picture.dtype == np.uint8
+    assert picture.tolist() == [[list(palette[0]), [9, 8, 7]], [list(palette[2**32 - 1]), [9, 8, 7]]]
+
+
+def panels(sheet):
+    """Which pure colours the sheet holds, and how many pixels of each."""
+    colours, counts = np.unique(np.asarray(sheet).reshape(-1, 3), axis=0, return_counts=True)
+    return {tuple(colour): int(count) for colour, count in zip(colours.tolist(), counts)}
+
+
+def test_a_comparison_shows_all_four_pictures_unchanged():
+    truth = np.full((60, 80, 3), (200, 10, 10), np.uint8)
+    render = np.full((60, 80, 3), (0.0, 1.0, 0.0), np.float32)
+    ids, true_ids = np.full((60, 80), 3), np.full((60, 80), 70_000)
+    sheet = comparison(truth, render, true_ids, ids, {3: (1, 2, 250), 70_000: (250, 2, 250)}, {3: "cup"}, "A title")
+    found = panels(sheet)
+    for colour in ((200, 10, 10), (0, 255, 0), (1, 2, 250), (250, 2, 250)):
+        assert found.get(colour, 0) >= 60 * 80, colour
+    without = comparison(truth, render, None, ids)
+    assert without.width < sheet.width
+    assert panels(without).get((250, 2, 250), 0) == 0
+
+
+def test_large_pictures_are_fitted_and_many_names_do_not_overflow():
+    rng = np.random.default_rng(0)
+    ids = rng.integers(1, 400, (30, 40)).repeat(40, 0).repeat(40, 1)
+    image = rng.random((1200, 1600, 3))
+    image[0, 0] = np.nan
+    sheet = comparison(image, image, ids, ids, None, {i: f"a rather long name of object {i}" for i in range(400)})
+    assert sheet.width <= 2000 and sheet.height < 700
+
+
+def test_a_contact_sheet_holds_each_picture():
+    images = [np.full((30, 40, 3), 40 * i, np.uint8) for i in range(1, 6)]
+    found = panels(contact_sheet([*images[:4], Image.fromarray(images[4])], list("abcde"), columns=3))
+    for i in range(1, 6):
+        assert found.get((40 * i,) * 3, 0) >= 30 * 40
+    with pytest.raises(ValueError, match="at least one"):
+        contact_sheet([], [])
+
+
+def test_pictures_are_saved_small(tmp_path):
+    flat = save_picture(Image.new("RGB", (900, 700), (1, 2, 3)), tmp_path / "flat.png")
+    assert flat.suffix == ".png" and Image.open(flat).getpixel((0, 0)) == (1, 2, 3)
+    y, x = np.mgrid[:600, :1800]
+    rng = np.random.default_rng(0)
+    photo = 120 + 60 * np.sin(x / 40)[..., None] + 50 * np.cos(y / 30)[..., None] + rng.normal(0, 4, (600, 1800, 3))
+    saved = save_picture(Image.fromarray(np.clip(photo, 0, 255).astype(np.uint8)), tmp_path / "photo.png")
+    assert saved.suffix == ".jpg" and saved.stat().st_size < 300_000
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["flat.png", "photo.jpg"]
