@@ -373,7 +373,9 @@ def _checked_mask(source: _Source, colour: bool) -> np.ndarray:
     ids = read_mask(source.mask_path, colour)
     height, width = ids.shape
     camera = source.camera
-    if abs(width * camera.height / (height * camera.width) - 1) > _ASPECT_TOLERANCE:
+    # A shape differs by rounding when one more or one less pixel would make it agree.
+    expected = height * camera.width / camera.height
+    if abs(width - expected) > max(1.0, _ASPECT_TOLERANCE * expected):
         raise InputError(
             f"{source.mask_path} is {width}x{height} pixels, but its image {source.image_path.name} is "
             f"{camera.width}x{camera.height}; make the mask the image's size."

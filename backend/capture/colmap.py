@@ -388,6 +388,8 @@ def _points_txt(path: Path, warnings: list[str]) -> _RawPoints:
             if len(fields) < 8:
                 raise ValueError
             ids.append(int(fields[0]))
+            if not 0 <= ids[-1] < 2**63:
+                raise ValueError
             xyz.append((float(fields[1]), float(fields[2]), float(fields[3])))
             rgb.append((int(fields[4]) & 255, int(fields[5]) & 255, int(fields[6]) & 255))
             errors.append(float(fields[7]))

@@ -1,0 +1,174 @@
+"""Tiny synthetic captures: coloured spheres seen by a ring of cameras, with exact masks and tracks."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+MODELS = [
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
+    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION",
+    "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR",
+]  # fmt: skip
+SPHERES = [(1, (-0.7, 0.0, 0.0), 0.5), (2, (0.7, 0.1, 0.0), 0.45), (5, (0.0, -0.2, 0.9), 0.35)]
+
+
+class Scene:
+    """What `write_capture` wrote, and the truth behind it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.camera: tuple[str, int, int, list[float]] = ("PINHOLE", 96, 72, [])
+        self.names: list[str] = []
+        self.quaternions: list[np.ndarray] = []
+        self.viewmats: list[np.ndarray] = []
+        self.ids: list[np.ndarray] = []
+        self.xyz = np.zeros((0, 3))
+        self.point_objects = np.zeros(0, np.int64)
+        self.seen: list[np.ndarray] = []
+        self.pixels: list[np.ndarray] = []
+
+    def lens(self) -> pycolmap.Camera:
+        model, width, height, params = self.camera
+        return pycolmap.Camera(model=model, width=width, height=height, params=params)
+
+
+def rays_of(lens: pycolmap.Camera) -> np.ndarray:
+    """The viewing direction of each pixel's centre, (h, w, 3), z = 1."""
+    x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    xy = np.asarray(lens.cam_from_img(np.stack([x.ravel(), y.ravel()], 1)))
+    return np.column_stack([xy, np.ones(len(xy))]).reshape(lens.height, lens.width, 3)
+
+
+def sphere_ids(rays: np.ndarray, viewmat: np.ndarray, spheres: list) -> tuple[np.ndarray, np.ndarray]:
+    """The ID that each ray (..., 3) meets first (0: none), and how far along the ray (infinite: none)."""
+    best, ids = np.full(rays.shape[:-1], np.inf), np.zeros(rays.shape[:-1], np.int64)
+    for object_id, centre, radius in spheres:
+        c = viewmat[:3, :3] @ centre + viewmat[:3, 3]
+        a, b = (rays * rays).sum(-1), rays @ c
+        root = b * b - a * (c @ c - radius * radius)
+        with np.errstate(invalid="ignore"):
+            t = (b - np.sqrt(root)) / a
+        nearer = (root > 0) & (t > 0) & (t < best)
+        best, ids = np.where(nearer, t, best), np.where(nearer, object_id, ids)
+    return ids, best
+
+
+def look_at(eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The quaternion (w, x, y, z) and the world-to-camera matrix of a camera at `eye` that looks at the origin."""
+    forward = -eye / np.linalg.norm(eye)
+    right = np.cross(forward, [0.0, -1.0, 0.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    x, y, z, w = pycolmap.Rotation3d(rotation).quat
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+    return np.array([w, x, y, z]), viewmat
+
+
+def write_model(scene: Scene, folder: Path, suffix: str) -> None:
+    """The scene as COLMAP writes it, binary or text."""
+    folder.mkdir(parents=True, exist_ok=True)
+    model, width, height, params = scene.camera
+    tracks: dict[int, list[tuple[int, int]]] = {i: [] for i in range(len(scene.xyz))}
+    for view, seen in enumerate(scene.seen):
+        for at, point in enumerate(seen):
+            tracks[int(point)].append((view + 1, at))
+    if suffix == ".bin":
+        data = struct.pack("<QIiQQ", 1, 1, MODELS.index(model), width, height) + struct.pack(
+            f"<{len(params)}d", *params
+        )
+        (folder / "cameras.bin").write_bytes(data)
+        data = struct.pack("<Q", len(scene.names))
+        for view, name in enumerate(scene.names):
+            pose = [*scene.quaternions[view], *scene.viewmats[view][:3, 3]]
+            data += struct.pack("<I7dI", view + 1, *pose, 1) + name.encode() + b"\0"
+            data += struct.pack("<Q", len(scene.seen[view]))
+            for (x, y), point in zip(scene.pixels[view], scene.seen[view]):
+                data += struct.pack("<ddq", x, y, 10 * int(point) + 3)
+        (folder / "images.bin").write_bytes(data)
+        data = struct.pack("<Q", len(scene.xyz))
+        for point, xyz in enumerate(scene.xyz):
+            data += struct.pack("<Q3d3BdQ", 10 * point + 3, *xyz, 10, 20, point % 256, 0.5, len(tracks[point]))
+            data += b"".join(struct.pack("<II", *entry) for entry in tracks[point])
+        (folder / "points3D.bin").write_bytes(data)
+        return
+    (folder / "cameras.txt").write_text(
+        f"# cameras\n1 {model} {width} {height} {' '.join(map(repr, map(float, params)))}\n"
+    )
+    lines = ["# Image list", f"# Number of images: {len(scene.names)}"]
+    for view, name in enumerate(scene.names):
+        pose = " ".join(repr(float(v)) for v in [*scene.quaternions[view], *scene.viewmats[view][:3, 3]])
+        lines.append(f"{view + 1} {pose} 1 {name}")
+        seen = zip(scene.pixels[view], scene.seen[view])
+        lines.append(" ".join(f"{float(x)!r} {float(y)!r} {10 * int(p) + 3}" for (x, y), p in seen))
+    (folder / "images.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    lines = ["# 3D point list"]
+    for point, xyz in enumerate(scene.xyz):
+        track = " ".join(f"{image} {at}" for image, at in tracks[point])
+        lines.append(f"{10 * point + 3} {' '.join(repr(float(v)) for v in xyz)} 10 20 {point % 256} 0.5 {track}")
+    (folder / "points3D.txt").write_text("\n".join(lines) + "\n")
+
+
+@pytest.fixture
+def write_capture(tmp_path):
+    """A function that writes a capture and returns its `Scene`.
+
+    Options: views, size (width, height), camera model and params (default PINHOLE with a focal length of the width),
+    masks (False: none), suffix (".bin" or ".txt"), names (one a view), spheres [(id, centre, radius)], points an object.
+    """
+
+    def write(
+        name="capture", views=6, size=(96, 72), model="PINHOLE", params=None, masks=True, suffix=".bin", names=None,
+        spheres=SPHERES, points=60, seed=0,
+    ) -> Scene:  # fmt: skip
+        rng = np.random.default_rng(seed)
+        scene = Scene(tmp_path / name)
+        width, height = size
+        params = params or [width, width, width / 2, height / 2]
+        scene.camera = (model, width, height, params)
+        scene.names = names or [f"view_{i:03d}.png" for i in range(views)]
+        directions = rng.normal(size=(len(spheres), points, 3))
+        directions /= np.linalg.norm(directions, axis=2, keepdims=True)
+        scene.xyz = np.concatenate([c + r * d for (_, c, r), d in zip(spheres, directions)])
+        scene.point_objects = np.repeat([i for i, _, _ in spheres], points)
+        lens = scene.lens()
+        rays = rays_of(lens)
+        for view, image_name in enumerate(scene.names):
+            angle = 2 * np.pi * view / len(scene.names)
+            quaternion, viewmat = look_at(np.array([4 * np.sin(angle), -0.8, 4 * np.cos(angle)]))
+            scene.quaternions.append(quaternion)
+            scene.viewmats.append(viewmat)
+            ids, depth = sphere_ids(rays, viewmat, spheres)
+            scene.ids.append(ids)
+            path = scene.folder / "images" / image_name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            shade = np.where(np.isfinite(depth), 255 / (1 + depth**2 / 8), 30)
+            image = np.stack([shade, (ids * 40) % 256, 255 - shade], -1).astype(np.uint8)
+            Image.fromarray(image).save(path, quality=95)
+            if masks:
+                path = (scene.folder / "masks" / image_name).with_suffix(".png")
+                path.parent.mkdir(parents=True, exist_ok=True)
+                Image.fromarray(ids.astype(np.uint16)).save(path)
+            camera_xyz = scene.xyz @ viewmat[:3, :3].T + viewmat[:3, 3]
+            pixels = np.asarray(lens.img_from_cam(camera_xyz))
+            _, nearest = sphere_ids(camera_xyz / camera_xyz[:, 2:], viewmat, spheres)
+            inside = (pixels >= 0).all(1) & (pixels < size).all(1) & (camera_xyz[:, 2] > 0)
+            seen = np.flatnonzero(inside & (camera_xyz[:, 2] <= nearest * (1 + 1e-6)))
+            scene.seen.append(seen)
+            scene.pixels.append(pixels[seen])
+        if masks:
+            labels = {str(i): f"sphere {i}" for i, _, _ in spheres}
+            (scene.folder / "labels.json").write_text(json.dumps({"0": "unlabelled", **labels}))
+        write_model(scene, scene.folder / "sparse" / "0", suffix)
+        return scene
+
+    # Reached through the fixture, since test folders are no packages to import from.
+    write.sphere_ids, write.write_model, write.rays_of = sphere_ids, write_model, rays_of
+    return write

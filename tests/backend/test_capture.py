@@ -1,0 +1,945 @@
+"""Captures: every camera model, mask format and kind of bad input; real COLMAP files where ../shared/data is there."""
+
+from __future__ import annotations
+
+import json
+import struct
+import threading
+import unicodedata
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from backend.capture import check_capture, load_capture
+from backend.capture.colmap import CAMERA_MODELS, Camera, read_model
+from backend.capture.files import read_mask
+from backend.capture.undistort import distort, pinhole_for, source_pixels, to_pycolmap
+from backend.protocol import HOLDOUT_EVERY, InputError, Reporter
+from PIL import Image
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+FIXTURES = DATA / "fixtures"
+
+
+def fixture(name: str) -> Path:
+    if not (FIXTURES / name).is_dir():
+        pytest.skip(f"fixture {name} is absent")
+    return FIXTURES / name
+
+
+def refused(folder: Path, tmp_path: Path, *words: str, **options) -> str:
+    """Loading is refused with one sentence that holds `words`, writes nothing half, and checking says the same."""
+    cache = tmp_path / "cache-of-refused"
+    with pytest.raises(InputError) as caught:
+        load_capture(folder, cache, **options)
+    sentence = str(caught.value)
+    assert "\n" not in sentence and sentence.endswith(".") and len(sentence) < 600
+    for word in words:
+        assert word in sentence, sentence
+    assert not list(cache.rglob("*.part"))
+    problems = check_capture(folder)["problems"]
+    assert sentence in problems or any(all(word in problem for word in words) for problem in problems), problems
+    return sentence
+
+
+# What a capture is
+
+
+def test_views_points_and_masks_are_what_was_written(write_capture, tmp_path):
+    scene = write_capture(views=9)
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    assert [view.name for view in capture.views] == sorted(scene.names)
+    assert capture.warnings == []
+    for index, view in enumerate(capture.views):
+        assert view.image_file == scene.folder / "images" / view.name
+        assert view.mask_file == scene.folder / "masks" / view.name
+        np.testing.assert_allclose(view.viewmat, scene.viewmats[index], atol=1e-12)
+        np.testing.assert_array_equal(view.K, [[96, 0, 48], [0, 96, 36], [0, 0, 1]])
+        assert capture.image(index).shape == (72, 96, 3) and capture.image(index).dtype == np.uint8
+        mask = capture.mask(index)
+        assert mask is not None and mask.dtype == np.int64
+        np.testing.assert_array_equal(mask, scene.ids[index])
+        keypoints = capture.keypoints(index)
+        np.testing.assert_allclose(keypoints.xy, scene.pixels[index], atol=1e-9)
+        np.testing.assert_array_equal(keypoints.point_index, scene.seen[index])
+    np.testing.assert_array_equal(capture.points.xyz, scene.xyz)
+    np.testing.assert_array_equal(capture.points.ids, 10 * np.arange(len(scene.xyz)) + 3)
+    np.testing.assert_array_equal(capture.points.rgb[:, 2], np.arange(len(scene.xyz)) % 256)
+    assert (capture.points.error == 0.5).all()
+    assert capture.names == {1: "sphere 1", 2: "sphere 2", 5: "sphere 5"}
+    assert capture.object_ids.tolist() == [1, 2, 5]
+    assert capture.test_indices == (0, HOLDOUT_EVERY) and len(capture.train_indices) == 7
+    assert not set(capture.test_indices) & set(capture.train_indices)
+    assert capture.counts["registered"] == capture.counts["masks"] == 9
+    assert list((tmp_path / "cache" / "views").glob("*.png")) == [], "a pinhole image is used where it lies"
+
+
+def test_text_and_binary_models_are_the_same(write_capture, tmp_path):
+    names = ["a b.png", "日本/x  y.png", " #1.png".strip(), "UPPER name.PNG", "back\\slash.png", "z.png"]
+    one = write_capture(name="one", names=names, suffix=".bin")
+    two = write_capture(name="two", names=names, suffix=".txt")
+    a, b = load_capture(one.folder, tmp_path / "a"), load_capture(two.folder, tmp_path / "b")
+    assert [v.name for v in a.views] == [v.name for v in b.views] == sorted(names)
+    np.testing.assert_array_equal(a.points.xyz, b.points.xyz)
+    for i in range(len(names)):
+        np.testing.assert_array_equal(a.views[i].viewmat, b.views[i].viewmat)
+        np.testing.assert_array_equal(a.keypoints(i).xy, b.keypoints(i).xy)
+        np.testing.assert_array_equal(a.keypoints(i).point_index, b.keypoints(i).point_index)
+
+
+def test_reading_agrees_with_pycolmap(write_capture):
+    scene = write_capture(model="OPENCV", params=[80, 82, 47, 37, 0.05, -0.02, 0.001, 0.002])
+    folder = scene.folder / "sparse" / "0"
+    theirs, ours = pycolmap.Reconstruction(str(folder)), read_model(folder)
+    assert len(theirs.images) == len(ours.images) and len(theirs.points3D) == len(ours.xyz)
+    by_name = {image.name: image for image in ours.images}
+    for image in theirs.images.values():
+        np.testing.assert_allclose(image.cam_from_world().matrix(), by_name[image.name].viewmat[:3], atol=1e-12)
+    assert list(theirs.cameras[1].params) == list(ours.cameras[1].params)
+
+
+def test_camera_models_are_colmaps():
+    for number, (name, count) in CAMERA_MODELS.items():
+        model = getattr(pycolmap.CameraModelId, name)
+        assert int(model) == number
+        made = pycolmap.Camera.create_from_model_id(1, model, 100.0, 64, 48)
+        assert len(made.params) == count
+
+
+def test_reduced_images_masks_and_intrinsics_belong_together(write_capture, tmp_path):
+    scene = write_capture(size=(97, 74))
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    full = np.asarray(Image.open(capture.views[1].image_file)).astype(float)
+    for downscale in (2, 3, 5):
+        width, height = 97 // downscale, 74 // downscale
+        image, mask = capture.image(1, downscale), capture.mask(1, downscale)
+        assert image.shape == (height, width, 3) and mask is not None and mask.shape == (height, width)
+        cropped = full[: height * downscale, : width * downscale]
+        mean = cropped.reshape(height, downscale, width, downscale, 3).mean((1, 3))
+        assert np.abs(image - mean).max() <= 0.6
+        assert set(np.unique(mask)) <= {0, 1, 2, 5}
+        centre = downscale // 2
+        np.testing.assert_array_equal(mask, scene.ids[1][centre::downscale, centre::downscale][:height, :width])
+        np.testing.assert_allclose(capture.K(1, downscale) * [[downscale], [downscale], [1]], capture.views[1].K)
+    with pytest.raises(ValueError):
+        capture.image(1, 100)
+
+
+def test_few_views_hold_none_out(write_capture, tmp_path):
+    capture = load_capture(write_capture(views=2).folder, tmp_path / "cache")
+    assert capture.test_indices == () and capture.train_indices == (0, 1)
+    assert any("held out" in warning for warning in capture.warnings)
+
+
+def test_memory_is_bounded_and_threads_agree(write_capture, tmp_path):
+    scene = write_capture(views=8)
+    size = 96 * 72 * 3
+    capture = load_capture(scene.folder, tmp_path / "cache", memory_mb=2.5 * size / 1e6)
+    expected = [np.asarray(Image.open(view.image_file)) for view in capture.views]
+    wrong = []
+
+    def work(seed: int) -> None:
+        for i in np.random.default_rng(seed).integers(0, 8, 60):
+            if not np.array_equal(capture.image(int(i)), expected[i]):
+                wrong.append(i)
+
+    threads = [threading.Thread(target=work, args=(seed,)) for seed in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+    assert 0 < capture._held.bytes <= 2.5 * size
+    assert capture._held.bytes == sum(array.nbytes for array in capture._held._arrays.values())
+    assert capture.image(7) is capture.image(7), "the last image is held"
+    with pytest.raises(ValueError):
+        capture.image(7)[0] = 0
+
+
+@pytest.mark.parametrize("mode", ["L", "LA", "RGBA", "P", "I;16", "CMYK", "1"])
+def test_images_of_every_kind_become_rgb(write_capture, tmp_path, mode):
+    scene = write_capture(views=3, names=[f"{i}.{'tif' if mode == 'CMYK' else 'png'}" for i in range(3)])
+    for name in scene.names:
+        grey = np.tile(np.linspace(0, 255, 96).astype(np.uint8), (72, 1))
+        if mode == "I;16":
+            image = Image.fromarray(grey.astype(np.uint16) * 257)
+        elif mode == "RGBA":
+            image = Image.fromarray(np.stack([grey, grey, grey, np.zeros_like(grey)], -1), "RGBA")
+        elif mode == "P":
+            image = Image.fromarray(grey).convert("P")
+        else:
+            image = Image.fromarray(grey).convert("RGB").convert(mode)
+        image.save(scene.folder / "images" / name)
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    image = capture.image(0)
+    assert image.shape == (72, 96, 3) and image.dtype == np.uint8
+    if mode != "1":
+        assert np.abs(image.astype(int) - grey[..., None]).max() <= 1
+
+
+# Undistortion
+
+LENSES = {
+    "SIMPLE_RADIAL": [500, 320, 240, 0.05],
+    "RADIAL": [500, 320, 240, 0.05, 0.01],
+    "OPENCV": [500, 510, 320, 240, 0.05, 0.01, 0.001, 0.002],
+    "OPENCV_FISHEYE": [300, 310, 320, 240, 0.02, 0.01, 0.001, 0.0005],
+    "FULL_OPENCV": [500, 510, 320, 240, 0.05, 0.01, 0.001, 0.002, 0.001, 0.01, 0.002, 0.0001],
+    "FOV": [500, 510, 320, 240, 0.5],
+    "SIMPLE_RADIAL_FISHEYE": [300, 320, 240, 0.02],
+    "RADIAL_FISHEYE": [300, 320, 240, 0.02, 0.01],
+    "THIN_PRISM_FISHEYE": [300, 310, 320, 240, 0.02, 0.01, 0.001, 0.0005, 0.001, 0.002, 0.0001, 0.0002],
+    "RAD_TAN_THIN_PRISM_FISHEYE": [300, 310, 320, 240, 0.02, 0.01, 0, 0, 0, 0, 0.001, 0.001, 0.001, 0, 0.001, 0],
+    "SIMPLE_DIVISION": [500, 320, 240, -0.1],
+    "DIVISION": [500, 510, 320, 240, -0.1],
+    "SIMPLE_FISHEYE": [300, 320, 240],
+    "FISHEYE": [300, 310, 320, 240],
+    "EUCM": [300, 310, 320, 240, 0.6, 1.1],
+    "RADIAL with a barrel": [500, 300, 250, -0.25, 0.08],
+    "OPENCV off centre": [700, 700, 500, 100, 0.1, -0.2, 0.0, 0.0],
+}
+
+
+def lens_of(name: str, width: int = 640, height: int = 480) -> Camera:
+    return Camera(7, name.split()[0], width, height, tuple(map(float, LENSES[name])))
+
+
+@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("max_size", [0, 400])
+def test_known_points_land_where_the_pinhole_says(write_capture, tmp_path, name, max_size):
+    """Spots painted where pycolmap's distorted camera sees 3D points are found where the undistorted K puts them."""
+    camera = lens_of(name)
+    scene = write_capture(
+        views=3, size=(640, 480), model=camera.model, params=list(camera.params), masks=False, points=2
+    )
+    lens = scene.lens()
+    target = pinhole_for(camera, Path("cameras.bin"), max_size)
+    assert max(target.width, target.height) <= (max_size or 10_000)
+    rng = np.random.default_rng(1)
+    x, y = np.meshgrid(np.linspace(0.08, 0.92, 6) * target.width, np.linspace(0.08, 0.92, 5) * target.height)
+    spots = np.stack([x.ravel(), y.ravel()], 1) + rng.uniform(-0.5, 0.5, (30, 2))
+    depth = rng.uniform(1, 5, 30)
+    xyz = np.column_stack([(spots - target.K[:2, 2]) / [target.K[0, 0], target.K[1, 1]], np.ones(30)]) * depth[:, None]
+    seen = np.asarray(lens.img_from_cam(xyz))
+    assert (seen > 0).all() and (seen < [640, 480]).all()
+    # A spot is round in the pinhole view, so in the distorted image it has the shape that the inverse model gives it.
+    canvas = np.zeros((480, 640))
+    rays = write_capture.rays_of(lens)[..., :2] * [target.K[0, 0], target.K[1, 1]] + target.K[:2, 2]
+    for (u, v), (a, b) in zip(spots, seen.astype(int)):
+        near = np.s_[max(b - 15, 0) : b + 16, max(a - 15, 0) : a + 16]
+        spot = np.exp(-((rays[near] - [u, v]) ** 2).sum(-1) / (2 * 2.5**2))
+        canvas[near] = np.maximum(canvas[near], spot)
+    for image_name in scene.names:
+        grey = (255 * canvas[..., None]).round().astype(np.uint8)
+        Image.fromarray(np.repeat(grey, 3, 2)).save(scene.folder / "images" / image_name)
+    capture = load_capture(scene.folder, tmp_path / "cache", max_size=max_size)
+    image = capture.image(0)[..., 0].astype(float)
+    assert image.shape == (target.height, target.width)
+    off = np.empty((30, 2))
+    for i, (u, v) in enumerate(spots.astype(int)):
+        patch = image[v - 7 : v + 8, u - 7 : u + 8]
+        gy, gx = np.mgrid[v - 7 : v + 8, u - 7 : u + 8] + 0.5
+        off[i] = np.array([(patch * gx).sum(), (patch * gy).sum()]) / patch.sum() - spots[i]
+    assert np.abs(off).max() < 0.1 and np.abs(np.median(off, 0)).max() < 0.03
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_undistorted_images_have_no_blank_pixels(name):
+    camera = lens_of(name)
+    target = pinhole_for(camera, Path("cameras.bin"), 0)
+    at = source_pixels(camera, target)
+    assert (at >= -0.01).all() and (at[0] <= 480.01).all() and (at[1] <= 640.01).all()
+    # The view is not needlessly small: some ray at its border lies at the image's border, or at the limit of 60 degrees.
+    reach = [-target.K[0, 2] / target.K[0, 0], (target.width - target.K[0, 2]) / target.K[0, 0]]
+    touches = min(at.min(), (480 - at[0]).min(), (640 - at[1]).min()) < 2
+    assert touches or max(map(abs, reach)) > 1.72
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_keypoints_are_undistorted(write_capture, tmp_path, name):
+    camera = lens_of(name)
+    scene = write_capture(views=3, size=(640, 480), model=camera.model, params=list(camera.params))
+    capture = load_capture(scene.folder, tmp_path / "cache", max_size=500)
+    for index, view in enumerate(capture.views):
+        keypoints = capture.keypoints(index)
+        assert len(keypoints.xy) == len(scene.seen[index]) > 20
+        xyz = capture.points.xyz[keypoints.point_index] @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        projected = xyz @ view.K.T
+        np.testing.assert_allclose(keypoints.xy, projected[:, :2] / projected[:, 2:], atol=0.02)
+
+
+@pytest.mark.parametrize("name", ["OPENCV", "THIN_PRISM_FISHEYE", "RADIAL with a barrel"])
+def test_undistorted_masks_are_the_pinholes(write_capture, tmp_path, name):
+    sphere_ids = write_capture.sphere_ids
+
+    camera = lens_of(name)
+    spheres = [(1, (-0.7, 0.0, 0.0), 0.5), (70_000, (0.7, 0.1, 0.0), 0.45), (4_000_000_000, (0.0, -0.2, 0.9), 0.35)]
+    scene = write_capture(views=3, size=(640, 480), model=camera.model, params=list(camera.params), spheres=spheres)
+    for index, image_name in enumerate(scene.names):
+        path = (scene.folder / "masks" / image_name).with_suffix(".npy")
+        path.with_suffix(".png").unlink()
+        np.save(path, scene.ids[index].astype(np.uint32))
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    assert capture.object_ids.tolist() == [1, 70_000, 4_000_000_000]
+    for index, view in enumerate(capture.views):
+        x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+        rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(view.K).T
+        truth, _ = sphere_ids(rays, view.viewmat, spheres)
+        mask = capture.mask(index)
+        assert mask is not None and mask.shape == truth.shape
+        assert set(np.unique(mask)) <= {0, 1, 70_000, 4_000_000_000}
+        assert (mask == truth).mean() > 0.995
+
+
+def test_fold_over_is_culled():
+    """Beyond the fold a ray lands in the image a second time; the view must end before it."""
+    camera = Camera(1, "SIMPLE_RADIAL", 200, 150, (100.0, 100.0, 75.0, -0.5))
+    target = pinhole_for(camera, Path("cameras.bin"), 0)
+    corner = np.hypot(target.K[0, 2] / target.K[0, 0], target.K[1, 2] / target.K[1, 1])
+    assert 0.6 < corner < np.sqrt(1 / 1.5), "the fold lies at sqrt(1 / (3 * 0.5))"
+    at = source_pixels(camera, target)
+    assert (np.diff(at[1], axis=1) > 0).all() and (np.diff(at[0], axis=0) > 0).all()
+
+
+def test_a_wide_fisheye_is_clamped():
+    camera = Camera(1, "OPENCV_FISHEYE", 1000, 1000, (260.0, 260.0, 500.0, 500.0, 0.0, 0.0, 0.0, 0.0))
+    target = pinhole_for(camera, Path("cameras.bin"), 0)
+    assert 2 * np.degrees(np.arctan(target.width / 2 / target.K[0, 0])) == pytest.approx(120, abs=0.5)
+
+
+@pytest.mark.parametrize(
+    "params",
+    [(4.95, 960, 540, 343.1), (400, 960, 540, 343.1), (1000, 960, 540, -40.0), (0.0, 960, 540, 0.0), (1e9, 960, 540, 0.1),
+     (-900.0, 960, 540, 0.0), (900.0, 1e7, 540, 0.0)],
+)  # fmt: skip
+def test_impossible_lenses_are_refused(params):
+    with pytest.raises(InputError, match=r"cameras\.bin gives camera 1 \(SIMPLE_RADIAL\).*degenerate"):
+        pinhole_for(Camera(1, "SIMPLE_RADIAL", 1920, 1080, tuple(map(float, params))), Path("cameras.bin"), 0)
+
+
+def test_random_lenses_never_make_garbage():
+    rng = np.random.default_rng(0)
+    made = 0
+    for _ in range(60):
+        strength = 10.0 ** rng.uniform(-2, 1)
+        params = (rng.uniform(50, 900), rng.uniform(50, 900), *rng.uniform(0, 200, 2), *rng.normal(size=8) * strength)
+        camera = Camera(1, "FULL_OPENCV", 200, 150, params)
+        try:
+            target = pinhole_for(camera, Path("cameras.bin"), 0)
+        except InputError:
+            continue
+        made += 1
+        assert 0.2 * 200 <= target.width < 20_000 and 0.2 * 150 <= target.height < 20_000
+        at = source_pixels(camera, target)
+        assert (at >= -0.5).all() and (at[0] <= 150.5).all() and (at[1] <= 200.5).all()
+    assert made > 5
+
+
+def test_a_panorama_is_refused_by_name(write_capture, tmp_path):
+    scene = write_capture(masks=False)
+    (scene.folder / "sparse/0/cameras.bin").write_bytes(struct.pack("<QIiQQ2d", 1, 1, 17, 96, 72, 96, 72))
+    refused(scene.folder, tmp_path, "cameras.bin", "EQUIRECTANGULAR", "panorama")
+
+
+# The cache
+
+
+def test_the_cache_is_used_and_follows_its_sources(write_capture, tmp_path):
+    scene = write_capture(views=3, model="SIMPLE_RADIAL", params=[90, 48, 36, 0.1])
+    cache = tmp_path / "cache"
+
+    def load():
+        capture = load_capture(scene.folder, cache)
+        return capture, [view.image_file.stat().st_mtime_ns for view in capture.views]
+
+    first, times = load()
+    assert all(view.image_file.parent == cache / "views" for view in first.views)
+    second, again = load()
+    assert times == again, "nothing changed, so nothing is made anew"
+    np.testing.assert_array_equal(second.object_ids, first.object_ids)
+    path = scene.folder / "images" / scene.names[1]
+    Image.fromarray(np.full((72, 96, 3), 200, np.uint8)).save(path)
+    third, changed = load()
+    assert changed[0] == times[0] and changed[1] != times[1] and (third.image(1) == 200).all()
+    third.views[0].image_file.write_bytes(b"")
+    fourth, _ = load()
+    np.testing.assert_array_equal(fourth.image(0), first.image(0))
+    np.save((scene.folder / "masks" / scene.names[0]).with_suffix(".png.npy"), np.full((72, 96), 9))
+    assert 9 in load()[0].object_ids
+    assert {path.suffix for path in (cache / "views").iterdir()} <= {".png", ".json"}
+
+
+def test_a_killed_run_leaves_nothing_half_and_the_next_goes_on(write_capture, tmp_path, monkeypatch):
+    import backend.capture.capture as module
+
+    scene = write_capture(views=5, model="SIMPLE_RADIAL", params=[90, 48, 36, 0.1])
+    made = []
+    original = module.write_image
+
+    def dying(path, image):
+        if len(made) >= 2:
+            raise KeyboardInterrupt
+        made.append(path)
+        original(path, image)
+
+    monkeypatch.setattr(module, "write_image", dying)
+    with pytest.raises(KeyboardInterrupt):
+        load_capture(scene.folder, tmp_path / "cache")
+    for path in (tmp_path / "cache").rglob("*.png"):
+        Image.open(path).load()
+    assert not list((tmp_path / "cache").rglob("*.part"))
+    monkeypatch.setattr(module, "write_image", original)
+    assert len(load_capture(scene.folder, tmp_path / "cache").views) == 5
+
+
+def test_a_full_disk_is_one_sentence(write_capture, tmp_path, monkeypatch):
+    import backend.capture.capture as module
+
+    def full(path, image):
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(module, "write_image", full)
+    scene = write_capture(views=3, model="SIMPLE_RADIAL", params=[90, 48, 36, 0.1])
+    with pytest.raises(InputError, match="No space left on device"):
+        load_capture(scene.folder, tmp_path / "cache")
+
+
+def test_images_are_reduced_to_the_largest_size(write_capture, tmp_path):
+    scene = write_capture(views=3, size=(96, 72))
+    capture = load_capture(scene.folder, tmp_path / "cache", max_size=50)
+    view = capture.views[1]
+    assert (view.width, view.height) == (50, 38) == capture.image(1).shape[1::-1]
+    np.testing.assert_allclose(view.K, np.diag([50 / 96, 38 / 72, 1]) @ [[96, 0, 48], [0, 96, 36], [0, 0, 1]])
+    mask = capture.mask(1)
+    assert mask is not None and mask.shape == (38, 50) and set(np.unique(mask)) <= {0, 1, 2, 5}
+    keypoints = capture.keypoints(1)
+    np.testing.assert_allclose(keypoints.xy, scene.pixels[1] * [50 / 96, 38 / 72], atol=1e-9)
+    assert load_capture(scene.folder, tmp_path / "cache", max_size=0).views[1].width == 96
+
+
+# Masks
+
+
+def expected_ids(scene, index: int, code) -> np.ndarray:
+    return np.vectorize(lambda i: code.get(i, i))(scene.ids[index])
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["8 bit", "16 bit", "palette", "1 bit", "2 bit", "4 bit", "grey rgb", "rgb", "rgba", "npy", "npy float", "npz", "npz named",
+     "appended", "npy 3d", "bool", "tif"],
+)  # fmt: skip
+def test_every_mask_format(write_capture, tmp_path, kind):
+    scene = write_capture(views=4, names=[f"robot/{i}.png" for i in range(4)])
+    code = {"16 bit": {1: 300, 2: 65_535}, "rgb": {1: 255, 2: 65_793, 5: 16_000_000}, "rgba": {1: 255, 2: 256},
+            "npy": {1: 70_000, 2: 4_294_967_295}, "npz": {1: 70_000}, "1 bit": {2: 1, 5: 1}, "bool": {2: 1, 5: 1},
+            "2 bit": {5: 3}, "4 bit": {5: 15}}.get(kind, {})  # fmt: skip
+    for index, name in enumerate(scene.names):
+        ids = expected_ids(scene, index, code)
+        path = (scene.folder / "masks" / name).with_suffix(".png")
+        path.unlink()
+        if kind in ("8 bit", "16 bit"):
+            Image.fromarray(ids.astype(np.uint8 if kind == "8 bit" else np.uint16)).save(path)
+        elif kind in ("palette", "2 bit", "4 bit"):
+            if kind == "palette":
+                image = Image.fromarray(ids.astype(np.uint8), "P")
+                image.putpalette([200, 10, 10, 0, 255, 0, 9, 9, 9, 1, 1, 1, 2, 2, 2, 70, 80, 90])
+                image.save(path)
+            else:
+                path.write_bytes(low_bit_png(ids, 2 if kind == "2 bit" else 4))
+        elif kind == "1 bit":
+            Image.fromarray(ids > 0).save(path)
+        elif kind == "grey rgb":
+            Image.fromarray(np.repeat(ids[..., None], 3, 2).astype(np.uint8)).save(path)
+        elif kind in ("rgb", "rgba"):
+            planes = [ids & 255, ids >> 8 & 255, ids >> 16, np.full_like(ids, 128)][: len(kind)]
+            Image.fromarray(np.stack(planes, -1).astype(np.uint8)).save(path)
+        elif kind == "npy":
+            np.save(path.with_suffix(".npy"), ids.astype(np.uint32))
+        elif kind == "npy float":
+            np.save(path.with_suffix(".npy"), ids.astype(np.float32))
+        elif kind == "npy 3d":
+            np.save(path.with_suffix(".npy"), ids[None].astype(np.int16))
+        elif kind == "bool":
+            np.save(path.with_suffix(".npy"), ids > 0)
+        elif kind == "npz":
+            np.savez(path.with_suffix(".npz"), ids)
+        elif kind == "npz named":
+            np.savez(path.with_suffix(".npz"), scores=np.ones(3), ids=ids)
+        elif kind == "tif":
+            Image.fromarray(ids.astype(np.uint16)).save(path.with_suffix(".tif"))
+        else:
+            Image.fromarray(ids.astype(np.uint8)).save(str(scene.folder / "masks" / name) + ".png")
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    seen = set()
+    for index in range(4):
+        expected = expected_ids(scene, index, code)
+        np.testing.assert_array_equal(capture.mask(index), expected)
+        seen |= set(np.unique(expected).tolist()) - {0}
+    assert capture.object_ids.tolist() == sorted(seen) and capture.has_masks
+
+
+def low_bit_png(ids: np.ndarray, bits: int) -> bytes:
+    """A grey PNG of fewer than 8 bits, which Pillow cannot write."""
+    import zlib
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    per = 8 // bits
+    groups = ids.reshape(ids.shape[0], -1, per) << (bits * np.arange(per)[::-1])
+    rows = np.pad(groups.sum(-1), ((0, 0), (1, 0))).astype(np.uint8)
+    head = struct.pack(">IIBBBBB", ids.shape[1], ids.shape[0], bits, 0, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", head)
+        + chunk(b"IDAT", zlib.compress(rows.tobytes()))
+        + chunk(b"IEND", b"")
+    )
+
+
+def test_grey_or_colour_is_decided_for_the_capture(write_capture, tmp_path):
+    """A colour-coded ID may be grey in a view that shows no other: 65,793 is (1, 1, 1)."""
+    scene = write_capture(views=3)
+    for index, name in enumerate(scene.names):
+        ids = np.full((72, 96), 65_793)
+        if index == 2:
+            ids[:10] = 255
+        Image.fromarray(np.stack([ids & 255, ids >> 8 & 255, ids >> 16], -1).astype(np.uint8)).save(
+            scene.folder / "masks" / name
+        )
+    assert load_capture(scene.folder, tmp_path / "cache").object_ids.tolist() == [255, 65_793]
+
+
+@pytest.mark.parametrize("size", [(48, 36), (192, 144), (95, 72)])
+def test_a_mask_of_another_size_and_equal_shape_is_taken_nearest(write_capture, tmp_path, size):
+    scene = write_capture(views=3)
+    for index, name in enumerate(scene.names):
+        ids = Image.fromarray(scene.ids[index].astype(np.uint8)).resize(size, Image.Resampling.NEAREST)
+        ids.save(scene.folder / "masks" / name)
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    for index in range(3):
+        mask = capture.mask(index)
+        assert mask is not None and mask.shape == (72, 96) and (mask == scene.ids[index]).mean() > 0.95
+
+
+def test_some_masks_may_be_missing_but_not_most(write_capture, tmp_path):
+    scene = write_capture(views=6)
+    for name in scene.names[:3]:
+        (scene.folder / "masks" / name).unlink()
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    assert capture.mask(0) is None and capture.mask(4) is not None and capture.counts["masks"] == 3
+    assert any("3 of 6 images have no mask" in warning for warning in capture.warnings)
+    (scene.folder / "masks" / scene.names[3]).unlink()
+    refused(scene.folder, tmp_path, "masks/view_000.png", "missing", "4 of 6")
+
+
+def test_no_masks_at_all(write_capture, tmp_path):
+    capture = load_capture(write_capture(masks=False).folder, tmp_path / "cache")
+    assert not capture.has_masks and capture.mask(0) is None and len(capture.object_ids) == 0
+
+
+@pytest.mark.parametrize(
+    "text, expected",
+    [('{"0": "none", "7": "cup"}', {7: "cup"}), ('{"cup": 7, "box": 9}', {7: "cup", 9: "box"}),
+     ('[{"id": 7, "name": "cup"}]', {7: "cup"}), ("# names\n7 cup\n9: big box\n", {7: "cup", 9: "big box"}), ("{}", {})],
+)  # fmt: skip
+def test_names(write_capture, tmp_path, text, expected):
+    scene = write_capture(masks=False)
+    (scene.folder / ("labels.json" if text[0] in "{[" else "labels.txt")).write_text(text)
+    assert load_capture(scene.folder, tmp_path / "cache").names == expected
+
+
+# Finding files
+
+
+def test_names_are_found_however_unicode_and_separators_are_written(write_capture, tmp_path):
+    names = ["Cámara.png", "dir/b.png", "plain.PNG"]
+    scene = write_capture(names=names, masks=False)
+    scene.names = [unicodedata.normalize("NFD", names[0]), "dir\\b.png", "PLAIN.png"]
+    write_model = write_capture.write_model
+
+    write_model(scene, scene.folder / "sparse" / "0", ".bin")
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    found = {view.image_file.relative_to(scene.folder / "images").as_posix() for view in capture.views}
+    assert found == set(names)
+
+
+def test_missing_and_unregistered_images_are_counted(write_capture, tmp_path):
+    scene = write_capture(views=6)
+    (scene.folder / "images" / scene.names[2]).unlink()
+    for name in ("extra.jpg", "more/extra.png"):
+        (scene.folder / "images" / name).parent.mkdir(exist_ok=True)
+        Image.new("RGB", (5, 5)).save(scene.folder / "images" / name)
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    assert len(capture.views) == 5 == capture.counts["used"]
+    assert capture.counts["missing"] == 1 and capture.counts["unregistered"] == 2 and capture.counts["registered"] == 6
+    assert any("view_002.png" in warning for warning in capture.warnings)
+    assert any("extra.jpg" in warning and "2 of 7" in warning for warning in capture.warnings)
+
+
+@pytest.mark.parametrize("layout", ["sparse/0", "sparse", "."])
+def test_where_a_model_may_lie(write_capture, tmp_path, layout):
+    scene = write_capture()
+    target = scene.folder / layout
+    for path in list((scene.folder / "sparse/0").iterdir()):
+        path.rename(target / path.name)
+    if layout != "sparse/0":
+        (scene.folder / "sparse/0").rmdir()
+    assert len(load_capture(scene.folder, tmp_path / "cache").views) == 6
+
+
+def test_the_largest_of_several_models_is_used(write_capture, tmp_path):
+    scene, other = write_capture(name="main", views=3), write_capture(name="other", views=6)
+    (other.folder / "sparse/0").rename(scene.folder / "sparse/1")
+    for name in other.names:
+        (other.folder / "images" / name).replace(scene.folder / "images" / name)
+        (other.folder / "masks" / name).replace(scene.folder / "masks" / name)
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    assert len(capture.views) == 6 and any("1 (6 images) is used, not 0 (3 images)" in w for w in capture.warnings)
+
+
+# Bad input
+
+
+def spoil(scene, what: str) -> tuple[str, ...]:
+    """Break the capture; what the sentence must name."""
+    model, images, masks = scene.folder / "sparse/0", scene.folder / "images", scene.folder / "masks"
+    first = scene.names[0]
+    if what.endswith("is missing"):
+        name = what.split()[0]
+        (model / name).unlink()
+        return name, "missing"
+    if what.endswith("is cut short"):
+        path = model / what.split()[0]
+        path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+        return path.name, "cut short"
+    if what.endswith("is empty"):
+        (model / what.split()[0]).write_bytes(b"")
+        return what.split()[0], "cut short"
+    data = bytearray((model / "images.bin").read_bytes())
+    if what == "no pose":
+        (model / "images.bin").write_bytes(struct.pack("<Q", 0))
+        return "images.bin", "no image with a pose"
+    if what in ("NaN pose", "zero rotation", "infinite position"):
+        value, at, count = {
+            "NaN pose": (np.nan, 12, 1),
+            "zero rotation": (0.0, 12, 4),
+            "infinite position": (np.inf, 44, 1),
+        }[what]
+        struct.pack_into(f"<{count}d", data, at, *[value] * count)
+        (model / "images.bin").write_bytes(data)
+        return "images.bin", first, "not a number"
+    if what == "absent camera":
+        struct.pack_into("<I", data, 8 + 4 + 56, 99)
+        (model / "images.bin").write_bytes(data)
+        return "images.bin", first, "camera 99"
+    if what == "outside name":
+        (model / "images.bin").write_bytes(bytes(data).replace(first.encode(), b"../" + first.encode()[3:]))
+        return "images.bin", "lies outside"
+    if what == "3 points":
+        (model / "points3D.bin").write_bytes(
+            struct.pack("<Q", 3) + b"".join(struct.pack("<Q3d3BdQ", i, i, 0, 0, 1, 2, 3, 0.1, 0) for i in range(3))
+        )
+        return "points3D.bin", "only 3 points"
+    if what == "unknown model":
+        (model / "cameras.bin").write_bytes(struct.pack("<QIiQQ4d", 1, 1, 77, 96, 72, 1, 1, 1, 1))
+        return "cameras.bin", "77"
+    if what == "NaN camera":
+        (model / "cameras.bin").write_bytes(struct.pack("<QIiQQ4d", 1, 1, 1, 96, 72, np.nan, 1, 1, 1))
+        return "cameras.bin", "NaN"
+    if what == "degenerate camera":
+        (model / "cameras.bin").write_bytes(struct.pack("<QIiQQ4d", 1, 1, 2, 96, 72, 90, 48, 36, 5000.0))
+        return "cameras.bin", "degenerate"
+    if what == "image size":
+        Image.new("RGB", (72, 96)).save(images / first)
+        return first, "72x96", "96x72"
+    if what == "damaged image":
+        (images / first).write_bytes((images / first).read_bytes()[:300])
+        return first, "cannot be read as an image"
+    if what == "not an image":
+        (images / first).write_text("hello")
+        return first, "cannot be read as an image"
+    if what == "no images":
+        for name in scene.names:
+            (images / name).unlink()
+        return "images", "none of the 6 images", first
+    if what == "no images folder":
+        images.rename(scene.folder / "pictures")
+        return "images", "does not exist"
+    path = masks / first
+    if what == "mask size":
+        Image.new("L", (50, 72)).save(path)
+        return f"masks/{first}", "50x72", "96x72"
+    if what == "JPEG mask":
+        path.unlink()
+        Image.new("L", (96, 72)).save(path.with_suffix(".jpg"))
+        return "masks/view_000.jpg", "JPEG"
+    if what == "JPEG mask in disguise":
+        Image.new("L", (96, 72)).save(path, "JPEG")
+        return f"masks/{first}", "JPEG"
+    if what == "picture mask":
+        for name in scene.names:
+            noise = np.random.default_rng(0).integers(0, 255, (72, 96, 3)).astype(np.uint8)
+            Image.fromarray(noise).save(masks / name)
+        return "masks/view_000.png", "not an ID map"
+    if what == "damaged mask":
+        path.write_bytes(path.read_bytes()[:60])
+        return f"masks/{first}", "cannot be read"
+    path.unlink()
+    arrays = {
+        "fractional mask": (np.full((72, 96), 0.5), "not an ID map"),
+        "NaN mask": (np.full((72, 96), np.nan), "not an ID map"),
+        "negative mask": (np.full((72, 96), -1), "not an ID map"),
+        "too large mask": (np.full((72, 96), 2**32), "not an ID map"),
+        "vector mask": (np.zeros(5), "not an ID map"),
+        "text mask": (np.full((72, 96), "a"), "not an ID map"),
+    }
+    if what in arrays:
+        np.save(path.with_suffix(".npy"), arrays[what][0])
+        return "masks/view_000.npy", arrays[what][1]
+    if what == "pickled mask":
+        np.save(path.with_suffix(".npy"), np.array([{}], object), allow_pickle=True)
+        return "masks/view_000.npy", "cannot be read"
+    assert what == "empty npz", what
+    np.savez(path.with_suffix(".npz"))
+    return "masks/view_000.npz", "(none)"
+
+
+@pytest.mark.parametrize(
+    "what",
+    ["cameras.bin is missing", "images.bin is missing", "points3D.bin is missing", "cameras.bin is cut short",
+     "images.bin is cut short", "points3D.bin is cut short", "images.bin is empty", "no pose", "NaN pose", "zero rotation",
+     "infinite position", "absent camera", "outside name", "3 points", "unknown model", "NaN camera", "degenerate camera",
+     "image size", "damaged image", "not an image", "no images", "no images folder", "mask size", "JPEG mask",
+     "JPEG mask in disguise", "picture mask", "damaged mask", "fractional mask", "NaN mask", "negative mask",
+     "too large mask", "vector mask", "text mask", "pickled mask", "empty npz"],
+)  # fmt: skip
+def test_bad_input_is_one_sentence(write_capture, tmp_path, what):
+    scene = write_capture()
+    refused(scene.folder, tmp_path, *spoil(scene, what))
+
+
+def test_no_folder_no_model_no_cache(write_capture, tmp_path):
+    refused(tmp_path / "nowhere", tmp_path, "nowhere", "does not exist")
+    (tmp_path / "file").write_text("")
+    refused(tmp_path / "file", tmp_path, "is a file")
+    (tmp_path / "empty").mkdir()
+    refused(tmp_path / "empty", tmp_path, "no COLMAP model", "sparse/0")
+    with pytest.raises(InputError, match="cannot be written"):
+        load_capture(write_capture().folder, tmp_path / "file" / "cache")
+
+
+@pytest.mark.parametrize("text", ["not json", "[1, 2]", '"x"', '{"a": "b"}', '{"-4": "b"}', '{"99999999999": "b"}'])
+def test_bad_names(write_capture, tmp_path, text):
+    scene = write_capture()
+    (scene.folder / "labels.json").write_text(text)
+    refused(scene.folder, tmp_path, "labels.json")
+
+
+@pytest.mark.parametrize("line", ["1 1 0 0 0 0 0", "1 a 0 0 0 0 0 0 1 x.png", "1 1 0 0 0 0 0 3 1 x.png\n1.0 2.0"])
+def test_malformed_text_names_the_line(write_capture, tmp_path, line):
+    scene = write_capture(suffix=".txt")
+    path = scene.folder / "sparse/0/images.txt"
+    path.write_text("# comment\n" + line)
+    refused(scene.folder, tmp_path, "images.txt", f"line {2 + line.count(chr(10))}")
+
+
+def test_points_that_are_not_finite_are_left_out(write_capture, tmp_path):
+    scene = write_capture(suffix=".txt")
+    path = scene.folder / "sparse/0/points3D.txt"
+    lines = path.read_text().splitlines()
+    lines[1] = "3 nan 0 0 1 2 3 0.5"
+    path.write_text("\n".join(lines) + "\n")
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    assert len(capture.points.xyz) == 179 and any("not finite" in warning for warning in capture.warnings)
+    for index in range(6):
+        keypoints, view = capture.keypoints(index), capture.views[index]
+        projected = (
+            capture.points.xyz[keypoints.point_index] @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        ) @ view.K.T
+        np.testing.assert_allclose(keypoints.xy, projected[:, :2] / projected[:, 2:], atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+def test_damaged_models_never_raise_anything_else(write_capture, suffix):
+    scene = write_capture(
+        suffix=suffix, views=3, points=4, model="OPENCV", params=[80, 82, 47, 37, 0.05, -0.02, 0.001, 0.002]
+    )
+    folder = scene.folder / "sparse/0"
+    rng = np.random.default_rng(0)
+    refusals = 0
+    for name in ("cameras", "images", "points3D"):
+        path = folder / f"{name}{suffix}"
+        whole = path.read_bytes()
+        for trial in range(120):
+            data = bytearray(whole)
+            if trial % 2:
+                data = data[: rng.integers(len(data))]
+            for _ in range(trial % 4):
+                if len(data):
+                    data[rng.integers(len(data))] = rng.integers(256)
+            path.write_bytes(data)
+            try:
+                model = read_model(folder)
+                for camera_id in {image.camera_id for image in model.images}:
+                    pinhole_for(model.cameras[camera_id], path, 1600)
+            except InputError as error:
+                refusals += 1
+                assert str(error).endswith(".") and "\n" not in str(error)
+        path.write_bytes(whole)
+    assert refusals > 100
+    read_model(folder)
+
+
+# Checking
+
+
+def test_check_says_what_is_there_and_writes_nothing(write_capture):
+    scene = write_capture(views=9, model="SIMPLE_RADIAL", params=[90, 48, 36, 0.1])
+    before = sorted(scene.folder.rglob("*"))
+    steps = []
+
+    class Counting(Reporter):
+        def progress(self, done, total, **fields):
+            steps.append((done, total))
+
+    found = check_capture(scene.folder, reporter=Counting())
+    assert sorted(scene.folder.rglob("*")) == before and steps[-1] == (9, 9)
+    assert found["problems"] == [] == found["warnings"]
+    assert found["counts"]["used"] == 9 and found["points"] == 180 and found["mean_reprojection_error"] == 0.5
+    assert found["cameras"] == [
+        {"id": 1, "model": "SIMPLE_RADIAL", "width": 96, "height": 72, "images": 9, "undistort": True}
+    ]
+    assert [(entry["id"], entry["name"]) for entry in found["objects"]] == [(i, f"sphere {i}") for i in (1, 2, 5)]
+    assert all(entry["views"] > 5 for entry in found["objects"])
+    json.dumps(found, allow_nan=False)
+
+
+def test_check_collects_all_problems(write_capture):
+    scene = write_capture(views=6)
+    (scene.folder / "images" / scene.names[0]).write_text("no image")
+    Image.new("RGB", (10, 10)).save(scene.folder / "images" / scene.names[1])
+    Image.new("L", (10, 10)).save(scene.folder / "masks" / scene.names[2])
+    (scene.folder / "labels.json").write_text("{")
+    problems = check_capture(scene.folder)["problems"]
+    assert len(problems) == 4
+    for name in ["labels.json", *scene.names[:3]]:
+        assert any(name in problem for problem in problems)
+
+
+# COLMAP's own files
+
+
+NAMES = [
+    "plain.jpg", "with space.jpg", "日本語/画像 001.png", "sub/dir/Ünïcödé.JPG", "dots.in.name.v2.jpeg", "emoji_🍌.png",
+    unicodedata.normalize("NFD", "Cámara") + "_NFD.jpg", "back\\slash.jpg", "quote's.jpg", "#hash%20.jpg", "UPPER.PNG",
+]  # fmt: skip
+
+
+def with_images(model_folder: Path, folder: Path) -> Path:
+    """A capture around a model of real COLMAP: an image of the right size for each name."""
+    model = read_model(model_folder)
+    folder.mkdir()
+    (folder / "sparse").symlink_to(model_folder)
+    for image in model.images:
+        camera = model.cameras[image.camera_id]
+        path = folder / "images" / image.name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (camera.width, camera.height), (90, 120, 30)).save(path)
+    return folder
+
+
+@pytest.mark.parametrize("suffix", ["bin", "txt"])
+def test_all_camera_models(tmp_path, suffix):
+    folder = fixture(f"all_camera_models_{suffix}")
+    capture = load_capture(with_images(folder, tmp_path / "capture"), tmp_path / "cache")
+    assert [view.name for view in capture.views] == sorted(NAMES)
+    assert {view.camera_id for view in capture.views} == set(range(10, 120, 10)) and len(capture.points.xyz) == 60
+    for index, view in enumerate(capture.views):
+        assert (capture.image(index) == [90, 120, 30]).mean() > 0.99, "nothing but the image's colour"
+        keypoints = capture.keypoints(index)
+        assert len(keypoints.xy) == (0 if view.name == "UPPER.PNG" else 50)
+        if len(keypoints.xy):
+            p = (capture.points.xyz[keypoints.point_index] @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]) @ view.K.T
+            # The fixture's observations are exact projections with noise of a pixel at most.
+            assert np.median(np.linalg.norm(keypoints.xy - p[:, :2] / p[:, 2:], axis=1)) < 1
+
+
+@pytest.mark.parametrize("suffix", ["bin", "txt"])
+def test_rigs_and_frames(tmp_path, suffix):
+    folder = fixture(f"rigs_{suffix}")
+    theirs = pycolmap.Reconstruction(str(folder))
+    capture = load_capture(with_images(folder, tmp_path / "capture"), tmp_path / "cache")
+    assert len(capture.views) == 24 and len(capture.points.xyz) == 200
+    poses = {image.name: image.cam_from_world().matrix() for image in theirs.images.values()}
+    for index, view in enumerate(capture.views):
+        np.testing.assert_allclose(view.viewmat[:3], poses[view.name], atol=1e-9)
+        keypoints = capture.keypoints(index)
+        p = (capture.points.xyz[keypoints.point_index] @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]) @ view.K.T
+        np.testing.assert_allclose(keypoints.xy, p[:, :2] / p[:, 2:], atol=1e-3)
+
+
+def test_extreme_distortion(tmp_path):
+    folder = fixture("unicode_names_extreme_distortion")
+    capture = load_capture(with_images(folder, tmp_path / "capture"), tmp_path / "cache", max_size=800)
+    model = read_model(folder)
+    camera = next(iter(model.cameras.values()))
+    target = pinhole_for(camera, Path("cameras.bin"), 0)
+    edge = np.array([[x, y] for x in (0, target.width) for y in (0, target.height)])
+    rays = (edge - target.K[:2, 2]) / [target.K[0, 0], target.K[1, 1]]
+    assert np.linalg.norm(rays, axis=1).max() < 0.51, "the distortion folds over at a radius of 0.51"
+    assert (distort(to_pycolmap(camera), rays) > -1).all()
+    for index, view in enumerate(capture.views):
+        assert unicodedata.is_normalized("NFD", view.name) and " " in view.name and view.height == 800
+        assert (capture.image(index) == [90, 120, 30]).all()
+        assert len(capture.keypoints(index).xy) == 129
+
+
+def test_three_images(tmp_path):
+    capture = load_capture(with_images(fixture("three_images"), tmp_path / "capture"), tmp_path / "cache")
+    assert len(capture.views) == 3 and len(capture.points.xyz) == 1334
+    assert capture.test_indices == (0,) and capture.views[0].width == 699
+
+
+def test_subfolders(tmp_path):
+    folder = fixture("missing_cameras_subfolders_txt")
+    refused(folder, tmp_path, "images", "does not exist")
+    model = read_model(folder)
+    assert len(model.images) == 9 and all(image.name[:5] in ("sub1/", "sub2/") for image in model.images)
+
+
+def test_refused_fixtures(tmp_path):
+    refused(fixture("truncated"), tmp_path, "images.bin is cut short", "82 images")
+    refused(fixture("cameras_only"), tmp_path, "images.bin and points3D.bin are missing")
+    refused(fixture("degenerate_two_images"), tmp_path, "cameras.bin", "SIMPLE_RADIAL", "degenerate")
+
+
+def test_tabletop(tmp_path):
+    if not (DATA / "tabletop").is_dir():
+        pytest.skip("the capture tabletop is absent")
+    capture = load_capture(DATA / "tabletop", tmp_path / "cache")
+    assert (
+        len(capture.views) == 42 and capture.counts["masks"] == 42 and capture.object_ids.tolist() == list(range(1, 9))
+    )
+    errors = []
+    for index, view in enumerate(capture.views):
+        keypoints = capture.keypoints(index)
+        p = (capture.points.xyz[keypoints.point_index] @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]) @ view.K.T
+        errors.append(np.linalg.norm(keypoints.xy - p[:, :2] / p[:, 2:], axis=1))
+        assert capture.image(index).mean() > 20
+    assert np.concatenate(errors).mean() < 1.0, "COLMAP's own mean reprojection error is 0.81 pixels"
+
+
+def test_banana(tmp_path):
+    if not (DATA / "banana").is_dir():
+        pytest.skip("the capture banana is absent")
+    capture = load_capture(DATA / "banana", tmp_path / "cache")
+    assert len(capture.views) == 14 and not capture.has_masks and capture.views[0].image_file.parent.name == "images"
+
+
+def test_masks_read_alone_decide_by_themselves(tmp_path):
+    Image.fromarray(np.full((4, 4, 3), 7, np.uint8)).save(tmp_path / "grey.png")
+    assert read_mask(tmp_path / "grey.png").tolist() == [[7] * 4] * 4
+    assert read_mask(tmp_path / "grey.png", colour=True)[0, 0] == 7 * 0x10101
