@@ -11,7 +11,7 @@ PINHOLE = 1  # COLMAP's number for the camera model
 
 
 def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Write `pixels` as PNG: (H, W) uint8 or uint16 greyscale, or (H, W, 3) uint8 RGB.  Equal pixels give equal bytes."""
+    """Write `pixels` as PNG: (H, W) uint8 or uint16 greyscale, or (H, W, 3) uint8 RGB; equal bytes for equal pixels."""
     height, width = pixels.shape[:2]
     colour = 2 if pixels.ndim == 3 else 0
     if colour == 2 and (pixels.shape[2] != 3 or pixels.dtype != np.uint8):
@@ -93,6 +93,7 @@ def write_colmap(folder: Path, intrinsics, size, names, rotations, translations,
 
     parts = [struct.pack("<Q", len(points["xyz"]))]
     for i, track in enumerate(points["track"]):
-        parts.append(struct.pack("<Q3d3BdQ", i + 1, *points["xyz"][i], *points["rgb"][i], points["error"][i], len(track)))
+        values = (*points["xyz"][i], *points["rgb"][i], points["error"][i])
+        parts.append(struct.pack("<Q3d3BdQ", i + 1, *values, len(track)))
         parts.append(np.ascontiguousarray(track, "<i4").tobytes())
     (folder / "points3D.bin").write_bytes(b"".join(parts))

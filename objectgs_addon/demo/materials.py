@@ -77,9 +77,16 @@ class _Nodes:
 
     def vary(self, colour, place, amount: float = .35, scale: float = 14.0):
         """Lighter and darker patches, so that repeats of a pattern can be told apart."""
-        patches = self.ramp(self.noise(place, scale, 1.5), [_grey(1 - amount), _grey(1.0), _grey(1 - amount / 2), _grey(1.0)],
-                            soft=True, stops=[.3, .45, .58, .72])
+        greys = [_grey(1 - amount), _grey(1.0), _grey(1 - amount / 2), _grey(1.0)]
+        patches = self.ramp(self.noise(place, scale, 1.5), greys, soft=True, stops=[.3, .45, .58, .72])
         return self.mix(1.0, colour, patches, "MULTIPLY")
+
+    def glow(self, colour):
+        """Colour that needs no light: none is traced for the room, half of the pixels, and none of it is noisy."""
+        shader = self.add("Emission", {0: colour, 1: .9})
+        self.tree.links.new(shader.outputs[0], self.add("OutputMaterial").inputs[0])
+        self.material.cycles.emission_sampling = "NONE"
+        return self.material
 
     def finish(self, colour, roughness: float = .85, specular: float = .1):
         shader = self.add("BsdfPrincipled", {"Base Color": colour, "Roughness": roughness,
@@ -111,8 +118,9 @@ def _checker(n, raw, place, c, size, around):
 def _bricks(n, raw, place, c, size, around):
     u, z = n.wrap(raw, around)
     vector = n.join(n.math("MULTIPLY", u, .5), n.math("DIVIDE", z, size * 4))
-    return n.add("TexBrick", {"Vector": vector, "Color1": c[0], "Color2": c[1], "Mortar": c[2], "Scale": 1.0,
-                              "Mortar Size": .022, "Mortar Smooth": .3, "Brick Width": .5, "Row Height": .25}).outputs[0]
+    sizes = {"Scale": 1.0, "Mortar Size": .022, "Mortar Smooth": .3, "Brick Width": .5, "Row Height": .25}
+    colours = {"Color1": c[0], "Color2": c[1], "Mortar": c[2]}
+    return n.add("TexBrick", {"Vector": vector, **colours, **sizes}).outputs[0]
 
 
 def _mosaic(n, raw, place, c, size, around):
@@ -137,13 +145,14 @@ def _zigzag(n, raw, place, c, size, around):
 
 
 def _waves(n, raw, place, c, size, around):
-    node = n.add("TexWave", {"Vector": place, "Scale": .09 / size, "Distortion": 5.0, "Detail": 1.0, "Detail Scale": 1.2},
-                 wave_type="BANDS", bands_direction="DIAGONAL")
+    values = {"Vector": place, "Scale": .09 / size, "Distortion": 5.0, "Detail": 1.0, "Detail Scale": 1.2}
+    node = n.add("TexWave", values, wave_type="BANDS", bands_direction="DIAGONAL")
     return n.ramp(node.outputs[1], c)
 
 
 def _clouds(n, raw, place, c, size, around):
-    return n.ramp(n.noise(place, .42 / size, 1.5), c, stops=[0] + [.38 + .24 * i / (len(c) - 2) for i in range(len(c) - 1)])
+    stops = [0] + [.38 + .24 * i / (len(c) - 2) for i in range(len(c) - 1)]
+    return n.ramp(n.noise(place, .42 / size, 1.5), c, stops=stops)
 
 
 # kind: pattern, size of a detail (m), details around, sRGB colours, roughness, specular level
@@ -189,24 +198,23 @@ def table(rng) -> bpy.types.Material:
     return n.finish(n.vary(colour, place, .25, 6.0))
 
 
-def backdrop(rng) -> bpy.types.Material:
-    """Tiled floor, and a wall with large soft cells and stripes; details of 6 cm and more, as it is farther away."""
-    n = _Nodes("backdrop")
+def floor(rng) -> bpy.types.Material:
+    """Tiles, darker under the table."""
+    n = _Nodes("floor")
     raw, place = n.place(tuple(map(float, rng.uniform(-5, 5, 3))))
-    z = n.add("SeparateXYZ", {0: raw}).outputs[2]
-    tiles = n.add("TexChecker", {"Vector": place, "Scale": 4.5, "Color1": _linear("8d857c"), "Color2": _linear("a69c90")})
-    floor = n.vary(tiles.outputs[0], place, .3, 5.0)
-    choice = n.add("SeparateColor", {0: n.cells(place, 3.2)["Color"]}).outputs[0]
-    wall = n.ramp(choice, [_linear(code) for code in ("8fb0b8", "a9c3c2", "7f9fb0", "b9c6b8", "98b3a6")])
-    edge = n.cells(place, 3.2, "DISTANCE_TO_EDGE")[0]
-    wall = n.mix(n.step(edge, .05, .06), _linear("dfe3dc"), wall)
-    wall = n.vary(wall, place, .28, 4.0)
+    colour = n.add("TexChecker", {"Vector": place, "Scale": 4.5, "Color1": _linear("8d857c"),
+                                  "Color2": _linear("a69c90")}).outputs[0]
     x, y, _ = n.add("SeparateXYZ", {0: raw}).outputs
     away = n.math("SQRT", n.math("ADD", n.math("MULTIPLY", x, x), n.math("MULTIPLY", y, y)))
     shade = n.add("MapRange", {0: away, 1: .2, 2: 1.7, 3: .35, 4: .8}, interpolation_type="SMOOTHSTEP").outputs[0]
-    floor = n.mix(1.0, floor, n.join(shade, shade, shade), "MULTIPLY")  # the table's shadow
-    # It glows: no light is traced for half of the pixels, and none of them is noisy
-    glow = n.add("Emission", {0: n.mix(n.step(z, -.55, .05), floor, wall), 1: .9})
-    n.tree.links.new(glow.outputs[0], n.add("OutputMaterial").inputs[0])
-    n.material.cycles.emission_sampling = "NONE"
-    return n.material
+    return n.glow(n.mix(1.0, n.vary(colour, place, .3, 5.0), n.join(shade, shade, shade), "MULTIPLY"))
+
+
+def wall(rng) -> bpy.types.Material:
+    """Large cells with light joints; details of 6 cm and more, as the wall is farther away."""
+    n = _Nodes("wall")
+    _, place = n.place(tuple(map(float, rng.uniform(-5, 5, 3))))
+    choice = n.add("SeparateColor", {0: n.cells(place, 3.2)["Color"]}).outputs[0]
+    colour = n.ramp(choice, [_linear(code) for code in ("8fb0b8", "a9c3c2", "7f9fb0", "b9c6b8", "98b3a6")])
+    edge = n.cells(place, 3.2, "DISTANCE_TO_EDGE")[0]
+    return n.glow(n.vary(n.mix(n.step(edge, .05, .06), _linear("dfe3dc"), colour), place, .28, 4.0))

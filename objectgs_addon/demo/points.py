@@ -61,7 +61,7 @@ def _seeds(picture, depth, count, rng) -> np.ndarray:
 
 
 def make(views, intrinsics, pictures, depths, ids, rng, target: int = 13_500) -> Cloud:
-    """About `target` points (fewer from few or small views) for `views` with their pictures, depths (metres), ID maps."""
+    """About `target` points (fewer from few or small views) of `views` with pictures, depths (metres) and ID maps."""
     height, width = depths[0].shape
     target = min(target, len(views) * height * width // 40)
     per_view = max(1, int(np.ceil(target * 1.8 / len(views))))

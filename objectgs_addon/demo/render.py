@@ -55,7 +55,7 @@ class Renderer:
         render.image_settings.color_mode, render.image_settings.color_depth = "RGB", "32"
         cycles = scene.cycles
         cycles.device = "CPU"
-        cycles.use_adaptive_sampling = False
+        cycles.use_light_tree = False
         cycles.max_bounces, cycles.diffuse_bounces, cycles.glossy_bounces = 3, 2, 2
         cycles.transmission_bounces = cycles.volume_bounces = cycles.transparent_max_bounces = 0
         cycles.caustics_reflective = cycles.caustics_refractive = False
@@ -67,25 +67,36 @@ class Renderer:
         scene.collection.objects.link(self.camera)
         scene.camera = self.camera
         self.override = _id_and_depth()
+        meshes = {o.data for o in scene.collection.all_objects if isinstance(o.data, bpy.types.Mesh)}
+        self.looks = {mesh: list(mesh.materials) for mesh in meshes}
+
+    def _dress(self, looks) -> None:
+        """Set the meshes' materials."""
+        for mesh, materials in looks.items():
+            for slot, material in enumerate(materials):
+                mesh.materials[slot] = material
 
     def close(self) -> None:
         """Free what was made for rendering beside the scene's own objects."""
+        self._dress(self.looks)
         bpy.data.materials.remove(self.override)
 
     def for_pictures(self) -> None:
         """Settings for `picture`."""
-        self.scene.view_layers[0].material_override = None
+        self._dress(self.looks)
         cycles = self.scene.cycles
         cycles.samples, cycles.seed = self.samples, self.seed
-        cycles.pixel_filter_type, cycles.filter_width = "BLACKMAN_HARRIS", 1.5
+        # Measured at 42 dB between two seeds: half the noise is that of edges in the textures, so the rays go there
+        cycles.use_adaptive_sampling, cycles.adaptive_threshold, cycles.adaptive_min_samples = True, .03, 4
+        cycles.pixel_filter_type = "BOX"
         cycles.use_denoising, cycles.denoiser = True, "OPENIMAGEDENOISE"
-        cycles.denoising_input_passes, cycles.denoising_prefilter = "RGB_ALBEDO_NORMAL", "FAST"
+        cycles.denoising_input_passes, cycles.denoising_prefilter = "RGB_ALBEDO_NORMAL", "NONE"
 
     def for_truth(self) -> None:
-        """Settings for `truth`: one ray through the centre of each pixel (Cycles ignores the width of its box filter)."""
-        self.scene.view_layers[0].material_override = self.override
+        """Settings for `truth`: one ray through each pixel's centre (Cycles ignores the width of its box filter)."""
+        self._dress({mesh: [self.override] * len(looks) for mesh, looks in self.looks.items()})
         cycles = self.scene.cycles
-        cycles.samples, cycles.seed = 1, 0
+        cycles.samples, cycles.seed, cycles.use_adaptive_sampling = 1, 0, False
         cycles.pixel_filter_type, cycles.filter_width = "GAUSSIAN", .01
         cycles.use_denoising = False
 
@@ -141,4 +152,5 @@ def _id_and_depth() -> bpy.types.Material:
     tree.links.new(depth, colour.inputs[1])
     tree.links.new(colour.outputs[0], glow.inputs["Color"])
     tree.links.new(glow.outputs[0], output.inputs["Surface"])
+    material.cycles.emission_sampling = "NONE"  # or every triangle becomes a lamp, 0.5 s more a view
     return material

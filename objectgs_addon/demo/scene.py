@@ -64,9 +64,10 @@ def build(objects: int, seed: int) -> tuple[bpy.types.Scene, list[Thing]]:
     for thing, (x, y, turn) in zip(things, places):
         matrix = Matrix.Translation((x, y, 0)) @ Matrix.Rotation(turn, 4, "Z") @ Matrix.Scale(scale, 4)
         thing.object.matrix_world = matrix
-    for name, mesh, look in (("table", shapes.table(max(.62, spread + .06)), materials.table),
-                             ("backdrop", shapes.backdrop(2.6), materials.backdrop)):
-        mesh.materials.append(look(rng_for(seed, 2, len(things))))
+    for name, mesh, looks in (("table", shapes.table(max(.62, spread + .06)), [materials.table]),
+                              ("backdrop", shapes.backdrop(2.6), [materials.floor, materials.wall])):
+        for i, look in enumerate(looks):
+            mesh.materials.append(look(rng_for(seed, 2, len(things), i)))
         thing = Thing(len(things) + 1, name, bpy.data.objects.new(name, mesh))
         scene.collection.objects.link(thing.object)
         things.append(thing)
@@ -87,7 +88,7 @@ def _size(mesh) -> tuple[float, float]:
 
 
 def _arrange(sizes: np.ndarray, seed: int):
-    """Places (x, y, turn) without overlap, dense, high things nearer the middle; the radius used; and a common scale."""
+    """Places (x, y, turn) without overlap, dense, high things inside; the radius used; and a common scale."""
     rng = rng_for(seed, 3)
     scale, limit = 1.0, .44
     while True:

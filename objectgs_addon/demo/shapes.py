@@ -132,8 +132,9 @@ def mug(scene):
 
 def bottle(scene):
     """Bottle with a long neck, 36 cm high."""
-    return lathe("bottle", _rounded([(0, 0), (.052, 0), (.056, .006), (.056, .03), (.056, .19), (.054, .22), (.022, .25),
-                                     (.020, .28), (.020, .335), (.025, .337), (.025, .36), (.016, .36), (0, .36)]))
+    return lathe("bottle", _rounded([(0, 0), (.052, 0), (.056, .006), (.056, .03), (.056, .19), (.054, .22),
+                                     (.022, .25), (.020, .28), (.020, .335), (.025, .337), (.025, .36),
+                                     (.016, .36), (0, .36)]))
 
 
 def ring(scene):
@@ -214,8 +215,8 @@ def die(scene):
 
 def pumpkin(scene):
     """Ribbed pumpkin, 16 cm high."""
-    profile = _rounded([(0, .012), (.04, 0), (.10, .02), (.115, .07), (.09, .12), (.03, .13), (.016, .135), (.013, .155),
-                        (.015, .16), (0, .161)])
+    profile = _rounded([(0, .012), (.04, 0), (.10, .02), (.115, .07), (.09, .12), (.03, .13), (.016, .135),
+                        (.013, .155), (.015, .16), (0, .161)])
     return lathe("pumpkin", profile, segments=96, lobes=9, depth=.06)
 
 
@@ -227,8 +228,8 @@ def mushroom(scene):
 
 def gear(scene):
     """Thick gear that lies flat, 24 cm wide."""
-    return lathe("gear", [(0, 0), (.10, 0), (.104, .004), (.104, .076), (.10, .08), (.05, .08), (.046, .076), (.044, .05),
-                          (0, .05)], segments=120, lobes=10, depth=.09)
+    return lathe("gear", [(0, 0), (.10, 0), (.104, .004), (.104, .076), (.10, .08), (.05, .08), (.046, .076),
+                          (.044, .05), (0, .05)], segments=120, lobes=10, depth=.09)
 
 
 MAKERS = {maker.__name__: maker for maker in (
@@ -249,13 +250,17 @@ def table(radius: float) -> bpy.types.Mesh:
 
 
 def backdrop(radius: float) -> bpy.types.Mesh:
-    """Closed room of `radius` metres without corners: floor at z = -0.7, round wall, dome.  Normals point inwards."""
+    """Closed room of `radius` metres without corners: floor at z = -0.7 (material 0), wall and dome (1).
+
+    Normals point inwards."""
     z, top = -.70, 2.4
     line = _rounded([(radius - .55, z), (radius - .1, z), (radius, z + .15), (radius, .6), (radius, 1.2),
                      (radius * .8, top - .3), (radius * .4, top)], 3)
     floor = [(r, z) for r in np.linspace(.1, radius - .6, 20)]
     mesh = _finish(lathe("backdrop", [(0, z), *floor, *line, (0, top)], segments=128))
     mesh.flip_normals()
+    for face in mesh.polygons:
+        face.material_index = int(face.center.z > z + .02)
     return mesh
 
 
