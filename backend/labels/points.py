@@ -10,7 +10,7 @@ import numpy as np
 
 from ..capture import Points
 from ..protocol import InputError, write_atomic
-from .vote import Votes
+from .voting import Votes
 
 _VERTEX = np.dtype([("xyz", "<f8", 3), ("rgb", "u1", 3), ("object_id", "<u4"), ("margin", "<f4"), ("votes", "<u4")])
 _PROPERTIES = (

@@ -121,7 +121,7 @@ def write_capture(tmp_path):
     """A function that writes a capture and returns its `Scene`.
 
     Options: views, size (width, height), camera model and params (default PINHOLE with a focal length of the width),
-    masks (False: none), suffix (".bin" or ".txt"), names (one a view), spheres [(id, centre, radius)], points an object.
+    masks (False: none), suffix (".bin" or ".txt"), names (one a view), spheres [(id, centre, radius)], points (each).
     """
 
     def write(
