@@ -117,7 +117,8 @@ class JsonReporter(Reporter):
         self.stream = stream or sys.stdout
 
     def _emit(self, type: str, **fields: Any) -> None:
-        self.stream.write(json.dumps({"type": type, "time": round(time.time(), 3), **fields}, ensure_ascii=False) + "\n")
+        event = {"type": type, "time": round(time.time(), 3), **fields}
+        self.stream.write(json.dumps(event, ensure_ascii=False) + "\n")
         self.stream.flush()
 
     def status(self, message: str) -> None:

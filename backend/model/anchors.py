@@ -1,0 +1,136 @@
+"""Scaffold-style anchors that each carry an object ID (Lu et al. 2024; ObjectGS section 3.2).
+
+All trainable numbers of an anchor lie in one row of one matrix, so that the optimiser touches a visible anchor once
+and a checkpoint is a handful of tensors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+SH_C0 = 0.28209479177387814
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Columns of an anchor's row: `offsets` k offsets in units of the anchor's extent, log extents (3 for the offsets,
+    3 for the splats' scales), the `features` of the heads, and per offset a residual to what the heads say:
+    opacity, scale and rotation, base colour."""
+
+    offsets: int = 10
+    features: int = 32
+
+    @property
+    def offset_columns(self) -> slice:
+        return slice(0, 3 * self.offsets)
+
+    @property
+    def extent_columns(self) -> slice:
+        return slice(3 * self.offsets, 3 * self.offsets + 6)
+
+    @property
+    def feature_columns(self) -> slice:
+        start = 3 * self.offsets + 6
+        return slice(start, start + self.features)
+
+    @property
+    def opacity_columns(self) -> slice:
+        start = self.feature_columns.stop
+        return slice(start, start + self.offsets)
+
+    @property
+    def shape_columns(self) -> slice:
+        start = self.opacity_columns.stop
+        return slice(start, start + 7 * self.offsets)
+
+    @property
+    def color_columns(self) -> slice:
+        start = self.shape_columns.stop
+        return slice(start, start + 3 * self.offsets)
+
+    @property
+    def columns(self) -> int:
+        return self.color_columns.stop
+
+
+@dataclass
+class Anchors:
+    """N anchors. positions (N, 3) float32, cell centres in scene units; rows (N, layout.columns) float32 trainable;
+    ids (N,) int32 index into the model's object table; voxel: edge of the finest cell in scene units."""
+
+    layout: Layout
+    voxel: float
+    positions: np.ndarray
+    rows: np.ndarray
+    ids: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+def median_spacing(xyz: np.ndarray) -> float:
+    """Median distance of points (M, 3) to their nearest other point; coincident points are counted once.
+
+    Falls back to 1/100 of the extent, and to 1, where fewer than two different points exist.
+    """
+    distinct = np.unique(xyz, axis=0)
+    if len(distinct) < 2:
+        return 1.0
+    distance, _ = cKDTree(distinct).query(distinct, k=2)
+    spacing = float(np.median(distance[:, 1]))
+    extent = float(np.ptp(distinct, axis=0).max())
+    return spacing if spacing > 1e-9 * extent else extent / 100
+
+
+def cell_keys(xyz: np.ndarray, cell: float) -> np.ndarray:
+    """Integer cell of each position: (M, 3) int64, cells of edge `cell` centred on its multiples."""
+    return np.round(np.asarray(xyz, np.float64) / cell).astype(np.int64)
+
+
+def seed_anchors(
+    xyz: np.ndarray, rgb: np.ndarray, ids: np.ndarray, voxel: float, layout: Layout, rng: np.random.Generator
+) -> Anchors:
+    """One anchor for each occupied voxel.
+
+    xyz (M, 3) scene units, rgb (M, 3) in [0, 1], ids (M,) object index. An anchor takes the majority ID of its points
+    (ties: the ID of the point nearest to the cell's centre) and the mean colour of the points that carry it.
+    """
+    keys = cell_keys(xyz, voxel)
+    cells, inverse = np.unique(keys, axis=0, return_inverse=True)
+    inverse = inverse.reshape(-1)
+    n = len(cells)
+    positions = (cells * voxel).astype(np.float32)
+    distance = np.linalg.norm(xyz - positions[inverse], axis=1)
+
+    pairs, pair_of, votes = np.unique(np.stack([inverse, ids], 1), axis=0, return_inverse=True, return_counts=True)
+    pair_of = pair_of.reshape(-1)
+    nearest = np.full(len(pairs), np.inf)
+    np.minimum.at(nearest, pair_of, distance)
+    order = np.lexsort((pairs[:, 1], nearest, -votes, pairs[:, 0]))
+    first = order[np.unique(pairs[order, 0], return_index=True)[1]]
+    owner = pairs[first, 1].astype(np.int32)
+
+    mine = ids == owner[inverse]
+    count = np.maximum(np.bincount(inverse[mine], minlength=n), 1)
+    color = np.stack([np.bincount(inverse[mine], rgb[mine, c], minlength=n) / count for c in range(3)], 1)
+
+    rows = new_rows(n, layout, rng)
+    neighbours = min(4, n)
+    if neighbours > 1:
+        spacing = cKDTree(positions).query(positions, k=neighbours)[0][:, 1:].mean(1)
+        spacing = np.clip(spacing, voxel, 20 * voxel)
+    else:
+        spacing = np.full(n, voxel)
+    rows[:, layout.extent_columns] = np.log(spacing)[:, None]
+    rows[:, layout.color_columns] = np.tile((color - 0.5) / SH_C0, (1, layout.offsets))
+    return Anchors(layout, voxel, positions, rows, owner)
+
+
+def new_rows(count: int, layout: Layout, rng: np.random.Generator) -> np.ndarray:
+    """Rows (count, columns) float32 of fresh anchors: scattered offsets, everything else 0."""
+    rows = np.zeros((count, layout.columns), np.float32)
+    rows[:, layout.offset_columns] = rng.normal(0, 0.5, (count, 3 * layout.offsets))
+    return rows

@@ -1,0 +1,46 @@
+"""The small networks that turn an anchor's feature into splats (Scaffold-GS; ObjectGS section 3.2)."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from .anchors import Layout
+
+HIDDEN = 32
+
+
+class Heads(nn.Module):
+    """Opacity, shape and colour heads, 32 hidden units each.
+
+    In `explicit` mode they see the anchor's feature alone and colour is spherical harmonics of `sh_degree`, so the
+    model is plain splats at any moment. In `view` mode (the paper's) they also see the distance and direction from
+    the camera, and colour is one value a splat.
+    """
+
+    def __init__(self, layout: Layout, mode: str, sh_degree: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.mode = mode
+        self.coefficients = (sh_degree + 1) ** 2 if mode == "explicit" else 1
+        self.inputs = layout.features + (4 if mode == "view" else 0)
+        k = layout.offsets
+        self.hidden = nn.Linear(self.inputs, 3 * HIDDEN)
+        self.opacity = nn.Linear(HIDDEN, k)
+        self.shape = nn.Linear(HIDDEN, 7 * k)
+        self.color = nn.Linear(HIDDEN, 3 * self.coefficients * k)
+        with torch.no_grad():
+            for layer in (self.hidden, self.opacity, self.shape, self.color):
+                bound = layer.in_features**-0.5
+                layer.weight.uniform_(-bound, bound, generator=generator)
+                layer.bias.zero_()
+            self.hidden.bias.uniform_(-0.5, 0.5, generator=generator)
+            self.opacity.weight.mul_(0.3)
+            self.color.weight.mul_(0.1)
+            self.shape.bias.view(k, 7)[:, 3] = 1.0
+            self.opacity.bias.fill_(0.2)
+
+    def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """(n, inputs) -> opacity (n, k), shape (n, 7 k), colour (n, 3 K k), all before their activations."""
+        hidden = torch.relu(self.hidden(features))
+        opacity, shape, color = hidden.split(HIDDEN, 1)
+        return self.opacity(opacity), self.shape(shape), self.color(color)

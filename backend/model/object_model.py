@@ -1,0 +1,136 @@
+"""The trained model: anchors, heads, background, and how its scene units relate to the capture's world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numba import njit, prange
+
+from .anchors import Anchors
+from .generate import Generated, generate
+from .heads import Heads
+from .splats import Splats
+
+
+@dataclass(frozen=True)
+class Normalization:
+    """scene = (world - centre) * scale: keeps float32 exact for georeferenced, tiny and huge captures alike."""
+
+    centre: tuple[float, float, float]
+    scale: float
+
+    def to_scene(self, xyz: np.ndarray) -> np.ndarray:
+        """World positions (M, 3) -> scene units, float64."""
+        return (np.asarray(xyz, np.float64) - np.array(self.centre)) * self.scale
+
+    def to_world(self, xyz: np.ndarray) -> np.ndarray:
+        """Scene positions (M, 3) -> world units, float64."""
+        return np.asarray(xyz, np.float64) / self.scale + np.array(self.centre)
+
+    def viewmat(self, viewmat: np.ndarray) -> np.ndarray:
+        """A world-to-camera matrix (4, 4) for scene coordinates, camera space scaled alike."""
+        out = np.array(viewmat, np.float64)
+        out[:3, 3] = (out[:3, 3] + out[:3, :3] @ np.array(self.centre)) * self.scale
+        return out
+
+    @classmethod
+    def of(cls, camera_centres: np.ndarray, points: np.ndarray) -> Normalization:
+        """Centred on the points' median; the median distance of points from there becomes 1 at most, of cameras 2."""
+        centre = np.median(points, axis=0)
+        spread = np.median(np.linalg.norm(points - centre, axis=1))
+        reach = np.median(np.linalg.norm(camera_centres - centre, axis=1)) / 2
+        size = max(spread, reach)
+        scale = 1.0 / size if np.isfinite(size) and size > 0 else 1.0
+        return cls((float(centre[0]), float(centre[1]), float(centre[2])), float(scale))
+
+
+@dataclass
+class ObjectModel:
+    """anchors and heads in scene units; background (3,) linear-in-display RGB; object_ids (C,) int64: the ID behind
+    each class index; normalization to the capture's world."""
+
+    anchors: Anchors
+    heads: Heads
+    background: torch.Tensor
+    object_ids: np.ndarray
+    normalization: Normalization
+
+    @property
+    def explicit(self) -> bool:
+        """Whether the model is plain splats at any moment."""
+        return self.heads.mode == "explicit"
+
+    def generate(self, seen: np.ndarray | None = None, eye: np.ndarray | None = None) -> Generated:
+        """Gaussians of the anchors `seen` ((n,) int64; None: all), without gradients. eye: see `generate`."""
+        a = self.anchors
+        pick = (lambda x: x) if seen is None else (lambda x: x[seen])
+        with torch.no_grad():
+            return generate(
+                a.layout, torch.from_numpy(pick(a.positions)), torch.from_numpy(pick(a.rows)),
+                torch.from_numpy(pick(a.ids)), self.heads, eye,
+            )  # fmt: skip
+
+    def splats(self, eye: np.ndarray | None = None) -> Splats:
+        """The whole model as plain splats in world units. In `view` mode as seen from `eye` (scene units)."""
+        g = self.generate(eye=eye)
+        quats = g.quats.double().numpy()
+        norm = np.linalg.norm(quats, axis=1, keepdims=True)
+        usable = norm[:, 0] > 1e-4
+        splats = Splats(
+            means=self.normalization.to_world(g.means.numpy()),
+            quats=(quats / np.where(norm > 0, norm, 1)).astype(np.float32),
+            scales=(g.scales.double().numpy() / self.normalization.scale),
+            opacities=g.opacities.numpy(),
+            sh=g.sh.numpy(),
+            object_ids=self.object_ids[g.ids.numpy()],
+        )
+        return splats if usable.all() else splats.select(usable)
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _in_view(positions, rows, k, viewmat, intrinsics, width, height, near, seen):
+    fx, fy, cx, cy = intrinsics
+    # Distance from the four side planes of the frustum, in units of length.
+    planes = np.empty((4, 2))
+    planes[0] = fx, cx
+    planes[1] = -fx, width - cx
+    planes[2] = fy, cy
+    planes[3] = -fy, height - cy
+    for a in prange(positions.shape[0]):
+        reach = 0.0
+        for i in range(3):
+            extent = np.exp(min(rows[a, 3 * k + i], np.float32(20.0)))
+            largest = 0.0
+            for j in range(k):
+                largest = max(largest, abs(rows[a, 3 * j + i]))
+            reach += (largest * extent) ** 2
+        width3 = 0.0
+        for i in range(3):
+            width3 = max(width3, np.exp(min(rows[a, 3 * k + 3 + i], np.float32(20.0))))
+        reach = np.sqrt(reach) + 3.4 * width3
+        x, y, z = positions[a, 0], positions[a, 1], positions[a, 2]
+        px = viewmat[0, 0] * x + viewmat[0, 1] * y + viewmat[0, 2] * z + viewmat[0, 3]
+        py = viewmat[1, 0] * x + viewmat[1, 1] * y + viewmat[1, 2] * z + viewmat[1, 3]
+        pz = viewmat[2, 0] * x + viewmat[2, 1] * y + viewmat[2, 2] * z + viewmat[2, 3]
+        inside = pz + reach > near
+        for p in range(4):
+            side = px if p < 2 else py
+            distance = (planes[p, 0] * side + planes[p, 1] * pz) / np.sqrt(planes[p, 0] ** 2 + planes[p, 1] ** 2)
+            # The blur adds about two pixels at the border.
+            margin = 2.0 * max(pz, near) / min(fx, fy)
+            inside = inside and distance > -reach - margin
+        seen[a] = inside
+
+
+def anchors_in_view(
+    anchors: Anchors, viewmat: np.ndarray, intrinsics: np.ndarray, width: int, height: int, near: float
+) -> np.ndarray:
+    """Indices (n,) int64 of the anchors that may touch the picture; none that does is left out.
+
+    viewmat (4, 4) float64 scene to camera; intrinsics (fx, fy, cx, cy) in pixels.
+    """
+    seen = np.empty(len(anchors), np.bool_)
+    _in_view(anchors.positions, anchors.rows, anchors.layout.offsets, viewmat, intrinsics, width, height, near, seen)
+    return np.flatnonzero(seen)

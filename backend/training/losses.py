@@ -1,0 +1,226 @@
+"""What training minimises, with hand-written gradients: L1, SSIM and the probability of the labels.
+
+L = (1 - lambda_ssim) L1 + lambda_ssim (1 - SSIM) - lambda_semantic mean log P_label, over the composed picture
+color + (1 - alpha) background (ObjectGS equation 8; SSIM of Wang et al. 2004 with an 11 x 11 Gaussian of sigma 1.5,
+zero beyond the borders).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit, prange
+
+from ..raster import simd
+
+_RADIUS = 5
+_C1 = 0.01**2
+_C2 = 0.03**2
+_WINDOW = np.exp(-0.5 * (np.arange(-_RADIUS, _RADIUS + 1) / 1.5) ** 2)
+_WINDOW = (_WINDOW / _WINDOW.sum()).astype(np.float32)
+PROBABILITY_FLOOR = 1e-2
+"""Added to P under the logarithm: a pixel whose object is absent pulls hard, but not without bound."""
+
+
+@njit(inline="always", error_model="numpy")
+def _blur_row(source, window, out, width):
+    """out[x] = sum_k window[k] source[x + k]; source is padded by the window's radius."""
+    for x in range(0, width, simd.LANES):
+        acc = simd.splat(window[0]) * simd.load(source, x)
+        for k in range(1, 2 * _RADIUS + 1):
+            acc = acc + simd.splat(window[k]) * simd.load(source, x + k)
+        simd.store(out, x, acc)
+
+
+@njit(inline="always", error_model="numpy")
+def _add_row(weight, source, at, out, width):
+    w = simd.splat(weight)
+    for x in range(0, width, simd.LANES):
+        simd.store(out, x, simd.load(out, x) + w * simd.load(source, at + x))
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def ssim_gradient(image, target, window, gradient):
+    """Mean SSIM of image and target (3, H, W); gradient (3, H, W) receives that of the mean."""
+    channels, height, width = image.shape
+    stride = (width + simd.LANES - 1) // simd.LANES * simd.LANES
+    blurred = np.empty(channels * height * 5 * stride, np.float32)
+    partial = np.empty(channels * height * 3 * stride, np.float32)
+    sums = np.zeros(channels * height)
+    scale = np.float32(1.0 / (channels * height * width))
+    for line in prange(channels * height):
+        c, y = line // height, line % height
+        padded = np.zeros(stride + 2 * _RADIUS + simd.LANES, np.float32)
+        row = np.empty(stride, np.float32)
+        for moment in range(5):
+            for x in range(width):
+                a, b = image[c, y, x], target[c, y, x]
+                if moment == 0:
+                    value = a
+                elif moment == 1:
+                    value = b
+                elif moment == 2:
+                    value = a * a
+                elif moment == 3:
+                    value = b * b
+                else:
+                    value = a * b
+                padded[x + _RADIUS] = value
+            _blur_row(padded, window, row, width)
+            base = (line * 5 + moment) * stride
+            for x in range(stride):
+                blurred[base + x] = row[x]
+    for line in prange(channels * height):
+        c, y = line // height, line % height
+        m = np.zeros((5, stride), np.float32)
+        for moment in range(5):
+            for k in range(max(-_RADIUS, -y), min(_RADIUS + 1, height - y)):
+                _add_row(window[k + _RADIUS], blurred, ((line + k) * 5 + moment) * stride, m[moment], width)
+        padded = np.zeros(stride + 2 * _RADIUS + simd.LANES, np.float32)
+        rows = np.empty((3, stride), np.float32)
+        total = 0.0
+        for x in range(width):
+            mu1, mu2 = m[0, x], m[1, x]
+            s11, s22, s12 = m[2, x] - mu1 * mu1, m[3, x] - mu2 * mu2, m[4, x] - mu1 * mu2
+            a = 2 * mu1 * mu2 + np.float32(_C1)
+            b = 2 * s12 + np.float32(_C2)
+            d = mu1 * mu1 + mu2 * mu2 + np.float32(_C1)
+            e = s11 + s22 + np.float32(_C2)
+            value = a * b / (d * e)
+            total += value
+            # d/d(blurred x), d/d(blurred x^2), d/d(blurred x y)
+            g11 = -value / e
+            g12 = 2 * a / (d * e)
+            rows[0, x] = (2 * mu2 * b / (d * e) - 2 * mu1 * value / d - 2 * mu1 * g11 - mu2 * g12) * scale
+            rows[1, x] = g11 * scale
+            rows[2, x] = g12 * scale
+        sums[line] = total
+        row = np.empty(stride, np.float32)
+        for i in range(3):
+            for x in range(width):
+                padded[x + _RADIUS] = rows[i, x]
+            _blur_row(padded, window, row, width)
+            base = (line * 3 + i) * stride
+            for x in range(stride):
+                partial[base + x] = row[x]
+    for line in prange(channels * height):
+        c, y = line // height, line % height
+        m = np.zeros((3, stride), np.float32)
+        for i in range(3):
+            for k in range(max(-_RADIUS, -y), min(_RADIUS + 1, height - y)):
+                _add_row(window[k + _RADIUS], partial, ((line + k) * 3 + i) * stride, m[i], width)
+        for x in range(width):
+            gradient[c, y, x] = m[0, x] + 2 * image[c, y, x] * m[1, x] + target[c, y, x] * m[2, x]
+    return sums.sum() * float(scale)
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _compose(color, alpha, background, target, image):
+    """image = color + (1 - alpha) background; returns mean |image - target|."""
+    _, height, width = color.shape
+    sums = np.zeros(height)
+    for y in prange(height):
+        total = np.float32(0.0)
+        for c in range(3):
+            for x in range(width):
+                value = color[c, y, x] + (1 - alpha[y, x]) * background[c]
+                image[c, y, x] = value
+                total += abs(value - target[c, y, x])
+        sums[y] = total
+    return sums.sum() / (3.0 * height * width)
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _image_gradient(image, target, alpha, background, g_ssim, l1_weight, ssim_weight, g_color, g_alpha, g_background):
+    _, height, width = image.shape
+    step = np.float32(l1_weight / (3.0 * height * width))
+    ssim_weight = np.float32(ssim_weight)
+    partial = np.zeros((height, 3))
+    for y in prange(height):
+        for x in range(width):
+            g_alpha[y, x] = 0.0
+        for c in range(3):
+            total = np.float32(0.0)
+            for x in range(width):
+                difference = image[c, y, x] - target[c, y, x]
+                g = step if difference > 0 else (-step if difference < 0 else np.float32(0.0))
+                g -= ssim_weight * g_ssim[c, y, x]
+                g_color[c, y, x] = g
+                g_alpha[y, x] -= g * background[c]
+                total += g * (1 - alpha[y, x])
+            partial[y, c] = total
+    for c in range(3):
+        g_background[c] = partial[:, c].sum()
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _label_loss(weight, labels, floor, scale, g_weight):
+    """-mean log((P + floor) / (1 + floor)) over pixels with a label >= 0, and its gradient times `scale`."""
+    height, width = weight.shape
+    counts = np.zeros(height, np.int64)
+    sums = np.zeros(height)
+    for y in prange(height):
+        for x in range(width):
+            if labels[y, x] >= 0:
+                counts[y] += 1
+                sums[y] -= math.log((weight[y, x] + floor) / (1.0 + floor))
+    count = max(counts.sum(), 1)
+    for y in prange(height):
+        for x in range(width):
+            if labels[y, x] >= 0:
+                g_weight[y, x] = -scale / (count * (weight[y, x] + floor))
+            else:
+                g_weight[y, x] = 0.0
+    return sums.sum() / count
+
+
+class _ImageLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, color, alpha, weight, background, target, labels, ssim_weight, semantic_weight):
+        arrays = [t.detach().numpy() for t in (color, alpha, background)]
+        shown = target.numpy()
+        image = np.empty_like(shown)
+        l1 = _compose(arrays[0], arrays[1], arrays[2], shown, image)
+        g_ssim = np.empty_like(shown)
+        ssim = ssim_gradient(image, shown, _WINDOW, g_ssim) if ssim_weight else 1.0
+        if not ssim_weight:
+            g_ssim[:] = 0
+        g_color, g_alpha, g_background = np.empty_like(shown), np.empty_like(arrays[1]), np.empty(3, np.float32)
+        _image_gradient(
+            image, shown, arrays[1], arrays[2], g_ssim, 1 - ssim_weight, ssim_weight, g_color, g_alpha, g_background
+        )
+        semantic = 0.0
+        g_weight = None
+        if weight is not None:
+            g_weight = np.empty_like(arrays[1])
+            semantic = _label_loss(
+                weight.detach().numpy(), labels.numpy(), PROBABILITY_FLOOR, semantic_weight, g_weight
+            )
+        ctx.gradients = (g_color, g_alpha, g_weight, g_background)
+        loss = (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim) + semantic_weight * semantic
+        return torch.tensor(loss, dtype=torch.float32)
+
+    @staticmethod
+    def backward(ctx: Any, g):
+        scaled = [None if a is None else torch.from_numpy(a) * g for a in ctx.gradients]
+        return (*scaled, None, None, None, None)
+
+
+def image_loss(
+    color: torch.Tensor,
+    alpha: torch.Tensor,
+    weight: torch.Tensor | None,
+    background: torch.Tensor,
+    target: torch.Tensor,
+    labels: torch.Tensor | None,
+    ssim_weight: float,
+    semantic_weight: float,
+) -> torch.Tensor:
+    """Scalar loss of one view: color and target (3, H, W), alpha, weight and labels (H, W; -1 = ignored), background (3,).
+
+    weight is the rendered probability of each pixel's label; None leaves the semantic term out.
+    """
+    return _ImageLoss.apply(color, alpha, weight, background, target, labels, ssim_weight, semantic_weight)

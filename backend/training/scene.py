@@ -1,0 +1,77 @@
+"""A capture as training sees it: normalised cameras, pictures as planes, labels as class indices."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+
+import numpy as np
+import torch
+
+from ..capture import Capture
+from ..model.object_model import Normalization
+from ..raster import Camera
+
+
+class Scene:
+    """Cameras and targets of a capture for the classes `object_ids` ((C,) int64, ascending, 0 first)."""
+
+    def __init__(
+        self,
+        capture: Capture,
+        object_ids: np.ndarray,
+        normalization: Normalization,
+        zero_is_object: bool = False,
+        memory_mb: float = 2000,
+    ) -> None:
+        self.capture = capture
+        self.object_ids = object_ids
+        self.normalization = normalization
+        self.zero_is_object = zero_is_object
+        self._budget = memory_mb * 1e6
+        self._held: OrderedDict[tuple[int, int], tuple[torch.Tensor, torch.Tensor | None]] = OrderedDict()
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    def camera(self, index: int, downscale: int = 1) -> Camera:
+        """A view's camera in scene units."""
+        view = self.capture.views[index]
+        return Camera(
+            self.normalization.viewmat(view.viewmat),
+            self.capture.K(index, downscale),
+            view.width // downscale,
+            view.height // downscale,
+        )
+
+    def target(self, index: int, downscale: int = 1) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """A view's picture (3, H, W) float32 in [0, 1] and its labels (H, W) int32, -1 where nothing is taught."""
+        key = (index, downscale)
+        with self._lock:
+            if key in self._held:
+                self._held.move_to_end(key)
+                return self._held[key]
+        pixels = self.capture.image(index, downscale)
+        picture = torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1), np.float32) / np.float32(255))
+        mask = self.capture.mask(index, downscale)
+        labels = None if mask is None else torch.from_numpy(self._classes(mask))
+        size = picture.numel() * 4 + (0 if labels is None else labels.numel() * 4)
+        with self._lock:
+            self._held[key] = (picture, labels)
+            self._bytes += size
+            while self._bytes > self._budget and len(self._held) > 1:
+                _, (old, old_labels) = self._held.popitem(last=False)
+                self._bytes -= old.numel() * 4 + (0 if old_labels is None else old_labels.numel() * 4)
+        return picture, labels
+
+    def forget(self) -> None:
+        """Give the held pictures' memory back."""
+        with self._lock:
+            self._held.clear()
+            self._bytes = 0
+
+    def _classes(self, mask: np.ndarray) -> np.ndarray:
+        place = np.clip(np.searchsorted(self.object_ids, mask), 0, len(self.object_ids) - 1)
+        known = self.object_ids[place] == mask
+        if not self.zero_is_object:
+            known &= mask != 0
+        return np.where(known, place, -1).astype(np.int32)

@@ -1,0 +1,82 @@
+"""What a training can be told, and how its rates fall as it goes on."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from ..model.anchors import Layout
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Choices that make the model what it is; a checkpoint only continues under the same ones.
+
+    mode: `explicit` or `view`; sh_degree: of explicit colour; offsets: splats an anchor; voxel: edge of an anchor's
+    cell in world units (None: the median spacing of the points); max_anchors: growth stops there.
+    background: `learned`, `black` or `white`. zero_is_object: whether pixels of ID 0 are taught as a class.
+    """
+
+    seed: int = 0
+    mode: str = "explicit"
+    sh_degree: int = 1
+    offsets: int = 10
+    voxel: float | None = None
+    max_anchors: int = 200_000
+    background: str = "learned"
+    semantic_weight: float = 0.1
+    ssim_weight: float = 0.2
+    volume_weight: float = 0.01
+    zero_is_object: bool = False
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+    @property
+    def layout(self) -> Layout:
+        """Columns of an anchor's row."""
+        return Layout(offsets=self.offsets)
+
+
+GROW_FROM, GROW_UNTIL, GROW_EVERY = 0.1, 0.5, 100
+"""Growth runs between these shares of the training, every so many steps; statistics start half way to the first."""
+
+_ROW_RATES = {
+    "offset_columns": (1e-2, 1e-4),
+    "extent_columns": (7e-3, 1e-3),
+    "feature_columns": (7.5e-3, 1e-3),
+    "opacity_columns": (2e-2, 2e-3),
+    "shape_columns": (1e-2, 1e-3),
+    "color_columns": (1e-2, 1e-3),
+}
+HEAD_RATES = {
+    "hidden": (4e-3, 1e-4),
+    "opacity": (2e-3, 2e-5),
+    "shape": (4e-3, 1e-4),
+    "color": (8e-3, 5e-5),
+    "background": (1e-2, 1e-4),
+}
+
+
+def rate(ends: tuple[float, float], share: float) -> float:
+    """Learning rate after a share (0 to 1) of the training: exponential from the first end to the last."""
+    return ends[0] * (ends[1] / ends[0]) ** min(max(share, 0.0), 1.0)
+
+
+def row_rates(layout: Layout, share: float) -> np.ndarray:
+    """Learning rate of each column of the anchors' rows: (columns,) float32."""
+    rates = np.zeros(layout.columns, np.float32)
+    for name, ends in _ROW_RATES.items():
+        rates[getattr(layout, name)] = rate(ends, share)
+    return rates
+
+
+def downscale_at(share: float, longest: int) -> int:
+    """Coarse to fine: by how much to reduce pictures of `longest` pixels after a share of the training."""
+    wanted = 4 if share < 0.08 else 2 if share < 0.25 else 1
+    while wanted > 1 and longest // wanted < 300:
+        wanted //= 2
+    return wanted
