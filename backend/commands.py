@@ -182,7 +182,6 @@ def report(options: argparse.Namespace, reporter: Reporter, stop: Callable[[], b
         truth = capture.mask(index)
         shown = comparison(capture.image(index), drawn.image, truth, drawn.ids, None, capture.names)
         pictures.append((f"View {capture.views[index].name}", shown))
-        )
     progress = progress_of(state)
     model_file = folder.splats
     value = {

@@ -219,8 +219,8 @@ def image_loss(
     ssim_weight: float,
     semantic_weight: float,
 ) -> torch.Tensor:
-    """Scalar loss of one view: color and target (3, H, W), alpha, weight and labels (H, W; -1 = ignored), background (3,).
+    """Scalar loss of one view: color and target (3, H, W), alpha, weight and labels (H, W), background (3,).
 
-    weight is the rendered probability of each pixel's label; None leaves the semantic term out.
+    Labels of -1 are ignored. weight is the rendered probability of each pixel's label; None leaves the semantic term out.
     """
     return _ImageLoss.apply(color, alpha, weight, background, target, labels, ssim_weight, semantic_weight)
