@@ -10,7 +10,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from . import __version__
-from .protocol import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, EXIT_FAILED, Cancelled, InputError, JsonReporter
+from .protocol import (
+    EXIT_BAD_INPUT,
+    EXIT_CANCELLED,
+    EXIT_DONE,
+    EXIT_FAILED,
+    Cancelled,
+    InputError,
+    JsonReporter,
+    Reporter,
+)
 
 _OUT = "the reconstruction folder (made if it is not there)"
 
@@ -130,7 +139,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     options = parser().parse_args(arguments)
     if options.json:
-        reporter = JsonReporter()
+        reporter: Reporter = JsonReporter()
     else:
         from .console import ConsoleReporter
 

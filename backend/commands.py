@@ -180,6 +180,7 @@ def report(options: argparse.Namespace, reporter: Reporter, stop: Callable[[], b
     for index in indices[:: max(len(indices) // 3, 1)][:3]:
         drawn = draw(model, scene.camera(index))
         truth = capture.mask(index)
+        assert drawn.ids is not None
         shown = comparison(capture.image(index), drawn.image, truth, drawn.ids, None, capture.names)
         pictures.append((f"View {capture.views[index].name}", shown))
     progress = progress_of(state)
@@ -335,6 +336,7 @@ def _held_out(folder: Reconstruction, reporter: Reporter) -> Callable[[ObjectMod
                 ids.add(picture.ids, truth)
         first = (scene.capture.test_indices or (0,))[0]
         shown = draw(model, scene.camera(first))
+        assert shown.ids is not None
         preview = comparison(scene.capture.image(first), shown.image, scene.capture.mask(first), shown.ids)
         path = save_picture(preview, folder.previews / "latest.png")
         scores = ids.result()

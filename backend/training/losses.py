@@ -221,6 +221,6 @@ def image_loss(
 ) -> torch.Tensor:
     """Scalar loss of one view: color and target (3, H, W), alpha, weight and labels (H, W), background (3,).
 
-    Labels of -1 are ignored. weight is the rendered probability of each pixel's label; None leaves the semantic term out.
+    Labels of -1 are ignored. weight is the rendered probability of each pixel's label; None: no semantic term.
     """
     return _ImageLoss.apply(color, alpha, weight, background, target, labels, ssim_weight, semantic_weight)
