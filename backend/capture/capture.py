@@ -166,6 +166,7 @@ class Capture:
 
     def _read_image(self, index: int, downscale: int) -> np.ndarray:
         image = read_image(self.views[index].image_file)
+        self._check_unchanged(index, self.views[index].image_file, image.size)
         width, height = self._reduced_size(index, downscale)
         if downscale > 1:
             image = image.crop((0, 0, width * downscale, height * downscale)).reduce(downscale)
@@ -175,9 +176,17 @@ class Capture:
         path = self.views[index].mask_file
         assert path is not None
         ids = read_mask(path, self._colour_masks)
+        self._check_unchanged(index, path, (ids.shape[1], ids.shape[0]))
         width, height = self._reduced_size(index, downscale)
         first = downscale // 2
         return np.ascontiguousarray(ids[first::downscale, first::downscale][:height, :width])
+
+    def _check_unchanged(self, index: int, path: Path, size: tuple[int, int]) -> None:
+        view = self.views[index]
+        if size != (view.width, view.height):
+            raise InputError(
+                f"{path} was {view.width}x{view.height} pixels and is now {size[0]}x{size[1]}; start again."
+            )
 
     def _reduced_size(self, index: int, downscale: int) -> tuple[int, int]:
         view = self.views[index]
@@ -385,7 +394,7 @@ def _checked_mask(source: _Source, colour: bool) -> np.ndarray:
 
 def _in_parallel(work: Callable[[_T], _R], items: Iterable[_T]) -> Iterator[_R]:
     """Results in order; the first error stops what has not begun."""
-    pool = ThreadPoolExecutor(max(1, min(8, os.cpu_count() or 1)))
+    pool = ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1)))
     try:
         yield from pool.map(work, items)
     finally:
@@ -446,10 +455,11 @@ def _prepare(source: _Source, survey: _Survey, cache: Path) -> tuple[View, tuple
     The stamp beside the cached files is written last and says what they were made from.
     """
     name = source.image.name
-    digest = hashlib.sha256(name.encode("utf-8")).hexdigest()[:12]
+    camera, target = source.camera, source.target
+    # The size is part of the name, so that captures loaded at two sizes do not pull files from under each other.
+    digest = hashlib.sha256(f"{name}\0{target.width}x{target.height}".encode()).hexdigest()[:12]
     stem = re.sub(r"[^A-Za-z0-9_-]+", "_", name)[-40:].strip("_") + "-" + digest
     stamp_path = cache / f"{stem}.json"
-    camera, target = source.camera, source.target
     made_from = {
         "version": _CACHE_VERSION,
         "image": _identity(source.image_path),

@@ -127,12 +127,12 @@ def _inner_box(lens: pycolmap.Camera, width: int, height: int, fx: float, fy: fl
     middle = undistort(lens, np.array([[width / 2, height / 2]]))[0]
     if not np.isfinite(middle).all() or np.abs(middle).max() > MAX_TAN:
         return None
-    directions = 8 * 64
+    directions = 256
     angle = np.arange(directions) * (2 * math.pi / directions)
     ray = np.stack([np.cos(angle), np.sin(angle)], 1)
     reach = MAX_TAN * math.sqrt(2) + float(np.abs(middle).max())
     fine = min(reach, 4 * math.hypot(width / fx, height / fy) / 2)
-    t = np.unique(np.concatenate([np.linspace(0, reach, 257), np.linspace(0, fine, 257)]))
+    t = np.unique(np.concatenate([np.linspace(0, reach, 97), np.linspace(0, fine, 129)]))
     good = _valid(lens, middle + t[:, None, None] * ray, width, height, fx, fy)
     if not good[0].all():
         return None
@@ -156,12 +156,22 @@ def _inner_box(lens: pycolmap.Camera, width: int, height: int, fx: float, fy: fl
     # Where rays end at a fold instead of a side, the rectangle shrinks about the middle until none ends inside it.
     sides = np.where(edge > middle, [x1, y1], [x0, y0]) - middle
     shrink = min(1.0, float(np.max((edge - middle) / sides, 1).min()))
-    mx, my = float(middle[0]), float(middle[1])
-    return tuple(float(m + (side - m) * shrink) for side, m in ((x0, mx), (y0, my), (x1, mx), (y1, my)))
+    along = np.linspace(0, 1, 65)[:, None]
+    for _ in range(50):
+        low_corner, high_corner = middle + ([x0, y0] - middle) * shrink, middle + ([x1, y1] - middle) * shrink
+        other = np.array([high_corner[0], low_corner[1]]), np.array([low_corner[0], high_corner[1]])
+        border = np.concatenate([a + (b - a) * along for a in (low_corner, high_corner) for b in other])
+        # Half a pixel of slack: that far out, the outermost pixel itself is what is seen.
+        if _valid(lens, border, width, height, fx, fy, slack=0.5).all():
+            return *map(float, low_corner), *map(float, high_corner)
+        shrink *= 0.99
+    return None
 
 
-def _valid(lens: pycolmap.Camera, xy: np.ndarray, width: int, height: int, fx: float, fy: float) -> np.ndarray:
-    """Which normalised coordinates (..., 2) land in the image without a fold."""
+def _valid(
+    lens: pycolmap.Camera, xy: np.ndarray, width: int, height: int, fx: float, fy: float, slack: float = 0.0
+) -> np.ndarray:
+    """Which normalised coordinates (..., 2) land in the image, or `slack` pixels outside, without a fold."""
     shape, flat = xy.shape[:-1], xy.reshape(-1, 2)
     right, down = np.array([_STEP, 0.0]), np.array([0.0, _STEP])
     with np.errstate(invalid="ignore", over="ignore"):
@@ -170,7 +180,7 @@ def _valid(lens: pycolmap.Camera, xy: np.ndarray, width: int, height: int, fx: f
         dy = (distort(lens, flat + down) - at) / _STEP
         determinant = (dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0]) / (fx * fy)
         # 1% of the area at the axis: rays this dense are the rim of a fold.
-        good = (determinant > 0.01) & (at >= 0).all(1) & (at <= [width, height]).all(1)
+        good = (determinant > 0.01) & (at >= -slack).all(1) & (at <= np.array([width, height]) + slack).all(1)
     return good.reshape(shape)
 
 

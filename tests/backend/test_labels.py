@@ -143,7 +143,7 @@ def test_a_synthetic_scene_has_its_known_answer(write_capture, tmp_path):
             assert votes.counts == {i: int((votes.ids == i).sum()) for i in (1, 2, 5)} and votes.warnings == []
             assert ((votes.margins >= 0) & (votes.margins <= 1)).all()
     assert share["majority", True] > 0.985 and share["correspondence", True] > 0.96
-    assert share["majority", True] > share["majority", False]
+    assert share["majority", False] > 0.985, "on convex objects seen from all around the hidden side is outvoted too"
     assert share["probability", True] > share["probability", False] + 0.05
 
 
