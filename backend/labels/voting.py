@@ -51,7 +51,7 @@ def vote(
     smallest. probability: the ID is drawn in proportion to those votes, from `seed`. correspondence: only views in
     which COLMAP observed the point vote, at the observed pixel. `occlusion` drops views in which nearer points hide
     the point, unless COLMAP observed it there (no effect on correspondence). On the demo capture it raises the share
-    of points labelled right from 97.4% to 99.3% (majority) and from 75% to 97% (probability).
+    of points labelled right from 97.4% to 99.3% (majority) and from 75% to 98% (probability).
     """
     if strategy not in ("majority", "probability", "correspondence"):
         raise ValueError(f"unknown strategy {strategy!r}")
