@@ -31,6 +31,11 @@ def _array(tensor: torch.Tensor) -> np.ndarray:
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means, quats, scales, opacities, sh, ids, camera, labels, want_depth, holder):
+        ctx.means_type = means.dtype
+        if means.dtype == torch.float64:
+            # Far from the origin (georeferenced captures) float32 would round positions: count from the camera.
+            means = means - torch.from_numpy(camera.centre)
+            camera = camera.at_origin()
         gaussians = cpu.Gaussians(
             _array(means), _array(quats), _array(scales), _array(opacities), _array(sh),
             np.ascontiguousarray(ids.numpy(), np.int32),
@@ -53,7 +58,8 @@ class _Rasterize(torch.autograd.Function):
         g_depth = planes[-1] if frame.depth is not None else None
         out = cpu.backward(frame, planes[0], planes[1], g_weight, g_depth)
         arrays = (out.means, out.quats, out.scales, out.opacities, out.sh)
-        return (*(torch.from_numpy(a) for a in arrays), None, None, None, None, None)
+        g_means, *others = (torch.from_numpy(a) for a in arrays)
+        return (g_means.to(ctx.means_type), *others, None, None, None, None, None)
 
 
 def rasterize(
@@ -70,7 +76,8 @@ def rasterize(
     """Draw 3D Gaussians (Kerbl et al. 2023), differentiable in the first five arguments.
 
     means (N, 3), quats (N, 4) wxyz of any length, scales (N, 3) linear, opacities (N,) in (0, 1), sh (N, K, 3) with
-    K = 1, 4, 9 or 16 (colour = 0.5 + SH, clamped at 0): float32. ids (N,) int32. labels (H, W) int32: also return the
+    K = 1, 4, 9 or 16 (colour = 0.5 + SH, clamped at 0): float32. Means in float64 are taken relative to the camera
+    before they are rounded, for scenes far from the origin. ids (N,) int32. labels (H, W) int32: also return the
     probability that each pixel shows its label (the paper's P at the label); nothing is computed that is not asked for.
     """
     holder: list[cpu.Frame] = []

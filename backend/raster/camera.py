@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,4 +31,10 @@ class Camera:
     @property
     def centre(self) -> np.ndarray:
         """(3,) float64: where the camera stands in the world."""
-        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+        return -np.asarray(self.viewmat[:3, :3].T @ self.viewmat[:3, 3], np.float64)
+
+    def at_origin(self) -> Camera:
+        """The same camera moved to the world's origin."""
+        viewmat = self.viewmat.copy()
+        viewmat[:3, 3] = 0.0
+        return replace(self, viewmat=viewmat)

@@ -31,7 +31,7 @@ class Gaussians:
 
 @dataclass
 class Frame:
-    """A picture and what its gradient needs. color (3, H, W), transmittance (H, W); weight and depth (H, W) if asked."""
+    """A picture and what its gradient needs. color (3, H, W), transmittance (H, W), weight and depth if asked."""
 
     gaussians: Gaussians
     camera: Camera
@@ -61,7 +61,7 @@ def forward(gaussians: Gaussians, camera: Camera, labels: np.ndarray | None = No
     splats = np.empty((g.means.shape[0], SPLAT_COLUMNS), np.float32)
     viewmat, intrinsics = camera.arrays()
     project(g.means, g.quats, g.scales, g.opacities, g.sh, viewmat, intrinsics, width, height, camera.near, splats)
-    tiles, members, places, slots = bin_splats(splats, depth_order(splats), width, height)
+    tiles, members, places, slots = bin_splats(splats, depth_order(splats, g.ids), width, height)
     color = np.empty((3, height, width), np.float32)
     transmittance = np.empty((height, width), np.float32)
     weight = np.empty((height, width), np.float32) if labels is not None else None
@@ -98,7 +98,10 @@ def backward(
         frame.color, frame.transmittance, _or_none(frame.weight), _or_none(frame.depth),
         g_color, g_alpha, _or_none(g_weight), _or_none(g_depth), rows,
     )  # fmt: skip
-    out = Gaussians(*(np.empty_like(a) for a in (g.means, g.quats, g.scales, g.opacities, g.sh)), np.empty(0, np.int32))
+    out = Gaussians(
+        np.empty_like(g.means), np.empty_like(g.quats), np.empty_like(g.scales), np.empty_like(g.opacities),
+        np.empty_like(g.sh), np.empty(0, np.int32),
+    )  # fmt: skip
     frame.screen_gradient = np.empty((g.means.shape[0], 2), np.float32)
     viewmat, intrinsics = camera.arrays()
     project_backward(

@@ -21,8 +21,8 @@ _LOG2_CUT = math.log2(ALPHA_MIN)
 
 
 @njit(cache=True, error_model="numpy")
-def depth_order(splats):
-    """Indices of the visible splats, nearest first; equal depths are ordered by position, not by index."""
+def depth_order(splats, ids):
+    """Indices (int32) of the visible splats, nearest first; equal depths go by look and id, not by index."""
     n = splats.shape[0]
     order = np.empty(n, np.int32)
     keys = np.empty(n, np.uint32)
@@ -58,46 +58,49 @@ def depth_order(splats):
         while last < count and keys[last] == keys[first]:
             last += 1
         if last - first > 1:
-            _order_ties(splats, order, first, last)
+            _order_ties(splats, ids, order, first, last)
         first = last
     return order
 
 
 @njit(cache=True, error_model="numpy")
-def _order_ties(splats, order, first, last):
-    """Sort order[first:last] by (u, v, opacity, colour); heap sort, since thousands may share one depth."""
+def _order_ties(splats, ids, order, first, last):
+    """Sort order[first:last] by position, shape, opacity, colour and id; a heap sort, as thousands may tie."""
     n = last - first
     for start in range(n // 2 - 1, -1, -1):
-        _sift(splats, order, first, start, n)
+        _sift(splats, ids, order, first, start, n)
     for end in range(n - 1, 0, -1):
         order[first], order[first + end] = order[first + end], order[first]
-        _sift(splats, order, first, 0, end)
+        _sift(splats, ids, order, first, 0, end)
 
 
 @njit(cache=True, error_model="numpy")
-def _sift(splats, order, first, root, end):
+def _sift(splats, ids, order, first, root, end):
     while 2 * root + 1 < end:
         child = 2 * root + 1
-        if child + 1 < end and _before(splats, order[first + child], order[first + child + 1]):
+        if child + 1 < end and _before(splats, ids, order[first + child], order[first + child + 1]):
             child += 1
-        if not _before(splats, order[first + root], order[first + child]):
+        if not _before(splats, ids, order[first + root], order[first + child]):
             return
         order[first + root], order[first + child] = order[first + child], order[first + root]
         root = child
 
 
 @njit(cache=True, error_model="numpy")
-def _before(splats, i, j):
+def _before(splats, ids, i, j):
     for column in range(DEPTH):
         if splats[i, column] != splats[j, column]:
             return splats[i, column] < splats[j, column]
+    if ids[i] != ids[j]:
+        return ids[i] < ids[j]
     return i < j
 
 
 @njit(cache=True, error_model="numpy")
-def _row_ends(splats, n, row, columns):
+def _row_ends(splats, n, row, columns, height):
     """First and last + 1 tile column that splat n's ellipse reaches inside tile row `row`."""
-    u, v = splats[n, U], splats[n, V]
+    v = splats[n, V]
+    u = splats[n, U] + splats[n, SLOPE] * (v - min(max(v, 0.0), height))
     half_w, half_h = splats[n, HALF_W], splats[n, HALF_H]
     top = max(row * TILE_H - v, -half_h)
     bottom = min((row + 1) * TILE_H - v, half_h)
@@ -131,7 +134,7 @@ def bin_splats(splats, order, width, height):
         bottom = min(int(math.floor((splats[s, V] + splats[s, HALF_H]) / TILE_H)) + 1, lines)
         met = 0
         for row in range(top, bottom):
-            first, last = _row_ends(splats, s, row, columns)
+            first, last = _row_ends(splats, s, row, columns, height)
             for column in range(first, last):
                 tiles[row * columns + column + 1] += 1
                 met += 1
@@ -149,7 +152,7 @@ def bin_splats(splats, order, width, height):
         bottom = min(int(math.floor((splats[s, V] + splats[s, HALF_H]) / TILE_H)) + 1, lines)
         slot = slots[s]
         for row in range(top, bottom):
-            first, last = _row_ends(splats, s, row, columns)
+            first, last = _row_ends(splats, s, row, columns, height)
             for column in range(first, last):
                 tile = row * columns + column
                 members[fill[tile]] = s

@@ -13,8 +13,8 @@ from numba import njit, prange
 
 from . import simd
 from .cpu_bin import TILE_H, TILE_W
-from .cpu_project import HALF_H, HALF_W, A, V
-from .cpu_tiles import STRIDE, live_rows, row_span
+from .cpu_project import HALF_H, HALF_W, A
+from .cpu_tiles import ROW_SLOTS, STRIDE, live_rows, splat_rows
 from .settings import ALPHA_MAX, ALPHA_MIN, STOP
 
 _LOG2_CUT = np.float32(math.log2(ALPHA_MIN))
@@ -45,6 +45,10 @@ def most_probable(splats, ids, tiles, members, best_id, best_weight):
         winner_weight = np.zeros(plane, np.float32)
         winner = np.full(plane, -1, np.int32)
         live = np.zeros(TILE_H, np.bool_)
+        starts = np.empty(ROW_SLOTS, np.int32)
+        stops = np.empty(ROW_SLOTS, np.int32)
+        tops = np.empty(ROW_SLOTS, np.float32)
+        centres = np.empty(ROW_SLOTS, np.float32)
         for row in range(rows):
             live[row] = True
             for x in range(cols):
@@ -68,15 +72,13 @@ def most_probable(splats, ids, tiles, members, best_id, best_weight):
                 count = k
                 break
             n = members[first + k]
-            y0 = max(int(math.floor(splats[n, V] - splats[n, HALF_H])), tile_y) - tile_y
-            y1 = min(int(math.floor(splats[n, V] + splats[n, HALF_H])) + 1, tile_y + rows) - tile_y
+            y0, y1 = splat_rows(splats, n, tile_x, tile_y, rows, height, starts, stops, tops, centres)
             quad = simd.splat(-splats[n, A])
             for row in range(y0, y1):
-                start, stop, _dy, top, centre = row_span(splats, n, tile_x, tile_y + row)
-                row_top = simd.splat(top)
-                for x in range(start, stop, simd.LANES):
+                row_top = simd.splat(tops[row])
+                for x in range(starts[row], stops[row], simd.LANES):
                     at = row * STRIDE + x
-                    d = simd.ramp(np.float32(tile_x + x) + np.float32(0.5) - centre)
+                    d = simd.ramp(np.float32(x) - centres[row])
                     exponent = quad * d * d + row_top
                     alpha = simd.minimum(simd.exp2(exponent), alpha_max)
                     t = simd.load(T, at)
@@ -95,13 +97,12 @@ def most_probable(splats, ids, tiles, members, best_id, best_weight):
             while group < count and owners[grouped[group]] == owner:
                 k = grouped[group]
                 n = members[first + k]
-                y0 = max(int(math.floor(splats[n, V] - splats[n, HALF_H])), tile_y) - tile_y
-                y1 = min(int(math.floor(splats[n, V] + splats[n, HALF_H])) + 1, tile_y + rows) - tile_y
+                y0, y1 = splat_rows(splats, n, tile_x, tile_y, rows, height, starts, stops, tops, centres)
                 low = min(low, y0)
                 high = max(high, y1)
                 at_kept = begin[k]
                 for row in range(y0, y1):
-                    start, stop, _dy, _top, _centre = row_span(splats, n, tile_x, tile_y + row)
+                    start, stop = starts[row], stops[row]
                     if start < stop:
                         left = min(left, start)
                     for x in range(start, stop, simd.LANES):

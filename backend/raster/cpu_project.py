@@ -6,8 +6,10 @@ A screen splat is stored so that a pixel row needs no cancelling terms: with the
     log2 alpha(x, y) = lop - A (x - u - s dy)^2 - C dy^2,
     s = b / c,  A = k / (a - b^2 / c),  C = k / c,  k = log2(e) / 2,
 
-which equals the usual quadratic form but stays exact for long diagonal needles. Inputs and outputs are float32,
-the arithmetic between them float64: this stage is a small share of the time and where determinants underflow.
+which equals the usual quadratic form but stays exact for long diagonal needles. The ridge x = u + s dy is stored by
+its column U in the picture's row nearest to v, so that a needle whose centre is far away keeps its place. Inputs and
+outputs are float32, the arithmetic between them float64 (and said so: in a kernel, float() of a float32 is a float32):
+this stage is a small share of the time and where determinants underflow.
 """
 
 from __future__ import annotations
@@ -17,14 +19,16 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from .settings import ALPHA_MIN, BLUR, MAX_SH_COEFFICIENTS, MIN_QUAT_NORM2, TAN_MARGIN
+from .settings import ALPHA_MIN, BLUR, MAX_EXTENT, MAX_SH_COEFFICIENTS, MIN_QUAT_NORM2, TAN_MARGIN
 
 # Columns of a screen splat.
 U, V, SLOPE, A, C, LOP, RED, GREEN, BLUE, DEPTH, HALF_W, HALF_H = range(12)
 SPLAT_COLUMNS = 12
 # Columns of a gradient row: moments of dL/d(log2 alpha) over the splat's pixels, then colour and depth.
 M0, MY, MYY, MX, MXY, MXX, G_RED, G_GREEN, G_BLUE, G_DEPTH = range(10)
-GRADIENT_COLUMNS = 10
+GRADIENT_COLUMNS = 16  # the rest pads a row to one cache line, written as one vector
+
+_MAX_COLOR = 3e38  # what float32 holds
 
 _HALF_LOG2E = 0.5 / math.log(2.0)
 _LN2 = math.log(2.0)
@@ -136,6 +140,27 @@ def _jacobian(px, py, pz, fx, fy, tan_limits, T, W):
 
 
 @njit(cache=True, error_model="numpy")
+def _footprint(T, R, scales, n, V0, V1):
+    """V = T R diag(scales[n]) as its two rows; returns a, b, c of V V^T + blur and a - b^2 / c."""
+    a = 0.0
+    b = 0.0
+    c = 0.0
+    for j in range(3):
+        scale = np.float64(scales[n, j])
+        V0[j] = (T[0, 0] * R[0, j] + T[0, 1] * R[1, j] + T[0, 2] * R[2, j]) * scale
+        V1[j] = (T[1, 0] * R[0, j] + T[1, 1] * R[1, j] + T[1, 2] * R[2, j]) * scale
+        a += V0[j] * V0[j]
+        b += V0[j] * V1[j]
+        c += V1[j] * V1[j]
+    # The determinant of V V^T is the squared area that V's rows span; a c - b^2 would cancel for diagonal needles.
+    x = V0[1] * V1[2] - V0[2] * V1[1]
+    y = V0[2] * V1[0] - V0[0] * V1[2]
+    z = V0[0] * V1[1] - V0[1] * V1[0]
+    conditional = (x * x + y * y + z * z + BLUR * (a + c + BLUR)) / (c + BLUR)
+    return a + BLUR, b, c + BLUR, conditional
+
+
+@njit(cache=True, error_model="numpy")
 def tangent_limits(fx, fy, cx, cy, width, height):
     """Clamp limits of x/z and y/z: the field of view with a margin on every side."""
     limits = np.empty(4)
@@ -163,36 +188,33 @@ def project(means, quats, scales, opacities, sh, viewmat, intrinsics, width, hei
     for chunk in prange(chunks):
         R = np.empty((3, 3))
         T = np.empty((2, 3))
+        V0 = np.empty(3)
+        V1 = np.empty(3)
         basis = np.empty(MAX_SH_COEFFICIENTS)
         for n in range(chunk * 256, min(chunk * 256 + 256, means.shape[0])):
             splats[n, HALF_H] = -1.0
-            opacity = float(opacities[n])
+            opacity = np.float64(opacities[n])
             if not opacity > ALPHA_MIN:
                 continue
-            mx, my, mz = float(means[n, 0]), float(means[n, 1]), float(means[n, 2])
+            mx, my, mz = np.float64(means[n, 0]), np.float64(means[n, 1]), np.float64(means[n, 2])
             px = W[0, 0] * mx + W[0, 1] * my + W[0, 2] * mz + t[0]
             py = W[1, 0] * mx + W[1, 1] * my + W[1, 2] * mz + t[1]
             pz = W[2, 0] * mx + W[2, 1] * my + W[2, 2] * mz + t[2]
             if not pz > near:
                 continue
-            qw, qx, qy, qz = float(quats[n, 0]), float(quats[n, 1]), float(quats[n, 2]), float(quats[n, 3])
+            qw, qx, qy, qz = (
+                np.float64(quats[n, 0]),
+                np.float64(quats[n, 1]),
+                np.float64(quats[n, 2]),
+                np.float64(quats[n, 3]),
+            )
             norm2 = qw * qw + qx * qx + qy * qy + qz * qz
             if not norm2 > MIN_QUAT_NORM2:
                 continue
             inverse = 1.0 / math.sqrt(norm2)
             _rotation(qw * inverse, qx * inverse, qy * inverse, qz * inverse, R)
             _jacobian(px, py, pz, fx, fy, limits, T, W)
-            a = BLUR
-            b = 0.0
-            c = BLUR
-            for j in range(3):
-                scale = float(scales[n, j])
-                v0 = (T[0, 0] * R[0, j] + T[0, 1] * R[1, j] + T[0, 2] * R[2, j]) * scale
-                v1 = (T[1, 0] * R[0, j] + T[1, 1] * R[1, j] + T[1, 2] * R[2, j]) * scale
-                a += v0 * v0
-                b += v0 * v1
-                c += v1 * v1
-            conditional = max(a - b * b / c, BLUR)
+            a, b, c, conditional = _footprint(T, R, scales, n, V0, V1)
             u = fx * px / pz + cx
             v = fy * py / pz + cy
             lop = math.log2(opacity)
@@ -202,17 +224,21 @@ def project(means, quats, scales, opacities, sh, viewmat, intrinsics, width, hei
             # Written so that a NaN or an infinity fails every test.
             if not (u + half_w > 0.0 and u - half_w < width and v + half_h > 0.0 and v - half_h < height):
                 continue
-            if not (half_w < 1e9 and half_h < 1e9):
+            if not (half_w < MAX_EXTENT and half_h < MAX_EXTENT):
                 continue
             dx, dy, dz = mx - eye[0], my - eye[1], mz - eye[2]
             length = math.sqrt(dx * dx + dy * dy + dz * dz)
             sh_basis(dx / length, dy / length, dz / length, count, basis)
+            finite = True
             for channel in range(3):
                 value = 0.5
                 for k in range(count):
                     value += basis[k] * sh[n, k, channel]
+                finite = finite and abs(value) < _MAX_COLOR
                 splats[n, RED + channel] = max(value, 0.0)
-            splats[n, U] = u
+            if not finite:
+                continue
+            splats[n, U] = u + b / c * (min(max(v, 0.0), height) - v)
             splats[n, V] = v
             splats[n, SLOPE] = b / c
             splats[n, A] = _HALF_LOG2E / conditional
@@ -246,7 +272,7 @@ def project_backward(
         basis = np.empty(MAX_SH_COEFFICIENTS)
         weights = np.empty(MAX_SH_COEFFICIENTS)
         g_color = np.empty(3)
-        g = np.empty(GRADIENT_COLUMNS)
+        g = np.empty(G_DEPTH + 1)
         V0 = np.empty(3)
         V1 = np.empty(3)
         gR = np.empty((3, 3))
@@ -264,32 +290,27 @@ def project_backward(
             g_screen[n, 1] = 0.0
             if slots[n] == slots[n + 1]:
                 continue
-            for i in range(GRADIENT_COLUMNS):
+            for i in range(G_DEPTH + 1):
                 g[i] = 0.0
             for slot in range(slots[n], slots[n + 1]):
-                for i in range(GRADIENT_COLUMNS):
+                for i in range(G_DEPTH + 1):
                     g[i] += rows[slot, i]
 
-            mx, my, mz = float(means[n, 0]), float(means[n, 1]), float(means[n, 2])
+            mx, my, mz = np.float64(means[n, 0]), np.float64(means[n, 1]), np.float64(means[n, 2])
             px = W[0, 0] * mx + W[0, 1] * my + W[0, 2] * mz + t[0]
             py = W[1, 0] * mx + W[1, 1] * my + W[1, 2] * mz + t[1]
             pz = W[2, 0] * mx + W[2, 1] * my + W[2, 2] * mz + t[2]
-            qw, qx, qy, qz = float(quats[n, 0]), float(quats[n, 1]), float(quats[n, 2]), float(quats[n, 3])
+            qw, qx, qy, qz = (
+                np.float64(quats[n, 0]),
+                np.float64(quats[n, 1]),
+                np.float64(quats[n, 2]),
+                np.float64(quats[n, 3]),
+            )
             inverse = 1.0 / math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
             qw, qx, qy, qz = qw * inverse, qx * inverse, qy * inverse, qz * inverse
             _rotation(qw, qx, qy, qz, R)
             tx, ty = _jacobian(px, py, pz, fx, fy, limits, T, W)
-            a = BLUR
-            b = 0.0
-            c = BLUR
-            for j in range(3):
-                scale = float(scales[n, j])
-                V0[j] = (T[0, 0] * R[0, j] + T[0, 1] * R[1, j] + T[0, 2] * R[2, j]) * scale
-                V1[j] = (T[1, 0] * R[0, j] + T[1, 1] * R[1, j] + T[1, 2] * R[2, j]) * scale
-                a += V0[j] * V0[j]
-                b += V0[j] * V1[j]
-                c += V1[j] * V1[j]
-            conditional = max(a - b * b / c, BLUR)
+            _a, b, c, conditional = _footprint(T, R, scales, n, V0, V1)
             slope = b / c
             quad_a = _HALF_LOG2E / conditional
             quad_c = _HALF_LOG2E / c
@@ -298,21 +319,22 @@ def project_backward(
             g_v = 2.0 * quad_c * g[MY] - 2.0 * quad_a * slope * g[MX]
             g_slope = 2.0 * quad_a * g[MXY]
             g_conditional = g[MXX] * quad_a / conditional
-            g_a = g_conditional
-            g_b = -2.0 * slope * g_conditional + g_slope / c
-            g_c = slope * slope * g_conditional - g_slope * slope / c + g[MYY] * quad_c / c
+            g_b = g_slope / c
+            g_c = g[MYY] * quad_c / c
             g_screen[n, 0] = g_u
             g_screen[n, 1] = g_v
-            g_opacities[n] = g[M0] / (_LN2 * float(opacities[n]))
+            g_opacities[n] = g[M0] / (_LN2 * np.float64(opacities[n]))
 
-            # Covariance to V = T R diag(scale), then to its three factors.
+            # Covariance to V = T R diag(scale), then to its three factors. What the conditional variance sends back is
+            # along V0 - slope V1; taken apart into a, b and c it would cancel for needles.
             for i in range(2):
                 for j in range(3):
                     gT[i, j] = 0.0
             for j in range(3):
-                scale = float(scales[n, j])
-                gV0 = 2.0 * g_a * V0[j] + g_b * V1[j]
-                gV1 = 2.0 * g_c * V1[j] + g_b * V0[j]
+                scale = np.float64(scales[n, j])
+                across = V0[j] - slope * V1[j]
+                gV0 = 2.0 * g_conditional * across + g_b * V1[j]
+                gV1 = g_b * (across - slope * V1[j]) + 2.0 * (g_c * V1[j] - slope * g_conditional * across)
                 g_scale = 0.0
                 for i in range(3):
                     gM = T[0, i] * gV0 + T[1, i] * gV1

@@ -16,29 +16,7 @@ from numba import njit, prange
 
 from . import simd
 from .cpu_bin import TILE_H, TILE_W
-from .cpu_project import (
-    BLUE,
-    DEPTH,
-    G_BLUE,
-    G_DEPTH,
-    G_GREEN,
-    G_RED,
-    GREEN,
-    HALF_H,
-    LOP,
-    M0,
-    MX,
-    MXX,
-    MXY,
-    MY,
-    MYY,
-    RED,
-    SLOPE,
-    A,
-    C,
-    U,
-    V,
-)  # fmt: skip
+from .cpu_project import BLUE, DEPTH, GRADIENT_COLUMNS, GREEN, HALF_H, LOP, RED, SLOPE, A, C, U, V
 from .settings import ALPHA_MAX, ALPHA_MIN, STOP
 
 STRIDE = TILE_W + simd.LANES
@@ -50,25 +28,45 @@ _STOP = np.float32(STOP)
 _LN2 = np.float32(math.log(2.0))
 _ONE = np.float32(1.0)
 _ZERO = np.float32(0.0)
-_ROUND_UP = np.float32(0.999999)
+_ROUND_UP = np.float32(0.9999)
+_MARGIN = np.float32(1e-3)
+ROW_SLOTS = TILE_H + simd.LANES
+"""Length of the arrays that `splat_rows` fills: whole vectors from any row of the tile on."""
+
 _CHECK_EVERY = 32
 
 
 @njit(inline="always", error_model="numpy")
-def row_span(splats, n, tile_x, y):
-    """Pixels [start, stop) of row y (in the tile's columns) where the splat reaches ALPHA_MIN, and the row's terms."""
-    dy = np.float32(y) + np.float32(0.5) - splats[n, V]
-    top = splats[n, LOP] - splats[n, C] * dy * dy
-    centre = splats[n, U] + splats[n, SLOPE] * dy
-    reach = (top - _LOG2_CUT) / splats[n, A]
-    if not reach > _ZERO:
-        return 0, 0, dy, top, centre
-    half = math.sqrt(reach)
-    low = min(max(centre - half - np.float32(0.5) - np.float32(tile_x), _ZERO), np.float32(TILE_W))
-    high = min(max(centre + half - np.float32(0.5) - np.float32(tile_x), np.float32(-1.0)), np.float32(TILE_W - 1))
-    start = int(low + _ROUND_UP)
-    stop = int(high + _ONE)
-    return start, stop, dy, top, centre
+def splat_rows(splats, n, tile_x, tile_y, rows, height, starts, stops, tops, centres):
+    """The rows [y0, y1) of a tile that splat n reaches, and for each of them, written to the last four arguments:
+
+    its pixels [start, stop) where the splat may reach ALPHA_MIN, and the terms top and centre of
+    log2 alpha = top - A (x - centre)^2. The span may be a pixel too wide, never too narrow.
+    """
+    v = splats[n, V]
+    y0 = max(int(math.floor(v - splats[n, HALF_H])) - tile_y, 0)
+    y1 = min(int(math.floor(v + splats[n, HALF_H])) + 1 - tile_y, rows)
+    middle = simd.splat(v)
+    anchor = simd.splat(min(max(v, _ZERO), np.float32(height)))
+    u = simd.splat(splats[n, U] - np.float32(0.5) - np.float32(tile_x))
+    slope = simd.splat(splats[n, SLOPE])
+    lop = simd.splat(splats[n, LOP])
+    c = simd.splat(splats[n, C])
+    per_a = simd.splat(_ONE / splats[n, A])
+    zero = simd.splat(_ZERO)
+    for row in range(y0, y1, simd.LANES):
+        y = simd.ramp(np.float32(tile_y + row) + np.float32(0.5))
+        dy = y - middle
+        top = lop - c * dy * dy
+        centre = u + slope * (y - anchor)
+        half = simd.sqrt(simd.maximum((top - simd.splat(_LOG2_CUT)) * per_a, zero)) + simd.splat(_MARGIN)
+        low = simd.minimum(simd.maximum(centre - half, zero), simd.splat(np.float32(TILE_W)))
+        high = simd.minimum(simd.maximum(centre + half, simd.splat(-_ONE)), simd.splat(np.float32(TILE_W - 1)))
+        simd.store(starts, row, simd.truncate(low + simd.splat(_ROUND_UP)))
+        simd.store(stops, row, simd.truncate(high + simd.splat(_ONE)))
+        simd.store(tops, row, top)
+        simd.store(centres, row, centre)
+    return y0, y1
 
 
 @njit(inline="always", error_model="numpy")
@@ -113,6 +111,10 @@ def blend(splats, ids, labels, tiles, members, want_labels, want_depth, color, t
         dep = planes[5 * plane :]
         want = np.empty(plane, np.int32)
         live = np.zeros(TILE_H, np.bool_)
+        starts = np.empty(ROW_SLOTS, np.int32)
+        stops = np.empty(ROW_SLOTS, np.int32)
+        tops = np.empty(ROW_SLOTS, np.float32)
+        centres = np.empty(ROW_SLOTS, np.float32)
         for row in range(rows):
             live[row] = True
             for x in range(cols):
@@ -131,8 +133,7 @@ def blend(splats, ids, labels, tiles, members, want_labels, want_depth, color, t
                 last = member
                 break
             n = members[member]
-            y0 = max(int(math.floor(splats[n, V] - splats[n, HALF_H])), tile_y) - tile_y
-            y1 = min(int(math.floor(splats[n, V] + splats[n, HALF_H])) + 1, tile_y + rows) - tile_y
+            y0, y1 = splat_rows(splats, n, tile_x, tile_y, rows, height, starts, stops, tops, centres)
             quad = simd.splat(-splats[n, A])
             r = simd.splat(splats[n, RED])
             g = simd.splat(splats[n, GREEN])
@@ -142,11 +143,10 @@ def blend(splats, ids, labels, tiles, members, want_labels, want_depth, color, t
             for row in range(y0, y1):
                 if not live[row]:
                     continue
-                start, stop, _dy, top, centre = row_span(splats, n, tile_x, tile_y + row)
-                row_top = simd.splat(top)
-                for x in range(start, stop, simd.LANES):
+                row_top = simd.splat(tops[row])
+                for x in range(starts[row], stops[row], simd.LANES):
                     at = row * STRIDE + x
-                    d = simd.ramp(np.float32(tile_x + x) + np.float32(0.5) - centre)
+                    d = simd.ramp(np.float32(x) - centres[row])
                     exponent = quad * d * d + row_top
                     alpha = simd.minimum(simd.exp2(exponent), alpha_max)
                     t = simd.load(T, at)
@@ -208,6 +208,10 @@ def blend_backward(
         gd = planes[7 * plane :]
         want = np.empty(plane, np.int32)
         live = np.zeros(TILE_H, np.bool_)
+        starts = np.empty(ROW_SLOTS, np.int32)
+        stops = np.empty(ROW_SLOTS, np.int32)
+        tops = np.empty(ROW_SLOTS, np.float32)
+        centres = np.empty(ROW_SLOTS, np.float32)
         for row in range(rows):
             live[row] = True
             y = tile_y + row
@@ -240,14 +244,12 @@ def blend_backward(
         for member in range(first, tiles[tile + 1]):
             place = places[member]
             if member - first >= ends[tile]:
-                for i in range(rows_out.shape[1]):
-                    rows_out[place, i] = 0.0
+                simd.store(rows_out, place * GRADIENT_COLUMNS, zero)
                 continue
             if (member - first) % _CHECK_EVERY == _CHECK_EVERY - 1:
                 live_rows(T, live)
             n = members[member]
-            y0 = max(int(math.floor(splats[n, V] - splats[n, HALF_H])), tile_y) - tile_y
-            y1 = min(int(math.floor(splats[n, V] + splats[n, HALF_H])) + 1, tile_y + rows) - tile_y
+            y0, y1 = splat_rows(splats, n, tile_x, tile_y, rows, height, starts, stops, tops, centres)
             quad = simd.splat(-splats[n, A])
             r = simd.splat(splats[n, RED])
             g = simd.splat(splats[n, GREEN])
@@ -267,14 +269,13 @@ def blend_backward(
             for row in range(y0, y1):
                 if not live[row]:
                     continue
-                start, stop, dy, top, centre = row_span(splats, n, tile_x, tile_y + row)
-                row_top = simd.splat(top)
-                row_dy = simd.splat(dy)
+                row_top = simd.splat(tops[row])
+                row_dy = simd.splat(np.float32(tile_y + row) + np.float32(0.5) - splats[n, V])
                 row0 = zero
                 row1 = zero
-                for x in range(start, stop, simd.LANES):
+                for x in range(starts[row], stops[row], simd.LANES):
                     at = row * STRIDE + x
-                    d = simd.ramp(np.float32(tile_x + x) + np.float32(0.5) - centre)
+                    d = simd.ramp(np.float32(x) - centres[row])
                     exponent = quad * d * d + row_top
                     raw = simd.exp2(exponent)
                     alpha = simd.minimum(raw, alpha_max)
@@ -299,7 +300,7 @@ def blend_backward(
                     sum_r = sum_r + w * wr
                     sum_g = sum_g + w * wg
                     sum_b = sum_b + w * wb
-                    # Where alpha was clamped or dropped it has no gradient; alpha itself is the exponential's derivative.
+                    # Where alpha was clamped or dropped it has no gradient; else alpha is the exponential's derivative.
                     slope = simd.keep(simd.at_least(alpha_max, raw), alpha) * (t * dot - left / clear)
                     row0 = row0 + slope
                     slope = slope * d
@@ -311,13 +312,6 @@ def blend_backward(
                 myy = myy + row0 * row_dy
                 mx = mx + row1
                 mxy = mxy + row1 * row_dy
-            rows_out[place, M0] = simd.total(m0) * _LN2
-            rows_out[place, MY] = simd.total(my) * _LN2
-            rows_out[place, MYY] = simd.total(myy) * _LN2
-            rows_out[place, MX] = simd.total(mx) * _LN2
-            rows_out[place, MXY] = simd.total(mxy) * _LN2
-            rows_out[place, MXX] = simd.total(mxx) * _LN2
-            rows_out[place, G_RED] = simd.total(sum_r)
-            rows_out[place, G_GREEN] = simd.total(sum_g)
-            rows_out[place, G_BLUE] = simd.total(sum_b)
-            rows_out[place, G_DEPTH] = simd.total(sum_z) if want_depth else _ZERO
+            ln2 = simd.splat(_LN2)
+            moments = (m0 * ln2, my * ln2, myy * ln2, mx * ln2, mxy * ln2, mxx * ln2)
+            simd.store(rows_out, place * GRADIENT_COLUMNS, simd.totals((*moments, sum_r, sum_g, sum_b, sum_z)))

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 
 from .camera import Camera
-from .settings import ALPHA_MAX, ALPHA_MIN, BLUR, MIN_QUAT_NORM2, STOP, TAN_MARGIN
+from .settings import ALPHA_MAX, ALPHA_MIN, BLUR, MAX_EXTENT, MIN_QUAT_NORM2, STOP, TAN_MARGIN
 
 
 class ReferencePicture(NamedTuple):
@@ -75,8 +75,11 @@ def rasterize_reference(
     eye = -(W.T @ t)
     # Splats that the guards drop are left out before any division, so that no NaN gradient passes a mask.
     z = (means @ W.T + t)[:, 2]
-    kept = (z > camera.near) & (opacities > ALPHA_MIN) & ((quats**2).sum(-1) > MIN_QUAT_NORM2)
-    kept = torch.nonzero(kept & torch.isfinite(means).all(-1) & torch.isfinite(scales).all(-1)).squeeze(-1)
+    kept = (
+        (z > camera.near) & (opacities > ALPHA_MIN) & torch.isfinite(opacities) & ((quats**2).sum(-1) > MIN_QUAT_NORM2)
+    )
+    for values in (means, quats, scales, sh.flatten(1)):
+        kept &= torch.isfinite(values).all(-1)
     means, quats, scales, opacities, sh, ids = (v[kept] for v in (means, quats, scales, opacities, sh, ids))
 
     p = means @ W.T + t
@@ -92,7 +95,10 @@ def rasterize_reference(
     M = J @ W @ R * scales[:, None, :]
     cov = M @ M.transpose(1, 2) + BLUR * torch.eye(2, dtype=dtype)
     a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
-    conditional = torch.clamp(a - b * b / c, min=BLUR)
+    # a - b^2 / c, where a c - b^2 without the blur is the squared area that M's rows span.
+    area2 = (torch.linalg.cross(M[:, 0], M[:, 1], dim=-1) ** 2).sum(-1)
+    conditional = (area2 + BLUR * (a + c - BLUR)) / c
+    extent2 = 2 * torch.log(opacities / ALPHA_MIN) * torch.maximum(a, c)
     directions = means - eye
     colors = sh_colors(sh, directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True))
 
@@ -103,6 +109,8 @@ def rasterize_reference(
     depth = torch.zeros(height, width, dtype=dtype)
     probabilities = torch.zeros(height, width, objects, dtype=dtype)
     for n in torch.argsort(z.detach(), stable=True).tolist():
+        if not extent2[n] < MAX_EXTENT**2:
+            continue
         dy = (lines - v[n])[:, None]
         d = columns[None, :] - u[n] - b[n] / c[n] * dy
         power = 0.5 * (d * d / conditional[n] + dy * dy / c[n])

@@ -6,12 +6,16 @@ ALPHA_MAX = 0.99
 ALPHA_MIN = 1.0 / 255.0
 """A splat's contribution to a pixel below this is dropped; it also bounds the splat's extent."""
 
-STOP = 1e-4
+STOP = 1.01e-4
 """A pixel takes no further splats once the light that reaches them falls below this. The splat that crosses
-the limit is still drawn, so no combination of ALPHA_MAX and STOP can make an opaque splat vanish."""
+the limit is still drawn, so no combination of ALPHA_MAX and STOP can make an opaque splat vanish. A little above
+(1 - ALPHA_MAX)^2, so that rounding does not decide whether a third splat is seen behind two opaque ones."""
 
 BLUR = 0.3
 """Variance in square pixels added to every splat's footprint (low-pass filter of 3D Gaussian splatting)."""
+
+MAX_EXTENT = 1e9
+"""Splats that reach further than this from their centre, in pixels, are dropped: their scale ran away."""
 
 NEAR = 0.01
 """Near plane, in scene units after normalisation."""

@@ -14,6 +14,7 @@ import operator
 
 from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
 
 LANES = 16
@@ -266,6 +267,28 @@ maximum = _minmax(">")
 
 
 @intrinsic
+def sqrt(typingctx, a):
+    """Square root of every lane."""
+
+    def codegen(context, builder, signature, args):
+        kind = ir.FunctionType(_FLOATS, [_FLOATS])
+        function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.sqrt.v{LANES}f32")
+        return builder.call(function, args)
+
+    return Floats(Floats), codegen
+
+
+@intrinsic
+def truncate(typingctx, a):
+    """Lanes as int32, rounded towards 0."""
+
+    def codegen(context, builder, signature, args):
+        return builder.fptosi(args[0], _INTS)
+
+    return Ints(Floats), codegen
+
+
+@intrinsic
 def total(typingctx, a):
     """Sum of the lanes as a float32, in a fixed tree order."""
 
@@ -279,6 +302,32 @@ def total(typingctx, a):
         return builder.extract_element(value, ir.Constant(ir.IntType(32), 0))
 
     return types.float32(Floats), codegen
+
+
+@intrinsic
+def totals(typingctx, sums):
+    """Lane i: the sum of the lanes of sums[i], for a tuple of up to LANES; in a fixed tree order."""
+    if not isinstance(sums, types.UniTuple) or sums.count > LANES:
+        return None
+
+    def codegen(context, builder, signature, args):
+        rows = [builder.extract_value(args[0], i) for i in range(sums.count)]
+        # Each round adds the two halves of every block of lanes and lays a pair of vectors side by side.
+        half = LANES // 2
+        while half:
+            sides = [block + side * LANES for block in range(0, LANES, 2 * half) for side in (0, 1)]
+            picks = [
+                ir.Constant(ir.VectorType(ir.IntType(32), LANES), [s + i + shift for s in sides for i in range(half)])
+                for shift in (0, half)
+            ]
+            pairs = [
+                (row, rows[i + half] if i + half < len(rows) else _constant(0.0)) for i, row in enumerate(rows[:half])
+            ]
+            rows = [builder.fadd(*(builder.shuffle_vector(a, b, p) for p in picks)) for a, b in pairs]
+            half //= 2
+        return rows[0]
+
+    return Floats(sums), codegen
 
 
 # 2**f on [-1/2, 1/2]: minimax polynomial of degree 5, largest relative error 7.5e-8 before rounding.

@@ -1,0 +1,468 @@
+"""Stiff and extreme scenes: pictures finite and equal to the float64 reference, gradients finite and equal too."""
+
+import dataclasses
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from backend.raster import Camera, cpu, object_map, rasterize
+from backend.raster.reference import rasterize_reference
+from backend.raster.settings import ALPHA_MIN, NEAR
+from tests.backend.test_raster import NAMES, as_float32, camera, compare, random_scene
+
+WIDTH, HEIGHT = 45, 33
+
+
+def straight(width=WIDTH, height=HEIGHT, focal=40.0, **kwargs):
+    """Looks along +z; the point (0, 0, z) falls on the centre of the picture's middle pixel."""
+    K = np.array([[focal, 0, width // 2 + 0.5], [0, focal, height // 2 + 0.5], [0, 0, 1]])
+    return Camera(np.eye(4), K, width, height, **kwargs)
+
+
+def one(
+    mean=(0.0, 0.0, 2.0), quat=(1.0, 0.0, 0.0, 0.0), scale=(0.1, 0.1, 0.1), opacity=0.7, color=(0.9, 0.2, 0.4), id=0
+):
+    dc = (np.array(color) - 0.5) / 0.28209479177387814
+    sh = np.zeros((1, 4, 3))
+    sh[0, 0] = dc
+    sh[0, 1:] = 0.05
+    return {
+        "means": torch.tensor([mean], dtype=torch.float64),
+        "quats": torch.tensor([quat], dtype=torch.float64),
+        "scales": torch.tensor([scale], dtype=torch.float64),
+        "opacities": torch.tensor([opacity], dtype=torch.float64),
+        "sh": torch.tensor(sh),
+        "ids": torch.tensor([id], dtype=torch.int32),
+    }
+
+
+def join(*scenes):
+    return {k: torch.cat([s[k] for s in scenes]) for k in scenes[0]}
+
+
+def among_others(scene, seed=0):
+    """The stiff splats with ordinary ones around them, whose gradients must not suffer."""
+    return join(scene, random_scene(seed, count=25))
+
+
+def draw(scene, cam, labels=None, seed=0):
+    """Picture and gradients of a random loss, all as NumPy arrays."""
+    leaves = {k: v.clone() if k == "ids" else v.clone().requires_grad_() for k, v in scene.items()}
+    picture = rasterize(**leaves, camera=cam, labels=labels, want_depth=True)
+    planes = [p for p in picture[:4] if p is not None]
+    rng = np.random.default_rng(seed)
+    sum((p * torch.tensor(rng.normal(size=tuple(p.shape)), dtype=p.dtype)).sum() for p in planes).backward()
+    arrays = {f"plane {i}": p.detach().numpy() for i, p in enumerate(planes)}
+    arrays |= {name: leaves[name].grad.numpy() for name in NAMES}
+    arrays["object"], arrays["probability"] = object_map(picture)
+    return arrays
+
+
+def assert_same_bits(a, b):
+    for name in a:
+        assert np.array_equal(a[name].view(np.uint8), b[name].view(np.uint8)), name
+
+
+def assert_unharmed(bad, seed=1):
+    """A dropped splat leaves the others' picture and gradients bit for bit as they are without it."""
+    others = as_float32(random_scene(seed, count=25))
+    bad = as_float32(bad)
+    alone, together = draw(others, camera()), draw(join(bad, others), camera())
+    count = bad["means"].shape[0]
+    for name in NAMES:
+        assert not together[name][:count].any(), name
+        together[name] = together[name][count:]
+    assert_same_bits(alone, together)
+
+
+# Shapes
+
+
+def test_zero_quaternion_is_dropped():
+    assert_unharmed(one(quat=(0, 0, 0, 0)))
+    assert_unharmed(one(quat=(1e-5, 0, 0, 0)))
+    compare(among_others(one(quat=(0, 0, 0, 0))), camera())
+
+
+@pytest.mark.parametrize("length", [1e-3, 1e3, 1e9])
+def test_quaternion_of_any_length(length):
+    q = np.array([0.3, -0.5, 0.7, 0.2]) * length
+    compare(one(quat=tuple(q), scale=(0.2, 0.05, 0.1)), camera())
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_one_zero_scale(axis):
+    scale = [0.2, 0.2, 0.2]
+    scale[axis] = 0.0
+    compare(among_others(one(quat=(0.9, 0.3, -0.2, 0.1), scale=scale)), camera())
+
+
+def test_edge_on_disc():
+    compare(among_others(one(scale=(0.0, 0.3, 0.3))), straight())
+
+
+def test_all_scales_zero_is_a_blurred_point():
+    got, _ = compare(among_others(one(scale=(0, 0, 0))), straight())
+    assert got.alpha[HEIGHT // 2, WIDTH // 2] > 0.5
+
+
+def test_scales_whose_determinant_underflows_float32():
+    compare(among_others(one(scale=(1e-22, 1e-22, 1e-22))), camera())
+    compare(among_others(one(scale=(1e-30, 0.3, 1e-30), quat=(0.9, 0.3, 0.2, 0.4))), camera())
+
+
+@pytest.mark.parametrize("ratio", [1e3, 1e4, 1e5, 1e6])
+@pytest.mark.parametrize("angle", [0.0, 90.0, 45.0, 30.0, 89.999])
+@pytest.mark.parametrize("thin", [1e-6, 1e-3])
+def test_needle(ratio, angle, thin):
+    half = np.deg2rad(angle) / 2
+    needle = one(quat=(np.cos(half), 0, 0, np.sin(half)), scale=(thin * ratio, thin, thin), mean=(0.013, -0.021, 2.0))
+    compare(needle, camera())
+    compare(among_others(needle), camera())
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_needles_in_any_direction(seed):
+    rng = np.random.default_rng(seed)
+    scene = random_scene(seed, count=20)
+    scene["scales"] = torch.tensor(10.0 ** rng.uniform(-6, 1, (20, 3)))
+    compare(scene, camera(), seed=seed)
+
+
+def test_huge_splat_off_the_picture():
+    for mean in ((300.0, 0, 2.0), (-250.0, 180.0, 2.0), (0, 1e4, 2.0)):
+        scale = np.linalg.norm(mean) / 2
+        compare(among_others(one(mean=mean, scale=(scale, scale / 3, scale))), straight())
+
+
+def test_long_diagonal_needle_centred_off_the_picture():
+    half = np.pi / 8
+    quat = (np.cos(half), 0, 0, np.sin(half))
+    for distance in (10.0, 1e3, 1e5):
+        compare(one(mean=(distance, distance, 2.0), scale=(distance, 1e-3, 1e-3), quat=quat), straight())
+
+
+def test_splat_that_misses_the_picture_has_no_gradient():
+    assert_unharmed(one(mean=(50.0, 0, 2.0)))
+
+
+@pytest.mark.parametrize("scale", [np.inf, 3e38, 1e20, 1e9])
+def test_overflowing_scale(scale):
+    """exp() of a log-scale that ran away."""
+    for scales in ((scale, 0.1, 0.1), (0.1, scale, 0.1), (scale, scale, scale)):
+        compare(among_others(one(scale=scales, quat=(0.9, 0.3, -0.2, 0.1))), camera())
+
+
+# Opacity
+
+
+def test_opaque_splat_on_a_pixel_centre_is_drawn():
+    for opacity in (0.999, 1.0, 1.7):
+        got, _ = compare(one(opacity=opacity, scale=(1e-4,) * 3), straight())
+        assert got.alpha[HEIGHT // 2, WIDTH // 2].item() == pytest.approx(0.99)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 0.1, 1.0])
+@pytest.mark.parametrize("opacity", [0.98, 0.99, 1.0])
+def test_sixteen_opaque_splats_stacked(scale, opacity):
+    layers = [one(mean=(0, 0, 1 + 0.1 * i), opacity=opacity, scale=(scale,) * 3, id=i % 5) for i in range(16)]
+    compare(join(*layers), straight())
+
+
+def test_hundreds_of_layers_stop_where_the_reference_does():
+    rng = np.random.default_rng(0)
+    scene = random_scene(0, count=400)
+    scene["opacities"] = torch.tensor(rng.uniform(0.3, 1.0, 400))
+    compare(scene, camera())
+
+
+@pytest.mark.parametrize("opacity", [0.0, -1.0, ALPHA_MIN * 0.999])
+def test_nothing_visible(opacity):
+    scene = random_scene(0)
+    scene["opacities"] = torch.full_like(scene["opacities"], opacity)
+    got, _ = compare(scene, camera())
+    assert not got.color.any() and not got.alpha.any() and not got.weight.any() and not got.depth.any()
+    ids, probability = object_map(got)
+    assert (ids == -1).all() and not probability.any()
+
+
+def test_no_splats():
+    scene = {k: v[:0] for k, v in random_scene(0).items()}
+    got, _ = compare(scene, camera())
+    assert not got.alpha.any()
+    assert (object_map(got)[0] == -1).all()
+
+
+# Depth
+
+
+@pytest.mark.parametrize("near", [NEAR, 0.2])
+def test_depth_around_the_near_plane(near):
+    edge = np.float32(near)
+    depths = (0.0, np.nextafter(edge, np.float32(0)), edge, np.nextafter(edge, np.float32(1)), -2.0, -near)
+    for z in depths:
+        scene = among_others(one(mean=(0, 0, float(z)), scale=(0.001,) * 3))
+        got, _ = compare(scene, straight(near=near))
+        assert got.frame.seen[0] == (float(z) > near)
+
+
+def test_splat_at_the_camera_centre_is_dropped():
+    viewmat = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    cam = camera()
+    pose = np.eye(4)
+    pose[:3, :3] = viewmat * np.sign(np.linalg.det(viewmat))
+    pose[:3, 3] = pose[:3, :3] @ [-0.5, 0.25, 2.0]
+    cam = dataclasses.replace(cam, viewmat=pose)
+    scene = among_others(one(mean=(0.5, -0.25, -2.0)))
+    got, _ = compare(scene, cam)
+    assert not got.frame.seen[0]
+
+
+def test_coincident_points():
+    scene = random_scene(0, count=40)
+    scene["means"] = scene["means"][:1].expand(40, 3).contiguous()
+    scene["opacities"] *= 0.3
+    scene["quats"] = scene["quats"][:1].expand(40, 4).contiguous()
+    scene["scales"] = scene["scales"][:1].expand(40, 3).contiguous()
+    scene["opacities"] = scene["opacities"][:1].expand(40).contiguous()
+    scene["sh"] = scene["sh"][:1].expand(40, 4, 3).contiguous()
+    scene["ids"] = torch.zeros(40, dtype=torch.int32)
+    compare(scene, camera())
+
+
+@pytest.mark.parametrize("same", ["depth", "everything but the id"])
+def test_equal_depths_do_not_depend_on_the_input_order(same):
+    scene = as_float32(random_scene(3, count=80))
+    if same == "depth":
+        scene["means"][:, 2] = 2.0
+    else:
+        scene = {k: v if k == "ids" else v[:1].expand_as(v).clone() for k, v in scene.items()}
+    labels = torch.tensor(np.random.default_rng(0).integers(0, 5, (HEIGHT, WIDTH)), dtype=torch.int32)
+    cam = camera()
+    first = draw(scene, cam, labels)
+    for seed in range(3):
+        mixed = torch.tensor(np.random.default_rng(seed).permutation(80))
+        again = draw({k: v[mixed] for k, v in scene.items()}, cam, labels)
+        if same == "depth":
+            for name in NAMES:
+                first_mixed = first[name][mixed.numpy()]
+                assert np.array_equal(again[name], first_mixed), name
+        assert_same_bits({k: v for k, v in first.items() if k not in NAMES}, again)
+
+
+# Not a number
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_splat_that_is_not_finite_is_dropped(name, value):
+    bad = one()
+    bad[name].view(-1)[0] = value
+    if name == "opacities" and value == -np.inf:
+        bad = join(bad, bad)
+    assert_unharmed(bad)
+
+
+# Labels
+
+
+def test_no_labelled_pixel():
+    cam = camera()
+    scene = {k: v.requires_grad_(k != "ids") for k, v in as_float32(random_scene(0)).items()}
+    picture = rasterize(**scene, camera=cam, labels=torch.full((cam.height, cam.width), -1, dtype=torch.int32))
+    assert not picture.weight.any()
+    picture.weight.sum().backward()
+    assert not any(scene[name].grad.any() for name in NAMES)
+
+
+def test_one_class():
+    """With one object the label's probability is the picture's alpha."""
+    cam = camera()
+    scene = as_float32(random_scene(0, objects=1))
+    picture = rasterize(**scene, camera=cam, labels=torch.zeros(cam.height, cam.width, dtype=torch.int32))
+    np.testing.assert_allclose(picture.weight, picture.alpha, atol=1e-6)
+    compare(random_scene(0, objects=1), cam, objects=1)
+
+
+def test_probability_zero_under_the_logarithm():
+    cam = camera()
+    scene = random_scene(0, count=30)
+    labels = torch.full((cam.height, cam.width), 4, dtype=torch.int32)
+    labels[:, :20] = 77
+    fast = {k: v.clone().requires_grad_(k != "ids") for k, v in as_float32(scene).items()}
+    slow = {k: v if k == "ids" else v.double().requires_grad_() for k, v in as_float32(scene).items()}
+    floor = 1e-6
+    picture = rasterize(**fast, camera=cam, labels=labels)
+    assert not picture.weight[:, :20].any()
+    loss = -torch.log(picture.weight.clamp(min=floor)).mean()
+    loss.backward()
+    want = rasterize_reference(**slow, camera=cam, objects=5).probabilities[..., 4].clone()
+    want = torch.where(labels == 4, want, torch.zeros(()).double())
+    reference = -torch.log(want.clamp(min=floor)).mean()
+    reference.backward()
+    assert loss.item() == pytest.approx(reference.item(), rel=1e-4)
+    for name in ("means", "quats", "scales", "opacities"):
+        a, b = fast[name].grad.double(), slow[name].grad
+        assert torch.isfinite(a).all()
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4 * b.abs().max().item(), err_msg=name)
+
+
+def dense_probabilities(scene, cam, values):
+    """P (H, W, n) for the n IDs in `values`, from the label weights of the same kernels, one ID at a time."""
+    planes = []
+    for value in values:
+        labels = torch.full((cam.height, cam.width), int(value), dtype=torch.int32)
+        planes.append(rasterize(**scene, camera=cam, labels=labels).weight.numpy())
+    return np.stack(planes, -1)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_object_map_equals_the_dense_computation(seed):
+    rng = np.random.default_rng(seed)
+    cam = camera(150, 71)
+    scene = as_float32(random_scene(seed, count=300))
+    values = np.unique(rng.integers(-(2**31), 2**31, 40)).astype(np.int32)
+    scene["ids"] = torch.tensor(rng.choice(values, 300))
+    ids, probability = object_map(rasterize(**scene, camera=cam))
+    dense = dense_probabilities(scene, cam, values)
+    np.testing.assert_allclose(probability, dense.max(-1), rtol=1e-5, atol=1e-7)
+    drawn = dense.max(-1) > 0
+    assert not (ids[~drawn] + 1).any()
+    picked = dense[(*np.nonzero(drawn), np.searchsorted(values, ids[drawn]))]
+    np.testing.assert_allclose(picked, dense.max(-1)[drawn], rtol=1e-5, atol=1e-7)
+
+
+def test_object_map_gives_ties_to_the_smallest_id():
+    """Two objects of equal weight, one at either side of the same row of pixels, in both orders of input."""
+    cam = straight(65, 33)
+    left, right = (one(mean=(x, 0, 2.0), scale=(0.5, 0.5, 0.1), opacity=0.2) for x in (-0.1, 0.1))
+    for a, b in ((70_000, 9), (9, 70_000)):
+        left["ids"][0], right["ids"][0] = a, b
+        right["means"] = left["means"].clone()
+        # Behind, so that the one in front does not win: (1 - 0.2) * 0.25 = 0.2.
+        right["opacities"][0] = 0.25
+        ids, probability = object_map(rasterize(**as_float32(join(left, right)), camera=cam))
+        dense = dense_probabilities(as_float32(join(left, right)), cam, [9, 70_000])
+        expected = np.where(dense.max(-1) > 0, np.array([9, 70_000])[dense.argmax(-1)], -1)
+        assert np.array_equal(ids, expected)
+        assert np.array_equal(probability, dense.max(-1))
+
+
+def test_ten_thousand_objects_and_large_ids():
+    rng = np.random.default_rng(0)
+    cam = camera(97, 71)
+    count = 12_000
+    scene = as_float32(random_scene(0, count=count, size=0.02))
+    names = rng.choice(2**31 - 1, 10_000, replace=False).astype(np.int32)
+    assert (names > 65_535).mean() > 0.99
+    which = np.concatenate([np.arange(10_000), rng.integers(0, 10_000, count - 10_000)])
+    scene["ids"] = torch.tensor(names[which])
+    picture = rasterize(**scene, camera=cam)
+    ids, probability = object_map(picture)
+    labels = torch.tensor(ids)
+    again = rasterize(**scene, camera=cam, labels=labels)
+    np.testing.assert_allclose(again.weight, probability, rtol=1e-5, atol=1e-6)
+    assert np.isin(ids[ids >= 0], names).all()
+    # Renaming the objects, in the same order, renames the map and changes nothing else.
+    small = {**scene, "ids": torch.tensor(np.argsort(np.argsort(names)).astype(np.int32)[which])}
+    ids_small, probability_small = object_map(rasterize(**small, camera=cam))
+    assert np.array_equal(ids, np.where(ids_small >= 0, np.sort(names)[ids_small], -1))
+    assert np.array_equal(probability, probability_small)
+
+
+# Sizes and coordinates
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (67, 1), (63, 31), (64, 32), (65, 33), (129, 65), (127, 3)])
+def test_odd_sizes(size):
+    compare(random_scene(0, count=40), camera(*size))
+
+
+def test_scene_far_from_the_origin():
+    """Georeferenced: float64 means are taken relative to the camera before they become float32."""
+    offset = torch.tensor([4.6e6, -1.2e6, 3.1e6], dtype=torch.float64)
+    scene = {k: v if k in ("ids", "means") else v.float() for k, v in random_scene(0).items()}
+    cam = camera()
+    viewmat = cam.viewmat.copy()
+    viewmat[:3, 3] = -viewmat[:3, :3] @ offset.numpy()
+    far = dataclasses.replace(cam, viewmat=viewmat)
+    labels = torch.zeros(cam.height, cam.width, dtype=torch.int32)
+    here = draw(scene, cam, labels)
+    there = draw({**scene, "means": scene["means"] + offset}, far, labels)
+    assert there["means"].dtype == np.float64
+    for name in here:
+        # 1e-9 is what float64 itself loses at this offset.
+        np.testing.assert_allclose(
+            there[name], here[name], rtol=1e-4, atol=1e-4 * np.abs(here[name]).max(), err_msg=name
+        )
+
+
+@pytest.mark.parametrize("size", [1e-4, 1e-2, 1e4])
+def test_scene_of_another_size(size):
+    scene = random_scene(0)
+    scene["means"] *= size
+    scene["scales"] *= size
+    compare(scene, dataclasses.replace(camera(), near=NEAR * size))
+
+
+# Determinism
+
+
+def dense_scene():
+    return as_float32(random_scene(5, count=3000, size=0.05)), camera(200, 133)
+
+
+def test_same_input_gives_the_same_bits():
+    scene, cam = dense_scene()
+    labels = torch.zeros(cam.height, cam.width, dtype=torch.int32)
+    assert_same_bits(draw(scene, cam, labels), draw(scene, cam, labels))
+
+
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread only")
+def test_one_and_two_threads_give_the_same_bits():
+    scene, cam = dense_scene()
+    labels = torch.zeros(cam.height, cam.width, dtype=torch.int32)
+    before = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        single = draw(scene, cam, labels)
+        numba.set_num_threads(2)
+        double = draw(scene, cam, labels)
+    finally:
+        numba.set_num_threads(before)
+    assert_same_bits(single, double)
+
+
+# The reference itself
+
+
+@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
+def test_gradcheck_of_the_reference(coefficients):
+    scene = random_scene(2, count=4, coefficients=coefficients, size=0.3)
+    scene["opacities"] *= 0.8
+    cam = straight(7, 5, focal=6.0)
+    ids = scene.pop("ids")
+
+    def picture(*leaves):
+        out = rasterize_reference(*leaves, ids, cam, 5)
+        return out.color, out.alpha, out.depth, out.probabilities
+
+    assert torch.autograd.gradcheck(picture, [scene[name].requires_grad_() for name in NAMES], eps=1e-7, atol=1e-5)
+
+
+def test_backward_of_unused_planes():
+    """Planes without a gradient (None from autograd) count as zero."""
+    scene = {k: v.requires_grad_(k != "ids") for k, v in as_float32(random_scene(0)).items()}
+    cam = camera()
+    rasterize(**scene, camera=cam, want_depth=True).color.sum().backward()
+    assert all(torch.isfinite(scene[name].grad).all() for name in NAMES)
+    frame = cpu.forward(
+        cpu.Gaussians(*(scene[n].detach().numpy() for n in (*NAMES, "ids"))),
+        cam,
+        np.zeros((cam.height, cam.width), np.int32),
+    )
+    out = cpu.backward(frame, np.ones_like(frame.color), np.zeros_like(frame.transmittance))
+    for name in NAMES:
+        np.testing.assert_allclose(getattr(out, name), scene[name].grad, rtol=1e-5, atol=1e-6)
