@@ -70,6 +70,7 @@ def parser() -> argparse.ArgumentParser:
     train.add_argument("--background", choices=("learned", "black", "white"), default="learned")
     train.add_argument("--semantic-weight", type=float, help="weight of the labels (0.1; 0.01 for poor masks)")
     train.add_argument("--unlabelled-is-object", action="store_true", help="teach pixels of ID 0 as a class")
+    train.add_argument("--checkpoint-seconds", type=_positive_float, default=30.0, help="time between checkpoints (30)")
     train.add_argument("--restart", action="store_true", help="forget an earlier training in DIR")
 
     def result(name: str, help: str) -> argparse.ArgumentParser:

@@ -114,7 +114,7 @@ def train(options: argparse.Namespace, reporter: Reporter, stop: Callable[[], bo
     folder.previews.mkdir(exist_ok=True)
     reporter.status(f"Training {len(trainer.model.anchors)} anchors")
     with _stage(folder, "train"):
-        trainer.run(budget, folder.checkpoint, reporter, _held_out(folder, reporter), stop)
+        trainer.run(budget, folder.checkpoint, reporter, _held_out(folder, reporter), stop, options.checkpoint_seconds)
     with _stage(folder, "export"):
         reporter.status("Writing splats.ply")
         splats, note = _explicit(trainer.model, trainer.scene)

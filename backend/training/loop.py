@@ -198,6 +198,7 @@ class Trainer:
         reporter: Reporter,
         evaluate: Evaluate | None = None,
         should_stop: Callable[[], bool] = lambda: False,
+        checkpoint_seconds: float = CHECKPOINT_SECONDS,
     ) -> None:
         """Train until the budget is spent. Raises Cancelled after saving when `should_stop` says so."""
         p = self.progress
@@ -223,7 +224,7 @@ class Trainer:
                 last_report = now
                 p.seconds = before + now - started
                 self._report(budget, reporter, smooth, (now - started) / (p.step - first_step))
-            if now - last_saved >= CHECKPOINT_SECONDS:
+            if now - last_saved >= checkpoint_seconds:
                 self.save(checkpoints)
                 last_saved = time.monotonic()
         self.save(checkpoints)

@@ -117,7 +117,11 @@ def ssim_gradient(image, target, window, gradient):
     return sums.sum() * float(scale)
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+# Sums may be reordered, so that they vectorise; NaN must still come through.
+_REORDER = {"reassoc", "contract", "nsz"}
+
+
+@njit(parallel=True, cache=True, error_model="numpy", fastmath=_REORDER)
 def _compose(color, alpha, background, target, image):
     """image = color + (1 - alpha) background; returns mean |image - target|."""
     _, height, width = color.shape
@@ -133,7 +137,7 @@ def _compose(color, alpha, background, target, image):
     return sums.sum() / (3.0 * height * width)
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(parallel=True, cache=True, error_model="numpy", fastmath=_REORDER)
 def _image_gradient(image, target, alpha, background, g_ssim, l1_weight, ssim_weight, g_color, g_alpha, g_background):
     _, height, width = image.shape
     step = np.float32(l1_weight / (3.0 * height * width))

@@ -1,0 +1,423 @@
+"""Losses against autograd, growth rules, checkpoints, and whole trainings on tiny captures."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from backend.capture import load_capture
+from backend.labels import vote
+from backend.model.anchors import Anchors, Layout, cell_keys, median_spacing, seed_anchors
+from backend.model.checkpoint import CURRENT, PREVIOUS, load_checkpoint, save_checkpoint
+from backend.model.generate import generate
+from backend.model.growth import GrowthStatistics, grow_and_prune
+from backend.model.heads import Heads
+from backend.model.object_model import Normalization, anchors_in_view
+from backend.protocol import Cancelled, InputError, Reporter
+from backend.raster import Camera, rasterize
+from backend.raster.draw import draw
+from backend.training.adam import BETA1, BETA2, step_rows
+from backend.training.loop import Budget, Trainer
+from backend.training.losses import PROBABILITY_FLOOR, image_loss
+from backend.training.settings import Settings
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+# --- losses ----------------------------------------------------------------------------------------------------------
+
+
+def slow_ssim(a, b):
+    x = torch.arange(-5, 6, dtype=a.dtype)
+    window = torch.exp(-0.5 * (x / 1.5) ** 2)
+    window = window / window.sum()
+    kernel = (window[:, None] * window[None, :])[None, None].repeat(3, 1, 1, 1)
+
+    def blur(v):
+        return torch.nn.functional.conv2d(v[None], kernel, padding=5, groups=3)[0]
+
+    m1, m2 = blur(a), blur(b)
+    s11, s22, s12 = blur(a * a) - m1 * m1, blur(b * b) - m2 * m2, blur(a * b) - m1 * m2
+    top = (2 * m1 * m2 + 0.01**2) * (2 * s12 + 0.03**2)
+    return (top / ((m1 * m1 + m2 * m2 + 0.01**2) * (s11 + s22 + 0.03**2))).mean()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 33), (24, 50)])
+def test_image_loss_and_gradients_equal_autograd(size):
+    rng = np.random.default_rng(3)
+    h, w = size
+    base = [rng.uniform(0, 1, s) for s in ((3, h, w), (h, w), (h, w), (3,))]
+    target = torch.tensor(rng.uniform(0, 1, (3, h, w)))
+    labels = torch.tensor(rng.integers(-1, 3, (h, w)), dtype=torch.int32)
+    fast = [torch.tensor(v, dtype=torch.float32, requires_grad=True) for v in base]
+    slow = [torch.tensor(np.float32(v), dtype=torch.float64, requires_grad=True) for v in base]
+    got = image_loss(*fast, target.float(), labels, 0.2, 0.1)
+    color, alpha, weight, background = slow
+    shown = color + (1 - alpha) * background[:, None, None]
+    labelled = labels >= 0
+    semantic = -torch.log((weight[labelled] + PROBABILITY_FLOOR) / (1 + PROBABILITY_FLOOR)).mean()
+    want = 0.8 * (shown - target).abs().mean() + 0.2 * (1 - slow_ssim(shown, target))
+    if labelled.any():
+        want = want + 0.1 * semantic
+    assert float(got.detach()) == pytest.approx(float(want), rel=1e-4)
+    got.backward()
+    want.backward()
+    for a, b in zip(fast, slow):
+        reference = b.grad if b.grad is not None else torch.zeros_like(b)
+        np.testing.assert_allclose(a.grad.numpy(), reference.numpy(), rtol=2e-3, atol=2e-5 * reference.abs().max())
+
+
+def test_loss_of_a_picture_without_labels_has_no_semantic_term():
+    color, target = torch.rand(3, 8, 9), torch.rand(3, 8, 9)
+    labels = torch.full((8, 9), -1, dtype=torch.int32)
+    weight = torch.zeros(8, 9, requires_grad=True)
+    loss = image_loss(color, torch.ones(8, 9), weight, torch.zeros(3), target, labels, 0.2, 0.1)
+    loss.backward()
+    assert torch.isfinite(loss)
+    assert (weight.grad == 0).all()
+
+
+def test_probability_zero_under_the_logarithm_is_finite():
+    weight = torch.zeros(4, 4, requires_grad=True)
+    labels = torch.zeros(4, 4, dtype=torch.int32)
+    loss = image_loss(
+        torch.zeros(3, 4, 4), torch.zeros(4, 4), weight, torch.zeros(3), torch.zeros(3, 4, 4), labels, 0, 1
+    )
+    loss.backward()
+    assert torch.isfinite(loss) and torch.isfinite(weight.grad).all() and (weight.grad < 0).all()
+
+
+def test_adam_equals_torch_on_seen_rows_and_leaves_the_others():
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(20, 7)).astype(np.float32)
+    before = values.copy()
+    first, second = np.zeros_like(values), np.zeros_like(values)
+    seen = np.array([1, 4, 19])
+    parameter = torch.tensor(values[seen], requires_grad=True)
+    optimizer = torch.optim.Adam([parameter], lr=0.01, eps=1e-15)
+    rates = np.full(7, 0.01, np.float32)
+    for step in range(1, 6):
+        g = rng.normal(size=(3, 7)).astype(np.float32)
+        step_rows(values, first, second, seen, g, rates, 1 - BETA1**step, 1 - BETA2**step)
+        parameter.grad = torch.tensor(g)
+        optimizer.step()
+    np.testing.assert_allclose(values[seen], parameter.detach().numpy(), rtol=1e-5, atol=1e-6)
+    others = np.setdiff1d(np.arange(20), seen)
+    assert (values[others] == before[others]).all()
+
+
+def test_adam_skips_a_row_that_is_not_finite():
+    values = np.ones((3, 4), np.float32)
+    first, second = np.zeros_like(values), np.zeros_like(values)
+    g = np.ones((3, 4), np.float32)
+    g[1, 2] = np.nan
+    skipped = step_rows(values, first, second, np.arange(3), g, np.full(4, 0.1, np.float32), 0.1, 0.001)
+    assert skipped == 1 and (values[1] == 1).all() and (values[[0, 2]] < 1).all()
+
+
+# --- anchors, heads, growth ------------------------------------------------------------------------------------------
+
+
+def test_one_anchor_a_voxel_with_the_majority_id():
+    xyz = np.array([[0.1, 0, 0], [0.2, 0, 0], [-0.1, 0, 0], [3, 0, 0], [3.2, 0.1, 0]])
+    ids = np.array([2, 2, 1, 3, 1])
+    anchors = seed_anchors(xyz, np.zeros((5, 3)), ids, 1.0, Layout(4, 8), np.random.default_rng(0))
+    assert len(anchors) == 2
+    assert anchors.ids.tolist() == [2, 3]  # majority; then the tie goes to the point nearest to the centre
+    assert len(np.unique(cell_keys(anchors.positions, 1.0), axis=0)) == 2
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_coincident_points_give_one_finite_anchor(count):
+    xyz = np.zeros((count, 3))
+    voxel = median_spacing(xyz)
+    anchors = seed_anchors(xyz, np.ones((count, 3)), np.zeros(count, int), voxel, Layout(), np.random.default_rng(0))
+    assert len(anchors) == 1 and np.isfinite(anchors.rows).all() and voxel > 0
+
+
+@pytest.mark.parametrize("mode", ["explicit", "view"])
+def test_generated_gaussians_have_the_gradients_of_their_equations(mode):
+    layout = Layout(3, 5)
+    rng = np.random.default_rng(1)
+    rows = torch.tensor(rng.normal(0, 0.5, (6, layout.columns)), dtype=torch.float32, requires_grad=True)
+    positions = torch.tensor(rng.normal(size=(6, 3)), dtype=torch.float32)
+    ids = torch.arange(6, dtype=torch.int32)
+    heads = Heads(layout, mode, 1, torch.Generator().manual_seed(0))
+    eye = np.array([0.1, 0.2, -3.0])
+    g = generate(layout, positions, rows, ids, heads, eye)
+    assert 0 < len(g.source) < 18 and (g.ids == g.source // 3).all()
+
+    again = rows.detach().clone().requires_grad_()
+    features = again[:, layout.feature_columns]
+    if mode == "view":
+        to_anchor = positions - torch.tensor(eye, dtype=torch.float32)
+        distance = to_anchor.norm(dim=1, keepdim=True)
+        features = torch.cat([features, distance, to_anchor / distance], 1)
+    raw_o, raw_s, raw_c = heads(features)
+    extent = torch.exp(again[:, layout.extent_columns])
+    opacity = torch.tanh(raw_o + again[:, layout.opacity_columns]).reshape(-1)
+    shape = (raw_s + again[:, layout.shape_columns]).reshape(-1, 7)
+    offsets = again[:, layout.offset_columns].reshape(6, 3, 3)
+    want = {
+        "means": (positions[:, None] + offsets * extent[:, None, :3]).reshape(-1, 3),
+        "quats": shape[:, 3:],
+        "scales": (extent[:, 3:].repeat_interleave(3, 0)) * torch.sigmoid(shape[:, :3]),
+        "opacities": opacity,
+        "sh": raw_c.reshape(18, heads.coefficients, 3),
+    }
+    dc = again[:, layout.color_columns].reshape(18, 1, 3)
+    want["sh"] = torch.cat([want["sh"][:, :1] + dc, want["sh"][:, 1:]], 1)
+    loss = loss_want = 0
+    for name, value in want.items():
+        value = value[g.source]
+        got = getattr(g, name)
+        np.testing.assert_allclose(got.detach(), value.detach(), rtol=1e-5, atol=1e-6)
+        weights = torch.tensor(rng.normal(size=tuple(value.shape)), dtype=torch.float32)
+        loss = loss + (got * weights).sum()
+        loss_want = loss_want + (value * weights).sum()
+    head_gradients = torch.autograd.grad(loss, [rows, *heads.parameters()], retain_graph=True)
+    want_gradients = torch.autograd.grad(loss_want, [again, *heads.parameters()])
+    for a, b in zip(head_gradients, want_gradients):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5 * float(b.abs().max()))
+
+
+def test_no_anchor_that_would_be_drawn_is_left_out_of_a_view():
+    rng = np.random.default_rng(5)
+    layout = Layout(4, 8)
+    n = 400
+    rows = rng.normal(0, 0.5, (n, layout.columns)).astype(np.float32)
+    rows[:, layout.extent_columns] = rng.normal(-2, 0.7, (n, 6))
+    anchors = Anchors(layout, 0.1, rng.normal(0, 3, (n, 3)).astype(np.float32), rows, np.zeros(n, np.int32))
+    heads = Heads(layout, "explicit", 0, torch.Generator().manual_seed(1))
+    camera = Camera(np.eye(4), np.array([[50.0, 0, 30], [0, 60, 20], [0, 0, 1]]), 64, 48)
+    with torch.no_grad():
+        g = generate(
+            layout, torch.from_numpy(anchors.positions), torch.from_numpy(rows), torch.from_numpy(anchors.ids), heads
+        )
+        drawn = rasterize(*g[:6], camera)
+    needed = np.unique(g.source.numpy()[drawn.frame.seen] // 4)
+    seen = anchors_in_view(anchors, *camera.arrays(), camera.width, camera.height, camera.near)
+    assert set(needed) <= set(seen)
+    assert len(seen) < n
+
+
+def grown(gradient, ids=(1, 2), positions=((0.0, 0, 0), (8.0, 0, 0)), offset=(0.0, 0.0, 0.0), opacity=1.0):
+    layout = Layout(1, 4)
+    rows = np.zeros((2, layout.columns), np.float32)
+    rows[:, layout.offset_columns] = offset
+    anchors = Anchors(layout, 1.0, np.array(positions, np.float32), rows, np.array(ids, np.int32))
+    statistics = GrowthStatistics(
+        np.array(gradient, np.float32) * 10, np.full(2, 10, np.int32), np.full(2, opacity * 10, np.float32),
+        np.full(2, 10, np.int32),
+    )  # fmt: skip
+    return anchors, grow_and_prune(anchors, statistics, 5, np.random.default_rng(0))
+
+
+def test_a_child_takes_its_parents_id_and_a_free_cell():
+    anchors, growth = grown([1.0, 0.0], offset=(2.2, 0, 0))
+    assert growth.added >= 1 and growth.pruned == 0
+    assert set(anchors.ids[2:]) == {1}
+    assert len(np.unique(cell_keys(anchors.positions, 1.0), axis=0)) == len(anchors)
+
+
+def test_of_two_objects_that_want_one_cell_the_larger_gradient_wins():
+    positions = ((0.0, 0, 0), (4.0, 0, 0))
+    layout = Layout(1, 4)
+    for gradient, winner in (([1.0, 2.0], 2), ([2.0, 1.0], 1)):
+        rows = np.zeros((2, layout.columns), np.float32)
+        rows[0, :3], rows[1, :3] = (2.1, 0, 0), (-2.1, 0, 0)
+        anchors = Anchors(layout, 1.0, np.array(positions, np.float32), rows, np.array([1, 2], np.int32))
+        statistics = GrowthStatistics(
+            np.array(gradient, np.float32) * 10, np.full(2, 10, np.int32), np.full(2, 10, np.float32),
+            np.full(2, 10, np.int32),
+        )  # fmt: skip
+        grow_and_prune(anchors, statistics, 5, np.random.default_rng(0))
+        place = np.flatnonzero((cell_keys(anchors.positions, 1.0) == [2, 0, 0]).all(1))
+        assert len(place) == 1 and anchors.ids[place[0]] == winner
+
+
+def test_transparent_anchors_are_pruned():
+    anchors, growth = grown([0.0, 0.0], opacity=0.001)
+    assert growth.pruned == 2 and len(anchors) == 0
+
+
+# --- checkpoints -----------------------------------------------------------------------------------------------------
+
+
+def test_a_checkpoint_cut_short_falls_back_to_the_one_before_and_says_so(tmp_path):
+    for step in (1, 2):
+        save_checkpoint(tmp_path, {"x": np.full(1000, step, np.float32)}, {"step": step})
+    assert load_checkpoint(tmp_path)[1]["step"] == 2
+    data = (tmp_path / CURRENT).read_bytes()
+    for cut in (0, 5, 100, len(data) - 1):
+        (tmp_path / CURRENT).write_bytes(data[:cut])
+        tensors, state, warning = load_checkpoint(tmp_path)
+        assert state["step"] == 1 and tensors["x"][0] == 1
+        assert CURRENT in warning and PREVIOUS in warning
+    (tmp_path / PREVIOUS).unlink()
+    with pytest.raises(InputError, match="cut short"):
+        load_checkpoint(tmp_path)
+
+
+def test_a_full_disk_leaves_the_checkpoint_before(tmp_path, monkeypatch):
+    save_checkpoint(tmp_path, {"x": np.zeros(3)}, {"step": 1})
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(InputError, match="No space left"):
+        save_checkpoint(tmp_path, {"x": np.ones(3)}, {"step": 2})
+    assert [p.name for p in tmp_path.iterdir()] == [CURRENT]
+    assert load_checkpoint(tmp_path)[1]["step"] == 1
+
+
+# --- whole trainings -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def tiny(write_capture, tmp_path):
+    """A capture, its points' objects, and a scene with an offset and scale of one's choice."""
+
+    def make(**options):
+        scene = write_capture(views=9, size=(64, 48), **options)
+        capture = load_capture(scene.folder, tmp_path / "cache")
+        ids = vote(capture).ids if capture.has_masks else np.zeros(len(capture.points.xyz), np.int64)
+        return capture, ids
+
+    return make
+
+
+SMALL = Settings(offsets=4, sh_degree=1)
+
+
+def mean_loss(trainer, steps, share=0.3):
+    return float(np.mean([trainer.step(share) for _ in range(steps)]))
+
+
+def test_training_lowers_the_loss_and_draws_the_right_objects(tiny):
+    capture, ids = tiny()
+    trainer = Trainer.start(capture, ids, SMALL)
+    before = mean_loss(trainer, 8)
+    for i in range(150):
+        trainer.step(i / 150)
+    assert mean_loss(trainer, 8, 1.0) < 0.5 * before
+    # The ring's 40 degree gaps leave nothing to learn a held-out view from; a taught one must come out.
+    index = capture.train_indices[0]
+    picture = draw(trainer.model, trainer.scene.camera(index))
+    truth = capture.mask(index)
+    assert (picture.ids[truth > 0] == truth[truth > 0]).mean() > 0.95
+    assert picture.probability[truth > 0].mean() > 0.85
+
+
+def test_equal_seeds_give_bitwise_equal_models_and_resuming_changes_nothing(tiny, tmp_path):
+    capture, ids = tiny()
+    whole = Trainer.start(capture, ids, SMALL)
+    whole.run(Budget(steps=40), tmp_path / "a", Reporter())
+    again = Trainer.start(capture, ids, SMALL)
+    again.run(Budget(steps=40), tmp_path / "b", Reporter())
+    assert (whole.model.anchors.rows == again.model.anchors.rows).all()
+
+    parts = Trainer.start(capture, ids, SMALL)
+    calls = iter(range(1000))
+    with pytest.raises(Cancelled):
+        parts.run(Budget(steps=40), tmp_path / "c", Reporter(), should_stop=lambda: next(calls) >= 17)
+    resumed, warning = Trainer.resume(capture, tmp_path / "c", SMALL)
+    assert warning is None and resumed.progress.step == 17
+    resumed.run(Budget(steps=40), tmp_path / "c", Reporter())
+    assert (whole.model.anchors.rows == resumed.model.anchors.rows).all()
+    for a, b in zip(whole.model.heads.parameters(), resumed.model.heads.parameters()):
+        assert (a == b).all()
+
+    other = Trainer.start(capture, ids, Settings(offsets=4, sh_degree=1, seed=1))
+    other.run(Budget(steps=40), tmp_path / "d", Reporter())
+    assert not np.array_equal(whole.model.anchors.rows, other.model.anchors.rows)
+
+
+def test_a_checkpoint_of_other_settings_is_refused(tiny, tmp_path):
+    capture, ids = tiny()
+    Trainer.start(capture, ids, SMALL).run(Budget(steps=2), tmp_path / "a", Reporter())
+    with pytest.raises(InputError, match="sh_degree"):
+        Trainer.resume(capture, tmp_path / "a", Settings(offsets=4, sh_degree=2))
+
+
+def test_the_clock_ends_a_training_by_minutes(tiny, tmp_path):
+    capture, ids = tiny()
+    trainer = Trainer.start(capture, ids, SMALL)
+    started = time.monotonic()
+    trainer.run(Budget(seconds=2.0), tmp_path / "a", Reporter())
+    assert time.monotonic() - started < 4.0
+    assert trainer.progress.step > 1
+
+
+def test_a_capture_without_masks_trains_as_one_scene(tiny):
+    capture, ids = tiny(masks=False)
+    trainer = Trainer.start(capture, ids, SMALL)
+    before = mean_loss(trainer, 8)
+    for i in range(60):
+        trainer.step(i / 60)
+    assert mean_loss(trainer, 8, 1.0) < before
+    assert trainer.model.object_ids.tolist() == [0]
+
+
+def test_explicit_splats_are_the_model(tiny):
+    capture, ids = tiny()
+    trainer = Trainer.start(capture, ids, SMALL)
+    for i in range(20):
+        trainer.step(i / 20)
+    index = capture.test_indices[0]
+    shown = draw(trainer.model, trainer.scene.camera(index))
+    splats = trainer.model.splats()
+    view = capture.views[index]
+    camera = Camera(view.viewmat, view.K, view.width, view.height, near=0.01 / trainer.model.normalization.scale)
+    tensors = [torch.from_numpy(np.asarray(a, np.float32)) for a in
+               (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)]  # fmt: skip
+    drawn = rasterize(*tensors, torch.from_numpy(splats.object_ids.astype(np.int32)), camera)
+    image = drawn.color + (1 - drawn.alpha) * trainer.model.background.detach()[:, None, None]
+    np.testing.assert_allclose(image.clamp(0, 1).permute(1, 2, 0), shown.image, atol=1e-3)
+
+
+@pytest.mark.parametrize(("scale", "offset"), [(1e-4, 0.0), (1e4, 0.0), (1.0, 1e6)])
+def test_normalization_makes_scale_and_place_irrelevant(scale, offset):
+    rng = np.random.default_rng(0)
+    points, eyes = rng.normal(size=(500, 3)), rng.normal(size=(9, 3)) * 4
+    a = Normalization.of(eyes, points)
+    b = Normalization.of(eyes * scale + offset, points * scale + offset)
+    np.testing.assert_allclose(a.to_scene(points), b.to_scene(points * scale + offset), atol=1e-6)
+    viewmat = np.eye(4)
+    viewmat[:3, 3] = -eyes[0]
+    moved = np.eye(4)
+    moved[:3, 3] = -(eyes[0] * scale + offset)
+    np.testing.assert_allclose(a.viewmat(viewmat), b.viewmat(moved), atol=1e-6)
+
+
+def test_kill_9_and_resume_loses_nothing_but_time(write_capture, tmp_path):
+    """The command is killed between two checkpoints; resumed, it ends at the very model of an undisturbed run."""
+    scene = write_capture(views=9, size=(64, 48))
+    common = ["--steps", "260", "--offsets", "4", "--threads", "1"]
+
+    def command(out, *more):
+        return [sys.executable, "-m", "backend", "train", str(scene.folder), "--out", str(out), *common, *more]
+
+    subprocess.run(command(tmp_path / "whole"), cwd=ROOT, check=True, capture_output=True, timeout=240)
+    killed = subprocess.Popen(
+        command(tmp_path / "killed", "--checkpoint-seconds", "0.2"), cwd=ROOT, stdout=subprocess.DEVNULL
+    )
+    current = tmp_path / "killed" / "checkpoint" / CURRENT
+    deadline = time.monotonic() + 120
+    while not current.exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    time.sleep(0.3)
+    killed.send_signal(signal.SIGKILL)
+    killed.wait()
+    assert load_checkpoint(current.parent)[1]["progress"]["step"] < 260
+    subprocess.run(command(tmp_path / "killed"), cwd=ROOT, check=True, capture_output=True, timeout=240)
+    whole, _, _ = load_checkpoint(tmp_path / "whole" / "checkpoint")
+    resumed, state, _ = load_checkpoint(current.parent)
+    assert state["progress"]["step"] == 260
+    assert np.array_equal(whole["anchors.rows"], resumed["anchors.rows"])
