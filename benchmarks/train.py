@@ -1,0 +1,134 @@
+"""Where the time of a training step goes, on the demo capture with 40,000 splats at its own resolution.
+
+    python benchmarks/train.py [--json] [--capture build/demo/capture] [--splats 40000] [--steps 60]
+
+The model is trained for a moment first, so that splats have the sizes they have in earnest.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from backend.capture import load_capture  # noqa: E402
+from backend.labels import vote  # noqa: E402
+from backend.training import loop  # noqa: E402
+from backend.training.settings import Settings  # noqa: E402
+
+PARTS = ("raster", "heads", "loss", "optimizer")
+
+
+class Stopwatch:
+    """Adds up the seconds spent inside wrapped functions, by part."""
+
+    def __init__(self) -> None:
+        self.seconds = dict.fromkeys(PARTS, 0.0)
+
+    def wrap(self, owner: object, name: str, part: str) -> None:
+        """Replace owner.name by a version that is timed as `part`."""
+        inner = getattr(owner, name)
+
+        def timed(*arguments, **options):
+            started = time.perf_counter()
+            try:
+                return inner(*arguments, **options)
+            finally:
+                self.seconds[part] += time.perf_counter() - started
+
+        setattr(owner, name, timed)
+
+
+def trainer_of(folder: Path, splats: int) -> loop.Trainer:
+    """A trainer on the capture, warmed up, with about `splats` splats."""
+    capture = load_capture(folder, Path(tempfile.mkdtemp(prefix="objectgs-benchmark-")))
+    ids = vote(capture).ids if capture.has_masks else np.zeros(len(capture.points.xyz), np.int64)
+    trainer = loop.Trainer.start(capture, ids, Settings())
+    for step in range(300):
+        trainer.step(0.25 + 0.25 * step / 300)
+    anchors = trainer.model.anchors
+    keep = min(1.0, splats / max(trainer.splats, 1))
+    chosen = np.sort(np.random.default_rng(0).permutation(len(anchors))[: round(keep * len(anchors))])
+    anchors.positions, anchors.rows, anchors.ids = anchors.positions[chosen], anchors.rows[chosen], anchors.ids[chosen]
+    trainer._first, trainer._second = trainer._first[chosen], trainer._second[chosen]
+    for step in range(150):
+        trainer.step(0.6 + 0.1 * step / 150)
+    return trainer
+
+
+def measure(trainer: loop.Trainer, steps: int) -> dict:
+    """Step time (median, ms) and the share of each part."""
+    from backend.model.generate import _Assemble
+    from backend.raster import _Rasterize
+    from backend.training.losses import _ImageLoss
+
+    watch = Stopwatch()
+    watch.wrap(loop, "rasterize", "raster")
+    watch.wrap(_Rasterize, "backward", "raster")
+    watch.wrap(loop, "image_loss", "loss")
+    watch.wrap(_ImageLoss, "backward", "loss")
+    watch.wrap(loop, "generate", "heads")
+    watch.wrap(_Assemble, "backward", "heads")
+    watch.wrap(loop.Trainer, "_update", "optimizer")
+    # What the heads' own layers spend in the backward pass is what autograd spends beyond the functions above.
+    whole = {"seconds": 0.0}
+    inner = torch.Tensor.backward
+
+    def timed_backward(self, *arguments, **options):
+        before = sum(watch.seconds.values())
+        started = time.perf_counter()
+        inner(self, *arguments, **options)
+        whole["seconds"] += time.perf_counter() - started - (sum(watch.seconds.values()) - before)
+
+    torch.Tensor.backward = timed_backward
+    times = []
+    for _ in range(steps):
+        started = time.perf_counter()
+        trainer.step(0.7)
+        times.append(time.perf_counter() - started)
+    torch.Tensor.backward = inner
+    total = sum(times)
+    seconds = {**watch.seconds, "heads": watch.seconds["heads"] + whole["seconds"]}
+    shares = {part: seconds[part] / total for part in PARTS}
+    shares["other"] = 1 - sum(shares.values())
+    return {
+        "step_ms": 1e3 * float(np.median(times)),
+        "step_ms_quartiles": [1e3 * float(np.quantile(times, q)) for q in (0.25, 0.75)],
+        "steps_per_second": 1 / float(np.median(times)),
+        "splats": trainer.splats,
+        "anchors": len(trainer.model.anchors),
+        "threads": torch.get_num_threads(),
+        "shares": shares,
+    }
+
+
+def main() -> None:
+    """Print the table, or one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--capture", type=Path, default=ROOT / "build/demo/capture")
+    parser.add_argument("--splats", type=int, default=40_000)
+    parser.add_argument("--steps", type=int, default=60)
+    options = parser.parse_args()
+    found = measure(trainer_of(options.capture, options.splats), options.steps)
+    if options.json:
+        print(json.dumps(found))
+        return
+    print(f"{found['splats']:,} splats of {found['anchors']:,} anchors, {found['threads']} threads")
+    low, high = found["step_ms_quartiles"]
+    print(f"step {found['step_ms']:.1f} ms (quartiles {low:.1f} to {high:.1f}): {found['steps_per_second']:.1f} steps/s")
+    for part, share in found["shares"].items():
+        print(f"{part:10s} {share:6.1%}  {share * found['step_ms']:6.1f} ms")
+
+
+if __name__ == "__main__":
+    main()
