@@ -101,6 +101,10 @@ class ConsoleReporter(Reporter):
         self.close()
         self._print(f"error: {message}", self.errors)
 
+    def stopped(self, message: str) -> None:
+        """Say that it was stopped, and what becomes of it."""
+        self.status(message)
+
     def done(self, **fields: Any) -> None:
         """Close with the figures, and with every other field as a line of its own."""
         self.close()

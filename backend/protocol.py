@@ -6,11 +6,16 @@ Standard library and NumPy only, so that Blender's own Python can import it.
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, BinaryIO, TextIO
+
+import numpy as np
 
 EXIT_DONE = 0
 EXIT_FAILED = 1
@@ -61,18 +66,47 @@ class Reconstruction:
         return self
 
 
-def write_atomic(path: Path, data: bytes) -> None:
-    """Write `data` beside `path`, sync it, then rename, so that `path` is either old or new, never half."""
+@contextmanager
+def atomic_file(path: Path) -> Iterator[BinaryIO]:
+    """A file beside `path` to write to; synced and renamed at the end, so that `path` is old or new, never half.
+
+    An OSError names `path`, also where the system names nothing (a full disk).
+    """
     part = path.with_name(path.name + ".part")
     try:
         with open(part, "wb") as file:
-            file.write(data)
+            yield file
             file.flush()
             os.fsync(file.fileno())
         os.replace(part, path)
-    except BaseException:
+    except BaseException as error:
         part.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            error.filename = str(path)
         raise
+
+
+def write_atomic(path: Path, data: bytes) -> None:
+    """Write `data` to `path` as `atomic_file` does."""
+    with atomic_file(path) as file:
+        file.write(data)
+
+
+def plain(value: Any, where: str = "value") -> Any:
+    """NumPy numbers, paths and tuples as what JSON knows; NaN and infinity as None. Raises ValueError for the rest."""
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, np.generic | np.ndarray):
+        return plain(value.tolist(), where)
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(key): plain(entry, f"{where}.{key}") for key, entry in value.items()}
+    if isinstance(value, Sequence):
+        return [plain(entry, f"{where}[{i}]") for i, entry in enumerate(value)]
+    raise ValueError(f"{where} is a {type(value).__name__}, which JSON cannot hold")
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -94,7 +128,8 @@ class Reporter:
     """Takes a command's events; this base class drops them (for tests and library use).
 
     status(message): what is being done now. progress(done, total, ...): any extra fields as keywords,
-    `seconds_left` among them. preview(path): a picture was written. warning(message). done(**fields).
+    `seconds_left` among them. preview(path): a picture was written. warning(message). A command ends with one of
+    done(**fields), stopped(message) where the user asked for it, and error(message).
     """
 
     def status(self, message: str) -> None: ...
@@ -107,7 +142,45 @@ class Reporter:
 
     def error(self, message: str) -> None: ...
 
+    def stopped(self, message: str) -> None: ...
+
     def done(self, **fields: Any) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class StoppingReporter(Reporter):
+    """Hands events on, and raises Cancelled at the first progress after `should_stop` says so.
+
+    For work that writes whole files alone and so may end between any two of its steps.
+    """
+
+    def __init__(self, reporter: Reporter, should_stop: Callable[[], bool]) -> None:
+        self._reporter = reporter
+        self._should_stop = should_stop
+
+    def status(self, message: str) -> None:
+        self._reporter.status(message)
+
+    def progress(self, done: float, total: float, **fields: Any) -> None:
+        self._reporter.progress(done, total, **fields)
+        if self._should_stop():
+            raise Cancelled("Stopped; what is finished is kept, run the same command again for the rest.")
+
+    def preview(self, path: Path, **fields: Any) -> None:
+        self._reporter.preview(path, **fields)
+
+    def warning(self, message: str) -> None:
+        self._reporter.warning(message)
+
+    def error(self, message: str) -> None:
+        self._reporter.error(message)
+
+    def stopped(self, message: str) -> None:
+        self._reporter.stopped(message)
+
+    def done(self, **fields: Any) -> None:
+        self._reporter.done(**fields)
 
 
 class JsonReporter(Reporter):
@@ -118,7 +191,7 @@ class JsonReporter(Reporter):
 
     def _emit(self, type: str, **fields: Any) -> None:
         event = {"type": type, "time": round(time.time(), 3), **fields}
-        self.stream.write(json.dumps(event, ensure_ascii=False) + "\n")
+        self.stream.write(json.dumps(plain(event), ensure_ascii=False, allow_nan=False) + "\n")
         self.stream.flush()
 
     def status(self, message: str) -> None:
@@ -135,6 +208,9 @@ class JsonReporter(Reporter):
 
     def error(self, message: str) -> None:
         self._emit("error", message=message)
+
+    def stopped(self, message: str) -> None:
+        self._emit("done", stopped=True, message=message)
 
     def done(self, **fields: Any) -> None:
         self._emit("done", **fields)

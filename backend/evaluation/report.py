@@ -10,11 +10,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from PIL import Image
 
 from ..palette import object_colours
-from ..protocol import Reconstruction, write_atomic, write_json
+from ..protocol import Reconstruction, plain, write_atomic, write_json
 from .pictures import save_picture
 
 QUALITY = ("psnr", "ssim", "lpips", "miou", "mbiou", "dice", "accuracy")
@@ -49,51 +48,34 @@ def complete(report: Mapping[str, Any]) -> dict[str, Any]:
 
     Raises ValueError that names the entry where something has the wrong type: a program made it, not a user.
     """
-    plain = _plain(report, "report")
+    as_json = plain(report, "report")
     out: dict[str, Any] = {}
     for name in ("capture", "settings", "machine"):
-        out[name] = _mapping(plain, name)
+        out[name] = _mapping(as_json, name)
     for name in ("left_out", "stages", "curve"):
-        out[name] = _entries(plain, name)
-    model = _mapping(plain, "model")
+        out[name] = _entries(as_json, name)
+    model = _mapping(as_json, "model")
     out["model"] = _numbers({**dict.fromkeys(("anchors", "gaussians", "bytes")), **model}, "model")
-    quality = _mapping(plain, "quality")
+    quality = _mapping(as_json, "quality")
     out["quality"] = _numbers({**dict.fromkeys(QUALITY), **quality}, "quality", QUALITY)
-    out["objects"] = _entries(plain, "objects")
+    out["objects"] = _entries(as_json, "objects")
     for entry in out["objects"]:
         if entry["name"] is None:
             entry["name"] = str(entry["id"])
         entry["mesh"] = {**dict.fromkeys(MESH), **(entry["mesh"] or {})}
     out["curve"].sort(key=lambda entry: entry["seconds"])
-    return {**out, **{name: value for name, value in plain.items() if name not in out}}
+    return {**out, **{name: value for name, value in as_json.items() if name not in out}}
 
 
-def _plain(value: Any, where: str) -> Any:
-    """NumPy numbers, paths and tuples as what JSON knows; NaN and infinity as None."""
-    if value is None or isinstance(value, bool | int | str):
-        return value
-    if isinstance(value, np.generic | np.ndarray):
-        return _plain(value.tolist(), where)
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, Mapping):
-        return {str(key): _plain(entry, f"{where}.{key}") for key, entry in value.items()}
-    if isinstance(value, Sequence):
-        return [_plain(entry, f"{where}[{i}]") for i, entry in enumerate(value)]
-    raise ValueError(f"{where} is a {type(value).__name__}, which JSON cannot hold")
-
-
-def _mapping(plain: Mapping[str, Any], name: str) -> dict[str, Any]:
-    value = plain.get(name)
+def _mapping(as_json: Mapping[str, Any], name: str) -> dict[str, Any]:
+    value = as_json.get(name)
     if value is not None and not isinstance(value, dict):
         raise ValueError(f"report.{name} must be an object, not a {type(value).__name__}")
     return value or {}
 
 
-def _entries(plain: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
-    value = plain.get(name) or []
+def _entries(as_json: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
+    value = as_json.get(name) or []
     if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
         raise ValueError(f"report.{name} must be a list of objects")
     entries = [{**dict.fromkeys(_ENTRIES[name]), **entry} for entry in value]
@@ -133,8 +115,6 @@ def write_report(
     """
     report = complete(report)
     reconstruction.pictures.mkdir(parents=True, exist_ok=True)
-    write_json(reconstruction.report_json, report)
-
     shown, rule = _objects_to_show(report["objects"])
     palette = {**object_colours(entry["id"] for entry in shown), **(colours or {})}
     files: list[tuple[str, Path]] = []
@@ -167,6 +147,7 @@ def write_report(
         if rows:
             parts += [f"## {heading}", _table(("", "Value"), rows)]
     parts.append("Every figure is in `report.json`; — means not measured, or not set.")
+    write_json(reconstruction.report_json, report)
     write_atomic(reconstruction.report_md, ("\n\n".join(parts) + "\n").encode())
     return report
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.splats import Splats
-from ..protocol import InputError
+from ..protocol import InputError, atomic_file
 
 OPACITY_MARGIN = 1e-7
 """Opacities are kept this far from 0 and 1, so that their logits are finite in float32."""
@@ -81,18 +81,10 @@ def write_splats(path: Path, splats: Splats) -> list[str]:
     header += [f"property {spelled[kinds.get(name, 'f4')]} {name}" for name in names]
     header += ["end_header", ""]
 
-    part = path.with_name(path.name + ".part")
-    try:
-        with open(part, "wb") as file:
-            file.write("\n".join(header).encode("ascii"))
-            for start in range(0, len(splats), ROWS_AT_ONCE):
-                file.write(_rows(splats, slice(start, start + ROWS_AT_ONCE), dtype).tobytes())
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+    with atomic_file(path) as file:
+        file.write("\n".join(header).encode("ascii"))
+        for start in range(0, len(splats), ROWS_AT_ONCE):
+            file.write(_rows(splats, slice(start, start + ROWS_AT_ONCE), dtype).tobytes())
     return warnings
 
 
