@@ -9,8 +9,9 @@ import torch
 
 from . import cpu
 from .camera import Camera
+from .cpu import compile_kernels
 
-__all__ = ["Camera", "Rendered", "object_map", "rasterize"]
+__all__ = ["Camera", "Rendered", "compile_kernels", "object_map", "rasterize"]
 
 
 class Rendered(NamedTuple):
@@ -40,7 +41,8 @@ class _Rasterize(torch.autograd.Function):
             _array(means), _array(quats), _array(scales), _array(opacities), _array(sh),
             np.ascontiguousarray(ids.numpy(), np.int32),
         )  # fmt: skip
-        frame = cpu.forward(gaussians, camera, None if labels is None else labels.numpy(), want_depth)
+        wanted = None if labels is None else np.ascontiguousarray(labels.numpy(), np.int32)
+        frame = cpu.forward(gaussians, camera, wanted, want_depth)
         ctx.frame = frame
         holder.append(frame)
         outputs = [torch.from_numpy(frame.color), torch.from_numpy(1.0 - frame.transmittance)]

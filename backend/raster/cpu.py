@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -57,10 +59,11 @@ class Frame:
 def forward(gaussians: Gaussians, camera: Camera, labels: np.ndarray | None = None, want_depth: bool = False) -> Frame:
     """Draw `gaussians`. labels (H, W) int32: also sum, per pixel, the weights of splats whose id is the label."""
     g = gaussians
-    height, width = camera.height, camera.width
+    height, width = int(camera.height), int(camera.width)
     splats = np.empty((g.means.shape[0], SPLAT_COLUMNS), np.float32)
     viewmat, intrinsics = camera.arrays()
-    project(g.means, g.quats, g.scales, g.opacities, g.sh, viewmat, intrinsics, width, height, camera.near, splats)
+    near = float(camera.near)
+    project(g.means, g.quats, g.scales, g.opacities, g.sh, viewmat, intrinsics, width, height, near, splats)
     tiles, members, places, slots = bin_splats(splats, depth_order(splats, g.ids), width, height)
     color = np.empty((3, height, width), np.float32)
     transmittance = np.empty((height, width), np.float32)
@@ -105,7 +108,7 @@ def backward(
     frame.screen_gradient = np.empty((g.means.shape[0], 2), np.float32)
     viewmat, intrinsics = camera.arrays()
     project_backward(
-        g.means, g.quats, g.scales, g.opacities, g.sh, viewmat, intrinsics, camera.width, camera.height,
+        g.means, g.quats, g.scales, g.opacities, g.sh, viewmat, intrinsics, int(camera.width), int(camera.height),
         frame.splats, frame.slots, rows,
         out.means, out.quats, out.scales, out.opacities, out.sh, frame.screen_gradient,
     )  # fmt: skip
@@ -119,3 +122,30 @@ def object_map(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     best_weight = np.empty(shape, np.float32)
     most_probable(frame.splats, frame.gaussians.ids, frame.tiles, frame.members, best_id, best_weight)
     return best_id, best_weight
+
+
+def compile_kernels(progress: Callable[[int, int], object] | None = None) -> float:
+    """Make every kernel ready, compiled or read from numba's cache on disk; returns the seconds it took.
+
+    progress(done, total) is called before the first and after every kernel. What follows in this process compiles
+    nothing more, whatever is asked for; a later process reads the cache (NUMBA_CACHE_DIR, or `__pycache__` beside
+    the kernels, or the user's own cache folder where that is not writable).
+    """
+    started = time.perf_counter()
+    total = 3
+    report = progress or (lambda done, total: None)
+    report(0, total)
+    ones = np.ones((1, 4), np.float32)
+    g = Gaussians(
+        ones[:, :3].copy(), ones, ones[:, :3].copy(), ones[0, :1].copy(), np.zeros((1, 1, 3), np.float32),
+        np.zeros(1, np.int32),
+    )  # fmt: skip
+    camera = Camera(np.eye(4), np.eye(3), 2, 2)
+    frame = forward(g, camera, np.zeros((2, 2), np.int32), want_depth=True)
+    report(1, total)
+    plane = np.ones((2, 2), np.float32)
+    backward(frame, np.ones((3, 2, 2), np.float32), plane, plane, plane)
+    report(2, total)
+    object_map(frame)
+    report(3, total)
+    return time.perf_counter() - started

@@ -1,6 +1,7 @@
 """Which tile meets which splat, front to back, on the CPU.
 
 One radix sort of the depths, then a counting pass over the tiles keeps that order, so no key is sorted twice.
+The lists do not depend on how many threads made them.
 A tile row takes a splat only between the exact left and right ends of its ellipse inside that row.
 """
 
@@ -9,18 +10,37 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 
 from .cpu_project import DEPTH, HALF_H, HALF_W, LOP, SLOPE, A, C, U, V
+from .kernel import kernel
 from .settings import ALPHA_MIN
 
 TILE_W = 64
 TILE_H = 32
 
-_LOG2_CUT = math.log2(ALPHA_MIN)
+_LOG2_CUT = np.float32(math.log2(ALPHA_MIN))
+_PER_TILE_W = np.float32(1.0 / TILE_W)
+_PER_TILE_H = np.float32(1.0 / TILE_H)
+_HALF = np.float32(0.5)
+_ZERO = np.float32(0.0)
+_CHUNK, _CHUNKS = 512, 64
+"""Splats that a thread takes at once: at least so many, in at most so many portions."""
 
 
-@njit(cache=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
+def spread(index, count):
+    """A permutation of range(count) that visits tiles far apart, as neighbours take equally long.
+
+    numba gives every thread one run of neighbouring indices; a busy corner of the picture is shared this way.
+    """
+    step = int(count * 0.6180339887) | 1
+    while math.gcd(step, count) > 1:
+        step += 2
+    return index * step % count
+
+
+@kernel()
 def depth_order(splats, ids):
     """Indices (int32) of the visible splats, nearest first; equal depths go by look and id, not by index."""
     n = splats.shape[0]
@@ -63,7 +83,7 @@ def depth_order(splats, ids):
     return order
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _order_ties(splats, ids, order, first, last):
     """Sort order[first:last] by position, shape, opacity, colour and id; a heap sort, as thousands may tie."""
     n = last - first
@@ -74,7 +94,7 @@ def _order_ties(splats, ids, order, first, last):
         _sift(splats, ids, order, first, 0, end)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _sift(splats, ids, order, first, root, end):
     while 2 * root + 1 < end:
         child = 2 * root + 1
@@ -86,7 +106,7 @@ def _sift(splats, ids, order, first, root, end):
         root = child
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _before(splats, ids, i, j):
     for column in range(DEPTH):
         if splats[i, column] != splats[j, column]:
@@ -96,27 +116,43 @@ def _before(splats, ids, i, j):
     return i < j
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _row_ends(splats, n, row, columns, height):
     """First and last + 1 tile column that splat n's ellipse reaches inside tile row `row`."""
     v = splats[n, V]
-    u = splats[n, U] + splats[n, SLOPE] * (v - min(max(v, 0.0), height))
+    anchor = min(max(v, _ZERO), np.float32(height))
+    slope = splats[n, SLOPE]
+    u = splats[n, U] + slope * (v - anchor)
     half_w, half_h = splats[n, HALF_W], splats[n, HALF_H]
-    top = max(row * TILE_H - v, -half_h)
-    bottom = min((row + 1) * TILE_H - v, half_h)
-    # The rightmost point of the ellipse lies at dy = peak, the leftmost at -peak; off them the ends only shrink.
+    box_first = max(math.floor((u - half_w - _HALF) * _PER_TILE_W), 0)
+    box_last = min(math.floor((u + half_w + _HALF) * _PER_TILE_W) + 1, columns)
+    if box_last - box_first < 2:
+        return int(box_first), int(box_last)
+    top = max(np.float32(row * TILE_H), v - half_h)
+    bottom = min(np.float32((row + 1) * TILE_H), v + half_h)
+    # The rightmost point of the ellipse lies at y = v + peak, the leftmost at v - peak; off them the ends only shrink.
     reach = splats[n, LOP] - _LOG2_CUT
-    peak = splats[n, SLOPE] * reach / (splats[n, C] * half_w)
-    dy = min(max(peak, top), bottom)
-    right = u + splats[n, SLOPE] * dy + math.sqrt(max(reach - splats[n, C] * dy * dy, 0.0) / splats[n, A])
-    dy = min(max(-peak, top), bottom)
-    left = u + splats[n, SLOPE] * dy - math.sqrt(max(reach - splats[n, C] * dy * dy, 0.0) / splats[n, A])
-    first = max(math.floor((left - 0.5) / TILE_W), 0)
-    last = min(math.floor((right + 0.5) / TILE_W) + 1, columns)
-    return first, last
+    peak = slope * reach / (splats[n, C] * half_w)
+    y = min(max(v + peak, top), bottom)
+    half = math.sqrt(max(reach - splats[n, C] * (y - v) * (y - v), _ZERO) / splats[n, A])
+    right = splats[n, U] + slope * (y - anchor) + half
+    y = min(max(v - peak, top), bottom)
+    half = math.sqrt(max(reach - splats[n, C] * (y - v) * (y - v), _ZERO) / splats[n, A])
+    left = splats[n, U] + slope * (y - anchor) - half
+    first = max(math.floor((left - _HALF) * _PER_TILE_W), box_first)
+    last = min(math.floor((right + _HALF) * _PER_TILE_W) + 1, box_last)
+    return int(first), int(last)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
+def _tile_rows(splats, n, lines):
+    """First and last + 1 tile row that splat n's box reaches."""
+    first = max(math.floor((splats[n, V] - splats[n, HALF_H]) * _PER_TILE_H), 0)
+    last = min(math.floor((splats[n, V] + splats[n, HALF_H]) * _PER_TILE_H) + 1, lines)
+    return int(first), int(last)
+
+
+@kernel(parallel=True)
 def bin_splats(splats, order, width, height):
     """Fill the tiles' lists.
 
@@ -125,38 +161,47 @@ def bin_splats(splats, order, width, height):
     """
     columns = (width + TILE_W - 1) // TILE_W
     lines = (height + TILE_H - 1) // TILE_H
-    n = splats.shape[0]
-    tiles = np.zeros(columns * lines + 1, np.int64)
-    slots = np.zeros(n + 1, np.int64)
-    for i in range(order.size):
-        s = order[i]
-        top = max(int(math.floor((splats[s, V] - splats[s, HALF_H]) / TILE_H)), 0)
-        bottom = min(int(math.floor((splats[s, V] + splats[s, HALF_H]) / TILE_H)) + 1, lines)
-        met = 0
-        for row in range(top, bottom):
-            first, last = _row_ends(splats, s, row, columns, height)
-            for column in range(first, last):
-                tiles[row * columns + column + 1] += 1
-                met += 1
-        slots[s + 1] = met
-    for i in range(columns * lines):
-        tiles[i + 1] += tiles[i]
-    for i in range(n):
+    count = columns * lines
+    # Chunks of the depth order are counted side by side, then each fills its own part of every tile's list.
+    chunk = max(_CHUNK, (order.size + _CHUNKS - 1) // _CHUNKS)
+    chunks = (order.size + chunk - 1) // chunk
+    fills = np.zeros((chunks, count), np.int64)
+    slots = np.zeros(splats.shape[0] + 1, np.int64)
+    for k in prange(chunks):
+        for i in range(k * chunk, min(k * chunk + chunk, order.size)):
+            s = order[i]
+            top, bottom = _tile_rows(splats, s, lines)
+            met = 0
+            for row in range(top, bottom):
+                first, last = _row_ends(splats, s, row, columns, height)
+                for column in range(first, last):
+                    fills[k, row * columns + column] += 1
+                met += max(last - first, 0)
+            slots[s + 1] = met
+    tiles = np.empty(count + 1, np.int64)
+    total = 0
+    for tile in range(count):
+        tiles[tile] = total
+        for k in range(chunks):
+            here = fills[k, tile]
+            fills[k, tile] = total
+            total += here
+    tiles[count] = total
+    for i in range(splats.shape[0]):
         slots[i + 1] += slots[i]
-    members = np.empty(tiles[columns * lines], np.int32)
-    places = np.empty(tiles[columns * lines], np.int64)
-    fill = tiles[:-1].copy()
-    for i in range(order.size):
-        s = order[i]
-        top = max(int(math.floor((splats[s, V] - splats[s, HALF_H]) / TILE_H)), 0)
-        bottom = min(int(math.floor((splats[s, V] + splats[s, HALF_H]) / TILE_H)) + 1, lines)
-        slot = slots[s]
-        for row in range(top, bottom):
-            first, last = _row_ends(splats, s, row, columns, height)
-            for column in range(first, last):
-                tile = row * columns + column
-                members[fill[tile]] = s
-                places[fill[tile]] = slot
-                fill[tile] += 1
-                slot += 1
+    members = np.empty(total, np.int32)
+    places = np.empty(total, np.int64)
+    for k in prange(chunks):
+        for i in range(k * chunk, min(k * chunk + chunk, order.size)):
+            s = order[i]
+            top, bottom = _tile_rows(splats, s, lines)
+            slot = slots[s]
+            for row in range(top, bottom):
+                first, last = _row_ends(splats, s, row, columns, height)
+                for column in range(first, last):
+                    place = fills[k, row * columns + column]
+                    fills[k, row * columns + column] = place + 1
+                    members[place] = s
+                    places[place] = slot
+                    slot += 1
     return tiles, members, places, slots

@@ -1,7 +1,7 @@
 """The most probable object of every pixel, exactly, at a cost that does not grow with the number of objects.
 
 P_i(x) sums the blending weights of the splats with ID i. The weights are computed once, in depth order, and kept
-for the tile; a second pass adds them up object by object, over that object's box alone, and keeps the largest.
+for the tile; a second pass adds them up object by object, over the pixels that object reaches, and keeps the largest.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ import numpy as np
 from numba import njit, prange
 
 from . import simd
-from .cpu_bin import TILE_H, TILE_W
+from .cpu_bin import TILE_H, TILE_W, spread
 from .cpu_project import HALF_H, HALF_W, A
 from .cpu_tiles import ROW_SLOTS, STRIDE, live_rows, splat_rows
+from .kernel import kernel
 from .settings import ALPHA_MAX, ALPHA_MIN, STOP
 
 _LOG2_CUT = np.float32(math.log2(ALPHA_MIN))
@@ -24,7 +25,16 @@ _ONE = np.float32(1.0)
 _CHECK_EVERY = 32
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
+def _contest(winner_weight, winner, at, weight, owner):
+    """Let `owner` win the pixels from `at` on where its weight is above the best so far."""
+    best = simd.load(winner_weight, at)
+    wins = simd.above(weight, best)
+    simd.store(winner_weight, at, simd.where(wins, weight, best))
+    simd.store(winner, at, simd.where_i(wins, owner, simd.load_i(winner, at)))
+
+
+@kernel(parallel=True)
 def most_probable(splats, ids, tiles, members, best_id, best_weight):
     """Write best_id (H, W) int32 and best_weight (H, W) float32 = max_i P_i; ID -1 and weight 0 where nothing is drawn.
 
@@ -33,7 +43,8 @@ def most_probable(splats, ids, tiles, members, best_id, best_weight):
     height, width = best_id.shape
     columns = (width + TILE_W - 1) // TILE_W
     plane = TILE_H * STRIDE
-    for tile in prange(tiles.size - 1):
+    for index in prange(tiles.size - 1):
+        tile = spread(index, tiles.size - 1)
         tile_x = (tile % columns) * TILE_W
         tile_y = (tile // columns) * TILE_H
         rows = min(TILE_H, height - tile_y)
@@ -90,12 +101,18 @@ def most_probable(splats, ids, tiles, members, best_id, best_weight):
         for k in range(count):
             owners[k] = ids[members[first + k]]
         grouped = np.argsort(owners, kind="mergesort")
+        left = np.full(TILE_H, TILE_W, np.int32)
+        right = np.zeros(TILE_H, np.int32)
         group = 0
         while group < count:
             owner = owners[grouped[group]]
-            left, right, low, high = TILE_W, 0, TILE_H, 0
-            while group < count and owners[grouped[group]] == owner:
-                k = grouped[group]
+            mine = simd.splat_i(owner)
+            after = group + 1
+            while after < count and owners[grouped[after]] == owner:
+                after += 1
+            alone = after - group == 1  # nothing to add up
+            low, high = TILE_H, 0
+            for k in grouped[group:after]:
                 n = members[first + k]
                 y0, y1 = splat_rows(splats, n, tile_x, tile_y, rows, height, starts, stops, tops, centres)
                 low = min(low, y0)
@@ -103,24 +120,25 @@ def most_probable(splats, ids, tiles, members, best_id, best_weight):
                 at_kept = begin[k]
                 for row in range(y0, y1):
                     start, stop = starts[row], stops[row]
-                    if start < stop:
-                        left = min(left, start)
                     for x in range(start, stop, simd.LANES):
                         at = row * STRIDE + x
-                        simd.store(current, at, simd.load(current, at) + simd.load(kept, at_kept))
+                        weight = simd.load(kept, at_kept)
+                        if alone:
+                            _contest(winner_weight, winner, at, weight, mine)
+                        else:
+                            simd.store(current, at, simd.load(current, at) + weight)
                         at_kept += simd.LANES
-                        right = max(right, min(x + simd.LANES, TILE_W))
-                group += 1
-            mine = simd.splat_i(owner)
+                    left[row] = min(left[row], start)
+                    right[row] = max(right[row], stop)
+            group = after
             for row in range(low, high):
-                for x in range(left, right, simd.LANES):
-                    at = row * STRIDE + x
-                    here = simd.load(current, at)
-                    best = simd.load(winner_weight, at)
-                    wins = simd.above(here, best)
-                    simd.store(winner_weight, at, simd.where(wins, here, best))
-                    simd.store(winner, at, simd.where_i(wins, mine, simd.load_i(winner, at)))
-                    simd.store(current, at, simd.splat(np.float32(0.0)))
+                if not alone:
+                    for x in range(left[row], right[row], simd.LANES):
+                        at = row * STRIDE + x
+                        _contest(winner_weight, winner, at, simd.load(current, at), mine)
+                        simd.store(current, at, simd.splat(np.float32(0.0)))
+                left[row] = TILE_W
+                right[row] = 0
         for row in range(rows):
             for x in range(cols):
                 best_id[tile_y + row, tile_x + x] = winner[row * STRIDE + x]

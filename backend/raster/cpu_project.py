@@ -17,8 +17,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from .kernel import kernel
 from .settings import ALPHA_MIN, BLUR, MAX_EXTENT, MAX_SH_COEFFICIENTS, MIN_QUAT_NORM2, TAN_MARGIN
 
 # Columns of a screen splat.
@@ -48,7 +49,7 @@ _C3 = (
 )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def sh_basis(x, y, z, count, out):
     """Real spherical harmonics of degree 0-3 at the unit direction (x, y, z); `count` = 1, 4, 9 or 16."""
     out[0] = _C0
@@ -73,7 +74,7 @@ def sh_basis(x, y, z, count, out):
             out[15] = _C3[6] * x * (xx - 3.0 * yy)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def sh_gradient(x, y, z, count, g):
     """Gradient of sum_k g[k] Y_k(x, y, z) with respect to the direction, before its normalisation."""
     gx = gy = gz = 0.0
@@ -115,7 +116,7 @@ def sh_gradient(x, y, z, count, g):
     return gx, gy, gz
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _rotation(qw, qx, qy, qz, R):
     R[0, 0] = 1.0 - 2.0 * (qy * qy + qz * qz)
     R[0, 1] = 2.0 * (qx * qy - qw * qz)
@@ -128,7 +129,7 @@ def _rotation(qw, qx, qy, qz, R):
     R[2, 2] = 1.0 - 2.0 * (qx * qx + qy * qy)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _jacobian(px, py, pz, fx, fy, tan_limits, T, W):
     """T = J W, with the ray's tangents clamped so that far off-screen splats keep a bounded footprint."""
     tx = min(max(px / pz, tan_limits[0]), tan_limits[1])
@@ -139,7 +140,7 @@ def _jacobian(px, py, pz, fx, fy, tan_limits, T, W):
     return tx, ty
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _footprint(T, R, scales, n, V0, V1):
     """V = T R diag(scales[n]) as its two rows; returns a, b, c of V V^T + blur and a - b^2 / c."""
     a = 0.0
@@ -160,7 +161,7 @@ def _footprint(T, R, scales, n, V0, V1):
     return a + BLUR, b, c + BLUR, conditional
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def tangent_limits(fx, fy, cx, cy, width, height):
     """Clamp limits of x/z and y/z: the field of view with a margin on every side."""
     limits = np.empty(4)
@@ -171,7 +172,7 @@ def tangent_limits(fx, fy, cx, cy, width, height):
     return limits
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def project(means, quats, scales, opacities, sh, viewmat, intrinsics, width, height, near, splats):
     """Fill `splats` (N, 12) float32; HALF_H < 0 marks a splat that cannot be seen.
 
@@ -249,7 +250,7 @@ def project(means, quats, scales, opacities, sh, viewmat, intrinsics, width, hei
             splats[n, HALF_H] = half_h
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def project_backward(
     means, quats, scales, opacities, sh, viewmat, intrinsics, width, height, splats, slots, rows,
     g_means, g_quats, g_scales, g_opacities, g_sh, g_screen,

@@ -15,8 +15,9 @@ import numpy as np
 from numba import njit, prange
 
 from . import simd
-from .cpu_bin import TILE_H, TILE_W
+from .cpu_bin import TILE_H, TILE_W, spread
 from .cpu_project import BLUE, DEPTH, GRADIENT_COLUMNS, GREEN, HALF_H, LOP, RED, SLOPE, A, C, U, V
+from .kernel import kernel
 from .settings import ALPHA_MAX, ALPHA_MIN, STOP
 
 STRIDE = TILE_W + simd.LANES
@@ -86,7 +87,7 @@ def live_rows(T, live):
     return some
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def blend(splats, ids, labels, tiles, members, want_labels, want_depth, color, transmittance, weight, depth, ends):
     """Draw. labels (H, W) int32; color (3, H, W), transmittance, weight and depth (H, W): float32, all written.
 
@@ -97,7 +98,8 @@ def blend(splats, ids, labels, tiles, members, want_labels, want_depth, color, t
     columns = (width + TILE_W - 1) // TILE_W
     count = tiles.size - 1
     plane = TILE_H * STRIDE
-    for tile in prange(count):
+    for index in prange(count):
+        tile = spread(index, count)
         tile_x = (tile % columns) * TILE_W
         tile_y = (tile // columns) * TILE_H
         rows = min(TILE_H, height - tile_y)
@@ -178,7 +180,7 @@ def blend(splats, ids, labels, tiles, members, want_labels, want_depth, color, t
                     depth[y, tile_x + x] = dep[row * STRIDE + x]
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def blend_backward(
     splats, ids, labels, tiles, members, places, ends, want_labels, want_depth,
     color, transmittance, weight, depth, g_color, g_alpha, g_weight, g_depth, rows_out,
@@ -192,7 +194,8 @@ def blend_backward(
     columns = (width + TILE_W - 1) // TILE_W
     count = tiles.size - 1
     plane = TILE_H * STRIDE
-    for tile in prange(count):
+    for index in prange(count):
+        tile = spread(index, count)
         tile_x = (tile % columns) * TILE_W
         tile_y = (tile // columns) * TILE_H
         rows = min(TILE_H, height - tile_y)
