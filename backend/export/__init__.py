@@ -1,5 +1,6 @@
 """Files that other programs read."""
 
+from .fit import agreement, fit_splats
 from .ply import read_splats, write_splats
 
-__all__ = ["read_splats", "write_splats"]
+__all__ = ["agreement", "fit_splats", "read_splats", "write_splats"]
