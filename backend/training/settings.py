@@ -45,12 +45,12 @@ GROW_FROM, GROW_UNTIL, GROW_EVERY = 0.1, 0.5, 100
 """Growth runs between these shares of the training, every so many steps; statistics start half way to the first."""
 
 _ROW_RATES = {
-    "offset_columns": (1e-2, 1e-4),
-    "extent_columns": (7e-3, 1e-3),
-    "feature_columns": (7.5e-3, 1e-3),
-    "opacity_columns": (2e-2, 2e-3),
-    "shape_columns": (1e-2, 1e-3),
-    "color_columns": (1e-2, 1e-3),
+    "offset_columns": (4e-2, 4e-4),
+    "extent_columns": (2.8e-2, 2.8e-3),
+    "feature_columns": (3e-2, 3e-3),
+    "opacity_columns": (8e-2, 8e-3),
+    "shape_columns": (4e-2, 4e-3),
+    "color_columns": (4e-2, 4e-3),
 }
 HEAD_RATES = {
     "hidden": (4e-3, 1e-4),
