@@ -24,20 +24,21 @@ _PER_TILE_W = np.float32(1.0 / TILE_W)
 _PER_TILE_H = np.float32(1.0 / TILE_H)
 _HALF = np.float32(0.5)
 _ZERO = np.float32(0.0)
-_CHUNK, _CHUNKS = 512, 64
+_CHUNK, _CHUNKS = 2048, 16
 """Splats that a thread takes at once: at least so many, in at most so many portions."""
 
 
 @njit(inline="always", error_model="numpy")
-def spread(index, count):
-    """A permutation of range(count) that visits tiles far apart, as neighbours take equally long.
+def spread(index, columns, lines):
+    """The index-th tile to work on: rows of tiles in an order that visits rows far apart, each from left to right.
 
-    numba gives every thread one run of neighbouring indices; a busy corner of the picture is shared this way.
+    numba gives every thread one run of neighbouring indices; a busy part of the picture is shared this way, and
+    neighbours in a row still find each other's splats in the cache.
     """
-    step = int(count * 0.6180339887) | 1
-    while math.gcd(step, count) > 1:
+    step = int(lines * 0.6180339887) | 1
+    while math.gcd(step, lines) > 1:
         step += 2
-    return index * step % count
+    return index // columns * step % lines * columns + index % columns
 
 
 @kernel()

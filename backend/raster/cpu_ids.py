@@ -44,7 +44,7 @@ def most_probable(splats, ids, tiles, members, best_id, best_weight):
     columns = (width + TILE_W - 1) // TILE_W
     plane = TILE_H * STRIDE
     for index in prange(tiles.size - 1):
-        tile = spread(index, tiles.size - 1)
+        tile = spread(index, columns, (tiles.size - 1) // columns)
         tile_x = (tile % columns) * TILE_W
         tile_y = (tile // columns) * TILE_H
         rows = min(TILE_H, height - tile_y)

@@ -99,7 +99,7 @@ def blend(splats, ids, labels, tiles, members, want_labels, want_depth, color, t
     count = tiles.size - 1
     plane = TILE_H * STRIDE
     for index in prange(count):
-        tile = spread(index, count)
+        tile = spread(index, columns, count // columns)
         tile_x = (tile % columns) * TILE_W
         tile_y = (tile // columns) * TILE_H
         rows = min(TILE_H, height - tile_y)
@@ -195,7 +195,7 @@ def blend_backward(
     count = tiles.size - 1
     plane = TILE_H * STRIDE
     for index in prange(count):
-        tile = spread(index, count)
+        tile = spread(index, columns, count // columns)
         tile_x = (tile % columns) * TILE_W
         tile_y = (tile // columns) * TILE_H
         rows = min(TILE_H, height - tile_y)
