@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import errno
+import os
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import NoReturn
 
 from . import __version__
 from .protocol import (
@@ -19,92 +23,218 @@ from .protocol import (
     InputError,
     JsonReporter,
     Reporter,
+    StoppingReporter,
 )
 
-_OUT = "the reconstruction folder (made if it is not there)"
+DEFAULT_MINUTES = 5.0
+
+_INTRODUCTION = """\
+From photos to labelled splats. A capture is a folder with images/, the COLMAP
+model of their cameras in sparse/0, and, for objects, one picture of object IDs
+for each image in masks/. What is made of it goes into a reconstruction folder.
+
+  python -m backend check    garden                      what is in the capture?
+  python -m backend train    garden --out garden-splats  make the splats (5 minutes)
+  python -m backend evaluate garden-splats               how good are they?
+  python -m backend report   garden-splats               read garden-splats/report.md
+"""
+
+_ENDING = """\
+`python -m backend COMMAND --help` lists a command's options. Ctrl+C stops at any
+time; the same command goes on from there. Exit codes: 0 done, 2 the input cannot
+be used (one sentence says why), 130 stopped, 1 anything else.
+"""
+
+_CHECK = """\
+Look through a capture and say what it holds and what is wrong with it: cameras,
+images without a pose, masks, objects. Nothing is written.
+"""
+
+_VOTE = """\
+Give each 3D point of the capture the object that most masks show there. Leaves
+points.ply, with an object_id for each point, and objects.json in the
+reconstruction folder. `train` does this by itself where it is not done yet.
+"""
+
+_TRAIN = """\
+Make the splats. Leaves splats.ply, which splat viewers and Blender read, a
+checkpoint to go on from, and previews/latest.png, which shows how it looks now.
+Run again with more --minutes or --steps, it goes on where it stopped.
+"""
+
+_RENDER = """\
+Draw the splats from the capture's cameras into DIR/renders, named as the images.
+"""
+
+_EVALUATE = """\
+Compare renders with the photos that training has not seen (every 8th). PSNR and
+SSIM say how close the pictures are; mIoU, mBIoU, Dice and accuracy how well the
+objects agree with the masks. `report` shows the figures.
+"""
+
+_REPORT = """\
+Write report.md, with pictures, plots and what was left out, and report.json, the
+same for programs. Run `evaluate` before, so that the report says how good it is.
+"""
+
+_DOCTOR = """\
+Say which versions and devices are there, and try everything on a tiny scene. The
+first run compiles the kernels, about a minute, so that later commands start at once.
+"""
+
+
+class _UsageError(Exception):
+    """The command line makes no sense; the message is argparse's, made a sentence."""
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise _UsageError(f"{message[:1].upper()}{message[1:]}; see `{self.prog} --help`.")
 
 
 def parser() -> argparse.ArgumentParser:
     """Every command and option."""
-    top = argparse.ArgumentParser(prog="python -m backend", description="From a COLMAP capture to labelled splats.")
+    how = argparse.RawDescriptionHelpFormatter
+    top = _Parser(
+        prog="python -m backend", description=_INTRODUCTION, epilog=_ENDING, formatter_class=how, allow_abbrev=False
+    )
     top.add_argument("--version", action="version", version=__version__)
-    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND", title="commands")
 
-    def command(name: str, help: str) -> argparse.ArgumentParser:
-        sub = commands.add_parser(name, help=help, description=help)
-        sub.add_argument("--json", action="store_true", help="print events as JSON lines")
-        sub.add_argument("--threads", type=_positive, help="how many processor threads to use (default: all)")
+    def command(name: str, summary: str, description: str, example: str) -> argparse.ArgumentParser:
+        sub = commands.add_parser(
+            name, help=summary, description=description, formatter_class=how, allow_abbrev=False,
+            epilog=f"example:\n  python -m backend {name} {example}".rstrip(),
+        )  # fmt: skip
+        sub.add_argument("--json", action="store_true", help="print events as JSON lines, for other programs")
+        sub.add_argument("--threads", type=_count, metavar="N", help="processor cores to use (default: all)")
         return sub
+
+    def memory_option(sub: argparse.ArgumentParser) -> None:
+        sub.add_argument(
+            "--memory-mb", type=_count, default=2000, metavar="MB", help="memory for images; more is faster (2000)"
+        )
 
     def capture_options(sub: argparse.ArgumentParser) -> None:
-        sub.add_argument("capture", type=Path, metavar="CAPTURE", help="folder with images/, sparse/0 and masks/")
-        sub.add_argument("--max-size", type=_positive, default=1600, help="reduce images to this longest side (1600)")
-        sub.add_argument("--memory-mb", type=_positive, default=2000, help="budget for decoded images (2000)")
-
-    def vote_options(sub: argparse.ArgumentParser) -> None:
-        sub.add_argument("--out", type=Path, required=True, metavar="DIR", help=_OUT)
-        sub.add_argument("--seed", type=int, default=0, help="fixes everything that is drawn at random (0)")
+        sub.add_argument("capture", type=Path, metavar="CAPTURE", help="folder with images/, sparse/0/ and masks/")
         sub.add_argument(
-            "--strategy", choices=("majority", "probability", "correspondence"), default="majority",
-            help="how the views' masks decide a point's object (majority)",
+            "--max-size", type=_count, default=1600, metavar="PIXELS",
+            help="larger images are reduced to this longest side (1600)",
         )  # fmt: skip
 
-    check = command("check", "Say what a capture holds and what is wrong with it; writes nothing.")
+    def vote_options(sub: argparse.ArgumentParser) -> None:
+        capture_options(sub)
+        memory_option(sub)
+        sub.add_argument(
+            "--out", type=Path, required=True, metavar="DIR", help="reconstruction folder, made where it is not there"
+        )
+        sub.add_argument(
+            "--strategy", choices=("majority", "probability", "correspondence"), default="majority",
+            help="a point's object: the one most masks show there (majority), one drawn as often as masks show it, "
+            "or only by masks of images in which COLMAP found the point",
+        )  # fmt: skip
+        sub.add_argument("--seed", type=_seed, default=0, metavar="N", help="same seed, same result (0)")
+
+    check = command("check", "say what a capture holds and what is wrong with it", _CHECK, "garden")
     capture_options(check)
 
-    vote = command("vote", "Lift the masks to the point cloud: points.ply with an object_id for each point.")
-    capture_options(vote)
+    vote = command("vote", "give each point its object, from the masks", _VOTE, "garden --out garden-splats")
     vote_options(vote)
 
-    train = command("train", "Train the splats; goes on where an earlier run stopped. Votes first if that is not done.")
-    capture_options(train)
+    train = command("train", "make the splats", _TRAIN, "garden --out garden-splats --minutes 10")
     vote_options(train)
     length = train.add_mutually_exclusive_group()
-    length.add_argument("--minutes", type=_positive_float, help="train this long in all (default: 5)")
-    length.add_argument("--steps", type=_positive, help="train this many steps in all")
-    train.add_argument("--mode", choices=("explicit", "view"), default="explicit", help="what the heads see (explicit)")
-    train.add_argument("--sh-degree", type=int, choices=(0, 1, 2, 3), default=1, help="of explicit colour (1)")
-    train.add_argument("--offsets", type=_positive, help="splats an anchor")
-    train.add_argument("--voxel", type=_positive_float, help="edge of an anchor's cell (default: the points' spacing)")
-    train.add_argument("--max-anchors", type=_positive, help="growth stops there")
-    train.add_argument("--background", choices=("learned", "black", "white"), default="learned")
-    train.add_argument("--semantic-weight", type=float, help="weight of the labels (0.1; 0.01 for poor masks)")
-    train.add_argument("--unlabelled-is-object", action="store_true", help="teach pixels of ID 0 as a class")
-    train.add_argument("--checkpoint-seconds", type=_positive_float, default=30.0, help="time between checkpoints (30)")
+    length.add_argument(
+        "--minutes", type=_amount, default=DEFAULT_MINUTES, metavar="M",
+        help=f"train this long in all ({DEFAULT_MINUTES:g})",
+    )  # fmt: skip
+    length.add_argument("--steps", type=_count, metavar="N", help="train this many steps in all, however long it takes")
     train.add_argument("--restart", action="store_true", help="forget an earlier training in DIR")
+    train.add_argument(
+        "--checkpoint-seconds", type=_amount, default=30.0, metavar="S",
+        help="the most work that a crash can cost (30)",
+    )  # fmt: skip
+    finer = train.add_argument_group("how the splats are made; the defaults suit most captures")
+    finer.add_argument(
+        "--mode", choices=("explicit", "view"), default="explicit",
+        help="explicit: splats.ply is exactly the model; view: as in the paper, splats change with the camera and "
+        "splats.ply is a fit (explicit)",
+    )  # fmt: skip
+    finer.add_argument(
+        "--sh-degree", type=int, choices=(0, 1, 2, 3), default=1,
+        help="how much colour may change with direction, in explicit mode; 0: not at all (1)",
+    )  # fmt: skip
+    finer.add_argument(
+        "--background", choices=("learned", "black", "white"), default="learned", help="behind all splats (learned)"
+    )
+    finer.add_argument(
+        "--voxel", type=_amount, metavar="SIZE", help="finest detail, in the capture's units (automatic)"
+    )
+    finer.add_argument("--offsets", type=_count, metavar="N", help="splats around each anchor (10)")
+    finer.add_argument("--max-anchors", type=_count, metavar="N", help="growth stops there (200000)")
+    finer.add_argument(
+        "--semantic-weight", type=_weight, metavar="W", help="how much masks count; 0.01 for poor ones (0.1)"
+    )
+    finer.add_argument("--unlabelled-is-object", action="store_true", help="ID 0 is an object too, not just unlabelled")
 
-    def result(name: str, help: str) -> argparse.ArgumentParser:
-        sub = command(name, help)
-        sub.add_argument("folder", type=Path, metavar="DIR", help="the reconstruction folder")
-        sub.add_argument("--memory-mb", type=_positive, default=2000, help="budget for decoded images (2000)")
+    def result(name: str, summary: str, description: str, example: str) -> argparse.ArgumentParser:
+        sub = command(name, summary, description, example)
+        sub.add_argument("folder", type=Path, metavar="DIR", help="reconstruction folder, as given to train --out")
+        sub.add_argument("--capture", type=Path, metavar="CAPTURE", help="where the capture is now, if it was moved")
+        memory_option(sub)
         return sub
 
-    render = result("render", "Draw the trained model from the capture's cameras into DIR/renders.")
-    render.add_argument("--views", choices=("held-out", "all"), default="held-out")
-    render.add_argument("--ids", action="store_true", help="also 16-bit pictures of the object IDs")
-    render.add_argument("--depth", action="store_true", help="also depth in world units, .npy")
-    result("evaluate", "Measure the model on the held-out views: PSNR, SSIM, mIoU, mBIoU, Dice, accuracy.")
-    result("report", "Write report.json and report.md with pictures and error against run time.")
-    command("doctor", "Say which versions and devices are there and whether the kernels compile.")
+    render = result("render", "draw the splats as pictures", _RENDER, "garden-splats --views all --ids")
+    render.add_argument(
+        "--views", choices=("held-out", "all"), default="held-out", help="those not trained on, or all (held-out)"
+    )
+    render.add_argument("--ids", action="store_true", help="also the object IDs, as NAME.ids.png of 16 bits")
+    render.add_argument("--depth", action="store_true", help="also the depth in the capture's units, as NAME.depth.npy")
+    result("evaluate", "measure how good the splats are", _EVALUATE, "garden-splats")
+    result("report", "write a report with pictures", _REPORT, "garden-splats")
+    command("doctor", "say whether everything works on this computer", _DOCTOR, "")
     return top
 
 
-def _positive(text: str) -> int:
-    value = int(text)
+def _count(text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
     if value <= 0:
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
     return value
 
 
-def _positive_float(text: str) -> float:
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+def _seed(text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
+    if not 0 <= value < 2**63:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 on")
+    return value
+
+
+def _weight(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number from 0 on")
+    return value
+
+
+def _amount(text: str) -> float:
+    value = _weight(text)
+    if value == 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
     return value
 
 
 class StopRequest:
-    """Set by an interrupt, a termination signal, or a line `stop` on standard input."""
+    """Set by an interrupt, a termination signal, or a line `stop` on standard input; asked by calling it."""
 
     def __init__(self) -> None:
         self._event = threading.Event()
@@ -112,63 +242,92 @@ class StopRequest:
     def __call__(self) -> bool:
         return self._event.is_set()
 
-    def set(self) -> None:
-        """Ask to stop."""
-        self._event.set()
+    @contextmanager
+    def listening(self, read_stdin: bool) -> Iterator[None]:
+        """Take over the signals, and standard input where another program drives this one.
 
-    def listen(self, read_stdin: bool) -> None:
-        """Take over the signals, and standard input where another program drives this one."""
+        A second signal interrupts at once, whatever is being done.
+        """
 
         def on_signal(number, frame):
             if self._event.is_set():
                 raise KeyboardInterrupt
             self._event.set()
 
-        signal.signal(signal.SIGINT, on_signal)
-        signal.signal(signal.SIGTERM, on_signal)
-        if read_stdin:
+        if read_stdin and sys.stdin is not None:
+            threading.Thread(target=self._read, daemon=True).start()
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
-            def wait() -> None:
-                for line in sys.stdin:
-                    if line.strip() == "stop":
-                        self._event.set()
-
-            threading.Thread(target=wait, daemon=True).start()
+    def _read(self) -> None:
+        try:
+            for line in sys.stdin:
+                if line.strip() == "stop":
+                    self._event.set()
+        except (OSError, ValueError):
+            pass  # Closed, or not to be read: then nothing can be asked there.
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
-    options = parser().parse_args(arguments)
-    if options.json:
-        reporter: Reporter = JsonReporter()
-    else:
-        from .console import ConsoleReporter
-
-        reporter = ConsoleReporter()
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    reporter = _reporter(as_json="--json" in arguments)
     stop = StopRequest()
     try:
-        if threading.current_thread() is threading.main_thread():
-            stop.listen(read_stdin=options.json)
-        from . import commands
+        options = parser().parse_args(arguments)
+        with stop.listening(read_stdin=options.json):
+            from . import commands
 
-        commands.set_threads(options.threads)
-        getattr(commands, options.command)(options, reporter, stop)
+            commands.set_threads(options.threads)
+            getattr(commands, options.command)(options, StoppingReporter(reporter, stop))
         return EXIT_DONE
-    except InputError as error:
+    except (InputError, _UsageError) as error:
         reporter.error(str(error))
         return EXIT_BAD_INPUT
     except (Cancelled, KeyboardInterrupt) as error:
-        reporter.status(str(error) or "Stopped.")
+        reporter.stopped(str(error) or "Stopped at once.")
         return EXIT_CANCELLED
-    except MemoryError:
-        reporter.error("There is not enough memory; try a smaller --max-size or --memory-mb.")
-        return EXIT_FAILED
+    except BrokenPipeError:
+        # Nobody reads any more. Python would complain once again when it flushes at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_CANCELLED
     except Exception as error:
+        sentence = _refusal(error)
+        if sentence:
+            reporter.error(sentence)
+            return EXIT_BAD_INPUT
         import traceback
 
-        reporter.error(f"An unexpected failure: {type(error).__name__}: {error}")
         traceback.print_exc(file=sys.stderr)
+        reporter.error(f"An unexpected failure: {type(error).__name__}: {' '.join(str(error).split())}")
         return EXIT_FAILED
     finally:
-        if hasattr(reporter, "close"):
-            reporter.close()
+        reporter.close()
+
+
+def _reporter(as_json: bool) -> Reporter:
+    if as_json:
+        return JsonReporter()
+    from .console import ConsoleReporter
+
+    return ConsoleReporter()
+
+
+def _refusal(error: Exception) -> str | None:
+    """What the machine lacks for what was asked, as a sentence; None for every other failure."""
+    # torch says that memory ran out with a RuntimeError.
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "allocate memory" in str(error)):
+        return "There is not enough memory; try a smaller --max-size, --memory-mb or --max-anchors."
+    if isinstance(error, OSError) and error.filename:
+        full = error.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", None))
+        what = "could not be written" if full else "cannot be used"
+        advice = "free some space and run the same command again" if full else "check it and its permissions"
+        return f"{error.filename} {what} ({error.strerror}); {advice}."
+    return None

@@ -152,35 +152,39 @@ class Reporter:
 class StoppingReporter(Reporter):
     """Hands events on, and raises Cancelled at the first progress after `should_stop` says so.
 
-    For work that writes whole files alone and so may end between any two of its steps.
+    For work that writes whole files alone and so may end between any two of its steps. Other work asks `should_stop`
+    itself and tells `reporter`, the one behind.
     """
 
     def __init__(self, reporter: Reporter, should_stop: Callable[[], bool]) -> None:
-        self._reporter = reporter
-        self._should_stop = should_stop
+        self.reporter = reporter
+        self.should_stop = should_stop
 
     def status(self, message: str) -> None:
-        self._reporter.status(message)
+        self.reporter.status(message)
 
     def progress(self, done: float, total: float, **fields: Any) -> None:
-        self._reporter.progress(done, total, **fields)
-        if self._should_stop():
+        self.reporter.progress(done, total, **fields)
+        if self.should_stop():
             raise Cancelled("Stopped; what is finished is kept, run the same command again for the rest.")
 
     def preview(self, path: Path, **fields: Any) -> None:
-        self._reporter.preview(path, **fields)
+        self.reporter.preview(path, **fields)
 
     def warning(self, message: str) -> None:
-        self._reporter.warning(message)
+        self.reporter.warning(message)
 
     def error(self, message: str) -> None:
-        self._reporter.error(message)
+        self.reporter.error(message)
 
     def stopped(self, message: str) -> None:
-        self._reporter.stopped(message)
+        self.reporter.stopped(message)
 
     def done(self, **fields: Any) -> None:
-        self._reporter.done(**fields)
+        self.reporter.done(**fields)
+
+    def close(self) -> None:
+        self.reporter.close()
 
 
 class JsonReporter(Reporter):

@@ -169,7 +169,7 @@ def _log_covariances(quats: torch.Tensor, scales: torch.Tensor) -> NDArray[np.fl
 
 
 def _axes(shape: NDArray) -> tuple[NDArray, NDArray]:
-    """Unit quaternions (n, 4) wxyz and scales (n, 3) of covariances, from the upper parts (n, 6) of their logarithms."""
+    """Unit quaternions (n, 4) wxyz and scales (n, 3) of covariances; `shape` (n, 6): their logarithms' upper parts."""
     logs = np.zeros((len(shape), 3, 3))
     logs[:, _UPPER_3[0], _UPPER_3[1]] = logs[:, _UPPER_3[1], _UPPER_3[0]] = shape
     values, axes = np.linalg.eigh(logs)
