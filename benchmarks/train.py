@@ -125,7 +125,9 @@ def main() -> None:
         return
     print(f"{found['splats']:,} splats of {found['anchors']:,} anchors, {found['threads']} threads")
     low, high = found["step_ms_quartiles"]
-    print(f"step {found['step_ms']:.1f} ms (quartiles {low:.1f} to {high:.1f}): {found['steps_per_second']:.1f} steps/s")
+    print(
+        f"step {found['step_ms']:.1f} ms (quartiles {low:.1f} to {high:.1f}): {found['steps_per_second']:.1f} steps/s"
+    )
     for part, share in found["shares"].items():
         print(f"{part:10s} {share:6.1%}  {share * found['step_ms']:6.1f} ms")
 

@@ -31,6 +31,7 @@ def draw(model: ObjectModel, camera: Camera, want_ids: bool = True, want_depth: 
     with torch.no_grad():
         drawn = rasterize(*g[:6], camera, want_depth=want_depth)
         image = drawn.color + (1 - drawn.alpha) * model.background.detach()[:, None, None]
+        image = image * torch.tensor(camera.gain)[:, None, None]
         pixels = image.clamp(0, 1).permute(1, 2, 0).contiguous().numpy()
     alpha = drawn.alpha.numpy()
     depth = None

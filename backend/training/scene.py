@@ -11,10 +11,14 @@ import torch
 from ..capture import Capture
 from ..model.object_model import Normalization
 from ..raster import Camera
+from .exposure import measure_gains, varies
 
 
 class Scene:
-    """Cameras and targets of a capture for the classes `object_ids` ((C,) int64, ascending, 0 first)."""
+    """Cameras and targets of a capture for the classes `object_ids` ((C,) int64, ascending, 0 first).
+
+    Where the photos' exposure varies (`exposure_varies`), `gains` (V, 3) say by how much; else they are 1.
+    """
 
     def __init__(
         self,
@@ -23,11 +27,15 @@ class Scene:
         normalization: Normalization,
         zero_is_object: bool = False,
         memory_mb: float = 2000,
+        undo_exposure: bool = True,
     ) -> None:
         self.capture = capture
         self.object_ids = object_ids
         self.normalization = normalization
         self.zero_is_object = zero_is_object
+        gains = measure_gains(capture) if undo_exposure else np.ones((len(capture.views), 3))
+        self.exposure_varies = varies(gains)
+        self.gains = gains if self.exposure_varies else np.ones_like(gains)
         self._budget = memory_mb * 1e6
         self._held: OrderedDict[tuple[int, int], tuple[torch.Tensor, torch.Tensor | None]] = OrderedDict()
         self._bytes = 0
@@ -41,17 +49,19 @@ class Scene:
             self.capture.K(index, downscale),
             view.width // downscale,
             view.height // downscale,
+            gain=(float(self.gains[index, 0]), float(self.gains[index, 1]), float(self.gains[index, 2])),
         )
 
     def target(self, index: int, downscale: int = 1) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """A view's picture (3, H, W) float32 in [0, 1] and its labels (H, W) int32, -1 where nothing is taught."""
+        """A view's picture at the common exposure, (3, H, W) float32, and its labels (H, W) int32, -1 = not taught."""
         key = (index, downscale)
         with self._lock:
             if key in self._held:
                 self._held.move_to_end(key)
                 return self._held[key]
         pixels = self.capture.image(index, downscale)
-        picture = torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1), np.float32) / np.float32(255))
+        scale = (1 / (255 * self.gains[index])).astype(np.float32)
+        picture = torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1), np.float32) * scale[:, None, None])
         mask = self.capture.mask(index, downscale)
         labels = None if mask is None else torch.from_numpy(self._classes(mask))
         size = picture.numel() * 4 + (0 if labels is None else labels.numel() * 4)

@@ -1,0 +1,57 @@
+"""Gains of photos that set their own exposure, against known ones."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from backend.training.exposure import measure_gains, varies
+
+
+def photos(gains, cameras, held_out=(), points=200, noise=0.0):
+    """A stand-in for a capture: every view shows every point on a 3 x 3 patch of its colour times the view's gain."""
+    rng = np.random.default_rng(0)
+    colors = rng.uniform(0.1, 0.6, (points, 3))
+    columns = int(np.ceil(np.sqrt(points)))
+    x, y = np.arange(points) % columns, np.arange(points) // columns
+
+    def image(index, downscale=1):
+        pixels = np.zeros((3 * columns + 3, 3 * columns + 3, 3))
+        for dx in range(3):
+            for dy in range(3):
+                pixels[3 * y + dy, 3 * x + dx] = colors * gains[index] + rng.normal(0, noise, (points, 3))
+        return np.round(np.clip(pixels, 0, 1) * 255).astype(np.uint8)
+
+    keypoints = SimpleNamespace(xy=np.stack([3 * x + 1.5, 3 * y + 1.5], 1), point_index=np.arange(points))
+    return SimpleNamespace(
+        views=[SimpleNamespace(camera_id=c) for c in cameras],
+        train_indices=tuple(i for i in range(len(cameras)) if i not in held_out),
+        points=SimpleNamespace(xyz=np.zeros((points, 3))),
+        image=image,
+        keypoints=lambda index: keypoints,
+    )
+
+
+def test_known_gains_are_found():
+    truth = np.exp(np.random.default_rng(1).normal(0, 0.15, (8, 3)))
+    found = measure_gains(photos(truth, [1] * 8, noise=0.01))
+    truth /= np.exp(np.log(truth).mean(0))
+    np.testing.assert_allclose(found, truth, rtol=0.01)
+    assert varies(found)
+
+
+def test_equal_photos_do_not_vary():
+    assert not varies(measure_gains(photos(np.ones((8, 3)), [1] * 8, noise=0.02)))
+
+
+def test_a_held_out_view_takes_its_neighbours_gain_and_its_own_pixels_do_not_count():
+    truth = np.array([[1.0] * 3, [1.1] * 3, [3.0] * 3, [1.3] * 3, [0.8] * 3])
+    cameras = [1, 1, 1, 1, 2]
+    found = measure_gains(photos(truth, cameras, held_out=(2,)))
+    np.testing.assert_allclose(found[2], np.sqrt(found[1] * found[3]), rtol=1e-6)
+    darker = truth.copy()
+    darker[2] = 0.2
+    np.testing.assert_array_equal(found, measure_gains(photos(darker, cameras, held_out=(2,))))
+
+
+def test_without_observations_gains_are_one():
+    assert (measure_gains(photos(np.full((4, 3), 0.5), [1] * 4, points=5)) == 1).all()
