@@ -282,9 +282,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     stop = StopRequest()
     try:
         options = parser().parse_args(arguments)
-        with stop.listening(read_stdin=options.json):
-            from . import commands
+        # Before the signals are taken over, since pycolmap takes SIGTERM for itself when it is imported.
+        from . import commands
 
+        with stop.listening(read_stdin=options.json):
             commands.set_threads(options.threads)
             getattr(commands, options.command)(options, StoppingReporter(reporter, stop))
         return EXIT_DONE

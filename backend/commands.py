@@ -49,6 +49,7 @@ from .protocol import (
     write_atomic,
     write_json,
 )
+from .raster import compile_kernels
 from .raster.draw import draw
 from .training.loop import Budget, Progress, Trainer, load_model, progress_of
 from .training.scene import Scene
@@ -202,6 +203,7 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         "capture": {
             "folder": capture.folder.name, "views": len(capture.views), "held_out": len(capture.test_indices),
             "objects": len(capture.object_ids), **capture.counts,
+            "exposure_varies": trained.scene.exposure_varies,
             "cameras": ", ".join(f"{count} {name}" for name, count in capture.counts["cameras"].items()),
         },
         "settings": {
@@ -232,8 +234,10 @@ def doctor(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     found = machine()
     for key, value in found.items():
         reporter.status(f"{key}: {value}")
-    reporter.status("Compiling the kernels (once for a machine) and training a few splats")
     started = time.monotonic()
+    reporter.status("Compiling the renderer's kernels (once for a machine)")
+    compile_kernels(lambda done, total: reporter.progress(done, total))
+    reporter.status("Training a few splats")
     with tempfile.TemporaryDirectory(prefix="objectgs-doctor-") as place:
         _train_a_little(Path(place), reporter)
     seconds = time.monotonic() - started
@@ -582,6 +586,10 @@ def _left_out(trained: _Trained) -> list[dict[str, str]]:
             f"labels of {counts['used'] - counts['masks']} views", "their masks are missing",
         ),
         (
+            not trained.scene.exposure_varies, "undoing of exposure and white balance",
+            "the photos agree about the points that they share",
+        ),
+        (
             downscale_at(0.0, longest) == 1, "reduced pictures at the start of training",
             f"{longest} pixels are few enough to train on from the start",
         ),
@@ -668,9 +676,9 @@ def _stage(folder: Reconstruction, name: str) -> Iterator[None]:
 
 def _record_stage(folder: Reconstruction, name: str, seconds: float) -> None:
     """Seconds of a stage, and this process's peak memory until its end; the latest run of a stage counts."""
-    stages = [stage for stage in _memory(folder).get("stages", []) if stage["name"] != name]
-    stages.append({"name": name, "seconds": round(seconds, 2), "peak_rss_mb": _peak_mb()})
-    _remember(folder, stages=stages)
+    stages = {stage["name"]: stage for stage in _memory(folder).get("stages", [])}
+    stages[name] = {"name": name, "seconds": round(seconds, 2), "peak_rss_mb": _peak_mb()}
+    _remember(folder, stages=list(stages.values()))
 
 
 def _peak_mb() -> float:

@@ -73,8 +73,9 @@ def agreement(model: ObjectModel, splats: Splats, cameras: Sequence[Camera]) -> 
         with torch.no_grad():
             drawn = rasterize(means, quats, scales, opacities, sh, ids, camera)
             image = drawn.color + (1 - drawn.alpha) * model.background.detach()[:, None, None]
-        theirs = image.clamp(0, 1).permute(1, 2, 0).numpy()
-        found.append(psnr(theirs, draw(model, camera, want_ids=False).image))
+            image = image * torch.tensor(camera.gain)[:, None, None]
+        shown = image.clamp(0, 1).permute(1, 2, 0).numpy()
+        found.append(psnr(shown, draw(model, camera, want_ids=False).image))
     return float(np.mean(found)) if found else None
 
 

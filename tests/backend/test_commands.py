@@ -1,0 +1,709 @@
+"""The command line as a user meets it: the whole chain, exit codes, events, and what happens when things go wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from backend import arguments, commands
+from backend.capture import load_capture
+from backend.export import agreement, fit_splats, read_splats
+from backend.export.fit import sh_basis
+from backend.model.checkpoint import CURRENT, PREVIOUS, load_checkpoint
+from backend.protocol import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, EXIT_FAILED
+from backend.raster.reference import sh_colors
+from backend.training.loop import Trainer
+from backend.training.settings import Settings
+
+ROOT = Path(__file__).resolve().parents[2]
+FIXTURES = ROOT.parent / "shared" / "data" / "fixtures"
+TYPES = {"status", "progress", "preview", "warning", "error", "done"}
+SMALL = ("--offsets", "4")
+
+
+@dataclass
+class Answer:
+    """What one command said."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def events(self) -> list[dict]:
+        """The lines of stdout, each a JSON object of a known type; the last one closes."""
+        events = [json.loads(line) for line in self.out.splitlines()]
+        assert events and {event["type"] for event in events} <= TYPES
+        assert events[-1]["type"] in ("done", "error")
+        assert sum(event["type"] in ("done", "error") for event in events) == 1
+        return events
+
+    def messages(self, kind: str) -> list[str]:
+        return [event["message"] for event in self.events if event["type"] == kind]
+
+
+@pytest.fixture
+def ask(capsys, request):
+    """Runs a command in this process; `--json` in the arguments for events."""
+    threads = numba.get_num_threads(), torch.get_num_threads()
+
+    def restore():
+        numba.set_num_threads(threads[0])
+        torch.set_num_threads(threads[1])
+
+    request.addfinalizer(restore)
+
+    def run(*words) -> Answer:
+        capsys.readouterr()
+        code = arguments.main([*map(str, words), "--threads", "1"])
+        said = capsys.readouterr()
+        return Answer(code, said.out, said.err)
+
+    return run
+
+
+_kept: dict[str, Path] = {}
+
+
+@pytest.fixture
+def trained(write_capture, tmp_path, tmp_path_factory, ask):
+    """A capture, and a copy of a reconstruction of it in 20 steps; both made once."""
+    if not _kept:
+        place = tmp_path_factory.mktemp("trained")
+        shutil.copytree(write_capture(name="first", views=9, size=(64, 48)).folder, place / "capture")
+        assert ask("train", place / "capture", "--out", place / "out", "--steps", 20, *SMALL).code == EXIT_DONE
+        _kept.update(capture=place / "capture", out=place / "out")
+    shutil.copytree(_kept["out"], tmp_path / "out")
+    return _kept["capture"], tmp_path / "out"
+
+
+def refused(answer: Answer, *words: str) -> str:
+    """The command was refused with one plain sentence that holds `words`; returns it."""
+    assert answer.code == EXIT_BAD_INPUT, answer
+    sentences = [line for line in answer.err.splitlines() if line.startswith("error: ")]
+    assert len(sentences) == 1 and "Traceback" not in answer.err, answer.err
+    assert all(line.startswith(("error: ", "warning: ")) for line in answer.err.splitlines()), answer.err
+    assert sentences[0].endswith(".")
+    for word in words:
+        assert word in sentences[0], sentences[0]
+    return sentences[0]
+
+
+def no_halves(folder: Path) -> None:
+    assert not [path for path in folder.rglob("*") if path.suffix == ".part" or path.name.startswith(".write-test")]
+
+
+def step_of(out: Path) -> int:
+    return load_checkpoint(out / "checkpoint")[1]["progress"]["step"]
+
+
+# --- the whole chain -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("masks", [True, False])
+def test_the_whole_chain(write_capture, tmp_path, ask, masks):
+    capture, out = write_capture(views=9, size=(64, 48), masks=masks).folder, tmp_path / "deep" / "out"
+    found = ask("check", capture, "--json")
+    assert found.code == EXIT_DONE and found.events[-1]["check"]["problems"] == []
+    assert not out.exists()
+
+    voted = ask("vote", capture, "--out", out, "--json")
+    assert voted.code == EXIT_DONE
+    objects = json.loads((out / "objects.json").read_text())["objects"]
+    assert [entry["id"] for entry in objects] == ([1, 2, 5] if masks else [])
+    assert any("masks" in message for message in voted.messages("warning")) is not masks
+
+    ended = ask("train", capture, "--out", out, "--steps", 20, *SMALL, "--json")
+    assert ended.code == EXIT_DONE and ended.events[-1]["steps"] == 20
+    assert (ended.events[-1]["miou"] is not None) is masks
+    previews = [event["path"] for event in ended.events if event["type"] == "preview"]
+    assert previews and all(Path(path).exists() for path in previews)
+    splats, warnings = read_splats(out / "splats.ply")
+    assert len(splats) > 100 and warnings == []
+    assert set(splats.object_ids.tolist()) == ({1, 2, 5} if masks else {0}) | ({0} & set(splats.object_ids.tolist()))
+
+    assert ask("evaluate", out, "--json").events[-1]["psnr"] > 5
+    drawn = ask("render", out, "--ids", "--depth", "--json")
+    assert drawn.events[-1]["views"] == 2
+    assert {path.name for path in (out / "renders").iterdir()} == {
+        f"view_{i}.{suffix}" for i in ("000", "008") for suffix in ("png", "ids.png", "depth.npy")
+    }
+    ids = np.asarray(Image.open(out / "renders/view_008.ids.png"))
+    assert ids.shape == (48, 64) and set(np.unique(ids)) <= {0, 1, 2, 5}
+    depth = np.load(out / "renders/view_008.depth.npy")
+    assert depth.shape == (48, 64) and 2 < np.median(depth[depth > 0]) < 6, "cameras are 4 units away"
+    assert ask("report", out, "--json").code == EXIT_DONE
+
+    report = json.loads((out / "report.json").read_text())
+    assert {"capture", "settings", "machine", "left_out", "stages", "curve", "model", "quality", "objects"} <= set(
+        report
+    )
+    assert report["settings"]["steps"] == 20 and report["settings"]["minutes"] is None
+    stages = {stage["name"]: stage for stage in report["stages"]}
+    assert list(stages) == ["read", "vote", "train", "export", "evaluate", "render", "report"]
+    assert all(stage["seconds"] >= 0 and 50 < stage["peak_rss_mb"] < 5000 for stage in stages.values())
+    quality = report["quality"]
+    assert set(quality) == {"psnr", "ssim", "lpips", "miou", "mbiou", "dice", "accuracy"}
+    measured = {name for name, value in quality.items() if value is not None}
+    assert measured == ({"psnr", "ssim", "miou", "mbiou", "dice", "accuracy"} if masks else {"psnr", "ssim"})
+    assert report["model"]["gaussians"] == len(splats)
+    assert report["model"]["bytes"] == (out / "splats.ply").stat().st_size
+    assert [entry["id"] for entry in report["objects"]] == ([1, 2, 5] if masks else [])
+    assert all(entry["name"] == f"sphere {entry['id']}" and entry["anchors"] > 0 for entry in report["objects"])
+    assert [point["step"] for point in report["curve"]][-1] == 20
+    left_out = {entry["what"]: entry["why"] for entry in report["left_out"]}
+    assert any("votes" in what and "no masks" in why for what, why in left_out.items()) is not masks
+    assert any("undistortion" in what for what in left_out)
+    assert (out / "report.md").exists()
+    no_halves(out)
+
+
+def test_terminal_output_says_each_thing_once(write_capture, tmp_path, ask):
+    scene = write_capture(views=9, size=(64, 48))
+    (scene.folder / "masks" / scene.names[1]).unlink()
+    answer = ask("train", scene.folder, "--out", tmp_path / "out", "--steps", 2, *SMALL)
+    assert answer.code == EXIT_DONE
+    lines = answer.err.splitlines() + [line for line in answer.out.splitlines() if not line.startswith("  ")]
+    assert len(lines) == len(set(lines)), lines
+    assert answer.err.count("have no mask") == 1
+
+
+def test_a_view_dependent_model_trains_evaluates_and_exports_a_fit(write_capture, tmp_path, ask):
+    capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"
+    answer = ask("train", capture, "--out", out, "--steps", 40, "--mode", "view", *SMALL, "--json")
+    assert answer.code == EXIT_DONE
+    (warning,) = [message for message in answer.messages("warning") if "fit" in message]
+    fidelity = answer.events[-1]["psnr_of_export"]
+    assert f"{fidelity:.1f} dB" in warning and fidelity > 25
+    splats, _ = read_splats(out / "splats.ply")
+    assert splats.degree == 2 and set(splats.object_ids.tolist()) <= {0, 1, 2, 5}
+    for command in ("evaluate", "report"):
+        assert ask(command, out).code == EXIT_DONE
+    model = json.loads((out / "report.json").read_text())["model"]
+    assert model["psnr_of_export"] == fidelity and model["gaussians"] == len(splats)
+
+
+def test_unlabelled_pixels_count_where_they_are_declared_an_object(write_capture, tmp_path, ask):
+    capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"
+    assert ask("train", capture, "--out", out, "--steps", 5, *SMALL, "--unlabelled-is-object").code == EXIT_DONE
+    assert ask("evaluate", out).code == EXIT_DONE
+    found = json.loads((out / "evaluation.json").read_text())["objects"]
+    assert [entry["id"] for entry in found] == [0, 1, 2, 5]
+    assert ask("report", out).code == EXIT_DONE
+
+
+# --- going on --------------------------------------------------------------------------------------------------------
+
+
+def test_training_again_is_done_goes_on_or_begins_anew(trained, ask):
+    capture, out = trained
+    train = ("train", capture, "--out", out, *SMALL)
+    again = ask(*train, "--steps", 20, "--json")
+    assert again.code == EXIT_DONE and any("Already trained for 20 steps" in m for m in again.messages("status"))
+    assert step_of(out) == 20
+    longer = ask(*train, "--steps", 30, "--json")
+    assert any("Going on after step 20" in m for m in longer.messages("status"))
+    assert longer.events[-1]["steps"] == 30 and step_of(out) == 30
+    refused(ask(*train, "--steps", 40, "--sh-degree", 2), "checkpoint", "sh_degree", "--restart")
+    refused(ask(*train, "--steps", 40, "--strategy", "correspondence"), "--strategy majority", "--restart")
+    refused(ask(*train, "--steps", 40, "--max-size", 40), "--max-size 1600", "--restart")
+    assert step_of(out) == 30
+    anew = ask(*train, "--steps", 10, "--sh-degree", 2, "--strategy", "correspondence", "--restart", "--json")
+    assert anew.events[-1]["steps"] == 10 and step_of(out) == 10
+    assert read_splats(out / "splats.ply")[0].degree == 2
+    assert not (out / "checkpoint" / PREVIOUS).exists(), "nothing of the earlier training is left to fall back on"
+
+
+def test_another_capture_does_not_continue_a_training(trained, write_capture, ask):
+    _, out = trained
+    other = write_capture(name="other", views=9, size=(64, 48), seed=1).folder
+    refused(ask("train", other, "--out", out, "--steps", 40, *SMALL), "another capture", str(other), "--restart")
+    refused(ask("render", out, "--capture", other), str(other), "not the one")
+
+
+def test_votes_are_cast_once_and_again_when_they_would_differ(write_capture, tmp_path, ask, monkeypatch):
+    scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
+    cast = []
+    original = commands.vote_points
+    monkeypatch.setattr(commands, "vote_points", lambda *a, **k: (cast.append(a[1]), original(*a, **k))[1])
+    train = ("train", scene.folder, "--out", out, "--steps", 1, *SMALL, "--restart")
+    assert ask("vote", scene.folder, "--out", out).code == EXIT_DONE
+    assert ask(*train).code == EXIT_DONE and cast == ["majority"]
+    assert ask(*train, "--seed", 3).code == EXIT_DONE and cast == ["majority"], "no part of a majority is drawn"
+    assert ask(*train, "--strategy", "probability").code == EXIT_DONE and cast[1:] == ["probability"]
+    assert ask(*train, "--strategy", "probability", "--seed", 3).code == EXIT_DONE and len(cast) == 3
+    assert ask(*train).code == EXIT_DONE and len(cast) == 4
+    Image.fromarray(np.full((48, 64), 2, np.uint8)).save(scene.folder / "masks" / scene.names[1])
+    assert ask(*train).code == EXIT_DONE and len(cast) == 5, "a mask was edited"
+    (out / "points.ply").write_bytes((out / "points.ply").read_bytes()[:200])
+    assert ask(*train).code == EXIT_DONE and len(cast) == 6, "points.ply was cut short"
+
+
+def test_a_report_leaves_out_what_was_measured_on_an_earlier_model(trained, ask):
+    capture, out = trained
+    missing = ask("report", out)
+    assert "evaluation.json" in missing.err and "run `evaluate`" in missing.err
+    report = json.loads((out / "report.json").read_text())
+    assert set(report["quality"].values()) == {None}
+    assert [(entry["id"], entry["iou"]) for entry in report["objects"]] == [(1, None), (2, None), (5, None)]
+    assert ask("evaluate", out).code == EXIT_DONE and ask("report", out).err == ""
+    assert json.loads((out / "report.json").read_text())["quality"]["psnr"] > 5
+    assert ask("train", capture, "--out", out, "--steps", 25, *SMALL).code == EXIT_DONE
+    assert "earlier state" in ask("report", out).err
+    assert json.loads((out / "report.json").read_text())["quality"]["psnr"] is None
+
+
+def test_a_capture_that_moved_is_found_again(write_capture, tmp_path, ask):
+    capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"
+    assert ask("train", capture, "--out", out, "--steps", 5, *SMALL).code == EXIT_DONE
+    moved = capture.rename(tmp_path / "moved")
+    for command in ("evaluate", "render", "report"):
+        refused(ask(command, out), str(capture), "is gone", "--capture")
+    assert not (out / "renders").exists() and not (out / "report.json").exists()
+    assert ask("evaluate", out, "--capture", moved).code == EXIT_DONE
+    assert ask("render", out).code == EXIT_DONE, "the place is remembered"
+    again = ask("train", moved, "--out", out, "--steps", 5, *SMALL)
+    assert again.code == EXIT_DONE and "Already trained" in again.out
+
+
+def test_renders_do_not_overwrite_each_other(write_capture, tmp_path, ask):
+    names = ["a/1.png", "a/1.jpg", "a/2.png", "b/1.png"]
+    capture, out = write_capture(views=4, size=(64, 48), names=names, masks=False).folder, tmp_path / "out"
+    assert ask("train", capture, "--out", out, "--steps", 2, *SMALL).code == EXIT_DONE
+    assert ask("render", out, "--views", "all").code == EXIT_DONE
+    found = {path.relative_to(out / "renders").as_posix() for path in (out / "renders").rglob("*.png")}
+    assert found == {"a/1.png.png", "a/1.jpg.png", "a/2.png", "b/1.png"}
+
+
+def test_too_few_views_to_hold_any_out(write_capture, tmp_path, ask):
+    capture, out = write_capture(views=2, size=(64, 48)).folder, tmp_path / "out"
+    assert ask("train", capture, "--out", out, "--steps", 3, *SMALL).code == EXIT_DONE
+    refused(ask("evaluate", out), str(capture), "too few views")
+    assert ask("render", out).code == EXIT_DONE and len(list((out / "renders").iterdir())) == 2
+    assert ask("report", out).code == EXIT_DONE
+    report = json.loads((out / "report.json").read_text())
+    assert report["quality"]["psnr"] is None and report["curve"][-1]["psnr"] is None
+
+
+# --- bad input -------------------------------------------------------------------------------------------------------
+
+
+def spoil(scene, what: str) -> tuple[str, ...]:
+    """Break the capture; what the sentence must name."""
+    model, images, masks = scene.folder / "sparse/0", scene.folder / "images", scene.folder / "masks"
+    first = scene.names[0]
+    if what == "no folder":
+        shutil.rmtree(scene.folder)
+        return str(scene.folder), "does not exist"
+    if what.startswith("missing"):
+        (model / what.split()[1]).unlink()
+        return what.split()[1], "missing"
+    if what.startswith("truncated"):
+        path = model / what.split()[1]
+        path.write_bytes(path.read_bytes()[:-7])
+        return path.name, "cut short"
+    data = bytearray((model / "images.bin").read_bytes())
+    if what == "no pose":
+        (model / "images.bin").write_bytes(struct.pack("<Q", 0))
+        return "images.bin", "no image with a pose"
+    if what == "NaN pose":
+        struct.pack_into("<d", data, 12, np.nan)
+        (model / "images.bin").write_bytes(data)
+        return "images.bin", first
+    if what == "3 points":
+        points = b"".join(struct.pack("<Q3d3BdQ", i, i, 0, 0, 1, 2, 3, 0.1, 0) for i in range(3))
+        (model / "points3D.bin").write_bytes(struct.pack("<Q", 3) + points)
+        return "points3D.bin", "only 3 points"
+    if what == "image size":
+        Image.new("RGB", (48, 64)).save(images / first)
+        return f"images/{first}", "48x64", "64x48"
+    if what == "masks missing":
+        for name in scene.names[:6]:
+            (masks / name).unlink()
+        return f"masks/{first}", "missing"
+    if what == "mask size":
+        Image.new("L", (50, 48)).save(masks / first)
+        return f"masks/{first}", "50x48", "64x48"
+    assert what == "mask is a picture"
+    for name in scene.names:
+        noise = np.random.default_rng(0).integers(0, 255, (96, 128, 3)).astype(np.uint8)
+        Image.fromarray(noise).save(masks / name)
+    return f"masks/{first}", "not an ID map"
+
+
+@pytest.mark.parametrize(
+    "what",
+    ["no folder", "missing cameras.bin", "missing points3D.bin", "truncated images.bin", "truncated points3D.bin",
+     "no pose", "NaN pose", "3 points", "image size", "masks missing", "mask size", "mask is a picture"],
+)  # fmt: skip
+def test_bad_captures_are_one_sentence_and_leave_nothing(write_capture, tmp_path, ask, what):
+    scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "made" / "out"
+    words = spoil(scene, what)
+    refused(ask("check", scene.folder), *words)
+    for command in ("vote", "train"):
+        refused(ask(command, scene.folder, "--out", out), *words)
+        assert not out.parent.exists(), "a refused command leaves no folder"
+    events = ask("train", scene.folder, "--out", out, "--json").events
+    assert events[-1]["type"] == "error" and all(word in events[-1]["message"] for word in words)
+
+    out.mkdir(parents=True)
+    (out / "mine.txt").write_text("kept")
+    assert ask("train", scene.folder, "--out", out).code == EXIT_BAD_INPUT
+    assert [path.name for path in out.iterdir()] == ["mine.txt"], "a folder that was there is left as it was"
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("truncated", ("images.bin", "cut short")),
+        ("cameras_only", ("images.bin", "missing")),
+        ("missing_cameras_subfolders_txt", ("images", "does not exist")),
+        ("degenerate_two_images", ("cameras.bin", "degenerate")),
+    ],
+)
+def test_bad_real_models(tmp_path, ask, name, words):
+    if not (FIXTURES / name).is_dir():
+        pytest.skip(f"fixture {name} is absent")
+    refused(ask("check", FIXTURES / name), name, *words)
+    refused(ask("train", FIXTURES / name, "--out", tmp_path / "out"), name, *words)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("below", ["file", "file/out"])
+def test_a_folder_that_cannot_be_written_to(write_capture, tmp_path, ask, below):
+    (tmp_path / "file").write_text("mine")
+    refused(ask("vote", write_capture().folder, "--out", tmp_path / below), str(tmp_path / below), "--out")
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_folders_that_hold_no_reconstruction(trained, write_capture, tmp_path, ask):
+    capture, out = trained
+    (tmp_path / "empty").mkdir()
+    assert ask("vote", capture, "--out", tmp_path / "voted").code == EXIT_DONE
+    for command in ("evaluate", "render", "report"):
+        refused(ask(command, tmp_path / "nowhere"), "nowhere", "does not exist")
+        refused(ask(command, tmp_path / "empty"), "empty", "train first")
+        refused(ask(command, tmp_path / "voted"), "voted", "train first")
+    assert list((tmp_path / "empty").iterdir()) == []
+    (out / "objectgs.json").write_text('{"stages": ')
+    refused(ask("report", out), "objectgs.json", "JSON")
+    (out / "objectgs.json").write_text("{}")
+    refused(ask("report", out), "objectgs.json", "train")
+    refused(ask("train", capture, "--out", out, "--steps", 30, *SMALL), "objectgs.json", "--restart")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [[], ["fly"], ["train"], ["train", "x"], ["train", "x", "--out", "y", "--steps", "0"],
+     ["train", "x", "--out", "y", "--minutes", "nan"], ["train", "x", "--out", "y", "--minutes", "-1"],
+     ["train", "x", "--out", "y", "--minutes", "1", "--steps", "5"], ["train", "x", "--out", "y", "--seed", "-1"],
+     ["train", "x", "--out", "y", "--semantic-weight", "-0.1"], ["train", "x", "--out", "y", "--sh-degree", "4"],
+     ["check", "x", "--max-size", "many"], ["render", "x", "--views", "some"]],
+)  # fmt: skip
+def test_a_command_line_that_makes_no_sense(capsys, words):
+    assert arguments.main(words) == EXIT_BAD_INPUT
+    said = capsys.readouterr()
+    refused(Answer(EXIT_BAD_INPUT, said.out, said.err), "--help")
+    assert "_" not in said.err.replace("command_line", ""), "no name of a function"
+    assert arguments.main([*words, "--json"]) == EXIT_BAD_INPUT
+    assert Answer(EXIT_BAD_INPUT, *capsys.readouterr()).events[-1]["type"] == "error"
+
+
+# --- a full disk, a damaged checkpoint -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def full_disk_for(monkeypatch):
+    """Makes the disk full for files whose name ends so."""
+    original = os.fsync
+
+    def start(folder: Path, ending: str) -> None:
+        def fsync(descriptor):
+            for path in folder.rglob(f"*{ending}.part"):
+                if os.fstat(descriptor).st_ino == path.stat().st_ino:
+                    raise OSError(28, "No space left on device")
+            original(descriptor)
+
+        monkeypatch.setattr(os, "fsync", fsync)
+
+    return start
+
+
+def test_a_disk_full_while_a_checkpoint_is_written(trained, ask, full_disk_for, monkeypatch):
+    capture, out = trained
+    train = ("train", capture, "--out", out, "--steps", 30, *SMALL)
+    full_disk_for(out, "safetensors")
+    refused(ask(*train), str(out / "checkpoint" / CURRENT), "No space left on device")
+    no_halves(out)
+    assert step_of(out) == 20
+    monkeypatch.undo()
+    resumed = ask(*train)
+    assert resumed.code == EXIT_DONE and "Going on after step 20" in resumed.out and step_of(out) == 30
+
+
+@pytest.mark.parametrize(
+    ("command", "ending"),
+    [("train", "splats.ply"), ("train", "latest.png"), ("train", "objectgs.json"), ("evaluate", "evaluation.json"),
+     ("render", "view_000.png"), ("render", "view_000.ids.png"), ("report", "report.md")],
+)  # fmt: skip
+def test_a_disk_full_at_any_other_file(trained, ask, full_disk_for, command, ending):
+    capture, out = trained
+    words = ("train", capture, "--out", out, "--steps", 25, *SMALL) if command == "train" else (command, out)
+    before = (out / "splats.ply").read_bytes()
+    full_disk_for(out, ending)
+    refused(ask(*words, *(["--ids"] if command == "render" else [])), ending, "No space left on device", "free some")
+    no_halves(out)
+    assert step_of(out) == (25 if ending == "splats.ply" else 20)
+    assert (out / "splats.ply").read_bytes() == before
+
+
+def test_a_disk_full_from_the_start_leaves_no_folder(write_capture, tmp_path, ask, full_disk_for):
+    full_disk_for(tmp_path, "")
+    refused(ask("vote", write_capture().folder, "--out", tmp_path / "out"), str(tmp_path / "out"), "No space left")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_checkpoint_cut_short_falls_back_and_says_so(trained, ask):
+    capture, out = trained
+    assert ask("train", capture, "--out", out, "--steps", 25, *SMALL).code == EXIT_DONE
+    current = out / "checkpoint" / CURRENT
+    current.write_bytes(current.read_bytes()[:5000])
+    for command in ("evaluate", "render", "report"):
+        answer = ask(command, out)
+        assert answer.code == EXIT_DONE and f"{current} is cut short" in answer.err
+    answer = ask("train", capture, "--out", out, "--steps", 30, *SMALL)
+    assert answer.code == EXIT_DONE and f"{current} is cut short" in answer.err
+    assert "Going on after step 20" in answer.out and step_of(out) == 30
+    for path in (current, out / "checkpoint" / PREVIOUS):
+        path.write_bytes(b"")
+    refused(ask("render", out), str(out / "checkpoint"), "cut short")
+    refused(ask("train", capture, "--out", out, "--steps", 40, *SMALL), str(out / "checkpoint"), "--restart")
+    assert ask("train", capture, "--out", out, "--steps", 5, *SMALL, "--restart").code == EXIT_DONE
+
+
+# --- stopping --------------------------------------------------------------------------------------------------------
+
+
+def signal_at(monkeypatch, owner, name: str, call: int, number=signal.SIGINT) -> None:
+    """Raise a signal in a call of `owner.name`."""
+    original = getattr(owner, name)
+    calls = []
+
+    def wrapper(*args, **keywords):
+        calls.append(1)
+        if len(calls) == call:
+            signal.raise_signal(number)
+        return original(*args, **keywords)
+
+    monkeypatch.setattr(owner, name, wrapper)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_and_the_same_command_goes_on(trained, ask, monkeypatch, number):
+    capture, out = trained
+    train = ("train", capture, "--out", out, "--steps", 40, *SMALL)
+    handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    signal_at(monkeypatch, Trainer, "step", 7, number)
+    stopped = ask(*train, "--json")
+    assert stopped.code == EXIT_CANCELLED
+    assert stopped.events[-1]["stopped"] is True and "after 27 steps" in stopped.events[-1]["message"]
+    assert step_of(out) == 27
+    stages = {s["name"]: s["seconds"] for s in json.loads((out / "objectgs.json").read_text())["stages"]}
+    spent = load_checkpoint(out / "checkpoint")[1]["progress"]["seconds"]
+    assert stages["train"] == pytest.approx(spent, abs=0.02), "the time before the stop counts"
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == handlers
+    monkeypatch.undo()
+    resumed = ask(*train)
+    assert resumed.code == EXIT_DONE and "Going on after step 27" in resumed.out and step_of(out) == 40
+
+
+def test_a_line_stop_on_standard_input(trained, ask, monkeypatch):
+    capture, out = trained
+    begun = threading.Event()
+
+    class Typed:
+        def __iter__(self):
+            yield "hello\n"
+            begun.wait(60)
+            yield "stop\n"
+            time.sleep(60)
+
+    original = Trainer.step
+
+    def step(self, share):
+        begun.set()
+        return original(self, share)
+
+    monkeypatch.setattr(Trainer, "step", step)
+    monkeypatch.setattr(sys, "stdin", Typed())
+    stopped = ask("train", capture, "--out", out, "--steps", 100_000, *SMALL, "--json")
+    assert stopped.code == EXIT_CANCELLED and stopped.events[-1]["stopped"] is True
+    assert 20 < step_of(out) < 100_000
+
+
+def test_stopping_anything_else_leaves_whole_files(write_capture, trained, tmp_path, ask, monkeypatch):
+    import backend.labels.voting as voting
+
+    capture, out = trained
+    with monkeypatch.context() as patch:
+        signal_at(patch, voting, "_projected", 3)
+        assert ask("vote", capture, "--out", tmp_path / "voted").code == EXIT_CANCELLED
+    assert not (tmp_path / "voted/points.ply").exists() and not (tmp_path / "voted/objects.json").exists()
+    for words in (("render", out, "--views", "all", "--ids"), ("evaluate", out), ("report", out)):
+        with monkeypatch.context() as patch:
+            signal_at(patch, commands, "draw", 2)
+            answer = ask(*words)
+        assert answer.code == EXIT_CANCELLED and "Stopped" in answer.out and "error" not in answer.err
+        assert len(list((out / "renders").glob("view_???.png"))) == 2
+        assert not (out / "evaluation.json").exists() and not (out / "report.md").exists()
+    no_halves(out)
+    no_halves(tmp_path / "voted")
+    scene = write_capture(name="bent", views=5, model="SIMPLE_RADIAL", params=[90, 48, 36, 0.1])
+    with monkeypatch.context() as patch:
+        signal_at(patch, commands, "load_capture", 1)
+        assert ask("vote", scene.folder, "--out", tmp_path / "bent-out").code == EXIT_CANCELLED
+    no_halves(tmp_path / "bent-out")
+    assert ask("vote", scene.folder, "--out", tmp_path / "bent-out").code == EXIT_DONE
+
+
+def test_a_second_signal_ends_it_at_once(trained, ask, monkeypatch):
+    capture, out = trained
+
+    def twice(*_):
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Trainer, "step", twice)
+    answer = ask("train", capture, "--out", out, "--steps", 40, *SMALL)
+    assert answer.code == EXIT_CANCELLED and "Stopped at once" in answer.out and step_of(out) == 20
+
+
+def test_a_real_process_stops_on_a_signal_and_on_a_reader_that_left(write_capture, tmp_path):
+    scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
+    train = [sys.executable, "-m", "backend", "train", str(scene.folder), "--out", str(out), "--steps", "100000",
+             *SMALL, "--threads", "1", "--json"]  # fmt: skip
+    process = subprocess.Popen(train, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if '"preview"' in line and len(lines) > 3:
+            process.send_signal(signal.SIGTERM)
+            break
+    rest, err = process.communicate(timeout=60)
+    answer = Answer(process.returncode, "".join(lines) + rest, err)
+    assert answer.code == EXIT_CANCELLED and answer.events[-1]["stopped"] is True and err == ""
+    assert step_of(out) > 0
+
+    process = subprocess.Popen(train, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process.stdout.readline()
+    process.stdout.close()
+    assert process.wait(timeout=60) == EXIT_CANCELLED
+    assert process.stderr.read() == ""
+    assert step_of(out) > 0
+
+
+# --- what else a program may meet ------------------------------------------------------------------------------------
+
+
+def test_an_unexpected_failure_is_exit_code_1(write_capture, ask, monkeypatch):
+    def broken(*_):
+        raise ZeroDivisionError("two\nlines")
+
+    monkeypatch.setattr(commands, "check_capture", broken)
+    answer = ask("check", write_capture().folder, "--json")
+    assert answer.code == EXIT_FAILED and "Traceback" in answer.err
+    assert answer.messages("error") == ["An unexpected failure: ZeroDivisionError: two lines"]
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])
+def test_too_little_memory_is_one_sentence(write_capture, ask, monkeypatch, error):
+    def greedy(*_):
+        raise error
+
+    monkeypatch.setattr(commands, "check_capture", greedy)
+    refused(ask("check", write_capture().folder), "not enough memory", "--max-size")
+
+
+def test_figures_without_a_finite_value_are_null_in_events(trained, ask, monkeypatch):
+    _, out = trained
+    monkeypatch.setattr("backend.evaluation.metrics.psnr", lambda a, b: float("inf"))
+    answer = ask("evaluate", out, "--json")
+    assert answer.code == EXIT_DONE and "Infinity" not in answer.out
+    assert json.loads((out / "evaluation.json").read_text())["quality"]["psnr"] is None
+
+
+def test_doctor_takes_a_small_scene_through_everything(ask):
+    answer = ask("doctor", "--json")
+    assert answer.code == EXIT_DONE and "works" in answer.events[-1]["message"]
+    assert answer.events[-1]["machine"]["device"] == "cpu"
+
+
+def test_help_says_what_each_command_does_with_an_example(capsys):
+    names = ["check", "vote", "train", "render", "evaluate", "report", "doctor"]
+    texts = {}
+    for words in ([], *([name] for name in names)):
+        with pytest.raises(SystemExit) as ended:
+            arguments.main([*words, "--help"])
+        assert ended.value.code == 0
+        texts["".join(words)] = text = capsys.readouterr().out
+        assert max(map(len, text.splitlines())) <= 90
+    for name in names:
+        assert f"    {name} " in texts[""] and f"example:\n  python -m backend {name}" in texts[name]
+    defaults = Settings()
+    train = " ".join(texts["train"].split())
+    for option, value in {
+        "--max-anchors N": defaults.max_anchors, "--offsets N": defaults.offsets,
+        "--semantic-weight W": defaults.semantic_weight, "--minutes M": 5,
+    }.items():  # fmt: skip
+        assert f"({value})" in train.rsplit(option + " ", 1)[1].split(" --")[0], option
+
+
+# --- the fit of a view-dependent model -------------------------------------------------------------------------------
+
+
+def test_the_basis_is_the_rasterizers():
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(50, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    sh = rng.normal(size=(50, 9, 3)) * 0.1
+    wanted = sh_colors(torch.from_numpy(sh), torch.from_numpy(directions)).numpy()
+    np.testing.assert_allclose(np.einsum("nk,nkc->nc", sh_basis(directions), sh) + 0.5, wanted, atol=1e-5)
+
+
+def test_a_model_that_does_not_look_at_the_view_is_fitted_exactly(write_capture, tmp_path, ask, monkeypatch):
+    scene = write_capture(views=9, size=(64, 48))
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    ids = np.repeat([1, 2, 5], len(capture.points.xyz) // 3)
+    commands.set_threads(1)
+    trainer = Trainer.start(capture, ids, Settings(mode="view", offsets=4))
+    for i in range(30):
+        trainer.step(i / 30)
+    model = trainer.model
+    cameras = [trainer.scene.camera(i) for i in range(len(capture.views))]
+    assert 20 < agreement(model, fit_splats(model, cameras), cameras) < 60
+    with torch.no_grad():
+        model.heads.hidden.weight[:, -4:] = 0.0
+    splats = fit_splats(model, cameras)
+    assert agreement(model, splats, cameras) > 60
+    assert set(splats.object_ids.tolist()) <= {0, 1, 2, 5}
+    monkeypatch.setattr("backend.export.fit._ANCHORS_AT_ONCE", 50)
+    monkeypatch.setattr("backend.export.fit._SPLATS_AT_ONCE", 70)
+    parts = fit_splats(model, cameras)
+    for name in ("means", "quats", "scales", "opacities", "sh", "object_ids"):
+        np.testing.assert_array_equal(getattr(parts, name), getattr(splats, name))
+    assert agreement(model, splats, []) is None
