@@ -411,7 +411,7 @@ def _described(capture: Capture, max_size: int) -> dict[str, Any]:
 
 
 def _name(capture: Capture, object_id: int) -> str:
-    return capture.names.get(object_id, f"object {object_id}")
+    return capture.names.get(object_id, f"object {object_id}" if object_id else "unlabelled")
 
 
 # --- training and export ---------------------------------------------------------------------------------------------
