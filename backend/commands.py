@@ -299,7 +299,9 @@ def _trained(options: argparse.Namespace, reporter: Reporter) -> _Trained:
     if warning:
         reporter.warning(warning)
     if "training" not in memory:
-        raise InputError(f"{folder.settings} does not say what {folder.checkpoint} was trained from; train again.")
+        raise InputError(
+            f"{folder.settings} does not say what {folder.checkpoint} was trained from; train again with --restart."
+        )
     place = Path(options.capture or memory["capture"]["folder"])
     if not place.is_dir():
         raise InputError(f"The capture {place} of {folder.folder} is gone; say with --capture where it is now.")
