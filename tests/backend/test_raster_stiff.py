@@ -86,6 +86,10 @@ def test_zero_quaternion_is_dropped():
     compare(among_others(one(quat=(0, 0, 0, 0))), camera())
 
 
+BEHIND_OPAQUE = 2e-4
+"""What lies behind nearly opaque splats gets the small difference of two float32 sums, divided by 1 - alpha."""
+
+
 @pytest.mark.parametrize("length", [1e-3, 1e3, 1e9])
 def test_quaternion_of_any_length(length):
     q = np.array([0.3, -0.5, 0.7, 0.2]) * length
@@ -168,14 +172,14 @@ def test_opaque_splat_on_a_pixel_centre_is_drawn():
 @pytest.mark.parametrize("opacity", [0.98, 0.99, 1.0])
 def test_sixteen_opaque_splats_stacked(scale, opacity):
     layers = [one(mean=(0, 0, 1 + 0.1 * i), opacity=opacity, scale=(scale,) * 3, id=i % 5) for i in range(16)]
-    compare(join(*layers), straight())
+    compare(join(*layers), straight(), gradient_tolerance=BEHIND_OPAQUE)
 
 
 def test_hundreds_of_layers_stop_where_the_reference_does():
     rng = np.random.default_rng(0)
     scene = random_scene(0, count=400)
     scene["opacities"] = torch.tensor(rng.uniform(0.3, 1.0, 400))
-    compare(scene, camera())
+    compare(scene, camera(), gradient_tolerance=BEHIND_OPAQUE)
 
 
 @pytest.mark.parametrize("opacity", [0.0, -1.0, ALPHA_MIN * 0.999])
