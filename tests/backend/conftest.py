@@ -6,8 +6,6 @@ import json
 import struct
 from pathlib import Path
 
-import backend  # noqa: F401 - first, since it says how the threads of the libraries below wait
-
 import numpy as np
 import pycolmap
 import pytest
