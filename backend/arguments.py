@@ -5,11 +5,8 @@ from __future__ import annotations
 import argparse
 import errno
 import os
-import signal
 import sys
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
@@ -25,6 +22,7 @@ from .protocol import (
     Reporter,
     StoppingReporter,
 )
+from .stopping import StopRequest
 
 DEFAULT_MINUTES = 5.0
 
@@ -196,24 +194,22 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
-def _count(text: str) -> int:
+def _whole(text: str, least: int, wanted: str) -> int:
     try:
         value = int(text)
     except ValueError:
-        value = 0
-    if value <= 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
+        value = least - 1
+    if not least <= value < 2**63:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number {wanted}")
     return value
+
+
+def _count(text: str) -> int:
+    return _whole(text, 1, "above 0")
 
 
 def _seed(text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = -1
-    if not 0 <= value < 2**63:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 on")
-    return value
+    return _whole(text, 0, "from 0 on")
 
 
 def _weight(text: str) -> float:
@@ -233,48 +229,6 @@ def _amount(text: str) -> float:
     return value
 
 
-class StopRequest:
-    """Set by an interrupt, a termination signal, or a line `stop` on standard input; asked by calling it."""
-
-    def __init__(self) -> None:
-        self._event = threading.Event()
-
-    def __call__(self) -> bool:
-        return self._event.is_set()
-
-    @contextmanager
-    def listening(self, read_stdin: bool) -> Iterator[None]:
-        """Take over the signals, and standard input where another program drives this one.
-
-        A second signal interrupts at once, whatever is being done.
-        """
-
-        def on_signal(number, frame):
-            if self._event.is_set():
-                raise KeyboardInterrupt
-            self._event.set()
-
-        if read_stdin and sys.stdin is not None:
-            threading.Thread(target=self._read, daemon=True).start()
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-    def _read(self) -> None:
-        try:
-            for line in sys.stdin:
-                if line.strip() == "stop":
-                    self._event.set()
-        except (OSError, ValueError):
-            pass  # Closed, or not to be read: then nothing can be asked there.
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
@@ -283,11 +237,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         options = parser().parse_args(arguments)
         # Before the signals are taken over, since pycolmap takes SIGTERM for itself when it is imported.
-        from . import commands
+        from .commands import COMMANDS
+        from .commands.machine import set_threads
 
         with stop.listening(read_stdin=options.json):
-            commands.set_threads(options.threads)
-            getattr(commands, options.command)(options, StoppingReporter(reporter, stop))
+            set_threads(options.threads)
+            COMMANDS[options.command](options, StoppingReporter(reporter, stop))
         return EXIT_DONE
     except (InputError, _UsageError) as error:
         reporter.error(str(error))

@@ -12,8 +12,8 @@ from .settings import NEAR
 @dataclass(frozen=True)
 class Camera:
     """viewmat (4, 4) float64 world to camera with OpenCV axes; K (3, 3) float64 in pixels, the first pixel's centre at
-    (0.5, 0.5); width and height in pixels; near: nearest drawn depth in scene units; gain: how much brighter, channel by channel, the camera's photo is than the
-    scene (a finished picture is multiplied by it)."""
+    (0.5, 0.5); width and height in pixels; near: nearest drawn depth in scene units; gain: how much brighter, channel
+    by channel, the camera's photo is than the scene (a finished picture is multiplied by it)."""
 
     viewmat: np.ndarray
     K: np.ndarray

@@ -1,7 +1,7 @@
 """How much brighter or bluer each photo is than the others: cameras that set their own exposure and white balance.
 
-COLMAP's points are seen in many photos. Photo i shows point p as gain_i * color_p, channel by channel; gains and colours
-are found by alternating least squares. Training then compares the splats with photos of one common exposure.
+COLMAP's points are seen in many photos. Photo i shows point p as gain_i * color_p, channel by channel; gains and
+colours are found by alternating least squares. Training then compares the splats with photos of one common exposure.
 """
 
 from __future__ import annotations

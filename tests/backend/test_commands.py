@@ -22,10 +22,11 @@ from PIL import Image
 
 from backend import arguments, commands
 from backend.capture import load_capture
+from backend.commands.lock import LOCK
 from backend.export import agreement, fit_splats, read_splats
 from backend.export.fit import sh_basis
 from backend.model.checkpoint import CURRENT, PREVIOUS, load_checkpoint
-from backend.protocol import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, EXIT_FAILED
+from backend.protocol import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, EXIT_FAILED, InputError
 from backend.raster.reference import sh_colors
 from backend.training.loop import Trainer
 from backend.training.settings import Settings
@@ -105,7 +106,9 @@ def refused(answer: Answer, *words: str) -> str:
 
 
 def no_halves(folder: Path) -> None:
-    assert not [path for path in folder.rglob("*") if path.suffix == ".part" or path.name.startswith(".write-test")]
+    """Nothing is left that was meant to be there only while a command ran."""
+    hidden = [path for path in folder.rglob(".*") if path.name == LOCK or path.name.startswith(".write-test")]
+    assert not [*folder.rglob("*.part"), *hidden]
 
 
 def step_of(out: Path) -> int:
@@ -239,8 +242,8 @@ def test_another_capture_does_not_continue_a_training(trained, write_capture, as
 def test_votes_are_cast_once_and_again_when_they_would_differ(write_capture, tmp_path, ask, monkeypatch):
     scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
     cast = []
-    original = commands.vote_points
-    monkeypatch.setattr(commands, "vote_points", lambda *a, **k: (cast.append(a[1]), original(*a, **k))[1])
+    original = commands.vote.vote_points
+    monkeypatch.setattr(commands.vote, "vote_points", lambda *a, **k: (cast.append(a[1]), original(*a, **k))[1])
     train = ("train", scene.folder, "--out", out, "--steps", 1, *SMALL, "--restart")
     assert ask("vote", scene.folder, "--out", out).code == EXIT_DONE
     assert ask(*train).code == EXIT_DONE and cast == ["majority"]
@@ -566,7 +569,7 @@ def test_stopping_anything_else_leaves_whole_files(write_capture, trained, tmp_p
     assert not (tmp_path / "voted/points.ply").exists() and not (tmp_path / "voted/objects.json").exists()
     for words in (("render", out, "--views", "all", "--ids"), ("evaluate", out), ("report", out)):
         with monkeypatch.context() as patch:
-            signal_at(patch, commands, "draw", 2)
+            signal_at(patch, getattr(commands, words[0]), "draw", 2)
             answer = ask(*words)
         assert answer.code == EXIT_CANCELLED and "Stopped" in answer.out and "error" not in answer.err
         assert len(list((out / "renders").glob("view_???.png"))) == 2
@@ -575,7 +578,7 @@ def test_stopping_anything_else_leaves_whole_files(write_capture, trained, tmp_p
     no_halves(tmp_path / "voted")
     scene = write_capture(name="bent", views=5, model="SIMPLE_RADIAL", params=[90, 48, 36, 0.1])
     with monkeypatch.context() as patch:
-        signal_at(patch, commands, "load_capture", 1)
+        signal_at(patch, commands.folder, "load_capture", 1)
         assert ask("vote", scene.folder, "--out", tmp_path / "bent-out").code == EXIT_CANCELLED
     no_halves(tmp_path / "bent-out")
     assert ask("vote", scene.folder, "--out", tmp_path / "bent-out").code == EXIT_DONE
@@ -615,6 +618,72 @@ def test_a_real_process_stops_on_a_signal_and_on_a_reader_that_left(write_captur
     assert process.wait(timeout=60) == EXIT_CANCELLED
     assert process.stderr.read() == ""
     assert step_of(out) > 0
+    no_halves(out)
+
+
+# --- two at once -----------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_is_trained_by_one_process_until_it_ends_or_is_killed(write_capture, tmp_path, ask):
+    capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"
+    train = ("train", str(capture), "--out", str(out), *SMALL)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "backend", *train, "--steps", "100000", "--threads", "1", "--json"],
+        cwd=ROOT, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    with process:
+        try:
+            assert any('"preview"' in line for line in process.stdout)
+            for words in (train, ("vote", capture, "--out", out), (*train, "--restart")):
+                sentence = refused(ask(*words))
+                assert sentence == (
+                    f"error: {out} is being trained by another process (pid {process.pid}); wait for it or stop it."
+                )
+            assert process.poll() is None and (out / "points.ply").exists()
+        finally:
+            process.kill()
+        # Dead, though nobody has asked yet how it ended.
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        assert (out / LOCK).read_text() == f"{process.pid}\n"
+        assert ask(*train, "--steps", 5).code == EXIT_DONE
+    no_halves(out)
+
+
+@pytest.mark.parametrize("left", ["", "no number", "999999999", "0", "-1", "an older process's"])
+def test_a_lock_without_its_process_is_taken_over(trained, ask, left):
+    capture, out = trained
+    (out / LOCK).write_text(str(os.getpid()) if "older" in left else left)
+    train = ("train", capture, "--out", out, "--steps", 20, *SMALL)
+    if "older" in left:
+        refused(ask(*train), f"pid {os.getpid()}")
+        os.utime(out / LOCK, (1e9, 1e9))
+    assert ask(*train).code == EXIT_DONE
+    no_halves(out)
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt, OSError, MemoryError, InputError])
+def test_the_lock_goes_however_a_training_ends(trained, ask, monkeypatch, error):
+    capture, out = trained
+    seen = []
+
+    def step(*_):
+        seen.append((out / LOCK).read_text())
+        raise error("It ended.")
+
+    monkeypatch.setattr(Trainer, "step", step)
+    assert ask("train", capture, "--out", out, "--steps", 30, *SMALL).code != EXIT_DONE
+    assert seen == [f"{os.getpid()}\n"]
+    no_halves(out)
+
+
+def test_a_lock_that_cannot_be_written_leaves_nothing(tmp_path, monkeypatch):
+    def full():
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(commands.lock.os, "getpid", full)
+    with pytest.raises(OSError) as failure, commands.lock.locked(tmp_path):
+        pass
+    assert failure.value.filename == str(tmp_path / LOCK) and not list(tmp_path.iterdir())
 
 
 # --- what else a program may meet ------------------------------------------------------------------------------------
@@ -624,7 +693,7 @@ def test_an_unexpected_failure_is_exit_code_1(write_capture, ask, monkeypatch):
     def broken(*_):
         raise ZeroDivisionError("two\nlines")
 
-    monkeypatch.setattr(commands, "check_capture", broken)
+    monkeypatch.setattr(commands.check, "check_capture", broken)
     answer = ask("check", write_capture().folder, "--json")
     assert answer.code == EXIT_FAILED and "Traceback" in answer.err
     assert answer.messages("error") == ["An unexpected failure: ZeroDivisionError: two lines"]
@@ -635,7 +704,7 @@ def test_too_little_memory_is_one_sentence(write_capture, ask, monkeypatch, erro
     def greedy(*_):
         raise error
 
-    monkeypatch.setattr(commands, "check_capture", greedy)
+    monkeypatch.setattr(commands.check, "check_capture", greedy)
     refused(ask("check", write_capture().folder), "not enough memory", "--max-size")
 
 
@@ -689,7 +758,7 @@ def test_a_model_that_does_not_look_at_the_view_is_fitted_exactly(write_capture,
     scene = write_capture(views=9, size=(64, 48))
     capture = load_capture(scene.folder, tmp_path / "cache")
     ids = np.repeat([1, 2, 5], len(capture.points.xyz) // 3)
-    commands.set_threads(1)
+    commands.machine.set_threads(1)
     trainer = Trainer.start(capture, ids, Settings(mode="view", offsets=4))
     for i in range(30):
         trainer.step(i / 30)

@@ -1,0 +1,23 @@
+"""What each command does. It takes the parsed options and a reporter, and leaves files in the reconstruction folder.
+
+A module for each command; `folder`, `lock`, `record` and `machine` are what they share. Importing this brings in torch
+and the rest, so `backend.arguments` does it only once there is something to do.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+
+from ..protocol import StoppingReporter
+from . import check, doctor, evaluate, render, report, train, vote
+
+COMMANDS: dict[str, Callable[[argparse.Namespace, StoppingReporter], None]] = {
+    "check": check.check,
+    "vote": vote.vote,
+    "train": train.train,
+    "render": render.render,
+    "evaluate": evaluate.evaluate,
+    "report": report.report,
+    "doctor": doctor.doctor,
+}

@@ -1,0 +1,109 @@
+"""Opening a reconstruction folder: one to make splats in, or one with a model to draw and measure."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..capture import Capture, load_capture
+from ..model.object_model import ObjectModel
+from ..protocol import InputError, Reconstruction, Reporter
+from ..training.loop import Progress, load_model, progress_of
+from ..training.scene import Scene
+from .lock import FolderInUse, locked
+from .record import record, recorded, stage
+
+
+@contextmanager
+def open_reconstruction(options: argparse.Namespace, reporter: Reporter) -> Iterator[tuple[Reconstruction, Capture]]:
+    """The folder of --out, made where it is not there and locked meanwhile, and the capture to fill it from.
+
+    Bad input leaves nothing behind.
+    """
+    folder = Reconstruction(options.out)
+    absent = [path for path in (folder.cache, folder.folder, *folder.folder.parents) if not path.exists()]
+    with ExitStack() as held:
+        with _removed_if_refused(absent):
+            folder.create()
+            held.enter_context(locked(folder.folder))
+            with stage(folder, "read"):
+                capture = load_capture(options.capture, folder.cache, options.memory_mb, options.max_size, reporter)
+        yield folder, capture
+
+
+@contextmanager
+def _removed_if_refused(absent: Sequence[Path]) -> Iterator[None]:
+    """Remove what was made of `absent` (innermost first), unless another process makes use of it."""
+    try:
+        yield
+    except FolderInUse:
+        raise
+    except (InputError, OSError):
+        if absent:
+            shutil.rmtree(absent[-1], ignore_errors=True)
+        raise
+
+
+class Trained(NamedTuple):
+    """A reconstruction folder with a model in it, opened."""
+
+    folder: Reconstruction
+    capture: Capture
+    model: ObjectModel
+    scene: Scene
+    progress: Progress
+
+
+def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
+    """What `train` left in DIR, with the capture it was made from; InputError where one of them is not there."""
+    folder = Reconstruction(options.folder)
+    if not folder.folder.is_dir():
+        raise InputError(f"{folder.folder} does not exist; give the folder that `train` was told with --out.")
+    if not folder.settings.exists():
+        raise InputError(
+            f"{folder.folder} is no reconstruction, since it holds no {folder.settings.name}; train first."
+        )
+    memory = recorded(folder)
+    model, state, warning = load_model(folder.checkpoint)
+    if warning:
+        reporter.warning(warning)
+    if "training" not in memory:
+        raise InputError(
+            f"{folder.settings} does not say what {folder.checkpoint} was trained from; train again with --restart."
+        )
+    place = Path(options.capture or memory["capture"]["folder"])
+    if not place.is_dir():
+        raise InputError(f"The capture {place} of {folder.folder} is gone; say with --capture where it is now.")
+    max_size = memory["capture"]["max_size"]
+    capture = load_capture(place, folder.cache, options.memory_mb, max_size, reporter)
+    if digest(capture) != memory["capture"]["digest"]:
+        raise InputError(
+            f"The capture {place} is not the one that {folder.folder} was trained on; put that one back, say with "
+            "--capture where it is, or train again."
+        )
+    if options.capture:
+        record(folder, capture=described(capture, max_size))
+    zero_is_object = state["settings"]["zero_is_object"]
+    scene = Scene(capture, model.object_ids, model.normalization, zero_is_object, options.memory_mb)
+    return Trained(folder, capture, model, scene, progress_of(state))
+
+
+def digest(capture: Capture) -> str:
+    """Tells one capture from another, wherever it lies: names, poses and points."""
+    sha = hashlib.sha256()
+    for view in capture.views:
+        sha.update(view.name.encode() + b"\0" + np.ascontiguousarray(view.viewmat).tobytes())
+    sha.update(np.ascontiguousarray(capture.points.xyz).tobytes())
+    return sha.hexdigest()[:16]
+
+
+def described(capture: Capture, max_size: int) -> dict[str, Any]:
+    """A capture as objectgs.json holds it."""
+    return {"folder": str(capture.folder.resolve()), "max_size": max_size, "digest": digest(capture)}

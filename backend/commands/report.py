@@ -1,0 +1,160 @@
+"""`report`: report.json, report.md and their pictures, from what the earlier commands left."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from ..evaluation import comparison, write_report
+from ..protocol import Reconstruction, Reporter, StoppingReporter, read_json
+from ..raster.draw import draw
+from ..training.loop import Progress
+from ..training.settings import downscale_at
+from .evaluate import evaluation_file
+from .folder import Trained, open_trained
+from .machine import machine_facts
+from .record import recorded, stage
+from .vote import object_name
+
+PICTURES_IN_REPORT = 3
+
+
+def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
+    """Write report.json, report.md and their pictures from what the earlier commands left."""
+    trained = open_trained(options, reporter)
+    folder, capture, model, progress = trained.folder, trained.capture, trained.model, trained.progress
+    evaluation = _evaluation(folder, progress, reporter)
+    with stage(folder, "report"):
+        pictures = _pictures(trained, reporter)
+    memory = recorded(folder)
+    training = memory["training"]
+    export = memory.get("export", {})
+    value = {
+        "capture": {
+            "folder": capture.folder.name, "views": len(capture.views), "held_out": len(capture.test_indices),
+            "objects": len(capture.object_ids), **capture.counts,
+            "exposure_varies": trained.scene.exposure_varies,
+            "cameras": ", ".join(f"{count} {name}" for name, count in capture.counts["cameras"].items()),
+        },
+        "settings": {
+            "minutes": training["minutes"], "steps": training["steps"], "max_size": memory["capture"]["max_size"],
+            "strategy": training["votes"]["strategy"], **training["settings"],
+        },
+        "machine": machine_facts(),
+        "left_out": _left_out(trained),
+        "stages": memory.get("stages", []),
+        "curve": progress.curve,
+        "model": {
+            "anchors": len(model.anchors),
+            "gaussians": len(model.generate().source) if model.explicit else export.get("splats"),
+            "bytes": folder.splats.stat().st_size if folder.splats.exists() else None,
+            "trained_steps": progress.step, "trained_seconds": round(progress.seconds, 1),
+            "psnr_of_export": export.get("psnr_of_export"),
+        },
+        "quality": evaluation["quality"],
+        "objects": _objects(trained, evaluation["objects"]),
+        "views": evaluation["views"],
+    }  # fmt: skip
+    write_report(folder, value, pictures, title=capture.folder.resolve().name)
+    reporter.done(report=str(folder.report_md))
+
+
+def _evaluation(folder: Reconstruction, progress: Progress, reporter: Reporter) -> dict[str, Any]:
+    """What `evaluate` found; nothing, and a warning, where that is missing or of an earlier state of the model."""
+    nothing: dict[str, Any] = {"quality": {}, "objects": [], "views": []}
+    path = evaluation_file(folder)
+    if not path.exists():
+        reporter.warning(f"{path} does not exist, so the report has no quality; run `evaluate` first.")
+        return nothing
+    found = read_json(path)
+    if found.get("step") != progress.step:
+        reporter.warning(f"{path} is of an earlier state of the model, so the report leaves it out; run `evaluate`.")
+        return nothing
+    return found
+
+
+def _pictures(trained: Trained, reporter: Reporter) -> list[tuple[str, Image.Image]]:
+    capture = trained.capture
+    views = capture.test_indices or tuple(range(len(capture.views)))
+    views = views[:: max(len(views) // PICTURES_IN_REPORT, 1)][:PICTURES_IN_REPORT]
+    reporter.status("Drawing the report's pictures")
+    pictures = []
+    for done, index in enumerate(views, 1):
+        drawn = draw(trained.model, trained.scene.camera(index))
+        assert drawn.ids is not None
+        shown = comparison(capture.image(index), drawn.image, capture.mask(index), drawn.ids, None, capture.names)
+        pictures.append((f"View {capture.views[index].name}", shown))
+        reporter.progress(done, len(views), what="pictures")
+    return pictures
+
+
+def _objects(trained: Trained, evaluated: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Every object that the masks show or the model holds; those that no held-out view shows were not measured."""
+    model, capture = trained.model, trained.capture
+    anchors = np.bincount(model.anchors.ids, minlength=len(model.object_ids))
+    anchors_of = dict(zip(model.object_ids.tolist(), anchors.tolist(), strict=True))
+    measured = {entry["id"]: entry for entry in evaluated}
+    ids = ({*anchors_of, *capture.object_ids.tolist()} - {0}) | set(measured)
+    return [
+        {"iou": None, **measured.get(i, {}), "id": i, "name": object_name(capture, i), "anchors": anchors_of.get(i, 0)}
+        for i in sorted(ids)
+    ]
+
+
+def _left_out(trained: Trained) -> list[dict[str, str]]:
+    """What was not done, and why this scene did not need it or could not have it."""
+    folder, capture, progress = trained.folder, trained.capture, trained.progress
+    memory = recorded(folder)
+    settings = memory["training"]["settings"]
+    counts = capture.counts
+    longest = max(max(view.width, view.height) for view in capture.views)
+    cases = [
+        (not capture.has_masks, "votes, the label loss and object scores", "the capture has no masks"),
+        (
+            capture.has_masks and settings["semantic_weight"] == 0, "the label loss",
+            "--semantic-weight 0 was asked for",
+        ),
+        (
+            not any(view.image_file.is_relative_to(folder.cache) for view in capture.views),
+            "undistortion and reduction of the images",
+            f"all are pinhole pictures of at most {memory['capture']['max_size']} pixels already",
+        ),
+        (
+            counts["unregistered"] > 0, f"{counts['unregistered']} images without a pose",
+            "COLMAP could not place them",
+        ),
+        (
+            counts["missing"] > 0, f"{counts['missing']} images that the model names",
+            "their files are not in the capture",
+        ),
+        (
+            capture.has_masks and counts["masks"] < counts["used"],
+            f"labels of {counts['used'] - counts['masks']} views", "their masks are missing",
+        ),
+        (
+            not trained.scene.exposure_varies, "undoing of exposure and white balance",
+            "the photos agree about the points that they share",
+        ),
+        (
+            downscale_at(0.0, longest) == 1, "reduced pictures at the start of training",
+            f"{longest} pixels are few enough to train on from the start",
+        ),
+        (
+            progress.last_growth == 0, "growth and pruning of anchors",
+            f"{progress.step} steps are too few to say where anchors are missing",
+        ),
+        (
+            len(trained.model.anchors) >= settings["max_anchors"], "further growth of anchors",
+            f"--max-anchors {settings['max_anchors']} was reached",
+        ),
+        (
+            settings["background"] != "learned", "a learned background",
+            f"--background {settings['background']} was asked for",
+        ),
+        (not capture.test_indices, "quality on held-out views", "there are too few views to hold any out"),
+        (bool(capture.test_indices), "LPIPS", "it needs a trained network, which is not part of this program"),
+    ]  # fmt: skip
+    return [{"what": what, "why": why} for applies, what, why in cases if applies]

@@ -1,0 +1,169 @@
+"""`train`: begins, resumes or extends a training; leaves a checkpoint, previews and splats.ply."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from collections.abc import Callable
+from typing import Any
+
+from ..capture import Capture
+from ..evaluation import IdScores, ImageScores, comparison, save_picture
+from ..export import agreement, fit_splats, write_splats
+from ..labels.points import read_points
+from ..model.object_model import ObjectModel
+from ..protocol import Cancelled, InputError, Reconstruction, Reporter, StoppingReporter, plain
+from ..raster.draw import draw
+from ..training.loop import Budget, Trainer
+from ..training.scene import Scene
+from ..training.settings import Settings
+from .folder import described, digest, open_reconstruction
+from .record import record, record_stage, recorded, stage
+from .vote import cast_votes, votes_are_current, votes_key
+
+
+def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
+    """Train, resume or extend; leaves a checkpoint, previews and splats.ply."""
+    budget = Budget(options.steps, None if options.steps else 60.0 * options.minutes)
+    with open_reconstruction(options, reporter) as (folder, capture):
+        trainer = _begun(folder, capture, options, reporter)
+        progress = trainer.progress
+        if progress.step and budget.share(progress.step, progress.seconds) >= 1:
+            reporter.status(
+                f"Already trained for {progress.step} steps in {progress.seconds:.0f} s; ask for more --minutes or "
+                "--steps to extend it, or --restart to begin anew."
+            )
+        else:
+            record(
+                folder,
+                capture=described(capture, options.max_size),
+                training={
+                    "settings": trainer.settings.as_dict(),
+                    "minutes": None if options.steps else options.minutes,
+                    "steps": options.steps,
+                    "votes": votes_key(capture, options),
+                },
+            )
+            _run(trainer, budget, folder, options.checkpoint_seconds, reporter)
+        with stage(folder, "export"):
+            export = _export(trainer.model, trainer.scene, folder, reporter)
+        record(folder, export=export)
+    latest = progress.curve[-1] if progress.curve else {}
+    reporter.done(
+        steps=progress.step, seconds=round(progress.seconds, 1), anchors=len(trainer.model.anchors),
+        splats=str(folder.splats), psnr=latest.get("psnr"), miou=latest.get("miou"),
+        psnr_of_export=export["psnr_of_export"],
+    )  # fmt: skip
+
+
+def _begun(
+    folder: Reconstruction, capture: Capture, options: argparse.Namespace, reporter: StoppingReporter
+) -> Trainer:
+    """The training to go on with, or a new one, after a vote where the one that is there would differ."""
+    settings = _settings(options)
+    resumed = None if options.restart else _resumed(folder, capture, settings, options, reporter)
+    if resumed is not None:
+        return resumed
+    if not votes_are_current(folder, capture, options):
+        cast_votes(folder, capture, options, reporter)
+    trainer = Trainer.start(capture, read_points(folder.points).ids, settings, options.memory_mb)
+    if options.restart:
+        shutil.rmtree(folder.checkpoint, ignore_errors=True)
+    return trainer
+
+
+def _resumed(
+    folder: Reconstruction, capture: Capture, settings: Settings, options: argparse.Namespace, reporter: Reporter
+) -> Trainer | None:
+    """The training that DIR holds, or None; InputError where it was one of another capture or other choices."""
+    resumed = Trainer.resume(capture, folder.checkpoint, settings, options.memory_mb)
+    if resumed is None:
+        return None
+    trainer, warning = resumed
+    if warning:
+        reporter.warning(warning)
+    memory = recorded(folder)
+    otherwise = "use the same, another --out, or --restart to train anew."
+    if "training" not in memory:
+        raise InputError(f"{folder.settings} does not say what {folder.checkpoint} was trained from; {otherwise}")
+    if memory["capture"]["digest"] != digest(capture):
+        raise InputError(f"{folder.checkpoint} was trained on another capture than {capture.folder}; {otherwise}")
+    if memory["capture"]["max_size"] != options.max_size:
+        before = memory["capture"]["max_size"]
+        raise InputError(f"{folder.checkpoint} was trained with --max-size {before}; {otherwise}")
+    strategy = memory["training"]["votes"]["strategy"]
+    if strategy != options.strategy:
+        raise InputError(f"{folder.checkpoint} was trained with --strategy {strategy}; {otherwise}")
+    return trainer
+
+
+def _settings(options: argparse.Namespace) -> Settings:
+    given = {
+        "offsets": options.offsets, "max_anchors": options.max_anchors, "voxel": options.voxel,
+        "semantic_weight": options.semantic_weight,
+    }  # fmt: skip
+    return Settings(
+        seed=options.seed, mode=options.mode, sh_degree=options.sh_degree, background=options.background,
+        zero_is_object=options.unlabelled_is_object, **{k: v for k, v in given.items() if v is not None},
+    )  # fmt: skip
+
+
+def _run(
+    trainer: Trainer, budget: Budget, folder: Reconstruction, checkpoint_seconds: float, reporter: StoppingReporter
+) -> None:
+    """Train. The loop heeds a stop by itself, since it has a checkpoint to write first."""
+    folder.previews.mkdir(exist_ok=True)
+    step = trainer.progress.step
+    begun = f"Going on after step {step} with" if step else "Training"
+    reporter.status(f"{begun} {len(trainer.model.anchors):,} anchors")
+    measure = _held_out(folder, reporter)
+    try:
+        trainer.run(budget, folder.checkpoint, reporter.reporter, measure, reporter.should_stop, checkpoint_seconds)
+    except Cancelled:
+        record_stage(folder, "train", trainer.progress.seconds)
+        raise
+    record_stage(folder, "train", trainer.progress.seconds)
+
+
+def _held_out(folder: Reconstruction, reporter: StoppingReporter) -> Callable[[ObjectModel, Scene], dict[str, Any]]:
+    """Figures of the held-out views for the curve, and a preview of the first of them."""
+
+    def measure(model: ObjectModel, scene: Scene) -> dict[str, Any]:
+        images, ids = ImageScores(), IdScores(scene.zero_is_object)
+        capture = scene.capture
+        for place, index in enumerate(capture.test_indices or (0,)):
+            photo, truth = capture.image(index), capture.mask(index)
+            picture = draw(model, scene.camera(index), want_ids=truth is not None or place == 0)
+            if place == 0:
+                assert picture.ids is not None
+                preview = comparison(photo, picture.image, truth, picture.ids, None, capture.names)
+                reporter.preview(save_picture(preview, folder.previews / "latest.png"))
+            if capture.test_indices:
+                images.add(picture.image, photo)
+                if truth is not None and picture.ids is not None:
+                    ids.add(picture.ids, truth)
+        scores = ids.result()
+        return {"psnr": images.result()["psnr"], "miou": scores["miou"], "mbiou": scores["mbiou"]}
+
+    return measure
+
+
+def _export(model: ObjectModel, scene: Scene, folder: Reconstruction, reporter: Reporter) -> dict[str, Any]:
+    """Write splats.ply; returns how many splats it holds and, where they are only a fit, their PSNR to the model."""
+    reporter.status(f"Writing {folder.splats.name}")
+    if model.explicit:
+        splats, psnr = model.splats(), None
+    else:
+        capture = scene.capture
+        splats = fit_splats(model, [scene.camera(i) for i in capture.train_indices], reporter)
+        views = capture.test_indices or capture.train_indices
+        psnr = plain(agreement(model, splats, [scene.camera(i) for i in views]))
+        where = "held-out" if capture.test_indices else "training"
+        how_well = "cannot be measured" if psnr is None else f"is {psnr:.1f} dB"
+        reporter.warning(
+            f"A view-dependent model has no exact splats: {folder.splats.name} is a fit, whose PSNR to the model's own "
+            f"pictures of the {where} views {how_well}."
+        )
+    for sentence in write_splats(folder.splats, splats):
+        reporter.warning(sentence)
+    return {"splats": len(splats), "psnr_of_export": None if psnr is None else round(psnr, 2)}
