@@ -41,7 +41,7 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument("--mask-noise", type=float, default=0.0, metavar="X", help=(
         "mistakes in masks/, 0 (none, default) to 1 (poor): borders wander up to 4X pixels; an object of a view is "
         "1-3 pixels too large or small with probability X, has a wrong ID with 0.15 X, is missing with 0.10 X"))
-    demo.add_argument("--samples", type=int, default=24, help="rays a pixel at most, denoised (default 24)")
+    demo.add_argument("--samples", type=int, default=20, help="rays a pixel at most, denoised (default 20)")
     demo.add_argument("--overwrite", action="store_true", help="replace a demo capture with other settings in OUT")
     return parser
 

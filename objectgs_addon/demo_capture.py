@@ -42,7 +42,7 @@ class Settings:
     height: int = 240
     seed: int = 0
     mask_noise: float = 0.0
-    samples: int = 24
+    samples: int = 20
 
     def check(self) -> None:
         """Raise `DemoError` for a value out of range."""

@@ -14,8 +14,10 @@ import torch
 from numba import njit, prange
 
 from .anchors import Layout
+from .heads import HIDDEN, Heads
 
 OPACITY_MIN = 1.0 / 255.0
+_RAW_OPACITY_MIN = np.float32(math.atanh(OPACITY_MIN))
 _LOG_EXTENT_MAX = 20.0
 
 
@@ -45,10 +47,10 @@ def _forward(positions, rows, opacity, shape, color, k, features, coefficients, 
         for i in range(6):
             extent[i] = math.exp(min(rows[a, 3 * k + i], np.float32(_LOG_EXTENT_MAX)))
         for j in range(k):
-            alpha = math.tanh(opacity[a, j] + rows[a, n_opacity + j])
-            if not alpha > OPACITY_MIN:
+            raw_opacity = opacity[a, j] + rows[a, n_opacity + j]
+            if not raw_opacity > _RAW_OPACITY_MIN:
                 continue
-            opacities[at] = alpha
+            opacities[at] = math.tanh(raw_opacity)
             source[at] = a * k + j
             for i in range(3):
                 means[at, i] = positions[a, i] + rows[a, 3 * j + i] * extent[i]
@@ -70,7 +72,7 @@ def _count(rows, opacity, k, features, counts):
     for a in prange(rows.shape[0]):
         kept = 0
         for j in range(k):
-            if math.tanh(opacity[a, j] + rows[a, n_opacity + j]) > OPACITY_MIN:
+            if opacity[a, j] + rows[a, n_opacity + j] > _RAW_OPACITY_MIN:
                 kept += 1
         counts[a] = kept
 
@@ -118,33 +120,57 @@ def _backward(rows, k, features, coefficients, starts, splats, grads, out):
                     g_color[a, (j * coefficients + c) * 3 + i] = g_sh[n, c, i]
 
 
-class _Assemble(torch.autograd.Function):
+class _Generate(torch.autograd.Function):
+    """Heads and assembly as one node: the heads' gradient is written by hand, so that nothing of an anchor's row is
+    copied on the way and the features' gradient lands in the row's own columns."""
+
     @staticmethod
-    def forward(ctx: Any, positions, rows, opacity, shape, color, layout: Layout):
-        arrays = [t.detach().numpy() for t in (positions, rows, opacity, shape, color)]
+    def forward(ctx: Any, positions, rows, seen_from, layout: Layout, *parameters):
+        w_hidden, b_hidden, w_opacity, b_opacity, w_shape, b_shape, w_color, b_color = parameters
         k, features = layout.offsets, layout.features
-        coefficients = arrays[4].shape[1] // (3 * k)
-        starts = np.zeros(len(arrays[0]) + 1, np.int64)
-        _count(arrays[1], arrays[2], k, features, starts[1:])
+        inputs = rows[:, layout.feature_columns]
+        inputs = inputs.contiguous() if seen_from is None else torch.cat([inputs, seen_from], 1)
+        hidden = torch.addmm(b_hidden, inputs, w_hidden.T).relu_()
+        h_opacity, h_shape, h_color = hidden.split(HIDDEN, 1)
+        raw = (
+            torch.addmm(b_opacity, h_opacity, w_opacity.T),
+            torch.addmm(b_shape, h_shape, w_shape.T),
+            torch.addmm(b_color, h_color, w_color.T),
+        )
+        opacity, shape, color = (r.numpy() for r in raw)
+        values = rows.detach().numpy()
+        coefficients = color.shape[1] // (3 * k)
+        starts = np.zeros(len(values) + 1, np.int64)
+        _count(values, opacity, k, features, starts[1:])
         np.cumsum(starts, out=starts)
         n = int(starts[-1])
         out = tuple(np.empty(s, np.float32) for s in ((n, 3), (n, 4), (n, 3), (n,), (n, coefficients, 3)))
         source = np.empty(n, np.int64)
-        _forward(*arrays, k, features, coefficients, starts, (*out, source))
-        ctx.saved = (arrays[1], k, features, coefficients, starts, (out[2], out[3], source))
-        ctx.widths = [a.shape[1] for a in arrays[1:]]
-        tensors = [torch.from_numpy(a) for a in out]
+        _forward(positions.numpy(), values, opacity, shape, color, k, features, coefficients, starts, (*out, source))
+        ctx.arrays = (values, k, features, coefficients, starts, (out[2], out[3], source))
+        ctx.layout = layout
+        ctx.save_for_backward(inputs, hidden, w_hidden, w_opacity, w_shape, w_color)
         source_tensor = torch.from_numpy(source)
         ctx.mark_non_differentiable(source_tensor)
-        return (*tensors, source_tensor)
+        return (*(torch.from_numpy(a) for a in out), source_tensor)
 
     @staticmethod
     def backward(ctx: Any, *gradients):
-        rows = ctx.saved[0]
-        out = tuple(np.empty((len(rows), width), np.float32) for width in ctx.widths)
-        grads = tuple(np.ascontiguousarray(g.numpy()) for g in gradients[:5])
-        _backward(*ctx.saved, grads, out)
-        return (None, *(torch.from_numpy(a) for a in out), None)
+        inputs, hidden, w_hidden, w_opacity, w_shape, w_color = ctx.saved_tensors
+        n = len(hidden)
+        widths = (ctx.arrays[0].shape[1], len(w_opacity), len(w_shape), len(w_color))
+        out = tuple(np.empty((n, width), np.float32) for width in widths)
+        _backward(*ctx.arrays, tuple(np.ascontiguousarray(g.numpy()) for g in gradients[:5]), out)
+        g_rows, *g_raw = (torch.from_numpy(a) for a in out)
+        g_hidden = torch.empty_like(hidden)
+        head_gradients = []
+        parts = zip(g_raw, hidden.split(HIDDEN, 1), g_hidden.split(HIDDEN, 1), (w_opacity, w_shape, w_color))
+        for g, h, g_h, weight in parts:
+            g_h.copy_(g @ weight)
+            head_gradients += [g.T @ h, g.sum(0)]
+        g_hidden = torch.ops.aten.threshold_backward(g_hidden, hidden, 0)
+        g_rows[:, ctx.layout.feature_columns] = (g_hidden @ w_hidden)[:, : ctx.layout.features]
+        return (None, g_rows, None, None, g_hidden.T @ inputs, g_hidden.sum(0), *head_gradients)
 
 
 def generate(
@@ -152,21 +178,22 @@ def generate(
     positions: torch.Tensor,
     rows: torch.Tensor,
     ids: torch.Tensor,
-    heads: torch.nn.Module,
+    heads: Heads,
     eye: np.ndarray | None = None,
 ) -> Generated:
     """Gaussians of n anchors: positions (n, 3), rows (n, columns), ids (n,) int32; differentiable in rows and heads.
 
     eye (3,): the camera's centre in scene units, needed in `view` mode alone.
     """
-    features = rows[:, layout.feature_columns]
+    seen_from = None
     if heads.mode == "view":
         if eye is None:
             raise ValueError("view mode needs the camera's centre")
         to_anchor = positions - torch.as_tensor(eye, dtype=positions.dtype)
         distance = torch.linalg.vector_norm(to_anchor, dim=1, keepdim=True).clamp(min=1e-6)
-        features = torch.cat([features, distance, to_anchor / distance], 1)
-    opacity, shape, color = heads(features)
-    *tensors, source = _Assemble.apply(positions, rows, opacity, shape, color, layout)
+        seen_from = torch.cat([distance, to_anchor / distance], 1)
+    layers = (heads.hidden, heads.opacity, heads.shape, heads.color)
+    parameters = [p for layer in layers for p in (layer.weight, layer.bias)]
+    *tensors, source = _Generate.apply(positions, rows, seen_from, layout, *parameters)
     means, quats, scales, opacities, sh = tensors
     return Generated(means, quats, scales, opacities, sh, ids[source // layout.offsets], source)

@@ -73,7 +73,7 @@ def grow_and_prune(
     statistics: GrowthStatistics,
     min_visits: int,
     rng: np.random.Generator,
-    threshold: float = 1e-4,
+    threshold: float = 2e-4,
     min_opacity: float = 0.005,
     max_anchors: int = 10**9,
 ) -> Growth:
