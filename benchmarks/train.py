@@ -22,6 +22,7 @@ sys.path.insert(0, str(ROOT))
 
 from backend.capture import load_capture  # noqa: E402
 from backend.labels import vote  # noqa: E402
+from backend.model.anchors import median_spacing  # noqa: E402
 from backend.training import loop  # noqa: E402
 from backend.training.settings import Settings  # noqa: E402
 
@@ -49,19 +50,22 @@ class Stopwatch:
 
 
 def trainer_of(folder: Path, splats: int) -> loop.Trainer:
-    """A trainer on the capture, warmed up, with about `splats` splats."""
+    """A trainer on the capture, warmed up, with about `splats` splats: from finer cells where there are too few."""
     capture = load_capture(folder, Path(tempfile.mkdtemp(prefix="objectgs-benchmark-")))
     ids = vote(capture).ids if capture.has_masks else np.zeros(len(capture.points.xyz), np.int64)
-    trainer = loop.Trainer.start(capture, ids, Settings())
-    for step in range(300):
-        trainer.step(0.25 + 0.25 * step / 300)
+    for fineness in (1.0, 0.6, 0.3):
+        trainer = loop.Trainer.start(capture, ids, Settings(voxel=fineness * median_spacing(capture.points.xyz)))
+        for step in range(450):
+            trainer.step(0.15 + 0.45 * step / 450)
+        if trainer.splats >= splats:
+            break
     anchors = trainer.model.anchors
     keep = min(1.0, splats / max(trainer.splats, 1))
     chosen = np.sort(np.random.default_rng(0).permutation(len(anchors))[: round(keep * len(anchors))])
     anchors.positions, anchors.rows, anchors.ids = anchors.positions[chosen], anchors.rows[chosen], anchors.ids[chosen]
     trainer._first, trainer._second = trainer._first[chosen], trainer._second[chosen]
-    for step in range(150):
-        trainer.step(0.6 + 0.1 * step / 150)
+    for step in range(60):
+        trainer.step(0.7 + 0.001 * step)
     return trainer
 
 

@@ -19,6 +19,7 @@ from .heads import HIDDEN, Heads
 OPACITY_MIN = 1.0 / 255.0
 _RAW_OPACITY_MIN = np.float32(math.atanh(OPACITY_MIN))
 _LOG_EXTENT_MAX = 20.0
+_CHUNK = 128
 
 
 class Generated(NamedTuple):
@@ -39,31 +40,33 @@ def _forward(positions, rows, opacity, shape, color, k, features, coefficients, 
     n_opacity = 3 * k + 6 + features
     n_shape = n_opacity + k
     n_color = n_shape + 7 * k
-    for a in prange(positions.shape[0]):
-        at = starts[a]
-        if at == starts[a + 1]:
-            continue
+    count = positions.shape[0]
+    for chunk in prange((count + _CHUNK - 1) // _CHUNK):
         extent = np.empty(6, np.float32)
-        for i in range(6):
-            extent[i] = math.exp(min(rows[a, 3 * k + i], np.float32(_LOG_EXTENT_MAX)))
-        for j in range(k):
-            raw_opacity = opacity[a, j] + rows[a, n_opacity + j]
-            if not raw_opacity > _RAW_OPACITY_MIN:
+        for a in range(chunk * _CHUNK, min(chunk * _CHUNK + _CHUNK, count)):
+            at = starts[a]
+            if at == starts[a + 1]:
                 continue
-            opacities[at] = math.tanh(raw_opacity)
-            source[at] = a * k + j
-            for i in range(3):
-                means[at, i] = positions[a, i] + rows[a, 3 * j + i] * extent[i]
-                raw = shape[a, 7 * j + i] + rows[a, n_shape + 7 * j + i]
-                scales[at, i] = extent[3 + i] / (np.float32(1.0) + math.exp(-raw))
-            for i in range(4):
-                quats[at, i] = shape[a, 7 * j + 3 + i] + rows[a, n_shape + 7 * j + 3 + i]
-            for c in range(coefficients):
+            for i in range(6):
+                extent[i] = math.exp(min(rows[a, 3 * k + i], np.float32(_LOG_EXTENT_MAX)))
+            for j in range(k):
+                raw_opacity = opacity[a, j] + rows[a, n_opacity + j]
+                if not raw_opacity > _RAW_OPACITY_MIN:
+                    continue
+                opacities[at] = math.tanh(raw_opacity)
+                source[at] = a * k + j
                 for i in range(3):
-                    sh[at, c, i] = color[a, (j * coefficients + c) * 3 + i]
-            for i in range(3):
-                sh[at, 0, i] += rows[a, n_color + 3 * j + i]
-            at += 1
+                    means[at, i] = positions[a, i] + rows[a, 3 * j + i] * extent[i]
+                    raw = shape[a, 7 * j + i] + rows[a, n_shape + 7 * j + i]
+                    scales[at, i] = extent[3 + i] / (np.float32(1.0) + math.exp(-raw))
+                for i in range(4):
+                    quats[at, i] = shape[a, 7 * j + 3 + i] + rows[a, n_shape + 7 * j + 3 + i]
+                for c in range(coefficients):
+                    for i in range(3):
+                        sh[at, c, i] = color[a, (j * coefficients + c) * 3 + i]
+                for i in range(3):
+                    sh[at, 0, i] += rows[a, n_color + 3 * j + i]
+                at += 1
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
@@ -85,39 +88,41 @@ def _backward(rows, k, features, coefficients, starts, splats, grads, out):
     n_opacity = 3 * k + 6 + features
     n_shape = n_opacity + k
     n_color = n_shape + 7 * k
-    for a in prange(rows.shape[0]):
-        for i in range(g_rows.shape[1]):
-            g_rows[a, i] = 0.0
-        for i in range(k):
-            g_opacity[a, i] = 0.0
-        for i in range(7 * k):
-            g_shape[a, i] = 0.0
-        for i in range(g_color.shape[1]):
-            g_color[a, i] = 0.0
+    count = rows.shape[0]
+    for chunk in prange((count + _CHUNK - 1) // _CHUNK):
         extent = np.empty(6, np.float32)
-        for i in range(6):
-            extent[i] = math.exp(min(rows[a, 3 * k + i], np.float32(_LOG_EXTENT_MAX)))
-        for n in range(starts[a], starts[a + 1]):
-            j = source[n] - a * k
-            alpha = opacities[n]
-            g = g_opacities[n] * (np.float32(1.0) - alpha * alpha)
-            g_opacity[a, j] = g
-            g_rows[a, n_opacity + j] = g
-            for i in range(3):
-                g_rows[a, 3 * j + i] = g_means[n, i] * extent[i]
-                g_rows[a, 3 * k + i] += g_means[n, i] * rows[a, 3 * j + i] * extent[i]
-                g_rows[a, 3 * k + 3 + i] += g_scales[n, i] * scales[n, i]
-                share = scales[n, i] / extent[3 + i]
-                g = g_scales[n, i] * scales[n, i] * (np.float32(1.0) - share)
-                g_shape[a, 7 * j + i] = g
-                g_rows[a, n_shape + 7 * j + i] = g
-                g_rows[a, n_color + 3 * j + i] = g_sh[n, 0, i]
-            for i in range(4):
-                g_shape[a, 7 * j + 3 + i] = g_quats[n, i]
-                g_rows[a, n_shape + 7 * j + 3 + i] = g_quats[n, i]
-            for c in range(coefficients):
+        for a in range(chunk * _CHUNK, min(chunk * _CHUNK + _CHUNK, count)):
+            for i in range(g_rows.shape[1]):
+                g_rows[a, i] = 0.0
+            for i in range(k):
+                g_opacity[a, i] = 0.0
+            for i in range(7 * k):
+                g_shape[a, i] = 0.0
+            for i in range(g_color.shape[1]):
+                g_color[a, i] = 0.0
+            for i in range(6):
+                extent[i] = math.exp(min(rows[a, 3 * k + i], np.float32(_LOG_EXTENT_MAX)))
+            for n in range(starts[a], starts[a + 1]):
+                j = source[n] - a * k
+                alpha = opacities[n]
+                g = g_opacities[n] * (np.float32(1.0) - alpha * alpha)
+                g_opacity[a, j] = g
+                g_rows[a, n_opacity + j] = g
                 for i in range(3):
-                    g_color[a, (j * coefficients + c) * 3 + i] = g_sh[n, c, i]
+                    g_rows[a, 3 * j + i] = g_means[n, i] * extent[i]
+                    g_rows[a, 3 * k + i] += g_means[n, i] * rows[a, 3 * j + i] * extent[i]
+                    g_rows[a, 3 * k + 3 + i] += g_scales[n, i] * scales[n, i]
+                    share = scales[n, i] / extent[3 + i]
+                    g = g_scales[n, i] * scales[n, i] * (np.float32(1.0) - share)
+                    g_shape[a, 7 * j + i] = g
+                    g_rows[a, n_shape + 7 * j + i] = g
+                    g_rows[a, n_color + 3 * j + i] = g_sh[n, 0, i]
+                for i in range(4):
+                    g_shape[a, 7 * j + 3 + i] = g_quats[n, i]
+                    g_rows[a, n_shape + 7 * j + 3 + i] = g_quats[n, i]
+                for c in range(coefficients):
+                    for i in range(3):
+                        g_color[a, (j * coefficients + c) * 3 + i] = g_sh[n, c, i]
 
 
 class _Generate(torch.autograd.Function):

@@ -42,3 +42,14 @@ def step_rows(values, first, second, seen, gradients, rates, correction1, correc
             second[row, j] = v
             values[row, j] -= rates[j] * (m * c1) / (np.sqrt(v * c2) + np.float32(EPSILON))
     return bad.sum()
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def take_rows(values, seen):
+    """values[seen], the rows (n, D) of values (N, D) that a step works on."""
+    out = np.empty((seen.size, values.shape[1]), values.dtype)
+    for i in prange(seen.size):
+        row = seen[i]
+        for j in range(values.shape[1]):
+            out[i, j] = values[row, j]
+    return out

@@ -22,8 +22,8 @@ from ..model.heads import Heads
 from ..model.object_model import Normalization, ObjectModel, anchors_in_view
 from ..protocol import Cancelled, InputError, Reporter
 from ..raster import Rendered, rasterize
-from .adam import BETA1, BETA2, step_rows
-from .losses import image_loss
+from .adam import BETA1, BETA2, step_rows, take_rows
+from .losses import image_loss, volume_loss
 from .scene import Scene
 from .settings import GROW_EVERY, GROW_FROM, GROW_UNTIL, HEAD_RATES, Settings, downscale_at, rate, row_rates
 
@@ -274,7 +274,7 @@ class Trainer:
         if len(seen) == 0:
             return math.nan
 
-        rows = torch.from_numpy(anchors.rows[seen]).requires_grad_()
+        rows = torch.from_numpy(take_rows(anchors.rows, seen)).requires_grad_()
         g = generate(
             anchors.layout, torch.from_numpy(anchors.positions[seen]), rows, torch.from_numpy(anchors.ids[seen]),
             self.model.heads, camera.centre,
@@ -286,7 +286,7 @@ class Trainer:
             settings.ssim_weight, settings.semantic_weight,
         )  # fmt: skip
         if settings.volume_weight and len(g.scales):
-            loss = loss + settings.volume_weight * g.scales.prod(1).mean()
+            loss = loss + settings.volume_weight * volume_loss(g.scales)
         value = float(loss.detach())
         if not math.isfinite(value):
             p.skipped += 1

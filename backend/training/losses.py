@@ -24,6 +24,9 @@ _WINDOW = (_WINDOW / _WINDOW.sum()).astype(np.float32)
 PROBABILITY_FLOOR = 1e-2
 """Added to P under the logarithm: a pixel whose object is absent pulls hard, but not without bound."""
 
+# Sums may be reordered, so that they vectorise; NaN must still come through.
+_REORDER = {"reassoc", "contract", "nsz"}
+
 
 @njit(inline="always", error_model="numpy")
 def _blur_row(source, window, out, width):
@@ -42,7 +45,7 @@ def _add_row(weight, source, at, out, width):
         simd.store(out, x, simd.load(out, x) + w * simd.load(source, at + x))
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(parallel=True, cache=True, error_model="numpy", fastmath=_REORDER)
 def ssim_gradient(image, target, window, gradient):
     """Mean SSIM of image and target (3, H, W); gradient (3, H, W) receives that of the mean."""
     channels, height, width = image.shape
@@ -55,20 +58,16 @@ def ssim_gradient(image, target, window, gradient):
         c, y = line // height, line % height
         padded = np.zeros(stride + 2 * _RADIUS + simd.LANES, np.float32)
         row = np.empty(stride, np.float32)
+        shown, wanted = image[c, y], target[c, y]
         for moment in range(5):
-            for x in range(width):
-                a, b = image[c, y, x], target[c, y, x]
-                if moment == 0:
-                    value = a
-                elif moment == 1:
-                    value = b
-                elif moment == 2:
-                    value = a * a
-                elif moment == 3:
-                    value = b * b
-                else:
-                    value = a * b
-                padded[x + _RADIUS] = value
+            left = shown if moment in (0, 2, 4) else wanted
+            right = shown if moment == 2 else wanted
+            if moment < 2:
+                for x in range(width):
+                    padded[x + _RADIUS] = left[x]
+            else:
+                for x in range(width):
+                    padded[x + _RADIUS] = left[x] * right[x]
             _blur_row(padded, window, row, width)
             base = (line * 5 + moment) * stride
             for x in range(stride):
@@ -81,7 +80,7 @@ def ssim_gradient(image, target, window, gradient):
                 _add_row(window[k + _RADIUS], blurred, ((line + k) * 5 + moment) * stride, m[moment], width)
         padded = np.zeros(stride + 2 * _RADIUS + simd.LANES, np.float32)
         rows = np.empty((3, stride), np.float32)
-        total = 0.0
+        total = np.float32(0.0)
         for x in range(width):
             mu1, mu2 = m[0, x], m[1, x]
             s11, s22, s12 = m[2, x] - mu1 * mu1, m[3, x] - mu2 * mu2, m[4, x] - mu1 * mu2
@@ -89,12 +88,13 @@ def ssim_gradient(image, target, window, gradient):
             b = 2 * s12 + np.float32(_C2)
             d = mu1 * mu1 + mu2 * mu2 + np.float32(_C1)
             e = s11 + s22 + np.float32(_C2)
-            value = a * b / (d * e)
+            over_d, over_e = np.float32(1.0) / d, np.float32(1.0) / e
+            value = a * b * over_d * over_e
             total += value
             # d/d(blurred x), d/d(blurred x^2), d/d(blurred x y)
-            g11 = -value / e
-            g12 = 2 * a / (d * e)
-            rows[0, x] = (2 * mu2 * b / (d * e) - 2 * mu1 * value / d - 2 * mu1 * g11 - mu2 * g12) * scale
+            g11 = -value * over_e
+            g12 = 2 * a * over_d * over_e
+            rows[0, x] = (2 * mu2 * b * over_d * over_e - 2 * mu1 * value * over_d - 2 * mu1 * g11 - mu2 * g12) * scale
             rows[1, x] = g11 * scale
             rows[2, x] = g12 * scale
         sums[line] = total
@@ -115,10 +115,6 @@ def ssim_gradient(image, target, window, gradient):
         for x in range(width):
             gradient[c, y, x] = m[0, x] + 2 * image[c, y, x] * m[1, x] + target[c, y, x] * m[2, x]
     return sums.sum() * float(scale)
-
-
-# Sums may be reordered, so that they vectorise; NaN must still come through.
-_REORDER = {"reassoc", "contract", "nsz"}
 
 
 @njit(parallel=True, cache=True, error_model="numpy", fastmath=_REORDER)
@@ -211,6 +207,41 @@ class _ImageLoss(torch.autograd.Function):
     def backward(ctx: Any, g):
         scaled = [None if a is None else torch.from_numpy(a) * g for a in ctx.gradients]
         return (*scaled, None, None, None, None)
+
+
+@njit(parallel=True, cache=True, error_model="numpy", fastmath=_REORDER)
+def _volumes(scales, gradient):
+    """Mean product of the rows of scales (N, 3), and its gradient."""
+    n = scales.shape[0]
+    chunks = (n + 1023) // 1024
+    sums = np.zeros(chunks)
+    share = np.float32(1.0 / n)
+    for chunk in prange(chunks):
+        total = np.float32(0.0)
+        for i in range(chunk * 1024, min(chunk * 1024 + 1024, n)):
+            a, b, c = scales[i, 0], scales[i, 1], scales[i, 2]
+            gradient[i, 0] = b * c * share
+            gradient[i, 1] = a * c * share
+            gradient[i, 2] = a * b * share
+            total += a * b * c
+        sums[chunk] = total
+    return sums.sum() / n
+
+
+class _VolumeLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, scales):
+        ctx.gradient = np.empty(tuple(scales.shape), np.float32)
+        return torch.tensor(_volumes(scales.detach().numpy(), ctx.gradient), dtype=torch.float32)
+
+    @staticmethod
+    def backward(ctx: Any, g):
+        return torch.from_numpy(ctx.gradient) * g
+
+
+def volume_loss(scales: torch.Tensor) -> torch.Tensor:
+    """Mean volume of the splats, prod(scales) of scales (N, 3), N > 0 (Scaffold-GS equation 9, taken as a mean)."""
+    return _VolumeLoss.apply(scales)
 
 
 def image_loss(

@@ -23,7 +23,7 @@ from backend.raster import Camera, rasterize
 from backend.raster.draw import draw
 from backend.training.adam import BETA1, BETA2, step_rows
 from backend.training.loop import Budget, Trainer
-from backend.training.losses import PROBABILITY_FLOOR, image_loss
+from backend.training.losses import PROBABILITY_FLOOR, image_loss, volume_loss
 from backend.training.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -70,6 +70,16 @@ def test_image_loss_and_gradients_equal_autograd(size):
     for a, b in zip(fast, slow):
         reference = b.grad if b.grad is not None else torch.zeros_like(b)
         np.testing.assert_allclose(a.grad.numpy(), reference.numpy(), rtol=2e-3, atol=2e-5 * reference.abs().max())
+
+
+def test_volume_loss_is_the_mean_product_of_the_scales():
+    fast = torch.rand(2500, 3, requires_grad=True)
+    slow = fast.detach().double().requires_grad_()
+    got, want = volume_loss(fast), slow.prod(1).mean()
+    assert float(got.detach()) == pytest.approx(float(want.detach()), rel=1e-5)
+    (3 * got).backward()
+    (3 * want).backward()
+    np.testing.assert_allclose(fast.grad, slow.grad, rtol=1e-5)
 
 
 def test_loss_of_a_picture_without_labels_has_no_semantic_term():
