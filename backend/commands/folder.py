@@ -21,6 +21,16 @@ from .lock import FolderInUse, locked
 from .record import record, recorded, stage
 
 
+def memory_for_files(options: argparse.Namespace) -> float:
+    """The part of --memory-mb, in megabytes, that decoded files may take; as bytes they need a quarter of the room."""
+    return options.memory_mb / 5
+
+
+def memory_for_planes(options: argparse.Namespace) -> float:
+    """The part of --memory-mb, in megabytes, for the same pictures as the float planes that training compares with."""
+    return options.memory_mb - memory_for_files(options)
+
+
 @contextmanager
 def open_reconstruction(options: argparse.Namespace, reporter: Reporter) -> Iterator[tuple[Reconstruction, Capture]]:
     """The folder of --out, made where it is not there and locked meanwhile, and the capture to fill it from.
@@ -34,7 +44,9 @@ def open_reconstruction(options: argparse.Namespace, reporter: Reporter) -> Iter
             folder.create()
             held.enter_context(locked(folder.folder))
             with stage(folder, "read"):
-                capture = load_capture(options.capture, folder.cache, options.memory_mb, options.max_size, reporter)
+                capture = load_capture(
+                    options.capture, folder.cache, memory_for_files(options), options.max_size, reporter
+                )
         yield folder, capture
 
 
@@ -82,7 +94,7 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
     if not place.is_dir():
         raise InputError(f"The capture {place} of {folder.folder} is gone; say with --capture where it is now.")
     max_size = memory["capture"]["max_size"]
-    capture = load_capture(place, folder.cache, options.memory_mb, max_size, reporter)
+    capture = load_capture(place, folder.cache, memory_for_files(options), max_size, reporter)
     if digest(capture) != memory["capture"]["digest"]:
         raise InputError(
             f"The capture {place} is not the one that {folder.folder} was trained on; put that one back, say with "
@@ -91,7 +103,7 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
     if options.capture:
         record(folder, capture=described(capture, max_size))
     zero_is_object = state["settings"]["zero_is_object"]
-    scene = Scene(capture, model.object_ids, model.normalization, zero_is_object, options.memory_mb)
+    scene = Scene(capture, model.object_ids, model.normalization, zero_is_object, memory_for_planes(options))
     return Trained(folder, capture, model, scene, progress_of(state))
 
 

@@ -17,7 +17,7 @@ from ..raster.draw import draw
 from ..training.loop import Budget, Trainer
 from ..training.scene import Scene
 from ..training.settings import Settings
-from .folder import described, digest, open_reconstruction
+from .folder import described, digest, memory_for_planes, open_reconstruction
 from .record import record, record_stage, recorded, stage
 from .vote import cast_votes, votes_are_current, votes_key
 
@@ -66,7 +66,7 @@ def _begun(
         return resumed
     if not votes_are_current(folder, capture, options):
         cast_votes(folder, capture, options, reporter)
-    trainer = Trainer.start(capture, read_points(folder.points).ids, settings, options.memory_mb)
+    trainer = Trainer.start(capture, read_points(folder.points).ids, settings, memory_for_planes(options))
     if options.restart:
         shutil.rmtree(folder.checkpoint, ignore_errors=True)
     return trainer
@@ -76,7 +76,7 @@ def _resumed(
     folder: Reconstruction, capture: Capture, settings: Settings, options: argparse.Namespace, reporter: Reporter
 ) -> Trainer | None:
     """The training that DIR holds, or None; InputError where it was one of another capture or other choices."""
-    resumed = Trainer.resume(capture, folder.checkpoint, settings, options.memory_mb)
+    resumed = Trainer.resume(capture, folder.checkpoint, settings, memory_for_planes(options))
     if resumed is None:
         return None
     trainer, warning = resumed
