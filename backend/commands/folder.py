@@ -103,7 +103,10 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
     if options.capture:
         record(folder, capture=described(capture, max_size))
     zero_is_object = state["settings"]["zero_is_object"]
-    scene = Scene(capture, model.object_ids, model.normalization, zero_is_object, memory_for_planes(options))
+    scene = Scene(
+        capture, model.object_ids, model.normalization, zero_is_object, memory_for_planes(options),
+        teach_unlabelled=state["teach_unlabelled"],
+    )  # fmt: skip
     return Trained(folder, capture, model, scene, progress_of(state))
 
 

@@ -37,6 +37,7 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             "folder": capture.folder.name, "views": len(capture.views), "held_out": len(capture.test_indices),
             "objects": len(capture.object_ids), **capture.counts,
             "exposure_varies": trained.scene.exposure_varies,
+            "unlabelled_is_taught": trained.scene.teach_unlabelled,
             "cameras": ", ".join(f"{count} {name}" for name, count in capture.counts["cameras"].items()),
         },
         "settings": {
@@ -133,6 +134,10 @@ def _left_out(trained: Trained) -> list[dict[str, str]]:
         (
             capture.has_masks and counts["masks"] < counts["used"],
             f"labels of {counts['used'] - counts['masks']} views", "their masks are missing",
+        ),
+        (
+            capture.has_masks and not trained.scene.teach_unlabelled, "teaching of unlabelled pixels",
+            "nearly every point has an object, so they are taken for gaps in the masks",
         ),
         (
             not trained.scene.exposure_varies, "undoing of exposure and white balance",

@@ -25,7 +25,7 @@ from ..raster import Rendered, rasterize
 from .adam import BETA1, BETA2, step_rows, take_rows
 from .losses import image_loss, volume_loss
 from .scene import Scene
-from .settings import GROW_EVERY, GROW_FROM, GROW_UNTIL, HEAD_RATES, Settings, downscale_at, rate, row_rates
+from .settings import GROW_EVERY, GROW_FROM, GROW_UNTIL, HEAD_RATES, REST_FROM, Settings, downscale_at, rate, row_rates
 
 CHECKPOINT_SECONDS = 30.0
 _REPORT_SECONDS = 0.5
@@ -107,7 +107,8 @@ class Trainer:
         heads = Heads(settings.layout, settings.mode, settings.sh_degree, generator)
         grey = {"learned": 0.5, "black": 0.0, "white": 1.0}[settings.background]
         model = ObjectModel(anchors, heads, torch.full((3,), grey), object_ids, normalization)
-        scene = Scene(capture, object_ids, normalization, settings.zero_is_object, memory_mb)
+        rest = capture.has_masks and bool((np.asarray(point_ids) == 0).mean() >= REST_FROM)
+        scene = Scene(capture, object_ids, normalization, settings.zero_is_object, memory_mb, teach_unlabelled=rest)
         return cls(scene, settings, model, rng)
 
     # --- state on disk -------------------------------------------------------------------------------------------
@@ -140,6 +141,7 @@ class Trainer:
             {
                 "settings": self.settings.as_dict(),
                 "voxel": anchors.voxel,
+                "teach_unlabelled": self.scene.teach_unlabelled,
                 "normalization": {"centre": model.normalization.centre, "scale": model.normalization.scale},
                 "rng": self.rng.bit_generator.state,
                 "progress": {**p.__dict__},
@@ -166,7 +168,10 @@ class Trainer:
                 "another --out, or --restart to train anew."
             )
         model = model_from_checkpoint(tensors, state)
-        scene = Scene(capture, model.object_ids, model.normalization, stored.zero_is_object, memory_mb)
+        scene = Scene(
+            capture, model.object_ids, model.normalization, stored.zero_is_object, memory_mb,
+            teach_unlabelled=state["teach_unlabelled"],
+        )  # fmt: skip
         rng = np.random.default_rng()
         rng.bit_generator.state = state["rng"]
         trainer = cls(scene, stored, model, rng)

@@ -17,6 +17,7 @@ from .exposure import measure_gains, varies
 class Scene:
     """Cameras and targets of a capture for the classes `object_ids` ((C,) int64, ascending, 0 first).
 
+    teach_unlabelled: pixels of ID 0 are taught to show no object; otherwise nothing is taught there.
     Where the photos' exposure varies (`exposure_varies`), `gains` (V, 3) say by how much; else they are 1.
     """
 
@@ -28,11 +29,13 @@ class Scene:
         zero_is_object: bool = False,
         memory_mb: float = 2000,
         undo_exposure: bool = True,
+        teach_unlabelled: bool = False,
     ) -> None:
         self.capture = capture
         self.object_ids = object_ids
         self.normalization = normalization
         self.zero_is_object = zero_is_object
+        self.teach_unlabelled = teach_unlabelled or zero_is_object
         gains = measure_gains(capture) if undo_exposure else np.ones((len(capture.views), 3))
         self.exposure_varies = varies(gains)
         self.gains = gains if self.exposure_varies else np.ones_like(gains)
@@ -82,6 +85,6 @@ class Scene:
     def _classes(self, mask: np.ndarray) -> np.ndarray:
         place = np.clip(np.searchsorted(self.object_ids, mask), 0, len(self.object_ids) - 1)
         known = self.object_ids[place] == mask
-        if not self.zero_is_object:
+        if not self.teach_unlabelled:
             known &= mask != 0
         return np.where(known, place, -1).astype(np.int32)

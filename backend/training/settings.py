@@ -41,6 +41,11 @@ class Settings:
         return Layout(offsets=self.offsets)
 
 
+REST_FROM = 0.05
+"""Share of the points that no mask ever gave an object, from which on unlabelled pixels are taken for the rest of the
+scene rather than for gaps in the masks. Objects that are taught nothing there spread over it."""
+
+
 GROW_FROM, GROW_UNTIL, GROW_EVERY = 0.1, 0.5, 100
 """Growth runs between these shares of the training, every so many steps; statistics start half way to the first."""
 

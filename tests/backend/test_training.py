@@ -375,6 +375,23 @@ def test_a_capture_without_masks_trains_as_one_scene(tiny):
     assert trainer.model.object_ids.tolist() == [0]
 
 
+def test_unlabelled_pixels_are_taught_where_many_points_have_no_object(tiny):
+    capture, ids = tiny()
+    gaps = Trainer.start(capture, ids, SMALL)
+    bare = ids.copy()
+    bare[: len(ids) // 4] = 0
+    rest = Trainer.start(capture, bare, SMALL)
+    index = capture.train_indices[0]
+    nothing = torch.from_numpy(capture.mask(index) == 0)
+    assert (gaps.scene.target(index)[1][nothing] == -1).all()
+    assert (rest.scene.target(index)[1][nothing] == 0).all()
+    for trainer in (gaps, rest):
+        for i in range(120):
+            trainer.step(i / 120)
+    drawn = [(draw(t.model, t.scene.camera(index)).ids[nothing.numpy()] > 0).mean() for t in (gaps, rest)]
+    assert drawn[1] < 0.5 * drawn[0]
+
+
 def test_explicit_splats_are_the_model(tiny):
     capture, ids = tiny()
     trainer = Trainer.start(capture, ids, SMALL)
