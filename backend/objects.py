@@ -1,0 +1,96 @@
+"""objects.json: the objects of a reconstruction as the votes found them, and what the user changed about them.
+
+    {"objects": [{"id": 1, "name": "mug", "colour": [59, 125, 216], "points": 812}, ...],
+     "edits": {"1": {"name": "cup", "colour": [255, 0, 0], "merged_into": 2, "left_out": true}, ...}}
+
+A new vote replaces "objects" and keeps "edits". Standard library and NumPy only, so that Blender's own Python can
+import it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from .protocol import InputError, read_json, write_json
+
+EDITABLE = ("name", "colour", "merged_into", "left_out")
+
+
+@dataclass(frozen=True)
+class SceneObject:
+    """One object: its ID in the masks, name, sRGB colour 0 .. 255, how many points voted for it, and the user's edits.
+
+    merged_into: the ID of the object that it is shown and meshed with, or None; left_out: not to be reconstructed.
+    """
+
+    id: int
+    name: str
+    colour: tuple[int, int, int]
+    points: int
+    merged_into: int | None = None
+    left_out: bool = False
+
+
+def read_objects(path: Path) -> list[SceneObject]:
+    """The objects with the user's edits applied, by ascending ID; InputError where the file is missing or broken."""
+    content = read_json(path)
+    edits = _edits(content, path)
+    try:
+        return [
+            SceneObject(
+                id=int(entry["id"]),
+                points=int(entry["points"]),
+                **{
+                    "name": str(entry["name"]), "colour": entry["colour"],
+                    **_known(edits.get(str(entry["id"]), {})),
+                },
+            )
+            for entry in sorted(content["objects"], key=lambda entry: entry["id"])
+        ]  # fmt: skip
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path} does not list objects as expected ({error!r}); run the vote again.") from error
+
+
+def write_objects(path: Path, objects: Sequence[Mapping[str, Any]]) -> None:
+    """Replace the objects ({"id", "name", "colour", "points"} each) and keep the edits that are there."""
+    edits = _edits(read_json(path), path) if path.exists() else {}
+    write_json(path, {"objects": list(objects), "edits": edits})
+
+
+def edit_object(path: Path, object_id: int, **changes: Any) -> None:
+    """Change what the user may (`EDITABLE`) about one object; None takes an edit back to what the vote says."""
+    unknown = set(changes) - set(EDITABLE)
+    if unknown:
+        raise ValueError(f"{', '.join(sorted(unknown))} cannot be edited")
+    content = read_json(path)
+    edits = _edits(content, path)
+    kept = {**edits.get(str(object_id), {}), **changes}
+    edits[str(object_id)] = {key: value for key, value in kept.items() if value is not None}
+    write_json(path, {**content, "edits": {key: value for key, value in edits.items() if value}})
+
+
+def merged(objects: Sequence[SceneObject]) -> dict[int, int]:
+    """ID -> the ID that it is shown as, merges of merges followed; a merge into an unknown ID or itself is none."""
+    into = {entry.id: entry.merged_into for entry in objects}
+    found = {}
+    for start in into:
+        at, seen = start, {start}
+        while (after := into[at]) is not None and after in into and after not in seen:
+            seen.add(after)
+            at = after
+        found[start] = at
+    return found
+
+
+def _edits(content: Any, path: Path) -> dict[str, dict[str, Any]]:
+    edits = content.get("edits", {}) if isinstance(content, dict) else None
+    if not isinstance(edits, dict) or not all(isinstance(edit, dict) for edit in edits.values()):
+        raise InputError(f"{path} does not list objects as expected; run the vote again.")
+    return dict(edits)
+
+
+def _known(edit: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in edit.items() if key in EDITABLE}
