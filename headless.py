@@ -8,6 +8,7 @@ Exit codes: 0 done, 2 bad input (one sentence says what), 130 cancelled, 1 anyth
 """
 
 import argparse
+import importlib
 import importlib.util
 import signal
 import sys
@@ -15,16 +16,24 @@ import traceback
 from pathlib import Path
 
 
-def _addon():
-    """The package beside this file.  Loaded by its place, so Blender's module search path stays as it is."""
-    if "objectgs_addon" not in sys.modules:
-        folder = Path(__file__).resolve().parent / "objectgs_addon"
-        spec = importlib.util.spec_from_file_location(
-            "objectgs_addon", folder / "__init__.py", submodule_search_locations=[str(folder)])
-        module = importlib.util.module_from_spec(spec)
-        sys.modules["objectgs_addon"] = module
-        spec.loader.exec_module(module)
-    return sys.modules["objectgs_addon"]
+ROOT = Path(__file__).resolve().parent
+
+
+def extension():
+    """The extension's root package: the one Blender has loaded from this folder, or else loaded as `objectgs`.
+
+    Loaded by its place, so Blender's module search path stays as it is.
+    """
+    init = ROOT / "__init__.py"
+    for module in list(sys.modules.values()):
+        file = getattr(module, "__file__", None)
+        if file and getattr(module, "__path__", None) and Path(file).name == init.name and Path(file).resolve() == init:
+            return module
+    spec = importlib.util.spec_from_file_location("objectgs", init, submodule_search_locations=[str(ROOT)])
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["objectgs"] = module
+    spec.loader.exec_module(module)
+    return module
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -49,9 +58,7 @@ def _parser() -> argparse.ArgumentParser:
 def _demo(options) -> None:
     import bpy
 
-    _addon()
-    from objectgs_addon import demo_capture
-
+    demo_capture = importlib.import_module(f"{extension().__name__}.objectgs_addon.demo_capture")
     if bpy.app.background:
         bpy.ops.wm.read_factory_settings(use_empty=True)
     settings = demo_capture.Settings(

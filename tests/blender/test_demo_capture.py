@@ -13,8 +13,8 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
-from objectgs_addon import demo_capture  # noqa: E402
-from objectgs_addon.demo import mask_noise  # noqa: E402
+from objectgs.objectgs_addon import demo_capture  # noqa: E402
+from objectgs.objectgs_addon.demo import mask_noise  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = demo_capture.Settings(objects=7, views=4, width=64, height=48, samples=2)
