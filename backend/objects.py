@@ -40,16 +40,9 @@ def read_objects(path: Path) -> list[SceneObject]:
     edits = _edits(content, path)
     try:
         return [
-            SceneObject(
-                id=int(entry["id"]),
-                points=int(entry["points"]),
-                **{
-                    "name": str(entry["name"]), "colour": entry["colour"],
-                    **_known(edits.get(str(entry["id"]), {})),
-                },
-            )
+            _object({**entry, **_known(edits.get(str(entry["id"]), {}))})
             for entry in sorted(content["objects"], key=lambda entry: entry["id"])
-        ]  # fmt: skip
+        ]
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} does not list objects as expected ({error!r}); run the vote again.") from error
 
@@ -60,15 +53,16 @@ def write_objects(path: Path, objects: Sequence[Mapping[str, Any]]) -> None:
     write_json(path, {"objects": list(objects), "edits": edits})
 
 
-def edit_object(path: Path, object_id: int, **changes: Any) -> None:
-    """Change what the user may (`EDITABLE`) about one object; None takes an edit back to what the vote says."""
-    unknown = set(changes) - set(EDITABLE)
+def edit_objects(path: Path, changes: Mapping[int, Mapping[str, Any]]) -> None:
+    """Change what the user may (`EDITABLE`) about objects, by ID; None takes an edit back to what the vote says."""
+    unknown = {key for change in changes.values() for key in change} - set(EDITABLE)
     if unknown:
         raise ValueError(f"{', '.join(sorted(unknown))} cannot be edited")
     content = read_json(path)
     edits = _edits(content, path)
-    kept = {**edits.get(str(object_id), {}), **changes}
-    edits[str(object_id)] = {key: value for key, value in kept.items() if value is not None}
+    for object_id, change in changes.items():
+        kept = {**edits.get(str(object_id), {}), **change}
+        edits[str(object_id)] = {key: value for key, value in kept.items() if value is not None}
     write_json(path, {**content, "edits": {key: value for key, value in edits.items() if value}})
 
 
@@ -83,6 +77,19 @@ def merged(objects: Sequence[SceneObject]) -> dict[int, int]:
             at = after
         found[start] = at
     return found
+
+
+def _object(entry: Mapping[str, Any]) -> SceneObject:
+    red, green, blue = (int(channel) for channel in entry["colour"])
+    into = entry.get("merged_into")
+    return SceneObject(
+        id=int(entry["id"]),
+        name=str(entry["name"]),
+        colour=(red, green, blue),
+        points=int(entry["points"]),
+        merged_into=None if into is None else int(into),
+        left_out=bool(entry.get("left_out", False)),
+    )
 
 
 def _edits(content: Any, path: Path) -> dict[str, dict[str, Any]]:

@@ -41,9 +41,11 @@ class Reconstruction:
         self.folder = Path(folder)
         self.settings = self.folder / "objectgs.json"
         self.objects = self.folder / "objects.json"
+        self.cameras = self.folder / "cameras.json"
         self.points = self.folder / "points.ply"
         self.checkpoint = self.folder / "checkpoint"
         self.splats = self.folder / "splats.ply"
+        self.anchors = self.folder / "anchors.ply"
         self.meshes = self.folder / "meshes"
         self.previews = self.folder / "previews"
         self.renders = self.folder / "renders"

@@ -9,8 +9,9 @@ from typing import Any
 from ..capture import Capture
 from ..labels import vote as vote_points
 from ..labels.points import read_points, write_points
+from ..objects import write_objects
 from ..palette import object_colours
-from ..protocol import InputError, Reconstruction, Reporter, StoppingReporter, write_json
+from ..protocol import InputError, Reconstruction, Reporter, StoppingReporter
 from .folder import digest, open_reconstruction
 from .record import record, recorded, stage
 
@@ -35,7 +36,7 @@ def cast_votes(folder: Reconstruction, capture: Capture, options: argparse.Names
             if i
         ]
         write_points(folder.points, capture.points, votes)
-        write_json(folder.objects, {"objects": objects})
+        write_objects(folder.objects, objects)
     record(folder, votes=votes_key(capture, options))
     for entry in objects:
         reporter.status(f"object {entry['id']} {entry['name']}: {entry['points']:,} points")

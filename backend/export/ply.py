@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import os
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..model.splats import Splats
+from ..ply import read_vertices, vertex_header
 from ..protocol import InputError, atomic_file
 
 OPACITY_MARGIN = 1e-7
@@ -19,26 +18,6 @@ OPACITY_MARGIN = 1e-7
 SMALLEST_SCALE = float(np.finfo(np.float32).tiny)
 FLOAT32_RELATIVE_ERROR = 2.0**-24
 ROWS_AT_ONCE = 1 << 16
-LONGEST_HEADER = 1 << 20
-
-_TYPES = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "i2",
-    "int16": "i2",
-    "ushort": "u2",
-    "uint16": "u2",
-    "int": "i4",
-    "int32": "i4",
-    "uint": "u4",
-    "uint32": "u4",
-    "float": "f4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
-}
 
 
 def property_names(degree: int) -> list[str]:
@@ -76,13 +55,9 @@ def write_splats(path: Path, splats: Splats) -> list[str]:
     position = "f8" if _needs_double(splats) else "f4"
     kinds = {"x": position, "y": position, "z": position, "object_id": "u4"}
     dtype = np.dtype([(name, "<" + kinds.get(name, "f4")) for name in names])
-    spelled = {"f4": "float", "f8": "double", "u4": "uint"}
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(splats)}"]
-    header += [f"property {spelled[kinds.get(name, 'f4')]} {name}" for name in names]
-    header += ["end_header", ""]
 
     with atomic_file(path) as file:
-        file.write("\n".join(header).encode("ascii"))
+        file.write(vertex_header(dtype, len(splats)))
         for start in range(0, len(splats), ROWS_AT_ONCE):
             file.write(_rows(splats, slice(start, start + ROWS_AT_ONCE), dtype).tobytes())
     return warnings
@@ -138,12 +113,7 @@ def read_splats(path: Path) -> tuple[Splats, list[str]]:
     Raises InputError that names the file when it is missing, cut short, ASCII, or holds no splats.
     """
     path = Path(path)
-    try:
-        with open(path, "rb") as file:
-            table = _read_table(file, path)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror or error}).") from error
-
+    table = read_vertices(path)
     names = table.dtype.names or ()
     needed = [name for name in property_names(0) if name not in ("nx", "ny", "nz", "object_id")]
     missing = [name for name in needed if name not in names]
@@ -214,55 +184,3 @@ def _object_ids(column: NDArray, warnings: list[str]) -> NDArray:
     if not good.all():
         warnings.append(f"{int((~good).sum())} splats have an object_id that is no ID; they were given 0.")
     return ids
-
-
-def _read_table(file: BinaryIO, path: Path) -> NDArray:
-    """The vertex element as a structured array with the file's own property names."""
-    head = file.read(LONGEST_HEADER)
-    if not head.startswith(b"ply"):
-        raise InputError(f"{path} is not a PLY file.")
-    end = head.find(b"end_header")
-    newline = head.find(b"\n", end)
-    if end < 0 or newline < 0:
-        raise InputError(f"{path} has no complete PLY header; it may be cut short.")
-    order = ""
-    count = -1
-    fields: list[tuple[str, str]] = []
-    element = ""
-    for line in head[:end].decode("ascii", "replace").splitlines():
-        words = line.split()
-        if not words or words[0] in ("ply", "comment", "obj_info"):
-            continue
-        if words[0] == "format" and len(words) >= 2:
-            if words[1] == "ascii":
-                raise InputError(f"{path} is an ASCII PLY file; only binary ones are read. Save it as binary PLY.")
-            order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(words[1], "")
-        elif words[0] == "element" and len(words) == 3 and words[2].isdigit():
-            if count >= 0:
-                break
-            element = words[1]
-            size = int(words[2])
-            if element == "vertex":
-                count = size
-            elif size:
-                raise InputError(f"{path} has an element {element} before its vertices, which is not supported.")
-        elif words[0] == "property" and element == "vertex":
-            if len(words) != 3 or words[1] not in _TYPES:
-                raise InputError(f"{path} has a vertex property that is not a plain number: {line.strip()!r}.")
-            fields.append((words[2], _TYPES[words[1]]))
-        elif words[0] != "property":
-            raise InputError(f"{path} has a PLY header line that makes no sense: {line.strip()!r}.")
-    if not order or count < 0 or not fields:
-        raise InputError(f"{path} has no format or no vertices in its PLY header.")
-    try:
-        dtype = np.dtype([(name, order + kind) for name, kind in fields])
-    except ValueError as error:
-        raise InputError(f"{path} names a vertex property twice.") from error
-    available = os.fstat(file.fileno()).st_size - newline - 1
-    if available < count * dtype.itemsize:
-        raise InputError(
-            f"{path} is cut short: its header promises {count} splats, "
-            f"but only {available // dtype.itemsize} are there."
-        )
-    file.seek(newline + 1)
-    return np.fromfile(file, dtype, count)

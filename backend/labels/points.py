@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..capture import Points
-from ..protocol import InputError, write_atomic
+from ..ply import read_vertices, vertex_header, write_vertices
+from ..protocol import InputError
 from .voting import Votes
 
-_VERTEX = np.dtype([("xyz", "<f8", 3), ("rgb", "u1", 3), ("object_id", "<u4"), ("margin", "<f4"), ("votes", "<u4")])
-_PROPERTIES = (
-    *(f"property double {axis}" for axis in "xyz"),
-    *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
-    "property uint object_id",
-    "property float margin",
-    "property uint votes",
+_VERTEX = np.dtype(
+    [
+        *((axis, "<f8") for axis in "xyz"),
+        *((colour, "u1") for colour in ("red", "green", "blue")),
+        *(("object_id", "<u4"), ("margin", "<f4"), ("votes", "<u4")),
+    ]
 )
 
 
@@ -34,38 +33,26 @@ class LabelledPoints:
     visible: np.ndarray
 
 
-def _header(count: int) -> bytes:
-    lines = ("ply", "format binary_little_endian 1.0", f"element vertex {count}", *_PROPERTIES, "end_header", "")
-    return "\n".join(lines).encode("ascii")
-
-
 def write_points(path: Path, points: Points, votes: Votes) -> None:
     """Write the points with their labels to `path`, atomically."""
     vertices = np.empty(len(points.xyz), _VERTEX)
-    vertices["xyz"], vertices["rgb"] = points.xyz, points.rgb
+    for i, names in enumerate(zip("xyz", ("red", "green", "blue"))):
+        vertices[names[0]], vertices[names[1]] = points.xyz[:, i], points.rgb[:, i]
     vertices["object_id"], vertices["margin"], vertices["votes"] = votes.ids, votes.margins, votes.visible
-    write_atomic(path, _header(len(vertices)) + vertices.tobytes())
+    write_vertices(path, vertices)
 
 
 def read_points(path: Path) -> LabelledPoints:
     """Read what `write_points` wrote; raises InputError that names the file when it is anything else."""
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError as error:
-        raise InputError(f"{path} does not exist; run the vote first.") from error
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}); check the file.") from error
-    start = data.find(b"end_header\n") + len(b"end_header\n")
-    match = re.search(rb"element vertex (\d{1,12})\n", data[:start])
-    count = int(match[1]) if match else -1
-    if count < 0 or data[:start] != _header(count):
+    if not path.exists():
+        raise InputError(f"{path} does not exist; run the vote first.")
+    vertices = read_vertices(path)
+    whole = len(vertex_header(_VERTEX, len(vertices))) + len(vertices) * _VERTEX.itemsize
+    if vertices.dtype != _VERTEX or path.stat().st_size != whole:
         raise InputError(f"{path} is not a labelled point cloud of this program; run the vote again.")
-    if len(data) - start != count * _VERTEX.itemsize:
-        raise InputError(f"{path} is cut short or overlong for {count} points; run the vote again.")
-    vertices = np.frombuffer(data, _VERTEX, count, start)
     return LabelledPoints(
-        vertices["xyz"].copy(),
-        vertices["rgb"].copy(),
+        np.stack([vertices[axis] for axis in "xyz"], 1),
+        np.stack([vertices[colour] for colour in ("red", "green", "blue")], 1),
         vertices["object_id"].astype(np.int64),
         vertices["margin"].copy(),
         vertices["votes"].astype(np.int32),

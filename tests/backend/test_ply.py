@@ -9,6 +9,7 @@ import pytest
 
 from backend.export import read_splats, write_splats
 from backend.model.splats import Splats, concatenate
+from backend.ply import read_vertices, write_vertices
 from backend.protocol import InputError
 
 
@@ -236,7 +237,7 @@ def test_a_truncated_file_is_named(tmp_path):
         with pytest.raises(InputError, match=r"cut\.ply"):
             read_splats(tmp_path / "cut.ply")
     (tmp_path / "cut.ply").write_bytes(data[:-1])
-    with pytest.raises(InputError, match="promises 10 splats, but only 9"):
+    with pytest.raises(InputError, match="promises 10 vertices, but only 9"):
         read_splats(tmp_path / "cut.ply")
 
 
@@ -265,6 +266,38 @@ def test_what_is_no_splat_file_is_refused_in_one_sentence(tmp_path, text, why):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(InputError, match=r"none\.ply"):
         read_splats(tmp_path / "none.ply")
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_a_table_of_every_type_survives_the_file(tmp_path, order):
+    kinds = ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"]
+    table = np.zeros(3, np.dtype([(f"p{kind}", order + kind) for kind in kinds], align=True))
+    for kind in kinds:
+        limits = np.finfo(kind) if kind[0] == "f" else np.iinfo(kind)
+        table[f"p{kind}"] = limits.min, limits.max, 1
+    write_vertices(tmp_path / "a.ply", table)
+    again = read_vertices(tmp_path / "a.ply")
+    assert again.dtype == np.dtype([(f"p{kind}", "<" + kind) for kind in kinds])
+    assert again.tolist() == table.tolist()
+    write_vertices(tmp_path / "a.ply", table[:0])
+    assert len(read_vertices(tmp_path / "a.ply")) == 0
+
+
+def test_a_table_that_ply_cannot_hold_leaves_the_old_file(tmp_path):
+    write_vertices(tmp_path / "a.ply", np.zeros(1, [("x", "f4")]))
+    before = (tmp_path / "a.ply").read_bytes()
+    for field in ("i8", ("f4", 3), "U3"):
+        with pytest.raises(ValueError, match="property wide"):
+            write_vertices(tmp_path / "a.ply", np.zeros(1, [("x", "f4"), ("wide", field)]))
+    assert (tmp_path / "a.ply").read_bytes() == before and len(list(tmp_path.iterdir())) == 1
+
+
+def test_elements_after_the_vertices_are_left_alone(tmp_path):
+    path = tmp_path / "mesh.ply"
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nelement face 1\n"
+    head += "property list uchar int vertex_indices\nend_header\n"
+    path.write_bytes(head.encode() + struct.pack("<fB3i", 2.5, 3, 0, 0, 0))
+    assert read_vertices(path).tolist() == [(2.5,)]
 
 
 def test_select_and_concatenate():

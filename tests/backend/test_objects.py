@@ -1,0 +1,98 @@
+"""objects.json: what the votes found, the user's edits over it, and merges of merges."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from backend.objects import SceneObject, edit_objects, merged, read_objects, write_objects
+from backend.protocol import InputError
+
+MUG = {"id": 1, "name": "mug", "colour": [10, 20, 30], "points": 812}
+BOX = {"id": 2**32 - 1, "name": "box", "colour": [40, 50, 60], "points": 7}
+
+
+@pytest.fixture
+def path(tmp_path):
+    """objects.json with the box before the mug."""
+    write_objects(tmp_path / "objects.json", [BOX, MUG])
+    return tmp_path / "objects.json"
+
+
+def test_objects_are_as_the_votes_found_them(path):
+    assert read_objects(path) == [
+        SceneObject(1, "mug", (10, 20, 30), 812),
+        SceneObject(2**32 - 1, "box", (40, 50, 60), 7),
+    ]
+
+
+def test_edits_are_seen_and_outlive_a_vote(path):
+    edit_objects(path, {1: dict(name="cup", colour=(255, 0, 0))})
+    edit_objects(path, {1: dict(merged_into=2**32 - 1, left_out=True)})
+    edited = SceneObject(1, "cup", (255, 0, 0), 812, 2**32 - 1, True)
+    assert read_objects(path)[0] == edited
+    edit_objects(path, {1: {}, 2**32 - 1: {"name": None}, 77: {"left_out": False}})
+    write_objects(path, [{**MUG, "name": "mug again", "points": 3}])
+    assert read_objects(path) == [SceneObject(1, "cup", (255, 0, 0), 3, 2**32 - 1, True)]
+    write_objects(path, [BOX])
+    assert read_objects(path) == [SceneObject(2**32 - 1, "box", (40, 50, 60), 7)]
+    write_objects(path, [MUG])
+    assert read_objects(path) == [edited], "an edit waits for its object to come back"
+
+
+def test_an_edit_is_taken_back(path):
+    edit_objects(path, {1: dict(name="cup", left_out=True)})
+    edit_objects(path, {1: dict(name=None)})
+    assert read_objects(path)[0] == SceneObject(1, "mug", (10, 20, 30), 812, None, True)
+    edit_objects(path, {1: dict(left_out=None)})
+    assert json.loads(path.read_text())["edits"] == {}
+
+
+def test_only_what_may_be_edited_is(path):
+    before = path.read_text()
+    with pytest.raises(ValueError, match="points"):
+        edit_objects(path, {1: dict(points=3)})
+    assert path.read_text() == before
+    content = json.loads(before)
+    path.write_text(json.dumps({**content, "edits": {"1": {"points": 3, "id": 9, "later": 1}}}))
+    assert read_objects(path)[0] == SceneObject(1, "mug", (10, 20, 30), 812)
+
+
+@pytest.mark.parametrize(
+    ("into", "shown"),
+    [
+        ({}, {1: 1, 2: 2, 3: 3}),
+        ({1: 2, 2: 3}, {1: 3, 2: 3, 3: 3}),
+        ({1: 1}, {1: 1, 2: 2, 3: 3}),
+        ({1: 9}, {1: 1, 2: 2, 3: 3}),
+        ({1: 0}, {1: 1, 2: 2, 3: 3}),
+    ],
+)
+def test_merges_are_followed(into, shown):
+    assert merged([SceneObject(i, "", (0, 0, 0), 1, into.get(i)) for i in (1, 2, 3)]) == shown
+
+
+def test_merges_in_a_circle_end():
+    circle = merged([SceneObject(i, "", (0, 0, 0), 1, i % 3 + 1) for i in (1, 2, 3)])
+    assert set(circle) == {1, 2, 3} and set(circle.values()) <= {1, 2, 3}
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "{", "[]", "{}", '{"objects": 3}', '{"objects": [{"id": 1}]}', '{"objects": [], "edits": []}',
+     '{"objects": [], "edits": {"1": 2}}',
+     '{"objects": [{"id": 1, "name": "a", "colour": [1, 2], "points": 1}]}',
+     '{"objects": [{"id": 1, "name": "a", "colour": [1, 2, 3], "points": 1}], "edits": {"1": {"merged_into": "x"}}}'],
+)  # fmt: skip
+def test_broken_files_are_one_sentence(tmp_path, text):
+    path = tmp_path / "objects.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"objects\.json") as caught:
+        read_objects(path)
+    assert "\n" not in str(caught.value) and path.read_text() == text
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"objects\.json does not exist"):
+        read_objects(tmp_path / "objects.json")
