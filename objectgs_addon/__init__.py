@@ -1,2 +1,21 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What ObjectGS holds and shows inside Blender, and the demo capture that Blender renders itself."""
+"""What ObjectGS holds and shows inside Blender, and the demo capture that Blender renders itself.
+
+bpy is imported only where it is needed, since some of these modules serve outside of Blender too.
+"""
+
+
+def register():
+    """Add properties, preferences, lists, panels and handlers."""
+    from . import click_selection, object_list, panels, preferences, properties, running
+
+    for module in (properties, preferences, object_list, running, click_selection, panels):
+        module.register()
+
+
+def unregister():
+    """Take them back; background jobs are told to stop and have saved when this returns."""
+    from . import click_selection, object_list, panels, preferences, properties, running
+
+    for module in (panels, click_selection, running, object_list, preferences, properties):
+        module.unregister()

@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A click in the viewport or the outliner on one part of an object selects all of it, and the list follows."""
+
+import bpy
+
+from . import object_edits, scene
+from .selection import selectable
+
+_owner = object()
+
+
+def _active_changed() -> None:
+    """Called by Blender when another object becomes active."""
+    context = bpy.context
+    part = getattr(context, "active_object", None)
+    if part is None or part.mode != "OBJECT" or not part.select_get():
+        return
+    object_id = scene.object_id_of(part)
+    root = scene.root_of(part, context.scene) if object_id is not None else None
+    if root is None:
+        return
+    context.scene.objectgs.active = root
+    for index, item in enumerate(root.objectgs.objects):
+        if object_edits.from_stored(item.object_id) == object_id:
+            with object_edits.without_callbacks():
+                root.objectgs.active_object = index
+            break
+    if context.scene.objectgs.select_whole:
+        for other in scene.parts_of(scene.object_collections(root)[object_id]):
+            if selectable(other):
+                other.select_set(True)
+
+
+def _subscribe() -> None:
+    bpy.msgbus.subscribe_rna(key=(bpy.types.LayerObjects, "active"), owner=_owner, args=(), notify=_active_changed)
+
+
+@bpy.app.handlers.persistent
+def _file_loaded(*_) -> None:
+    bpy.msgbus.clear_by_owner(_owner)
+    _subscribe()
+
+
+def register():
+    _subscribe()
+    bpy.app.handlers.load_post.append(_file_loaded)
+
+
+def unregister():
+    bpy.app.handlers.load_post.remove(_file_loaded)
+    bpy.msgbus.clear_by_owner(_owner)

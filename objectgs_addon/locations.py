@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Where things are: the extension's files, the user's folder, the backend's Python."""
+
+import os
+import sys
+from pathlib import Path
+
+import bpy
+
+from . import environment
+from .backend_process import backend_command, backend_environment
+from .jobs import Job
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = __package__.rpartition(".")[0]
+
+NO_BACKEND = "The compute backend is not set up; open the preferences of ObjectGS and press Set Up Backend"
+
+
+def preferences():
+    """The add-on's preferences, or None where it was not enabled as an add-on (headless)."""
+    addon = bpy.context.preferences.addons.get(PACKAGE)
+    return addon.preferences if addon else None
+
+
+def user_folder() -> Path:
+    """The folder for what must outlive an update of the extension; made where it is not there."""
+    if PACKAGE.startswith("bl_ext."):
+        return Path(bpy.utils.extension_path_user(PACKAGE, create=True))
+    return Path(bpy.utils.user_resource("DATAFILES", path="objectgs", create=True))
+
+
+def environment_folder() -> Path:
+    """Where the backend's own environment is set up."""
+    return user_folder() / "environment"
+
+
+def reconstructions_folder() -> Path:
+    """Where reconstructions go unless the user says otherwise."""
+    chosen = preferences().reconstructions if preferences() else ""
+    return Path(bpy.path.abspath(chosen)) if chosen else user_folder() / "reconstructions"
+
+
+def backend_python() -> Path | None:
+    """The Python that runs the backend: the user's, or the environment that was set up; None where there is none."""
+    chosen = os.environ.get("OBJECTGS_PYTHON") or (preferences().backend_python if preferences() else "")
+    if chosen:
+        path = Path(bpy.path.abspath(chosen))
+        return path if path.is_file() else None
+    state = environment.inspect(environment_folder())
+    return state.python if state.state == "ready" else None
+
+
+def base_python() -> Path:
+    """The Python that a new environment is made from: the user's choice, or Blender's own."""
+    chosen = preferences().base_python if preferences() else ""
+    return Path(bpy.path.abspath(chosen)) if chosen else Path(sys.executable)
+
+
+def backend_job(title: str, kind: str, folder: Path | None, *arguments: str) -> Job:
+    """A job that runs `python -m backend ARGUMENTS --json`; the backend must be there (`backend_python`)."""
+    return Job(title=title, kind=kind, folder=folder, command=backend_command(backend_python(), *arguments), cwd=ROOT,
+               environment=backend_environment(user_folder() / "cache"))
+
+
+def demo_folder() -> Path:
+    """Where the demo capture goes."""
+    return user_folder() / "demo-capture"
+
+
+def demo_job() -> Job:
+    """A job in which another Blender, without a window, renders the demo capture."""
+    script = [str(ROOT / "headless.py"), "--", "demo", str(demo_folder()), "--json"]
+    return Job(title="Make demo capture", kind="demo", folder=demo_folder(),
+               command=[bpy.app.binary_path, "--background", "--factory-startup", "--python", *script], cwd=ROOT,
+               environment={})

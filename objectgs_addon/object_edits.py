@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The objects list and objects.json: filled from the file, and the user's edits written back to it."""
+
+from contextlib import contextmanager
+
+import bpy
+
+from ..backend.objects import SceneObject, edit_objects, merged, read_objects
+from ..backend.protocol import InputError, Reconstruction
+from . import messages, scene, selection
+
+_filling = False
+
+
+@contextmanager
+def without_callbacks():
+    """Rows are being set by code: their update callbacks must not take that for an edit."""
+    global _filling
+    before, _filling = _filling, True
+    try:
+        yield
+    finally:
+        _filling = before
+
+
+def to_stored(object_id: int) -> int:
+    """A mask's ID (0 .. 2^32 - 1) as Blender's signed 32-bit integers hold it."""
+    return object_id - (1 << 32) if object_id >= 1 << 31 else object_id
+
+
+def from_stored(value: int) -> int:
+    """The mask's ID again."""
+    return value + (1 << 32) if value < 0 else value
+
+
+def fill(root) -> None:
+    """Make the list agree with objects.json and with the splats that are shown; empty where there was no vote yet."""
+    properties = root.objectgs
+    path = Reconstruction(scene.folder_of(root)).objects
+    entries = read_objects(path) if path.exists() else []
+    shown = splat_counts(root)
+    active = active_item(root)
+    active_id = active.object_id if active else None
+    with without_callbacks():
+        properties.objects.clear()
+        for entry in entries:
+            item = properties.objects.add()
+            item.name = entry.name
+            item.object_id = to_stored(entry.id)
+            item.colour = [channel / 255.0 for channel in entry.colour]
+            item.chosen = not entry.left_out
+            item.points = entry.points
+            item.splats = shown.get(entry.id, 0)
+            item.is_merged = entry.merged_into is not None
+            item.merged_into = to_stored(entry.merged_into or 0)
+            if item.object_id == active_id:
+                properties.active_object = len(properties.objects) - 1
+        properties.active_object = max(0, min(properties.active_object, len(entries) - 1))
+
+
+def splat_counts(root) -> dict[int, int]:
+    """Object ID -> how many splats its collection shows, merged ones included."""
+    return {
+        object_id: sum(len(part.data.vertices) for part in scene.parts_of(collection)
+                       if scene.kind_of(part) == "splats")
+        for object_id, collection in scene.object_collections(root).items()
+    }
+
+
+def store(root) -> None:
+    """Write back what the list says, after undo or redo changed it."""
+    path = Reconstruction(scene.folder_of(root)).objects
+    if not path.exists():
+        return
+    entries = {entry.id: entry for entry in read_objects(path)}
+    items = {from_stored(item.object_id): item for item in root.objectgs.objects}
+    if set(items) != set(entries):
+        return
+    changes = {}
+    for object_id, item in items.items():
+        entry = entries[object_id]
+        wanted = {"name": item.name, "colour": _rgb(item), "left_out": None if item.chosen else True,
+                  "merged_into": from_stored(item.merged_into) if item.is_merged else None}
+        there = {"name": entry.name, "colour": list(entry.colour), "left_out": entry.left_out or None,
+                 "merged_into": entry.merged_into}
+        changed = {key: value for key, value in wanted.items() if value != there[key]}
+        if changed:
+            changes[object_id] = changed
+    if changes:
+        edit_objects(path, changes)
+
+
+def merge(root, object_ids, into: int) -> None:
+    """Show `object_ids` as parts of the object `into` from now on."""
+    _edit(root, {object_id: {"merged_into": into} for object_id in object_ids if object_id != into})
+
+
+def split(root, object_id: int) -> int:
+    """Take back every merge into `object_id`, and its own; returns how many there were."""
+    items = root.objectgs.objects
+    apart = [from_stored(item.object_id) for item in items if item.is_merged and (
+        from_stored(item.merged_into) == object_id or from_stored(item.object_id) == object_id)]
+    _edit(root, {part: {"merged_into": None} for part in apart})
+    return len(apart)
+
+
+def choose(root, chosen: dict[int, bool]) -> None:
+    """Say for each ID whether training is to make it an object."""
+    _edit(root, {object_id: {"left_out": None if wanted else True} for object_id, wanted in chosen.items()})
+
+
+def _edit(root, changes: dict[int, dict]) -> None:
+    """Write edits to objects.json and show them."""
+    if not changes:
+        return
+    folder = scene.folder_of(root)
+    edit_objects(Reconstruction(folder).objects, changes)
+    for owner in scenes_of(root):
+        show(root, owner)
+        break
+    fill(root)
+
+
+def show(root, owner) -> None:
+    """Bring Blender's collections into agreement with the folder."""
+    folder = scene.folder_of(root)
+    if Reconstruction(folder).splats.exists():
+        scene.show_result(root, folder, owner)
+    else:
+        scene.show_objects(root, folder, owner)
+
+
+def shown_as(root, object_id: int) -> int:
+    """The ID of the object whose collection shows `object_id`: itself, or what it was merged into."""
+    rows = [SceneObject(from_stored(item.object_id), item.name, (0, 0, 0), 0,
+                        from_stored(item.merged_into) if item.is_merged else None) for item in root.objectgs.objects]
+    return merged(rows).get(object_id, object_id)
+
+
+def scenes_of(root):
+    """The scenes that hold the reconstruction."""
+    return [owner for owner in bpy.data.scenes if root in owner.collection.children_recursive]
+
+
+def active_item(root):
+    """The active row, or None."""
+    properties = root.objectgs
+    if 0 <= properties.active_object < len(properties.objects):
+        return properties.objects[properties.active_object]
+    return None
+
+
+def _rgb(item) -> list[int]:
+    return [round(255 * channel) for channel in item.colour]
+
+
+# Update callbacks of the rows' properties.
+
+
+def name_changed(item, _context) -> None:
+    if _filling:
+        return
+    if not item.name.strip():
+        fill(item.id_data)  # An empty name is no name: the one before comes back.
+        return
+    _row_changed(item, name=item.name.strip())
+
+
+def colour_changed(item, _context) -> None:
+    _row_changed(item, colour=_rgb(item))
+
+
+def chosen_changed(item, _context) -> None:
+    _row_changed(item, left_out=None if item.chosen else True)
+
+
+def _row_changed(item, **changes) -> None:
+    """One row was edited by the user. A folder that is gone or cannot be written must not raise in a callback."""
+    if _filling:
+        return
+    root = item.id_data
+    try:
+        folder = scene.folder_of(root)
+        edit_objects(Reconstruction(folder).objects, {from_stored(item.object_id): changes})
+        for owner in scenes_of(root):
+            scene.show_objects(root, folder, owner)
+            break
+    except (InputError, OSError) as error:
+        messages.show(str(error), "ERROR")
+
+
+def active_changed(properties, context) -> None:
+    """A click in the list selects the object in the viewport."""
+    if _filling:
+        return
+    root = properties.id_data
+    item = active_item(root)
+    if item is not None:
+        selection.select_object(context, root, shown_as(root, from_stored(item.object_id)))
+

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The add-on's preferences: where the compute backend is, and where reconstructions go."""
+
+import textwrap
+
+import bpy
+from bpy.props import EnumProperty, StringProperty
+
+from . import environment, job_display, locations, running
+
+
+class Preferences(bpy.types.AddonPreferences):
+    """What holds for every .blend."""
+
+    bl_idname = locations.PACKAGE
+
+    device: EnumProperty(name="For", default="cpu", items=[
+        ("cpu", "Processor", "Works on every computer; about 1 GB"),
+        ("cuda", "NVIDIA GPU", "Also brings the packages for NVIDIA graphics cards; several GB")])
+    backend_python: StringProperty(
+        name="Backend's Python", subtype="FILE_PATH",
+        description="A Python that has the backend's packages already; empty: the one that Set Up Backend makes")
+    base_python: StringProperty(
+        name="Made From", subtype="FILE_PATH",
+        description="Python 3.11 to 3.13 that a new environment is made from; empty: Blender's own")
+    reconstructions: StringProperty(
+        name="Reconstructions", subtype="DIR_PATH",
+        description="Where reconstructions are saved unless said otherwise; empty: in the extension's user folder")
+
+    def draw(self, context):
+        layout = self.layout
+        box = layout.box()
+        box.label(text="Compute Backend", icon="SYSTEM")
+        _draw_state(box, context)
+        row = box.row()
+        row.prop(self, "device", expand=True)
+        row = box.row()
+        row.operator("objectgs.set_up_backend", icon="IMPORT")
+        row.operator("objectgs.check_backend", icon="CHECKMARK")
+        row.operator("objectgs.remove_backend", icon="TRASH")
+        column = box.column()
+        column.use_property_split = True
+        column.prop(self, "backend_python")
+        column.prop(self, "base_python")
+        column = layout.column()
+        column.use_property_split = True
+        column.prop(self, "reconstructions")
+
+
+def _draw_state(layout, context) -> None:
+    """Whether the backend works, or what goes on about it."""
+    job = running.queue.of_folder(locations.environment_folder())
+    if job is not None and not job.is_finished:
+        job_display.draw_running(layout, job, running.queue.jobs.index(job))
+        return
+    sentence, icon = backend_state()
+    for line in textwrap.wrap(sentence, max(40, context.region.width // 9)):
+        layout.label(text=line, icon=icon)
+        icon = "BLANK1"
+    if job is not None:
+        job_display.draw_over(layout, job)
+
+
+def backend_state() -> tuple[str, str]:
+    """A sentence about the backend, and an icon."""
+    if locations.backend_python() is not None:
+        return f"The backend is at {locations.backend_python()}", "CHECKMARK"
+    chosen = locations.preferences().backend_python
+    if chosen:
+        return f"{bpy.path.abspath(chosen)} does not exist; choose the program of a Python, or empty the field", "ERROR"
+    return environment.inspect(locations.environment_folder()).sentence, "INFO"
+
+
+def register():
+    bpy.utils.register_class(Preferences)
+
+
+def unregister():
+    bpy.utils.unregister_class(Preferences)

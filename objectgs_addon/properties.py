@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the .blend remembers: the reconstruction a scene works on, its list of objects and how to train it.
+
+`Collection.objectgs` holds a reconstruction's state, `Scene.objectgs` which one is active. Everything here is undone
+and saved with the .blend; what runs in the background is not here (see `running`).
+"""
+
+import bpy
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    FloatVectorProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
+
+from . import object_edits
+from .scene import colour_points_by, kind_of
+
+
+class ObjectItem(bpy.types.PropertyGroup):
+    """A row of the objects list. IDs above 2^31 - 1 are stored as the int32 of the same bits."""
+
+    name: StringProperty(name="Name", description="Name of the object, kept in the reconstruction",
+                         update=object_edits.name_changed)
+    colour: FloatVectorProperty(name="Color", description="Color that stands for the object", subtype="COLOR_GAMMA",
+                                size=3, min=0.0, max=1.0, update=object_edits.colour_changed)
+    chosen: BoolProperty(name="Reconstruct", default=True, update=object_edits.chosen_changed,
+                         description="Make this object when training; otherwise it stays part of the unlabelled rest")
+    object_id: IntProperty(name="ID", description="Value of the object's pixels in the masks")
+    points: IntProperty(name="Points", description="Points of the capture that were voted to be this object")
+    splats: IntProperty(name="Splats", description="Gaussian splats of this object")
+    is_merged: BoolProperty(name="Merged", description="Shown as a part of another object")
+    merged_into: IntProperty(name="Merged into", description="ID of the object that this one is a part of")
+
+
+class ReconstructionProperties(bpy.types.PropertyGroup):
+    """State of one reconstruction, on its collection."""
+
+    objects: CollectionProperty(type=ObjectItem)
+    active_object: IntProperty(name="Active Object", default=0, update=object_edits.active_changed, options=set())
+    minutes: FloatProperty(
+        name="Minutes", default=5.0, min=0.1, soft_max=120.0, precision=1, step=50,
+        description="How long to train in all. More gives a sharper result; a finished training can be extended")
+    mode: EnumProperty(name="Model", default="explicit", items=[
+        ("explicit", "Plain splats", "What Blender shows and the PLY holds is exactly the model"),
+        ("view", "View-dependent", "As in the paper: splats change with the camera; the PLY is a fit")])
+    sh_degree: IntProperty(name="SH Degree", default=1, min=0, max=3,
+                           description="How much colours may change with the direction they are seen from")
+    strategy: EnumProperty(name="Votes", default="majority", items=[
+        ("majority", "Majority", "The object that most masks show at a point"),
+        ("probability", "Probability", "Drawn by chance, in proportion to the votes"),
+        ("correspondence", "Correspondence", "Only the photos in which COLMAP found the point")])
+    max_size: IntProperty(name="Image Size", default=1600, min=64, soft_max=8192,
+                          description="Larger photos are reduced to this longest side, in pixels")
+    colour_by: EnumProperty(name="Color Points By", default="photo", items=[
+        ("photo", "Photo", "Colors of the photos"), ("object", "Object", "Color of the object voted for")],
+        update=lambda self, _context: colour_points_by(self.id_data, self.colour_by))
+
+
+def _is_reconstruction(_scene, collection) -> bool:
+    return kind_of(collection) == "reconstruction"
+
+
+class SceneProperties(bpy.types.PropertyGroup):
+    """What a scene works on."""
+
+    active: PointerProperty(type=bpy.types.Collection, name="Reconstruction", poll=_is_reconstruction,
+                            description="The reconstruction that the panel works on")
+    select_whole: BoolProperty(
+        name="Select Whole Objects", default=True,
+        description="Clicking one part of an object selects all of it, so that it moves as a whole")
+
+
+CLASSES = (ObjectItem, ReconstructionProperties, SceneProperties)
+
+
+def register():
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+    bpy.types.Collection.objectgs = PointerProperty(type=ReconstructionProperties)
+    bpy.types.Scene.objectgs = PointerProperty(type=SceneProperties)
+
+
+def unregister():
+    del bpy.types.Scene.objectgs
+    del bpy.types.Collection.objectgs
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)

@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Which objects of a reconstruction a view layer shows."""
+
+from . import scene
+
+
+def _layers(layer):
+    """A layer collection and all below it."""
+    yield layer
+    for child in layer.children:
+        yield from _layers(child)
+
+
+def object_layers(view_layer, root) -> dict:
+    """Object ID -> its layer collection, of the objects that have one."""
+    top = next((layer for layer in _layers(view_layer.layer_collection) if layer.collection == root), None)
+    return {} if top is None else {
+        scene.object_id_of(layer.collection): layer for layer in _layers(top)
+        if scene.kind_of(layer.collection) == "object"}
+
+
+def toggle_solo(view_layer, root, object_id: int) -> bool:
+    """Hide every object but one, or show all where that one is alone already; False where it has no collection."""
+    layers = object_layers(view_layer, root)
+    if object_id not in layers:
+        return False
+    alone = all(layer.hide_viewport != (other == object_id) for other, layer in layers.items())
+    for other, layer in layers.items():
+        layer.hide_viewport = not alone and other != object_id
+    return True

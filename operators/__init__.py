@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What can be done: one file a verb. Each reads the context, calls objectgs_addon and reports."""
+
+
+def _classes():
+    from . import (
+        choose_objects,
+        import_capture,
+        make_demo,
+        merge_objects,
+        orient,
+        pause_job,
+        select_object,
+        set_up_backend,
+        show_preview,
+        show_result,
+        solo_object,
+        stop_job,
+        train,
+        vote,
+    )
+
+    modules = (import_capture, make_demo, vote, train, pause_job, stop_job, show_result, show_preview, select_object,
+               solo_object, merge_objects, choose_objects, orient, set_up_backend)
+    return [cls for module in modules for cls in module.CLASSES]
+
+
+def _import_menu(menu, _context):
+    menu.layout.operator("objectgs.import_capture", text="ObjectGS Capture (COLMAP)")
+
+
+def register():
+    import bpy
+
+    for cls in _classes():
+        bpy.utils.register_class(cls)
+    bpy.types.TOPBAR_MT_file_import.append(_import_menu)
+
+
+def unregister():
+    import bpy
+
+    bpy.types.TOPBAR_MT_file_import.remove(_import_menu)
+    for cls in reversed(_classes()):
+        bpy.utils.unregister_class(cls)

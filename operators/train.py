@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Train: make the splats, in the background."""
+
+import bpy
+from bpy.props import BoolProperty
+
+from ..objectgs_addon import locations, running, scene
+from ..objectgs_addon.folder_state import folder_state
+from . import need
+
+
+class Train(bpy.types.Operator):
+    bl_idname = "objectgs.train"
+    bl_label = "Train"
+    bl_description = "Make the splats in the background; goes on where an earlier training stopped"
+    bl_options = {"REGISTER"}
+
+    restart: BoolProperty(name="Train Anew", options={"SKIP_SAVE"},
+                          description="Forget the training that is there and begin again")
+
+    @classmethod
+    def description(cls, _context, properties):
+        return "Forget the training that is there and begin again" if properties.restart else cls.bl_description
+
+    @classmethod
+    def poll(cls, context):
+        return (need.backend(cls) and need.reconstruction(cls, context) and need.idle(cls, context)
+                and need.capture(cls, context))
+
+    def invoke(self, context, event):
+        if self.restart:
+            return context.window_manager.invoke_confirm(self, event)
+        return self.execute(context)
+
+    def execute(self, context):
+        root = need.active_root(context)
+        properties = root.objectgs
+        folder = scene.folder_of(root)
+        state = folder_state(folder)
+        if not self.restart and state.trained and state.seconds >= 60.0 * properties.minutes:
+            self.report({"ERROR"}, f"It was trained for {state.seconds / 60:.1f} minutes already; raise Minutes to "
+                                   "extend the training, or use Train Anew")
+            return {"CANCELLED"}
+        arguments = ["train", str(state.capture), "--out", str(folder), "--minutes", f"{properties.minutes:g}",
+                     "--mode", properties.mode, "--sh-degree", str(properties.sh_degree), "--strategy",
+                     properties.strategy, "--max-size", str(properties.max_size)]
+        if self.restart:
+            arguments.append("--restart")
+        job = locations.backend_job(f"Train {root.name}", "train", folder, *arguments)
+        return running.submit(job, context.scene, self.report)
+
+
+CLASSES = (Train,)

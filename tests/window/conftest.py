@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Which Blenders the window tests run in; skipped by name where there is none."""
+
+import subprocess
+import sys
+
+import pytest
+
+from . import harness
+
+BACKEND = sys.executable
+
+
+@pytest.fixture(scope="session")
+def extension_zip(tmp_path_factory):
+    """The extension as `make zip` builds it."""
+    subprocess.run(["make", "zip"], cwd=harness.ROOT, check=True, stdout=subprocess.DEVNULL)
+    return max((harness.ROOT / "build").glob("objectgs-*.zip"), key=lambda path: path.stat().st_mtime)
+
+
+@pytest.fixture(scope="module", params=list(harness.blenders()) or ["none"])
+def blender(request, tmp_path_factory, extension_zip):
+    """A Blender with a window and the extension installed; one for all tests of a module."""
+    if request.param == "none":
+        pytest.skip("no Blender with a window: set OBJECTGS_BLENDER to one of version 4.2 or newer")
+    missing = harness.missing_tools()
+    if missing:
+        pytest.skip(f"{', '.join(missing)} must be installed to drive a window")
+    command, variables = harness.blenders()[request.param]
+    shots = harness.ROOT / "build" / "window" / request.param
+    running = harness.Blender(command, variables, tmp_path_factory.mktemp("blender"), shots)
+    try:
+        running.wait_for("True", timeout=120)
+        running.run(f"""
+            bpy.context.preferences.view.show_splash = False
+            bpy.ops.extensions.package_install_files(
+                filepath={str(extension_zip)!r}, repo="user_default", enable_on_install=True)
+            preferences = bpy.context.preferences.addons["bl_ext.user_default.objectgs"].preferences
+        """)
+        yield running
+    finally:
+        running.close()

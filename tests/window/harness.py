@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A real Blender in a window on a virtual screen, driven from outside by scripts, clicks and keys."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import textwrap
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+SIZE = (1600, 900)
+
+
+def blenders() -> dict[str, tuple[list[str], dict[str, str]]]:
+    """Name -> (command that opens a window, extra variables) of each Blender that can be had here.
+
+    OBJECTGS_BLENDER names one (a program); else those that ../shared/tools/real-blender has set up.
+    """
+    chosen = os.environ.get("OBJECTGS_BLENDER")
+    if chosen:
+        return {"blender": ([chosen], {})}
+    tool = ROOT.parent / "shared" / "tools" / "real-blender"
+    if not tool.is_file():
+        return {}
+    suites = {"4.3": "trixie", "5.2": "sid"}
+    return {version: ([str(tool), "gui"], {"REAL_BLENDER_SUITE": suite}) for version, suite in suites.items()
+            if Path(f"/var/tmp/real-blender-{suite}/usr/bin/blender").exists()}
+
+
+class Failed(Exception):
+    """A script failed inside Blender, or Blender is gone."""
+
+
+class Blender:
+    """One running Blender. `shots` is where screenshots go, `place` a scratch folder of its own."""
+
+    def __init__(self, command, variables, place: Path, shots: Path, display: str = ":97") -> None:
+        self.place, self.shots, self.display = place, shots, display
+        self.scripts = place / "scripts"
+        self.scripts.mkdir(parents=True)
+        shots.mkdir(parents=True, exist_ok=True)
+        self._count = 0
+        self._screen = subprocess.Popen(["Xvfb", display, "-screen", "0", f"{SIZE[0]}x{SIZE[1]}x24"],
+                                        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        _wait(lambda: Path(f"/tmp/.X11-unix/X{display[1:]}").exists(), 10, "the virtual screen does not start")
+        environment = {**os.environ, **variables, "DISPLAY": display, "LIBGL_ALWAYS_SOFTWARE": "1",
+                       "BLENDER_USER_RESOURCES": str(place / "user")}
+        (place / "user").mkdir()
+        self._log = open(place / "blender.log", "wb")
+        self._process = subprocess.Popen(
+            [*command, "--window-geometry", "0", "0", str(SIZE[0]), str(SIZE[1]), "--python",
+             str(Path(__file__).with_name("driver.py")), "--", str(self.scripts)],
+            cwd=ROOT, env=environment, stdout=self._log, stderr=subprocess.STDOUT, start_new_session=True)
+
+    def run(self, script: str, timeout: float = 60.0):
+        """Execute a script inside Blender and return its variable `result`."""
+        self._count += 1
+        part = self.scripts / "next.part"
+        part.write_text(textwrap.dedent(script), encoding="utf-8")
+        part.rename(self.scripts / f"{self._count}.py")
+        answer = self.scripts / f"{self._count}.json"
+        _wait(lambda: answer.exists() or self._process.poll() is not None, timeout,
+              f"Blender does not answer:\n{script}")
+        if not answer.exists():
+            raise Failed(f"Blender has ended with code {self._process.returncode}; see {self._log.name}")
+        content = json.loads(answer.read_text(encoding="utf-8"))
+        if "error" in content:
+            raise Failed(content["error"])
+        return content["result"]
+
+    def wait_for(self, expression: str, timeout: float = 60.0):
+        """Ask until the expression is true; returns its value."""
+        found = []
+
+        def true() -> bool:
+            found[:] = [self.run(f"result = {expression}")]
+            return bool(found[0])
+
+        _wait(true, timeout, f"it never became true: {expression}", 0.3)
+        return found[0]
+
+    def shot(self, name: str) -> Path:
+        """A picture of the whole screen."""
+        path = self.shots / f"{name}.png"
+        self._tool("import", "-window", "root", str(path))
+        return path
+
+    def click(self, x: float, y: float, button: int = 1, key: str | None = None) -> None:
+        """Move the mouse to a place (pixels from the upper left) and click there, with `key` held."""
+        self._tool("xdotool", "mousemove", str(round(x)), str(round(y)))
+        time.sleep(0.4)
+        held = ["keydown", key] if key else []
+        self._tool("xdotool", *held, "click", str(button), *(["keyup", key] if key else []))
+        time.sleep(0.6)
+
+    def move(self, x: float, y: float) -> None:
+        """Move the mouse."""
+        self._tool("xdotool", "mousemove", str(round(x)), str(round(y)))
+        time.sleep(0.4)
+
+    def key(self, *keys: str) -> None:
+        """Press keys, for instance "ctrl+z"."""
+        for name in keys:
+            self._tool("xdotool", "key", name)
+            time.sleep(0.3)
+
+    def close(self) -> None:
+        """End Blender and the screen."""
+        for process in (self._process, self._screen):
+            if process.poll() is None:
+                if process is self._process:
+                    os.killpg(process.pid, signal.SIGTERM)
+                else:
+                    process.terminate()
+                try:
+                    process.wait(10)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+        self._log.close()
+
+    def quit(self, timeout: float = 30.0) -> int:
+        """Let Blender quit as a user would; returns its exit code."""
+        part = self.scripts / "next.part"
+        part.write_text("bpy.ops.wm.quit_blender()", encoding="utf-8")
+        part.rename(self.scripts / f"{self._count + 1}.py")
+        return self._process.wait(timeout)
+
+    def _tool(self, *command: str) -> None:
+        subprocess.run(command, env={**os.environ, "DISPLAY": self.display}, check=True, timeout=30,
+                       stdout=subprocess.DEVNULL)
+
+
+def missing_tools() -> list[str]:
+    """Programs that the harness needs and that are not here."""
+    return [tool for tool in ("Xvfb", "xdotool", "import") if shutil.which(tool) is None]
+
+
+def _wait(done, timeout: float, sentence: str, interval: float = 0.1) -> None:
+    deadline = time.monotonic() + timeout
+    while not done():
+        if time.monotonic() > deadline:
+            raise Failed(sentence)
+        time.sleep(interval)
