@@ -1,0 +1,413 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Background jobs, with small programs that stand in for the backend: they report, wait, crash, hang and babble."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from objectgs.objectgs_addon import jobs
+from objectgs.objectgs_addon.backend_process import BackendProcess, backend_command, backend_environment
+from objectgs.objectgs_addon.jobs import Job, JobQueue, State, lock_holder, run_blocking
+
+posix = pytest.mark.skipif(os.name != "posix", reason="signals and niceness are POSIX's")
+WAIT = 10.0
+
+PRELUDE = """
+import json, os, signal, sys, time
+def say(kind, **fields):
+    print(json.dumps({"type": kind, "time": 0, **fields}), flush=True)
+def hear():
+    return sys.stdin.readline().strip()
+"""
+
+TRAINS = """
+assert hear() == "attached"
+say("status", message="Training")
+say("progress", done=0.25, total=1.0, step=10, seconds_left=30.0, splats=5000, anchors=500, psnr=None)
+while (word := hear()) != "stop":
+    say("status", message={"pause": "Paused", "resume": "Going on", "": "Nobody there"}[word])
+    if not word:
+        sys.exit(3)
+say("done", stopped=True, message="Saved at step 10.")
+sys.exit(130)
+"""
+
+DEAF = """
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+say("status", message="Busy")
+time.sleep(60)
+"""
+
+
+@pytest.fixture
+def make(tmp_path):
+    """make(code, **fields): a job that runs the Python `code`; what still runs at the end of the test is killed."""
+    made = []
+
+    def one(code, kind="train", **fields):
+        script = tmp_path / f"fake{len(made)}.py"
+        script.write_text(PRELUDE + code, encoding="utf-8")
+        fields = {"title": "Fake", "folder": None, "cwd": tmp_path, "command": [sys.executable, str(script)]} | fields
+        made.append(Job(kind=kind, **fields))
+        return made[-1]
+
+    yield one
+    for job in made:
+        job.kill()
+
+
+def until(condition, look=lambda: None):
+    """Call `look` until `condition()` holds."""
+    deadline = time.monotonic() + WAIT
+    while not condition():
+        assert time.monotonic() < deadline, "it never came"
+        look()
+        time.sleep(0.01)
+
+
+def run(job):
+    """The job at its end, by a queue of its own."""
+    queue = JobQueue()
+    queue.add(job)
+    until(lambda: job.is_finished, queue.poll)
+    return job
+
+
+def started(job, queue=None):
+    """The queue, once the job has said something."""
+    queue = queue or JobQueue()
+    queue.add(job)
+    until(lambda: job.message, queue.poll)
+    return queue
+
+
+def test_figures_of_a_whole_run(make, tmp_path):
+    job = run(make("""
+say("status", message="Reading the capture")
+say("progress", done=5, total=10)
+say("status", message="Training")
+say("warning", message="3 images have no pose.")
+say("warning", message="3 images have no pose.")
+say("progress", done=0.5, total=1.0, step=7, seconds_left=12.5, splats=100, anchors=10, psnr=25.5, miou=None)
+say("preview", path="latest.png")
+say("quality", seconds=3.0, step=9, psnr=26.5, miou=0.75, mbiou=0.5)
+say("done", steps=12, splats="splats.ply", anchors=11, psnr=27.0)
+"""))
+    assert job.state is State.DONE and job.exit_code == 0 and job.error is None
+    assert job.progress == 1 and job.seconds_left is None
+    assert job.warnings == ["3 images have no pose."]
+    assert (job.step, job.splats, job.anchors, job.psnr, job.miou) == (9, 100, 11, 27.0, 0.75)
+    assert job.preview == Path("latest.png")
+    assert job.curve == [{"seconds": 3.0, "step": 9, "psnr": 26.5, "miou": 0.75, "mbiou": 0.5}]
+    assert job.result == {"steps": 12, "splats": "splats.ply", "anchors": 11, "psnr": 27.0}
+
+
+def test_the_one_after_waits_and_all_changes_are_told(make):
+    queue, order = JobQueue(), []
+    first, second = make('say("done")', title="first"), make('say("done")', title="second")
+    queue.add(first)
+    queue.add(second)
+
+    def look():
+        order.extend((job.title, job.state) for job in queue.poll())
+        assert not (first.state is State.RUNNING and second.state is not State.WAITING)
+
+    until(lambda: second.is_finished, look)
+    assert [title for title, state in order if state is State.DONE] == ["first", "second"]
+    assert not queue.poll() and queue.running is None
+    queue.clear_finished()
+    assert queue.jobs == []
+
+
+def test_pause_resume_stop(make):
+    job = make(TRAINS)
+    queue = started(job)
+    until(lambda: job.step, queue.poll)
+    assert (job.progress, job.seconds_left, job.psnr) == (0.25, 30.0, None)
+    job.pause()
+    assert job.state is State.PAUSED and queue.running is job
+    until(lambda: job.message == "Paused", queue.poll)
+    job.resume()
+    until(lambda: job.message == "Going on", queue.poll)
+    assert job.state is State.RUNNING
+    job.pause()
+    job.stop()
+    assert job.state is State.STOPPING
+    until(lambda: job.is_finished, queue.poll)
+    assert job.state is State.STOPPED and job.message == "Saved at step 10." and job.exit_code == 130
+
+
+def test_only_training_pauses(make):
+    job = make(TRAINS, kind="import")
+    started(job)
+    assert not job.can_pause
+    job.pause()
+    assert job.state is State.RUNNING
+
+
+def test_stopping_a_waiting_job_removes_it(make):
+    busy, waiting = make(TRAINS), make(TRAINS)
+    queue = started(busy)
+    queue.add(waiting)
+    waiting.stop()
+    assert waiting in queue.poll() and waiting.state is State.STOPPED
+    assert queue.jobs == [busy] and not queue.poll()
+    busy.stop()
+    until(lambda: busy.is_finished, queue.poll)
+    assert queue.jobs == [busy]
+
+
+def test_stop_twice_ends_a_deaf_one_by_force(make, monkeypatch):
+    monkeypatch.setattr(jobs, "GRACE_SECONDS", 0.5)
+    job = make(DEAF)
+    queue = started(job)
+    job.stop()
+    time.sleep(0.7)
+    queue.poll()
+    assert job.state is State.STOPPING
+    job.stop()
+    until(lambda: job.is_finished, queue.poll)
+    assert job.state is State.STOPPED and "force" in job.message
+
+
+def test_stop_all_waits_for_those_that_save_and_kills_the_deaf(make):
+    for code, how in (TRAINS, "Saved at step 10."), (DEAF, "Ended by force; what was saved last is kept"):
+        job, waiting = make(code), make(code)
+        queue = started(job)
+        queue.add(waiting)
+        queue.stop_all(timeout=WAIT if code is TRAINS else 0.3)
+        assert job.state is State.STOPPED and job.message == how
+        assert waiting.state is State.STOPPED and waiting.exit_code is None
+        assert queue.running is None
+
+
+@posix
+def test_crash_shows_the_last_message(make):
+    job = run(make("""
+print("reading", file=sys.stderr)
+print("terminate called: out of cheese", file=sys.stderr, flush=True)
+os.abort()
+"""))
+    assert job.state is State.FAILED and job.exit_code == -signal.SIGABRT
+    assert job.error == "The backend crashed (Aborted); its last message: terminate called: out of cheese"
+    assert job.log == ["reading", "terminate called: out of cheese"]
+    job = run(make("os.kill(os.getpid(), signal.SIGKILL)"))
+    assert "memory" in job.error
+
+
+@posix
+def test_segfault_is_named_by_the_interpreter(make, tmp_path):
+    job = run(make("import ctypes; ctypes.string_at(0)", environment=backend_environment(tmp_path)))
+    assert job.state is State.FAILED and "Segmentation fault" in job.error.split(";")[0]
+    assert job.error.endswith("Fatal Python error: Segmentation fault")
+
+
+def test_error_and_exit_codes(make):
+    job = run(make('say("error", message="garden has no images."); sys.exit(2)'))
+    assert (job.state, job.error, job.message) == (State.FAILED, "garden has no images.", "garden has no images.")
+    job = run(make("sys.exit(130)"))
+    assert job.state is State.STOPPED
+    job = run(make("raise ValueError('no such thing')"))
+    assert job.state is State.FAILED
+    assert job.error == "The backend ended unexpectedly (exit code 1); its last message: ValueError: no such thing"
+    job = run(make("say('status', message='Hello')"))
+    assert job.state is State.FAILED and job.error == "The backend ended without a result."
+    job = run(make("say('done', message='All there.'); sys.exit(3)"))
+    assert job.state is State.DONE and job.message == "All there." and "exit code 3" in job.warnings[0]
+
+
+def test_garbage_between_events(make):
+    job = run(make(r"""
+out = sys.stdout.buffer
+out.write(b"\xff\xfe not text\n{ broken\n[1]\n{\"no\": \"type\"}\n\n" + b"x" * 3_000_000 + b"\n")
+for i in range(100):
+    out.write(b"line %d\n" % i)
+out.write('{"type": "status", "message": "Größe"}\r\n'.encode())
+out.write(b'{"type": "progress", "done": "much", "total": null}\n{"type": "progress", "done": 1, "total": 0}\n')
+out.write(b'{"type": "progress", "done": NaN, "total": 1, "step": true}\n{"type": "unheard-of"}\n')
+out.write(b'{"type": "done", "message": "without an end of line"}')
+"""))
+    assert job.state is State.DONE and job.message == "without an end of line"
+    assert len(job.log) == 40 and job.log[-1] == "line 99" and job.step is None
+
+
+def test_a_flood_of_events_is_taken_in_parts(make):
+    job = make('[say("progress", done=i, total=5000, step=i) for i in range(5000)]; say("done")')
+    queue, longest = started(make('say("done", message="first")')), 0.0
+    queue.add(job)
+    while not job.is_finished:
+        before = job.step or 0
+        queue.poll()
+        longest = max(longest, (job.step or 0) - before)
+    assert job.state is State.DONE and job.step == 4999
+    assert longest <= 200
+
+
+def test_closed_pipes_are_no_end(make):
+    job = make("""
+os.close(0)
+say("status", message="Closed")
+time.sleep(0.3)
+say("done")
+""")
+    queue = started(job)
+    job.pause()
+    job.stop()
+    until(lambda: job.is_finished, queue.poll)
+    assert job.state is State.DONE
+
+
+def test_a_grandchild_that_keeps_the_pipes_holds_nothing_up(make, monkeypatch):
+    monkeypatch.setattr("objectgs.objectgs_addon.backend_process._PIPES_STAY_OPEN", 0.2)
+    job = make("""
+import subprocess
+child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(20)"])
+say("done", child=child.pid)
+""")
+    run(job)
+    assert job.state is State.DONE
+    os.kill(job.result["child"], getattr(signal, "SIGKILL", signal.SIGTERM))
+
+
+@posix
+def test_kill_takes_the_children_along(make):
+    job = make("""
+import subprocess
+child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+say("status", message=str(child.pid))
+time.sleep(60)
+""")
+    queue = started(job)
+    child = int(job.message)
+    job.kill()
+    until(lambda: job.is_finished, queue.poll)
+    assert job.state is State.STOPPED
+
+    def gone():
+        result = subprocess.run(["ps", "-o", "stat=", "-p", str(child)], capture_output=True, text=True)
+        return result.stdout.strip()[:1] in ("", "Z")
+
+    until(gone)
+
+
+@posix
+def test_own_group_lower_priority_clean_environment(make, monkeypatch, tmp_path):
+    monkeypatch.setenv("PYTHONHOME", "/nowhere")
+    monkeypatch.setenv("PYTHONPATH", "/nowhere")
+    monkeypatch.setenv("OBJECTGS_TEST", "stays")
+    job = run(make("""
+say("done", group=os.getpgid(0), pid=os.getpid(), nice=os.nice(0), variables=dict(os.environ))
+""", environment=backend_environment(tmp_path / "cache")))
+    assert job.state is State.DONE
+    found, variables = job.result, job.result["variables"]
+    assert found["group"] == found["pid"] and found["nice"] > os.nice(0)
+    assert "PYTHONHOME" not in variables and "PYTHONPATH" not in variables and variables["OBJECTGS_TEST"] == "stays"
+    assert variables["NUMBA_CACHE_DIR"] == str(tmp_path / "cache") and variables["PYTHONUTF8"] == "1"
+
+
+def test_what_cannot_be_started(make, tmp_path):
+    job = run(make("", command=[str(tmp_path / "no-python"), "-m", "backend"]))
+    assert job.state is State.FAILED and "no-python could not be started" in job.error
+    job = run(make("", cwd=tmp_path / "gone"))
+    assert job.state is State.FAILED and "gone is gone" in job.error
+    (tmp_path / "text").write_text("no program")
+    job = run(make("", command=[str(tmp_path / "text")]))
+    assert job.state is State.FAILED and "could not be started" in job.error
+    job = run(make("print('usage: tar'); sys.exit(64)", if_silent="tar is no Python."))
+    assert job.error == "tar is no Python."
+
+
+def test_the_end_of_the_driver_is_seen(tmp_path):
+    script = tmp_path / "fake.py"
+    script.write_text(PRELUDE + TRAINS)
+    process = BackendProcess([sys.executable, str(script)], tmp_path)
+    until(lambda: any(event["type"] == "progress" for event in process.poll()))
+    process._process.stdin.close()
+    until(lambda: any(event.get("message") == "Nobody there" for event in process.poll()))
+    until(lambda: (process.poll(), process.exit_code)[1] == 3)
+    assert not process.send("pause")
+
+
+def test_time_left_is_estimated_where_the_backend_says_none(make, monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr(jobs.time, "monotonic", lambda: clock[0])
+    job = Job(title="", kind="train", folder=None, command=[], cwd=Path())
+    job.state, job._phase_began = State.RUNNING, 0.0
+    job._take({"type": "status", "message": "Undistorting"})
+    clock[0] += 10
+    job._take({"type": "progress", "done": 1, "total": 4})
+    assert job.seconds_left == pytest.approx(30)
+    job._take({"type": "progress", "done": 2, "total": 4, "seconds_left": 7})
+    assert job.seconds_left == 7
+    job._take({"type": "status", "message": "Voting"})
+    assert job.seconds_left is None
+    clock[0] += 5
+    job._take({"type": "progress", "done": 5, "total": 10})
+    assert job.seconds_left == pytest.approx(5)
+
+
+def test_folder_by_any_name(make, tmp_path):
+    (tmp_path / "a").mkdir()
+    queue = JobQueue()
+    older, newer = make("", folder=tmp_path / "a"), make("", folder=tmp_path / "b" / ".." / "a")
+    queue.add(older)
+    queue.add(newer)
+    queue.add(make("", folder=None))
+    assert queue.of_folder(tmp_path / "a" / ".") is newer
+    assert queue.of_folder(tmp_path / "b") is None
+
+
+def test_run_blocking_tells_and_returns_the_exit_code(make):
+    said = []
+    code = run_blocking(make("""
+say("status", message="Voting")
+time.sleep(0.2)
+say("warning", message="One mask is empty.")
+say("done", message="Voted.")
+"""), said.append)
+    assert code == 0 and said == ["Voting", "warning: One mask is empty.", "Voted."]
+    said.clear()
+    assert run_blocking(make('say("error", message="No masks."); sys.exit(2)'), said.append) == 2
+    assert said == ["error: No masks."]
+    assert run_blocking(make("os._exit(9)"), said.append) == 1
+    assert run_blocking(make("", command=["/no/such/python"]), said.append) == 2
+
+
+@posix
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_run_blocking_saves_on_a_signal(make, number):
+    before = signal.getsignal(number)
+    threading.Timer(0.7, os.kill, (os.getpid(), number)).start()
+    said = []
+    assert run_blocking(make(TRAINS), said.append) == 130
+    assert said[-1] == "Saved at step 10." and signal.getsignal(number) is before
+
+
+@posix
+def test_run_blocking_a_second_signal_ends_it_by_force(make):
+    for seconds in (0.7, 1.0):
+        threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT)).start()
+    assert run_blocking(make(DEAF), lambda line: None) == 130
+
+
+def test_lock_holder(tmp_path):
+    lock = tmp_path / ".lock"
+    assert lock_holder(tmp_path) is None and lock_holder(tmp_path / "gone") is None
+    child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    lock.write_text(f"{child.pid}\n")
+    assert lock_holder(tmp_path) == child.pid
+    child.communicate(b"\n")
+    assert lock_holder(tmp_path) is None
+    for text in ("", "pid", "-1", "0", str(os.getpid()), "9" * 40):
+        lock.write_text(text)
+        assert lock_holder(tmp_path) is None, text
+
+
+def test_command_line():
+    assert backend_command("/py", "train", Path("a"), "--out", "b") == [
+        "/py", "-m", "backend", "train", str(Path("a")), "--out", "b", "--json"]
