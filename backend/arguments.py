@@ -48,6 +48,11 @@ Look through a capture and say what it holds and what is wrong with it: cameras,
 images without a pose, masks, objects. Nothing is written.
 """
 
+_IMPORT = """\
+Get a capture ready to be shown: undistort its images once, and leave its cameras in
+cameras.json and its points in points.ply. `vote` and `train` do this by themselves.
+"""
+
 _VOTE = """\
 Give each 3D point of the capture the object that most masks show there. Leaves
 points.ply, with an object_id for each point, and objects.json in the
@@ -120,12 +125,15 @@ def parser() -> argparse.ArgumentParser:
             help="larger images are reduced to this longest side (1600)",
         )  # fmt: skip
 
-    def vote_options(sub: argparse.ArgumentParser) -> None:
+    def making_options(sub: argparse.ArgumentParser) -> None:
         capture_options(sub)
         memory_option(sub)
         sub.add_argument(
             "--out", type=Path, required=True, metavar="DIR", help="reconstruction folder, made where it is not there"
         )
+
+    def vote_options(sub: argparse.ArgumentParser) -> None:
+        making_options(sub)
         sub.add_argument(
             "--strategy", choices=("majority", "probability", "correspondence"), default="majority",
             help="a point's object: the one most masks show there (majority), one drawn as often as masks show it, "
@@ -135,6 +143,9 @@ def parser() -> argparse.ArgumentParser:
 
     check = command("check", "say what a capture holds and what is wrong with it", _CHECK, "garden")
     capture_options(check)
+
+    making = command("import", "get cameras and points ready to be shown", _IMPORT, "garden --out garden-splats")
+    making_options(making)
 
     vote = command("vote", "give each point its object, from the masks", _VOTE, "garden --out garden-splats")
     vote_options(vote)

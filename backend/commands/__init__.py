@@ -10,10 +10,11 @@ import argparse
 from collections.abc import Callable
 
 from ..protocol import StoppingReporter
-from . import check, doctor, evaluate, render, report, train, vote
+from . import check, doctor, evaluate, importing, render, report, train, vote
 
 COMMANDS: dict[str, Callable[[argparse.Namespace, StoppingReporter], None]] = {
     "check": check.check,
+    "import": importing.import_capture,
     "vote": vote.vote,
     "train": train.train,
     "render": render.render,

@@ -17,6 +17,7 @@ from ..model.object_model import ObjectModel
 from ..protocol import InputError, Reconstruction, Reporter
 from ..training.loop import Progress, load_model, progress_of
 from ..training.scene import Scene
+from .cameras import write_cameras
 from .lock import FolderInUse, locked
 from .record import record, recorded, stage
 
@@ -35,7 +36,7 @@ def memory_for_planes(options: argparse.Namespace) -> float:
 def open_reconstruction(options: argparse.Namespace, reporter: Reporter) -> Iterator[tuple[Reconstruction, Capture]]:
     """The folder of --out, made where it is not there and locked meanwhile, and the capture to fill it from.
 
-    Bad input leaves nothing behind.
+    Leaves cameras.json. Bad input leaves nothing behind.
     """
     folder = Reconstruction(options.out)
     absent = [path for path in (folder.cache, folder.folder, *folder.folder.parents) if not path.exists()]
@@ -47,6 +48,7 @@ def open_reconstruction(options: argparse.Namespace, reporter: Reporter) -> Iter
                 capture = load_capture(
                     options.capture, folder.cache, memory_for_files(options), options.max_size, reporter
                 )
+                write_cameras(folder, capture)
         yield folder, capture
 
 
@@ -93,15 +95,18 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
     place = Path(options.capture or memory["capture"]["folder"])
     if not place.is_dir():
         raise InputError(f"The capture {place} of {folder.folder} is gone; say with --capture where it is now.")
-    max_size = memory["capture"]["max_size"]
+    # What it was trained from, not memory["capture"], which a later import of another capture replaces.
+    trained_from = memory["training"]["votes"]
+    max_size = trained_from["max_size"]
     capture = load_capture(place, folder.cache, memory_for_files(options), max_size, reporter)
-    if digest(capture) != memory["capture"]["digest"]:
+    if digest(capture) != trained_from["capture"]:
         raise InputError(
             f"The capture {place} is not the one that {folder.folder} was trained on; put that one back, say with "
             "--capture where it is, or train again."
         )
     if options.capture:
         record(folder, capture=described(capture, max_size))
+        write_cameras(folder, capture)
     zero_is_object = state["settings"]["zero_is_object"]
     scene = Scene(
         capture, model.object_ids, model.normalization, zero_is_object, memory_for_planes(options),

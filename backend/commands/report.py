@@ -41,8 +41,9 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             "cameras": ", ".join(f"{count} {name}" for name, count in capture.counts["cameras"].items()),
         },
         "settings": {
-            "minutes": training["minutes"], "steps": training["steps"], "max_size": memory["capture"]["max_size"],
-            "strategy": training["votes"]["strategy"], **training["settings"],
+            "minutes": training["minutes"], "steps": training["steps"],
+            "max_size": training["votes"]["max_size"], "strategy": training["votes"]["strategy"],
+            **training["settings"],
         },
         "machine": machine_facts(),
         "left_out": _left_out(trained),
@@ -121,7 +122,7 @@ def _left_out(trained: Trained) -> list[dict[str, str]]:
         (
             not any(view.image_file.is_relative_to(folder.cache) for view in capture.views),
             "undistortion and reduction of the images",
-            f"all are pinhole pictures of at most {memory['capture']['max_size']} pixels already",
+            f"all are pinhole pictures of at most {memory['training']['votes']['max_size']} pixels already",
         ),
         (
             counts["unregistered"] > 0, f"{counts['unregistered']} images without a pose",

@@ -41,7 +41,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
                     "settings": trainer.settings.as_dict(),
                     "minutes": None if options.steps else options.minutes,
                     "steps": options.steps,
-                    "votes": votes_key(capture, options),
+                    "votes": votes_key(capture, options.max_size, options.strategy, options.seed),
                 },
             )
             _run(trainer, budget, folder, options.checkpoint_seconds, reporter)
@@ -64,7 +64,7 @@ def _begun(
     resumed = None if options.restart else _resumed(folder, capture, settings, options, reporter)
     if resumed is not None:
         return resumed
-    if not votes_are_current(folder, capture, options):
+    if not votes_are_current(folder, capture, options.max_size, options.strategy, options.seed):
         cast_votes(folder, capture, options, reporter)
     trainer = Trainer.start(capture, read_points(folder.points).ids, settings, memory_for_planes(options))
     if options.restart:
@@ -86,14 +86,13 @@ def _resumed(
     otherwise = "use the same, another --out, or --restart to train anew."
     if "training" not in memory:
         raise InputError(f"{folder.settings} does not say what {folder.checkpoint} was trained from; {otherwise}")
-    if memory["capture"]["digest"] != digest(capture):
+    votes = memory["training"]["votes"]
+    if votes["capture"] != digest(capture):
         raise InputError(f"{folder.checkpoint} was trained on another capture than {capture.folder}; {otherwise}")
-    if memory["capture"]["max_size"] != options.max_size:
-        before = memory["capture"]["max_size"]
-        raise InputError(f"{folder.checkpoint} was trained with --max-size {before}; {otherwise}")
-    strategy = memory["training"]["votes"]["strategy"]
-    if strategy != options.strategy:
-        raise InputError(f"{folder.checkpoint} was trained with --strategy {strategy}; {otherwise}")
+    if votes["max_size"] != options.max_size:
+        raise InputError(f"{folder.checkpoint} was trained with --max-size {votes['max_size']}; {otherwise}")
+    if votes["strategy"] != options.strategy:
+        raise InputError(f"{folder.checkpoint} was trained with --strategy {votes['strategy']}; {otherwise}")
     return trainer
 
 

@@ -37,14 +37,16 @@ def cast_votes(folder: Reconstruction, capture: Capture, options: argparse.Names
         ]
         write_points(folder.points, capture.points, votes)
         write_objects(folder.objects, objects)
-    record(folder, votes=votes_key(capture, options))
+    record(folder, votes=votes_key(capture, options.max_size, options.strategy, options.seed))
     for entry in objects:
         reporter.status(f"object {entry['id']} {entry['name']}: {entry['points']:,} points")
 
 
-def votes_are_current(folder: Reconstruction, capture: Capture, options: argparse.Namespace) -> bool:
+def votes_are_current(folder: Reconstruction, capture: Capture, max_size: int, strategy: str, seed: int) -> bool:
     """Whether points.ply is whole and holds the votes that would be cast again."""
-    if not folder.points.exists() or recorded(folder).get("votes") != votes_key(capture, options):
+    if not folder.points.exists() or not folder.objects.exists():
+        return False
+    if recorded(folder).get("votes") != votes_key(capture, max_size, strategy, seed):
         return False
     try:
         return len(read_points(folder.points).ids) == len(capture.points.xyz)
@@ -52,7 +54,7 @@ def votes_are_current(folder: Reconstruction, capture: Capture, options: argpars
         return False
 
 
-def votes_key(capture: Capture, options: argparse.Namespace) -> dict[str, Any]:
+def votes_key(capture: Capture, max_size: int, strategy: str, seed: int) -> dict[str, Any]:
     """What the votes depend on; a mask that was edited since counts as another one."""
     masks = hashlib.sha256()
     for view in capture.views:
@@ -60,9 +62,9 @@ def votes_key(capture: Capture, options: argparse.Namespace) -> dict[str, Any]:
             status = view.mask_file.stat()
             masks.update(f"{view.name}\0{status.st_size}\0{status.st_mtime_ns}\0".encode())
     return {
-        "strategy": options.strategy,
-        "seed": options.seed if options.strategy == "probability" else None,
-        "max_size": options.max_size,
+        "strategy": strategy,
+        "seed": seed if strategy == "probability" else None,
+        "max_size": max_size,
         "capture": digest(capture),
         "masks": masks.hexdigest()[:16] if capture.has_masks else None,
     }

@@ -25,7 +25,9 @@ from backend.capture import load_capture
 from backend.commands.lock import LOCK
 from backend.export import agreement, fit_splats, read_splats
 from backend.export.fit import sh_basis
+from backend.labels import read_points
 from backend.model.checkpoint import CURRENT, PREVIOUS, load_checkpoint
+from backend.objects import edit_objects, read_objects
 from backend.protocol import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, EXIT_FAILED, InputError
 from backend.raster.reference import sh_colors
 from backend.training.loop import Trainer
@@ -210,6 +212,72 @@ def test_unlabelled_pixels_count_where_they_are_declared_an_object(write_capture
     assert ask("report", out).code == EXIT_DONE
 
 
+# --- a capture ready to be shown -------------------------------------------------------------------------------------
+
+
+def cameras_of(out: Path) -> dict:
+    return json.loads((out / "cameras.json").read_text())
+
+
+@pytest.mark.parametrize("masks", [True, False])
+@pytest.mark.parametrize("bent", [True, False])
+def test_an_import_leaves_cameras_and_points_to_show(write_capture, tmp_path, ask, masks, bent):
+    lens = {"model": "SIMPLE_RADIAL", "params": [90, 48, 36, 0.1]} if bent else {"size": (64, 48)}
+    scene, out = write_capture(views=9, masks=masks, **lens), tmp_path / "deep" / "out"
+    answer = ask("import", scene.folder, "--out", out, "--json")
+    assert answer.code == EXIT_DONE and answer.events[-1]["views"] == 9 and answer.events[-1]["masks"] is masks
+    written = cameras_of(out)
+    assert written["capture"] == str(scene.folder.resolve()) and written["origin"] == [0, 0, 0]
+    capture = load_capture(scene.folder, out / "cache")
+    for index, (camera, view) in enumerate(zip(written["cameras"], capture.views, strict=True)):
+        assert camera["name"] == view.name and camera["held_out"] is (index in (0, 8))
+        assert (camera["width"], camera["height"]) == (view.width, view.height)
+        assert camera["K"] == view.K.tolist() and camera["viewmat"] == view.viewmat.tolist()
+        for place, file in ((camera["image"], view.image_file), (camera["mask"], view.mask_file)):
+            assert (place is None) == (file is None)
+            assert place is None or (out / place).resolve() == file.resolve(), "a relative path is one in the folder"
+        assert camera["image"].startswith("cache/views/" if bent else str(scene.folder))
+        with Image.open(out / camera["image"]) as image:
+            assert image.size == (view.width, view.height)
+    rotation = np.array(written["upright"]["rotation"])
+    assert rotation[2] == pytest.approx([0, -1, 0], abs=0.02), "these cameras stand upright about -Y"
+    points = read_points(out / "points.ply")
+    np.testing.assert_array_equal(points.xyz, capture.points.xyz)
+    np.testing.assert_array_equal(points.rgb, capture.points.rgb)
+    assert not points.ids.any() and not points.visible.any() and not (out / "objects.json").exists()
+    assert json.loads((out / "objectgs.json").read_text())["capture"]["folder"] == str(scene.folder.resolve())
+    no_halves(out)
+    assert ask("train", scene.folder, "--out", out, "--steps", 2, *SMALL).code == EXIT_DONE
+    assert set(read_points(out / "points.ply").ids) - {0} == ({1, 2, 5} if masks else set()), "training votes, as ever"
+    assert cameras_of(out) == written
+
+
+def test_an_import_keeps_a_vote_on_the_same_capture(write_capture, tmp_path, ask):
+    scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
+    for vote in ((), ("--strategy", "probability", "--seed", 3)):
+        assert ask("vote", scene.folder, "--out", out, *vote).code == EXIT_DONE
+        before = (out / "points.ply").read_bytes(), (out / "objects.json").read_bytes()
+        assert ask("import", scene.folder, "--out", out).code == EXIT_DONE
+        assert ((out / "points.ply").read_bytes(), (out / "objects.json").read_bytes()) == before
+    edit_objects(out / "objects.json", {1: {"name": "cup"}})
+    Image.fromarray(np.full((48, 64), 2, np.uint8)).save(scene.folder / "masks" / scene.names[1])
+    assert ask("import", scene.folder, "--out", out).code == EXIT_DONE
+    assert not read_points(out / "points.ply").ids.any() and read_objects(out / "objects.json") == []
+    assert ask("vote", scene.folder, "--out", out).code == EXIT_DONE
+    assert [entry.name for entry in read_objects(out / "objects.json")] == ["cup", "sphere 2", "sphere 5"]
+
+
+def test_an_import_of_another_capture_does_not_pass_for_the_trained_one(trained, write_capture, ask):
+    capture, out = trained
+    other = write_capture(name="other", views=9, size=(64, 48), seed=1).folder
+    assert ask("import", other, "--out", out).code == EXIT_DONE
+    refused(ask("train", other, "--out", out, "--steps", 30, *SMALL), "another capture", str(other))
+    refused(ask("evaluate", out), str(other), "not the one")
+    assert ask("evaluate", out, "--capture", capture).code == EXIT_DONE
+    assert cameras_of(out)["capture"] == str(capture.resolve())
+    assert ask("train", other, "--out", out, "--steps", 5, *SMALL, "--restart").code == EXIT_DONE
+
+
 # --- going on --------------------------------------------------------------------------------------------------------
 
 
@@ -358,7 +426,7 @@ def test_bad_captures_are_one_sentence_and_leave_nothing(write_capture, tmp_path
     scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "made" / "out"
     words = spoil(scene, what)
     refused(ask("check", scene.folder), *words)
-    for command in ("vote", "train"):
+    for command in ("import", "vote", "train"):
         refused(ask(command, scene.folder, "--out", out), *words)
         assert not out.parent.exists(), "a refused command leaves no folder"
     events = ask("train", scene.folder, "--out", out, "--json").events
@@ -723,7 +791,7 @@ def test_doctor_takes_a_small_scene_through_everything(ask):
 
 
 def test_help_says_what_each_command_does_with_an_example(capsys):
-    names = ["check", "vote", "train", "render", "evaluate", "report", "doctor"]
+    names = ["check", "import", "vote", "train", "render", "evaluate", "report", "doctor"]
     texts = {}
     for words in ([], *([name] for name in names)):
         with pytest.raises(SystemExit) as ended:

@@ -1,0 +1,40 @@
+"""cameras.json: the capture's cameras and how to stand it up, for programs that show it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..capture import Capture, stand_up
+from ..protocol import Reconstruction, plain, write_json
+
+
+def write_cameras(folder: Reconstruction, capture: Capture) -> None:
+    """Write cameras.json: the views in the capture's coordinates, `origin` and the `upright` transform.
+
+    Images and masks are absolute paths, or relative to the reconstruction folder where they lie in it.
+    """
+    stood = stand_up(np.array([view.viewmat for view in capture.views]), capture.points.xyz)
+    held_out = set(capture.test_indices)
+    value = {
+        "capture": capture.folder.resolve(),
+        "origin": stood.origin,
+        "upright": {"rotation": stood.rotation, "translation": stood.translation},
+        "cameras": [
+            {
+                "name": view.name,
+                "image": _place(view.image_file, folder.folder),
+                "mask": None if view.mask_file is None else _place(view.mask_file, folder.folder),
+                "width": view.width, "height": view.height, "K": view.K, "viewmat": view.viewmat,
+                "held_out": index in held_out,
+            }
+            for index, view in enumerate(capture.views)
+        ],
+    }  # fmt: skip
+    write_json(folder.cameras, plain(value))
+
+
+def _place(path: Path, folder: Path) -> str:
+    path, folder = path.resolve(), folder.resolve()
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)
