@@ -1,0 +1,16 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A reconstruction folder as collections, cameras, points and splats in Blender. bpy and NumPy only, no operators."""
+
+from .cameras import use_camera
+from .capture import show_capture, warnings_of
+from .kinds import folder_of, kind_of, object_collections, object_id_of, parts_of, root_of
+from .orientation import orient_to_ground, scale_to_distance
+from .points import colour_points_by
+from .preview import prepare_render
+from .result import Shown, show_objects, show_result
+
+__all__ = [
+    "Shown", "colour_points_by", "folder_of", "kind_of", "object_collections", "object_id_of", "orient_to_ground",
+    "parts_of", "prepare_render", "root_of", "scale_to_distance", "show_capture", "show_objects", "show_result",
+    "use_camera", "warnings_of",
+]

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A reconstruction's collection with its capture: the parent that stands it up, cameras and points."""
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from . import carrier
+from .cameras import read_cameras, show_cameras, use_camera
+from .kinds import (
+    CAMERA,
+    CAPTURE,
+    FOLDER,
+    PARENT,
+    RECONSTRUCTION,
+    capture_of,
+    folder_of,
+    kind_of,
+    mark,
+    parent_of,
+    points_of,
+)
+from .objects_file import Objects
+from .points import read_points, show_points
+
+ORIGIN = "objectgs_origin"
+UPRIGHT = "objectgs_upright"
+WARNINGS = "objectgs_warnings"
+
+
+def show_capture(scene: bpy.types.Scene, folder: Path, root: bpy.types.Collection | None = None,
+                 name: str | None = None) -> bpy.types.Collection:
+    """Show the cameras and points of a reconstruction folder in `scene`; returns the reconstruction's collection.
+
+    `root` is updated where it is given, or else the scene's collection of the same folder; without either a new one
+    called `name` (default: the folder's name) is made. Raises InputError, before anything is changed, where the
+    folder's files cannot be used.
+    """
+    folder = Path(folder).absolute()
+    cameras = read_cameras(folder)
+    table = read_points(folder)
+    objects = Objects.read(folder)
+    if root is None:
+        root = next((child for child in scene.collection.children_recursive
+                     if kind_of(child) == RECONSTRUCTION and folder_of(child) == folder), None)
+    if root is not None:
+        carrier.require_object_mode([points_of(root)])
+
+    is_new = root is None
+    if root is None:
+        root = bpy.data.collections.new(name or folder.name)
+        mark(root, RECONSTRUCTION)
+    root[FOLDER] = str(folder)
+    root[ORIGIN] = cameras.origin.tolist()
+    parent = _stand_up(root, cameras.upright, cameras.views)
+    capture = capture_of(root)
+    new_capture = capture is None
+    if capture is None:
+        capture = bpy.data.collections.new(f"{root.name} capture")
+        mark(capture, CAPTURE)
+    root[WARNINGS] = "\n".join(show_cameras(capture, parent, cameras))
+    show_points(capture, parent, f"{root.name} points", table, cameras.origin, objects)
+
+    # Linked last: Blender brings all view layers up to date for each link below a scene.
+    if new_capture:
+        root.children.link(capture)
+    if is_new:
+        scene.collection.children.link(root)
+    ours = [thing for thing in capture.objects if kind_of(thing) == CAMERA]
+    if ours and (scene.camera is None or scene.camera in ours):
+        use_camera(scene, scene.camera or min(ours, key=lambda thing: thing["objectgs_image"]))
+    return root
+
+
+def warnings_of(root: bpy.types.Collection) -> list[str]:
+    """What the last `show_capture` has to say about the cameras."""
+    text = root.get(WARNINGS, "")
+    return text.split("\n") if text else []
+
+
+def origin_of(root: bpy.types.Collection) -> np.ndarray:
+    """(3,) what is subtracted from the capture's coordinates."""
+    return np.array(root.get(ORIGIN, (0.0, 0.0, 0.0)), np.float64)
+
+
+def _stand_up(root: bpy.types.Collection, upright: np.ndarray, views) -> bpy.types.Object:
+    """The parent empty, made where there is none; one that the user has moved stays where it is."""
+    parent = parent_of(root)
+    wanted = Matrix(upright.tolist())
+    if parent is None:
+        parent = bpy.data.objects.new(root.name, None)
+        mark(parent, PARENT)
+        parent.empty_display_type = "ARROWS"
+        centres = np.array([-view.viewmat[:3, :3].T @ view.viewmat[:3, 3] for view in views]).reshape(-1, 3)
+        parent.empty_display_size = 0.15 * float(np.linalg.norm(np.ptp(centres, axis=0))) if len(centres) > 1 else 1.0
+        root.objects.link(parent)
+        for thing in root.all_objects:
+            if thing.parent is None and kind_of(thing) is not None and thing != parent:
+                thing.parent = parent
+    elif list(parent.get(UPRIGHT, ())) != _numbers(parent.matrix_basis):
+        return parent
+    parent.matrix_basis = wanted
+    parent[UPRIGHT] = _numbers(parent.matrix_basis)
+    return parent
+
+
+def _numbers(matrix: Matrix) -> list[float]:
+    return [value for row in matrix for value in row]

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Who is what: custom properties on collections and objects, and finding things by them.
+
+Nothing is ever found by its name, since users rename things and Blender numbers names that are taken.
+"""
+
+from pathlib import Path
+
+import bpy
+
+KIND = "objectgs"
+OBJECT_ID = "object_id"
+FOLDER = "objectgs_folder"
+
+RECONSTRUCTION = "reconstruction"
+PARENT = "parent"
+CAPTURE = "capture"
+CAMERA = "camera"
+POINTS = "points"
+OBJECT = "object"
+OBJECT_PARENT = "object_parent"
+SPLATS = "splats"
+ANCHORS = "anchors"
+
+
+def kind_of(block) -> str | None:
+    """What a collection, object, mesh, material or node group is to this extension; None where it is not ours."""
+    kind = block.get(KIND) if block is not None else None
+    return kind if isinstance(kind, str) else None
+
+
+def object_id_of(block) -> int | None:
+    """ID 0 .. 2^32 - 1 of the object that a collection or an object belongs to, or None."""
+    value = block.get(OBJECT_ID) if kind_of(block) is not None else None
+    return int(value) & 0xFFFFFFFF if isinstance(value, int) else None
+
+
+def mark(block, kind: str, object_id: int | None = None) -> None:
+    """Say what `block` is; IDs from 2^31 on are kept as the int32 of the same bits, all that Blender can store."""
+    block[KIND] = kind
+    if object_id is not None:
+        block[OBJECT_ID] = object_id - (1 << 32) if object_id >= 1 << 31 else object_id
+
+
+def folder_of(root: bpy.types.Collection) -> Path:
+    """The reconstruction folder, absolute; it need not exist any more."""
+    return Path(root.get(FOLDER, ""))
+
+
+def parts_of(collection: bpy.types.Collection) -> list[bpy.types.Object]:
+    """Our objects that lie directly in `collection`."""
+    return [thing for thing in collection.objects if kind_of(thing) is not None]
+
+
+def part_of(collection: bpy.types.Collection, kind: str) -> bpy.types.Object | None:
+    """The first object of a kind that lies directly in `collection`, or None."""
+    return next((thing for thing in collection.objects if kind_of(thing) == kind), None)
+
+
+def parent_of(root: bpy.types.Collection) -> bpy.types.Object | None:
+    """The empty that everything of a reconstruction hangs on, or None where the user deleted it."""
+    return part_of(root, PARENT)
+
+
+def capture_of(root: bpy.types.Collection) -> bpy.types.Collection | None:
+    """The collection of the cameras and points, or None."""
+    return next((child for child in root.children_recursive if kind_of(child) == CAPTURE), None)
+
+
+def points_of(root: bpy.types.Collection) -> bpy.types.Object | None:
+    """The point cloud's object, or None."""
+    capture = capture_of(root)
+    return part_of(capture, POINTS) if capture is not None else None
+
+
+def object_collections(root: bpy.types.Collection) -> dict[int, bpy.types.Collection]:
+    """Object ID -> its collection; also those that the user moved out of the reconstruction's.
+
+    Where the user duplicated one, the first counts.
+    """
+    found: dict[int, bpy.types.Collection] = {}
+    for collection in root.children_recursive:
+        if kind_of(collection) == OBJECT:
+            found.setdefault(object_id_of(collection) or 0, collection)
+    parent = parent_of(root)
+    if parent is not None:
+        known = set(found.values())
+        for collection in bpy.data.collections:
+            if kind_of(collection) == OBJECT and collection not in known:
+                pivot = part_of(collection, OBJECT_PARENT)
+                if pivot is not None and pivot.parent == parent:
+                    found.setdefault(object_id_of(collection) or 0, collection)
+    return found
+
+
+def root_of(block, scene: bpy.types.Scene) -> bpy.types.Collection | None:
+    """The reconstruction's collection in `scene` that an object or a collection belongs to, or None."""
+    roots = [child for child in scene.collection.children_recursive if kind_of(child) == RECONSTRUCTION]
+    if isinstance(block, bpy.types.Collection):
+        for root in roots:
+            if root == block or block in root.children_recursive:
+                return root
+        block = part_of(block, OBJECT_PARENT)
+    if not isinstance(block, bpy.types.Object):
+        return None
+    above = block
+    while above is not None and kind_of(above) != PARENT:
+        above = above.parent
+    for root in roots:
+        if above is not None and parent_of(root) == above:
+            return root
+    return next((root for root in roots if block in root.all_objects[:]), None)

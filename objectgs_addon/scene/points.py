@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The capture's point cloud: a mesh carrier whose vertices are shown as points in one of two colours."""
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...backend.ply import read_vertices
+from ...backend.protocol import InputError, Reconstruction
+from . import carrier, preview
+from .kinds import POINTS, mark, part_of, points_of
+from .objects_file import Objects, linear_colours
+
+SIZE = 0.0025
+"""Radius of a point relative to the diagonal of the box that holds the middle 90 percent of the points."""
+
+COLOURINGS = ("photo", "object")
+
+
+def read_points(folder: Path) -> np.ndarray:
+    """points.ply as a structured array; InputError where it is missing or holds something else."""
+    path = Reconstruction(folder).points
+    if not path.is_file():
+        raise InputError(f"{folder} has no points.ply; run Import again.")
+    table = read_vertices(path)
+    missing = {"x", "y", "z", "red", "green", "blue", "object_id"} - set(table.dtype.names)
+    if missing:
+        raise InputError(f"{path} has no property {', '.join(sorted(missing))}; run Import again.")
+    return table
+
+
+def positions_of(table: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(n, 3) float64 in the reconstruction's coordinates."""
+    return np.stack([table[axis].astype(np.float64) - origin[i] for i, axis in enumerate("xyz")], axis=1)
+
+
+def show_points(capture: bpy.types.Collection, parent: bpy.types.Object, name: str, table: np.ndarray,
+                origin: np.ndarray, objects: Objects) -> None:
+    """Make or update the point cloud's object in `capture`."""
+    positions = positions_of(table, origin)
+    thing = part_of(capture, POINTS)
+    if thing is None:
+        mesh = bpy.data.meshes.new(name)
+        thing = bpy.data.objects.new(name, mesh)
+        mark(thing, POINTS)
+        thing.parent = parent
+        thing.hide_render = True
+        mesh.materials.append(preview.points_material())
+        modifier = thing.modifiers.new("ObjectGS Points", "NODES")
+        modifier.node_group = preview.points_group()
+        preview.set_input(modifier, "Size", SIZE * _diagonal(positions))
+        preview.set_input(modifier, "Material", mesh.materials[0])
+        capture.objects.link(thing)
+    ids = table["object_id"].astype(np.int64)
+    margins = table["margin"] if "margin" in table.dtype.names else np.zeros(len(table), np.float32)
+    photo = np.stack([table[channel] for channel in ("red", "green", "blue")], axis=1)
+    active = thing.data.attributes.active_color_name
+    carrier.fill(thing.data, positions, {
+        "photo": ("FLOAT_COLOR", linear_colours(photo)),
+        "object": ("FLOAT_COLOR", objects.colours(ids)),
+        "object_id": ("INT", carrier.stored_ids(ids)),
+        "margin": ("FLOAT", margins),
+    })
+    _activate(thing, active if active in COLOURINGS else "photo")
+
+
+def colour_points_by(root: bpy.types.Collection, by: str) -> None:
+    """Show the point cloud in its colours of the photos ("photo") or of its objects ("object")."""
+    if by not in COLOURINGS:
+        raise ValueError(f"points cannot be coloured by {by}")
+    thing = points_of(root)
+    if thing is None:
+        return
+    modifier = preview.modifier_of(thing, preview.POINTS_GROUP)
+    if modifier is not None:
+        preview.set_input(modifier, "By Object", by == "object")
+    if by in thing.data.attributes:
+        _activate(thing, by)
+    thing.update_tag()
+
+
+def _activate(thing: bpy.types.Object, by: str) -> None:
+    """The active colour is what Solid shows with its color set to Attribute."""
+    thing.data.attributes.active_color_name = by
+
+
+def _diagonal(positions: np.ndarray) -> float:
+    if len(positions) < 2:
+        return 1.0
+    low, high = np.percentile(positions, [5, 95], axis=0)
+    return float(np.linalg.norm(high - low)) or 1.0

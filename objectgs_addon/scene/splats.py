@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""splats.ply and anchors.ply as the attributes of mesh carriers."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from ...backend.ply import read_vertices
+from ...backend.protocol import InputError, Reconstruction
+from .carrier import stored_ids
+
+_NEEDED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
+           "rot_0", "rot_1", "rot_2", "rot_3")
+LARGEST_LOG_SCALE = 80.0
+
+
+def read_splats(folder: Path) -> tuple[np.ndarray, list[str]]:
+    """splats.ply as a structured array without splats that cannot be shown, and warnings about those."""
+    path = Reconstruction(folder).splats
+    if not path.is_file():
+        raise InputError(f"{folder} has no splats.ply; train first.")
+    table = read_vertices(path)
+    names = table.dtype.names
+    missing = [name for name in _NEEDED if name not in names]
+    if missing:
+        raise InputError(f"{path} is no file of Gaussian splats: it has no property {', '.join(missing)}.")
+    _rest_count(names, path)
+    return _without_unusable(table, _NEEDED, path.name, "splats")
+
+
+def read_anchors(folder: Path) -> tuple[np.ndarray | None, list[str]]:
+    """anchors.ply as a structured array, None where there is none, and warnings."""
+    path = Reconstruction(folder).anchors
+    if not path.is_file():
+        return None, []
+    table = read_vertices(path)
+    needed = ("x", "y", "z", "object_id", "scale_0", "scale_1", "scale_2", "opacity", "splats")
+    missing = [name for name in needed if name not in table.dtype.names]
+    if missing:
+        raise InputError(f"{path} has no property {', '.join(missing)}; train again.")
+    return _without_unusable(table, needed, path.name, "anchors")
+
+
+def ids_of(table: np.ndarray) -> np.ndarray:
+    """(n,) int64 object IDs; 0 where the file names none."""
+    if "object_id" not in table.dtype.names:
+        return np.zeros(len(table), np.int64)
+    return np.clip(np.rint(table["object_id"]), 0, 0xFFFFFFFF).astype(np.int64)
+
+
+def splat_attributes(table: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
+    """The attributes of Blender's own Gaussian splats: linear scale and opacity, unit quaternions, and the ID.
+
+    `radiance:base` holds the raw constant coefficients and the opacity, `radiance:sh_1` .. the higher ones, RGB each.
+    """
+    rest = _rest_count(table.dtype.names) // 3
+    base = _columns(table, "f_dc_0", "f_dc_1", "f_dc_2", "opacity")
+    base[:, 3] = 1.0 / (1.0 + np.exp(-np.clip(base[:, 3], -80.0, 80.0)))
+    rotation = _columns(table, "rot_0", "rot_1", "rot_2", "rot_3")
+    rotation /= np.sqrt(np.einsum("ij,ij->i", rotation, rotation))[:, None]
+    attributes = {
+        "radiance:base": ("FLOAT_COLOR", base),
+        "scale": ("FLOAT_VECTOR", np.exp(_columns(table, "scale_0", "scale_1", "scale_2"))),
+        "rotation": ("QUATERNION", rotation),
+        "object_id": ("INT", stored_ids(ids_of(table))),
+    }
+    for k in range(rest):
+        names = (f"f_rest_{channel * rest + k}" for channel in range(3))
+        attributes[f"radiance:sh_{k + 1}"] = ("FLOAT_VECTOR", _columns(table, *names))
+    return attributes
+
+
+def anchor_attributes(table: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
+    """What an anchor says of the splats that it makes: scaling of their offsets, mean opacity, how many."""
+    return {
+        "object_id": ("INT", stored_ids(ids_of(table))),
+        "scale": ("FLOAT_VECTOR", _columns(table, "scale_0", "scale_1", "scale_2")),
+        "opacity": ("FLOAT", table["opacity"]),
+        "splats": ("INT", table["splats"].astype(np.int32)),
+    }
+
+
+def _columns(table: np.ndarray, *names: str) -> np.ndarray:
+    """(n, len(names)) float32."""
+    values = np.empty((len(table), len(names)), np.float32)
+    for i, name in enumerate(names):
+        values[:, i] = table[name]
+    return values
+
+
+def _rest_count(names, path: Path | None = None) -> int:
+    """How many properties f_rest_* there are."""
+    count = sum(name.startswith("f_rest_") for name in names)
+    if path is not None and (count % 3 or math.isqrt(count // 3 + 1) ** 2 != count // 3 + 1
+                             or any(f"f_rest_{i}" not in names for i in range(count))):
+        raise InputError(f"{path} has {count} properties f_rest_*; 0, 9, 24 or 45, numbered from 0, were expected.")
+    return count
+
+
+def _without_unusable(table: np.ndarray, names, file: str, what: str) -> tuple[np.ndarray, list[str]]:
+    keep = np.ones(len(table), bool)
+    for name in names:
+        keep &= np.isfinite(table[name])
+    if "rot_0" in names:
+        keep &= np.maximum.reduce([np.abs(table[f"rot_{i}"]) for i in range(4)], initial=0.0) > 1e-12
+        for axis in range(3):
+            keep &= table[f"scale_{axis}"] < LARGEST_LOG_SCALE
+    if keep.all():
+        return table, []
+    return table[keep], [f"{int((~keep).sum())} of {len(table)} {what} in {file} were left out: they hold NaN, "
+                         "infinity or no rotation."]
