@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The backend's environment, made of two tiny packages from a folder and a backend that only pretends; no network."""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import pytest
+from objectgs.objectgs_addon import backend_process, environment
+from objectgs.objectgs_addon import environment_worker as worker
+from objectgs.objectgs_addon.jobs import JobQueue, State
+
+WAIT = 60.0
+
+BACKEND = """
+import json, sys
+assert sys.argv[1:] == ["doctor", "--json"] and sys.stdin.readline() == "attached\\n"
+import torch
+def say(kind, **fields):
+    print(json.dumps({"type": kind, **fields}), flush=True)
+say("status", message="Trying it")
+for i in range(4):
+    say("progress", done=i % 2, total=2)
+mode = open("mode").read()
+if mode == "crash":
+    print("OSError: libsomething.so is missing", file=sys.stderr)
+    sys.exit(1)
+say("done", message="It works.", machine={"torch": "2.13.0"})
+"""
+
+
+def wheel(folder, name, version):
+    """The smallest package that pip installs."""
+    info = f"{name}-{version}.dist-info"
+    files = {
+        f"{name}.py": f"__version__ = '{version}'\n",
+        f"{info}/METADATA": f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n",
+        f"{info}/WHEEL": "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+    }
+    files[f"{info}/RECORD"] = "".join(f"{path},,\n" for path in [*files, f"{info}/RECORD"])
+    with zipfile.ZipFile(folder / f"{name}-{version}-py3-none-any.whl", "w") as archive:
+        for path, text in files.items():
+            archive.writestr(path, text)
+
+
+@pytest.fixture
+def root(tmp_path, monkeypatch):
+    """A folder with requirements/ and a backend/, as an extension's; packages come from its wheels/ alone."""
+    for name in ("wheels", "requirements", "backend"):
+        (tmp_path / name).mkdir()
+    for name, version in ("torch", "2.13.0"), ("smallnumba", "0.68"):
+        wheel(tmp_path / "wheels", name, version)
+    (tmp_path / "requirements" / "torch.txt").write_text("torch==2.13.0\n")
+    (tmp_path / "requirements" / "backend.txt").write_text("# Wheels only.\n\nsmallnumba==0.68  # kernels\n")
+    (tmp_path / "backend" / "__init__.py").write_text("")
+    (tmp_path / "backend" / "__main__.py").write_text(BACKEND)
+    (tmp_path / "mode").write_text("work")
+    for name in list(os.environ):
+        if name.startswith("PIP_"):
+            monkeypatch.delenv(name)
+    monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path / "wheels"))
+    monkeypatch.setattr(backend_process, "_NICENESS", 0)
+    monkeypatch.setattr(environment, "ROOT", tmp_path)
+    monkeypatch.setattr(environment, "REQUIREMENTS", tmp_path / "requirements")
+    environment._wanted.cache_clear()
+    yield tmp_path
+    environment._wanted.cache_clear()
+
+
+def run(job, until=lambda: False, after=None):
+    """Run a job to its end; once `until()` holds, `after` is done to it. Returns the shares of progress seen."""
+    queue, shares = JobQueue(), []
+    queue.add(job)
+    deadline = time.monotonic() + WAIT
+    while not job.is_finished:
+        assert time.monotonic() < deadline, (job.message, job.log)
+        queue.poll()
+        shares.append(job.progress)
+        if after and until():
+            after()
+            after = None
+        time.sleep(0.02)
+    return shares
+
+
+def test_set_up_after_one_that_was_killed(root):
+    folder = root / "user" / "environment"
+    assert environment.inspect(folder).state == "absent"
+    assert environment.inspect(folder).python is None
+
+    job = environment.set_up_job(sys.executable, folder, "cpu")
+    run(job, worker.environment_python(folder).exists, job.kill)
+    assert job.state is State.STOPPED
+    assert environment.inspect(folder).state == "incomplete" and environment.inspect(folder).python is None
+
+    (folder / "venv" / "leftover").write_text("")
+    job = environment.set_up_job(sys.executable, folder, "cpu")
+    shares = run(job)
+    assert job.state is State.DONE, (job.error, job.log)
+    assert job.message == "It works." and shares == sorted(shares)
+    state = environment.inspect(folder)
+    assert state.state == "ready" and "PyTorch 2.13.0" in state.sentence
+    assert not (folder / "venv" / "leftover").exists() and not (folder / "tmp").exists()
+    found = subprocess.run([state.python, "-c", "import smallnumba, torch; print(torch.__version__)"],
+                           capture_output=True, text=True, check=True)
+    assert found.stdout == "2.13.0\n"
+
+    ready = json.loads((folder / "ready.json").read_text())
+    assert ready["packages"]["smallnumba"] == "0.68" and ready["device"] == "cpu"
+    (root / "requirements" / "backend.txt").write_text("smallnumba==0.69\n")
+    environment._wanted.cache_clear()
+    assert environment.inspect(folder).state == "outdated"
+
+    environment.remove(folder)
+    assert environment.inspect(folder).state == "absent" and not folder.exists()
+
+
+def test_failed_set_ups_leave_nothing(root):
+    folder = root / "environment"
+    (root / "requirements" / "backend.txt").write_text("smallnumba==0.69\n")
+    job = environment.set_up_job(sys.executable, folder, "cpu")
+    run(job)
+    assert job.state is State.FAILED and job.exit_code == 2
+    assert job.error.startswith("There is no ready-made package smallnumba==0.69 for this computer (")
+    assert not folder.exists()
+
+    job = environment.set_up_job(sys.executable, folder, "cpu")
+    run(job, lambda: job.message == "Making an environment", job.stop)
+    assert job.state is State.STOPPED and job.message == "Stopped; nothing of the environment stays."
+    assert not folder.exists()
+
+
+def test_what_goes_wrong_while_the_driver_is_gone(root):
+    """The set-up notices the end of its input, ends what it runs, and cleans up."""
+    folder = root / "environment"
+    job = environment.set_up_job(sys.executable, folder, "cpu")
+    run(job, lambda: (folder / "venv").exists(), lambda: job._process._process.stdin.close())
+    assert job.state is State.STOPPED and not folder.exists()
+
+
+def test_other_peoples_files_are_left_alone(root):
+    folder = root / "photos"
+    folder.mkdir()
+    (folder / "holiday.jpg").write_text("")
+    job = environment.set_up_job(sys.executable, folder, "cpu")
+    run(job)
+    assert job.state is State.FAILED and "left alone" in job.error
+    assert environment.inspect(folder).state == "broken" and "holiday" not in environment.inspect(folder).sentence
+    with pytest.raises(OSError, match="not ObjectGS's"):
+        environment.remove(folder)
+    (folder / worker.STAMP).write_text("")
+    with pytest.raises(OSError, match="not ObjectGS's"):
+        environment.remove(folder)
+    worker.remove_own(folder)
+    assert [path.name for path in folder.iterdir()] == ["holiday.jpg"]
+    (root / "link").symlink_to(folder)
+    assert not worker.is_ours(root / "link") and worker.is_ours(root / "new")
+
+
+def test_states_of_a_broken_environment(root):
+    folder = root / "environment"
+    python = worker.environment_python(folder)
+    python.parent.mkdir(parents=True)
+    python.write_text("")
+    (folder / worker.STAMP).write_text("")
+    marker = {"python": "3.11.7", "base": str(python), "packages": {}, "requirements": "old"}
+    for at, (text, state) in enumerate([
+            ("{", "broken"), ("[]", "broken"), ('{"python": "3.11.7"}', "broken"),
+            (json.dumps({**marker, "base": str(root / "gone")}), "broken"), (json.dumps(marker), "outdated")]):
+        (folder / worker.MARKER).write_text(text)
+        os.utime(folder / worker.MARKER, (at, at))
+        assert environment.inspect(folder).state == state, text
+    python.unlink()
+    state = environment.inspect(folder)
+    assert state.state == "broken" and str(python) in state.sentence and state.python is None
+
+
+def test_inspect_is_cheap(root):
+    folder = root / "environment"
+    worker.environment_python(folder).parent.mkdir(parents=True)
+    worker.environment_python(folder).write_text("")
+    (folder / worker.STAMP).write_text("")
+    marker = {"python": "3.11.7", "base": sys.executable, "packages": {}, "requirements": environment._wanted()}
+    (folder / worker.MARKER).write_text(json.dumps(marker))
+    assert environment.inspect(folder).state == "ready"
+    started = time.perf_counter()
+    for _ in range(100):
+        environment.inspect(folder)
+    assert time.perf_counter() - started < 1.0
+
+
+def test_two_at_once(root):
+    folder = root / "environment"
+    with worker.claimed(folder):
+        with pytest.raises(worker.Refused, match="Another Blender"), worker.claimed(folder):
+            pass
+        assert (folder / worker.STAMP).is_file()
+
+
+def test_what_a_removal_left_goes_with_the_next_set_up(root):
+    old = root / "environment.removed-7-0"
+    (old / "venv").mkdir(parents=True)
+    (old / worker.STAMP).write_text("")
+    with worker.claimed(root / "environment"):
+        assert not old.exists()
+
+
+def test_pythons_that_will_not_do(root, monkeypatch):
+    options = argparse.Namespace(folder=root / "environment", requirements=root / "requirements", device="cpu")
+
+    def refusal():
+        with pytest.raises(worker.Refused) as caught:
+            worker.set_up(options, lambda: False)
+        assert not options.folder.exists()
+        return str(caught.value)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(worker, "OLDEST", (3, 99))
+        assert "needs 3.11, 3.12 or 3.13" in refusal()
+    with monkeypatch.context() as patch:
+        patch.setattr(worker.struct, "calcsize", lambda _: 4)
+        assert "32-bit" in refusal()
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "ensurepip", None)
+        assert "ensurepip is missing" in refusal()
+    monkeypatch.setitem(worker.GIGABYTES, "cpu", 1e9)
+    assert "free; make room" in refusal()
+
+
+def test_probe(root, monkeypatch):
+    folder = root / "environment"
+    job = environment.probe_job(sys.executable, folder)
+    run(job)
+    assert job.state is State.FAILED and "lacks torch and smallnumba; install them" in job.error
+    assert not folder.exists()
+
+    packages = root / "packages"
+    packages.mkdir()
+    with zipfile.ZipFile(root / "wheels" / "torch-2.13.0-py3-none-any.whl") as archive:
+        archive.extractall(packages)
+    (root / "requirements" / "backend.txt").write_text("pytest==0.1\n")
+    job = environment.probe_job(sys.executable, folder)
+    job.environment["PYTHONPATH"] = str(packages)
+    run(job)
+    assert job.state is State.DONE and job.message == "It works.", (job.error, job.log)
+    assert len(job.warnings) == 1 and job.warnings[0].startswith("pytest is version ")
+
+    (root / "mode").write_text("crash")
+    job = environment.probe_job(sys.executable, folder)
+    job.environment["PYTHONPATH"] = str(packages)
+    run(job)
+    assert job.error == ("The packages are there, but the backend does not work with them (exit code 1): "
+                         "OSError: libsomething.so is missing.")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="POSIX programs")
+@pytest.mark.parametrize("program", ["/bin/ls", "/bin/true", "/bin/sh"])
+def test_probe_of_what_is_no_python(root, program):
+    job = environment.probe_job(program, root / "environment")
+    run(job)
+    assert job.error == f"{program} is no Python, or one older than 3.11; choose a Python 3.11, 3.12 or 3.13."
+
+
+@pytest.mark.parametrize(("lines", "sentence"), [
+    (["WARNING: Retrying (Retry(total=4)) after connection broken by 'NewConnectionError'",
+      "ERROR: Could not find a version that satisfies the requirement numpy==2.4.6 (from versions: none)",
+      "ERROR: No matching distribution found for numpy==2.4.6"], "could not be reached"),
+    (["ERROR: No matching distribution found for numpy==2.4.6"], "no ready-made package numpy==2.4.6 for this"),
+    (["ERROR: Could not install packages due to an OSError: [Errno 28] No space left on device"], "disk is full"),
+    (["ERROR: THESE PACKAGES DO NOT MATCH THE HASHES FROM THE REQUIREMENTS FILE."], "damaged"),
+    (["Collecting x", "ERROR: Some new trouble."], "could not be installed: Some new trouble."),
+    ([], "it said nothing"),
+])
+def test_why_pip_failed(lines, sentence):
+    assert sentence in worker.why_pip_failed(lines)
+
+
+def test_requirements_of_this_extension():
+    root = Path(worker.__file__).resolve().parents[1]
+    for name in worker.REQUIREMENTS:
+        for line in worker.requirement_lines(root / "requirements" / name):
+            assert line.count("==") == 1 and line == line.replace(" ", ""), line
