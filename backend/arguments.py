@@ -20,9 +20,8 @@ from .protocol import (
     InputError,
     JsonReporter,
     Reporter,
-    StoppingReporter,
 )
-from .stopping import StopRequest
+from .stopping import StoppingReporter, StopRequest
 
 DEFAULT_MINUTES = 5.0
 
@@ -244,7 +243,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     reporter = _reporter(as_json="--json" in arguments)
-    stop = StopRequest()
+    try:
+        return _run(arguments, reporter)
+    except BrokenPipeError:
+        # Nobody reads any more. Python would complain once again when it flushes at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_CANCELLED
+    finally:
+        reporter.close()
+
+
+def _run(arguments: list[str], reporter: Reporter) -> int:
+    stop = StopRequest(announce=reporter.status)
     try:
         options = parser().parse_args(arguments)
         # Before the signals are taken over, since pycolmap takes SIGTERM for itself when it is imported.
@@ -262,9 +272,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         reporter.stopped(str(error) or "Stopped at once.")
         return EXIT_CANCELLED
     except BrokenPipeError:
-        # Nobody reads any more. Python would complain once again when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return EXIT_CANCELLED
+        raise
     except Exception as error:
         sentence = _refusal(error)
         if sentence:
@@ -275,8 +283,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         traceback.print_exc(file=sys.stderr)
         reporter.error(f"An unexpected failure: {type(error).__name__}: {' '.join(str(error).split())}")
         return EXIT_FAILED
-    finally:
-        reporter.close()
 
 
 def _reporter(as_json: bool) -> Reporter:

@@ -10,7 +10,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, TextIO
@@ -130,7 +130,8 @@ class Reporter:
     """Takes a command's events; this base class drops them (for tests and library use).
 
     status(message): what is being done now. progress(done, total, ...): any extra fields as keywords,
-    `seconds_left` among them. preview(path): a picture was written. warning(message). A command ends with one of
+    `seconds_left` among them. preview(path): a picture was written. quality(**figures): what was measured on held-out
+    views, and when: seconds and step of the training, psnr, miou, mbiou. warning(message). A command ends with one of
     done(**fields), stopped(message) where the user asked for it, and error(message).
     """
 
@@ -139,6 +140,8 @@ class Reporter:
     def progress(self, done: float, total: float, **fields: Any) -> None: ...
 
     def preview(self, path: Path, **fields: Any) -> None: ...
+
+    def quality(self, **figures: Any) -> None: ...
 
     def warning(self, message: str) -> None: ...
 
@@ -149,44 +152,6 @@ class Reporter:
     def done(self, **fields: Any) -> None: ...
 
     def close(self) -> None: ...
-
-
-class StoppingReporter(Reporter):
-    """Hands events on, and raises Cancelled at the first progress after `should_stop` says so.
-
-    For work that writes whole files alone and so may end between any two of its steps. Other work asks `should_stop`
-    itself and tells `reporter`, the one behind.
-    """
-
-    def __init__(self, reporter: Reporter, should_stop: Callable[[], bool]) -> None:
-        self.reporter = reporter
-        self.should_stop = should_stop
-
-    def status(self, message: str) -> None:
-        self.reporter.status(message)
-
-    def progress(self, done: float, total: float, **fields: Any) -> None:
-        self.reporter.progress(done, total, **fields)
-        if self.should_stop():
-            raise Cancelled("Stopped; what is finished is kept, run the same command again for the rest.")
-
-    def preview(self, path: Path, **fields: Any) -> None:
-        self.reporter.preview(path, **fields)
-
-    def warning(self, message: str) -> None:
-        self.reporter.warning(message)
-
-    def error(self, message: str) -> None:
-        self.reporter.error(message)
-
-    def stopped(self, message: str) -> None:
-        self.reporter.stopped(message)
-
-    def done(self, **fields: Any) -> None:
-        self.reporter.done(**fields)
-
-    def close(self) -> None:
-        self.reporter.close()
 
 
 class JsonReporter(Reporter):
@@ -208,6 +173,9 @@ class JsonReporter(Reporter):
 
     def preview(self, path: Path, **fields: Any) -> None:
         self._emit("preview", path=str(path), **fields)
+
+    def quality(self, **figures: Any) -> None:
+        self._emit("quality", **figures)
 
     def warning(self, message: str) -> None:
         self._emit("warning", message=message)

@@ -114,6 +114,8 @@ def _opened(path: Path) -> PilImage.Image:
 
 
 def _unreadable(path: Path, error: BaseException) -> InputError:
+    if isinstance(error, OSError) and error.strerror:
+        return InputError(f"{path} cannot be read ({error.strerror}); put it back, or check it and its permissions.")
     why = f" ({error})" if isinstance(error, PilImage.DecompressionBombError) else ""
     return InputError(f"{path} cannot be read as an image{why}: it is damaged or of an unknown format; replace it.")
 
@@ -176,6 +178,8 @@ def _array_mask(path: Path) -> np.ndarray:
     except InputError:
         raise
     except Exception as error:  # NumPy and zipfile raise many kinds on damaged files
+        if isinstance(error, OSError) and error.strerror:
+            raise _unreadable(path, error) from error
         raise InputError(f"{path} cannot be read as a NumPy array: it is damaged or not one; replace it.") from error
     ids = np.asarray(loaded)
     if ids.ndim == 3 and 1 in (ids.shape[0], ids.shape[2]):

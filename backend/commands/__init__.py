@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 
-from ..protocol import StoppingReporter
+from ..stopping import StoppingReporter
 from . import check, doctor, evaluate, importing, render, report, train, vote
 
 COMMANDS: dict[str, Callable[[argparse.Namespace, StoppingReporter], None]] = {

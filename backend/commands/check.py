@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 
 from ..capture import check_capture
-from ..protocol import InputError, StoppingReporter
+from ..protocol import InputError
+from ..stopping import StoppingReporter
 
 
 def check(options: argparse.Namespace, reporter: StoppingReporter) -> None:

@@ -12,9 +12,10 @@ from PIL import Image
 
 from ..capture import load_capture
 from ..labels import vote as vote_points
-from ..protocol import Reconstruction, Reporter, StoppingReporter
+from ..protocol import Reconstruction, Reporter
 from ..raster import compile_kernels
 from ..raster.draw import draw
+from ..stopping import StoppingReporter
 from ..training.loop import Budget, Trainer
 from ..training.settings import Settings
 from .machine import machine_facts
@@ -46,7 +47,7 @@ def _train_a_little(place: Path, reporter: StoppingReporter) -> None:
     capture = load_capture(capture_folder, folder.cache, reporter=quiet)
     ids = vote_points(capture, reporter=quiet).ids
     trainer = Trainer.start(capture, ids, Settings(offsets=2))
-    trainer.run(Budget(steps=STEPS), folder.checkpoint, reporter.reporter, should_stop=reporter.should_stop)
+    trainer.run(Budget(steps=STEPS), folder.checkpoint, reporter.reporter, stop=reporter.stop)
     picture = draw(trainer.model, trainer.scene.camera(0), want_depth=True)
     if not np.isfinite(picture.image).all():
         raise RuntimeError("a small training ended in a picture that is not finite")

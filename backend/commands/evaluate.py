@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from ..evaluation import evaluate as evaluate_views
-from ..protocol import InputError, Reconstruction, StoppingReporter, plain, write_json
+from ..protocol import InputError, Reconstruction, plain, write_json
 from ..raster.draw import draw
+from ..stopping import StoppingReporter
 from .folder import open_trained
 from .record import stage
 

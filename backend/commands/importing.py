@@ -9,7 +9,7 @@ import numpy as np
 from ..labels import Votes
 from ..labels.points import write_points
 from ..objects import write_objects
-from ..protocol import StoppingReporter
+from ..stopping import StoppingReporter
 from .folder import described, open_reconstruction
 from .record import record, recorded
 from .vote import votes_are_current

@@ -11,8 +11,9 @@ import numpy as np
 from PIL import Image
 
 from ..evaluation.pictures import as_bytes
-from ..protocol import StoppingReporter, write_atomic
+from ..protocol import write_atomic
 from ..raster.draw import draw
+from ..stopping import StoppingReporter
 from .folder import open_trained
 from .record import stage
 

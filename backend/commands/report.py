@@ -9,8 +9,9 @@ import numpy as np
 from PIL import Image
 
 from ..evaluation import comparison, write_report
-from ..protocol import Reconstruction, Reporter, StoppingReporter, read_json
+from ..protocol import Reconstruction, Reporter, read_json
 from ..raster.draw import draw
+from ..stopping import StoppingReporter
 from ..training.loop import Progress
 from ..training.settings import downscale_at
 from .evaluate import evaluation_file

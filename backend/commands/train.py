@@ -12,8 +12,9 @@ from ..evaluation import IdScores, ImageScores, comparison, save_picture
 from ..export import agreement, fit_splats, write_splats
 from ..labels.points import read_points
 from ..model.object_model import ObjectModel
-from ..protocol import Cancelled, InputError, Reconstruction, Reporter, StoppingReporter, plain
+from ..protocol import Cancelled, InputError, Reconstruction, Reporter, plain
 from ..raster.draw import draw
+from ..stopping import StoppingReporter
 from ..training.loop import Budget, Trainer
 from ..training.scene import Scene
 from ..training.settings import Settings
@@ -117,7 +118,7 @@ def _run(
     reporter.status(f"{begun} {len(trainer.model.anchors):,} anchors")
     measure = _held_out(folder, reporter)
     try:
-        trainer.run(budget, folder.checkpoint, reporter.reporter, measure, reporter.should_stop, checkpoint_seconds)
+        trainer.run(budget, folder.checkpoint, reporter.reporter, measure, reporter.stop, checkpoint_seconds)
     except Cancelled:
         record_stage(folder, "train", trainer.progress.seconds)
         raise

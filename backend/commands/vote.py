@@ -11,7 +11,8 @@ from ..labels import vote as vote_points
 from ..labels.points import read_points, write_points
 from ..objects import write_objects
 from ..palette import object_colours
-from ..protocol import InputError, Reconstruction, Reporter, StoppingReporter
+from ..protocol import InputError, Reconstruction, Reporter
+from ..stopping import StoppingReporter
 from .folder import digest, open_reconstruction
 from .record import record, recorded, stage
 

@@ -6,6 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from ..model.heads import Heads
 from ..model.object_model import Normalization, ObjectModel, anchors_in_view
 from ..protocol import Cancelled, InputError, Reporter
 from ..raster import Rendered, rasterize
+from ..stopping import StopRequest
 from .adam import BETA1, BETA2, step_rows, take_rows
 from .losses import image_loss, volume_loss
 from .scene import Scene
@@ -202,10 +204,32 @@ class Trainer:
         checkpoints: Path,
         reporter: Reporter,
         evaluate: Evaluate | None = None,
-        should_stop: Callable[[], bool] = lambda: False,
+        stop: StopRequest | None = None,
         checkpoint_seconds: float = CHECKPOINT_SECONDS,
     ) -> None:
-        """Train until the budget is spent. Raises Cancelled after saving when `should_stop` says so."""
+        """Train until the budget is spent. Raises Cancelled after saving when `stop` says so.
+
+        A pause is no part of the training's time; a checkpoint is saved before it. Where a picture cannot be read or a
+        file cannot be written, the steps until then are saved before the error goes on.
+        """
+        first_step = self.progress.step
+        try:
+            self._train(budget, checkpoints, reporter, evaluate, stop or StopRequest(), checkpoint_seconds)
+        except (InputError, OSError):
+            if self.progress.step > first_step:
+                with suppress(InputError, OSError):
+                    self.save(checkpoints)
+            raise
+
+    def _train(
+        self,
+        budget: Budget,
+        checkpoints: Path,
+        reporter: Reporter,
+        evaluate: Evaluate | None,
+        stop: StopRequest,
+        checkpoint_seconds: float,
+    ) -> None:
         p = self.progress
         started = last_saved = last_report = time.monotonic()
         before = p.seconds
@@ -219,7 +243,14 @@ class Trainer:
                 self._evaluate(evaluate, reporter, share)
             if share >= 1.0:
                 break
-            if should_stop():
+            if stop.paused:
+                self.save(checkpoints)
+                last_saved = time.monotonic()
+            asked = time.monotonic()
+            stopped = stop()
+            waited = time.monotonic() - asked
+            started, last_saved, last_report = started + waited, last_saved + waited, last_report + waited
+            if stopped:
                 self.save(checkpoints)
                 raise Cancelled(f"Stopped after {p.step} steps; run the same command again to go on.")
             loss = self.step(share)
@@ -242,6 +273,7 @@ class Trainer:
             p.evaluated += 1
         quality = evaluate(self.model, self.scene)
         p.curve.append({"seconds": round(p.seconds, 2), "step": p.step, **quality})
+        reporter.quality(**p.curve[-1])
 
     def _report(self, budget: Budget, reporter: Reporter, loss: float, pace: float) -> None:
         p = self.progress
@@ -268,10 +300,12 @@ class Trainer:
         p, anchors, settings = self.progress, self.model.anchors, self.settings
         if not p.queue:
             p.queue = self.rng.permutation(self.scene.capture.train_indices).tolist()
-        index = p.queue.pop()
+        index = p.queue[-1]
         view = self.scene.capture.views[index]
         downscale = downscale_at(share, max(view.width, view.height))
         picture, labels = self.scene.target(index, downscale)
+        # Only now, so that a picture that cannot be read stays the next one.
+        p.queue.pop()
         camera = self.scene.camera(index, downscale)
         viewmat, intrinsics = camera.arrays()
         seen = anchors_in_view(anchors, viewmat, intrinsics, camera.width, camera.height, camera.near)

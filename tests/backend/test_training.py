@@ -21,6 +21,7 @@ from backend.model.object_model import Normalization, anchors_in_view
 from backend.protocol import Cancelled, InputError, Reporter
 from backend.raster import Camera, rasterize
 from backend.raster.draw import draw
+from backend.stopping import StopRequest
 from backend.training.adam import BETA1, BETA2, step_rows
 from backend.training.loop import Budget, Trainer
 from backend.training.losses import PROBABILITY_FLOOR, image_loss, volume_loss
@@ -335,8 +336,13 @@ def test_equal_seeds_give_bitwise_equal_models_and_resuming_changes_nothing(tiny
 
     parts = Trainer.start(capture, ids, SMALL)
     calls = iter(range(1000))
+
+    class StopLater(StopRequest):
+        def __call__(self):
+            return next(calls) >= 17
+
     with pytest.raises(Cancelled):
-        parts.run(Budget(steps=40), tmp_path / "c", Reporter(), should_stop=lambda: next(calls) >= 17)
+        parts.run(Budget(steps=40), tmp_path / "c", Reporter(), stop=StopLater())
     resumed, warning = Trainer.resume(capture, tmp_path / "c", SMALL)
     assert warning is None and resumed.progress.step == 17
     resumed.run(Budget(steps=40), tmp_path / "c", Reporter())
