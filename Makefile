@@ -2,7 +2,10 @@
 # PYTHON must be a Python 3.11 (what Blender 5.0's module needs); TORCH may name another build of torch.
 
 PYTHON ?= python3
-TORCH ?= torch==2.13.0
+# Blender 5.2's module needs a Python 3.13; empty where there is none.
+PYTHON313 ?= $(shell python3.13 -c "import sys; print(sys.executable)" 2>/dev/null \
+	|| ls $$(pyenv root 2>/dev/null)/versions/3.13*/bin/python3.13 2>/dev/null | tail -1)
+TORCH ?= $(shell sed '/^\#/d' requirements/torch.txt)
 DEMO ?= build/demo
 DEMO_MINUTES ?= 2.4
 
@@ -13,19 +16,28 @@ BIN = bin
 endif
 BACKEND = .venv/$(BIN)/python
 BLENDER = .venv-bpy/$(BIN)/python
+HEADLESS = $(BLENDER) headless.py
+# Blender's own tool for extensions, as its module brings it.
+EXTENSION_TOOL = site-packages/bpy/*/scripts/addons_core/bl_pkg/cli/blender_ext.py
+BLENDER_EXT = $(BLENDER) $(wildcard .venv-bpy/lib/python*/$(EXTENSION_TOOL) .venv-bpy/Lib/$(EXTENSION_TOOL))
 
-.PHONY: help venv demo test lint benchmarks clean
+export OBJECTGS_PYTHON = $(abspath $(BACKEND))
+
+.PHONY: help venv demo zip test test-blenders lint benchmarks clean
 
 help:
-	@echo "make demo        a capture made by Blender becomes labelled splats, with a report, in $(DEMO)"
-	@echo "make test        the tests"
-	@echo "make venv        the backend's environment, .venv, alone"
-	@echo "make benchmarks  speed of the rasterizer and of training"
-	@echo "make clean       remove environments and build/"
+	@echo "make demo           a capture made by Blender becomes objects in a .blend, with a report, in $(DEMO)"
+	@echo "make zip            the extension to install in Blender, in build/"
+	@echo "make test           the tests"
+	@echo "make test-blenders  the tests of the Blender side in Blender 4.2 and 5.2"
+	@echo "make lint           what a change must pass beside the tests"
+	@echo "make venv           the backend's environment, .venv, alone"
+	@echo "make benchmarks     speed of the rasterizer and of training"
+	@echo "make clean          remove environments and build/"
 
 venv: .venv/ready
 
-.venv/ready: requirements/backend.txt requirements/dev.txt
+.venv/ready: requirements/torch.txt requirements/backend.txt requirements/dev.txt
 	$(PYTHON) -m venv .venv
 	$(BACKEND) -m pip install --quiet --disable-pip-version-check "$(TORCH)"
 	$(BACKEND) -m pip install --quiet --disable-pip-version-check -r requirements/backend.txt -r requirements/dev.txt
@@ -37,18 +49,34 @@ venv: .venv/ready
 	$(BLENDER) -m pip install --quiet --disable-pip-version-check -r requirements/blender.txt
 	@touch $@
 
+.venv-bpy-%/ready: requirements/blender-%.txt
+	$(if $(filter 5.2,$*),$(PYTHON313),$(PYTHON)) -m venv .venv-bpy-$*
+	.venv-bpy-$*/$(BIN)/python -m pip install --quiet --disable-pip-version-check -r $<
+	@touch $@
+
 demo: .venv/ready .venv-bpy/ready
-	$(BLENDER) headless.py demo $(DEMO)/capture
+	$(HEADLESS) demo $(DEMO)/capture
 	$(BACKEND) -m backend check $(DEMO)/capture
-	$(BACKEND) -m backend vote $(DEMO)/capture --out $(DEMO)
-	$(BACKEND) -m backend train $(DEMO)/capture --out $(DEMO) --minutes $(DEMO_MINUTES)
-	$(BACKEND) -m backend evaluate $(DEMO)
-	$(BACKEND) -m backend report $(DEMO)
-	@echo "Done: see $(DEMO)/report.md"
+	$(HEADLESS) run $(DEMO)/capture --out $(DEMO) --minutes $(DEMO_MINUTES)
+	@echo "Done: see $(DEMO)/report.md and $(DEMO)/objectgs.blend"
+
+zip: .venv-bpy/ready
+	@mkdir -p build
+	$(BLENDER_EXT) build --source-dir . --output-dir build
+	$(BLENDER_EXT) validate build/objectgs-*.zip
 
 test: .venv/ready .venv-bpy/ready
 	$(BACKEND) -m pytest tests/backend
 	$(BLENDER) -m pytest tests/blender
+	$(BACKEND) -m pytest tests/window
+
+test-blenders: .venv/ready .venv-bpy-4.2/ready
+	.venv-bpy-4.2/$(BIN)/python -m pytest tests/blender
+	@if [ -n "$(PYTHON313)" ]; then \
+		$(MAKE) .venv-bpy-5.2/ready && .venv-bpy-5.2/$(BIN)/python -m pytest tests/blender; \
+	else \
+		echo "There is no Python 3.13 here, so Blender 5.2 was left out; PYTHON313 may name one."; \
+	fi
 
 lint: .venv/ready
 	$(BACKEND) -m ruff check .
@@ -60,4 +88,4 @@ benchmarks: .venv/ready
 	$(BACKEND) benchmarks/train.py
 
 clean:
-	rm -rf .venv .venv-bpy build
+	rm -rf .venv .venv-bpy .venv-bpy-4.2 .venv-bpy-5.2 build

@@ -20,16 +20,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ..backend.protocol import Cancelled, InputError, Reporter
 from .demo import files, mask_noise, points, scene
-from .demo.render import Cancelled, Renderer
+from .demo.render import Renderer
 
 VERSION = 1  # counts up when equal settings give another capture
 
-__all__ = ["Cancelled", "DemoError", "Settings", "make"]
-
-
-class DemoError(ValueError):
-    """Input that cannot be used; the message is one sentence for the user."""
+__all__ = ["Settings", "make"]
 
 
 @dataclass(frozen=True)
@@ -45,27 +42,28 @@ class Settings:
     samples: int = 20
 
     def check(self) -> None:
-        """Raise `DemoError` for a value out of range."""
+        """Raise `InputError` for a value out of range."""
         ranges = {"objects": (1, 60), "views": (4, 1000), "width": (32, 4096), "height": (32, 4096),
                   "seed": (0, 2**31 - 1), "mask_noise": (0, 1), "samples": (1, 4096)}
         for name, (low, high) in ranges.items():
             value = getattr(self, name)
             if not low <= value <= high:
-                raise DemoError(f"{name.replace('_', ' ').capitalize()} must be between {low} and {high}, not {value}.")
+                what = name.replace("_", " ").capitalize()
+                raise InputError(f"{what} must be between {low} and {high}, not {value}.")
 
 
-def make(out, settings: Settings | None = None, overwrite: bool = False, report: Callable[[str], None] = print,
+def make(out, settings: Settings | None = None, overwrite: bool = False, reporter: Reporter | None = None,
          stopped: Callable[[], bool] = lambda: False) -> Path:
     """Make the capture in the folder `out` and return its path.
 
-    An equal capture that is there already is kept.  Raises `DemoError` for bad input and `Cancelled` when `stopped()`
+    An equal capture that is there already is kept.  Raises `InputError` for bad input and `Cancelled` when `stopped()`
     says so between two views; nothing half-made stays behind.
     """
-    settings = settings or Settings()
+    settings, reporter = settings or Settings(), reporter or Reporter()
     settings.check()
     out = Path(out).expanduser().absolute()
     if _is_there(out, settings, overwrite):
-        report(f"The same demo capture is already in {out}; nothing to do.")
+        reporter.status(f"The same demo capture is already in {out}; nothing to do.")
         return out
     part = out.with_name(out.name + ".part")
     try:
@@ -74,9 +72,9 @@ def make(out, settings: Settings | None = None, overwrite: bool = False, report:
             shutil.rmtree(part)
         part.mkdir()
     except OSError as error:
-        raise DemoError(f"The folder {out} cannot be written: {error.strerror or error}.") from error
+        raise InputError(f"The folder {out} cannot be written: {error.strerror or error}.") from error
     try:
-        _fill(part, settings, report, stopped)
+        _fill(part, settings, reporter, stopped)
         _swap(part, out)
     except BaseException:
         shutil.rmtree(part, ignore_errors=True)
@@ -85,19 +83,19 @@ def make(out, settings: Settings | None = None, overwrite: bool = False, report:
 
 
 def _is_there(out: Path, settings: Settings, overwrite: bool) -> bool:
-    """Whether `out` holds this capture; raises `DemoError` if it holds something that must stay."""
+    """Whether `out` holds this capture; raises `InputError` if it holds something that must stay."""
     if not out.exists():
         return False
     if not out.is_dir():
-        raise DemoError(f"{out} is a file; the demo capture needs a folder.")
+        raise InputError(f"{out} is a file; the demo capture needs a folder.")
     if not any(out.iterdir()):
         return False
     if not (out / "truth" / "objects.json").is_file():
-        raise DemoError(f"The folder {out} is not empty and holds no demo capture; choose another one.")
+        raise InputError(f"The folder {out} is not empty and holds no demo capture; choose another one.")
     if _recorded(out) == _record(settings):
         return True
     if not overwrite:
-        raise DemoError(f"The folder {out} holds a demo capture with other settings; --overwrite replaces it.")
+        raise InputError(f"The folder {out} holds a demo capture with other settings; --overwrite replaces it.")
     return False
 
 
@@ -132,14 +130,14 @@ def _json(path: Path, value) -> None:
     path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
 
 
-def _fill(part: Path, settings: Settings, report, stopped) -> None:
+def _fill(part: Path, settings: Settings, reporter, stopped) -> None:
     start = time.monotonic()
     for name in ("images", "masks", "sparse/0", "truth/masks", "truth/depth", "truth/meshes"):
         (part / name).mkdir(parents=True)
     built, things = scene.build(settings.objects, settings.seed)
     try:
         views = scene.cameras(settings.views, settings.seed)
-        pictures, depths, ids = _render(built, views, settings, part, report, stopped)
+        pictures, depths, ids = _render(built, views, settings, part, reporter, stopped)
         _write_truth(part, things)
     finally:
         scene.remove(built)
@@ -156,32 +154,32 @@ def _fill(part: Path, settings: Settings, report, stopped) -> None:
     np.savez(part / "truth" / "points.npz", object_id=cloud.object_id.astype(np.int32), outlier=cloud.outlier)
     _json(part / "labels.json", {str(thing.id): thing.name for thing in things})
     _json(part / "truth" / "settings.json", _record(settings))
-    report(f"{len(views)} views, {len(things)} objects, {len(cloud.points['xyz'])} points "
-           f"in {time.monotonic() - start:.0f} s.")
+    reporter.status(f"{len(views)} views, {len(things)} objects, {len(cloud.points['xyz'])} points "
+                    f"in {time.monotonic() - start:.0f} s.")
 
 
-def _render(built, views, settings: Settings, part: Path, report, stopped):
+def _render(built, views, settings: Settings, part: Path, reporter, stopped):
     """Pictures, depths and ID maps of all views; all pictures first, because changing over costs time."""
     renderer = Renderer(built, settings.width, settings.height, settings.samples, settings.seed, part)
     pictures, truth = [], []
-    begin = last = time.monotonic()
+    total = 2 * len(views)
     try:
+        reporter.status("Rendering IDs and depth")
         renderer.for_truth()
-        for view in views:
+        for i, view in enumerate(views, 1):
             if stopped():
                 raise Cancelled
             truth.append(renderer.truth(view))
-        report(f"IDs and depth of {len(views)} views: {time.monotonic() - begin:.0f} s.")
+            reporter.progress(i, total)
+        reporter.status("Rendering pictures")
         renderer.for_pictures()
         begin = time.monotonic()
         for i, view in enumerate(views, 1):
             if stopped():
                 raise Cancelled
             pictures.append(renderer.picture(view))
-            now = time.monotonic()
-            if now - last > 5 or i == len(views):
-                last = now
-                report(f"View {i} of {len(views)}, {(now - begin) / i * (len(views) - i):.0f} s left.")
+            left = (time.monotonic() - begin) / i * (len(views) - i)
+            reporter.progress(len(views) + i, total, seconds_left=round(left, 1))
     finally:
         renderer.close()
     return pictures, [depth for _, depth in truth], [labels for labels, _ in truth]

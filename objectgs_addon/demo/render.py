@@ -1,42 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Rendering with Cycles on the CPU: pictures, and exact IDs and depth at pixel centres."""
 
-import contextlib
-import os
-import sys
 from pathlib import Path
 
 import bpy
 import numpy as np
 from mathutils import Matrix
 
+from ...backend.protocol import Cancelled
+from ..quiet import quiet
 from .scene import FOCAL, View
-
-
-class Cancelled(Exception):
-    """The user stopped the rendering."""
-
-
-@contextlib.contextmanager
-def _quiet():
-    """Blender prints lines for every picture; keep them out of a terminal's progress."""
-    if not bpy.app.background:
-        yield
-        return
-    sys.stdout.flush()
-    try:
-        kept = os.dup(1)
-    except OSError:
-        yield
-        return
-    sink = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(sink, 1)
-        yield
-    finally:
-        os.dup2(kept, 1)
-        os.close(kept)
-        os.close(sink)
 
 
 class Renderer:
@@ -119,7 +92,7 @@ class Renderer:
         path = self.folder / "view.exr"
         path.unlink(missing_ok=True)
         self.scene.render.filepath = str(path)
-        with _quiet():
+        with quiet():
             result = bpy.ops.render.render(write_still=True, scene=self.scene.name)
         if "FINISHED" not in result:
             raise Cancelled

@@ -1,6 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The checkout's root as package `objectgs`, as headless.py loads it, and what the tests of the Blender side share."""
 
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
 import pytest
 
 bpy = pytest.importorskip("bpy")
@@ -9,6 +14,8 @@ import headless  # noqa: E402
 
 headless.extension()
 
+from objectgs.objectgs_addon import demo_capture  # noqa: E402
+
 
 @pytest.fixture
 def fresh():
@@ -16,3 +23,28 @@ def fresh():
     bpy.ops.wm.read_factory_settings(use_empty=True)
     yield
     bpy.ops.wm.read_factory_settings(use_empty=True)
+
+
+@pytest.fixture(scope="session")
+def capture(tmp_path_factory) -> Path:
+    """A demo capture: 3 objects and 12 views of 96x72. To be read only."""
+    settings = demo_capture.Settings(objects=3, views=12, width=96, height=72, samples=2)
+    return demo_capture.make(tmp_path_factory.mktemp("capture") / "demo", settings)
+
+
+@pytest.fixture(scope="session")
+def backend_python() -> str:
+    """The Python that has the compute backend."""
+    python = os.environ.get("OBJECTGS_PYTHON") or shutil.which(headless.ROOT / ".venv" / "bin" / "python")
+    if not python:
+        pytest.skip("no compute backend: set OBJECTGS_PYTHON, or run make venv")
+    return str(python)
+
+
+@pytest.fixture(scope="session")
+def trained(capture, backend_python, tmp_path_factory) -> Path:
+    """A reconstruction of `capture` after a few steps. To be read only."""
+    folder = tmp_path_factory.mktemp("reconstruction") / "demo"
+    command = [backend_python, "-m", "backend", "train", capture, "--out", folder, "--steps", "30"]
+    subprocess.run(command, cwd=headless.ROOT, check=True, timeout=300)
+    return folder

@@ -13,6 +13,7 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
+from objectgs.backend.protocol import Cancelled  # noqa: E402
 from objectgs.objectgs_addon import demo_capture  # noqa: E402
 from objectgs.objectgs_addon.demo import mask_noise  # noqa: E402
 
@@ -24,13 +25,13 @@ SMALL = demo_capture.Settings(objects=7, views=12, width=160, height=120, sample
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory):
     """4 views of 64x48."""
-    return demo_capture.make(tmp_path_factory.mktemp("demo") / "tiny", TINY, report=lambda line: None)
+    return demo_capture.make(tmp_path_factory.mktemp("demo") / "tiny", TINY)
 
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     """12 views of 160x120: enough for tracks."""
-    return demo_capture.make(tmp_path_factory.mktemp("demo") / "small", SMALL, report=lambda line: None)
+    return demo_capture.make(tmp_path_factory.mktemp("demo") / "small", SMALL)
 
 
 def read_png(path):
@@ -185,7 +186,7 @@ def test_points_agree_with_depth_and_tracks(small):
 
 
 def test_same_seed_same_bytes(tiny, tmp_path):
-    again = demo_capture.make(tmp_path / "again", TINY, report=lambda line: None)
+    again = demo_capture.make(tmp_path / "again", TINY)
     files = sorted(p.relative_to(tiny) for p in tiny.rglob("*") if p.is_file())
     assert files == sorted(p.relative_to(again) for p in again.rglob("*") if p.is_file())
     for file in files:
@@ -220,7 +221,7 @@ def test_command_line(tiny, tmp_path):
 
 
 def test_stop_leaves_nothing(tmp_path):
-    with pytest.raises(demo_capture.Cancelled):
-        demo_capture.make(tmp_path / "x", TINY, report=lambda line: None, stopped=lambda: True)
+    with pytest.raises(Cancelled):
+        demo_capture.make(tmp_path / "x", TINY, stopped=lambda: True)
     assert not list(tmp_path.iterdir())
     assert "ObjectGS demo" not in bpy.data.scenes

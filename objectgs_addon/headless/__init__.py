@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""ObjectGS without a window: the commands of headless.py.
+
+`arguments` says what can be asked, `commands` and `batch` do it; this module turns what happens into an exit code.
+"""
+
+import contextlib
+import signal
+import traceback
+
+from ...backend.protocol import (
+    EXIT_BAD_INPUT,
+    EXIT_CANCELLED,
+    EXIT_DONE,
+    EXIT_FAILED,
+    Cancelled,
+    InputError,
+    JsonReporter,
+)
+from . import batch, commands
+from .arguments import UsageError, parse
+from .lines import LineReporter
+
+COMMANDS = {
+    "demo": commands.demo,
+    "import": commands.backend,
+    "vote": commands.backend,
+    "train": commands.backend,
+    "build": commands.build,
+    "render": commands.render,
+    "run": commands.run,
+    "batch": batch.batch,
+}
+
+
+def main(arguments: list[str]) -> int:
+    """Run one command line and return the exit code."""
+    reporter = JsonReporter() if "--json" in arguments else LineReporter()
+    try:
+        options = parse(arguments)
+        options.reporter = reporter
+        with _stoppable():
+            COMMANDS[options.command](options)
+        reporter.done()
+        return EXIT_DONE
+    except (KeyboardInterrupt, Cancelled) as error:
+        reporter.stopped(str(error) or "Cancelled.")
+        return EXIT_CANCELLED
+    except (InputError, UsageError) as error:
+        reporter.error(str(error))
+        return EXIT_BAD_INPUT
+    except commands.StepFailed as error:
+        reporter.error(str(error))
+        return EXIT_FAILED
+    except Exception as error:
+        if isinstance(error, OSError) and error.filename:
+            reporter.error(commands.sentence(error))
+            return EXIT_BAD_INPUT
+        traceback.print_exc()
+        reporter.error(f"An unexpected failure: {type(error).__name__}: {' '.join(str(error).split())}")
+        return EXIT_FAILED
+
+
+@contextlib.contextmanager
+def _stoppable():
+    """Ctrl-C and SIGTERM raise KeyboardInterrupt; Blender would take the first for itself, the second ends it."""
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler if handler is not None else signal.SIG_DFL)

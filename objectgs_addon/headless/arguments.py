@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The command line of headless.py: what can be asked."""
+
+import argparse
+import re
+from pathlib import Path
+
+_INTRODUCTION = """\
+ObjectGS without a window: from captures to .blend files and pictures.
+
+  blender -b -P headless.py -- run   garden --out garden-splats --minutes 10
+  blender -b -P headless.py -- batch captures --out results --minutes 10
+
+A Python that has the bpy wheel does the same: python headless.py run ...
+"""
+
+_ENDING = """\
+`COMMAND --help` lists a command's options. Ctrl+C or SIGTERM stops at any time;
+the same command goes on from there. Exit codes: 0 done, 2 the input cannot be
+used (one sentence says why), 130 cancelled, 1 anything else.
+"""
+
+_BATCH = """\
+Run every capture in FOLDER (each sub-folder with images/ or sparse/), each into
+DIR/<name>, and leave a summary in DIR/batch.md and DIR/batch.json. One that
+fails does not stop the others. The same command later goes on with what is not
+done; what was finished with the same settings is skipped. Exit code 2 if any
+capture cannot be used, 1 if any failed for another reason.
+"""
+
+_TRAIN_OPTIONS = """\
+Every other option behind CAPTURE is one of the backend's train command:
+--minutes M or --steps N, --max-size PIXELS, --strategy ... (train --help lists them).
+"""
+
+
+class UsageError(Exception):
+    """The command line makes no sense; the message is one sentence."""
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message):
+        raise UsageError(f"{message[:1].upper()}{message[1:]}; see headless.py --help.")
+
+
+def parse(arguments: list[str]) -> argparse.Namespace:
+    """The options of a command line, `command` and, where options are handed on to the backend, `rest` among them.
+
+    Raises `UsageError`; prints and raises SystemExit for --help.
+    """
+    options, rest = _parser().parse_known_args(arguments)
+    if options.takes is None:
+        if rest:
+            raise UsageError(f"Unrecognized arguments: {' '.join(rest)}; see headless.py --help.")
+        return options
+    if not rest or rest[0].startswith("-"):
+        raise UsageError(f"{options.takes} must come first: {options.command} {options.takes} --out DIR.")
+    options.source, *options.rest = rest
+    return options
+
+
+def _parser() -> argparse.ArgumentParser:
+    how = argparse.RawDescriptionHelpFormatter
+    top = _Parser(prog="headless.py", description=_INTRODUCTION, epilog=_ENDING, formatter_class=how,
+                  allow_abbrev=False)
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND", title="commands")
+
+    def command(name: str, summary: str, description: str, usage: str | None = None, takes: str | None = None,
+                epilog: str | None = None) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=summary, description=description, usage=usage, epilog=epilog,
+                                  formatter_class=how, allow_abbrev=False)
+        sub.set_defaults(takes=takes)
+        return sub
+
+    _demo(command("demo", "render the demo capture", (
+        "Render the built-in demo capture: objects on a table, with masks, a sparse model and the truth.")))
+    for name, summary in (("import", "open a capture"), ("vote", "give each point its object, from the masks"),
+                          ("train", "make the splats")):
+        _backend(command(
+            name, summary, f"The backend's {name} command: {summary}.", takes="CAPTURE",
+            usage=f"headless.py {name} CAPTURE --out DIR [OPTIONS]",
+            epilog=f"OPTIONS are those of `python -m backend {name}`, whose --help explains them."))
+    build = command("build", "make a .blend of a reconstruction",
+                    "Put a reconstruction's cameras, points and splats into a new .blend file.")
+    build.add_argument("folder", type=Path, metavar="DIR", help="reconstruction folder")
+    build.add_argument("--blend", type=Path, metavar="FILE", help="file to write (DIR/objectgs.blend)")
+    render = command("render", "make a picture of a .blend", "Render a picture of a .blend file that build has made.")
+    render.add_argument("source", type=Path, metavar="DIR_OR_BLEND",
+                        help="reconstruction folder with its objectgs.blend, or any .blend file")
+    render.add_argument("--out", type=Path, required=True, metavar="PICTURE", help="file.png, .jpg or .exr")
+    render.add_argument("--camera", metavar="NAME", help="a camera of the file (the scene's own)")
+    _picture(render)
+    run = command("run", "everything: from a capture to a .blend and a picture", (
+        "Train, measure, make DIR/objectgs.blend and render it into DIR/render.png."), takes="CAPTURE",
+        usage="headless.py run CAPTURE --out DIR [OPTIONS]", epilog=_TRAIN_OPTIONS)
+    _backend(run)
+    _picture(run)
+    batch = command("batch", "run every capture of a folder", _BATCH, takes="FOLDER",
+                    usage="headless.py batch FOLDER --out DIR [OPTIONS]", epilog=_TRAIN_OPTIONS)
+    _backend(batch)
+    _picture(batch)
+    return top
+
+
+def _demo(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("out", type=Path, metavar="OUT", help="folder to make")
+    sub.add_argument("--objects", type=int, default=8, help="objects on the table, 1 to 60 (default 8)")
+    sub.add_argument("--views", type=int, default=48, help="pictures on two rings (default 48)")
+    sub.add_argument("--width", type=int, default=320, help="pixels (default 320)")
+    sub.add_argument("--height", type=int, default=240, help="pixels (default 240)")
+    sub.add_argument("--seed", type=int, default=0, help="same seed, same capture (default 0)")
+    sub.add_argument("--mask-noise", type=float, default=0.0, metavar="X", help=(
+        "mistakes in masks/, 0 (none, default) to 1 (poor): borders wander up to 4X pixels; an object of a view is "
+        "1-3 pixels too large or small with probability X, has a wrong ID with 0.15 X, is missing with 0.10 X"))
+    sub.add_argument("--samples", type=int, default=20, help="rays a pixel at most, denoised (default 20)")
+    sub.add_argument("--json", action="store_true", help="print events as JSON lines, for other programs")
+    sub.add_argument("--overwrite", action="store_true", help="replace a demo capture with other settings in OUT")
+
+
+def _backend(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for what is made")
+    sub.add_argument("--backend-python", metavar="PATH", help=(
+        "the Python that has the compute backend (the variable OBJECTGS_PYTHON, or what the preferences say)"))
+
+
+def _picture(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--engine", choices=("CYCLES", "EEVEE"), help="the renderer (the file's own)")
+    sub.add_argument("--samples", type=_count, metavar="N", help="samples a pixel (the file's own)")
+    sub.add_argument("--size", type=_size, metavar="WxH", help="pixels (the file's own)")
+
+
+def _count(text: str) -> int:
+    if not re.fullmatch("[1-9][0-9]{0,5}", text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
+    return int(text)
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch("([0-9]{1,5})x([0-9]{1,5})", text)
+    width, height = map(int, match.groups()) if match else (0, 0)
+    if not (4 <= width <= 65536 and 4 <= height <= 65536):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size such as 640x480")
+    return width, height

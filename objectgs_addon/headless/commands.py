@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the commands of headless.py do, one function each; `batch` has a module of its own."""
+
+import os
+import shutil
+from pathlib import Path
+
+import bpy
+
+from ...backend.protocol import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError, Reconstruction
+from ...backend.stopping import StopRequest
+from .. import demo_capture, locations, scene
+from ..jobs import run_blocking
+from ..quiet import quiet
+from .lines import say
+from .picture import render_picture
+
+BLEND = "objectgs.blend"
+PICTURE = "render.png"
+SAMPLES = 32
+"""Rays a pixel in the .blend that is built, unless --samples says otherwise."""
+
+_TITLES = {"import": "Import", "vote": "Vote", "train": "Train", "evaluate": "Evaluate", "report": "Report"}
+
+
+class StepFailed(Exception):
+    """A step failed for a reason that is not the input; the message is one sentence."""
+
+
+def sentence(error: OSError) -> str:
+    """A file that cannot be used, in one sentence."""
+    return f"{error.filename} cannot be used ({error.strerror}); check it, its permissions and the free space."
+
+
+def whole(path: Path) -> Path:
+    """A path that stays right in another working directory; links are left as they are."""
+    return Path(os.path.abspath(path.expanduser()))
+
+
+def demo(options) -> None:
+    """Render the demo capture."""
+    _empty_file()
+    settings = demo_capture.Settings(
+        objects=options.objects, views=options.views, width=options.width, height=options.height, seed=options.seed,
+        mask_noise=options.mask_noise, samples=options.samples)
+    stop = StopRequest()
+    with stop.listening(read_stdin=options.json):
+        demo_capture.make(options.out, settings, options.overwrite, options.reporter, stop)
+
+
+def backend(options) -> None:
+    """One of the backend's own commands on a capture: import, vote or train."""
+    find_backend(options.backend_python)
+    folder = whole(options.out)
+    _run_backend(options.command, folder, whole(Path(options.source)), "--out", folder, *options.rest)
+
+
+def build(options) -> None:
+    """A .blend of a reconstruction."""
+    folder = whole(options.folder)
+    build_blend(folder, whole(options.blend) if options.blend else folder / BLEND)
+
+
+def render(options) -> None:
+    """A picture of a .blend."""
+    source = whole(options.source)
+    blend = source / BLEND if source.is_dir() else source
+    if not blend.is_file():
+        raise InputError(f"There is no file {blend}; make it with the build command.")
+    render_picture(blend, whole(options.out), options.camera, options.engine, options.samples, options.size)
+    say(f"Wrote {options.out}.")
+
+
+def run(options) -> None:
+    """Everything for one capture: train, evaluate, report, build and render."""
+    find_backend(options.backend_python)
+    reconstruct(whole(Path(options.source)), whole(options.out), options)
+
+
+def reconstruct(capture: Path, folder: Path, options) -> None:
+    """Make splats, a report, a .blend and a picture of `capture` in `folder`; what is there already is gone on from."""
+    _run_backend("train", folder, capture, "--out", folder, *options.rest)
+    _run_backend("evaluate", folder, folder)
+    _run_backend("report", folder, folder)
+    build_blend(folder, folder / BLEND)
+    render_picture(folder / BLEND, folder / PICTURE, None, options.engine, options.samples, options.size)
+    say(f"Wrote {folder / PICTURE}.")
+
+
+def find_backend(python: str | None) -> None:
+    """Settle which Python runs the backend: `python`, OBJECTGS_PYTHON, or what the preferences and the set-up say."""
+    wanted = python or os.environ.get("OBJECTGS_PYTHON")
+    if wanted:
+        found = shutil.which(os.path.expanduser(wanted))
+        if found is None:
+            raise InputError(f"There is no Python at {wanted}; check --backend-python or OBJECTGS_PYTHON.")
+        os.environ["OBJECTGS_PYTHON"] = os.path.abspath(found)
+    elif locations.backend_python() is None:
+        raise InputError("The compute backend is not set up; name a Python that has it with --backend-python or "
+                         "OBJECTGS_PYTHON, or set it up in the preferences of ObjectGS.")
+
+
+def build_blend(folder: Path, blend: Path) -> None:
+    """Put the reconstruction in `folder` into a new file and save it as `blend`."""
+    files = Reconstruction(folder)
+    if not (folder / "cameras.json").is_file():
+        raise InputError(f"{folder} holds no reconstruction; make one with the import or train command.")
+    _empty_file()
+    target = bpy.context.scene
+    with quiet():
+        root = scene.show_capture(target, folder)
+        warnings = scene.warnings_of(root)
+        if files.splats.exists():
+            warnings += scene.show_result(root, folder, target).warnings
+        scene.prepare_render(target)
+        # Works on every machine; EEVEE needs a display, or draws on the processor.
+        target.render.engine = "CYCLES"
+        target.cycles.samples = SAMPLES
+    for warning in warnings:
+        say(f"Warning: {warning}")
+    blend.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with quiet():
+            bpy.ops.wm.save_as_mainfile(filepath=str(blend))
+    except RuntimeError as error:
+        raise InputError(f"{blend} could not be written; check its folder and the free space.") from error
+    say(f"Wrote {blend}.")
+
+
+def _run_backend(command: str, folder: Path, *arguments: object) -> None:
+    """Run a command of the backend until it ends; raises what main() makes its exit code of."""
+    job = locations.backend_job(_TITLES[command], command, folder, command, *map(str, arguments))
+    code = run_blocking(job, echo=lambda line: None if job.error else say(line))
+    if code == EXIT_DONE:
+        return
+    if code == EXIT_CANCELLED:
+        raise Cancelled
+    if code == EXIT_BAD_INPUT:
+        raise InputError(job.error)
+    raise StepFailed(job.error)
+
+
+def _empty_file() -> None:
+    """A new file without objects; the user's preferences stay as they are."""
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)

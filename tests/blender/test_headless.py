@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""headless.py: what its commands leave behind, its exit codes, and that it can be stopped at any moment."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+import headless  # noqa: E402
+
+SIZE = ("--size", "48x36", "--samples", "1")
+
+
+def start(*arguments, **variables):
+    environment = {**os.environ, **variables}
+    return subprocess.Popen([sys.executable, headless.__file__, *map(str, arguments)], env=environment, text=True,
+                            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def run(*arguments, **variables):
+    process = start(*arguments, **variables)
+    process.output, process.errors = process.communicate(timeout=400)
+    return process
+
+
+def refusal(*arguments, **variables):
+    """The one sentence of a command that cannot be done; exit code 2."""
+    ran = run(*arguments, **variables)
+    assert ran.returncode == 2, ran.output + ran.errors
+    assert ran.errors.count("\n") == 1 and "Traceback" not in ran.output, ran.errors
+    return ran.errors
+
+
+def size_of(picture):
+    image = bpy.data.images.load(str(picture))
+    try:
+        return tuple(image.size)
+    finally:
+        bpy.data.images.remove(image)
+
+
+@pytest.fixture(scope="module")
+def blend(trained, tmp_path_factory):
+    """The .blend that build makes of the reconstruction."""
+    file = tmp_path_factory.mktemp("blend") / "made" / "scene.blend"
+    ran = run("build", trained, "--blend", file)
+    assert ran.returncode == 0, ran.output + ran.errors
+    return file
+
+
+def test_help(capsys):
+    ran = run("--help")
+    assert ran.returncode == 0
+    for command in ("demo", "import", "vote", "train", "build", "render", "run", "batch"):
+        assert f"\n    {command}" in ran.output
+        with pytest.raises(SystemExit) as ended:
+            headless.main([command, "--help"])
+        assert ended.value.code == 0
+        assert capsys.readouterr().out.startswith(f"usage: headless.py {command}")
+
+
+@pytest.mark.parametrize("arguments, words", [
+    ((), "COMMAND"),
+    (("grow",), "grow"),
+    (("build",), "DIR"),
+    (("train", "somewhere"), "--out"),
+    (("train", "--out", "x"), "CAPTURE must come first"),
+    (("run", "--steps", "5", "somewhere", "--out", "x"), "CAPTURE must come first"),
+    (("build", "x", "--colour", "red"), "--colour"),
+    (("render", "x", "--out", "a.png", "--size", "640"), "640x480"),
+    (("render", "x", "--out", "a.png", "--samples", "0"), "'0'"),
+])
+def test_arguments_that_make_no_sense(arguments, words, capsys):
+    assert headless.main(list(arguments)) == 2
+    said = capsys.readouterr()
+    assert words in said.err and said.err.count("\n") == 1 and not said.out
+
+
+def test_build_holds_the_reconstruction(blend, trained):
+    bpy.ops.wm.open_mainfile(filepath=str(blend))
+    kinds = {collection.get("objectgs") for collection in bpy.data.collections}
+    assert {"reconstruction", "capture", "object"} <= kinds
+    names = {collection.name for collection in bpy.data.collections if collection.get("objectgs") == "object"}
+    wanted = {entry["name"] for entry in json.loads((trained / "objects.json").read_text())["objects"]}
+    assert wanted <= names
+    assert bpy.context.scene.camera is not None
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+
+
+def test_build_and_render_refuse(trained, blend, tmp_path):
+    assert "no reconstruction" in refusal("build", tmp_path)
+    assert "build" in refusal("render", tmp_path, "--out", tmp_path / "a.png")
+    assert ".png" in refusal("render", blend, "--out", tmp_path / "a.tiff")
+    assert "no camera 'nobody'" in refusal("render", blend, "--out", tmp_path / "a.png", "--camera", "nobody")
+    broken = tmp_path / "broken.blend"
+    broken.write_bytes(b"not a blend")
+    assert str(broken) in refusal("render", broken, "--out", tmp_path / "a.png")
+    (tmp_path / "file").write_text("")
+    assert str(tmp_path / "file") in refusal("build", trained, "--blend", tmp_path / "file" / "a.blend")
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["broken.blend", "file"]
+
+
+def test_render_from_any_camera(blend, tmp_path):
+    bpy.ops.wm.open_mainfile(filepath=str(blend))
+    camera = next(entry.name for entry in bpy.context.scene.objects
+                  if entry.type == "CAMERA" and entry != bpy.context.scene.camera)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    before = blend.read_bytes()
+    for name in ("default.png", "other.jpg", "other.exr"):
+        chosen = () if name == "default.png" else ("--camera", camera)
+        ran = run("render", blend, "--out", tmp_path / name, "--engine", "CYCLES", *SIZE, *chosen)
+        assert ran.returncode == 0, ran.output + ran.errors
+        assert size_of(tmp_path / name) == (48, 36)
+    assert blend.read_bytes() == before
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_no_backend(capture, tmp_path):
+    user = {"OBJECTGS_PYTHON": "", "BLENDER_USER_RESOURCES": str(tmp_path / "user")}
+    for command in ("import", "vote", "train", "run"):
+        assert "not set up" in refusal(command, capture, "--out", tmp_path / "out", **user)
+    assert "nowhere" in refusal("train", capture, "--out", tmp_path / "out", "--backend-python", tmp_path / "nowhere")
+    assert not (tmp_path / "out").exists()
+
+
+def test_backend_commands(capture, backend_python, tmp_path):
+    for command in ("import", "vote"):
+        out = tmp_path / command
+        ran = run(command, capture, "--out", out, "--backend-python", backend_python, OBJECTGS_PYTHON="")
+        assert ran.returncode == 0, ran.output + ran.errors
+        assert (out / "cameras.json").is_file() and (out / "points.ply").is_file()
+    assert "images" in refusal("vote", tmp_path, "--out", tmp_path / "x", OBJECTGS_PYTHON=backend_python)
+    assert "--wrong" in refusal("train", capture, "--out", tmp_path / "x", "--wrong", OBJECTGS_PYTHON=backend_python)
+    assert not (tmp_path / "x").exists()
+
+
+def test_paths_are_those_of_the_working_directory(capture, backend_python, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    here = os.path.relpath(capture)
+    ran = run("import", here, "--out", "made", OBJECTGS_PYTHON=os.path.relpath(backend_python))
+    assert ran.returncode == 0, ran.output + ran.errors
+    assert (tmp_path / "made" / "cameras.json").is_file()
+
+
+def wait_for(path, process):
+    for _ in range(1200):
+        if path.exists():
+            return
+        assert process.poll() is None, process.communicate()
+        time.sleep(.1)
+    raise AssertionError(f"{path} never came")
+
+
+def test_stopped_training_is_kept(capture, backend_python, tmp_path):
+    process = start("run", capture, "--out", tmp_path / "out", "--steps", "100000", "--checkpoint-seconds", "1",
+                    OBJECTGS_PYTHON=backend_python)
+    wait_for(tmp_path / "out" / "checkpoint", process)
+    process.send_signal(signal.SIGTERM)
+    output, errors = process.communicate(timeout=120)
+    assert process.returncode == 130, output + errors
+    assert errors.count("\n") == 1
+    assert (tmp_path / "out" / "checkpoint").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_demo_leaves_nothing(tmp_path, number):
+    process = start("demo", tmp_path / "demo", "--views", "500")
+    wait_for(tmp_path / "demo.part", process)
+    process.send_signal(number)
+    output, errors = process.communicate(timeout=120)
+    assert process.returncode == 130, output + errors
+    assert not list(tmp_path.iterdir())
+
+
+def test_demo_speaks_json(tmp_path):
+    small = ("--objects", "1", "--views", "4", "--width", "32", "--height", "32", "--samples", "1")
+    ran = run("demo", tmp_path / "demo", "--json", *small)
+    assert ran.returncode == 0, ran.errors
+    events = [json.loads(line) for line in ran.output.splitlines() if line.startswith("{")]
+    assert events[-1]["type"] == "done"
+    shares = [event["done"] / event["total"] for event in events if event["type"] == "progress"]
+    assert shares == sorted(shares) and shares[-1] == 1
+    refused = run("demo", tmp_path / "demo", "--json", "--objects", "0")
+    assert refused.returncode == 2
+    assert json.loads(refused.output.splitlines()[-1])["type"] == "error"
+
+
+def test_demo_stops_when_its_driver_is_gone(tmp_path):
+    process = start("demo", tmp_path / "demo", "--views", "500", "--json")
+    process.stdin.write("attached\n")
+    process.stdin.flush()
+    wait_for(tmp_path / "demo.part", process)
+    output, errors = process.communicate(timeout=120)
+    assert process.returncode == 130, output + errors
+    assert not list(tmp_path.iterdir())
+
+
+def test_stopped_rendering_ends_soon(blend, tmp_path):
+    process = start("render", blend, "--out", tmp_path / "a.png", "--engine", "CYCLES", "--size", "4000x3000",
+                    "--samples", "4000")
+    time.sleep(10)
+    process.send_signal(signal.SIGTERM)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, output + errors
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="module")
+def batch(capture, backend_python, tmp_path_factory):
+    """(folder of captures, where they went, first run of the batch): two good captures and a bad one."""
+    folder = tmp_path_factory.mktemp("batch")
+    shutil.copytree(capture, folder / "captures" / "a")
+    shutil.copytree(capture, folder / "captures" / "c")
+    (folder / "captures" / "b" / "images").mkdir(parents=True)
+    (folder / "captures" / "notes").mkdir()
+    arguments = (folder / "captures", "--out", folder / "out", "--steps", "5", *SIZE)
+    return folder / "captures", folder / "out", arguments, run("batch", *arguments, OBJECTGS_PYTHON=backend_python)
+
+
+def summary(out):
+    return {entry["name"]: entry for entry in json.loads((out / "batch.json").read_text())["captures"]}
+
+
+def test_batch_survives_a_bad_capture(batch):
+    _, out, _, ran = batch
+    assert ran.returncode == 2, ran.output + ran.errors
+    entries = summary(out)
+    assert {name: entry["state"] for name, entry in entries.items()} == {"a": "done", "b": "bad input", "c": "done"}
+    assert entries["a"]["splats"] > 0 and entries["a"]["seconds"] > 0 and 5 < entries["a"]["psnr"] < 60
+    assert "b" in entries["b"]["error"] and entries["a"]["error"] is None
+    table = (out / "batch.md").read_text()
+    assert all(f"| {name} |" in table for name in entries) and entries["b"]["error"] in table
+    for name in ("a", "c"):
+        assert (out / name / "objectgs.blend").is_file() and size_of(out / name / "render.png") == (48, 36)
+
+
+def test_batch_goes_on_with_what_is_not_done(batch, capture, backend_python):
+    captures, out, arguments, _ = batch
+    first = summary(out)
+    shutil.copytree(capture, captures / "b", dirs_exist_ok=True)
+    (captures / "c" / "labels.json").write_text(json.dumps({"1": "cup"}))
+    again = run("batch", *arguments, OBJECTGS_PYTHON=backend_python)
+    assert again.returncode == 0, again.output + again.errors
+    second = summary(out)
+    assert second["a"] == first["a"] and "a (1 of 3): done before" in again.output
+    assert [second[name]["state"] for name in "abc"] == ["done"] * 3
+    assert second["c"]["settings"] != first["c"]["settings"]
+
+
+def test_batch_refuses(tmp_path):
+    assert "captures" in refusal("batch", tmp_path, "--out", tmp_path / "out")
+    assert "nowhere" in refusal("batch", tmp_path / "nowhere", "--out", tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+
+
+def test_cancelled_batch_writes_its_summary(capture, backend_python, tmp_path):
+    shutil.copytree(capture, tmp_path / "captures" / "a")
+    process = start("batch", tmp_path / "captures", "--out", tmp_path / "out", "--steps", "100000",
+                    "--checkpoint-seconds", "1", OBJECTGS_PYTHON=backend_python)
+    wait_for(tmp_path / "out" / "a" / "checkpoint", process)
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=120)
+    assert process.returncode == 130, output + errors
+    entry = summary(tmp_path / "out")["a"]
+    assert entry["state"] == "unfinished" and "Cancelled" in entry["error"] and entry["seconds"] > 0
+
+
+def test_a_crash_of_the_backend_is_told(capture, tmp_path):
+    python = tmp_path / "python"
+    python.write_text("#!/bin/sh\necho 'out of luck' >&2\nexit 3\n")
+    python.chmod(0o755)
+    ran = run("train", capture, "--out", tmp_path / "out", "--backend-python", python)
+    assert ran.returncode == 1 and "out of luck" in ran.errors and "Traceback" not in ran.errors
