@@ -5,6 +5,7 @@ The queue lives as long as Blender does, not in the .blend: opening another file
 whoever opens the reconstruction's .blend again finds its job by the folder.
 """
 
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 
@@ -84,6 +85,10 @@ def _over(job: Job) -> None:
             finish(job)
         except (InputError, OSError) as error:
             messages.show(f"{job.title}: {error}", "ERROR")
+        except Exception as error:
+            # An exception that leaves a timer ends it, and with it every other job.
+            traceback.print_exc()
+            messages.show(f"{job.title}: the result could not be shown ({type(error).__name__}: {error})", "ERROR")
 
 
 def finish(job: Job) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import bpy
 
-KIND = "objectgs"
+KIND = "objectgs_kind"  # Not "objectgs": before Blender 5.0 a property group of that name would take its place.
 OBJECT_ID = "object_id"
 FOLDER = "objectgs_folder"
 
