@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import os
 import re
 import threading
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -84,8 +85,9 @@ class Keypoints:
 class Capture:
     """Views sorted by name, points, and their images and ID maps, decoded on demand within a memory budget.
 
-    `names` holds the labels' names without 0, `warnings` sentences for the user, `counts` what was found. Arrays that
-    the methods return are shared and read-only; all methods may be called from several threads.
+    `names` holds the labels' names without 0, `left_out` (n,) int64 the IDs that pass for 0, `warnings` sentences for
+    the user, `counts` what was found. Arrays that the methods return are shared and read-only; all methods may be
+    called from several threads.
     """
 
     def __init__(
@@ -111,6 +113,7 @@ class Capture:
         self._raw = raw
         self._colour_masks = colour_masks
         self._held = _Held(memory_mb * 1e6)
+        self.left_out = np.zeros(0, np.int64)
         enough = len(views) >= _MIN_VIEWS_TO_HOLD_OUT
         held_out = [i for i in range(len(views)) if enough and i % HOLDOUT_EVERY == 0]
         self.test_indices: tuple[int, ...] = tuple(held_out)
@@ -118,6 +121,17 @@ class Capture:
 
     def __len__(self) -> int:
         return len(self.views)
+
+    def edited(self, names: Mapping[int, str], left_out: Iterable[int]) -> Capture:
+        """The same capture with these names too, and with the IDs `left_out` as 0; decoded files are shared."""
+        other = copy.copy(self)
+        other.left_out = np.unique(np.array(list(left_out), np.int64))
+        other.names = {i: name for i, name in {**self.names, **names}.items() if i not in other.left_out}
+        return other
+
+    def without_left_out(self, ids: np.ndarray) -> np.ndarray:
+        """`ids`, of any shape, with those left out as 0."""
+        return np.where(np.isin(ids, self.left_out), 0, ids) if len(self.left_out) else ids
 
     @property
     def has_masks(self) -> bool:
@@ -127,11 +141,12 @@ class Capture:
     @property
     def object_ids(self) -> np.ndarray:
         """The IDs other than 0 that occur in the masks: (n,) int64, ascending."""
-        return np.array(sorted({i for ids in self._ids_of_views for i in ids} - {0}), np.int64)
+        ids = np.array(sorted({i for ids in self._ids_of_views for i in ids} - {0}), np.int64)
+        return ids[~np.isin(ids, self.left_out)]
 
     def ids_in(self, index: int) -> tuple[int, ...]:
         """The IDs, 0 among them, that occur in one view's mask, ascending; empty where it has none."""
-        return self._ids_of_views[index]
+        return tuple(np.unique(self.without_left_out(np.array(self._ids_of_views[index], np.int64))).tolist())
 
     def image(self, index: int, downscale: int = 1) -> np.ndarray:
         """A view's pixels: (height // downscale, width // downscale, 3) uint8, the mean over blocks of
@@ -142,7 +157,8 @@ class Capture:
         """A view's ID map, the size of `image`: (h, w) int64, taken at each block's centre; None where it has none."""
         if self.views[index].mask_file is None:
             return None
-        return self._held.get(("mask", index, downscale), lambda: self._read_mask(index, downscale)).astype(np.int64)
+        ids = self._held.get(("mask", index, downscale), lambda: self._read_mask(index, downscale))
+        return self.without_left_out(ids.astype(np.int64))
 
     def K(self, index: int, downscale: int = 1) -> np.ndarray:
         """The intrinsics (3,3) float64 that belong to `image(index, downscale)`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +14,7 @@ import numpy as np
 
 from ..capture import Capture, load_capture
 from ..model.object_model import ObjectModel
+from ..objects import read_objects
 from ..protocol import InputError, Reconstruction, Reporter
 from ..training.loop import Progress, load_model, progress_of
 from ..training.scene import Scene
@@ -107,12 +108,20 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
     if options.capture:
         record(folder, capture=described(capture, max_size))
         write_cameras(folder, capture)
+    # What it was trained without, whatever the user has since chosen.
+    capture = edited(capture, folder, memory["training"].get("left_out", ()))
     zero_is_object = state["settings"]["zero_is_object"]
     scene = Scene(
         capture, model.object_ids, model.normalization, zero_is_object, memory_for_planes(options),
         teach_unlabelled=state["teach_unlabelled"],
     )  # fmt: skip
     return Trained(folder, capture, model, scene, progress_of(state))
+
+
+def edited(capture: Capture, folder: Reconstruction, left_out: Iterable[int]) -> Capture:
+    """The capture with the user's names of its objects, and without those that are left out."""
+    known = read_objects(folder.objects) if folder.objects.exists() else []
+    return capture.edited({entry.id: entry.name for entry in known}, left_out)
 
 
 def digest(capture: Capture) -> str:

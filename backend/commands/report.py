@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image
 
 from ..evaluation import comparison, write_report
+from ..objects import read_objects
 from ..protocol import Reconstruction, Reporter, read_json
 from ..raster.draw import draw
 from ..stopping import StoppingReporter
@@ -164,4 +165,9 @@ def _left_out(trained: Trained) -> list[dict[str, str]]:
         (not capture.test_indices, "quality on held-out views", "there are too few views to hold any out"),
         (bool(capture.test_indices), "LPIPS", "it needs a trained network, which is not part of this program"),
     ]  # fmt: skip
+    known = {entry.id: entry.name for entry in read_objects(folder.objects)} if folder.objects.exists() else {}
+    cases += [
+        (True, f"splats of {known.get(i, f'object {i}')}", "they were not wanted when training began")
+        for i in capture.left_out.tolist()
+    ]
     return [{"what": what, "why": why} for applies, what, why in cases if applies]

@@ -1,4 +1,4 @@
-"""`train`: begins, resumes or extends a training; leaves a checkpoint, previews and splats.ply."""
+"""`train`: begins, resumes or extends a training; leaves a checkpoint, previews, splats.ply and anchors.ply."""
 
 from __future__ import annotations
 
@@ -9,22 +9,23 @@ from typing import Any
 
 from ..capture import Capture
 from ..evaluation import IdScores, ImageScores, comparison, save_picture
-from ..export import agreement, fit_splats, write_splats
+from ..export import agreement, fit_splats, write_anchors, write_splats
 from ..labels.points import read_points
 from ..model.object_model import ObjectModel
+from ..objects import read_objects
 from ..protocol import Cancelled, InputError, Reconstruction, Reporter, plain
 from ..raster.draw import draw
 from ..stopping import StoppingReporter
 from ..training.loop import Budget, Trainer
 from ..training.scene import Scene
 from ..training.settings import Settings
-from .folder import described, digest, memory_for_planes, open_reconstruction
+from .folder import described, digest, edited, memory_for_planes, open_reconstruction
 from .record import record, record_stage, recorded, stage
 from .vote import cast_votes, votes_are_current, votes_key
 
 
 def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
-    """Train, resume or extend; leaves a checkpoint, previews and splats.ply."""
+    """Train, resume or extend; leaves a checkpoint, previews, splats.ply and anchors.ply."""
     budget = Budget(options.steps, None if options.steps else 60.0 * options.minutes)
     with open_reconstruction(options, reporter) as (folder, capture):
         trainer = _begun(folder, capture, options, reporter)
@@ -42,6 +43,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
                     "settings": trainer.settings.as_dict(),
                     "minutes": None if options.steps else options.minutes,
                     "steps": options.steps,
+                    "left_out": trainer.scene.capture.left_out.tolist(),
                     "votes": votes_key(capture, options.max_size, options.strategy, options.seed),
                 },
             )
@@ -67,7 +69,9 @@ def _begun(
         return resumed
     if not votes_are_current(folder, capture, options.max_size, options.strategy, options.seed):
         cast_votes(folder, capture, options, reporter)
-    trainer = Trainer.start(capture, read_points(folder.points).ids, settings, memory_for_planes(options))
+    capture = edited(capture, folder, _left_out(folder))
+    point_ids = capture.without_left_out(read_points(folder.points).ids)
+    trainer = Trainer.start(capture, point_ids, settings, memory_for_planes(options))
     if options.restart:
         shutil.rmtree(folder.checkpoint, ignore_errors=True)
     return trainer
@@ -77,7 +81,9 @@ def _resumed(
     folder: Reconstruction, capture: Capture, settings: Settings, options: argparse.Namespace, reporter: Reporter
 ) -> Trainer | None:
     """The training that DIR holds, or None; InputError where it was one of another capture or other choices."""
-    resumed = Trainer.resume(capture, folder.checkpoint, settings, memory_for_planes(options))
+    left_out = _left_out(folder)
+    edited_capture = edited(capture, folder, left_out)
+    resumed = Trainer.resume(edited_capture, folder.checkpoint, settings, memory_for_planes(options))
     if resumed is None:
         return None
     trainer, warning = resumed
@@ -94,7 +100,20 @@ def _resumed(
         raise InputError(f"{folder.checkpoint} was trained with --max-size {votes['max_size']}; {otherwise}")
     if votes["strategy"] != options.strategy:
         raise InputError(f"{folder.checkpoint} was trained with --strategy {votes['strategy']}; {otherwise}")
+    before = memory["training"].get("left_out", [])
+    if before != left_out:
+        without = f"without {', '.join(map(str, before))}" if before else "with all objects"
+        raise InputError(
+            f"{folder.checkpoint} was trained {without}, and {folder.objects} leaves out "
+            f"{', '.join(map(str, left_out)) or 'none'}; leave out the same, or use --restart to train anew."
+        )
     return trainer
+
+
+def _left_out(folder: Reconstruction) -> list[int]:
+    """The IDs that the user wants no splats of, ascending."""
+    known = read_objects(folder.objects) if folder.objects.exists() else []
+    return [entry.id for entry in known if entry.left_out]
 
 
 def _settings(options: argparse.Namespace) -> Settings:
@@ -149,13 +168,15 @@ def _held_out(folder: Reconstruction, reporter: StoppingReporter) -> Callable[[O
 
 
 def _export(model: ObjectModel, scene: Scene, folder: Reconstruction, reporter: Reporter) -> dict[str, Any]:
-    """Write splats.ply; returns how many splats it holds and, where they are only a fit, their PSNR to the model."""
+    """Write splats.ply and anchors.ply; returns how many they hold and, where the splats are only a fit, their PSNR to
+    the model."""
     reporter.status(f"Writing {folder.splats.name}")
+    psnr = None
     if model.explicit:
-        splats, psnr = model.splats(), None
+        splats, source = model.splats()
     else:
         capture = scene.capture
-        splats = fit_splats(model, [scene.camera(i) for i in capture.train_indices], reporter)
+        splats, source = fit_splats(model, [scene.camera(i) for i in capture.train_indices], reporter)
         views = capture.test_indices or capture.train_indices
         psnr = plain(agreement(model, splats, [scene.camera(i) for i in views]))
         where = "held-out" if capture.test_indices else "training"
@@ -166,4 +187,9 @@ def _export(model: ObjectModel, scene: Scene, folder: Reconstruction, reporter: 
         )
     for sentence in write_splats(folder.splats, splats):
         reporter.warning(sentence)
-    return {"splats": len(splats), "psnr_of_export": None if psnr is None else round(psnr, 2)}
+    write_anchors(folder.anchors, model, splats, source)
+    return {
+        "splats": len(splats),
+        "anchors": len(model.anchors),
+        "psnr_of_export": None if psnr is None else round(psnr, 2),
+    }

@@ -40,8 +40,11 @@ _UPPER = np.triu_indices((SH_DEGREE + 1) ** 2)
 _UPPER_3 = np.triu_indices(3)
 
 
-def fit_splats(model: ObjectModel, cameras: Sequence[Camera], reporter: Reporter | None = None) -> Splats:
-    """The plain splats in world units that look most like `model` through `cameras` (scene units).
+def fit_splats(
+    model: ObjectModel, cameras: Sequence[Camera], reporter: Reporter | None = None
+) -> tuple[Splats, NDArray[np.int64]]:
+    """The plain splats in world units that look most like `model` through `cameras` (scene units), and source (N,):
+    anchor * offsets + offset of each.
 
     Splats that no camera sees are left out: nothing has taught them.
     """
@@ -49,13 +52,15 @@ def fit_splats(model: ObjectModel, cameras: Sequence[Camera], reporter: Reporter
     taken = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), MAX_VIEWS)).astype(int))
     starts = range(0, len(model.anchors), _ANCHORS_AT_ONCE)
     parts: list[Splats] = []
+    sources = [np.zeros(0, np.int64)]
     for start in starts:
         sums = _Sums(model, start, min(start + _ANCHORS_AT_ONCE, len(model.anchors)))
         for done, index in enumerate(taken, 1):
             sums.add(cameras[index])
             reporter.progress(len(parts) * len(taken) + done, len(starts) * len(taken), what="views")
         parts.append(sums.splats())
-    return concatenate(parts) if parts else Splats.empty(SH_DEGREE)
+        sources.append(sums.used() + start * model.anchors.layout.offsets)
+    return concatenate(parts) if parts else Splats.empty(SH_DEGREE), np.concatenate(sources)
 
 
 def agreement(model: ObjectModel, splats: Splats, cameras: Sequence[Camera]) -> float | None:
@@ -136,9 +141,13 @@ class _Sums:
         self.normal[slots] += w[:, None] * basis[:, _UPPER[0]] * basis[:, _UPPER[1]]
         self.colour[slots] += (w[:, None] * basis)[:, :, None] * colour[:, None, :]
 
+    def used(self) -> NDArray[np.int64]:
+        """The slots, from this part's first on, of splats that some camera sees: (n,), ascending."""
+        return np.flatnonzero(self.weight > 0)
+
     def splats(self) -> Splats:
-        """The fitted splats, in world units."""
-        used = np.flatnonzero(self.weight > 0)
+        """The fitted splats, in world units, in the order of `used`."""
+        used = self.used()
         pieces = np.split(used, range(_SPLATS_AT_ONCE, len(used), _SPLATS_AT_ONCE))
         return concatenate([self._fitted(piece) for piece in pieces])
 

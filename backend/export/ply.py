@@ -52,7 +52,7 @@ def write_splats(path: Path, splats: Splats) -> list[str]:
         raise ValueError("object IDs must be from 0 to 2^32 - 1")
 
     names = property_names(splats.degree)
-    position = "f8" if _needs_double(splats) else "f4"
+    position = position_kind(splats)
     kinds = {"x": position, "y": position, "z": position, "object_id": "u4"}
     dtype = np.dtype([(name, "<" + kinds.get(name, "f4")) for name in names])
 
@@ -96,12 +96,12 @@ def _usable(means: NDArray, quats: NDArray, scales: NDArray, opacities: NDArray,
     return keep
 
 
-def _needs_double(splats: Splats) -> bool:
-    """Whether float32 positions would be off by more than 1e-6 of the extent of the splats."""
+def position_kind(splats: Splats) -> str:
+    """`f8` where float32 positions would be off by more than 1e-6 of the extent of the splats, else `f4`."""
     if len(splats) == 0 or splats.means.dtype != np.float64:
-        return False
+        return "f4"
     extent = float(np.ptp(splats.means, axis=0).max() + splats.scales.max())
-    return float(np.abs(splats.means).max()) * FLOAT32_RELATIVE_ERROR > 1e-6 * extent
+    return "f8" if float(np.abs(splats.means).max()) * FLOAT32_RELATIVE_ERROR > 1e-6 * extent else "f4"
 
 
 def read_splats(path: Path) -> tuple[Splats, list[str]]:

@@ -72,8 +72,11 @@ class ObjectModel:
                 torch.from_numpy(pick(a.ids)), self.heads, eye,
             )  # fmt: skip
 
-    def splats(self, eye: np.ndarray | None = None) -> Splats:
-        """The whole model as plain splats in world units. In `view` mode as seen from `eye` (scene units)."""
+    def splats(self, eye: np.ndarray | None = None) -> tuple[Splats, np.ndarray]:
+        """The whole model as plain splats in world units, and source (N,) int64: anchor * offsets + offset of each.
+
+        In `view` mode as seen from `eye` (scene units).
+        """
         g = self.generate(eye=eye)
         quats = g.quats.double().numpy()
         norm = np.linalg.norm(quats, axis=1, keepdims=True)
@@ -86,7 +89,8 @@ class ObjectModel:
             sh=g.sh.numpy(),
             object_ids=self.object_ids[g.ids.numpy()],
         )
-        return splats if usable.all() else splats.select(usable)
+        source = g.source.numpy()
+        return (splats, source) if usable.all() else (splats.select(usable), source[usable])
 
 
 @njit(parallel=True, cache=True, error_model="numpy")

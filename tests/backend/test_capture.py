@@ -282,7 +282,7 @@ def test_undistorted_masks_are_the_pinholes(write_capture, tmp_path, name):
         path.with_suffix(".png").unlink()
         np.save(path, scene.ids[index].astype(np.uint32))
     capture = load_capture(scene.folder, tmp_path / "cache")
-    assert capture.object_ids.tolist() == [1, 70_000, 4_000_000_000]
+    assert capture.object_ids.tolist() == [1, 2, 5]
     for index, view in enumerate(capture.views):
         x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
         rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(view.K).T
@@ -955,3 +955,17 @@ def test_masks_read_alone_decide_by_themselves(tmp_path):
     Image.fromarray(np.full((4, 4, 3), 7, np.uint8)).save(tmp_path / "grey.png")
     assert read_mask(tmp_path / "grey.png").tolist() == [[7] * 4] * 4
     assert read_mask(tmp_path / "grey.png", colour=True)[0, 0] == 7 * 0x10101
+
+
+def test_an_edited_capture_shows_ids_that_are_left_out_as_0(write_capture, tmp_path):
+    scene = write_capture()
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    edited = capture.edited({5: "cup"}, [2])
+    assert capture.object_ids.tolist() == [1, 2, 5] and len(capture.left_out) == 0
+    assert edited.object_ids.tolist() == [1, 5]
+    assert edited.names == {1: "sphere 1", 5: "cup"}
+    for index in range(len(capture)):
+        ids = capture.mask(index)
+        np.testing.assert_array_equal(edited.mask(index), np.where(ids == 2, 0, ids))
+        assert edited.ids_in(index) == tuple(np.unique(edited.mask(index)).tolist())
+        assert edited.image(index) is capture.image(index), "decoded once"

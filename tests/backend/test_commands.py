@@ -28,6 +28,7 @@ from backend.export.fit import sh_basis
 from backend.labels import read_points
 from backend.model.checkpoint import CURRENT, PREVIOUS, load_checkpoint
 from backend.objects import edit_objects, read_objects
+from backend.ply import read_vertices
 from backend.protocol import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, EXIT_FAILED, InputError
 from backend.raster.reference import sh_colors
 from backend.training.loop import Trainer
@@ -136,6 +137,10 @@ def test_the_whole_chain(write_capture, tmp_path, ask, masks):
     ended = ask("train", capture, "--out", out, "--steps", 20, *SMALL, "--json")
     assert ended.code == EXIT_DONE and ended.events[-1]["steps"] == 20
     assert (ended.events[-1]["miou"] is not None) is masks
+    measured = [event for event in ended.events if event["type"] == "quality"]
+    assert [event["step"] for event in measured] == sorted({event["step"] for event in measured})
+    assert measured[-1]["step"] == 20 and all(event["psnr"] > 5 and event["seconds"] >= 0 for event in measured)
+    assert all((event["miou"] is not None) is masks and "mbiou" in event for event in measured)
     previews = [event["path"] for event in ended.events if event["type"] == "preview"]
     assert previews and all(Path(path).exists() for path in previews)
     splats, warnings = read_splats(out / "splats.ply")
@@ -186,6 +191,33 @@ def test_terminal_output_says_each_thing_once(write_capture, tmp_path, ask):
     lines = answer.err.splitlines() + [line for line in answer.out.splitlines() if not line.startswith("  ")]
     assert len(lines) == len(set(lines)), lines
     assert answer.err.count("have no mask") == 1
+
+
+@pytest.mark.parametrize(("mode", "far"), [("explicit", 0), ("explicit", 1e6), ("view", 0)])
+def test_anchors_say_where_the_splats_come_from(write_capture, tmp_path, ask, mode, far):
+    scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
+    for viewmat in scene.viewmats:
+        viewmat[:3, 3] -= viewmat[:3, :3] @ np.full(3, far)
+    scene.xyz += far
+    write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
+    answer = ask("train", scene.folder, "--out", out, "--steps", 40, "--mode", mode, *SMALL, "--json")
+    assert answer.code == EXIT_DONE
+    anchors, splats = read_vertices(out / "anchors.ply"), read_vertices(out / "splats.ply")
+    names = ("x", "y", "z", "object_id", "scale_0", "scale_1", "scale_2", "opacity", "splats")
+    assert anchors.dtype.names == names and anchors.dtype["splats"] == anchors.dtype["object_id"] == np.uint32
+    assert anchors.dtype["x"] == splats.dtype["x"] == (np.float64 if far else np.float32)
+    exported = json.loads((out / "objectgs.json").read_text())["export"]
+    assert len(anchors) == exported["anchors"] == answer.events[-1]["anchors"]
+    assert anchors["splats"].sum() == len(splats) == exported["splats"] and 0 < anchors["splats"].max() <= 4
+    for i in np.unique(anchors["object_id"]):
+        assert anchors["splats"][anchors["object_id"] == i].sum() == (splats["object_id"] == i).sum()
+    opacity = 1 / (1 + np.exp(-splats["opacity"].astype(float)))
+    assert (anchors["opacity"] * anchors["splats"]).sum() == pytest.approx(opacity.sum(), rel=1e-3)
+    xyz = np.stack([anchors[axis] for axis in "xyz"], 1) - far
+    nearest = np.linalg.norm(xyz[:, None] - (scene.xyz - far), axis=2).min(1)
+    assert nearest.max() < 0.5, "anchors stand where points are"
+    scale = np.stack([anchors[f"scale_{i}"] for i in range(3)], 1)
+    assert np.isfinite(scale).all() and (scale > 1e-3).all() and (scale < 2).all()
 
 
 def test_a_view_dependent_model_trains_evaluates_and_exports_a_fit(write_capture, tmp_path, ask):
@@ -276,6 +308,57 @@ def test_an_import_of_another_capture_does_not_pass_for_the_trained_one(trained,
     assert ask("evaluate", out, "--capture", capture).code == EXIT_DONE
     assert cameras_of(out)["capture"] == str(capture.resolve())
     assert ask("train", other, "--out", out, "--steps", 5, *SMALL, "--restart").code == EXIT_DONE
+
+
+# --- the user's edits ------------------------------------------------------------------------------------------------
+
+
+def test_an_object_that_is_left_out_is_in_no_splat(write_capture, tmp_path, ask):
+    capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"
+    assert ask("vote", capture, "--out", out).code == EXIT_DONE
+    edit_objects(out / "objects.json", {2: {"left_out": True}, 5: {"name": "planet"}})
+    assert ask("vote", capture, "--out", out).code == EXIT_DONE
+    assert 2 in read_points(out / "points.ply").ids and read_objects(out / "objects.json")[1].points > 0
+    train = ("train", capture, "--out", out, *SMALL)
+    ended = ask(*train, "--steps", 20, "--json")
+    assert ended.code == EXIT_DONE
+    assert set(read_splats(out / "splats.ply")[0].object_ids.tolist()) <= {0, 1, 5}
+    assert set(read_vertices(out / "anchors.ply")["object_id"].tolist()) <= {0, 1, 5}
+    assert json.loads((out / "objectgs.json").read_text())["training"]["left_out"] == [2]
+
+    edit_objects(out / "objects.json", {2: {"left_out": None}})
+    refused(ask(*train, "--steps", 30), "without 2", "objects.json leaves out none", "--restart")
+    assert ask("evaluate", out).code == EXIT_DONE and ask("report", out).code == EXIT_DONE
+    report = json.loads((out / "report.json").read_text())
+    assert [(entry["id"], entry["name"]) for entry in report["objects"]] == [(1, "sphere 1"), (5, "planet")]
+    assert all(entry["iou"] is not None for entry in report["objects"])
+    assert any(entry["what"] == "splats of sphere 2" for entry in report["left_out"])
+    assert ask("render", out, "--ids").code == EXIT_DONE
+
+    edit_objects(out / "objects.json", {2: {"left_out": True}})
+    assert ask(*train, "--steps", 25).code == EXIT_DONE and step_of(out) == 25
+    edit_objects(out / "objects.json", {2: {"left_out": False}})
+    assert ask(*train, "--steps", 20, "--restart").code == EXIT_DONE
+    assert 2 in read_splats(out / "splats.ply")[0].object_ids
+    edit_objects(out / "objects.json", {1: {"left_out": True}})
+    refused(ask(*train, "--steps", 30), "with all objects", "leaves out 1", "--restart")
+
+
+def test_all_objects_may_be_left_out(write_capture, tmp_path, ask):
+    capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"
+    assert ask("vote", capture, "--out", out).code == EXIT_DONE
+    edit_objects(out / "objects.json", {i: {"left_out": True} for i in (1, 2, 5)})
+    for words in (("train", capture, "--out", out, "--steps", 10, *SMALL), ("evaluate", out), ("report", out)):
+        assert ask(*words).code == EXIT_DONE
+    assert set(read_splats(out / "splats.ply")[0].object_ids.tolist()) == {0}
+    assert json.loads((out / "report.json").read_text())["quality"]["miou"] is None
+
+
+def test_a_merge_is_a_view_that_training_ignores(trained, ask):
+    capture, out = trained
+    edit_objects(out / "objects.json", {1: {"merged_into": 2}})
+    assert ask("train", capture, "--out", out, "--steps", 25, *SMALL).code == EXIT_DONE
+    assert {1, 2} <= set(read_splats(out / "splats.ply")[0].object_ids.tolist())
 
 
 # --- going on --------------------------------------------------------------------------------------------------------
@@ -529,7 +612,8 @@ def test_a_disk_full_while_a_checkpoint_is_written(trained, ask, full_disk_for, 
 
 @pytest.mark.parametrize(
     ("command", "ending"),
-    [("train", "splats.ply"), ("train", "latest.png"), ("train", "objectgs.json"), ("evaluate", "evaluation.json"),
+    [("train", "splats.ply"), ("train", "anchors.ply"), ("train", "latest.png"),
+     ("train", "cameras.json"), ("train", "objectgs.json"), ("evaluate", "evaluation.json"),
      ("render", "view_000.png"), ("render", "view_000.ids.png"), ("report", "report.md")],
 )  # fmt: skip
 def test_a_disk_full_at_any_other_file(trained, ask, full_disk_for, command, ending):
@@ -539,8 +623,10 @@ def test_a_disk_full_at_any_other_file(trained, ask, full_disk_for, command, end
     full_disk_for(out, ending)
     refused(ask(*words, *(["--ids"] if command == "render" else [])), ending, "No space left on device", "free some")
     no_halves(out)
-    assert step_of(out) == {"splats.ply": 25, "latest.png": 23}.get(ending, 20), "what was trained is kept"
-    assert (out / "splats.ply").read_bytes() == before
+    assert step_of(out) == {"splats.ply": 25, "anchors.ply": 25, "latest.png": 23}.get(ending, 20), (
+        "what was trained is kept"
+    )
+    assert ((out / "splats.ply").read_bytes() == before) is (ending != "anchors.ply")
 
 
 def test_a_disk_full_from_the_start_leaves_no_folder(write_capture, tmp_path, ask, full_disk_for):
@@ -832,15 +918,17 @@ def test_a_model_that_does_not_look_at_the_view_is_fitted_exactly(write_capture,
         trainer.step(i / 30)
     model = trainer.model
     cameras = [trainer.scene.camera(i) for i in range(len(capture.views))]
-    assert 20 < agreement(model, fit_splats(model, cameras), cameras) < 60
+    assert 20 < agreement(model, fit_splats(model, cameras)[0], cameras) < 60
     with torch.no_grad():
         model.heads.hidden.weight[:, -4:] = 0.0
-    splats = fit_splats(model, cameras)
+    splats, source = fit_splats(model, cameras)
     assert agreement(model, splats, cameras) > 60
     assert set(splats.object_ids.tolist()) <= {0, 1, 2, 5}
     monkeypatch.setattr("backend.export.fit._ANCHORS_AT_ONCE", 50)
     monkeypatch.setattr("backend.export.fit._SPLATS_AT_ONCE", 70)
-    parts = fit_splats(model, cameras)
+    parts, again = fit_splats(model, cameras)
+    np.testing.assert_array_equal(again, source)
+    assert (model.object_ids[model.anchors.ids[source // 4]] == splats.object_ids).all()
     for name in ("means", "quats", "scales", "opacities", "sh", "object_ids"):
         np.testing.assert_array_equal(getattr(parts, name), getattr(splats, name))
     assert agreement(model, splats, []) is None

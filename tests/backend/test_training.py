@@ -405,7 +405,7 @@ def test_explicit_splats_are_the_model(tiny):
         trainer.step(i / 20)
     index = capture.test_indices[0]
     shown = draw(trainer.model, trainer.scene.camera(index))
-    splats = trainer.model.splats()
+    splats, _ = trainer.model.splats()
     view = capture.views[index]
     camera = Camera(view.viewmat, view.K, view.width, view.height, near=0.01 / trainer.model.normalization.scale)
     tensors = [torch.from_numpy(np.asarray(a, np.float32)) for a in
