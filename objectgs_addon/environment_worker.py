@@ -359,10 +359,11 @@ class Pip:
         if self._run(command, lambda: self._tick(megabytes)) != 0:
             raise Refused(why_pip_failed(self.lines))
 
-    def offers(self, index: str, requirement: str, build: str) -> bool:
-        """Whether an index has this build of a package; an index that is not reached costs a few seconds."""
+    def offers(self, requirement: str, build: str, index: str | None = None) -> bool:
+        """Whether the user's indexes, or another one, have this build; one that is not reached costs a few seconds."""
         name, _, version = requirement.partition("==")
-        self._run(["index", "versions", name, "--index-url", index, "--retries", "0", "--timeout", str(PROBE_SECONDS)])
+        where = ["--index-url", index] if index else []
+        self._run(["index", "versions", name, *where, "--retries", "0", "--timeout", str(PROBE_SECONDS)])
         return any(re.search(rf"\b{re.escape(version)}\+{build}", line) for line in self.lines)
 
     def _run(self, arguments: list[str], on_tick=lambda: None) -> int:
@@ -520,9 +521,9 @@ def _to_stderr(line: str) -> None:
 def _build(pip: Pip, torch: str, device: str) -> list[str]:
     """pip's options for the build of PyTorch that fits; on the usual index Linux has CUDA's and Windows the CPU's."""
     build = {("Linux", "cpu"): "cpu", ("Windows", "cuda"): "cu130"}.get((platform.system(), device))
-    if build is None:
+    if build is None or pip.offers(torch, build):
         return []
-    if pip.offers(WHEELS + build, torch, build):
+    if pip.offers(torch, build, WHEELS + build):
         return ["--extra-index-url", WHEELS + build]
     if device == "cuda":
         say("warning", message="PyTorch's builds for NVIDIA GPUs could not be reached, so the one for processors is "

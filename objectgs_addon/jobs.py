@@ -126,7 +126,7 @@ class Job:
             self._process.stop()
             self._stop_asked = time.monotonic()
             self._shift_clock()
-            self._set(State.STOPPING, "Stopping: saving what is there")
+            self._set(State.STOPPING, "Stopping")
 
     def kill(self) -> None:
         """End it at once; what it saved last is kept."""

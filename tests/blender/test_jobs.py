@@ -15,7 +15,7 @@ from objectgs.objectgs_addon.backend_process import BackendProcess, backend_comm
 from objectgs.objectgs_addon.jobs import Job, JobQueue, State, lock_holder, run_blocking
 
 posix = pytest.mark.skipif(os.name != "posix", reason="signals and niceness are POSIX's")
-WAIT = 10.0
+WAIT = 30.0
 
 PRELUDE = """
 import json, os, signal, sys, time
