@@ -540,7 +540,7 @@ def _brings_cuda(pip: Pip) -> bool:
 def probe(options: argparse.Namespace, stop: StopRequest) -> None:
     """Look whether this Python has the backend's packages, then try the backend with it."""
     check_python()
-    missing = []
+    missing, other = [], []
     for name in REQUIREMENTS:
         for line in requirement_lines(options.requirements / name):
             package, _, wanted = line.partition("==")
@@ -550,11 +550,13 @@ def probe(options: argparse.Namespace, stop: StopRequest) -> None:
                 missing.append(package)
                 continue
             if found.partition("+")[0] != wanted:
-                say("warning", message=f"{package} is version {found}; ObjectGS was tested with {wanted}.")
+                other.append(f"{package} is version {found}; ObjectGS was tested with {wanted}.")
     if missing:
         files = " ".join(f'-r "{options.requirements / name}"' for name in REQUIREMENTS)
         raise Refused(f"{sys.executable} lacks {' and '.join(filter(None, [', '.join(missing[:-1]), missing[-1]]))}; "
                       f"install them (pip install {files}) or choose another Python.")
+    for sentence in other:
+        say("warning", message=sentence)
     progress = Progress({"check": 60})
     progress.begin("check", "Checking the backend")
     checked = check_backend(Path(sys.executable), progress, stop)
