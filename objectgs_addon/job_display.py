@@ -3,10 +3,14 @@
 
 import textwrap
 
+import bpy
+
 from .jobs import Job, State
 
-LINE = 46
-"""Characters in a line of the sidebar."""
+CHARACTER = 6.6
+"""Width of a character in pixels, at Blender's usual size."""
+AROUND = 60.0
+"""Pixels of a line that borders and an icon take."""
 
 
 def duration(seconds: float) -> str:
@@ -44,7 +48,7 @@ def draw_running(layout, job: Job, index: int) -> None:
     if job.state is not State.STOPPING:
         row.operator("objectgs.stop_job", text="", icon="X").index = index
     if job.message and job.state is not State.WAITING:
-        layout.label(text=f"{job.title}: {job.message}")
+        write(layout, f"{job.title}: {job.message}")
     draw_figures(layout, job)
 
 
@@ -75,8 +79,10 @@ def draw_over(layout, job: Job) -> None:
 
 
 def write(layout, text: str, icon: str = "NONE") -> None:
-    """`text` in as many lines as it needs."""
+    """`text` in as many lines as it needs in the region that is being drawn."""
+    scale = bpy.context.preferences.system.ui_scale
+    width = max(20, int((bpy.context.region.width / scale - AROUND) / CHARACTER))
     column = layout.column(align=True)
-    for line in textwrap.wrap(text, LINE):
+    for line in textwrap.wrap(text, width):
         column.label(text=line, icon=icon)
         icon = "BLANK1"

@@ -13,7 +13,7 @@ class ObjectList(bpy.types.UIList):
     layers = {}
     """Object ID -> layer collection: looked for once a redraw, since every row asks."""
 
-    def draw_item(self, _context, layout, root_properties, item, _icon, _active, _property, _index=0, _flag=0):
+    def draw_item(self, _context, layout, _properties, item, _icon, _active, _property, _index=0, _flag=0):
         row = layout.row(align=True)
         swatch = row.row()
         swatch.ui_units_x = 0.8
@@ -24,7 +24,7 @@ class ObjectList(bpy.types.UIList):
         numbers = row.row()
         numbers.alignment = "RIGHT"
         numbers.active = False
-        numbers.label(text=_counts(item, root_properties))
+        numbers.label(text=_count(item))
         row.prop(item, "chosen", text="", icon="CHECKBOX_HLT" if item.chosen else "CHECKBOX_DEHLT", emboss=False)
         layer = ObjectList.layers.get(object_edits.from_stored(item.object_id))
         if layer is None:
@@ -43,14 +43,21 @@ class ObjectList(bpy.types.UIList):
         return wanted, order
 
 
-def _counts(item, properties) -> str:
+def describe(item, properties) -> str:
+    """A row's numbers in words."""
     object_id = object_edits.from_stored(item.object_id)
+    words = [f"ID {object_id}", f"{item.points:,} points"]
+    if item.splats:
+        words.append(f"{item.splats:,} splats")
     if item.is_merged:
         into = next((other.name for other in properties.objects if other.object_id == item.merged_into), "?")
-        return f"{object_id} in {into}"
-    if item.splats:
-        return f"{object_id}:  {_short(item.splats)} splats"
-    return f"{object_id}:  {_short(item.points)} points"
+        words.append(f"part of {into}")
+    return ", ".join(words)
+
+
+def _count(item) -> str:
+    """Splats, or points where there are none yet."""
+    return "" if item.is_merged else _short(item.splats or item.points)
 
 
 def _short(count: int) -> str:

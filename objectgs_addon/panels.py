@@ -7,6 +7,7 @@ from ..backend.protocol import Reconstruction
 from . import jobs, locations, previews, running, scene
 from .folder_state import folder_state
 from .job_display import draw_over, draw_running, duration, summary, write
+from .object_list import describe
 
 
 class _Tab:
@@ -145,6 +146,8 @@ class ObjectsPanel(_WithReconstruction, bpy.types.Panel):
         column.operator("objectgs.split_objects", text="", icon="UNLINKED")
         column.separator()
         column.operator_menu_enum("objectgs.choose_objects", "which", text="", icon="CHECKBOX_HLT")
+        if 0 <= properties.active_object < len(properties.objects):
+            write(layout, describe(properties.objects[properties.active_object], properties))
         left_out = sum(not item.chosen for item in properties.objects)
         if left_out:
             layout.label(text=f"{left_out} of {len(properties.objects)} are left out when training")

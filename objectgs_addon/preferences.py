@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The add-on's preferences: where the compute backend is, and where reconstructions go."""
 
-import textwrap
-
 import bpy
 from bpy.props import EnumProperty, StringProperty
 
@@ -21,19 +19,21 @@ class Preferences(bpy.types.AddonPreferences):
         name="Backend's Python", subtype="FILE_PATH",
         description="A Python that has the backend's packages already; empty: the one that Set Up Backend makes")
     base_python: StringProperty(
-        name="Made From", subtype="FILE_PATH",
+        name="Base Python", subtype="FILE_PATH",
         description="Python 3.11 to 3.13 that a new environment is made from; empty: Blender's own")
     reconstructions: StringProperty(
         name="Reconstructions", subtype="DIR_PATH",
         description="Where reconstructions are saved unless said otherwise; empty: in the extension's user folder")
 
-    def draw(self, context):
+    def draw(self, _context):
         layout = self.layout
         box = layout.box()
         box.label(text="Compute Backend", icon="SYSTEM")
-        _draw_state(box, context)
+        _draw_state(box)
         row = box.row()
         row.prop(self, "device", expand=True)
+        if not bpy.app.online_access:
+            box.label(text="To download it, allow online access: Preferences > System > Network", icon="INFO")
         row = box.row()
         row.operator("objectgs.set_up_backend", icon="IMPORT")
         row.operator("objectgs.check_backend", icon="CHECKMARK")
@@ -47,16 +47,14 @@ class Preferences(bpy.types.AddonPreferences):
         column.prop(self, "reconstructions")
 
 
-def _draw_state(layout, context) -> None:
+def _draw_state(layout) -> None:
     """Whether the backend works, or what goes on about it."""
     job = running.queue.of_folder(locations.environment_folder())
     if job is not None and not job.is_finished:
         job_display.draw_running(layout, job, running.queue.jobs.index(job))
         return
     sentence, icon = backend_state()
-    for line in textwrap.wrap(sentence, max(40, context.region.width // 9)):
-        layout.label(text=line, icon=icon)
-        icon = "BLANK1"
+    job_display.write(layout, sentence, icon)
     if job is not None:
         job_display.draw_over(layout, job)
 

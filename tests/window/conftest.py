@@ -3,12 +3,11 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from . import harness
-
-BACKEND = sys.executable
 
 
 @pytest.fixture(scope="session")
@@ -31,12 +30,7 @@ def blender(request, tmp_path_factory, extension_zip):
     running = harness.Blender(command, variables, tmp_path_factory.mktemp("blender"), shots)
     try:
         running.wait_for("True", timeout=120)
-        running.run(f"""
-            bpy.context.preferences.view.show_splash = False
-            bpy.ops.extensions.package_install_files(
-                filepath={str(extension_zip)!r}, repo="user_default", enable_on_install=True)
-            preferences = bpy.context.preferences.addons["bl_ext.user_default.objectgs"].preferences
-        """)
+        running.install(extension_zip, Path(sys.executable))
         yield running
     finally:
         running.close()

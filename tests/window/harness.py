@@ -12,6 +12,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 SIZE = (1600, 900)
+PACKAGE = "bl_ext.user_default.objectgs"
 
 
 def blenders() -> dict[str, tuple[list[str], dict[str, str]]]:
@@ -54,6 +55,18 @@ class Blender:
             [*command, "--window-geometry", "0", "0", str(SIZE[0]), str(SIZE[1]), "--python",
              str(Path(__file__).with_name("driver.py")), "--", str(self.scripts)],
             cwd=ROOT, env=environment, stdout=self._log, stderr=subprocess.STDOUT, start_new_session=True)
+
+    def install(self, archive: Path, backend_python: Path) -> None:
+        """Install the extension's zip, say which Python has the backend, and begin with an empty scene."""
+        self.key("Escape")  # The splash screen.
+        self.run(f"""
+            bpy.ops.extensions.package_install_files(
+                filepath={str(archive)!r}, repo="user_default", enable_on_install=True)
+            preferences = bpy.context.preferences.addons["{PACKAGE}"].preferences
+            preferences.backend_python = {str(backend_python)!r}
+            for thing in list(bpy.data.objects):
+                bpy.data.objects.remove(thing)
+        """, timeout=120)
 
     def run(self, script: str, timeout: float = 60.0):
         """Execute a script inside Blender and return its variable `result`."""

@@ -1,0 +1,104 @@
+"""How long Blender's main thread is blocked while training runs, and while a million splats come in.
+
+A timer inside a Blender with a window should tick every 10 ms; its longest gap is what the user feels. Needs a Blender
+that tests/window can drive, the extension's zip (make zip) and a capture:
+
+    .venv/bin/python benchmarks/window.py build/demo/capture [--json]
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from tests.window import harness
+
+PACKAGE = "bl_ext.user_default.objectgs"
+NAMES = f"""
+from {PACKAGE}.objectgs_addon import running, scene
+owner = bpy.context.scene
+root = owner.objectgs.active
+"""
+START = """
+import time
+gaps = bpy.app.driver_namespace["gaps"] = []
+bpy.app.driver_namespace["last"] = time.perf_counter()
+def tick():
+    now = time.perf_counter()
+    gaps.append(now - bpy.app.driver_namespace["last"])
+    bpy.app.driver_namespace["last"] = now
+    return 0.01
+bpy.app.driver_namespace["tick"] = tick
+bpy.app.timers.register(tick)
+"""
+STOP = """
+bpy.app.timers.unregister(bpy.app.driver_namespace["tick"])
+gaps = sorted(bpy.app.driver_namespace["gaps"])
+result = {"ticks": len(gaps), "median_ms": 1000 * gaps[len(gaps) // 2], "p99_ms": 1000 * gaps[int(0.99 * len(gaps))],
+          "longest_ms": 1000 * gaps[-1]}
+"""
+
+
+def measure(name: str, command, variables, capture: Path, archive: Path, seconds: float) -> dict[str, dict[str, float]]:
+    """Gaps of the timer in one Blender: at rest, while training runs, and how long the result takes to come in."""
+    place = Path(tempfile.mkdtemp(prefix="objectgs-window-"))
+    blender = harness.Blender(command, variables, place, place / "shots", ":96")
+    found: dict[str, dict[str, float]] = {}
+    try:
+        blender.wait_for("True", timeout=120)
+        blender.install(archive, Path(sys.executable))
+        blender.run(START)
+        time.sleep(10)
+        found["at rest"] = blender.run(STOP)
+        blender.run(
+            NAMES + f"bpy.ops.objectgs.import_capture(directory={str(capture)!r}, folder={str(place / 'out')!r})"
+        )
+        wait(blender, "owner.objectgs.active is not None")
+        blender.run(NAMES + f"root.objectgs.minutes = {seconds / 60}; bpy.ops.objectgs.train()")
+        wait(blender, "running.queue.running is not None and running.queue.running.step")
+        blender.run(START)
+        wait(blender, "running.queue.running is None or running.queue.running.progress > 0.98", 1.0)
+        found["training"] = blender.run(STOP)
+    finally:
+        blender.close()
+    return found
+
+
+def wait(blender: harness.Blender, expression: str, interval: float = 0.5) -> None:
+    """Until an expression is true inside Blender."""
+    for _ in range(1000):
+        if blender.run(NAMES + f"result = bool({expression})"):
+            return
+        time.sleep(interval)
+    raise harness.Failed(f"it never became true: {expression}")
+
+
+def main() -> None:
+    """Measure in every Blender that is here."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--seconds", type=float, default=60.0, help="length of the training")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    archive = max((harness.ROOT / "build").glob("objectgs-*.zip"), key=lambda path: path.stat().st_mtime)
+    results = {
+        name: measure(name, *how, options.capture.resolve(), archive, options.seconds)
+        for name, how in harness.blenders().items()
+    }
+    if options.json:
+        print(json.dumps(results))
+        return
+    for name, found in results.items():
+        for when, gaps in found.items():
+            print(
+                f"Blender {name}, {when}: longest {gaps['longest_ms']:.0f} ms, 99 % below {gaps['p99_ms']:.0f} ms, "
+                f"median {gaps['median_ms']:.0f} ms of {gaps['ticks']:.0f} ticks"
+            )
+
+
+if __name__ == "__main__":
+    main()

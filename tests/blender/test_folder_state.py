@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How far a reconstruction folder is, from its files alone."""
+
+import json
+import struct
+
+import pytest
+
+pytest.importorskip("bpy")
+
+from objectgs.objectgs_addon.folder_state import folder_state
+
+
+def write_checkpoint(folder, step, seconds):
+    """The header of a safetensors file, as the backend writes it; no tensors."""
+    state = json.dumps({"format": 1, "progress": {"step": step, "seconds": seconds}})
+    header = json.dumps({"__metadata__": {"state": state}}).encode()
+    (folder / "checkpoint").mkdir(exist_ok=True)
+    (folder / "checkpoint" / "model.safetensors").write_bytes(struct.pack("<Q", len(header)) + header)
+
+
+def test_a_folder_that_is_gone(tmp_path):
+    state = folder_state(tmp_path / "gone")
+    assert not state.exists and not state.imported and state.capture is None and state.steps == 0
+
+
+def test_each_step_is_seen(tmp_path):
+    folder = tmp_path / "rec"
+    folder.mkdir()
+    assert folder_state(folder).exists and not folder_state(folder).imported
+    (folder / "points.ply").write_bytes(b"ply")
+    (folder / "cameras.json").write_text(json.dumps({"capture": "/somewhere/else", "cameras": []}))
+    state = folder_state(folder)
+    assert state.imported and str(state.capture) == "/somewhere/else" and not state.voted
+    (folder / "objects.json").write_text("{}")
+    write_checkpoint(folder, 700, 12.5)
+    state = folder_state(folder)
+    assert state.voted and (state.steps, state.seconds) == (700, 12.5) and not state.trained
+    (folder / "splats.ply").write_bytes(b"ply")
+    assert folder_state(folder).trained
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff" * 8, b"\x05\0\0\0\0\0\0\0{\"a\":", struct.pack("<Q", 2) + b"{}"])
+def test_broken_files_count_as_nothing(tmp_path, content):
+    (tmp_path / "checkpoint").mkdir()
+    (tmp_path / "checkpoint" / "model.safetensors").write_bytes(content)
+    (tmp_path / "cameras.json").write_text("{nonsense")
+    state = folder_state(tmp_path)
+    assert state.steps == 0 and state.capture is None

@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Which point a click takes."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("bpy")
+
+from objectgs.objectgs_addon.picking import nearest
+
+SIZE = (200, 100)
+
+
+def perspective(near=0.1, far=100.0):
+    """A camera at the origin that looks along -Z, 90 degrees wide: world to clip space."""
+    aspect = SIZE[0] / SIZE[1]
+    return np.array([[1, 0, 0, 0], [0, aspect, 0, 0],
+                     [0, 0, -(far + near) / (far - near), -2 * far * near / (far - near)], [0, 0, -1, 0]])
+
+
+def test_a_click_takes_the_point_under_it():
+    points = np.array([[0.0, 0, -5], [1, 0, -5]])
+    assert nearest(points, perspective(), SIZE, np.array([100, 50]), 12) == 0
+    assert nearest(points, perspective(), SIZE, np.array([121, 51]), 12) == 1
+    assert nearest(points, perspective(), SIZE, np.array([160, 80]), 12) is None
+
+
+def test_the_point_in_front_hides_the_one_behind():
+    points = np.array([[0.0, 0, -9], [0.02, 0, -3]])
+    assert nearest(points, perspective(), SIZE, np.array([100, 50]), 12) == 1
+
+
+def test_points_behind_the_eye_and_no_points_are_never_taken():
+    points = np.array([[0.0, 0, 5], [np.nan, 0, -5], [0, 0, 0]])
+    assert nearest(points, perspective(), SIZE, np.array([100, 50]), 12) is None
+    assert nearest(np.zeros((0, 3)), perspective(), SIZE, np.array([100, 50]), 12) is None
