@@ -12,7 +12,7 @@ from . import carrier, preview
 from .kinds import POINTS, mark, part_of, points_of
 from .objects_file import Objects, linear_colours
 
-SIZE = 0.0025
+SIZE = 0.004
 """Radius of a point relative to the diagonal of the box that holds the middle 90 percent of the points."""
 
 COLOURINGS = ("photo", "object")

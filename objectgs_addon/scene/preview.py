@@ -20,6 +20,9 @@ SMALLEST_ALPHA = 1.0 / 255.0
 FLATTEST = 1e-3
 """Smallest scale of a splat relative to its largest: flatter ellipsoids have no surface that a ray could meet."""
 
+LARGEST_NEARNESS = 0.9
+"""Squared radius of a splat over its distance from the camera, both in sigmas; nearer ones are not rendered."""
+
 BALL_FACES = 0.9341
 """How near to the centre the faces come of an icosphere of 80 faces and radius 1."""
 
@@ -57,22 +60,38 @@ class Graph:
         node = self.node("GeometryNodeInputNamedAttribute", {"Name": name}, data_type=kind)
         return next(socket for socket in node.outputs if socket.enabled and socket.name == "Attribute")
 
+    def separated(self, vector) -> list[bpy.types.NodeSocket]:
+        """The three numbers of a vector."""
+        return list(self.node("ShaderNodeSeparateXYZ", {0: vector}).outputs)
+
+    def rotated(self, vector, rotation) -> bpy.types.NodeSocket:
+        """A vector turned by a rotation (geometry nodes)."""
+        return self.node("FunctionNodeRotateVector", {"Vector": vector, "Rotation": rotation}).outputs[0]
+
+    def store(self, geometry, name: str, kind: str, value) -> bpy.types.NodeSocket:
+        """The geometry with a named attribute of its points (geometry nodes)."""
+        return self.node("GeometryNodeStoreNamedAttribute", {"Geometry": geometry, "Name": name, "Value": value},
+                         data_type=kind, domain="POINT").outputs[0]
+
+    def removed(self, geometry, pattern: str) -> bpy.types.NodeSocket:
+        """The geometry without attributes of this name, which may hold a `*` (geometry nodes)."""
+        node = self.node("GeometryNodeRemoveAttribute", {"Geometry": geometry, "Name": pattern})
+        if hasattr(node, "pattern_mode"):
+            node.pattern_mode = "WILDCARD"
+        elif "Pattern Mode" in node.inputs:  # Blender 5.0 on
+            node.inputs["Pattern Mode"].default_value = "Wildcard"
+        return node.outputs[0]
+
     def arrange(self) -> None:
         """Place nodes in columns from left to right by how far from an input they are."""
-        depth: dict = {}
-        for node in self.tree.nodes:
-            depth[node] = 0
-        for _ in range(len(self.tree.nodes)):
-            changed = False
-            for link in self.tree.links:
-                if depth[link.to_node] <= depth[link.from_node]:
-                    depth[link.to_node] = depth[link.from_node] + 1
-                    changed = True
-            if not changed:
-                break
+        into: dict[str, list[str]] = {node.name: [] for node in self.tree.nodes}
+        for link in self.tree.links:
+            into[link.to_node.name].append(link.from_node.name)
+        columns: dict[str, int] = {}
         rows: dict[int, int] = {}
-        for node in self.tree.nodes:
-            column = depth[node]
+        for node in self.tree.nodes:  # A node is made after those it is linked to.
+            column = max((columns.get(name, -1) + 1 for name in into[node.name]), default=0)
+            columns[node.name] = column
             node.location = (220.0 * column, -180.0 * rows.get(column, 0))
             rows[column] = rows.get(column, 0) + 1
 
@@ -142,8 +161,7 @@ def _make_points_group(name: str) -> bpy.types.NodeTree:
     colour = graph.node("GeometryNodeSwitch", {
         "Switch": given.outputs["By Object"], "False": graph.attribute("photo", "FLOAT_COLOR"),
         "True": graph.attribute("object", "FLOAT_COLOR")}, input_type="RGBA").outputs[0]
-    coloured = graph.node("GeometryNodeStoreNamedAttribute", data_type="FLOAT_COLOR", domain="POINT", inputs={
-        "Geometry": given.outputs["Geometry"], "Name": "colour", "Value": colour}).outputs[0]
+    coloured = graph.store(given.outputs["Geometry"], "colour", "FLOAT_COLOR", colour)
     shape = graph.node("GeometryNodeMeshUVSphere", {
         "Segments": 4, "Rings": 2, "Radius": given.outputs["Size"]}).outputs["Mesh"]
     placed = graph.node("GeometryNodeInstanceOnPoints", {"Points": coloured, "Instance": shape}).outputs[0]
@@ -175,138 +193,270 @@ def _make_points_material(name: str) -> bpy.types.Material:
     return material
 
 
-# Splats.
+# Splats. The viewport shows points, or ellipsoids that are right from every side. Renders show discs that face the
+# camera: one hit a splat and ray instead of two, in the order of the splats' centres, and colours for the direction.
 
 SPLATS_GROUP = "splats_preview"
+RENDER_GROUP = "splats_render"
 
 
-def splats_group() -> bpy.types.NodeTree:
-    """The group that shows a mesh carrier's splats: as ellipsoids in renders, as points in the viewport."""
-    return _shared(bpy.data.node_groups, SPLATS_GROUP, 1, "ObjectGS Splats", _make_splats_group)
+def add_splats_modifiers(thing: bpy.types.Object, material: bpy.types.Material, largest_point: float) -> None:
+    """Show a mesh carrier's splats, with `material`: one modifier for the viewport, one for renders.
+
+    largest_point: radius of the viewport's points at most, in the mesh's units.
+    """
+    viewport = thing.modifiers.new("ObjectGS Splats", "NODES")
+    viewport.node_group = _shared(bpy.data.node_groups, SPLATS_GROUP, 1, "ObjectGS Splats", _make_splats_group)
+    viewport.show_render = False
+    set_input(viewport, "Material", material)
+    set_input(viewport, "Largest Point", largest_point)
+    render = thing.modifiers.new("ObjectGS Render", "NODES")
+    render.node_group = _shared(bpy.data.node_groups, RENDER_GROUP, 1, "ObjectGS Render", _make_render_group)
+    render.show_viewport = False
+    set_input(render, "Material", material)
 
 
 def _make_splats_group(name: str) -> bpy.types.NodeTree:
     tree = _geometry_group(name, [
-        ("Ellipsoids in Viewport", "NodeSocketBool", False, None, "Show what a render shows; slow with many splats"),
-        ("Point Size", "NodeSocketFloat", 1.0, 0.0, "Radius of the viewport's points relative to the splats' size"),
-        ("Minimum Opacity", "NodeSocketFloat", 0.1, 0.0, "Fainter splats have no point in the viewport"),
-        ("Material", "NodeSocketMaterial", None, None, "Material of the splats"),
+        ("Ellipsoids", "NodeSocketBool", False, None, "The splats' true shapes instead of points; slow with many"),
+        ("Point Size", "NodeSocketFloat", 1.0, 0.0, "Radius of the points relative to the splats' size"),
+        ("Largest Point", "NodeSocketFloat", 1.0, 0.0, "Radius that no point exceeds"),
+        ("Minimum Opacity", "NodeSocketFloat", 0.1, 0.0, "Fainter splats have no point"),
+        ("Material", "NodeSocketMaterial", None, None, "Material of the points"),
     ])
     graph = Graph(tree)
     given = graph.node("NodeGroupInput")
-    base = graph.attribute("radiance:base", "FLOAT_COLOR")
-    scale = graph.attribute("scale", "FLOAT_VECTOR")
-    separate = graph.node("FunctionNodeSeparateColor", {0: base})
-    opacity = separate.outputs["Alpha"]
-
-    # The colour that the splats mean is sRGB; Blender's is linear.
-    linear = graph.node("FunctionNodeCombineColor")
-    for channel in range(3):
-        value = graph.math("MULTIPLY_ADD", separate.outputs[channel], SH_C0, 0.5)
-        tree.links.new(_linear(graph, value), linear.inputs[channel])
-    tree.links.new(opacity, linear.inputs["Alpha"])
-
+    splat = _Splat(graph)
+    raw = graph.vector("MULTIPLY_ADD", splat.base, (SH_C0,) * 3, (0.5,) * 3)
     points = graph.node("GeometryNodeMeshToPoints", {"Mesh": given.outputs["Geometry"]}).outputs[0]
-    coloured = graph.node("GeometryNodeStoreNamedAttribute", data_type="FLOAT_COLOR", domain="POINT", inputs={
-        "Geometry": points, "Name": "colour", "Value": linear.outputs[0]}).outputs[0]
 
-    # Ellipsoids reach to where alpha falls to 1/255, which is this many sigmas.
-    ratio = graph.math("MAXIMUM", graph.math("MULTIPLY", opacity, 1.0 / SMALLEST_ALPHA), 1.0)
-    reach = graph.math("SQRT", graph.math("MULTIPLY", graph.math("LOGARITHM", ratio, math.e), 2.0))
-    sides = graph.node("ShaderNodeSeparateXYZ", {0: scale})
-    longest = graph.math("MAXIMUM", graph.math("MAXIMUM", sides.outputs[0], sides.outputs[1]), sides.outputs[2])
-    thinnest = graph.math("MULTIPLY", longest, FLATTEST)
-    size = graph.vector("SCALE", graph.vector("MAXIMUM", scale, thinnest), reach)
-    dressed_ball = graph.node("GeometryNodeSetMaterial", {
-        "Geometry": _bounding_ball(graph), "Material": given.outputs["Material"]}).outputs[0]
+    first, second, third = splat.sides
+    middle = graph.math("MAXIMUM", graph.math("MINIMUM", first, second), graph.math(
+        "MINIMUM", graph.math("MAXIMUM", first, second), third))
+    radius = graph.math("MINIMUM", graph.math("MULTIPLY", middle, given.outputs["Point Size"]),
+                        given.outputs["Largest Point"])
+    faint = graph.math("LESS_THAN", splat.opacity, given.outputs["Minimum Opacity"])
+    clear = graph.node("GeometryNodeDeleteGeometry", {"Geometry": points, "Selection": faint}).outputs[0]
+    dots = graph.node("GeometryNodeSetPointRadius", {
+        "Points": clear, "Radius": radius}).outputs[0]
+    dots = graph.store(dots, "colour", "FLOAT_COLOR", _linear_colour(graph, raw, 1.0))
+    dots = graph.node("GeometryNodeSetMaterial", {
+        "Geometry": dots, "Material": given.outputs["Material"]}).outputs[0]
+
+    size = graph.vector("SCALE", graph.vector("MAXIMUM", splat.scale, splat.thinnest), splat.reach)
+    ball = graph.node("GeometryNodeMeshIcoSphere", {"Radius": 1.0 / BALL_FACES, "Subdivisions": 2}).outputs["Mesh"]
+    ball = graph.node("GeometryNodeSetMaterial", {"Geometry": ball, "Material": _ellipsoids_material()}).outputs[0]
+    coloured = graph.store(points, "colour", "FLOAT_COLOR", _linear_colour(graph, raw, splat.opacity))
     ellipsoids = graph.node("GeometryNodeInstanceOnPoints", {
-        "Points": coloured, "Selection": graph.math("GREATER_THAN", opacity, SMALLEST_ALPHA),
-        "Instance": dressed_ball, "Rotation": graph.attribute("rotation", "QUATERNION"),
+        "Points": coloured, "Selection": splat.is_seen, "Instance": ball, "Rotation": splat.rotation,
         "Scale": size}).outputs[0]
 
-    middle = graph.math("DIVIDE", graph.math("ADD", graph.math("ADD", sides.outputs[0], sides.outputs[1]),
-                                             sides.outputs[2]), 3.0)
-    faint = graph.math("LESS_THAN", opacity, given.outputs["Minimum Opacity"])
-    clear = graph.node("GeometryNodeDeleteGeometry", {"Geometry": coloured, "Selection": faint}).outputs[0]
-    sized = graph.node("GeometryNodeSetPointRadius", {
-        "Points": clear, "Radius": graph.math("MULTIPLY", middle, given.outputs["Point Size"])}).outputs[0]
-    flagged = graph.node("GeometryNodeStoreNamedAttribute", data_type="FLOAT", domain="POINT", inputs={
-        "Geometry": sized, "Name": "is_point", "Value": 1.0}).outputs[0]
-    dots = graph.node("GeometryNodeSetMaterial", {
-        "Geometry": flagged, "Material": given.outputs["Material"]}).outputs[0]
-
-    as_ellipsoids = graph.node("FunctionNodeBooleanMath", {
-        0: graph.node("GeometryNodeIsViewport").outputs[0], 1: given.outputs["Ellipsoids in Viewport"]},
-        operation="IMPLY").outputs[0]
     shown = graph.node("GeometryNodeSwitch", {
-        "Switch": as_ellipsoids, "False": dots, "True": ellipsoids}, input_type="GEOMETRY").outputs[0]
+        "Switch": given.outputs["Ellipsoids"], "False": dots, "True": ellipsoids}, input_type="GEOMETRY").outputs[0]
     graph.node("NodeGroupOutput", {0: shown})
     graph.arrange()
     return tree
 
 
-def _linear(graph: Graph, value: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-    """An sRGB channel as linear light, 0 below 0."""
-    value = graph.math("MAXIMUM", value, 0.0)
-    high = graph.math("POWER", graph.math("DIVIDE", graph.math("ADD", value, 0.055), 1.055), 2.4)
-    return graph.node("GeometryNodeSwitch", {
-        "Switch": graph.math("GREATER_THAN", value, 0.04045), "False": graph.math("DIVIDE", value, 12.92),
-        "True": high}, input_type="FLOAT").outputs[0]
+def _make_render_group(name: str) -> bpy.types.NodeTree:
+    tree = _geometry_group(name, [
+        ("Material", "NodeSocketMaterial", None, None, "Material of the splats"),
+    ])
+    graph = Graph(tree)
+    given = graph.node("NodeGroupInput")
+    splat = _Splat(graph)
+    place = graph.node("GeometryNodeInputPosition").outputs[0]
+    camera = graph.node("GeometryNodeInputActiveCamera").outputs[0]
+    eye = graph.node("GeometryNodeObjectInfo", {"Object": camera}, transform_space="RELATIVE").outputs["Location"]
+    towards = graph.vector("SUBTRACT", eye, place)
+
+    # In the space where the splat is a unit ball: direction to the eye, and two directions across it.
+    sigmas = graph.vector("MAXIMUM", splat.scale, splat.thinnest)
+    back = graph.node("FunctionNodeInvertRotation", {0: splat.rotation}).outputs[0]
+    local = graph.vector("DIVIDE", graph.rotated(towards, back), sigmas)
+    distance = graph.vector("LENGTH", local, output="Value")
+    axis = graph.vector("NORMALIZE", local)
+    x = graph.separated(axis)[0]
+    # Any vector that is not along the axis will do.
+    aside = graph.node("ShaderNodeCombineXYZ", {
+        0: graph.math("LESS_THAN", graph.math("ABSOLUTE", x), 0.6),
+        1: graph.math("GREATER_THAN", graph.math("ABSOLUTE", x), 0.6)}).outputs[0]
+    across = graph.vector("NORMALIZE", graph.vector("CROSS_PRODUCT", axis, aside))
+    along = graph.vector("CROSS_PRODUCT", axis, across)
+
+    # Seen from nearby a ball hides more of the plane through its centre than its own disc.
+    ratio = graph.math("DIVIDE", splat.reach, graph.math("MAXIMUM", distance, 1e-20))
+    nearness = graph.math("MULTIPLY", ratio, ratio)
+    outside = graph.math("LESS_THAN", nearness, LARGEST_NEARNESS)
+    widened = graph.math("DIVIDE", 1.0, graph.math("SQRT", graph.math("SUBTRACT", 1.0, graph.math(
+        "MINIMUM", nearness, LARGEST_NEARNESS))))
+    extent = graph.math("MULTIPLY", splat.reach, widened)
+
+    raw = graph.vector("MULTIPLY_ADD", splat.base, (SH_C0,) * 3, (0.5,) * 3)
+    raw = _add_harmonics(graph, raw, graph.vector("NORMALIZE", graph.vector("SCALE", towards, -1.0)))
+    kept = graph.node("FunctionNodeBooleanMath", {0: splat.is_seen, 1: outside}, operation="AND").outputs[0]
+    dropped = graph.node("FunctionNodeBooleanMath", {0: kept}, operation="NOT").outputs[0]
+    points = graph.node("GeometryNodeMeshToPoints", {"Mesh": given.outputs["Geometry"]}).outputs[0]
+    points = graph.node("GeometryNodeDeleteGeometry", {"Geometry": points, "Selection": dropped}).outputs[0]
+    points = graph.store(points, "colour", "FLOAT_COLOR", _linear_colour(graph, raw, splat.opacity))
+    points = graph.store(points, "centre", "FLOAT_VECTOR", place)
+    for label, direction in (("across", across), ("along", along)):
+        wide = graph.vector("MULTIPLY", graph.vector("SCALE", direction, extent), sigmas)
+        points = graph.store(points, label, "FLOAT_VECTOR", graph.rotated(wide, splat.rotation))
+    points = graph.store(points, "disc_size", "FLOAT_VECTOR", graph.node("ShaderNodeCombineXYZ", {
+        0: widened, 1: widened, 2: nearness}).outputs[0])
+    for pattern in ("radiance:*", "rotation", "scale", "object_id"):
+        points = graph.removed(points, pattern)
+
+    square = graph.node("GeometryNodeMeshGrid", {
+        "Size X": 2.0, "Size Y": 2.0, "Vertices X": 2, "Vertices Y": 2}).outputs["Mesh"]
+    square = graph.store(square, "disc", "FLOAT_VECTOR", graph.node("GeometryNodeInputPosition").outputs[0])
+    quads = graph.node("GeometryNodeInstanceOnPoints", {"Points": points, "Instance": square}).outputs[0]
+    quads = graph.node("GeometryNodeRealizeInstances", {"Geometry": quads}).outputs[0]
+    corner_x, corner_y, _ = graph.separated(graph.attribute("disc", "FLOAT_VECTOR"))
+    put = graph.vector("ADD", graph.attribute("centre", "FLOAT_VECTOR"), graph.vector(
+        "ADD", graph.vector("SCALE", graph.attribute("across", "FLOAT_VECTOR"), corner_x),
+        graph.vector("SCALE", graph.attribute("along", "FLOAT_VECTOR"), corner_y)))
+    quads = graph.node("GeometryNodeSetPosition", {"Geometry": quads, "Position": put}).outputs[0]
+    flat = graph.node("ShaderNodeCombineXYZ", {0: corner_x, 1: corner_y, 2: 1.0}).outputs[0]
+    quads = graph.store(quads, "disc", "FLOAT_VECTOR", graph.vector(
+        "MULTIPLY", flat, graph.attribute("disc_size", "FLOAT_VECTOR")))
+    for spent in ("centre", "across", "along", "disc_size"):
+        quads = graph.removed(quads, spent)
+    quads = graph.node("GeometryNodeSetMaterial", {
+        "Geometry": quads, "Material": given.outputs["Material"]}).outputs[0]
+    graph.node("NodeGroupOutput", {0: quads})
+    graph.arrange()
+    return tree
 
 
-def _bounding_ball(graph: Graph) -> bpy.types.NodeSocket:
-    """An icosphere of 80 faces that encloses the unit ball."""
-    return graph.node("GeometryNodeMeshIcoSphere", {"Radius": 1.0 / BALL_FACES, "Subdivisions": 2}).outputs["Mesh"]
+class _Splat:
+    """What geometry nodes read of a splat, and what follows from it."""
+
+    def __init__(self, graph: Graph) -> None:
+        base = graph.attribute("radiance:base", "FLOAT_COLOR")
+        self.base = base
+        self.opacity = graph.node("FunctionNodeSeparateColor", {0: base}).outputs["Alpha"]
+        self.scale = graph.attribute("scale", "FLOAT_VECTOR")
+        self.rotation = graph.attribute("rotation", "QUATERNION")
+        self.sides = graph.separated(self.scale)
+        longest = graph.math("MAXIMUM", graph.math("MAXIMUM", *self.sides[:2]), self.sides[2])
+        self.thinnest = graph.math("MULTIPLY", longest, FLATTEST)
+        # Alpha falls to 1/255 this many sigmas from the centre.
+        ratio = graph.math("MAXIMUM", graph.math("MULTIPLY", self.opacity, 1.0 / SMALLEST_ALPHA), 1.0)
+        self.reach = graph.math("SQRT", graph.math("MULTIPLY", graph.math("LOGARITHM", ratio, math.e), 2.0))
+        self.is_seen = graph.math("GREATER_THAN", self.opacity, 1.01 * SMALLEST_ALPHA)
+
+
+def _linear_colour(graph: Graph, raw: bpy.types.NodeSocket, alpha) -> bpy.types.NodeSocket:
+    """What the splats mean is sRGB, and may be below 0; Blender's colours are linear."""
+    channels = {}
+    for index, channel in enumerate(graph.separated(raw)):
+        value = graph.math("MAXIMUM", channel, 0.0)
+        high = graph.math("POWER", graph.math("DIVIDE", graph.math("ADD", value, 0.055), 1.055), 2.4)
+        channels[index] = graph.node("GeometryNodeSwitch", {
+            "Switch": graph.math("GREATER_THAN", value, 0.04045), "False": graph.math("DIVIDE", value, 12.92),
+            "True": high}, input_type="FLOAT").outputs[0]
+    return graph.node("FunctionNodeCombineColor", {**channels, "Alpha": alpha}).outputs[0]
+
+
+def _add_harmonics(graph: Graph, colour: bpy.types.NodeSocket, direction: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    """`colour` and the spherical harmonics of degree 1 to 3 for a direction; what a splat does not have counts 0."""
+    x, y, z = graph.separated(direction)
+    xx, yy, zz = (graph.math("MULTIPLY", side, side) for side in (x, y, z))
+    xy, yz, xz = graph.math("MULTIPLY", x, y), graph.math("MULTIPLY", y, z), graph.math("MULTIPLY", x, z)
+
+    def combined(*terms) -> bpy.types.NodeSocket:
+        """Sum of factor * output."""
+        total = 0.0
+        for factor, value in terms:
+            total = graph.math("MULTIPLY_ADD", value, factor, total)
+        return total
+
+    def times(left, right) -> bpy.types.NodeSocket:
+        return graph.math("MULTIPLY", left, right)
+
+    round_ = combined((4.0, zz), (-1.0, xx), (-1.0, yy))
+    terms = (
+        (-0.4886025119029199, y), (0.4886025119029199, z), (-0.4886025119029199, x),
+        (1.0925484305920792, xy), (-1.0925484305920792, yz),
+        (0.31539156525252005, combined((2.0, zz), (-1.0, xx), (-1.0, yy))),
+        (-1.0925484305920792, xz), (0.5462742152960396, combined((1.0, xx), (-1.0, yy))),
+        (-0.5900435899266435, times(y, combined((3.0, xx), (-1.0, yy)))), (2.890611442640554, times(xy, z)),
+        (-0.4570457994644658, times(y, round_)),
+        (0.3731763325901154, times(z, combined((2.0, zz), (-3.0, xx), (-3.0, yy)))),
+        (-0.4570457994644658, times(x, round_)), (1.445305721320277, times(z, combined((1.0, xx), (-1.0, yy)))),
+        (-0.5900435899266435, times(x, combined((1.0, xx), (-3.0, yy)))),
+    )
+    for k, (factor, value) in enumerate(terms, start=1):
+        weight = graph.math("MULTIPLY", value, factor)
+        colour = graph.vector("ADD", colour, graph.vector(
+            "SCALE", graph.attribute(f"radiance:sh_{k}", "FLOAT_VECTOR"), weight))
+    return colour
 
 
 def splats_material(name: str, colour: tuple[float, ...]) -> bpy.types.Material:
     """A new material for one object's splats; `colour` (linear RGB) is what Solid shows."""
     material, graph = _empty_material(name)
     mark(material, "splats_material")
-    group = graph.node("ShaderNodeGroup", node_tree=_splat_shader())
+    shader = _shared(bpy.data.node_groups, "splat_shader", 1, "ObjectGS Splat", _make_splat_shader)
+    group = graph.node("ShaderNodeGroup", node_tree=shader)
     group.width = 200.0
     graph.node("ShaderNodeOutputMaterial", {"Surface": group.outputs[0]}, location=(260.0, 0.0))
     material.diffuse_color = (*colour, 1.0)
-    material.surface_render_method = "DITHERED"
     return material
 
 
-def _splat_shader() -> bpy.types.NodeTree:
-    """Shared by all splats' materials: the Gaussian's alpha on an ellipsoid, all of it on a point."""
-    return _shared(bpy.data.node_groups, "splat_shader", 1, "ObjectGS Splat", _make_splat_shader)
-
-
 def _make_splat_shader(name: str) -> bpy.types.NodeTree:
+    """Discs by their attribute `disc`: place on the disc and how near the camera is; points have none, and alpha 1."""
     tree = bpy.data.node_groups.new(name, "ShaderNodeTree")
     tree.interface.new_socket("Shader", in_out="OUTPUT", socket_type="NodeSocketShader")
     graph = Graph(tree)
-    of_instance = graph.node("ShaderNodeAttribute", attribute_type="INSTANCER", attribute_name="colour")
-    of_point = graph.node("ShaderNodeAttribute", attribute_type="GEOMETRY", attribute_name="colour")
-    is_point = graph.node("ShaderNodeAttribute", attribute_type="GEOMETRY", attribute_name="is_point").outputs["Fac"]
-    opacity = of_instance.outputs["Alpha"]
+    colour = graph.node("ShaderNodeAttribute", attribute_type="GEOMETRY", attribute_name="colour")
+    disc = graph.node("ShaderNodeAttribute", attribute_type="GEOMETRY", attribute_name="disc").outputs["Vector"]
+    x, y, nearness = graph.separated(disc)
+    flat = graph.math("ADD", graph.math("MULTIPLY", x, x), graph.math("MULTIPLY", y, y))
+    beside = graph.math("DIVIDE", flat, graph.math("MULTIPLY_ADD", flat, nearness, 1.0))
+    _falloff(graph, colour.outputs["Color"], colour.outputs["Alpha"], beside, None)
+    return tree
+
+
+def _ellipsoids_material() -> bpy.types.Material:
+    """The shared material of ellipsoids, whose colour is an attribute of the instance."""
+    return _shared(bpy.data.materials, "ellipsoids_material", 1, "ObjectGS Ellipsoids", _make_ellipsoids_material)
+
+
+def _make_ellipsoids_material(name: str) -> bpy.types.Material:
+    material, graph = _empty_material(name)
+    colour = graph.node("ShaderNodeAttribute", attribute_type="INSTANCER", attribute_name="colour")
     geometry = graph.node("ShaderNodeNewGeometry")
     place = graph.node("ShaderNodeTexCoord").outputs["Object"]
     eye = graph.node("ShaderNodeVectorTransform", {"Vector": geometry.outputs["Incoming"]}, vector_type="VECTOR",
                      convert_from="WORLD", convert_to="OBJECT").outputs[0]
-    eye = graph.vector("NORMALIZE", eye)
-    # The ray passes the centre at this squared distance, where 1 is the ellipsoid's surface.
-    along = graph.vector("DOT_PRODUCT", place, eye, output="Value")
+    along = graph.vector("DOT_PRODUCT", place, graph.vector("NORMALIZE", eye), output="Value")
     beside = graph.math("SUBTRACT", graph.vector("DOT_PRODUCT", place, place, output="Value"),
                         graph.math("MULTIPLY", along, along))
-    # opacity * exp(-sigmas^2 / 2), with sigmas^2 = 2 ln(255 opacity) * beside
+    _falloff(graph, colour.outputs["Color"], colour.outputs["Alpha"], beside, geometry.outputs["Backfacing"])
+    return material
+
+
+def _falloff(graph: Graph, colour, opacity, beside, hidden) -> None:
+    """The Gaussian's light and alpha as the tree's output.
+
+    beside: squared distance at which the ray passes the centre, 1 where alpha falls to 1/255; hidden: 1 where there
+    is nothing, or None. opacity * exp(-sigmas^2 / 2) with sigmas^2 = 2 ln(255 opacity) * beside.
+    """
     falloff = graph.math("POWER", graph.math("MULTIPLY", opacity, 1.0 / SMALLEST_ALPHA),
                          graph.math("MULTIPLY", beside, -1.0))
-    alpha = graph.math("MULTIPLY", opacity, falloff)
-    alpha = graph.math("MULTIPLY", alpha, graph.math("LESS_THAN", beside, 1.0))
-    alpha = graph.math("MULTIPLY", alpha, graph.math("SUBTRACT", 1.0, geometry.outputs["Backfacing"]))
-    alpha = graph.math("MAXIMUM", alpha, is_point)
-    colour = graph.vector("ADD", of_instance.outputs["Color"], of_point.outputs["Color"])
+    alpha = graph.math("MULTIPLY", graph.math("MULTIPLY", opacity, falloff), graph.math("LESS_THAN", beside, 1.0))
+    if hidden is not None:
+        alpha = graph.math("MULTIPLY", alpha, graph.math("SUBTRACT", 1.0, hidden))
     emission = graph.node("ShaderNodeEmission", {"Color": colour}).outputs[0]
     clear = graph.node("ShaderNodeBsdfTransparent").outputs[0]
     mixed = graph.node("ShaderNodeMixShader", {0: alpha, 1: clear, 2: emission}).outputs[0]
-    graph.node("NodeGroupOutput", {0: mixed})
+    is_group = isinstance(graph.tree, bpy.types.ShaderNodeTree) and graph.tree.interface.items_tree
+    graph.node("NodeGroupOutput" if is_group else "ShaderNodeOutputMaterial", {0: mixed})
     graph.arrange()
-    return tree
 
 
 def _empty_material(name: str) -> tuple[bpy.types.Material, Graph]:
@@ -314,6 +464,9 @@ def _empty_material(name: str) -> tuple[bpy.types.Material, Graph]:
     if material.node_tree is None:
         material.use_nodes = True  # always so, and warned about, from Blender 5.0 on
     material.node_tree.nodes.clear()
+    material.surface_render_method = "DITHERED"
+    if hasattr(material, "cycles"):
+        material.cycles.emission_sampling = "NONE"  # A million small lamps are no use, and slow.
     return material, Graph(material.node_tree)
 
 

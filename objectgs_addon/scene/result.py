@@ -28,11 +28,14 @@ from .kinds import (
 )
 from .objects_file import Objects
 from .points import positions_of, read_points, show_points
-from .splats import anchor_attributes, ids_of, read_anchors, read_splats, splat_attributes
+from .splats import anchor_attributes, ids_of, middle_scale, read_anchors, read_splats, splat_attributes
 
 NAME = "objectgs_name"
 CENTRE = "objectgs_centre"
 GROUPING = "objectgs_grouping"
+
+LARGEST_POINT = 3.0
+"""Largest radius of a point in the viewport relative to the size of the splats in the middle."""
 
 
 @dataclass
@@ -63,6 +66,7 @@ def show_result(root: bpy.types.Collection, folder: Path, scene: bpy.types.Scene
     splat_groups = _groups(splats, objects)
     anchor_groups = {} if anchors is None else _groups(anchors, objects)
     parent = parent_of(root)
+    largest_point = LARGEST_POINT * middle_scale(splats)
     shown = Shown(warnings=warnings + more)
     new = []
     for object_id in sorted(set(splat_groups) | set(anchor_groups)):
@@ -74,7 +78,7 @@ def show_result(root: bpy.types.Collection, folder: Path, scene: bpy.types.Scene
             new.append(collection)
         positions = positions_of(own_splats, origin)
         pivot = _pivot(collection, parent, object_id, positions)
-        _show_splats(collection, pivot, object_id, objects, own_splats, positions)
+        _show_splats(collection, pivot, object_id, objects, own_splats, positions, largest_point)
         shown.splats += len(own_splats)
         if own_anchors is not None:
             _show_anchors(collection, pivot, object_id, own_anchors, positions_of(own_anchors, origin))
@@ -166,14 +170,13 @@ def _part(collection, kind: str, object_id: int, pivot) -> tuple[bpy.types.Objec
     return thing, True
 
 
-def _show_splats(collection, pivot, object_id: int, objects: Objects, table, positions) -> None:
+def _show_splats(collection, pivot, object_id: int, objects: Objects, table, positions,
+                 largest_point: float) -> None:
     thing, is_new = _part(collection, SPLATS, object_id, pivot)
     if is_new:
         material = preview.splats_material(collection[NAME], to_linear(objects.rgb(object_id)))
         thing.data.materials.append(material)
-        modifier = thing.modifiers.new("ObjectGS Splats", "NODES")
-        modifier.node_group = preview.splats_group()
-        preview.set_input(modifier, "Material", material)
+        preview.add_splats_modifiers(thing, material, largest_point)
     carrier.fill(thing.data, positions - _centre(pivot), splat_attributes(table))
 
 

@@ -49,6 +49,14 @@ def ids_of(table: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(table["object_id"]), 0, 0xFFFFFFFF).astype(np.int64)
 
 
+def middle_scale(table: np.ndarray) -> float:
+    """Of a sample of splats: the median of their middle scales; 1 without splats."""
+    if len(table) == 0:
+        return 1.0
+    some = table[:: max(1, len(table) // 10_000)]
+    return float(np.exp(np.median(np.median(_columns(some, "scale_0", "scale_1", "scale_2"), axis=1))))
+
+
 def splat_attributes(table: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
     """The attributes of Blender's own Gaussian splats: linear scale and opacity, unit quaternions, and the ID.
 
