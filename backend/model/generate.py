@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 
+from ..raster.kernel import kernel
 from .anchors import Layout
 from .heads import HIDDEN, Heads
 
@@ -34,7 +35,7 @@ class Generated(NamedTuple):
     source: torch.Tensor
 
 
-@njit(cache=True, error_model="numpy", parallel=True)
+@kernel(parallel=True)
 def _forward(positions, rows, opacity, shape, color, k, features, coefficients, starts, out):
     means, quats, scales, opacities, sh, source = out
     n_opacity = 3 * k + 6 + features
@@ -69,7 +70,7 @@ def _forward(positions, rows, opacity, shape, color, k, features, coefficients, 
                 at += 1
 
 
-@njit(cache=True, error_model="numpy", parallel=True)
+@kernel(parallel=True)
 def _count(rows, opacity, k, features, counts):
     n_opacity = 3 * k + 6 + features
     for a in prange(rows.shape[0]):
@@ -80,7 +81,7 @@ def _count(rows, opacity, k, features, counts):
         counts[a] = kept
 
 
-@njit(cache=True, error_model="numpy", parallel=True)
+@kernel(parallel=True)
 def _backward(rows, k, features, coefficients, starts, splats, grads, out):
     scales, opacities, source = splats
     g_means, g_quats, g_scales, g_opacities, g_sh = grads

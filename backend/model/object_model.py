@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 
+from ..raster.kernel import kernel
 from .anchors import Anchors
 from .generate import Generated, generate
 from .heads import Heads
@@ -93,7 +94,7 @@ class ObjectModel:
         return (splats, source) if usable.all() else (splats.select(usable), source[usable])
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def _in_view(positions, rows, k, viewmat, intrinsics, width, height, near, seen):
     fx, fy, cx, cy = intrinsics
     # Distance from the four side planes of the frustum, in units of length.

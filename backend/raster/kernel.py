@@ -1,4 +1,4 @@
-"""`kernel` compiles a function with numba and keeps the result on disk until anything in this package changes."""
+"""`kernel` compiles a function with numba and keeps the result on disk until anything changes that it may depend on."""
 
 from __future__ import annotations
 
@@ -11,28 +11,34 @@ from typing import Any
 
 from numba import njit
 
+_LAYERS = ("raster", "model", "training")
+"""The packages that hold kernels; each may use what lies in it and in those before it."""
+
 
 @functools.cache
-def _package_digest() -> str:
+def _digest_up_to(package: str) -> str:
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
+    for folder in _LAYERS[: _LAYERS.index(package) + 1]:
+        for path in sorted((Path(__file__).parents[1] / folder).glob("*.py")):
+            digest.update(path.read_bytes())
     return digest.hexdigest()
 
 
-def kernel(parallel: bool = False) -> Callable[[Callable[..., Any]], Any]:
+def kernel(parallel: bool = False, fastmath: bool | set[str] = False) -> Callable[[Callable[..., Any]], Any]:
     """Decorator: numba.njit with NumPy's division, cached on disk.
 
     numba renews a function's cache when the function's own file changes, although the code holds constants and
-    functions of other files too; here the cache is as old as the content of all of this package's files.
+    functions of other files too; here the cache is as old as the content of all files of the function's package and of
+    the packages below it.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        dispatcher = njit(parallel=parallel, cache=True, error_model="numpy")(function)
+        dispatcher = njit(parallel=parallel, cache=True, error_model="numpy", fastmath=fastmath)(function)
+        digest = _digest_up_to(function.__module__.split(".")[-2])
         # Without a cache folder, or with another numba inside, numba's own rule stays.
         with contextlib.suppress(AttributeError):
             cache_file = dispatcher._cache._cache_file
-            cache_file._source_stamp = (cache_file._source_stamp, _package_digest())
+            cache_file._source_stamp = (cache_file._source_stamp, digest)
         return dispatcher
 
     return decorate

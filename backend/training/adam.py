@@ -7,14 +7,16 @@ visible, not what exists.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from ..raster.kernel import kernel
 
 BETA1 = 0.9
 BETA2 = 0.999
 EPSILON = 1e-15
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def step_rows(values, first, second, seen, gradients, rates, correction1, correction2):
     """In place: values, first and second moments (N, D); seen (n,) int64 rows; gradients (n, D); rates (D,) float32.
 
@@ -44,7 +46,7 @@ def step_rows(values, first, second, seen, gradients, rates, correction1, correc
     return bad.sum()
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def take_rows(values, seen):
     """values[seen], the rows (n, D) of values (N, D) that a step works on."""
     out = np.empty((seen.size, values.shape[1]), values.dtype)

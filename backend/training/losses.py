@@ -15,6 +15,7 @@ import torch
 from numba import njit, prange
 
 from ..raster import simd
+from ..raster.kernel import kernel
 
 _RADIUS = 5
 _C1 = 0.01**2
@@ -45,7 +46,7 @@ def _add_row(weight, source, at, out, width):
         simd.store(out, x, simd.load(out, x) + w * simd.load(source, at + x))
 
 
-@njit(parallel=True, cache=True, error_model="numpy", fastmath=_REORDER)
+@kernel(parallel=True, fastmath=_REORDER)
 def ssim_gradient(image, target, window, gradient):
     """Mean SSIM of image and target (3, H, W); gradient (3, H, W) receives that of the mean."""
     channels, height, width = image.shape
@@ -117,7 +118,7 @@ def ssim_gradient(image, target, window, gradient):
     return sums.sum() * float(scale)
 
 
-@njit(parallel=True, cache=True, error_model="numpy", fastmath=_REORDER)
+@kernel(parallel=True, fastmath=_REORDER)
 def _compose(color, alpha, background, target, image):
     """image = color + (1 - alpha) background; returns mean |image - target|."""
     _, height, width = color.shape
@@ -133,7 +134,7 @@ def _compose(color, alpha, background, target, image):
     return sums.sum() / (3.0 * height * width)
 
 
-@njit(parallel=True, cache=True, error_model="numpy", fastmath=_REORDER)
+@kernel(parallel=True, fastmath=_REORDER)
 def _image_gradient(image, target, alpha, background, g_ssim, l1_weight, ssim_weight, g_color, g_alpha, g_background):
     _, height, width = image.shape
     step = np.float32(l1_weight / (3.0 * height * width))
@@ -156,7 +157,7 @@ def _image_gradient(image, target, alpha, background, g_ssim, l1_weight, ssim_we
         g_background[c] = partial[:, c].sum()
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def _label_loss(weight, labels, floor, scale, g_weight):
     """-mean log((P + floor) / (1 + floor)) over pixels with a label >= 0, and its gradient times `scale`."""
     height, width = weight.shape
@@ -209,7 +210,7 @@ class _ImageLoss(torch.autograd.Function):
         return (*scaled, None, None, None, None)
 
 
-@njit(parallel=True, cache=True, error_model="numpy", fastmath=_REORDER)
+@kernel(parallel=True, fastmath=_REORDER)
 def _volumes(scales, gradient):
     """Mean product of the rows of scales (N, 3), and its gradient."""
     n = scales.shape[0]

@@ -100,3 +100,26 @@ print(tangent_limits(1.0, 1.0, 0.0, 0.0, 2, 2)[1], sum(tangent_limits.stats.cach
     settings = tmp_path / "raster" / "settings.py"
     settings.write_text(settings.read_text().replace("TAN_MARGIN = 0.3", "TAN_MARGIN = 0.5"))
     assert [limit(), limit()] == [[2.5, 0], [2.5, 1]]
+
+
+@pytest.mark.parametrize(
+    ("changed", "renewed"), [("raster/camera.py", True), ("model/heads.py", True), ("training/settings.py", False)]
+)
+def test_a_models_kernels_are_renewed_with_what_lies_below_them(tmp_path, changed, renewed):
+    shutil.copytree(ROOT / "backend", tmp_path / "backend", ignore=shutil.ignore_patterns("__pycache__"))
+    script = """
+import numpy as np
+from backend.model.generate import _count
+_count(np.zeros((1, 50), np.float32), np.zeros((1, 1), np.float32), 1, 32, np.zeros(1, np.int64))
+print(sum(_count.stats.cache_hits.values()))
+"""
+
+    def hits():
+        done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return int(done.stdout)
+
+    assert [hits(), hits()] == [0, 1]
+    path = tmp_path / "backend" / changed
+    path.write_text(path.read_text() + "# changed\n")
+    assert hits() == (0 if renewed else 1)
