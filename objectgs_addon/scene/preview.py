@@ -127,7 +127,10 @@ def set_input(modifier: bpy.types.NodesModifier, name: str, value) -> None:
     """Set an input of a geometry-nodes modifier by its label."""
     for item in modifier.node_group.interface.items_tree:
         if item.item_type == "SOCKET" and item.in_out == "INPUT" and item.name == name:
-            modifier[item.identifier] = value
+            if hasattr(modifier, "properties"):  # 5.2 and newer
+                getattr(modifier.properties.inputs, item.identifier).value = value
+            else:
+                modifier[item.identifier] = value
             return
     raise KeyError(name)
 
@@ -200,20 +203,26 @@ SPLATS_GROUP = "splats_preview"
 RENDER_GROUP = "splats_render"
 
 
-def add_splats_modifiers(thing: bpy.types.Object, material: bpy.types.Material, largest_point: float) -> None:
-    """Show a mesh carrier's splats, with `material`: one modifier for the viewport, one for renders.
+def add_splats_modifiers(thing: bpy.types.Object, largest_point: float) -> None:
+    """Show a mesh carrier's splats: one modifier for the viewport, one for renders.
 
     largest_point: radius of the viewport's points at most, in the mesh's units.
     """
     viewport = thing.modifiers.new("ObjectGS Splats", "NODES")
     viewport.node_group = _shared(bpy.data.node_groups, SPLATS_GROUP, 1, "ObjectGS Splats", _make_splats_group)
     viewport.show_render = False
-    set_input(viewport, "Material", material)
     set_input(viewport, "Largest Point", largest_point)
     render = thing.modifiers.new("ObjectGS Render", "NODES")
     render.node_group = _shared(bpy.data.node_groups, RENDER_GROUP, 1, "ObjectGS Render", _make_render_group)
     render.show_viewport = False
-    set_input(render, "Material", material)
+
+
+def use_material(thing: bpy.types.Object, material: bpy.types.Material) -> None:
+    """Give the splats of an object a material, in the viewport and in renders."""
+    for kind in (SPLATS_GROUP, RENDER_GROUP):
+        modifier = modifier_of(thing, kind)
+        if modifier is not None:
+            set_input(modifier, "Material", material)
 
 
 def _make_splats_group(name: str) -> bpy.types.NodeTree:

@@ -13,6 +13,10 @@ from .carrier import stored_ids
 _NEEDED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
            "rot_0", "rot_1", "rot_2", "rot_3")
 LARGEST_LOG_SCALE = 80.0
+ROWS_AT_ONCE = 1 << 14
+"""Few enough to stay in the processor's cache while their columns are looked at."""
+
+LARGEST_TABLE = 1 << 22
 
 
 def read_splats(folder: Path) -> tuple[np.ndarray, list[str]]:
@@ -46,7 +50,19 @@ def ids_of(table: np.ndarray) -> np.ndarray:
     """(n,) int64 object IDs; 0 where the file names none."""
     if "object_id" not in table.dtype.names:
         return np.zeros(len(table), np.int64)
-    return np.clip(np.rint(table["object_id"]), 0, 0xFFFFFFFF).astype(np.int64)
+    ids = table["object_id"]
+    if ids.dtype.kind == "f":
+        ids = np.rint(np.nan_to_num(ids, nan=0.0))
+    return np.clip(ids.astype(np.int64), 0, 0xFFFFFFFF)
+
+
+def unique_ids(ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The different IDs, ascending, and the place of each of (n,) `ids` among them; without a sort for small ones."""
+    if len(ids) == 0 or ids.max() >= LARGEST_TABLE:
+        unique, inverse = np.unique(ids, return_inverse=True)
+        return unique, inverse.reshape(-1)
+    counts = np.bincount(ids)
+    return np.flatnonzero(counts), (np.cumsum(counts > 0) - 1)[ids]
 
 
 def middle_scale(table: np.ndarray) -> float:
@@ -107,13 +123,14 @@ def _rest_count(names, path: Path | None = None) -> int:
 
 
 def _without_unusable(table: np.ndarray, names, file: str, what: str) -> tuple[np.ndarray, list[str]]:
-    keep = np.ones(len(table), bool)
-    for name in names:
-        keep &= np.isfinite(table[name])
-    if "rot_0" in names:
-        keep &= np.maximum.reduce([np.abs(table[f"rot_{i}"]) for i in range(4)], initial=0.0) > 1e-12
-        for axis in range(3):
-            keep &= table[f"scale_{axis}"] < LARGEST_LOG_SCALE
+    keep = np.empty(len(table), bool)
+    for start in range(0, len(table), ROWS_AT_ONCE):
+        rows = table[start:start + ROWS_AT_ONCE]
+        good = np.isfinite(sum(rows[name].astype(np.float64) for name in names))
+        if "rot_0" in names:
+            good &= np.maximum.reduce([np.abs(rows[f"rot_{i}"]) for i in range(4)]) > 1e-12
+            good &= np.maximum.reduce([rows[f"scale_{i}"] for i in range(3)]) < LARGEST_LOG_SCALE
+        keep[start:start + ROWS_AT_ONCE] = good
     if keep.all():
         return table, []
     return table[keep], [f"{int((~keep).sum())} of {len(table)} {what} in {file} were left out: they hold NaN, "

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How long Blender is busy while a result comes in: many splats in few objects, and many objects.
+
+Runs inside Blender or in a Python that has the bpy wheel. Times are medians of fresh files; `show` is what
+`show_result` takes, from the files to the collections, `update` the first evaluation for the viewport that follows,
+`again` bringing the same result in once more.
+
+    blender -b -P benchmarks/blender_import.py -- [--json] [--splats 1000000] [--objects 1000] [--repeats 3]
+"""
+
+import argparse
+import importlib.util
+import json
+import statistics
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+DEGREE_1 = 9
+
+
+def extension():
+    """The checkout's root as package `objectgs`, loaded by its place."""
+    if "objectgs" not in sys.modules:
+        spec = importlib.util.spec_from_file_location(
+            "objectgs", ROOT / "__init__.py", submodule_search_locations=[str(ROOT)]
+        )
+        module = importlib.util.module_from_spec(spec)
+        sys.modules["objectgs"] = module
+        spec.loader.exec_module(module)
+    return importlib.import_module("objectgs.objectgs_addon.scene"), importlib.import_module("objectgs.backend.ply")
+
+
+def write_result(folder: Path, splats: int, objects: int, write_vertices) -> None:
+    """A reconstruction folder with random splats of degree 1, one anchor for ten, and a few points and cameras."""
+    rng = np.random.default_rng(0)
+    names = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(DEGREE_1))]
+    names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    table = np.empty(splats, [*((name, "<f4") for name in names), ("object_id", "<u4")])
+    for name in names:
+        table[name] = rng.normal(size=splats)
+    for axis in range(3):
+        table[f"scale_{axis}"] = np.log(0.01)
+    table["object_id"] = rng.integers(1, objects + 1, splats)
+    write_vertices(folder / "splats.ply", table)
+    anchors = np.zeros(
+        splats // 10,
+        [*((name, "<f4") for name in "xyz"), ("object_id", "<u4"), *((f"scale_{i}", "<f4") for i in range(3)),
+         ("opacity", "<f4"), ("splats", "<u4")],
+    )  # fmt: skip
+    for name in ("x", "y", "z", "object_id"):
+        anchors[name] = table[name][: len(anchors)]
+    write_vertices(folder / "anchors.ply", anchors)
+    points = np.zeros(
+        1000,
+        [*((name, "<f8") for name in "xyz"), *((name, "u1") for name in ("red", "green", "blue")),
+         ("object_id", "<u4"), ("margin", "<f4"), ("votes", "<u4")],
+    )  # fmt: skip
+    write_vertices(folder / "points.ply", points)
+    entries = [
+        {"id": i, "name": f"thing {i}", "colour": [200, 100, i % 256], "points": 1} for i in range(1, objects + 1)
+    ]
+    (folder / "objects.json").write_text(json.dumps({"objects": entries, "edits": {}}))
+    camera = {"name": "a.png", "image": "a.png", "mask": None, "width": 640, "height": 480, "held_out": False,
+              "K": [[500, 0, 320], [0, 500, 240], [0, 0, 1]], "viewmat": np.eye(4).tolist()}  # fmt: skip
+    upright = {"rotation": np.eye(3).tolist(), "translation": [0, 0, 0]}
+    content = {"capture": str(folder), "origin": [0, 0, 0], "upright": upright, "cameras": [camera]}
+    (folder / "cameras.json").write_text(json.dumps(content))
+
+
+def measure(splats: int, objects: int, repeats: int) -> dict:
+    """Seconds of `show`, `update` and `again`."""
+    scene, ply = extension()
+    times: dict[str, list[float]] = {"show": [], "update": [], "again": []}
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        write_result(folder, splats, objects, ply.write_vertices)
+        for _ in range(repeats):
+            bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+            owner = bpy.context.scene
+            root = scene.show_capture(owner, folder)
+            bpy.context.view_layer.update()
+            for name in times:
+                start = time.perf_counter()
+                if name == "update":
+                    bpy.context.view_layer.update()
+                else:
+                    scene.show_result(root, folder, owner)
+                times[name].append(time.perf_counter() - start)
+    return {"splats": splats, "objects": objects, **{k: round(statistics.median(v), 2) for k, v in times.items()}}
+
+
+def main(arguments: list[str]) -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(prog="blender_import.py", description=__doc__.split("\n", 1)[0])
+    parser.add_argument("--json", action="store_true", help="one JSON object as the last line")
+    parser.add_argument("--splats", type=int, default=1_000_000, help="in ten objects (default 1000000)")
+    parser.add_argument("--objects", type=int, default=1_000, help="of 100 splats each (default 1000)")
+    parser.add_argument("--repeats", type=int, default=3, help="the median of so many counts (default 3)")
+    options = parser.parse_args(arguments)
+    found = {
+        "blender": bpy.app.version_string,
+        "many_splats": measure(options.splats, 10, options.repeats),
+        "many_objects": measure(100 * options.objects, options.objects, options.repeats),
+    }
+    for case in ("many_splats", "many_objects"):
+        row = found[case]
+        print(f"{row['splats']:>9,} splats in {row['objects']:>5,} objects: shown in {row['show']:.2f} s, "
+              f"evaluated in {row['update']:.2f} s, shown again in {row['again']:.2f} s")  # fmt: skip
+    if options.json:
+        print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main(sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:])

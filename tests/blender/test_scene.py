@@ -1,0 +1,658 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A reconstruction folder in Blender: exact cameras, points, splats in their objects' collections, updates in place."""
+
+import json
+import math
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from bpy_extras.object_utils import world_to_camera_view
+from mathutils import Matrix, Vector
+from objectgs.backend.objects import edit_objects
+from objectgs.backend.palette import to_linear
+from objectgs.backend.ply import write_vertices
+from objectgs.backend.protocol import InputError
+from objectgs.objectgs_addon import scene as blender_scene
+from objectgs.objectgs_addon.scene import carrier, kinds, preview
+
+HUGE = 0xFFFFFFF0
+OBJECTS = {1: "mug", 2: "can", HUGE: "box"}
+K = np.array([[500.0, 0.0, 310.0], [0.0, 500.0, 250.5], [0.0, 0.0, 1.0]])
+
+
+def look_at(eye, target=(0.0, 0.0, 0.0)) -> np.ndarray:
+    """(4, 4) world to OpenCV camera."""
+    eye = np.asarray(eye, float)
+    forward = np.asarray(target, float) - eye
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    view = np.eye(4)
+    view[:3, :3], view[:3, 3] = rotation, -rotation @ eye
+    return view
+
+
+def write_cameras(folder: Path, views, intrinsics=K, size=(640, 480), origin=(0.0, 0.0, 0.0), upright=None) -> None:
+    upright = np.eye(4) if upright is None else upright
+    cameras = [
+        {"name": f"{i:03}.png", "image": f"images/{i:03}.png", "mask": None, "width": size[0], "height": size[1],
+         "K": np.asarray(intrinsics).tolist(), "viewmat": view.tolist(), "held_out": i % 8 == 0}
+        for i, view in enumerate(views)]
+    (folder / "images").mkdir(exist_ok=True)
+    for camera in cameras:
+        (folder / camera["image"]).write_bytes(b"not read until it is drawn")
+    (folder / "cameras.json").write_text(json.dumps({
+        "capture": str(folder), "origin": list(origin), "cameras": cameras,
+        "upright": {"rotation": upright[:3, :3].tolist(), "translation": upright[:3, 3].tolist()}}))
+
+
+def write_points(folder: Path, xyz, ids) -> None:
+    table = np.zeros(len(xyz), [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("red", "u1"), ("green", "u1"),
+                                ("blue", "u1"), ("object_id", "<u4"), ("margin", "<f4"), ("votes", "<u4")])
+    for axis, name in enumerate("xyz"):
+        table[name] = np.asarray(xyz)[:, axis]
+    table["red"], table["object_id"], table["margin"] = 200, ids, 0.5
+    write_vertices(folder / "points.ply", table)
+
+
+def write_objects(folder: Path, objects=OBJECTS) -> None:
+    entries = [{"id": object_id, "name": name, "colour": [10, 20, 30 + i], "points": 1}
+               for i, (object_id, name) in enumerate(objects.items())]
+    (folder / "objects.json").write_text(json.dumps({"objects": entries, "edits": {}}))
+
+
+def splat_table(ids, degree: int = 1, seed: int = 0) -> np.ndarray:
+    rest = 3 * ((degree + 1) ** 2 - 1)
+    names = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(rest)), "opacity",
+             "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    table = np.zeros(len(ids), [*((name, "<f4") for name in names), ("object_id", "<u4")])
+    rng = np.random.default_rng(seed)
+    for name in names:
+        table[name] = rng.normal(size=len(ids))
+    table["object_id"] = ids
+    return table
+
+
+def write_anchors(folder: Path, ids) -> None:
+    table = np.zeros(len(ids), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("object_id", "<u4"), ("scale_0", "<f4"),
+                                ("scale_1", "<f4"), ("scale_2", "<f4"), ("opacity", "<f4"), ("splats", "<u4")])
+    table["object_id"], table["opacity"], table["splats"], table["x"] = ids, 0.25, 7, 3.0
+    write_vertices(folder / "anchors.ply", table)
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """8 cameras around the origin, 30 points, 3 objects and 0 in 40 splats."""
+    place = tmp_path / "table top"
+    place.mkdir()
+    views = [look_at((3 * math.cos(a), 3 * math.sin(a), 1.0)) for a in np.linspace(0, 2 * math.pi, 8, endpoint=False)]
+    write_cameras(place, views)
+    rng = np.random.default_rng(1)
+    write_points(place, rng.normal(size=(30, 3)), np.resize([0, *OBJECTS], 30))
+    write_objects(place)
+    write_vertices(place / "splats.ply", splat_table(np.resize([0, *OBJECTS], 40)))
+    write_anchors(place, np.resize([0, *OBJECTS], 8))
+    return place
+
+
+@pytest.fixture
+def root(fresh, folder):
+    """The folder shown, with its result."""
+    owner = bpy.context.scene
+    shown = blender_scene.show_capture(owner, folder)
+    blender_scene.show_result(shown, folder, owner)
+    return shown
+
+
+def again(root, folder):
+    return blender_scene.show_result(root, folder, bpy.context.scene)
+
+
+def part(root, object_id, kind):
+    return kinds.part_of(blender_scene.object_collections(root)[object_id], kind)
+
+
+def cameras_of(root):
+    return sorted((thing for thing in kinds.capture_of(root).objects if blender_scene.kind_of(thing) == "camera"),
+                  key=lambda thing: thing.name)
+
+
+def counts():
+    return {name: len(getattr(bpy.data, name)) for name in (
+        "objects", "meshes", "collections", "cameras", "materials", "node_groups", "images")}
+
+
+# Cameras.
+
+
+@pytest.mark.parametrize("fy", [500.0, 501.5, 498.0])
+def test_cameras_project_as_the_capture_does(fresh, tmp_path, fy):
+    origin = np.array([1000.0, -2000.0, 30.0])
+    upright = np.eye(4)
+    upright[:3, :3] = np.array(Matrix.Rotation(0.7, 3, "X")) @ np.array(Matrix.Rotation(0.3, 3, "Z"))
+    upright[:3, 3] = 1.0, 2.0, 3.0
+    views = [look_at(np.array(eye) + origin, origin) for eye in ((3, 0.5, 1), (-2, 3, 0.2), (0.1, -4, 3))]
+    intrinsics = K.copy()
+    intrinsics[1, 1] = fy
+    write_cameras(tmp_path, views, intrinsics, origin=origin, upright=upright)
+    points = np.random.default_rng(0).uniform(-0.8, 0.8, (20, 3)) + origin
+    write_points(tmp_path, points, np.zeros(20, int))
+    owner = bpy.context.scene
+    root = blender_scene.show_capture(owner, tmp_path)
+    assert blender_scene.warnings_of(root) == []
+    for camera, view in zip(cameras_of(root), views):
+        blender_scene.use_camera(owner, camera)
+        bpy.context.view_layer.update()
+        seen = points @ view[:3, :3].T + view[:3, 3]
+        pixels = (seen @ intrinsics.T)[:, :2] / seen[:, 2:]
+        world = (points - origin) @ upright[:3, :3].T + upright[:3, 3]
+        for place, pixel in zip(world, pixels):
+            x, y, depth = world_to_camera_view(owner, camera, Vector(place))
+            ours = x * owner.render.resolution_x, (1.0 - y) * owner.render.resolution_y
+            assert ours == pytest.approx(pixel, abs=0.01)
+            assert depth > 0
+
+
+def test_a_camera_shows_its_photo_and_gives_the_render_its_size(root, folder):
+    owner = bpy.context.scene
+    cameras = cameras_of(root)
+    assert [camera.name for camera in cameras] == [f"{i:03}.png" for i in range(8)]
+    assert owner.camera == cameras[0]
+    assert (owner.render.resolution_x, owner.render.resolution_y) == (640, 480)
+    assert [camera["held_out"] for camera in cameras] == [True] + [False] * 7
+    for camera in cameras:
+        image = camera.data.background_images[0].image
+        assert camera.data.show_background_images
+        assert Path(image.filepath) == folder / "images" / camera.name
+        assert image.packed_file is None
+        assert 0.05 < camera.data.display_size < 3
+
+
+def test_the_users_camera_and_render_size_stay(fresh, folder):
+    owner = bpy.context.scene
+    own = bpy.data.objects.new("own", bpy.data.cameras.new("own"))
+    owner.collection.objects.link(own)
+    owner.camera = own
+    owner.render.resolution_x = 77
+    view_transform = owner.view_settings.view_transform
+    blender_scene.show_capture(owner, folder)
+    assert owner.camera == own
+    assert owner.render.resolution_x == 77
+    assert owner.view_settings.view_transform == view_transform
+
+
+def test_pixels_of_different_shapes_and_missing_photos_are_told(fresh, folder):
+    content = json.loads((folder / "cameras.json").read_text())
+    content["cameras"][3]["K"][1][1] *= 1.05
+    (folder / "cameras.json").write_text(json.dumps(content))
+    (folder / "images" / "005.png").unlink()
+    shown = blender_scene.show_capture(bpy.context.scene, folder)
+    shape, missing = blender_scene.warnings_of(shown)
+    assert "pixels of different shapes" in shape
+    assert "1 of 8 images are missing" in missing and "005.png" in missing
+    assert len(cameras_of(shown)[5].data.background_images) == 0
+
+
+def test_cameras_that_the_capture_has_lost_go(root, folder):
+    write_cameras(folder, [look_at((3, 0, 1)), look_at((0, 3, 1))])
+    before = len(bpy.data.cameras)
+    assert blender_scene.show_capture(bpy.context.scene, folder) == root
+    assert [camera.name for camera in cameras_of(root)] == ["000.png", "001.png"]
+    assert len(bpy.data.cameras) == before - 6
+
+
+# Points.
+
+
+def test_points_carry_both_colours_and_show_the_chosen_one(root, folder):
+    points = kinds.points_of(root)
+    mesh = points.data
+    assert points.hide_render
+    assert carrier.read(mesh, "photo")[0] == pytest.approx([*to_linear((200, 0, 0)), 1.0], abs=1e-6)
+    ids = carrier.read(mesh, "object_id").astype(np.int64) & 0xFFFFFFFF
+    assert set(ids) == {0, *OBJECTS}
+    place = int(np.flatnonzero(ids == 2)[0])
+    assert carrier.read(mesh, "object")[place] == pytest.approx([*to_linear((10, 20, 31)), 1.0], abs=1e-6)
+    assert carrier.read(mesh, "margin")[0] == 0.5
+    for by in ("object", "photo"):
+        blender_scene.colour_points_by(root, by)
+        shown = points.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+        assert len(shown.polygons) == 8 * 30
+        assert shown.attributes.active_color_name == by  # what Solid shows with its color set to Attribute
+        first = carrier.read(mesh, by)[:1]
+        assert carrier.read(shown, "colour")[1:7] == pytest.approx(np.repeat(first, 6, 0), abs=1e-6)
+        assert shown.materials[0].name == "ObjectGS Points"
+
+
+def test_a_vote_recolours_points_and_edits_rename(root, folder):
+    blender_scene.colour_points_by(root, "object")
+    edit_objects(folder / "objects.json", {1: dict(name="cup", colour=[255, 0, 0])})
+    write_points(folder, np.zeros((5, 3)), [1, 1, 1, 1, 2])
+    blender_scene.show_objects(root, folder, bpy.context.scene)
+    mesh = kinds.points_of(root).data
+    assert len(mesh.vertices) == 5
+    assert carrier.read(mesh, "object")[0] == pytest.approx([1, 0, 0, 1])
+    assert mesh.attributes.active_color_name == "object"
+    collection = blender_scene.object_collections(root)[1]
+    assert collection.name == "cup"
+    assert {thing.name for thing in collection.objects} == {"cup", "cup splats", "cup anchors"}
+    splats = part(root, 1, "splats")
+    assert tuple(splats.color) == pytest.approx((1, 0, 0, 1))
+    assert tuple(splats.data.materials[0].diffuse_color) == pytest.approx((1, 0, 0, 1))
+
+
+# Objects.
+
+
+def test_every_object_has_a_collection_with_its_splats_and_anchors(root, folder):
+    collections = blender_scene.object_collections(root)
+    assert {object_id: collection.name for object_id, collection in collections.items()} == {
+        **OBJECTS, 0: "Unlabelled"}
+    for object_id, collection in collections.items():
+        assert collection.name in root.children
+        assert blender_scene.kind_of(collection) == "object"
+        assert blender_scene.object_id_of(collection) == object_id
+        assert [blender_scene.kind_of(thing) for thing in blender_scene.parts_of(collection)] == [
+            "object_parent", "splats", "anchors"]
+        for thing in blender_scene.parts_of(collection):
+            assert blender_scene.object_id_of(thing) == object_id
+            assert blender_scene.root_of(thing, bpy.context.scene) == root
+        assert blender_scene.root_of(collection, bpy.context.scene) == root
+        anchors = part(root, object_id, "anchors")
+        assert anchors.hide_render and anchors.hide_viewport
+        assert list(carrier.read(anchors.data, "splats")) == [7, 7]
+        assert list(carrier.read(anchors.data, "opacity")) == [0.25, 0.25]
+    assert blender_scene.folder_of(root) == folder
+    assert kinds.object_id_of(root) is None
+    assert blender_scene.kind_of(bpy.context.scene) is None
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_splats_have_the_attributes_of_blenders_own(fresh, folder, degree):
+    table = splat_table(np.resize([1, 2], 20), degree)
+    write_vertices(folder / "splats.ply", table)
+    owner = bpy.context.scene
+    root = blender_scene.show_capture(owner, folder)
+    shown = blender_scene.show_result(root, folder, owner)
+    assert (shown.objects, shown.splats, shown.warnings) == (4, 20, [])
+    bpy.context.view_layer.update()
+    rows = table[table["object_id"] == 2]
+    splats = part(root, 2, "splats")
+    mesh = splats.data
+    world = carrier.read(mesh, "position") + np.array(splats.matrix_world.translation)
+    assert world == pytest.approx(np.stack([rows["x"], rows["y"], rows["z"]], 1), abs=1e-5)
+    base = carrier.read(mesh, "radiance:base")
+    assert base[:, :3] == pytest.approx(np.stack([rows[f"f_dc_{i}"] for i in range(3)], 1))
+    assert base[:, 3] == pytest.approx(1 / (1 + np.exp(-rows["opacity"])), abs=1e-6)
+    assert carrier.read(mesh, "scale") == pytest.approx(np.exp(np.stack([rows[f"scale_{i}"] for i in range(3)], 1)))
+    quaternion = np.stack([rows[f"rot_{i}"] for i in range(4)], 1)
+    assert carrier.read(mesh, "rotation") == pytest.approx(
+        quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True), abs=1e-6)
+    higher = (degree + 1) ** 2 - 1
+    assert f"radiance:sh_{higher + 1}" not in mesh.attributes
+    for k in range(higher):
+        assert carrier.read(mesh, f"radiance:sh_{k + 1}") == pytest.approx(
+            np.stack([rows[f"f_rest_{channel * higher + k}"] for channel in range(3)], 1))
+    assert set(carrier.read(mesh, "object_id")) == {2}
+    types = {a.name: a.data_type for a in mesh.attributes}
+    assert (types["radiance:base"], types["rotation"], types["scale"]) == ("FLOAT_COLOR", "QUATERNION", "FLOAT_VECTOR")
+
+
+def test_the_viewport_shows_points_or_ellipsoids(root):
+    splats = part(root, 1, "splats")
+    modifier = preview.modifier_of(splats, preview.SPLATS_GROUP)
+    instances = [1 for instance in bpy.context.evaluated_depsgraph_get().object_instances
+                 if instance.is_instance and instance.parent and instance.parent.original == splats]
+    assert len(instances) <= 1  # the point cloud itself
+    preview.set_input(modifier, "Ellipsoids", True)
+    splats.update_tag()
+    instances = [1 for instance in bpy.context.evaluated_depsgraph_get().object_instances
+                 if instance.is_instance and instance.parent and instance.parent.original == splats]
+    assert len(instances) == 10
+
+
+def test_what_cannot_be_shown_is_left_out_and_told(fresh, folder):
+    table = splat_table(np.resize([1, 2], 20))
+    table["x"][3], table["opacity"][4], table["scale_1"][5] = np.nan, np.inf, 200.0
+    for i in range(4):
+        table[f"rot_{i}"][6] = 0.0
+    write_vertices(folder / "splats.ply", table)
+    owner = bpy.context.scene
+    root = blender_scene.show_capture(owner, folder)
+    shown = blender_scene.show_result(root, folder, owner)
+    assert shown.splats == 16
+    assert shown.warnings == ["4 of 20 splats in splats.ply were left out: they hold NaN, infinity or no rotation."]
+
+
+# Updates in place.
+
+
+def test_showing_again_keeps_what_the_user_did(root, folder):
+    owner = bpy.context.scene
+    kitchen = bpy.data.collections.new("Kitchen")
+    owner.collection.children.link(kitchen)
+    mug = blender_scene.object_collections(root)[1]
+    kitchen.children.link(mug)
+    root.children.unlink(mug)
+    pivot, splats, anchors = blender_scene.parts_of(mug)
+    pivot.location, pivot.scale = (1, 2, 3), (2, 2, 2)
+    mug.name, splats.name, root.name = "My mug", "mine", "Breakfast"
+    splats.modifiers.new("own", "NODES")
+    own = bpy.data.materials.new("own")
+    splats.data.materials.append(own)
+    preview.set_input(splats.modifiers[0], "Point Size", 3.0)
+    splats.hide_render, anchors.hide_viewport = True, False
+    parent = kinds.parent_of(root)
+    parent.location = 5, 5, 5
+    local = carrier.read(splats.data, "position")
+    before = counts()
+
+    table = splat_table(np.resize([0, *OBJECTS], 40))
+    table["opacity"] += 1
+    write_vertices(folder / "splats.ply", table)
+    assert blender_scene.show_capture(owner, folder) == root
+    again(root, folder)
+    blender_scene.show_objects(root, folder, owner)
+
+    assert counts() == before
+    assert blender_scene.object_collections(root)[1] == mug
+    assert mug.name in kitchen.children and mug.name not in root.children
+    assert (mug.name, splats.name, root.name) == ("My mug", "mine", "Breakfast")
+    assert tuple(pivot.location) == (1, 2, 3) and tuple(pivot.scale) == (2, 2, 2)
+    assert tuple(parent.location) == (5, 5, 5)
+    assert [m.name for m in splats.modifiers] == ["ObjectGS Splats", "ObjectGS Render", "own"]
+    assert own in splats.data.materials[:]
+    assert splats.hide_render and not anchors.hide_viewport
+    assert carrier.read(splats.data, "position") == pytest.approx(local)
+    expected = 1 / (1 + np.exp(-table["opacity"][table["object_id"] == 1]))
+    assert carrier.read(splats.data, "radiance:base")[:, 3] == pytest.approx(expected, abs=1e-6)
+    assert blender_scene.root_of(splats, owner) == root
+    assert blender_scene.root_of(mug, owner) == root
+
+
+def test_a_result_of_other_size_replaces_the_one_before(root, folder):
+    write_vertices(folder / "splats.ply", splat_table(np.resize([0, *OBJECTS], 84), degree=0, seed=3))
+    shown = again(root, folder)
+    assert (shown.objects, shown.splats, shown.anchors) == (4, 84, 8)
+    mesh = part(root, 1, "splats").data
+    assert len(mesh.vertices) == 21
+    assert "radiance:sh_1" not in mesh.attributes
+    assert len(kinds.part_of(blender_scene.object_collections(root)[1], "splats").data.materials) == 1
+
+
+def test_objects_that_vanish_go_but_the_users_things_stay(root, folder):
+    cube = bpy.data.objects.new("cube", bpy.data.meshes.new("cube"))
+    blender_scene.object_collections(root)[2].objects.link(cube)
+    write_vertices(folder / "splats.ply", splat_table(np.resize([1], 10)))
+    (folder / "anchors.ply").unlink()
+    before = counts()
+    shown = again(root, folder)
+    assert shown.objects == 1
+    collections = blender_scene.object_collections(root)
+    assert set(collections) == {1, 2}
+    assert {thing.name for thing in collections[2].objects} == {"can", "cube"}
+    after = counts()
+    assert before["meshes"] - after["meshes"] == 6  # splats and anchors of 0, 2 and the last
+    assert before["materials"] - after["materials"] == 3
+    assert before["collections"] - after["collections"] == 2
+
+
+def test_merged_objects_come_into_one_collection_and_apart_again(root, folder):
+    edit_objects(folder / "objects.json", {2: dict(merged_into=1)})
+    blender_scene.show_objects(root, folder, bpy.context.scene)
+    collections = blender_scene.object_collections(root)
+    assert set(collections) == {0, 1, HUGE}
+    splats = part(root, 1, "splats")
+    assert len(splats.data.vertices) == 20
+    assert sorted(carrier.read(splats.data, "object_id")) == [1] * 10 + [2] * 10
+    edit_objects(folder / "objects.json", {2: dict(merged_into=None)})
+    blender_scene.show_objects(root, folder, bpy.context.scene)
+    assert {object_id: len(part(root, object_id, "splats").data.vertices)
+            for object_id in blender_scene.object_collections(root)} == {0: 10, 1: 10, 2: 10, HUGE: 10}
+
+
+def test_left_out_objects_go_nowhere(root, folder):
+    edit_objects(folder / "objects.json", {2: dict(left_out=True)})
+    blender_scene.show_objects(root, folder, bpy.context.scene)
+    assert set(blender_scene.object_collections(root)) == {0, 1, HUGE}
+    ids = carrier.read(kinds.points_of(root).data, "object_id")
+    colours = carrier.read(kinds.points_of(root).data, "object")
+    assert colours[ids == 2] == pytest.approx(np.repeat(colours[ids == 0][:1], np.count_nonzero(ids == 2), 0))
+
+
+def test_what_the_user_deleted_comes_back_with_the_next_result(root, folder):
+    bpy.data.objects.remove(part(root, 1, "splats"))
+    bpy.data.collections.remove(blender_scene.object_collections(root)[2])
+    bpy.data.objects.remove(kinds.parent_of(root))
+    blender_scene.show_capture(bpy.context.scene, folder)
+    again(root, folder)
+    assert len(part(root, 1, "splats").data.vertices) == 10
+    assert len(part(root, 2, "splats").data.vertices) == 10
+    assert part(root, HUGE, "object_parent").parent == kinds.parent_of(root)
+
+
+def test_two_reconstructions_in_one_file_stay_apart(root, folder, tmp_path):
+    other_folder = tmp_path / "other"
+    other_folder.mkdir()
+    write_cameras(other_folder, [look_at((3, 0, 1))])
+    write_points(other_folder, np.ones((3, 3)), [1, 1, 1])
+    write_vertices(other_folder / "splats.ply", splat_table(np.resize([1], 4)))
+    owner = bpy.context.scene
+    other = blender_scene.show_capture(owner, other_folder, name="Second")
+    blender_scene.show_result(other, other_folder, owner)
+    assert other != root and other.name == "Second"
+    assert set(blender_scene.object_collections(other)) == {1}
+    assert len(part(other, 1, "splats").data.vertices) == 4
+    assert len(part(root, 1, "splats").data.vertices) == 10
+    assert blender_scene.root_of(part(other, 1, "splats"), owner) == other
+    assert blender_scene.root_of(bpy.data.objects.new("stranger", None), owner) is None
+
+
+# Faults.
+
+
+@pytest.mark.parametrize("name, spoil, sentence", [
+    ("cameras.json", None, "has no cameras.json; run Import again"),
+    ("cameras.json", b"{}", "does not list cameras as expected"),
+    ("cameras.json", b"{", "cannot be read as JSON"),
+    ("points.ply", None, "has no points.ply; run Import again"),
+    ("points.ply", b"ply\n", "no complete PLY header"),
+    ("objects.json", b"[]", "does not list objects"),
+])
+def test_bad_captures_change_nothing(fresh, folder, name, spoil, sentence):
+    (folder / name).unlink() if spoil is None else (folder / name).write_bytes(spoil)
+    before = counts()
+    with pytest.raises(InputError, match=sentence):
+        blender_scene.show_capture(bpy.context.scene, folder)
+    assert counts() == before
+
+
+@pytest.mark.parametrize("name, spoil, sentence", [
+    ("splats.ply", None, "has no splats.ply; train first"),
+    ("splats.ply", "points.ply", "no file of Gaussian splats"),
+    ("anchors.ply", "points.ply", "has no property scale_0"),
+    ("splats.ply", "cut", "cut short"),
+])
+def test_bad_results_change_nothing(root, folder, name, spoil, sentence):
+    path = folder / name
+    if spoil is None:
+        path.unlink()
+    elif spoil == "cut":
+        path.write_bytes(path.read_bytes()[:-1])
+    else:
+        path.write_bytes((folder / spoil).read_bytes())
+    before = counts()
+    with pytest.raises(InputError, match=sentence):
+        again(root, folder)
+    assert counts() == before
+    assert len(part(root, 1, "splats").data.vertices) == 10
+
+
+def test_an_object_in_edit_mode_is_not_overwritten(root, folder):
+    splats = part(root, 1, "splats")
+    bpy.context.view_layer.objects.active = splats
+    bpy.ops.object.mode_set(mode="EDIT")
+    with pytest.raises(InputError, match="mug splats is in Edit Mode"):
+        again(root, folder)
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+
+def test_a_blend_file_without_its_folder_still_opens(root, folder, tmp_path):
+    blend = tmp_path / "old.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(blend))
+    folder.rename(tmp_path / "gone")
+    bpy.ops.wm.open_mainfile(filepath=str(blend))
+    owner = bpy.context.scene
+    shown = next(child for child in owner.collection.children if blender_scene.kind_of(child) == "reconstruction")
+    assert set(blender_scene.object_collections(shown)) == {0, *OBJECTS}
+    blender_scene.colour_points_by(shown, "object")
+    with pytest.raises(InputError, match="run Import again"):
+        blender_scene.show_capture(owner, blender_scene.folder_of(shown), shown)
+    with pytest.raises(InputError, match="train first"):
+        again(shown, folder)
+
+
+# Orientation.
+
+
+def test_three_points_become_the_ground_below_the_cameras(root):
+    parent = kinds.parent_of(root)
+    parent.matrix_world = Matrix.Rotation(2.1, 4, "X") @ Matrix.Translation((1, 2, 3))
+    bpy.context.view_layer.update()
+    before = parent.matrix_world.copy()
+    corners = [before @ Vector(corner) for corner in ((0, 0, -0.5), (1, 0, -0.5), (0, 1, -0.5))]
+    for order in ((0, 1, 2), (2, 1, 0)):
+        parent.matrix_world = before
+        blender_scene.orient_to_ground(root, *(corners[i] for i in order))
+        move = parent.matrix_world @ before.inverted()
+        for corner in corners:
+            assert (move @ corner).z == pytest.approx(0.0, abs=1e-5)
+        bpy.context.view_layer.update()
+        assert all(camera.matrix_world.translation.z > 0.5 for camera in cameras_of(root))
+        centre = sum(corners, Vector()) / 3
+        assert tuple((move @ centre).xy) == pytest.approx(tuple(centre.xy), abs=1e-5)
+    with pytest.raises(InputError, match="one line"):
+        blender_scene.orient_to_ground(root, (0, 0, 0), (1, 1, 1), (3, 3, 3))
+
+
+def test_two_points_become_a_distance_apart(root):
+    parent = kinds.parent_of(root)
+    before = parent.matrix_world.copy()
+    blender_scene.scale_to_distance(root, (1, 0, 0), (3, 0, 0), 0.5)
+    move = parent.matrix_world @ before.inverted()
+    assert (move @ Vector((3, 0, 0)) - move @ Vector((1, 0, 0))).length == pytest.approx(0.5)
+    with pytest.raises(InputError, match="same place"):
+        blender_scene.scale_to_distance(root, (1, 1, 1), (1, 1, 1), 2.0)
+    with pytest.raises(InputError, match="above 0"):
+        blender_scene.scale_to_distance(root, (0, 0, 0), (1, 1, 1), 0.0)
+
+
+# Renders.
+
+
+def rendered(tmp_path, size=(33, 33)) -> np.ndarray:
+    """(H, W, 3) linear, from the top, by Cycles."""
+    owner = bpy.context.scene
+    blender_scene.prepare_render(owner)
+    owner.render.engine = "CYCLES"
+    owner.cycles.device, owner.cycles.samples, owner.cycles.use_denoising = "CPU", 64, False
+    owner.cycles.pixel_filter_type, owner.cycles.filter_width = "BLACKMAN_HARRIS", 0.01
+    owner.render.image_settings.file_format = "OPEN_EXR"
+    owner.render.image_settings.color_depth = "32"
+    owner.render.filepath = str(tmp_path / "picture.exr")
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(owner.render.filepath)
+    pixels = np.array(image.pixels[:]).reshape(size[1], size[0], -1)[::-1, :, :3]
+    bpy.data.images.remove(image)
+    return pixels
+
+
+def test_a_rendered_splat_is_the_gaussian_with_its_colour_from_here(fresh, tmp_path):
+    """One splat of degree 3 under a moved, turned parent: every pixel against the formula."""
+    view = look_at((2.0, -3.0, 1.5))
+    intrinsics = np.array([[60.0, 0.0, 16.5], [0.0, 60.0, 16.5], [0.0, 0.0, 1.0]])
+    write_cameras(tmp_path, [view], intrinsics, size=(33, 33))
+    write_points(tmp_path, np.zeros((1, 3)), [1])
+    table = splat_table([1], degree=3, seed=5)
+    position = np.array([0.05, -0.1, 0.02])
+    for axis, name in enumerate("xyz"):
+        table[name] = position[axis]
+    scales = np.array([0.35, 0.15, 0.1])
+    for axis in range(3):
+        table[f"scale_{axis}"] = np.log(scales[axis])
+    table["opacity"] = np.log(0.8 / 0.2)
+    for i in range(45):
+        table[f"f_rest_{i}"] *= 0.1
+    table["f_dc_0"], table["f_dc_1"], table["f_dc_2"] = 0.9, 0.2, -0.5
+    write_vertices(tmp_path / "splats.ply", table)
+    owner = bpy.context.scene
+    root = blender_scene.show_capture(owner, tmp_path)
+    blender_scene.show_result(root, tmp_path, owner)
+    kinds.parent_of(root).matrix_world = Matrix.Translation((3, 4, 5)) @ Matrix.Rotation(1.0, 4, "Y")
+    image = rendered(tmp_path)
+
+    rotation = np.array(_rotation(table))
+    eye = -view[:3, :3].T @ view[:3, 3]
+    v, u = np.mgrid[0:33, 0:33] + 0.5
+    rays = np.stack([(u - 16.5) / 60.0, (v - 16.5) / 60.0, np.ones_like(u)], -1) @ view[:3, :3]
+    start = (eye - position) @ rotation / scales
+    rays = rays @ rotation / scales
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    squared = start @ start - (rays @ start) ** 2
+    alpha = 0.8 * np.exp(-0.5 * squared)
+    alpha[alpha < 1 / 255] = 0.0
+    colour = np.clip(0.5 + _harmonics(table, position - eye), 0.0, None)
+    linear = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
+    assert np.abs(image - alpha[..., None] * linear).max() < 0.002 * linear.max()
+    assert image.max() > 0.5 * linear.max()
+
+
+def _rotation(table):
+    w, x, y, z = np.array([table[f"rot_{i}"][0] for i in range(4)], float) / np.linalg.norm(
+        [table[f"rot_{i}"][0] for i in range(4)])
+    return [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]
+
+
+def _harmonics(table, direction):
+    """Colour of the spherical harmonics of degree 0 to 3, by their textbook formulas."""
+    x, y, z = direction / np.linalg.norm(direction)
+    pi = math.pi
+    basis = [
+        math.sqrt(1 / (4 * pi)),
+        -math.sqrt(3 / (4 * pi)) * y, math.sqrt(3 / (4 * pi)) * z, -math.sqrt(3 / (4 * pi)) * x,
+        math.sqrt(15 / (4 * pi)) * x * y, -math.sqrt(15 / (4 * pi)) * y * z,
+        math.sqrt(5 / (16 * pi)) * (3 * z * z - 1), -math.sqrt(15 / (4 * pi)) * x * z,
+        math.sqrt(15 / (16 * pi)) * (x * x - y * y),
+        -math.sqrt(35 / (32 * pi)) * y * (3 * x * x - y * y), math.sqrt(105 / (4 * pi)) * x * y * z,
+        -math.sqrt(21 / (32 * pi)) * y * (5 * z * z - 1), math.sqrt(7 / (16 * pi)) * z * (5 * z * z - 3),
+        -math.sqrt(21 / (32 * pi)) * x * (5 * z * z - 1), math.sqrt(105 / (16 * pi)) * z * (x * x - y * y),
+        -math.sqrt(35 / (32 * pi)) * x * (x * x - 3 * y * y),
+    ]
+    coefficients = np.array([[table[f"f_dc_{c}"][0], *(table[f"f_rest_{15 * c + k}"][0] for k in range(15))]
+                             for c in range(3)])
+    return coefficients @ basis
+
+
+def test_nearer_splats_hide_farther_ones(fresh, tmp_path):
+    write_cameras(tmp_path, [look_at((0.0, -3.0, 0.0))], [[60, 0, 16.5], [0, 60, 16.5], [0, 0, 1]], size=(33, 33))
+    write_points(tmp_path, np.zeros((1, 3)), [1])
+    table = splat_table([1, 2], degree=0)
+    for name in ("x", "z"):
+        table[name] = 0.0
+    table["y"] = 0.5, -0.5
+    for i in range(3):
+        table[f"scale_{i}"] = np.log(0.2)
+        table[f"f_dc_{i}"] = -0.5 / preview.SH_C0
+    table["f_dc_0"][0] = table["f_dc_1"][1] = 0.5 / preview.SH_C0
+    table["opacity"] = 6.0
+    write_vertices(tmp_path / "splats.ply", table)
+    owner = bpy.context.scene
+    root = blender_scene.show_capture(owner, tmp_path)
+    blender_scene.show_result(root, tmp_path, owner)
+    red, green, _ = rendered(tmp_path)[16, 16]
+    assert green > 0.98 and red < 0.02
