@@ -12,7 +12,7 @@ from pathlib import Path
 import bpy
 
 from ..backend.protocol import InputError
-from . import locations, messages, object_edits, previews, scene
+from . import locations, messages, object_edits, previews, scene, view
 from .jobs import Job, JobQueue, State, run_blocking
 
 INTERVAL = 0.1
@@ -38,7 +38,7 @@ def submit(job: Job, owner, report: Callable[[set, str], None]) -> set:
         return {"FINISHED"}
     queue.add(job)
     if not bpy.app.timers.is_registered(_tick):
-        bpy.app.timers.register(_tick, first_interval=0.0)
+        bpy.app.timers.register(_tick, first_interval=0.0, persistent=True)
     return {"FINISHED"}
 
 
@@ -115,6 +115,7 @@ def _show_capture(job: Job, owner) -> bool:
     object_edits.fill(root)
     if owner is not None:
         owner.objectgs.active = root
+        view.frame(root)
     return True
 
 

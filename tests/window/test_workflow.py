@@ -1,7 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """From the installed zip to objects that can be clicked, in a real window: import, vote, train, select, merge, undo."""
 
+import json
 import subprocess
+import textwrap
+import time
+from pathlib import Path
 
 import pytest
 
@@ -22,8 +26,6 @@ IDLE = "all(job.is_finished for job in running.queue.jobs)"
 
 
 def script(body: str) -> str:
-    import textwrap
-
     return PRELUDE + textwrap.dedent(body)
 
 
@@ -58,9 +60,6 @@ def window(blender, capture):
 
 def wait(blender, expression: str, timeout: float = 120.0):
     """Until an expression in the prelude's names is true."""
-    import json
-    import time
-
     deadline = time.monotonic() + timeout
     while time.monotonic() < deadline:
         value = blender.run(script(f"result = {expression}"))
@@ -116,7 +115,7 @@ def test_click_selects_the_whole_object(window):
         context = window_context()
         space = context["area"].spaces.active
         space.overlay.show_overlays = True
-        small = [i for i in root.objectgs.objects if i.name not in ("table", "wall", "floor")]
+        small = [i for i in root.objectgs.objects if i.name not in ("table", "backdrop")]
         item = max(small, key=lambda i: i.splats)
         collection = scene.object_collections(root)[object_edits.from_stored(item.object_id)]
         splats = next(part for part in scene.parts_of(collection) if scene.kind_of(part) == "splats")
@@ -132,7 +131,8 @@ def test_click_selects_the_whole_object(window):
         with bpy.context.temp_override(**context):
             bpy.ops.view3d.view_axis(type="TOP")
         at = np.array([v.co for v in splats.data.vertices])
-        middle = splats.matrix_world @ mathutils.Vector(np.median(at, axis=0))
+        top = at[np.argmax(at[:, 2])]
+        middle = splats.matrix_world @ mathutils.Vector(top)
         region3d = space.region_3d
         region3d.view_location = middle
         region3d.view_distance = 0.6
@@ -149,3 +149,91 @@ def test_click_selects_the_whole_object(window):
     window.shot("6-clicked")
     assert "splats" in selected and "object_parent" in selected
     assert window.run(script("result = object_edits.active_item(root).name")) == place[0]
+
+def test_merge_is_undone_and_split(window):
+    """Objects.json follows the list through merge, undo, redo and split."""
+    first = window.run(script("""
+        from pathlib import Path
+        from bl_ext.user_default.objectgs.backend.objects import read_objects
+        ids = [object_edits.from_stored(item.object_id) for item in root.objectgs.objects]
+        result = [ids[0], ids[1], object_edits.splat_counts(root)[ids[0]], object_edits.splat_counts(root)[ids[1]]]
+    """))
+    state = """
+        from bl_ext.user_default.objectgs.backend.objects import read_objects
+        entry = next(entry for entry in read_objects(scene.folder_of(root) / "objects.json") if entry.id == {0})
+        counts = object_edits.splat_counts(root)
+        result = [entry.merged_into, counts.get({0}, 0), counts[{1}]]
+    """.format(*first)
+    apart, together = [None, first[2], first[3]], [first[1], 0, first[2] + first[3]]
+    window.run(script(f"""
+        root.objectgs.active_object = 0
+        for selected in bpy.context.selected_objects:
+            selected.select_set(False)
+        with bpy.context.temp_override(**window_context()):
+            bpy.ops.ed.undo_push(message="before")
+            bpy.ops.objectgs.merge_objects("EXEC_DEFAULT", True, into="{first[1]}")
+    """))
+    assert window.run(script(state)) == together
+    middle = window.run("context = window_context(); r = context['region']; w = context['window']; "
+                        "result = [r.x + r.width / 3, w.height - r.y - r.height / 3]")
+    window.move(*middle)
+    window.key("ctrl+z")
+    assert window.run(script(state)) == apart
+    window.key("ctrl+shift+z")
+    assert window.run(script(state)) == together
+    window.run(script("""
+        with bpy.context.temp_override(**window_context()):
+            bpy.ops.objectgs.split_objects("EXEC_DEFAULT", True)
+    """))
+    assert window.run(script(state)) == apart
+
+
+def test_pause_resume_and_stop(window):
+    """A paused training stands still; a stopped one has saved; undo in between harms nothing."""
+    window.run(script("root.objectgs.minutes = 5; call(bpy.ops.objectgs.train)"))
+    wait(window, "running.queue.running is not None and running.queue.running.step")
+    window.run(script("call(bpy.ops.objectgs.pause_job)"))
+    wait(window, "running.queue.running.state.value == 'paused' and running.queue.running.message == 'Paused'")
+    first = window.run(script("result = running.queue.running.step"))
+    window.shot("7-paused")
+    window.key("ctrl+z")
+    time.sleep(1.5)
+    assert window.run(script("result = running.queue.running.step")) == first
+    window.run(script("call(bpy.ops.objectgs.resume_job)"))
+    wait(window, f"running.queue.running.step > {first}")
+    window.run(script("call(bpy.ops.objectgs.stop_job)"))
+    wait(window, IDLE)
+    assert window.run(script("result = running.queue.jobs[-1].state.value")) == "stopped"
+    assert window.run(script(f"""
+        from bl_ext.user_default.objectgs.objectgs_addon.folder_state import folder_state
+        result = folder_state(scene.folder_of(root)).steps >= {first}
+    """))
+
+
+def test_another_file_in_between_finds_the_job_again(window):
+    """Saving, opening an empty file and opening the first one again while training runs."""
+    path = window.place / "scene.blend"
+    window.run(script(f"""
+        root.objectgs.minutes = 30
+        call(bpy.ops.objectgs.train)
+        bpy.ops.wm.save_as_mainfile(filepath={str(path)!r})
+    """))
+    wait(window, "running.queue.running is not None and running.queue.running.step")
+    window.run("bpy.ops.wm.read_homefile(use_empty=False)")
+    time.sleep(1)
+    before = window.run(script("result = running.queue.running.step"))
+    window.run(f"bpy.ops.wm.open_mainfile(filepath={str(path)!r})")
+    wait(window, f"running.job_of(root) is running.queue.running and running.queue.running.step > {before}")
+    window.shot("8-reopened")
+
+
+def test_quitting_saves_and_the_file_explains(window):
+    """Blender quits while it trains: the training has saved, and nothing runs on."""
+    folder = Path(window.run(script("result = str(scene.folder_of(root))")))
+    pid = window.run(script("result = running.queue.running._process.pid"))
+    window.run("bpy.ops.wm.save_mainfile()")
+    assert window.quit() == 0
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{pid}").exists() and time.monotonic() < deadline:
+        time.sleep(0.2)
+    assert not Path(f"/proc/{pid}").exists() and not (folder / ".lock").exists()
