@@ -40,7 +40,7 @@ LARGEST_POINT = 3.0
 
 @dataclass
 class Shown:
-    """What `show_result` put into Blender: collections of objects, splats and anchors in all of them."""
+    """What `show_result` put into Blender: how many objects (the unlabelled rest is none), splats and anchors."""
 
     objects: int = 0
     splats: int = 0
@@ -89,7 +89,7 @@ def show_result(root: bpy.types.Collection, folder: Path, scene: bpy.types.Scene
             _remove(part_of(collection, ANCHORS))
         _rename(collection, objects.name(object_id))
         _recolour(collection, objects.rgb(object_id))
-        shown.objects += 1
+        shown.objects += object_id != 0
     for collection in collections.values():
         _empty(collection)
     for collection in new:

@@ -17,6 +17,7 @@ ROWS_AT_ONCE = 1 << 14
 """Few enough to stay in the processor's cache while their columns are looked at."""
 
 LARGEST_TABLE = 1 << 22
+"""IDs below this are told apart by counting, without a sort."""
 
 
 def read_splats(folder: Path) -> tuple[np.ndarray, list[str]]:

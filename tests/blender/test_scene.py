@@ -277,7 +277,7 @@ def test_splats_have_the_attributes_of_blenders_own(fresh, folder, degree):
     owner = bpy.context.scene
     root = blender_scene.show_capture(owner, folder)
     shown = blender_scene.show_result(root, folder, owner)
-    assert (shown.objects, shown.splats, shown.warnings) == (4, 20, [])
+    assert (shown.objects, shown.splats, shown.warnings) == (3, 20, [])
     bpy.context.view_layer.update()
     rows = table[table["object_id"] == 2]
     splats = part(root, 2, "splats")
@@ -376,7 +376,7 @@ def test_showing_again_keeps_what_the_user_did(root, folder):
 def test_a_result_of_other_size_replaces_the_one_before(root, folder):
     write_vertices(folder / "splats.ply", splat_table(np.resize([0, *OBJECTS], 84), degree=0, seed=3))
     shown = again(root, folder)
-    assert (shown.objects, shown.splats, shown.anchors) == (4, 84, 8)
+    assert (shown.objects, shown.splats, shown.anchors) == (3, 84, 8)
     mesh = part(root, 1, "splats").data
     assert len(mesh.vertices) == 21
     assert "radiance:sh_1" not in mesh.attributes
