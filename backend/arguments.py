@@ -60,7 +60,7 @@ reconstruction folder. `train` does this by itself where it is not done yet.
 
 _TRAIN = """\
 Make the splats. Leaves splats.ply, which splat viewers and Blender read, a
-checkpoint to go on from, and previews/latest.png, which shows how it looks now.
+checkpoint to go on from, and previews/, which show how it looks now.
 Run again with more --minutes or --steps, it goes on where it stopped.
 """
 

@@ -86,6 +86,7 @@ class Job:
 
     _process: BackendProcess | None = field(default=None, repr=False)
     _changed: bool = field(default=False, repr=False)
+    _new_preview: bool = field(default=False, repr=False)
     _answered: bool = field(default=False, repr=False)
     _done: bool = field(default=False, repr=False)
     _killed: bool = field(default=False, repr=False)
@@ -164,6 +165,11 @@ class Job:
         changed, self._changed = self._changed, False
         return changed
 
+    def take_preview(self) -> bool:
+        """Whether a preview was written since this was last asked."""
+        new, self._new_preview = self._new_preview, False
+        return new
+
     def _set(self, state: State, message: str | None = None) -> None:
         self.state = state
         self._changed = True
@@ -193,6 +199,7 @@ class Job:
             self._take_figures(event)
         elif kind == "preview":
             self.preview = Path(str(event.get("path", "")))
+            self._new_preview = True
         elif kind == "warning":
             if message not in self.warnings and len(self.warnings) < _WARNINGS:
                 self.warnings.append(message)

@@ -3,7 +3,6 @@
 
 import bpy
 
-from ..backend.protocol import Reconstruction
 from . import jobs, locations, previews, running, scene
 from .folder_state import folder_state
 from .job_display import draw_over, draw_running, duration, summary, write
@@ -85,8 +84,7 @@ class TrainPanel(_WithReconstruction, bpy.types.Panel):
             _explain(layout, folder, properties, job)
         icon = previews.icon_of(folder)
         if icon:
-            layout.template_icon(icon, scale=9.0)
-        if (Reconstruction(folder).previews / "latest.png").is_file():
+            layout.template_icon(icon, scale=8.0)
             layout.operator("objectgs.show_preview", icon="IMAGE_DATA")
 
 

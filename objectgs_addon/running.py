@@ -56,8 +56,8 @@ def busy(folder: Path) -> bool:
 def _tick() -> float | None:
     changed = queue.poll()
     for job in changed:
-        if job.preview is not None:
-            previews.update(job)
+        if job.take_preview():
+            previews.refresh(job.folder)
         if job.is_finished:
             _over(job)
     if changed:

@@ -3,7 +3,6 @@
 
 import bpy
 
-from ..backend.protocol import Reconstruction
 from ..objectgs_addon import previews, scene
 from . import need
 
@@ -17,13 +16,13 @@ class ShowPreview(bpy.types.Operator):
     def poll(cls, context):
         if not need.reconstruction(cls, context):
             return False
-        if _picture(context).is_file():
+        if previews.picture_of(scene.folder_of(need.active_root(context)), previews.COMPARISON):
             return True
         cls.poll_message_set("There is no preview yet; train first")
         return False
 
     def execute(self, context):
-        image = previews.image_of(scene.folder_of(need.active_root(context)), _picture(context))
+        image = previews.image_of(scene.folder_of(need.active_root(context)))
         editor = next((area for window in context.window_manager.windows for area in window.screen.areas
                        if area.type == "IMAGE_EDITOR"), None)
         if editor is None and not bpy.app.background:
@@ -33,10 +32,6 @@ class ShowPreview(bpy.types.Operator):
         if editor is not None:
             editor.spaces.active.image = image
         return {"FINISHED"}
-
-
-def _picture(context):
-    return Reconstruction(scene.folder_of(need.active_root(context))).previews / "latest.png"
 
 
 CLASSES = (ShowPreview,)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ..capture import Capture
-from ..evaluation import IdScores, ImageScores, comparison, save_picture
+from ..evaluation import IdScores, ImageScores, comparison, save_picture, thumbnail
 from ..export import agreement, fit_splats, write_anchors, write_splats
 from ..labels.points import read_points
 from ..model.object_model import ObjectModel
@@ -20,6 +20,7 @@ from ..training.loop import Budget, Trainer
 from ..training.scene import Scene
 from ..training.settings import Settings
 from .folder import described, digest, edited, memory_for_planes, open_reconstruction
+from .kernels import have_kernels_ready
 from .record import record, record_stage, recorded, stage
 from .vote import cast_votes, votes_are_current, votes_key
 
@@ -131,6 +132,7 @@ def _run(
     trainer: Trainer, budget: Budget, folder: Reconstruction, checkpoint_seconds: float, reporter: StoppingReporter
 ) -> None:
     """Train. The loop heeds a stop by itself, since it has a checkpoint to write first."""
+    have_kernels_ready(reporter)
     folder.previews.mkdir(exist_ok=True)
     step = trainer.progress.step
     begun = f"Going on after step {step} with" if step else "Training"
@@ -156,7 +158,8 @@ def _held_out(folder: Reconstruction, reporter: StoppingReporter) -> Callable[[O
             if place == 0:
                 assert picture.ids is not None
                 preview = comparison(photo, picture.image, truth, picture.ids, None, capture.names)
-                reporter.preview(save_picture(preview, folder.previews / "latest.png"))
+                render = save_picture(thumbnail(picture.image), folder.previews / "render.png")
+                reporter.preview(save_picture(preview, folder.previews / "latest.png"), render=render)
             if capture.test_indices:
                 images.add(picture.image, photo)
                 if truth is not None and picture.ids is not None:

@@ -1,7 +1,7 @@
 """How good a reconstruction is, on views it has not seen, and the report that says so."""
 
 from .metrics import IdScores, ImageScores, psnr, ssim
-from .pictures import comparison, contact_sheet, id_picture, save_picture
+from .pictures import comparison, contact_sheet, id_picture, save_picture, thumbnail
 from .protocols import evaluate
 from .report import write_report
 
@@ -15,5 +15,6 @@ __all__ = [
     "psnr",
     "save_picture",
     "ssim",
+    "thumbnail",
     "write_report",
 ]

@@ -16,7 +16,8 @@ _LAYERS = ("raster", "model", "training")
 
 
 @functools.cache
-def _digest_up_to(package: str) -> str:
+def digest_up_to(package: str) -> str:
+    """The content of all files that the kernels of `package` may be made of, as a hash."""
     digest = hashlib.sha256()
     for folder in _LAYERS[: _LAYERS.index(package) + 1]:
         for path in sorted((Path(__file__).parents[1] / folder).glob("*.py")):
@@ -34,7 +35,7 @@ def kernel(parallel: bool = False, fastmath: bool | set[str] = False) -> Callabl
 
     def decorate(function: Callable[..., Any]) -> Any:
         dispatcher = njit(parallel=parallel, cache=True, error_model="numpy", fastmath=fastmath)(function)
-        digest = _digest_up_to(function.__module__.split(".")[-2])
+        digest = digest_up_to(function.__module__.split(".")[-2])
         # Without a cache folder, or with another numba inside, numba's own rule stays.
         with contextlib.suppress(AttributeError):
             cache_file = dispatcher._cache._cache_file

@@ -131,7 +131,9 @@ def test_click_selects_the_whole_object(window):
         with bpy.context.temp_override(**context):
             bpy.ops.view3d.view_axis(type="TOP")
         at = np.array([v.co for v in splats.data.vertices])
-        top = at[np.argmax(at[:, 2])]
+        base = np.empty(4 * len(at), np.float32)
+        splats.data.attributes["radiance:base"].data.foreach_get("color", base)
+        top = at[np.argmax(base[3::4])]
         middle = splats.matrix_world @ mathutils.Vector(top)
         region3d = space.region_3d
         region3d.view_location = middle

@@ -1,0 +1,88 @@
+"""Compiling all kernels before the clock of a training runs, once for a machine."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import tempfile
+from pathlib import Path
+
+import llvmlite.binding
+import numba
+import numpy as np
+from PIL import Image
+
+from ..capture import load_capture
+from ..labels import vote as vote_points
+from ..protocol import Reconstruction, Reporter
+from ..raster import compile_kernels
+from ..raster.draw import draw
+from ..raster.kernel import digest_up_to
+from ..stopping import StoppingReporter
+from ..training.loop import Budget, Trainer
+from ..training.settings import Settings
+
+STEPS = 220
+"""A second or two, and enough for anchors to grow once: after 100 steps, in the first half of the training."""
+
+
+def have_kernels_ready(reporter: StoppingReporter) -> None:
+    """Compile what is not compiled yet on this machine; returns at once where a run before has done it."""
+    mark = _mark()
+    if not mark.exists():
+        try_kernels(reporter)
+
+
+def try_kernels(reporter: StoppingReporter) -> None:
+    """Compile all kernels, with progress, and see them run in a training of a few splats."""
+    reporter.status("Compiling the renderer's kernels (once for a machine)")
+    compile_kernels(lambda done, total: reporter.progress(done, total))
+    reporter.status("Training a few splats")
+    with tempfile.TemporaryDirectory(prefix="objectgs-kernels-") as place:
+        _train_a_little(Path(place), reporter)
+    # A cache that cannot be written to has no use for the mark either.
+    with contextlib.suppress(OSError):
+        mark = _mark()
+        mark.parent.mkdir(parents=True, exist_ok=True)
+        mark.touch()
+
+
+def _mark() -> Path:
+    """A file beside numba's own that says: the kernels of these sources are there, for this numba and processor."""
+    kernels = f"{digest_up_to('training')} {numba.__version__} {llvmlite.binding.get_host_cpu_name()}"
+    folder = Path(numba.config.CACHE_DIR or Path(__file__).parents[1] / "raster" / "__pycache__")
+    return folder / f"objectgs-{hashlib.sha256(kernels.encode()).hexdigest()[:16]}.ready"
+
+
+def _train_a_little(place: Path, reporter: StoppingReporter) -> None:
+    """Take a made-up capture through every part, so that each kernel is compiled, cached and seen to run."""
+    capture_folder, folder = place / "capture", Reconstruction(place / "out").create()
+    _write_small_capture(capture_folder)
+    quiet = Reporter()
+    capture = load_capture(capture_folder, folder.cache, reporter=quiet)
+    ids = vote_points(capture, reporter=quiet).ids
+    trainer = Trainer.start(capture, ids, Settings(offsets=2))
+    trainer.run(Budget(steps=STEPS), folder.checkpoint, quiet, stop=reporter.stop)
+    picture = draw(trainer.model, trainer.scene.camera(0), want_depth=True)
+    if not np.isfinite(picture.image).all():
+        raise RuntimeError("a small training ended in a picture that is not finite")
+
+
+def _write_small_capture(folder: Path) -> None:
+    """Four views, 64x48, of two clusters of points, with masks; a COLMAP model in text."""
+    rng = np.random.default_rng(0)
+    for name in ("images", "masks", "sparse/0"):
+        (folder / name).mkdir(parents=True)
+    points = rng.normal(0, 0.3, (200, 3)) + np.where(np.arange(200) < 100, -0.5, 0.5)[:, None] * [1, 0, 0]
+    pictures = []
+    for i in range(4):
+        pictures += [f"{i + 1} 1 0 0 0 {0.2 * i - 0.3} 0 3 1 {i}.png", ""]
+        Image.fromarray(rng.integers(0, 255, (48, 64, 3), np.uint8)).save(folder / "images" / f"{i}.png")
+        Image.fromarray(np.repeat([[1] * 32 + [2] * 32], 48, 0).astype(np.uint8)).save(folder / "masks" / f"{i}.png")
+    model = {
+        "cameras": ["1 PINHOLE 64 48 64 64 32 24"],
+        "images": pictures,
+        "points3D": [f"{i} {x} {y} {z} 128 128 128 0" for i, (x, y, z) in enumerate(points.tolist())],
+    }
+    for name, lines in model.items():
+        (folder / "sparse/0" / f"{name}.txt").write_text("\n".join(lines) + "\n")
