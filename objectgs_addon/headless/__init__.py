@@ -5,7 +5,9 @@
 """
 
 import contextlib
+import os
 import signal
+import sys
 import traceback
 
 from ...backend.protocol import (
@@ -49,6 +51,10 @@ def main(arguments: list[str]) -> int:
     except (InputError, UsageError) as error:
         reporter.error(str(error))
         return EXIT_BAD_INPUT
+    except BrokenPipeError:
+        # Nobody reads any more. Python would complain once again when it flushes at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_CANCELLED
     except commands.StepFailed as error:
         reporter.error(str(error))
         return EXIT_FAILED
@@ -63,11 +69,17 @@ def main(arguments: list[str]) -> int:
 
 @contextlib.contextmanager
 def _stoppable():
-    """Ctrl-C and SIGTERM raise KeyboardInterrupt; Blender would take the first for itself, the second ends it."""
+    """Ctrl-C and SIGTERM raise KeyboardInterrupt; Blender would take the first for itself, the second ends it.
+
+    A reader that went away ends Blender too, where a plain Python raises BrokenPipeError.
+    """
     def stop(*_):
         raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    wanted = {signal.SIGINT: stop, signal.SIGTERM: stop}
+    if hasattr(signal, "SIGPIPE"):
+        wanted[signal.SIGPIPE] = signal.SIG_IGN
+    before = {number: signal.signal(number, handler) for number, handler in wanted.items()}
     try:
         yield
     finally:

@@ -23,7 +23,7 @@ def batch(options) -> None:
     Reconstruction(out).create()
     summary = _Summary(out, captures)
     for number, capture in enumerate(captures, 1):
-        wanted = {**settings, "capture": str(capture), "files": _fingerprint(capture)}
+        wanted = {**settings, "capture": str(capture), "files": fingerprint(capture)}
         entry = summary.entry(capture.name)
         title = f"{capture.name} ({number} of {len(captures)})"
         if _is_done(entry, wanted, out / capture.name):
@@ -50,7 +50,7 @@ def _captures(source: Path) -> list[Path]:
     return found
 
 
-def _fingerprint(capture: Path) -> list[int]:
+def fingerprint(capture: Path) -> list[int]:
     """Count, bytes and latest change (ns) of the files that a reconstruction is made of."""
     states = [path.stat() for part in ("images", "masks", "sparse", "labels.json")
               for path in ([capture / part] if (capture / part).is_file() else (capture / part).rglob("*"))

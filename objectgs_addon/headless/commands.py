@@ -17,7 +17,7 @@ from .picture import render_picture
 
 BLEND = "objectgs.blend"
 PICTURE = "render.png"
-SAMPLES = 32
+SAMPLES = 16
 """Rays a pixel in the .blend that is built, unless --samples says otherwise."""
 
 _TITLES = {"import": "Import", "vote": "Vote", "train": "Train", "evaluate": "Evaluate", "report": "Report"}

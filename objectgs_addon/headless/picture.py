@@ -12,6 +12,7 @@ import bpy
 
 from ...backend.protocol import EXIT_CANCELLED, Cancelled, InputError
 from ..quiet import quiet
+from .lines import say
 
 FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".exr": "OPEN_EXR"}
 
@@ -71,6 +72,9 @@ def _choose_engine(scene, engine: str | None, samples: int | None) -> None:
             scene.render.engine = "BLENDER_EEVEE_NEXT"  # 4.2 to 4.5
         except TypeError:
             scene.render.engine = "BLENDER_EEVEE"
+    if scene.render.engine == "CYCLES" and scene.cycles.use_denoising and not scene.cycles.denoiser:
+        scene.cycles.use_denoising = False
+        say("Warning: this Blender cannot denoise; more --samples make a cleaner picture.")
     if samples is not None:
         if scene.render.engine == "CYCLES":
             scene.cycles.samples = samples
@@ -89,7 +93,7 @@ def _render(scene, path: Path) -> None:
         with quiet(), _ended_by_signals(path):
             result = bpy.ops.render.render(write_still=True, scene=scene.name)
     except RuntimeError as error:
-        reason = " ".join(str(error).removeprefix("Error: ").split()).rstrip(".")
+        reason = str(error).strip().splitlines()[0].removeprefix("Error: ").rstrip(".")
         raise InputError(f"The picture could not be rendered: {reason}.") from error
     if "FINISHED" not in result:
         raise Cancelled("Cancelled; no picture was written.")

@@ -13,6 +13,8 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
+from objectgs.objectgs_addon.headless.batch import fingerprint  # noqa: E402
+
 import headless  # noqa: E402
 
 SIZE = ("--size", "48x36", "--samples", "1")
@@ -85,9 +87,9 @@ def test_arguments_that_make_no_sense(arguments, words, capsys):
 
 def test_build_holds_the_reconstruction(blend, trained):
     bpy.ops.wm.open_mainfile(filepath=str(blend))
-    kinds = {collection.get("objectgs") for collection in bpy.data.collections}
+    kinds = {collection.get("objectgs_kind") for collection in bpy.data.collections}
     assert {"reconstruction", "capture", "object"} <= kinds
-    names = {collection.name for collection in bpy.data.collections if collection.get("objectgs") == "object"}
+    names = {collection.name for collection in bpy.data.collections if collection.get("objectgs_kind") == "object"}
     wanted = {entry["name"] for entry in json.loads((trained / "objects.json").read_text())["objects"]}
     assert wanted <= names
     assert bpy.context.scene.camera is not None
@@ -214,14 +216,13 @@ def test_stopped_rendering_ends_soon(blend, tmp_path):
 
 @pytest.fixture(scope="module")
 def batch(capture, backend_python, tmp_path_factory):
-    """(folder of captures, where they went, first run of the batch): two good captures and a bad one."""
+    """(folder of captures, where they went, the arguments, the first run): a good capture and a bad one."""
     folder = tmp_path_factory.mktemp("batch")
-    shutil.copytree(capture, folder / "captures" / "a")
-    shutil.copytree(capture, folder / "captures" / "c")
-    (folder / "captures" / "b" / "images").mkdir(parents=True)
+    shutil.copytree(capture, folder / "captures" / "good")
+    (folder / "captures" / "bad" / "images").mkdir(parents=True)
     (folder / "captures" / "notes").mkdir()
-    arguments = (folder / "captures", "--out", folder / "out", "--steps", "5", *SIZE)
-    return folder / "captures", folder / "out", arguments, run("batch", *arguments, OBJECTGS_PYTHON=backend_python)
+    arguments = ("batch", folder / "captures", "--out", folder / "out", "--steps", "5", *SIZE)
+    return folder / "captures", folder / "out", arguments, run(*arguments, OBJECTGS_PYTHON=backend_python)
 
 
 def summary(out):
@@ -231,27 +232,33 @@ def summary(out):
 def test_batch_survives_a_bad_capture(batch):
     _, out, _, ran = batch
     assert ran.returncode == 2, ran.output + ran.errors
-    entries = summary(out)
-    assert {name: entry["state"] for name, entry in entries.items()} == {"a": "done", "b": "bad input", "c": "done"}
-    assert entries["a"]["splats"] > 0 and entries["a"]["seconds"] > 0 and 5 < entries["a"]["psnr"] < 60
-    assert "b" in entries["b"]["error"] and entries["a"]["error"] is None
+    bad, good = summary(out).values()
+    assert (bad["name"], bad["state"], good["name"], good["state"]) == ("bad", "bad input", "good", "done")
+    assert good["splats"] > 0 and good["seconds"] > 0 and 5 < good["psnr"] < 60 and good["error"] is None
+    assert str(out.parent / "captures" / "bad") in bad["error"]
     table = (out / "batch.md").read_text()
-    assert all(f"| {name} |" in table for name in entries) and entries["b"]["error"] in table
-    for name in ("a", "c"):
-        assert (out / name / "objectgs.blend").is_file() and size_of(out / name / "render.png") == (48, 36)
+    assert bad["error"] in table and "| good | done |" in table and "notes" not in table
+    assert (out / "good" / "objectgs.blend").is_file() and size_of(out / "good" / "render.png") == (48, 36)
 
 
 def test_batch_goes_on_with_what_is_not_done(batch, capture, backend_python):
     captures, out, arguments, _ = batch
     first = summary(out)
-    shutil.copytree(capture, captures / "b", dirs_exist_ok=True)
-    (captures / "c" / "labels.json").write_text(json.dumps({"1": "cup"}))
-    again = run("batch", *arguments, OBJECTGS_PYTHON=backend_python)
+    shutil.copytree(capture, captures / "bad", dirs_exist_ok=True)
+    again = run(*arguments, OBJECTGS_PYTHON=backend_python)
     assert again.returncode == 0, again.output + again.errors
     second = summary(out)
-    assert second["a"] == first["a"] and "a (1 of 3): done before" in again.output
-    assert [second[name]["state"] for name in "abc"] == ["done"] * 3
-    assert second["c"]["settings"] != first["c"]["settings"]
+    assert second["good"] == first["good"] and "good (2 of 2): done before" in again.output
+    assert second["bad"]["state"] == "done" and second["bad"]["error"] is None
+
+
+def test_batch_does_a_changed_capture_again(capture, tmp_path):
+    shutil.copytree(capture, tmp_path / "a")
+    before = fingerprint(tmp_path / "a")
+    assert fingerprint(tmp_path / "a") == before
+    mask = min((tmp_path / "a" / "masks").iterdir())
+    mask.write_bytes(mask.read_bytes())
+    assert fingerprint(tmp_path / "a") != before
 
 
 def test_batch_refuses(tmp_path):
