@@ -11,7 +11,7 @@ from pathlib import Path
 
 import bpy
 
-from ..backend.protocol import InputError
+from ..backend.protocol import InputError, Reconstruction
 from . import locations, messages, object_edits, previews, scene, view
 from .jobs import Job, JobQueue, State, run_blocking
 
@@ -72,9 +72,9 @@ def redraw() -> None:
             for region in area.regions:
                 if (area.type, region.type) in (("VIEW_3D", "UI"), ("PREFERENCES", "WINDOW")):
                     region.tag_redraw()
-        for area in window.screen.areas:
-            if area.type == "STATUSBAR":
-                area.tag_redraw()
+        # No area of a screen, so this is the way to have the status bar drawn; a modal operator's text stays.
+        if not len(getattr(window, "modal_operators", ())):
+            window.workspace.status_text_set_internal(None)
 
 
 def _over(job: Job) -> None:
@@ -115,7 +115,8 @@ def _show_capture(job: Job, owner) -> bool:
     object_edits.fill(root)
     if owner is not None:
         owner.objectgs.active = root
-        view.frame(root)
+        view.show(root)
+    job.warnings.extend(scene.warnings_of(root))
     return True
 
 
@@ -130,8 +131,10 @@ def _show_votes(job: Job, _owner) -> bool:
 
 
 def _show_result(job: Job, _owner) -> bool:
-    roots = _roots_of(job.folder)
+    roots = _roots_of(job.folder) if Reconstruction(job.folder).splats.exists() else []
     for root in roots:
+        if not scene.object_collections(root):
+            view.hide_points(root)
         for holder in object_edits.scenes_of(root)[:1]:
             shown = scene.show_result(root, job.folder, holder)
             job.warnings.extend(shown.warnings)

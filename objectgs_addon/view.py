@@ -1,24 +1,33 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the 3D viewports look at."""
+"""What the 3D viewports look at and show."""
 
 import bpy
 
 from . import scene
 
 
-def frame(root) -> None:
-    """Let every 3D viewport of the windows that show a reconstruction's scene look at its cameras and points."""
+def show(root) -> None:
+    """Let every 3D viewport of a reconstruction's scene look at its cameras, and show colours in Solid mode."""
     for window in bpy.context.window_manager.windows:
         if root not in window.scene.collection.children_recursive:
             continue
         for area in window.screen.areas:
             if area.type == "VIEW_3D":
+                area.spaces.active.shading.color_type = "VERTEX"
                 region = next(region for region in area.regions if region.type == "WINDOW")
                 with bpy.context.temp_override(window=window, area=area, region=region):
-                    _frame_in_context(root)
+                    _frame(root)
 
 
-def _frame_in_context(root) -> None:
+def hide_points(root) -> None:
+    """Take the point cloud out of sight, since splats come into its place."""
+    for part in root.all_objects:
+        if scene.kind_of(part) == "points":
+            part.hide_set(True)
+
+
+def _frame(root) -> None:
+    """Look at the cameras in the viewport of the context; the selection stays."""
     context = bpy.context
     selected = list(context.selected_objects)
     for thing in selected:

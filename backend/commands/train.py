@@ -48,10 +48,14 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
                     "votes": votes_key(capture, options.max_size, options.strategy, options.seed),
                 },
             )
-            _run(trainer, budget, folder, options.checkpoint_seconds, reporter)
-        with stage(folder, "export"):
-            export = _export(trainer.model, trainer.scene, folder, reporter)
-        record(folder, export=export)
+            try:
+                _run(trainer, budget, folder, options.checkpoint_seconds, reporter)
+            except Cancelled:
+                # What a stopped training has come to is there to be seen too, where that takes no time.
+                if trainer.model.explicit and progress.step:
+                    _export(trainer.model, trainer.scene, folder, reporter)
+                raise
+        export = _export(trainer.model, trainer.scene, folder, reporter)
     latest = progress.curve[-1] if progress.curve else {}
     reporter.done(
         steps=progress.step, seconds=round(progress.seconds, 1), anchors=len(trainer.model.anchors),
@@ -171,8 +175,15 @@ def _held_out(folder: Reconstruction, reporter: StoppingReporter) -> Callable[[O
 
 
 def _export(model: ObjectModel, scene: Scene, folder: Reconstruction, reporter: Reporter) -> dict[str, Any]:
-    """Write splats.ply and anchors.ply; returns how many they hold and, where the splats are only a fit, their PSNR to
-    the model."""
+    """Write splats.ply and anchors.ply; returns, and records, how many they hold and, where the splats are only a fit,
+    their PSNR to the model."""
+    with stage(folder, "export"):
+        export = _write_export(model, scene, folder, reporter)
+    record(folder, export=export)
+    return export
+
+
+def _write_export(model: ObjectModel, scene: Scene, folder: Reconstruction, reporter: Reporter) -> dict[str, Any]:
     reporter.status(f"Writing {folder.splats.name}")
     psnr = None
     if model.explicit:

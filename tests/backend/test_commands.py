@@ -676,8 +676,10 @@ def test_a_signal_saves_and_the_same_command_goes_on(trained, ask, monkeypatch, 
     train = ("train", capture, "--out", out, "--steps", 40, *SMALL)
     handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     signal_at(monkeypatch, Trainer, "step", 7, number)
+    before = (out / "splats.ply").read_bytes()
     stopped = ask(*train, "--json")
     assert stopped.code == EXIT_CANCELLED
+    assert (out / "splats.ply").read_bytes() != before, "what the stopped training has come to is there to be seen"
     assert stopped.events[-1]["stopped"] is True and "after 27 steps" in stopped.events[-1]["message"]
     assert step_of(out) == 27
     stages = {s["name"]: s["seconds"] for s in json.loads((out / "objectgs.json").read_text())["stages"]}
