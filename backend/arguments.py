@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from . import __version__
+from . import __version__, lacking
 from .protocol import (
     EXIT_BAD_INPUT,
     EXIT_CANCELLED,
@@ -298,6 +298,8 @@ def _refusal(error: Exception) -> str | None:
     # torch says that memory ran out with a RuntimeError.
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "allocate memory" in str(error)):
         return "There is not enough memory; try a smaller --max-size, --memory-mb or --max-anchors."
+    if isinstance(error, ModuleNotFoundError):
+        return lacking(error)
     if isinstance(error, OSError) and error.filename:
         full = error.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", None))
         what = "could not be written" if full else "cannot be used"

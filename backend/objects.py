@@ -16,6 +16,7 @@ from typing import Any
 
 from .protocol import InputError, read_json, write_json
 
+LARGEST_ID = 2**32 - 1
 EDITABLE = ("name", "colour", "merged_into", "left_out")
 
 
@@ -43,8 +44,8 @@ def read_objects(path: Path) -> list[SceneObject]:
             _object({**entry, **_known(edits.get(str(entry["id"]), {}))})
             for entry in sorted(content["objects"], key=lambda entry: entry["id"])
         ]
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path} does not list objects as expected ({error!r}); run the vote again.") from error
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{path} does not list objects as expected ({error!r}); delete it and vote again.") from error
 
 
 def write_objects(path: Path, objects: Sequence[Mapping[str, Any]]) -> None:
@@ -80,22 +81,34 @@ def merged(objects: Sequence[SceneObject]) -> dict[int, int]:
 
 
 def _object(entry: Mapping[str, Any]) -> SceneObject:
-    red, green, blue = (int(channel) for channel in entry["colour"])
-    into = entry.get("merged_into")
+    red, green, blue = (_integer(channel, 255) for channel in entry["colour"])
+    object_id, into = _integer(entry["id"], LARGEST_ID), entry.get("merged_into")
     return SceneObject(
-        id=int(entry["id"]),
-        name=str(entry["name"]),
+        id=object_id,
+        name=_name(str(entry["name"])) or f"object {object_id}",
         colour=(red, green, blue),
-        points=int(entry["points"]),
-        merged_into=None if into is None else int(into),
+        points=_integer(entry["points"], 2**31 - 1),
+        merged_into=None if into is None else _integer(into, LARGEST_ID),
         left_out=bool(entry.get("left_out", False)),
     )
+
+
+def _integer(value: Any, largest: int) -> int:
+    number = int(value)
+    if not 0 <= number <= largest:
+        raise ValueError(f"{value} is not between 0 and {largest}")
+    return number
+
+
+def _name(text: str) -> str:
+    """`text` on one line and as valid Unicode, which JSON's escapes need not be and Blender's names must."""
+    return " ".join(text.encode("utf-8", "replace").decode().replace("\0", " ").split())
 
 
 def _edits(content: Any, path: Path) -> dict[str, dict[str, Any]]:
     edits = content.get("edits", {}) if isinstance(content, dict) else None
     if not isinstance(edits, dict) or not all(isinstance(edit, dict) for edit in edits.values()):
-        raise InputError(f"{path} does not list objects as expected; run the vote again.")
+        raise InputError(f"{path} does not list objects as expected; delete it and vote again.")
     return dict(edits)
 
 

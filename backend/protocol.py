@@ -123,7 +123,9 @@ def read_json(path: Path) -> Any:
     except FileNotFoundError as error:
         raise InputError(f"{path} does not exist; run the step that makes it first.") from error
     except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as JSON ({error}).") from error
+        raise InputError(
+            f"{path} cannot be read as JSON ({error}); repair it, or delete it and run the step that makes it."
+        ) from error
 
 
 class Reporter:

@@ -252,7 +252,7 @@ class Job:
 
     def _crash(self, code: int) -> str:
         """One sentence for an end that the program did not explain, and its last words."""
-        if self.if_silent is not None and not self._answered:
+        if self.if_silent is not None and not self._answered and code >= 0:
             return self.if_silent
         words = _last_words(self.log)
         how = "ended without a result" if code == EXIT_DONE else _how_it_ended(code)

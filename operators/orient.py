@@ -5,6 +5,7 @@ import bpy
 from bpy.props import FloatProperty, FloatVectorProperty
 from mathutils import Vector
 
+from ..backend.protocol import InputError
 from ..objectgs_addon import picking, scene
 from . import need
 
@@ -74,7 +75,7 @@ class SetGround(_PicksPoints, bpy.types.Operator):
     def execute(self, context):
         try:
             scene.orient_to_ground(need.active_root(context), *self._points())
-        except ValueError as error:
+        except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         return {"FINISHED"}
@@ -99,7 +100,7 @@ class SetDistance(_PicksPoints, bpy.types.Operator):
     def execute(self, context):
         try:
             scene.scale_to_distance(need.active_root(context), *self._points(), self.distance)
-        except ValueError as error:
+        except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         return {"FINISHED"}
