@@ -9,12 +9,11 @@ import bpy
 
 from . import environment
 from .backend_process import backend_command, backend_environment
+from .environment_worker import VERSIONS
 from .jobs import Job
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = __package__.rpartition(".")[0]
-
-NO_BACKEND = "The compute backend is not set up; open the preferences of ObjectGS and press Set Up Backend"
 
 
 def preferences():
@@ -43,12 +42,27 @@ def reconstructions_folder() -> Path:
 
 def backend_python() -> Path | None:
     """The Python that runs the backend: the user's, or the environment that was set up; None where there is none."""
-    chosen = os.environ.get("OBJECTGS_PYTHON") or (preferences().backend_python if preferences() else "")
-    if chosen:
-        path = Path(bpy.path.abspath(chosen))
-        return path if path.is_file() else None
+    chosen = _chosen_python()
+    if chosen is not None:
+        return chosen if chosen.is_file() else None
     state = environment.inspect(environment_folder())
     return state.python if state.state == "ready" else None
+
+
+def backend_sentence() -> str:
+    """What there is to say about the backend: where it is, or why it cannot be run and what to do."""
+    chosen = _chosen_python()
+    if chosen is None:
+        return environment.inspect(environment_folder()).sentence
+    if chosen.is_file():
+        return f"The backend is at {chosen}."
+    return f"The backend's Python {chosen} does not exist; choose the program of a Python, or empty the field."
+
+
+def _chosen_python() -> Path | None:
+    """The Python that the user has chosen, whether it is there or not."""
+    chosen = os.environ.get("OBJECTGS_PYTHON") or (preferences().backend_python if preferences() else "")
+    return Path(bpy.path.abspath(chosen)) if chosen else None
 
 
 def base_python() -> Path:
@@ -59,8 +73,10 @@ def base_python() -> Path:
 
 def backend_job(title: str, kind: str, folder: Path | None, *arguments: str) -> Job:
     """A job that runs `python -m backend ARGUMENTS --json`; the backend must be there (`backend_python`)."""
-    return Job(title=title, kind=kind, folder=folder, command=backend_command(backend_python(), *arguments), cwd=ROOT,
-               environment=backend_environment(user_folder() / "cache"))
+    python = backend_python()
+    silent = f"{python} cannot run the backend; choose a Python {VERSIONS} that has its packages, or set it up anew."
+    return Job(title=title, kind=kind, folder=folder, command=backend_command(python, *arguments), cwd=ROOT,
+               environment=backend_environment(user_folder() / "cache"), if_silent=silent)
 
 
 def demo_folder() -> Path:

@@ -4,7 +4,7 @@
 import bpy
 from bpy.props import EnumProperty, StringProperty
 
-from . import environment, job_display, locations, running
+from . import job_display, locations, running
 
 
 class Preferences(bpy.types.AddonPreferences):
@@ -61,12 +61,7 @@ def _draw_state(layout) -> None:
 
 def backend_state() -> tuple[str, str]:
     """A sentence about the backend, and an icon."""
-    if locations.backend_python() is not None:
-        return f"The backend is at {locations.backend_python()}", "CHECKMARK"
-    chosen = locations.preferences().backend_python
-    if chosen:
-        return f"{bpy.path.abspath(chosen)} does not exist; choose the program of a Python, or empty the field", "ERROR"
-    return environment.inspect(locations.environment_folder()).sentence, "INFO"
+    return locations.backend_sentence(), "CHECKMARK" if locations.backend_python() is not None else "ERROR"
 
 
 def register():

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Import a capture: cameras with their photos, and the point cloud."""
 
+import itertools
 import re
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import bpy
 from bpy.props import IntProperty, StringProperty
 
 from ..objectgs_addon import locations, running
+from ..objectgs_addon.folder_state import folder_state
 from . import need
 
 
@@ -45,8 +47,9 @@ class ImportCapture(bpy.types.Operator):
             self.report({"ERROR"}, f"The folder {capture or 'of the capture'} does not exist; choose another")
             return {"CANCELLED"}
         folder = Path(bpy.path.abspath(self.folder)).resolve() if self.folder else _folder_for(capture)
-        if running.busy(folder):
-            self.report({"ERROR"}, f"A job works in {folder} already; wait for it or stop it")
+        sentence = need.in_use(folder)
+        if sentence is not None:
+            self.report({"ERROR"}, sentence)
             return {"CANCELLED"}
         job = locations.backend_job(f"Import {capture.name}", "import", folder, "import", str(capture), "--out",
                                     str(folder), "--max-size", str(self.max_size))
@@ -54,9 +57,16 @@ class ImportCapture(bpy.types.Operator):
 
 
 def _folder_for(capture: Path) -> Path:
-    """A reconstruction folder named as the capture (or as its parent where the capture's name says nothing)."""
+    """A reconstruction folder named as the capture (or as its parent where the capture's name says nothing).
+
+    Numbered where that name belongs to another capture.
+    """
     name = capture.name if capture.name.lower() not in ("capture", "colmap", "data") else capture.parent.name
-    return locations.reconstructions_folder() / (re.sub(r"[^\w.-]+", "_", name) or "capture")
+    name = re.sub(r"[^\w.-]+", "_", name) or "capture"
+    for number in itertools.count(1):
+        folder = locations.reconstructions_folder() / (name if number == 1 else f"{name}-{number}")
+        if folder_state(folder).capture in (None, capture):
+            return folder
 
 
 CLASSES = (ImportCapture,)

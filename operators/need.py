@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What operators need before they can run; each refusal says why, for the greyed-out button's tooltip."""
 
+import os
+from pathlib import Path
+
 from ..objectgs_addon import jobs, locations, running, scene
 from ..objectgs_addon.folder_state import folder_state
 
@@ -14,7 +17,7 @@ def backend(cls) -> bool:
     """Whether the compute backend can be run."""
     if locations.backend_python() is not None:
         return True
-    cls.poll_message_set(locations.NO_BACKEND)
+    cls.poll_message_set(f"{locations.backend_sentence()} See the preferences of ObjectGS")
     return False
 
 
@@ -33,21 +36,30 @@ def reconstruction(cls, context) -> bool:
 
 def idle(cls, context) -> bool:
     """Whether nothing works in the active reconstruction's folder, here or in another program."""
-    folder = scene.folder_of(active_root(context))
+    sentence = in_use(scene.folder_of(active_root(context)))
+    if sentence is not None:
+        cls.poll_message_set(sentence)
+    return sentence is None
+
+
+def in_use(folder: Path) -> str | None:
+    """Who works in a reconstruction folder, as a sentence; None where nobody does."""
     if running.busy(folder):
-        cls.poll_message_set("A job works on this reconstruction; wait for it or stop it")
-        return False
+        return f"A job works in {folder}; wait for it or stop it"
     holder = jobs.lock_holder(folder)
     if holder is not None:
-        cls.poll_message_set(f"Another program works on this reconstruction (process {holder}); wait for it or stop it")
-        return False
-    return True
+        return f"Another program (process {holder}) works in {folder}; wait for it or stop it"
+    return None
 
 
 def capture(cls, context) -> bool:
     """Whether the active reconstruction's capture is where it was."""
-    place = folder_state(scene.folder_of(active_root(context))).capture
-    if place is not None and place.is_dir():
+    folder = scene.folder_of(active_root(context))
+    place = folder_state(folder).capture
+    if place is None:
+        cls.poll_message_set(f"{folder / 'cameras.json'} does not say where the capture is; import it again")
+        return False
+    if os.path.isdir(place):
         return True
     cls.poll_message_set(f"The capture {place} is gone; put it back, or import it again from where it is now")
     return False
