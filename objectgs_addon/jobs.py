@@ -190,6 +190,8 @@ class Job:
             if self.state is State.RUNNING:
                 self._phase_began = time.monotonic()
                 self.seconds_left = None
+                if self.progress == 1.0:  # The phase before is over, not the job.
+                    self.progress = 0.0
             if self.state is not State.STOPPING:
                 self.message = message
         elif kind == "progress":

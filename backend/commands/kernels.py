@@ -37,7 +37,7 @@ def try_kernels(reporter: StoppingReporter) -> None:
     """Compile all kernels, with progress, and see them run in a training of a few splats."""
     reporter.status("Compiling the renderer's kernels (once for a machine)")
     compile_kernels(lambda done, total: reporter.progress(done, total))
-    reporter.status("Training a few splats")
+    reporter.status("Trying them on a few splats")
     with tempfile.TemporaryDirectory(prefix="objectgs-kernels-") as place:
         _train_a_little(Path(place), reporter)
     # A cache that cannot be written to has no use for the mark either.
