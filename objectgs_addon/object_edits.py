@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The objects list and objects.json: filled from the file, and the user's edits written back to it."""
 
+import json
 from contextlib import contextmanager
 
 import bpy
@@ -53,6 +54,7 @@ def fill(root) -> None:
             item.splats = shown.get(entry.id, 0)
             item.is_merged = entry.merged_into is not None
             item.merged_into = to_stored(entry.merged_into or 0)
+            _remember(item)
             if item.object_id == active_id:
                 properties.active_object = len(properties.objects) - 1
         properties.active_object = max(0, min(properties.active_object, len(entries) - 1))
@@ -113,12 +115,13 @@ def _edit(root, changes: dict[int, dict]) -> None:
     """Write edits to objects.json and show them."""
     if not changes:
         return
-    folder = scene.folder_of(root)
-    edit_objects(Reconstruction(folder).objects, changes)
-    for owner in scenes_of(root):
-        show(root, owner)
-        break
-    fill(root)
+    _require_object_mode(root)
+    edit_objects(Reconstruction(scene.folder_of(root)).objects, changes)
+    try:
+        for owner in scenes_of(root)[:1]:
+            show(root, owner)
+    finally:
+        fill(root)
 
 
 def show(root, owner) -> None:
@@ -143,11 +146,10 @@ def scenes_of(root):
 
 
 def active_item(root):
-    """The active row, or None."""
+    """The active row, or None where there are no rows."""
     properties = root.objectgs
-    if 0 <= properties.active_object < len(properties.objects):
-        return properties.objects[properties.active_object]
-    return None
+    count = len(properties.objects)
+    return properties.objects[min(max(properties.active_object, 0), count - 1)] if count else None
 
 
 def _rgb(item) -> list[int]:
@@ -160,10 +162,13 @@ def _rgb(item) -> list[int]:
 def name_changed(item, _context) -> None:
     if _filling:
         return
-    if not item.name.strip():
-        fill(item.id_data)  # An empty name is no name: the one before comes back.
+    name = " ".join(item.name.split())
+    if not name:
+        _restore(item)  # An empty name is no name.
         return
-    _row_changed(item, name=item.name.strip())
+    with without_callbacks():
+        item.name = name
+    _row_changed(item, name=name)
 
 
 def colour_changed(item, _context) -> None:
@@ -175,18 +180,41 @@ def chosen_changed(item, _context) -> None:
 
 
 def _row_changed(item, **changes) -> None:
-    """One row was edited by the user. A folder that is gone or cannot be written must not raise in a callback."""
+    """One row was edited by the user; it is as before where that cannot be stored. A callback must not raise."""
     if _filling:
         return
     root = item.id_data
+    folder = scene.folder_of(root)
     try:
-        folder = scene.folder_of(root)
+        _require_object_mode(root)
         edit_objects(Reconstruction(folder).objects, {from_stored(item.object_id): changes})
-        for owner in scenes_of(root):
-            scene.show_objects(root, folder, owner)
-            break
     except (InputError, OSError) as error:
-        messages.show(str(error), "ERROR")
+        _restore(item)
+        messages.show(f"{item.name} was not changed: {messages.sentence(error)}", "ERROR")
+        return
+    _remember(item)
+    try:
+        for owner in scenes_of(root)[:1]:
+            scene.show_objects(root, folder, owner)
+    except (InputError, OSError) as error:
+        messages.show(messages.sentence(error), "ERROR")
+
+
+def _require_object_mode(root) -> None:
+    """Raise InputError before anything is changed that could then not be shown."""
+    scene.require_object_mode(part for part in root.all_objects if scene.kind_of(part) is not None)
+
+
+def _remember(item) -> None:
+    """Keep what a refused edit goes back to."""
+    item.stored = json.dumps([item.name, list(item.colour), item.chosen])
+
+
+def _restore(item) -> None:
+    """Take back an edit that was refused."""
+    if item.stored:
+        with without_callbacks():
+            item.name, item.colour, item.chosen = json.loads(item.stored)
 
 
 def active_changed(properties, context) -> None:

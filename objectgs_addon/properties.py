@@ -35,6 +35,7 @@ class ObjectItem(bpy.types.PropertyGroup):
     splats: IntProperty(name="Splats", description="Gaussian splats of this object")
     is_merged: BoolProperty(name="Merged", description="Shown as a part of another object")
     merged_into: IntProperty(name="Merged into", description="ID of the object that this one is a part of")
+    stored: StringProperty(name="Stored", description="What objects.json says: what a refused edit goes back to")
 
 
 class ReconstructionProperties(bpy.types.PropertyGroup):

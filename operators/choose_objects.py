@@ -5,7 +5,7 @@ import bpy
 from bpy.props import EnumProperty
 
 from ..backend.protocol import InputError
-from ..objectgs_addon import object_edits, selection
+from ..objectgs_addon import messages, object_edits, selection
 from . import need
 
 
@@ -36,7 +36,7 @@ class ChooseObjects(bpy.types.Operator):
         try:
             object_edits.choose(root, {object_id: object_id in kept for object_id in rows})
         except (InputError, OSError) as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, messages.sentence(error))
             return {"CANCELLED"}
         return {"FINISHED"}
 

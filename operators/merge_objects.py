@@ -5,7 +5,7 @@ import bpy
 from bpy.props import EnumProperty
 
 from ..backend.protocol import InputError
-from ..objectgs_addon import object_edits, selection
+from ..objectgs_addon import messages, object_edits, selection
 from . import need
 
 _choices = []
@@ -69,7 +69,7 @@ class MergeObjects(bpy.types.Operator):
         try:
             object_edits.merge(root, sources, int(self.into))
         except (InputError, OSError) as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, messages.sentence(error))
             return {"CANCELLED"}
         return {"FINISHED"}
 
@@ -97,7 +97,7 @@ class SplitObjects(bpy.types.Operator):
         try:
             object_edits.split(root, object_edits.from_stored(object_edits.active_item(root).object_id))
         except (InputError, OSError) as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, messages.sentence(error))
             return {"CANCELLED"}
         return {"FINISHED"}
 

@@ -7,7 +7,7 @@ import bpy
 from bpy.props import StringProperty
 
 from ..backend.protocol import InputError, Reconstruction
-from ..objectgs_addon import object_edits, scene
+from ..objectgs_addon import messages, object_edits, scene
 from . import need
 
 
@@ -49,6 +49,11 @@ class OpenReconstruction(bpy.types.Operator):
 def _show(operator, context, folder: Path, root) -> set:
     try:
         root = scene.show_capture(context.scene, folder, root)
+    except (InputError, OSError) as error:
+        operator.report({"ERROR"}, messages.sentence(error))
+        return {"CANCELLED"}
+    context.scene.objectgs.active = root
+    try:
         if Reconstruction(folder).splats.exists():
             shown = scene.show_result(root, folder, context.scene)
             for sentence in shown.warnings:
@@ -56,9 +61,7 @@ def _show(operator, context, folder: Path, root) -> set:
             operator.report({"INFO"}, f"{shown.splats:,} splats of {shown.objects} objects")
         object_edits.fill(root)
     except (InputError, OSError) as error:
-        operator.report({"ERROR"}, str(error))
-        return {"CANCELLED"}
-    context.scene.objectgs.active = root
+        operator.report({"ERROR"}, messages.sentence(error))  # Cameras and points are there, and can be undone.
     return {"FINISHED"}
 
 

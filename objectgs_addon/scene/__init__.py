@@ -3,6 +3,7 @@
 
 from .cameras import use_camera
 from .capture import show_capture, warnings_of
+from .carrier import require_object_mode
 from .kinds import folder_of, kind_of, object_collections, object_id_of, parts_of, root_of
 from .orientation import orient_to_ground, scale_to_distance
 from .points import colour_points_by
@@ -11,6 +12,6 @@ from .result import Shown, show_objects, show_result
 
 __all__ = [
     "Shown", "colour_points_by", "folder_of", "kind_of", "object_collections", "object_id_of", "orient_to_ground",
-    "parts_of", "prepare_render", "root_of", "scale_to_distance", "show_capture", "show_objects", "show_result",
-    "use_camera", "warnings_of",
+    "parts_of", "prepare_render", "require_object_mode", "root_of", "scale_to_distance", "show_capture",
+    "show_objects", "show_result", "use_camera", "warnings_of",
 ]

@@ -58,7 +58,7 @@ def read_cameras(folder: Path) -> Cameras:
         upright[:3, 3] = _matrix(content["upright"]["translation"], (3,))
         views = [_view(entry, folder) for entry in content["cameras"]]
         return Cameras(_matrix(content["origin"], (3,)), upright, views)
-    except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, np.linalg.LinAlgError) as error:
         raise InputError(f"{path} does not list cameras as expected ({error!r}); run Import again.") from error
 
 
@@ -69,6 +69,7 @@ def _view(entry: Any, folder: Path) -> View:
     if view.width < 1 or view.height < 1 or view.K[0, 0] <= 0 or view.K[1, 1] <= 0:
         raise ValueError(f"camera {view.name} has no size or no focal length")
     np.linalg.inv(view.viewmat)
+    view.name.encode()  # Blender takes no text that is not valid Unicode, which JSON's escapes need not be.
     return view
 
 

@@ -7,14 +7,18 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from ...backend.protocol import InputError
 from . import carrier
 from .cameras import read_cameras, show_cameras, use_camera
 from .kinds import (
     CAMERA,
     CAPTURE,
     FOLDER,
+    OBJECT_PARENT,
     PARENT,
+    POINTS,
     RECONSTRUCTION,
+    adopt,
     capture_of,
     folder_of,
     kind_of,
@@ -39,6 +43,8 @@ def show_capture(scene: bpy.types.Scene, folder: Path, root: bpy.types.Collectio
     folder's files cannot be used.
     """
     folder = Path(folder).absolute()
+    if any("\ud800" <= character <= "\udfff" for character in str(folder)):
+        raise InputError(f"{str(folder)!r} is not valid Unicode, which Blender cannot keep; rename the folder.")
     cameras = read_cameras(folder)
     table = read_points(folder)
     objects = Objects.read(folder)
@@ -60,13 +66,14 @@ def show_capture(scene: bpy.types.Scene, folder: Path, root: bpy.types.Collectio
     if capture is None:
         capture = bpy.data.collections.new(f"{root.name} capture")
         mark(capture, CAPTURE)
+        adopt(capture, root, (CAMERA, POINTS))
     root[WARNINGS] = "\n".join(show_cameras(capture, parent, cameras))
     show_points(capture, parent, f"{root.name} points", table, cameras.origin, objects)
 
     # Linked last: Blender brings all view layers up to date for each link below a scene.
     if new_capture:
         root.children.link(capture)
-    if is_new:
+    if is_new or not any(root in other.collection.children_recursive for other in bpy.data.scenes):
         scene.collection.children.link(root)
     ours = [thing for thing in capture.objects if kind_of(thing) == CAMERA]
     if ours and (scene.camera is None or scene.camera in ours):
@@ -97,7 +104,7 @@ def _stand_up(root: bpy.types.Collection, upright: np.ndarray, views) -> bpy.typ
         parent.empty_display_size = 0.15 * float(np.linalg.norm(np.ptp(centres, axis=0))) if len(centres) > 1 else 1.0
         root.objects.link(parent)
         for thing in root.all_objects:
-            if thing.parent is None and kind_of(thing) is not None and thing != parent:
+            if thing.parent is None and kind_of(thing) in (CAMERA, POINTS, OBJECT_PARENT):
                 thing.parent = parent
     elif list(parent.get(UPRIGHT, ())) != _numbers(parent.matrix_basis):
         return parent

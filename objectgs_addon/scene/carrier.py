@@ -17,10 +17,14 @@ _FIELDS = {
 
 
 def require_object_mode(things) -> None:
-    """Raise InputError where one of the objects is in Edit Mode, whose mesh would overwrite what is written to it."""
+    """Raise InputError where one of the objects is in Edit Mode or another mode that works on its mesh.
+
+    Edit Mode would overwrite what is written to the mesh when it is left.
+    """
     for thing in things:
-        if thing is not None and thing.data is not None and thing.data.is_editmode:
-            raise InputError(f"{thing.name} is in Edit Mode; leave it and try again.")
+        if thing is not None and (thing.mode != "OBJECT" or getattr(thing.data, "is_editmode", False)):
+            mode = "Edit" if thing.mode == "OBJECT" else thing.mode.replace("_", " ").title()
+            raise InputError(f"{thing.name} is in {mode} Mode; leave it and try again.")
 
 
 def fill(mesh: bpy.types.Mesh, positions: np.ndarray, attributes: dict[str, tuple[str, np.ndarray]]) -> None:

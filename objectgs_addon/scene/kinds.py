@@ -62,6 +62,14 @@ def parent_of(root: bpy.types.Collection) -> bpy.types.Object | None:
     return part_of(root, PARENT)
 
 
+def adopt(collection: bpy.types.Collection, root: bpy.types.Collection, kinds, object_id: int | None = None) -> None:
+    """Move parts that lie about in `root` itself into `collection`: those of a collection that the user dissolved."""
+    for thing in list(root.objects):
+        if kind_of(thing) in kinds and (object_id is None or object_id_of(thing) == object_id):
+            collection.objects.link(thing)
+            root.objects.unlink(thing)
+
+
 def capture_of(root: bpy.types.Collection) -> bpy.types.Collection | None:
     """The collection of the cameras and points, or None."""
     return next((child for child in root.children_recursive if kind_of(child) == CAPTURE), None)

@@ -17,6 +17,7 @@ from .kinds import (
     OBJECT,
     OBJECT_PARENT,
     SPLATS,
+    adopt,
     capture_of,
     kind_of,
     mark,
@@ -75,6 +76,7 @@ def show_result(root: bpy.types.Collection, folder: Path, scene: bpy.types.Scene
         collection = collections.pop(object_id, None)
         if collection is None:
             collection = _new_collection(object_id, objects)
+            adopt(collection, root, (OBJECT_PARENT, SPLATS, ANCHORS), object_id)
             new.append(collection)
         positions = positions_of(own_splats, origin)
         pivot = _pivot(collection, parent, object_id, positions)
@@ -174,6 +176,8 @@ class _Makers:
         """The carrier of a kind in `collection`, made where there is none."""
         thing = part_of(collection, kind)
         if thing is not None:
+            if thing.parent is None:
+                thing.parent = pivot  # The user deleted the one before.
             return thing
         name = f"{collection[NAME]} {kind}"
         mesh = bpy.data.meshes.new(name)
