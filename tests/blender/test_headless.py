@@ -281,7 +281,7 @@ def test_cancelled_batch_writes_its_summary(capture, backend_python, tmp_path):
 
 def test_a_crash_of_the_backend_is_told(capture, tmp_path):
     python = tmp_path / "python"
-    python.write_text("#!/bin/sh\necho 'out of luck' >&2\nexit 3\n")
+    python.write_text("""#!/bin/sh\necho '{"type": "status", "message": "Hello"}'\necho 'out of luck' >&2\nexit 3\n""")
     python.chmod(0o755)
     ran = run("train", capture, "--out", tmp_path / "out", "--backend-python", python)
     assert ran.returncode == 1 and "out of luck" in ran.errors and "Traceback" not in ran.errors
