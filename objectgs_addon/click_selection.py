@@ -41,11 +41,21 @@ def _file_loaded(*_) -> None:
     _subscribe()
 
 
+@bpy.app.handlers.persistent
+def _undone(*_) -> None:
+    """Blender kept the selection as the click itself left it."""
+    _active_changed()
+
+
 def register():
     _subscribe()
+    bpy.app.handlers.undo_post.append(_undone)
+    bpy.app.handlers.redo_post.append(_undone)
     bpy.app.handlers.load_post.append(_file_loaded)
 
 
 def unregister():
+    bpy.app.handlers.redo_post.remove(_undone)
+    bpy.app.handlers.undo_post.remove(_undone)
     bpy.app.handlers.load_post.remove(_file_loaded)
     bpy.msgbus.clear_by_owner(_owner)

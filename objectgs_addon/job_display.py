@@ -62,7 +62,7 @@ def draw_figures(layout, job: Job) -> None:
     if job.splats:
         figures.append(f"{job.splats:,} splats")
     if figures:
-        layout.label(text="   ".join(figures))
+        write(layout, "   ".join(figures))
 
 
 def draw_over(layout, job: Job) -> None:

@@ -166,8 +166,9 @@ class DisplayPanel(_WithReconstruction, bpy.types.Panel):
         layout.label(text="Color points by")
         layout.row().prop(properties, "colour_by", expand=True)
         layout.label(text="Splats: objects or photo")
-        layout.row().prop_enum(context.space_data.shading, "type", "SOLID", text="Objects")
-        layout.row().prop_enum(context.space_data.shading, "type", "MATERIAL", text="Photo")
+        row = layout.row(align=True)
+        row.prop_enum(context.space_data.shading, "type", "SOLID", text="Objects")
+        row.prop_enum(context.space_data.shading, "type", "MATERIAL", text="Photo")
 
 
 class JobsPanel(_Tab, bpy.types.Panel):
