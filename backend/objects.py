@@ -59,6 +59,7 @@ def edit_objects(path: Path, changes: Mapping[int, Mapping[str, Any]]) -> None:
     unknown = {key for change in changes.values() for key in change} - set(EDITABLE)
     if unknown:
         raise ValueError(f"{', '.join(sorted(unknown))} cannot be edited")
+    read_objects(path)  # Edits of objects that nobody can read would make a broken file look newer.
     content = read_json(path)
     edits = _edits(content, path)
     for object_id, change in changes.items():

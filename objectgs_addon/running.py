@@ -19,8 +19,12 @@ INTERVAL = 0.1
 """Seconds between two looks at the queue."""
 
 queue = JobQueue()
-_wanted_in: dict[int, str] = {}
-"""id(job) -> name of the scene that asked for it."""
+_wanted_in: dict[Job, int] = {}
+"""Job -> the session's ID of the scene that asked for it, which stays when that is renamed."""
+_results: list[Job] = []
+"""Jobs whose result is still to be shown, because something is in the way."""
+_told: set[Job] = set()
+"""Those of them for which the user knows why."""
 
 
 def submit(job: Job, owner, report: Callable[[set, str], None]) -> set:
@@ -28,13 +32,17 @@ def submit(job: Job, owner, report: Callable[[set, str], None]) -> set:
 
     Returns what an operator returns.
     """
-    _wanted_in[id(job)] = owner.name
+    _wanted_in[job] = owner.session_uid
     if bpy.app.background:
         run_blocking(job, echo=lambda line: print(line, flush=True))
         if job.state is not State.DONE:
             report({"ERROR"}, job.error or job.message)
             return {"CANCELLED"}
-        finish(job)
+        try:
+            finish(job)
+        except (InputError, OSError) as error:
+            report({"ERROR"}, f"{job.title}: {messages.sentence(error)}")
+            return {"CANCELLED"}
         return {"FINISHED"}
     queue.add(job)
     if not bpy.app.timers.is_registered(_tick):
@@ -57,12 +65,13 @@ def _tick() -> float | None:
     changed = queue.poll()
     for job in changed:
         if job.take_preview():
-            previews.refresh(job.folder)
+            _carefully(job, previews.refresh, job.folder)
         if job.is_finished:
             _over(job)
+    _show_results()
     if changed:
         redraw()
-    return INTERVAL if any(not job.is_finished for job in queue.jobs) else None
+    return INTERVAL if _results or any(not job.is_finished for job in queue.jobs) else None
 
 
 def redraw() -> None:
@@ -81,65 +90,120 @@ def _over(job: Job) -> None:
     if job.state is State.FAILED:
         messages.show(f"{job.title}: {job.error}", "ERROR")
     elif job.state is State.DONE or (job.state is State.STOPPED and job.kind == "train"):
-        try:
-            finish(job)
-        except (InputError, OSError) as error:
-            messages.show(f"{job.title}: {error}", "ERROR")
-        except Exception as error:
-            # An exception that leaves a timer ends it, and with it every other job.
-            traceback.print_exc()
-            messages.show(f"{job.title}: the result could not be shown ({type(error).__name__}: {error})", "ERROR")
+        _results.append(job)
+        return
+    _wanted_in.pop(job, None)
+
+
+def _show_results() -> None:
+    """Show what is ready, in the order it came, unless Blender or the user is busy with the same data."""
+    while _results:
+        job = _results[0]
+        obstacle = _obstacle(job)
+        if obstacle is not None:
+            if job not in _told:
+                _told.add(job)
+                messages.show(f"{job.title} has ended; its result is shown when {obstacle}.")
+            return
+        _told.discard(_results.pop(0))
+        _carefully(job, finish, job)
+
+
+def _obstacle(job: Job) -> str | None:
+    """What must be over before a result may be shown: changes to data in use would crash Blender or get lost."""
+    if bpy.app.is_job_running("RENDER") or bpy.app.is_job_running("OBJECT_BAKE"):
+        return "rendering has ended"
+    for window in bpy.context.window_manager.windows:
+        if any(operator.bl_idname.startswith("TRANSFORM_OT_") for operator in window.modal_operators):
+            return "what is being moved has its place"
+    for root in _roots_of(job.folder):
+        for part in root.all_objects:
+            if scene.kind_of(part) is not None and part.mode != "OBJECT":
+                return f"{part.name} is in Object Mode again"
+    return None
+
+
+def _carefully(job: Job, action: Callable, *arguments) -> None:
+    """Call `action` and tell how it failed: an exception that leaves a timer ends it, and with it every other job."""
+    try:
+        action(*arguments)
+    except (InputError, OSError) as error:
+        messages.show(f"{job.title}: {messages.sentence(error)}", "ERROR")
+    except Exception as error:
+        traceback.print_exc()
+        messages.show(f"{job.title}: the result could not be shown ({type(error).__name__}: {error})", "ERROR")
 
 
 def finish(job: Job) -> None:
-    """Show what a job has made, in the scene that asked for it, if that is still open."""
-    owner = bpy.data.scenes.get(_wanted_in.pop(id(job), ""))
+    """Show what a job has made: in the scene that asked for it, and wherever else the reconstruction is shown."""
+    wanted_in = _wanted_in.pop(job, None)
+    owner = next((owner for owner in bpy.data.scenes if owner.session_uid == wanted_in), None)
     after = _AFTER.get(job.kind)
-    if after is None or (owner is None and not _roots_of(job.folder)):
-        return
-    if after(job, owner):
+    if after is not None and after(job, owner):
         _push_undo(job.title)
 
 
 def _roots_of(folder: Path | None) -> list:
     return [] if folder is None else [
         collection for collection in bpy.data.collections
-        if scene.kind_of(collection) == "reconstruction" and scene.folder_of(collection) == folder]
+        if scene.kind_of(collection) == "reconstruction" and scene.folder_of(collection) == folder
+        and collection.library is None]
+
+
+def _shown_roots(job: Job, owner) -> list:
+    """The reconstruction's collections that lie in scenes; one that the user took out of `owner` comes back."""
+    roots = _roots_of(job.folder)
+    for root in roots:
+        if owner is not None and owner.objectgs.active == root and not object_edits.scenes_of(root):
+            owner.collection.children.link(root)
+    return [root for root in roots if object_edits.scenes_of(root)]
 
 
 def _show_capture(job: Job, owner) -> bool:
-    roots = _roots_of(job.folder)
-    if owner is None and not roots:
-        return False
-    root = scene.show_capture(owner or object_edits.scenes_of(roots[0])[0], job.folder, roots[0] if roots else None)
-    object_edits.fill(root)
+    roots = _shown_roots(job, owner)
+    for root in roots:
+        scene.show_capture(object_edits.scenes_of(root)[0], job.folder, root)
+        object_edits.fill(root)
     if owner is not None:
+        root = next((root for root in roots if owner in object_edits.scenes_of(root)), None)
+        if root is None:
+            root = scene.show_capture(owner, job.folder)
+            object_edits.fill(root)
+            roots.append(root)
         owner.objectgs.active = root
         view.show(root)
-    job.warnings.extend(scene.warnings_of(root))
-    return True
+    if roots:
+        job.warnings.extend(scene.warnings_of(roots[0]))
+    return bool(roots) or _explain(job)
 
 
-def _show_votes(job: Job, _owner) -> bool:
-    roots = _roots_of(job.folder)
+def _show_votes(job: Job, owner) -> bool:
+    roots = _shown_roots(job, owner)
     for root in roots:
-        for holder in object_edits.scenes_of(root)[:1]:
-            scene.show_objects(root, job.folder, holder)
+        scene.show_objects(root, job.folder, object_edits.scenes_of(root)[0])
         object_edits.fill(root)
         root.objectgs.colour_by = "object"
-    return bool(roots)
+    return bool(roots) or _explain(job)
 
 
-def _show_result(job: Job, _owner) -> bool:
-    roots = _roots_of(job.folder) if Reconstruction(job.folder).splats.exists() else []
+def _show_result(job: Job, owner) -> bool:
+    if not Reconstruction(job.folder).splats.exists():
+        return False
+    roots = _shown_roots(job, owner)
     for root in roots:
         if not scene.object_collections(root):
             view.hide_points(root)
-        for holder in object_edits.scenes_of(root)[:1]:
-            shown = scene.show_result(root, job.folder, holder)
-            job.warnings.extend(shown.warnings)
+        shown = scene.show_result(root, job.folder, object_edits.scenes_of(root)[0])
+        job.warnings.extend(shown.warnings)
         object_edits.fill(root)
-    return bool(roots)
+    return bool(roots) or _explain(job)
+
+
+def _explain(job: Job) -> bool:
+    """Say where the result is that has no place in the open file any more; False, since nothing has changed."""
+    messages.show(f"{job.title} has ended, but its scene or collection is gone; Open Reconstruction shows "
+                  f"{job.folder}.")
+    return False
 
 
 def _import_demo(job: Job, owner) -> bool:
@@ -171,7 +235,7 @@ def _undone(*_) -> None:
             try:
                 object_edits.store(root)
             except (InputError, OSError) as error:
-                messages.show(str(error), "ERROR")
+                messages.show(messages.sentence(error), "ERROR")
 
 
 @bpy.app.handlers.persistent
@@ -202,4 +266,6 @@ def unregister():
     if bpy.app.timers.is_registered(_tick):
         bpy.app.timers.unregister(_tick)
     queue.stop_all(timeout=10.0)
+    for known in (_results, _told, _wanted_in):
+        known.clear()
     previews.clear()

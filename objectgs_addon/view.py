@@ -21,9 +21,11 @@ def show(root) -> None:
 
 def hide_points(root) -> None:
     """Take the point cloud out of sight, since splats come into its place."""
-    for part in root.all_objects:
-        if scene.kind_of(part) == "points":
-            part.hide_set(True)
+    points = [part for part in root.all_objects if scene.kind_of(part) == "points"]
+    for layer in (layer for owner in bpy.data.scenes for layer in owner.view_layers):
+        for part in points:
+            if layer.objects.get(part.name) == part:
+                part.hide_set(True, view_layer=layer)
 
 
 def _frame(root) -> None:

@@ -49,6 +49,7 @@ class OpenReconstruction(bpy.types.Operator):
 def _show(operator, context, folder: Path, root) -> set:
     try:
         root = scene.show_capture(context.scene, folder, root)
+        object_edits.fill(root)
     except (InputError, OSError) as error:
         operator.report({"ERROR"}, messages.sentence(error))
         return {"CANCELLED"}
@@ -59,7 +60,7 @@ def _show(operator, context, folder: Path, root) -> set:
             for sentence in shown.warnings:
                 operator.report({"WARNING"}, sentence)
             operator.report({"INFO"}, f"{shown.splats:,} splats of {shown.objects} objects")
-        object_edits.fill(root)
+            object_edits.fill(root)
     except (InputError, OSError) as error:
         operator.report({"ERROR"}, messages.sentence(error))  # Cameras and points are there, and can be undone.
     return {"FINISHED"}

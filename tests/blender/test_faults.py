@@ -1,0 +1,580 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Bad input and faults as a user meets them: one plain sentence, and Blender's data and the folder stay whole."""
+
+import errno
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import headless
+
+bpy = pytest.importorskip("bpy")
+
+from objectgs.backend.objects import read_objects  # noqa: E402
+from objectgs.backend.protocol import Reconstruction  # noqa: E402
+from objectgs.objectgs_addon import environment_worker, locations, messages, object_edits, running, scene  # noqa: E402
+from objectgs.objectgs_addon.jobs import Job, State  # noqa: E402
+
+FIXTURES = headless.ROOT.parent / "shared" / "data" / "fixtures"
+WAIT = 60.0
+
+WORKS = """
+import json, sys, time
+print(json.dumps({"type": "status", "message": "Working"}), flush=True)
+"""
+ENDS = WORKS + 'print(json.dumps({"type": "done"}), flush=True)\n'
+UNTIL_STOPPED = WORKS + """
+for line in sys.stdin:
+    if line.strip() == "stop":
+        break
+print(json.dumps({"type": "done", "stopped": True, "message": "Saved"}), flush=True)
+sys.exit(130)
+"""
+
+
+@pytest.fixture
+def extension(fresh, tmp_path, monkeypatch):
+    """The extension, registered in an empty file, with its folders in tmp_path."""
+    root = headless.extension()
+    monkeypatch.setattr(locations, "user_folder", lambda: tmp_path / "user")
+    monkeypatch.setattr(locations, "backend_environment", lambda _cache: {})  # Kernels that are compiled already.
+    monkeypatch.delenv("OBJECTGS_PYTHON", raising=False)
+    root.register()
+    yield root
+    root.unregister()
+    running.queue.clear_finished()
+
+
+@pytest.fixture
+def said(monkeypatch):
+    """What pop-ups say."""
+    sentences = []
+    monkeypatch.setattr(messages, "show", lambda text, kind="INFO": sentences.append(text))
+    return sentences
+
+
+@pytest.fixture
+def folder(trained, tmp_path) -> Path:
+    """A trained reconstruction folder of the test's own."""
+    return Path(shutil.copytree(trained, tmp_path / "demo"))
+
+
+@pytest.fixture
+def shown(extension, folder):
+    """`folder` in the scene; its root."""
+    bpy.ops.objectgs.open_reconstruction(directory=str(folder))
+    return bpy.context.scene.objectgs.active
+
+
+def refusal(operator, **options) -> str:
+    """The sentence with which an operator, called as a script does, fails."""
+    with pytest.raises(RuntimeError) as failed:
+        operator(**options)
+    return str(failed.value)
+
+
+def plain(sentence: str) -> bool:
+    return sentence.strip() != "" and "Traceback" not in sentence and "Errno" not in sentence
+
+
+def job(tmp_path, code=ENDS, kind="train", folder=None, title="Fake") -> Job:
+    """A job that runs the Python `code`."""
+    script = tmp_path / f"fake-{len(list(tmp_path.glob('fake-*')))}.py"
+    script.write_text(code, encoding="utf-8")
+    return Job(title=title, kind=kind, folder=folder, command=[sys.executable, str(script)], cwd=tmp_path)
+
+
+def start(job: Job, owner) -> Job:
+    """What `running.submit` does in a window."""
+    running._wanted_in[job] = owner.session_uid
+    running.queue.add(job)
+    return job
+
+
+def tick_until(condition) -> None:
+    """Blender's timer, until `condition()` holds."""
+    deadline = time.monotonic() + WAIT
+    while not condition():
+        assert time.monotonic() < deadline, "it never came"
+        running._tick()
+        time.sleep(0.01)
+
+
+def run(job: Job, owner) -> Job:
+    """A job to its end, its result included."""
+    start(job, owner)
+    tick_until(lambda: job.is_finished and not running._results)
+    return job
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def blocks() -> dict[str, list[str]]:
+    return {kind: sorted(block.name for block in getattr(bpy.data, kind))
+            for kind in ("collections", "objects", "meshes", "cameras", "images", "materials")}
+
+
+# The backend
+
+
+def test_no_backend(extension, shown, capture):
+    for operator in (bpy.ops.objectgs.vote, bpy.ops.objectgs.train, bpy.ops.objectgs.check_backend):
+        assert not operator.poll()
+    assert "is not set up; press Set Up Backend" in refusal(bpy.ops.objectgs.train)
+    assert "is not set up" in refusal(bpy.ops.objectgs.import_capture, directory=str(capture))
+
+
+def test_backend_of_another_version(extension, shown):
+    place = locations.environment_folder()
+    python = environment_worker.environment_python(place)
+    python.parent.mkdir(parents=True)
+    python.symlink_to(sys.executable)
+    (place / environment_worker.STAMP).write_text("")
+    marker = {"python": "3.11", "base": sys.executable, "requirements": "of another version", "packages": {}}
+    (place / environment_worker.MARKER).write_text(json.dumps(marker))
+    assert "was set up for another version of ObjectGS" in refusal(bpy.ops.objectgs.train)
+    (place / environment_worker.MARKER).write_text("{")
+    assert "ready.json cannot be read" in refusal(bpy.ops.objectgs.train)
+
+
+def test_python_that_is_not_there(extension, shown, monkeypatch, tmp_path):
+    monkeypatch.setenv("OBJECTGS_PYTHON", str(tmp_path / "gone"))
+    assert f"{tmp_path / 'gone'} does not exist" in refusal(bpy.ops.objectgs.train)
+
+
+@pytest.mark.parametrize("name, program, sentence", [
+    ("no program", None, "could not be started (Permission denied); choose another Python"),
+    ("no Python", "#!/bin/sh\nexit 0\n", "cannot run the backend; choose a Python 3.11"),
+    ("too old", "#!/bin/sh\necho 'SyntaxError: invalid syntax' >&2\nexit 1\n", "cannot run the backend; choose a"),
+])
+def test_wrong_python(extension, monkeypatch, capture, tmp_path, name, program, sentence):
+    python = tmp_path / "python"
+    python.write_text(program or "text")
+    python.chmod(0o755 if program else 0o644)
+    monkeypatch.setenv("OBJECTGS_PYTHON", str(python))
+    before = blocks()
+    told = refusal(bpy.ops.objectgs.import_capture, directory=str(capture), folder=str(tmp_path / "out"))
+    assert sentence in told and str(python) in told and plain(told)
+    assert blocks() == before and not (tmp_path / "out").exists()
+
+
+def test_python_without_the_packages(extension, monkeypatch, capture, tmp_path):
+    """The Python of these tests has bpy and NumPy alone."""
+    monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
+    told = refusal(bpy.ops.objectgs.import_capture, directory=str(capture), folder=str(tmp_path / "out"))
+    assert "lacks the package" in told and sys.executable in told and not (tmp_path / "out").exists()
+
+
+# Importing
+
+
+@pytest.mark.parametrize("name", ["cameras_only", "truncated", "degenerate_two_images",
+                                  "missing_cameras_subfolders_txt"])
+def test_broken_model_is_refused(extension, backend_python, monkeypatch, tmp_path, name):
+    if not (FIXTURES / name).is_dir():
+        pytest.skip(f"{FIXTURES / name} is not here")
+    monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
+    before = blocks()
+    told = refusal(bpy.ops.objectgs.import_capture, directory=str(FIXTURES / name), folder=str(tmp_path / "out"))
+    assert name in told and plain(told) and len(told.strip().splitlines()) == 1
+    assert blocks() == before and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("make, sentence", [
+    (lambda place: None, "does not exist"), (lambda place: place.mkdir(), "cannot be read|does not|no COLMAP|missing"),
+    (lambda place: place.write_text("a file"), "does not exist")])
+def test_folder_that_is_no_capture(extension, backend_python, monkeypatch, tmp_path, make, sentence):
+    monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
+    make(tmp_path / "capture")
+    told = refusal(bpy.ops.objectgs.import_capture, directory=str(tmp_path / "capture"), folder=str(tmp_path / "out"))
+    assert plain(told) and str(tmp_path / "capture") in told
+    assert not (tmp_path / "out").exists() and not bpy.data.collections
+
+
+def test_two_captures_of_one_name_get_folders_of_their_own(extension, tmp_path):
+    from objectgs.operators.import_capture import _folder_for
+
+    first, second = tmp_path / "a" / "mug", tmp_path / "b" / "mug"
+    taken = _folder_for(first)
+    taken.mkdir(parents=True)
+    (taken / "cameras.json").write_text(json.dumps({"capture": str(first)}))
+    assert _folder_for(first) == taken and _folder_for(second) == taken.with_name("mug-2")
+
+
+def test_import_where_another_works(extension, shown, folder, capture, tmp_path, monkeypatch):
+    monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
+    held = start(job(tmp_path, UNTIL_STOPPED, folder=folder), bpy.context.scene)
+    before = snapshot(folder)
+    assert f"A job works in {folder}" in refusal(bpy.ops.objectgs.import_capture, directory=str(capture),
+                                                 folder=str(folder))
+    assert f"A job works in {folder}" in refusal(bpy.ops.objectgs.train)
+    held.stop()
+    tick_until(lambda: held.is_finished)
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
+        (folder / ".lock").write_text(f"{other.pid}\n")
+        told = refusal(bpy.ops.objectgs.import_capture, directory=str(capture), folder=str(folder))
+        assert f"Another program (process {other.pid}) works in {folder}" in told
+        other.communicate(b"\n")
+    (folder / ".lock").unlink()
+    assert snapshot(folder) == before
+
+
+# Files that go or break while they are in use
+
+
+def test_capture_deleted(extension, backend_python, capture, tmp_path, monkeypatch):
+    """Before training the button says so; in the middle of it what was trained is kept, or a sentence says why not."""
+    monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
+    place = Path(shutil.copytree(capture, tmp_path / "capture"))
+    bpy.ops.objectgs.import_capture(directory=str(place), folder=str(tmp_path / "out"))
+    root = bpy.context.scene.objectgs.active
+    training = locations.backend_job("Train", "train", tmp_path / "out", "train", str(place), "--out",
+                                     str(tmp_path / "out"), "--steps", "40")
+    start(training, bpy.context.scene)
+    tick_until(lambda: training.step or training.is_finished)
+    shutil.rmtree(place)
+    tick_until(lambda: training.is_finished and not running._results)
+    assert training.state is State.DONE or plain(training.error)
+    assert not (tmp_path / "out" / ".lock").exists() and not list((tmp_path / "out").rglob("*.part"))
+    assert scene.kind_of(root) == "reconstruction"
+    assert f"The capture {place} is gone" in refusal(bpy.ops.objectgs.train)
+    (tmp_path / "out" / "cameras.json").write_text("{}")
+    assert "does not say where the capture is" in refusal(bpy.ops.objectgs.train)
+
+
+@pytest.fixture
+def tiny_disk(tmp_path):
+    """A file system of 96 KiB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=96k", "tmpfs", place], capture_output=True)
+    if mounted.returncode:
+        pytest.skip("mounting a tiny disk is not allowed here")
+    yield place
+    subprocess.run(["umount", "-l", place], check=True)
+
+
+def test_full_disk(extension, backend_python, capture, tiny_disk, monkeypatch):
+    monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
+    (tiny_disk / "filler").write_bytes(bytes(88 * 1024))
+    told = refusal(bpy.ops.objectgs.import_capture, directory=str(capture), folder=str(tiny_disk / "out"))
+    assert "No space left" in told and "free some space" in told and plain(told)
+    assert not bpy.data.collections and not list(tiny_disk.rglob("*.part"))
+
+
+def test_full_disk_while_editing(shown, folder, said, monkeypatch):
+    def full(_descriptor):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    before, row = snapshot(folder), shown.objectgs.objects[1]
+    name, colour = row.name, tuple(row.colour)
+    monkeypatch.setattr(os, "fsync", full)
+    row.name, row.colour, row.chosen = "cup", (0.1, 0.2, 0.3), False
+    assert (row.name, tuple(row.colour), row.chosen) == (name, colour, True)
+    assert len(said) == 3 and all("objects.json" in text and "free some space" in text for text in said)
+    assert "free some space" in refusal(bpy.ops.objectgs.merge_objects, into=str(object_edits.from_stored(
+        shown.objectgs.objects[2].object_id)))
+    assert snapshot(folder) == before
+
+
+def test_old_file_without_its_folder(shown, folder, said, tmp_path, monkeypatch):
+    monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "old.blend"))
+    shutil.rmtree(folder)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "old.blend"))
+    root = bpy.context.scene.objectgs.active
+    before = blocks()
+    operators = bpy.ops.objectgs
+    for operator in (operators.vote, operators.train, operators.show_result, operators.show_preview,
+                     operators.merge_objects, operators.split_objects, operators.choose_objects,
+                     operators.set_ground, operators.set_distance, operators.solo_object, operators.select_object):
+        assert f"The folder {folder} of this reconstruction is gone" in refusal(operator)
+    row = root.objectgs.objects[1]
+    name, colour = row.name, tuple(row.colour)
+    row.name, row.colour, row.chosen = "cup", (0.1, 0.2, 0.3), False
+    row.name = "  "
+    assert (row.name, tuple(row.colour), row.chosen) == (name, colour, True)
+    assert len(said) == 3 and all(plain(text) and "objects.json does not exist" in text for text in said)
+    assert "has no cameras.json" in refusal(operators.open_reconstruction, directory=str(folder))
+    assert blocks() == before and not folder.exists()
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '{"objects": null}', '{"objects": [{"id": 5e12, "name": "a", '
+                                     '"colour": [1, 2, 3], "points": 1}]}', '{"objects": [{"id": 1, "name": "a", '
+                                     '"colour": [1, 2, Infinity], "points": 1}]}'])
+def test_broken_objects_file(shown, folder, said, tmp_path, content):
+    (folder / "objects.json").write_text(content)
+    before, there = snapshot(folder), blocks()
+    row = shown.objectgs.objects[1]
+    name = row.name
+    row.name = "cup"
+    assert row.name == name and len(said) == 1 and "objects.json" in said[0]
+    told = refusal(bpy.ops.objectgs.show_result)
+    assert "objects.json" in told and "delete it" in told and plain(told)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "broken.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "broken.blend"))
+    running._undone()
+    assert snapshot(folder) == before and blocks() == there
+
+
+@pytest.mark.parametrize("name, content", [
+    ("cameras.json", b"{"), ("cameras.json", b'{"cameras": [{"name": "\\ud800"}]}'), ("points.ply", b"ply\n"),
+    ("objects.json", b"[]")])
+def test_broken_folder_leaves_no_half_made_collection(extension, folder, name, content):
+    (folder / name).write_bytes(content)
+    before = blocks()
+    told = refusal(bpy.ops.objectgs.open_reconstruction, directory=str(folder))
+    assert name in told and plain(told) and blocks() == before
+    assert bpy.context.scene.objectgs.active is None
+
+
+def test_broken_splats_leave_cameras_and_points(extension, folder):
+    (folder / "splats.ply").write_bytes((folder / "splats.ply").read_bytes()[:-7])
+    assert "splats.ply" in refusal(bpy.ops.objectgs.open_reconstruction, directory=str(folder))
+    root = bpy.context.scene.objectgs.active
+    assert not scene.object_collections(root) and len(root.objectgs.objects)
+
+
+# Jobs and what becomes of their scene meanwhile
+
+
+def test_each_result_lands_in_its_own_scene(extension, folder, trained, tmp_path):
+    first = bpy.context.scene
+    second, third = bpy.data.scenes.new("second"), bpy.data.scenes.new("third")
+    other = Path(shutil.copytree(trained, tmp_path / "other"))
+    jobs = [start(job(tmp_path, kind="import", folder=folder, title="a"), first),
+            start(job(tmp_path, kind="import", folder=other, title="b"), second),
+            start(job(tmp_path, kind="import", folder=folder, title="c"), third),
+            start(job(tmp_path, kind="train", folder=other, title="d"), second)]
+    running._tick()
+    assert [entry.state for entry in jobs[1:]] == [State.WAITING] * 3
+    first.name, second.name = "second", "renamed"
+    tick_until(lambda: all(entry.is_finished for entry in jobs) and not running._results)
+    for owner, place in ((first, folder), (second, other), (third, folder)):
+        roots = [child for child in owner.collection.children_recursive if scene.kind_of(child) == "reconstruction"]
+        assert roots == [owner.objectgs.active] and scene.folder_of(roots[0]) == place
+    assert scene.object_collections(second.objectgs.active) and not scene.object_collections(first.objectgs.active)
+
+
+@pytest.mark.parametrize("kind", ["import", "vote", "train"])
+def test_scene_and_collection_deleted_meanwhile(extension, folder, said, tmp_path, kind):
+    owner = bpy.data.scenes.new("owner")
+    root = scene.show_capture(owner, folder)
+    work = start(job(tmp_path, kind=kind, folder=folder), owner)
+    bpy.data.collections.remove(root)
+    bpy.data.scenes.remove(owner)
+    before = blocks()
+    tick_until(lambda: work.is_finished and not running._results)
+    assert len(said) == 1 and "Open Reconstruction" in said[0] and str(folder) in said[0]
+    assert blocks() == before
+    said.clear()
+    run(job(tmp_path, kind=kind, folder=folder), bpy.context.scene)
+    assert bool(bpy.context.scene.objectgs.active) == (kind == "import") and bool(said) == (kind != "import")
+
+
+def test_collection_renamed_or_taken_out_meanwhile(shown, folder, said, tmp_path):
+    work = start(job(tmp_path, folder=folder), bpy.context.scene)
+    shown.name = "mine"
+    bpy.context.scene.collection.children.unlink(shown)
+    tick_until(lambda: work.is_finished and not running._results)
+    assert shown.name == "mine" and shown in list(bpy.context.scene.collection.children) and not said
+
+
+def positions(root) -> dict[str, list[float]]:
+    """Where things are, rounded: world positions of the first vertex of each mesh, and of each camera."""
+    bpy.context.view_layer.update()
+    return {part.name: [round(value, 4) for value in (
+        part.matrix_world @ part.data.vertices[0].co if part.type == "MESH" and part.data.vertices
+        else part.matrix_world.translation)] for part in root.all_objects}
+
+
+def test_parents_deleted(shown, folder, tmp_path):
+    before = positions(shown)
+    parents = [part for part in shown.all_objects if scene.kind_of(part) in ("parent", "object_parent")]
+    for part in parents[:3]:
+        bpy.data.objects.remove(part)
+    run(job(tmp_path, folder=folder), bpy.context.scene)
+    assert bpy.ops.objectgs.show_result() == {"FINISHED"}
+    assert positions(shown) == before
+
+
+@pytest.mark.parametrize("with_objects", [True, False])
+def test_collections_dissolved(shown, folder, tmp_path, with_objects):
+    """As the outliner's Delete does, which gives the objects to the collection above, and as Delete Hierarchy."""
+    before = positions(shown)
+    for collection in list(shown.children_recursive):
+        for part in list(collection.objects):
+            if with_objects:
+                bpy.data.objects.remove(part)
+            else:
+                shown.objects.link(part)
+        bpy.data.collections.remove(collection)
+    run(job(tmp_path, folder=folder), bpy.context.scene)
+    assert bpy.ops.objectgs.show_result() == {"FINISHED"}
+    assert positions(shown) == before
+    assert [scene.kind_of(part) for part in shown.objects] == ["parent"]
+
+
+@pytest.mark.parametrize("mode", ["EDIT", "SCULPT"])
+def test_result_waits_for_object_mode(shown, folder, said, tmp_path, mode):
+    part = next(part for part in shown.all_objects if scene.kind_of(part) == "splats")
+    name = part.name
+    part.hide_set(False)
+    bpy.context.view_layer.objects.active = part
+    bpy.ops.object.mode_set(mode=mode)
+    row = shown.objectgs.objects[1]
+    row.name = "cup"
+    assert row.name != "cup" and f"{name} is in {mode.title()} Mode" in said.pop()
+    assert f"is in {mode.title()} Mode" in refusal(bpy.ops.objectgs.show_result)
+    work = start(job(tmp_path, folder=folder), bpy.context.scene)
+    tick_until(lambda: work.is_finished)
+    for _ in range(5):
+        assert running._tick() is not None
+    assert said == [f"Fake has ended; its result is shown when {name} is in Object Mode again."]
+    assert running._results == [work]
+    bpy.ops.object.mode_set(mode="OBJECT")
+    running._tick()
+    assert not running._results and len(said) == 1
+
+
+def test_result_waits_for_the_end_of_rendering(shown, folder, said, tmp_path, monkeypatch):
+    class Rendering:
+        """bpy.app, while a picture is rendered."""
+
+        def __getattr__(self, name):
+            return getattr(bpy.app, name)
+
+        def is_job_running(self, kind):
+            return kind == "RENDER"
+
+    class Blender:
+        app = Rendering()
+
+        def __getattr__(self, name):
+            return getattr(bpy, name)
+
+    monkeypatch.setattr(running, "bpy", Blender())
+    calls = []
+    monkeypatch.setattr(running, "finish", calls.append)
+    work = start(job(tmp_path, folder=folder), bpy.context.scene)
+    tick_until(lambda: work.is_finished)
+    assert running._tick() is not None and not calls
+    monkeypatch.setattr(running, "bpy", bpy)
+    running._tick()
+    assert calls == [work] and said == ["Fake has ended; its result is shown when rendering has ended."]
+
+
+def test_a_failure_of_one_result_stops_no_other_job(extension, folder, said, tmp_path, monkeypatch):
+    def fails(_job, _owner):
+        raise ZeroDivisionError("on purpose")
+
+    monkeypatch.setitem(running._AFTER, "vote", fails)
+    broken = start(job(tmp_path, kind="vote", folder=folder, title="Vote"), bpy.context.scene)
+    works = start(job(tmp_path, kind="import", folder=folder), bpy.context.scene)
+    tick_until(lambda: works.is_finished and not running._results)
+    assert broken.state is State.DONE and bpy.context.scene.objectgs.active is not None
+    assert said == ["Vote: the result could not be shown (ZeroDivisionError: on purpose)"]
+
+
+def test_registered_ten_times_while_a_job_runs(extension, folder, said, tmp_path):
+    for _ in range(10):
+        work = start(job(tmp_path, UNTIL_STOPPED, folder=folder), bpy.context.scene)
+        tick_until(lambda work=work: work.message)
+        extension.unregister()
+        assert work.state is State.STOPPED and work.exit_code == 130
+        extension.register()
+        assert not running.busy(folder) and not running._wanted_in
+    assert not said
+
+
+# Names and numbers
+
+
+def rename(folder, names: dict[int, str]) -> None:
+    """Change what the vote said, as other labels would."""
+    path = Reconstruction(folder).objects
+    content = json.loads(path.read_text())
+    for entry in content["objects"]:
+        entry["name"] = names.get(entry["id"], entry["name"])
+    path.write_text(json.dumps(content))
+
+
+def test_odd_names(shown, folder):
+    ids = [object_edits.from_stored(row.object_id) for row in shown.objectgs.objects if row.object_id][:5]
+    odd = ["", "Tasse\n☕\t/ \\ % \"q\"", "x" * 5000, "\ud800\0", "same", "same"]
+    for names in (dict(zip(ids, odd)), dict(zip(ids, odd[2:])), dict.fromkeys(ids, "same")):
+        rename(folder, names)
+        assert bpy.ops.objectgs.show_result() == {"FINISHED"}
+        collections = scene.object_collections(shown)
+        assert set(ids) <= set(collections) and len({entry.name for entry in collections.values()}) == len(collections)
+        assert all(collections[object_id].name and row.name for object_id, row in zip(ids, shown.objectgs.objects))
+    row = shown.objectgs.objects[1]
+    row.name = "  Größe \n 日本 "
+    assert row.name == "Größe 日本" and row.name in {entry.name for entry in read_objects(folder / "objects.json")}
+
+
+def test_many_objects_and_large_ids(shown, folder):
+    """300 rows with IDs up to 2^32 - 1: listed, chosen, merged, split and selected."""
+    path = Reconstruction(folder).objects
+    content = json.loads(path.read_text())
+    small = [entry["id"] for entry in content["objects"]]
+    large = [2**31 - 1, 2**31, 2**32 - 1]
+    content["objects"] += [{"id": object_id, "name": f"thing {object_id}", "colour": [1, 2, 3], "points": 0}
+                           for object_id in [*range(1000, 1300), *large]]
+    path.write_text(json.dumps(content))
+    (folder / "splats.ply").write_bytes(with_large_ids(folder / "splats.ply", dict(zip(small[1:], large[1:]))))
+    assert bpy.ops.objectgs.show_result() == {"FINISHED"}
+    rows = shown.objectgs.objects
+    listed = [object_edits.from_stored(row.object_id) for row in rows]
+    assert len(rows) == len(small) + 303 and listed[-3:] == large
+    assert set(large[1:]) <= set(scene.object_collections(shown))
+    shown.objectgs.active_object = 9999
+    assert object_edits.active_item(shown) == rows[-1]
+    shown.objectgs.active_object = len(rows) - 2
+    assert bpy.ops.objectgs.select_object() == {"FINISHED"}
+    assert {scene.object_id_of(part) for part in bpy.context.selected_objects} == {2**31}
+    for part in bpy.context.selected_objects:
+        part.select_set(False)
+    assert bpy.ops.objectgs.merge_objects(into=str(2**32 - 1)) == {"FINISHED"}
+    assert 2**31 not in scene.object_collections(shown)
+    assert {entry.id: entry.merged_into for entry in read_objects(path)}[2**31] == 2**32 - 1
+    shown.objectgs.active_object = len(rows) - 1
+    assert bpy.ops.objectgs.split_objects() == {"FINISHED"}
+    assert 2**31 in scene.object_collections(shown)
+    assert bpy.ops.objectgs.choose_objects(which="ACTIVE") == {"FINISHED"}
+    assert [entry.id for entry in read_objects(path) if not entry.left_out] == [2**32 - 1]
+    assert bpy.ops.objectgs.solo_object() == {"FINISHED"}
+
+
+def with_large_ids(path: Path, ids: dict[int, int]) -> bytes:
+    """splats.ply with some IDs replaced; object_id becomes an unsigned integer."""
+    from objectgs.backend.ply import read_vertices, vertex_header
+
+    table = read_vertices(path)
+    dtype = np.dtype([(name, "<u4" if name == "object_id" else table.dtype[name]) for name in table.dtype.names])
+    changed = np.empty(len(table), dtype)
+    for name in table.dtype.names:
+        changed[name] = table[name]
+    for old, new in ids.items():
+        changed["object_id"][table["object_id"] == old] = new
+    return vertex_header(dtype, len(changed)) + changed.tobytes()
+
+
+# Placing
+
+
+def test_points_that_say_nothing(shown):
+    assert "on one line" in refusal(bpy.ops.objectgs.set_ground, points=(0, 0, 0, 1, 0, 0, 2, 0, 0))
+    assert "at the same place" in refusal(bpy.ops.objectgs.set_distance, points=(1, 1, 1, 1, 1, 1))
+    bpy.data.objects.remove(next(part for part in shown.objects if scene.kind_of(part) == "parent"))
+    told = refusal(bpy.ops.objectgs.set_ground, points=(0, 0, 0, 1, 0, 0, 0, 1, 0))
+    assert "has lost the empty that moves it" in told
