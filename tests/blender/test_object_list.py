@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The list of objects and what its buttons do: names, colours, solo, choosing, merging, the selection."""
+
+import shutil
+
+import pytest
+
+import headless
+
+bpy = pytest.importorskip("bpy")
+
+from objectgs.backend.objects import read_objects  # noqa: E402
+from objectgs.objectgs_addon import object_edits, scene, selection, visibility  # noqa: E402
+from objectgs.objectgs_addon.object_list import describe  # noqa: E402
+
+
+@pytest.fixture
+def root(fresh, trained, tmp_path):
+    """A reconstruction with its objects shown, in a registered extension."""
+    extension = headless.extension()
+    extension.register()
+    folder = shutil.copytree(trained, tmp_path / "demo")
+    bpy.ops.objectgs.open_reconstruction(directory=str(folder))
+    yield bpy.context.scene.objectgs.active
+    extension.unregister()
+
+
+def entry(root, object_id):
+    """What objects.json says of an object."""
+    path = scene.folder_of(root) / "objects.json"
+    return next(found for found in read_objects(path) if found.id == object_id)
+
+
+def first_ids(root) -> list[int]:
+    """IDs of the rows that have splats."""
+    return [object_edits.from_stored(item.object_id) for item in root.objectgs.objects if item.splats]
+
+
+def activate(root, object_id: int) -> None:
+    """Make an object's row the active one, as a click in the list does."""
+    rows = [object_edits.from_stored(item.object_id) for item in root.objectgs.objects]
+    root.objectgs.active_object = rows.index(object_id)
+
+
+def test_rows_say_what_the_file_says(root):
+    entries = read_objects(scene.folder_of(root) / "objects.json")
+    items = root.objectgs.objects
+    assert [(object_edits.from_stored(i.object_id), i.name, i.points) for i in items] == [
+        (e.id, e.name, e.points) for e in entries]
+    counts = object_edits.splat_counts(root)
+    assert sum(counts.values()) > 0 and all(
+        item.splats == counts.get(object_edits.from_stored(item.object_id), 0) for item in items)
+    assert f"{items[0].points:,} points" in describe(items[0], root.objectgs)
+
+
+def test_a_new_name_and_colour_reach_the_file_and_the_collection(root):
+    object_id = first_ids(root)[0]
+    item = next(i for i in root.objectgs.objects if object_edits.from_stored(i.object_id) == object_id)
+    item.name = "  tall thing "
+    item.colour = (1.0, 0.5, 0.0)
+    assert entry(root, object_id).name == "tall thing" and entry(root, object_id).colour == (255, 128, 0)
+    collection = scene.object_collections(root)[object_id]
+    assert collection.name == "tall thing"
+    splats = next(part for part in scene.parts_of(collection) if scene.kind_of(part) == "splats")
+    assert splats.color[0] == pytest.approx(1.0) and splats.color[1] == pytest.approx(0.2159, abs=0.001)
+
+
+def test_solo_hides_the_others_and_once_more_shows_all(root):
+    object_id = first_ids(root)[0]
+    activate(root, object_id)
+    bpy.ops.objectgs.solo_object()
+    layers = visibility.object_layers(bpy.context.view_layer, root)
+    assert len(layers) > 2 and {i: layer.hide_viewport for i, layer in layers.items()} == {
+        i: i != object_id for i in layers}
+    other = first_ids(root)[1]
+    activate(root, other)
+    bpy.ops.objectgs.solo_object()
+    assert [i for i, layer in layers.items() if not layer.hide_viewport] == [other]
+    bpy.ops.objectgs.solo_object()
+    assert not any(layer.hide_viewport for layer in layers.values())
+
+
+def test_a_row_selects_its_object_and_the_selection_is_read_back(root):
+    first, second = first_ids(root)[:2]
+    activate(root, first)
+    assert selection.selected_ids(bpy.context, root) == [first]
+    kinds = {scene.kind_of(part) for part in bpy.context.selected_objects}
+    assert {"object_parent", "splats"} <= kinds
+    activate(root, second)
+    bpy.ops.objectgs.select_object(extend=True)
+    selection.select_object(bpy.context, root, first, extend=True)
+    assert selection.selected_ids(bpy.context, root) == [second, first], "the active one comes last"
+
+
+def test_selected_objects_are_merged_into_the_active_one_and_split(root):
+    first, second = first_ids(root)[:2]
+    before = object_edits.splat_counts(root)
+    selection.select_object(bpy.context, root, first)
+    selection.select_object(bpy.context, root, second, extend=True)
+    bpy.ops.objectgs.merge_objects(into=str(second))
+    assert entry(root, first).merged_into == second and entry(root, second).merged_into is None
+    after = object_edits.splat_counts(root)
+    assert after[second] == before[first] + before[second] and first not in after
+    assert object_edits.shown_as(root, first) == second
+    activate(root, second)
+    bpy.ops.objectgs.split_objects()
+    assert object_edits.splat_counts(root) == before and entry(root, first).merged_into is None
+
+
+def test_leaving_out_the_rest(root):
+    first, *others = [object_edits.from_stored(item.object_id) for item in root.objectgs.objects]
+    activate(root, first)
+    bpy.ops.objectgs.choose_objects(which="ACTIVE")
+    assert not entry(root, first).left_out and all(entry(root, i).left_out for i in others)
+    assert first in scene.object_collections(root) and not set(others) & set(scene.object_collections(root))
+    bpy.ops.objectgs.choose_objects(which="INVERT")
+    assert entry(root, first).left_out and not any(entry(root, i).left_out for i in others)
+    bpy.ops.objectgs.choose_objects(which="ALL")
+    assert not any(found.left_out for found in read_objects(scene.folder_of(root) / "objects.json"))
+
+
+def test_distance_and_ground_by_points(root):
+    parent = next(part for part in root.objects if scene.kind_of(part) == "parent")
+    bpy.ops.objectgs.set_distance(points=(0, 0, 0, 0.25, 0, 0), distance=1.0)
+    assert parent.matrix_world.to_scale().x == pytest.approx(4.0, rel=1e-5)
+    bpy.ops.objectgs.set_ground(points=(0, 0, 1, 1, 0, 1, 0, 1, 1))
+    bpy.context.view_layer.update()
+    with pytest.raises(RuntimeError):
+        bpy.ops.objectgs.set_ground(points=(0, 0, 0, 1, 0, 0, 2, 0, 0))
+    with pytest.raises(RuntimeError):
+        bpy.ops.objectgs.set_distance(points=(1, 1, 1, 1, 1, 1), distance=2.0)
+
+
+def test_points_take_the_colour_that_is_asked_for(root):
+    points = next(part for part in root.all_objects if scene.kind_of(part) == "points")
+    root.objectgs.colour_by = "object"
+    assert points.data.color_attributes.active_color_name == "object"
+    root.objectgs.colour_by = "photo"
+    assert points.data.color_attributes.active_color_name == "photo"
