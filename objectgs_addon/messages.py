@@ -19,7 +19,7 @@ def sentence(error: Exception) -> str:
 
 def show(text: str, kind: str = "INFO") -> None:
     """A pop-up with `text` in a window, a line on the console without one. kind: INFO or ERROR."""
-    print(f"ObjectGS: {text}")
+    print(f"ObjectGS: {text}", flush=True)
     manager = bpy.context.window_manager
     if bpy.app.background or manager is None or not manager.windows:
         return

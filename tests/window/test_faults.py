@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Faults that need a window: panels of a broken file, results that come while Blender or the user is busy, undo."""
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from . import harness
+from .harness import PACKAGE
+from .test_workflow import IDLE, script, wait
+
+FAKE = """
+import json, pathlib, sys, time
+go = pathlib.Path(sys.argv[1])
+print(json.dumps({"type": "status", "message": "Working"}), flush=True)
+while not go.exists():
+    time.sleep(0.05)
+print(json.dumps({"type": "done"}), flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    """A small reconstruction, a few steps old."""
+    place = tmp_path_factory.mktemp("trained")
+    python = harness.ROOT / ".venv-bpy" / "bin" / "python"
+    subprocess.run([python, "headless.py", "demo", place / "capture", "--objects", "3", "--views", "12", "--width",
+                    "96", "--height", "72", "--samples", "2"], cwd=harness.ROOT, check=True, stdout=subprocess.DEVNULL)
+    subprocess.run([sys.executable, "-m", "backend", "train", place / "capture", "--out", place / "demo", "--steps",
+                    "30"], cwd=harness.ROOT, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    return place / "demo"
+
+
+@pytest.fixture
+def window(blender):
+    """Blender with an empty file and the ObjectGS tab open."""
+    blender.run("""
+        bpy.ops.wm.read_homefile(use_empty=False)
+        for thing in list(bpy.data.objects):
+            bpy.data.objects.remove(thing)
+    """)
+    blender.run("window_context()['area'].spaces.active.show_region_ui = True")
+    time.sleep(1)
+    blender.run("""
+        for region in window_context()["area"].regions:
+            if region.type == "UI":
+                region.active_panel_category = "ObjectGS"
+    """)
+    return blender
+
+
+@pytest.fixture
+def folder(window, trained, request) -> Path:
+    """The reconstruction as the test's own folder, shown in the file."""
+    place = Path(shutil.copytree(trained, window.place / request.node.originalname))
+    window.run(script(f"""
+        with bpy.context.temp_override(**window_context()):
+            bpy.ops.objectgs.open_reconstruction("EXEC_DEFAULT", directory={str(place)!r})
+            bpy.ops.ed.undo_push(message="opened")
+    """))
+    yield place
+    shutil.rmtree(place, ignore_errors=True)
+
+
+def soon(window, expression: str) -> None:
+    """As `wait`, for what takes no work."""
+    wait(window, expression, 40.0)
+
+
+def log(window) -> str:
+    return (window.place / "blender.log").read_text(errors="replace")
+
+
+def start_fake(window, folder: Path, kind: str = "train", owner: str = "owner") -> Path:
+    """A job in the background that ends when the file that is returned is there."""
+    program, go = window.place / "fake.py", window.place / f"go-{time.monotonic()}"
+    program.write_text(FAKE)
+    window.run(script(f"""
+        from pathlib import Path
+        from {PACKAGE}.objectgs_addon.jobs import Job
+        job = Job(title="Fake", kind={kind!r}, folder=Path({str(folder)!r}), cwd=Path({str(window.place)!r}),
+                  command=[{sys.executable!r}, {str(program)!r}, {str(go)!r}])
+        running.submit(job, {owner}, print)
+    """))
+    return go
+
+
+def draws(window) -> None:
+    """Let everything be drawn anew; no panel and no callback may fail."""
+    window.run("""
+        for window in bpy.context.window_manager.windows:
+            for area in window.screen.areas:
+                for region in area.regions:
+                    region.tag_redraw()
+    """)
+    time.sleep(0.7)
+    assert "Traceback" not in log(window)
+
+
+def test_panels_of_a_file_whose_folder_is_gone(window, folder):
+    window.run(f"bpy.ops.wm.save_as_mainfile(filepath={str(window.place / 'old.blend')!r})")
+    shutil.rmtree(folder)
+    window.run(f"bpy.ops.wm.open_mainfile(filepath={str(window.place / 'old.blend')!r})")
+    draws(window)
+    name = window.run(script("result = root.objectgs.objects[1].name"))
+    assert window.run(script("root.objectgs.objects[1].name = 'cup'; result = root.objectgs.objects[1].name")) == name
+    draws(window)
+    window.shot("faults-folder-gone")
+    assert "was not changed" in log(window)
+    window.key("Escape")
+
+
+def test_panels_of_a_folder_with_broken_objects(window, folder):
+    (folder / "objects.json").write_text("{")
+    window.run(script("root.objectgs.objects.clear()"))
+    window.run(f"bpy.ops.wm.save_as_mainfile(filepath={str(window.place / 'broken.blend')!r})")
+    window.run(f"bpy.ops.wm.open_mainfile(filepath={str(window.place / 'broken.blend')!r})")
+    draws(window)
+    window.run(script("""
+        with bpy.context.temp_override(**window_context()):
+            try:
+                bpy.ops.objectgs.show_result("EXEC_DEFAULT")
+            except RuntimeError as error:
+                result = str(error)
+    """))
+    draws(window)
+    assert (folder / "objects.json").read_text() == "{"
+
+
+def test_result_waits_for_edit_mode(window, folder):
+    """The user edits splats when a training ends: their edit stays, the result comes when Edit Mode is left."""
+    go = start_fake(window, folder)
+    window.run(script("""
+        part = next(part for part in root.all_objects if scene.kind_of(part) == "splats" and part.visible_get())
+        with bpy.context.temp_override(**window_context()):
+            bpy.context.view_layer.objects.active = part
+            bpy.ops.object.mode_set(mode="EDIT")
+            bpy.ops.mesh.select_all(action="SELECT")
+    """))
+    go.touch()
+    soon(window, f"{IDLE} and len(running._results)")
+    assert "its result is shown when" in log(window)
+    window.shot("faults-edit-mode")
+    window.key("Escape")
+    assert window.run("result = bpy.context.mode") == "EDIT_MESH"
+    window.run(script("""
+        with bpy.context.temp_override(**window_context()):
+            bpy.ops.object.mode_set(mode="OBJECT")
+    """))
+    soon(window, "not running._results")
+    draws(window)
+
+
+def test_result_waits_for_the_end_of_a_render(window, folder):
+    window.run(script("""
+        owner.render.engine = "CYCLES"
+        owner.cycles.samples, owner.cycles.time_limit = 1 << 20, 10.0
+        owner.cycles.use_adaptive_sampling = owner.cycles.use_denoising = False
+    """))
+    go = start_fake(window, folder)
+    window.run(script("call(bpy.ops.render.render)"))
+    soon(window, "bpy.app.is_job_running('RENDER')")
+    go.touch()
+    soon(window, f"{IDLE} and len(running._results)")
+    assert window.run("result = bpy.app.is_job_running('RENDER')")
+    window.shot("faults-rendering")
+    soon(window, "not bpy.app.is_job_running('RENDER') and not running._results")
+    draws(window)
+
+
+def test_undo_while_a_job_runs(window, folder):
+    """Undo to before the reconstruction came, and redo, harm neither the job nor what it brings."""
+    go = start_fake(window, folder)
+    middle = window.run("context = window_context(); r = context['region']; w = context['window']; "
+                        "result = [r.x + r.width / 3, w.height - r.y - r.height / 3]")
+    window.move(*middle)
+    window.run(script("""
+        root.objectgs.objects[1].name = "cup"
+        with bpy.context.temp_override(**window_context()):
+            bpy.ops.ed.undo_push(message="renamed")
+    """))
+    window.key("ctrl+z")
+    names = [entry["name"] for entry in json.loads((folder / "objects.json").read_text())["objects"]]
+    assert window.run(script("result = root.objectgs.objects[1].name")) in names
+    window.key("ctrl+shift+z")
+    assert window.run(script("result = root.objectgs.objects[1].name")) == "cup"
+    go.touch()
+    soon(window, f"{IDLE} and not running._results")
+    window.key("ctrl+z")
+    window.key("ctrl+z")
+    window.key("ctrl+shift+z")
+    window.key("ctrl+shift+z")
+    assert window.run(script("result = sum(object_edits.splat_counts(root).values())")) > 100
+    draws(window)
+
+
+def test_two_scenes_with_two_jobs(window, folder):
+    """The user looks at one scene while results come in for both."""
+    other = Path(shutil.copytree(folder, window.place / "other"))
+    window.run("bpy.data.scenes.new('Second')")
+    first = start_fake(window, folder, "train")
+    second = start_fake(window, other, "import", "bpy.data.scenes['Second']")
+    window.run("bpy.data.scenes['Second'].name = 'Renamed'")
+    second.touch()
+    time.sleep(0.5)
+    first.touch()
+    soon(window, f"{IDLE} and not running._results")
+    assert window.run(script("""
+        result = [str(scene.folder_of(each.objectgs.active)) for each in (owner, bpy.data.scenes["Renamed"])]
+    """)) == [str(folder), str(other)]
+    draws(window)
+
+
+def test_collection_deleted_while_its_job_runs(window, folder):
+    go = start_fake(window, folder)
+    window.run(script("""
+        for collection in [*root.children_recursive, root]:
+            bpy.data.collections.remove(collection)
+    """))
+    go.touch()
+    soon(window, f"{IDLE} and not running._results")
+    assert "Open Reconstruction shows" in log(window)
+    draws(window)
+
+
+def test_disabled_while_a_job_runs(window, folder):
+    """The extension is switched off and on again: its job has ended, and everything can be used again."""
+    go = start_fake(window, folder)
+    soon(window, "running.queue.running is not None and running.queue.running.message")
+    window.run(f"""
+        import addon_utils
+        addon_utils.disable("{PACKAGE}")
+    """)
+    draws(window)
+    window.run(f"""
+        import addon_utils
+        addon_utils.enable("{PACKAGE}", default_set=True)
+    """)
+    go.touch()
+    draws(window)
+    assert window.run(script("result = list(bpy.ops.objectgs.show_result('EXEC_DEFAULT'))")) == ["FINISHED"]
