@@ -81,7 +81,7 @@ class TrainPanel(_WithReconstruction, bpy.types.Panel):
         else:
             if job is not None:
                 draw_over(layout, job)
-            _explain(layout, folder, properties, job)
+            _explain(layout, root, job)
         icon = previews.icon_of(folder)
         if icon:
             layout.template_icon(icon, scale=8.0)
@@ -93,16 +93,21 @@ def _train_text(folder, minutes: float) -> str:
     return "Go On Training" if state.steps and state.seconds < 60 * minutes else "Train"
 
 
-def _explain(layout, folder, properties, job) -> None:
+def _explain(layout, root, job) -> None:
     """What the folder holds that this Blender has not seen come about."""
+    folder, minutes = scene.folder_of(root), root.objectgs.minutes
     state = folder_state(folder)
     holder = jobs.lock_holder(folder)
     if holder is not None:
         write(layout, f"Another program works on this reconstruction (process {holder}). Its result can be reloaded "
                       "when it is done.", "INFO")
-    elif job is None and state.steps and state.seconds < 60 * properties.minutes - 0.5:
-        write(layout, f"Trained for {duration(state.seconds)} of {duration(60 * properties.minutes)}. "
+        return
+    if job is None and state.steps and state.seconds < 60 * minutes - 0.5:
+        write(layout, f"Trained for {duration(state.seconds)} of {duration(60 * minutes)}. "
                       "Go On Training continues from there.", "INFO")
+    if scene.result_is_newer(root):
+        write(layout, "The folder holds another result than the one shown.", "INFO")
+        layout.operator("objectgs.show_result", icon="FILE_REFRESH")
 
 
 class SettingsPanel(_WithReconstruction, bpy.types.Panel):

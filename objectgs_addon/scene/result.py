@@ -19,6 +19,7 @@ from .kinds import (
     SPLATS,
     adopt,
     capture_of,
+    folder_of,
     kind_of,
     mark,
     object_collections,
@@ -34,6 +35,8 @@ from .splats import anchor_attributes, ids_of, middle_scale, read_anchors, read_
 NAME = "objectgs_name"
 CENTRE = "objectgs_centre"
 GROUPING = "objectgs_grouping"
+SHOWN = "objectgs_shown"
+"""On the root: when the splats.ply that it shows was written."""
 
 LARGEST_POINT = 3.0
 """Largest radius of a point in the viewport relative to the size of the splats in the middle."""
@@ -97,7 +100,22 @@ def show_result(root: bpy.types.Collection, folder: Path, scene: bpy.types.Scene
     for collection in new:
         root.children.link(collection)
     root[GROUPING] = json.dumps(objects.grouping())
+    root[SHOWN] = _written(folder)
     return shown
+
+
+def result_is_newer(root: bpy.types.Collection) -> bool:
+    """Whether the folder holds another splats.ply than the one that is shown."""
+    written = _written(folder_of(root))
+    return bool(written) and root.get(SHOWN) != written
+
+
+def _written(folder: Path) -> str:
+    """When splats.ply was written, in nanoseconds; Blender's integers are too short for that. Empty without one."""
+    try:
+        return str(Reconstruction(folder).splats.stat().st_mtime_ns)
+    except OSError:
+        return ""
 
 
 def show_objects(root: bpy.types.Collection, folder: Path, scene: bpy.types.Scene) -> None:

@@ -137,3 +137,14 @@ def test_points_take_the_colour_that_is_asked_for(root):
     assert points.data.color_attributes.active_color_name == "object"
     root.objectgs.colour_by = "photo"
     assert points.data.color_attributes.active_color_name == "photo"
+
+
+def test_another_result_in_the_folder_is_noticed(root):
+    assert not scene.result_is_newer(root)
+    splats = scene.folder_of(root) / "splats.ply"
+    splats.write_bytes(splats.read_bytes())
+    assert scene.result_is_newer(root)
+    bpy.ops.objectgs.show_result()
+    assert not scene.result_is_newer(root)
+    splats.unlink()
+    assert not scene.result_is_newer(root)
