@@ -16,6 +16,21 @@ headless.extension()
 
 from objectgs.objectgs_addon import demo_capture  # noqa: E402
 
+_status = pytest.ExitCode.OK
+
+
+def pytest_sessionfinish(exitstatus):
+    global _status
+    _status = exitstatus
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_unconfigure(config):
+    """Where a property ever had a callback, Blender 4.2's module crashes while Python ends: leave before that."""
+    if bpy.app.version < (5, 0):
+        config.get_terminal_writer().flush()
+        os._exit(_status)
+
 
 @pytest.fixture
 def fresh():
