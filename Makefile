@@ -23,6 +23,9 @@ BLENDER_EXT = $(BLENDER) $(wildcard .venv-bpy/lib/python*/$(EXTENSION_TOOL) .ven
 
 export OBJECTGS_PYTHON = $(abspath $(BACKEND))
 
+# Compiled once, by `make venv`, for whatever runs the backend.
+export NUMBA_CACHE_DIR ?= $(abspath .venv/kernels)
+
 .PHONY: help venv demo zip test test-blenders lint benchmarks clean
 
 help:

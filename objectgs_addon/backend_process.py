@@ -55,10 +55,13 @@ class BackendProcess:
     """One child process, in a process group of its own and with lower priority.
 
     The first line that it gets is `attached`: from then on the end of its input means that nobody drives it any more.
-    Raises OSError where it cannot be started.
+    in_background: give way to everything else on this machine, so that a window stays responsive. Raises OSError where
+    it cannot be started.
     """
 
-    def __init__(self, command: Sequence[str], cwd: str | Path, environment: Mapping[str, str] | None = None) -> None:
+    def __init__(self, command: Sequence[str], cwd: str | Path, environment: Mapping[str, str] | None = None,
+                 in_background: bool = True) -> None:
+        _ignore_broken_pipes()
         self._events: queue.Queue[dict[str, Any]] = queue.Queue(_WAITING_EVENTS)
         self._log: deque[str] = deque(maxlen=LOG_LINES)
         self._ended_at: float | None = None
@@ -68,18 +71,15 @@ class BackendProcess:
             apart: dict[str, Any] = {
                 "creationflags": subprocess.CREATE_NO_WINDOW
                 | subprocess.CREATE_NEW_PROCESS_GROUP
-                | subprocess.BELOW_NORMAL_PRIORITY_CLASS
+                | (subprocess.BELOW_NORMAL_PRIORITY_CLASS if in_background else 0)
             }
         else:
             apart = {"process_group": 0}
         self._process = subprocess.Popen(
             list(command), cwd=cwd, env=child_environment(environment or {}), bufsize=0,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **apart)
-        if sys.platform != "win32":
-            try:
-                os.setpriority(os.PRIO_PROCESS, self._process.pid, _NICENESS)
-            except OSError:
-                pass  # It has ended already, or the system forbids it: then it runs as it is.
+        if in_background:
+            self._give_way()
         self._readers = [
             threading.Thread(target=self._read, args=(stream,), daemon=True)
             for stream in (self._process.stdout, self._process.stderr)
@@ -87,6 +87,16 @@ class BackendProcess:
         for reader in self._readers:
             reader.start()
         self.send("attached")
+
+    def _give_way(self) -> None:
+        """Let the child run when nothing else wants the processor, or seldom, as far as the system knows how to."""
+        try:
+            if hasattr(os, "SCHED_IDLE"):
+                os.sched_setscheduler(self.pid, os.SCHED_IDLE, os.sched_param(0))
+            elif sys.platform != "win32":
+                os.setpriority(os.PRIO_PROCESS, self.pid, _NICENESS)
+        except OSError:
+            pass  # It has ended already, or the system forbids it: then it runs as it is.
 
     @property
     def pid(self) -> int:
@@ -160,6 +170,13 @@ class BackendProcess:
                     self._events.put(event)
                 elif text := line.decode("utf-8", errors="replace").rstrip():
                     self._log.append(text[:_LOG_CHARACTERS])
+
+
+def _ignore_broken_pipes() -> None:
+    """Blender leaves SIGPIPE as the system has it: a word to a child that has just ended would end Blender too."""
+    if hasattr(signal, "SIGPIPE") and threading.current_thread() is threading.main_thread():
+        if signal.getsignal(signal.SIGPIPE) == signal.SIG_DFL:
+            signal.signal(signal.SIGPIPE, signal.SIG_IGN)
 
 
 def _event(line: bytes) -> dict[str, Any] | None:

@@ -137,11 +137,14 @@ class Job:
             self._killed = True
             self._process.kill()
 
-    def start(self) -> None:
-        """Start the process of a waiting job; where that fails, the job has failed and says why."""
+    def start(self, in_background: bool = True) -> None:
+        """Start the process of a waiting job; where that fails, the job has failed and says why.
+
+        in_background: as for `BackendProcess`.
+        """
         self._changed = True
         try:
-            self._process = BackendProcess(self.command, self.cwd, self.environment)
+            self._process = BackendProcess(self.command, self.cwd, self.environment, in_background)
         except (OSError, ValueError) as error:
             why = getattr(error, "strerror", None) or error
             self.error = f"{self.command[0]} could not be started ({why}); choose another Python for the backend."
@@ -359,7 +362,7 @@ def run_blocking(job: Job, echo: Callable[[str], None] = print) -> int:
     numbers = (signal.SIGINT, signal.SIGTERM) if main else ()
     before = {number: signal.signal(number, on_signal) for number in numbers}
     try:
-        job.start()
+        job.start(in_background=False)
         _watch(job, echo, asked)
     finally:
         for number, handler in before.items():

@@ -75,8 +75,9 @@ def backend_job(title: str, kind: str, folder: Path | None, *arguments: str) -> 
     """A job that runs `python -m backend ARGUMENTS --json`; the backend must be there (`backend_python`)."""
     python = backend_python()
     silent = f"{python} cannot run the backend; choose a Python {VERSIONS} that has its packages, or set it up anew."
+    cache = os.environ.get("NUMBA_CACHE_DIR") or user_folder() / "cache"
     return Job(title=title, kind=kind, folder=folder, command=backend_command(python, *arguments), cwd=ROOT,
-               environment=backend_environment(user_folder() / "cache"), if_silent=silent)
+               environment=backend_environment(cache), if_silent=silent)
 
 
 def demo_folder() -> Path:

@@ -5,6 +5,7 @@ The queue lives as long as Blender does, not in the .blend: opening another file
 whoever opens the reconstruction's .blend again finds its job by the folder.
 """
 
+import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -17,8 +18,12 @@ from .jobs import Job, JobQueue, State, run_blocking
 
 INTERVAL = 0.1
 """Seconds between two looks at the queue."""
+DRAW_EVERY = 1.0
+"""Seconds between two drawings of new figures."""
 
 queue = JobQueue()
+_drawn = 0.0
+_stale = False
 _wanted_in: dict[Job, int] = {}
 """Job -> the session's ID of the scene that asked for it, which stays when that is renamed."""
 _results: list[Job] = []
@@ -69,9 +74,18 @@ def _tick() -> float | None:
         if job.is_finished:
             _over(job)
     _show_results()
-    if changed:
-        redraw()
+    _redraw_soon(any(job.is_finished or job.state is not State.RUNNING for job in changed), bool(changed))
     return INTERVAL if _results or any(not job.is_finished for job in queue.jobs) else None
+
+
+def _redraw_soon(at_once: bool, changed: bool) -> None:
+    """Draw what has changed: a new state at once, new figures once a second, since drawing a window takes time."""
+    global _drawn, _stale
+    _stale = _stale or changed
+    now = time.monotonic()
+    if _stale and (at_once or now - _drawn >= DRAW_EVERY):
+        _drawn, _stale = now, False
+        redraw()
 
 
 def redraw() -> None:

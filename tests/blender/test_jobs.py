@@ -301,13 +301,32 @@ def test_own_group_lower_priority_clean_environment(make, monkeypatch, tmp_path)
     monkeypatch.setenv("PYTHONPATH", "/nowhere")
     monkeypatch.setenv("OBJECTGS_TEST", "stays")
     job = run(make("""
-say("done", group=os.getpgid(0), pid=os.getpid(), nice=os.nice(0), variables=dict(os.environ))
+way = os.sched_getscheduler(0) == os.SCHED_IDLE if hasattr(os, "SCHED_IDLE") else os.nice(0) > 0
+say("done", group=os.getpgid(0), pid=os.getpid(), gives_way=way, variables=dict(os.environ))
 """, environment=backend_environment(tmp_path / "cache")))
     assert job.state is State.DONE
     found, variables = job.result, job.result["variables"]
-    assert found["group"] == found["pid"] and found["nice"] > os.nice(0)
+    assert found["group"] == found["pid"] and found["gives_way"]
     assert "PYTHONHOME" not in variables and "PYTHONPATH" not in variables and variables["OBJECTGS_TEST"] == "stays"
     assert variables["NUMBA_CACHE_DIR"] == str(tmp_path / "cache") and variables["PYTHONUTF8"] == "1"
+
+
+def test_without_a_window_nobody_has_to_give_way(make):
+    job = make("""say("done", policy=os.sched_getscheduler(0) if hasattr(os, "SCHED_IDLE") else os.nice(0))""")
+    run_blocking(job, echo=lambda line: None)
+    assert job.result["policy"] == (os.sched_getscheduler(0) if hasattr(os, "SCHED_IDLE") else os.nice(0))
+
+
+@posix
+def test_a_word_to_a_process_that_has_ended_harms_nobody(tmp_path):
+    """As in Blender, which leaves SIGPIPE as the system has it."""
+    before = signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    try:
+        process = BackendProcess([sys.executable, "-c", "pass"], tmp_path)
+        until(lambda: process.exit_code == 0)
+        assert process.send("stop") is False
+    finally:
+        signal.signal(signal.SIGPIPE, before)
 
 
 def test_what_cannot_be_started(make, tmp_path):
