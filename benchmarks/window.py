@@ -1,7 +1,8 @@
 """How long Blender's main thread is blocked while training runs, and while a million splats come in.
 
 A timer inside a Blender with a window should tick every 10 ms; its longest gap is what the user feels. Needs a Blender
-that tests/window can drive, the extension's zip (make zip) and a capture:
+that tests/window can drive, the extension's zip (make zip) and a capture. "Undrawn" is with the same training but
+without the panels being drawn, which on a machine without a graphics card takes most of the time:
 
     .venv/bin/python benchmarks/window.py build/demo/capture [--json]
 """
@@ -43,14 +44,24 @@ result = {"ticks": len(gaps), "median_ms": 1000 * gaps[len(gaps) // 2], "p99_ms"
 """
 
 
-def measure(name: str, command, variables, capture: Path, archive: Path, seconds: float) -> dict[str, dict[str, float]]:
+def measure(
+    name: str, command, variables, capture: Path, archive: Path, seconds: float, size
+) -> dict[str, dict[str, float]]:
     """Gaps of the timer in one Blender: at rest, while training runs, and how long the result takes to come in."""
     place = Path(tempfile.mkdtemp(prefix="objectgs-window-"))
-    blender = harness.Blender(command, variables, place, place / "shots", ":96")
+    blender = harness.Blender(command, variables, place, place / "shots", ":96", size)
     found: dict[str, dict[str, float]] = {}
     try:
         blender.wait_for("True", timeout=120)
         blender.install(archive, Path(sys.executable))
+        blender.run("window_context()['area'].spaces.active.show_region_ui = True")
+        time.sleep(2)
+        blender.run(
+            "for region in window_context()['area'].regions:\n"
+            "    if region.type == 'UI':\n"
+            "        region.active_panel_category = 'ObjectGS'"
+        )
+        time.sleep(2)
         blender.run(START)
         time.sleep(10)
         found["at rest"] = blender.run(STOP)
@@ -63,6 +74,13 @@ def measure(name: str, command, variables, capture: Path, archive: Path, seconds
         blender.run(START)
         wait(blender, "running.queue.running is None or running.queue.running.progress > 0.98", 1.0)
         found["training"] = blender.run(STOP)
+        wait(blender, "running.queue.running is None")
+        blender.run(NAMES + f"root.objectgs.minutes = {2 * seconds / 60}; bpy.ops.objectgs.train()")
+        wait(blender, "running.queue.running is not None and running.queue.running.step")
+        blender.run(NAMES + "running.redraw = lambda: None")
+        blender.run(START)
+        wait(blender, "running.queue.running is None or running.queue.running.progress > 0.98", 1.0)
+        found["training, undrawn"] = blender.run(STOP)
     finally:
         blender.close()
     return found
@@ -82,11 +100,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("capture", type=Path)
     parser.add_argument("--seconds", type=float, default=60.0, help="length of the training")
+    parser.add_argument("--size", type=int, nargs=2, default=harness.SIZE, help="pixels of the window")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     archive = max((harness.ROOT / "build").glob("objectgs-*.zip"), key=lambda path: path.stat().st_mtime)
     results = {
-        name: measure(name, *how, options.capture.resolve(), archive, options.seconds)
+        name: measure(name, *how, options.capture.resolve(), archive, options.seconds, tuple(options.size))
         for name, how in harness.blenders().items()
     }
     if options.json:

@@ -74,7 +74,7 @@ def comparison(
     return _sheet(panels, len(panels), title, legend)
 
 
-def thumbnail(image: NDArray, longest: int = 512) -> Image.Image:
+def thumbnail(image: NDArray, longest: int = 256) -> Image.Image:
     """(h, w, 3) uint8 or float in [0, 1] as a picture whose longer side has at most `longest` pixels."""
     size = _fit(image.shape[1], image.shape[0], longest)
     return _resized(as_bytes(image), size, Image.Resampling.LANCZOS)

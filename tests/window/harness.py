@@ -36,15 +36,15 @@ class Failed(Exception):
 
 
 class Blender:
-    """One running Blender. `shots` is where screenshots go, `place` a scratch folder of its own."""
+    """One running Blender of `size` pixels. `shots` is where screenshots go, `place` a scratch folder of its own."""
 
-    def __init__(self, command, variables, place: Path, shots: Path, display: str = ":97") -> None:
+    def __init__(self, command, variables, place: Path, shots: Path, display: str = ":97", size=SIZE) -> None:
         self.place, self.shots, self.display = place, shots, display
         self.scripts = place / "scripts"
         self.scripts.mkdir(parents=True)
         shots.mkdir(parents=True, exist_ok=True)
         self._count = 0
-        self._screen = subprocess.Popen(["Xvfb", display, "-screen", "0", f"{SIZE[0]}x{SIZE[1]}x24"],
+        self._screen = subprocess.Popen(["Xvfb", display, "-screen", "0", f"{size[0]}x{size[1]}x24"],
                                         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         _wait(lambda: Path(f"/tmp/.X11-unix/X{display[1:]}").exists(), 10, "the virtual screen does not start")
         environment = {**os.environ, **variables, "DISPLAY": display, "LIBGL_ALWAYS_SOFTWARE": "1",
@@ -52,7 +52,7 @@ class Blender:
         (place / "user").mkdir()
         self._log = open(place / "blender.log", "wb")
         self._process = subprocess.Popen(
-            [*command, "--window-geometry", "0", "0", str(SIZE[0]), str(SIZE[1]), "--python",
+            [*command, "--window-geometry", "0", "0", str(size[0]), str(size[1]), "--python",
              str(Path(__file__).with_name("driver.py")), "--", str(self.scripts)],
             cwd=ROOT, env=environment, stdout=self._log, stderr=subprocess.STDOUT, start_new_session=True)
 
