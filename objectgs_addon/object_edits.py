@@ -9,6 +9,7 @@ import bpy
 from ..backend.objects import SceneObject, edit_objects, merged, read_objects
 from ..backend.protocol import InputError, Reconstruction
 from . import messages, scene, selection
+from .scene import from_stored, to_stored
 
 _filling = False
 
@@ -22,16 +23,6 @@ def without_callbacks():
         yield
     finally:
         _filling = before
-
-
-def to_stored(object_id: int) -> int:
-    """A mask's ID (0 .. 2^32 - 1) as Blender's signed 32-bit integers hold it."""
-    return object_id - (1 << 32) if object_id >= 1 << 31 else object_id
-
-
-def from_stored(value: int) -> int:
-    """The mask's ID again."""
-    return value + (1 << 32) if value < 0 else value
 
 
 def fill(root) -> None:

@@ -32,14 +32,24 @@ def kind_of(block) -> str | None:
 def object_id_of(block) -> int | None:
     """ID 0 .. 2^32 - 1 of the object that a collection or an object belongs to, or None."""
     value = block.get(OBJECT_ID) if kind_of(block) is not None else None
-    return int(value) & 0xFFFFFFFF if isinstance(value, int) else None
+    return from_stored(value) if isinstance(value, int) else None
 
 
 def mark(block, kind: str, object_id: int | None = None) -> None:
-    """Say what `block` is; IDs from 2^31 on are kept as the int32 of the same bits, all that Blender can store."""
+    """Say what `block` is."""
     block[KIND] = kind
     if object_id is not None:
-        block[OBJECT_ID] = object_id - (1 << 32) if object_id >= 1 << 31 else object_id
+        block[OBJECT_ID] = to_stored(object_id)
+
+
+def to_stored(object_id: int) -> int:
+    """A mask's ID (0 .. 2^32 - 1) as Blender's signed 32-bit integers hold it: the int32 of the same bits."""
+    return object_id - (1 << 32) if object_id >= 1 << 31 else object_id
+
+
+def from_stored(value: int) -> int:
+    """The mask's ID again."""
+    return value & 0xFFFFFFFF
 
 
 def folder_of(root: bpy.types.Collection) -> Path:
