@@ -13,7 +13,7 @@ class Preferences(bpy.types.AddonPreferences):
     bl_idname = locations.PACKAGE
 
     device: EnumProperty(name="For", default="cpu", items=[
-        ("cpu", "Processor", "Works on every computer; about 1 GB"),
+        ("cpu", "Processor", "Works on every computer; 1.6 GB on disk"),
         ("cuda", "NVIDIA GPU", "Also brings the packages for NVIDIA graphics cards; several GB")])
     backend_python: StringProperty(
         name="Backend's Python", subtype="FILE_PATH",

@@ -16,7 +16,7 @@ def _idle(cls) -> bool:
 class SetUpBackend(bpy.types.Operator):
     bl_idname = "objectgs.set_up_backend"
     bl_label = "Set Up Backend"
-    bl_description = ("Download the compute backend's packages (PyTorch and others, from 1 GB on) into a folder of "
+    bl_description = ("Download the compute backend's packages (PyTorch and others, 1.6 GB and more) into a folder of "
                       "their own. Nothing else on this computer is changed")
 
     @classmethod
