@@ -32,7 +32,7 @@ help:
 	@echo "make demo           a capture made by Blender becomes objects in a .blend, with a report, in $(DEMO)"
 	@echo "make zip            the extension to install in Blender, in build/"
 	@echo "make test           the tests"
-	@echo "make test-blenders  the tests of the Blender side in Blender 4.2 and 5.2"
+	@echo "make test-blenders  the tests of the Blender side in more versions of Blender"
 	@echo "make lint           what a change must pass beside the tests"
 	@echo "make venv           the backend's environment, .venv, alone"
 	@echo "make benchmarks     speed of the rasterizer and of training"
@@ -80,6 +80,7 @@ test-blenders: .venv/ready .venv-bpy-4.2/ready
 	else \
 		echo "There is no Python 3.13 here, so Blender 5.2 was left out; PYTHON313 may name one."; \
 	fi
+	$(BACKEND) -m pytest tests/window --all-blenders
 
 lint: .venv/ready
 	$(BACKEND) -m ruff check .

@@ -17,7 +17,18 @@ def extension_zip(tmp_path_factory):
     return max((harness.ROOT / "build").glob("objectgs-*.zip"), key=lambda path: path.stat().st_mtime)
 
 
-@pytest.fixture(scope="module", params=list(harness.blenders()) or ["none"])
+def pytest_addoption(parser):
+    parser.addoption("--all-blenders", action="store_true", help="in every Blender that is here, not only in one")
+
+
+def pytest_generate_tests(metafunc):
+    if "blender" in metafunc.fixturenames:
+        names = list(harness.blenders()) or ["none"]
+        wanted = names if metafunc.config.getoption("--all-blenders") else names[:1]
+        metafunc.parametrize("blender", wanted, indirect=True, scope="module")
+
+
+@pytest.fixture(scope="module")
 def blender(request, tmp_path_factory, extension_zip):
     """A Blender with a window and the extension installed; one for all tests of a module."""
     if request.param == "none":
