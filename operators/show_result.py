@@ -7,7 +7,7 @@ import bpy
 from bpy.props import StringProperty
 
 from ..backend.protocol import InputError, Reconstruction
-from ..objectgs_addon import messages, object_edits, scene
+from ..objectgs_addon import messages, object_edits, scene, view
 from . import need
 
 
@@ -56,6 +56,8 @@ def _show(operator, context, folder: Path, root) -> set:
     context.scene.objectgs.active = root
     try:
         if Reconstruction(folder).splats.exists():
+            if not scene.object_collections(root):
+                view.hide_points(root)
             shown = scene.show_result(root, folder, context.scene)
             for sentence in shown.warnings:
                 operator.report({"WARNING"}, sentence)

@@ -9,7 +9,7 @@ import bpy
 
 from ...backend.protocol import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError, Reconstruction
 from ...backend.stopping import StopRequest
-from .. import demo_capture, locations, scene
+from .. import demo_capture, locations, scene, view
 from ..jobs import run_blocking
 from ..quiet import quiet
 from .lines import say
@@ -112,6 +112,7 @@ def build_blend(folder: Path, blend: Path) -> None:
         warnings = scene.warnings_of(root)
         if files.splats.exists():
             warnings += scene.show_result(root, folder, target).warnings
+            view.hide_points(root)
         scene.prepare_render(target)
         # Works on every machine; EEVEE needs a display, or draws on the processor.
         target.render.engine = "CYCLES"
