@@ -97,7 +97,9 @@ def redraw() -> None:
                     region.tag_redraw()
         # No area of a screen, so this is the way to have the status bar drawn; a modal operator's text stays.
         if not len(getattr(window, "modal_operators", ())):
-            window.workspace.status_text_set_internal(None)
+            # Right after a file was opened a timer has no window, and Blender crashes without one here.
+            with bpy.context.temp_override(window=window):
+                window.workspace.status_text_set_internal(None)
 
 
 def _over(job: Job) -> None:
