@@ -11,7 +11,7 @@ from typing import Any
 
 from numba import njit
 
-_LAYERS = ("raster", "model", "training")
+_LAYERS = ("raster", "model", "training", "mesh")
 """The packages that hold kernels; each may use what lies in it and in those before it."""
 
 
