@@ -1,1 +1,1 @@
-"""From splats to meshes, object by object: what each view sees of it -> signed distance -> surface -> UVs -> texture."""
+"""From splats to meshes, object by object: what views see of it -> signed distance -> surface -> UVs -> texture."""
