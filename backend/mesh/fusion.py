@@ -7,7 +7,7 @@ another one. Where no view says anything, the point is inside if what was seen o
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
