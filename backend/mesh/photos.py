@@ -1,4 +1,4 @@
-"""The photographs as evidence of a surface's colours: where a photo shows the surface and nothing else, and how well."""
+"""The photographs as evidence of a surface's colours: where one shows the surface and nothing else, and how well."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Photo(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """The best photos' colours of N places: score (N, KEPT + 1) float32, descending, 0: none; color (N, KEPT, 3) uint8."""
+    """The best photos of N places: score (N, KEPT + 1) float32, descending, 0: none; color (N, KEPT, 3) uint8."""
 
     score: np.ndarray
     color: np.ndarray
@@ -89,7 +89,7 @@ def photo_of(views: Views, index: int, vertices: np.ndarray, faces: np.ndarray, 
 def _allowed(
     views: Views, index: int, labels: np.ndarray | None, classes: Sequence[int], box: tuple[int, int, int, int]
 ) -> np.ndarray:
-    """(h, w) bool: the pixels of `box` that show the objects, by the photo's own mask; where it is silent, the model."""
+    """(h, w) bool: the pixels of `box` that show the objects, by the photo's mask; where it is silent, by the model."""
     x, y, width, height = box
     ours = np.zeros(len(views.model.object_ids) + 1, np.bool_)  # the last one for the index -1
     ours[list(classes)] = True
@@ -174,7 +174,7 @@ def _measure_clearance(depth, allowed, step, clearance):
 
 
 def add_photo(photo: Photo, positions: np.ndarray, normals: np.ndarray, samples: Samples) -> None:
-    """Let `photo` take its place among the best of each place: positions and unit normals (N, 3) float32, scene units."""
+    """Let `photo` take its rank among the best of each place: positions and unit normals (N, 3) float32."""
     viewmat, intrinsics = photo.camera.arrays()
     _gather(
         positions, normals, photo.planes, photo.depth, photo.clearance, viewmat, intrinsics, photo.camera.centre,

@@ -51,7 +51,7 @@ def texture_size(surface: Surface, views: Views, classes: Sequence[int]) -> int:
     # All of the surface at the density that suits nearly all of what is seen.
     order = np.argsort(finest[seen])
     reached = np.cumsum(area[seen][order]) / max(float(area[seen].sum()), 1e-30)
-    density = finest[seen][order][min(np.searchsorted(reached, 0.8), len(order) - 1)]
+    density = finest[seen][order][min(int(np.searchsorted(reached, 0.8)), len(order) - 1)]
     needed = np.sqrt(density * area.sum() / _USED)
     return next((size for size in SIZES if size >= needed), SIZES[-1])
 

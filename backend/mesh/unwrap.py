@@ -64,13 +64,13 @@ def unwrap(surface: Surface, texture_size: int) -> np.ndarray:
 
 def _with_points(uvs: np.ndarray, origin: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """(F, 3, 2): faces that are in no chart, at (0, 0), become a point where another face has one of their corners."""
-    placed = uvs.any(1)
+    placed = (uvs != 0).any(1)
     known = np.zeros((origin.max() + 1, 2))
     known[origin[placed]] = uvs[placed]
     out = uvs[corners]
     lost = ~placed[corners].all(1)
     points = known[origin[corners[lost]]]
-    first = points.any(2).argmax(1)
+    first = (points != 0).any(2).argmax(1)
     out[lost] = points[np.arange(len(points)), first][:, None]
     return out
 
