@@ -16,9 +16,9 @@ from scipy.spatial import cKDTree
 
 from ..mesh.zbuffer import draw_mesh
 from ..mesh_file import Mesh, read_mesh
-from ..protocol import InputError, Reporter
+from ..protocol import InputError, Reporter, read_json
 from ..training.scene import Scene
-from .mesh_shape import shape_of
+from .mesh_shape import Shape, shape_of
 from .truth import TrueMesh, Truth
 
 THRESHOLDS = (0.02, 0.005)
@@ -85,8 +85,11 @@ def _to_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def agreement(accuracy: np.ndarray, completeness: np.ndarray) -> dict[str, float | None]:
-    """Distances of the mesh's points from the truth and of the truth's points from the mesh -> chamfer (the mean of the
-    two means, in the same unit), and precision, recall and F1 at each of THRESHOLDS; None where a side has no points."""
+    """Chamfer distance (the mean of the two mean distances), and precision, recall and F1 at each of THRESHOLDS.
+
+    accuracy (n,): distances of the mesh's points from the truth; completeness (m,): of the truth's points from the
+    mesh. All None where a side has no points.
+    """
     names = ["precision", "recall", "f1"]
     out: dict[str, float | None] = dict.fromkeys(["chamfer", *names, *(f"{name}_005" for name in names)])
     if len(accuracy) and len(completeness):
@@ -202,6 +205,24 @@ def texture_score(
     return score
 
 
+def mesh_entries(folder: Path, trained_steps: int, reporter: Reporter) -> dict[str, dict[str, Any]]:
+    """What meshes.json in `folder` says of each mesh, by its key: an object's ID, a set's name or "scene".
+
+    Nothing where there are no meshes; nothing, and a warning, where they are of another state of the model.
+    """
+    path = folder / "meshes.json"
+    if not path.exists():
+        return {}
+    record = read_json(path)
+    entries = record.get("meshes") if isinstance(record, dict) else None
+    if not isinstance(entries, dict) or not all(isinstance(entry, dict) for entry in entries.values()):
+        raise InputError(f"{path} does not list meshes as expected; make the meshes again.")
+    if record.get("trained_steps") != trained_steps:
+        reporter.warning(f"{path} is of an earlier state of the model, so its meshes are left out; run `mesh` again.")
+        return {}
+    return entries
+
+
 def digest(folder: Path, entry: Mapping[str, Any]) -> str:
     """Tells a mesh's files from those of another run."""
     sha = hashlib.sha256()
@@ -234,10 +255,10 @@ def evaluate_mesh(
     """
     names = [*agreement(np.zeros(0), np.zeros(0))]
     out: dict[str, Any] = {
-        **dict.fromkeys(["vertices", "faces", "watertight", "manifold", "components", "self_intersections", "invented"]),
+        **dict.fromkeys(["vertices", "faces", "invented", *Shape.__dataclass_fields__]),
         **dict.fromkeys([*names, *(f"{name}_all" for name in names), "seen", "texture_psnr", "texture_coverage"]),
         "why": entry.get("why"),
-    }  # fmt: skip
+    }
     if not entry.get("file"):
         return out
     try:
