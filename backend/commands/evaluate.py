@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..evaluation import evaluate as evaluate_views
-from ..evaluation.meshes import evaluate_mesh, members, mesh_entries
+from ..evaluation.meshes import evaluate_mesh, mesh_entries
 from ..evaluation.truth import load_truth
 from ..protocol import InputError, Reconstruction, plain, write_json
 from ..raster.draw import draw
@@ -50,9 +50,7 @@ def _meshes(trained: Trained, reporter: StoppingReporter) -> dict[str, dict[str,
     found = {}
     for done, (key, entry) in enumerate(entries.items()):
         reporter.progress(done, len(entries), what="meshes")
-        found[key] = evaluate_mesh(
-            folder, entry, members(key, entry), trained.scene, truth, capture.test_indices, reporter
-        )
+        found[key] = evaluate_mesh(folder, entry, trained.scene, truth, capture.test_indices, reporter)
     reporter.progress(len(entries), len(entries), what="meshes")
     return found
 

@@ -11,7 +11,7 @@ from PIL import Image
 from ..capture import Capture
 from ..evaluation import comparison, write_report
 from ..evaluation.mesh_pictures import MESHES_SHOWN, Card, figures_line, mesh_sheet, view_of
-from ..evaluation.meshes import digest, members, mesh_entries, read_texture
+from ..evaluation.meshes import digest, mesh_entries, object_of, read_texture
 from ..mesh_file import read_mesh
 from ..objects import read_objects
 from ..protocol import InputError, Reconstruction, Reporter, read_json
@@ -68,8 +68,8 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         "objects": _objects(trained, evaluation["objects"], meshes),
         "views": evaluation["views"],
         "meshes": [
-            {"name": _mesh_name(capture, key), "objects": members(key, mesh), **mesh}
-            for key, mesh in meshes.items() if not key.isdigit()
+            {**mesh, "name": _mesh_name(capture, key, mesh)}
+            for key, mesh in meshes.items() if object_of(key, mesh) is None
         ],
     }  # fmt: skip
     write_report(folder, value, pictures, title=capture.folder.resolve().name, mesh_sheet=sheet)
@@ -104,8 +104,9 @@ def _meshes(trained: Trained, evaluated: dict[str, Any], reporter: Reporter) -> 
     return found
 
 
-def _mesh_name(capture: Capture, key: str) -> str:
-    return object_name(capture, int(key)) if key.isdigit() else "whole scene" if key == "scene" else key
+def _mesh_name(capture: Capture, key: str, mesh: dict[str, Any]) -> str:
+    object_id = object_of(key, mesh)
+    return (mesh.get("name") or key) if object_id is None else object_name(capture, object_id)
 
 
 def _mesh_sheet(trained: Trained, meshes: dict[str, dict[str, Any]], reporter: Reporter) -> Image.Image | None:
@@ -113,12 +114,12 @@ def _mesh_sheet(trained: Trained, meshes: dict[str, dict[str, Any]], reporter: R
     capture, folder = trained.capture, trained.folder.meshes
     cards = []
     for key, mesh in list(meshes.items())[:MESHES_SHOWN]:
-        card = Card(_mesh_name(capture, key), figures_line(mesh), why=mesh.get("why") or "")
+        card = Card(_mesh_name(capture, key, mesh), figures_line(mesh), why=mesh.get("why") or "")
         if mesh.get("file") and not card.why:
             try:
                 card.mesh = read_mesh(folder / mesh["file"])
                 card.texture = read_texture(folder / card.mesh.texture) if card.mesh.texture else None
-                card.view = view_of(capture, members(key, mesh), capture.train_indices)
+                card.view = view_of(capture, mesh["ids"], capture.train_indices)
             except InputError as error:
                 reporter.warning(str(error))
                 card = Card(card.name, "", why="its files cannot be read")
@@ -151,12 +152,13 @@ def _objects(
     model, capture = trained.model, trained.capture
     anchors = np.bincount(model.anchors.ids, minlength=len(model.object_ids))
     anchors_of = dict(zip(model.object_ids.tolist(), anchors.tolist(), strict=True))
+    own = {object_of(key, mesh): mesh for key, mesh in meshes.items()}
     measured = {entry["id"]: entry for entry in evaluated}
     ids = ({*anchors_of, *capture.object_ids.tolist()} - {0}) | set(measured)
     return [
         {
             "iou": None, **measured.get(i, {}), "id": i, "name": object_name(capture, i),
-            "anchors": anchors_of.get(i, 0), "mesh": meshes.get(str(i)),
+            "anchors": anchors_of.get(i, 0), "mesh": own.get(i),
         }
         for i in sorted(ids)
     ]  # fmt: skip

@@ -206,21 +206,32 @@ def texture_score(
 
 
 def mesh_entries(folder: Path, trained_steps: int, reporter: Reporter) -> dict[str, dict[str, Any]]:
-    """What meshes.json in `folder` says of each mesh, by its key: an object's ID, a set's name or "scene".
+    """What meshes.json in `folder` says of each mesh, by its key: objects by their IDs, then sets and the whole scene.
 
-    Nothing where there are no meshes; nothing, and a warning, where they are of another state of the model.
+    Each has `ids`, of the objects that it shows, or None: the whole scene. Those of another state of the model are left
+    out with a warning.
     """
     path = folder / "meshes.json"
     if not path.exists():
         return {}
     record = read_json(path)
     entries = record.get("meshes") if isinstance(record, dict) else None
-    if not isinstance(entries, dict) or not all(isinstance(entry, dict) for entry in entries.values()):
-        raise InputError(f"{path} does not list meshes as expected; make the meshes again.")
-    if record.get("trained_steps") != trained_steps:
-        reporter.warning(f"{path} is of an earlier state of the model, so its meshes are left out; run `mesh` again.")
-        return {}
-    return entries
+    if not isinstance(entries, dict) or not all(
+        isinstance(entry, dict) and "ids" in entry for entry in entries.values()
+    ):
+        raise InputError(f"{path} does not list meshes as expected; delete it and make the meshes again.")
+    current = {key: entry for key, entry in entries.items() if entry.get("trained_steps") == trained_steps}
+    if len(current) < len(entries):
+        reporter.warning(
+            f"{len(entries) - len(current)} of {len(entries)} meshes in {folder} are of an earlier state of the model "
+            "and are left out; run `mesh` again."
+        )
+    return dict(sorted(current.items(), key=lambda item: (object_of(*item) is None, object_of(*item) or 0, item[0])))
+
+
+def object_of(key: str, entry: Mapping[str, Any]) -> int | None:
+    """The ID of the object whose own mesh an entry of meshes.json is; None for a set or the whole scene."""
+    return int(key) if key.isdecimal() and int(key) in (entry["ids"] or ()) else None
 
 
 def digest(folder: Path, entry: Mapping[str, Any]) -> str:
@@ -232,27 +243,20 @@ def digest(folder: Path, entry: Mapping[str, Any]) -> str:
     return sha.hexdigest()[:16]
 
 
-def members(key: str, entry: Mapping[str, Any]) -> list[int] | None:
-    """The object IDs that an entry of meshes.json stands for; None: the whole scene."""
-    if key == "scene":
-        return None
-    return [int(i) for i in entry.get("objects") or ([key] if key.isdigit() else [])]
-
-
 def evaluate_mesh(
     folder: Path,
     entry: Mapping[str, Any],
-    ids: Sequence[int] | None,
     scene: Scene,
     truth: Truth | None,
     indices: Sequence[int],
     reporter: Reporter,
 ) -> dict[str, Any]:
-    """Every figure of one mesh in `folder`, None for what cannot be measured; `entry` is its part of meshes.json, `ids`
-    the objects it shows (None: the whole scene), `indices` the held-out views.
+    """Every figure of one mesh in `folder`, None for what cannot be measured; `entry` is its part of meshes.json,
+    `indices` are the held-out views.
 
     Lengths are in the capture's units. A file that cannot be read is a warning.
     """
+    ids = entry["ids"]
     names = [*agreement(np.zeros(0), np.zeros(0))]
     out: dict[str, Any] = {
         **dict.fromkeys(["vertices", "faces", "invented", *Shape.__dataclass_fields__]),

@@ -23,8 +23,8 @@ from backend.evaluation.meshes import (
     SampledSurface,
     agreement,
     evaluate_mesh,
-    members,
     mesh_entries,
+    object_of,
     sample_texture,
     texture_score,
 )
@@ -302,7 +302,7 @@ def test_hidden_parts_count_only_where_all_counts(true_capture, tmp_path):
     scene = FakeScene([], [])
 
     def measured(name):
-        return evaluate_mesh(tmp_path, {"file": name}, [1], scene, truth, [], Reporter())
+        return evaluate_mesh(tmp_path, {"file": name, "ids": [1]}, scene, truth, [], Reporter())
 
     found = measured("1.ply")
     assert found["f1"] > 0.999 and found["f1_005"] > 0.99 and not found["watertight"]
@@ -426,7 +426,7 @@ def test_what_cannot_be_measured_is_none(tmp_path):
     heard = Warnings()
 
     def measured(entry):
-        return evaluate_mesh(tmp_path, entry, [4], FakeScene([photo], [None]), None, [0], heard)
+        return evaluate_mesh(tmp_path, {"ids": [4], **entry}, FakeScene([photo], [None]), None, [0], heard)
 
     absent = measured({"why": "too few views show it"})
     assert absent.pop("why") == "too few views show it" and set(absent.values()) == {None}
@@ -449,14 +449,19 @@ def test_what_cannot_be_measured_is_none(tmp_path):
 def test_meshes_of_another_state_are_left_out(tmp_path):
     heard = Warnings()
     assert mesh_entries(tmp_path, 20, heard) == {} and heard.said == []
-    record = {"trained_steps": 20, "meshes": {"1": {"file": "1.ply"}, "scene": {"why": "no"}}}
-    (tmp_path / "meshes.json").write_text(json.dumps(record))
-    assert mesh_entries(tmp_path, 20, heard) == record["meshes"] and heard.said == []
-    assert mesh_entries(tmp_path, 25, heard) == {} and "earlier state" in heard.said[0]
-    (tmp_path / "meshes.json").write_text('{"trained_steps": 20, "meshes": [1]}')
-    with pytest.raises(InputError, match=r"meshes\.json"):
-        mesh_entries(tmp_path, 20, heard)
-    assert members("7", {}) == [7] and members("scene", {}) is None and members("pair", {"objects": [1, 5]}) == [1, 5]
+    ids = {"scene": None, "77": [2, 10], "10": [10], "2": [2, 3], "old": [2]}
+    entries = {key: {"ids": value, "trained_steps": 20 if key != "old" else 15} for key, value in ids.items()}
+    (tmp_path / "meshes.json").write_text(json.dumps({"trained_steps": 20, "meshes": entries}))
+    found = mesh_entries(tmp_path, 20, heard)
+    assert list(found) == ["2", "10", "77", "scene"], "objects by ID, then a set called 77 and the scene"
+    assert [object_of(key, entry) for key, entry in found.items()] == [2, 10, None, None]
+    [said] = heard.said
+    assert "1 of 5 meshes" in said and "earlier state" in said
+    assert list(mesh_entries(tmp_path, 15, heard)) == ["old"]
+    for broken in ([1], {"1": {"file": "1.ply"}}, {"1": 7}):
+        (tmp_path / "meshes.json").write_text(json.dumps({"trained_steps": 20, "meshes": broken}))
+        with pytest.raises(InputError, match=r"meshes\.json"):
+            mesh_entries(tmp_path, 20, heard)
 
 
 # --- pictures --------------------------------------------------------------------------------------------------------
@@ -558,12 +563,13 @@ def test_evaluate_and_report_say_how_good_the_meshes_are(write_capture, tmp_path
     write_mesh(folder / "1.ply", dressed(vertices, faces, texture="1.png"))
     write_mesh(folder / "scene.ply", dressed(*joined(sphere(0.5), sphere(0.3, (0, 0, 1.2)))))
     record = {
-        "trained_steps": 12, "settings": {},
+        "trained_steps": 12,
         "meshes": {
-            "1": {"file": "1.ply", "texture": "1.png", "vertices": len(vertices), "faces": len(faces),
-                  "watertight": True, "invented": 0.0, "seconds": 1.0},
-            "5": {"why": "too few views show it"},
-            "scene": {"file": "scene.ply", "texture": "", "vertices": 1, "faces": 1, "watertight": True},
+            "1": {"ids": [1], "name": "sphere 1", "trained_steps": 12, "file": "1.ply", "texture": "1.png",
+                  "vertices": len(vertices), "faces": len(faces), "watertight": True, "invented": 0.0, "seconds": 1.0},
+            "5": {"ids": [5], "name": "sphere 5", "trained_steps": 12, "why": "too few views show it"},
+            "scene": {"ids": None, "name": "the whole scene", "trained_steps": 12, "file": "scene.ply", "texture": "",
+                      "vertices": 1, "faces": 1, "watertight": True},
         },
     }  # fmt: skip
     (folder / "meshes.json").write_text(json.dumps(record))
@@ -581,14 +587,16 @@ def test_evaluate_and_report_say_how_good_the_meshes_are(write_capture, tmp_path
     assert 3 < meshes[1]["texture_psnr"] < 40 and meshes[1]["texture_coverage"] > 0.9
     assert meshes[5]["why"] == "too few views show it" and meshes[5]["faces"] is None
     [whole] = report["meshes"]
-    assert whole["name"] == "whole scene" and whole["components"] == 2 and whole["f1"] > 0.99
+    assert whole["name"] == "the whole scene" and whole["components"] == 2 and whole["f1"] > 0.99
     text = (out / "report.md").read_text()
     assert "1 of 2 objects have a mesh; all watertight" in text and "| too few views show it |" in text
-    assert "(pictures/meshes.png)" in text and "| whole scene |" in text
+    assert "(pictures/meshes.png)" in text and "| the whole scene |" in text
     assert (out / "pictures" / "meshes.png").stat().st_size < 300_000
 
     # The record speaks of another state of the model: nothing of it is told.
-    (folder / "meshes.json").write_text(json.dumps({**record, "trained_steps": 11}))
+    for entry in record["meshes"].values():
+        entry["trained_steps"] = 11
+    (folder / "meshes.json").write_text(json.dumps(record))
     assert "earlier state" in run("evaluate", out)
     assert json.loads((out / "evaluation.json").read_text())["meshes"] == {}
     _, _, meshes = reported()
