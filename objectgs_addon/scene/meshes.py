@@ -7,6 +7,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from mathutils import Vector
 
 from ...backend.mesh_file import Mesh, read_mesh
 from ...backend.palette import to_linear
@@ -126,6 +127,11 @@ def show_meshes(root: bpy.types.Collection, folder: Path) -> ShownMeshes:
     return shown
 
 
+def has_shown_meshes(root: bpy.types.Collection) -> bool:
+    """Whether the reconstruction ever showed meshes, so that there is a choice."""
+    return SHOW in root
+
+
 def shown_kinds(root: bpy.types.Collection) -> str:
     """Which of SHOWS a reconstruction shows."""
     chosen = root.get(SHOW)
@@ -170,6 +176,21 @@ def object_meshes(root: bpy.types.Collection) -> dict[int, list[bpy.types.Object
     found = {object_id: [thing for thing in parts_of(collection) if kind_of(thing) == MESH]
              for object_id, collection in object_collections(root).items()}
     return {object_id: meshes for object_id, meshes in found.items() if meshes}
+
+
+def mark_asset(collection: bpy.types.Collection, meshes: list[bpy.types.Object]) -> None:
+    """Offer an object's collection in the asset browser; dropped, it stands where the mouse is, upright and in size.
+
+    The collection, since a mesh alone has its uprightness from what it hangs on.
+    """
+    corners = np.array([thing.matrix_world @ Vector(corner) for thing in meshes for corner in thing.bound_box])
+    low, high = corners.min(0), corners.max(0)
+    collection.instance_offset = (*((low + high) / 2)[:2], low[2])
+    if collection.asset_data is None:
+        collection.asset_mark()
+        collection.asset_data.description = f"{collection.name}, reconstructed from photos"
+    collection.asset_data.tags.new("ObjectGS", skip_if_exists=True)
+    collection.asset_generate_preview()
 
 
 def _hide(thing, hidden: bool) -> None:
