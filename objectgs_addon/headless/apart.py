@@ -11,12 +11,12 @@ from ...backend.protocol import InputError
 from .. import scene
 from ..scene.preview import Graph
 
-SIZE = (1280, 800)
-SAMPLES = 64
+SIZE = (960, 600)
+SAMPLES = 32
 LARGE = 2.5
 """What is so many times as large as the middle object stays where it is, as the table does."""
 
-OUTWARD = 0.75
+OUTWARD = 0.9
 """How far objects move away from the middle, relative to their distance from it."""
 LIFT = 0.35
 """How far they are lifted, relative to the size of the middle object."""
@@ -27,9 +27,9 @@ ELEVATION = math.radians(27.0)
 MARGIN = 1.08
 
 GROUND = (0.78, 0.78, 0.78)
-SKY = 0.6
-SUN = 1.7
-SUN_ANGLE = math.radians(24.0)
+SKY = 0.5
+SUN = 2.2
+SUN_ANGLE = math.radians(20.0)
 """How wide the sun is: the shadows' softness."""
 
 
@@ -54,8 +54,9 @@ def pull_apart(target: bpy.types.Scene) -> None:
     if not found:
         raise InputError("There are no meshes to pull apart; make them with the mesh command, then build again.")
     root, meshes = found[0]
+    scene.show_kinds(root, "meshes")
     target.view_layers[0].update()
-    boxes = {object_id: _box(things) for object_id, things in meshes.items()}
+    boxes = {object_id: scene.bounds(things) for object_id, things in meshes.items()}
     sizes = {object_id: float(np.linalg.norm(high - low)) for object_id, (low, high) in boxes.items()}
     eyes = np.array([thing.matrix_world.translation for thing in root.all_objects
                      if scene.kind_of(thing) == "camera"]).reshape(-1, 3)
@@ -83,12 +84,7 @@ def pull_apart(target: bpy.types.Scene) -> None:
     target.render.engine = "CYCLES"
     target.cycles.samples = SAMPLES
     target.cycles.use_denoising = True
-
-
-def _box(things) -> np.ndarray:
-    """(2, 3): the least and the greatest coordinates in the world."""
-    corners = np.array([thing.matrix_world @ Vector(corner) for thing in things for corner in thing.bound_box])
-    return np.stack([corners.min(0), corners.max(0)])
+    target.cycles.max_bounces = 2
 
 
 def _corners(box: np.ndarray) -> np.ndarray:
@@ -165,7 +161,7 @@ def _add_light(target, toward: np.ndarray) -> None:
     sun.energy, sun.angle = SUN, SUN_ANGLE
     thing = bpy.data.objects.new("Apart Sun", sun)
     aside = heading - math.radians(50.0)
-    down = Vector((math.cos(aside), math.sin(aside), -1.5))
+    down = Vector((math.cos(aside), math.sin(aside), -1.4))
     thing.rotation_mode = "QUATERNION"
     thing.rotation_quaternion = down.to_track_quat("-Z", "Y")
     target.collection.objects.link(thing)

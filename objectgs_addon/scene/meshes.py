@@ -7,7 +7,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-from mathutils import Vector
+from mathutils import Matrix
 
 from ...backend.mesh_file import Mesh, read_mesh
 from ...backend.palette import to_linear
@@ -183,14 +183,31 @@ def mark_asset(collection: bpy.types.Collection, meshes: list[bpy.types.Object])
 
     The collection, since a mesh alone has its uprightness from what it hangs on.
     """
-    corners = np.array([thing.matrix_world @ Vector(corner) for thing in meshes for corner in thing.bound_box])
-    low, high = corners.min(0), corners.max(0)
+    low, high = bounds(meshes)
     collection.instance_offset = (*((low + high) / 2)[:2], low[2])
     if collection.asset_data is None:
         collection.asset_mark()
         collection.asset_data.description = f"{collection.name}, reconstructed from photos"
     collection.asset_data.tags.new("ObjectGS", skip_if_exists=True)
     collection.asset_generate_preview()
+
+
+def bounds(meshes: list[bpy.types.Object]) -> np.ndarray:
+    """(2, 3) float64: the least and the greatest coordinates of meshes in the world."""
+    ends = []
+    for thing in meshes:
+        local = np.empty(3 * len(thing.data.vertices), np.float32)
+        thing.data.vertices.foreach_get("co", local)
+        matrix = np.array(_world_matrix(thing))
+        world = local.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
+        ends += [world.min(0), world.max(0)]
+    return np.stack([np.min(ends, axis=0), np.max(ends, axis=0)])
+
+
+def _world_matrix(thing: bpy.types.Object) -> Matrix:
+    """From what it hangs on, since Blender does not know the place of what is hidden."""
+    above = _world_matrix(thing.parent) @ thing.matrix_parent_inverse if thing.parent is not None else Matrix()
+    return above @ thing.matrix_basis
 
 
 def _hide(thing, hidden: bool) -> None:
