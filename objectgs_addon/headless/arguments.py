@@ -62,7 +62,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
         return options
     if not rest or rest[0].startswith("-"):
         out = "" if options.command == "mesh" else " --out DIR"
-        raise UsageError(f"{options.takes} must come first: {options.command} {options.takes}{out}.")
+        raise UsageError(f"{options.takes} must come first: headless.py {options.command} {options.takes}{out}.")
     options.source, *options.rest = rest
     return options
 

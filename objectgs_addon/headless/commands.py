@@ -79,8 +79,11 @@ def render(options) -> None:
         raise InputError(f"There is no file {blend}; make it with the build command.")
     if options.apart and options.camera:
         raise InputError("--apart brings a camera of its own; leave --camera out.")
-    prepare = apart.pull_apart if options.apart else _showing(options.show) if options.show else None
-    render_picture(blend, whole(options.out), options.camera, options.engine, options.samples, options.size, prepare)
+    if options.apart:
+        _render_apart(blend, whole(options.out), options)
+    else:
+        render_picture(blend, whole(options.out), options.camera, options.engine, options.samples, options.size,
+                       _showing(options.show) if options.show else None)
     say(f"Wrote {options.out}.")
 
 
@@ -101,12 +104,17 @@ def reconstruct(capture: Path, folder: Path, options) -> None:
     _run_backend("evaluate", folder, folder)
     _run_backend("report", folder, folder)
     has_meshes = build_blend(folder, folder / BLEND)
-    chosen = (None, options.engine, options.samples, options.size)
-    render_picture(folder / BLEND, folder / PICTURE, *chosen, _showing("splats"))
+    render_picture(folder / BLEND, folder / PICTURE, None, options.engine, options.samples, options.size,
+                   _showing("splats"))
     say(f"Wrote {folder / PICTURE}.")
     if has_meshes:
-        render_picture(folder / BLEND, folder / APART_PICTURE, *chosen, apart.pull_apart)
+        _render_apart(folder / BLEND, folder / APART_PICTURE, options)
         say(f"Wrote {folder / APART_PICTURE}.")
+
+
+def _render_apart(blend: Path, out: Path, options) -> None:
+    render_picture(blend, out, None, options.engine or "CYCLES", options.samples or apart.SAMPLES,
+                   options.size or apart.SIZE, apart.pull_apart)
 
 
 def _showing(which: str):

@@ -24,19 +24,19 @@ def render_picture(blend: Path, out: Path, camera: str | None = None, engine: st
     """Open `blend` and render its scene into `out`; what is None stays as the file says.
 
     camera: name of a camera object. engine: CYCLES or EEVEE. samples: a pixel. size: (width, height) in pixels.
-    prepare: changes the opened scene first; what is asked for with the other arguments goes on top.
+    prepare: changes the opened scene when it has its size; engine and samples go on top.
     `out` is the picture before or the new one, never half.  Raises `InputError`.
     """
     if out.suffix.lower() not in FORMATS:
         raise InputError(f"{out.name} has no known picture format; name it .png, .jpg or .exr.")
     scene = _open(blend)
+    if size is not None:
+        scene.render.resolution_x, scene.render.resolution_y = size
+        scene.render.resolution_percentage = 100
     if prepare is not None:
         prepare(scene)
     _choose_camera(scene, camera, blend)
     _choose_engine(scene, engine, samples)
-    if size is not None:
-        scene.render.resolution_x, scene.render.resolution_y = size
-        scene.render.resolution_percentage = 100
     out.parent.mkdir(parents=True, exist_ok=True)
     part = out.with_name(f"{out.stem}.part{out.suffix}")
     try:
