@@ -95,8 +95,9 @@ def _holds(box: np.ndarray, eyes: np.ndarray) -> bool:
 
 
 def _show_only(target, meshes) -> None:
+    shown = set(meshes)
     for thing in target.objects:
-        thing.hide_render = thing not in meshes
+        thing.hide_render = thing not in shown
 
 
 def _move(things, step: np.ndarray) -> None:

@@ -153,17 +153,16 @@ def apply_shown(root: bpy.types.Collection, changed) -> None:
     """Show what the reconstruction shows in the collections of IDs whose parts have come or gone."""
     which, collections = shown_kinds(root), object_collections(root)
     meshes, whole = object_meshes(root), scene_meshes(root)
+    hidden = {} if meshes else {thing: which == "splats" for thing in whole}
     # The unlabelled rest has no mesh of its own, and would lie about between those of the others.
     for object_id in {*changed, 0} & set(collections):
         replaced = object_id in meshes or (object_id == 0 and bool(meshes or whole))
         for thing in parts_of(collections[object_id]):
             if kind_of(thing) == SPLATS:
-                _hide(thing, which == "meshes" and replaced)
+                hidden[thing] = which == "meshes" and replaced
             elif kind_of(thing) == MESH:
-                _hide(thing, which == "splats")
-    if not meshes:
-        for thing in whole:
-            _hide(thing, which == "splats")
+                hidden[thing] = which == "splats"
+    _hide(hidden)
 
 
 def scene_meshes(root: bpy.types.Collection) -> list[bpy.types.Object]:
@@ -210,12 +209,23 @@ def _world_matrix(thing: bpy.types.Object) -> Matrix:
     return above @ thing.matrix_basis
 
 
-def _hide(thing, hidden: bool) -> None:
-    """Blender visits every object of the file for each of these settings, so only what differs is set."""
-    if thing.hide_viewport != hidden:
-        thing.hide_viewport = hidden
-    if thing.hide_render != hidden:
-        thing.hide_render = hidden
+def _hide(hidden: dict[bpy.types.Object, bool]) -> None:
+    """Hide objects or show them, in viewports and renders.
+
+    All but one at once and without Blender's notice, since it goes through every object of the file each time.
+    """
+    things = bpy.data.objects
+    places = {thing: place for place, thing in enumerate(things)}
+    for name in ("hide_viewport", "hide_render"):
+        flags = np.empty(len(things), bool)
+        things.foreach_get(name, flags)
+        changed = [thing for thing, value in hidden.items() if flags[places[thing]] != value]
+        if not changed:
+            continue
+        for thing in changed[:-1]:
+            flags[places[thing]] = hidden[thing]
+        things.foreach_set(name, flags)
+        setattr(changed[-1], name, hidden[changed[-1]])
 
 
 def _read_entries(folder: Path) -> list[_Entry]:
@@ -257,9 +267,13 @@ def _wanted(entries: list[_Entry], objects: Objects) -> tuple[list[tuple[_Entry,
         elif targets:
             warnings.append(f"The mesh of {objects.name(int(entry.key))} was made when other objects were merged with "
                             "it and is not shown; extract it again.")
+    of_target: dict[int, list[set[int]]] = {}
+    for entry, target in wanted:
+        if target is not None:
+            of_target.setdefault(target, []).append(set(entry.ids))
     # What was merged before its mesh was made is a part of that one.
     return [(entry, target) for entry, target in wanted if target is None or not any(
-        other != entry and where == target and set(other.ids) > set(entry.ids) for other, where in wanted)], warnings
+        other > set(entry.ids) for other in of_target[target])], warnings
 
 
 def _meshes_of(root, collections) -> dict[str, bpy.types.Object]:
@@ -415,7 +429,8 @@ def _load(entry: _Entry, name: str) -> bpy.types.Image:
         image = bpy.data.images.new(name, 1, 1)
         image.source = "FILE"
     image.name = name
-    image.filepath = _kept(path)
+    # Raw, since Blender goes through every node of the file otherwise.
+    image.filepath_raw = _kept(path)
     mark(image, TEXTURE)
     image[KEY] = entry.key
     return image
@@ -426,7 +441,7 @@ def _reload(image: bpy.types.Image, path: Path) -> None:
     packed = image.packed_file is not None
     if packed:
         image.unpack(method="REMOVE")
-    image.filepath = _kept(path)
+    image.filepath_raw = _kept(path)
     image.reload()
     if packed and path.is_file():
         image.pack()
