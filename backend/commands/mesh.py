@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from ..mesh.extract import extract
+from ..mesh.extract import extract, is_watertight
 from ..mesh.fusion import fuse
 from ..mesh.surface import NoSurface, Surface
 from ..mesh.texture import dress, texture_size
@@ -88,7 +88,7 @@ class _Part(Reporter):
 
     def __init__(self, reporter: StoppingReporter, done: int, total: int, started: float) -> None:
         self._reporter, self._done, self._total, self._started = reporter, done, total, started
-        self._before, self._share = 0.0, 0.0
+        self._before, self._share, self._shown = 0.0, 0.0, float(done)
 
     def begin(self, step: str) -> _Part:
         """What follows is this step of the mesh; returns itself."""
@@ -101,11 +101,13 @@ class _Part(Reporter):
         self._reporter.warning(message)
 
     def progress(self, done: float, total: float, **fields: Any) -> None:
-        share = self._before + self._share * done / max(total, 1)
-        behind = (self._done + share) / self._total
+        share = self._before + self._share * min(done / max(total, 1e-9), 1.0)
+        # A step that goes over the views more than once counts anew each time.
+        self._shown = max(self._shown, self._done + share)
+        behind = self._shown / self._total
         spent = time.monotonic() - self._started
         left = {"seconds_left": round(spent / behind - spent, 1)} if behind > 0 else {}
-        self._reporter.progress(round(self._done + share, 4), self._total, what="meshes", **left)
+        self._reporter.progress(round(self._shown, 4), self._total, what="meshes", **left)
 
 
 def _make(target: Target, options: argparse.Namespace, trained: Trained, views: Views, part: _Part) -> dict[str, Any]:
@@ -144,13 +146,6 @@ def _make(target: Target, options: argparse.Namespace, trained: Trained, views: 
         "invented": round(float(surface.invented.mean()), 4),
         "seconds": round(time.monotonic() - started, 2),
     }
-
-
-def is_watertight(faces: np.ndarray) -> bool:
-    """Whether every edge of faces (F, 3) is shared by exactly two of them, once in each direction."""
-    edges = np.stack([faces, np.roll(faces, -1, 1)], 2).reshape(-1, 2).astype(np.int64)
-    there, back = (np.unique(e[:, 0] << 32 | e[:, 1], return_counts=True) for e in (edges, edges[:, ::-1]))
-    return len(faces) > 0 and bool((there[1] == 1).all()) and np.array_equal(there[0], back[0])
 
 
 def _in_world(surface: Surface, colors: np.ndarray, uvs: np.ndarray, texture: str, model: ObjectModel) -> Mesh:
