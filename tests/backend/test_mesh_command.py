@@ -41,7 +41,7 @@ def entries(out) -> dict:
 def test_each_object_becomes_a_mesh_in_its_place(trained, ask, write_capture):
     answer = ask("mesh", trained, "--faces", 2000, "--texture-size", 256, "--json")
     assert answer.code == EXIT_DONE and answer.events[-1]["made"] == 3
-    shares = [event["done"] / event["total"] for event in answer.events if event["type"] == "progress"]
+    shares = [event["done"] / event["total"] for event in answer.events if event.get("what") == "meshes"]
     assert shares == sorted(shares) and shares[-1] == pytest.approx(1, abs=0.02) and len(shares) > 10
     for object_id, centre, radius in ((1, (-0.7, 0, 0), 0.5), (2, (0.7, 0.1, 0), 0.45), (5, (0, -0.2, 0.9), 0.35)):
         entry = entries(trained)[str(object_id)]
