@@ -57,8 +57,8 @@ def view_of(capture: Capture, ids: Sequence[int] | None, indices: Sequence[int])
     asked = list(indices)[:: max(1, len(indices) // _VIEWS_ASKED)]
     best, most = asked[0], -1
     for index in asked:
-        mask = None if ids is None else capture.mask(index)
-        pixels = 0 if mask is None else int(np.isin(mask, ids).sum())
+        mask = capture.mask(index)
+        pixels = 0 if mask is None or ids is None else int(np.isin(mask, ids).sum())
         if pixels > most:
             best, most = index, pixels
     return capture.views[best]
@@ -191,6 +191,8 @@ def mesh_sheet(cards: Sequence[Card], reporter: Reporter | None = None) -> Image
             continue
         for k, picture in enumerate(draw_card(card, size)):
             sheet.paste(picture, (x + k * (size + gap), y + head), _rounded(size))
+    if reporter is not None:
+        reporter.progress(len(cards), len(cards), what="meshes")
     return sheet
 
 
@@ -211,7 +213,7 @@ def save_sheet(sheet: Image.Image, path: Path, limit: int = 300_000) -> Path:
             write_atomic(path, buffer.getvalue())
             return path
         if picture.mode == "P":
-            scale *= 0.9
+            scale *= min(0.95, (limit / buffer.tell()) ** 0.5)
         size = max(1, round(sheet.width * scale)), max(1, round(sheet.height * scale))
         smaller = sheet if size == sheet.size else sheet.resize(size, Image.Resampling.LANCZOS)
         # Colours that fit well take long to find, so in every third row and column.

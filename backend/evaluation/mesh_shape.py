@@ -154,7 +154,7 @@ def _pierces(start: np.ndarray, end: np.ndarray, triangle: np.ndarray) -> np.nda
     """Whether lines from `start` to `end` (n, 3), which cross the triangles' planes, pass within the triangles."""
     signs = [_volume_sign(start, end, triangle[:, k], triangle[:, (k + 1) % 3]) for k in range(3)]
     turns = np.stack(signs, 1)
-    return (turns >= 0).all(1) | (turns <= 0).all(1)
+    return np.asarray((turns >= 0).all(1) | (turns <= 0).all(1))
 
 
 def _overlap(p: np.ndarray, q: np.ndarray) -> np.ndarray:

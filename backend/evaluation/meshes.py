@@ -16,9 +16,9 @@ from scipy.spatial import cKDTree
 
 from ..mesh.zbuffer import draw_mesh
 from ..mesh_file import Mesh, read_mesh
-from ..protocol import InputError, Reporter
+from ..protocol import InputError, Reporter, read_json
 from ..training.scene import Scene
-from .mesh_shape import shape_of
+from .mesh_shape import Shape, shape_of
 from .truth import TrueMesh, Truth
 
 THRESHOLDS = (0.02, 0.005)
@@ -85,8 +85,11 @@ def _to_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def agreement(accuracy: np.ndarray, completeness: np.ndarray) -> dict[str, float | None]:
-    """Distances of the mesh's points from the truth and of the truth's points from the mesh -> chamfer (the mean of the
-    two means, in the same unit), and precision, recall and F1 at each of THRESHOLDS; None where a side has no points."""
+    """Chamfer distance (the mean of the two mean distances), and precision, recall and F1 at each of THRESHOLDS.
+
+    accuracy (n,): distances of the mesh's points from the truth; completeness (m,): of the truth's points from the
+    mesh. All None where a side has no points.
+    """
     names = ["precision", "recall", "f1"]
     out: dict[str, float | None] = dict.fromkeys(["chamfer", *names, *(f"{name}_005" for name in names)])
     if len(accuracy) and len(completeness):
@@ -202,6 +205,35 @@ def texture_score(
     return score
 
 
+def mesh_entries(folder: Path, trained_steps: int, reporter: Reporter) -> dict[str, dict[str, Any]]:
+    """What meshes.json in `folder` says of each mesh, by its key: objects by their IDs, then sets and the whole scene.
+
+    Each has `ids`, of the objects that it shows, or None: the whole scene. Those of another state of the model are left
+    out with a warning.
+    """
+    path = folder / "meshes.json"
+    if not path.exists():
+        return {}
+    record = read_json(path)
+    entries = record.get("meshes") if isinstance(record, dict) else None
+    if not isinstance(entries, dict) or not all(
+        isinstance(entry, dict) and "ids" in entry for entry in entries.values()
+    ):
+        raise InputError(f"{path} does not list meshes as expected; delete it and make the meshes again.")
+    current = {key: entry for key, entry in entries.items() if entry.get("trained_steps") == trained_steps}
+    if len(current) < len(entries):
+        reporter.warning(
+            f"{len(entries) - len(current)} of {len(entries)} meshes in {folder} are of an earlier state of the model "
+            "and are left out; run `mesh` again."
+        )
+    return dict(sorted(current.items(), key=lambda item: (object_of(*item) is None, object_of(*item) or 0, item[0])))
+
+
+def object_of(key: str, entry: Mapping[str, Any]) -> int | None:
+    """The ID of the object whose own mesh an entry of meshes.json is; None for a set or the whole scene."""
+    return int(key) if key.isdecimal() and int(key) in (entry["ids"] or ()) else None
+
+
 def digest(folder: Path, entry: Mapping[str, Any]) -> str:
     """Tells a mesh's files from those of another run."""
     sha = hashlib.sha256()
@@ -211,33 +243,26 @@ def digest(folder: Path, entry: Mapping[str, Any]) -> str:
     return sha.hexdigest()[:16]
 
 
-def members(key: str, entry: Mapping[str, Any]) -> list[int] | None:
-    """The object IDs that an entry of meshes.json stands for; None: the whole scene."""
-    if key == "scene":
-        return None
-    return [int(i) for i in entry.get("objects") or ([key] if key.isdigit() else [])]
-
-
 def evaluate_mesh(
     folder: Path,
     entry: Mapping[str, Any],
-    ids: Sequence[int] | None,
     scene: Scene,
     truth: Truth | None,
     indices: Sequence[int],
     reporter: Reporter,
 ) -> dict[str, Any]:
-    """Every figure of one mesh in `folder`, None for what cannot be measured; `entry` is its part of meshes.json, `ids`
-    the objects it shows (None: the whole scene), `indices` the held-out views.
+    """Every figure of one mesh in `folder`, None for what cannot be measured; `entry` is its part of meshes.json,
+    `indices` are the held-out views.
 
     Lengths are in the capture's units. A file that cannot be read is a warning.
     """
+    ids = entry["ids"]
     names = [*agreement(np.zeros(0), np.zeros(0))]
     out: dict[str, Any] = {
-        **dict.fromkeys(["vertices", "faces", "watertight", "manifold", "components", "self_intersections", "invented"]),
+        **dict.fromkeys(["vertices", "faces", "invented", *Shape.__dataclass_fields__]),
         **dict.fromkeys([*names, *(f"{name}_all" for name in names), "seen", "texture_psnr", "texture_coverage"]),
         "why": entry.get("why"),
-    }  # fmt: skip
+    }
     if not entry.get("file"):
         return out
     try:

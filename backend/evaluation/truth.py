@@ -1,6 +1,6 @@
 """The true surfaces that a synthetic capture brings along, and which parts of them its cameras see.
 
-truth/objects.json           {"unit": "metre", "objects": [{"id": 1, "name": "mug", "mesh": "meshes/1_mug.ply"}, ...]}
+truth/objects.json           {"objects": [{"id": 1, "mesh": "meshes/1_mug.ply"}, ...]}
 truth/meshes/*.ply           triangles in the capture's frame, faces turned to the outside
 truth/depth/<image>.npy      (H, W) float32, along the camera's axis
 truth/masks/<image>.png      (H, W) object IDs
@@ -45,8 +45,7 @@ class _View:
 class Truth:
     """True surfaces by object ID, and what the views `indices` of `capture` see of them."""
 
-    def __init__(self, unit: str, meshes: dict[int, TrueMesh], capture: Capture, indices: Sequence[int]) -> None:
-        self.unit = unit
+    def __init__(self, meshes: dict[int, TrueMesh], capture: Capture, indices: Sequence[int]) -> None:
         self.meshes = meshes
         self._capture = capture
         self._indices = indices
@@ -93,11 +92,10 @@ def load_truth(capture: Capture, indices: Sequence[int]) -> Truth | None:
         return None
     content = read_json(listed)
     try:
-        unit = str(content["unit"])
         files = {int(entry["id"]): capture.folder / "truth" / entry["mesh"] for entry in content["objects"]}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{listed} does not list meshes as expected ({error!r}); make the capture again.") from error
-    return Truth(unit, {i: _read_mesh(path) for i, path in files.items()}, capture, indices)
+    return Truth({i: _read_mesh(path) for i, path in files.items()}, capture, indices)
 
 
 def _read_mesh(path: Path) -> TrueMesh:
