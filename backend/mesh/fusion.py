@@ -26,9 +26,9 @@ RESOLUTION = 256
 SMALLEST_PART = 0.03
 """Parts of the surface smaller than this share of the largest are taken for floaters."""
 
-_VOXEL_PER_PIXEL = 0.5
-_REACH_VOXELS, _REACH_PIXELS = 3.0, 1.5
-_BACK_VOXELS, _BACK_PIXELS = 2.0, 1.0
+_VOXEL_PER_PIXEL = 0.7
+_REACH_VOXELS, _REACH_PIXELS = 5.0, 3.5
+_BACK_VOXELS, _BACK_PIXELS = 3.0, 2.0
 _BYTES_PER_BLOCK = 8 * SAMPLES * 4
 """What a block takes at most, everything counted: sums, values, marks and the triangles in it."""
 _SURE = 1.0
