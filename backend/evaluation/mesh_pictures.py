@@ -81,10 +81,9 @@ def camera_for(vertices: np.ndarray, view: View, size: int) -> Camera:
         # What is nearer looks larger, so the picture's middle is not the box's.
         away, centre = 0.0, np.zeros(2)
         for _ in range(5):
-            away = float((np.abs(seen[:, :2] - centre).max(1) / slope - seen[:, 2]).max())
+            away = max(float((np.abs(seen[:, :2] - centre).max(1) / slope - seen[:, 2]).max()), 1e-12)
             projected = (seen[:, :2] - centre) / np.maximum(seen[:, 2:] + away, 1e-9 * away)
             centre += (projected.max(0) + projected.min(0)) / 2 * away
-        away = max(away, 1e-12)
         viewmat[:3, 3] = -pose @ middle + [-centre[0], -centre[1], away]
         focal = _FILLED * size / (2 * slope)
     K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
@@ -95,7 +94,7 @@ def draw_card(card: Card, size: int = _CELL) -> list[Image.Image]:
     """The mesh shaded, as wires and with its texture: three pictures of size x size pixels."""
     mesh = card.mesh
     assert mesh is not None and card.view is not None
-    camera = camera_for(mesh.vertices, card.view, size * _FINER)
+    camera = camera_for(mesh.vertices[np.unique(mesh.faces)], card.view, size * _FINER)
     pose = camera.viewmat[:3, :3]
     _, face, weights = draw_mesh(mesh.vertices, mesh.faces, camera)
     drawn = face >= 0
