@@ -30,9 +30,9 @@ _PAPER = (255, 255, 255)
 _PANEL = (246, 246, 248)
 _INK = (38, 38, 42)
 _FAINT = (118, 118, 124)
-_CLAY = np.array([0.80, 0.795, 0.785])
+_CLAY = np.array([0.80, 0.80, 0.80])
 _INVENTED = np.array([0.98, 0.66, 0.36])
-_WIRE = np.array([0.23, 0.30, 0.42])
+_WIRE = np.array([0.24, 0.27, 0.33])
 _VIEWS_ASKED = 60
 _FIELD = np.radians(28.0)
 _FILLED = 0.88
@@ -215,10 +215,18 @@ def save_sheet(sheet: Image.Image, path: Path, limit: int = 300_000) -> Path:
             scale *= min(0.95, (limit / buffer.tell()) ** 0.5)
         size = max(1, round(sheet.width * scale)), max(1, round(sheet.height * scale))
         smaller = sheet if size == sheet.size else sheet.resize(size, Image.Resampling.LANCZOS)
-        # Colours that fit well take long to find, so in every third row and column.
-        thinned = smaller.resize((-(-size[0] // 3), -(-size[1] // 3)), Image.Resampling.NEAREST)
-        colours = thinned.quantize(256, Image.Quantize.MEDIANCUT, kmeans=3)
-        picture = smaller.quantize(palette=colours, dither=Image.Dither.NONE)
+        picture = smaller.quantize(palette=_palette(np.asarray(smaller)), dither=Image.Dither.NONE)
+
+
+def _palette(pixels: np.ndarray) -> Image.Image:
+    """256 colours for pixels (H, W, 3) uint8, as Pillow takes them: the sheet's own two and what fits the rest."""
+    # Every third row and column is enough, and a colour that fills much must not take the others' places.
+    found, count = np.unique(pixels[::3, ::3].reshape(-1, 3) >> 2, axis=0, return_counts=True)
+    several = np.repeat(4 * found + 2, np.ceil(count**0.3).astype(int), axis=0).astype(np.uint8)
+    fitted = Image.fromarray(several[None]).quantize(254, Image.Quantize.MEDIANCUT, kmeans=3)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([*_PAPER, *_PANEL, *(fitted.getpalette() or [])[: 3 * 254]])
+    return palette
 
 
 def figures_line(figures: Mapping[str, Any]) -> str:
