@@ -215,18 +215,25 @@ def save_sheet(sheet: Image.Image, path: Path, limit: int = 300_000) -> Path:
             scale *= min(0.95, (limit / buffer.tell()) ** 0.5)
         size = max(1, round(sheet.width * scale)), max(1, round(sheet.height * scale))
         smaller = sheet if size == sheet.size else sheet.resize(size, Image.Resampling.LANCZOS)
-        picture = smaller.quantize(palette=_palette(np.asarray(smaller)), dither=Image.Dither.NONE)
+        picture = _in_few_colours(smaller)
 
 
-def _palette(pixels: np.ndarray) -> Image.Image:
-    """256 colours for pixels (H, W, 3) uint8, as Pillow takes them: the sheet's own two and what fits the rest."""
+def _in_few_colours(picture: Image.Image) -> Image.Image:
+    """The picture in 256 colours: the sheet's own two, exactly, and those that fit the rest."""
+    pixels = np.asarray(picture)
     # Every third row and column is enough, and a colour that fills much must not take the others' places.
     found, count = np.unique(pixels[::3, ::3].reshape(-1, 3) >> 2, axis=0, return_counts=True)
     several = np.repeat(4 * found + 2, np.ceil(count**0.3).astype(int), axis=0).astype(np.uint8)
     fitted = Image.fromarray(several[None]).quantize(254, Image.Quantize.MEDIANCUT, kmeans=3)
     palette = Image.new("P", (1, 1))
     palette.putpalette([*_PAPER, *_PANEL, *(fitted.getpalette() or [])[: 3 * 254]])
-    return palette
+    placed = np.array(picture.quantize(palette=palette, dither=Image.Dither.NONE))
+    # Pillow takes near colours for equal ones.
+    for place, own in enumerate((_PAPER, _PANEL)):
+        placed[(pixels == own).all(2)] = place
+    few = Image.fromarray(placed, "P")
+    few.putpalette(palette.getpalette() or [])
+    return few
 
 
 def figures_line(figures: Mapping[str, Any]) -> str:

@@ -535,6 +535,7 @@ def test_a_sheet_holds_every_mesh_and_stays_small(true_capture, tmp_path):
     path = save_sheet(many, tmp_path / "meshes.png", 100_000)
     assert path.name == "meshes.png" and path.stat().st_size <= 100_000
     kept = Image.open(path)
+    assert kept.convert("RGB").getpixel((0, 0)) == (255, 255, 255)
     assert kept.format == "PNG" and kept.width / kept.height == pytest.approx(many.width / many.height, rel=0.02)
     exact = save_sheet(one, tmp_path / "one.png")
     assert (np.asarray(Image.open(exact)) == np.asarray(one)).all()
