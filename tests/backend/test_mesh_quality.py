@@ -8,8 +8,10 @@ import math
 import time
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 
 import manifold3d
+import numba
 import numpy as np
 import pytest
 import torch
@@ -544,7 +546,9 @@ def test_a_sheet_holds_every_mesh_and_stays_small(true_capture, tmp_path):
 # --- the commands ----------------------------------------------------------------------------------------------------
 
 
-def test_evaluate_and_report_say_how_good_the_meshes_are(write_capture, tmp_path, capsys):
+def test_evaluate_and_report_say_how_good_the_meshes_are(write_capture, tmp_path, capsys, request):
+    request.addfinalizer(partial(numba.set_num_threads, numba.get_num_threads()))
+    request.addfinalizer(partial(torch.set_num_threads, torch.get_num_threads()))
     scene, out = write_capture(views=9, size=(64, 48), spheres=SPHERES), tmp_path / "out"
     write_truth(scene, write_capture, SPHERES)
 
