@@ -8,16 +8,13 @@ import math
 import time
 from dataclasses import replace
 from fractions import Fraction
-from functools import partial
 
 import manifold3d
-import numba
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from backend import arguments
 from backend.capture import load_capture
 from backend.evaluation.mesh_pictures import Card, camera_for, draw_card, mesh_sheet, save_sheet, view_of
 from backend.evaluation.mesh_shape import self_intersecting, shape_of
@@ -546,16 +543,14 @@ def test_a_sheet_holds_every_mesh_and_stays_small(true_capture, tmp_path):
 # --- the commands ----------------------------------------------------------------------------------------------------
 
 
-def test_evaluate_and_report_say_how_good_the_meshes_are(write_capture, tmp_path, capsys, request):
-    request.addfinalizer(partial(numba.set_num_threads, numba.get_num_threads()))
-    request.addfinalizer(partial(torch.set_num_threads, torch.get_num_threads()))
+def test_evaluate_and_report_say_how_good_the_meshes_are(write_capture, tmp_path, ask):
     scene, out = write_capture(views=9, size=(64, 48), spheres=SPHERES), tmp_path / "out"
     write_truth(scene, write_capture, SPHERES)
 
     def run(*words):
-        capsys.readouterr()
-        assert arguments.main([*map(str, words), "--threads", "1"]) == EXIT_DONE
-        return capsys.readouterr().err
+        answer = ask(*words)
+        assert answer.code == EXIT_DONE, answer
+        return answer.err
 
     def reported():
         said = run("report", out)
