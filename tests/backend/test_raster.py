@@ -37,22 +37,32 @@ def as_float32(scene):
     return {k: v if k == "ids" else v.float() for k, v in scene.items()}
 
 
-def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolerance=1e-5):
+def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolerance=1e-5, primitive="3d"):
+    """Picture and gradients of a random loss by both renderers; `primitive` "2d": with everything that discs have."""
     scene = as_float32(scene)
+    flat = primitive == "2d"
     rng = np.random.default_rng(seed)
     shape = (cam.height, cam.width)
     labels = torch.tensor(rng.integers(-1, objects, shape), dtype=torch.int32)
     fast = {k: v.clone().requires_grad_(k != "ids") for k, v in scene.items()}
     slow = {k: v.clone() if k == "ids" else v.double().requires_grad_() for k, v in scene.items()}
-    got = rasterize(**fast, camera=cam, labels=labels, want_depth=True)
-    want = rasterize_reference(**slow, camera=cam, objects=objects)
+    got = rasterize(
+        **fast, camera=cam, labels=labels, want_depth=True, want_median=True, want_normals=flat, want_distortion=flat,
+        primitive=primitive,
+    )  # fmt: skip
+    want = rasterize_reference(**slow, camera=cam, objects=objects, primitive=primitive)
     index = labels.long().clamp(min=0)[..., None]
     want_weight = torch.where(labels >= 0, want.probabilities.gather(-1, index)[..., 0], torch.zeros(()).double())
-    pairs = ((got.color, want.color), (got.alpha, want.alpha), (got.weight, want_weight), (got.depth, want.depth))
+    pairs = [(got.color, want.color), (got.alpha, want.alpha), (got.weight, want_weight), (got.depth, want.depth)]
+    if flat:
+        pairs += [(got.normals, want.normals), (got.distortion, want.distortion)]
     g = [torch.tensor(rng.normal(size=tuple(a.shape))) for a, _ in pairs]
     for a, b in pairs:
         assert torch.isfinite(a).all()
         np.testing.assert_allclose(a.detach().numpy(), b.detach().numpy(), rtol=1e-4, atol=value_tolerance)
+    # Where half of the light is taken almost exactly, rounding decides which of two splats is the one.
+    differs = np.abs(got.median.numpy() - want.median.numpy()) > 1e-4 * want.median.numpy() + value_tolerance
+    assert differs.mean() < 2e-3 and not got.median.requires_grad
     loss = sum((a * v.float()).sum() for (a, _), v in zip(pairs, g, strict=True))
     loss64 = sum((b * v).sum() for (_, b), v in zip(pairs, g, strict=True))
     if want.color.requires_grad:
@@ -79,7 +89,26 @@ def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolera
     return got, want
 
 
+PRIMITIVES = pytest.mark.parametrize("primitive", ["3d", "2d"])
+
+
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
-def test_agrees_with_reference_on_random_scenes(seed, coefficients):
-    compare(random_scene(seed, coefficients=coefficients), camera(), seed=seed)
+@pytest.mark.parametrize(
+    ("primitive", "coefficients"), [("3d", 1), ("3d", 4), ("3d", 9), ("3d", 16), ("2d", 1), ("2d", 4)]
+)
+def test_agrees_with_reference_on_random_scenes(seed, coefficients, primitive):
+    compare(random_scene(seed, coefficients=coefficients), camera(), seed=seed, primitive=primitive)
+
+
+def test_median_depth_is_that_of_the_splat_at_half_of_the_light():
+    cam = camera()
+    layers = random_scene(0, count=4, size=30.0)
+    layers["means"] = torch.tensor([[0, 0, z] for z in (2.0, 3.0, 4.0, 5.0)], dtype=torch.float64)
+    layers["quats"] = torch.tensor([[1.0, 0, 0, 0]] * 4)
+    layers["scales"][:] = 1e3
+    for opacities, depth in (
+        ((0.3, 0.2, 0.2, 0.2), 4.0), ((0.3, 0.5, 0.9, 0.9), 3.0), ((0.6, 0.9, 0.9, 0.9), 2.0), ((0.1,) * 4, 0.0)
+    ):  # fmt: skip
+        layers["opacities"] = torch.tensor(opacities)
+        median = rasterize(**as_float32(layers), camera=cam, want_median=True).median
+        np.testing.assert_allclose(median, depth)

@@ -1,0 +1,218 @@
+"""What each view sees: of the whole scene, and of one object alone and unhidden."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from ..model.generate import Generated
+from ..model.object_model import ObjectModel
+from ..raster import Camera, Rendered, object_map, rasterize
+from ..training.scene import Scene
+
+ALPHA_SEEN = 0.5
+"""From this alpha on a pixel has a depth."""
+
+_REACH = 3.4
+"""Standard deviations to which a splat is drawn, at most: sqrt(2 ln 255), and a little."""
+_BORDER = 2.0
+"""Pixels that the renderer's blur adds to a splat's reach."""
+
+
+@dataclass(frozen=True)
+class SceneMap:
+    """The whole scene in one view: depth (H, W) float32 along z in scene units, 0 where nothing is; ids (H, W) int32,
+    the class index of the most probable object, -1 where nothing is drawn; probability (H, W) float32 of that object;
+    alpha (H, W) float32."""
+
+    camera: Camera
+    depth: np.ndarray
+    ids: np.ndarray
+    probability: np.ndarray
+    alpha: np.ndarray
+
+
+@dataclass(frozen=True)
+class ObjectView:
+    """An object's own splats in one view, drawn without the rest of the scene, in a rectangle around them.
+
+    camera: the view's, cropped to the rectangle; x, y: the rectangle's upper left in the view, in pixels; depth (h, w)
+    float32 along z in scene units, 0 where alpha < 0.5; alpha (h, w) float32; color (h, w, 3) float32, not multiplied
+    by alpha, at the capture's common exposure; visible (h, w) float32: which share, 0..1, of the object's own light
+    reaches the camera in the whole scene.
+    """
+
+    camera: Camera
+    x: int
+    y: int
+    depth: np.ndarray
+    alpha: np.ndarray
+    color: np.ndarray
+    visible: np.ndarray
+
+
+def crop(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
+    """The part of a camera's picture whose upper left is the pixel (x, y)."""
+    K = np.array(camera.K, np.float64)
+    K[0, 2] -= x
+    K[1, 2] -= y
+    return replace(camera, K=K, width=width, height=height)
+
+
+class Views:
+    """The model through the cameras of `scene` (every view in `indices`), reduced by `downscale`.
+
+    What was drawn is kept as long as it fits into `memory_mb`: the scene's maps for good, the objects' views until
+    another object is asked for.
+    """
+
+    def __init__(
+        self,
+        model: ObjectModel,
+        scene: Scene,
+        indices: Sequence[int],
+        downscale: int = 1,
+        memory_mb: float = 600,
+    ) -> None:
+        self.model = model
+        self.scene = scene
+        self.indices = tuple(indices)
+        self.downscale = downscale
+        self._room = memory_mb * 1e6
+        self._maps: dict[int, SceneMap] = {}
+        self._views: dict[int, ObjectView | None] = {}
+        self._classes: tuple[int, ...] = ()
+        self._all: Generated | None = None
+        self._own: Generated | None = None
+
+    def camera(self, index: int) -> Camera:
+        """View `index`'s camera in scene units."""
+        return self.scene.camera(index, self.downscale)
+
+    def splats(self, classes: Sequence[int]) -> Generated:
+        """The Gaussians of the objects `classes` in scene units, as seen from the origin where that matters."""
+        self._turn_to(classes)
+        return self._own_splats(None)
+
+    def scene_map(self, index: int) -> SceneMap:
+        """What view `index` sees of the whole scene."""
+        if index in self._maps:
+            return self._maps[index]
+        camera = self.camera(index)
+        drawn = self._draw(self._scene_splats(camera), camera)
+        ids, probability = object_map(drawn)
+        alpha = drawn.alpha.numpy()
+        found = SceneMap(camera, _depth(drawn), ids, probability, alpha)
+        if self._take(4 * alpha.nbytes):
+            self._maps[index] = found
+        return found
+
+    def object_view(self, index: int, classes: Sequence[int]) -> ObjectView | None:
+        """What view `index` would see of the objects `classes` (indices) alone; None where they are out of view."""
+        self._turn_to(classes)
+        if index not in self._views:
+            view = self._object_view(index)
+            if view is not None and not self._take(_bytes(view)):
+                return view
+            self._views[index] = view
+        return self._views[index]
+
+    def _object_view(self, index: int) -> ObjectView | None:
+        camera = self.camera(index)
+        splats = self._own_splats(camera)
+        rectangle = _rectangle(splats, camera)
+        if rectangle is None:
+            return None
+        x, y, width, height = rectangle
+        camera = crop(camera, x, y, width, height)
+        drawn = self._draw(splats, camera)
+        alpha = drawn.alpha.numpy()
+        if not (alpha >= ALPHA_SEEN).any():
+            return None
+        shown = self._shown(index)[y : y + height, x : x + width]
+        visible = np.clip(shown / np.maximum(alpha, 1e-3), 0, 1).astype(np.float32)
+        color = np.moveaxis(drawn.color.numpy(), 0, 2) / np.maximum(alpha, 1e-3)[..., None]
+        return ObjectView(camera, x, y, _depth(drawn), alpha, np.ascontiguousarray(color), visible)
+
+    def _shown(self, index: int) -> np.ndarray:
+        """How much of each pixel's light in view `index` comes from the objects at hand, (H, W)."""
+        if len(self._classes) == 1:
+            # The scene's own map answers for one object: elsewhere another one is more probable.
+            whole = self.scene_map(index)
+            return np.where(whole.ids == self._classes[0], whole.probability, np.float32(0))
+        camera = self.camera(index)
+        splats = self._scene_splats(camera)
+        ours = torch.from_numpy(np.isin(splats.ids.numpy(), self._classes).astype(np.int32))
+        labels = torch.ones((camera.height, camera.width), dtype=torch.int32)
+        with torch.no_grad():
+            drawn = rasterize(*splats[:5], ours, camera, labels)
+        assert drawn.weight is not None
+        return drawn.weight.numpy()
+
+    def _draw(self, splats: Generated, camera: Camera) -> Rendered:
+        with torch.no_grad():
+            return rasterize(*splats[:6], camera, want_median=True)
+
+    def _scene_splats(self, camera: Camera) -> Generated:
+        if not self.model.explicit:
+            return self.model.generate(eye=camera.centre)
+        if self._all is None:
+            self._all = self.model.generate()
+        return self._all
+
+    def _own_splats(self, camera: Camera | None) -> Generated:
+        if self._own is not None:
+            return self._own
+        if self.model.explicit:
+            splats = self._scene_splats(self.camera(self.indices[0]))
+            ours = torch.from_numpy(np.isin(splats.ids.numpy(), self._classes))
+            self._own = Generated(*(part[ours] for part in splats))
+            return self._own
+        anchors = np.flatnonzero(np.isin(self.model.anchors.ids, self._classes))
+        return self.model.generate(anchors, np.zeros(3) if camera is None else camera.centre)
+
+    def _turn_to(self, classes: Sequence[int]) -> None:
+        classes = tuple(sorted({int(c) for c in classes}))
+        if classes != self._classes:
+            self._room += sum(_bytes(view) for view in self._views.values() if view is not None)
+            self._classes, self._views, self._own = classes, {}, None
+
+    def _take(self, size: float) -> bool:
+        fits = size <= self._room
+        if fits:
+            self._room -= size
+        return fits
+
+
+def _bytes(view: ObjectView) -> int:
+    return view.depth.nbytes + view.alpha.nbytes + view.color.nbytes + view.visible.nbytes
+
+
+def _depth(drawn: Rendered) -> np.ndarray:
+    assert drawn.median is not None
+    return np.where(drawn.alpha.numpy() >= ALPHA_SEEN, drawn.median.numpy(), np.float32(0))
+
+
+def _rectangle(splats: Generated, camera: Camera) -> tuple[int, int, int, int] | None:
+    """x, y, width and height of the part of the picture that the splats may touch; None where they touch none."""
+    points = splats.means.double().numpy() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    before = points[:, 2] > camera.near
+    points, scales = points[before], splats.scales.numpy()[before]
+    if not len(points):
+        return None
+    focal = np.array([camera.K[0, 0], camera.K[1, 1]])
+    centres = points[:, :2] / points[:, 2:] * focal + camera.K[:2, 2]
+    # Beside the axis a footprint is stretched along the radius.
+    slant = 1 + (points[:, :2] / points[:, 2:]) ** 2
+    reach = _REACH * scales.max(1)[:, None] * focal * np.sqrt(slant) / points[:, 2:] + _BORDER
+    size = np.array([camera.width, camera.height])
+    low, high = centres - reach, centres + reach
+    inside = ((high > 0) & (low < size)).all(1)
+    if not inside.any():
+        return None
+    first = np.clip(np.floor(low[inside].min(0)), 0, size - 1).astype(int)
+    last = np.clip(np.ceil(high[inside].max(0)), first + 1, size).astype(int)
+    return int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1])
