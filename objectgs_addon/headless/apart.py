@@ -48,7 +48,7 @@ def add_even_light(target: bpy.types.Scene) -> None:
 def pull_apart(target: bpy.types.Scene) -> None:
     """Make a picture of a scene: its objects' meshes apart, with light, ground and camera. It is not meant to be saved.
 
-    Large objects stay; what lies around the cameras, as a room does, is left out. Raises InputError without meshes.
+    Large objects stay; what lies around the others, as a room does, is left out. Raises InputError without meshes.
     """
     found = [(root, scene.object_meshes(root)) for root in reconstructions(target)]
     found = [(root, meshes) for root, meshes in found if meshes]
@@ -59,15 +59,13 @@ def pull_apart(target: bpy.types.Scene) -> None:
     target.view_layers[0].update()
     boxes = {object_id: scene.bounds(things) for object_id, things in meshes.items()}
     sizes = {object_id: float(np.linalg.norm(high - low)) for object_id, (low, high) in boxes.items()}
-    eyes = np.array([thing.matrix_world.translation for thing in root.all_objects
-                     if scene.kind_of(thing) == "camera"]).reshape(-1, 3)
     middle_size = float(np.median(list(sizes.values())))
     large = {object_id for object_id, size in sizes.items() if size > LARGE * middle_size}
-    around = {object_id for object_id in large if _holds(boxes[object_id], eyes)}
     moved = sorted(set(boxes) - large)
+    middles = np.array([boxes[object_id].mean(0) for object_id in moved])
+    around = {object_id for object_id in large if _holds(boxes[object_id], middles)}
     _show_only(target, [thing for object_id, things in meshes.items() if object_id not in around for thing in things])
 
-    middles = np.array([boxes[object_id][[0, 1]].mean(0) for object_id in moved])
     centre = np.append(np.median(middles[:, :2], axis=0), 0.0)
     shown = {object_id: boxes[object_id] for object_id in large - around}
     for object_id, middle in zip(moved, middles):
@@ -81,6 +79,7 @@ def pull_apart(target: bpy.types.Scene) -> None:
     toward = _add_camera(target, np.concatenate([_corners(shown[object_id]) for object_id in moved]))
     _add_light(target, toward)
     target.cycles.use_denoising = True
+    target.cycles.adaptive_threshold = 0.05
     target.cycles.max_bounces = 2
 
 
@@ -89,9 +88,9 @@ def _corners(box: np.ndarray) -> np.ndarray:
     return np.array([[box[i][0], box[j][1], box[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 
 
-def _holds(box: np.ndarray, eyes: np.ndarray) -> bool:
-    """Whether most of the cameras lie in a box."""
-    return len(eyes) > 0 and float(((eyes > box[0]) & (eyes < box[1])).all(1).mean()) > 0.5
+def _holds(box: np.ndarray, places: np.ndarray) -> bool:
+    """Whether most of the places (n, 3) lie in a box."""
+    return float(((places > box[0]) & (places < box[1])).all(1).mean()) > 0.5
 
 
 def _show_only(target, meshes) -> None:

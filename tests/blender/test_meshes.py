@@ -554,3 +554,7 @@ def test_assets(active):
     bpy.context.view_layer.update()
     low = min(place[2] for place in coordinates(mesh_of(active, 1)))
     assert blender_scene.object_collections(active)[1].instance_offset[2] == pytest.approx(low, abs=1e-5)
+
+
+def test_points_make_room_wherever_a_result_is_opened(active):
+    assert kinds.points_of(active).hide_get()
