@@ -38,7 +38,7 @@ _GRAZING = 0.1
 _SHARPNESS = 3.0
 """Power of the score: how much a better photo outweighs a worse one."""
 
-_ODD = 0.12
+_ODD = 0.25
 """Difference from the photos' median, of 1, at which a photo's say has fallen to 1 / e: highlights, passers-by."""
 
 
