@@ -154,7 +154,7 @@ class Views:
 
     def _draw(self, splats: Generated, camera: Camera) -> Rendered:
         with torch.no_grad():
-            return rasterize(*splats[:6], camera, want_depth=True)
+            return rasterize(*splats[:6], camera, want_median=True)
 
     def _scene_splats(self, camera: Camera) -> Generated:
         if not self.model.explicit:
@@ -192,9 +192,8 @@ def _bytes(view: ObjectView) -> int:
 
 
 def _depth(drawn: Rendered) -> np.ndarray:
-    assert drawn.depth is not None
-    alpha = drawn.alpha.numpy()
-    return np.where(alpha >= ALPHA_SEEN, drawn.depth.numpy() / np.maximum(alpha, ALPHA_SEEN), np.float32(0))
+    assert drawn.median is not None
+    return np.where(drawn.alpha.numpy() >= ALPHA_SEEN, drawn.median.numpy(), np.float32(0))
 
 
 def _rectangle(splats: Generated, camera: Camera) -> tuple[int, int, int, int] | None:

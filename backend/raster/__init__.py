@@ -16,12 +16,14 @@ __all__ = ["Camera", "Rendered", "compile_kernels", "object_map", "rasterize"]
 
 class Rendered(NamedTuple):
     """color (3, H, W) premultiplied, without background; alpha (H, W); weight (H, W): probability of the pixel's label;
-    depth (H, W): expected depth times alpha; frame: the renderer's own record, for `object_map` and growth."""
+    depth (H, W): expected depth times alpha; median (H, W): the depth at which half of the light is taken, 0 where less
+    is, without gradient; frame: the renderer's own record, for `object_map` and growth. None: not asked for."""
 
     color: torch.Tensor
     alpha: torch.Tensor
     weight: torch.Tensor | None
     depth: torch.Tensor | None
+    median: torch.Tensor | None
     frame: cpu.Frame
 
 
@@ -29,9 +31,13 @@ def _array(tensor: torch.Tensor) -> np.ndarray:
     return np.ascontiguousarray(tensor.detach().numpy(), np.float32)
 
 
+def _tensor(array: np.ndarray | None) -> torch.Tensor | None:
+    return None if array is None else torch.from_numpy(array)
+
+
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, means, quats, scales, opacities, sh, ids, camera, labels, want_depth, holder):
+    def forward(ctx: Any, means, quats, scales, opacities, sh, ids, camera, labels, want_depth, want_median, holder):
         ctx.means_type = means.dtype
         if means.dtype == torch.float64:
             # Far from the origin (georeferenced captures) float32 would round positions: count from the camera.
@@ -42,26 +48,22 @@ class _Rasterize(torch.autograd.Function):
             np.ascontiguousarray(ids.numpy(), np.int32),
         )  # fmt: skip
         wanted = None if labels is None else np.ascontiguousarray(labels.numpy(), np.int32)
-        frame = cpu.forward(gaussians, camera, wanted, want_depth)
+        frame = cpu.forward(gaussians, camera, wanted, want_depth, want_median)
         ctx.frame = frame
         holder.append(frame)
-        outputs = [torch.from_numpy(frame.color), torch.from_numpy(1.0 - frame.transmittance)]
-        if frame.weight is not None:
-            outputs.append(torch.from_numpy(frame.weight))
-        if frame.depth is not None:
-            outputs.append(torch.from_numpy(frame.depth))
-        return tuple(outputs)
+        median = _tensor(frame.median)
+        if median is not None:
+            ctx.mark_non_differentiable(median)
+        alpha = torch.from_numpy(1.0 - frame.transmittance)
+        return torch.from_numpy(frame.color), alpha, _tensor(frame.weight), _tensor(frame.depth), median
 
     @staticmethod
     def backward(ctx: Any, *gradients):
-        frame = ctx.frame
-        planes = [_array(g) for g in gradients]
-        g_weight = planes[2] if frame.weight is not None else None
-        g_depth = planes[-1] if frame.depth is not None else None
-        out = cpu.backward(frame, planes[0], planes[1], g_weight, g_depth)
+        g_color, g_alpha, g_weight, g_depth = (None if g is None else _array(g) for g in gradients[:4])
+        out = cpu.backward(ctx.frame, g_color, g_alpha, g_weight, g_depth)
         arrays = (out.means, out.quats, out.scales, out.opacities, out.sh)
         g_means, *others = (torch.from_numpy(a) for a in arrays)
-        return (g_means.to(ctx.means_type), *others, None, None, None, None, None)
+        return (g_means.to(ctx.means_type), *others, None, None, None, None, None, None)
 
 
 def rasterize(
@@ -74,6 +76,7 @@ def rasterize(
     camera: Camera,
     labels: torch.Tensor | None = None,
     want_depth: bool = False,
+    want_median: bool = False,
 ) -> Rendered:
     """Draw 3D Gaussians (Kerbl et al. 2023), differentiable in the first five arguments.
 
@@ -83,10 +86,10 @@ def rasterize(
     probability that each pixel shows its label (the paper's P at the label); nothing is computed that is not asked for.
     """
     holder: list[cpu.Frame] = []
-    outputs = _Rasterize.apply(means, quats, scales, opacities, sh, ids, camera, labels, want_depth, holder)
-    weight = outputs[2] if labels is not None else None
-    depth = outputs[-1] if want_depth else None
-    return Rendered(outputs[0], outputs[1], weight, depth, holder[0])
+    planes = _Rasterize.apply(
+        means, quats, scales, opacities, sh, ids, camera, labels, want_depth, want_median, holder
+    )  # fmt: skip
+    return Rendered(*planes, holder[0])
 
 
 def object_map(rendered: Rendered) -> tuple[np.ndarray, np.ndarray]:

@@ -33,7 +33,7 @@ class Gaussians:
 
 @dataclass
 class Frame:
-    """A picture and what its gradient needs. color (3, H, W), transmittance (H, W), weight and depth if asked."""
+    """A picture and what its gradient needs. color (3, H, W), transmittance (H, W), weight, depth, median if asked."""
 
     gaussians: Gaussians
     camera: Camera
@@ -42,6 +42,7 @@ class Frame:
     transmittance: np.ndarray
     weight: np.ndarray | None
     depth: np.ndarray | None
+    median: np.ndarray | None
     splats: np.ndarray
     tiles: np.ndarray
     members: np.ndarray
@@ -56,7 +57,13 @@ class Frame:
         return self.splats[:, HALF_H] > 0
 
 
-def forward(gaussians: Gaussians, camera: Camera, labels: np.ndarray | None = None, want_depth: bool = False) -> Frame:
+def forward(
+    gaussians: Gaussians,
+    camera: Camera,
+    labels: np.ndarray | None = None,
+    want_depth: bool = False,
+    want_median: bool = False,
+) -> Frame:
     """Draw `gaussians`. labels (H, W) int32: also sum, per pixel, the weights of splats whose id is the label."""
     g = gaussians
     height, width = int(camera.height), int(camera.width)
@@ -69,12 +76,15 @@ def forward(gaussians: Gaussians, camera: Camera, labels: np.ndarray | None = No
     transmittance = np.empty((height, width), np.float32)
     weight = np.empty((height, width), np.float32) if labels is not None else None
     depth = np.empty((height, width), np.float32) if want_depth else None
+    median = np.empty((height, width), np.float32) if want_median else None
     ends = np.empty(tiles.size - 1, np.int64)
     blend(
         splats, g.ids, _NO_LABELS if labels is None else labels, tiles, members, labels is not None, want_depth,
-        color, transmittance, _or_none(weight), _or_none(depth), ends,
+        want_median, color, transmittance, _or_none(weight), _or_none(depth), _or_none(median), ends,
     )  # fmt: skip
-    return Frame(g, camera, labels, color, transmittance, weight, depth, splats, tiles, members, places, slots, ends)
+    return Frame(
+        g, camera, labels, color, transmittance, weight, depth, median, splats, tiles, members, places, slots, ends
+    )
 
 
 def _or_none(plane: np.ndarray | None) -> np.ndarray:

@@ -26,6 +26,7 @@ STRIDE = TILE_W + simd.LANES
 _LOG2_CUT = np.float32(math.log2(ALPHA_MIN))
 _ALPHA_MAX = np.float32(ALPHA_MAX)
 _STOP = np.float32(STOP)
+_HALF = np.float32(0.5)
 _LN2 = np.float32(math.log(2.0))
 _ONE = np.float32(1.0)
 _ZERO = np.float32(0.0)
@@ -88,10 +89,14 @@ def live_rows(T, live):
 
 
 @kernel(parallel=True)
-def blend(splats, ids, labels, tiles, members, want_labels, want_depth, color, transmittance, weight, depth, ends):
-    """Draw. labels (H, W) int32; color (3, H, W), transmittance, weight and depth (H, W): float32, all written.
+def blend(
+    splats, ids, labels, tiles, members, want_labels, want_depth, want_median,
+    color, transmittance, weight, depth, median, ends,
+):  # fmt: skip
+    """Draw. labels (H, W) int32; color (3, H, W), transmittance, weight, depth and median (H, W): float32, all written.
 
-    weight: the summed w_i of splats whose id equals the pixel's label. depth: the summed w_i z_i.
+    weight: the summed w_i of splats whose id equals the pixel's label. depth: the summed w_i z_i. median: the z_i with
+    which T falls below 1/2, 0 where it never does.
     ends (T,): how many members of each tile were needed, for `blend_backward`.
     """
     height, width = transmittance.shape
@@ -104,13 +109,14 @@ def blend(splats, ids, labels, tiles, members, want_labels, want_depth, color, t
         tile_y = (tile // columns) * TILE_H
         rows = min(TILE_H, height - tile_y)
         cols = min(TILE_W, width - tile_x)
-        planes = np.zeros(6 * plane, np.float32)
+        planes = np.zeros(7 * plane, np.float32)
         T = planes[:plane]
         red = planes[plane : 2 * plane]
         green = planes[2 * plane : 3 * plane]
         blue = planes[3 * plane : 4 * plane]
         lab = planes[4 * plane : 5 * plane]
-        dep = planes[5 * plane :]
+        dep = planes[5 * plane : 6 * plane]
+        med = planes[6 * plane :]
         want = np.empty(plane, np.int32)
         live = np.zeros(TILE_H, np.bool_)
         starts = np.empty(ROW_SLOTS, np.int32)
@@ -128,6 +134,7 @@ def blend(splats, ids, labels, tiles, members, want_labels, want_depth, color, t
         stop_at = simd.splat(_STOP)
         alpha_max = simd.splat(_ALPHA_MAX)
         one = simd.splat(_ONE)
+        half = simd.splat(_HALF)
         first = tiles[tile]
         last = tiles[tile + 1]
         for member in range(first, last):
@@ -154,7 +161,8 @@ def blend(splats, ids, labels, tiles, members, want_labels, want_depth, color, t
                     t = simd.load(T, at)
                     alpha = simd.keep(simd.both(simd.at_least(exponent, cut), simd.at_least(t, stop_at)), alpha)
                     w = alpha * t
-                    simd.store(T, at, t * (one - alpha))
+                    after = t * (one - alpha)
+                    simd.store(T, at, after)
                     simd.store(red, at, simd.load(red, at) + w * r)
                     simd.store(green, at, simd.load(green, at) + w * g)
                     simd.store(blue, at, simd.load(blue, at) + w * b)
@@ -163,6 +171,9 @@ def blend(splats, ids, labels, tiles, members, want_labels, want_depth, color, t
                         simd.store(lab, at, simd.load(lab, at) + simd.keep(match, w))
                     if want_depth:
                         simd.store(dep, at, simd.load(dep, at) + w * z)
+                    if want_median:
+                        crosses = simd.both(simd.at_least(t, half), simd.above(half, after))
+                        simd.store(med, at, simd.where(crosses, z, simd.load(med, at)))
         ends[tile] = last - first
         for row in range(rows):
             y = tile_y + row
@@ -178,6 +189,9 @@ def blend(splats, ids, labels, tiles, members, want_labels, want_depth, color, t
             if want_depth:
                 for x in range(cols):
                     depth[y, tile_x + x] = dep[row * STRIDE + x]
+            if want_median:
+                for x in range(cols):
+                    median[y, tile_x + x] = med[row * STRIDE + x]
 
 
 @kernel(parallel=True)

@@ -15,11 +15,12 @@ from .settings import ALPHA_MAX, ALPHA_MIN, BLUR, MAX_EXTENT, MIN_QUAT_NORM2, ST
 
 
 class ReferencePicture(NamedTuple):
-    """color (3, H, W), alpha (H, W), depth (H, W) as in `Rendered`; probabilities (H, W, n), one channel an ID."""
+    """color (3, H, W), alpha, depth and median (H, W) as in `Rendered`; probabilities (H, W, n), one channel an ID."""
 
     color: torch.Tensor
     alpha: torch.Tensor
     depth: torch.Tensor
+    median: torch.Tensor
     probabilities: torch.Tensor
 
 
@@ -107,6 +108,7 @@ def rasterize_reference(
     T = torch.ones(height, width, dtype=dtype)
     color = torch.zeros(3, height, width, dtype=dtype)
     depth = torch.zeros(height, width, dtype=dtype)
+    median = torch.zeros(height, width, dtype=dtype)
     probabilities = torch.zeros(height, width, objects, dtype=dtype)
     for n in torch.argsort(z.detach(), stable=True).tolist():
         if not extent2[n] < MAX_EXTENT**2:
@@ -123,5 +125,7 @@ def rasterize_reference(
         channel = torch.zeros(objects, dtype=dtype)
         channel[int(ids[n])] = 1
         probabilities = probabilities + w[..., None] * channel
-        T = T * (1 - alpha)
-    return ReferencePicture(color, 1 - T, depth, probabilities)
+        after = T * (1 - alpha)
+        median = torch.where((T.detach() >= 0.5) & (after.detach() < 0.5), z[n].detach(), median)
+        T = after
+    return ReferencePicture(color, 1 - T, depth, median, probabilities)

@@ -44,7 +44,7 @@ def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolera
     labels = torch.tensor(rng.integers(-1, objects, shape), dtype=torch.int32)
     fast = {k: v.clone().requires_grad_(k != "ids") for k, v in scene.items()}
     slow = {k: v.clone() if k == "ids" else v.double().requires_grad_() for k, v in scene.items()}
-    got = rasterize(**fast, camera=cam, labels=labels, want_depth=True)
+    got = rasterize(**fast, camera=cam, labels=labels, want_depth=True, want_median=True)
     want = rasterize_reference(**slow, camera=cam, objects=objects)
     index = labels.long().clamp(min=0)[..., None]
     want_weight = torch.where(labels >= 0, want.probabilities.gather(-1, index)[..., 0], torch.zeros(()).double())
@@ -53,6 +53,9 @@ def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolera
     for a, b in pairs:
         assert torch.isfinite(a).all()
         np.testing.assert_allclose(a.detach().numpy(), b.detach().numpy(), rtol=1e-4, atol=value_tolerance)
+    # Where half of the light is taken almost exactly, rounding decides which of two splats is the one.
+    differs = np.abs(got.median.numpy() - want.median.numpy()) > 1e-4 * want.median.numpy() + value_tolerance
+    assert differs.mean() < 2e-3 and not got.median.requires_grad
     loss = sum((a * v.float()).sum() for (a, _), v in zip(pairs, g, strict=True))
     loss64 = sum((b * v).sum() for (_, b), v in zip(pairs, g, strict=True))
     if want.color.requires_grad:
@@ -83,3 +86,17 @@ def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolera
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
 def test_agrees_with_reference_on_random_scenes(seed, coefficients):
     compare(random_scene(seed, coefficients=coefficients), camera(), seed=seed)
+
+
+def test_median_depth_is_that_of_the_splat_at_half_of_the_light():
+    cam = camera()
+    layers = random_scene(0, count=4, size=30.0)
+    layers["means"] = torch.tensor([[0, 0, z] for z in (2.0, 3.0, 4.0, 5.0)], dtype=torch.float64)
+    layers["quats"] = torch.tensor([[1.0, 0, 0, 0]] * 4)
+    layers["scales"][:] = 1e3
+    for opacities, depth in (
+        ((0.3, 0.2, 0.2, 0.2), 4.0), ((0.3, 0.5, 0.9, 0.9), 3.0), ((0.6, 0.9, 0.9, 0.9), 2.0), ((0.1,) * 4, 0.0)
+    ):  # fmt: skip
+        layers["opacities"] = torch.tensor(opacities)
+        median = rasterize(**as_float32(layers), camera=cam, want_median=True).median
+        np.testing.assert_allclose(median, depth)

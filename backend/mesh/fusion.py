@@ -1,0 +1,279 @@
+"""What views see of an object -> its signed distance field, in blocks around the surface.
+
+What each view says about a point of space: free of the object where the camera sees through it, near the object's
+surface where that is what the camera sees there, and nothing at all behind what the camera sees, be it the object or
+another one. Where no view says anything, the point is inside if what was seen of the surface surrounds it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ..protocol import InputError, Reporter
+from ..raster import Camera
+from .blocks import AROUND, SAMPLES, SIDE, Blocks, distinct
+from .integrate import Sight, add, look, own_depth
+from .marching import compact, march, parts
+from .views import ObjectView, SceneMap
+from .winding import Winding
+
+RESOLUTION = 256
+"""Voxels along the object's longest side, at most."""
+SMALLEST_PART = 0.03
+"""Parts of the surface smaller than this share of the largest are taken for floaters."""
+
+_VOXEL_PER_PIXEL = 0.5
+_REACH_VOXELS, _REACH_PIXELS = 3.0, 1.5
+_BACK_VOXELS, _BACK_PIXELS = 2.0, 1.0
+_BYTES_PER_BLOCK = 8 * SAMPLES * 4
+"""What a block takes at most, everything counted: sums, values, marks and the triangles in it."""
+_SURE = 1.0
+"""From this weight on the views alone say how far the surface is."""
+_SEEN = 0.1
+"""From this weight on a sample was seen."""
+_STEPS_BESIDE = 26
+
+
+class NoSurface(InputError):
+    """There is no mesh of an object; the message says why in one sentence."""
+
+
+class SeesObjects(Protocol):
+    """What `fuse` needs of `Views`."""
+
+    indices: tuple[int, ...]
+
+    def scene_map(self, index: int) -> SceneMap: ...
+
+    def object_view(self, index: int, classes: Sequence[int]) -> ObjectView | None: ...
+
+
+@dataclass
+class Field:
+    """Signed distance, negative inside, in voxels: values (B, 512) float32 at the samples of `blocks`; seen (B, 512):
+    whether a view says something there. Sample (i, j, k) of block c lies at origin + voxel * (8 c + (i, j, k)) in scene
+    units. The zero level never leaves the blocks."""
+
+    origin: np.ndarray
+    voxel: float
+    blocks: Blocks
+    values: np.ndarray
+    seen: np.ndarray
+
+
+@dataclass
+class _Extent:
+    """Where an object was seen: points (n, 3), low and high corner without outliers, footprint of a pixel there."""
+
+    points: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    pixel: float
+    nearest: float
+
+
+def fuse(
+    views: SeesObjects,
+    classes: Sequence[int],
+    resolution: int = RESOLUTION,
+    memory_mb: float = 1500,
+    reporter: Reporter | None = None,
+) -> Field:
+    """The field of the objects `classes` (indices) as one.
+
+    The voxel is half a pixel's footprint on the object, or its longest side / `resolution` where that is more. Memory
+    grows with the surface; where `memory_mb` is not enough the voxel grows, with a warning. Raises NoSurface.
+    """
+    reporter = reporter or Reporter()
+    extent = _extent(views, classes)
+    size = float((extent.high - extent.low).max())
+    voxel = max(_VOXEL_PER_PIXEL * extent.pixel, size / resolution)
+    room = max(int(memory_mb * 1e6 / _BYTES_PER_BLOCK), 64)
+    asked = voxel
+    while True:
+        try:
+            field = _Fusion(views, classes, extent, voxel, room, reporter).run()
+            break
+        except _TooMany as error:
+            voxel *= max(1.1, (error.blocks / room) ** 0.5)
+    if voxel > asked:
+        reporter.warning(
+            f"The memory is enough for {size / voxel:.0f} voxels along the longest side, not for the "
+            f"{size / asked:.0f} that the photos allow; the mesh is coarser."
+        )
+    return field
+
+
+def _extent(views: SeesObjects, classes: Sequence[int]) -> _Extent:
+    """Where the object is, from all the pixels that show it."""
+    points, pixels, nearest = [np.zeros((0, 3))], [np.zeros(0)], np.inf
+    for index in views.indices:
+        view = views.object_view(index, classes)
+        if view is None:
+            continue
+        depth = own_depth(view)
+        v, u = np.nonzero(depth)
+        d = depth[v, u].astype(np.float64)
+        points.append(_lifted(view.camera, u + 0.5, v + 0.5, d))
+        pixels.append(d / view.camera.K[0, 0])
+        nearest = min(nearest, d.min(initial=np.inf))
+    every = np.concatenate(points)
+    if len(every) < 8:
+        raise NoSurface("No view shows enough of it: it is hidden, out of view or too small to be seen.")
+    low, high = np.quantile(every, (0.01, 0.99), axis=0)
+    return _Extent(every, low, high, float(np.median(np.concatenate(pixels))), float(nearest))
+
+
+def _lifted(camera: Camera, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """The points (n, 3) at `depth` in the pixels (u, v)."""
+    K = camera.K
+    local = np.stack([(u - K[0, 2]) / K[0, 0] * depth, (v - K[1, 2]) / K[1, 1] * depth, depth], 1)
+    return (local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+
+
+class _TooMany(Exception):
+    def __init__(self, blocks: int) -> None:
+        self.blocks = blocks
+
+
+class _Fusion:
+    def __init__(
+        self, views: SeesObjects, classes: Sequence[int], extent: _Extent, voxel: float, room: int, reporter: Reporter
+    ) -> None:  # fmt: skip
+        self.views = views
+        self.classes = classes
+        self.extent = extent
+        self.voxel = voxel
+        self.room = room
+        self.reporter = reporter
+        self.reach = max(_REACH_VOXELS * voxel, _REACH_PIXELS * extent.pixel)
+        self.back = max(_BACK_VOXELS * voxel, _BACK_PIXELS * extent.pixel)
+        self.origin = (extent.low + extent.high) / 2
+        self.sights: dict[int, Sight] = {}
+        # Beyond this box nothing is closed and nothing is seen: the object ends there.
+        pad = (extent.high - extent.low).max() * 0.5 + 4 * self.reach
+        self.box = np.stack([extent.low - pad - self.origin, extent.high + pad - self.origin]) / (SIDE * voxel)
+        self.rounds = 0
+
+    def run(self) -> Field:
+        blocks = Blocks(self._touched())
+        self._check(len(blocks))
+        total, weights = self._integrated(blocks.coords)
+        winding = self._seen_surface(blocks, total, weights)
+        values = self._finished(blocks.coords, total, weights, winding)
+        seen = weights >= _SEEN
+        fresh = np.arange(len(blocks))
+        while True:
+            coords = self._missing(blocks, values, fresh)
+            if not len(coords):
+                break
+            self._check(len(blocks) + len(coords))
+            total, weights = self._integrated(coords)
+            fresh = np.arange(len(blocks), len(blocks) + len(coords))
+            blocks = blocks.joined(coords)
+            values = np.concatenate([values, self._finished(coords, total, weights, winding)])
+            seen = np.concatenate([seen, weights >= _SEEN])
+            self.rounds += 1
+        return Field(self.origin, self.voxel, blocks, values, seen)
+
+    def _check(self, blocks: int) -> None:
+        if blocks > self.room:
+            raise _TooMany(blocks)
+
+    def _touched(self) -> np.ndarray:
+        """The blocks within reach of a point that was seen."""
+        points = (self.extent.points - self.origin) / self.voxel
+        coarse = distinct(np.floor(points).astype(np.int64))
+        offset = self.reach / self.voxel
+        corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * offset
+        found = [distinct(np.floor((coarse + 0.5 + corner) / SIDE).astype(np.int64)) for corner in corners]
+        return self._in_box(distinct(np.concatenate(found)))
+
+    def _in_box(self, coords: np.ndarray) -> np.ndarray:
+        return coords[((coords >= np.floor(self.box[0])) & (coords <= self.box[1])).all(1)]
+
+    def _sight(self, index: int) -> Sight:
+        if index not in self.sights:
+            scene = self.views.scene_map(index)
+            view = self.views.object_view(index, self.classes)
+            margin = 0
+            if view is not None:
+                margin = int(np.ceil(self.reach * scene.camera.K[0, 0] / max(self.extent.nearest, 1e-9))) + 1
+            self.sights[index] = look(scene, view, min(margin, 64), 2 * self.reach)
+        return self.sights[index]
+
+    def _integrated(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        total = np.zeros((len(coords), SAMPLES), np.float32)
+        weights = np.zeros((len(coords), SAMPLES), np.float32)
+        for done, index in enumerate(self.views.indices):
+            add(self._sight(index), self.origin, self.voxel, coords, self.reach, self.back, total, weights)
+            if not self.rounds:
+                self.reporter.progress(done + 1, len(self.views.indices) + 1)
+        if self.rounds:
+            self.reporter.progress(len(self.views.indices), len(self.views.indices) + 1)
+        return total, weights
+
+    def _seen_surface(self, blocks: Blocks, total: np.ndarray, weights: np.ndarray) -> Winding:
+        values = _nudged(total / np.maximum(weights, 1e-9) / self.voxel)
+        vertices, faces, _ = march(blocks, values, weights >= _SEEN, closed=False)
+        vertices, faces = largest_parts(vertices, faces)
+        if not len(faces):
+            raise NoSurface("The views see too little of it, or do not agree on where it is.")
+        return Winding(vertices, faces)
+
+    def _finished(self, coords: np.ndarray, total: np.ndarray, weights: np.ndarray, winding: Winding) -> np.ndarray:
+        """Distances in voxels, where they are not seen from the winding number."""
+        values = total / np.maximum(weights, 1e-9) / self.voxel
+        unsure = weights < _SURE
+        reach = self.reach / self.voxel
+        size = (self.extent.high - self.extent.low).mean() / self.voxel
+        closing = np.clip((0.5 - winding.at(coords, unsure)) * size, -reach, reach)
+        share = np.minimum(weights / _SURE, 1)
+        return _nudged(share * values + (1 - share) * closing).astype(np.float32)
+
+    def _missing(self, blocks: Blocks, values: np.ndarray, fresh: np.ndarray) -> np.ndarray:
+        """The neighbours that blocks with a part of the surface lack, (n, 3)."""
+        inside = (values < 0).reshape(-1, SIDE, SIDE, SIDE)
+        near = fresh if not self.rounds else np.unique(
+            np.concatenate([fresh, *(blocks.find(blocks.coords[fresh] + step) for step in _FACES)])
+        )  # fmt: skip
+        near = near[near >= 0]
+        flat = inside[near].reshape(len(near), -1)
+        crossed = flat.any(1) & ~flat.all(1)
+        for step in _FACES:
+            beside = blocks.find(blocks.coords[near] + step)
+            known = beside >= 0
+            axis = int(np.abs(step).argmax())
+            mine, theirs = (-1, 0) if step[axis] > 0 else (0, -1)
+            differs = inside[near[known]].take(mine, axis + 1) != inside[beside[known]].take(theirs, axis + 1)
+            crossed[known] |= differs.any((1, 2))
+        around = self._in_box(distinct((blocks.coords[near[crossed]][:, None] + AROUND).reshape(-1, 3)))
+        return around[blocks.find(around) < 0]
+
+
+_FACES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+
+
+def _nudged(values: np.ndarray) -> np.ndarray:
+    """Never 0, so that no two vertices coincide."""
+    return np.where(values < 0, np.minimum(values, -1e-3), np.maximum(values, 1e-3)).astype(np.float32)
+
+
+def largest_parts(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The connected parts of a surface that are no floaters."""
+    keep = faces[of_size(vertices, faces)]
+    return compact(vertices, keep)
+
+
+def of_size(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(F,) bool: faces of connected parts whose area is at least SMALLEST_PART of the largest part's."""
+    count, part = parts(faces, len(vertices))
+    if not count:
+        return np.zeros(0, bool)
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    area = np.bincount(part, np.linalg.norm(np.cross(b - a, c - a), axis=1), count)
+    return (area >= SMALLEST_PART * area.max())[part]

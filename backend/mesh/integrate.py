@@ -1,0 +1,196 @@
+"""Adding what one view sees to the samples of a sparse signed distance field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import prange
+from scipy.ndimage import distance_transform_edt
+
+from ..raster import Camera
+from ..raster.kernel import kernel
+from .blocks import SAMPLES, SIDE
+from .views import ALPHA_SEEN, ObjectView, SceneMap
+
+_MIN_SLOPE = 0.15
+
+
+@dataclass(frozen=True)
+class Sight:
+    """One view as evidence about one object.
+
+    front (H, W) float32: how far one sees, along z, infinite where nothing is. In a rectangle (h, w) whose upper left
+    is (x, y): own, the object's depth where the object is what one sees, else 0; slope, how much nearer to the surface
+    a step along z leads there; weight of the pixel; beside (h, w), pixels from there to the object's outline.
+    """
+
+    camera: Camera
+    front: np.ndarray
+    x: int
+    y: int
+    own: np.ndarray
+    slope: np.ndarray
+    weight: np.ndarray
+    beside: np.ndarray
+
+
+def own_depth(view: ObjectView) -> np.ndarray:
+    """The object's depth (h, w) where it is what one sees, elsewhere 0."""
+    return np.where(view.visible * view.alpha >= ALPHA_SEEN, view.depth, np.float32(0))
+
+
+def look(scene: SceneMap, view: ObjectView | None, margin: int, jump: float) -> Sight:
+    """What `view` and the scene around it say; `margin`: pixels around the object in which distances to its outline
+    are known; jump: depths of neighbouring pixels that differ by more belong to different surfaces."""
+    front = np.where(scene.depth > 0, scene.depth, np.float32(np.inf))
+    if view is None:
+        nothing = np.zeros((0, 0), np.float32)
+        return Sight(scene.camera, front, 0, 0, nothing, nothing, nothing, nothing)
+    height, width = front.shape
+    x0, y0 = max(view.x - margin, 0), max(view.y - margin, 0)
+    x1, y1 = min(view.x + view.alpha.shape[1] + margin, width), min(view.y + view.alpha.shape[0] + margin, height)
+    own = np.zeros((y1 - y0, x1 - x0), np.float32)
+    inner = own[view.y - y0 :, view.x - x0 :]
+    inner[: view.alpha.shape[0], : view.alpha.shape[1]] = own_depth(view)
+    seen = own > 0
+    if seen.any():
+        beside = np.maximum(distance_transform_edt(~seen) - 0.5, 0).astype(np.float32)
+    else:
+        beside = np.full(own.shape, max(margin, 1), np.float32)
+    K = scene.camera.K
+    slope = np.zeros_like(own)
+    weight = np.zeros_like(own)
+    _slopes(own, K[0, 0], K[1, 1], K[0, 2] - x0, K[1, 2] - y0, jump, slope, weight)
+    return Sight(scene.camera, front, x0, y0, own, slope, weight, beside)
+
+
+@kernel(parallel=True)
+def _slopes(own, fx, fy, cx, cy, jump, slope, weight):
+    """slope: the cosine between ray and normal times the ray's length for a step of 1 along z."""
+    height, width = own.shape
+    for v in prange(height):
+        for u in range(width):
+            d = own[v, u]
+            if d == 0.0:
+                continue
+            # Differences of the depth over one pixel, from the sides that lie on the same surface.
+            du = 0.0
+            dv = 0.0
+            sides_u = 0
+            sides_v = 0
+            for s in (-1, 1):
+                if 0 <= u + s < width and own[v, u + s] > 0 and abs(own[v, u + s] - d) < jump:
+                    du += s * (own[v, u + s] - d)
+                    sides_u += 1
+                if 0 <= v + s < height and own[v + s, u] > 0 and abs(own[v + s, u] - d) < jump:
+                    dv += s * (own[v + s, u] - d)
+                    sides_v += 1
+            x = (u + 0.5 - cx) / fx
+            y = (v + 0.5 - cy) / fy
+            if sides_u:
+                du /= sides_u
+            if sides_v:
+                dv /= sides_v
+            # Point (x d, y d, d): derivatives by u and v, and their cross product, the normal.
+            ux, uy, uz = d / fx + x * du, y * du, du
+            vx, vy, vz = x * dv, d / fy + y * dv, dv
+            nx = uy * vz - uz * vy
+            ny = uz * vx - ux * vz
+            nz = ux * vy - uy * vx
+            length = np.sqrt(nx * nx + ny * ny + nz * nz)
+            ray = np.sqrt(x * x + y * y + 1.0)
+            along = abs(nx * x + ny * y + nz) / max(length, 1e-30)
+            slope[v, u] = max(along, _MIN_SLOPE * ray)
+            weight[v, u] = max(along / ray, _MIN_SLOPE)
+            if sides_u < 2 or sides_v < 2:
+                weight[v, u] *= 0.5
+
+
+def add(
+    sight: Sight, origin: np.ndarray, voxel: float, coords: np.ndarray, reach: float, back: float,
+    total: np.ndarray, weights: np.ndarray,
+) -> None:  # fmt: skip
+    """Add a view to the samples of the blocks `coords` (B, 3): total and weights (B, 512) float32.
+
+    Distances are in scene units, cut off at `reach` in front of the surface; samples more than `back` behind it are
+    not touched, nor are those behind what another object hides.
+    """
+    viewmat, intrinsics = sight.camera.arrays()
+    _add(
+        viewmat, intrinsics, float(sight.camera.near), sight.front, sight.x, sight.y, sight.own, sight.slope,
+        sight.weight, sight.beside, np.asarray(origin, np.float64), float(voxel), coords, float(reach), float(back),
+        total, weights,
+    )  # fmt: skip
+
+
+@kernel(parallel=True)
+def _add(
+    viewmat, intrinsics, near, front, x0, y0, own, slope, weight, beside, origin, voxel, coords, reach, back,
+    total, weights,
+):  # fmt: skip
+    fx, fy, cx, cy = intrinsics
+    height, width = front.shape
+    h, w = own.shape
+    half = 0.5 * (SIDE - 1) * voxel
+    radius = half * np.sqrt(3.0)
+    for b in prange(coords.shape[0]):
+        corner = np.empty(3)
+        centre = np.empty(3)
+        for i in range(3):
+            corner[i] = origin[i] + coords[b, i] * SIDE * voxel
+            centre[i] = corner[i] + half
+        z = viewmat[2, 0] * centre[0] + viewmat[2, 1] * centre[1] + viewmat[2, 2] * centre[2] + viewmat[2, 3]
+        if z + radius <= near:
+            continue
+        if z > 2 * radius:
+            x = viewmat[0, 0] * centre[0] + viewmat[0, 1] * centre[1] + viewmat[0, 2] * centre[2] + viewmat[0, 3]
+            y = viewmat[1, 0] * centre[0] + viewmat[1, 1] * centre[1] + viewmat[1, 2] * centre[2] + viewmat[1, 3]
+            u, v = fx * x / z + cx, fy * y / z + cy
+            # No point of the sphere around the block projects farther from its centre than this.
+            spread = 2 * radius / z * (1 + max(abs(x), abs(y)) / z)
+            if u + fx * spread < 0 or u - fx * spread > width or v + fy * spread < 0 or v - fy * spread > height:
+                continue
+        for n in range(SAMPLES):
+            px = corner[0] + (n // (SIDE * SIDE)) * voxel
+            py = corner[1] + (n // SIDE % SIDE) * voxel
+            pz = corner[2] + (n % SIDE) * voxel
+            z = viewmat[2, 0] * px + viewmat[2, 1] * py + viewmat[2, 2] * pz + viewmat[2, 3]
+            if z <= near:
+                continue
+            u = fx * (viewmat[0, 0] * px + viewmat[0, 1] * py + viewmat[0, 2] * pz + viewmat[0, 3]) / z + cx
+            v = fy * (viewmat[1, 0] * px + viewmat[1, 1] * py + viewmat[1, 2] * pz + viewmat[1, 3]) / z + cy
+            if not (0 <= u < width and 0 <= v < height):
+                continue
+            iu, iv = int(u), int(v)
+            ru, rv = iu - x0, iv - y0
+            inside = 0 <= ru < w and 0 <= rv < h
+            if inside and own[rv, ru] > 0:
+                d = own[rv, ru]
+                # Between four pixels of one surface the depth is interpolated.
+                su, sv = u - 0.5 - x0, v - 0.5 - y0
+                au, av = int(np.floor(su)), int(np.floor(sv))
+                if 0 <= au < w - 1 and 0 <= av < h - 1:
+                    d00, d01, d10, d11 = own[av, au], own[av, au + 1], own[av + 1, au], own[av + 1, au + 1]
+                    low = min(min(d00, d01), min(d10, d11))
+                    high = max(max(d00, d01), max(d10, d11))
+                    if low > 0 and (high - low) * slope[rv, ru] < reach:
+                        tu, tv = su - au, sv - av
+                        d = (d00 * (1 - tu) + d01 * tu) * (1 - tv) + (d10 * (1 - tu) + d11 * tu) * tv
+                distance = (d - z) * slope[rv, ru]
+                if distance <= -back:
+                    continue
+                gain = weight[rv, ru]
+                if distance < 0:
+                    gain *= 1 + distance / back
+                total[b, n] += gain * min(distance, reach)
+                weights[b, n] += gain
+            else:
+                ahead = front[iv, iu] - z
+                if ahead <= 0:
+                    continue
+                distance = min(reach, ahead)
+                if inside:
+                    distance = min(distance, beside[rv, ru] * z / fx)
+                total[b, n] += distance
+                weights[b, n] += 1.0
