@@ -175,6 +175,10 @@ def parser() -> argparse.ArgumentParser:
         "splats.ply is a fit (explicit)",
     )  # fmt: skip
     finer.add_argument(
+        "--primitive", choices=("3d", "2d"), default="3d",
+        help="2d: flat splats, which lie on the surfaces; splats.ply holds them as thin Gaussians (3d)",
+    )  # fmt: skip
+    finer.add_argument(
         "--sh-degree", type=int, choices=(0, 1, 2, 3), default=1,
         help="how much colour may change with direction, in explicit mode; 0: not at all (1)",
     )  # fmt: skip
@@ -188,6 +192,12 @@ def parser() -> argparse.ArgumentParser:
     finer.add_argument("--max-anchors", type=_count, metavar="N", help="growth stops there (200000)")
     finer.add_argument(
         "--semantic-weight", type=_weight, metavar="W", help="how much masks count; 0.01 for poor ones (0.1)"
+    )
+    finer.add_argument(
+        "--normal-weight", type=_weight, metavar="W", help="how smooth a surface flat splats make (0.05)"
+    )
+    finer.add_argument(
+        "--distortion-weight", type=_weight, metavar="W", help="how much flat splats are drawn to one depth (0)"
     )
     finer.add_argument("--unlabelled-is-object", action="store_true", help="ID 0 is an object too, not just unlabelled")
 

@@ -67,6 +67,9 @@ def _train_a_little(place: Path, reporter: StoppingReporter) -> None:
     quiet = Reporter()
     capture = load_capture(capture_folder, folder.cache, reporter=quiet)
     ids = vote_points(capture, reporter=quiet).ids
+    discs = Trainer.start(capture, ids, Settings(offsets=2, primitive="2d"))
+    for share in (0.0, 1.0):
+        discs.step(share)
     trainer = Trainer.start(capture, ids, Settings(offsets=2))
     trainer.run(Budget(steps=STEPS), folder.checkpoint, quiet, stop=reporter.stop)
     _mesh_a_little(trainer)

@@ -36,7 +36,7 @@ class Gaussians:
 @dataclass
 class Frame:
     """A picture and what its gradient needs. color (3, H, W), transmittance (H, W); if asked weight, depth, median
-    (H, W), normals (3, H, W) and moments (2, H, W), the summed weights over depth and over its square."""
+    (H, W), normals (3, H, W) and moments (2, H, W), see `blend`."""
 
     gaussians: Gaussians
     camera: Camera

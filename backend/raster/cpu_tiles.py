@@ -157,7 +157,8 @@ def blend(
 
     tilts: None, or those of discs. weight: the summed w_i of splats whose id equals the pixel's label. depth: the
     summed w_i z_i. median: the z_i with which T falls below 1/2, 0 where it never does. Of discs alone: normals
-    (3, H, W), the summed w_i n_i, and moments (2, H, W), the summed w_i / z_i and w_i / z_i^2.
+    (3, H, W), the summed w_i n_i, and moments (2, H, W), the summed w_i m_i and w_i m_i^2 of m = 1 / z less that of the
+    first splat drawn, so that nothing cancels where depths differ little.
     ends (T,): how many members of each tile were needed, for `blend_backward`.
     """
     columns = (transmittance.shape[1] + TILE_W - 1) // TILE_W
@@ -183,7 +184,7 @@ def _blend_tile(
     tile_y = (tile // columns) * TILE_H
     rows = min(TILE_H, height - tile_y)
     cols = min(TILE_W, width - tile_x)
-    planes = np.zeros((7 if tilts is None else 12) * plane, np.float32)
+    planes = np.zeros((7 if tilts is None else 13) * plane, np.float32)
     T = planes[:plane]
     red = planes[plane : 2 * plane]
     green = planes[2 * plane : 3 * plane]
@@ -287,6 +288,9 @@ def _blend_tile(
                         _add(extra, at + 2 * plane, w * normal_z)
                     if want_moments:
                         inverse = per_z * simd.where(plane_drawn, q, one)
+                        origin = simd.where(simd.at_least(t, one), inverse, simd.load(extra, at + 5 * plane))
+                        simd.store(extra, at + 5 * plane, origin)
+                        inverse = inverse - origin
                         _add(extra, at + 3 * plane, w * inverse)
                         _add(extra, at + 4 * plane, w * inverse * inverse)
     ends[tile] = last - first
@@ -355,7 +359,7 @@ def _blend_backward_tile(
     tile_y = (tile // columns) * TILE_H
     rows = min(TILE_H, height - tile_y)
     cols = min(TILE_W, width - tile_x)
-    planes = np.zeros((8 if tilts is None else 13) * plane, np.float32)
+    planes = np.zeros((8 if tilts is None else 14) * plane, np.float32)
     T = planes[:plane]
     remaining = planes[plane : 2 * plane]
     gr = planes[2 * plane : 3 * plane]
@@ -515,9 +519,11 @@ def _blend_backward_tile(
                         g_q = g_q - wd * z * per_q
                     if want_moments:
                         inverse = per_z * simd.where(plane_drawn, q, one)
+                        origin = simd.where(simd.at_least(t, one), inverse, simd.load(extra, at + 5 * plane))
+                        simd.store(extra, at + 5 * plane, origin)
                         g1 = simd.load(extra, at + 3 * plane)
-                        g2 = inverse * simd.load(extra, at + 4 * plane)
-                        dot = dot + inverse * (g1 + g2)
+                        g2 = (inverse - origin) * simd.load(extra, at + 4 * plane)
+                        dot = dot + (inverse - origin) * (g1 + g2)
                         g1 = w * per_z * (g1 + g2 + g2)
                         sum_z = sum_z - g1 * inverse
                         g_q = g_q + simd.keep(plane_drawn, g1)

@@ -70,6 +70,7 @@ def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolera
         loss64.backward()
         for name in NAMES:
             a, b = fast[name].grad.double(), slow[name].grad
+            b = torch.zeros_like(a) if b is None else b
             assert torch.isfinite(a).all(), name
             largest = b.abs().max().item()
             relative = 10 * gradient_tolerance
