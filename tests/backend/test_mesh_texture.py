@@ -1,0 +1,321 @@
+"""Meshes drawn, unwrapped and dressed: against geometry worked out by hand and scenes of known colours."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from backend.mesh.atlas import fill, find_texels
+from backend.mesh.surface import Surface
+from backend.mesh.texture import dress, texture_size
+from backend.mesh.unwrap import unwrap
+from backend.mesh.zbuffer import draw_mesh
+from backend.protocol import Cancelled, Reporter
+from backend.raster import Camera
+
+
+def camera_at(eye, target=(0.0, 0.0, 0.0), width=64, height=48, focal=60.0) -> Camera:
+    forward = np.asarray(target, np.float64) - eye
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0] if abs(forward[2]) < 0.9 else [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    return Camera(
+        viewmat, np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float64), width, height
+    )
+
+
+def test_each_pixel_sees_what_a_ray_hits_first():
+    mesh = trimesh.util.concatenate(
+        [trimesh.creation.icosphere(2, 1.0), trimesh.creation.box((3.0, 0.4, 0.4)), trimesh.creation.torus(1.6, 0.2)]
+    )
+    camera = camera_at(np.array([2.5, -3.0, 1.8]), width=61, height=45)
+    depth, face, weights = draw_mesh(mesh.vertices, mesh.faces, camera)
+    y, x = np.mgrid[: camera.height, : camera.width].reshape(2, -1) + 0.5
+    rays = np.stack([(x - camera.K[0, 2]) / 60, (y - camera.K[1, 2]) / 60, np.ones_like(x)], 1) @ camera.viewmat[:3, :3]
+    corners = mesh.vertices[mesh.faces]
+    nearest, hit = np.full(len(rays), np.inf), np.full(len(rays), -1)
+    for f, (a, b, c) in enumerate(corners):
+        normal = np.cross(b - a, c - a)
+        t = ((a - camera.centre) @ normal) / (rays @ normal)
+        p = camera.centre + t[:, None] * rays
+        inside = np.all([np.cross(q - o, p - o) @ normal >= 0 for o, q in ((a, b), (b, c), (c, a))], axis=0)
+        closer = inside & (t > 0) & (t < nearest)
+        nearest[closer], hit[closer] = t[closer], f
+    assert (face.ravel() == hit).mean() > 0.998 and (hit >= 0).mean() > 0.2
+    same = (face.ravel() == hit) & (hit >= 0)
+    np.testing.assert_allclose(depth.ravel()[same], nearest[same], rtol=1e-6)
+    assert (depth[face < 0] == 0).all()
+    points = np.einsum("nij,ni->nj", corners[face.ravel()[same]], weights.reshape(-1, 3)[same].astype(np.float64))
+    np.testing.assert_allclose(points, camera.centre + nearest[same, None] * rays[same], atol=1e-5)
+
+
+def test_faces_that_reach_behind_the_camera_or_have_no_area():
+    camera = camera_at(np.zeros(3), (0.0, 1.0, 0.0))
+    floor = np.array([[-90, -90, -0.5], [90, -90, -0.5], [90, 90, -0.5], [-90, 90, -0.5]], np.float64)
+    depth, face, weights = draw_mesh(floor, np.array([[0, 1, 2], [0, 2, 3]]), camera)
+    assert (face[25:] >= 0).all() and (face[:24] < 0).all()
+    np.testing.assert_allclose(depth[47], 0.5 * 60 / 23.5, rtol=1e-6)
+    behind = floor - [0, 100, 0]
+    assert (draw_mesh(behind, np.array([[0, 1, 2]]), camera)[1] < 0).all()
+    broken = np.array([[0, 1, 0], [0, 1, 0], [1, 1, 0], [np.nan, 1, 0], [2, 1, 0], [0, 0, 0]], np.float64)
+    flat = np.array([[0, 1, 2], [0, 2, 4], [2, 3, 4], [5, 5, 5], [5, 0, 2]])
+    depth, face, weights = draw_mesh(broken, flat, camera)
+    assert (face < 0).all() and np.isfinite(depth).all() and np.isfinite(weights).all()
+    depth, face, weights = draw_mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32), camera)
+    assert depth.shape == face.shape == (48, 64) and (face < 0).all()
+
+
+def test_no_pixel_falls_between_faces_and_the_first_of_equal_faces_wins():
+    mesh = trimesh.creation.icosphere(4, 1.0)
+    _, face, _ = draw_mesh(mesh.vertices, mesh.faces, camera_at(np.zeros(3), (1.0, 1.0, 0.0)))
+    assert (face >= 0).all()
+    camera = camera_at(np.array([3.0, 0.5, 0.2]))
+    _, once, _ = draw_mesh(mesh.vertices, mesh.faces, camera)
+    _, twice, _ = draw_mesh(mesh.vertices, np.concatenate([mesh.faces, mesh.faces]), camera)
+    np.testing.assert_array_equal(once, twice)
+
+
+def surface_of(mesh: trimesh.Trimesh) -> Surface:
+    return Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int32), np.zeros(len(mesh.faces), bool))
+
+
+def areas(uvs: np.ndarray) -> np.ndarray:
+    a, b = uvs[:, 1] - uvs[:, 0], uvs[:, 2] - uvs[:, 0]
+    return (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
+
+
+@pytest.mark.parametrize("size", [1024, 4096])
+def test_layout_is_free_of_overlaps_and_proportional_to_area(size):
+    mesh = trimesh.creation.torus(1.0, 0.3, major_sections=60, minor_sections=30)
+    mesh.vertices += np.random.default_rng(0).normal(0, 0.004, mesh.vertices.shape)
+    uvs = unwrap(surface_of(mesh), size)
+    assert uvs.shape == (len(mesh.faces), 3, 2) and uvs.dtype == np.float32
+    assert uvs.min() >= 0 and uvs.max() <= 1
+    flat = areas(uvs.astype(np.float64))
+    assert (flat > 0).all()  # none mirrored
+    assert flat.sum() > 0.35
+    ratio = flat / mesh.area_faces
+    assert ratio.std() / ratio.mean() < 0.35
+    # A texel whose centre lies in two faces would be an overlap: then the areas add up to more than what is covered.
+    texels = find_texels(uvs, 512, 0, 512)
+    covered = (texels.weights >= 0).all(1).sum() / 512**2
+    np.testing.assert_allclose(covered, flat.sum(), rtol=0.02)
+
+
+def test_a_tiny_mesh_and_faces_without_area_are_unwrapped():
+    tetrahedron = trimesh.Trimesh(
+        np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]) * 1e-4 + 7,
+        [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]],
+    )
+    uvs = unwrap(surface_of(tetrahedron), 1024)
+    np.testing.assert_allclose(areas(uvs) / tetrahedron.area_faces, areas(uvs).sum() / tetrahedron.area, rtol=0.05)
+    vertices = np.vstack([tetrahedron.vertices, tetrahedron.vertices[:2].mean(0)])
+    faces = np.vstack([tetrahedron.faces, [[0, 4, 1], [0, 0, 0], [0, 1, 1]]]).astype(np.int32)
+    uvs = unwrap(Surface(vertices, faces, np.zeros(len(faces), bool)), 1024)
+    assert np.isfinite(uvs).all() and (areas(uvs[:4]) > 0).all() and np.abs(areas(uvs[4:])).max() < 1e-6
+    line = Surface(np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0.0]]), np.array([[0, 1, 2]], np.int32), np.zeros(1, bool))
+    assert np.isfinite(unwrap(line, 1024)).all()
+    nothing = Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros(0, bool))
+    assert unwrap(nothing, 1024).shape == (0, 3, 2)
+
+
+def test_texels_know_their_place_on_the_face():
+    uvs = np.array([[[0.1, 0.1], [0.6, 0.1], [0.1, 0.8]]], np.float32)
+    whole = find_texels(uvs, 64, 0, 64)
+    x, y = (whole.place % 64 + 0.5) / 64, 1 - (whole.place // 64 + 0.5) / 64
+    np.testing.assert_allclose(np.einsum("ij,nj->ni", uvs[0].T, whole.weights), np.stack([x, y], 1), atol=1e-5)
+    inside = (x > 0.1) & (y > 0.1) & ((x - 0.1) / 0.5 + (y - 0.1) / 0.7 < 1)
+    np.testing.assert_array_equal(inside, (whole.weights > 0).all(1))
+    assert (~inside).sum() > 60  # a rim of one texel around it
+    parts = [find_texels(uvs, 64, first, 24) for first in (0, 24, 48)]
+    np.testing.assert_array_equal(np.concatenate([part.place for part in parts]), whole.place)
+    np.testing.assert_allclose(np.concatenate([part.weights for part in parts]), whole.weights, atol=1e-5)
+
+
+def test_filling_continues_what_is_known():
+    values = np.zeros((33, 50, 3), np.float32)
+    known = np.zeros((33, 50), bool)
+    values[:, :20] = [0.2, 0.4, 0.6]
+    values[:, 30:] = [0.4, 0.4, 0.2]
+    known[:, :20] = known[:, 30:] = True
+    fill(values, known)
+    assert values.min() >= 0.2 - 1e-6 and values.max() <= 0.6 + 1e-6
+    np.testing.assert_allclose(values[:, 20], np.broadcast_to([0.2, 0.4, 0.6], (33, 3)), atol=0.1)
+    assert (np.diff(values[16, 18:32, 0]) >= -1e-6).all()
+    fill(values, np.zeros_like(known))
+    assert (values == 0).all()
+
+
+def colors_at(points: np.ndarray) -> np.ndarray:
+    """What the surface looks like: stripes on a gradient, (N, 3) in 0..1."""
+    waves = 0.15 * np.sin(points @ np.array([[5, 1, 0], [0, 4, 2], [2, 0, 5]]).T)
+    return np.clip(0.5 + 0.15 * points + waves, 0, 1).astype(np.float32)
+
+
+LOUD = np.array([1.0, 0.0, 1.0], np.float32)
+
+
+class StubViews:
+    """Photos of a mesh of known colours, behind another of one loud colour; class 1 is the first, class 2 the other."""
+
+    def __init__(self, mesh, other=None, eyes=24, size=160, masks=True, below=False):
+        self.downscale = 1
+        self.model = SimpleNamespace(object_ids=np.array([0, 7, 9]))
+        self.scene = self
+        angles = np.arange(eyes) * 2.4
+        heights = np.linspace(-0.9 if below else 0.1, 0.9, eyes)
+        self.cameras = [
+            camera_at(
+                4 * np.array([np.sqrt(1 - h * h) * np.cos(a), np.sqrt(1 - h * h) * np.sin(a), h]),
+                width=size, height=size * 3 // 4, focal=size * 1.2,
+            )
+            for a, h in zip(angles, heights)
+        ]  # fmt: skip
+        self.indices = tuple(i for i in range(eyes) if i % 6)
+        self.held_out = tuple(i for i in range(eyes) if i % 6 == 0)
+        self.masks = masks
+        self.pictures, self.labels, self.drawn = [], [], []
+        for camera in self.cameras:
+            image, label, drawn = self._photo(mesh, other, camera)
+            self.pictures.append(image)
+            self.labels.append(label)
+            self.drawn.append(drawn)
+
+    @staticmethod
+    def _photo(mesh, other, camera):
+        # Four samples a pixel, so that pixels at a border show both sides, as a photo's do.
+        fine = Camera(camera.viewmat, camera.K * [[2], [2], [1]], camera.width * 2, camera.height * 2)
+        depth, face, weights = draw_mesh(mesh.vertices, mesh.faces, fine)
+        image = np.full((fine.height, fine.width, 3), [0.0, 1.0, 0.0], np.float32)
+        points = np.einsum("nij,ni->nj", mesh.vertices[mesh.faces[face[face >= 0]]], weights[face >= 0])
+        image[face >= 0] = colors_at(points)
+        label = np.where(face >= 0, 1, 0)
+        if other is not None:
+            before, hit, _ = draw_mesh(other.vertices, other.faces, fine)
+            hides = (hit >= 0) & ((face < 0) | (before < depth))
+            image[hides], label[hides] = LOUD, 2
+        image = image.reshape(camera.height, 2, camera.width, 2, 3).mean((1, 3))
+        depth, face, _ = draw_mesh(mesh.vertices, mesh.faces, camera)
+        return image, label[1::2, 1::2].astype(np.int32), (depth, face)
+
+    def camera(self, index, downscale=1):
+        return self.cameras[index]
+
+    def target(self, index, downscale=1):
+        labels = torch.from_numpy(self.labels[index]) if self.masks else None
+        return torch.from_numpy(np.ascontiguousarray(self.pictures[index].transpose(2, 0, 1))), labels
+
+    def scene_map(self, index):
+        assert index in self.indices
+        return SimpleNamespace(ids=self.labels[index])
+
+    def object_view(self, index, classes):
+        assert index in self.indices and list(classes) == [1]
+        depth, face = self.drawn[index]
+        alpha = (face >= 0).astype(np.float32)
+        color = np.where(face[..., None] >= 0, np.float32([0.25, 0.5, 0.75]), LOUD)
+        return SimpleNamespace(
+            camera=self.cameras[index], x=0, y=0, depth=depth, alpha=alpha, color=color, visible=alpha
+        )
+
+
+def looked_up(texture, uvs, mesh, camera):
+    """The dressed mesh through a camera: (H, W, 3) float32 and where it is, (H, W)."""
+    _, face, weights = draw_mesh(mesh.vertices, mesh.faces, camera)
+    image = np.zeros((*face.shape, 3), np.float32)
+    uv = np.einsum("nij,ni->nj", uvs[face[face >= 0]], weights[face >= 0])
+    size = len(texture)
+    x, y = (uv[:, 0] * size).astype(int), ((1 - uv[:, 1]) * size).astype(int)
+    image[face >= 0] = texture[np.clip(y, 0, size - 1), np.clip(x, 0, size - 1)] / np.float32(255)
+    return image, face >= 0
+
+
+def psnr(a, b):
+    return 10 * np.log10(1 / np.mean((a - b) ** 2))
+
+
+def test_photos_give_the_surface_its_colours_back():
+    mesh = trimesh.creation.icosphere(3, 1.0)
+    views = StubViews(mesh, below=True)
+    surface = surface_of(mesh)
+    uvs = unwrap(surface, 512)
+    texture, colors = dress(surface, uvs, 512, views, [1])
+    assert texture.shape == (512, 512, 3) and texture.dtype == np.uint8
+    for index in views.held_out:
+        image, shown = looked_up(texture, uvs, mesh, views.cameras[index])
+        whole = shown & (views.labels[index] == 1)
+        inner = whole & (views.pictures[index][..., 1] < 0.99)
+        assert psnr(image[inner], views.pictures[index][inner]) > 30
+    # Looked up between texels at the charts' edges, nothing else comes in.
+    texels = find_texels(uvs, 512, 0, 512)
+    points = np.einsum("nij,ni->nj", mesh.vertices[mesh.faces[texels.face]], texels.weights)
+    assert np.abs(texture.reshape(-1, 3)[texels.place] / 255 - colors_at(points)).max() < 0.2
+    assert colors.shape == (len(mesh.vertices), 3) and colors.dtype == np.uint8
+    np.testing.assert_allclose(colors / 255, np.broadcast_to([0.25, 0.5, 0.75], colors.shape), atol=0.01)
+
+
+@pytest.mark.parametrize("masks", [True, False])
+def test_nothing_of_an_object_in_front_comes_in(masks):
+    mesh = trimesh.creation.box((1.6, 1.6, 1.6)).subdivide().subdivide().subdivide()
+    other = trimesh.creation.icosphere(3, 0.4)
+    other.vertices += [1.3, 0.2, 0.3]
+    views = StubViews(mesh, other, masks=masks)
+    surface = surface_of(mesh)
+    uvs = unwrap(surface, 512)
+    texture, _ = dress(surface, uvs, 512, views, [1])
+    texels = find_texels(uvs, 512, 0, 512)
+    points = np.einsum("nij,ni->nj", mesh.vertices[mesh.faces[texels.face]], texels.weights)
+    color = texture.reshape(-1, 3)[texels.place] / 255
+    seen = points[:, 2] > -0.7  # no camera looks from below
+    truth = colors_at(points)
+    assert np.abs(color - truth)[seen].mean() < 0.03
+    # Loud is bright in red and blue and dark in green; nothing tends towards it, nor towards the green behind.
+    towards = ((color - truth) * (LOUD - 0.5) * 2).min(1)
+    assert towards.max() < 0.1 and (-towards)[seen].max() < 0.35
+    # The bottom continues the sides.
+    bottom = points[:, 2] < -0.79
+    assert bottom.sum() > 1000 and np.isfinite(color).all()
+    sides = color[(points[:, 2] > -0.75) & (points[:, 2] < -0.5)]
+    assert (color[bottom] >= sides.min(0) - 0.1).all() and (color[bottom] <= sides.max(0) + 0.1).all()
+
+
+def test_what_no_photo_shows_has_the_splats_colours_and_a_stop_is_heard():
+    mesh = trimesh.creation.icosphere(2, 1.0)
+    views = StubViews(mesh, eyes=6)
+    views.labels = [np.where(label == 1, 2, label) for label in views.labels]
+    surface = surface_of(mesh)
+    uvs = unwrap(surface, 64)
+    texture, _ = dress(surface, uvs, 64, views, [1])
+    np.testing.assert_allclose(
+        texture.reshape(-1, 3) / 255, np.broadcast_to([0.25, 0.5, 0.75], (64 * 64, 3)), atol=0.01
+    )
+    views.indices = ()
+    texture, colors = dress(surface, uvs, 64, views, [1])
+    assert np.ptp(texture) <= 1 and np.ptp(colors) == 0
+
+    class Stopping(Reporter):
+        def progress(self, done, total, **fields):
+            raise Cancelled("")
+
+    views.indices = (1,)
+    with pytest.raises(Cancelled):
+        dress(surface, uvs, 64, views, [1], Stopping())
+
+
+def test_size_follows_the_photos():
+    mesh = trimesh.creation.icosphere(2, 1.0)
+    views = StubViews(mesh, eyes=7, size=80)
+    assert texture_size(surface_of(mesh), views, [1]) == 1024
+    for factor, size in ((4, 1024), (8, 2048), (16, 4096), (40, 4096)):
+        views.cameras = [
+            Camera(c.viewmat, np.diag([factor, factor, 1.0]) @ c.K, c.width * factor, c.height * factor)
+            for c in StubViews(mesh, eyes=7, size=80).cameras
+        ]
+        assert texture_size(surface_of(mesh), views, [1]) == size
