@@ -9,9 +9,9 @@ from scipy.sparse import coo_matrix
 from scipy.spatial import cKDTree
 
 from ..protocol import Reporter
-from .fusion import Field, NoSurface, largest_parts, of_size
+from .fusion import Field, largest_parts, of_size
 from .marching import compact, march, parts
-from .surface import Surface
+from .surface import NoSurface, Surface
 
 FACES = 20_000
 """How many triangles a mesh has at most unless asked otherwise."""
