@@ -74,6 +74,12 @@ SSIM say how close the pictures are; mIoU, mBIoU, Dice and accuracy how well the
 objects agree with the masks. `report` shows the figures.
 """
 
+_MESH = """\
+Make a textured mesh of each object: closed, in the capture's own place and scale,
+in DIR/meshes as PLY with a PNG. Stopped, the same command goes on with what is
+missing. `evaluate` afterwards measures the meshes too.
+"""
+
 _REPORT = """\
 Write report.md, with pictures, plots and what was left out, and report.json, the
 same for programs. Run `evaluate` before, so that the report says how good it is.
@@ -169,6 +175,10 @@ def parser() -> argparse.ArgumentParser:
         "splats.ply is a fit (explicit)",
     )  # fmt: skip
     finer.add_argument(
+        "--primitive", choices=("3d", "2d"), default="3d",
+        help="2d: flat splats, which lie on the surfaces; splats.ply holds them as thin Gaussians (3d)",
+    )  # fmt: skip
+    finer.add_argument(
         "--sh-degree", type=int, choices=(0, 1, 2, 3), default=1,
         help="how much colour may change with direction, in explicit mode; 0: not at all (1)",
     )  # fmt: skip
@@ -182,6 +192,12 @@ def parser() -> argparse.ArgumentParser:
     finer.add_argument("--max-anchors", type=_count, metavar="N", help="growth stops there (200000)")
     finer.add_argument(
         "--semantic-weight", type=_weight, metavar="W", help="how much masks count; 0.01 for poor ones (0.1)"
+    )
+    finer.add_argument(
+        "--normal-weight", type=_weight, metavar="W", help="how smooth a surface flat splats make (0.05)"
+    )
+    finer.add_argument(
+        "--distortion-weight", type=_weight, metavar="W", help="how much flat splats are drawn to one depth (0)"
     )
     finer.add_argument("--unlabelled-is-object", action="store_true", help="ID 0 is an object too, not just unlabelled")
 
@@ -198,6 +214,25 @@ def parser() -> argparse.ArgumentParser:
     )
     render.add_argument("--ids", action="store_true", help="also the object IDs, as NAME.ids.png of 16 bits")
     render.add_argument("--depth", action="store_true", help="also the depth in the capture's units, as NAME.depth.npy")
+    mesh = result("mesh", "make a textured mesh of each object", _MESH, "garden-splats --objects mug can")
+    mesh.add_argument(
+        "--objects", nargs="+", metavar="OBJECT", help="names or IDs; without: every object that is not left out"
+    )
+    mesh.add_argument(
+        "--set", action="append", type=_named_set, metavar="NAME=ID,ID",
+        help="one mesh of several objects, by names or IDs; may be given again",
+    )  # fmt: skip
+    mesh.add_argument("--scene", action="store_true", help="one mesh of everything")
+    mesh.add_argument(
+        "--faces", type=_faces, default=20_000, metavar="N",
+        help="most triangles of an object; the whole scene may have five times as many (20000)",
+    )  # fmt: skip
+    mesh.add_argument("--open", action="store_true", help="leave open what no camera saw, such as undersides")
+    mesh.add_argument(
+        "--texture-size", type=int, choices=(256, 512, 1024, 2048, 4096), metavar="PIXELS",
+        help="side of the texture: 256 to 4096 (from the photos' resolution)",
+    )  # fmt: skip
+    mesh.add_argument("--restart", action="store_true", help="make meshes anew that are there already")
     result("evaluate", "measure how good the splats are", _EVALUATE, "garden-splats")
     result("report", "write a report with pictures", _REPORT, "garden-splats")
     command("doctor", "say whether everything works on this computer", _DOCTOR, "")
@@ -216,6 +251,18 @@ def _whole(text: str, least: int, wanted: str) -> int:
 
 def _count(text: str) -> int:
     return _whole(text, 1, "above 0")
+
+
+def _faces(text: str) -> int:
+    return _whole(text, 100, "from 100 on")
+
+
+def _named_set(text: str) -> tuple[str, list[str]]:
+    name, _, words = text.partition("=")
+    found = [word.strip() for word in words.split(",") if word.strip()]
+    if not name.strip() or not found:
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=ID,ID")
+    return name.strip(), found
 
 
 def _seed(text: str) -> int:

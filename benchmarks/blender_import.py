@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How long Blender is busy while a result comes in: many splats in few objects, and many objects.
+"""How long Blender is busy while a result comes in: many splats in few objects, many objects, and their meshes.
 
 Runs inside Blender or in a Python that has the bpy wheel. Times are medians of fresh files; `show` is what
 `show_result` takes, from the files to the collections, `update` the first evaluation for the viewport that follows,
-`again` bringing the same result in once more.
+`again` bringing the same result in once more. `meshes` is a small mesh for each object that is shown already, `switch`
+showing splats instead of meshes.
 
     blender -b -P benchmarks/blender_import.py -- [--json] [--splats 1000000] [--objects 1000] [--repeats 3]
 """
@@ -33,7 +34,8 @@ def extension():
         module = importlib.util.module_from_spec(spec)
         sys.modules["objectgs"] = module
         spec.loader.exec_module(module)
-    return importlib.import_module("objectgs.objectgs_addon.scene"), importlib.import_module("objectgs.backend.ply")
+    names = ("objectgs_addon.scene", "backend.ply", "backend.mesh_file")
+    return tuple(importlib.import_module(f"objectgs.{name}") for name in names)
 
 
 def write_result(folder: Path, splats: int, objects: int, write_vertices) -> None:
@@ -73,22 +75,57 @@ def write_result(folder: Path, splats: int, objects: int, write_vertices) -> Non
     (folder / "cameras.json").write_text(json.dumps(content))
 
 
+def write_meshes(folder: Path, objects: int, mesh_file) -> None:
+    """meshes/ with a closed grid of 16 x 16 vertices, 512 faces, for each object, and one small texture."""
+    place = folder / "meshes"
+    place.mkdir()
+    image = bpy.data.images.new("texture", 64, 64)
+    image.filepath_raw, image.file_format = str(place / "texture.png"), "PNG"
+    image.save()
+    picture = (place / "texture.png").read_bytes()
+    u, v = (index.reshape(-1) for index in np.mgrid[0:16, 0:16])
+    at = lambda i, j: i % 16 * 16 + j % 16  # noqa: E731
+    faces = np.concatenate([
+        np.stack([at(u, v), at(u + 1, v), at(u + 1, v + 1)], 1), np.stack([at(u, v), at(u + 1, v + 1), at(u, v + 1)], 1)
+    ])  # fmt: skip
+    across = np.stack([np.cos(u / 8 * np.pi), np.sin(u / 8 * np.pi), 0 * u], 1)
+    vertices = across * (1 + 0.4 * np.cos(v / 8 * np.pi))[:, None]
+    vertices[:, 2] = 0.4 * np.sin(v / 8 * np.pi)
+    entries = {}
+    for i in range(1, objects + 1):
+        (place / f"{i}.png").write_bytes(picture)
+        mesh_file.write_mesh(place / f"{i}.ply", mesh_file.Mesh(
+            vertices + i, across.astype(np.float32), np.full((256, 3), 100, np.uint8), faces.astype(np.int32),
+            np.zeros((512, 3, 2), np.float32), np.zeros(512, bool), f"{i}.png"))  # fmt: skip
+        entries[i] = {"name": f"thing {i}", "ids": [i], "file": f"{i}.ply", "texture": f"{i}.png", "trained_steps": 0}
+    (place / "meshes.json").write_text(json.dumps({"trained_steps": 0, "meshes": entries}))
+
+
 def measure(splats: int, objects: int, repeats: int) -> dict:
     """Seconds of `show`, `update` and `again`."""
-    scene, ply = extension()
-    times: dict[str, list[float]] = {"show": [], "update": [], "again": []}
+    scene, ply, mesh_file = extension()
+    times: dict[str, list[float]] = {name: [] for name in ("show", "update", "again", "meshes", "switch")}
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         write_result(folder, splats, objects, ply.write_vertices)
+        write_meshes(folder, objects, mesh_file)
+        meshes, away = folder / "meshes", folder / "away"
         for _ in range(repeats):
+            meshes.rename(away)
             bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
             owner = bpy.context.scene
             root = scene.show_capture(owner, folder)
             bpy.context.view_layer.update()
             for name in times:
+                if name == "meshes":
+                    away.rename(meshes)
                 start = time.perf_counter()
                 if name == "update":
                     bpy.context.view_layer.update()
+                elif name == "meshes":
+                    scene.show_meshes(root, folder)
+                elif name == "switch":
+                    scene.show_kinds(root, "splats")
                 else:
                     scene.show_result(root, folder, owner)
                 times[name].append(time.perf_counter() - start)
@@ -111,7 +148,8 @@ def main(arguments: list[str]) -> None:
     for case in ("many_splats", "many_objects"):
         row = found[case]
         print(f"{row['splats']:>9,} splats in {row['objects']:>5,} objects: shown in {row['show']:.2f} s, "
-              f"evaluated in {row['update']:.2f} s, shown again in {row['again']:.2f} s")  # fmt: skip
+              f"evaluated in {row['update']:.2f} s, shown again in {row['again']:.2f} s; "
+              f"their meshes in {row['meshes']:.2f} s, splats again in {row['switch']:.2f} s")  # fmt: skip
     if options.json:
         print(json.dumps(found))
 

@@ -14,7 +14,8 @@ LONGEST_HEADER = 1 << 26
 @dataclass(frozen=True)
 class FolderState:
     """exists: the folder is there; imported: cameras and points are; voted: objects are; steps, seconds: of the
-    checkpoint's training (0: none); trained: splats are there; capture: where the photos are, or None."""
+    checkpoint's training (0: none); trained: splats are there; capture: where the photos are, or None; meshes: how
+    many there are; stale_meshes: those of another state of the training."""
 
     exists: bool
     imported: bool
@@ -23,6 +24,8 @@ class FolderState:
     seconds: float
     trained: bool
     capture: Path | None
+    meshes: int
+    stale_meshes: int
 
 
 _known: dict[Path, tuple[tuple, FolderState]] = {}
@@ -32,16 +35,18 @@ def folder_state(folder: Path) -> FolderState:
     """What is in `folder`; cheap enough to be asked while a panel is drawn."""
     paths = Reconstruction(folder)
     checkpoint = paths.checkpoint / "model.safetensors"
+    listed = paths.meshes / "meshes.json"
     stamp = tuple(_modified(path) for path in (
-        paths.folder, paths.cameras, paths.objects, paths.splats, checkpoint))
+        paths.folder, paths.cameras, paths.objects, paths.splats, checkpoint, listed))
     before = _known.get(paths.folder)
     if before is not None and before[0] == stamp:
         return before[1]
     steps, seconds = _progress(checkpoint)
+    made = _mesh_steps(listed)
     state = FolderState(
         exists=stamp[0] is not None, imported=stamp[1] is not None and paths.points.exists(),
         voted=stamp[2] is not None, steps=steps, seconds=seconds, trained=stamp[3] is not None,
-        capture=_capture(paths.cameras))
+        capture=_capture(paths.cameras), meshes=len(made), stale_meshes=sum(at != steps for at in made))
     _known[paths.folder] = (stamp, state)
     return state
 
@@ -58,6 +63,15 @@ def _capture(cameras: Path) -> Path | None:
         return Path(json.loads(cameras.read_text(encoding="utf-8"))["capture"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
+
+
+def _mesh_steps(listed: Path) -> list:
+    """The steps of the training that each mesh was made at."""
+    try:
+        meshes = json.loads(listed.read_text(encoding="utf-8"))["meshes"].values()
+        return [entry.get("trained_steps") for entry in meshes if "file" in entry]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return []
 
 
 def _progress(checkpoint: Path) -> tuple[int, float]:

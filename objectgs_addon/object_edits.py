@@ -30,7 +30,7 @@ def fill(root) -> None:
     properties = root.objectgs
     path = Reconstruction(scene.folder_of(root)).objects
     entries = read_objects(path) if path.exists() else []
-    shown = splat_counts(root)
+    shown, faces = splat_counts(root), face_counts(root)
     active = active_item(root)
     active_id = active.object_id if active else None
     with without_callbacks():
@@ -43,6 +43,7 @@ def fill(root) -> None:
             item.chosen = not entry.left_out
             item.points = entry.points
             item.splats = shown.get(entry.id, 0)
+            item.faces = faces.get(entry.id, 0)
             item.is_merged = entry.merged_into is not None
             item.merged_into = to_stored(entry.merged_into or 0)
             _remember(item)
@@ -58,6 +59,12 @@ def splat_counts(root) -> dict[int, int]:
                        if scene.kind_of(part) == "splats")
         for object_id, collection in scene.object_collections(root).items()
     }
+
+
+def face_counts(root) -> dict[int, int]:
+    """Object ID -> how many faces the meshes in its collection have, of the objects that have any."""
+    return {object_id: sum(len(mesh.data.polygons) for mesh in meshes)
+            for object_id, meshes in scene.object_meshes(root).items()}
 
 
 def store(root) -> None:

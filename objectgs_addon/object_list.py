@@ -49,6 +49,8 @@ def describe(item, properties) -> str:
     words = [f"ID {object_id}", f"{item.points:,} points"]
     if item.splats:
         words.append(f"{item.splats:,} splats")
+    if item.faces:
+        words.append(f"{item.faces:,} faces")
     if item.is_merged:
         into = next((other.name for other in properties.objects if other.object_id == item.merged_into), "?")
         words.append(f"part of {into}")

@@ -69,23 +69,31 @@ class TrainPanel(_WithReconstruction, bpy.types.Panel):
         properties = root.objectgs
         folder = scene.folder_of(root)
         job = running.job_of(root)
-        active = job is not None and not job.is_finished
+        if job is not None and job.kind == "mesh":
+            job = None  # The panel Meshes shows it.
+        active = running.busy(folder)
         column = layout.column()
         column.enabled = not active
         column.operator("objectgs.vote", icon="GROUP_VERTEX")
         row = column.row(align=True)
         row.operator("objectgs.train", icon="PLAY", text=_train_text(folder, properties.minutes))
         row.prop(properties, "minutes", text="Minutes")
-        if active:
-            _draw_job(layout, job, running.queue.jobs.index(job))
-        else:
-            if job is not None:
-                draw_over(layout, job)
+        if job is not None:
+            _draw_job_of(layout, job)
+        if not active:
             _explain(layout, root, job)
         icon = previews.icon_of(folder)
         if icon:
             layout.template_icon(icon, scale=8.0)
             layout.operator("objectgs.show_preview", icon="IMAGE_DATA")
+
+
+def _draw_job_of(layout, job) -> None:
+    """A reconstruction's job in the panel of what it does."""
+    if job.is_finished:
+        draw_over(layout, job)
+    else:
+        _draw_job(layout, job, running.queue.jobs.index(job))
 
 
 def _train_text(folder, minutes: float) -> str:
@@ -157,6 +165,43 @@ class ObjectsPanel(_WithReconstruction, bpy.types.Panel):
         layout.prop(context.scene.objectgs, "select_whole")
 
 
+class MeshesPanel(_WithReconstruction, bpy.types.Panel):
+    bl_idname = "OBJECTGS_PT_meshes"
+    bl_label = "Meshes"
+
+    def draw(self, context):
+        layout = self.layout
+        root = context.scene.objectgs.active
+        properties = root.objectgs
+        folder = scene.folder_of(root)
+        state = folder_state(folder)
+        job = running.job_of(root)
+        column = layout.column()
+        column.enabled = not running.busy(folder)
+        column.operator("objectgs.extract_meshes", icon="MESH_DATA")
+        column.row().prop(properties, "mesh_objects", expand=True)
+        column.use_property_split = True
+        column.prop(properties, "mesh_faces")
+        column.prop(properties, "texture_size")
+        column.prop(properties, "mesh_closed")
+        column.prop(properties, "mesh_scene")
+        if job is not None and job.kind == "mesh":
+            _draw_job_of(layout, job)
+        if state.stale_meshes and not running.busy(folder):
+            write(layout, f"{state.stale_meshes} of {state.meshes} meshes are of another state of the training. "
+                          "Extract Meshes brings them up to date.", "INFO")
+        if not scene.has_shown_meshes(root):
+            return
+        layout.label(text="Show")
+        layout.row().prop(properties, "shown", expand=True)
+        for mesh in scene.scene_meshes(root):
+            row = layout.row(align=True)
+            row.label(text=mesh.name, icon="OUTLINER_OB_MESH")
+            row.prop(mesh, "hide_viewport", text="", emboss=False)
+            row.prop(mesh, "hide_render", text="", emboss=False)
+        layout.operator("objectgs.mark_assets", icon="ASSET_MANAGER")
+
+
 class DisplayPanel(_WithReconstruction, bpy.types.Panel):
     bl_idname = "OBJECTGS_PT_display"
     bl_label = "Placement and Display"
@@ -208,7 +253,7 @@ def _status_bar(bar, _context) -> None:
         row.operator("objectgs.stop_job", text="", icon="X", emboss=False)
 
 
-CLASSES = (CapturePanel, TrainPanel, SettingsPanel, ObjectsPanel, DisplayPanel, JobsPanel)
+CLASSES = (CapturePanel, TrainPanel, SettingsPanel, ObjectsPanel, MeshesPanel, DisplayPanel, JobsPanel)
 
 
 def register():

@@ -19,7 +19,7 @@ class Picker:
     def __init__(self, context, root) -> None:
         positions = [_world_positions(part) for collection in (root, *root.children_recursive)
                      for part in collection.objects
-                     if scene.kind_of(part) in ("points", "splats") and part.visible_get()]
+                     if scene.kind_of(part) in ("points", "splats", "mesh") and part.visible_get()]
         self.positions = np.concatenate(positions) if positions else np.zeros((0, 3))
         self.picked = []
         self._handler = None

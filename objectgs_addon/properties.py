@@ -18,7 +18,7 @@ from bpy.props import (
 )
 
 from . import object_edits
-from .scene import colour_points_by, kind_of
+from .scene import SHOWS, colour_points_by, kind_of, show_kinds, shown_kinds
 
 
 class ObjectItem(bpy.types.PropertyGroup):
@@ -33,6 +33,7 @@ class ObjectItem(bpy.types.PropertyGroup):
     object_id: IntProperty(name="ID", description="Value of the object's pixels in the masks")
     points: IntProperty(name="Points", description="Points of the capture that were voted to be this object")
     splats: IntProperty(name="Splats", description="Gaussian splats of this object")
+    faces: IntProperty(name="Faces", description="Faces of this object's mesh; 0 where it has none")
     is_merged: BoolProperty(name="Merged", description="Shown as a part of another object")
     merged_into: IntProperty(name="Merged into", description="ID of the object that this one is a part of")
     stored: StringProperty(name="Stored", description="What objects.json says: what a refused edit goes back to")
@@ -60,6 +61,27 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
     colour_by: EnumProperty(name="Color Points By", default="photo", items=[
         ("photo", "Photo", "Colors of the photos"), ("object", "Object", "Color of the object voted for")],
         update=lambda self, _context: colour_points_by(self.id_data, self.colour_by))
+    # Kept where files made without the extension's properties have it, too.
+    shown: EnumProperty(name="Show", items=[
+        ("splats", "Splats", "The Gaussian splats", 0),
+        ("meshes", "Meshes", "The textured meshes; objects that have none show their splats", 1),
+        ("both", "Both", "Splats and meshes in the same place", 2)],
+        get=lambda self: SHOWS.index(shown_kinds(self.id_data)),
+        set=lambda self, value: show_kinds(self.id_data, SHOWS[value]))
+    mesh_objects: EnumProperty(name="Objects", default="all", items=[
+        ("all", "All", "Every object that is not left out; merged objects become one mesh"),
+        ("selected", "Selected", "Those selected in the viewport, or else the active one of the list")])
+    mesh_scene: BoolProperty(name="Whole Scene", description=(
+        "Also one mesh of everything, hidden beside those of the objects"))
+    mesh_faces: IntProperty(
+        name="Faces", default=20_000, min=100, soft_max=200_000, step=1000,
+        description="Most triangles of an object's mesh; that of the whole scene may have five times as many")
+    mesh_closed: BoolProperty(name="Closed", default=True, description=(
+        "Close each mesh where no camera saw the object, such as its underside; the attribute \"invented\" tells "
+        "these faces"))
+    texture_size: EnumProperty(name="Texture", default="auto", items=[
+        ("auto", "Automatic", "As the photos' resolution asks for"), ("1024", "1024 px", ""), ("2048", "2048 px", ""),
+        ("4096", "4096 px", "")], description="Side of the texture of each mesh")
 
 
 def _is_reconstruction(_scene, collection) -> bool:

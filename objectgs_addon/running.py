@@ -105,7 +105,7 @@ def redraw() -> None:
 def _over(job: Job) -> None:
     if job.state is State.FAILED:
         messages.show(f"{job.title}: {job.error}", "ERROR")
-    elif job.state is State.DONE or (job.state is State.STOPPED and job.kind == "train"):
+    elif job.state is State.DONE or (job.state is State.STOPPED and job.kind in ("train", "mesh")):
         _results.append(job)
         return
     _wanted_in.pop(job, None)
@@ -215,6 +215,18 @@ def _show_result(job: Job, owner) -> bool:
     return bool(roots) or _explain(job)
 
 
+def _show_meshes(job: Job, owner) -> bool:
+    """What was made before a stop is shown, too."""
+    roots = _shown_roots(job, owner)
+    for root in roots:
+        shown = scene.show_meshes(root, job.folder)
+        job.warnings.extend(shown.warnings)
+        if shown.meshes and scene.shown_kinds(root) == "splats":
+            scene.show_kinds(root, "meshes")
+        object_edits.fill(root)
+    return bool(roots) or _explain(job)
+
+
 def _explain(job: Job) -> bool:
     """Say where the result is that has no place in the open file any more; False, since nothing has changed."""
     messages.show(f"{job.title} has ended, but its scene or collection is gone; Open Reconstruction shows "
@@ -233,7 +245,8 @@ def _import_demo(job: Job, owner) -> bool:
     return False
 
 
-_AFTER = {"demo": _import_demo, "import": _show_capture, "vote": _show_votes, "train": _show_result}
+_AFTER = {"demo": _import_demo, "import": _show_capture, "vote": _show_votes, "train": _show_result,
+          "mesh": _show_meshes}
 
 
 def _push_undo(title: str) -> None:

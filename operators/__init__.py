@@ -5,8 +5,10 @@
 def _classes():
     from . import (
         choose_objects,
+        extract_meshes,
         import_capture,
         make_demo,
+        mark_assets,
         merge_objects,
         orient,
         pause_job,
@@ -20,8 +22,8 @@ def _classes():
         vote,
     )
 
-    modules = (import_capture, make_demo, vote, train, pause_job, stop_job, show_result, show_preview, select_object,
-               solo_object, merge_objects, choose_objects, orient, set_up_backend)
+    modules = (import_capture, make_demo, vote, train, extract_meshes, pause_job, stop_job, show_result, show_preview,
+               select_object, solo_object, merge_objects, choose_objects, mark_assets, orient, set_up_backend)
     return [cls for module in modules for cls in module.CLASSES]
 
 

@@ -65,6 +65,14 @@ def capture(cls, context) -> bool:
     return False
 
 
+def training(cls, context) -> bool:
+    """Whether the active reconstruction has a trained model, which splats of another program do not bring."""
+    if folder_state(scene.folder_of(active_root(context))).steps:
+        return True
+    cls.poll_message_set("There is no training yet whose objects could become meshes; train first")
+    return False
+
+
 def objects(cls, context) -> bool:
     """Whether the active reconstruction has a list of objects."""
     if not reconstruction(cls, context):

@@ -14,7 +14,8 @@ from . import need
 class ShowResult(bpy.types.Operator):
     bl_idname = "objectgs.show_result"
     bl_label = "Reload Result"
-    bl_description = "Bring points and splats up to date with the reconstruction folder; transforms and names stay"
+    bl_description = ("Bring points, splats and meshes up to date with the reconstruction folder; transforms, names "
+                      "and materials stay")
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod

@@ -10,7 +10,7 @@ import argparse
 from collections.abc import Callable
 
 from ..stopping import StoppingReporter
-from . import check, doctor, evaluate, importing, render, report, train, vote
+from . import check, doctor, evaluate, importing, mesh, render, report, train, vote
 
 COMMANDS: dict[str, Callable[[argparse.Namespace, StoppingReporter], None]] = {
     "check": check.check,
@@ -18,6 +18,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace, StoppingReporter], None]] = {
     "vote": vote.vote,
     "train": train.train,
     "render": render.render,
+    "mesh": mesh.mesh,
     "evaluate": evaluate.evaluate,
     "report": report.report,
     "doctor": doctor.doctor,

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..evaluation import evaluate as evaluate_views
+from ..evaluation.meshes import evaluate_mesh, mesh_entries
+from ..evaluation.truth import load_truth
 from ..protocol import InputError, Reconstruction, plain, write_json
 from ..raster.draw import draw
 from ..stopping import StoppingReporter
-from .folder import open_trained
+from .folder import Trained, open_trained
 from .record import stage
 
 
 def evaluate(options: argparse.Namespace, reporter: StoppingReporter) -> None:
-    """Measure on the held-out views; leaves evaluation.json, which `report` reads."""
+    """Measure splats and meshes on the held-out views; leaves evaluation.json, which `report` reads."""
     trained = open_trained(options, reporter)
     folder, capture = trained.folder, trained.capture
     if not capture.test_indices:
@@ -30,9 +33,26 @@ def evaluate(options: argparse.Namespace, reporter: StoppingReporter) -> None:
 
     with stage(folder, "evaluate"):
         found = evaluate_views(capture, drawn, capture.test_indices, reporter, trained.scene.zero_is_object)
-    write_json(evaluation_file(folder), plain({"step": trained.progress.step, **found}))
+        meshes = _meshes(trained, reporter)
+    write_json(evaluation_file(folder), plain({"step": trained.progress.step, **found, "meshes": meshes}))
     quality = {name: value for name, value in found["quality"].items() if value is not None}
     reporter.done(**{name: round(float(value), 4) for name, value in quality.items()})
+
+
+def _meshes(trained: Trained, reporter: StoppingReporter) -> dict[str, dict[str, Any]]:
+    """The figures of every mesh that the folder holds of this state of the model."""
+    capture, folder = trained.capture, trained.folder.meshes
+    entries = mesh_entries(folder, trained.progress.step, reporter)
+    if not entries:
+        return {}
+    reporter.status(f"Measuring {len(entries)} meshes")
+    truth = load_truth(capture, capture.train_indices)
+    found = {}
+    for done, (key, entry) in enumerate(entries.items()):
+        reporter.progress(done, len(entries), what="meshes")
+        found[key] = evaluate_mesh(folder, entry, trained.scene, truth, capture.test_indices, reporter)
+    reporter.progress(len(entries), len(entries), what="meshes")
+    return found
 
 
 def evaluation_file(folder: Reconstruction) -> Path:

@@ -14,6 +14,12 @@ from PIL import Image
 
 from ..capture import load_capture
 from ..labels import vote as vote_points
+from ..mesh.extract import extract
+from ..mesh.fusion import fuse
+from ..mesh.surface import NoSurface, Surface
+from ..mesh.texture import dress
+from ..mesh.unwrap import unwrap
+from ..mesh.views import Views
 from ..protocol import Reconstruction, Reporter
 from ..raster import compile_kernels
 from ..raster.draw import draw
@@ -49,7 +55,7 @@ def try_kernels(reporter: StoppingReporter) -> None:
 
 def _mark() -> Path:
     """A file beside numba's own that says: the kernels of these sources are there, for this numba and processor."""
-    kernels = f"{digest_up_to('training')} {numba.__version__} {llvmlite.binding.get_host_cpu_name()}"
+    kernels = f"{digest_up_to('mesh')} {numba.__version__} {llvmlite.binding.get_host_cpu_name()}"
     folder = Path(numba.config.CACHE_DIR or Path(__file__).parents[1] / "raster" / "__pycache__")
     return folder / f"objectgs-{hashlib.sha256(kernels.encode()).hexdigest()[:16]}.ready"
 
@@ -61,11 +67,26 @@ def _train_a_little(place: Path, reporter: StoppingReporter) -> None:
     quiet = Reporter()
     capture = load_capture(capture_folder, folder.cache, reporter=quiet)
     ids = vote_points(capture, reporter=quiet).ids
+    discs = Trainer.start(capture, ids, Settings(offsets=2, primitive="2d"))
+    for share in (0.0, 1.0):
+        discs.step(share)
     trainer = Trainer.start(capture, ids, Settings(offsets=2))
     trainer.run(Budget(steps=STEPS), folder.checkpoint, quiet, stop=reporter.stop)
+    _mesh_a_little(trainer)
     picture = draw(trainer.model, trainer.scene.camera(0), want_depth=True)
     if not np.isfinite(picture.image).all():
         raise RuntimeError("a small training ended in a picture that is not finite")
+
+
+def _mesh_a_little(trainer: Trainer) -> None:
+    """A mesh of the first object, and looks for a tetrahedron, where that has no surface yet."""
+    views = Views(trainer.model, trainer.scene, trainer.scene.capture.train_indices)
+    with contextlib.suppress(NoSurface):
+        extract(fuse(views, [1]), faces=500)
+    corners = np.array([[0.3, 0, 0], [-0.3, 0.3, 0], [-0.3, -0.3, 0], [0, 0, 0.4]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], np.int32)
+    shape = Surface(corners, faces, np.zeros(4, bool))
+    dress(shape, unwrap(shape, 64), 64, views, [1])
 
 
 def _write_small_capture(folder: Path) -> None:

@@ -14,6 +14,8 @@ import torch
 
 from .. import __version__
 
+_PACKAGES = ("torch", "numpy", "numba", "pycolmap", "scikit-image", "manifold3d", "xatlas")
+
 
 def set_threads(threads: int | None) -> None:
     """Use so many threads in kernels and in torch (None: every core that this process may use)."""
@@ -37,7 +39,7 @@ def machine_facts() -> dict[str, Any]:
         "threads": numba.get_num_threads(),
         "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
         "device": "cpu",
-        **{name: importlib.metadata.version(name) for name in ("torch", "numpy", "numba", "pycolmap")},
+        **{name: importlib.metadata.version(name) for name in _PACKAGES},
     }
 
 

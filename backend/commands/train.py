@@ -24,6 +24,9 @@ from .kernels import have_kernels_ready
 from .record import record, record_stage, recorded, stage
 from .vote import cast_votes, votes_are_current, votes_key
 
+_COMPARED_VIEWS = 20
+"""On so many views at most the exported splats are compared with the model."""
+
 
 def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Train, resume or extend; leaves a checkpoint, previews, splats.ply and anchors.ply."""
@@ -124,11 +127,13 @@ def _left_out(folder: Reconstruction) -> list[int]:
 def _settings(options: argparse.Namespace) -> Settings:
     given = {
         "offsets": options.offsets, "max_anchors": options.max_anchors, "voxel": options.voxel,
-        "semantic_weight": options.semantic_weight,
+        "semantic_weight": options.semantic_weight, "normal_weight": options.normal_weight,
+        "distortion_weight": options.distortion_weight,
     }  # fmt: skip
     return Settings(
         seed=options.seed, mode=options.mode, sh_degree=options.sh_degree, background=options.background,
-        zero_is_object=options.unlabelled_is_object, **{k: v for k, v in given.items() if v is not None},
+        zero_is_object=options.unlabelled_is_object, primitive=options.primitive,
+        **{k: v for k, v in given.items() if v is not None},
     )  # fmt: skip
 
 
@@ -186,18 +191,25 @@ def _export(model: ObjectModel, scene: Scene, folder: Reconstruction, reporter: 
 def _write_export(model: ObjectModel, scene: Scene, folder: Reconstruction, reporter: Reporter) -> dict[str, Any]:
     reporter.status(f"Writing {folder.splats.name}")
     psnr = None
+    capture = scene.capture
     if model.explicit:
         splats, source = model.splats()
     else:
-        capture = scene.capture
         splats, source = fit_splats(model, [scene.camera(i) for i in capture.train_indices], reporter)
-        views = capture.test_indices or capture.train_indices
+    if not model.explicit or model.primitive == "2d":
+        views = (capture.test_indices or capture.train_indices)[:_COMPARED_VIEWS]
         psnr = plain(agreement(model, splats, [scene.camera(i) for i in views]))
         where = "held-out" if capture.test_indices else "training"
         how_well = "cannot be measured" if psnr is None else f"is {psnr:.1f} dB"
-        reporter.warning(
-            f"A view-dependent model has no exact splats: {folder.splats.name} is a fit, whose PSNR to the model's own "
-            f"pictures of the {where} views {how_well}."
+        what, has = (
+            ("A view-dependent model has no exact splats", "a fit")
+            if not model.explicit
+            else ("Most programs know no flat splats", "thin Gaussians instead")
+        )
+        say = reporter.status if model.explicit else reporter.warning
+        say(
+            f"{what}: {folder.splats.name} holds {has}, whose PSNR to the model's own pictures of the {where} views "
+            f"{how_well}."
         )
     for sentence in write_splats(folder.splats, splats):
         reporter.warning(sentence)

@@ -6,6 +6,7 @@ import io
 import json
 import math
 import re
+import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from PIL import Image
 
 from ..palette import object_colours
 from ..protocol import Reconstruction, plain, write_atomic, write_json
+from .mesh_pictures import save_sheet
 from .pictures import save_picture
 
 QUALITY = ("psnr", "ssim", "lpips", "miou", "mbiou", "dice", "accuracy")
@@ -108,10 +110,12 @@ def write_report(
     pictures: Sequence[tuple[str, Image.Image]] = (),
     colours: Mapping[int, Sequence[int]] | None = None,
     title: str = "Reconstruction",
+    mesh_sheet: Image.Image | None = None,
 ) -> dict[str, Any]:
     """Write report.json and report.md with its plots and `pictures` (caption, image); returns what report.json holds.
 
-    `colours` are the objects' own (id -> red, green, blue 0 .. 255) where they differ from the palette's.
+    `colours` are the objects' own (id -> red, green, blue 0 .. 255) where they differ from the palette's; `mesh_sheet`
+    is the picture of the meshes.
     """
     report = complete(report)
     reconstruction.pictures.mkdir(parents=True, exist_ok=True)
@@ -125,6 +129,11 @@ def write_report(
     for i, (caption, image) in enumerate(pictures):
         slug = re.sub(r"[^a-z0-9]+", "-", caption.lower()).strip("-")[:40]
         files.append((caption, save_picture(image, reconstruction.pictures / f"{i + 1:02d}-{slug}.png")))
+    sheet_file = reconstruction.pictures / "meshes.png"
+    if mesh_sheet is None:
+        sheet_file.unlink(missing_ok=True)
+    else:
+        save_sheet(mesh_sheet, sheet_file)
     swatches = _write_swatches(reconstruction.pictures / "swatches", shown, palette)
 
     def link(path: Path) -> str:
@@ -141,6 +150,7 @@ def write_report(
         if bars_file:
             parts.append(f"![IoU of each object]({link(bars_file)})")
         parts.append(_objects_table(shown, {i: link(path) for i, path in swatches.items()}))
+    parts += _meshes_part(report, None if mesh_sheet is None else link(sheet_file))
     parts += [*_stages_part(report), *_left_out_part(report)]
     for name, heading in (("model", "Model"), ("capture", "Capture"), ("settings", "Settings"), ("machine", "Machine")):
         rows = [(_cell(key), _value(key, value)) for key, value in report[name].items()]
@@ -197,23 +207,93 @@ def _objects_to_show(objects: list[dict[str, Any]]) -> tuple[list[dict[str, Any]
 
 
 def _objects_table(objects: list[dict[str, Any]], swatches: Mapping[int, str]) -> str:
-    meshes = any(entry["mesh"]["faces"] is not None for entry in objects)
-    head = ["", "ID", "Name", "IoU", "Anchors"] + (["Mesh faces", "Watertight", "F1"] if meshes else [])
-    rows = []
-    for entry in objects:
-        row = [
+    rows = [
+        (
             f"![]({swatches[entry['id']]})",
             str(entry["id"]),
             _cell(entry["name"]),
             _number(entry["iou"], "{:.3f}"),
             _number(entry["anchors"], "{:,.0f}"),
-        ]
-        if meshes:
-            mesh = entry["mesh"]
-            watertight = {True: "yes", False: "no"}.get(mesh["watertight"], "—")
-            row += [_number(mesh["faces"], "{:,.0f}"), watertight, _number(mesh["f1"], "{:.3f}")]
-        rows.append(row)
-    return _table(head, rows, right=(1, 3, 4, 5, 7))
+        )
+        for entry in objects
+    ]
+    return _table(("", "ID", "Name", "IoU", "Anchors"), rows, right=(1, 3, 4))
+
+
+_MESH_COLUMNS = (
+    ("Faces", "faces", "{:,.0f}"),
+    ("Watertight", "watertight", ""),
+    ("Manifold", "manifold", ""),
+    ("Parts", "components", "{:,.0f}"),
+    ("Cut faces", "self_intersections", "{:,.0f}"),
+    ("Invented", "invented", "{:.1%}"),
+    ("Chamfer", "chamfer", "{:.3g}"),
+    ("Precision", "precision", "{:.3f}"),
+    ("Recall", "recall", "{:.3f}"),
+    ("F1", "f1", "{:.3f}"),
+    ("F1 at 0.005", "f1_005", "{:.3f}"),
+    ("F1 of all", "f1_all", "{:.3f}"),
+    ("Texture", "texture_psnr", "{:.1f} dB"),
+    ("Covered", "texture_coverage", "{:.1%}"),
+)
+_MESH_INTRO = """\
+*Faces*: triangles; *watertight*: no open edges; *manifold*: and nowhere pinched; *parts*: separate pieces; \
+*cut faces*: faces that cut through others of the mesh; *invented*: the share of faces that close what nobody saw."""
+_TRUTH_INTRO = """\
+*Chamfer*, *precision*, *recall* and *F1* compare with the true surface that the capture brings along, in its units: \
+the mean distance, both ways, and the share of points that the other surface has within 0.02: of the mesh's, of the \
+truth's, and both together. They count what at least two training views see; *F1 of all* counts hidden parts too."""
+_TEXTURE_INTRO = """\
+*Texture*: PSNR of the textured mesh against held-out photos inside the object's mask; *covered*: the share of the \
+mask that the mesh covers."""
+
+
+def _meshes_part(report: dict[str, Any], sheet: str | None) -> list[str]:
+    """The section about meshes; nothing where there are none."""
+    objects = [(entry["name"], entry["mesh"]) for entry in report["objects"]]
+    named = [*objects, *((entry["name"], entry) for entry in report.get("meshes") or [])]
+    made = [(name, mesh) for name, mesh in named if mesh.get("faces") is not None]
+    without = [(name, mesh["why"]) for name, mesh in named if mesh.get("faces") is None and mesh.get("why")]
+    if not made and not without:
+        return []
+    columns = [column for column in _MESH_COLUMNS if any(mesh.get(column[1]) is not None for _, mesh in made)]
+    keys = {key for _, key, _ in columns}
+    intros = ((_MESH_INTRO, "faces"), (_TRUTH_INTRO, "f1_all"), (_TEXTURE_INTRO, "texture_psnr"))
+    parts = ["## Meshes", _mesh_summary(objects)]
+    if sheet:
+        parts.append(f"![Each mesh: surface, wires and texture]({sheet})")
+    if made:
+        rows = [[_cell(name), *(_mesh_cell(mesh.get(key), how) for _, key, how in columns)] for name, mesh in made]
+        parts.append(_table(["", *(head for head, _, _ in columns)], rows, right=range(1, 1 + len(columns))))
+        parts.append(" ".join(intro for intro, key in intros if key in keys))
+    if without:
+        parts.append(_table(("No mesh of", "Why"), [(_cell(name), _cell(why)) for name, why in without]))
+    return parts
+
+
+def _mesh_cell(value: Any, how: str) -> str:
+    if value is None:
+        return "—"
+    return how.format(value) if how else {True: "yes", False: "**no**"}[bool(value)]
+
+
+def _mesh_summary(objects: Sequence[tuple[str, dict[str, Any]]]) -> str:
+    """One sentence: how many objects have a mesh, and how good these are."""
+    made = [(name, mesh) for name, mesh in objects if mesh.get("faces") is not None]
+    facts = [f"{len(made)} of {len(objects)} objects have a mesh"]
+    for key in ("watertight", "manifold"):
+        known = [mesh[key] for _, mesh in made if mesh.get(key) is not None]
+        if known:
+            facts.append(f"{'all' if all(known) else sum(known)} {key}")
+    for key, label, how in (
+        ("f1", "median F1 at 0.02", "{:.3f}"),
+        ("texture_psnr", "median texture PSNR", "{:.1f} dB"),
+    ):
+        values = sorted((mesh[key], name) for name, mesh in made if mesh.get(key) is not None)
+        if values:
+            middle = statistics.median(value for value, _ in values)
+            facts.append(f"{label} **{how.format(middle)}**, lowest {how.format(values[0][0])} ({_cell(values[0][1])})")
+    return "; ".join(facts) + "."
 
 
 def _stages_part(report: dict[str, Any]) -> list[str]:

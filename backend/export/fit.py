@@ -122,7 +122,8 @@ class _Sums:
         g = model.generate(seen, camera.centre)
         # With black splats, the gradient of the picture's sum by their colours is how many pixels each of them fills.
         black = torch.zeros_like(g.sh).requires_grad_()
-        rasterize(g.means, g.quats, g.scales, g.opacities, black, g.ids, camera).color[0].sum().backward()
+        drawn = rasterize(g.means, g.quats, g.scales, g.opacities, black, g.ids, camera, primitive=model.primitive)
+        drawn.color[0].sum().backward()
         assert black.grad is not None
         weight = black.grad[:, 0, 0].numpy() / np.float32(SH_C0)
         source = g.source.numpy()

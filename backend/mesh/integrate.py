@@ -14,6 +14,7 @@ from .blocks import SAMPLES, SIDE
 from .views import ALPHA_SEEN, ObjectView, SceneMap
 
 _MIN_SLOPE = 0.15
+FREE = 1.0
 
 
 @dataclass(frozen=True)
@@ -119,14 +120,14 @@ def add(
     viewmat, intrinsics = sight.camera.arrays()
     _add(
         viewmat, intrinsics, float(sight.camera.near), sight.front, sight.x, sight.y, sight.own, sight.slope,
-        sight.weight, sight.beside, np.asarray(origin, np.float64), float(voxel), coords, float(reach), float(back),
+        sight.weight, sight.beside, np.asarray(origin, np.float64), float(voxel), coords, float(reach), float(back), float(FREE),
         total, weights,
     )  # fmt: skip
 
 
 @kernel(parallel=True)
 def _add(
-    viewmat, intrinsics, near, front, x0, y0, own, slope, weight, beside, origin, voxel, coords, reach, back,
+    viewmat, intrinsics, near, front, x0, y0, own, slope, weight, beside, origin, voxel, coords, reach, back, free,
     total, weights,
 ):  # fmt: skip
     fx, fy, cx, cy = intrinsics
@@ -192,5 +193,5 @@ def _add(
                 distance = min(reach, ahead)
                 if inside:
                     distance = min(distance, beside[rv, ru] * z / fx)
-                total[b, n] += distance
-                weights[b, n] += 1.0
+                total[b, n] += free * distance
+                weights[b, n] += free

@@ -14,6 +14,9 @@ from .generate import Generated, generate
 from .heads import Heads
 from .splats import Splats
 
+DISC_THICKNESS = 1e-3
+"""A disc's third scale in files, as a share of the smaller of the other two."""
+
 
 @dataclass(frozen=True)
 class Normalization:
@@ -50,13 +53,14 @@ class Normalization:
 @dataclass
 class ObjectModel:
     """anchors and heads in scene units; background (3,) linear-in-display RGB; object_ids (C,) int64: the ID behind
-    each class index; normalization to the capture's world."""
+    each class index; normalization to the capture's world; primitive: "3d" Gaussians or "2d" discs."""
 
     anchors: Anchors
     heads: Heads
     background: torch.Tensor
     object_ids: np.ndarray
     normalization: Normalization
+    primitive: str = "3d"
 
     @property
     def explicit(self) -> bool:
@@ -64,14 +68,20 @@ class ObjectModel:
         return self.heads.mode == "explicit"
 
     def generate(self, seen: np.ndarray | None = None, eye: np.ndarray | None = None) -> Generated:
-        """Gaussians of the anchors `seen` ((n,) int64; None: all), without gradients. eye: see `generate`."""
+        """Gaussians of the anchors `seen` ((n,) int64; None: all), without gradients. eye: see `generate`.
+
+        A disc gets the third scale that it has where it is taken for a 3D Gaussian.
+        """
         a = self.anchors
         pick = (lambda x: x) if seen is None else (lambda x: x[seen])
         with torch.no_grad():
-            return generate(
+            g = generate(
                 a.layout, torch.from_numpy(pick(a.positions)), torch.from_numpy(pick(a.rows)),
                 torch.from_numpy(pick(a.ids)), self.heads, eye,
             )  # fmt: skip
+            if self.primitive == "2d":
+                g.scales[:, 2] = DISC_THICKNESS * g.scales[:, :2].amin(1)
+            return g
 
     def splats(self, eye: np.ndarray | None = None) -> tuple[Splats, np.ndarray]:
         """The whole model as plain splats in world units, and source (N,) int64: anchor * offsets + offset of each.
@@ -123,8 +133,8 @@ def _in_view(positions, rows, k, viewmat, intrinsics, width, height, near, seen)
         for p in range(4):
             side = px if p < 2 else py
             distance = (planes[p, 0] * side + planes[p, 1] * pz) / np.sqrt(planes[p, 0] ** 2 + planes[p, 1] ** 2)
-            # The blur adds about two pixels at the border.
-            margin = 2.0 * max(pz, near) / min(fx, fy)
+            # The blur, or a disc's spot, adds up to 2.4 pixels at the border.
+            margin = 2.4 * max(pz, near) / min(fx, fy)
             inside = inside and distance > -reach - margin
         seen[a] = inside
 

@@ -17,13 +17,17 @@ __all__ = ["Camera", "Rendered", "compile_kernels", "object_map", "rasterize"]
 class Rendered(NamedTuple):
     """color (3, H, W) premultiplied, without background; alpha (H, W); weight (H, W): probability of the pixel's label;
     depth (H, W): expected depth times alpha; median (H, W): the depth at which half of the light is taken, 0 where less
-    is, without gradient; frame: the renderer's own record, for `object_map` and growth. None: not asked for."""
+    is, without gradient; normals (3, H, W): mean normal in camera space, towards the camera, times alpha; distortion
+    (H, W): sum_{i<j} w_i w_j (1 / z_i - 1 / z_j)^2 over the weights w; frame: the renderer's own record, for
+    `object_map` and growth. What was not asked for is None."""
 
     color: torch.Tensor
     alpha: torch.Tensor
     weight: torch.Tensor | None
     depth: torch.Tensor | None
     median: torch.Tensor | None
+    normals: torch.Tensor | None
+    distortion: torch.Tensor | None
     frame: cpu.Frame
 
 
@@ -37,7 +41,7 @@ def _tensor(array: np.ndarray | None) -> torch.Tensor | None:
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, means, quats, scales, opacities, sh, ids, camera, labels, want_depth, want_median, holder):
+    def forward(ctx: Any, means, quats, scales, opacities, sh, ids, camera, labels, wanted, holder):
         ctx.means_type = means.dtype
         if means.dtype == torch.float64:
             # Far from the origin (georeferenced captures) float32 would round positions: count from the camera.
@@ -47,23 +51,28 @@ class _Rasterize(torch.autograd.Function):
             _array(means), _array(quats), _array(scales), _array(opacities), _array(sh),
             np.ascontiguousarray(ids.numpy(), np.int32),
         )  # fmt: skip
-        wanted = None if labels is None else np.ascontiguousarray(labels.numpy(), np.int32)
-        frame = cpu.forward(gaussians, camera, wanted, want_depth, want_median)
+        label_array = None if labels is None else np.ascontiguousarray(labels.numpy(), np.int32)
+        frame = cpu.forward(gaussians, camera, label_array, **wanted)
         ctx.frame = frame
         holder.append(frame)
         median = _tensor(frame.median)
         if median is not None:
             ctx.mark_non_differentiable(median)
         alpha = torch.from_numpy(1.0 - frame.transmittance)
-        return torch.from_numpy(frame.color), alpha, _tensor(frame.weight), _tensor(frame.depth), median
+        return (
+            torch.from_numpy(frame.color), alpha, _tensor(frame.weight), _tensor(frame.depth), _tensor(frame.normals),
+            _tensor(frame.moments), median,
+        )  # fmt: skip
 
     @staticmethod
     def backward(ctx: Any, *gradients):
-        g_color, g_alpha, g_weight, g_depth = (None if g is None else _array(g) for g in gradients[:4])
-        out = cpu.backward(ctx.frame, g_color, g_alpha, g_weight, g_depth)
+        # The last plane is the median, which has none.
+        g_color, g_alpha, *others = (None if g is None else _array(g) for g in gradients[:6])
+        assert g_color is not None and g_alpha is not None
+        out = cpu.backward(ctx.frame, g_color, g_alpha, *others)
         arrays = (out.means, out.quats, out.scales, out.opacities, out.sh)
-        g_means, *others = (torch.from_numpy(a) for a in arrays)
-        return (g_means.to(ctx.means_type), *others, None, None, None, None, None, None)
+        g_means, *g_others = (torch.from_numpy(a) for a in arrays)
+        return (g_means.to(ctx.means_type), *g_others, None, None, None, None, None)
 
 
 def rasterize(
@@ -77,19 +86,36 @@ def rasterize(
     labels: torch.Tensor | None = None,
     want_depth: bool = False,
     want_median: bool = False,
+    want_normals: bool = False,
+    want_distortion: bool = False,
+    primitive: str = "3d",
 ) -> Rendered:
-    """Draw 3D Gaussians (Kerbl et al. 2023), differentiable in the first five arguments.
+    """Draw 3D Gaussians (Kerbl et al. 2023) or, with primitive "2d", discs (Huang et al. 2024), differentiable in the
+    first five arguments.
 
     means (N, 3), quats (N, 4) wxyz of any length, scales (N, 3) linear, opacities (N,) in (0, 1), sh (N, K, 3) with
     K = 1, 4, 9 or 16 (colour = 0.5 + SH, clamped at 0): float32. Means in float64 are taken relative to the camera
     before they are rounded, for scenes far from the origin. ids (N,) int32. labels (H, W) int32: also return the
     probability that each pixel shows its label (the paper's P at the label); nothing is computed that is not asked for.
+
+    A disc lies in the plane of the first two axes of its rotation; its third scale has no effect. Its depth in a pixel
+    is that where the pixel's ray meets this plane, a 3D Gaussian's that of its centre. Normals and distortion are those
+    of discs.
     """
+    if primitive not in ("2d", "3d"):
+        raise ValueError(f"primitive is {primitive!r}, expected '2d' or '3d'")
+    if primitive == "3d" and (want_normals or want_distortion):
+        raise ValueError("3D Gaussians have no normals and no distortion")
+    wanted = {
+        "want_depth": want_depth, "want_median": want_median, "want_normals": want_normals,
+        "want_moments": want_distortion, "flat": primitive == "2d",
+    }  # fmt: skip
     holder: list[cpu.Frame] = []
-    planes = _Rasterize.apply(
-        means, quats, scales, opacities, sh, ids, camera, labels, want_depth, want_median, holder
-    )  # fmt: skip
-    return Rendered(*planes, holder[0])
+    color, alpha, weight, depth, normals, moments, median = _Rasterize.apply(
+        means, quats, scales, opacities, sh, ids, camera, labels, wanted, holder
+    )
+    distortion = None if moments is None else alpha * moments[1] - moments[0] ** 2
+    return Rendered(color, alpha, weight, depth, median, normals, distortion, holder[0])
 
 
 def object_map(rendered: Rendered) -> tuple[np.ndarray, np.ndarray]:

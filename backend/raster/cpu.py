@@ -10,11 +10,13 @@ import numpy as np
 
 from .camera import Camera
 from .cpu_bin import bin_splats, depth_order
+from .cpu_discs import TILT_COLUMNS
 from .cpu_ids import most_probable
 from .cpu_project import GRADIENT_COLUMNS, HALF_H, SPLAT_COLUMNS, project, project_backward
 from .cpu_tiles import blend, blend_backward
 
 _NO_PLANE = np.zeros((1, 1), np.float32)
+_NO_PLANES = np.zeros((1, 1, 1), np.float32)
 _NO_LABELS = np.zeros((1, 1), np.int32)
 
 
@@ -33,7 +35,8 @@ class Gaussians:
 
 @dataclass
 class Frame:
-    """A picture and what its gradient needs. color (3, H, W), transmittance (H, W), weight, depth, median if asked."""
+    """A picture and what its gradient needs. color (3, H, W), transmittance (H, W); if asked weight, depth, median
+    (H, W), normals (3, H, W) and moments (2, H, W), see `blend`."""
 
     gaussians: Gaussians
     camera: Camera
@@ -43,7 +46,10 @@ class Frame:
     weight: np.ndarray | None
     depth: np.ndarray | None
     median: np.ndarray | None
+    normals: np.ndarray | None
+    moments: np.ndarray | None
     splats: np.ndarray
+    tilts: np.ndarray | None
     tiles: np.ndarray
     members: np.ndarray
     places: np.ndarray
@@ -63,32 +69,45 @@ def forward(
     labels: np.ndarray | None = None,
     want_depth: bool = False,
     want_median: bool = False,
+    want_normals: bool = False,
+    want_moments: bool = False,
+    flat: bool = False,
 ) -> Frame:
-    """Draw `gaussians`. labels (H, W) int32: also sum, per pixel, the weights of splats whose id is the label."""
+    """Draw `gaussians`, as discs if `flat`. labels (H, W) int32: also sum, per pixel, the weights of splats whose id is
+    the label. Normals and moments are those of discs."""
     g = gaussians
-    height, width = int(camera.height), int(camera.width)
-    splats = np.empty((g.means.shape[0], SPLAT_COLUMNS), np.float32)
+    count, height, width = g.means.shape[0], int(camera.height), int(camera.width)
+    splats = np.empty((count, SPLAT_COLUMNS), np.float32)
+    tilts = np.empty((count, TILT_COLUMNS), np.float32) if flat else None
+    outlines = np.empty((count, SPLAT_COLUMNS), np.float32) if flat else splats
     viewmat, intrinsics = camera.arrays()
     near = float(camera.near)
-    project(g.means, g.quats, g.scales, g.opacities, g.sh, viewmat, intrinsics, width, height, near, splats)
-    tiles, members, places, slots = bin_splats(splats, depth_order(splats, g.ids), width, height)
+    project(
+        g.means, g.quats, g.scales, g.opacities, g.sh, viewmat, intrinsics, width, height, near, splats, tilts, outlines
+    )
+    tiles, members, places, slots = bin_splats(outlines, depth_order(splats, g.ids), width, height)
+
+    def planes(wanted: bool, *shape: int) -> np.ndarray | None:
+        return np.empty((*shape, height, width), np.float32) if wanted else None
+
     color = np.empty((3, height, width), np.float32)
     transmittance = np.empty((height, width), np.float32)
-    weight = np.empty((height, width), np.float32) if labels is not None else None
-    depth = np.empty((height, width), np.float32) if want_depth else None
-    median = np.empty((height, width), np.float32) if want_median else None
+    weight, depth, median = planes(labels is not None), planes(want_depth), planes(want_median)
+    normals, moments = planes(want_normals, 3), planes(want_moments, 2)
     ends = np.empty(tiles.size - 1, np.int64)
     blend(
-        splats, g.ids, _NO_LABELS if labels is None else labels, tiles, members, labels is not None, want_depth,
-        want_median, color, transmittance, _or_none(weight), _or_none(depth), _or_none(median), ends,
+        splats, tilts, g.ids, _NO_LABELS if labels is None else labels, tiles, members, labels is not None, want_depth,
+        want_median, want_normals, want_moments, color, transmittance, _or_none(weight), _or_none(depth),
+        _or_none(median), _or_none(normals, _NO_PLANES), _or_none(moments, _NO_PLANES), ends,
     )  # fmt: skip
     return Frame(
-        g, camera, labels, color, transmittance, weight, depth, median, splats, tiles, members, places, slots, ends
-    )
+        g, camera, labels, color, transmittance, weight, depth, median, normals, moments, splats, tilts,
+        tiles, members, places, slots, ends,
+    )  # fmt: skip
 
 
-def _or_none(plane: np.ndarray | None) -> np.ndarray:
-    return _NO_PLANE if plane is None else plane
+def _or_none(plane: np.ndarray | None, none: np.ndarray = _NO_PLANE) -> np.ndarray:
+    return none if plane is None else plane
 
 
 def backward(
@@ -97,6 +116,8 @@ def backward(
     g_alpha: np.ndarray,
     g_weight: np.ndarray | None = None,
     g_depth: np.ndarray | None = None,
+    g_normals: np.ndarray | None = None,
+    g_moments: np.ndarray | None = None,
 ) -> Gaussians:
     """Gradients of a frame's Gaussians (ids are None's stand-in: left empty) from those of its planes.
 
@@ -104,12 +125,17 @@ def backward(
     """
     g, camera = frame.gaussians, frame.camera
     labels = frame.labels
-    rows = np.empty((frame.members.size, GRADIENT_COLUMNS), np.float32)
+    with_normals = frame.normals is not None and g_normals is not None
+    rows = np.empty((frame.members.size, GRADIENT_COLUMNS * (2 if with_normals else 1)), np.float32)
     blend_backward(
-        frame.splats, g.ids, _NO_LABELS if labels is None else labels, frame.tiles, frame.members, frame.places,
-        frame.ends, labels is not None and g_weight is not None, frame.depth is not None and g_depth is not None,
+        frame.splats, frame.tilts, g.ids, _NO_LABELS if labels is None else labels, frame.tiles, frame.members,
+        frame.places, frame.ends, labels is not None and g_weight is not None,
+        frame.depth is not None and g_depth is not None, with_normals,
+        frame.moments is not None and g_moments is not None,
         frame.color, frame.transmittance, _or_none(frame.weight), _or_none(frame.depth),
-        g_color, g_alpha, _or_none(g_weight), _or_none(g_depth), rows,
+        _or_none(frame.normals, _NO_PLANES), _or_none(frame.moments, _NO_PLANES),
+        g_color, g_alpha, _or_none(g_weight), _or_none(g_depth), _or_none(g_normals, _NO_PLANES),
+        _or_none(g_moments, _NO_PLANES), rows,
     )  # fmt: skip
     out = Gaussians(
         np.empty_like(g.means), np.empty_like(g.quats), np.empty_like(g.scales), np.empty_like(g.opacities),
@@ -119,7 +145,7 @@ def backward(
     viewmat, intrinsics = camera.arrays()
     project_backward(
         g.means, g.quats, g.scales, g.opacities, g.sh, viewmat, intrinsics, int(camera.width), int(camera.height),
-        frame.splats, frame.slots, rows,
+        frame.splats, frame.tilts, frame.slots, rows,
         out.means, out.quats, out.scales, out.opacities, out.sh, frame.screen_gradient,
     )  # fmt: skip
     return out
@@ -130,7 +156,7 @@ def object_map(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     shape = (frame.camera.height, frame.camera.width)
     best_id = np.empty(shape, np.int32)
     best_weight = np.empty(shape, np.float32)
-    most_probable(frame.splats, frame.gaussians.ids, frame.tiles, frame.members, best_id, best_weight)
+    most_probable(frame.splats, frame.tilts, frame.gaussians.ids, frame.tiles, frame.members, best_id, best_weight)
     return best_id, best_weight
 
 
@@ -142,7 +168,7 @@ def compile_kernels(progress: Callable[[int, int], object] | None = None) -> flo
     the kernels, or the user's own cache folder where that is not writable).
     """
     started = time.perf_counter()
-    total = 3
+    total = 6
     report = progress or (lambda done, total: None)
     report(0, total)
     ones = np.ones((1, 4), np.float32)
@@ -151,11 +177,13 @@ def compile_kernels(progress: Callable[[int, int], object] | None = None) -> flo
         np.zeros(1, np.int32),
     )  # fmt: skip
     camera = Camera(np.eye(4), np.eye(3), 2, 2)
-    frame = forward(g, camera, np.zeros((2, 2), np.int32), want_depth=True)
-    report(1, total)
-    plane = np.ones((2, 2), np.float32)
-    backward(frame, np.ones((3, 2, 2), np.float32), plane, plane, plane)
-    report(2, total)
-    object_map(frame)
-    report(3, total)
+    color, plane = np.ones((3, 2, 2), np.float32), np.ones((2, 2), np.float32)
+    for flat in (False, True):
+        done = 3 if flat else 0
+        frame = forward(g, camera, np.zeros((2, 2), np.int32), flat=flat)
+        report(done + 1, total)
+        backward(frame, color, plane, plane)
+        report(done + 2, total)
+        object_map(frame)
+        report(done + 3, total)
     return time.perf_counter() - started

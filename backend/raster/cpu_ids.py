@@ -13,8 +13,9 @@ from numba import njit, prange
 
 from . import simd
 from .cpu_bin import TILE_H, TILE_W, spread
-from .cpu_project import HALF_H, HALF_W, A
-from .cpu_tiles import ROW_SLOTS, STRIDE, live_rows, splat_rows
+from .cpu_discs import NEAREST, QX, SPOT, SPOT_U
+from .cpu_project import HALF_H, HALF_W, LOP, A, V
+from .cpu_tiles import ROW_SLOTS, STRIDE, disc_rows, live_rows, splat_rows
 from .kernel import kernel
 from .settings import ALPHA_MAX, ALPHA_MIN, STOP
 
@@ -22,6 +23,8 @@ _LOG2_CUT = np.float32(math.log2(ALPHA_MIN))
 _ALPHA_MAX = np.float32(ALPHA_MAX)
 _STOP = np.float32(STOP)
 _ONE = np.float32(1.0)
+_HALF = np.float32(0.5)
+_SPOT = np.float32(SPOT)
 _CHECK_EVERY = 32
 
 
@@ -35,111 +38,144 @@ def _contest(winner_weight, winner, at, weight, owner):
 
 
 @kernel(parallel=True)
-def most_probable(splats, ids, tiles, members, best_id, best_weight):
+def most_probable(splats, tilts, ids, tiles, members, best_id, best_weight):
     """Write best_id (H, W) int32 and best_weight (H, W) float32 = max_i P_i; ID -1 and weight 0 where nothing is drawn.
 
-    Of objects with equal weight the smallest ID wins.
+    tilts: None, or those of discs. Of objects with equal weight the smallest ID wins.
     """
+    columns = (best_id.shape[1] + TILE_W - 1) // TILE_W
+    count = tiles.size - 1
+    for index in prange(count):
+        _contest_tile(
+            spread(index, columns, count // columns), splats, tilts, ids, tiles, members, best_id, best_weight
+        )
+
+
+@kernel()
+def _contest_tile(tile, splats, tilts, ids, tiles, members, best_id, best_weight):
     height, width = best_id.shape
     columns = (width + TILE_W - 1) // TILE_W
     plane = TILE_H * STRIDE
-    for index in prange(tiles.size - 1):
-        tile = spread(index, columns, (tiles.size - 1) // columns)
-        tile_x = (tile % columns) * TILE_W
-        tile_y = (tile // columns) * TILE_H
-        rows = min(TILE_H, height - tile_y)
-        cols = min(TILE_W, width - tile_x)
-        first = tiles[tile]
-        count = tiles[tile + 1] - first
-        T = np.zeros(plane, np.float32)
-        current = np.zeros(plane, np.float32)
-        winner_weight = np.zeros(plane, np.float32)
-        winner = np.full(plane, -1, np.int32)
-        live = np.zeros(TILE_H, np.bool_)
-        starts = np.empty(ROW_SLOTS, np.int32)
-        stops = np.empty(ROW_SLOTS, np.int32)
-        tops = np.empty(ROW_SLOTS, np.float32)
-        centres = np.empty(ROW_SLOTS, np.float32)
-        for row in range(rows):
-            live[row] = True
-            for x in range(cols):
-                T[row * STRIDE + x] = 1.0
-        room = 0
-        for k in range(count):
-            n = members[first + k]
-            across = min(int(2 * splats[n, HALF_W]) + 2, TILE_W) + simd.LANES
-            down = min(int(2 * splats[n, HALF_H]) + 2, TILE_H)
-            room += across * down
-        kept = np.empty(room, np.float32)
-        begin = np.empty(count + 1, np.int64)
-        cut = simd.splat(_LOG2_CUT)
-        stop_at = simd.splat(_STOP)
-        alpha_max = simd.splat(_ALPHA_MAX)
-        one = simd.splat(_ONE)
-        used = 0
-        for k in range(count):
-            begin[k] = used
-            if k % _CHECK_EVERY == _CHECK_EVERY - 1 and not live_rows(T, live):
-                count = k
-                break
-            n = members[first + k]
+    tile_x = (tile % columns) * TILE_W
+    tile_y = (tile // columns) * TILE_H
+    rows = min(TILE_H, height - tile_y)
+    cols = min(TILE_W, width - tile_x)
+    first = tiles[tile]
+    count = tiles[tile + 1] - first
+    T = np.zeros(plane, np.float32)
+    current = np.zeros(plane, np.float32)
+    winner_weight = np.zeros(plane, np.float32)
+    winner = np.full(plane, -1, np.int32)
+    live = np.zeros(TILE_H, np.bool_)
+    starts = np.empty(ROW_SLOTS, np.int32)
+    stops = np.empty(ROW_SLOTS, np.int32)
+    tops = np.empty(ROW_SLOTS, np.float32)
+    centres = np.empty(ROW_SLOTS, np.float32)
+    tilted = np.empty(ROW_SLOTS, np.float32)
+    for row in range(rows):
+        live[row] = True
+        for x in range(cols):
+            T[row * STRIDE + x] = 1.0
+    room = 0
+    for k in range(count):
+        n = members[first + k]
+        across = min(int(2 * splats[n, HALF_W]) + 2, TILE_W) + simd.LANES
+        down = min(int(2 * splats[n, HALF_H]) + 2, TILE_H)
+        room += across * down
+    kept = np.empty(room, np.float32)
+    begin = np.empty(count + 1, np.int64)
+    cut = simd.splat(_LOG2_CUT)
+    stop_at = simd.splat(_STOP)
+    alpha_max = simd.splat(_ALPHA_MAX)
+    one = simd.splat(_ONE)
+    spot = simd.splat(_SPOT)
+    used = 0
+    for k in range(count):
+        begin[k] = used
+        if k % _CHECK_EVERY == _CHECK_EVERY - 1 and not live_rows(T, live):
+            count = k
+            break
+        n = members[first + k]
+        if tilts is None:
             y0, y1 = splat_rows(splats, n, tile_x, tile_y, rows, height, starts, stops, tops, centres)
             quad = simd.splat(-splats[n, A])
-            for row in range(y0, y1):
-                row_top = simd.splat(tops[row])
-                for x in range(starts[row], stops[row], simd.LANES):
-                    at = row * STRIDE + x
-                    d = simd.ramp(np.float32(x) - centres[row])
+        else:
+            y0, y1 = disc_rows(splats, tilts, n, tile_x, tile_y, rows, height, starts, stops, tops, centres, tilted)
+            quad = simd.splat(splats[n, A])
+            lop = simd.splat(splats[n, LOP])
+            qx = simd.splat(tilts[n, QX])
+            nearest = simd.splat(tilts[n, NEAREST])
+            spot_u = tilts[n, SPOT_U] - _HALF - np.float32(tile_x)
+        for row in range(y0, y1):
+            row_top = simd.splat(tops[row])
+            if tilts is not None:
+                row_q = simd.splat(tilted[row])
+                dy = np.float32(tile_y + row) + _HALF - splats[n, V]
+                row_spot = simd.splat(_SPOT * dy * dy)
+            for x in range(starts[row], stops[row], simd.LANES):
+                at = row * STRIDE + x
+                d = simd.ramp(np.float32(x) - centres[row])
+                if tilts is None:
                     exponent = quad * d * d + row_top
-                    alpha = simd.minimum(simd.exp2(exponent), alpha_max)
-                    t = simd.load(T, at)
-                    alpha = simd.keep(simd.both(simd.at_least(exponent, cut), simd.at_least(t, stop_at)), alpha)
-                    simd.store(kept, used, alpha * t)
-                    simd.store(T, at, t * (one - alpha))
-                    used += simd.LANES
-        owners = np.empty(count, np.int32)
-        for k in range(count):
-            owners[k] = ids[members[first + k]]
-        grouped = np.argsort(owners, kind="mergesort")
-        left = np.full(TILE_H, TILE_W, np.int32)
-        right = np.zeros(TILE_H, np.int32)
-        group = 0
-        while group < count:
-            owner = owners[grouped[group]]
-            mine = simd.splat_i(owner)
-            after = group + 1
-            while after < count and owners[grouped[after]] == owner:
-                after += 1
-            alone = after - group == 1  # nothing to add up
-            low, high = TILE_H, 0
-            for k in grouped[group:after]:
-                n = members[first + k]
+                else:
+                    per_q = one / (qx * d + row_q)
+                    fall = (quad * d * d + row_top) * per_q * per_q
+                    ds = simd.ramp(np.float32(x) - spot_u)
+                    spot_fall = spot * ds * ds + row_spot
+                    plane_drawn = simd.both(simd.at_least(per_q, nearest), simd.above(spot_fall, fall))
+                    exponent = lop - simd.where(plane_drawn, fall, spot_fall)
+                alpha = simd.minimum(simd.exp2(exponent), alpha_max)
+                t = simd.load(T, at)
+                alpha = simd.keep(simd.both(simd.at_least(exponent, cut), simd.at_least(t, stop_at)), alpha)
+                simd.store(kept, used, alpha * t)
+                simd.store(T, at, t * (one - alpha))
+                used += simd.LANES
+    owners = np.empty(count, np.int32)
+    for k in range(count):
+        owners[k] = ids[members[first + k]]
+    grouped = np.argsort(owners, kind="mergesort")
+    left = np.full(TILE_H, TILE_W, np.int32)
+    right = np.zeros(TILE_H, np.int32)
+    group = 0
+    while group < count:
+        owner = owners[grouped[group]]
+        mine = simd.splat_i(owner)
+        after = group + 1
+        while after < count and owners[grouped[after]] == owner:
+            after += 1
+        alone = after - group == 1  # nothing to add up
+        low, high = TILE_H, 0
+        for k in grouped[group:after]:
+            n = members[first + k]
+            if tilts is None:
                 y0, y1 = splat_rows(splats, n, tile_x, tile_y, rows, height, starts, stops, tops, centres)
-                low = min(low, y0)
-                high = max(high, y1)
-                at_kept = begin[k]
-                for row in range(y0, y1):
-                    start, stop = starts[row], stops[row]
-                    for x in range(start, stop, simd.LANES):
-                        at = row * STRIDE + x
-                        weight = simd.load(kept, at_kept)
-                        if alone:
-                            _contest(winner_weight, winner, at, weight, mine)
-                        else:
-                            simd.store(current, at, simd.load(current, at) + weight)
-                        at_kept += simd.LANES
-                    left[row] = min(left[row], start)
-                    right[row] = max(right[row], stop)
-            group = after
-            for row in range(low, high):
-                if not alone:
-                    for x in range(left[row], right[row], simd.LANES):
-                        at = row * STRIDE + x
-                        _contest(winner_weight, winner, at, simd.load(current, at), mine)
-                        simd.store(current, at, simd.splat(np.float32(0.0)))
-                left[row] = TILE_W
-                right[row] = 0
-        for row in range(rows):
-            for x in range(cols):
-                best_id[tile_y + row, tile_x + x] = winner[row * STRIDE + x]
-                best_weight[tile_y + row, tile_x + x] = winner_weight[row * STRIDE + x]
+            else:
+                y0, y1 = disc_rows(splats, tilts, n, tile_x, tile_y, rows, height, starts, stops, tops, centres, tilted)
+            low = min(low, y0)
+            high = max(high, y1)
+            at_kept = begin[k]
+            for row in range(y0, y1):
+                start, stop = starts[row], stops[row]
+                for x in range(start, stop, simd.LANES):
+                    at = row * STRIDE + x
+                    weight = simd.load(kept, at_kept)
+                    if alone:
+                        _contest(winner_weight, winner, at, weight, mine)
+                    else:
+                        simd.store(current, at, simd.load(current, at) + weight)
+                    at_kept += simd.LANES
+                left[row] = min(left[row], start)
+                right[row] = max(right[row], stop)
+        group = after
+        for row in range(low, high):
+            if not alone:
+                for x in range(left[row], right[row], simd.LANES):
+                    at = row * STRIDE + x
+                    _contest(winner_weight, winner, at, simd.load(current, at), mine)
+                    simd.store(current, at, simd.splat(np.float32(0.0)))
+            left[row] = TILE_W
+            right[row] = 0
+    for row in range(rows):
+        for x in range(cols):
+            best_id[tile_y + row, tile_x + x] = winner[row * STRIDE + x]
+            best_weight[tile_y + row, tile_x + x] = winner_weight[row * STRIDE + x]

@@ -19,6 +19,21 @@ import math
 import numpy as np
 from numba import prange
 
+from .cpu_discs import (
+    MIDDLE,
+    NEAREST,
+    NORMAL_X,
+    NORMAL_Y,
+    NORMAL_Z,
+    Q0,
+    QX,
+    QY,
+    SPOT,
+    SPOT_U,
+    disc_footprint,
+    disc_outline,
+    disc_plane,
+)
 from .kernel import kernel
 from .settings import ALPHA_MIN, BLUR, MAX_EXTENT, MAX_SH_COEFFICIENTS, MIN_QUAT_NORM2, TAN_MARGIN
 
@@ -27,6 +42,10 @@ U, V, SLOPE, A, C, LOP, RED, GREEN, BLUE, DEPTH, HALF_W, HALF_H = range(12)
 SPLAT_COLUMNS = 12
 # Columns of a gradient row: moments of dL/d(log2 alpha) over the splat's pixels, then colour and depth.
 M0, MY, MYY, MX, MXY, MXX, G_RED, G_GREEN, G_BLUE, G_DEPTH = range(10)
+# Discs: the moments but the first are of the pixels in the plane, over Q^2; moments of dL/dQ there, and of
+# dL/d(log2 alpha) in the spot; and, where normals are asked for, their gradient.
+MQ, MQX, MQY, MSX, MSY = range(10, 15)
+G_NORMAL = 16
 GRADIENT_COLUMNS = 16  # the rest pads a row to one cache line, written as one vector
 
 _MAX_COLOR = 3e38  # what float32 holds
@@ -173,14 +192,19 @@ def tangent_limits(fx, fy, cx, cy, width, height):
 
 
 @kernel(parallel=True)
-def project(means, quats, scales, opacities, sh, viewmat, intrinsics, width, height, near, splats):
+def project(
+    means, quats, scales, opacities, sh, viewmat, intrinsics, width, height, near, splats, tilts, outlines
+):  # fmt: skip
     """Fill `splats` (N, 12) float32; HALF_H < 0 marks a splat that cannot be seen.
 
     means (N, 3), quats (N, 4) wxyz of any length, scales (N, 3), opacities (N,), sh (N, K, 3): float32.
-    viewmat (4, 4) and intrinsics (fx, fy, cx, cy): float64.
+    viewmat (4, 4) and intrinsics (fx, fy, cx, cy): float64. tilts: None, or for discs what cpu_discs.py says of each,
+    (N, 12) float32; then outlines (N, 12) takes the ellipses around them, as splats, for the tiles to meet.
     """
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     limits = tangent_limits(fx, fy, cx, cy, width, height)
+    if tilts is not None:
+        limits = np.array([-np.inf, np.inf, -np.inf, np.inf])
     W = viewmat[:3, :3].copy()
     t = viewmat[:3, 3].copy()
     eye = -(W.T @ t)
@@ -214,18 +238,63 @@ def project(means, quats, scales, opacities, sh, viewmat, intrinsics, width, hei
                 continue
             inverse = 1.0 / math.sqrt(norm2)
             _rotation(qw * inverse, qx * inverse, qy * inverse, qz * inverse, R)
-            _jacobian(px, py, pz, fx, fy, limits, T, W)
-            a, b, c, conditional = _footprint(T, R, scales, n, V0, V1)
             u = fx * px / pz + cx
             v = fy * py / pz + cy
             lop = math.log2(opacity)
             reach = lop - _LOG2_CUT
-            half_w = math.sqrt(reach * a / _HALF_LOG2E)
-            half_h = math.sqrt(reach * c / _HALF_LOG2E)
+            middle_u, middle_v = u, v
+            if tilts is None:
+                _jacobian(px, py, pz, fx, fy, limits, T, W)
+                a, b, c, conditional = _footprint(T, R, scales, n, V0, V1)
+                half_w = math.sqrt(reach * a / _HALF_LOG2E)
+                half_h = math.sqrt(reach * c / _HALF_LOG2E)
+                largest = max(half_w, half_h)
+            else:
+                _jacobian(px, py, pz, fx, fy, limits, T, W)
+                a, b, c, conditional, area, broad = disc_footprint(T, R, scales, n, V0, V1)
+                nx, ny, nz, _side, _distance, tilt_x, tilt_y = disc_plane(px, py, pz, fx, fy, W, R)
+                largest = math.sqrt(reach * max(a, c) / _HALF_LOG2E)
+                du, dv, out_a, out_b, out_c, out_conditional, bounded = disc_outline(
+                    a, b, c, area, broad, tilt_x, tilt_y, reach / _HALF_LOG2E, pz / near
+                )
+                if not bounded:
+                    du, dv = 0.5 * width - u, 0.5 * height - v
+                    out_a = out_c = out_conditional = 100.0 * (width + height) ** 2
+                middle_u, middle_v = u + du, v + dv
+                half_w = math.sqrt(out_a)
+                half_h = math.sqrt(out_c)
+                out_slope = out_b / out_c
+                outlines[n, U] = middle_u + out_slope * (min(max(middle_v, 0.0), height) - middle_v)
+                outlines[n, V] = middle_v
+                outlines[n, SLOPE] = out_slope
+                outlines[n, A] = reach / out_conditional
+                outlines[n, C] = reach / out_c
+                outlines[n, LOP] = lop
+                outlines[n, HALF_W] = half_w
+                outlines[n, HALF_H] = half_h
+                if not broad:
+                    a, b, c, conditional = 1.0, 0.0, _HALF_LOG2E / SPOT, _HALF_LOG2E / SPOT
+                    tilt_x = tilt_y = 0.0
+                # Along the ridge, from (u, v) to the picture's row nearest to it.
+                along = tilt_x * b / c + tilt_y
+                tilts[n, Q0] = 1.0 + along * (min(max(v, 0.0), height) - v)
+                tilts[n, QX] = tilt_x
+                tilts[n, QY] = along
+                tilts[n, NEAREST] = near / pz if broad else np.inf
+                tilts[n, SPOT_U] = u
+                tilts[n, MIDDLE] = middle_v
+                tilts[n, NORMAL_X] = nx
+                tilts[n, NORMAL_Y] = ny
+                tilts[n, NORMAL_Z] = nz
             # Written so that a NaN or an infinity fails every test.
-            if not (u + half_w > 0.0 and u - half_w < width and v + half_h > 0.0 and v - half_h < height):
+            if not (
+                middle_u + half_w > 0.0
+                and middle_u - half_w < width
+                and middle_v + half_h > 0.0
+                and middle_v - half_h < height
+            ):
                 continue
-            if not (half_w < MAX_EXTENT and half_h < MAX_EXTENT):
+            if not (largest < MAX_EXTENT):
                 continue
             dx, dy, dz = mx - eye[0], my - eye[1], mz - eye[2]
             length = math.sqrt(dx * dx + dy * dy + dz * dz)
@@ -252,150 +321,198 @@ def project(means, quats, scales, opacities, sh, viewmat, intrinsics, width, hei
 
 @kernel(parallel=True)
 def project_backward(
-    means, quats, scales, opacities, sh, viewmat, intrinsics, width, height, splats, slots, rows,
+    means, quats, scales, opacities, sh, viewmat, intrinsics, width, height, splats, tilts, slots, rows,
     g_means, g_quats, g_scales, g_opacities, g_sh, g_screen,
 ):  # fmt: skip
     """Sum each splat's gradient rows in slot order and carry them to the Gaussian's parameters.
 
-    slots (N + 1,): splat n owns rows[slots[n]:slots[n + 1]]. g_* are written for every n (0 where unseen);
-    g_screen (N, 2) receives dL/du and dL/dv in pixels, the statistic that growth follows.
+    slots (N + 1,): splat n owns rows[slots[n]:slots[n + 1]]. tilts: None, or those of discs. g_* are
+    written for every n (0 where unseen); g_screen (N, 2) receives dL/du and dL/dv in pixels, with the footprint moving
+    along: the statistic that growth follows.
     """
+    for chunk in prange((means.shape[0] + 255) // 256):
+        _project_backward_chunk(
+            chunk,
+            means, quats, scales, opacities, sh, viewmat, intrinsics, width, height, splats, tilts, slots, rows,
+            g_means, g_quats, g_scales, g_opacities, g_sh, g_screen,
+        )  # fmt: skip
+
+
+@kernel()
+def _project_backward_chunk(
+    chunk,
+    means, quats, scales, opacities, sh, viewmat, intrinsics, width, height, splats, tilts, slots, rows,
+    g_means, g_quats, g_scales, g_opacities, g_sh, g_screen,
+):  # fmt: skip
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     limits = tangent_limits(fx, fy, cx, cy, width, height)
+    axes = 3
+    counted = G_DEPTH + 1
+    if tilts is not None:
+        limits = np.array([-np.inf, np.inf, -np.inf, np.inf])
+        axes = 2
+        counted = G_NORMAL + 3 if rows.shape[1] > G_NORMAL else MSY + 1
     W = viewmat[:3, :3].copy()
     t = viewmat[:3, 3].copy()
     eye = -(W.T @ t)
     count = sh.shape[1]
-    chunks = (means.shape[0] + 255) // 256
-    for chunk in prange(chunks):
-        R = np.empty((3, 3))
-        T = np.empty((2, 3))
-        basis = np.empty(MAX_SH_COEFFICIENTS)
-        weights = np.empty(MAX_SH_COEFFICIENTS)
-        g_color = np.empty(3)
-        g = np.empty(G_DEPTH + 1)
-        V0 = np.empty(3)
-        V1 = np.empty(3)
-        gR = np.empty((3, 3))
-        gT = np.empty((2, 3))
-        for n in range(chunk * 256, min(chunk * 256 + 256, means.shape[0])):
-            for i in range(3):
-                g_means[n, i] = 0.0
-                g_scales[n, i] = 0.0
-                for k in range(count):
-                    g_sh[n, k, i] = 0.0
-            for i in range(4):
-                g_quats[n, i] = 0.0
-            g_opacities[n] = 0.0
-            g_screen[n, 0] = 0.0
-            g_screen[n, 1] = 0.0
-            if slots[n] == slots[n + 1]:
-                continue
-            for i in range(G_DEPTH + 1):
-                g[i] = 0.0
-            for slot in range(slots[n], slots[n + 1]):
-                for i in range(G_DEPTH + 1):
-                    g[i] += rows[slot, i]
-
-            mx, my, mz = np.float64(means[n, 0]), np.float64(means[n, 1]), np.float64(means[n, 2])
-            px = W[0, 0] * mx + W[0, 1] * my + W[0, 2] * mz + t[0]
-            py = W[1, 0] * mx + W[1, 1] * my + W[1, 2] * mz + t[1]
-            pz = W[2, 0] * mx + W[2, 1] * my + W[2, 2] * mz + t[2]
-            qw, qx, qy, qz = (
-                np.float64(quats[n, 0]),
-                np.float64(quats[n, 1]),
-                np.float64(quats[n, 2]),
-                np.float64(quats[n, 3]),
-            )
-            inverse = 1.0 / math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
-            qw, qx, qy, qz = qw * inverse, qx * inverse, qy * inverse, qz * inverse
-            _rotation(qw, qx, qy, qz, R)
-            tx, ty = _jacobian(px, py, pz, fx, fy, limits, T, W)
-            _a, b, c, conditional = _footprint(T, R, scales, n, V0, V1)
-            slope = b / c
-            quad_a = _HALF_LOG2E / conditional
-            quad_c = _HALF_LOG2E / c
-
-            g_u = 2.0 * quad_a * g[MX]
-            g_v = 2.0 * quad_c * g[MY] - 2.0 * quad_a * slope * g[MX]
-            g_slope = 2.0 * quad_a * g[MXY]
-            g_conditional = g[MXX] * quad_a / conditional
-            g_b = g_slope / c
-            g_c = g[MYY] * quad_c / c
-            g_screen[n, 0] = g_u
-            g_screen[n, 1] = g_v
-            g_opacities[n] = g[M0] / (_LN2 * np.float64(opacities[n]))
-
-            # Covariance to V = T R diag(scale), then to its three factors. What the conditional variance sends back is
-            # along V0 - slope V1; taken apart into a, b and c it would cancel for needles.
-            for i in range(2):
-                for j in range(3):
-                    gT[i, j] = 0.0
-            for j in range(3):
-                scale = np.float64(scales[n, j])
-                across = V0[j] - slope * V1[j]
-                gV0 = 2.0 * g_conditional * across + g_b * V1[j]
-                gV1 = g_b * (across - slope * V1[j]) + 2.0 * (g_c * V1[j] - slope * g_conditional * across)
-                g_scale = 0.0
-                for i in range(3):
-                    gM = T[0, i] * gV0 + T[1, i] * gV1
-                    g_scale += R[i, j] * gM
-                    gR[i, j] = gM * scale
-                    gT[0, i] += gV0 * R[i, j] * scale
-                    gT[1, i] += gV1 * R[i, j] * scale
-                g_scales[n, j] = g_scale
-
-            # Quaternion, tangent to the unit sphere.
-            gw = 2.0 * (qz * (gR[1, 0] - gR[0, 1]) + qy * (gR[0, 2] - gR[2, 0]) + qx * (gR[2, 1] - gR[1, 2]))
-            gx = 2.0 * (
-                qy * (gR[0, 1] + gR[1, 0]) + qz * (gR[0, 2] + gR[2, 0]) + qw * (gR[2, 1] - gR[1, 2])
-                - 2.0 * qx * (gR[1, 1] + gR[2, 2])
-            )  # fmt: skip
-            gy = 2.0 * (
-                qx * (gR[0, 1] + gR[1, 0]) + qz * (gR[1, 2] + gR[2, 1]) + qw * (gR[0, 2] - gR[2, 0])
-                - 2.0 * qy * (gR[0, 0] + gR[2, 2])
-            )  # fmt: skip
-            gz = 2.0 * (
-                qx * (gR[0, 2] + gR[2, 0]) + qy * (gR[1, 2] + gR[2, 1]) + qw * (gR[1, 0] - gR[0, 1])
-                - 2.0 * qz * (gR[0, 0] + gR[1, 1])
-            )  # fmt: skip
-            along = gw * qw + gx * qx + gy * qy + gz * qz
-            g_quats[n, 0] = (gw - along * qw) * inverse
-            g_quats[n, 1] = (gx - along * qx) * inverse
-            g_quats[n, 2] = (gy - along * qy) * inverse
-            g_quats[n, 3] = (gz - along * qz) * inverse
-
-            # Camera-space position: through the centre, the depth and the Jacobian.
-            g_px = g_u * fx / pz
-            g_py = g_v * fy / pz
-            g_pz = -(g_px * px + g_py * py) / pz + g[G_DEPTH]
-            g_tx = 0.0
-            g_ty = 0.0
-            for i in range(3):
-                g_tx -= gT[0, i] * fx / pz * W[2, i]
-                g_ty -= gT[1, i] * fy / pz * W[2, i]
-                g_pz -= (gT[0, i] * T[0, i] + gT[1, i] * T[1, i]) / pz
-            if limits[0] <= px / pz <= limits[1]:
-                g_px += g_tx / pz
-                g_pz -= g_tx * tx / pz
-            if limits[2] <= py / pz <= limits[3]:
-                g_py += g_ty / pz
-                g_pz -= g_ty * ty / pz
-
-            # Colour: through the SH coefficients and the viewing direction.
-            dx, dy, dz = mx - eye[0], my - eye[1], mz - eye[2]
-            length = math.sqrt(dx * dx + dy * dy + dz * dz)
-            dx, dy, dz = dx / length, dy / length, dz / length
-            sh_basis(dx, dy, dz, count, basis)
-            for channel in range(3):
-                g_color[channel] = g[G_RED + channel] if splats[n, RED + channel] > 0.0 else 0.0
+    R = np.empty((3, 3))
+    T = np.empty((2, 3))
+    basis = np.empty(MAX_SH_COEFFICIENTS)
+    weights = np.empty(MAX_SH_COEFFICIENTS)
+    g_color = np.empty(3)
+    g = np.empty(counted)
+    V0 = np.empty(3)
+    V1 = np.empty(3)
+    gR = np.empty((3, 3))
+    gT = np.empty((2, 3))
+    for n in range(chunk * 256, min(chunk * 256 + 256, means.shape[0])):
+        for i in range(3):
+            g_means[n, i] = 0.0
+            g_scales[n, i] = 0.0
             for k in range(count):
-                weights[k] = 0.0
-                for channel in range(3):
-                    g_sh[n, k, channel] = basis[k] * g_color[channel]
-                    weights[k] += g_color[channel] * sh[n, k, channel]
-            sx, sy, sz = sh_gradient(dx, dy, dz, count, weights)
-            radial = sx * dx + sy * dy + sz * dz
-            g_means[n, 0] = W[0, 0] * g_px + W[1, 0] * g_py + W[2, 0] * g_pz + (sx - radial * dx) / length
-            g_means[n, 1] = W[0, 1] * g_px + W[1, 1] * g_py + W[2, 1] * g_pz + (sy - radial * dy) / length
-            g_means[n, 2] = W[0, 2] * g_px + W[1, 2] * g_py + W[2, 2] * g_pz + (sz - radial * dz) / length
+                g_sh[n, k, i] = 0.0
+        for i in range(4):
+            g_quats[n, i] = 0.0
+        g_opacities[n] = 0.0
+        g_screen[n, 0] = 0.0
+        g_screen[n, 1] = 0.0
+        if slots[n] == slots[n + 1]:
+            continue
+        for i in range(counted):
+            g[i] = 0.0
+        for slot in range(slots[n], slots[n + 1]):
+            for i in range(counted):
+                g[i] += rows[slot, i]
+
+        mx, my, mz = np.float64(means[n, 0]), np.float64(means[n, 1]), np.float64(means[n, 2])
+        px = W[0, 0] * mx + W[0, 1] * my + W[0, 2] * mz + t[0]
+        py = W[1, 0] * mx + W[1, 1] * my + W[1, 2] * mz + t[1]
+        pz = W[2, 0] * mx + W[2, 1] * my + W[2, 2] * mz + t[2]
+        qw, qx, qy, qz = (
+            np.float64(quats[n, 0]),
+            np.float64(quats[n, 1]),
+            np.float64(quats[n, 2]),
+            np.float64(quats[n, 3]),
+        )
+        inverse = 1.0 / math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
+        qw, qx, qy, qz = qw * inverse, qx * inverse, qy * inverse, qz * inverse
+        _rotation(qw, qx, qy, qz, R)
+        tx, ty = _jacobian(px, py, pz, fx, fy, limits, T, W)
+        if tilts is None:
+            _a, b, c, conditional = _footprint(T, R, scales, n, V0, V1)
+        else:
+            _a, b, c, conditional, _area, broad = disc_footprint(T, R, scales, n, V0, V1)
+            if not broad:
+                b, c = 0.0, 1.0
+        slope = b / c
+        quad_a = _HALF_LOG2E / conditional
+        quad_c = _HALF_LOG2E / c
+
+        g_u = 2.0 * quad_a * g[MX]
+        g_v = 2.0 * quad_c * g[MY] - 2.0 * quad_a * slope * g[MX]
+        g_slope = 2.0 * quad_a * g[MXY]
+        g_conditional = g[MXX] * quad_a / conditional
+        g_b = g_slope / c
+        g_c = g[MYY] * quad_c / c
+        if tilts is not None:
+            nx, ny, nz, side, distance, tilt_x, tilt_y = disc_plane(px, py, pz, fx, fy, W, R)
+            g_u += 2.0 * SPOT * g[MSX]
+            g_v += 2.0 * SPOT * g[MSY]
+            g_qx = g_qy = 0.0
+            if broad:
+                g_u -= tilt_x * g[MQ]
+                g_v -= tilt_y * g[MQ]
+                g_qx = g[MQX] + slope * g[MQY]
+                g_qy = g[MQY]
+        g_screen[n, 0] = g_u
+        g_screen[n, 1] = g_v
+        g_opacities[n] = g[M0] / (_LN2 * np.float64(opacities[n]))
+
+        # Covariance to V = T R diag(scale), then to its three factors. What the conditional variance sends back is
+        # along V0 - slope V1; taken apart into a, b and c it would cancel for needles.
+        for i in range(2):
+            for j in range(3):
+                gT[i, j] = 0.0
+        for j in range(axes):
+            scale = np.float64(scales[n, j])
+            across = V0[j] - slope * V1[j]
+            gV0 = 2.0 * g_conditional * across + g_b * V1[j]
+            gV1 = g_b * (across - slope * V1[j]) + 2.0 * (g_c * V1[j] - slope * g_conditional * across)
+            g_scale = 0.0
+            for i in range(3):
+                gM = T[0, i] * gV0 + T[1, i] * gV1
+                g_scale += R[i, j] * gM
+                gR[i, j] = gM * scale
+                gT[0, i] += gV0 * R[i, j] * scale
+                gT[1, i] += gV1 * R[i, j] * scale
+            g_scales[n, j] = g_scale
+        g_px = g_py = g_pz = 0.0
+        if tilts is not None:
+            gn_x = gn_y = gn_z = 0.0
+            if broad:
+                kx, ky = g_qx * pz / (fx * distance), g_qy * pz / (fy * distance)
+                back = (kx * nx + ky * ny) / distance
+                g_px, g_py, g_pz = -back * nx, -back * ny, back * (distance / pz - nz)
+                gn_x, gn_y, gn_z = kx - back * px, ky - back * py, -back * pz
+            if counted > G_NORMAL:
+                gn_x, gn_y, gn_z = gn_x + g[G_NORMAL], gn_y + g[G_NORMAL + 1], gn_z + g[G_NORMAL + 2]
+            for i in range(3):
+                gR[i, 2] = side * (W[0, i] * gn_x + W[1, i] * gn_y + W[2, i] * gn_z)
+
+        # Quaternion, tangent to the unit sphere.
+        gw = 2.0 * (qz * (gR[1, 0] - gR[0, 1]) + qy * (gR[0, 2] - gR[2, 0]) + qx * (gR[2, 1] - gR[1, 2]))
+        gx = 2.0 * (
+            qy * (gR[0, 1] + gR[1, 0]) + qz * (gR[0, 2] + gR[2, 0]) + qw * (gR[2, 1] - gR[1, 2])
+            - 2.0 * qx * (gR[1, 1] + gR[2, 2])
+        )  # fmt: skip
+        gy = 2.0 * (
+            qx * (gR[0, 1] + gR[1, 0]) + qz * (gR[1, 2] + gR[2, 1]) + qw * (gR[0, 2] - gR[2, 0])
+            - 2.0 * qy * (gR[0, 0] + gR[2, 2])
+        )  # fmt: skip
+        gz = 2.0 * (
+            qx * (gR[0, 2] + gR[2, 0]) + qy * (gR[1, 2] + gR[2, 1]) + qw * (gR[1, 0] - gR[0, 1])
+            - 2.0 * qz * (gR[0, 0] + gR[1, 1])
+        )  # fmt: skip
+        along = gw * qw + gx * qx + gy * qy + gz * qz
+        g_quats[n, 0] = (gw - along * qw) * inverse
+        g_quats[n, 1] = (gx - along * qx) * inverse
+        g_quats[n, 2] = (gy - along * qy) * inverse
+        g_quats[n, 3] = (gz - along * qz) * inverse
+
+        # Camera-space position: through the centre, the depth and the Jacobian.
+        to_x = g_u * fx / pz
+        to_y = g_v * fy / pz
+        g_px += to_x
+        g_py += to_y
+        g_pz += g[G_DEPTH] - (to_x * px + to_y * py) / pz
+        g_tx = 0.0
+        g_ty = 0.0
+        for i in range(3):
+            g_tx -= gT[0, i] * fx / pz * W[2, i]
+            g_ty -= gT[1, i] * fy / pz * W[2, i]
+            g_pz -= (gT[0, i] * T[0, i] + gT[1, i] * T[1, i]) / pz
+        if limits[0] <= px / pz <= limits[1]:
+            g_px += g_tx / pz
+            g_pz -= g_tx * tx / pz
+        if limits[2] <= py / pz <= limits[3]:
+            g_py += g_ty / pz
+            g_pz -= g_ty * ty / pz
+
+        # Colour: through the SH coefficients and the viewing direction.
+        dx, dy, dz = mx - eye[0], my - eye[1], mz - eye[2]
+        length = math.sqrt(dx * dx + dy * dy + dz * dz)
+        dx, dy, dz = dx / length, dy / length, dz / length
+        sh_basis(dx, dy, dz, count, basis)
+        for channel in range(3):
+            g_color[channel] = g[G_RED + channel] if splats[n, RED + channel] > 0.0 else 0.0
+        for k in range(count):
+            weights[k] = 0.0
+            for channel in range(3):
+                g_sh[n, k, channel] = basis[k] * g_color[channel]
+                weights[k] += g_color[channel] * sh[n, k, channel]
+        sx, sy, sz = sh_gradient(dx, dy, dz, count, weights)
+        radial = sx * dx + sy * dy + sz * dz
+        g_means[n, 0] = W[0, 0] * g_px + W[1, 0] * g_py + W[2, 0] * g_pz + (sx - radial * dx) / length
+        g_means[n, 1] = W[0, 1] * g_px + W[1, 1] * g_py + W[2, 1] * g_pz + (sy - radial * dy) / length
+        g_means[n, 2] = W[0, 2] * g_px + W[1, 2] * g_py + W[2, 2] * g_pz + (sz - radial * dz) / length

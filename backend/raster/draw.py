@@ -29,7 +29,7 @@ def draw(model: ObjectModel, camera: Camera, want_ids: bool = True, want_depth: 
     seen = anchors_in_view(model.anchors, viewmat, intrinsics, camera.width, camera.height, camera.near)
     g = model.generate(seen, camera.centre)
     with torch.no_grad():
-        drawn = rasterize(*g[:6], camera, want_depth=want_depth)
+        drawn = rasterize(*g[:6], camera, want_depth=want_depth, primitive=model.primitive)
         image = drawn.color + (1 - drawn.alpha) * model.background.detach()[:, None, None]
         image = image * torch.tensor(camera.gain)[:, None, None]
         pixels = image.clamp(0, 1).permute(1, 2, 0).contiguous().numpy()

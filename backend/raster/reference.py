@@ -11,16 +11,29 @@ from typing import NamedTuple
 import torch
 
 from .camera import Camera
-from .settings import ALPHA_MAX, ALPHA_MIN, BLUR, MAX_EXTENT, MIN_QUAT_NORM2, STOP, TAN_MARGIN
+from .settings import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    BLUR,
+    DISC_BLUR,
+    MAX_EXTENT,
+    MIN_DISC_WIDTH,
+    MIN_QUAT_NORM2,
+    STOP,
+    TAN_MARGIN,
+)
 
 
 class ReferencePicture(NamedTuple):
-    """color (3, H, W), alpha, depth and median (H, W) as in `Rendered`; probabilities (H, W, n), one channel an ID."""
+    """color (3, H, W), alpha, depth, median and distortion (H, W), normals (3, H, W; 0 for 3D Gaussians) as in
+    `Rendered`; probabilities (H, W, n), one channel an ID."""
 
     color: torch.Tensor
     alpha: torch.Tensor
     depth: torch.Tensor
     median: torch.Tensor
+    normals: torch.Tensor
+    distortion: torch.Tensor
     probabilities: torch.Tensor
 
 
@@ -57,6 +70,43 @@ def sh_colors(sh: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
     return torch.clamp(0.5 + (torch.stack(basis, -1)[:, :, None] * sh).sum(1), min=0)
 
 
+def _footprints(p, axes, camera, blur, tan_margin):
+    """Projected covariances by the perspective's Jacobian: a, b, c (N,) of [[a, b], [b, c]] and a - b^2 / c.
+
+    p (N, 3) centres and axes (N, 3, 2 or 3) standard deviations in camera space; the Jacobian follows the direction of
+    view only so far beyond the picture.
+    """
+    fx, fy, cx, cy = (float(v) for v in camera.arrays()[1])
+    x, y, z = p.unbind(-1)
+    edge_x, edge_y = tan_margin * 0.5 * camera.width / fx, tan_margin * 0.5 * camera.height / fy
+    tx = torch.clamp(x / z, -cx / fx - edge_x, (camera.width - cx) / fx + edge_x)
+    ty = torch.clamp(y / z, -cy / fy - edge_y, (camera.height - cy) / fy + edge_y)
+    zero = torch.zeros_like(z)
+    J = torch.stack([fx / z, zero, -fx * tx / z, zero, fy / z, -fy * ty / z], -1).reshape(-1, 2, 3)
+    M = J @ axes
+    cov = M @ M.transpose(1, 2) + blur * torch.eye(2, dtype=p.dtype)
+    a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
+    # a - b^2 / c, where a c - b^2 without the blur is the squared area that M's rows span.
+    if axes.shape[-1] == 2:
+        area2 = (M[:, 0, 0] * M[:, 1, 1] - M[:, 0, 1] * M[:, 1, 0]) ** 2
+    else:
+        area2 = (torch.linalg.cross(M[:, 0], M[:, 1], dim=-1) ** 2).sum(-1)
+    return a, b, c, (area2 + blur * (a + c - blur)) / c
+
+
+def _disc_power(rays, p, R, scales, spot, near):
+    """Half the squared distance in standard deviations of each ray (H, W, 3) from a disc's centre, by where the ray
+    meets the disc's plane or, where it is less, that on the picture (`spot`); and the depth there."""
+    t1, t2, normal = R.unbind(-1)
+    inverse = (rays @ normal) / (p @ normal)
+    ahead = (inverse > 0) & (1 / torch.where(inverse > 0, inverse, 1) >= near)
+    z = 1 / torch.where(ahead, inverse, 1)
+    hit = rays * z[..., None] - p
+    power = 0.5 * ((hit @ t1 / scales[0]) ** 2 + (hit @ t2 / scales[1]) ** 2)
+    plane = ahead & (power < spot)
+    return torch.where(plane, power, spot), torch.where(plane, z, p[2])
+
+
 def rasterize_reference(
     means: torch.Tensor,
     quats: torch.Tensor,
@@ -66,14 +116,19 @@ def rasterize_reference(
     ids: torch.Tensor,
     camera: Camera,
     objects: int = 1,
+    primitive: str = "3d",
 ) -> ReferencePicture:
-    """Draw 3D Gaussians; shapes as in `backend.raster.rasterize`, ids in 0 .. objects - 1."""
+    """Draw 3D Gaussians or, with primitive "2d", discs; shapes as in `backend.raster.rasterize`, ids in
+    0 .. objects - 1."""
     dtype = means.dtype
+    flat = primitive == "2d"
     height, width = camera.height, camera.width
     viewmat = torch.as_tensor(camera.viewmat, dtype=torch.float64).to(dtype)
     fx, fy, cx, cy = (float(v) for v in camera.arrays()[1])
     W, t = viewmat[:3, :3], viewmat[:3, 3]
     eye = -(W.T @ t)
+    if flat:
+        scales = scales[:, :2]
     # Splats that the guards drop are left out before any division, so that no NaN gradient passes a mask.
     z = (means @ W.T + t)[:, 2]
     kept = (
@@ -86,46 +141,54 @@ def rasterize_reference(
     p = means @ W.T + t
     x, y, z = p.unbind(-1)
     u, v = fx * x / z + cx, fy * y / z + cy
-    tx = torch.clamp(x / z, -cx / fx - TAN_MARGIN * 0.5 * width / fx, (width - cx) / fx + TAN_MARGIN * 0.5 * width / fx)
-    ty = torch.clamp(
-        y / z, -cy / fy - TAN_MARGIN * 0.5 * height / fy, (height - cy) / fy + TAN_MARGIN * 0.5 * height / fy
-    )
-    zero = torch.zeros_like(z)
-    J = torch.stack([fx / z, zero, -fx * tx / z, zero, fy / z, -fy * ty / z], -1).reshape(-1, 2, 3)
-    R = rotation_matrices(quats / torch.linalg.vector_norm(quats, dim=-1, keepdim=True))
-    M = J @ W @ R * scales[:, None, :]
-    cov = M @ M.transpose(1, 2) + BLUR * torch.eye(2, dtype=dtype)
-    a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
-    # a - b^2 / c, where a c - b^2 without the blur is the squared area that M's rows span.
-    area2 = (torch.linalg.cross(M[:, 0], M[:, 1], dim=-1) ** 2).sum(-1)
-    conditional = (area2 + BLUR * (a + c - BLUR)) / c
+    R = W @ rotation_matrices(quats / torch.linalg.vector_norm(quats, dim=-1, keepdim=True))
+    axes = R[:, :, : scales.shape[1]] * scales[:, None, :]
+    if flat:
+        a, b, c, conditional = _footprints(p, axes, camera, 0.0, math.inf)
+        broad = c * conditional > MIN_DISC_WIDTH**2 * (a + c)
+    else:
+        a, b, c, conditional = _footprints(p, axes, camera, BLUR, TAN_MARGIN)
     extent2 = 2 * torch.log(opacities / ALPHA_MIN) * torch.maximum(a, c)
     directions = means - eye
     colors = sh_colors(sh, directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True))
 
     columns = torch.arange(width, dtype=dtype) + 0.5
     lines = torch.arange(height, dtype=dtype) + 0.5
+    rays = torch.stack([*torch.meshgrid((columns - cx) / fx, (lines - cy) / fy, indexing="xy")], -1)
+    rays = torch.cat([rays, torch.ones_like(rays[..., :1])], -1)
     T = torch.ones(height, width, dtype=dtype)
     color = torch.zeros(3, height, width, dtype=dtype)
-    depth = torch.zeros(height, width, dtype=dtype)
-    median = torch.zeros(height, width, dtype=dtype)
+    depth, median, inverse, inverse2 = torch.zeros(4, height, width, dtype=dtype)
+    normals = torch.zeros(3, height, width, dtype=dtype)
     probabilities = torch.zeros(height, width, objects, dtype=dtype)
     for n in torch.argsort(z.detach(), stable=True).tolist():
         if not extent2[n] < MAX_EXTENT**2:
             continue
         dy = (lines - v[n])[:, None]
-        d = columns[None, :] - u[n] - b[n] / c[n] * dy
-        power = 0.5 * (d * d / conditional[n] + dy * dy / c[n])
+        depths = z[n].expand(height, width)
+        if flat:
+            power = ((columns[None, :] - u[n]) ** 2 + dy**2) / (2 * DISC_BLUR)
+            if broad[n]:
+                power, depths = _disc_power(rays, p[n], R[n], scales[n], power, camera.near)
+        else:
+            d = columns[None, :] - u[n] - b[n] / c[n] * dy
+            power = 0.5 * (d * d / conditional[n] + dy * dy / c[n])
         raw = opacities[n] * torch.exp(-power)
         drawn = (raw >= ALPHA_MIN) & (T >= STOP)
         alpha = torch.where(drawn, torch.clamp(raw, max=ALPHA_MAX), torch.zeros_like(raw))
         w = alpha * T
         color = color + w * colors[n][:, None, None]
-        depth = depth + w * z[n]
+        depth = depth + w * depths
+        inverse, inverse2 = inverse + w / depths, inverse2 + w / depths**2
+        if flat:
+            normal = R[n, :, 2] * -torch.sign(R[n, :, 2] @ p[n])
+            normals = normals + w * normal[:, None, None]
         channel = torch.zeros(objects, dtype=dtype)
         channel[int(ids[n])] = 1
         probabilities = probabilities + w[..., None] * channel
         after = T * (1 - alpha)
-        median = torch.where((T.detach() >= 0.5) & (after.detach() < 0.5), z[n].detach(), median)
+        median = torch.where((T.detach() >= 0.5) & (after.detach() < 0.5), depths.detach(), median)
         T = after
-    return ReferencePicture(color, 1 - T, depth, median, probabilities)
+    # sum_{i<j} w_i w_j (1 / z_i - 1 / z_j)^2
+    distortion = (1 - T) * inverse2 - inverse**2
+    return ReferencePicture(color, 1 - T, depth, median, normals, distortion, probabilities)

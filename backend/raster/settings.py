@@ -14,6 +14,14 @@ the limit is still drawn, so no combination of ALPHA_MAX and STOP can make an op
 BLUR = 0.3
 """Variance in square pixels added to every splat's footprint (low-pass filter of 3D Gaussian splatting)."""
 
+DISC_BLUR = 0.5
+"""Variance in square pixels of the spot that a 2D splat is never smaller than (low-pass filter of 2D Gaussian
+splatting)."""
+
+MIN_DISC_WIDTH = 0.05
+"""A 2D splat seen so nearly from its edge that its standard deviation is below this, in pixels, is its spot alone: a
+line so thin would be hit by pixel centres or missed by chance, and its gradients have no bound."""
+
 MAX_EXTENT = 1e9
 """Splats that reach further than this from their centre, in pixels, are dropped: their scale ran away."""
 

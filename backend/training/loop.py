@@ -25,9 +25,20 @@ from ..protocol import Cancelled, InputError, Reporter
 from ..raster import Rendered, rasterize
 from ..stopping import StopRequest
 from .adam import BETA1, BETA2, step_rows, take_rows
-from .losses import image_loss, volume_loss
+from .losses import image_loss, normal_loss, volume_loss
 from .scene import Scene
-from .settings import GROW_EVERY, GROW_FROM, GROW_UNTIL, HEAD_RATES, REST_FROM, Settings, downscale_at, rate, row_rates
+from .settings import (
+    GROW_EVERY,
+    GROW_FROM,
+    GROW_UNTIL,
+    HEAD_RATES,
+    REST_FROM,
+    SURFACE_FROM,
+    Settings,
+    downscale_at,
+    rate,
+    row_rates,
+)
 
 CHECKPOINT_SECONDS = 30.0
 _REPORT_SECONDS = 0.5
@@ -108,7 +119,7 @@ class Trainer:
         generator = torch.Generator().manual_seed(settings.seed)
         heads = Heads(settings.layout, settings.mode, settings.sh_degree, generator)
         grey = {"learned": 0.5, "black": 0.0, "white": 1.0}[settings.background]
-        model = ObjectModel(anchors, heads, torch.full((3,), grey), object_ids, normalization)
+        model = ObjectModel(anchors, heads, torch.full((3,), grey), object_ids, normalization, settings.primitive)
         rest = capture.has_masks and bool((np.asarray(point_ids) == 0).mean() >= REST_FROM)
         scene = Scene(capture, object_ids, normalization, settings.zero_is_object, memory_mb, teach_unlabelled=rest)
         return cls(scene, settings, model, rng)
@@ -319,13 +330,25 @@ class Trainer:
             self.model.heads, camera.centre,
         )  # fmt: skip
         self.splats = len(g.source)
-        drawn = rasterize(*g[:6], camera, labels=labels if settings.semantic_weight else None)
+        flat = settings.primitive == "2d"
+        normal_weight, distortion_weight = (
+            weight if flat and share >= SURFACE_FROM else 0.0
+            for weight in (settings.normal_weight, settings.distortion_weight)
+        )
+        drawn = rasterize(
+            *g[:6], camera, labels=labels if settings.semantic_weight else None, primitive=settings.primitive,
+            want_depth=normal_weight > 0, want_normals=normal_weight > 0, want_distortion=distortion_weight > 0,
+        )  # fmt: skip
         loss = image_loss(
             drawn.color, drawn.alpha, drawn.weight, self.model.background, picture, labels,
             settings.ssim_weight, settings.semantic_weight,
         )  # fmt: skip
         if settings.volume_weight and len(g.scales):
-            loss = loss + settings.volume_weight * volume_loss(g.scales)
+            loss = loss + settings.volume_weight * (0.5 if flat else 1.0) * volume_loss(g.scales, flat)
+        if drawn.normals is not None and drawn.depth is not None:
+            loss = loss + normal_weight * normal_loss(drawn.normals, drawn.depth, drawn.alpha, intrinsics)
+        if drawn.distortion is not None:
+            loss = loss + distortion_weight * drawn.distortion.mean()
         value = float(loss.detach())
         if not math.isfinite(value):
             p.skipped += 1
@@ -390,8 +413,9 @@ def model_from_checkpoint(tensors: dict[str, np.ndarray], state: dict[str, Any])
     centre, scale = state["normalization"]["centre"], state["normalization"]["scale"]
     normalization = Normalization((centre[0], centre[1], centre[2]), scale)
     return ObjectModel(
-        anchors, heads, torch.from_numpy(tensors["background"].copy()), tensors["object_ids"], normalization
-    )
+        anchors, heads, torch.from_numpy(tensors["background"].copy()), tensors["object_ids"], normalization,
+        settings.primitive,
+    )  # fmt: skip
 
 
 def load_model(folder: Path) -> tuple[ObjectModel, dict[str, Any], str | None]:

@@ -25,6 +25,12 @@ _WINDOW = (_WINDOW / _WINDOW.sum()).astype(np.float32)
 PROBABILITY_FLOOR = 1e-2
 """Added to P under the logarithm: a pixel whose object is absent pulls hard, but not without bound."""
 
+_SOLID = 0.5
+"""A pixel covered less than this has no depth to take a normal from."""
+
+_GRAZING = 0.1
+"""Cosine between ray and normal below which a surface is taken for a jump in depth."""
+
 # Sums may be reordered, so that they vectorise; NaN must still come through.
 _REORDER = {"reassoc", "contract", "nsz"}
 
@@ -211,8 +217,8 @@ class _ImageLoss(torch.autograd.Function):
 
 
 @kernel(parallel=True, fastmath=_REORDER)
-def _volumes(scales, gradient):
-    """Mean product of the rows of scales (N, 3), and its gradient."""
+def _volumes(scales, flat, gradient):
+    """Mean product of the rows of scales (N, 3), or of their first two numbers if `flat`, and its gradient."""
     n = scales.shape[0]
     chunks = (n + 1023) // 1024
     sums = np.zeros(chunks)
@@ -220,10 +226,10 @@ def _volumes(scales, gradient):
     for chunk in prange(chunks):
         total = np.float32(0.0)
         for i in range(chunk * 1024, min(chunk * 1024 + 1024, n)):
-            a, b, c = scales[i, 0], scales[i, 1], scales[i, 2]
+            a, b, c = scales[i, 0], scales[i, 1], np.float32(1.0) if flat else scales[i, 2]
             gradient[i, 0] = b * c * share
             gradient[i, 1] = a * c * share
-            gradient[i, 2] = a * b * share
+            gradient[i, 2] = np.float32(0.0) if flat else a * b * share
             total += a * b * c
         sums[chunk] = total
     return sums.sum() / n
@@ -231,18 +237,126 @@ def _volumes(scales, gradient):
 
 class _VolumeLoss(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, scales):
+    def forward(ctx: Any, scales, flat):
         ctx.gradient = np.empty(tuple(scales.shape), np.float32)
-        return torch.tensor(_volumes(scales.detach().numpy(), ctx.gradient), dtype=torch.float32)
+        return torch.tensor(_volumes(scales.detach().numpy(), flat, ctx.gradient), dtype=torch.float32)
 
     @staticmethod
     def backward(ctx: Any, g):
-        return torch.from_numpy(ctx.gradient) * g
+        return torch.from_numpy(ctx.gradient) * g, None
 
 
-def volume_loss(scales: torch.Tensor) -> torch.Tensor:
-    """Mean volume of the splats, prod(scales) of scales (N, 3), N > 0 (Scaffold-GS equation 9, taken as a mean)."""
-    return _VolumeLoss.apply(scales)
+def volume_loss(scales: torch.Tensor, flat: bool = False) -> torch.Tensor:
+    """Mean volume of the splats, prod(scales) of scales (N, 3), N > 0 (Scaffold-GS equation 9, taken as a mean), or
+    their mean area if they are `flat`."""
+    return _VolumeLoss.apply(scales, flat)
+
+
+@kernel(parallel=True)
+def _normal_sums(normals, depth, alpha, intrinsics, partial):
+    """Sum of alpha - normals . N over the pixels where the depth says a normal N.
+
+    N is across the differences of the left and the right neighbour's point and of the upper and the lower one's.
+    partial (9, H, W) receives the sum's gradient with respect to the two differences, then N; 0 where there is none.
+    """
+    height, width = alpha.shape
+    sums = np.zeros(height)
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    for y in prange(height):
+        for x in range(width):
+            for i in range(9):
+                partial[i, y, x] = 0.0
+            if x == 0 or y == 0 or x == width - 1 or y == height - 1:
+                continue
+            lowest = min(min(alpha[y, x - 1], alpha[y, x + 1]), min(alpha[y - 1, x], alpha[y + 1, x]))
+            if not min(lowest, alpha[y, x]) > _SOLID:
+                continue
+            rx, ry = (x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy
+            left, right = depth[y, x - 1] / alpha[y, x - 1], depth[y, x + 1] / alpha[y, x + 1]
+            above, below = depth[y - 1, x] / alpha[y - 1, x], depth[y + 1, x] / alpha[y + 1, x]
+            az, bz = right - left, below - above
+            ax, ay = rx * az + (right + left) / fx, ry * az
+            bx, by = rx * bz, ry * bz + (below + above) / fy
+            nx, ny, nz = by * az - ay * bz, ax * bz - bx * az, ay * bx - ax * by
+            length = math.sqrt(nx * nx + ny * ny + nz * nz)
+            if not length > 0.0:
+                continue
+            nx, ny, nz = nx / length, ny / length, nz / length
+            if not -(nx * rx + ny * ry + nz) > _GRAZING * math.sqrt(rx * rx + ry * ry + 1.0):
+                continue
+            mx, my, mz = normals[0, y, x], normals[1, y, x], normals[2, y, x]
+            along = mx * nx + my * ny + mz * nz
+            sums[y] += alpha[y, x] - along
+            # N = -(a x b) / |a x b|
+            gx, gy, gz = (mx - along * nx) / length, (my - along * ny) / length, (mz - along * nz) / length
+            partial[0, y, x] = by * gz - bz * gy
+            partial[1, y, x] = bz * gx - bx * gz
+            partial[2, y, x] = bx * gy - by * gx
+            partial[3, y, x] = gy * az - gz * ay
+            partial[4, y, x] = gz * ax - gx * az
+            partial[5, y, x] = gx * ay - gy * ax
+            partial[6, y, x] = nx
+            partial[7, y, x] = ny
+            partial[8, y, x] = nz
+    return sums.sum()
+
+
+@kernel(parallel=True)
+def _normal_gradient(depth, alpha, intrinsics, partial, g_normals, g_depth, g_alpha):
+    """The gradient of `_normal_sums` with respect to its first three arguments, over the number of pixels."""
+    height, width = alpha.shape
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    share = 1.0 / (height * width)
+    for y in prange(height):
+        for x in range(width):
+            rx, ry = (x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy
+            g = 0.0
+            for i in range(3):
+                pull = 0.0
+                if x > 0:
+                    pull += partial[i, y, x - 1]
+                if x < width - 1:
+                    pull -= partial[i, y, x + 1]
+                if y > 0:
+                    pull += partial[3 + i, y - 1, x]
+                if y < height - 1:
+                    pull -= partial[3 + i, y + 1, x]
+                g += pull * (rx if i == 0 else ry if i == 1 else 1.0)
+                g_normals[i, y, x] = -share * partial[6 + i, y, x]
+            there = 1.0 if partial[6, y, x] != 0.0 or partial[7, y, x] != 0.0 or partial[8, y, x] != 0.0 else 0.0
+            g_depth[y, x] = 0.0
+            if alpha[y, x] > 0.0 and g != 0.0:
+                g_depth[y, x] = share * g / alpha[y, x]
+                there -= g * depth[y, x] / (alpha[y, x] * alpha[y, x])
+            g_alpha[y, x] = share * there
+
+
+class _NormalLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, normals, depth, alpha, intrinsics):
+        arrays = [t.detach().numpy() for t in (normals, depth, alpha)]
+        height, width = arrays[2].shape
+        partial = np.empty((9, height, width), np.float32)
+        value = _normal_sums(*arrays, intrinsics, partial) / (height * width)
+        ctx.gradients = tuple(np.empty_like(a) for a in arrays)
+        _normal_gradient(*arrays[1:], intrinsics, partial, *ctx.gradients)
+        return torch.tensor(value, dtype=torch.float32)
+
+    @staticmethod
+    def backward(ctx: Any, g):
+        return (*(torch.from_numpy(a) * g for a in ctx.gradients), None)
+
+
+def normal_loss(
+    normals: torch.Tensor, depth: torch.Tensor, alpha: torch.Tensor, intrinsics: np.ndarray
+) -> torch.Tensor:
+    """Mean over the pixels of sum_i w_i (1 - n_i . N), N the normal of the surface that the depth shows (Huang et al.
+    2024, equation 14).
+
+    normals (3, H, W), depth and alpha (H, W) as in `Rendered`; intrinsics (fx, fy, cx, cy) in pixels. Counts where the
+    pixel and its neighbours are covered and the surface is not seen from its very edge, as a jump in depth would be.
+    """
+    return _NormalLoss.apply(normals, depth, alpha, intrinsics)
 
 
 def image_loss(

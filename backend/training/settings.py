@@ -17,6 +17,8 @@ class Settings:
     mode: `explicit` or `view`; sh_degree: of explicit colour; offsets: splats an anchor; voxel: edge of an anchor's
     cell in world units (None: the median spacing of the points); max_anchors: growth stops there.
     background: `learned`, `black` or `white`. zero_is_object: whether pixels of ID 0 are taught as a class.
+    primitive: `3d` Gaussians or `2d` discs; for discs, normal_weight: how much the normals are to agree with the depth,
+    distortion_weight: how much the splats along a ray are to lie at one depth, and half of volume_weight for the area.
     """
 
     seed: int = 0
@@ -30,6 +32,9 @@ class Settings:
     ssim_weight: float = 0.2
     volume_weight: float = 0.01
     zero_is_object: bool = False
+    primitive: str = "3d"
+    normal_weight: float = 0.05
+    distortion_weight: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -48,6 +53,9 @@ scene rather than for gaps in the masks. Objects that are taught nothing there s
 
 GROW_FROM, GROW_UNTIL, GROW_EVERY = 0.1, 0.5, 100
 """Growth runs between these shares of the training, every so many steps; statistics start half way to the first."""
+
+SURFACE_FROM = 0.25
+"""Share of the training from which on discs are taught normals and depth: before, there is no surface yet."""
 
 _ROW_RATES = {
     "offset_columns": (4e-2, 4e-4),

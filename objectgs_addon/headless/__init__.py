@@ -28,6 +28,7 @@ COMMANDS = {
     "import": commands.backend,
     "vote": commands.backend,
     "train": commands.backend,
+    "mesh": commands.mesh,
     "build": commands.build,
     "render": commands.render,
     "run": commands.run,

@@ -34,6 +34,13 @@ Every other option behind CAPTURE is one of the backend's train command:
 """
 
 
+_MESH = """\
+Make a textured mesh of each object of the reconstruction in DIR, in DIR/meshes.
+OPTIONS are those of `python -m backend mesh`, whose --help explains them:
+--objects NAME ..., --set NAME=ID,ID, --scene, --faces N, --open, --texture-size N.
+"""
+
+
 class UsageError(Exception):
     """The command line makes no sense; the message is one sentence."""
 
@@ -54,7 +61,8 @@ def parse(arguments: list[str]) -> argparse.Namespace:
             raise UsageError(f"Unrecognized arguments: {' '.join(rest)}; see headless.py --help.")
         return options
     if not rest or rest[0].startswith("-"):
-        raise UsageError(f"{options.takes} must come first: {options.command} {options.takes} --out DIR.")
+        out = "" if options.command == "mesh" else " --out DIR"
+        raise UsageError(f"{options.takes} must come first: headless.py {options.command} {options.takes}{out}.")
     options.source, *options.rest = rest
     return options
 
@@ -80,8 +88,11 @@ def _parser() -> argparse.ArgumentParser:
             name, summary, f"The backend's {name} command: {summary}.", takes="CAPTURE",
             usage=f"headless.py {name} CAPTURE --out DIR [OPTIONS]",
             epilog=f"OPTIONS are those of `python -m backend {name}`, whose --help explains them."))
+    mesh = command("mesh", "make a textured mesh of each object", _MESH, takes="DIR",
+                   usage="headless.py mesh DIR [OPTIONS]")
+    _backend_python(mesh)
     build = command("build", "make a .blend of a reconstruction",
-                    "Put a reconstruction's cameras, points and splats into a new .blend file.")
+                    "Put a reconstruction's cameras, points, splats and meshes into a new .blend file.")
     build.add_argument("folder", type=Path, metavar="DIR", help="reconstruction folder")
     build.add_argument("--blend", type=Path, metavar="FILE", help="file to write (DIR/objectgs.blend)")
     render = command("render", "make a picture of a .blend", "Render a picture of a .blend file that build has made.")
@@ -89,15 +100,21 @@ def _parser() -> argparse.ArgumentParser:
                         help="reconstruction folder with its objectgs.blend, or any .blend file")
     render.add_argument("--out", type=Path, required=True, metavar="PICTURE", help="file.png, .jpg or .exr")
     render.add_argument("--camera", metavar="NAME", help="a camera of the file (the scene's own)")
+    render.add_argument("--show", choices=("splats", "meshes", "both"), help="what of the objects (as in the file)")
+    render.add_argument("--apart", action="store_true", help=(
+        "pull the objects' meshes apart before, with a light, a ground and a camera for it; the file stays as it is"))
     _picture(render)
     run = command("run", "everything: from a capture to a .blend and a picture", (
-        "Train, measure, make DIR/objectgs.blend and render it into DIR/render.png."), takes="CAPTURE",
+        "Train, make meshes, measure, make DIR/objectgs.blend and render it: DIR/render.png shows the splats,\n"
+        "DIR/pulled-apart.png the meshes."), takes="CAPTURE",
         usage="headless.py run CAPTURE --out DIR [OPTIONS]", epilog=_TRAIN_OPTIONS)
     _backend(run)
+    _meshes(run)
     _picture(run)
     batch = command("batch", "run every capture of a folder", _BATCH, takes="FOLDER",
                     usage="headless.py batch FOLDER --out DIR [OPTIONS]", epilog=_TRAIN_OPTIONS)
     _backend(batch)
+    _meshes(batch)
     _picture(batch)
     return top
 
@@ -119,6 +136,14 @@ def _demo(sub: argparse.ArgumentParser) -> None:
 
 def _backend(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for what is made")
+    _backend_python(sub)
+
+
+def _meshes(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--no-meshes", action="store_true", help="make no meshes: splats only")
+
+
+def _backend_python(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--backend-python", metavar="PATH", help=(
         "the Python that has the compute backend (the variable OBJECTGS_PYTHON, or what the preferences say)"))
 

@@ -19,7 +19,7 @@ def batch(options) -> None:
     captures = _captures(source)
     find_backend(options.backend_python)
     settings = {"version": __version__, "train": options.rest, "engine": options.engine, "samples": options.samples,
-                "size": list(options.size) if options.size else None}
+                "size": list(options.size) if options.size else None, "meshes": not options.no_meshes}
     Reconstruction(out).create()
     summary = _Summary(out, captures)
     for number, capture in enumerate(captures, 1):

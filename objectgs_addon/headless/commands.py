@@ -12,15 +12,18 @@ from ...backend.stopping import StopRequest
 from .. import demo_capture, locations, scene, view
 from ..jobs import run_blocking
 from ..quiet import quiet
+from . import apart
 from .lines import say
 from .picture import render_picture
 
 BLEND = "objectgs.blend"
 PICTURE = "render.png"
+APART_PICTURE = "pulled-apart.png"
 SAMPLES = 16
 """Rays a pixel in the .blend that is built, unless --samples says otherwise."""
 
-_TITLES = {"import": "Import", "vote": "Vote", "train": "Train", "evaluate": "Evaluate", "report": "Report"}
+_TITLES = {"import": "Import", "vote": "Vote", "train": "Train", "mesh": "Mesh", "evaluate": "Evaluate",
+           "report": "Report"}
 
 
 class StepFailed(Exception):
@@ -55,6 +58,13 @@ def backend(options) -> None:
     _run_backend(options.command, folder, whole(Path(options.source)), "--out", folder, *options.rest)
 
 
+def mesh(options) -> None:
+    """The backend's own command on a reconstruction: meshes of its objects."""
+    find_backend(options.backend_python)
+    folder = whole(Path(options.source))
+    _run_backend("mesh", folder, folder, *options.rest)
+
+
 def build(options) -> None:
     """A .blend of a reconstruction."""
     folder = whole(options.folder)
@@ -67,7 +77,13 @@ def render(options) -> None:
     blend = source / BLEND if source.is_dir() else source
     if not blend.is_file():
         raise InputError(f"There is no file {blend}; make it with the build command.")
-    render_picture(blend, whole(options.out), options.camera, options.engine, options.samples, options.size)
+    if options.apart and options.camera:
+        raise InputError("--apart brings a camera of its own; leave --camera out.")
+    if options.apart:
+        _render_apart(blend, whole(options.out), options)
+    else:
+        render_picture(blend, whole(options.out), options.camera, options.engine, options.samples, options.size,
+                       _showing(options.show) if options.show else None)
     say(f"Wrote {options.out}.")
 
 
@@ -78,13 +94,36 @@ def run(options) -> None:
 
 
 def reconstruct(capture: Path, folder: Path, options) -> None:
-    """Make splats, a report, a .blend and a picture of `capture` in `folder`; what is there already is gone on from."""
+    """Make splats, meshes, a report, a .blend and pictures of `capture` in `folder`, from what is there already."""
     _run_backend("train", folder, capture, "--out", folder, *options.rest)
+    if not options.no_meshes:
+        try:
+            _run_backend("mesh", folder, folder)
+        except InputError as error:  # Splats that no surface can be found in are a result still.
+            say(f"Warning: {error}")
     _run_backend("evaluate", folder, folder)
     _run_backend("report", folder, folder)
-    build_blend(folder, folder / BLEND)
-    render_picture(folder / BLEND, folder / PICTURE, None, options.engine, options.samples, options.size)
+    has_meshes = build_blend(folder, folder / BLEND)
+    render_picture(folder / BLEND, folder / PICTURE, None, options.engine, options.samples, options.size,
+                   _showing("splats"))
     say(f"Wrote {folder / PICTURE}.")
+    if has_meshes:
+        _render_apart(folder / BLEND, folder / APART_PICTURE, options)
+        say(f"Wrote {folder / APART_PICTURE}.")
+
+
+def _render_apart(blend: Path, out: Path, options) -> None:
+    render_picture(blend, out, None, options.engine or "CYCLES", options.samples or apart.SAMPLES,
+                   options.size or apart.SIZE, apart.pull_apart)
+
+
+def _showing(which: str):
+    """What makes an opened .blend show splats, meshes or both in its picture."""
+    def prepare(target: bpy.types.Scene) -> None:
+        for root in apart.reconstructions(target):
+            scene.show_kinds(root, which)
+
+    return prepare
 
 
 def find_backend(python: str | None) -> None:
@@ -100,8 +139,8 @@ def find_backend(python: str | None) -> None:
                          "OBJECTGS_PYTHON, or set it up in the preferences of ObjectGS.")
 
 
-def build_blend(folder: Path, blend: Path) -> None:
-    """Put the reconstruction in `folder` into a new file and save it as `blend`."""
+def build_blend(folder: Path, blend: Path) -> bool:
+    """Put the reconstruction in `folder` into a new file and save it as `blend`; whether objects have meshes there."""
     files = Reconstruction(folder)
     if not (folder / "cameras.json").is_file():
         raise InputError(f"{folder} holds no reconstruction; make one with the import or train command.")
@@ -114,6 +153,9 @@ def build_blend(folder: Path, blend: Path) -> None:
             warnings += scene.show_result(root, folder, target).warnings
             view.hide_points(root)
         scene.prepare_render(target)
+        has_meshes = bool(scene.object_meshes(root))
+        if has_meshes or scene.scene_meshes(root):
+            apart.add_even_light(target)
         # Works on every machine; EEVEE needs a display, or draws on the processor.
         target.render.engine = "CYCLES"
         target.cycles.samples = SAMPLES
@@ -126,6 +168,7 @@ def build_blend(folder: Path, blend: Path) -> None:
     except RuntimeError as error:
         raise InputError(f"{blend} could not be written; check its folder and the free space.") from error
     say(f"Wrote {blend}.")
+    return has_meshes
 
 
 def _run_backend(command: str, folder: Path, *arguments: object) -> None:

@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import bpy
@@ -18,20 +19,24 @@ FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".exr": "OPEN_EXR"}
 
 
 def render_picture(blend: Path, out: Path, camera: str | None = None, engine: str | None = None,
-                   samples: int | None = None, size: tuple[int, int] | None = None) -> None:
+                   samples: int | None = None, size: tuple[int, int] | None = None,
+                   prepare: Callable[[bpy.types.Scene], None] | None = None) -> None:
     """Open `blend` and render its scene into `out`; what is None stays as the file says.
 
     camera: name of a camera object. engine: CYCLES or EEVEE. samples: a pixel. size: (width, height) in pixels.
+    prepare: changes the opened scene when it has its size; engine and samples go on top.
     `out` is the picture before or the new one, never half.  Raises `InputError`.
     """
     if out.suffix.lower() not in FORMATS:
         raise InputError(f"{out.name} has no known picture format; name it .png, .jpg or .exr.")
     scene = _open(blend)
-    _choose_camera(scene, camera, blend)
-    _choose_engine(scene, engine, samples)
     if size is not None:
         scene.render.resolution_x, scene.render.resolution_y = size
         scene.render.resolution_percentage = 100
+    if prepare is not None:
+        prepare(scene)
+    _choose_camera(scene, camera, blend)
+    _choose_engine(scene, engine, samples)
     out.parent.mkdir(parents=True, exist_ok=True)
     part = out.with_name(f"{out.stem}.part{out.suffix}")
     try:

@@ -14,6 +14,7 @@ from .kinds import (
     CAMERA,
     CAPTURE,
     FOLDER,
+    MESH,
     OBJECT_PARENT,
     PARENT,
     POINTS,
@@ -23,6 +24,7 @@ from .kinds import (
     folder_of,
     kind_of,
     mark,
+    object_id_of,
     parent_of,
     points_of,
 )
@@ -104,7 +106,8 @@ def _stand_up(root: bpy.types.Collection, upright: np.ndarray, views) -> bpy.typ
         parent.empty_display_size = 0.15 * float(np.linalg.norm(np.ptp(centres, axis=0))) if len(centres) > 1 else 1.0
         root.objects.link(parent)
         for thing in root.all_objects:
-            if thing.parent is None and kind_of(thing) in (CAMERA, POINTS, OBJECT_PARENT):
+            of_all = kind_of(thing) == MESH and object_id_of(thing) is None
+            if thing.parent is None and (of_all or kind_of(thing) in (CAMERA, POINTS, OBJECT_PARENT)):
                 thing.parent = parent
     elif list(parent.get(UPRIGHT, ())) != _numbers(parent.matrix_basis):
         return parent

@@ -21,6 +21,11 @@ OBJECT = "object"
 OBJECT_PARENT = "object_parent"
 SPLATS = "splats"
 ANCHORS = "anchors"
+MESH = "mesh"
+
+SPLATS_MATERIAL = "splats_material"
+MESH_MATERIAL = "mesh_material"
+TEXTURE = "mesh_texture"
 
 
 def kind_of(block) -> str | None:

@@ -8,7 +8,7 @@ import math
 
 import bpy
 
-from .kinds import kind_of, mark
+from .kinds import SPLATS_MATERIAL, kind_of, mark
 
 VERSION = "objectgs_version"
 SH_C0 = 0.28209479177387814
@@ -407,7 +407,7 @@ def _add_harmonics(graph: Graph, colour: bpy.types.NodeSocket, direction: bpy.ty
 def splats_material(name: str, colour: tuple[float, ...]) -> bpy.types.Material:
     """A new material for one object's splats; `colour` (linear RGB) is what Solid shows."""
     material, graph = _empty_material(name)
-    mark(material, "splats_material")
+    mark(material, SPLATS_MATERIAL)
     shader = _shared(bpy.data.node_groups, "splat_shader", 1, "ObjectGS Splat", _make_splat_shader)
     group = graph.node("ShaderNodeGroup", node_tree=shader)
     group.width = 200.0

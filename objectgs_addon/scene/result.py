@@ -9,18 +9,17 @@ import bpy
 import numpy as np
 
 from ...backend.palette import to_linear
-from ...backend.protocol import Reconstruction
+from ...backend.protocol import InputError, Reconstruction
 from . import carrier, preview
 from .capture import origin_of
 from .kinds import (
     ANCHORS,
-    OBJECT,
+    MESH,
     OBJECT_PARENT,
     SPLATS,
     adopt,
     capture_of,
     folder_of,
-    kind_of,
     mark,
     object_collections,
     parent_of,
@@ -28,12 +27,12 @@ from .kinds import (
     parts_of,
     points_of,
 )
+from .meshes import apply_shown, show_meshes
+from .object_collection import NAME, centre_of, new_collection, pivot_of, recolour, remove, remove_if_empty, rename
 from .objects_file import Objects
 from .points import positions_of, read_points, show_points
 from .splats import anchor_attributes, ids_of, middle_scale, read_anchors, read_splats, splat_attributes, unique_ids
 
-NAME = "objectgs_name"
-CENTRE = "objectgs_centre"
 GROUPING = "objectgs_grouping"
 SHOWN = "objectgs_shown"
 """On the root: when the splats.ply that it shows was written."""
@@ -53,11 +52,12 @@ class Shown:
 
 
 def show_result(root: bpy.types.Collection, folder: Path, scene: bpy.types.Scene) -> Shown:
-    """Show splats.ply and anchors.ply: each object in its collection, merged ones in that of what they are shown as.
+    """Show splats.ply, anchors.ply and the meshes: each object in its collection, merged ones in that of the other.
 
     What is there is updated in place: transforms, modifiers, materials, visibility and the place of collections stay
     as the user left them. Objects that have no splats any more lose theirs, and their collection where nothing else
-    is in it. Raises InputError, before anything is changed, where the folder's files cannot be used.
+    is in it. Raises InputError, before anything is changed, where the folder's files cannot be used; meshes that cannot
+    be are a warning.
     """
     folder = Path(folder)
     splats, warnings = read_splats(folder)
@@ -78,25 +78,34 @@ def show_result(root: bpy.types.Collection, folder: Path, scene: bpy.types.Scene
         own_anchors = anchor_groups.get(object_id)
         collection = collections.pop(object_id, None)
         if collection is None:
-            collection = _new_collection(object_id, objects)
-            adopt(collection, root, (OBJECT_PARENT, SPLATS, ANCHORS), object_id)
+            collection = new_collection(object_id, objects)
+            adopt(collection, root, (OBJECT_PARENT, SPLATS, ANCHORS, MESH), object_id)
             new.append(collection)
         positions = positions_of(own_splats, origin)
-        pivot = _pivot(collection, parent, object_id, positions)
-        carrier.fill(makers.part(collection, SPLATS, object_id, pivot).data, positions - _centre(pivot),
+        pivot = pivot_of(collection, parent, object_id, positions)
+        carrier.fill(makers.part(collection, SPLATS, object_id, pivot).data, positions - centre_of(pivot),
                      splat_attributes(own_splats))
         shown.splats += len(own_splats)
         if own_anchors is not None:
             carrier.fill(makers.part(collection, ANCHORS, object_id, pivot).data,
-                         positions_of(own_anchors, origin) - _centre(pivot), anchor_attributes(own_anchors))
+                         positions_of(own_anchors, origin) - centre_of(pivot), anchor_attributes(own_anchors))
             shown.anchors += len(own_anchors)
         elif anchors is not None:
-            _remove(part_of(collection, ANCHORS))
-        _rename(collection, objects.name(object_id))
-        _recolour(collection, objects.rgb(object_id))
+            remove(part_of(collection, ANCHORS))
+        rename(collection, objects.name(object_id))
+        recolour(collection, objects.rgb(object_id))
         shown.objects += object_id != 0
     for collection in collections.values():
-        _empty(collection)
+        for kind in (SPLATS, ANCHORS):
+            remove(part_of(collection, kind))
+    try:
+        shown.warnings += show_meshes(root, folder).warnings
+    except InputError as error:
+        shown.warnings.append(str(error))
+    apply_shown(root, makers.changed)
+    still_there = object_collections(root)
+    for object_id in collections.keys() & still_there.keys():
+        remove_if_empty(still_there[object_id])
     for collection in new:
         root.children.link(collection)
     root[GROUPING] = json.dumps(objects.grouping())
@@ -134,8 +143,8 @@ def show_objects(root: bpy.types.Collection, folder: Path, scene: bpy.types.Scen
         show_result(root, folder, scene)
         return
     for object_id, collection in object_collections(root).items():
-        _rename(collection, objects.name(object_id))
-        _recolour(collection, objects.rgb(object_id))
+        rename(collection, objects.name(object_id))
+        recolour(collection, objects.rgb(object_id))
 
 
 def _groups(table: np.ndarray, objects: Objects) -> dict[int, np.ndarray]:
@@ -154,40 +163,14 @@ def _groups(table: np.ndarray, objects: Objects) -> dict[int, np.ndarray]:
     return {target: rows[ends[i - 1] if i else 0:ends[i]] for i, target in enumerate(targets)}
 
 
-def _new_collection(object_id: int, objects: Objects) -> bpy.types.Collection:
-    collection = bpy.data.collections.new(objects.name(object_id))
-    mark(collection, OBJECT, object_id)
-    collection[NAME] = objects.name(object_id)
-    return collection
-
-
-def _pivot(collection, parent, object_id: int, positions: np.ndarray) -> bpy.types.Object:
-    """The object's own parent empty, at its splats' centre when made; the user may move it."""
-    pivot = part_of(collection, OBJECT_PARENT)
-    if pivot is None:
-        pivot = bpy.data.objects.new(collection[NAME], None)
-        mark(pivot, OBJECT_PARENT, object_id)
-        pivot.empty_display_type = "PLAIN_AXES"
-        centre, size = np.zeros(3), 1.0
-        if len(positions):
-            centre = np.median(positions, axis=0)
-            size = 0.5 * float(np.median(np.linalg.norm(positions - centre, axis=1))) or 1.0
-        pivot.empty_display_size = size
-        pivot[CENTRE] = centre.tolist()
-        pivot.location = centre
-        pivot.parent = parent
-        collection.objects.link(pivot)
-    elif pivot.parent is None:
-        pivot.parent = parent
-    return pivot
-
-
 class _Makers:
     """Makes mesh carriers; the second of a kind is a copy of the first, which is several times faster."""
 
     def __init__(self, objects: Objects, largest_point: float) -> None:
         self.objects = objects
         self.largest_point = largest_point
+        self.changed: set[int] = set()
+        """IDs of the objects whose splats are new."""
         self._made: dict[str, bpy.types.Object] = {}
 
     def part(self, collection, kind: str, object_id: int, pivot) -> bpy.types.Object:
@@ -208,6 +191,7 @@ class _Makers:
         mark(thing, kind, object_id)
         if kind == SPLATS:
             self._dress(thing, first, collection[NAME], to_linear(self.objects.rgb(object_id)))
+            self.changed.add(object_id)
         elif first is None:
             # Blender visits every object of the file for each of these settings; copies have them.
             thing.hide_render = thing.hide_viewport = True
@@ -224,62 +208,3 @@ class _Makers:
             material.name, material.diffuse_color = name, (*colour, 1.0)
         thing.data.materials.append(material)
         preview.use_material(thing, material)
-
-
-def _centre(pivot) -> np.ndarray:
-    """Where the pivot was made, in the reconstruction's coordinates: the origin of its children's."""
-    return np.array(pivot.get(CENTRE, (0.0, 0.0, 0.0)), np.float64)
-
-
-def _rename(collection, name: str) -> None:
-    """Give collection and parts a new name from objects.json; names that the user gave in Blender stay else."""
-    if collection.get(NAME) == name:
-        return
-    collection[NAME] = collection.name = name
-    for thing in parts_of(collection):
-        kind = kind_of(thing)
-        thing.name = name if kind == OBJECT_PARENT else f"{name} {kind}"
-        if thing.data is not None:
-            thing.data.name = thing.name
-        for material in _materials(thing):
-            material.name = name
-
-
-def _recolour(collection, rgb: tuple[int, int, int]) -> None:
-    colour = (*to_linear(rgb), 1.0)
-    for thing in parts_of(collection):
-        thing.color = colour
-        for material in _materials(thing):
-            material.diffuse_color = colour
-
-
-def _materials(thing) -> list[bpy.types.Material]:
-    """The materials that we made for a splats object."""
-    if kind_of(thing) != SPLATS or thing.data is None:
-        return []
-    return [material for material in thing.data.materials if kind_of(material) == "splats_material"]
-
-
-def _empty(collection) -> None:
-    """Take splats and anchors out of a collection, and remove it where only its own empty is left."""
-    for kind in (SPLATS, ANCHORS):
-        _remove(part_of(collection, kind))
-    pivot = part_of(collection, OBJECT_PARENT)
-    others = [thing for thing in collection.objects if thing != pivot]
-    if others or collection.children or (pivot is not None and pivot.children):
-        return
-    _remove(pivot)
-    bpy.data.collections.remove(collection)
-
-
-def _remove(thing) -> None:
-    """Remove an object with its mesh and our materials, where nothing else uses them."""
-    if thing is None:
-        return
-    mesh, materials = thing.data, _materials(thing)
-    bpy.data.objects.remove(thing)
-    if mesh is not None and mesh.users == 0:
-        bpy.data.meshes.remove(mesh)
-    for material in materials:
-        if material.users == 0:
-            bpy.data.materials.remove(material)

@@ -1,4 +1,4 @@
-"""Tiny synthetic captures: coloured spheres seen by a ring of cameras, with exact masks and tracks."""
+"""Tiny synthetic captures (coloured spheres seen by a ring of cameras, with exact masks and tracks), and commands."""
 
 from __future__ import annotations
 
@@ -6,10 +6,16 @@ import json
 import struct
 from pathlib import Path
 
+import numba
 import numpy as np
 import pycolmap
 import pytest
+import torch
 from PIL import Image
+
+from backend import arguments
+
+from .asking import Answer
 
 MODELS = [
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
@@ -172,3 +178,23 @@ def write_capture(tmp_path):
     # Reached through the fixture, since test folders are no packages to import from.
     write.sphere_ids, write.write_model, write.rays_of = sphere_ids, write_model, rays_of
     return write
+
+
+@pytest.fixture
+def ask(capsys, request):
+    """Runs a command in this process; `--json` in the arguments for events."""
+    threads = numba.get_num_threads(), torch.get_num_threads()
+
+    def restore():
+        numba.set_num_threads(threads[0])
+        torch.set_num_threads(threads[1])
+
+    request.addfinalizer(restore)
+
+    def run(*words) -> Answer:
+        capsys.readouterr()
+        code = arguments.main([*map(str, words), "--threads", "1"])
+        said = capsys.readouterr()
+        return Answer(code, said.out, said.err)
+
+    return run

@@ -11,10 +11,8 @@ import subprocess
 import sys
 import threading
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -34,51 +32,11 @@ from backend.raster.reference import sh_colors
 from backend.training.loop import Trainer
 from backend.training.settings import Settings
 
+from .asking import Answer, refused
+
 ROOT = Path(__file__).resolve().parents[2]
 FIXTURES = ROOT.parent / "shared" / "data" / "fixtures"
-TYPES = {"status", "progress", "preview", "quality", "warning", "error", "done"}
 SMALL = ("--offsets", "4")
-
-
-@dataclass
-class Answer:
-    """What one command said."""
-
-    code: int
-    out: str
-    err: str
-
-    @property
-    def events(self) -> list[dict]:
-        """The lines of stdout, each a JSON object of a known type; the last one closes."""
-        events = [json.loads(line) for line in self.out.splitlines()]
-        assert events and {event["type"] for event in events} <= TYPES
-        assert events[-1]["type"] in ("done", "error")
-        assert sum(event["type"] in ("done", "error") for event in events) == 1
-        return events
-
-    def messages(self, kind: str) -> list[str]:
-        return [event["message"] for event in self.events if event["type"] == kind]
-
-
-@pytest.fixture
-def ask(capsys, request):
-    """Runs a command in this process; `--json` in the arguments for events."""
-    threads = numba.get_num_threads(), torch.get_num_threads()
-
-    def restore():
-        numba.set_num_threads(threads[0])
-        torch.set_num_threads(threads[1])
-
-    request.addfinalizer(restore)
-
-    def run(*words) -> Answer:
-        capsys.readouterr()
-        code = arguments.main([*map(str, words), "--threads", "1"])
-        said = capsys.readouterr()
-        return Answer(code, said.out, said.err)
-
-    return run
 
 
 _kept: dict[str, Path] = {}
@@ -94,18 +52,6 @@ def trained(write_capture, tmp_path, tmp_path_factory, ask):
         _kept.update(capture=place / "capture", out=place / "out")
     shutil.copytree(_kept["out"], tmp_path / "out")
     return _kept["capture"], tmp_path / "out"
-
-
-def refused(answer: Answer, *words: str) -> str:
-    """The command was refused with one plain sentence that holds `words`; returns it."""
-    assert answer.code == EXIT_BAD_INPUT, answer
-    sentences = [line for line in answer.err.splitlines() if line.startswith("error: ")]
-    assert len(sentences) == 1 and "Traceback" not in answer.err, answer.err
-    assert all(line.startswith(("error: ", "warning: ")) for line in answer.err.splitlines()), answer.err
-    assert sentences[0].endswith(".")
-    for word in words:
-        assert word in sentences[0], sentences[0]
-    return sentences[0]
 
 
 def no_halves(folder: Path) -> None:

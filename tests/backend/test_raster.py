@@ -37,18 +37,25 @@ def as_float32(scene):
     return {k: v if k == "ids" else v.float() for k, v in scene.items()}
 
 
-def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolerance=1e-5):
+def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolerance=1e-5, primitive="3d"):
+    """Picture and gradients of a random loss by both renderers; `primitive` "2d": with everything that discs have."""
     scene = as_float32(scene)
+    flat = primitive == "2d"
     rng = np.random.default_rng(seed)
     shape = (cam.height, cam.width)
     labels = torch.tensor(rng.integers(-1, objects, shape), dtype=torch.int32)
     fast = {k: v.clone().requires_grad_(k != "ids") for k, v in scene.items()}
     slow = {k: v.clone() if k == "ids" else v.double().requires_grad_() for k, v in scene.items()}
-    got = rasterize(**fast, camera=cam, labels=labels, want_depth=True, want_median=True)
-    want = rasterize_reference(**slow, camera=cam, objects=objects)
+    got = rasterize(
+        **fast, camera=cam, labels=labels, want_depth=True, want_median=True, want_normals=flat, want_distortion=flat,
+        primitive=primitive,
+    )  # fmt: skip
+    want = rasterize_reference(**slow, camera=cam, objects=objects, primitive=primitive)
     index = labels.long().clamp(min=0)[..., None]
     want_weight = torch.where(labels >= 0, want.probabilities.gather(-1, index)[..., 0], torch.zeros(()).double())
-    pairs = ((got.color, want.color), (got.alpha, want.alpha), (got.weight, want_weight), (got.depth, want.depth))
+    pairs = [(got.color, want.color), (got.alpha, want.alpha), (got.weight, want_weight), (got.depth, want.depth)]
+    if flat:
+        pairs += [(got.normals, want.normals), (got.distortion, want.distortion)]
     g = [torch.tensor(rng.normal(size=tuple(a.shape))) for a, _ in pairs]
     for a, b in pairs:
         assert torch.isfinite(a).all()
@@ -63,6 +70,7 @@ def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolera
         loss64.backward()
         for name in NAMES:
             a, b = fast[name].grad.double(), slow[name].grad
+            b = torch.zeros_like(a) if b is None else b
             assert torch.isfinite(a).all(), name
             largest = b.abs().max().item()
             relative = 10 * gradient_tolerance
@@ -82,10 +90,15 @@ def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolera
     return got, want
 
 
+PRIMITIVES = pytest.mark.parametrize("primitive", ["3d", "2d"])
+
+
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
-def test_agrees_with_reference_on_random_scenes(seed, coefficients):
-    compare(random_scene(seed, coefficients=coefficients), camera(), seed=seed)
+@pytest.mark.parametrize(
+    ("primitive", "coefficients"), [("3d", 1), ("3d", 4), ("3d", 9), ("3d", 16), ("2d", 1), ("2d", 4)]
+)
+def test_agrees_with_reference_on_random_scenes(seed, coefficients, primitive):
+    compare(random_scene(seed, coefficients=coefficients), camera(), seed=seed, primitive=primitive)
 
 
 def test_median_depth_is_that_of_the_splat_at_half_of_the_light():

@@ -47,11 +47,20 @@ def among_others(scene, seed=0):
     return join(scene, random_scene(seed, count=25))
 
 
-def draw(scene, cam, labels=None, seed=0):
+@pytest.fixture(params=["3d", "2d"])
+def primitive(request):
+    return request.param
+
+
+def draw(scene, cam, labels=None, seed=0, primitive="3d"):
     """Picture and gradients of a random loss, all as NumPy arrays."""
     leaves = {k: v.clone() if k == "ids" else v.clone().requires_grad_() for k, v in scene.items()}
-    picture = rasterize(**leaves, camera=cam, labels=labels, want_depth=True)
-    planes = [p for p in picture[:4] if p is not None]
+    flat = primitive == "2d"
+    picture = rasterize(
+        **leaves, camera=cam, labels=labels, want_depth=True, want_normals=flat, want_distortion=flat,
+        primitive=primitive,
+    )  # fmt: skip
+    planes = [p for p in picture[:7] if p is not None]
     rng = np.random.default_rng(seed)
     sum((p * torch.tensor(rng.normal(size=tuple(p.shape)), dtype=p.dtype)).sum() for p in planes).backward()
     arrays = {f"plane {i}": p.detach().numpy() for i, p in enumerate(planes)}
@@ -65,11 +74,14 @@ def assert_same_bits(a, b):
         assert np.array_equal(a[name].view(np.uint8), b[name].view(np.uint8)), name
 
 
-def assert_unharmed(bad, seed=1):
+def assert_unharmed(bad, seed=1, primitive="3d"):
     """A dropped splat leaves the others' picture and gradients bit for bit as they are without it."""
     others = as_float32(random_scene(seed, count=25))
     bad = as_float32(bad)
-    alone, together = draw(others, camera()), draw(join(bad, others), camera())
+    alone, together = (
+        draw(others, camera(), primitive=primitive),
+        draw(join(bad, others), camera(), primitive=primitive),
+    )
     count = bad["means"].shape[0]
     for name in NAMES:
         assert not together[name][:count].any(), name
@@ -80,10 +92,10 @@ def assert_unharmed(bad, seed=1):
 # Shapes
 
 
-def test_zero_quaternion_is_dropped():
-    assert_unharmed(one(quat=(0, 0, 0, 0)))
-    assert_unharmed(one(quat=(1e-5, 0, 0, 0)))
-    compare(among_others(one(quat=(0, 0, 0, 0))), camera())
+def test_zero_quaternion_is_dropped(primitive):
+    assert_unharmed(one(quat=(0, 0, 0, 0)), primitive=primitive)
+    assert_unharmed(one(quat=(1e-5, 0, 0, 0)), primitive=primitive)
+    compare(among_others(one(quat=(0, 0, 0, 0))), camera(), primitive=primitive)
 
 
 BEHIND_OPAQUE = 2e-4
@@ -91,110 +103,116 @@ BEHIND_OPAQUE = 2e-4
 
 
 @pytest.mark.parametrize("length", [1e-3, 1e3, 1e9])
-def test_quaternion_of_any_length(length):
+def test_quaternion_of_any_length(length, primitive):
     q = np.array([0.3, -0.5, 0.7, 0.2]) * length
-    compare(one(quat=tuple(q), scale=(0.2, 0.05, 0.1)), camera())
+    compare(one(quat=tuple(q), scale=(0.2, 0.05, 0.1)), camera(), primitive=primitive)
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_one_zero_scale(axis):
+def test_one_zero_scale(axis, primitive):
     scale = [0.2, 0.2, 0.2]
     scale[axis] = 0.0
-    compare(among_others(one(quat=(0.9, 0.3, -0.2, 0.1), scale=scale)), camera())
+    compare(among_others(one(quat=(0.9, 0.3, -0.2, 0.1), scale=scale)), camera(), primitive=primitive)
 
 
-def test_edge_on_disc():
-    compare(among_others(one(scale=(0.0, 0.3, 0.3))), straight())
+def test_edge_on_disc(primitive):
+    compare(among_others(one(scale=(0.0, 0.3, 0.3))), straight(), primitive=primitive)
 
 
-def test_all_scales_zero_is_a_blurred_point():
-    got, _ = compare(among_others(one(scale=(0, 0, 0))), straight())
+def test_all_scales_zero_is_a_blurred_point(primitive):
+    got, _ = compare(among_others(one(scale=(0, 0, 0))), straight(), primitive=primitive)
     assert got.alpha[HEIGHT // 2, WIDTH // 2] > 0.5
 
 
-def test_scales_whose_determinant_underflows_float32():
-    compare(among_others(one(scale=(1e-22, 1e-22, 1e-22))), camera())
-    compare(among_others(one(scale=(1e-30, 0.3, 1e-30), quat=(0.9, 0.3, 0.2, 0.4))), camera())
+def test_scales_whose_determinant_underflows_float32(primitive):
+    compare(among_others(one(scale=(1e-22, 1e-22, 1e-22))), camera(), primitive=primitive)
+    compare(among_others(one(scale=(1e-30, 0.3, 1e-30), quat=(0.9, 0.3, 0.2, 0.4))), camera(), primitive=primitive)
 
 
 @pytest.mark.parametrize("ratio", [1e3, 1e4, 1e5, 1e6])
 @pytest.mark.parametrize("angle", [0.0, 90.0, 45.0, 30.0, 89.999])
 @pytest.mark.parametrize("thin", [1e-6, 1e-3])
-def test_needle(ratio, angle, thin):
+def test_needle(ratio, angle, thin, primitive):
+    if primitive == "2d" and thin > 1e-6:
+        thin *= 10  # broad enough for its plane to be drawn
     half = np.deg2rad(angle) / 2
     needle = one(quat=(np.cos(half), 0, 0, np.sin(half)), scale=(thin * ratio, thin, thin), mean=(0.013, -0.021, 2.0))
-    compare(needle, camera())
-    compare(among_others(needle), camera())
+    compare(needle, camera(), primitive=primitive)
+    compare(among_others(needle), camera(), primitive=primitive)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_needles_in_any_direction(seed):
+def test_needles_in_any_direction(seed, primitive):
     rng = np.random.default_rng(seed)
     scene = random_scene(seed, count=20)
     scene["scales"] = torch.tensor(10.0 ** rng.uniform(-6, 1, (20, 3)))
-    compare(scene, camera(), seed=seed)
+    compare(scene, camera(), seed=seed, primitive=primitive)
 
 
-def test_huge_splat_off_the_picture():
+def test_huge_splat_off_the_picture(primitive):
     for mean in ((300.0, 0, 2.0), (-250.0, 180.0, 2.0), (0, 1e4, 2.0)):
         scale = np.linalg.norm(mean) / 2
-        compare(among_others(one(mean=mean, scale=(scale, scale / 3, scale))), straight())
+        compare(among_others(one(mean=mean, scale=(scale, scale / 3, scale))), straight(), primitive=primitive)
 
 
-def test_long_diagonal_needle_centred_off_the_picture():
+def test_long_diagonal_needle_centred_off_the_picture(primitive):
     half = np.pi / 8
     quat = (np.cos(half), 0, 0, np.sin(half))
     for distance in (10.0, 1e3, 1e5):
-        compare(one(mean=(distance, distance, 2.0), scale=(distance, 1e-3, 1e-3), quat=quat), straight())
+        compare(
+            one(mean=(distance, distance, 2.0), scale=(distance, 1e-3, 1e-3), quat=quat),
+            straight(),
+            primitive=primitive,
+        )
 
 
-def test_splat_that_misses_the_picture_has_no_gradient():
-    assert_unharmed(one(mean=(50.0, 0, 2.0)))
+def test_splat_that_misses_the_picture_has_no_gradient(primitive):
+    assert_unharmed(one(mean=(50.0, 0, 2.0)), primitive=primitive)
 
 
 @pytest.mark.parametrize("scale", [np.inf, 3e38, 1e20, 1e9])
-def test_overflowing_scale(scale):
+def test_overflowing_scale(scale, primitive):
     """exp() of a log-scale that ran away."""
     for scales in ((scale, 0.1, 0.1), (0.1, scale, 0.1), (scale, scale, scale)):
-        compare(among_others(one(scale=scales, quat=(0.9, 0.3, -0.2, 0.1))), camera())
+        compare(among_others(one(scale=scales, quat=(0.9, 0.3, -0.2, 0.1))), camera(), primitive=primitive)
 
 
 # Opacity
 
 
-def test_opaque_splat_on_a_pixel_centre_is_drawn():
+def test_opaque_splat_on_a_pixel_centre_is_drawn(primitive):
     for opacity in (0.999, 1.0, 1.7):
-        got, _ = compare(one(opacity=opacity, scale=(1e-4,) * 3), straight())
+        got, _ = compare(one(opacity=opacity, scale=(1e-4,) * 3), straight(), primitive=primitive)
         assert got.alpha[HEIGHT // 2, WIDTH // 2].item() == pytest.approx(0.99)
 
 
 @pytest.mark.parametrize("scale", [1e-4, 0.1, 1.0])
 @pytest.mark.parametrize("opacity", [0.98, 0.99, 1.0])
-def test_sixteen_opaque_splats_stacked(scale, opacity):
+def test_sixteen_opaque_splats_stacked(scale, opacity, primitive):
     layers = [one(mean=(0, 0, 1 + 0.1 * i), opacity=opacity, scale=(scale,) * 3, id=i % 5) for i in range(16)]
-    compare(join(*layers), straight(), gradient_tolerance=BEHIND_OPAQUE)
+    compare(join(*layers), straight(), gradient_tolerance=BEHIND_OPAQUE, primitive=primitive)
 
 
-def test_hundreds_of_layers_stop_where_the_reference_does():
+def test_hundreds_of_layers_stop_where_the_reference_does(primitive):
     rng = np.random.default_rng(0)
     scene = random_scene(0, count=400)
     scene["opacities"] = torch.tensor(rng.uniform(0.3, 1.0, 400))
-    compare(scene, camera(), gradient_tolerance=BEHIND_OPAQUE)
+    compare(scene, camera(), gradient_tolerance=BEHIND_OPAQUE, primitive=primitive)
 
 
 @pytest.mark.parametrize("opacity", [0.0, -1.0, ALPHA_MIN * 0.999])
-def test_nothing_visible(opacity):
+def test_nothing_visible(opacity, primitive):
     scene = random_scene(0)
     scene["opacities"] = torch.full_like(scene["opacities"], opacity)
-    got, _ = compare(scene, camera())
+    got, _ = compare(scene, camera(), primitive=primitive)
     assert not got.color.any() and not got.alpha.any() and not got.weight.any() and not got.depth.any()
     ids, probability = object_map(got)
     assert (ids == -1).all() and not probability.any()
 
 
-def test_no_splats():
+def test_no_splats(primitive):
     scene = {k: v[:0] for k, v in random_scene(0).items()}
-    got, _ = compare(scene, camera())
+    got, _ = compare(scene, camera(), primitive=primitive)
     assert not got.alpha.any()
     assert (object_map(got)[0] == -1).all()
 
@@ -203,16 +221,16 @@ def test_no_splats():
 
 
 @pytest.mark.parametrize("near", [NEAR, 0.2])
-def test_depth_around_the_near_plane(near):
+def test_depth_around_the_near_plane(near, primitive):
     edge = np.float32(near)
     depths = (0.0, np.nextafter(edge, np.float32(0)), edge, np.nextafter(edge, np.float32(1)), -2.0, -near)
     for z in depths:
         scene = among_others(one(mean=(0, 0, float(z)), scale=(0.001,) * 3))
-        got, _ = compare(scene, straight(near=near))
+        got, _ = compare(scene, straight(near=near), primitive=primitive)
         assert got.frame.seen[0] == (float(z) > near)
 
 
-def test_splat_at_the_camera_centre_is_dropped():
+def test_splat_at_the_camera_centre_is_dropped(primitive):
     viewmat = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     cam = camera()
     pose = np.eye(4)
@@ -220,11 +238,11 @@ def test_splat_at_the_camera_centre_is_dropped():
     pose[:3, 3] = pose[:3, :3] @ [-0.5, 0.25, 2.0]
     cam = dataclasses.replace(cam, viewmat=pose)
     scene = among_others(one(mean=(0.5, -0.25, -2.0)))
-    got, _ = compare(scene, cam)
+    got, _ = compare(scene, cam, primitive=primitive)
     assert not got.frame.seen[0]
 
 
-def test_coincident_points():
+def test_coincident_points(primitive):
     scene = random_scene(0, count=40)
     scene["means"] = scene["means"][:1].expand(40, 3).contiguous()
     scene["opacities"] *= 0.3
@@ -233,11 +251,11 @@ def test_coincident_points():
     scene["opacities"] = scene["opacities"][:1].expand(40).contiguous()
     scene["sh"] = scene["sh"][:1].expand(40, 4, 3).contiguous()
     scene["ids"] = torch.zeros(40, dtype=torch.int32)
-    compare(scene, camera())
+    compare(scene, camera(), primitive=primitive)
 
 
 @pytest.mark.parametrize("same", ["depth", "everything but the id"])
-def test_equal_depths_do_not_depend_on_the_input_order(same):
+def test_equal_depths_do_not_depend_on_the_input_order(same, primitive):
     scene = as_float32(random_scene(3, count=80))
     if same == "depth":
         scene["means"][:, 2] = 2.0
@@ -245,10 +263,10 @@ def test_equal_depths_do_not_depend_on_the_input_order(same):
         scene = {k: v if k == "ids" else v[:1].expand_as(v).clone() for k, v in scene.items()}
     labels = torch.tensor(np.random.default_rng(0).integers(0, 5, (HEIGHT, WIDTH)), dtype=torch.int32)
     cam = camera()
-    first = draw(scene, cam, labels)
+    first = draw(scene, cam, labels, primitive=primitive)
     for seed in range(3):
         mixed = torch.tensor(np.random.default_rng(seed).permutation(80))
-        again = draw({k: v[mixed] for k, v in scene.items()}, cam, labels)
+        again = draw({k: v[mixed] for k, v in scene.items()}, cam, labels, primitive=primitive)
         if same == "depth":
             for name in NAMES:
                 first_mixed = first[name][mixed.numpy()]
@@ -261,12 +279,12 @@ def test_equal_depths_do_not_depend_on_the_input_order(same):
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_splat_that_is_not_finite_is_dropped(name, value):
+def test_splat_that_is_not_finite_is_dropped(name, value, primitive):
     bad = one()
     bad[name].view(-1)[0] = value
     if name == "opacities" and value == -np.inf:
         bad = join(bad, bad)
-    assert_unharmed(bad)
+    assert_unharmed(bad, primitive=primitive)
 
 
 # Labels
@@ -281,13 +299,13 @@ def test_no_labelled_pixel():
     assert not any(scene[name].grad.any() for name in NAMES)
 
 
-def test_one_class():
+def test_one_class(primitive):
     """With one object the label's probability is the picture's alpha."""
     cam = camera()
     scene = as_float32(random_scene(0, objects=1))
     picture = rasterize(**scene, camera=cam, labels=torch.zeros(cam.height, cam.width, dtype=torch.int32))
     np.testing.assert_allclose(picture.weight, picture.alpha, atol=1e-6)
-    compare(random_scene(0, objects=1), cam, objects=1)
+    compare(random_scene(0, objects=1), cam, objects=1, primitive=primitive)
 
 
 def test_probability_zero_under_the_logarithm():
@@ -380,11 +398,11 @@ def test_ten_thousand_objects_and_large_ids():
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (67, 1), (63, 31), (64, 32), (65, 33), (129, 65), (127, 3)])
-def test_odd_sizes(size):
-    compare(random_scene(0, count=40), camera(*size))
+def test_odd_sizes(size, primitive):
+    compare(random_scene(0, count=40), camera(*size), gradient_tolerance=2e-5, primitive=primitive)
 
 
-def test_scene_far_from_the_origin():
+def test_scene_far_from_the_origin(primitive):
     """Georeferenced: float64 means are taken relative to the camera before they become float32."""
     offset = torch.tensor([4.6e6, -1.2e6, 3.1e6], dtype=torch.float64)
     scene = {k: v if k in ("ids", "means") else v.float() for k, v in random_scene(0).items()}
@@ -393,8 +411,8 @@ def test_scene_far_from_the_origin():
     viewmat[:3, 3] = -viewmat[:3, :3] @ offset.numpy()
     far = dataclasses.replace(cam, viewmat=viewmat)
     labels = torch.zeros(cam.height, cam.width, dtype=torch.int32)
-    here = draw(scene, cam, labels)
-    there = draw({**scene, "means": scene["means"] + offset}, far, labels)
+    here = draw(scene, cam, labels, primitive=primitive)
+    there = draw({**scene, "means": scene["means"] + offset}, far, labels, primitive=primitive)
     assert there["means"].dtype == np.float64
     for name in here:
         # 1e-9 is what float64 itself loses at this offset.
@@ -404,11 +422,11 @@ def test_scene_far_from_the_origin():
 
 
 @pytest.mark.parametrize("size", [1e-4, 1e-2, 1e4])
-def test_scene_of_another_size(size):
+def test_scene_of_another_size(size, primitive):
     scene = random_scene(0)
     scene["means"] *= size
     scene["scales"] *= size
-    compare(scene, dataclasses.replace(camera(), near=NEAR * size))
+    compare(scene, dataclasses.replace(camera(), near=NEAR * size), primitive=primitive)
 
 
 # Determinism
@@ -418,22 +436,22 @@ def dense_scene():
     return as_float32(random_scene(5, count=3000, size=0.05)), camera(200, 133)
 
 
-def test_same_input_gives_the_same_bits():
+def test_same_input_gives_the_same_bits(primitive):
     scene, cam = dense_scene()
     labels = torch.zeros(cam.height, cam.width, dtype=torch.int32)
-    assert_same_bits(draw(scene, cam, labels), draw(scene, cam, labels))
+    assert_same_bits(draw(scene, cam, labels, primitive=primitive), draw(scene, cam, labels, primitive=primitive))
 
 
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread only")
-def test_one_and_two_threads_give_the_same_bits():
+def test_one_and_two_threads_give_the_same_bits(primitive):
     scene, cam = dense_scene()
     labels = torch.zeros(cam.height, cam.width, dtype=torch.int32)
     before = numba.get_num_threads()
     try:
         numba.set_num_threads(1)
-        single = draw(scene, cam, labels)
+        single = draw(scene, cam, labels, primitive=primitive)
         numba.set_num_threads(2)
-        double = draw(scene, cam, labels)
+        double = draw(scene, cam, labels, primitive=primitive)
     finally:
         numba.set_num_threads(before)
     assert_same_bits(single, double)

@@ -135,6 +135,58 @@ def test_report_md_shows_figures_pictures_and_what_was_left_out(reconstruction):
     assert left_over == []
 
 
+def with_meshes():
+    mesh = {
+        "vertices": 10_000, "faces": 19_998, "watertight": True, "manifold": True, "chamfer": 0.00251,
+        "precision": 0.9, "recall": 0.8, "f1": 0.847, "f1_005": 0.61, "f1_all": 0.7, "texture_psnr": 26.34,
+        "texture_coverage": 0.995, "components": 1, "self_intersections": 0, "invented": 0.125,
+    }  # fmt: skip
+    leaky = {**mesh, "watertight": False, "manifold": False, "f1": math.nan, "texture_psnr": 20.0, "faces": 500}
+    return {
+        "objects": [
+            {"id": 1, "name": "mug", "mesh": mesh},
+            {"id": 2, "name": "ring", "mesh": leaky},
+            {"id": 3, "name": "po|ster", "mesh": {"why": "one view shows it"}},
+            {"id": 4, "name": "not asked for"},
+        ],
+        "meshes": [{"name": "whole scene", "objects": None, **mesh, "faces": 20_000}],
+    }
+
+
+def test_meshes_have_a_section_with_their_figures_and_why_there_is_none(reconstruction):
+    sheet = Image.new("RGB", (300, 200), (250, 250, 250))
+    returned = write_report(reconstruction, with_meshes(), mesh_sheet=sheet)
+    report = strictly(reconstruction.report_json.read_text(encoding="utf-8"))
+    assert report == returned
+    assert report["objects"][0]["mesh"]["f1_005"] == 0.61 and report["objects"][1]["mesh"]["f1"] is None
+    assert report["objects"][2]["mesh"]["why"] == "one view shows it" and report["objects"][2]["mesh"]["faces"] is None
+    assert report["meshes"][0]["faces"] == 20_000
+    text = reconstruction.report_md.read_text(encoding="utf-8")
+    section = text[text.index("## Meshes") :]
+    assert "2 of 4 objects have a mesh; 1 watertight; 1 manifold; median F1 at 0.02 **0.847**" in section
+    assert "median texture PSNR **23.2 dB**, lowest 20.0 dB (ring)" in section
+    rows = {line.split(" | ")[0].strip("| "): line for line in section.splitlines() if line.startswith("|")}
+    for value in ("19,998", "0.00251", "0.847", "0.610", "0.700", "26.3 dB", "99.5%", "12.5%", "yes"):
+        assert f" {value} |" in rows["mug"], value
+    assert rows["ring"].count("**no**") == 2 and " — |" in rows["ring"]
+    assert "one view shows it" in rows[r"po\|ster"] and "20,000" in rows["whole scene"]
+    assert "not asked for" not in section
+    assert "![Each mesh: surface, wires and texture](pictures/meshes.png)" in section
+    assert (np.asarray(Image.open(reconstruction.pictures / "meshes.png")) == np.asarray(sheet)).all()
+    write_report(reconstruction, a_report())
+    assert not (reconstruction.pictures / "meshes.png").exists(), "no picture of meshes that are gone"
+
+
+def test_without_truth_the_mesh_table_has_no_empty_columns(reconstruction):
+    report = with_meshes()
+    for entry in (report["objects"][0]["mesh"], report["objects"][1]["mesh"], report["meshes"][0]):
+        for name in ("chamfer", "precision", "recall", "f1", "f1_005", "f1_all"):
+            entry[name] = None
+    write_report(reconstruction, report)
+    section = reconstruction.report_md.read_text(encoding="utf-8").split("## Meshes")[1]
+    assert "F1" not in section and "Chamfer" not in section and "Texture" in section
+
+
 def test_names_cannot_break_the_tables(reconstruction):
     write_report(reconstruction, a_report())
     lines = reconstruction.report_md.read_text(encoding="utf-8").splitlines()

@@ -2,6 +2,7 @@
 """headless.py: what its commands leave behind, its exit codes, and that it can be stopped at any moment."""
 
 import json
+import math
 import os
 import shutil
 import signal
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
@@ -16,6 +18,8 @@ bpy = pytest.importorskip("bpy")
 from objectgs.objectgs_addon.headless.batch import fingerprint  # noqa: E402
 
 import headless  # noqa: E402
+
+from .building import tetrahedron, write_meshes  # noqa: E402
 
 SIZE = ("--size", "48x36", "--samples", "1")
 
@@ -60,7 +64,7 @@ def blend(trained, tmp_path_factory):
 def test_help(capsys):
     ran = run("--help")
     assert ran.returncode == 0
-    for command in ("demo", "import", "vote", "train", "build", "render", "run", "batch"):
+    for command in ("demo", "import", "vote", "train", "mesh", "build", "render", "run", "batch"):
         assert f"\n    {command}" in ran.output
         with pytest.raises(SystemExit) as ended:
             headless.main([command, "--help"])
@@ -78,6 +82,8 @@ def test_help(capsys):
     (("build", "x", "--colour", "red"), "--colour"),
     (("render", "x", "--out", "a.png", "--size", "640"), "640x480"),
     (("render", "x", "--out", "a.png", "--samples", "0"), "'0'"),
+    (("render", "x", "--out", "a.png", "--show", "points"), "points"),
+    (("mesh", "--scene"), "DIR must come first: headless.py mesh DIR."),
 ])
 def test_arguments_that_make_no_sense(arguments, words, capsys):
     assert headless.main(list(arguments)) == 2
@@ -124,10 +130,80 @@ def test_render_from_any_camera(blend, tmp_path):
     assert len(list(tmp_path.iterdir())) == 3
 
 
+@pytest.fixture(scope="module")
+def meshed(trained, tmp_path_factory):
+    """A trained folder with a mesh of each object but the last, and its .blend; they stand in a ring, in a room."""
+    folder = shutil.copytree(trained, tmp_path_factory.mktemp("meshed") / "demo")
+    ids = [entry["id"] for entry in json.loads((folder / "objects.json").read_text())["objects"]]
+    meshes = {str(i): tetrahedron((math.cos(i), math.sin(i), 0.0), 0.8) for i in ids[:-1]}
+    meshes[str(ids[0])] = tetrahedron((-9, -9, -9), 40.0)  # a room
+    write_meshes(folder, meshes)
+    ran = run("build", folder)
+    assert ran.returncode == 0, ran.output + ran.errors
+    return folder
+
+
+def opened(blend):
+    bpy.ops.wm.open_mainfile(filepath=str(blend))
+    return bpy.data.objects
+
+
+def pixels(picture):
+    """(H, W, 3), 0 .. 1."""
+    image = bpy.data.images.load(str(picture))
+    try:
+        return np.array(image.pixels[:]).reshape(image.size[1], image.size[0], -1)[..., :3]
+    finally:
+        bpy.data.images.remove(image)
+
+
+def test_build_holds_meshes_with_their_textures(meshed, tmp_path):
+    moved = shutil.copytree(meshed, tmp_path / "moved")
+    meshes = [thing for thing in opened(moved / "objectgs.blend") if thing.get("objectgs_kind") == "mesh"]
+    assert len(meshes) >= 3 and not any(thing.hide_render for thing in meshes)
+    splats = [thing for thing in bpy.data.objects if thing.get("objectgs_kind") == "splats"]
+    assert [thing.hide_render for thing in splats].count(False) == 1, "that of the object without a mesh"
+    for thing in meshes:
+        image = next(node for node in thing.data.materials[0].node_tree.nodes if node.type == "TEX_IMAGE").image
+        assert image.filepath.startswith("//meshes/") and tuple(image.size) == (4, 4)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+
+
+def test_render_shows_what_is_asked_for(meshed, tmp_path):
+    pictures = {}
+    for which in ("splats", "meshes", "both"):
+        ran = run("render", meshed, "--out", tmp_path / f"{which}.png", "--engine", "CYCLES", "--show", which, *SIZE)
+        assert ran.returncode == 0, ran.output + ran.errors
+        pictures[which] = pixels(tmp_path / f"{which}.png")
+    for one, other in (("splats", "meshes"), ("splats", "both")):
+        assert np.abs(pictures[one] - pictures[other]).mean() > 0.02
+    assert pictures["meshes"].max() > 0.3, "there is light in the file"
+
+
+def test_a_picture_of_the_objects_pulled_apart(meshed, tmp_path):
+    before = (meshed / "objectgs.blend").read_bytes()
+    for size in ("96x60", "60x96"):
+        ran = run("render", meshed, "--apart", "--out", tmp_path / f"{size}.png", "--size", size, "--samples", "4")
+        assert ran.returncode == 0, ran.output + ran.errors
+        seen = pixels(tmp_path / f"{size}.png")
+        bright = seen.min(2) > 0.6
+        assert seen.shape[1::-1] == tuple(map(int, size.split("x")))
+        assert bright[[0, -1]].all() and bright[:, [0, -1]].all(), "all objects are inside, the room is not there"
+        assert 0.02 < 1 - bright.mean() < 0.7
+    assert (meshed / "objectgs.blend").read_bytes() == before
+    assert "leave --camera out" in refusal("render", meshed, "--apart", "--camera", "x", "--out", tmp_path / "a.png")
+
+
+def test_nothing_to_pull_apart(blend, tmp_path):
+    assert "no meshes to pull apart" in refusal("render", blend, "--apart", "--out", tmp_path / "a.png")
+    assert not list(tmp_path.iterdir())
+
+
 def test_no_backend(capture, tmp_path):
     user = {"OBJECTGS_PYTHON": "", "BLENDER_USER_RESOURCES": str(tmp_path / "user")}
     for command in ("import", "vote", "train", "run"):
         assert "not set up" in refusal(command, capture, "--out", tmp_path / "out", **user)
+    assert "not set up" in refusal("mesh", tmp_path, **user)
     assert "nowhere" in refusal("train", capture, "--out", tmp_path / "out", "--backend-python", tmp_path / "nowhere")
     assert not (tmp_path / "out").exists()
 
@@ -221,7 +297,7 @@ def batch(capture, backend_python, tmp_path_factory):
     shutil.copytree(capture, folder / "captures" / "good")
     (folder / "captures" / "bad" / "images").mkdir(parents=True)
     (folder / "captures" / "notes").mkdir()
-    arguments = ("batch", folder / "captures", "--out", folder / "out", "--steps", "5", *SIZE)
+    arguments = ("batch", folder / "captures", "--out", folder / "out", "--steps", "5", "--no-meshes", *SIZE)
     return folder / "captures", folder / "out", arguments, run(*arguments, OBJECTGS_PYTHON=backend_python)
 
 

@@ -17,85 +17,12 @@ from objectgs.backend.protocol import InputError
 from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.scene import carrier, kinds, preview
 
-HUGE = 0xFFFFFFF0
-OBJECTS = {1: "mug", 2: "can", HUGE: "box"}
-K = np.array([[500.0, 0.0, 310.0], [0.0, 500.0, 250.5], [0.0, 0.0, 1.0]])
-
-
-def look_at(eye, target=(0.0, 0.0, 0.0)) -> np.ndarray:
-    """(4, 4) world to OpenCV camera."""
-    eye = np.asarray(eye, float)
-    forward = np.asarray(target, float) - eye
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    view = np.eye(4)
-    view[:3, :3], view[:3, 3] = rotation, -rotation @ eye
-    return view
-
-
-def write_cameras(folder: Path, views, intrinsics=K, size=(640, 480), origin=(0.0, 0.0, 0.0), upright=None) -> None:
-    upright = np.eye(4) if upright is None else upright
-    cameras = [
-        {"name": f"{i:03}.png", "image": f"images/{i:03}.png", "mask": None, "width": size[0], "height": size[1],
-         "K": np.asarray(intrinsics).tolist(), "viewmat": view.tolist(), "held_out": i % 8 == 0}
-        for i, view in enumerate(views)]
-    (folder / "images").mkdir(exist_ok=True)
-    for camera in cameras:
-        (folder / camera["image"]).write_bytes(b"not read until it is drawn")
-    (folder / "cameras.json").write_text(json.dumps({
-        "capture": str(folder), "origin": list(origin), "cameras": cameras,
-        "upright": {"rotation": upright[:3, :3].tolist(), "translation": upright[:3, 3].tolist()}}))
-
-
-def write_points(folder: Path, xyz, ids) -> None:
-    table = np.zeros(len(xyz), [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("red", "u1"), ("green", "u1"),
-                                ("blue", "u1"), ("object_id", "<u4"), ("margin", "<f4"), ("votes", "<u4")])
-    for axis, name in enumerate("xyz"):
-        table[name] = np.asarray(xyz)[:, axis]
-    table["red"], table["object_id"], table["margin"] = 200, ids, 0.5
-    write_vertices(folder / "points.ply", table)
-
-
-def write_objects(folder: Path, objects=OBJECTS) -> None:
-    entries = [{"id": object_id, "name": name, "colour": [10, 20, 30 + i], "points": 1}
-               for i, (object_id, name) in enumerate(objects.items())]
-    (folder / "objects.json").write_text(json.dumps({"objects": entries, "edits": {}}))
-
-
-def splat_table(ids, degree: int = 1, seed: int = 0) -> np.ndarray:
-    rest = 3 * ((degree + 1) ** 2 - 1)
-    names = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(rest)), "opacity",
-             "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    table = np.zeros(len(ids), [*((name, "<f4") for name in names), ("object_id", "<u4")])
-    rng = np.random.default_rng(seed)
-    for name in names:
-        table[name] = rng.normal(size=len(ids))
-    table["object_id"] = ids
-    return table
-
-
-def write_anchors(folder: Path, ids) -> None:
-    table = np.zeros(len(ids), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("object_id", "<u4"), ("scale_0", "<f4"),
-                                ("scale_1", "<f4"), ("scale_2", "<f4"), ("opacity", "<f4"), ("splats", "<u4")])
-    table["object_id"], table["opacity"], table["splats"], table["x"] = ids, 0.25, 7, 3.0
-    write_vertices(folder / "anchors.ply", table)
+from .building import HUGE, OBJECTS, K, look_at, splat_table, write_cameras, write_folder, write_points
 
 
 @pytest.fixture
 def folder(tmp_path) -> Path:
-    """8 cameras around the origin, 30 points, 3 objects and 0 in 40 splats."""
-    place = tmp_path / "table top"
-    place.mkdir()
-    views = [look_at((3 * math.cos(a), 3 * math.sin(a), 1.0)) for a in np.linspace(0, 2 * math.pi, 8, endpoint=False)]
-    write_cameras(place, views)
-    rng = np.random.default_rng(1)
-    write_points(place, rng.normal(size=(30, 3)), np.resize([0, *OBJECTS], 30))
-    write_objects(place)
-    write_vertices(place / "splats.ply", splat_table(np.resize([0, *OBJECTS], 40)))
-    write_anchors(place, np.resize([0, *OBJECTS], 8))
-    return place
+    return write_folder(tmp_path / "table top")
 
 
 @pytest.fixture

@@ -1,0 +1,290 @@
+"""How good meshes are: against true surfaces where the capture brings them, as objects to work with, and their texture
+on held-out views."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from scipy.spatial import cKDTree
+
+from ..mesh.zbuffer import draw_mesh
+from ..mesh_file import Mesh, read_mesh
+from ..protocol import InputError, Reporter, read_json
+from ..training.scene import Scene
+from .mesh_shape import Shape, shape_of
+from .truth import TrueMesh, Truth
+
+THRESHOLDS = (0.02, 0.005)
+"""Distances, in the capture's units, up to which a point of one surface counts as found in the other: the one that
+papers on object meshes use, and a stricter one."""
+SAMPLES = 30_000
+_NEIGHBOURS = 6
+_SUBPIXELS = 3
+
+
+class SampledSurface:
+    """A triangle mesh to measure distances to and from.
+
+    points (SAMPLES, 3): even over the area, the same ones each time; normals (SAMPLES, 3) unit.
+    """
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, samples: int = SAMPLES) -> None:
+        corners = np.asarray(vertices, np.float64)[faces]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        double_area = np.linalg.norm(cross, axis=1)
+        kept = double_area > 0
+        self._corners, cross, double_area = corners[kept], cross[kept], double_area[kept]
+        if not len(double_area):
+            raise ValueError("a surface without area cannot be sampled")
+        rng = np.random.default_rng(0)
+        ends = np.cumsum(double_area)
+        face = np.minimum(np.searchsorted(ends, rng.random(samples) * ends[-1], side="right"), len(ends) - 1)
+        root, along = np.sqrt(rng.random(samples)), rng.random(samples)
+        weights = np.stack([1 - root, root * (1 - along), root * along], 1)
+        self.points = np.einsum("nc,ncx->nx", weights, self._corners[face])
+        normals = cross / double_area[:, None]
+        self.normals = normals[face]
+        # Each face's middle too, so that the nearest ones of these are of the nearest faces.
+        self.anchors = np.concatenate([self.points, self._corners.mean(1)])
+        self.anchor_normals = np.concatenate([self.normals, normals])
+        self._face = np.concatenate([face, np.arange(len(ends))])
+        self._tree = cKDTree(self.anchors)
+
+    def distances(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far points (n, 3) are from this surface, (n,), and the index in `anchors` of the nearest, (n,)."""
+        _, near = self._tree.query(points, min(_NEIGHBOURS, len(self.anchors)), workers=-1)
+        near = near.reshape(len(points), -1)
+        best = np.full(len(points), np.inf)
+        for column in near.T:
+            best = np.minimum(best, _to_triangles(points, self._corners[self._face[column]]))
+        return np.sqrt(best), near[:, 0]
+
+
+def _to_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Squared distances of points (n, 3) from triangles (n, 3, 3), which have an area."""
+    edges = np.roll(corners, -1, axis=1) - corners
+    normal = np.cross(edges[:, 0], -edges[:, 2])
+    within = np.ones(len(points), bool)
+    nearest = np.full(len(points), np.inf)
+    for k in range(3):
+        edge, away = edges[:, k], points - corners[:, k]
+        within &= np.einsum("nx,nx->n", np.cross(edge, away), normal) >= 0
+        length = np.maximum(np.einsum("nx,nx->n", edge, edge), 1e-300)
+        along = np.clip(np.einsum("nx,nx->n", away, edge) / length, 0, 1)
+        offset = away - along[:, None] * edge
+        nearest = np.minimum(nearest, np.einsum("nx,nx->n", offset, offset))
+    height = np.einsum("nx,nx->n", points - corners[:, 0], normal)
+    return np.where(within, height**2 / np.einsum("nx,nx->n", normal, normal), nearest)
+
+
+def agreement(accuracy: np.ndarray, completeness: np.ndarray) -> dict[str, float | None]:
+    """Chamfer distance (the mean of the two mean distances), and precision, recall and F1 at each of THRESHOLDS.
+
+    accuracy (n,): distances of the mesh's points from the truth; completeness (m,): of the truth's points from the
+    mesh. All None where a side has no points.
+    """
+    names = ["precision", "recall", "f1"]
+    out: dict[str, float | None] = dict.fromkeys(["chamfer", *names, *(f"{name}_005" for name in names)])
+    if len(accuracy) and len(completeness):
+        out["chamfer"] = float(accuracy.mean() + completeness.mean()) / 2
+        for threshold, suffix in zip(THRESHOLDS, ("", "_005")):
+            precision, recall = float((accuracy <= threshold).mean()), float((completeness <= threshold).mean())
+            both = precision + recall
+            out |= {
+                f"precision{suffix}": precision,
+                f"recall{suffix}": recall,
+                f"f1{suffix}": 2 * precision * recall / both if both else 0.0,
+            }
+    return out
+
+
+def against_truth(mesh: Mesh, true: TrueMesh, truth: Truth, ids: Sequence[int]) -> dict[str, float | None]:
+    """`agreement` over the truth's surface that at least two views see, the same over all of it (names that end in
+    "_all"), and `seen`, that part's share of the area.
+
+    Over the seen part, points of the mesh whose nearest true point is unseen count nowhere.
+    """
+    made, wanted = SampledSurface(mesh.vertices, mesh.faces), SampledSurface(true.vertices, true.faces)
+    seen = truth.seen(wanted.anchors, wanted.anchor_normals, ids)
+    accuracy, nearest = wanted.distances(made.points)
+    completeness, _ = made.distances(wanted.points)
+    seen_points = seen[: len(wanted.points)]
+    return {
+        **agreement(accuracy[seen[nearest]], completeness[seen_points]),
+        **{f"{name}_all": value for name, value in agreement(accuracy, completeness).items()},
+        "seen": float(seen_points.mean()),
+    }
+
+
+def read_texture(path: Path) -> np.ndarray:
+    """A mesh's texture (S, S, 3) uint8 sRGB."""
+    try:
+        with Image.open(path) as picture:
+            return np.asarray(picture.convert("RGB"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read ({error}); make the meshes again.") from error
+
+
+def sample_texture(texture: np.ndarray, uvs: np.ndarray) -> np.ndarray:
+    """Colours 0 .. 1 (n, 3) float32 at uvs (n, 2), bilinear; (0, 0) is the texture's lower left."""
+    height, width = texture.shape[:2]
+    x = np.clip(uvs[:, 0] * width - 0.5, 0, width - 1)
+    y = np.clip((1 - uvs[:, 1]) * height - 0.5, 0, height - 1)
+    column, row = x.astype(int), y.astype(int)
+    right, below = np.minimum(column + 1, width - 1), np.minimum(row + 1, height - 1)
+    across, down = (x - column)[:, None].astype(np.float32), (y - row)[:, None].astype(np.float32)
+    upper = texture[row, column] * (1 - across) + texture[row, right] * across
+    lower = texture[below, column] * (1 - across) + texture[below, right] * across
+    return (upper * (1 - down) + lower * down) / np.float32(255)
+
+
+@dataclass
+class TextureScore:
+    """Pixels of the object's masks, those of them that the mesh covers, and the squared error summed over these and
+    their three channels."""
+
+    pixels: int = 0
+    covered: int = 0
+    squares: float = 0.0
+
+    def figures(self) -> dict[str, float | None]:
+        """texture_psnr in dB over all covered pixels of all views together, texture_coverage; None: not measured."""
+        if not self.covered:
+            return {"texture_psnr": None, "texture_coverage": 0.0 if self.pixels else None}
+        mean = max(self.squares / (3 * self.covered), 1e-10)
+        return {"texture_psnr": -10 * math.log10(mean), "texture_coverage": self.covered / self.pixels}
+
+
+def texture_score(
+    mesh: Mesh, texture: np.ndarray, scene: Scene, ids: Sequence[int] | None, indices: Sequence[int]
+) -> TextureScore:
+    """The textured mesh alone beside the photos `indices`, at the common exposure, where their masks show one of `ids`
+    (None: everywhere)."""
+    score = TextureScore()
+    vertices = scene.normalization.to_scene(mesh.vertices)
+    classes = None if ids is None else np.flatnonzero(np.isin(scene.object_ids, ids))
+    for index in indices:
+        photo, labels = scene.target(index)
+        if classes is None:
+            wanted = np.ones(photo.shape[1:], bool)
+        elif labels is None:
+            continue
+        else:
+            wanted = np.isin(labels.numpy(), classes)
+        if not wanted.any():
+            continue
+        rows, columns = np.flatnonzero(wanted.any(1)), np.flatnonzero(wanted.any(0))
+        part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        wanted = wanted[part]
+        K = scene.camera(index).K.copy()
+        K[:2, 2] -= columns[0], rows[0]
+        K[:2] *= _SUBPIXELS
+        height, width = wanted.shape
+        camera = replace(scene.camera(index), K=K, width=width * _SUBPIXELS, height=height * _SUBPIXELS)
+        _, face, weights = draw_mesh(vertices, mesh.faces, camera)
+        drawn = face >= 0
+        colours = np.zeros((*face.shape, 3), np.float32)
+        uvs = np.einsum("nc,ncx->nx", weights[drawn], mesh.uvs[face[drawn]])
+        colours[drawn] = sample_texture(texture, uvs)
+        blocks = (height, _SUBPIXELS, width, _SUBPIXELS)
+        count = drawn.reshape(blocks).sum((1, 3))
+        # A pixel is the mesh's where at least half of it is, and then has the colour of that part.
+        covered = wanted & (2 * count >= _SUBPIXELS**2)
+        pixels = colours.reshape(*blocks, 3).sum((1, 3))[covered] / count[covered][:, None]
+        error = pixels - photo.numpy()[:, *part].transpose(1, 2, 0)[covered]
+        score.pixels += int(wanted.sum())
+        score.covered += int(covered.sum())
+        score.squares += float((error.astype(np.float64) ** 2).sum())
+    return score
+
+
+def mesh_entries(folder: Path, trained_steps: int, reporter: Reporter) -> dict[str, dict[str, Any]]:
+    """What meshes.json in `folder` says of each mesh, by its key: objects by their IDs, then sets and the whole scene.
+
+    Each has `ids`, of the objects that it shows, or None: the whole scene. Those of another state of the model are left
+    out with a warning.
+    """
+    path = folder / "meshes.json"
+    if not path.exists():
+        return {}
+    record = read_json(path)
+    entries = record.get("meshes") if isinstance(record, dict) else None
+    if not isinstance(entries, dict) or not all(
+        isinstance(entry, dict) and "ids" in entry for entry in entries.values()
+    ):
+        raise InputError(f"{path} does not list meshes as expected; delete it and make the meshes again.")
+    current = {key: entry for key, entry in entries.items() if entry.get("trained_steps") == trained_steps}
+    if len(current) < len(entries):
+        reporter.warning(
+            f"{len(entries) - len(current)} of {len(entries)} meshes in {folder} are of an earlier state of the model "
+            "and are left out; run `mesh` again."
+        )
+    return dict(sorted(current.items(), key=lambda item: (object_of(*item) is None, object_of(*item) or 0, item[0])))
+
+
+def object_of(key: str, entry: Mapping[str, Any]) -> int | None:
+    """The ID of the object whose own mesh an entry of meshes.json is; None for a set or the whole scene."""
+    return int(key) if key.isdecimal() and int(key) in (entry["ids"] or ()) else None
+
+
+def digest(folder: Path, entry: Mapping[str, Any]) -> str:
+    """Tells a mesh's files from those of another run."""
+    sha = hashlib.sha256()
+    for name in (entry.get("file"), entry.get("texture")):
+        if name and (folder / name).exists():
+            sha.update((folder / name).read_bytes())
+    return sha.hexdigest()[:16]
+
+
+def evaluate_mesh(
+    folder: Path,
+    entry: Mapping[str, Any],
+    scene: Scene,
+    truth: Truth | None,
+    indices: Sequence[int],
+    reporter: Reporter,
+) -> dict[str, Any]:
+    """Every figure of one mesh in `folder`, None for what cannot be measured; `entry` is its part of meshes.json,
+    `indices` are the held-out views.
+
+    Lengths are in the capture's units. A file that cannot be read is a warning.
+    """
+    ids = entry["ids"]
+    names = [*agreement(np.zeros(0), np.zeros(0))]
+    out: dict[str, Any] = {
+        **dict.fromkeys(["vertices", "faces", "invented", *Shape.__dataclass_fields__]),
+        **dict.fromkeys([*names, *(f"{name}_all" for name in names), "seen", "texture_psnr", "texture_coverage"]),
+        "why": entry.get("why"),
+    }
+    if not entry.get("file"):
+        return out
+    try:
+        mesh = read_mesh(folder / entry["file"])
+    except InputError as error:
+        reporter.warning(str(error))
+        return {**out, "why": "its file cannot be read"}
+    out |= {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "digest": digest(folder, entry)}
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    if not np.isfinite(mesh.vertices).all() or not (area > 0).any():
+        return {**out, "why": "it has no surface"}
+    out |= vars(shape_of(mesh.vertices, mesh.faces))
+    out["invented"] = float(mesh.invented.mean())
+    true = None if truth is None else truth.of(list(truth.meshes) if ids is None else ids)
+    if true is not None and truth is not None:
+        out |= against_truth(mesh, true, truth, list(truth.meshes) if ids is None else ids)
+    if mesh.texture:
+        try:
+            texture = read_texture(folder / mesh.texture)
+        except InputError as error:
+            reporter.warning(str(error))
+        else:
+            out |= texture_score(mesh, texture, scene, ids, indices).figures()
+    return out

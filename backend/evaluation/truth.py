@@ -1,0 +1,144 @@
+"""The true surfaces that a synthetic capture brings along, and which parts of them its cameras see.
+
+truth/objects.json           {"objects": [{"id": 1, "mesh": "meshes/1_mug.ply"}, ...]}
+truth/meshes/*.ply           triangles in the capture's frame, faces turned to the outside
+truth/depth/<image>.npy      (H, W) float32, along the camera's axis
+truth/masks/<image>.png      (H, W) object IDs
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from ..capture import Capture
+from ..ply import LONGEST_HEADER, read_vertices
+from ..protocol import InputError, read_json
+
+VIEWS_TO_COUNT = 2
+"""So many views must see a piece of surface before a reconstruction can be blamed for it."""
+_PIXELS_DEEP = 1.5
+"""A point may differ from the depth at its pixel by so many times the pixel's width there: surfaces are slanted."""
+_BYTES_HELD = 400_000_000
+_FACES = "property list uchar int vertex_indices"
+
+
+@dataclass
+class TrueMesh:
+    """vertices (V, 3) float64 in the capture's world, faces (F, 3) int32."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+@dataclass
+class _View:
+    viewmat: np.ndarray
+    intrinsics: np.ndarray
+    depth: np.ndarray
+    ids: np.ndarray
+
+
+class Truth:
+    """True surfaces by object ID, and what the views `indices` of `capture` see of them."""
+
+    def __init__(self, meshes: dict[int, TrueMesh], capture: Capture, indices: Sequence[int]) -> None:
+        self.meshes = meshes
+        self._capture = capture
+        self._indices = indices
+        self._held: dict[int, _View] = {}
+        self._bytes = 0
+
+    def of(self, ids: Collection[int]) -> TrueMesh | None:
+        """The surface of one object or several together; None where the truth lacks one of them."""
+        if not ids or not all(i in self.meshes for i in ids):
+            return None
+        parts = [self.meshes[i] for i in ids]
+        first = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+        faces = [part.faces + start for part, start in zip(parts, first)]
+        return TrueMesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
+
+    def seen(self, points: np.ndarray, normals: np.ndarray, ids: Collection[int]) -> np.ndarray:
+        """Which points (n, 3) of the objects `ids`, with outward normals (n, 3), at least two views see: (n,) bool.
+
+        A view sees a point that it looks at from outside, whose pixel shows one of `ids` and lies as deep as the point.
+        """
+        views = np.zeros(len(points), np.int32)
+        for view in map(self._view, self._indices):
+            fx, fy, cx, cy = view.intrinsics
+            turn = view.viewmat[:3, :3]
+            seen_from = points @ turn.T + view.viewmat[:3, 3]
+            height, width = view.depth.shape
+            at = np.flatnonzero(((points + view.viewmat[:3, 3] @ turn) * normals).sum(1) < 0)
+            at = at[seen_from[at, 2] > 0]
+            x, y, z = seen_from[at].T
+            column, row = np.floor(fx * x / z + cx), np.floor(fy * y / z + cy)
+            inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            at, z, column, row = at[inside], z[inside], column[inside].astype(int), row[inside].astype(int)
+            found = np.isin(view.ids[row, column], list(ids))
+            found &= np.abs(view.depth[row, column] - z) <= _PIXELS_DEEP * z / fx
+            views[at[found]] += 1
+        return views >= VIEWS_TO_COUNT
+
+    def _view(self, index: int) -> _View:
+        if index in self._held:
+            return self._held[index]
+        view = _read_view(self._capture, index)
+        self._bytes += view.depth.nbytes + view.ids.nbytes
+        if self._bytes <= _BYTES_HELD:
+            self._held[index] = view
+        return view
+
+
+def load_truth(capture: Capture, indices: Sequence[int]) -> Truth | None:
+    """The truth of a capture, seen by its views `indices`; None where it brings none."""
+    listed = capture.folder / "truth" / "objects.json"
+    if not listed.exists():
+        return None
+    content = read_json(listed)
+    try:
+        files = {int(entry["id"]): capture.folder / "truth" / entry["mesh"] for entry in content["objects"]}
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{listed} does not list meshes as expected ({error!r}); make the capture again.") from error
+    return Truth({i: _read_mesh(path) for i, path in files.items()}, capture, indices)
+
+
+def _read_mesh(path: Path) -> TrueMesh:
+    table = read_vertices(path)
+    vertices = np.stack([table[name] for name in "xyz"], 1).astype(np.float64)
+    data = path.read_bytes()
+    end = data.find(b"end_header\n", 0, LONGEST_HEADER) + len(b"end_header\n")
+    lines = data[:end].decode("ascii", "replace").splitlines()
+    counts = [int(line.split()[2]) for line in lines if line.startswith("element face ")]
+    row = np.dtype([("corners", "u1"), ("vertices", "<i4", 3)])
+    start = end + table.nbytes
+    if len(counts) != 1 or _FACES not in lines or len(data) != start + counts[0] * row.itemsize:
+        raise InputError(f"{path} is no mesh of triangles as the demo writes it; make the capture again.")
+    faces = np.frombuffer(data[start:], row)["vertices"]
+    if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
+        raise InputError(f"{path} has faces of vertices that it does not hold; make the capture again.")
+    return TrueMesh(vertices, faces.astype(np.int32))
+
+
+def _read_view(capture: Capture, index: int) -> _View:
+    view = capture.views[index]
+    name = Path(view.name)
+    depth_file = capture.folder / "truth" / "depth" / name.with_suffix(".npy")
+    ids_file = capture.folder / "truth" / "masks" / name.with_suffix(".png")
+    try:
+        depth = np.load(depth_file)
+        with Image.open(ids_file) as picture:
+            ids = np.asarray(picture)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{depth_file} or {ids_file} cannot be read ({error}); make the capture again.") from error
+    if depth.ndim != 2 or ids.shape != depth.shape:
+        raise InputError(f"{depth_file} and {ids_file} are not of one size; make the capture again.")
+    # The truth has the size of the images on disk, the capture's views may be smaller.
+    across, down = depth.shape[1] / view.width, depth.shape[0] / view.height
+    K = capture.K(index)
+    intrinsics = np.array([K[0, 0] * across, K[1, 1] * down, K[0, 2] * across, K[1, 2] * down])
+    return _View(view.viewmat, intrinsics, depth, ids)

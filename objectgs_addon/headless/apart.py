@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The objects' meshes pulled apart, for a picture: lifted and moved outward from the middle, in soft light."""
+
+import math
+
+import bpy
+import numpy as np
+from mathutils import Matrix, Vector
+
+from ...backend.protocol import InputError
+from .. import scene
+from ..scene.preview import Graph
+
+SIZE = (960, 600)
+SAMPLES = 32
+"""What makes a good picture within half a minute on two cores."""
+LARGE = 2.5
+"""What is so many times as large as the middle object stays where it is, as the table does."""
+
+OUTWARD = 0.9
+"""How far objects move away from the middle, relative to their distance from it."""
+LIFT = 0.35
+"""How far they are lifted, relative to the size of the middle object."""
+
+LENS = 60.0
+SENSOR = 36.0
+ELEVATION = math.radians(27.0)
+MARGIN = 1.08
+
+GROUND = (0.78, 0.78, 0.78)
+SKY = 0.5
+SUN = 2.2
+SUN_ANGLE = math.radians(20.0)
+"""How wide the sun is: the shadows' softness."""
+
+
+def reconstructions(target: bpy.types.Scene) -> list[bpy.types.Collection]:
+    """The collections of the reconstructions that lie in a scene."""
+    return [child for child in target.collection.children_recursive if scene.kind_of(child) == "reconstruction"]
+
+
+def add_even_light(target: bpy.types.Scene) -> None:
+    """Even white light from everywhere, which shows a texture's own colours; what is behind stays black."""
+    world = target.world = bpy.data.worlds.new("ObjectGS Light")
+    _light_evenly(world, 1.0, behind=0.0)
+
+
+def pull_apart(target: bpy.types.Scene) -> None:
+    """Make a picture of a scene: its objects' meshes apart, with light, ground and camera. It is not meant to be saved.
+
+    Large objects stay; what lies around the others, as a room does, is left out. Raises InputError without meshes.
+    """
+    found = [(root, scene.object_meshes(root)) for root in reconstructions(target)]
+    found = [(root, meshes) for root, meshes in found if meshes]
+    if not found:
+        raise InputError("There are no meshes to pull apart; make them with the mesh command, then build again.")
+    root, meshes = found[0]
+    scene.show_kinds(root, "meshes")
+    target.view_layers[0].update()
+    boxes = {object_id: scene.bounds(things) for object_id, things in meshes.items()}
+    sizes = {object_id: float(np.linalg.norm(high - low)) for object_id, (low, high) in boxes.items()}
+    middle_size = float(np.median(list(sizes.values())))
+    large = {object_id for object_id, size in sizes.items() if size > LARGE * middle_size}
+    moved = sorted(set(boxes) - large)
+    middles = np.array([boxes[object_id].mean(0) for object_id in moved])
+    around = {object_id for object_id in large if _holds(boxes[object_id], middles)}
+    _show_only(target, [thing for object_id, things in meshes.items() if object_id not in around for thing in things])
+
+    centre = np.append(np.median(middles[:, :2], axis=0), 0.0)
+    shown = {object_id: boxes[object_id] for object_id in large - around}
+    for object_id, middle in zip(moved, middles):
+        step = OUTWARD * (middle - centre) * (1.0, 1.0, 0.0) + (0.0, 0.0, LIFT * middle_size)
+        _move(meshes[object_id], step)
+        shown[object_id] = boxes[object_id] + step
+    low = min(box[0][2] for box in [*shown.values(), *(boxes[object_id] for object_id in moved)])
+    extent = float(np.linalg.norm(np.ptp(np.concatenate(list(shown.values())), axis=0)))
+    _add_ground(target, Vector((*centre[:2], low)), 40.0 * extent)
+    target.render.pixel_aspect_x = target.render.pixel_aspect_y = 1.0
+    toward = _add_camera(target, np.concatenate([_corners(shown[object_id]) for object_id in moved]))
+    _add_light(target, toward)
+    target.cycles.use_denoising = True
+    target.cycles.adaptive_threshold = 0.05
+    target.cycles.max_bounces = 2
+
+
+def _corners(box: np.ndarray) -> np.ndarray:
+    """(8, 3)."""
+    return np.array([[box[i][0], box[j][1], box[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+
+
+def _holds(box: np.ndarray, places: np.ndarray) -> bool:
+    """Whether most of the places (n, 3) lie in a box."""
+    return float(((places > box[0]) & (places < box[1])).all(1).mean()) > 0.5
+
+
+def _show_only(target, meshes) -> None:
+    shown = set(meshes)
+    for thing in target.objects:
+        thing.hide_render = thing not in shown
+
+
+def _move(things, step: np.ndarray) -> None:
+    for thing in things:
+        thing.matrix_world = Matrix.Translation(step) @ thing.matrix_world
+
+
+def _add_ground(target, place: Vector, size: float) -> None:
+    mesh = bpy.data.meshes.new("Ground")
+    corners = [place + size * Vector(corner) for corner in ((-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0))]
+    mesh.from_pydata(corners, [], [(0, 1, 2, 3)])
+    material = bpy.data.materials.new("Ground")
+    if material.node_tree is None:
+        material.use_nodes = True
+    material.node_tree.nodes.clear()
+    graph = Graph(material.node_tree)
+    shader = graph.node("ShaderNodeBsdfDiffuse", {"Color": (*GROUND, 1.0)}).outputs[0]
+    graph.node("ShaderNodeOutputMaterial", {"Surface": shader})
+    mesh.materials.append(material)
+    target.collection.objects.link(bpy.data.objects.new("Ground", mesh))
+
+
+def _add_camera(target, corners: np.ndarray) -> np.ndarray:
+    """A camera that has all `corners` (n, 3) in view, from the side of the scene's own; the direction that it looks."""
+    centre = Vector((corners.min(0) + corners.max(0)) / 2)
+    away = Vector((0.0, -1.0, 0.0))
+    if target.camera is not None:
+        aside = target.camera.matrix_world.translation - centre
+        away = Vector((aside.x, aside.y, 0.0)).normalized() if aside.xy.length > 1e-6 else away
+    toward = -(away * math.cos(ELEVATION) + Vector((0.0, 0.0, math.sin(ELEVATION))))
+    rotation = toward.to_track_quat("-Z", "Y")
+    # Coordinates to the right, up and towards the camera; the nearest place from which all of them fit.
+    seen = (corners - np.array(centre)) @ np.array(rotation.to_matrix())
+    half = np.array([1.0, target.render.resolution_y / target.render.resolution_x]) * SENSOR / LENS / 2.0 / MARGIN
+    x = y = 0.0
+    for _ in range(20):
+        need = np.abs(seen[:, :2] - (x, y)) / half + seen[:, 2:]
+        distance = need.max()
+        # The middle of what the picture shows, not of the box.
+        screen = (seen[:, :2] - (x, y)) / (distance - seen[:, 2:])
+        shift = (screen.min(0) + screen.max(0)) / 2.0 * distance
+        x, y = x + shift[0], y + shift[1]
+    camera = bpy.data.cameras.new("Apart")
+    camera.sensor_fit, camera.sensor_width, camera.lens = "HORIZONTAL", SENSOR, LENS
+    camera.clip_start, camera.clip_end = 0.01 * distance, 100.0 * distance
+    thing = bpy.data.objects.new("Apart", camera)
+    thing.rotation_mode = "QUATERNION"
+    thing.rotation_quaternion = rotation
+    thing.location = centre + rotation @ Vector((x, y, distance))
+    target.collection.objects.link(thing)
+    target.camera = thing
+    return np.array(toward)
+
+
+def _add_light(target, toward: np.ndarray) -> None:
+    """A wide sun from behind the camera's left shoulder, and a sky."""
+    heading = math.atan2(toward[1], toward[0])
+    sun = bpy.data.lights.new("Apart", "SUN")
+    sun.energy, sun.angle = SUN, SUN_ANGLE
+    thing = bpy.data.objects.new("Apart Sun", sun)
+    aside = heading - math.radians(50.0)
+    down = Vector((math.cos(aside), math.sin(aside), -1.4))
+    thing.rotation_mode = "QUATERNION"
+    thing.rotation_quaternion = down.to_track_quat("-Z", "Y")
+    target.collection.objects.link(thing)
+    target.world = bpy.data.worlds.new("Apart")
+    _light_evenly(target.world, SKY, behind=SKY)
+    target.render.film_transparent = False
+
+
+def _light_evenly(world: bpy.types.World, strength: float, behind: float) -> None:
+    """White light of a strength from everywhere; the camera sees it with the strength `behind`."""
+    if world.node_tree is None:
+        world.use_nodes = True
+    world.node_tree.nodes.clear()
+    graph = Graph(world.node_tree)
+    camera = graph.node("ShaderNodeLightPath").outputs["Is Camera Ray"]
+    light = graph.math("MULTIPLY_ADD", camera, behind - strength, strength)
+    sky = graph.node("ShaderNodeBackground", {"Color": (1.0, 1.0, 1.0, 1.0), "Strength": light}).outputs[0]
+    graph.node("ShaderNodeOutputWorld", {"Surface": sky})
+    graph.arrange()

@@ -1,0 +1,43 @@
+"""What a command answered, taken apart."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+from backend.protocol import EXIT_BAD_INPUT
+
+TYPES = {"status", "progress", "preview", "quality", "warning", "error", "done"}
+
+
+@dataclass
+class Answer:
+    """What one command said."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def events(self) -> list[dict]:
+        """The lines of stdout, each a JSON object of a known type; the last one closes."""
+        events = [json.loads(line) for line in self.out.splitlines()]
+        assert events and {event["type"] for event in events} <= TYPES
+        assert events[-1]["type"] in ("done", "error")
+        assert sum(event["type"] in ("done", "error") for event in events) == 1
+        return events
+
+    def messages(self, kind: str) -> list[str]:
+        return [event["message"] for event in self.events if event["type"] == kind]
+
+
+def refused(answer: Answer, *words: str) -> str:
+    """The command was refused with one plain sentence that holds `words`; returns it."""
+    assert answer.code == EXIT_BAD_INPUT, answer
+    sentences = [line for line in answer.err.splitlines() if line.startswith("error: ")]
+    assert len(sentences) == 1 and "Traceback" not in answer.err, answer.err
+    assert all(line.startswith(("error: ", "warning: ")) for line in answer.err.splitlines()), answer.err
+    assert sentences[0].endswith(".")
+    for word in words:
+        assert word in sentences[0], sentences[0]
+    return sentences[0]

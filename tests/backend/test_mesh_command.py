@@ -1,0 +1,155 @@
+"""The mesh command: what it leaves, what it refuses, how it stops and goes on."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from backend.commands import mesh as command
+from backend.mesh.surface import NoSurface
+from backend.mesh_file import read_mesh
+from backend.objects import edit_objects
+from backend.protocol import EXIT_CANCELLED, EXIT_DONE, Cancelled
+
+from .asking import refused
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """A folder for what is trained once."""
+    return tmp_path_factory.mktemp("spheres")
+
+
+@pytest.fixture
+def trained(kept, tmp_path, write_capture, ask):
+    """Three spheres, trained long enough to have a shape; a copy."""
+    if not (kept / "out").exists():
+        shutil.copytree(write_capture(views=24, size=(96, 72)).folder, kept / "capture")
+        assert ask("train", kept / "capture", "--out", kept / "out", "--steps", 250, "--offsets", 4).code == EXIT_DONE
+    shutil.copytree(kept / "out", tmp_path / "out")
+    return tmp_path / "out"
+
+
+def entries(out) -> dict:
+    return json.loads((out / "meshes" / "meshes.json").read_text())["meshes"]
+
+
+def test_each_object_becomes_a_mesh_in_its_place(trained, ask, write_capture):
+    answer = ask("mesh", trained, "--faces", 2000, "--texture-size", 256, "--json")
+    assert answer.code == EXIT_DONE and answer.events[-1]["made"] == 3
+    shares = [event["done"] / event["total"] for event in answer.events if event.get("what") == "meshes"]
+    assert shares == sorted(shares) and shares[-1] == pytest.approx(1, abs=0.02) and len(shares) > 10
+    for object_id, centre, radius in ((1, (-0.7, 0, 0), 0.5), (2, (0.7, 0.1, 0), 0.45), (5, (0, -0.2, 0.9), 0.35)):
+        entry = entries(trained)[str(object_id)]
+        assert entry["name"] == f"sphere {object_id}" and entry["ids"] == [object_id] and entry["trained_steps"] == 250
+        found = read_mesh(trained / "meshes" / entry["file"])
+        assert len(found.faces) == entry["faces"] <= 2000 and len(found.vertices) == entry["vertices"]
+        assert entry["watertight"] is True and entry["invented"] == pytest.approx(found.invented.mean(), abs=1e-3)
+        distance = np.linalg.norm(found.vertices - centre, axis=1)
+        assert abs(np.median(distance) - radius) < 0.1 * radius, "where and as large as the sphere is"
+        outward = (found.normals * (found.vertices - centre)).sum(1) / distance
+        assert np.median(outward) > 0.9
+        assert 0 <= found.uvs.min() and found.uvs.max() <= 1
+        with Image.open(trained / "meshes" / found.texture) as texture:
+            assert texture.size == (256, 256)
+            assert np.asarray(texture).std() > 1
+    assert not list(trained.rglob("*.part")) and not (trained / ".lock").exists()
+
+
+def test_merged_objects_sets_and_the_scene(trained, ask):
+    edit_objects(trained / "objects.json", {2: {"merged_into": 1}, 5: {"left_out": True}})
+    quick = ("--faces", 1000, "--texture-size", 256)
+    assert ask("mesh", trained, *quick).code == EXIT_DONE
+    assert set(entries(trained)) == {"1"} and entries(trained)["1"]["ids"] == [1, 2]
+    xs = read_mesh(trained / "meshes" / "1.ply").vertices[:, 0]
+    assert xs.min() < -0.9 and xs.max() > 0.9, "both spheres"
+    assert ask("mesh", trained, *quick, "--set", "pair=1,sphere 5", "--scene", "--objects", "5").code == EXIT_DONE
+    found = entries(trained)
+    assert set(found) == {"1", "5", "pair", "scene"}
+    assert found["pair"]["ids"] == [1, 2, 5] and found["scene"]["ids"] is None
+    assert (trained / "meshes" / "scene.ply").exists() and (trained / "meshes" / "pair.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--objects", "7"), ("no object 7", "1 sphere 1")),
+        (("--objects", "teapot"), ("no object teapot", "sphere 5")),
+        (("--set", "1=1,2"), ("--set 1=",)),
+        (("--set", "pair"), ("NAME=ID,ID",)),
+        (("--faces", "3"), ("from 100 on",)),
+        (("--texture-size", "1000"), ("1000",)),
+    ],
+)
+def test_what_cannot_be_asked_for(trained, ask, words, said):
+    refused(ask("mesh", trained, *words), *said)
+    assert not (trained / "meshes").exists()
+
+
+class Stub:
+    """Stands in for the slow part: counts what is made, and may stop the command or find no surface."""
+
+    def __init__(self, monkeypatch, stop_at: int | None = None, without=()) -> None:
+        self.made: list[str] = []
+        self._stop_at = stop_at
+
+        def make(target, options, trained, views, part):
+            if len(self.made) == self._stop_at:
+                raise Cancelled("Stopped.")
+            self.made.append(target.key)
+            entry = {"name": target.name, **command._origin(target, options, trained)}
+            if target.key in without:
+                return {**entry, "why": f"Nobody saw {target.name}."}
+            for suffix in ("ply", "png"):
+                (trained.folder.meshes / f"{target.key}.{suffix}").write_bytes(b"")
+            return {**entry, "file": f"{target.key}.ply", "texture": f"{target.key}.png"}
+
+        monkeypatch.setattr(command, "_make", make)
+
+
+def test_what_was_made_before_a_stop_is_not_made_again(trained, ask, monkeypatch):
+    first = Stub(monkeypatch, stop_at=2)
+    assert ask("mesh", trained).code == EXIT_CANCELLED and first.made == ["1", "2"]
+    assert set(entries(trained)) == {"1", "2"} and not (trained / ".lock").exists()
+    second = Stub(monkeypatch)
+    assert ask("mesh", trained).code == EXIT_DONE and second.made == ["5"]
+    assert set(entries(trained)) == {"1", "2", "5"}
+    assert ask("mesh", trained).code == EXIT_DONE and second.made == ["5"], "all are there"
+    (trained / "meshes" / "2.png").unlink()
+    assert ask("mesh", trained).code == EXIT_DONE and second.made == ["5", "2"]
+    assert ask("mesh", trained, "--objects", "1", "--faces", 500).code == EXIT_DONE and second.made[2:] == ["1"]
+    assert ask("mesh", trained, "--faces", 500, "--restart").code == EXIT_DONE and second.made[3:] == ["1", "2", "5"]
+
+
+def test_a_longer_training_makes_meshes_out_of_date(trained, kept, ask, monkeypatch):
+    made = Stub(monkeypatch).made
+    assert ask("mesh", trained, "--objects", "1").code == EXIT_DONE
+    more = ask("train", kept / "capture", "--out", trained, "--steps", 252, "--offsets", 4)
+    assert more.code == EXIT_DONE
+    assert ask("mesh", trained, "--objects", "1").code == EXIT_DONE and made == ["1", "1"]
+    assert entries(trained)["1"]["trained_steps"] == 252
+
+
+def test_an_object_without_a_surface_says_why(trained, ask, monkeypatch):
+    Stub(monkeypatch, without={"2"})
+    answer = ask("mesh", trained, "--json")
+    assert answer.code == EXIT_DONE and answer.events[-1]["without"] == 1
+    assert answer.messages("warning") == ["Nobody saw sphere 2."] == [entries(trained)["2"]["why"]]
+    Stub(monkeypatch, without={"1", "2", "5"})
+    refused(ask("mesh", trained, "--restart", "--objects", "2"), "Nobody saw sphere 2.")
+
+
+def test_no_surface_takes_an_earlier_mesh_away(trained, ask, monkeypatch):
+    (trained / "meshes").mkdir()
+    (trained / "meshes" / "1.ply").write_bytes(b"old")
+
+    def fuse(*_, **__):
+        raise NoSurface("No view shows sphere 1.")
+
+    monkeypatch.setattr(command, "fuse", fuse)
+    refused(ask("mesh", trained, "--objects", "1"), "No view shows sphere 1.")
+    assert not (trained / "meshes" / "1.ply").exists() and entries(trained)["1"]["why"] == "No view shows sphere 1."

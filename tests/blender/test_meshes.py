@@ -1,0 +1,560 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Meshes in Blender: exact place, UVs, colours, material; updates in place; what is shown; merges and faults."""
+
+import json
+import os
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from mathutils import Matrix
+from objectgs.backend.objects import edit_objects
+from objectgs.backend.ply import write_vertices
+from objectgs.backend.protocol import InputError
+from objectgs.objectgs_addon import locations, running
+from objectgs.objectgs_addon import scene as blender_scene
+from objectgs.objectgs_addon.folder_state import folder_state
+from objectgs.objectgs_addon.scene import kinds
+
+import headless
+
+from .building import HUGE, OBJECTS, look_at, splat_table, tetrahedron, write_cameras, write_folder, write_meshes
+
+ORIGIN = np.array([1000.0, -2000.0, 30.0])
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """A folder whose objects 1 and 2 have meshes, far from the origin; HUGE has none, and says why."""
+    place = write_folder(tmp_path / "table top")
+    upright = np.eye(4)
+    upright[:3, :3] = np.array(Matrix.Rotation(0.7, 3, "X")) @ np.array(Matrix.Rotation(0.3, 3, "Z"))
+    upright[:3, 3] = 1.0, 2.0, 3.0
+    write_cameras(place, [look_at(ORIGIN + np.array([3, 0, 1]), ORIGIN)], origin=ORIGIN, upright=upright)
+    splats = splat_table(np.resize([0, *OBJECTS], 40))
+    for axis, name in enumerate("xyz"):
+        splats[name] += ORIGIN[axis]
+    write_vertices(place / "splats.ply", splats)
+    write_meshes(place, {"1": tetrahedron(ORIGIN + 0.5), "2": tetrahedron(ORIGIN - 0.5, 0.5),
+                         str(HUGE): "box was seen in one view only."})
+    return place
+
+
+@pytest.fixture
+def root(fresh, folder):
+    """The folder shown, with its result."""
+    shown = blender_scene.show_capture(bpy.context.scene, folder)
+    assert blender_scene.show_result(shown, folder, bpy.context.scene).warnings == []
+    return shown
+
+
+def parts(root, object_id, kind):
+    collection = blender_scene.object_collections(root)[object_id]
+    return [thing for thing in collection.objects if blender_scene.kind_of(thing) == kind]
+
+
+def mesh_of(root, object_id):
+    (thing,) = parts(root, object_id, "mesh")
+    return thing
+
+
+def rewrite(folder, rgb=(0, 255, 0), **meshes):
+    """Meshes of object 1 and others, made anew: newer, larger, green."""
+    meshes = {key.removeprefix("_"): mesh for key, mesh in meshes.items()} or {"1": tetrahedron(ORIGIN, 2.0)}
+    write_meshes(folder, meshes, rgb=rgb)
+    for path in (folder / "meshes").iterdir():
+        later = path.stat().st_mtime_ns + 5_000_000_000
+        os.utime(path, ns=(later, later))
+
+
+def coordinates(thing) -> np.ndarray:
+    """(V, 3) of a mesh in the world."""
+    local = np.empty(3 * len(thing.data.vertices), np.float32)
+    thing.data.vertices.foreach_get("co", local)
+    matrix = np.array(thing.matrix_world)
+    return local.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def counts():
+    return {name: len(getattr(bpy.data, name)) for name in ("objects", "meshes", "collections", "materials", "images")}
+
+
+def shader_of(material):
+    return next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
+
+
+def picture_of(material):
+    return next(node for node in material.node_tree.nodes if node.type == "TEX_IMAGE").image
+
+
+# What a mesh is.
+
+
+def test_a_mesh_is_exactly_where_the_file_says(root, folder):
+    bpy.context.view_layer.update()
+    upright = np.array(kinds.parent_of(root).matrix_world)
+    for object_id, centre, size in ((1, 0.5, 1.0), (2, -0.5, 0.5)):
+        thing = mesh_of(root, object_id)
+        expected = tetrahedron(ORIGIN + centre, size).vertices - ORIGIN
+        assert coordinates(thing) == pytest.approx(expected @ upright[:3, :3].T + upright[:3, 3], abs=2e-6)
+        assert thing.parent == parts(root, object_id, "object_parent")[0]
+        assert tuple(thing.matrix_basis.translation) == (0, 0, 0), "its origin is the pivot's, as the splats' is"
+        assert blender_scene.object_id_of(thing) == object_id
+        assert blender_scene.root_of(thing, bpy.context.scene) == root
+    assert parts(root, HUGE, "mesh") == []
+    blender_scene.show_kinds(root, "both")
+    bpy.context.view_layer.update()
+    assert parts(root, 1, "splats")[0].matrix_world == mesh_of(root, 1).matrix_world
+
+
+def test_a_mesh_carries_all_that_the_file_holds(root):
+    thing, given = mesh_of(root, 1), tetrahedron()
+    mesh = thing.data
+    assert [tuple(polygon.vertices) for polygon in mesh.polygons] == [tuple(face) for face in given.faces]
+    assert [layer.name for layer in mesh.uv_layers] == ["UVMap"] and mesh.uv_layers.active.active_render
+    assert np.array([entry.vector for entry in mesh.uv_layers["UVMap"].uv]) == pytest.approx(given.uvs.reshape(-1, 2))
+    colours = mesh.color_attributes["Col"]
+    assert (colours.data_type, colours.domain) == ("BYTE_COLOR", "POINT")
+    assert np.array([entry.color_srgb for entry in colours.data])[:, :3] * 255 == pytest.approx(given.colors, abs=1e-3)
+    assert mesh.color_attributes.active_color == colours
+    invented = mesh.attributes["invented"]
+    assert (invented.data_type, invented.domain) == ("BOOLEAN", "FACE")
+    assert [entry.value for entry in invented.data] == list(given.invented)
+    assert all(polygon.use_smooth for polygon in mesh.polygons)
+    normals = np.array([entry.vector for entry in mesh.corner_normals])
+    assert normals == pytest.approx(given.normals[given.faces.reshape(-1)], abs=0.01)
+    assert not mesh.validate()
+    assert (thing.name, mesh.name) == ("mug mesh", "mug mesh")
+
+
+def test_the_material_shows_the_texture(root, folder):
+    materials = [mesh_of(root, object_id).data.materials[0] for object_id in (1, 2)]
+    assert materials[0] != materials[1]
+    for material, name in zip(materials, ("1.png", "2.png")):
+        shader = shader_of(material)
+        picture = shader.inputs["Base Color"].links[0].from_node.image
+        assert Path(picture.filepath) == folder / "meshes" / name
+        assert picture.colorspace_settings.name == "sRGB" and tuple(picture.size) == (4, 4)
+        assert shader.inputs["Roughness"].default_value > 0.5
+        assert shader.inputs["Specular IOR Level"].default_value < 0.5
+        assert tuple(picture.pixels[:3]) == pytest.approx((200 / 255, 100 / 255, 50 / 255), abs=1e-3)
+
+
+def test_a_saved_file_finds_its_textures_wherever_it_goes(root, folder, tmp_path):
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "objectgs.blend"))
+    folder.rename(tmp_path / "elsewhere")
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "elsewhere" / "objectgs.blend"))
+    found = [image for image in bpy.data.images if blender_scene.kind_of(image) == "mesh_texture"]
+    assert sorted(image.filepath for image in found) == ["//meshes/1.png", "//meshes/2.png"]
+    assert all(tuple(image.size) == (4, 4) for image in found)
+
+
+def test_a_mesh_can_be_used_in_another_file(root, folder, tmp_path):
+    """Dropped from the asset browser, which appends the collection and shows an instance of it."""
+    bpy.context.view_layer.update()
+    before = coordinates(mesh_of(root, 1))
+    collection = blender_scene.object_collections(root)[1]
+    blender_scene.mark_asset(collection, parts(root, 1, "mesh"))
+    assert collection.asset_data is not None and [tag.name for tag in collection.asset_data.tags] == ["ObjectGS"]
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    with bpy.data.libraries.load(str(tmp_path / "library.blend"), assets_only=True) as (there, wanted):
+        assert there.collections == ["mug"]
+        wanted.collections = ["mug"]
+    dropped = bpy.data.objects.new("dropped", None)
+    dropped.instance_type, dropped.instance_collection = "COLLECTION", wanted.collections[0]
+    dropped.location = 10, 20, 30
+    bpy.context.scene.collection.objects.link(dropped)
+    (instance,) = [np.array(entry.matrix_world) for entry in bpy.context.evaluated_depsgraph_get().object_instances
+                   if entry.is_instance and blender_scene.kind_of(entry.object.original) == "mesh"]
+    thing = next(thing for thing in bpy.data.objects if blender_scene.kind_of(thing) == "mesh")
+    local = np.array([vertex.co for vertex in thing.data.vertices])
+    placed = local @ instance[:3, :3].T + instance[:3, 3]
+    low, high = before.min(0), before.max(0)
+    stand = np.array([*((low + high) / 2)[:2], low[2]])
+    assert placed == pytest.approx(before - stand + (10, 20, 30), abs=1e-5), "upright, in size, on what is below"
+    assert tuple(picture_of(thing.data.materials[0]).size) == (4, 4)
+
+
+# Updates in place.
+
+
+def test_meshes_made_again_keep_what_the_user_did(root, folder):
+    thing = mesh_of(root, 1)
+    pivot = thing.parent
+    ours = thing.data.materials[0]
+    shader_of(ours).inputs["Roughness"].default_value = 0.1
+    own = bpy.data.materials.new("own")
+    thing.data.materials.append(own)
+    thing.name, thing.data.name = "mine", "mine too"
+    thing.location, pivot.scale = (1, 2, 3), (2, 2, 2)
+    thing.modifiers.new("Decimate", "DECIMATE")
+    thing.shape_key_add(name="Basis")
+    thing.hide_render = True
+    thing.hide_set(True)
+    before, image = counts(), picture_of(ours)
+    rewrite(folder)
+    shown = blender_scene.show_meshes(root, folder)
+    assert (shown.meshes, shown.updated, shown.warnings) == (1, 1, [])
+    assert mesh_of(root, 1) == thing and thing.parent == pivot
+    assert thing.data.materials[:] == [ours, own]
+    assert shader_of(ours).inputs["Roughness"].default_value == pytest.approx(0.1)
+    assert (thing.name, thing.data.name) == ("mine", "mine too")
+    assert tuple(thing.location) == (1, 2, 3) and tuple(pivot.scale) == (2, 2, 2)
+    assert [modifier.type for modifier in thing.modifiers] == ["DECIMATE"]
+    assert thing.hide_render and thing.hide_get()
+    assert np.ptp([vertex.co for vertex in thing.data.vertices], axis=0) == pytest.approx([2, 2, 2])
+    assert [layer.name for layer in thing.data.uv_layers] == ["UVMap"]
+    assert picture_of(ours) == image and tuple(image.pixels[:3]) == pytest.approx((0, 1, 0))
+    after = counts()
+    assert after == {**before, "objects": before["objects"] - 1, "meshes": before["meshes"] - 1,
+                     "materials": before["materials"] - 1, "images": before["images"] - 1}, "the can has none any more"
+
+
+def test_a_material_of_the_users_own_stays_and_our_texture_in_it_follows(root, folder):
+    thing = mesh_of(root, 1)
+    own = bpy.data.materials.new("own")
+    if own.node_tree is None:
+        own.use_nodes = True
+    image = picture_of(thing.data.materials[0])
+    own.node_tree.nodes.new("ShaderNodeTexImage").image = image
+    thing.data.materials[0] = own
+    image.pack()
+    rewrite(folder)
+    blender_scene.show_meshes(root, folder)
+    assert thing.data.materials[:] == [own]
+    assert image.packed_file is not None and tuple(image.pixels[:3]) == pytest.approx((0, 1, 0))
+
+
+def test_a_mesh_whose_files_are_the_same_is_not_touched(root, folder):
+    thing = mesh_of(root, 1)
+    thing.data.vertices[0].co.x += 5
+    moved = coordinates(thing)
+    blender_scene.show_result(root, folder, bpy.context.scene)
+    assert blender_scene.show_meshes(root, folder).updated == 0
+    assert coordinates(thing) == pytest.approx(moved)
+    bpy.data.objects.remove(thing)
+    assert blender_scene.show_meshes(root, folder).updated == 1, "and comes again where it was deleted"
+
+
+def test_meshes_come_back_to_their_pivots(root, folder):
+    bpy.context.view_layer.update()
+    before = coordinates(mesh_of(root, 1))
+    bpy.data.objects.remove(parts(root, 1, "object_parent")[0])
+    bpy.data.collections.remove(blender_scene.object_collections(root)[2])
+    blender_scene.show_capture(bpy.context.scene, folder)
+    blender_scene.show_result(root, folder, bpy.context.scene)
+    bpy.context.view_layer.update()
+    assert coordinates(mesh_of(root, 1)) == pytest.approx(before, abs=2e-6)
+    assert len(mesh_of(root, 2).data.polygons) == 4
+
+
+def test_names_and_colours_follow_the_list(root, folder):
+    edit_objects(folder / "objects.json", {1: dict(name="cup", colour=[255, 0, 0])})
+    blender_scene.show_objects(root, folder, bpy.context.scene)
+    thing = mesh_of(root, 1)
+    assert (thing.name, thing.data.materials[0].name) == ("cup mesh", "cup mesh")
+    assert tuple(thing.color) == tuple(thing.data.materials[0].diffuse_color) == pytest.approx((1, 0, 0, 1))
+
+
+# Merged and left out.
+
+
+def test_merged_objects_bring_their_meshes_along_until_they_have_one(root, folder):
+    bpy.context.view_layer.update()
+    can, before = mesh_of(root, 2), coordinates(mesh_of(root, 2))
+    edit_objects(folder / "objects.json", {2: dict(merged_into=1)})
+    blender_scene.show_objects(root, folder, bpy.context.scene)
+    bpy.context.view_layer.update()
+    assert can in parts(root, 1, "mesh") and len(parts(root, 1, "mesh")) == 2
+    assert can.parent == parts(root, 1, "object_parent")[0] and blender_scene.object_id_of(can) == 1
+    assert coordinates(can) == pytest.approx(before, abs=2e-6)
+    assert 2 not in blender_scene.object_collections(root)
+
+    write_meshes(folder, {"1": tetrahedron(ORIGIN), "2": tetrahedron(ORIGIN)}, ids={"1": [1, 2]})
+    assert blender_scene.show_meshes(root, folder).meshes == 1
+    assert mesh_of(root, 1) != can
+
+    edit_objects(folder / "objects.json", {2: dict(merged_into=None)})
+    warnings = blender_scene.show_result(root, folder, bpy.context.scene).warnings
+    assert len(warnings) == 1 and "mug" in warnings[0] and "extract it again" in warnings[0]
+    assert parts(root, 1, "mesh") == [] and len(mesh_of(root, 2).data.polygons) == 4
+    assert not parts(root, 1, "splats")[0].hide_render
+
+
+def test_split_objects_get_their_meshes_back_with_their_materials(root, folder):
+    can = mesh_of(root, 2)
+    material = can.data.materials[0]
+    for into in (1, None):
+        edit_objects(folder / "objects.json", {2: dict(merged_into=into)})
+        blender_scene.show_objects(root, folder, bpy.context.scene)
+    assert mesh_of(root, 2) == can and can.data.materials[:] == [material]
+    assert len(parts(root, 1, "mesh")) == 1
+
+
+def test_left_out_objects_have_no_mesh(root, folder):
+    before = counts()
+    edit_objects(folder / "objects.json", {2: dict(left_out=True)})
+    blender_scene.show_objects(root, folder, bpy.context.scene)
+    assert 2 not in blender_scene.object_collections(root)
+    assert counts()["images"] == before["images"] - 1
+
+
+# What is shown.
+
+
+def hidden(things) -> set[bool]:
+    return {value for thing in things for value in (thing.hide_viewport, thing.hide_render)}
+
+
+def test_meshes_take_the_place_of_splats(root):
+    assert blender_scene.shown_kinds(root) == "meshes", "since there are meshes from the beginning"
+    expected = {"splats": ({True}, {False}, {False}, {False}), "both": ({False}, {False}, {False}, {False}),
+                "meshes": ({False}, {True}, {False}, {True})}
+    for which, (meshes, splats, without, rest) in expected.items():
+        blender_scene.show_kinds(root, which)
+        assert blender_scene.shown_kinds(root) == which
+        for object_id in (1, 2):
+            assert hidden(parts(root, object_id, "mesh")) == meshes
+            assert hidden(parts(root, object_id, "splats")) == splats
+        assert hidden(parts(root, HUGE, "splats")) == without, "it has no mesh to show"
+        assert hidden(parts(root, 0, "splats")) == rest
+        assert hidden(parts(root, 1, "anchors")) == {True}
+    with pytest.raises(ValueError):
+        blender_scene.show_kinds(root, "points")
+
+
+def test_what_comes_later_follows_the_choice(root, folder):
+    rewrite(folder, **{"_1": tetrahedron(ORIGIN), f"_{HUGE}": tetrahedron(ORIGIN)})
+    blender_scene.show_meshes(root, folder)
+    assert hidden(parts(root, HUGE, "mesh")) == {False} and hidden(parts(root, HUGE, "splats")) == {True}
+    assert hidden(parts(root, 2, "splats")) == {False}, "its mesh is gone"
+    blender_scene.show_kinds(root, "splats")
+    rewrite(folder, _2=tetrahedron(ORIGIN))
+    blender_scene.show_meshes(root, folder)
+    assert hidden(parts(root, 2, "mesh")) == {True} and hidden(parts(root, 2, "splats")) == {False}
+
+
+def test_splats_are_shown_until_there_are_meshes(fresh, folder):
+    (folder / "meshes" / "meshes.json").rename(folder / "later.json")
+    root = blender_scene.show_capture(bpy.context.scene, folder)
+    blender_scene.show_result(root, folder, bpy.context.scene)
+    assert blender_scene.shown_kinds(root) == "splats" and not blender_scene.has_shown_meshes(root)
+    assert hidden(parts(root, 1, "splats")) == {False}
+    (folder / "later.json").rename(folder / "meshes" / "meshes.json")
+    assert blender_scene.show_meshes(root, folder).meshes == 2
+    assert blender_scene.shown_kinds(root) == "meshes" and hidden(parts(root, 1, "splats")) == {True}
+
+
+def test_the_whole_scene_and_sets_are_hidden_beside_the_objects(root, folder):
+    write_meshes(folder, {"1": tetrahedron(ORIGIN), "scene": tetrahedron(ORIGIN + 1, 3.0),
+                          "pair": tetrahedron(ORIGIN)}, ids={"pair": [1, 2]})
+    assert blender_scene.show_meshes(root, folder).meshes == 3
+    whole = {thing.name: thing for thing in blender_scene.scene_meshes(root)}
+    assert set(whole) == {"name of scene mesh", "name of pair mesh"}
+    assert hidden(whole.values()) == {True}
+    whole["name of scene mesh"].hide_viewport = False
+    bpy.context.view_layer.update()
+    upright = np.array(kinds.parent_of(root).matrix_world)
+    expected = (tetrahedron((1, 1, 1), 3.0).vertices) @ upright[:3, :3].T + upright[:3, 3]
+    assert coordinates(whole["name of scene mesh"]) == pytest.approx(expected, abs=2e-6)
+    whole["name of pair mesh"].hide_viewport = False
+    blender_scene.show_kinds(root, "both")
+    assert not whole["name of pair mesh"].hide_viewport, "only the user shows and hides them"
+    write_meshes(folder, {"1": tetrahedron(ORIGIN)})
+    blender_scene.show_meshes(root, folder)
+    assert blender_scene.scene_meshes(root) == []
+
+
+def test_a_scene_without_objects_shows_its_one_mesh(fresh, folder):
+    write_vertices(folder / "splats.ply", splat_table(np.zeros(20, int)))
+    write_meshes(folder, {"scene": tetrahedron(ORIGIN)})
+    root = blender_scene.show_capture(bpy.context.scene, folder)
+    blender_scene.show_result(root, folder, bpy.context.scene)
+    assert hidden(blender_scene.scene_meshes(root)) == {False} and hidden(parts(root, 0, "splats")) == {True}
+    blender_scene.show_kinds(root, "splats")
+    assert hidden(blender_scene.scene_meshes(root)) == {True} and hidden(parts(root, 0, "splats")) == {False}
+
+
+# Faults.
+
+
+@pytest.mark.parametrize("spoil, sentence", [
+    (lambda path: path.unlink(), "2.ply cannot be read"),
+    (lambda path: path.write_bytes(path.read_bytes()[:-1]), "2.ply is cut short"),
+    (lambda path: path.write_bytes(b"ply\n"), "2.ply is not a mesh"),
+])
+def test_a_broken_mesh_is_told_and_the_others_come(root, folder, spoil, sentence):
+    kept = mesh_of(root, 2)
+    rewrite(folder, _1=tetrahedron(ORIGIN, 2.0), _2=tetrahedron(ORIGIN, 2.0))
+    spoil(folder / "meshes" / "2.ply")
+    shown = blender_scene.show_meshes(root, folder)
+    assert (shown.meshes, shown.updated) == (2, 1)
+    assert len(shown.warnings) == 1 and sentence in shown.warnings[0] and shown.warnings[0].endswith(".")
+    assert mesh_of(root, 2) == kept and len(kept.data.polygons) == 4
+
+
+@pytest.mark.parametrize("change", [
+    lambda mesh: mesh.vertices.__setitem__((0, 0), np.nan), lambda mesh: setattr(mesh, "faces", mesh.faces[:0])])
+def test_a_mesh_without_a_surface_is_told(root, folder, change):
+    bad = tetrahedron(ORIGIN)
+    change(bad)
+    if not len(bad.faces):
+        bad.uvs, bad.invented = bad.uvs[:0], bad.invented[:0]
+    rewrite(folder, _1=bad)
+    (sentence,) = blender_scene.show_meshes(root, folder).warnings
+    assert "1.ply holds no surface" in sentence
+
+
+def test_faces_that_are_none_do_no_harm(root, folder):
+    strange = tetrahedron(ORIGIN)
+    strange.faces[0] = 1, 1, 1
+    strange.uvs[1], strange.normals[2] = np.nan, np.nan
+    rewrite(folder, _1=strange)
+    assert blender_scene.show_meshes(root, folder).warnings == []
+    mesh = mesh_of(root, 1).data
+    assert len(mesh.polygons) == 3 and not mesh.validate()
+
+
+@pytest.mark.parametrize("content", [
+    "[]", "{", '{"meshes": {"1": 5}}', '{"meshes": {"1": {"file": "1.ply", "ids": 7}}}',
+    '{"meshes": {"1": {"file": "1.ply", "ids": ["x"]}}}'])
+def test_a_broken_list_of_meshes_changes_nothing(root, folder, content):
+    (folder / "meshes" / "meshes.json").write_text(content)
+    before = counts()
+    with pytest.raises(InputError, match=r"meshes\.json"):
+        blender_scene.show_meshes(root, folder)
+    (sentence,) = blender_scene.show_result(root, folder, bpy.context.scene).warnings
+    assert "meshes.json" in sentence and counts() == before
+
+
+def test_a_missing_texture_is_told_and_comes_later(fresh, folder):
+    (folder / "meshes" / "1.png").rename(folder / "away.png")
+    root = blender_scene.show_capture(bpy.context.scene, folder)
+    (sentence,) = blender_scene.show_result(root, folder, bpy.context.scene).warnings
+    assert "1.png is missing" in sentence
+    (folder / "away.png").rename(folder / "meshes" / "1.png")
+    assert blender_scene.show_meshes(root, folder).warnings == []
+    image = picture_of(mesh_of(root, 1).data.materials[0])
+    assert tuple(image.pixels[:3]) == pytest.approx((200 / 255, 100 / 255, 50 / 255), abs=1e-3)
+
+
+def test_nothing_outside_of_the_folder_is_read(root, folder):
+    rewrite(folder, _1=tetrahedron(ORIGIN))
+    listed = folder / "meshes" / "meshes.json"
+    content = json.loads(listed.read_text())
+    content["meshes"]["1"]["file"] = "../secret/1.ply"
+    listed.write_text(json.dumps(content))
+    assert blender_scene.show_meshes(root, folder).warnings == []
+    content["meshes"]["1"]["file"] = "../points.ply"
+    listed.write_text(json.dumps(content))
+    (sentence,) = blender_scene.show_meshes(root, folder).warnings
+    assert str(folder / "meshes" / "points.ply") in sentence
+
+
+def test_a_mesh_in_edit_mode_is_not_overwritten(root, folder):
+    bpy.context.view_layer.objects.active = mesh_of(root, 1)
+    bpy.ops.object.mode_set(mode="EDIT")
+    rewrite(folder)
+    with pytest.raises(InputError, match="mug mesh is in Edit Mode"):
+        blender_scene.show_meshes(root, folder)
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+
+# The panel's side of it.
+
+
+@pytest.fixture
+def active(fresh, folder, monkeypatch, tmp_path):
+    """The folder opened in the registered extension; its root. It seems trained, and there seems to be a backend."""
+    extension = headless.extension()
+    extension.register()
+    python = tmp_path / "python"
+    python.write_text("")
+    monkeypatch.setenv("OBJECTGS_PYTHON", str(python))
+    bpy.ops.objectgs.open_reconstruction(directory=str(folder))
+    yield bpy.context.scene.objectgs.active
+    extension.unregister()
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """The backend's arguments of each job that is submitted; none runs."""
+    jobs = []
+
+    def submit(job, owner, report):
+        jobs.append([str(word) for word in job.command[job.command.index("backend") + 1:-1]])
+        return {"FINISHED"}
+
+    monkeypatch.setattr(running, "submit", submit)
+    monkeypatch.setattr("objectgs.operators.need.training", lambda *_: True)
+    return jobs
+
+
+def test_the_operator_asks_for_what_the_panel_says(active, asked, folder):
+    extract, properties = bpy.ops.objectgs.extract_meshes, active.objectgs
+    extract()
+    properties.mesh_faces, properties.texture_size, properties.mesh_closed = 5000, "2048", False
+    properties.mesh_scene = True
+    extract()
+    properties.mesh_scene, properties.mesh_objects = False, "selected"
+    mesh_of(active, 2).select_set(True)
+    bpy.context.view_layer.objects.active = mesh_of(active, 2)
+    extract()
+    for thing in bpy.context.selected_objects:
+        thing.select_set(False)
+    properties.active_object = 0
+    for thing in bpy.context.selected_objects:
+        thing.select_set(False)
+    extract()
+    options = ["--faces", "5000", "--open", "--texture-size", "2048"]
+    named = ["mesh", str(folder), "--faces", "5000"]
+    assert asked[0] == ["mesh", str(folder), "--faces", "20000"]
+    assert asked[1] == [*named, "--objects", "1", "2", str(HUGE), "--scene", *options[2:]]
+    assert asked[2] == [*named, "--objects", "2", *options[2:]]
+    assert asked[3] == [*named, "--objects", "1", *options[2:]]
+
+
+def test_the_operator_says_what_it_needs(active):
+    assert not bpy.ops.objectgs.extract_meshes.poll(), "nothing was trained"
+    with pytest.raises(RuntimeError, match="train first"):
+        bpy.ops.objectgs.extract_meshes()
+
+
+def test_a_job_that_ends_shows_its_meshes(active, folder, monkeypatch):
+    properties = active.objectgs
+    assert properties.shown == "meshes"
+    properties.shown = "splats"
+    assert hidden(parts(active, 1, "splats")) == {False} and blender_scene.shown_kinds(active) == "splats"
+    rewrite(folder)
+    job = locations.backend_job("Meshes", "mesh", blender_scene.folder_of(active), "mesh")
+    running._wanted_in[job] = bpy.context.scene.session_uid
+    running.finish(job)
+    assert properties.shown == "meshes" and hidden(parts(active, 1, "mesh")) == {False}
+    assert properties.objects[0].faces == 4 and properties.objects[1].faces == 0
+    properties.shown = "both"
+    running.finish(job)
+    assert properties.shown == "both", "the user's choice stays where meshes are shown already"
+
+
+def test_the_folder_tells_of_meshes_that_are_out_of_date(folder):
+    state = folder_state(folder)
+    assert (state.meshes, state.stale_meshes) == (2, 2)
+    assert folder_state(folder.parent).meshes == 0
+
+
+def test_assets(active):
+    bpy.ops.objectgs.mark_assets()
+    marked = {collection.name for collection in bpy.data.collections if collection.asset_data}
+    assert marked == {"mug", "can"}
+    mesh_of(active, 1).location.z += 1
+    mesh_of(active, 1).select_set(True)
+    bpy.ops.objectgs.mark_assets()
+    bpy.context.view_layer.update()
+    low = min(place[2] for place in coordinates(mesh_of(active, 1)))
+    assert blender_scene.object_collections(active)[1].instance_offset[2] == pytest.approx(low, abs=1e-5)
+
+
+def test_points_make_room_wherever_a_result_is_opened(active):
+    assert kinds.points_of(active).hide_get()
