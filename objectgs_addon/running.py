@@ -223,7 +223,6 @@ def _show_meshes(job: Job, owner) -> bool:
         job.warnings.extend(shown.warnings)
         if shown.meshes and scene.shown_kinds(root) == "splats":
             scene.show_kinds(root, "meshes")
-        view.hide_points(root)
         object_edits.fill(root)
     return bool(roots) or _explain(job)
 

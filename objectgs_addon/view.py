@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What the 3D viewports look at and show."""
 
+import contextlib
+
 import bpy
 
-from . import scene
+from . import object_edits, scene
 
 
 def show(root) -> None:
@@ -20,11 +22,12 @@ def show(root) -> None:
 
 
 def hide_points(root) -> None:
-    """Take the point cloud out of sight, since splats come into its place."""
+    """Take the point cloud out of sight, since splats or meshes come into its place."""
     points = [part for part in root.all_objects if scene.kind_of(part) == "points"]
-    for layer in (layer for owner in bpy.data.scenes for layer in owner.view_layers):
+    for layer in (layer for owner in object_edits.scenes_of(root) for layer in owner.view_layers):
         for part in points:
-            if layer.objects.get(part.name) == part:
+            # Not looked for in the layer, which does not list yet what was just linked.
+            with contextlib.suppress(RuntimeError):  # It was taken out of this layer.
                 part.hide_set(True, view_layer=layer)
 
 

@@ -113,6 +113,8 @@ def _mesh_sheet(trained: Trained, meshes: dict[str, dict[str, Any]], reporter: R
     """Pictures of the meshes, or None where there are none."""
     capture, folder = trained.capture, trained.folder.meshes
     cards = []
+    if len(meshes) > MESHES_SHOWN:
+        reporter.status(f"The picture of the meshes shows the first {MESHES_SHOWN} of {len(meshes)}")
     for key, mesh in list(meshes.items())[:MESHES_SHOWN]:
         card = Card(_mesh_name(capture, key, mesh), figures_line(mesh), why=mesh.get("why") or "")
         if mesh.get("file") and not card.why:
@@ -123,6 +125,9 @@ def _mesh_sheet(trained: Trained, meshes: dict[str, dict[str, Any]], reporter: R
             except InputError as error:
                 reporter.warning(str(error))
                 card = Card(card.name, "", why="its files cannot be read")
+            else:
+                if not len(card.mesh.faces) or not np.isfinite(card.mesh.vertices).all():
+                    card = Card(card.name, "", why="it has no surface")
         cards.append(card)
     if not cards:
         return None

@@ -30,9 +30,9 @@ _PAPER = (255, 255, 255)
 _PANEL = (246, 246, 248)
 _INK = (38, 38, 42)
 _FAINT = (118, 118, 124)
-_CLAY = np.array([0.80, 0.795, 0.785])
+_CLAY = np.array([0.80, 0.80, 0.80])
 _INVENTED = np.array([0.98, 0.66, 0.36])
-_WIRE = np.array([0.23, 0.30, 0.42])
+_WIRE = np.array([0.24, 0.27, 0.33])
 _VIEWS_ASKED = 60
 _FIELD = np.radians(28.0)
 _FILLED = 0.88
@@ -81,10 +81,9 @@ def camera_for(vertices: np.ndarray, view: View, size: int) -> Camera:
         # What is nearer looks larger, so the picture's middle is not the box's.
         away, centre = 0.0, np.zeros(2)
         for _ in range(5):
-            away = float((np.abs(seen[:, :2] - centre).max(1) / slope - seen[:, 2]).max())
+            away = max(float((np.abs(seen[:, :2] - centre).max(1) / slope - seen[:, 2]).max()), 1e-12)
             projected = (seen[:, :2] - centre) / np.maximum(seen[:, 2:] + away, 1e-9 * away)
             centre += (projected.max(0) + projected.min(0)) / 2 * away
-        away = max(away, 1e-12)
         viewmat[:3, 3] = -pose @ middle + [-centre[0], -centre[1], away]
         focal = _FILLED * size / (2 * slope)
     K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
@@ -95,7 +94,7 @@ def draw_card(card: Card, size: int = _CELL) -> list[Image.Image]:
     """The mesh shaded, as wires and with its texture: three pictures of size x size pixels."""
     mesh = card.mesh
     assert mesh is not None and card.view is not None
-    camera = camera_for(mesh.vertices, card.view, size * _FINER)
+    camera = camera_for(mesh.vertices[np.unique(mesh.faces)], card.view, size * _FINER)
     pose = camera.viewmat[:3, :3]
     _, face, weights = draw_mesh(mesh.vertices, mesh.faces, camera)
     drawn = face >= 0
@@ -216,10 +215,25 @@ def save_sheet(sheet: Image.Image, path: Path, limit: int = 300_000) -> Path:
             scale *= min(0.95, (limit / buffer.tell()) ** 0.5)
         size = max(1, round(sheet.width * scale)), max(1, round(sheet.height * scale))
         smaller = sheet if size == sheet.size else sheet.resize(size, Image.Resampling.LANCZOS)
-        # Colours that fit well take long to find, so in every third row and column.
-        thinned = smaller.resize((-(-size[0] // 3), -(-size[1] // 3)), Image.Resampling.NEAREST)
-        colours = thinned.quantize(256, Image.Quantize.MEDIANCUT, kmeans=3)
-        picture = smaller.quantize(palette=colours, dither=Image.Dither.NONE)
+        picture = _in_few_colours(smaller)
+
+
+def _in_few_colours(picture: Image.Image) -> Image.Image:
+    """The picture in 256 colours: the sheet's own two, exactly, and those that fit the rest."""
+    pixels = np.asarray(picture)
+    # Every third row and column is enough, and a colour that fills much must not take the others' places.
+    found, count = np.unique(pixels[::3, ::3].reshape(-1, 3) >> 2, axis=0, return_counts=True)
+    several = np.repeat(4 * found + 2, np.ceil(count**0.3).astype(int), axis=0).astype(np.uint8)
+    fitted = Image.fromarray(several[None]).quantize(254, Image.Quantize.MEDIANCUT, kmeans=3)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([*_PAPER, *_PANEL, *(fitted.getpalette() or [])[: 3 * 254]])
+    placed = np.array(picture.quantize(palette=palette, dither=Image.Dither.NONE))
+    # Pillow takes near colours for equal ones.
+    for place, own in enumerate((_PAPER, _PANEL)):
+        placed[(pixels == own).all(2)] = place
+    few = Image.fromarray(placed, "P")
+    few.putpalette(palette.getpalette() or [])
+    return few
 
 
 def figures_line(figures: Mapping[str, Any]) -> str:

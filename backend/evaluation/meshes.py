@@ -26,7 +26,7 @@ THRESHOLDS = (0.02, 0.005)
 papers on object meshes use, and a stricter one."""
 SAMPLES = 30_000
 _NEIGHBOURS = 6
-_SUBPIXELS = 2
+_SUBPIXELS = 3
 
 
 class SampledSurface:

@@ -23,6 +23,7 @@ VIEWS_TO_COUNT = 2
 """So many views must see a piece of surface before a reconstruction can be blamed for it."""
 _PIXELS_DEEP = 1.5
 """A point may differ from the depth at its pixel by so many times the pixel's width there: surfaces are slanted."""
+_BYTES_HELD = 400_000_000
 _FACES = "property list uchar int vertex_indices"
 
 
@@ -49,7 +50,8 @@ class Truth:
         self.meshes = meshes
         self._capture = capture
         self._indices = indices
-        self._views: list[_View] | None = None
+        self._held: dict[int, _View] = {}
+        self._bytes = 0
 
     def of(self, ids: Collection[int]) -> TrueMesh | None:
         """The surface of one object or several together; None where the truth lacks one of them."""
@@ -65,10 +67,8 @@ class Truth:
 
         A view sees a point that it looks at from outside, whose pixel shows one of `ids` and lies as deep as the point.
         """
-        if self._views is None:
-            self._views = [_read_view(self._capture, index) for index in self._indices]
         views = np.zeros(len(points), np.int32)
-        for view in self._views:
+        for view in map(self._view, self._indices):
             fx, fy, cx, cy = view.intrinsics
             turn = view.viewmat[:3, :3]
             seen_from = points @ turn.T + view.viewmat[:3, 3]
@@ -83,6 +83,15 @@ class Truth:
             found &= np.abs(view.depth[row, column] - z) <= _PIXELS_DEEP * z / fx
             views[at[found]] += 1
         return views >= VIEWS_TO_COUNT
+
+    def _view(self, index: int) -> _View:
+        if index in self._held:
+            return self._held[index]
+        view = _read_view(self._capture, index)
+        self._bytes += view.depth.nbytes + view.ids.nbytes
+        if self._bytes <= _BYTES_HELD:
+            self._held[index] = view
+        return view
 
 
 def load_truth(capture: Capture, indices: Sequence[int]) -> Truth | None:

@@ -13,11 +13,12 @@ from typing import Protocol
 
 import numpy as np
 
-from ..protocol import InputError, Reporter
+from ..protocol import Reporter
 from ..raster import Camera
 from .blocks import AROUND, SAMPLES, SIDE, Blocks, distinct
 from .integrate import Sight, add, look, own_depth
 from .marching import compact, march, parts
+from .surface import NoSurface
 from .views import ObjectView, SceneMap
 from .winding import Winding
 
@@ -26,20 +27,18 @@ RESOLUTION = 256
 SMALLEST_PART = 0.03
 """Parts of the surface smaller than this share of the largest are taken for floaters."""
 
-_VOXEL_PER_PIXEL = 0.5
-_REACH_VOXELS, _REACH_PIXELS = 3.0, 1.5
-_BACK_VOXELS, _BACK_PIXELS = 2.0, 1.0
+_VOXEL_PER_PIXEL = 0.7
+_REACH_VOXELS, _REACH_PIXELS = 5.0, 3.5
+_BACK_VOXELS, _BACK_PIXELS = 3.0, 2.0
 _BYTES_PER_BLOCK = 8 * SAMPLES * 4
 """What a block takes at most, everything counted: sums, values, marks and the triangles in it."""
 _SURE = 1.0
 """From this weight on the views alone say how far the surface is."""
 _SEEN = 0.1
 """From this weight on a sample was seen."""
+_SKIN = 1.75
+"""Voxels below the surface to which a sample is part of what was seen; a cell across the surface has none deeper."""
 _STEPS_BESIDE = 26
-
-
-class NoSurface(InputError):
-    """There is no mesh of an object; the message says why in one sentence."""
 
 
 class SeesObjects(Protocol):
@@ -165,7 +164,7 @@ class _Fusion:
         total, weights = self._integrated(blocks.coords)
         winding = self._seen_surface(blocks, total, weights)
         values = self._finished(blocks.coords, total, weights, winding)
-        seen = weights >= _SEEN
+        seen = self._seen(total, weights)
         fresh = np.arange(len(blocks))
         while True:
             coords = self._missing(blocks, values, fresh)
@@ -176,7 +175,7 @@ class _Fusion:
             fresh = np.arange(len(blocks), len(blocks) + len(coords))
             blocks = blocks.joined(coords)
             values = np.concatenate([values, self._finished(coords, total, weights, winding)])
-            seen = np.concatenate([seen, weights >= _SEEN])
+            seen = np.concatenate([seen, self._seen(total, weights)])
             self.rounds += 1
         return Field(self.origin, self.voxel, blocks, values, seen)
 
@@ -219,11 +218,15 @@ class _Fusion:
 
     def _seen_surface(self, blocks: Blocks, total: np.ndarray, weights: np.ndarray) -> Winding:
         values = _nudged(total / np.maximum(weights, 1e-9) / self.voxel)
-        vertices, faces, _ = march(blocks, values, weights >= _SEEN, closed=False)
+        vertices, faces, _ = march(blocks, values, self._seen(total, weights), closed=False)
         vertices, faces = largest_parts(vertices, faces)
         if not len(faces):
             raise NoSurface("The views see too little of it, or do not agree on where it is.")
         return Winding(vertices, faces)
+
+    def _seen(self, total: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Whether a sample was seen, from the front or just below the surface."""
+        return (weights >= _SEEN) & (total > -_SKIN * self.voxel * weights)
 
     def _finished(self, coords: np.ndarray, total: np.ndarray, weights: np.ndarray, winding: Winding) -> np.ndarray:
         """Distances in voxels, where they are not seen from the winding number."""

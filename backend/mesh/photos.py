@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
+from numba import njit, prange
 
 from ..raster.camera import Camera
 from ..raster.kernel import kernel
@@ -38,7 +38,7 @@ _GRAZING = 0.1
 _SHARPNESS = 3.0
 """Power of the score: how much a better photo outweighs a worse one."""
 
-_ODD = 0.12
+_ODD = 0.25
 """Difference from the photos' median, of 1, at which a photo's say has fallen to 1 / e: highlights, passers-by."""
 
 
@@ -191,56 +191,64 @@ def _cubic(t, out):
     out[3] = (t - 1.0) * t * t / 2.0
 
 
+@njit(inline="always", error_model="numpy")
+def look(positions, normals, n, least, eye, viewmat, intrinsics, depth, clearance, safe):
+    """How well a photo shows place `n`, 0: not at all, or not better than `least`; the pixel (u, v) there, counted from
+    pixels' centres, and its clearance. viewmat, intrinsics and eye: of the photo's camera."""
+    fx, fy, cx, cy = intrinsics
+    height, width = depth.shape
+    focal = (fx + fy) / 2
+    x, y, z = positions[n, 0], positions[n, 1], positions[n, 2]
+    dx, dy, dz = eye[0] - x, eye[1] - y, eye[2] - z
+    facing = dx * normals[n, 0] + dy * normals[n, 1] + dz * normals[n, 2]
+    if facing <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0
+    facing /= np.sqrt(dx * dx + dy * dy + dz * dz)
+    pz = viewmat[2, 0] * x + viewmat[2, 1] * y + viewmat[2, 2] * z + viewmat[2, 3]
+    if facing < _GRAZING or pz <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0
+    score = (facing * focal / pz) ** 2
+    if score <= least:
+        return 0.0, 0.0, 0.0, 0.0
+    px = viewmat[0, 0] * x + viewmat[0, 1] * y + viewmat[0, 2] * z + viewmat[0, 3]
+    py = viewmat[1, 0] * x + viewmat[1, 1] * y + viewmat[1, 2] * z + viewmat[1, 3]
+    u = px / pz * fx + cx - 0.5
+    v = py / pz * fy + cy - 0.5
+    if not (u >= 0.0 and v >= 0.0 and u < width - 1 and v < height - 1):
+        return 0.0, 0.0, 0.0, 0.0
+    clear = between(clearance, u, v)
+    if clear < _CLEAR or pz > between(depth, u, v) + _BEHIND * pz / focal:
+        return 0.0, 0.0, 0.0, 0.0
+    return score * max(min((clear - _CLEAR) / (safe - _CLEAR), 1.0), 1e-3), u, v, clear
+
+
+@njit(inline="always", error_model="numpy")
+def between(plane, u, v):
+    """A plane's value at (u, v), counted from pixels' centres, between its four neighbours, all inside."""
+    column, row = int(u), int(v)
+    fu, fv = u - column, v - row
+    return (plane[row, column] * (1 - fu) + plane[row, column + 1] * fu) * (1 - fv) + (
+        plane[row + 1, column] * (1 - fu) + plane[row + 1, column + 1] * fu
+    ) * fv
+
+
 @kernel(parallel=True)
 def _gather(
     positions, normals, planes, depth, clearance, viewmat, intrinsics, eye, corner, safe, scores, colors
 ):  # fmt: skip
-    fx, fy, cx, cy = intrinsics
-    height, width = depth.shape
-    focal = (fx + fy) / 2
     block = 1024
     for b in prange((positions.shape[0] + block - 1) // block):
         across = np.empty(4)
         down = np.empty(4)
         color = np.empty(3)
         for n in range(b * block, min((b + 1) * block, positions.shape[0])):
-            x, y, z = positions[n, 0], positions[n, 1], positions[n, 2]
-            dx, dy, dz = eye[0] - x, eye[1] - y, eye[2] - z
-            facing = dx * normals[n, 0] + dy * normals[n, 1] + dz * normals[n, 2]
-            if facing <= 0.0:
-                continue
-            facing /= np.sqrt(dx * dx + dy * dy + dz * dz)
-            if facing < _GRAZING:
-                continue
-            pz = viewmat[2, 0] * x + viewmat[2, 1] * y + viewmat[2, 2] * z + viewmat[2, 3]
-            if pz <= 0.0:
-                continue
-            px = viewmat[0, 0] * x + viewmat[0, 1] * y + viewmat[0, 2] * z + viewmat[0, 3]
-            py = viewmat[1, 0] * x + viewmat[1, 1] * y + viewmat[1, 2] * z + viewmat[1, 3]
-            u = px / pz * fx + cx - 0.5
-            v = py / pz * fy + cy - 0.5
-            if not (u >= 0.0 and v >= 0.0 and u < width - 1 and v < height - 1):
-                continue
-            score = (facing * focal / pz) ** 2
+            score, u, v, clear = look(
+                positions, normals, n, scores[n, KEPT], eye, viewmat, intrinsics, depth, clearance, safe
+            )
             if score <= scores[n, KEPT]:
                 continue
-            column, row = int(u), int(v)
-            fu, fv = u - column, v - row
-            clear = (clearance[row, column] * (1 - fu) + clearance[row, column + 1] * fu) * (1 - fv) + (
-                clearance[row + 1, column] * (1 - fu) + clearance[row + 1, column + 1] * fu
-            ) * fv
-            if clear < _CLEAR:
-                continue
-            seen = (depth[row, column] * (1 - fu) + depth[row, column + 1] * fu) * (1 - fv) + (
-                depth[row + 1, column] * (1 - fu) + depth[row + 1, column + 1] * fu
-            ) * fv
-            if pz > seen + _BEHIND * pz / focal:
-                continue
-            score *= max(min((clear - _CLEAR) / (safe - _CLEAR), 1.0), 1e-3)
-            if score <= scores[n, KEPT]:
-                continue
-            column += corner[0]
-            row += corner[1]
+            column, row = int(u) + corner[0], int(v) + corner[1]
+            fu, fv = u - int(u), v - int(v)
             if (
                 clear >= _CUBIC
                 and column > 0

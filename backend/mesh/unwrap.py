@@ -14,8 +14,8 @@ _PACKED_AT = 1024
 _PADDING = 4
 """Texels of the picture between charts, at least."""
 
-_LARGEST_CHART = 20000
-"""Faces in a chart, about; the time grows with their square."""
+_TOGETHER = 5000
+"""Faces, at most, among which charts are found: the time grows with the square of a chart's faces."""
 
 _SMOOTHED_FROM = 500
 """Faces from which on the charts are found on a smoothed copy."""
@@ -31,7 +31,7 @@ def unwrap(surface: Surface, texture_size: int) -> np.ndarray:
     nearly proportional to areas on the surface. Faces without area become points.
     """
     vertices = np.asarray(surface.vertices, np.float64)
-    faces = np.ascontiguousarray(surface.faces, np.uint32)
+    faces = np.ascontiguousarray(surface.faces, np.int32)
     if not len(faces):
         return np.zeros((0, 3, 2), np.float32)
     if len(faces) >= _SMOOTHED_FROM:
@@ -39,27 +39,38 @@ def unwrap(surface: Surface, texture_size: int) -> np.ndarray:
     low = vertices.min(0)
     vertices = (vertices - low) / max(float((vertices.max(0) - low).max()), 1e-30)
     atlas = xatlas.Atlas()
-    atlas.add_mesh(vertices.astype(np.float32), faces)
+    parts = _parts(vertices[surface.faces].mean(1), np.arange(len(faces)))
+    members = [np.unique(faces[part], return_inverse=True) for part in parts]
+    for used, corners in members:
+        atlas.add_mesh(vertices[used].astype(np.float32), corners.reshape(-1, 3).astype(np.uint32))
     charts = xatlas.ChartOptions()
     # Fewer terms to weigh: less than half of the time, and charts as large.
     charts.max_cost = 4.0
     charts.roundness_weight = charts.straightness_weight = 0.0
     charts.normal_seam_weight = charts.texture_seam_weight = 0.0
     charts.fix_winding = True
-    if len(faces) > _LARGEST_CHART:
-        a, b, c = np.moveaxis(vertices[surface.faces], 1, 0)
-        area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
-        charts.max_chart_area = float(area) * _LARGEST_CHART / len(faces)
     packing = xatlas.PackOptions()
     packing.resolution = _PACKED_AT
     packing.padding = max(1, -(-_PADDING * _PACKED_AT // texture_size))
     packing.bilinear = True
     packing.rotate_charts = False  # It transposes them, which mirrors.
     atlas.generate(charts, packing)
-    origin, corners, uvs = atlas[0]
-    # A length is as many texels across as up: xatlas gives shares of the width and of the height.
-    uvs = np.nan_to_num(np.asarray(uvs, np.float64)) * [atlas.width, atlas.height] / max(atlas.width, atlas.height, 1)
-    return _with_points(uvs, np.asarray(origin, np.int64), np.asarray(corners, np.int64)).astype(np.float32)
+    out = np.empty((len(faces), 3, 2), np.float32)
+    for k, part in enumerate(parts):
+        origin, corners, uvs = atlas[k]
+        # Shares of the width and of the height: a length has to be as many texels across as up.
+        uvs = np.nan_to_num(np.asarray(uvs, np.float64)) * [atlas.width, atlas.height]
+        uvs /= max(atlas.width, atlas.height, 1)
+        out[part] = _with_points(uvs, np.asarray(origin, np.int64), np.asarray(corners, np.int64))
+    return out
+
+
+def _parts(centres: np.ndarray, faces: np.ndarray) -> list[np.ndarray]:
+    """`faces` (n,) in groups of `_TOGETHER` at most, halved across their longest side; centres (F, 3) of all faces."""
+    if len(faces) <= _TOGETHER:
+        return [faces]
+    order = faces[np.argsort(centres[faces, np.ptp(centres[faces], axis=0).argmax()], kind="stable")]
+    return _parts(centres, order[: len(order) // 2]) + _parts(centres, order[len(order) // 2 :])
 
 
 def _with_points(uvs: np.ndarray, origin: np.ndarray, corners: np.ndarray) -> np.ndarray:

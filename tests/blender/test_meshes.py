@@ -336,6 +336,17 @@ def test_what_comes_later_follows_the_choice(root, folder):
     assert hidden(parts(root, 2, "mesh")) == {True} and hidden(parts(root, 2, "splats")) == {False}
 
 
+def test_what_the_user_hid_stays_hidden(root, folder):
+    blender_scene.show_kinds(root, "both")
+    things = [*parts(root, 0, "splats"), *parts(root, 1, "splats"), mesh_of(root, 1)]
+    for thing in things:
+        thing.hide_viewport = thing.hide_render = True
+    rewrite(folder, _1=tetrahedron(ORIGIN), _2=tetrahedron(ORIGIN), **{f"_{HUGE}": tetrahedron(ORIGIN)})
+    blender_scene.show_meshes(root, folder)
+    blender_scene.show_result(root, folder, bpy.context.scene)
+    assert hidden(things) == {True}
+
+
 def test_splats_are_shown_until_there_are_meshes(fresh, folder):
     (folder / "meshes" / "meshes.json").rename(folder / "later.json")
     root = blender_scene.show_capture(bpy.context.scene, folder)
@@ -554,3 +565,7 @@ def test_assets(active):
     bpy.context.view_layer.update()
     low = min(place[2] for place in coordinates(mesh_of(active, 1)))
     assert blender_scene.object_collections(active)[1].instance_offset[2] == pytest.approx(low, abs=1e-5)
+
+
+def test_points_make_room_wherever_a_result_is_opened(active):
+    assert kinds.points_of(active).hide_get()
