@@ -22,7 +22,7 @@ from .surface import Surface
 from .texture import neighbours, vertex_normals
 from .views import Views
 
-_REACHES = (2.0, 1.0)
+_REACHES = (1.5, 1.0)
 """How far a vertex may move in each round, in pixels' sizes on it."""
 
 _PHOTOS = 6
@@ -35,8 +35,12 @@ _OUTSIDE = 1.0
 
 _NONE = 255
 _NOISE = (2.5 / 255) ** 2
-_STIFFNESS = 1.0
-_STAY = 0.01
+_STIFFNESS = 3.0
+_STAY = 0.05
+_TURN = 0.5
+"""Cosine of the angle by which a face may turn."""
+
+_UNFOLDED = 40
 _SHARED = 3
 """Rounds in which neighbours average what their patches say."""
 
@@ -55,9 +59,9 @@ def _moved(
     vertices = np.ascontiguousarray(surface.vertices, np.float64)
     faces = np.ascontiguousarray(surface.faces, np.int32)
     near = neighbours(vertices, faces)
-    mean = diags(1 / np.maximum(np.asarray(near.sum(1)).ravel(), 1e-30)) @ near
+    mean = (diags(1 / np.maximum(np.asarray(near.sum(1)).ravel(), 1e-30)) @ near).tocsr()
     normals = vertex_normals(vertices, faces)
-    for _ in range(2):
+    for _ in range(5):
         normals = normals + mean @ normals
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     count = len(vertices)
@@ -85,7 +89,30 @@ def _moved(
             )
     cost = np.empty((count, _PLACES))
     _disagreement(patches, cost)
-    return vertices + (_settled(cost, away, near) * pixel)[:, None] * normals
+    way = (_settled(cost, away, near) * pixel)[:, None] * normals
+    return vertices + _without_folds(vertices, faces, way, mean)
+
+
+def _without_folds(vertices: np.ndarray, faces: np.ndarray, way: np.ndarray, mean: csr_matrix) -> np.ndarray:
+    """`way` (V, 3), which the vertices go, smoothed wherever faces would turn over."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    before = np.cross(b - a, c - a)
+    even = mean.copy()
+    even.data = 1 / np.repeat(np.maximum(np.diff(even.indptr), 1), np.diff(even.indptr))
+    for round in range(_UNFOLDED):
+        a, b, c = np.moveaxis((vertices + way)[faces], 1, 0)
+        after = np.cross(b - a, c - a)
+        least = _TURN * np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+        folded = (before * after).sum(1) < least
+        if not folded.any():
+            break
+        near = np.zeros(len(vertices))
+        near[faces[folded]] = 1
+        for _ in range(1 + round // 4):
+            near = near + even @ near
+        near = near > 0
+        way = np.where(near[:, None], (way + even @ way) / 2, way)
+    return way
 
 
 def _footprint(vertices: np.ndarray, photos: dict[int, Photo], best: np.ndarray) -> np.ndarray:
