@@ -13,11 +13,12 @@ from typing import Protocol
 
 import numpy as np
 
-from ..protocol import InputError, Reporter
+from ..protocol import Reporter
 from ..raster import Camera
 from .blocks import AROUND, SAMPLES, SIDE, Blocks, distinct
 from .integrate import Sight, add, look, own_depth
 from .marching import compact, march, parts
+from .surface import NoSurface
 from .views import ObjectView, SceneMap
 from .winding import Winding
 
@@ -38,10 +39,6 @@ _SEEN = 0.1
 _SKIN = 1.75
 """Voxels below the surface to which a sample is part of what was seen; a cell across the surface has none deeper."""
 _STEPS_BESIDE = 26
-
-
-class NoSurface(InputError):
-    """There is no mesh of an object; the message says why in one sentence."""
 
 
 class SeesObjects(Protocol):

@@ -148,13 +148,13 @@ class Views:
         ours = torch.from_numpy(np.isin(splats.ids.numpy(), self._classes).astype(np.int32))
         labels = torch.ones((camera.height, camera.width), dtype=torch.int32)
         with torch.no_grad():
-            drawn = rasterize(*splats[:5], ours, camera, labels)
+            drawn = rasterize(*splats[:5], ours, camera, labels, primitive=self.model.primitive)
         assert drawn.weight is not None
         return drawn.weight.numpy()
 
     def _draw(self, splats: Generated, camera: Camera) -> Rendered:
         with torch.no_grad():
-            return rasterize(*splats[:6], camera, want_median=True)
+            return rasterize(*splats[:6], camera, want_median=True, primitive=self.model.primitive)
 
     def _scene_splats(self, camera: Camera) -> Generated:
         if not self.model.explicit:

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 
-from backend.mesh.views import Views
+from backend.mesh.blocks import SAMPLES, Blocks
+from backend.mesh.extract import extract, is_watertight
+from backend.mesh.fusion import fuse
+from backend.mesh.marching import march, parts
+from backend.mesh.surface import NoSurface
+from backend.mesh.views import ObjectView, SceneMap, Views, crop
+from backend.mesh.winding import Winding
 from backend.model.generate import Generated
+from backend.protocol import Cancelled, Reporter
 from backend.raster import Camera, rasterize
 
 
@@ -50,7 +59,7 @@ def views_of(splats, cameras, explicit=True, **options):
         assert explicit or eye is not None
         return splats if seen is None else Generated(*(part[torch.from_numpy(seen)] for part in splats))
 
-    model = SimpleNamespace(generate=generate, explicit=explicit, anchors=SimpleNamespace(ids=ids))
+    model = SimpleNamespace(generate=generate, explicit=explicit, primitive="3d", anchors=SimpleNamespace(ids=ids))
     scene = SimpleNamespace(camera=lambda index, downscale: cameras[index])
     return Views(model, scene, range(len(cameras)), **options)
 
@@ -114,3 +123,390 @@ def test_views_stay_within_their_memory():
     held = [*views._maps.values(), *views._views.values()]
     size = sum(p.nbytes for v in held for p in vars(v).values() if isinstance(p, np.ndarray))
     assert 0 < size <= 0.12e6
+
+
+# --- shapes that are seen exactly ------------------------------------------------------------------------------------
+
+
+def ball(centre=(0, 0, 0), radius=0.5):
+    return lambda p: np.linalg.norm(p - np.array(centre), axis=-1) - radius
+
+
+def box(low, high):
+    low, high = np.array(low, float), np.array(high, float)
+
+    def distance(p):
+        q = np.abs(p - (low + high) / 2) - (high - low) / 2
+        return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0)
+
+    return distance
+
+
+def ring(radius=0.4, thickness=0.15):
+    def distance(p):
+        across = np.hypot(p[..., 0], p[..., 2]) - radius
+        return np.hypot(across, p[..., 1]) - thickness
+
+    return distance
+
+
+def bowl(radius=0.5, thickness=0.06):
+    """The lower half of a hollow ball."""
+    return lambda p: np.maximum(np.abs(np.linalg.norm(p, axis=-1) - radius) - thickness, p[..., 2])
+
+
+def rod(a, b, radius):
+    a, b = np.array(a, float), np.array(b, float)
+
+    def distance(p):
+        t = np.clip((p - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+        return np.linalg.norm(p - a - t[..., None] * (b - a), axis=-1) - radius
+
+    return distance
+
+
+class Exact:
+    """What `fuse` needs of Views, of shapes given by their signed distance: exact depths, sharp edges."""
+
+    def __init__(self, shapes, cameras):
+        self.shapes, self.cameras = list(shapes), list(cameras)
+        self.indices = tuple(range(len(self.cameras)))
+        self._alone = {}
+
+    def depths(self, index):
+        """The depth of each shape, (shapes, H, W), infinite where it is not."""
+        if index not in self._alone:
+            camera = self.cameras[index]
+            u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+            K = camera.K
+            rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.shape)], -1)
+            rays = (rays @ camera.viewmat[:3, :3]).reshape(-1, 3)
+            length = np.linalg.norm(rays, axis=1)
+            self._alone[index] = np.array([self.trace(s, camera.centre, rays / length[:, None]) for s in self.shapes])
+            self._alone[index] = (self._alone[index] / length).reshape(len(self.shapes), *u.shape)
+        return self._alone[index]
+
+    @staticmethod
+    def trace(shape, eye, rays):
+        t, live = np.zeros(len(rays)), np.arange(len(rays))
+        for _ in range(80):
+            step = shape(eye + t[live, None] * rays[live])
+            t[live] += step
+            live = live[(np.abs(step) > 1e-6) & (t[live] < 20)]
+            if not len(live):
+                break
+        t[live] = np.where(np.abs(shape(eye + t[live, None] * rays[live])) < 1e-4, t[live], np.inf)
+        return np.where(t < 20, t, np.inf)
+
+    def scene_map(self, index):
+        depths = self.depths(index)
+        nearest = depths.min(0)
+        hit = np.isfinite(nearest)
+        ids = np.where(hit, depths.argmin(0), -1).astype(np.int32)
+        one = hit.astype(np.float32)
+        return SceneMap(self.cameras[index], np.where(hit, nearest, 0).astype(np.float32), ids, one, one)
+
+    def object_view(self, index, classes):
+        depth = self.depths(index)[list(classes)].min(0)
+        hit = np.isfinite(depth)
+        if not hit.any():
+            return None
+        v, u = np.nonzero(hit)
+        place = np.s_[v.min() : v.max() + 1, u.min() : u.max() + 1]
+        visible = np.isin(self.scene_map(index).ids, classes)[place].astype(np.float32)
+        alpha = hit[place].astype(np.float32)
+        depth = np.where(hit, depth, 0)[place].astype(np.float32)
+        camera = crop(self.cameras[index], u.min(), v.min(), depth.shape[1], depth.shape[0])
+        color = np.ones((*depth.shape, 3), np.float32)
+        return ObjectView(camera, int(u.min()), int(v.min()), depth, alpha, color, visible)
+
+
+def around(count=10, distance=2.5, heights=(-0.9, 0.2, 1.2), **options):
+    """Cameras around the origin at several heights."""
+    cameras = []
+    for i in range(count):
+        height = heights[i % len(heights)]
+        angle = 2 * np.pi * i / count + 0.1
+        cameras.append(camera_at((distance * np.cos(angle), distance * np.sin(angle), height), **options))
+    return cameras
+
+
+def volume(surface):
+    a, b, c = (surface.vertices[surface.faces[:, i]] for i in range(3))
+    return float((np.cross(a, b) * c).sum() / 6)
+
+
+def holes(surface):
+    """How many handles the surface has, counted over its parts together: genus."""
+    count, _ = parts(surface.faces, len(surface.vertices))
+    euler = len(surface.vertices) - len(surface.faces) // 2
+    return count - euler / 2
+
+
+def assert_sound(surface):
+    """Closed, two-manifold, turned outside, finite, without loose vertices."""
+    assert len(surface.faces) and np.isfinite(surface.vertices).all()
+    assert len(surface.invented) == len(surface.faces)
+    assert len(np.unique(surface.faces)) == len(surface.vertices)
+    assert is_watertight(surface.faces)
+    solid = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    assert solid.is_watertight and solid.is_winding_consistent
+    assert volume(surface) > 0
+
+
+def errors(surface, shape, seen_only=True):
+    """Distances of the vertices from the true surface."""
+    keep = np.unique(surface.faces[~surface.invented]) if seen_only else slice(None)
+    return np.abs(shape(surface.vertices[keep]))
+
+
+def test_vertices_lie_exactly_on_a_ball():
+    shape = ball((0.03, -0.02, 0.05), 0.5)
+    field = fuse(Exact([shape], around(12)), [0])
+    surface = extract(field, faces=10**6)
+    assert_sound(surface)
+    error = errors(surface, shape)
+    assert error.mean() < 0.1 * field.voxel and np.quantile(error, 0.95) < 0.35 * field.voxel
+    assert np.abs(surface.vertices.mean(0) - [0.03, -0.02, 0.05]).max() < 0.1 * field.voxel
+    assert volume(surface) == pytest.approx(4 / 3 * np.pi * 0.5**3, rel=0.02)
+    assert holes(surface) == 0
+    assert surface.invented.mean() < 0.02
+
+
+def test_a_box_far_from_the_origin_keeps_its_place():
+    low, high = np.array([1000.1, 0.2, -0.3]), np.array([1000.7, 0.5, 0.3])
+    cameras = []
+    for camera in around(12, heights=(-1.5, 0.3, 1.6)):
+        viewmat = camera.viewmat.copy()
+        viewmat[:3, 3] -= viewmat[:3, :3] @ (low + high) / 2
+        cameras.append(replace(camera, viewmat=viewmat))
+    shape = box(low, high)
+    field = fuse(Exact([shape], cameras), [0])
+    surface = extract(field)
+    assert_sound(surface)
+    assert errors(surface, shape).mean() < 0.2 * field.voxel
+    assert volume(surface) == pytest.approx(np.prod(high - low), rel=0.06)
+
+
+def test_a_ring_keeps_its_hole():
+    shape = ring()
+    surface = extract(fuse(Exact([shape], around(14)), [0]))
+    assert_sound(surface)
+    assert holes(surface) == 1
+    assert volume(surface) == pytest.approx(2 * np.pi**2 * 0.4 * 0.15**2, rel=0.06)
+
+
+def test_a_bowl_stays_open_where_cameras_saw_into_it():
+    shape = bowl()
+    field = fuse(Exact([shape], around(14, heights=(-1.5, 1.5, 2.5))), [0])
+    surface = extract(field)
+    assert_sound(surface)
+    assert volume(surface) < 0.5 * (2 / 3 * np.pi * 0.56**3)
+    assert errors(surface, shape).mean() < 0.2 * field.voxel
+
+
+def test_what_stands_on_a_table_gets_a_flat_base_where_it_stands():
+    cup = box((-0.3, -0.3, 0.0), (0.3, 0.3, 0.7))
+    table = box((-1.5, -1.5, -0.2), (1.5, 1.5, 0.0))
+    views = Exact([cup, table], around(12, heights=(0.8, 1.4, 2.2)))
+    field = fuse(views, [0])
+    surface = extract(field)
+    assert_sound(surface)
+    base = surface.faces[surface.invented]
+    assert len(base)
+    assert np.abs(surface.vertices[base][..., 2]).mean() < 0.5 * field.voxel
+    assert surface.vertices[:, 2].min() > -1.2 * field.voxel
+    assert volume(surface) == pytest.approx(0.6 * 0.6 * 0.7, rel=0.06)
+
+    open_surface = extract(field, closed=False)
+    assert not open_surface.invented.any()
+    assert not is_watertight(open_surface.faces)
+    assert open_surface.vertices[:, 2].min() > -0.5 * field.voxel
+    down = np.cross(*(open_surface.vertices[open_surface.faces[:, i]] - open_surface.vertices[open_surface.faces[:, 0]]
+                      for i in (1, 2)))[:, 2]  # fmt: skip
+    area = np.linalg.norm(down)
+    assert (down < -0.9 * area).sum() == 0
+
+
+def test_behind_another_object_is_unknown_not_free():
+    target, wall = ball(radius=0.4), box((0.8, -1.5, -1.5), (0.9, 1.5, 1.5))
+    views = Exact([target, wall], around(12))
+    hidden = sum(views.scene_map(i).ids[24, 32] == 1 for i in views.indices)
+    assert hidden >= 4
+    surface = extract(fuse(views, [0]))
+    assert_sound(surface)
+    # The half that the others see fixes the ball; what is hidden is closed smoothly and never eaten away.
+    assert volume(surface) == pytest.approx(4 / 3 * np.pi * 0.4**3, rel=0.12)
+
+
+def test_touching_objects_come_apart():
+    left, right = box((-0.6, -0.3, -0.3), (0.0, 0.3, 0.3)), box((0.0, -0.3, -0.3), (0.6, 0.3, 0.3))
+    views = Exact([left, right], around(14, heights=(-1.5, 0.2, 1.6)))
+    surfaces = [extract(fuse(views, [c])) for c in (0, 1)]
+    for surface in surfaces:
+        assert_sound(surface)
+        assert volume(surface) == pytest.approx(0.6**3, rel=0.08)
+    assert surfaces[0].vertices[:, 0].max() < 0.08 and surfaces[1].vertices[:, 0].min() > -0.08
+    both = extract(fuse(views, [0, 1]))
+    assert_sound(both)
+    assert parts(both.faces, len(both.vertices))[0] == 1
+    assert volume(both) == pytest.approx(2 * 0.6**3, rel=0.06)
+
+
+def test_a_poster_becomes_a_thin_flat_slab():
+    poster = box((-0.5, -0.01, -0.4), (0.5, 0.0, 0.4))
+    cameras = [camera_at((x, 2.2, z)) for x in (-0.8, 0, 0.8) for z in (-0.5, 0.5)]
+    field = fuse(Exact([poster], cameras), [0])
+    surface = extract(field)
+    assert_sound(surface)
+    assert np.ptp(surface.vertices[:, 1]) < 6 * field.voxel
+    front = surface.vertices[np.unique(surface.faces[~surface.invented])]
+    inner = np.abs(front[:, 0]) < 0.4
+    assert np.abs(front[inner & (np.abs(front[:, 2]) < 0.3), 1]).max() < 0.3 * field.voxel
+    assert surface.vertices[:, 0].max() == pytest.approx(0.5, abs=2 * field.voxel)
+
+
+def test_a_thin_handle_and_a_second_part_stay():
+    shapes = [ball((-0.3, 0, 0), 0.25), rod((-0.1, 0, 0), (0.5, 0, 0.1), 0.035), ball((0.1, 0, 0.6), 0.12)]
+    views = Exact([lambda p: np.min([s(p) for s in shapes], 0)], around(14))
+    surface = extract(fuse(views, [0]))
+    assert_sound(surface)
+    assert surface.vertices[:, 0].max() > 0.48
+    assert parts(surface.faces, len(surface.vertices))[0] == 2
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_one_or_two_views_give_the_side_that_they_saw(count):
+    shape = ball(radius=0.5)
+    surface = extract(fuse(Exact([shape], around(6)[:count]), [0]))
+    assert_sound(surface)
+    assert errors(surface, shape).mean() < 0.02
+    assert 0.15 < surface.invented.mean() < 0.8
+    assert np.linalg.norm(surface.vertices, axis=1).max() < 0.6
+
+
+def test_an_object_that_the_pictures_cut_off_ends_there():
+    beam = box((-5, -0.2, -0.2), (5, 0.2, 0.2))
+    cameras = [camera_at((0.3 * i - 0.7, *at)) for i in range(5) for at in ((2.5, 1.2), (-2.5, 1.2), (0.1, -2.5))]
+    surface = extract(fuse(Exact([beam], cameras), [0]))
+    assert_sound(surface)
+    assert errors(surface, beam).mean() < 0.02
+    assert 1.5 < np.ptp(surface.vertices[:, 0]) < 6
+
+
+def test_no_view_of_it_is_said_in_a_sentence():
+    wall, hidden = box((1.0, -2, -2), (1.1, 2, 2)), ball(radius=0.3)
+    views = Exact([hidden, wall], [camera_at((2.5, 0.1 * i, 0)) for i in range(3)])
+    for classes in ([0], []):
+        with pytest.raises(NoSurface, match=r"^[A-Z].*\.$"):
+            fuse(views, classes) if classes else fuse(Exact([ball((9, 9, 9))], around(3)), [0])
+
+
+def test_a_speck_is_a_mesh_or_a_sentence():
+    for radius in (0.02, 0.05, 0.08):
+        shape = ball((0.1, 0.2, 0), radius)
+        try:
+            surface = extract(fuse(Exact([shape], around(6)), [0]))
+        except NoSurface:
+            assert radius < 0.05
+            continue
+        assert_sound(surface)
+        assert errors(surface, shape, seen_only=False).mean() < 0.03
+
+
+def test_a_few_splats_are_a_mesh_or_a_sentence():
+    cloud = sheet(0.0, 1, half=0.1, step=0.1)
+    splats = Generated(*(part[:3] for part in cloud))
+    splats.scales[:] = 0.06
+    surface = extract(fuse(views_of(splats, around(8)), [1]))
+    assert_sound(surface)
+    assert np.abs(surface.vertices).max() < 0.4
+
+
+def test_memory_grows_with_the_surface_and_is_kept():
+    views = Exact([ball()], around(6, width=128, height=96, focal=120.0))
+    coarse, fine = (len(fuse(views, [0], resolution=n).blocks) for n in (32, 64))
+    assert fine < 5 * coarse
+    said = []
+    reporter = Reporter()
+    reporter.warning = said.append
+    small = fuse(views, [0], memory_mb=1.5, reporter=reporter)
+    assert len(small.blocks) * SAMPLES * 5 < 1.5e6
+    assert len(said) == 1 and "memory" in said[0]
+    surface = extract(small)
+    assert_sound(surface)
+    assert errors(surface, ball()).mean() < 0.3 * small.voxel
+
+
+def test_the_budget_of_faces_holds_and_invented_faces_stay_marked():
+    cup = box((-0.3, -0.3, 0.0), (0.3, 0.3, 0.7))
+    views = Exact([cup, box((-1.5, -1.5, -0.2), (1.5, 1.5, 0.0))], around(12, heights=(0.8, 1.4, 2.2)))
+    field = fuse(views, [0])
+    for budget in (4000, 500):
+        surface = extract(field, faces=budget)
+        assert_sound(surface)
+        assert budget // 2 < len(surface.faces) <= budget
+        centres = surface.vertices[surface.faces].mean(1)
+        inner = (np.abs(centres[:, :2]) < 0.22).all(1)
+        assert surface.invented[inner & (centres[:, 2] < 0.1)].all()
+        assert not surface.invented[inner & (centres[:, 2] > 0.4)].any()
+        assert errors(surface, cup).mean() < 0.3 * field.voxel
+    assert len(extract(field, closed=False, faces=500).faces) <= 500
+
+
+def test_stopping_and_progress():
+    class Stopping(Reporter):
+        seen = 0
+
+        def progress(self, done, total, **fields):
+            assert 0 <= done <= total
+            self.seen += 1
+            if self.seen == 3:
+                raise Cancelled
+
+    with pytest.raises(Cancelled):
+        fuse(Exact([ball()], around(6)), [0], reporter=Stopping())
+
+
+def test_cubes_of_cells_join_without_a_seam():
+    grid = np.stack(np.meshgrid(*[np.arange(-5, 5)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    blocks = Blocks(grid)
+    local = np.stack(np.meshgrid(*[np.arange(8)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    points = grid[:, None] * 8 + local
+    distance = np.linalg.norm(points - [0.4, -0.3, 1.2], axis=-1) - 30.0
+    near = (np.abs(distance) < 14).any(1)
+    blocks = Blocks(grid[near])
+    values = distance[near].astype(np.float32)
+    vertices, faces, seen = march(blocks, values, np.ones(values.shape, bool), True)
+    assert is_watertight(faces) and seen.all()
+    assert len(np.unique(np.round(vertices, 4), axis=0)) == len(vertices)
+    assert len(vertices) - len(faces) // 2 == 2
+    assert np.abs(np.linalg.norm(vertices - [0.4, -0.3, 1.2], axis=1) - 30).max() < 0.02
+
+
+def test_the_winding_number_closes_a_flat_hole_flat():
+    points = trimesh.creation.icosphere(5, 20.0)
+    grid = np.stack(np.meshgrid(*[np.arange(-5, 5)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    local = np.stack(np.meshgrid(*[np.arange(8)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    place = (grid[:, None] * 8 + local).reshape(-1, 3)
+    off = np.abs(np.linalg.norm(place, axis=1) - 20)
+    every = np.ones((len(grid), SAMPLES), bool)
+    found = Winding(points.vertices, points.faces).at(grid, every).ravel()
+    inside = np.linalg.norm(place, axis=1) < 20
+    assert np.abs(found - inside)[off > 3].max() < 0.05
+    upper = points.faces[points.vertices[points.faces].mean(1)[:, 2] > 0]
+    found = Winding(points.vertices, upper).at(grid, every).ravel()
+    hole = np.linalg.norm(place[:, :2], axis=1) < 14
+    assert (found[hole & (place[:, 2] == 2)] > 0.5).all()
+    assert (found[hole & (place[:, 2] == -2)] < 0.5).all()
+
+
+def test_torn_surfaces_are_found_out():
+    solid = trimesh.creation.box()
+    assert is_watertight(solid.faces)
+    assert not is_watertight(solid.faces[1:])
+    assert not is_watertight(np.concatenate([solid.faces, solid.faces[:1]]))
+    turned = solid.faces.copy()
+    turned[0] = turned[0][::-1]
+    assert not is_watertight(turned)
+    assert not is_watertight(np.zeros((0, 3), int))
