@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.sparse import coo_matrix, diags
+from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import cg
 
 from ..protocol import Reporter
@@ -114,6 +114,15 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.where(length > 0, total / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
 
 
+def neighbours(vertices: np.ndarray, faces: np.ndarray) -> csr_matrix:
+    """(V, V): how closely vertices are tied, 1 / length of the edge between them; 0 without one."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = np.concatenate([edges, edges[:, ::-1]])
+    length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
+    ties = 1 / np.maximum(length, 1e-3 * max(float(length.mean()), 1e-30))
+    return coo_matrix((ties, (edges[:, 0], edges[:, 1])), (len(vertices), len(vertices))).tocsr()
+
+
 class _Mean:
     """Weighted sums of colours at vertices."""
 
@@ -197,11 +206,7 @@ def _continued(mean: _Mean, vertices: np.ndarray, faces: np.ndarray, otherwise: 
     out[~known] = out[known].mean(0)
     if known.all():
         return out
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    edges = np.concatenate([edges, edges[:, ::-1]])
-    length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
-    pull = 1 / np.maximum(length, 1e-3 * max(float(length.mean()), 1e-30))
-    near = coo_matrix((pull, (edges[:, 0], edges[:, 1])), (len(vertices), len(vertices))).tocsr()
+    near = neighbours(vertices, faces)
     mine = np.asarray(near.sum(1)).ravel()[~known]
     unknown = np.flatnonzero(~known)
     system = diags(np.maximum(mine, 1e-30)) - near[unknown][:, unknown]
