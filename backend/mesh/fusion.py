@@ -23,7 +23,7 @@ from .surface import NoSurface
 from .views import ObjectView, SceneMap
 from .winding import Winding
 
-RESOLUTION = 192
+RESOLUTION = 256
 """Voxels along the object's longest side, at most."""
 SMALLEST_PART = 0.03
 """Parts of the surface smaller than this share of the largest are taken for floaters."""
