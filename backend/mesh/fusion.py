@@ -16,6 +16,7 @@ import numpy as np
 from ..protocol import Reporter
 from ..raster import Camera
 from .blocks import AROUND, SAMPLES, SIDE, Blocks, distinct
+from .holes import Patches
 from .integrate import Sight, add, look, own_depth
 from .marching import compact, march, parts
 from .surface import NoSurface
@@ -226,7 +227,11 @@ class _Fusion:
         vertices, faces = largest_parts(vertices, faces)
         if not len(faces):
             raise NoSurface("The views see too little of it, or do not agree on where it is.")
-        return Winding(vertices, faces)
+        self.patches = Patches(vertices, faces)
+        return Winding(
+            np.concatenate([vertices, self.patches.points]),
+            np.concatenate([faces, self.patches.faces + len(vertices)]),
+        )
 
     def _seen(self, total: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Whether a sample was seen, from the front or just below the surface."""
@@ -244,6 +249,7 @@ class _Fusion:
         reach = self.reach / self.voxel
         size = (self.extent.high - self.extent.low).mean() / self.voxel
         closing = np.clip((0.5 - winding.at(coords, unsure)) * size, -reach, reach)
+        self.patches.thicken(coords, unsure, 0.8 * self.back / self.voxel, closing)
         share = np.minimum(weights / _SURE, 1)
         return _nudged(share * values + (1 - share) * closing).astype(np.float32)
 

@@ -22,7 +22,7 @@ class Sight:
 
     front (H, W) float32: how far one sees, along z, infinite where nothing is. In a rectangle (h, w) whose upper left
     is (x, y): own, the object's depth where the object is what one sees, else 0; slope, how much nearer to the surface
-    a step along z leads there; weight of the pixel; beside, pixels to the object's outline, negative within it.
+    a step along z leads there; weight of the pixel; beside, pixels to the object's outline.
     """
 
     camera: Camera
@@ -55,9 +55,7 @@ def look(scene: SceneMap, view: ObjectView | None, margin: int, jump: float) -> 
     inner[: view.alpha.shape[0], : view.alpha.shape[1]] = own_depth(view)
     seen = own > 0
     if seen.any():
-        # Pixels' centres are half a pixel from the outline at least, on either side.
-        outside, inside = distance_transform_edt(~seen), distance_transform_edt(np.pad(seen, 1, mode="edge"))
-        beside = np.where(seen, 0.5 - inside[1:-1, 1:-1], outside - 0.5).astype(np.float32)
+        beside = _beside(seen, own, front[y0:y1, x0:x1], jump)
     else:
         beside = np.full(own.shape, max(margin, 1), np.float32)
     K = scene.camera.K
@@ -65,6 +63,15 @@ def look(scene: SceneMap, view: ObjectView | None, margin: int, jump: float) -> 
     weight = np.zeros_like(own)
     _slopes(own, K[0, 0], K[1, 1], K[0, 2] - x0, K[1, 2] - y0, jump, slope, weight)
     return Sight(scene.camera, front, x0, y0, own, slope, weight, beside)
+
+
+def _beside(seen: np.ndarray, own: np.ndarray, front: np.ndarray, jump: float) -> np.ndarray:
+    """Pixels (h, w) to the object's outline, negative within it and where it may go on behind something else."""
+    nearest = distance_transform_edt(~seen, return_distances=False, return_indices=True)
+    filled = seen | (front < own[tuple(nearest)] + jump)
+    # Pixels' centres are half a pixel from the outline at least, on either side.
+    outside, inside = distance_transform_edt(~filled), distance_transform_edt(np.pad(filled, 1, mode="edge"))
+    return np.where(filled, 0.5 - inside[1:-1, 1:-1], outside - 0.5).astype(np.float32)
 
 
 @kernel(parallel=True)
@@ -200,5 +207,7 @@ def _add(
                 ahead = front[iv, iu] - z
                 if ahead <= 0:
                     continue
-                total[b, n] += min(min(reach, ahead), aside)
+                # Where the object may go on behind what is seen here, no outline bounds the distance.
+                hides = inside and beside[rv, ru] < 0
+                total[b, n] += min(reach, ahead) if hides else min(min(reach, ahead), aside)
                 weights[b, n] += 1.0

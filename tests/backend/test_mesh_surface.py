@@ -328,6 +328,22 @@ def test_what_stands_on_a_table_gets_a_flat_base_where_it_stands():
     assert (down < -0.9 * area).sum() == 0
 
 
+def test_a_sheet_has_no_hole_where_something_stands_on_it():
+    cup = box((-0.3, -0.3, 0.0), (0.3, 0.3, 0.7))
+    sheet_of_paper = box((-0.9, -0.9, -0.02), (0.9, 0.9, 0.0))
+    views = Exact([cup, sheet_of_paper], around(14, distance=3.0, heights=(1.8, 2.2, 2.8), width=96, height=72))
+    field = fuse(views, [1])
+    surface = extract(field)
+    assert_sound(surface)
+    assert holes(surface) == 0
+    centres = surface.vertices[surface.faces].mean(1)
+    normals = np.cross(*(surface.vertices[surface.faces[:, i]] - surface.vertices[surface.faces[:, 0]] for i in (1, 2)))
+    cover = (np.abs(centres[:, :2]) < 0.2).all(1) & (normals[:, 2] > 0)
+    assert cover.sum() > 10 and surface.invented[cover].all()
+    assert np.abs(centres[cover, 2]).max() < field.voxel
+    assert np.ptp(surface.vertices[:, 2]) < 6 * field.voxel
+
+
 def test_behind_another_object_is_unknown_not_free():
     target, wall = ball(radius=0.4), box((0.8, -1.5, -1.5), (0.9, 1.5, 1.5))
     views = Exact([target, wall], around(12))
