@@ -84,10 +84,10 @@ def write_meshes(folder: Path, objects: int, mesh_file) -> None:
     image.save()
     picture = (place / "texture.png").read_bytes()
     u, v = (index.reshape(-1) for index in np.mgrid[0:16, 0:16])
-    at = lambda i, j: i % 16 * 16 + j % 16  # noqa: E731
-    faces = np.concatenate([
-        np.stack([at(u, v), at(u + 1, v), at(u + 1, v + 1)], 1), np.stack([at(u, v), at(u + 1, v + 1), at(u, v + 1)], 1)
-    ])  # fmt: skip
+    here, right, above, across_it = (
+        (u + i) % 16 * 16 + (v + j) % 16 for i, j in ((0, 0), (1, 0), (0, 1), (1, 1))
+    )  # fmt: skip
+    faces = np.concatenate([np.stack([here, right, across_it], 1), np.stack([here, across_it, above], 1)])
     across = np.stack([np.cos(u / 8 * np.pi), np.sin(u / 8 * np.pi), 0 * u], 1)
     vertices = across * (1 + 0.4 * np.cos(v / 8 * np.pi))[:, None]
     vertices[:, 2] = 0.4 * np.sin(v / 8 * np.pi)

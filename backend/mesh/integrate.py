@@ -14,7 +14,6 @@ from .blocks import SAMPLES, SIDE
 from .views import ALPHA_SEEN, ObjectView, SceneMap
 
 _MIN_SLOPE = 0.15
-FREE = 1.0
 
 
 @dataclass(frozen=True)
@@ -23,7 +22,7 @@ class Sight:
 
     front (H, W) float32: how far one sees, along z, infinite where nothing is. In a rectangle (h, w) whose upper left
     is (x, y): own, the object's depth where the object is what one sees, else 0; slope, how much nearer to the surface
-    a step along z leads there; weight of the pixel; beside (h, w), pixels from there to the object's outline.
+    a step along z leads there; weight of the pixel; beside, pixels to the object's outline, negative within it.
     """
 
     camera: Camera
@@ -56,7 +55,9 @@ def look(scene: SceneMap, view: ObjectView | None, margin: int, jump: float) -> 
     inner[: view.alpha.shape[0], : view.alpha.shape[1]] = own_depth(view)
     seen = own > 0
     if seen.any():
-        beside = np.maximum(distance_transform_edt(~seen) - 0.5, 0).astype(np.float32)
+        # Pixels' centres are half a pixel from the outline at least, on either side.
+        outside, inside = distance_transform_edt(~seen), distance_transform_edt(np.pad(seen, 1, mode="edge"))
+        beside = np.where(seen, 0.5 - inside[1:-1, 1:-1], outside - 0.5).astype(np.float32)
     else:
         beside = np.full(own.shape, max(margin, 1), np.float32)
     K = scene.camera.K
@@ -120,14 +121,14 @@ def add(
     viewmat, intrinsics = sight.camera.arrays()
     _add(
         viewmat, intrinsics, float(sight.camera.near), sight.front, sight.x, sight.y, sight.own, sight.slope,
-        sight.weight, sight.beside, np.asarray(origin, np.float64), float(voxel), coords, float(reach), float(back), float(FREE),
+        sight.weight, sight.beside, np.asarray(origin, np.float64), float(voxel), coords, float(reach), float(back),
         total, weights,
     )  # fmt: skip
 
 
 @kernel(parallel=True)
 def _add(
-    viewmat, intrinsics, near, front, x0, y0, own, slope, weight, beside, origin, voxel, coords, reach, back, free,
+    viewmat, intrinsics, near, front, x0, y0, own, slope, weight, beside, origin, voxel, coords, reach, back,
     total, weights,
 ):  # fmt: skip
     fx, fy, cx, cy = intrinsics
@@ -166,21 +167,30 @@ def _add(
             iu, iv = int(u), int(v)
             ru, rv = iu - x0, iv - y0
             inside = 0 <= ru < w and 0 <= rv < h
+            su, sv = u - 0.5 - x0, v - 0.5 - y0
+            au, av = int(np.floor(su)), int(np.floor(sv))
+            tu, tv = su - au, sv - av
+            between = 0 <= au < w - 1 and 0 <= av < h - 1
+            aside = reach
+            if between:
+                above = beside[av, au] * (1 - tu) + beside[av, au + 1] * tu
+                below = beside[av + 1, au] * (1 - tu) + beside[av + 1, au + 1] * tu
+                aside = (above * (1 - tv) + below * tv) * z / fx
+            elif inside:
+                aside = beside[rv, ru] * z / fx
             if inside and own[rv, ru] > 0:
                 d = own[rv, ru]
                 # Between four pixels of one surface the depth is interpolated.
-                su, sv = u - 0.5 - x0, v - 0.5 - y0
-                au, av = int(np.floor(su)), int(np.floor(sv))
-                if 0 <= au < w - 1 and 0 <= av < h - 1:
+                if between:
                     d00, d01, d10, d11 = own[av, au], own[av, au + 1], own[av + 1, au], own[av + 1, au + 1]
                     low = min(min(d00, d01), min(d10, d11))
                     high = max(max(d00, d01), max(d10, d11))
                     if low > 0 and (high - low) * slope[rv, ru] < reach:
-                        tu, tv = su - au, sv - av
                         d = (d00 * (1 - tu) + d01 * tu) * (1 - tv) + (d10 * (1 - tu) + d11 * tu) * tv
                 distance = (d - z) * slope[rv, ru]
                 if distance <= -back:
                     continue
+                distance = max(distance, aside) if aside > 0 else distance
                 gain = weight[rv, ru]
                 if distance < 0:
                     gain *= 1 + distance / back
@@ -190,8 +200,5 @@ def _add(
                 ahead = front[iv, iu] - z
                 if ahead <= 0:
                     continue
-                distance = min(reach, ahead)
-                if inside:
-                    distance = min(distance, beside[rv, ru] * z / fx)
-                total[b, n] += free * distance
-                weights[b, n] += free
+                total[b, n] += min(min(reach, ahead), aside)
+                weights[b, n] += 1.0

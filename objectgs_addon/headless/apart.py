@@ -17,7 +17,7 @@ SAMPLES = 32
 LARGE = 2.5
 """What is so many times as large as the middle object stays where it is, as the table does."""
 
-OUTWARD = 0.9
+OUTWARD = 0.7
 """How far objects move away from the middle, relative to their distance from it."""
 LIFT = 0.35
 """How far they are lifted, relative to the size of the middle object."""
@@ -76,7 +76,9 @@ def pull_apart(target: bpy.types.Scene) -> None:
     extent = float(np.linalg.norm(np.ptp(np.concatenate(list(shown.values())), axis=0)))
     _add_ground(target, Vector((*centre[:2], low)), 40.0 * extent)
     target.render.pixel_aspect_x = target.render.pixel_aspect_y = 1.0
-    toward = _add_camera(target, np.concatenate([_corners(shown[object_id]) for object_id in moved]))
+    corners = np.stack([_corners(shown[object_id]) for object_id in moved])
+    toward = _best_direction(root, corners)
+    _add_camera(target, toward, corners.reshape(-1, 3))
     _add_light(target, toward)
     target.cycles.use_denoising = True
     target.cycles.adaptive_threshold = 0.05
@@ -119,14 +121,26 @@ def _add_ground(target, place: Vector, size: float) -> None:
     target.collection.objects.link(bpy.data.objects.new("Ground", mesh))
 
 
-def _add_camera(target, corners: np.ndarray) -> np.ndarray:
-    """A camera that has all `corners` (n, 3) in view, from the side of the scene's own; the direction that it looks."""
+def _best_direction(root, corners: np.ndarray) -> Vector:
+    """The direction to look, from the side of one of the photos, in which most of the boxes (n, 8, 3) is to be seen."""
+    centre = (corners.min((0, 1)) + corners.max((0, 1))) / 2
+    eyes = [thing.matrix_world.translation for thing in root.all_objects if scene.kind_of(thing) == "camera"]
+    sides = [Vector((eye.x - centre[0], eye.y - centre[1])) for eye in eyes[:: max(1, len(eyes) // 50)]]
+    sides = [side.normalized() for side in sides if side.length > 1e-6] or [Vector((0.0, -1.0))]
+    directions = [-Vector((*(side * math.cos(ELEVATION)), math.sin(ELEVATION))) for side in sides]
+
+    def in_view(toward: Vector) -> float:
+        seen = (corners @ np.array(toward.to_track_quat("-Z", "Y").to_matrix()))[..., :2]
+        low, high = seen.min(1), seen.max(1)
+        both = np.clip(np.minimum(high[:, None], high) - np.maximum(low[:, None], low), 0.0, None).prod(2)
+        return float(2.0 * np.trace(both) - both.sum())  # each with itself, less each pair, twice
+
+    return max(directions, key=in_view)
+
+
+def _add_camera(target, toward: Vector, corners: np.ndarray) -> None:
+    """A camera that looks `toward` and has all `corners` (n, 3) in view."""
     centre = Vector((corners.min(0) + corners.max(0)) / 2)
-    away = Vector((0.0, -1.0, 0.0))
-    if target.camera is not None:
-        aside = target.camera.matrix_world.translation - centre
-        away = Vector((aside.x, aside.y, 0.0)).normalized() if aside.xy.length > 1e-6 else away
-    toward = -(away * math.cos(ELEVATION) + Vector((0.0, 0.0, math.sin(ELEVATION))))
     rotation = toward.to_track_quat("-Z", "Y")
     # Coordinates to the right, up and towards the camera; the nearest place from which all of them fit.
     seen = (corners - np.array(centre)) @ np.array(rotation.to_matrix())
@@ -148,12 +162,11 @@ def _add_camera(target, corners: np.ndarray) -> np.ndarray:
     thing.location = centre + rotation @ Vector((x, y, distance))
     target.collection.objects.link(thing)
     target.camera = thing
-    return np.array(toward)
 
 
-def _add_light(target, toward: np.ndarray) -> None:
+def _add_light(target, toward: Vector) -> None:
     """A wide sun from behind the camera's left shoulder, and a sky."""
-    heading = math.atan2(toward[1], toward[0])
+    heading = math.atan2(toward.y, toward.x)
     sun = bpy.data.lights.new("Apart", "SUN")
     sun.energy, sun.angle = SUN, SUN_ANGLE
     thing = bpy.data.objects.new("Apart Sun", sun)

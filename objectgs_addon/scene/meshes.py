@@ -100,6 +100,7 @@ def show_meshes(root: bpy.types.Collection, folder: Path) -> ShownMeshes:
     if not entries and not there:
         return ShownMeshes()
     carrier.require_object_mode(there.values())
+    had_meshes = bool(there)
     wanted, warnings = _wanted(entries, objects)
     shown = ShownMeshes(warnings=warnings)
     maker = _Maker(root, objects, collections)
@@ -118,7 +119,8 @@ def show_meshes(root: bpy.types.Collection, folder: Path) -> ShownMeshes:
     if SHOW not in root and shown.meshes:
         show_kinds(root, "meshes")
     elif maker.changed:
-        apply_shown(root, maker.changed)
+        # The unlabelled rest, which never has a mesh, follows the first mesh that comes and the last that goes.
+        apply_shown(root, {*maker.changed, 0} if had_meshes != bool(shown.meshes) else maker.changed)
     for object_id in maker.changed:
         if object_id is not None and object_id not in maker.new:
             remove_if_empty(collections[object_id])
@@ -154,8 +156,8 @@ def apply_shown(root: bpy.types.Collection, changed) -> None:
     which, collections = shown_kinds(root), object_collections(root)
     meshes, whole = object_meshes(root), scene_meshes(root)
     hidden = {} if meshes else {thing: which == "splats" for thing in whole}
-    # The unlabelled rest has no mesh of its own, and would lie about between those of the others.
-    for object_id in {*changed, 0} & set(collections):
+    for object_id in set(changed) & set(collections):
+        # The unlabelled rest would lie about between the meshes of the others.
         replaced = object_id in meshes or (object_id == 0 and bool(meshes or whole))
         for thing in parts_of(collections[object_id]):
             if kind_of(thing) == SPLATS:

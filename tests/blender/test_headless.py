@@ -199,6 +199,49 @@ def test_nothing_to_pull_apart(blend, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def stand_in(place, backend_python, meshes: str):
+    """A Python that does as the backend's does, but for the mesh command a line of shell; and the file of its calls."""
+    calls, python = place / "calls", place / "python"
+    python.write_text(f"""#!/bin/sh
+echo "$3" >> '{calls}'
+[ "$3" = mesh ] || exec '{backend_python}' "$@"
+{meshes}
+""")
+    python.chmod(0o755)
+    return python, calls
+
+
+def test_run_makes_meshes_before_it_measures(capture, trained, meshed, backend_python, tmp_path):
+    folder = shutil.copytree(trained, tmp_path / "out")
+    python, calls = stand_in(tmp_path, backend_python,
+                             f"cp -r '{meshed}/meshes' \"$4/meshes\" && echo '{{\"type\": \"done\"}}'")
+    arguments = ("run", capture, "--out", folder, "--steps", "30", *SIZE, "--backend-python", python)
+    ran = run(*arguments)
+    assert ran.returncode == 0, ran.output + ran.errors
+    assert calls.read_text().split() == ["train", "mesh", "evaluate", "report"]
+    assert size_of(folder / "render.png") == size_of(folder / "pulled-apart.png") == (48, 36)
+    assert np.abs(pixels(folder / "render.png") - pixels(folder / "pulled-apart.png")).mean() > 0.02
+    assert any(thing.get("objectgs_kind") == "mesh" for thing in opened(folder / "objectgs.blend"))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+
+    (folder / "pulled-apart.png").unlink()
+    shutil.rmtree(folder / "meshes")
+    calls.unlink()
+    assert run(*arguments, "--no-meshes").returncode == 0
+    assert "mesh" not in calls.read_text().split() and not (folder / "pulled-apart.png").exists()
+
+
+def test_splats_without_meshes_are_a_result_still(capture, trained, backend_python, tmp_path):
+    folder = shutil.copytree(trained, tmp_path / "out")
+    python, _ = stand_in(tmp_path, backend_python,
+                         "echo '{\"type\": \"error\", \"message\": \"There is no mesh to be had.\"}'; exit 2")
+    ran = run("run", capture, "--out", folder, "--steps", "30", *SIZE, "--backend-python", python)
+    assert ran.returncode == 0, ran.output + ran.errors
+    assert "Warning: There is no mesh to be had." in ran.output
+    assert (folder / "render.png").is_file() and not (folder / "pulled-apart.png").exists()
+    assert "no mesh to be had" in refusal("mesh", folder, "--backend-python", python)
+
+
 def test_no_backend(capture, tmp_path):
     user = {"OBJECTGS_PYTHON": "", "BLENDER_USER_RESOURCES": str(tmp_path / "user")}
     for command in ("import", "vote", "train", "run"):

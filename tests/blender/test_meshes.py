@@ -336,6 +336,17 @@ def test_what_comes_later_follows_the_choice(root, folder):
     assert hidden(parts(root, 2, "mesh")) == {True} and hidden(parts(root, 2, "splats")) == {False}
 
 
+def test_what_the_user_hid_stays_hidden(root, folder):
+    blender_scene.show_kinds(root, "both")
+    things = [*parts(root, 0, "splats"), *parts(root, 1, "splats"), mesh_of(root, 1)]
+    for thing in things:
+        thing.hide_viewport = thing.hide_render = True
+    rewrite(folder, _1=tetrahedron(ORIGIN), _2=tetrahedron(ORIGIN), **{f"_{HUGE}": tetrahedron(ORIGIN)})
+    blender_scene.show_meshes(root, folder)
+    blender_scene.show_result(root, folder, bpy.context.scene)
+    assert hidden(things) == {True}
+
+
 def test_splats_are_shown_until_there_are_meshes(fresh, folder):
     (folder / "meshes" / "meshes.json").rename(folder / "later.json")
     root = blender_scene.show_capture(bpy.context.scene, folder)

@@ -97,7 +97,7 @@ def test_training_shows_objects(window):
     """))
     wait(window, "running.queue.running is not None and running.queue.running.progress > 0.2")
     window.shot("3-training")
-    wait(window, f"{IDLE} and len(scene.object_collections(root)) > 1", 180)
+    wait(window, f"{IDLE} and len(scene.object_collections(root)) > 1", 400)
     counts = window.run(script("result = object_edits.splat_counts(root)"))
     assert sum(counts.values()) > 500
     window.shot("4-trained")
@@ -190,6 +190,49 @@ def test_merge_is_undone_and_split(window):
     assert window.run(script(state)) == apart
 
 
+def test_extracted_meshes_take_the_place_of_splats(window):
+    """Two objects become meshes in the background; the others show their splats still."""
+    chosen = window.run(script("""
+        properties = root.objectgs
+        small = sorted((i for i in properties.objects if i.name not in ("table", "backdrop")), key=lambda i: -i.splats)
+        chosen = [object_edits.from_stored(item.object_id) for item in small[:2]]
+        for selected in bpy.context.selected_objects:
+            selected.select_set(False)
+        for object_id, collection in scene.object_collections(root).items():
+            for part in collection.objects:
+                part.hide_set(False)
+                part.select_set(object_id in chosen)
+        properties.mesh_objects, properties.mesh_faces, properties.texture_size = "selected", 3000, "1024"
+        call(bpy.ops.objectgs.extract_meshes)
+        result = chosen
+    """))
+    wait(window, "running.queue.running is not None and running.queue.running.progress > 0.1", 240)
+    window.shot("7-extracting")
+    wait(window, f"{IDLE} and scene.object_meshes(root)", 300)
+    shown = window.run(script("""
+        result = {object_id: [[scene.kind_of(part), part.visible_get(), len(part.data.polygons)]
+                              for part in collection.objects if scene.kind_of(part) in ("splats", "mesh")]
+                  for object_id, collection in scene.object_collections(root).items() if object_id}
+    """))
+    for object_id, parts in shown.items():
+        found = {kind: (visible, faces) for kind, visible, faces in parts}
+        assert ("mesh" in found) == (int(object_id) in chosen)
+        assert found["splats"][0] != (int(object_id) in chosen)
+        if "mesh" in found:
+            visible, faces = found["mesh"]
+            assert visible and 100 < faces <= 3000
+    assert window.run(script("result = [root.objectgs.shown, running.queue.jobs[-1].error]")) == ["meshes", None]
+    window.run("""
+        context = window_context()
+        context["area"].spaces.active.shading.type = "MATERIAL"
+        with bpy.context.temp_override(**context):
+            bpy.ops.view3d.view_selected()
+    """)
+    time.sleep(5)
+    window.shot("8-meshes")
+    window.run("window_context()['area'].spaces.active.shading.type = 'SOLID'")
+
+
 def test_pause_resume_and_stop(window):
     """A paused training stands still; a stopped one has saved; undo in between harms nothing."""
     window.run(script("root.objectgs.minutes = 5; call(bpy.ops.objectgs.train)"))
@@ -197,7 +240,7 @@ def test_pause_resume_and_stop(window):
     window.run(script("call(bpy.ops.objectgs.pause_job)"))
     wait(window, "running.queue.running.state.value == 'paused' and running.queue.running.message == 'Paused'")
     first = window.run(script("result = running.queue.running.step"))
-    window.shot("7-paused")
+    window.shot("9-paused")
     window.key("ctrl+z")
     time.sleep(1.5)
     assert window.run(script("result = running.queue.running.step")) == first
@@ -226,7 +269,7 @@ def test_another_file_in_between_finds_the_job_again(window):
     before = window.run(script("result = running.queue.running.step"))
     window.run(f"bpy.ops.wm.open_mainfile(filepath={str(path)!r})")
     wait(window, f"running.job_of(root) is running.queue.running and running.queue.running.step > {before}")
-    window.shot("8-reopened")
+    window.shot("10-reopened")
     # Timers and drawing go on in the moment when a file has just been opened and nothing is in the context yet.
     for pause in (0.0, 0.2, 0.5, 0.8):
         window.run("bpy.ops.wm.read_homefile(use_empty=False)")
