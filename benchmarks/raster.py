@@ -86,6 +86,15 @@ class Scene:
         """What the rasterizer does in a training step."""
         cpu.backward(self.forward(), self.g_color, self.g_alpha, self.g_weight)
 
+    def step_discs(self, surface: bool = False) -> None:
+        """The same step for the same splats as discs; surface: with depth, normals and distortion and their gradients
+        as well."""
+        frame = cpu.forward(
+            self.gaussians, self.camera, self.labels, surface, False, surface, surface, flat=True
+        )  # fmt: skip
+        three = (self.g_alpha, self.g_color, self.g_color[:2].copy()) if surface else ()
+        cpu.backward(frame, self.g_color, self.g_alpha, self.g_weight, *three)
+
     def id_render(self) -> None:
         """Colour, and the most probable object of every pixel."""
         cpu.object_map(cpu.forward(self.gaussians, self.camera))
@@ -211,6 +220,16 @@ def main() -> None:
     say(f"\nForward + backward, {MIDDLE[0]} splats at {MIDDLE[1]}x{MIDDLE[2]}, ns a pair:")
     say(f"{threads['1']:.2f} on 1 thread, {threads['2']:.2f} on 2: {speed_up:.2f} times faster")
 
+    jobs: dict[str, Callable[[], object]] = {
+        "3d": middle.step, "2d": middle.step_discs, "2d with normals": lambda: middle.step_discs(surface=True)
+    }  # fmt: skip
+    kinds = {name: time for name, (time, _) in timed(jobs, options.repeats).items()}
+    say("\nForward + backward of the same splats as 3D Gaussians and as discs, ms:")
+    say(
+        f"{kinds['3d']:.1f} as 3D Gaussians, {kinds['2d']:.1f} as discs ({kinds['2d'] / kinds['3d']:.2f} times),"
+        f" {kinds['2d with normals']:.1f} with depth, normals and distortion"
+    )
+
     reference = against_reference(options.repeats)
     say(f"\nForward + backward of {SMALL[0]} splats at {SMALL[1]}x{SMALL[2]} by both: the torch reference takes")
     say(f"{reference['reference_ms']:.0f} ms ({reference['reference_ns_per_pair']:.0f} ns a pair), the kernels")
@@ -218,7 +237,7 @@ def main() -> None:
 
     say(f"\n{'objects':>8} {'step ms':>16} {'ID render ms':>16} {'scattered ms':>12} {'MB':>6}")
     scenes = {n: Scene(*MIDDLE, objects=n) for n in OBJECTS}
-    jobs: dict[str, Callable[[], object]] = {f"step {n}": s.step for n, s in scenes.items()}
+    jobs = {f"step {n}": s.step for n, s in scenes.items()}
     jobs |= {f"ids {n}": s.id_render for n, s in scenes.items()}
     jobs |= {f"scattered {n}": Scene(*MIDDLE, objects=n, scattered=True).id_render for n in OBJECTS}
     times = timed(jobs, options.repeats)
@@ -236,7 +255,7 @@ def main() -> None:
         pair = ("forward_ns_per_pair", "backward_ns_per_pair")
         middle_of = {key: statistics.median(row[key] for row in sizes) for key in pair}
         print(json.dumps({**middle_of, "times_faster_than_reference": reference["times"], "threads": threads,
-                          "objects": objects, "two_d_over_three_d": None,
+                          "objects": objects, "two_d_over_three_d": kinds["2d"] / kinds["3d"], "primitives_ms": kinds,
                           "sizes": sizes, "reference": reference}))  # fmt: skip
 
 

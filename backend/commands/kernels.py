@@ -16,6 +16,7 @@ from ..capture import load_capture
 from ..labels import vote as vote_points
 from ..mesh.extract import extract
 from ..mesh.fusion import fuse
+from ..mesh.refine import refine
 from ..mesh.surface import NoSurface, Surface
 from ..mesh.texture import dress
 from ..mesh.unwrap import unwrap
@@ -85,7 +86,7 @@ def _mesh_a_little(trainer: Trainer) -> None:
         extract(fuse(views, [1]), faces=500)
     corners = np.array([[0.3, 0, 0], [-0.3, 0.3, 0], [-0.3, -0.3, 0], [0, 0, 0.4]])
     faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], np.int32)
-    shape = Surface(corners, faces, np.zeros(4, bool))
+    shape = refine(Surface(corners, faces, np.zeros(4, bool)), views, [1])
     dress(shape, unwrap(shape, 64), 64, views, [1])
 
 

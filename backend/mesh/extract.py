@@ -26,15 +26,20 @@ def extract(field: Field, closed: bool = True, faces: int = FACES, reporter: Rep
 
     Closed, the surface is watertight and two-manifold; otherwise it ends where no camera saw it. Raises NoSurface.
     """
+    reporter = reporter or Reporter()
+    reporter.progress(0, 3)
     vertices, triangles, seen = march(field.blocks, field.values, field.seen, closed)
     keep = _worth(vertices, triangles, seen, closed)
     if not keep.any():
         raise NoSurface("The views see too little of it, or do not agree on where it is.")
     seen = seen[keep]
     vertices, triangles = compact(vertices, triangles[keep])
+    reporter.progress(1, 3)
     vertices = _smoothed(vertices, triangles)
+    reporter.progress(1.5, 3)
     full = vertices[triangles].mean(1)
     reduced, triangles = _reduced(vertices, triangles, faces, closed)
+    reporter.progress(2.5, 3)
     _, nearest = cKDTree(full).query(reduced[triangles].mean(1))
     return Surface(field.origin + field.voxel * reduced, triangles, ~seen[nearest])
 

@@ -32,13 +32,16 @@ _REACH_VOXELS, _REACH_PIXELS = 5.0, 3.5
 _BACK_VOXELS, _BACK_PIXELS = 3.0, 2.0
 _BYTES_PER_BLOCK = 8 * SAMPLES * 4
 """What a block takes at most, everything counted: sums, values, marks and the triangles in it."""
+_COARSEST, _FEW = 16, 1000
+"""Voxels along the longest side, at least, however small the memory; and blocks that are enough for so few."""
+_CLOSING = 8
+"""How many views' time the closing of the surface takes, about."""
 _SURE = 1.0
 """From this weight on the views alone say how far the surface is."""
 _SEEN = 0.1
 """From this weight on a sample was seen."""
 _SKIN = 1.75
 """Voxels below the surface to which a sample is part of what was seen; a cell across the surface has none deeper."""
-_STEPS_BESIDE = 26
 
 
 class SeesObjects(Protocol):
@@ -88,7 +91,7 @@ def fuse(
     grows with the surface; where `memory_mb` is not enough the voxel grows, with a warning. Raises NoSurface.
     """
     reporter = reporter or Reporter()
-    extent = _extent(views, classes)
+    extent = _extent(views, classes, reporter)
     size = float((extent.high - extent.low).max())
     voxel = max(_VOXEL_PER_PIXEL * extent.pixel, size / resolution)
     room = max(int(memory_mb * 1e6 / _BYTES_PER_BLOCK), 64)
@@ -99,6 +102,9 @@ def fuse(
             break
         except _TooMany as error:
             voxel *= max(1.1, (error.blocks / room) ** 0.5)
+            if voxel > size / _COARSEST:
+                # So few blocks that no one would miss their memory.
+                voxel, room = max(asked, size / _COARSEST), error.blocks + _FEW
     if voxel > asked:
         reporter.warning(
             f"The memory is enough for {size / voxel:.0f} voxels along the longest side, not for the "
@@ -107,10 +113,11 @@ def fuse(
     return field
 
 
-def _extent(views: SeesObjects, classes: Sequence[int]) -> _Extent:
+def _extent(views: SeesObjects, classes: Sequence[int], reporter: Reporter) -> _Extent:
     """Where the object is, from all the pixels that show it."""
     points, pixels, nearest = [np.zeros((0, 3))], [np.zeros(0)], np.inf
-    for index in views.indices:
+    for done, index in enumerate(views.indices):
+        reporter.progress(done, 2 * len(views.indices) + _CLOSING)
         view = views.object_view(index, classes)
         if view is None:
             continue
@@ -210,10 +217,7 @@ class _Fusion:
         weights = np.zeros((len(coords), SAMPLES), np.float32)
         for done, index in enumerate(self.views.indices):
             add(self._sight(index), self.origin, self.voxel, coords, self.reach, self.back, total, weights)
-            if not self.rounds:
-                self.reporter.progress(done + 1, len(self.views.indices) + 1)
-        if self.rounds:
-            self.reporter.progress(len(self.views.indices), len(self.views.indices) + 1)
+            self._progress(done + 1)
         return total, weights
 
     def _seen_surface(self, blocks: Blocks, total: np.ndarray, weights: np.ndarray) -> Winding:
@@ -227,6 +231,11 @@ class _Fusion:
     def _seen(self, total: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Whether a sample was seen, from the front or just below the surface."""
         return (weights >= _SEEN) & (total > -_SKIN * self.voxel * weights)
+
+    def _progress(self, views: float) -> None:
+        """Tell how many views the samples around what was seen have; later rounds are few samples."""
+        count = len(self.views.indices)
+        self.reporter.progress(2 * count if self.rounds else count + views, 2 * count + _CLOSING)
 
     def _finished(self, coords: np.ndarray, total: np.ndarray, weights: np.ndarray, winding: Winding) -> np.ndarray:
         """Distances in voxels, where they are not seen from the winding number."""

@@ -23,7 +23,7 @@ def march(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """vertices (V, 3) float64 in voxels, faces (F, 3) int32 counter-clockwise from outside, and (F,) bool: seen.
 
-    values, seen (B, 512): negative inside; a cell counts as seen where all its samples are. Not closed: seen cells only.
+    values, seen (B, 512): negative inside; a cell counts as seen where all its samples are. Only those unless closed.
     """
     volume = np.empty((_CELLS + 1,) * 3, np.float32)
     state = np.empty((_CELLS + 1,) * 3, np.uint8)
@@ -62,10 +62,10 @@ def _fill(values, seen, found, place, volume, state, cells, closed):
         x0, y0, z0 = place[k, 0] * SIDE, place[k, 1] * SIDE, place[k, 2] * SIDE
         for i in range(min(SIDE, size - x0)):
             for j in range(min(SIDE, size - y0)):
-                for l in range(min(SIDE, size - z0)):
-                    n = (i * SIDE + j) * SIDE + l
-                    volume[x0 + i, y0 + j, z0 + l] = values[b, n]
-                    state[x0 + i, y0 + j, z0 + l] = 2 if seen[b, n] else 1
+                for h in range(min(SIDE, size - z0)):
+                    n = (i * SIDE + j) * SIDE + h
+                    volume[x0 + i, y0 + j, z0 + h] = values[b, n]
+                    state[x0 + i, y0 + j, z0 + h] = 2 if seen[b, n] else 1
     crossed = False
     for k in range(found.size):
         x0, y0, z0 = place[k, 0] * SIDE, place[k, 1] * SIDE, place[k, 2] * SIDE
@@ -75,9 +75,9 @@ def _fill(values, seen, found, place, volume, state, cells, closed):
                     least = 2
                     inside = 0
                     for c in range(8):
-                        i, j, l = x + (c >> 2), y + ((c >> 1) & 1), z + (c & 1)
-                        least = min(least, state[i, j, l])
-                        inside += volume[i, j, l] < 0
+                        i, j, h = x + (c >> 2), y + ((c >> 1) & 1), z + (c & 1)
+                        least = min(least, state[i, j, h])
+                        inside += volume[i, j, h] < 0
                     if inside == 0 or inside == 8 or (least < 2 and not closed):
                         continue
                     cells[x + 1, y + 1, z + 1] = least

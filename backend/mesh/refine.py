@@ -22,7 +22,7 @@ from .surface import Surface
 from .texture import neighbours, vertex_normals
 from .views import Views
 
-_REACHES = (2.0, 1.0)
+_REACHES = (1.5, 1.0)
 """How far a vertex may move in each round, in pixels' sizes on it."""
 
 _PHOTOS = 6
@@ -33,10 +33,18 @@ _PATCH = 5
 _OUTSIDE = 1.0
 """Clearance below which a pixel may show another thing."""
 
+_AT_ONCE = 50_000
+_HELD = 300e6
+"""Vertices whose patches are looked up together, and bytes of the photos' depths that are kept meanwhile."""
+
 _NONE = 255
 _NOISE = (2.5 / 255) ** 2
-_STIFFNESS = 1.0
-_STAY = 0.01
+_STIFFNESS = 3.0
+_STAY = 0.05
+_TURN = 0.5
+"""Cosine of the angle by which a face may turn."""
+
+_UNFOLDED = 40
 _SHARED = 3
 """Rounds in which neighbours average what their patches say."""
 
@@ -55,47 +63,74 @@ def _moved(
     vertices = np.ascontiguousarray(surface.vertices, np.float64)
     faces = np.ascontiguousarray(surface.faces, np.int32)
     near = neighbours(vertices, faces)
-    mean = diags(1 / np.maximum(np.asarray(near.sum(1)).ravel(), 1e-30)) @ near
+    mean = (diags(1 / np.maximum(np.asarray(near.sum(1)).ravel(), 1e-30)) @ near).tocsr()
     normals = vertex_normals(vertices, faces)
-    for _ in range(2):
+    for _ in range(5):
         normals = normals + mean @ normals
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     count = len(vertices)
     score = np.zeros((count, _PHOTOS), np.float32)
     chosen = np.full((count, _PHOTOS), -1, np.int32)
-    total = 2 * len(views.indices) * len(_REACHES)
-    done = 2 * len(views.indices) * step
-    photos: dict[int, Photo] = {}
-    for k, index in enumerate(views.indices):
-        reporter.progress(done + k, total)
+    size = np.zeros(count)
+    blocks = [slice(first, first + _AT_ONCE) for first in range(0, count, _AT_ONCE)]
+    rounds = 1 + len(blocks)
+    total = rounds * len(views.indices) * len(_REACHES)
+    done = rounds * len(views.indices) * step
+    held: dict[int, Photo | None] = {}
+    room = float(_HELD)
+    for index in views.indices:
+        reporter.progress(done, total)
+        done += 1
         photo = photo_of(views, index, vertices, faces, classes)
         if photo is not None:
-            photos[index] = photo._replace(planes=np.zeros((0, 0, 0), np.float32))
-            _choose(vertices, normals, index, *_seen_by(photo), photo.safe, score, chosen)
-    pixel = _footprint(vertices, photos, chosen[:, 0])
+            _choose(vertices, normals, index, *_seen_by(photo), photo.safe, score, chosen, size)
+            # The planes are the scene's to keep.
+            photo = photo._replace(planes=np.zeros((0, 0, 0), np.float32))
+            room -= photo.depth.nbytes + photo.clearance.nbytes
+        if room > 0:
+            held[index] = photo
+    known = size > 0
+    pixel = np.where(known, size, np.median(size[known]) if known.any() else 0.0)
     away = np.linspace(-reach, reach, _PLACES)
-    patches = np.full((count, _PHOTOS, _PLACES, _PATCH * _PATCH, 3), _NONE, np.uint8)
-    for k, index in enumerate(views.indices):
-        reporter.progress(done + len(views.indices) + k, total)
-        if index in photos:
-            photo = photos[index]
+    cost = np.empty((count, _PLACES))
+    for block in blocks:
+        patches = np.full((len(cost[block]), _PHOTOS, _PLACES, _PATCH * _PATCH, 3), _NONE, np.uint8)
+        for index in views.indices:
+            reporter.progress(done, total)
+            done += 1
+            if not (chosen[block] == index).any():
+                continue
+            photo = held[index] if index in held else photo_of(views, index, vertices, faces, classes)
+            assert photo is not None
             planes = views.scene.target(index)[0].numpy()
             _look_up(
-                vertices, normals, pixel, away, chosen, index, *_seen_by(photo), planes, (photo.x, photo.y), patches
-            )
-    cost = np.empty((count, _PLACES))
-    _disagreement(patches, cost)
-    return vertices + (_settled(cost, away, near) * pixel)[:, None] * normals
+                vertices[block], normals[block], pixel[block], away, chosen[block], index, *_seen_by(photo), planes,
+                (photo.x, photo.y), patches,
+            )  # fmt: skip
+        _disagreement(patches, cost[block])
+    way = (_settled(cost, away, near) * pixel)[:, None] * normals
+    return vertices + _without_folds(vertices, faces, way, mean)
 
 
-def _footprint(vertices: np.ndarray, photos: dict[int, Photo], best: np.ndarray) -> np.ndarray:
-    """(V,): a pixel's size at each vertex in the photo `best` (V,) for it, -1: none; there the median of the others."""
-    size = np.full(len(vertices), np.nan)
-    for index in np.unique(best[best >= 0]):
-        camera = photos[int(index)].camera
-        depth = vertices[best == index] @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
-        size[best == index] = depth / (camera.K[0, 0] + camera.K[1, 1]) * 2
-    return np.where(np.isfinite(size), size, np.nanmedian(size) if np.isfinite(size).any() else 0.0)
+def _without_folds(vertices: np.ndarray, faces: np.ndarray, way: np.ndarray, mean: csr_matrix) -> np.ndarray:
+    """`way` (V, 3), which the vertices go, smoothed wherever faces would turn over."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    before = np.cross(b - a, c - a)
+    even = mean.copy()
+    even.data = 1 / np.repeat(np.maximum(np.diff(even.indptr), 1), np.diff(even.indptr))
+    for round in range(_UNFOLDED):
+        a, b, c = np.moveaxis((vertices + way)[faces], 1, 0)
+        after = np.cross(b - a, c - a)
+        least = _TURN * np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+        folded = (before * after).sum(1) < least
+        if not folded.any():
+            break
+        near = np.zeros(len(vertices))
+        near[faces[folded]] = 1
+        for _ in range(1 + round // 4):
+            near = near + even @ near
+        way = np.where(near[:, None] > 0, (way + even @ way) / 2, way)
+    return way
 
 
 def _seen_by(photo: Photo) -> tuple[np.ndarray, ...]:
@@ -128,7 +163,7 @@ def _settled(cost: np.ndarray, away: np.ndarray, near: csr_matrix) -> np.ndarray
 
 
 @kernel(parallel=True)
-def _choose(vertices, normals, index, eye, viewmat, intrinsics, depth, clearance, safe, scores, chosen):
+def _choose(vertices, normals, index, eye, viewmat, intrinsics, depth, clearance, safe, scores, chosen, size):
     for n in prange(vertices.shape[0]):
         last = scores.shape[1] - 1
         score, _u, _v, _clear = look(
@@ -143,6 +178,11 @@ def _choose(vertices, normals, index, eye, viewmat, intrinsics, depth, clearance
             at -= 1
         scores[n, at] = score
         chosen[n, at] = index
+        if at == 0:
+            z = viewmat[2, 3]
+            for axis in range(3):
+                z += viewmat[2, axis] * vertices[n, axis]
+            size[n] = 2 * z / (intrinsics[0] + intrinsics[1])
 
 
 @kernel(parallel=True)

@@ -100,15 +100,15 @@ def _evaluate(coords, wanted, fine, fine_of, middle, middle_of, coarse, out):
         for n in range(wanted.shape[1]):
             if not wanted[b, n]:
                 continue
-            i, j, l = n // (SIDE * SIDE), n // SIDE % SIDE, n % SIDE
+            i, j, h = n // (SIDE * SIDE), n // SIDE % SIDE, n % SIDE
             value = 0.0
             for k in range(8):
                 s = i / (SIDE - 1) if k >> 2 else 1 - i / (SIDE - 1)
                 t = j / (SIDE - 1) if (k >> 1) & 1 else 1 - j / (SIDE - 1)
-                r = l / (SIDE - 1) if k & 1 else 1 - l / (SIDE - 1)
+                r = h / (SIDE - 1) if k & 1 else 1 - h / (SIDE - 1)
                 value += s * t * r * far[k]
             for q in range(count):
                 m = near[q]
                 for f in range(fine_of[m], fine_of[m + 1]):
-                    value += _dipole(fine[f], corner[0] + i, corner[1] + j, corner[2] + l)
+                    value += _dipole(fine[f], corner[0] + i, corner[1] + j, corner[2] + h)
             out[b, n] = value * scale

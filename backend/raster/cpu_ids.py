@@ -47,7 +47,7 @@ def most_probable(splats, tilts, ids, tiles, members, best_id, best_weight):
     count = tiles.size - 1
     for index in prange(count):
         _contest_tile(
-            spread(index, columns, count // columns), splats, tilts, ids, tiles, members, best_id, best_weight
+            spread(np.int64(index), columns, count // columns), splats, tilts, ids, tiles, members, best_id, best_weight
         )
 
 

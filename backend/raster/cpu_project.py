@@ -332,7 +332,7 @@ def project_backward(
     """
     for chunk in prange((means.shape[0] + 255) // 256):
         _project_backward_chunk(
-            chunk,
+            np.int64(chunk),
             means, quats, scales, opacities, sh, viewmat, intrinsics, width, height, splats, tilts, slots, rows,
             g_means, g_quats, g_scales, g_opacities, g_sh, g_screen,
         )  # fmt: skip

@@ -165,7 +165,7 @@ def blend(
     count = tiles.size - 1
     for index in prange(count):
         _blend_tile(
-            spread(index, columns, count // columns),
+            spread(np.int64(index), columns, count // columns),
             splats, tilts, ids, labels, tiles, members, want_labels, want_depth, want_median, want_normals,
             want_moments, color, transmittance, weight, depth, median, normals, moments, ends,
         )  # fmt: skip
@@ -338,7 +338,7 @@ def blend_backward(
     count = tiles.size - 1
     for index in prange(count):
         _blend_backward_tile(
-            spread(index, columns, count // columns),
+            spread(np.int64(index), columns, count // columns),
             splats, tilts, ids, labels, tiles, members, places, ends, want_labels, want_depth, want_normals,
             want_moments, color, transmittance, weight, depth, normals, moments,
             g_color, g_alpha, g_weight, g_depth, g_normals, g_moments, rows_out,

@@ -301,7 +301,7 @@ def test_a_bowl_stays_open_where_cameras_saw_into_it():
     field = fuse(Exact([shape], around(14, heights=(-1.5, 1.5, 2.5))), [0])
     surface = extract(field)
     assert_sound(surface)
-    assert volume(surface) < 0.5 * (2 / 3 * np.pi * 0.56**3)
+    assert volume(surface) == pytest.approx(2 / 3 * np.pi * (0.56**3 - 0.44**3), rel=0.06)
     assert errors(surface, shape).mean() < 0.2 * field.voxel
 
 
@@ -321,7 +321,7 @@ def test_what_stands_on_a_table_gets_a_flat_base_where_it_stands():
     open_surface = extract(field, closed=False)
     assert not open_surface.invented.any()
     assert not is_watertight(open_surface.faces)
-    assert open_surface.vertices[:, 2].min() > -0.5 * field.voxel
+    assert open_surface.vertices[:, 2].min() > -field.voxel
     down = np.cross(*(open_surface.vertices[open_surface.faces[:, i]] - open_surface.vertices[open_surface.faces[:, 0]]
                       for i in (1, 2)))[:, 2]  # fmt: skip
     area = np.linalg.norm(down)
@@ -430,12 +430,13 @@ def test_memory_grows_with_the_surface_and_is_kept():
     said = []
     reporter = Reporter()
     reporter.warning = said.append
-    small = fuse(views, [0], memory_mb=1.5, reporter=reporter)
-    assert len(small.blocks) * SAMPLES * 5 < 1.5e6
+    small = fuse(views, [0], memory_mb=5, reporter=reporter)
+    assert len(small.blocks) * SAMPLES * 16 < 5e6
     assert len(said) == 1 and "memory" in said[0]
     surface = extract(small)
     assert_sound(surface)
     assert errors(surface, ball()).mean() < 0.3 * small.voxel
+    assert_sound(extract(fuse(views, [0], memory_mb=0.1)))
 
 
 def test_the_budget_of_faces_holds_and_invented_faces_stay_marked():

@@ -10,6 +10,7 @@ import torch
 import trimesh
 
 from backend.mesh.atlas import fill, find_texels
+from backend.mesh.refine import refine
 from backend.mesh.surface import Surface
 from backend.mesh.texture import dress, texture_size
 from backend.mesh.unwrap import unwrap
@@ -307,6 +308,37 @@ def test_what_no_photo_shows_has_the_splats_colours_and_a_stop_is_heard():
     views.indices = (1,)
     with pytest.raises(Cancelled):
         dress(surface, uvs, 64, views, [1], Stopping())
+
+
+def test_a_surface_moves_to_where_the_photos_agree():
+    mesh = trimesh.creation.icosphere(4, 1.0)
+    views = StubViews(mesh, below=True)
+    surface = surface_of(mesh)
+    pixel = 4 / views.cameras[0].K[0, 0]
+    bumps = 1 - pixel * (0.8 + 0.5 * np.sin(mesh.vertices @ [7, 2, 3]))
+    surface.vertices = mesh.vertices * bumps[:, None]
+    refined = refine(surface, views, [1])
+    np.testing.assert_array_equal(refined.faces, surface.faces)
+    before = np.abs(np.linalg.norm(surface.vertices, axis=1) - 1)
+    after = np.abs(np.linalg.norm(refined.vertices, axis=1) - 1)
+    assert np.median(after) < 0.25 * np.median(before) and after.max() < before.max()
+    a, b, c = np.moveaxis(refined.vertices[refined.faces], 1, 0)
+    assert ((np.cross(b - a, c - a) * (a + b + c)).sum(1) > 0).all()  # nothing folded
+
+
+def test_a_surface_stays_where_the_photos_say_nothing():
+    mesh = trimesh.creation.icosphere(3, 0.97)
+    views = StubViews(trimesh.creation.icosphere(3, 1.0))
+    for picture in views.pictures:
+        picture[:] = 0.5
+    surface = surface_of(mesh)
+    moved = np.linalg.norm(refine(surface, views, [1]).vertices - mesh.vertices, axis=1)
+    assert moved.max() < 0.2 * 4 / views.cameras[0].K[0, 0]
+    views.labels = [np.zeros_like(label) for label in views.labels]
+    views.masks = False
+    np.testing.assert_allclose(refine(surface, views, [1]).vertices, mesh.vertices, atol=1e-12)
+    views.indices = ()
+    np.testing.assert_allclose(refine(surface, views, [1]).vertices, mesh.vertices, atol=1e-12)
 
 
 def test_size_follows_the_photos():

@@ -457,19 +457,132 @@ def test_one_and_two_threads_give_the_same_bits(primitive):
     assert_same_bits(single, double)
 
 
+# Discs
+
+
+def tilted(angle, scale=(0.5, 0.3, 1.0), **kwargs):
+    """A disc turned about the x axis: 0 faces the camera of `straight`, pi / 2 is seen from its edge."""
+    return one(quat=(np.cos(angle / 2), np.sin(angle / 2), 0, 0), scale=scale, **kwargs)
+
+
+def facts(scene, cam):
+    """Kernels' picture of discs with all that it can hold."""
+    return rasterize(
+        **as_float32(scene), camera=cam, want_depth=True, want_median=True, want_normals=True, want_distortion=True,
+        primitive="2d",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("turn", [1e-6, 1e-4, 1e-3, 1e-2, 0.1])
+def test_disc_seen_almost_from_its_edge(turn):
+    # Not in the middle of a pixel, where plane and spot are equal and only one of them is seen by the gradients.
+    for mean in ((0.003, 0.002, 2.0), (0.011, -0.023, 2.0), (0.403, 0.001, 2.0)):
+        scene = tilted(np.pi / 2 - turn, mean=mean)
+        got, _ = compare(scene, straight(), primitive="2d")
+        # However thin, it is not smaller than its spot.
+        u, v = int(20 * mean[0] + WIDTH / 2), int(20 * mean[1] + HEIGHT / 2)
+        assert got.alpha[v, u] > 0.2
+        compare(among_others(scene), straight(), primitive="2d")
+
+
+def test_disc_seen_from_its_very_edge():
+    """Which side of it is seen is not defined, but it is there and harmless."""
+    arrays = draw(as_float32(among_others(tilted(np.pi / 2))), straight(), primitive="2d")
+    assert all(np.isfinite(array).all() for array in arrays.values())
+    assert draw(as_float32(tilted(np.pi / 2)), straight(), primitive="2d")["plane 1"].max() > 0.5
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-6, 1e-3, 0.1])
+def test_plane_through_the_camera(turn):
+    """The distance along the ray to the plane is 0, or nearly, in every pixel or in some."""
+    lying = (np.cos(np.pi / 4 + turn), np.sin(np.pi / 4 + turn), 0, 0)
+    for mean in ((0.001, 0.003, 0.5), (0.001, 1e-4, 0.5), (0.1, 0.01, 0.02), (0.001, 0.02, 2.0)):
+        for scale in ((0.2, 0.3, 1), (5.0, 8.0, 1)):
+            scene = among_others(one(mean=mean, quat=lying, scale=scale))
+            compare(scene, straight(), gradient_tolerance=5e-5, value_tolerance=1e-4, primitive="2d")
+
+
+def test_disc_that_reaches_behind_the_camera():
+    """A floor under the camera: drawn up to its end, not drawn above the horizon where its plane lies behind."""
+    floor = one(mean=(0.003, 0.302, 1.0), quat=(np.sqrt(0.5), np.sqrt(0.5), 0, 0), scale=(4, 4, 1), opacity=0.9)
+    got, _ = compare(floor, straight(), primitive="2d")
+    assert (got.alpha[-1] > 0.5).all() and not got.alpha[: HEIGHT // 2].any()
+    compare(among_others(floor), straight(), gradient_tolerance=2e-5, primitive="2d")
+
+
+def test_disc_is_cut_at_the_near_plane():
+    floor = one(mean=(0.003, 0.052, 1.0), quat=(np.sqrt(0.5), np.sqrt(0.5), 0, 0), scale=(4, 4, 1), opacity=0.9)
+    got, _ = compare(floor, straight(near=0.2), primitive="2d")
+    assert not got.alpha[-1].any() and got.alpha[-8].all()
+    drawn = got.alpha > 0
+    assert (got.depth[drawn] / got.alpha[drawn] > 0.2).all()
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.6, -1.2, np.pi])
+def test_depth_and_normal_are_those_of_the_plane(angle):
+    got = facts(tilted(angle, scale=(0.8, 0.8, 1), opacity=0.9), straight())
+    inside = got.alpha.numpy() > 0.5
+    normal = np.array([0, np.sin(angle), -np.cos(angle)])
+    normal *= -np.sign(normal[2])
+    y, _ = np.mgrid[:HEIGHT, :WIDTH]
+    wanted = 2 / (1 + (y + 0.5 - HEIGHT // 2 - 0.5) / 40 * normal[1] / normal[2])
+    np.testing.assert_allclose((got.depth / got.alpha).numpy()[inside], wanted[inside], rtol=1e-5)
+    np.testing.assert_allclose(got.median.numpy()[inside], wanted[inside], rtol=1e-5)
+    for i in range(3):
+        np.testing.assert_allclose((got.normals[i] / got.alpha).numpy()[inside], normal[i], atol=1e-5)
+    assert inside.sum() > 20 and got.distortion.abs().max() < 1e-7
+
+
+def test_distortion_of_two_discs():
+    got = facts(join(*(one(mean=(0, 0, z), scale=(9, 9, 1), opacity=0.5) for z in (1.0, 2.0))), straight())
+    middle = got.distortion[HEIGHT // 2, WIDTH // 2].item()
+    assert middle == pytest.approx(0.5 * 0.25 * (1 - 0.5) ** 2, rel=1e-4)
+
+
+def test_the_third_scale_of_a_disc_has_no_effect():
+    scene = random_scene(1, count=30)
+    cam = camera()
+    first = draw(as_float32(scene), cam, primitive="2d")
+    for value in (0.0, 1e30, np.nan):
+        scene["scales"][:, 2] = value
+        assert_same_bits(first, draw(as_float32(scene), cam, primitive="2d"))
+    assert not first["scales"][:, 2].any()
+
+
+def test_what_3d_gaussians_do_not_have():
+    scene = as_float32(one())
+    for wanted in ({"want_normals": True}, {"want_distortion": True}, {"primitive": "4d"}):
+        with pytest.raises(ValueError, match=r"3D Gaussians have no|expected '2d' or '3d'"):
+            rasterize(**scene, camera=straight(), **wanted)
+
+
+def test_screen_gradient_is_that_of_a_moving_footprint():
+    """Growth follows it: the plane's part must be in it, not the spot's alone."""
+    scene = as_float32(tilted(0.7, scale=(0.15, 0.2, 1)))
+    leaves = {k: v.requires_grad_(k != "ids") for k, v in scene.items()}
+    picture = rasterize(**leaves, camera=straight(), primitive="2d")
+    pattern = torch.sin(torch.arange(WIDTH) / 5.0)[None, :].expand(HEIGHT, WIDTH)
+    (picture.alpha * pattern).sum().backward()
+    columns = torch.arange(WIDTH) + 0.5
+    # d/du of sum alpha(x - u) pattern(x) is sum alpha pattern'.
+    wanted = (picture.alpha * (torch.cos((columns - 0.5) / 5.0) / 5.0)[None, :]).sum()
+    assert picture.frame.screen_gradient[0, 0] == pytest.approx(wanted.item(), rel=0.03)
+
+
 # The reference itself
 
 
-@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
-def test_gradcheck_of_the_reference(coefficients):
+@pytest.mark.parametrize(("primitive", "coefficients"), [("3d", 1), ("3d", 4), ("3d", 9), ("3d", 16), ("2d", 4)])
+def test_gradcheck_of_the_reference(primitive, coefficients):
     scene = random_scene(2, count=4, coefficients=coefficients, size=0.3)
     scene["opacities"] *= 0.8
     cam = straight(7, 5, focal=6.0)
     ids = scene.pop("ids")
 
     def picture(*leaves):
-        out = rasterize_reference(*leaves, ids, cam, 5)
-        return out.color, out.alpha, out.depth, out.probabilities
+        out = rasterize_reference(*leaves, ids, cam, 5, primitive)
+        discs = (out.normals, out.distortion) if primitive == "2d" else ()
+        return out.color, out.alpha, out.depth, out.probabilities, *discs
 
     assert torch.autograd.gradcheck(picture, [scene[name].requires_grad_() for name in NAMES], eps=1e-7, atol=1e-5)
 
