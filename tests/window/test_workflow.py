@@ -208,7 +208,7 @@ def test_extracted_meshes_take_the_place_of_splats(window):
     """))
     wait(window, "running.queue.running is not None and running.queue.running.progress > 0.1", 240)
     window.shot("7-extracting")
-    wait(window, f"{IDLE} and scene.object_meshes(root)", 300)
+    wait(window, f"{IDLE} and bool(scene.object_meshes(root))", 300)
     shown = window.run(script("""
         result = {object_id: [[scene.kind_of(part), part.visible_get(), len(part.data.polygons)]
                               for part in collection.objects if scene.kind_of(part) in ("splats", "mesh")]
