@@ -77,7 +77,8 @@ class _Entry:
 
     @property
     def is_object(self) -> bool:
-        return self.key.isdecimal()
+        # A set may have a number for its name.
+        return self.ids is not None and self.key.isdecimal() and int(self.key) in self.ids
 
     def written(self) -> str:
         """When its files were written, as text: Blender's integers are too short for nanoseconds."""

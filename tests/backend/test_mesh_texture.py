@@ -287,6 +287,22 @@ def test_nothing_of_an_object_in_front_comes_in(masks):
     assert (color[bottom] >= sides.min(0) - 0.1).all() and (color[bottom] <= sides.max(0) + 0.1).all()
 
 
+def test_a_part_behind_another_does_not_take_its_colours():
+    box = trimesh.creation.box((1.6, 1.6, 1.6)).subdivide().subdivide().subdivide()
+    ball = trimesh.creation.icosphere(3, 0.5)
+    ball.vertices += [1.5, 0.2, 0.3]
+    mesh = trimesh.util.concatenate([box, ball])
+    surface = surface_of(mesh)
+    uvs = unwrap(surface, 512)
+    texture, _ = dress(surface, uvs, 512, StubViews(mesh, below=True), [1])
+    texels = find_texels(uvs, 512, 0, 512)
+    points = np.einsum("nij,ni->nj", mesh.vertices[mesh.faces[texels.face]], texels.weights)
+    behind = (points[:, 0] > 0.79) & (points[:, 0] < 0.81) & (np.abs(points[:, 1:] - [0.2, 0.3]) < 0.5).all(1)
+    assert behind.sum() > 1000
+    wrong = np.abs(texture.reshape(-1, 3)[texels.place] / 255 - colors_at(points)).max(1)
+    assert wrong[behind].mean() < 0.03 and np.quantile(wrong, 0.99) < 0.12
+
+
 def test_what_no_photo_shows_has_the_splats_colours_and_a_stop_is_heard():
     mesh = trimesh.creation.icosphere(2, 1.0)
     views = StubViews(mesh, eyes=6)

@@ -1,5 +1,6 @@
 """Losses against autograd, growth rules, checkpoints, and whole trainings on tiny captures."""
 
+import dataclasses
 import signal
 import subprocess
 import sys
@@ -24,7 +25,7 @@ from backend.raster.draw import draw
 from backend.stopping import StopRequest
 from backend.training.adam import BETA1, BETA2, step_rows
 from backend.training.loop import Budget, Trainer
-from backend.training.losses import PROBABILITY_FLOOR, image_loss, volume_loss
+from backend.training.losses import PROBABILITY_FLOOR, image_loss, normal_loss, volume_loss
 from backend.training.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -73,14 +74,70 @@ def test_image_loss_and_gradients_equal_autograd(size):
         np.testing.assert_allclose(a.grad.numpy(), reference.numpy(), rtol=2e-3, atol=2e-5 * reference.abs().max())
 
 
-def test_volume_loss_is_the_mean_product_of_the_scales():
+@pytest.mark.parametrize("axes", [2, 3])
+def test_volume_loss_is_the_mean_product_of_the_scales(axes):
     fast = torch.rand(2500, 3, requires_grad=True)
     slow = fast.detach().double().requires_grad_()
-    got, want = volume_loss(fast), slow.prod(1).mean()
+    got, want = volume_loss(fast, flat=axes == 2), slow[:, :axes].prod(1).mean()
     assert float(got.detach()) == pytest.approx(float(want.detach()), rel=1e-5)
     (3 * got).backward()
     (3 * want).backward()
     np.testing.assert_allclose(fast.grad, slow.grad, rtol=1e-5)
+
+
+def slow_normal_loss(normals, depth, alpha, intrinsics):
+    fx, fy, cx, cy = intrinsics
+    h, w = alpha.shape
+    x, y = torch.meshgrid((torch.arange(w) + 0.5 - cx) / fx, (torch.arange(h) + 0.5 - cy) / fy, indexing="xy")
+    rays = torch.stack([x, y, torch.ones_like(x)], -1)
+    points = rays * (depth / alpha)[..., None]
+    across, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
+    normal = torch.nn.functional.normalize(torch.linalg.cross(down, across), dim=-1)
+    middle = rays[1:-1, 1:-1]
+    counted = -(normal * middle).sum(-1) > 0.1 * middle.norm(dim=-1)
+    a = alpha.detach()
+    for part in (a[1:-1, 1:-1], a[1:-1, 2:], a[1:-1, :-2], a[2:, 1:-1], a[:-2, 1:-1]):
+        counted &= part > 0.5
+    loss = alpha[1:-1, 1:-1] - (normals.permute(1, 2, 0)[1:-1, 1:-1] * normal).sum(-1)
+    return torch.where(counted, loss, 0).sum() / (h * w), counted
+
+
+def test_normal_loss_and_gradients_equal_autograd():
+    rng = np.random.default_rng(0)
+    h, w = 19, 31
+    x, y = np.meshgrid(np.arange(w), np.arange(h))
+    alpha = rng.uniform(0.45, 1, (h, w))
+    depth = (3 + 0.03 * x + 0.02 * y + rng.normal(0, 0.02, (h, w))) * alpha
+    base = [rng.normal(size=(3, h, w)) * 0.4, depth, alpha]
+    intrinsics = np.array([20.0, 22.0, 15.3, 8.2])
+    fast = [torch.tensor(v, dtype=torch.float32, requires_grad=True) for v in base]
+    slow = [torch.tensor(np.float32(v), dtype=torch.float64, requires_grad=True) for v in base]
+    got = normal_loss(*fast, intrinsics)
+    want, counted = slow_normal_loss(*slow, intrinsics)
+    assert 100 < counted.sum() < counted.numel() - 20
+    assert float(got.detach()) == pytest.approx(float(want.detach()), rel=1e-5)
+    (3 * got).backward()
+    (3 * want).backward()
+    for a, b in zip(fast, slow, strict=True):
+        np.testing.assert_allclose(a.grad, b.grad, rtol=1e-4, atol=1e-5 * b.grad.abs().max().item())
+
+
+def test_normal_loss_of_a_plane_is_nothing():
+    """Rendered discs of one plane have its normal and its depth."""
+    camera = Camera(np.eye(4), np.array([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]]), 32, 24)
+    spread = torch.linspace(-1, 1, 12)
+    x, y = (v.reshape(-1) for v in torch.meshgrid(spread, spread, indexing="xy"))
+    half = 0.25
+    means = torch.stack([x, y * np.cos(2 * half), 2 + y * np.sin(2 * half)], 1).float()
+    n = len(means)
+    quats = torch.tensor([[np.cos(half), np.sin(half), 0, 0]]).float().repeat(n, 1)
+    drawn = rasterize(
+        means, quats, torch.full((n, 3), 0.2), torch.full((n,), 0.9), torch.zeros(n, 1, 3),
+        torch.zeros(n, dtype=torch.int32), camera, want_depth=True, want_normals=True, primitive="2d",
+    )  # fmt: skip
+    assert (drawn.alpha > 0.9).all()
+    assert abs(float(normal_loss(drawn.normals, drawn.depth, drawn.alpha, camera.arrays()[1]))) < 1e-4
+    assert float(normal_loss(-drawn.normals, drawn.depth, drawn.alpha, camera.arrays()[1])) > 1
 
 
 def test_loss_of_a_picture_without_labels_has_no_semantic_term():
@@ -311,9 +368,13 @@ def mean_loss(trainer, steps, share=0.3):
     return float(np.mean([trainer.step(share) for _ in range(steps)]))
 
 
-def test_training_lowers_the_loss_and_draws_the_right_objects(tiny):
+FLAT = dataclasses.replace(SMALL, primitive="2d")
+
+
+@pytest.mark.parametrize("settings", [SMALL, FLAT], ids=["3d", "2d"])
+def test_training_lowers_the_loss_and_draws_the_right_objects(tiny, settings):
     capture, ids = tiny()
-    trainer = Trainer.start(capture, ids, SMALL)
+    trainer = Trainer.start(capture, ids, settings)
     before = mean_loss(trainer, 8)
     for i in range(150):
         trainer.step(i / 150)
@@ -360,6 +421,51 @@ def test_a_checkpoint_of_other_settings_is_refused(tiny, tmp_path):
     Trainer.start(capture, ids, SMALL).run(Budget(steps=2), tmp_path / "a", Reporter())
     with pytest.raises(InputError, match="sh_degree"):
         Trainer.resume(capture, tmp_path / "a", Settings(offsets=4, sh_degree=2))
+    with pytest.raises(InputError, match="primitive"):
+        Trainer.resume(capture, tmp_path / "a", FLAT)
+
+
+def test_a_checkpoint_from_before_2d_splats_is_one_of_3d_gaussians(tiny, tmp_path):
+    capture, ids = tiny()
+    Trainer.start(capture, ids, SMALL).run(Budget(steps=2), tmp_path, Reporter())
+    tensors, state, _ = load_checkpoint(tmp_path)
+    for name in ("primitive", "normal_weight", "distortion_weight"):
+        del state["settings"][name]
+    save_checkpoint(tmp_path, tensors, {k: v for k, v in state.items() if k != "format"})
+    trainer, _ = Trainer.resume(capture, tmp_path, SMALL)
+    assert trainer.model.primitive == "3d"
+
+
+def test_normals_and_distortion_are_only_computed_where_they_count(tiny, monkeypatch):
+    capture, ids = tiny()
+    asked = []
+
+    def seen(*args, **kwargs):
+        asked.append([kwargs[f"want_{what}"] for what in ("depth", "normals", "distortion")])
+        return rasterize(*args, **kwargs)
+
+    monkeypatch.setattr("backend.training.loop.rasterize", seen)
+    both = dataclasses.replace(FLAT, distortion_weight=1.0)
+    for settings, share, wanted in (
+        (SMALL, 0.9, [False] * 3), (FLAT, 0.1, [False] * 3), (FLAT, 0.9, [True, True, False]), (both, 0.9, [True] * 3),
+        (dataclasses.replace(FLAT, normal_weight=0.0), 0.9, [False] * 3),
+    ):  # fmt: skip
+        assert np.isfinite(Trainer.start(capture, ids, settings).step(share))
+        assert asked.pop() == wanted
+
+
+def test_normal_loss_makes_normals_agree_with_the_depth(tiny):
+    capture, ids = tiny()
+    found = []
+    for weight in (0.0, 0.2):
+        trainer = Trainer.start(capture, ids, dataclasses.replace(FLAT, normal_weight=weight))
+        for i in range(80):
+            trainer.step(0.3 + i / 200)
+        camera = trainer.scene.camera(capture.train_indices[0])
+        g = trainer.model.generate()
+        drawn = rasterize(*g[:6], camera, want_depth=True, want_normals=True, primitive="2d")
+        found.append(float(normal_loss(drawn.normals, drawn.depth, drawn.alpha, camera.arrays()[1])))
+    assert found[1] < 0.8 * found[0]
 
 
 def test_the_clock_ends_a_training_by_minutes(tiny, tmp_path):
@@ -398,9 +504,10 @@ def test_unlabelled_pixels_are_taught_where_many_points_have_no_object(tiny):
     assert drawn[1] < 0.5 * drawn[0]
 
 
-def test_explicit_splats_are_the_model(tiny):
+@pytest.mark.parametrize("settings", [SMALL, FLAT], ids=["3d", "2d"])
+def test_explicit_splats_are_the_model(tiny, settings):
     capture, ids = tiny()
-    trainer = Trainer.start(capture, ids, SMALL)
+    trainer = Trainer.start(capture, ids, settings)
     for i in range(20):
         trainer.step(i / 20)
     index = capture.test_indices[0]
@@ -410,9 +517,14 @@ def test_explicit_splats_are_the_model(tiny):
     camera = Camera(view.viewmat, view.K, view.width, view.height, near=0.01 / trainer.model.normalization.scale)
     tensors = [torch.from_numpy(np.asarray(a, np.float32)) for a in
                (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)]  # fmt: skip
-    drawn = rasterize(*tensors, torch.from_numpy(splats.object_ids.astype(np.int32)), camera)
+    drawn = rasterize(
+        *tensors, torch.from_numpy(splats.object_ids.astype(np.int32)), camera, primitive=settings.primitive
+    )
     image = drawn.color + (1 - drawn.alpha) * trainer.model.background.detach()[:, None, None]
     image = image * torch.tensor(trainer.scene.gains[index], dtype=torch.float32)[:, None, None]
+    if settings.primitive == "2d":
+        thin, wide = splats.scales.min(1), np.sort(splats.scales, axis=1)[:, 1]
+        assert (splats.scales[:, 2] == thin).all() and np.allclose(thin, 1e-3 * wide, rtol=1e-4)
     np.testing.assert_allclose(image.clamp(0, 1).permute(1, 2, 0), shown.image, atol=1e-3)
 
 

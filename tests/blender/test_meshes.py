@@ -360,10 +360,11 @@ def test_splats_are_shown_until_there_are_meshes(fresh, folder):
 
 def test_the_whole_scene_and_sets_are_hidden_beside_the_objects(root, folder):
     write_meshes(folder, {"1": tetrahedron(ORIGIN), "scene": tetrahedron(ORIGIN + 1, 3.0),
-                          "pair": tetrahedron(ORIGIN)}, ids={"pair": [1, 2]})
-    assert blender_scene.show_meshes(root, folder).meshes == 3
+                          "pair": tetrahedron(ORIGIN), "77": tetrahedron(ORIGIN)}, ids={"pair": [1, 2], "77": [1, 2]})
+    shown = blender_scene.show_meshes(root, folder)
+    assert (shown.meshes, shown.warnings) == (4, [])
     whole = {thing.name: thing for thing in blender_scene.scene_meshes(root)}
-    assert set(whole) == {"name of scene mesh", "name of pair mesh"}
+    assert set(whole) == {"name of scene mesh", "name of pair mesh", "name of 77 mesh"}
     assert hidden(whole.values()) == {True}
     whole["name of scene mesh"].hide_viewport = False
     bpy.context.view_layer.update()
