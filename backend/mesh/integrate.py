@@ -14,6 +14,7 @@ from .blocks import SAMPLES, SIDE
 from .views import ALPHA_SEEN, ObjectView, SceneMap
 
 _MIN_SLOPE = 0.15
+"""Cosine between ray and normal below which a surface counts as no more slanted."""
 
 
 @dataclass(frozen=True)

@@ -132,10 +132,23 @@ class Views:
         alpha = drawn.alpha.numpy()
         if not (alpha >= ALPHA_SEEN).any():
             return None
-        shown = self._shown(index)[y : y + height, x : x + width]
+        shown = self._shown(index)[y : y + height, x : x + width] * self._claimed(index)[y : y + height, x : x + width]
         visible = np.clip(shown / np.maximum(alpha, 1e-3), 0, 1).astype(np.float32)
         color = np.moveaxis(drawn.color.numpy(), 0, 2) / np.maximum(alpha, 1e-3)[..., None]
         return ObjectView(camera, x, y, _depth(drawn), alpha, np.ascontiguousarray(color), visible)
+
+    def _claimed(self, index: int) -> np.ndarray:
+        """Where the photo's mask leaves room for the objects at hand, (H, W) bool.
+
+        Training teaches no object where a mask says 0, so there any object's splats may have painted the background;
+        a mask that shows an object elsewhere says that this is not it.
+        """
+        camera = self.camera(index)
+        mask = self.scene.capture.mask(index, self.downscale)
+        known = self.model.object_ids[[c for c in self._classes if c]]
+        if mask is None or len(known) < len(self._classes) or not np.isin(mask, known).any():
+            return np.ones((camera.height, camera.width), bool)
+        return mask != 0
 
     def _shown(self, index: int) -> np.ndarray:
         """How much of each pixel's light in view `index` comes from the objects at hand, (H, W)."""

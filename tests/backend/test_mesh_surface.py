@@ -51,8 +51,8 @@ def sheet(x, class_index, half=0.5, step=0.05, colour=0.5):
     )
 
 
-def views_of(splats, cameras, explicit=True, **options):
-    """`Views` of plain splats."""
+def views_of(splats, cameras, explicit=True, mask=None, **options):
+    """`Views` of plain splats; the objects' IDs are ten times their classes."""
     ids = splats.ids.numpy()
 
     def generate(seen=None, eye=None):
@@ -60,7 +60,9 @@ def views_of(splats, cameras, explicit=True, **options):
         return splats if seen is None else Generated(*(part[torch.from_numpy(seen)] for part in splats))
 
     model = SimpleNamespace(generate=generate, explicit=explicit, primitive="3d", anchors=SimpleNamespace(ids=ids))
-    scene = SimpleNamespace(camera=lambda index, downscale: cameras[index])
+    model.object_ids = np.arange(3) * 10
+    capture = SimpleNamespace(mask=lambda index, downscale: mask)
+    scene = SimpleNamespace(camera=lambda index, downscale: cameras[index], capture=capture)
     return Views(model, scene, range(len(cameras)), **options)
 
 
@@ -90,6 +92,18 @@ def test_an_object_is_drawn_unhidden_and_knows_how_much_of_it_is_hidden(explicit
     assert seen.depth[24, 32] == pytest.approx(3.0, abs=0.01)
     assert seen.depth[31, 39] == pytest.approx(4.0, abs=0.03)
     assert seen.depth[0, 0] == 0
+
+
+def test_what_a_mask_leaves_unlabelled_beside_an_object_is_not_the_object():
+    mask = np.zeros((48, 64), np.int32)
+    mask[:, :32] = 20
+    splats = sheet(0.0, 2)
+    for given, seen in ((mask, 0), (np.zeros_like(mask), 1), (None, 1)):
+        view = views_of(splats, [camera_at((4, 0, 0))], mask=given).object_view(0, [2])
+        middle = 32 - view.x
+        assert view.visible[:, :middle].max() > 0.99
+        assert (view.visible[:, middle:].max() > 0.99) == seen
+        assert view.alpha[:, middle:].max() > 0.9
 
 
 def test_a_view_through_the_crop_is_the_view_itself():
