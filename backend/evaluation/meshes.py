@@ -109,15 +109,17 @@ def against_truth(mesh: Mesh, true: TrueMesh, truth: Truth, ids: Sequence[int]) 
     """`agreement` over the truth's surface that at least two views see, the same over all of it (names that end in
     "_all"), and `seen`, that part's share of the area.
 
-    Over the seen part, points of the mesh whose nearest true point is unseen count nowhere.
+    The seen part of the mesh is what at least two views would see of it, were it alone, less the points whose nearest
+    true point is unseen: the back of a wall that nobody walked around is right or wrong over all of the surface only.
     """
     made, wanted = SampledSurface(mesh.vertices, mesh.faces), SampledSurface(true.vertices, true.faces)
     seen = truth.seen(wanted.anchors, wanted.anchor_normals, ids)
     accuracy, nearest = wanted.distances(made.points)
     completeness, _ = made.distances(wanted.points)
     seen_points = seen[: len(wanted.points)]
+    counted = seen[nearest] & truth.sees_of(made.points, made.normals, mesh.vertices, mesh.faces)
     return {
-        **agreement(accuracy[seen[nearest]], completeness[seen_points]),
+        **agreement(accuracy[counted], completeness[seen_points]),
         **{f"{name}_all": value for name, value in agreement(accuracy, completeness).items()},
         "seen": float(seen_points.mean()),
     }

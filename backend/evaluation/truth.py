@@ -8,7 +8,7 @@ truth/masks/<image>.png      (H, W) object IDs
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,8 +16,10 @@ import numpy as np
 from PIL import Image
 
 from ..capture import Capture
+from ..mesh.zbuffer import draw_mesh
 from ..ply import LONGEST_HEADER, read_vertices
 from ..protocol import InputError, read_json
+from ..raster import Camera
 
 VIEWS_TO_COUNT = 2
 """So many views must see a piece of surface before a reconstruction can be blamed for it."""
@@ -67,22 +69,19 @@ class Truth:
 
         A view sees a point that it looks at from outside, whose pixel shows one of `ids` and lies as deep as the point.
         """
-        views = np.zeros(len(points), np.int32)
-        for view in map(self._view, self._indices):
+        views = map(self._view, self._indices)
+        return _seen(points, normals, ((view, np.where(np.isin(view.ids, list(ids)), view.depth, 0)) for view in views))
+
+    def sees_of(self, points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        """The same for points of another surface, vertices (V, 3) and faces (F, 3), that stands there alone."""
+
+        def drawn(view: _View) -> np.ndarray:
             fx, fy, cx, cy = view.intrinsics
-            turn = view.viewmat[:3, :3]
-            seen_from = points @ turn.T + view.viewmat[:3, 3]
             height, width = view.depth.shape
-            at = np.flatnonzero(((points + view.viewmat[:3, 3] @ turn) * normals).sum(1) < 0)
-            at = at[seen_from[at, 2] > 0]
-            x, y, z = seen_from[at].T
-            column, row = np.floor(fx * x / z + cx), np.floor(fy * y / z + cy)
-            inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-            at, z, column, row = at[inside], z[inside], column[inside].astype(int), row[inside].astype(int)
-            found = np.isin(view.ids[row, column], list(ids))
-            found &= np.abs(view.depth[row, column] - z) <= _PIXELS_DEEP * z / fx
-            views[at[found]] += 1
-        return views >= VIEWS_TO_COUNT
+            K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
+            return draw_mesh(vertices, faces, Camera(view.viewmat, K, width, height))[0]
+
+        return _seen(points, normals, ((view, drawn(view)) for view in map(self._view, self._indices)))
 
     def _view(self, index: int) -> _View:
         if index in self._held:
@@ -92,6 +91,25 @@ class Truth:
         if self._bytes <= _BYTES_HELD:
             self._held[index] = view
         return view
+
+
+def _seen(points: np.ndarray, normals: np.ndarray, looks: Iterable[tuple[_View, np.ndarray]]) -> np.ndarray:
+    """Which points at least two of the views see, each given with the depth (H, W) of what counts, 0 elsewhere."""
+    views = np.zeros(len(points), np.int32)
+    for view, depth in looks:
+        fx, fy, cx, cy = view.intrinsics
+        turn = view.viewmat[:3, :3]
+        seen_from = points @ turn.T + view.viewmat[:3, 3]
+        height, width = depth.shape
+        at = np.flatnonzero(((points + view.viewmat[:3, 3] @ turn) * normals).sum(1) < 0)
+        at = at[seen_from[at, 2] > 0]
+        x, y, z = seen_from[at].T
+        column, row = np.floor(fx * x / z + cx), np.floor(fy * y / z + cy)
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        at, z, column, row = at[inside], z[inside], column[inside].astype(int), row[inside].astype(int)
+        deep = depth[row, column]
+        views[at[(deep > 0) & (np.abs(deep - z) <= _PIXELS_DEEP * z / fx)]] += 1
+    return views >= VIEWS_TO_COUNT
 
 
 def load_truth(capture: Capture, indices: Sequence[int]) -> Truth | None:
