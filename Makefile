@@ -69,7 +69,7 @@ zip: .venv-bpy/ready
 	$(BLENDER_EXT) validate build/objectgs-*.zip
 
 test: .venv/ready .venv-bpy/ready
-	$(BACKEND) -m pytest tests/backend
+	$(BACKEND) -m pytest -n 2 tests/backend
 	$(BLENDER) -m pytest tests/blender
 	$(BACKEND) -m pytest tests/window
 

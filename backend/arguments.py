@@ -26,12 +26,13 @@ from .stopping import StoppingReporter, StopRequest
 DEFAULT_MINUTES = 5.0
 
 _INTRODUCTION = """\
-From photos to labelled splats. A capture is a folder with images/, the COLMAP
+From photos to labelled splats and meshes. A capture is a folder with images/, the COLMAP
 model of their cameras in sparse/0, and, for objects, one picture of object IDs
 for each image in masks/. What is made of it goes into a reconstruction folder.
 
   python -m backend check    garden                      what is in the capture?
   python -m backend train    garden --out garden-splats  make the splats (5 minutes)
+  python -m backend mesh     garden-splats               make each object's mesh
   python -m backend evaluate garden-splats               how good are they?
   python -m backend report   garden-splats               read garden-splats/report.md
 """
@@ -71,7 +72,9 @@ Draw the splats from the capture's cameras into DIR/renders, named as the images
 _EVALUATE = """\
 Compare renders with the photos that training has not seen (every 8th). PSNR and
 SSIM say how close the pictures are; mIoU, mBIoU, Dice and accuracy how well the
-objects agree with the masks. `report` shows the figures.
+objects agree with the masks. Meshes are measured too: whether they are closed, how
+their texture looks in those photos, and, where CAPTURE/truth has the true surfaces,
+how close they come. `report` shows the figures.
 """
 
 _MESH = """\

@@ -132,6 +132,7 @@ class SettingsPanel(_WithReconstruction, bpy.types.Panel):
         row = layout.row()
         row.active = properties.mode == "explicit"
         row.prop(properties, "sh_degree")
+        layout.prop(properties, "primitive")
         layout.prop(properties, "strategy")
         layout.prop(properties, "max_size")
         layout.operator("objectgs.train", text="Train Anew", icon="LOOP_BACK").restart = True

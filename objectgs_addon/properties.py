@@ -52,6 +52,9 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
         ("view", "View-dependent", "As in the paper: splats change with the camera; the PLY is a fit")])
     sh_degree: IntProperty(name="SH Degree", default=1, min=0, max=3,
                            description="How much colours may change with the direction they are seen from")
+    primitive: EnumProperty(name="Splats", default="3d", items=[
+        ("3d", "Ellipsoids", "3D Gaussians: the best pictures"),
+        ("2d", "Discs", "2D Gaussians: the best meshes, since discs lie on surfaces")])
     strategy: EnumProperty(name="Votes", default="majority", items=[
         ("majority", "Majority", "The object that most masks show at a point"),
         ("probability", "Probability", "Drawn by chance, in proportion to the votes"),

@@ -42,8 +42,8 @@ class Train(bpy.types.Operator):
                                    "extend the training, or use Train Anew")
             return {"CANCELLED"}
         arguments = ["train", str(state.capture), "--out", str(folder), "--minutes", f"{properties.minutes:g}",
-                     "--mode", properties.mode, "--sh-degree", str(properties.sh_degree), "--strategy",
-                     properties.strategy, "--max-size", str(properties.max_size)]
+                     "--mode", properties.mode, "--sh-degree", str(properties.sh_degree), "--primitive",
+                     properties.primitive, "--strategy", properties.strategy, "--max-size", str(properties.max_size)]
         if self.restart:
             arguments.append("--restart")
         job = locations.backend_job(f"Train {root.name}", "train", folder, *arguments)

@@ -33,6 +33,7 @@ from ..objects import merged, read_objects
 from ..protocol import InputError, Reconstruction, Reporter, read_json, write_atomic, write_json
 from ..stopping import StoppingReporter
 from .folder import Trained, open_trained
+from .kernels import have_kernels_ready
 from .lock import locked
 from .record import record_stage
 
@@ -57,6 +58,7 @@ def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Make the meshes that are asked for and are not there yet; each is written as soon as it is done."""
     trained = open_trained(options, reporter)
     folder = trained.folder
+    have_kernels_ready(reporter)
     with locked(folder.folder):
         targets = _targets(options, folder, trained.model)
         folder.meshes.mkdir(exist_ok=True)
@@ -151,10 +153,8 @@ def _make(target: Target, options: argparse.Namespace, trained: Trained, views: 
 
 
 def _in_world(surface: Surface, colors: np.ndarray, uvs: np.ndarray, texture: str, model: ObjectModel) -> Mesh:
-    return Mesh(
-        model.normalization.to_world(surface.vertices), surface.normals(), colors, surface.faces, uvs,
-        surface.invented, texture,
-    )  # fmt: skip
+    vertices, normals = model.normalization.to_world(surface.vertices), surface.normals().astype(np.float32)
+    return Mesh(vertices, normals, colors, surface.faces, uvs, surface.invented, texture)
 
 
 def _write_picture(path: Path, pixels: np.ndarray) -> None:

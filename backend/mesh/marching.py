@@ -41,7 +41,8 @@ def march(
             continue
         # scikit-image looks a cell's mask up at its last corner.
         vertices, faces, _, _ = marching_cubes(volume, 0.0, mask=cells > 0, allow_degenerate=True)
-        centre = np.floor(vertices[faces].mean(1)).astype(np.int64) + 1
+        # Rounded, a face of the last cells may lie in the cube's border.
+        centre = np.minimum(np.floor(vertices[faces].mean(1)).astype(np.int64), _CELLS - 1) + 1
         all_seen.append(cells[centre[:, 0], centre[:, 1], centre[:, 2]] == 2)
         all_vertices.append(vertices.astype(np.float64) + cube * _CELLS)
         all_faces.append(faces.astype(np.int64) + count)

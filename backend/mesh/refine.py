@@ -18,8 +18,8 @@ from scipy.sparse.linalg import cg
 from ..protocol import Reporter
 from ..raster.kernel import kernel
 from .photos import Photo, look, photo_of
-from .surface import Surface
-from .texture import neighbours, vertex_normals
+from .surface import Surface, vertex_normals
+from .texture import neighbours
 from .views import Views
 
 _REACHES = (1.5, 1.0)

@@ -17,22 +17,27 @@ class Surface:
     invented: np.ndarray
 
     def normals(self) -> np.ndarray:
-        """Unit normals of the vertices, (V, 3) float32: faces count by their angle there (Thuermer and Wuethrich 1998).
+        """Unit normals of the vertices, (V, 3) float64."""
+        return vertex_normals(self.vertices, self.faces)
 
-        A vertex of degenerate faces alone looks along z.
-        """
-        corners = self.vertices[self.faces]
-        ahead = np.roll(corners, -1, 1) - corners
-        ahead /= np.maximum(np.linalg.norm(ahead, axis=2, keepdims=True), 1e-300)
-        behind = -np.roll(ahead, 1, 1)
-        angles = np.arccos(np.clip((ahead * behind).sum(2), -1, 1))
-        across = np.cross(ahead[:, 0], behind[:, 0])
-        across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
-        weighted = angles[:, :, None] * across[:, None]
-        at, count = self.faces.ravel(), len(self.vertices)
-        sums = np.stack([np.bincount(at, weighted[:, :, i].ravel(), count) for i in range(3)], 1)
-        length = np.linalg.norm(sums, axis=1, keepdims=True)
-        return np.where(length > 1e-9, sums / np.maximum(length, 1e-9), [0.0, 0.0, 1.0]).astype(np.float32)
+
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(V, 3) float64 unit normals: faces count by their angle at the vertex (Thuermer and Wuethrich 1998).
+
+    (0, 0, 1) where only degenerate faces meet, or none.
+    """
+    corners = vertices[faces]
+    ahead = np.roll(corners, -1, 1) - corners
+    ahead /= np.maximum(np.linalg.norm(ahead, axis=2, keepdims=True), 1e-300)
+    behind = -np.roll(ahead, 1, 1)
+    angles = np.arccos(np.clip((ahead * behind).sum(2), -1, 1))
+    across = np.cross(ahead[:, 0], behind[:, 0])
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
+    weighted = angles[:, :, None] * across[:, None]
+    at, count = faces.ravel(), len(vertices)
+    sums = np.stack([np.bincount(at, weighted[:, :, i].ravel(), count) for i in range(3)], 1)
+    length = np.linalg.norm(sums, axis=1, keepdims=True)
+    return np.where(length > 1e-9, sums / np.maximum(length, 1e-9), [0.0, 0.0, 1.0])
 
 
 class NoSurface(Exception):

@@ -13,7 +13,7 @@ from ..raster.camera import Camera
 from ..raster.kernel import kernel
 from .atlas import Texels, fill, find_texels, interpolate
 from .photos import Photo, Samples, add_photo, blend, photo_of
-from .surface import Surface
+from .surface import Surface, vertex_normals
 from .views import Views
 
 SIZES = (1024, 2048, 4096)
@@ -100,18 +100,6 @@ def dress(
     base = _continued(photos, vertices, faces, vertex_colors)
     _complete(texture, state, base, faces, uvs, steps)
     return texture, np.rint(np.clip(vertex_colors, 0, 1) * 255).astype(np.uint8)
-
-
-def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(V, 3) float64 unit normals: the faces' mean, weighted by area; (0, 0, 1) where there is none."""
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    normal = np.cross(b - a, c - a)
-    total = np.zeros_like(vertices)
-    for axis in range(3):
-        for corner in range(3):
-            total[:, axis] += np.bincount(faces[:, corner], normal[:, axis], minlength=len(vertices))
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.where(length > 0, total / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
 
 
 def neighbours(vertices: np.ndarray, faces: np.ndarray) -> csr_matrix:

@@ -541,3 +541,16 @@ def test_torn_surfaces_are_found_out():
     turned[0] = turned[0][::-1]
     assert not is_watertight(turned)
     assert not is_watertight(np.zeros((0, 3), int))
+
+
+def test_a_surface_in_the_border_of_two_cubes_is_there_once():
+    # So near below sample 64 that float32 puts it there: the cubes of the marching end at it.
+    grid = np.stack(np.meshgrid([0, 1], [0, 1], [7, 8], indexing="ij"), -1).reshape(-1, 3)
+    blocks = Blocks(grid)
+    places = 8 * grid[:, None] + np.stack(np.unravel_index(np.arange(SAMPLES), (8, 8, 8)), 1)
+    values = (places[..., 2] - 64 + 1e-6).astype(np.float32)
+    vertices, faces, seen = march(blocks, values, np.ones(values.shape, bool), True)
+    assert seen.all() and np.abs(vertices[:, 2] - 64).max() < 1e-4
+    corners = vertices[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    assert area == pytest.approx(15 * 15)
