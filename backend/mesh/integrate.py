@@ -21,13 +21,15 @@ _MIN_SLOPE = 0.15
 class Sight:
     """One view as evidence about one object.
 
-    front (H, W) float32: how far one sees, along z, infinite where nothing is. In a rectangle (h, w) whose upper left
-    is (x, y): own, the object's depth where the object is what one sees, else 0; slope, how much nearer to the surface
-    a step along z leads there; weight of the pixel; beside, pixels to the object's outline.
+    front (H, W) float32: how far one sees, along z, infinite where nothing is; trust (H, W) that it deserves. In a
+    rectangle (h, w) whose upper left is (x, y): own, the object's depth where the object is what one sees, else 0;
+    slope, how much nearer to the surface a step along z leads there; weight of the pixel; beside, pixels to the
+    object's outline.
     """
 
     camera: Camera
     front: np.ndarray
+    trust: np.ndarray
     x: int
     y: int
     own: np.ndarray
@@ -45,9 +47,10 @@ def look(scene: SceneMap, view: ObjectView | None, margin: int, jump: float) -> 
     """What `view` and the scene around it say; `margin`: pixels around the object in which distances to its outline
     are known; jump: depths of neighbouring pixels that differ by more belong to different surfaces."""
     front = np.where(scene.depth > 0, scene.depth, np.float32(np.inf))
+    trust = np.where(scene.depth > 0, scene.trust, np.float32(1))
     if view is None:
         nothing = np.zeros((0, 0), np.float32)
-        return Sight(scene.camera, front, 0, 0, nothing, nothing, nothing, nothing)
+        return Sight(scene.camera, front, trust, 0, 0, nothing, nothing, nothing, nothing)
     height, width = front.shape
     x0, y0 = max(view.x - margin, 0), max(view.y - margin, 0)
     x1, y1 = min(view.x + view.alpha.shape[1] + margin, width), min(view.y + view.alpha.shape[0] + margin, height)
@@ -63,7 +66,8 @@ def look(scene: SceneMap, view: ObjectView | None, margin: int, jump: float) -> 
     slope = np.zeros_like(own)
     weight = np.zeros_like(own)
     _slopes(own, K[0, 0], K[1, 1], K[0, 2] - x0, K[1, 2] - y0, jump, slope, weight)
-    return Sight(scene.camera, front, x0, y0, own, slope, weight, beside)
+    weight[view.y - y0 :, view.x - x0 :][: view.alpha.shape[0], : view.alpha.shape[1]] *= view.trust
+    return Sight(scene.camera, front, trust, x0, y0, own, slope, weight, beside)
 
 
 def _beside(seen: np.ndarray, own: np.ndarray, front: np.ndarray, jump: float) -> np.ndarray:
@@ -128,15 +132,15 @@ def add(
     """
     viewmat, intrinsics = sight.camera.arrays()
     _add(
-        viewmat, intrinsics, float(sight.camera.near), sight.front, sight.x, sight.y, sight.own, sight.slope,
-        sight.weight, sight.beside, np.asarray(origin, np.float64), float(voxel), coords, float(reach), float(back),
-        total, weights,
+        viewmat, intrinsics, float(sight.camera.near), sight.front, sight.trust, sight.x, sight.y, sight.own,
+        sight.slope, sight.weight, sight.beside, np.asarray(origin, np.float64), float(voxel), coords, float(reach),
+        float(back), total, weights,
     )  # fmt: skip
 
 
 @kernel(parallel=True)
 def _add(
-    viewmat, intrinsics, near, front, x0, y0, own, slope, weight, beside, origin, voxel, coords, reach, back,
+    viewmat, intrinsics, near, front, trust, x0, y0, own, slope, weight, beside, origin, voxel, coords, reach, back,
     total, weights,
 ):  # fmt: skip
     fx, fy, cx, cy = intrinsics
@@ -210,5 +214,6 @@ def _add(
                     continue
                 # Where the object may go on behind what is seen here, no outline bounds the distance.
                 hides = inside and beside[rv, ru] < 0
-                total[b, n] += min(reach, ahead) if hides else min(min(reach, ahead), aside)
-                weights[b, n] += 1.0
+                gain = trust[iv, iu]
+                total[b, n] += gain * (min(reach, ahead) if hides else min(min(reach, ahead), aside))
+                weights[b, n] += gain

@@ -42,6 +42,12 @@ _ODD = 0.25
 """Difference from the photos' median, of 1, at which a photo's say has fallen to 1 / e: highlights, passers-by."""
 
 
+_HELD = 300e6
+"""Bytes of the photos' depths that are kept."""
+
+_NO_PLANES = np.zeros((0, 0, 0), np.float32)
+
+
 class Photo(NamedTuple):
     """A photo's view of a surface. planes (3, H, W) float32 at the common exposure; camera: of a rectangle of it, whose
     upper left is the pixel (x, y); depth (h, w) float32 of the surface there, 0 where it is not; clearance (h, w)
@@ -68,8 +74,36 @@ class Samples(NamedTuple):
         return cls(np.zeros((count, KEPT + 1), np.float32), np.zeros((count, KEPT, 3), np.uint8))
 
 
-def photo_of(views: Views, index: int, vertices: np.ndarray, faces: np.ndarray, classes: Sequence[int]) -> Photo | None:
-    """View `index` as evidence of the mesh's colours (scene units); None where the mesh is out of view."""
+class Photos:
+    """All photos of one surface: vertices (V, 3) float64 in scene units, faces (F, 3) int32, of the objects `classes`.
+
+    photos[i] is view i as evidence of the surface's colours, None where the surface is out of view. What was found out
+    is kept for the next time, as long as it fits.
+    """
+
+    def __init__(self, views: Views, vertices: np.ndarray, faces: np.ndarray, classes: Sequence[int]) -> None:
+        self.views, self.classes, self.indices = views, classes, views.indices
+        self.vertices = np.ascontiguousarray(vertices, np.float64)
+        self.faces = np.ascontiguousarray(faces, np.int32)
+        self._held: dict[int, Photo | None] = {}
+        self._room = float(_HELD)
+
+    def __getitem__(self, index: int) -> Photo | None:
+        if index not in self._held:
+            photo = _photo_of(self.views, index, self.vertices, self.faces, self.classes)
+            size = 0 if photo is None else photo.depth.nbytes + photo.clearance.nbytes
+            if size > self._room:
+                return photo
+            self._room -= size
+            # The planes are the scene's to keep.
+            self._held[index] = None if photo is None else photo._replace(planes=_NO_PLANES)
+        photo = self._held[index]
+        return None if photo is None else photo._replace(planes=self.views.scene.target(index)[0].numpy())
+
+
+def _photo_of(
+    views: Views, index: int, vertices: np.ndarray, faces: np.ndarray, classes: Sequence[int]
+) -> Photo | None:  # fmt: skip
     whole = views.scene.camera(index)
     box = _box(vertices, whole)
     if box is None:
@@ -173,12 +207,19 @@ def _measure_clearance(depth, allowed, step, clearance):
             clearance[row, column] = value
 
 
-def add_photo(photo: Photo, positions: np.ndarray, normals: np.ndarray, samples: Samples) -> None:
-    """Let `photo` take its rank among the best of each place: positions and unit normals (N, 3) float32."""
+def add_photo(
+    photo: Photo, positions: np.ndarray, normals: np.ndarray, corners: np.ndarray, weights: np.ndarray,
+    offsets: np.ndarray, samples: Samples,
+) -> None:  # fmt: skip
+    """Let `photo` take its rank among the best of each place: positions and unit normals (N, 3) float32.
+
+    Its colours are changed by offsets (V, 3) float32, given at vertices, of which each place lies between the three
+    corners (N, 3) int32 with weights (N, 3) float32.
+    """
     viewmat, intrinsics = photo.camera.arrays()
     _gather(
-        positions, normals, photo.planes, photo.depth, photo.clearance, viewmat, intrinsics, photo.camera.centre,
-        (photo.x, photo.y), photo.safe, samples.score, samples.color,
+        positions, normals, corners, weights, offsets, photo.planes, photo.depth, photo.clearance, viewmat, intrinsics,
+        photo.camera.centre, (photo.x, photo.y), photo.safe, samples.score, samples.color,
     )  # fmt: skip
 
 
@@ -234,7 +275,8 @@ def between(plane, u, v):
 
 @kernel(parallel=True)
 def _gather(
-    positions, normals, planes, depth, clearance, viewmat, intrinsics, eye, corner, safe, scores, colors
+    positions, normals, corners, weights, offsets, planes, depth, clearance, viewmat, intrinsics, eye, corner, safe,
+    scores, colors,
 ):  # fmt: skip
     block = 1024
     for b in prange((positions.shape[0] + block - 1) // block):
@@ -270,6 +312,9 @@ def _gather(
                     color[c] = (planes[c, row, column] * (1 - fu) + planes[c, row, column + 1] * fu) * (1 - fv) + (
                         planes[c, row + 1, column] * (1 - fu) + planes[c, row + 1, column + 1] * fu
                     ) * fv
+            for c in range(3):
+                for i in range(3):
+                    color[c] += weights[n, i] * offsets[corners[n, i], c]
             at = KEPT
             while at > 0 and scores[n, at - 1] < score:
                 scores[n, at] = scores[n, at - 1]

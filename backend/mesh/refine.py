@@ -17,9 +17,8 @@ from scipy.sparse.linalg import cg
 
 from ..protocol import Reporter
 from ..raster.kernel import kernel
-from .photos import Photo, look, photo_of
-from .surface import Surface, vertex_normals
-from .texture import neighbours
+from .photos import Photo, Photos, look
+from .surface import Surface, neighbours, vertex_normals
 from .views import Views
 
 _REACHES = (1.5, 1.0)
@@ -34,8 +33,7 @@ _OUTSIDE = 1.0
 """Clearance below which a pixel may show another thing."""
 
 _AT_ONCE = 50_000
-_HELD = 300e6
-"""Vertices whose patches are looked up together, and bytes of the photos' depths that are kept meanwhile."""
+"""Vertices whose patches are looked up together."""
 
 _NONE = 255
 _NOISE = (2.5 / 255) ** 2
@@ -60,8 +58,8 @@ def refine(surface: Surface, views: Views, classes: Sequence[int], reporter: Rep
 def _moved(
     surface: Surface, views: Views, classes: Sequence[int], reach: float, reporter: Reporter, step: int
 ) -> np.ndarray:
-    vertices = np.ascontiguousarray(surface.vertices, np.float64)
-    faces = np.ascontiguousarray(surface.faces, np.int32)
+    photos = Photos(views, surface.vertices, surface.faces, classes)
+    vertices, faces = photos.vertices, photos.faces
     near = neighbours(vertices, faces)
     mean = (diags(1 / np.maximum(np.asarray(near.sum(1)).ravel(), 1e-30)) @ near).tocsr()
     normals = vertex_normals(vertices, faces)
@@ -76,19 +74,12 @@ def _moved(
     rounds = 1 + len(blocks)
     total = rounds * len(views.indices) * len(_REACHES)
     done = rounds * len(views.indices) * step
-    held: dict[int, Photo | None] = {}
-    room = float(_HELD)
     for index in views.indices:
         reporter.progress(done, total)
         done += 1
-        photo = photo_of(views, index, vertices, faces, classes)
+        photo = photos[index]
         if photo is not None:
             _choose(vertices, normals, index, *_seen_by(photo), photo.safe, score, chosen, size)
-            # The planes are the scene's to keep.
-            photo = photo._replace(planes=np.zeros((0, 0, 0), np.float32))
-            room -= photo.depth.nbytes + photo.clearance.nbytes
-        if room > 0:
-            held[index] = photo
     known = size > 0
     pixel = np.where(known, size, np.median(size[known]) if known.any() else 0.0)
     away = np.linspace(-reach, reach, _PLACES)
@@ -100,12 +91,11 @@ def _moved(
             done += 1
             if not (chosen[block] == index).any():
                 continue
-            photo = held[index] if index in held else photo_of(views, index, vertices, faces, classes)
+            photo = photos[index]
             assert photo is not None
-            planes = views.scene.target(index)[0].numpy()
             _look_up(
-                vertices[block], normals[block], pixel[block], away, chosen[block], index, *_seen_by(photo), planes,
-                (photo.x, photo.y), patches,
+                vertices[block], normals[block], pixel[block], away, chosen[block], index, *_seen_by(photo),
+                photo.planes, (photo.x, photo.y), patches,
             )  # fmt: skip
         _disagreement(patches, cost[block])
     way = (_settled(cost, away, near) * pixel)[:, None] * normals

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix
 
 
 @dataclass
@@ -38,6 +39,15 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     sums = np.stack([np.bincount(at, weighted[:, :, i].ravel(), count) for i in range(3)], 1)
     length = np.linalg.norm(sums, axis=1, keepdims=True)
     return np.where(length > 1e-9, sums / np.maximum(length, 1e-9), [0.0, 0.0, 1.0])
+
+
+def neighbours(vertices: np.ndarray, faces: np.ndarray) -> csr_matrix:
+    """(V, V): how closely vertices are tied, 1 / length of the edge between them; 0 without one."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = np.concatenate([edges, edges[:, ::-1]])
+    length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
+    ties = 1 / np.maximum(length, 1e-3 * max(float(length.mean()), 1e-30))
+    return coo_matrix((ties, (edges[:, 0], edges[:, 1])), (len(vertices), len(vertices))).tocsr()
 
 
 class NoSurface(Exception):

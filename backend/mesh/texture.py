@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.sparse import coo_matrix, csr_matrix, diags
+from scipy.sparse import diags
 from scipy.sparse.linalg import cg
 
 from ..protocol import Reporter
 from ..raster.camera import Camera
 from ..raster.kernel import kernel
 from .atlas import Texels, fill, find_texels, interpolate
-from .photos import Photo, Samples, add_photo, blend, photo_of
-from .surface import Surface, vertex_normals
+from .levelling import level
+from .photos import Photo, Photos, Samples, add_photo, blend
+from .surface import Surface, neighbours, vertex_normals
 from .views import Views
 
 SIZES = (1024, 2048, 4096)
@@ -71,7 +72,8 @@ def dress(
     vertices have the splats' colours.
     """
     reporter = reporter or Reporter()
-    vertices, faces = _arrays(surface)
+    pictures = Photos(views, surface.vertices, surface.faces, classes)
+    vertices, faces = pictures.vertices, pictures.faces
     normals = vertex_normals(vertices, faces)
     texture = np.zeros((size, size, 3), np.uint8)
     state = np.zeros((size, size), np.uint8)
@@ -79,17 +81,21 @@ def dress(
     photos = _Mean(len(vertices))
     rows = max(1, _AT_ONCE // size)
     steps = [(first, min(rows, size - first)) for first in range(0, size, rows)]
+    passes = (1 + len(steps)) * len(views.indices)
+    as_it_is = np.zeros((len(vertices), 3), np.float32)
+    offsets = level(pictures, normals, lambda done: reporter.progress(done, passes))
     for step, (first, count) in enumerate(steps):
         texels = find_texels(uvs, size, first, count)
         positions = _on_faces(vertices, faces, texels)
         facing = _on_faces(normals, faces, texels)
         samples = Samples.none(len(texels.face))
+        corners = faces[texels.face]
         for done, index in enumerate(views.indices):
-            reporter.progress(step * len(views.indices) + done, len(steps) * len(views.indices))
-            photo = photo_of(views, index, vertices, faces, classes)
+            reporter.progress((step + 1) * len(views.indices) + done, passes)
+            photo = pictures[index]
             if photo is None:
                 continue
-            add_photo(photo, positions, facing, samples)
+            add_photo(photo, positions, facing, corners, texels.weights, offsets.get(index, as_it_is), samples)
             if step == 0:
                 _add_splats(splats, photo, vertices, normals, views, index, classes)
         color, seen = blend(samples)
@@ -100,15 +106,6 @@ def dress(
     base = _continued(photos, vertices, faces, vertex_colors)
     _complete(texture, state, base, faces, uvs, steps)
     return texture, np.rint(np.clip(vertex_colors, 0, 1) * 255).astype(np.uint8)
-
-
-def neighbours(vertices: np.ndarray, faces: np.ndarray) -> csr_matrix:
-    """(V, V): how closely vertices are tied, 1 / length of the edge between them; 0 without one."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    edges = np.concatenate([edges, edges[:, ::-1]])
-    length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
-    ties = 1 / np.maximum(length, 1e-3 * max(float(length.mean()), 1e-30))
-    return coo_matrix((ties, (edges[:, 0], edges[:, 1])), (len(vertices), len(vertices))).tocsr()
 
 
 class _Mean:

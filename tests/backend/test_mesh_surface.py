@@ -51,7 +51,7 @@ def sheet(x, class_index, half=0.5, step=0.05, colour=0.5):
     )
 
 
-def views_of(splats, cameras, explicit=True, mask=None, **options):
+def views_of(splats, cameras, explicit=True, mask=None, primitive="3d", **options):
     """`Views` of plain splats; the objects' IDs are ten times their classes."""
     ids = splats.ids.numpy()
 
@@ -59,7 +59,7 @@ def views_of(splats, cameras, explicit=True, mask=None, **options):
         assert explicit or eye is not None
         return splats if seen is None else Generated(*(part[torch.from_numpy(seen)] for part in splats))
 
-    model = SimpleNamespace(generate=generate, explicit=explicit, primitive="3d", anchors=SimpleNamespace(ids=ids))
+    model = SimpleNamespace(generate=generate, explicit=explicit, primitive=primitive, anchors=SimpleNamespace(ids=ids))
     model.object_ids = np.arange(3) * 10
     capture = SimpleNamespace(mask=lambda index, downscale: mask)
     scene = SimpleNamespace(camera=lambda index, downscale: cameras[index], capture=capture)
@@ -92,6 +92,33 @@ def test_an_object_is_drawn_unhidden_and_knows_how_much_of_it_is_hidden(explicit
     assert seen.depth[24, 32] == pytest.approx(3.0, abs=0.01)
     assert seen.depth[31, 39] == pytest.approx(4.0, abs=0.03)
     assert seen.depth[0, 0] == 0
+
+
+def test_a_depth_deserves_trust_where_the_light_comes_from_one_place():
+    veil, wall = sheet(1.0, 2, half=0.1), sheet(0.0, 2)
+    veil = veil._replace(opacities=veil.opacities * 0.3)
+    splats = Generated(*(torch.cat(parts) for parts in zip(veil, wall)))
+    camera = camera_at((4, 0, 0))
+    for primitive in ("2d", "3d"):
+        flat = {"quats": torch.tensor([[0.5, 0.5, 0.5, 0.5]]).repeat(len(splats.means), 1)} if primitive == "2d" else {}
+        if flat:
+            flat["scales"] = torch.full_like(splats.scales, 0.025)
+        found = views_of(splats._replace(**flat), [camera], primitive=primitive).object_view(0, [2])
+        y, x = 24 - found.y, 32 - found.x
+        assert found.trust[y, x] < 0.3, primitive
+        beside = found.trust[y, x - 6]
+        assert beside > 0.9 and found.depth[y, x - 6] == pytest.approx(4.0, abs=0.01)
+        assert found.trust[found.alpha < 0.5].max() == 0
+    # The median of discs is on one of two that share a surface, their mean is between them.
+    first, second = sheet(0.03, 2), sheet(0.0, 2)
+    pair = Generated(*(torch.cat(parts) for parts in zip(first, second)))
+    pair = pair._replace(
+        quats=torch.tensor([[0.5, 0.5, 0.5, 0.5]]).repeat(len(pair.means), 1),
+        scales=torch.full_like(pair.scales, 0.025), opacities=pair.opacities * 0.3,
+    )  # fmt: skip
+    found = views_of(pair, [camera], primitive="2d").object_view(0, [2])
+    depth = found.depth[24 - found.y, 32 - found.x]
+    assert 3.973 < depth < 3.997
 
 
 def test_what_a_mask_leaves_unlabelled_beside_an_object_is_not_the_object():
@@ -218,7 +245,7 @@ class Exact:
         hit = np.isfinite(nearest)
         ids = np.where(hit, depths.argmin(0), -1).astype(np.int32)
         one = hit.astype(np.float32)
-        return SceneMap(self.cameras[index], np.where(hit, nearest, 0).astype(np.float32), ids, one, one)
+        return SceneMap(self.cameras[index], np.where(hit, nearest, 0).astype(np.float32), one, ids, one, one)
 
     def object_view(self, index, classes):
         depth = self.depths(index)[list(classes)].min(0)
@@ -232,7 +259,7 @@ class Exact:
         depth = np.where(hit, depth, 0)[place].astype(np.float32)
         camera = crop(self.cameras[index], u.min(), v.min(), depth.shape[1], depth.shape[0])
         color = np.ones((*depth.shape, 3), np.float32)
-        return ObjectView(camera, int(u.min()), int(v.min()), depth, alpha, color, visible)
+        return ObjectView(camera, int(u.min()), int(v.min()), depth, alpha, alpha, color, visible)
 
 
 def around(count=10, distance=2.5, heights=(-0.9, 0.2, 1.2), **options):
