@@ -13,6 +13,9 @@ from ..raster.kernel import kernel
 from .blocks import SAMPLES, SIDE
 from .views import ALPHA_SEEN, ObjectView, SceneMap
 
+_DOUBT = 3.0
+"""Doubt about a pixel's depth, in pixels' sizes, at which it counts for half."""
+
 _MIN_SLOPE = 0.15
 """Cosine between ray and normal below which a surface counts as no more slanted."""
 
@@ -21,10 +24,10 @@ _MIN_SLOPE = 0.15
 class Sight:
     """One view as evidence about one object.
 
-    front (H, W) float32: how far one sees, along z, infinite where nothing is; trust (H, W) that it deserves. In a
-    rectangle (h, w) whose upper left is (x, y): own, the object's depth where the object is what one sees, else 0;
-    slope, how much nearer to the surface a step along z leads there; weight of the pixel; beside, pixels to the
-    object's outline.
+    front (H, W) float32: how far one sees, along z, infinite where nothing is; trust (H, W) that it deserves, 0..1. In
+    a rectangle (h, w) whose upper left is (x, y): own, the object's depth where the object is what one sees, else 0;
+    doubt, how far off that may be along z; slope, how much nearer to the surface a step along z leads there; weight of
+    the pixel; beside, pixels to the object's outline.
     """
 
     camera: Camera
@@ -33,6 +36,7 @@ class Sight:
     x: int
     y: int
     own: np.ndarray
+    doubt: np.ndarray
     slope: np.ndarray
     weight: np.ndarray
     beside: np.ndarray
@@ -47,16 +51,17 @@ def look(scene: SceneMap, view: ObjectView | None, margin: int, jump: float) -> 
     """What `view` and the scene around it say; `margin`: pixels around the object in which distances to its outline
     are known; jump: depths of neighbouring pixels that differ by more belong to different surfaces."""
     front = np.where(scene.depth > 0, scene.depth, np.float32(np.inf))
-    trust = np.where(scene.depth > 0, scene.trust, np.float32(1))
+    trust = _trust(scene.doubt, scene.depth, scene.camera)
     if view is None:
         nothing = np.zeros((0, 0), np.float32)
-        return Sight(scene.camera, front, trust, 0, 0, nothing, nothing, nothing, nothing)
-    height, width = front.shape
+        return Sight(scene.camera, front, trust, 0, 0, nothing, nothing, nothing, nothing, nothing)
+    height, width = view.alpha.shape
     x0, y0 = max(view.x - margin, 0), max(view.y - margin, 0)
-    x1, y1 = min(view.x + view.alpha.shape[1] + margin, width), min(view.y + view.alpha.shape[0] + margin, height)
+    x1, y1 = min(view.x + width + margin, front.shape[1]), min(view.y + height + margin, front.shape[0])
     own = np.zeros((y1 - y0, x1 - x0), np.float32)
-    inner = own[view.y - y0 :, view.x - x0 :]
-    inner[: view.alpha.shape[0], : view.alpha.shape[1]] = own_depth(view)
+    doubt = np.zeros_like(own)
+    inside = slice(view.y - y0, view.y - y0 + height), slice(view.x - x0, view.x - x0 + width)
+    own[inside], doubt[inside] = own_depth(view), view.doubt
     seen = own > 0
     if seen.any():
         beside = _beside(seen, own, front[y0:y1, x0:x1], jump)
@@ -66,8 +71,14 @@ def look(scene: SceneMap, view: ObjectView | None, margin: int, jump: float) -> 
     slope = np.zeros_like(own)
     weight = np.zeros_like(own)
     _slopes(own, K[0, 0], K[1, 1], K[0, 2] - x0, K[1, 2] - y0, jump, slope, weight)
-    weight[view.y - y0 :, view.x - x0 :][: view.alpha.shape[0], : view.alpha.shape[1]] *= view.trust
-    return Sight(scene.camera, front, trust, x0, y0, own, slope, weight, beside)
+    weight *= _trust(doubt, own, scene.camera)
+    return Sight(scene.camera, front, trust, x0, y0, own, doubt, slope, weight, beside)
+
+
+def _trust(doubt: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """How much a depth is believed, 0..1; 1 where there is none."""
+    pixels = doubt / np.where(depth > 0, depth, 1) * np.float32(camera.K[0, 0])
+    return (1 / (1 + (pixels / np.float32(_DOUBT)) ** 2)).astype(np.float32)
 
 
 def _beside(seen: np.ndarray, own: np.ndarray, front: np.ndarray, jump: float) -> np.ndarray:
@@ -133,15 +144,15 @@ def add(
     viewmat, intrinsics = sight.camera.arrays()
     _add(
         viewmat, intrinsics, float(sight.camera.near), sight.front, sight.trust, sight.x, sight.y, sight.own,
-        sight.slope, sight.weight, sight.beside, np.asarray(origin, np.float64), float(voxel), coords, float(reach),
-        float(back), total, weights,
+        sight.doubt, sight.slope, sight.weight, sight.beside, np.asarray(origin, np.float64), float(voxel), coords,
+        float(reach), float(back), total, weights,
     )  # fmt: skip
 
 
 @kernel(parallel=True)
 def _add(
-    viewmat, intrinsics, near, front, trust, x0, y0, own, slope, weight, beside, origin, voxel, coords, reach, back,
-    total, weights,
+    viewmat, intrinsics, near, front, trust, x0, y0, own, doubt, slope, weight, beside, origin, voxel, coords, reach,
+    back, total, weights,
 ):  # fmt: skip
     fx, fy, cx, cy = intrinsics
     height, width = front.shape
@@ -200,12 +211,16 @@ def _add(
                     if low > 0 and (high - low) * slope[rv, ru] < reach:
                         d = (d00 * (1 - tu) + d01 * tu) * (1 - tv) + (d10 * (1 - tu) + d11 * tu) * tv
                 distance = (d - z) * slope[rv, ru]
-                if distance <= -back:
+                # What may be off is that much thicker, and as much less sharp, or what one view sees too near another
+                # one that sees it too far would wipe out.
+                off = doubt[rv, ru] * slope[rv, ru]
+                if distance <= -back - off:
                     continue
-                distance = max(distance, aside) if aside > 0 else distance
                 gain = weight[rv, ru]
                 if distance < 0:
-                    gain *= 1 + distance / back
+                    gain *= 1 + distance / (back + off)
+                distance *= reach / (reach + off)
+                distance = max(distance, aside) if aside > 0 else distance
                 total[b, n] += gain * min(distance, reach)
                 weights[b, n] += gain
             else:

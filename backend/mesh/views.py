@@ -16,9 +16,6 @@ from ..training.scene import Scene
 ALPHA_SEEN = 0.5
 """From this alpha on a pixel has a depth."""
 
-_DOUBT = 3.0
-"""Pixels' sizes between a pixel's median and mean depth at which it counts for half."""
-
 _REACH = 3.4
 """Standard deviations to which a splat is drawn, at most: sqrt(2 ln 255), and a little."""
 _BORDER = 2.0
@@ -27,13 +24,13 @@ _BORDER = 2.0
 
 @dataclass(frozen=True)
 class SceneMap:
-    """The whole scene in one view: depth (H, W) float32 along z in scene units, 0 where nothing is; trust (H, W)
-    float32, 0..1, how far that may be believed; ids (H, W) int32, the class index of the most probable object, -1 where
+    """The whole scene in one view: depth (H, W) float32 along z in scene units, 0 where nothing is; doubt (H, W)
+    float32, how far off that may be, likewise; ids (H, W) int32, the class index of the most probable object, -1 where
     nothing is drawn; probability (H, W) float32 of that object; alpha (H, W) float32."""
 
     camera: Camera
     depth: np.ndarray
-    trust: np.ndarray
+    doubt: np.ndarray
     ids: np.ndarray
     probability: np.ndarray
     alpha: np.ndarray
@@ -44,17 +41,16 @@ class ObjectView:
     """An object's own splats in one view, drawn without the rest of the scene, in a rectangle around them.
 
     camera: the view's, cropped to the rectangle; x, y: the rectangle's upper left in the view, in pixels; depth (h, w)
-    float32 along z in scene units, 0 where alpha < 0.5; trust (h, w) float32, 0..1, how far that may be believed; alpha
-    (h, w) float32; color (h, w, 3) float32, not multiplied
-    by alpha, at the capture's common exposure; visible (h, w) float32: which share, 0..1, of the object's own light
-    reaches the camera in the whole scene.
+    float32 along z in scene units, 0 where alpha < 0.5; doubt (h, w) float32, how far off that may be, likewise; alpha
+    (h, w) float32; color (h, w, 3) float32, not multiplied by alpha, at the capture's common exposure; visible (h, w)
+    float32: which share, 0..1, of the object's own light reaches the camera in the whole scene.
     """
 
     camera: Camera
     x: int
     y: int
     depth: np.ndarray
-    trust: np.ndarray
+    doubt: np.ndarray
     alpha: np.ndarray
     color: np.ndarray
     visible: np.ndarray
@@ -111,7 +107,7 @@ class Views:
         drawn = self._draw(self._scene_splats(camera), camera)
         ids, probability = object_map(drawn)
         alpha = drawn.alpha.numpy()
-        found = SceneMap(camera, *self._depth(drawn, camera), ids, probability, alpha)
+        found = SceneMap(camera, *self._depth(drawn), ids, probability, alpha)
         if self._take(5 * alpha.nbytes):
             self._maps[index] = found
         return found
@@ -141,7 +137,7 @@ class Views:
         shown = self._shown(index)[y : y + height, x : x + width] * self._claimed(index)[y : y + height, x : x + width]
         visible = np.clip(shown / np.maximum(alpha, 1e-3), 0, 1).astype(np.float32)
         color = np.moveaxis(drawn.color.numpy(), 0, 2) / np.maximum(alpha, 1e-3)[..., None]
-        return ObjectView(camera, x, y, *self._depth(drawn, camera), alpha, np.ascontiguousarray(color), visible)
+        return ObjectView(camera, x, y, *self._depth(drawn), alpha, np.ascontiguousarray(color), visible)
 
     def _claimed(self, index: int) -> np.ndarray:
         """Where the photo's mask leaves room for the objects at hand, (H, W) bool.
@@ -175,8 +171,8 @@ class Views:
         with torch.no_grad():
             return rasterize(*splats[:6], camera, want_depth=True, want_median=True, primitive=self.model.primitive)
 
-    def _depth(self, drawn: Rendered, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Depth (h, w) of what was drawn, 0 where too little is, and the trust (h, w) that it deserves.
+    def _depth(self, drawn: Rendered) -> tuple[np.ndarray, np.ndarray]:
+        """Depth (h, w) of what was drawn, 0 where too little is, and how far off it may be (h, w), both along z.
 
         Where the light of a pixel comes from one surface, its median and its mean depth agree. The mean of discs, each
         met where the pixel's ray meets its plane, is the surface that they share; the median jumps from one to the
@@ -186,9 +182,8 @@ class Views:
         alpha, median = drawn.alpha.numpy(), drawn.median.numpy()
         mean = drawn.depth.numpy() / np.maximum(alpha, 1e-3)
         seen = (alpha >= ALPHA_SEEN) & (median > 0)
-        pixels = np.abs(mean - median) / np.where(seen, median, 1) * np.float32(camera.K[0, 0])
-        trust = np.where(seen, 1 / (1 + (pixels / np.float32(_DOUBT)) ** 2), np.float32(0))
-        return np.where(seen, mean if self.model.primitive == "2d" else median, np.float32(0)), trust
+        depth = mean if self.model.primitive == "2d" else median
+        return np.where(seen, depth, np.float32(0)), np.where(seen, np.abs(mean - median), np.float32(0))
 
     def _scene_splats(self, camera: Camera) -> Generated:
         if not self.model.explicit:
@@ -222,7 +217,7 @@ class Views:
 
 
 def _bytes(view: ObjectView) -> int:
-    return view.depth.nbytes + view.trust.nbytes + view.alpha.nbytes + view.color.nbytes + view.visible.nbytes
+    return view.depth.nbytes + view.doubt.nbytes + view.alpha.nbytes + view.color.nbytes + view.visible.nbytes
 
 
 def _rectangle(splats: Generated, camera: Camera) -> tuple[int, int, int, int] | None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.ndimage import zoom
 
 from backend.mesh.blocks import SAMPLES, Blocks
 from backend.mesh.extract import extract, is_watertight
@@ -17,6 +18,7 @@ from backend.mesh.marching import march, parts
 from backend.mesh.surface import NoSurface
 from backend.mesh.views import ObjectView, SceneMap, Views, crop
 from backend.mesh.winding import Winding
+from backend.mesh.zbuffer import draw_mesh
 from backend.model.generate import Generated
 from backend.protocol import Cancelled, Reporter
 from backend.raster import Camera, rasterize
@@ -94,7 +96,7 @@ def test_an_object_is_drawn_unhidden_and_knows_how_much_of_it_is_hidden(explicit
     assert seen.depth[0, 0] == 0
 
 
-def test_a_depth_deserves_trust_where_the_light_comes_from_one_place():
+def test_a_depth_is_sure_where_the_light_comes_from_one_place():
     veil, wall = sheet(1.0, 2, half=0.1), sheet(0.0, 2)
     veil = veil._replace(opacities=veil.opacities * 0.3)
     splats = Generated(*(torch.cat(parts) for parts in zip(veil, wall)))
@@ -105,10 +107,9 @@ def test_a_depth_deserves_trust_where_the_light_comes_from_one_place():
             flat["scales"] = torch.full_like(splats.scales, 0.025)
         found = views_of(splats._replace(**flat), [camera], primitive=primitive).object_view(0, [2])
         y, x = 24 - found.y, 32 - found.x
-        assert found.trust[y, x] < 0.3, primitive
-        beside = found.trust[y, x - 6]
-        assert beside > 0.9 and found.depth[y, x - 6] == pytest.approx(4.0, abs=0.01)
-        assert found.trust[found.alpha < 0.5].max() == 0
+        assert found.doubt[y, x] > 0.2, primitive
+        assert found.doubt[y, x - 6] < 0.02 and found.depth[y, x - 6] == pytest.approx(4.0, abs=0.01)
+        assert found.doubt[found.alpha < 0.5].max() == 0
     # The median of discs is on one of two that share a surface, their mean is between them.
     first, second = sheet(0.03, 2), sheet(0.0, 2)
     pair = Generated(*(torch.cat(parts) for parts in zip(first, second)))
@@ -245,7 +246,7 @@ class Exact:
         hit = np.isfinite(nearest)
         ids = np.where(hit, depths.argmin(0), -1).astype(np.int32)
         one = hit.astype(np.float32)
-        return SceneMap(self.cameras[index], np.where(hit, nearest, 0).astype(np.float32), one, ids, one, one)
+        return SceneMap(self.cameras[index], np.where(hit, nearest, 0).astype(np.float32), 0 * one, ids, one, one)
 
     def object_view(self, index, classes):
         depth = self.depths(index)[list(classes)].min(0)
@@ -259,7 +260,7 @@ class Exact:
         depth = np.where(hit, depth, 0)[place].astype(np.float32)
         camera = crop(self.cameras[index], u.min(), v.min(), depth.shape[1], depth.shape[0])
         color = np.ones((*depth.shape, 3), np.float32)
-        return ObjectView(camera, int(u.min()), int(v.min()), depth, alpha, alpha, color, visible)
+        return ObjectView(camera, int(u.min()), int(v.min()), depth, 0 * alpha, alpha, color, visible)
 
 
 def around(count=10, distance=2.5, heights=(-0.9, 0.2, 1.2), **options):
@@ -421,6 +422,44 @@ def test_a_poster_becomes_a_thin_flat_slab():
     inner = np.abs(front[:, 0]) < 0.4
     assert np.abs(front[inner & (np.abs(front[:, 2]) < 0.3), 1]).max() < 0.3 * field.voxel
     assert surface.vertices[:, 0].max() == pytest.approx(0.5, abs=2 * field.voxel)
+
+
+def test_views_that_know_how_far_off_they_may_be_do_not_pierce_a_sheet():
+    class Unsure(Exact):
+        """Off by up to `most`, each view elsewhere, and by how much is said or not."""
+
+        def __init__(self, *scene, most, said):
+            super().__init__(*scene)
+            self.most, self.said = most, said
+
+        def wrong(self, index):
+            rough = np.random.default_rng(index).uniform(-self.most, self.most, (12, 16))
+            return zoom(rough, 8, order=1).astype(np.float32)
+
+        def object_view(self, index, classes):
+            view = super().object_view(index, classes)
+            wrong = self.wrong(index)[view.y :, view.x :][: view.alpha.shape[0], : view.alpha.shape[1]]
+            depth = np.where(view.depth > 0, view.depth + wrong, 0).astype(np.float32)
+            return replace(view, depth=depth, doubt=np.abs(wrong) * self.said)
+
+        def scene_map(self, index):
+            scene = super().scene_map(index)
+            wrong = self.wrong(index)
+            depth = np.where(scene.depth > 0, scene.depth + wrong, 0).astype(np.float32)
+            return replace(scene, depth=depth, doubt=np.abs(wrong) * self.said)
+
+    poster = box((-0.5, -0.01, -0.4), (0.5, 0.0, 0.4))
+    cameras = [camera_at((x, 2.2, z), 128, 96, 120.0) for x in (-0.9, -0.3, 0.3, 0.9) for z in (-0.5, 0, 0.5)]
+    in_front = camera_at((0, 2.2, 0), 128, 96, 120.0)
+    seen = {}
+    for said in (False, True):
+        surface = extract(fuse(Unsure([poster], cameras, most=0.25, said=said), [0]))
+        assert_sound(surface)
+        depth, _, _ = draw_mesh(surface.vertices, surface.faces, in_front)
+        seen[said] = depth[48 - 17 : 48 + 17, 64 - 22 : 64 + 22]
+    assert (seen[False] == 0).mean() > 0.03 and (seen[True] > 0).all()
+    wrong = {said: np.abs(depth[depth > 0] - 2.2).mean() for said, depth in seen.items()}
+    assert wrong[True] < 0.04 and wrong[True] < wrong[False] / 2
 
 
 def test_a_thin_handle_and_a_second_part_stay():
