@@ -42,7 +42,7 @@ def simulated() -> bool:
 
 
 def on_gpu(tensor: torch.Tensor) -> bool:
-    """Whether work on this tensor goes the GPU's way: torch operations and CUDA kernels instead of numba's on arrays."""
+    """Whether work on this tensor goes the GPU's way: torch and CUDA kernels instead of numba's kernels on arrays."""
     return tensor.is_cuda or simulated()
 
 
@@ -97,7 +97,7 @@ def _lacking_driver() -> str | None:
 
 
 def sentence_for(error: str, toolkit: str | None) -> str:
-    """What torch says when CUDA does not start, as a sentence that helps; toolkit: the CUDA version torch is built for."""
+    """What torch says when CUDA does not start, as a sentence that helps; toolkit: the CUDA that torch is built for."""
     said = error.lower()
     if "driver on your system is too old" in said or "driver version is insufficient" in said:
         return (

@@ -10,7 +10,7 @@ from numba import njit, prange
 
 from ..raster.camera import Camera
 from ..raster.kernel import kernel
-from .views import Views, crop
+from .views import Views
 from .zbuffer import draw_mesh
 
 KEPT = 6
@@ -75,7 +75,7 @@ def photo_of(views: Views, index: int, vertices: np.ndarray, faces: np.ndarray, 
     if box is None:
         return None
     x, y, width, height = box
-    camera = crop(whole, x, y, width, height)
+    camera = whole.crop(x, y, width, height)
     depth, _, _ = draw_mesh(vertices, faces, camera)
     picture, labels = views.scene.target(index)
     allowed = _allowed(views, index, None if labels is None else labels.numpy(), classes, box)

@@ -15,7 +15,7 @@ from backend.mesh.extract import extract, is_watertight
 from backend.mesh.fusion import fuse
 from backend.mesh.marching import march, parts
 from backend.mesh.surface import NoSurface
-from backend.mesh.views import ObjectView, SceneMap, Views, crop
+from backend.mesh.views import ObjectView, SceneMap, Views
 from backend.mesh.winding import Winding
 from backend.model.generate import Generated
 from backend.protocol import Cancelled, Reporter
@@ -230,7 +230,7 @@ class Exact:
         visible = np.isin(self.scene_map(index).ids, classes)[place].astype(np.float32)
         alpha = hit[place].astype(np.float32)
         depth = np.where(hit, depth, 0)[place].astype(np.float32)
-        camera = crop(self.cameras[index], u.min(), v.min(), depth.shape[1], depth.shape[0])
+        camera = self.cameras[index].crop(u.min(), v.min(), depth.shape[1], depth.shape[0])
         color = np.ones((*depth.shape, 3), np.float32)
         return ObjectView(camera, int(u.min()), int(v.min()), depth, alpha, color, visible)
 
