@@ -54,7 +54,7 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             "max_size": training["votes"]["max_size"], "strategy": training["votes"]["strategy"],
             **training["settings"],
         },
-        "machine": machine_facts(),
+        "machine": {**machine_facts(model.device), "device": trained.trained_on},
         "left_out": _left_out(trained),
         "stages": memory.get("stages", []),
         "curve": progress.curve,
