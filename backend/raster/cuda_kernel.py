@@ -110,7 +110,8 @@ if simulated():
         """Wait for the other threads of the warp."""
         threading.current_thread().syncthreads()  # type: ignore[attr-defined]
 
-    def any_in_warp(condition: Any) -> bool:
+    @kernel()
+    def any_in_warp(condition):
         """Whether the condition may hold in a thread of the warp; if not, it holds in none."""
         return True
 

@@ -471,3 +471,10 @@ def project_splat_backward(
     g_means[n, 0] = view[0, 0] * g_px + view[1, 0] * g_py + view[2, 0] * g_pz + (sx - radial * dx) / length
     g_means[n, 1] = view[0, 1] * g_px + view[1, 1] * g_py + view[2, 1] * g_pz + (sy - radial * dy) / length
     g_means[n, 2] = view[0, 2] * g_px + view[1, 2] * g_py + view[2, 2] * g_pz + (sz - radial * dz) / length
+
+
+def gradient_columns(flat: bool, with_normals: bool) -> int:
+    """How many columns of a gradient row are in use."""
+    if not flat:
+        return G_DEPTH + 1
+    return G_NORMAL + 3 if with_normals else MSY + 1
