@@ -37,6 +37,11 @@ def as_float32(scene):
     return {k: v if k == "ids" else v.float() for k, v in scene.items()}
 
 
+def mapped(picture):
+    """The object map as NumPy arrays, whichever renderer drew."""
+    return tuple(torch.as_tensor(a).cpu().numpy() for a in object_map(picture))
+
+
 def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolerance=1e-5, primitive="3d"):
     """Picture and gradients of a random loss by both renderers; `primitive` "2d": with everything that discs have."""
     scene = as_float32(scene)
@@ -82,7 +87,7 @@ def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolera
             counted = norms[1] > 1e-3 * largest
             ratio = (norms[0] / norms[1])[counted].numpy()
             np.testing.assert_allclose(ratio, 1, rtol=100 * gradient_tolerance, err_msg=name)
-    ids, probability = object_map(got)
+    ids, probability = mapped(got)
     dense = want.probabilities.detach().numpy()
     np.testing.assert_allclose(probability, dense.max(-1), rtol=1e-4, atol=value_tolerance)
     picked = np.take_along_axis(dense, np.maximum(ids, 0)[..., None], -1)[..., 0]

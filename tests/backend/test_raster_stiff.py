@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from backend.raster import Camera, cpu, object_map, rasterize
+from backend.raster import Camera, cpu, rasterize
 from backend.raster.reference import rasterize_reference
 from backend.raster.settings import ALPHA_MIN, NEAR
-from tests.backend.test_raster import NAMES, as_float32, camera, compare, random_scene
+from tests.backend.test_raster import NAMES, as_float32, camera, compare, mapped, random_scene
 
 WIDTH, HEIGHT = 45, 33
 
@@ -65,7 +65,7 @@ def draw(scene, cam, labels=None, seed=0, primitive="3d"):
     sum((p * torch.tensor(rng.normal(size=tuple(p.shape)), dtype=p.dtype)).sum() for p in planes).backward()
     arrays = {f"plane {i}": p.detach().numpy() for i, p in enumerate(planes)}
     arrays |= {name: leaves[name].grad.numpy() for name in NAMES}
-    arrays["object"], arrays["probability"] = object_map(picture)
+    arrays["object"], arrays["probability"] = mapped(picture)
     return arrays
 
 
@@ -206,7 +206,7 @@ def test_nothing_visible(opacity, primitive):
     scene["opacities"] = torch.full_like(scene["opacities"], opacity)
     got, _ = compare(scene, camera(), primitive=primitive)
     assert not got.color.any() and not got.alpha.any() and not got.weight.any() and not got.depth.any()
-    ids, probability = object_map(got)
+    ids, probability = mapped(got)
     assert (ids == -1).all() and not probability.any()
 
 
@@ -214,7 +214,7 @@ def test_no_splats(primitive):
     scene = {k: v[:0] for k, v in random_scene(0).items()}
     got, _ = compare(scene, camera(), primitive=primitive)
     assert not got.alpha.any()
-    assert (object_map(got)[0] == -1).all()
+    assert (mapped(got)[0] == -1).all()
 
 
 # Depth
@@ -347,7 +347,7 @@ def test_object_map_equals_the_dense_computation(seed):
     scene = as_float32(random_scene(seed, count=300))
     values = np.unique(rng.integers(-(2**31), 2**31, 40)).astype(np.int32)
     scene["ids"] = torch.tensor(rng.choice(values, 300))
-    ids, probability = object_map(rasterize(**scene, camera=cam))
+    ids, probability = mapped(rasterize(**scene, camera=cam))
     dense = dense_probabilities(scene, cam, values)
     np.testing.assert_allclose(probability, dense.max(-1), rtol=1e-5, atol=1e-7)
     drawn = dense.max(-1) > 0
@@ -365,7 +365,7 @@ def test_object_map_gives_ties_to_the_smallest_id():
         right["means"] = left["means"].clone()
         # Behind, so that the one in front does not win: (1 - 0.2) * 0.25 = 0.2.
         right["opacities"][0] = 0.25
-        ids, probability = object_map(rasterize(**as_float32(join(left, right)), camera=cam))
+        ids, probability = mapped(rasterize(**as_float32(join(left, right)), camera=cam))
         dense = dense_probabilities(as_float32(join(left, right)), cam, [9, 70_000])
         expected = np.where(dense.max(-1) > 0, np.array([9, 70_000])[dense.argmax(-1)], -1)
         assert np.array_equal(ids, expected)
@@ -382,14 +382,14 @@ def test_ten_thousand_objects_and_large_ids():
     which = np.concatenate([np.arange(10_000), rng.integers(0, 10_000, count - 10_000)])
     scene["ids"] = torch.tensor(names[which])
     picture = rasterize(**scene, camera=cam)
-    ids, probability = object_map(picture)
+    ids, probability = mapped(picture)
     labels = torch.tensor(ids)
     again = rasterize(**scene, camera=cam, labels=labels)
     np.testing.assert_allclose(again.weight, probability, rtol=1e-5, atol=1e-6)
     assert np.isin(ids[ids >= 0], names).all()
     # Renaming the objects, in the same order, renames the map and changes nothing else.
     small = {**scene, "ids": torch.tensor(np.argsort(np.argsort(names)).astype(np.int32)[which])}
-    ids_small, probability_small = object_map(rasterize(**small, camera=cam))
+    ids_small, probability_small = mapped(rasterize(**small, camera=cam))
     assert np.array_equal(ids, np.where(ids_small >= 0, np.sort(names)[ids_small], -1))
     assert np.array_equal(probability, probability_small)
 
