@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import functools
 import importlib.util
-import os
 from typing import Any
 
 import numpy as np
 import torch
+from numba import config
 
 from .protocol import InputError
 
@@ -38,7 +38,7 @@ def pick(asked: str) -> torch.device:
 
 def simulated() -> bool:
     """Whether numba runs CUDA kernels in its simulator."""
-    return os.environ.get("NUMBA_ENABLE_CUDASIM") == "1"
+    return bool(config.ENABLE_CUDASIM)
 
 
 def on_gpu(tensor: torch.Tensor) -> bool:

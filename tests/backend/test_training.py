@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from backend.capture import load_capture
-from backend.labels import vote
 from backend.model.anchors import Anchors, Layout, cell_keys, median_spacing, seed_anchors
 from backend.model.checkpoint import CURRENT, PREVIOUS, load_checkpoint, save_checkpoint
 from backend.model.generate import generate
@@ -343,19 +341,6 @@ def test_a_full_disk_leaves_the_checkpoint_before(tmp_path, monkeypatch):
 
 
 # --- whole trainings -------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def tiny(write_capture, tmp_path):
-    """A capture, its points' objects, and a scene with an offset and scale of one's choice."""
-
-    def make(**options):
-        scene = write_capture(views=9, size=(64, 48), **options)
-        capture = load_capture(scene.folder, tmp_path / "cache")
-        ids = vote(capture).ids if capture.has_masks else np.zeros(len(capture.points.xyz), np.int64)
-        return capture, ids
-
-    return make
 
 
 SMALL = Settings(offsets=4, sh_degree=1)
