@@ -74,7 +74,7 @@ def _contest_kernel(flat: bool) -> Any:
 
     @cuda_kernel(launch_bounds=THREADS)
     def contest(splats, tilts, slots, names, bounds, starts, members, ends, columns, best_id, best_weight):
-        stage = cuda.shared.array((_STAGED, stride), np.float32)
+        stage = cuda.shared.array((_STAGED, stride), np.float32, alignment=16)
         staged_slots = cuda.shared.array(_STAGED, np.int32)
         sums = cuda.shared.array((SLOTS, THREADS), np.float32)
         height, width = best_id.shape
