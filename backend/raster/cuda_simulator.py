@@ -33,7 +33,7 @@ def run(function: Callable[..., Any], blocks: int, threads: int, arguments: tupl
 
 
 class _Shared:
-    """Shared memory of a block: each line of a kernel that asks for an array has one."""
+    """Shared memory of a block: each line of a kernel that asks for an array has one; what it holds is of no use."""
 
     def __init__(self) -> None:
         self._arrays: dict[int, np.ndarray] = {}
@@ -41,7 +41,8 @@ class _Shared:
     def array(self, shape: Any, dtype: Any, alignment: int | None = None) -> np.ndarray:
         line = sys._getframe(1).f_lineno
         if line not in self._arrays:
-            self._arrays[line] = np.empty(shape, dtype)
+            useless = np.nan if np.issubdtype(dtype, np.floating) else np.iinfo(dtype).max
+            self._arrays[line] = np.full(shape, useless, dtype)
         return self._arrays[line]
 
 

@@ -31,14 +31,14 @@ def draw(model: ObjectModel, camera: Camera, want_ids: bool = True, want_depth: 
     with torch.no_grad():
         drawn = rasterize(*g[:6], camera, want_depth=want_depth, primitive=model.primitive)
         image = drawn.color + (1 - drawn.alpha) * model.background.detach()[:, None, None]
-        image = image * torch.tensor(camera.gain)[:, None, None]
-        pixels = image.clamp(0, 1).permute(1, 2, 0).contiguous().numpy()
-    alpha = drawn.alpha.numpy()
+        image = image * torch.tensor(camera.gain, device=image.device)[:, None, None]
+        pixels = image.clamp(0, 1).permute(1, 2, 0).contiguous().cpu().numpy()
+    alpha = drawn.alpha.cpu().numpy()
     depth = None
     if drawn.depth is not None:
-        depth = drawn.depth.numpy() / np.maximum(alpha, 1e-6) / np.float32(model.normalization.scale)
+        depth = drawn.depth.cpu().numpy() / np.maximum(alpha, 1e-6) / np.float32(model.normalization.scale)
     ids = probability = None
     if want_ids:
-        classes, probability = object_map(drawn)
+        classes, probability = (torch.as_tensor(a).cpu().numpy() for a in object_map(drawn))
         ids = np.where(classes >= 0, model.object_ids[np.maximum(classes, 0)], 0)
     return Picture(pixels, ids, probability, alpha, depth)
