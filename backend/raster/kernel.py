@@ -37,7 +37,11 @@ def kernel(
 
     def decorate(function: Callable[..., Any]) -> Any:
         dispatcher = njit(
-            parallel=parallel, cache=True, error_model="numpy", fastmath=fastmath, inline="always" if inline else "never"
+            parallel=parallel,
+            cache=True,
+            error_model="numpy",
+            fastmath=fastmath,
+            inline="always" if inline else "never",
         )(function)
         digest = digest_up_to(function.__module__.split(".")[-2])
         # Without a cache folder, or with another numba inside, numba's own rule stays.
