@@ -141,4 +141,8 @@ def rasterize(
 def object_map(rendered: Rendered) -> tuple[Any, Any]:
     """The most probable ID (H, W) int32 (-1 where nothing is drawn) and its probability (H, W) float32: NumPy arrays
     from the CPU renderer, tensors on the device from the CUDA renderer."""
-    return _renderer(rendered.color.device).object_map(rendered.frame)
+    if isinstance(rendered.frame, cpu.Frame):
+        return cpu.object_map(rendered.frame)
+    from . import cuda
+
+    return cuda.object_map(rendered.frame)

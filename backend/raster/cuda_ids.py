@@ -17,7 +17,17 @@ from numba import cuda
 
 from .cuda_bin import TILE, Lists
 from .cuda_kernel import cuda_kernel, device_function, exp2, launch
-from .cuda_tiles import THREADS, disc_exponent, pixel_of, splat_exponent, stage_disc, stage_splat, staged_columns
+from .cuda_tiles import (
+    FIRST,
+    NEXT,
+    THREADS,
+    disc_exponent,
+    pixel_of,
+    splat_exponent,
+    stage_disc,
+    stage_splat,
+    staged_columns,
+)
 from .settings import ALPHA_MAX, ALPHA_MIN, STOP
 
 SLOTS = 32
@@ -37,9 +47,8 @@ def _contest_kernel(flat: bool) -> Any:
     @device_function
     def weigh(stage, slots, count, x, y, lowest, sums, thread, t):
         """Add the weights in a pixel of staged splats to those of their slots; returns what light is left."""
-        for k in range(count):
-            if t < _STOP:
-                break
+        k = FIRST
+        while k < count and t >= _STOP:
             if flat:
                 exponent, _, _ = disc_exponent(stage, k, x, y)
             else:
@@ -50,6 +59,7 @@ def _contest_kernel(flat: bool) -> Any:
                 if slot >= 0 and slot < SLOTS:
                     sums[slot, thread] += alpha * t
                 t *= _ONE - alpha
+            k += NEXT
         return t
 
     @device_function
@@ -64,16 +74,16 @@ def _contest_kernel(flat: bool) -> Any:
 
     @cuda_kernel(launch_bounds=THREADS)
     def contest(splats, tilts, slots, names, bounds, starts, members, ends, columns, best_id, best_weight):
-        stage = cuda.shared.array((_STAGED, stride), np.float32)
+        stage = cuda.shared.array((_STAGED, stride), np.float32, alignment=16)
         staged_slots = cuda.shared.array(_STAGED, np.int32)
         sums = cuda.shared.array((SLOTS, THREADS), np.float32)
         height, width = best_id.shape
         thread = cuda.threadIdx.x
         tile = cuda.blockIdx.x
-        tile_x = tile % columns * TILE
-        tile_y = tile // columns * TILE
+        tile_x = np.int32(tile % columns * TILE)
+        tile_y = np.int32(tile // columns * TILE)
         x, y = pixel_of(thread)
-        px, py = tile_x + x, tile_y + y
+        px, py = np.int32(tile_x + x), np.int32(tile_y + y)
         inside = px < width and py < height
         first = starts[tile]
         last = first + ends[tile]
@@ -98,9 +108,10 @@ def _contest_kernel(flat: bool) -> Any:
                         stage_splat(splats, n, tile_x, height, stage, thread)
                 cuda.syncthreads()
                 t = weigh(
-                    stage, staged_slots, here, np.float32(x), np.float32(py) + _HALF, np.int32(lowest), sums, thread, t
+                    stage, staged_slots, np.uint64(here), np.float32(x), np.float32(py) + _HALF, np.int32(lowest), sums,
+                    np.uint64(thread), t,
                 )  # fmt: skip
-            most, place = largest(sums, count, thread, (most, -1))
+            most, place = largest(sums, count, np.uint64(thread), (most, -1))
             if place >= 0:
                 name = names[lowest + place]
         if inside:

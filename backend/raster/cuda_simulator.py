@@ -7,6 +7,7 @@ so that a kernel that lacks a barrier draws something wrong.
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -22,11 +23,27 @@ def run(function: Callable[..., Any], blocks: int, threads: int, arguments: tupl
     """One block after the other; arguments are NumPy arrays, tuples of them, and scalars."""
     meet = bool(_BARRIERS & set(function.__code__.co_names))
     for block in range(blocks):
-        with swapped_cuda_module(function, FakeCUDAModule((blocks, 1, 1), (threads, 1, 1), 0)):
+        module = FakeCUDAModule((blocks, 1, 1), (threads, 1, 1), 0)
+        module._shared = _Shared()
+        with swapped_cuda_module(function, module):
             if meet:
                 _Block(lambda: function(*arguments), block, threads).run()
             else:
                 _Block(lambda: _one_after_the_other(function, threads, arguments), block, 1).run()
+
+
+class _Shared:
+    """Shared memory of a block: each line of a kernel that asks for an array has one; what it holds is of no use."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[int, np.ndarray] = {}
+
+    def array(self, shape: Any, dtype: Any, alignment: int | None = None) -> np.ndarray:
+        line = sys._getframe(1).f_lineno
+        if line not in self._arrays:
+            useless = np.nan if np.issubdtype(dtype, np.floating) else np.iinfo(dtype).max
+            self._arrays[line] = np.full(shape, useless, dtype)
+        return self._arrays[line]
 
 
 class _Thread(threading.Thread):

@@ -74,6 +74,10 @@ _ZERO = np.float32(0.0)
 _HALF = np.float32(0.5)
 _ONE = np.float32(1.0)
 
+# Loops over shared memory count without a sign: an index that might be negative costs a test each time.
+FIRST = np.uint64(0)
+NEXT = np.uint64(1)
+
 
 class Wanted(NamedTuple):
     """What a picture holds beside its colour; `flat`: it is of discs."""
@@ -87,7 +91,8 @@ class Wanted(NamedTuple):
 
 
 def staged_columns(flat: bool) -> int:
-    return PER_DEPTH + 1 if flat else S_DEPTH + 1
+    """Length of a staged row, a multiple of 16 bytes, so that four neighbours are read at once."""
+    return 20 if flat else 12
 
 
 @device_function
@@ -156,7 +161,7 @@ def pixel_of(thread):
     """Column and row in the tile of a thread's pixel."""
     lane = thread % WARP
     warp = thread // WARP
-    return lane % 8 + warp % 2 * 8, lane // 8 + warp // 2 * 4
+    return np.int32(lane % 8 + warp % 2 * 8), np.int32(lane // 8 + warp // 2 * 4)
 
 
 @functools.cache
@@ -173,16 +178,15 @@ def blend_kernel(wanted: Wanted) -> Any:
         """Blend the staged splats into a pixel. The state: T, red, green, blue, weight, depth, median, three of the
         normal, two moments and their origin, and how many of the staged splats were needed."""
         t, red, green, blue, weight, depth, median, nx, ny, nz, m1, m2, origin, _ = state
-        needed = 0
-        for k in range(count):
-            if t < _STOP:
-                break
+        needed = FIRST
+        k = FIRST
+        while k < count and t >= _STOP:
             if flat:
                 exponent, q, per_q = disc_exponent(stage, k, x, y)
             else:
                 exponent = splat_exponent(stage, k, x, y)
             if exponent >= _LOG2_CUT:
-                needed = k + 1
+                needed = k + NEXT
                 alpha = min(exp2(exponent), _ALPHA_MAX)
                 w = alpha * t
                 after = t * (_ONE - alpha)
@@ -214,6 +218,7 @@ def blend_kernel(wanted: Wanted) -> Any:
                     m1 += w * inverse
                     m2 += w * inverse * inverse
                 t = after
+            k += NEXT
         return t, red, green, blue, weight, depth, median, nx, ny, nz, m1, m2, origin, needed
 
     @cuda_kernel(launch_bounds=THREADS)
@@ -221,16 +226,16 @@ def blend_kernel(wanted: Wanted) -> Any:
         splats, tilts, ids, labels, starts, members, columns, color, transmittance, weight, depth, median, normals,
         moments, ends,
     ):  # fmt: skip
-        stage = cuda.shared.array((STAGED, stride), np.float32)
+        stage = cuda.shared.array((STAGED, stride), np.float32, alignment=16)
         owners = cuda.shared.array(STAGED, np.int32)
         furthest = cuda.shared.array(1, np.int32)
         height, width = transmittance.shape
         thread = cuda.threadIdx.x
         tile = cuda.blockIdx.x
-        tile_x = tile % columns * TILE
-        tile_y = tile // columns * TILE
+        tile_x = np.int32(tile % columns * TILE)
+        tile_y = np.int32(tile // columns * TILE)
         x, y = pixel_of(thread)
-        px, py = tile_x + x, tile_y + y
+        px, py = np.int32(tile_x + x), np.int32(tile_y + y)
         inside = px < width and py < height
         label = np.int32(-1)
         if want_labels and inside:
@@ -241,11 +246,11 @@ def blend_kernel(wanted: Wanted) -> Any:
         t = zero
         if inside:
             t = _ONE
-        state = (t, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, 0)
-        needed = 0
+        state = (t, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, FIRST)
+        needed = np.int32(0)
         first, last = starts[tile], starts[tile + 1]
         for base in range(first, last, STAGED):
-            if not cuda.syncthreads_or(state[0] >= _STOP):
+            if not cuda.syncthreads_or(np.int32(state[0] >= _STOP)):
                 break
             if base + thread < last:
                 n = members[base + thread]
@@ -255,9 +260,10 @@ def blend_kernel(wanted: Wanted) -> Any:
                 else:
                     stage_splat(splats, n, tile_x, height, stage, thread)
             cuda.syncthreads()
-            state = draw(stage, owners, min(STAGED, last - base), np.float32(x), np.float32(py) + _HALF, label, state)
-            if state[13] > 0:
-                needed = base - first + state[13]
+            count = np.uint64(min(STAGED, last - base))
+            state = draw(stage, owners, count, np.float32(x), np.float32(py) + _HALF, label, state)
+            if state[13] > FIRST:
+                needed = np.int32(base - first + np.int64(state[13]))
         cuda.syncthreads()
         cuda.atomic.max(furthest, 0, needed)
         cuda.syncthreads()
@@ -310,8 +316,9 @@ def blend_backward_kernel(wanted: Wanted) -> Any:
         splats there is any in this warp. state: T, and what is still to come of sum w dL/dw."""
         t, remaining = state
         g_red, g_green, g_blue = pixels[0, thread], pixels[1, thread], pixels[2, thread]
-        for s in range(count):
-            k = base + s
+        s = FIRST
+        k = base
+        while s < count:
             if flat:
                 exponent, q, per_q = disc_exponent(stage, k, x, y)
             else:
@@ -320,8 +327,6 @@ def blend_backward_kernel(wanted: Wanted) -> Any:
             hit = any_in_warp(drawn)
             if thread % WARP == 0:
                 hits[s, thread // WARP] = hit
-            if not hit:
-                continue
             w = _ZERO
             slope = _ZERO
             if drawn:
@@ -356,24 +361,30 @@ def blend_backward_kernel(wanted: Wanted) -> Any:
                 if raw <= _ALPHA_MAX:
                     slope = alpha * (t * dot - remaining * reciprocal(clear))
                 t *= clear
-            pairs[s, thread] = w
-            pairs[s, THREADS + thread] = slope
-            if flat:
-                pairs[s, 2 * THREADS + thread] = per_q
+            if hit:
+                pairs[s, thread] = w
+                pairs[s, THREADS + thread] = slope
+                if flat:
+                    pairs[s, 2 * THREADS + thread] = per_q
+            s += NEXT
+            k += NEXT
         return t, remaining
 
     @device_function
-    def add_up(stage, k, s, lane, tile_y, pixels, pairs, hits):
+    def add_up(stage, k, s, lane, tile_y, warps, pixels, pairs, hits):
         """As a lane of splat k's warp: its gradient row over the pixels that this lane goes through."""
         zero = _ZERO
         m0, my, myy, mx, mxy, mxx = zero, zero, zero, zero, zero, zero
         red, green, blue, depth = zero, zero, zero, zero
         mq, mqx, mqy, msx, msy = zero, zero, zero, zero, zero
         nx, ny, nz = zero, zero, zero
-        for warp in range(WARPS):
+        warp = FIRST
+        thread = lane
+        while warp < warps:
             if not hits[s, warp]:
+                warp += NEXT
+                thread += np.uint64(WARP)
                 continue
-            thread = warp * WARP + lane
             column, row = pixel_of(thread)
             x, y = np.float32(column), np.float32(tile_y + row) + _HALF
             d, dy = offsets(stage, k, x, y)
@@ -429,6 +440,8 @@ def blend_backward_kernel(wanted: Wanted) -> Any:
             mx += along
             mxy += along * dy
             mxx += along * d
+            warp += NEXT
+            thread += np.uint64(WARP)
         m0 *= _LN2
         my *= _LN2
         myy *= _LN2
@@ -477,19 +490,21 @@ def blend_backward_kernel(wanted: Wanted) -> Any:
         splats, tilts, ids, labels, starts, members, places, ends, columns, color, transmittance, weight, depth,
         normals, moments, g_color, g_alpha, g_weight, g_depth, g_normals, g_moments, rows,
     ):  # fmt: skip
-        stage = cuda.shared.array((STAGED_BACKWARD, stride), np.float32)
+        stage = cuda.shared.array((STAGED_BACKWARD, stride), np.float32, alignment=16)
         owners = cuda.shared.array(STAGED_BACKWARD, np.int32)
         pixels = cuda.shared.array((kept, THREADS), np.float32)
         pairs = cuda.shared.array((WARPS, room), np.float32)
         hits = cuda.shared.array((WARPS, WARPS), np.int8)
         height, width = transmittance.shape
         thread = cuda.threadIdx.x
-        warp, lane = thread // WARP, thread % WARP
+        warp, lane = np.uint32(thread) // np.uint32(WARP), np.uint32(thread) % np.uint32(WARP)
+        # Not known when this is compiled: the loop over them, unrolled, would need too many registers.
+        warps = np.uint64(cuda.blockDim.x // WARP)
         tile = cuda.blockIdx.x
-        tile_x = tile % columns * TILE
-        tile_y = tile // columns * TILE
+        tile_x = np.int32(tile % columns * TILE)
+        tile_y = np.int32(tile // columns * TILE)
         x, y = pixel_of(thread)
-        px, py = tile_x + x, tile_y + y
+        px, py = np.int32(tile_x + x), np.int32(tile_y + y)
         label = np.int32(-1)
         t = _ZERO
         remaining = _ZERO
@@ -540,12 +555,15 @@ def blend_backward_kernel(wanted: Wanted) -> Any:
             cuda.syncthreads()
             for k in range(0, here, WARPS):
                 state = weigh(
-                    stage, owners, k, min(WARPS, here - k), thread, np.float32(x), np.float32(py) + _HALF, label,
+                    stage, owners, np.uint64(k), np.uint64(min(WARPS, here - k)), np.uint64(thread), np.float32(x),
+                    np.float32(py) + _HALF, label,
                     a_gradient, w_gradient, pixels, pairs, hits, state,
                 )  # fmt: skip
                 cuda.syncthreads()
                 if k + warp < here:
-                    sums = add_up(stage, k + warp, warp, lane, tile_y, pixels, pairs, hits)
+                    sums = add_up(
+                        stage, np.uint64(k + warp), np.uint64(warp), np.uint64(lane), tile_y, warps, pixels, pairs, hits
+                    )
                 sync_warp()
                 if k + warp < here:
                     share_sums(pairs, warp, lane, sums)

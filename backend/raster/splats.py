@@ -202,7 +202,7 @@ def view_of(camera: Camera, flat: bool) -> np.ndarray:
     return np.concatenate([viewmat[:3], [intrinsics, limits, [*camera.centre, camera.near]]])
 
 
-@kernel()
+@kernel(inline=True)
 def project_splat(
     n, means, quats, scales, opacities, sh, view, width, height, splats, tilts, outlines, R, T, V0, V1, basis
 ):  # fmt: skip
@@ -312,7 +312,7 @@ def project_splat(
     splats[n, HALF_H] = half_h
 
 
-@kernel()
+@kernel(inline=True)
 def no_gradient(n, g_means, g_quats, g_scales, g_opacities, g_sh, g_screen):
     """Zero the gradients of splat n."""
     for i in range(3):
@@ -327,7 +327,7 @@ def no_gradient(n, g_means, g_quats, g_scales, g_opacities, g_sh, g_screen):
     g_screen[n, 1] = 0.0
 
 
-@kernel()
+@kernel(inline=True)
 def project_splat_backward(
     n, g, with_normals, means, quats, scales, opacities, sh, view, splats, tilts,
     g_means, g_quats, g_scales, g_opacities, g_sh, g_screen, R, T, V0, V1, basis, gR, gT, weights, g_color,

@@ -18,6 +18,13 @@ _ZERO = np.float32(0.0)
 
 
 @kernel()
+def _floor(x):
+    """Of a float32, as an integer; on a GPU, math.floor would take the way of float64."""
+    whole = np.int64(x)
+    return whole - 1 if np.float32(whole) > x else whole
+
+
+@kernel()
 def row_ends(splats, n, row, columns, height, tile_w, tile_h):
     """First and last + 1 tile column that splat n's ellipse reaches inside tile row `row`; tiles are powers of two."""
     per_tile_w = _ONE / np.float32(tile_w)
@@ -26,10 +33,10 @@ def row_ends(splats, n, row, columns, height, tile_w, tile_h):
     slope = splats[n, SLOPE]
     u = splats[n, U] + slope * (v - anchor)
     half_w, half_h = splats[n, HALF_W], splats[n, HALF_H]
-    box_first = max(math.floor((u - half_w - _HALF) * per_tile_w), 0)
-    box_last = min(math.floor((u + half_w + _HALF) * per_tile_w) + 1, columns)
+    box_first = max(_floor((u - half_w - _HALF) * per_tile_w), 0)
+    box_last = min(_floor((u + half_w + _HALF) * per_tile_w) + 1, columns)
     if box_last - box_first < 2:
-        return int(box_first), int(box_last)
+        return box_first, box_last
     top = max(np.float32(row * tile_h), v - half_h)
     bottom = min(np.float32((row + 1) * tile_h), v + half_h)
     # The rightmost point of the ellipse lies at y = v + peak, the leftmost at v - peak; off them the ends only shrink.
@@ -41,18 +48,18 @@ def row_ends(splats, n, row, columns, height, tile_w, tile_h):
     y = min(max(v - peak, top), bottom)
     half = math.sqrt(max(reach - splats[n, C] * (y - v) * (y - v), _ZERO) / splats[n, A])
     left = splats[n, U] + slope * (y - anchor) - half
-    first = max(math.floor((left - _HALF) * per_tile_w), box_first)
-    last = min(math.floor((right + _HALF) * per_tile_w) + 1, box_last)
-    return int(first), int(last)
+    first = max(_floor((left - _HALF) * per_tile_w), box_first)
+    last = min(_floor((right + _HALF) * per_tile_w) + 1, box_last)
+    return first, last
 
 
 @kernel()
 def tile_rows(splats, n, lines, tile_h):
     """First and last + 1 tile row that splat n's box reaches."""
     per_tile_h = _ONE / np.float32(tile_h)
-    first = max(math.floor((splats[n, V] - splats[n, HALF_H]) * per_tile_h), 0)
-    last = min(math.floor((splats[n, V] + splats[n, HALF_H]) * per_tile_h) + 1, lines)
-    return int(first), int(last)
+    first = max(_floor((splats[n, V] - splats[n, HALF_H]) * per_tile_h), 0)
+    last = min(_floor((splats[n, V] + splats[n, HALF_H]) * per_tile_h) + 1, lines)
+    return first, last
 
 
 @kernel()
