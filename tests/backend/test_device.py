@@ -5,6 +5,11 @@ Without a GPU the torch versions run on tensors in the processor's memory, with 
 
 import dataclasses
 import math
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,6 +32,7 @@ from backend.training.loop import Budget, Trainer, strips
 from backend.training.losses import image_loss, normal_loss, volume_loss
 from backend.training.settings import Settings
 
+ROOT = Path(__file__).resolve().parents[2]
 SMALL = Settings(offsets=4, sh_degree=1)
 FLAT = dataclasses.replace(SMALL, primitive="2d", distortion_weight=0.1)
 
@@ -388,6 +394,34 @@ def test_a_picture_whose_loss_is_not_finite_changes_nothing(tiny, as_on_gpu, mon
     monkeypatch.undo()
 
 
+LOSSES = """
+import sys
+from backend.capture import load_capture
+from backend.labels import vote
+from backend.raster.draw import draw
+from backend.training.loop import Trainer
+from backend.training.settings import Settings
+capture = load_capture(sys.argv[1], sys.argv[2])
+trainer = Trainer.start(capture, vote(capture).ids, Settings(offsets=1, primitive=sys.argv[3], voxel=0.3))
+print(*(float(trainer.step(share)) for share in (0.3, 0.8)))
+print(draw(trainer.model, trainer.scene.camera(0)).image.mean())
+"""
+
+
+@pytest.mark.parametrize("primitive", ["3d", "2d"])
+def test_the_whole_loop_runs_in_numbas_simulator(write_capture, tmp_path, primitive):
+    """With the CUDA kernels: two steps and a picture are those of the processor."""
+    folder = write_capture(views=3, size=(24, 18), points=20).folder
+    found = []
+    for simulate in ("0", "1"):
+        command = [sys.executable, "-c", LOSSES, str(folder), str(tmp_path / "cache"), primitive]
+        environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": simulate}
+        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=240)
+        assert done.returncode == 0, done.stderr
+        found.append([float(word) for word in done.stdout.split()])
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-4)
+
+
 # --- out of memory ---------------------------------------------------------------------------------------------------
 
 
@@ -538,3 +572,22 @@ def test_too_little_memory_is_said_with_figures():
     assert device.short_of_memory("GPU", 3e9, 8e9) is None
     assert "0.3 GB of memory free" in device.short_of_memory("GPU", 0.3e9, 8e9)
     assert "has 0.5 GB of memory," in device.short_of_memory("GPU", 0.4e9, 0.5e9)
+
+
+@without_cuda
+@pytest.mark.skipif(shutil.which("make") is None or shutil.which("nvidia-smi") is not None, reason="no make, or a GPU")
+def test_make_gpu_without_a_gpu_says_so_and_passes_nothing():
+    done = subprocess.run(
+        ["make", "gpu", f"PYTHON={sys.executable}"], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0
+    assert done.stdout.strip().splitlines() == [
+        "There is no NVIDIA GPU here, so nothing was run, and nothing counts as passed."
+    ]
+
+
+def test_training_needs_nothing_that_reads_captures():
+    """So that a machine which has torch and numba alone can measure it."""
+    absent = ("pycolmap", "xatlas", "manifold3d", "fast_simplification", "skimage", "matplotlib", "tqdm")
+    code = f"import sys; sys.modules.update(dict.fromkeys({absent})); import backend.training.loop, backend.raster.draw"
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=120)
