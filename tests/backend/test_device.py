@@ -402,23 +402,24 @@ from backend.raster.draw import draw
 from backend.training.loop import Trainer
 from backend.training.settings import Settings
 capture = load_capture(sys.argv[1], sys.argv[2])
-trainer = Trainer.start(capture, vote(capture).ids, Settings(offsets=1, primitive=sys.argv[3], voxel=0.3))
-print(*(float(trainer.step(share)) for share in (0.3, 0.8)))
-print(draw(trainer.model, trainer.scene.camera(0)).image.mean())
+for primitive in ("3d", "2d"):
+    trainer = Trainer.start(capture, vote(capture).ids, Settings(offsets=1, primitive=primitive, voxel=0.3))
+    print(*(float(trainer.step(share)) for share in (0.3, 0.8)))
+    print(draw(trainer.model, trainer.scene.camera(0)).image.mean())
 """
 
 
-@pytest.mark.parametrize("primitive", ["3d", "2d"])
-def test_the_whole_loop_runs_in_numbas_simulator(write_capture, tmp_path, primitive):
-    """With the CUDA kernels: two steps and a picture are those of the processor."""
+def test_the_whole_loop_runs_in_numbas_simulator(write_capture, tmp_path):
+    """With the CUDA kernels: steps and pictures are those of the processor."""
     folder = write_capture(views=3, size=(24, 18), points=20).folder
     found = []
     for simulate in ("0", "1"):
-        command = [sys.executable, "-c", LOSSES, str(folder), str(tmp_path / "cache"), primitive]
+        command = [sys.executable, "-c", LOSSES, str(folder), str(tmp_path / "cache")]
         environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": simulate}
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=240)
         assert done.returncode == 0, done.stderr
         found.append([float(word) for word in done.stdout.split()])
+    assert len(found[0]) == 6
     np.testing.assert_allclose(found[1], found[0], rtol=1e-4)
 
 
