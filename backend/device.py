@@ -21,6 +21,9 @@ CHOICES = ("auto", "cpu", "cuda")
 LEAST_MEMORY = 1e9
 """Bytes of GPU memory that must be free: CUDA itself and torch's libraries take about half of them."""
 
+_SAID_WHEN_FULL = ("CUDA_ERROR_OUT_OF_MEMORY", "CUDA error: out of memory", "CUBLAS_STATUS_ALLOC_FAILED")
+"""By numba's driver, CUDA's own calls and its library for matrices."""
+
 CPU = torch.device("cpu")
 
 
@@ -63,8 +66,8 @@ def upload(values: np.ndarray, like: torch.Tensor | torch.device) -> torch.Tenso
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether this says that the GPU's memory is full: torch's own error, or one that numba's driver passes on."""
-    return isinstance(error, torch.cuda.OutOfMemoryError) or "CUDA_ERROR_OUT_OF_MEMORY" in str(error)
+    """Whether this says that the GPU's memory is full."""
+    return isinstance(error, torch.cuda.OutOfMemoryError) or any(words in str(error) for words in _SAID_WHEN_FULL)
 
 
 @functools.cache

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
+from .. import device
 from ..raster.camera import Camera
 from ..raster.kernel import kernel
 from .views import Views
@@ -78,12 +79,12 @@ def photo_of(views: Views, index: int, vertices: np.ndarray, faces: np.ndarray, 
     camera = whole.crop(x, y, width, height)
     depth, _, _ = draw_mesh(vertices, faces, camera)
     picture, labels = views.scene.target(index)
-    allowed = _allowed(views, index, None if labels is None else labels.numpy(), classes, box)
+    allowed = _allowed(views, index, None if labels is None else device.host(labels), classes, box)
     clearance = np.empty((height, width), np.float32)
     focal = (camera.K[0, 0] + camera.K[1, 1]) / 2
     _measure_clearance(depth, allowed, _STEP / focal, clearance)
     safe = _SAFE * max(1.0, max(whole.width, whole.height) / _SMALL)
-    return Photo(picture.numpy(), camera, x, y, depth, clearance, safe)
+    return Photo(device.host(picture), camera, x, y, depth, clearance, safe)
 
 
 def _allowed(

@@ -15,6 +15,7 @@ from numba import prange
 from scipy.sparse import csr_matrix, diags
 from scipy.sparse.linalg import cg
 
+from .. import device
 from ..protocol import Reporter
 from ..raster.kernel import kernel
 from .photos import Photo, look, photo_of
@@ -102,7 +103,7 @@ def _moved(
                 continue
             photo = held[index] if index in held else photo_of(views, index, vertices, faces, classes)
             assert photo is not None
-            planes = views.scene.target(index)[0].numpy()
+            planes = device.host(views.scene.target(index)[0])
             _look_up(
                 vertices[block], normals[block], pixel[block], away, chosen[block], index, *_seen_by(photo), planes,
                 (photo.x, photo.y), patches,

@@ -569,6 +569,12 @@ def test_what_torch_says_becomes_a_sentence_that_helps(said, part):
     assert part in sentence and sentence.endswith(".") and "\n" not in sentence
 
 
+@pytest.mark.parametrize("said", ["CUDA error: out of memory", "CUBLAS_STATUS_ALLOC_FAILED when calling cublasCreate"])
+def test_a_full_gpu_is_known_by_what_is_said(said):
+    assert device.is_out_of_memory(RuntimeError(said))
+    assert not device.is_out_of_memory(RuntimeError("CUDA error: an illegal memory access was encountered"))
+
+
 def test_too_little_memory_is_said_with_figures():
     assert device.short_of_memory("GPU", 3e9, 8e9) is None
     assert "0.3 GB of memory free" in device.short_of_memory("GPU", 0.3e9, 8e9)
