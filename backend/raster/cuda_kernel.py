@@ -13,6 +13,7 @@ import contextlib
 import functools
 import math
 import threading
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -21,6 +22,9 @@ import torch
 from numba import config, cuda
 
 from .kernel import digest_up_to, kernel
+
+# Small pictures and few splats make small grids, which is no news to anyone.
+warnings.filterwarnings("ignore", message="Grid size .* will likely result in GPU under-utilization")
 
 WARP = 32
 ALL_LANES = 0xFFFFFFFF
