@@ -113,7 +113,7 @@ gpu:
 gpu-with:
 	$(GPU_PYTHON) -c "import sys; from backend import device; sys.exit(device.why_not_cuda())"
 	$(GPU_PYTHON) -m pytest tests/gpu
-	$(GPU_PYTHON) benchmarks/gpu.py $(if $(CAPTURE),--capture "$(CAPTURE)")
+	$(GPU_PYTHON) benchmarks/gpu.py $(if $(CAPTURE),--demo "$(CAPTURE)")
 
 clean:
 	rm -rf .venv .venv-bpy .venv-bpy-4.2 .venv-bpy-5.2 build
