@@ -26,7 +26,12 @@ export OBJECTGS_PYTHON = $(abspath $(BACKEND))
 # Compiled once, by `make venv`, for whatever runs the backend.
 export NUMBA_CACHE_DIR ?= $(abspath .venv/kernels)
 
-.PHONY: help venv demo zip test test-blenders lint benchmarks clean
+# Where `make gpu` looks for a torch that sees a GPU: in PYTHON where it is given, else in these.
+GPU_PYTHONS = $(if $(filter command environment,$(firstword $(origin PYTHON))),$(PYTHON),$(BACKEND) python3)
+# The capture that benchmarks/gpu.py trains on, where there is one.
+CAPTURE ?= $(wildcard build/demo/capture)
+
+.PHONY: help venv demo zip test test-blenders lint benchmarks gpu gpu-with clean
 
 help:
 	@echo "make demo           a capture made by Blender becomes objects in a .blend, with a report, in $(DEMO)"
@@ -36,6 +41,7 @@ help:
 	@echo "make lint           what a change must pass beside the tests"
 	@echo "make venv           the backend's environment, .venv, alone"
 	@echo "make benchmarks     speed of the rasterizer and of training"
+	@echo "make gpu            tests and benchmarks on an NVIDIA GPU; CAPTURE may name what to train on"
 	@echo "make clean          remove environments and build/"
 
 venv: .venv/ready
@@ -90,6 +96,24 @@ lint: .venv/ready
 benchmarks: .venv/ready
 	$(BACKEND) benchmarks/raster.py
 	$(BACKEND) benchmarks/train.py
+
+# Nothing is installed here: it works without a network, with whatever the Python has.
+gpu:
+	@for python in $(GPU_PYTHONS); do \
+		if "$$python" -c "import sys, torch; sys.exit(not torch.cuda.is_available())" >/dev/null 2>&1; then \
+			exec $(MAKE) --no-print-directory gpu-with GPU_PYTHON="$$python"; \
+		fi; \
+	done; \
+	if nvidia-smi -L >/dev/null 2>&1; then \
+		echo "There is an NVIDIA GPU, but the torch of $(GPU_PYTHONS) does not see it; name a Python whose does (PYTHON=...)."; \
+		exit 1; \
+	fi; \
+	echo "There is no NVIDIA GPU here, so nothing was run, and nothing counts as passed."
+
+gpu-with:
+	$(GPU_PYTHON) -c "import sys; from backend import device; sys.exit(device.why_not_cuda())"
+	$(GPU_PYTHON) -m pytest tests/gpu
+	$(GPU_PYTHON) benchmarks/gpu.py $(if $(CAPTURE),--demo "$(CAPTURE)")
 
 clean:
 	rm -rf .venv .venv-bpy .venv-bpy-4.2 .venv-bpy-5.2 build

@@ -126,6 +126,12 @@ def parser() -> argparse.ArgumentParser:
             "--memory-mb", type=_count, default=2000, metavar="MB", help="memory for images; more is faster (2000)"
         )
 
+    def device_option(sub: argparse.ArgumentParser) -> None:
+        sub.add_argument(
+            "--device", choices=("auto", "cpu", "cuda"), default="auto",
+            help="cpu, or cuda: an NVIDIA GPU; `doctor` says why one is not used (auto: cuda where it works)",
+        )  # fmt: skip
+
     def capture_options(sub: argparse.ArgumentParser) -> None:
         sub.add_argument("capture", type=Path, metavar="CAPTURE", help="folder with images/, sparse/0/ and masks/")
         sub.add_argument(
@@ -160,6 +166,7 @@ def parser() -> argparse.ArgumentParser:
 
     train = command("train", "make the splats", _TRAIN, "garden --out garden-splats --minutes 10")
     vote_options(train)
+    device_option(train)
     length = train.add_mutually_exclusive_group()
     length.add_argument(
         "--minutes", type=_amount, default=DEFAULT_MINUTES, metavar="M",
@@ -209,6 +216,7 @@ def parser() -> argparse.ArgumentParser:
         sub.add_argument("folder", type=Path, metavar="DIR", help="reconstruction folder, as given to train --out")
         sub.add_argument("--capture", type=Path, metavar="CAPTURE", help="where the capture is now, if it was moved")
         memory_option(sub)
+        device_option(sub)
         return sub
 
     render = result("render", "draw the splats as pictures", _RENDER, "garden-splats --views all --ids")
@@ -238,7 +246,7 @@ def parser() -> argparse.ArgumentParser:
     mesh.add_argument("--restart", action="store_true", help="make meshes anew that are there already")
     result("evaluate", "measure how good the splats are", _EVALUATE, "garden-splats")
     result("report", "write a report with pictures", _REPORT, "garden-splats")
-    command("doctor", "say whether everything works on this computer", _DOCTOR, "")
+    device_option(command("doctor", "say whether everything works on this computer", _DOCTOR, ""))
     return top
 
 
@@ -345,6 +353,13 @@ def _reporter(as_json: bool) -> Reporter:
 
 def _refusal(error: Exception) -> str | None:
     """What the machine lacks for what was asked, as a sentence; None for every other failure."""
+    from .device import is_out_of_memory
+
+    if is_out_of_memory(error):
+        return (
+            "The GPU's memory is full; close programs that use it, or try a smaller --max-size or --max-anchors, or "
+            "--device cpu. The same command goes on from the last checkpoint."
+        )
     # torch says that memory ran out with a RuntimeError.
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "allocate memory" in str(error)):
         return "There is not enough memory; try a smaller --max-size, --memory-mb or --max-anchors."

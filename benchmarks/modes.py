@@ -65,7 +65,8 @@ def silence(trainer: Trainer) -> None:
         parameter.requires_grad_(False)
     columns = anchors.layout.shape_columns
     shape = anchors.rows[:, columns].shape
-    anchors.rows[:, columns] += np.random.default_rng(1).normal(0, 0.3, shape).astype(np.float32)
+    turned = np.random.default_rng(1).normal(0, 0.3, shape).astype(np.float32)
+    anchors.rows[:, columns] += torch.from_numpy(turned)
 
 
 def main() -> None:

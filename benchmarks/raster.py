@@ -35,8 +35,8 @@ if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
 from backend.raster import Camera, compile_kernels, cpu  # noqa: E402
-from backend.raster.cpu_project import HALF_H, HALF_W, U, V  # noqa: E402
 from backend.raster.reference import rasterize_reference  # noqa: E402
+from backend.raster.splats import HALF_H, HALF_W, U, V  # noqa: E402
 
 SIZES = ((40_000, 320, 240, 1.2), (50_000, 640, 480, 2.0), (200_000, 1280, 960, 2.0))
 MIDDLE = SIZES[1]

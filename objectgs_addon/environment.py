@@ -59,7 +59,7 @@ def inspect(folder: str | Path) -> EnvironmentState:
     if not python.exists() or not os.path.exists(ready["base"]):
         gone = ready["base"] if python.is_symlink() or python.exists() else python
         return EnvironmentState("broken", None, f"The backend's Python {gone} is gone; {_AGAIN} again.")
-    if ready["requirements"] != _wanted():
+    if ready["requirements"] != _wanted(ready["device"]):
         return EnvironmentState(
             "outdated", None, f"The compute backend was set up for another version of ObjectGS; {_AGAIN} again.")
     found = f"Python {ready['python']}, PyTorch {ready['packages'].get('torch', '?')}"
@@ -71,16 +71,16 @@ def _ready(path: Path, _changed: int) -> dict[str, Any] | None:
     """The marker, read again only when its file has changed; None where it is not as the set-up writes it."""
     try:
         ready = json.loads(path.read_text(encoding="utf-8"))
-        shape = {"python": str, "base": str, "requirements": str, "packages": dict}
+        shape = {"python": str, "base": str, "requirements": str, "packages": dict, "device": str}
         return ready if all(isinstance(ready[name], kind) for name, kind in shape.items()) else None
     except (ValueError, KeyError, TypeError):
         return None
 
 
-@functools.lru_cache(1)
-def _wanted() -> str:
-    """The digest of this extension's requirements; its files do not change while it is loaded."""
-    return worker.requirements_digest(REQUIREMENTS)
+@functools.lru_cache(2)
+def _wanted(device: str) -> str:
+    """The digest of this extension's requirements for a device; its files do not change while it is loaded."""
+    return worker.requirements_digest(REQUIREMENTS, device)
 
 
 def cache_folder(folder: str | Path) -> Path:

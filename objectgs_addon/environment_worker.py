@@ -45,6 +45,8 @@ REMOVED = ".removed-"
 OLDEST, NEWEST = (3, 11), (3, 13)
 VERSIONS = "3.11, 3.12 or 3.13"
 REQUIREMENTS = ("torch.txt", "backend.txt")
+CUDA_REQUIREMENTS = "cuda.txt"
+"""What an environment for NVIDIA GPUs holds beside."""
 WHEELS = "https://download.pytorch.org/whl/"
 PROBE_SECONDS = 8
 GIGABYTES = {"cpu": 2.5, "cuda": 9.0}
@@ -79,9 +81,14 @@ def environment_python(folder: Path) -> Path:
     return folder / VENV / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 
 
-def requirements_digest(requirements: Path) -> str:
+def requirement_files(requirements: Path, device: str) -> list[Path]:
+    """What to install for a device (cpu or cuda), torch first."""
+    return [requirements / name for name in (*REQUIREMENTS, *([CUDA_REQUIREMENTS] if device == "cuda" else []))]
+
+
+def requirements_digest(requirements: Path, device: str) -> str:
     """What tells environments apart: the requirements without comments and blank lines. OSError where files lack."""
-    lines = [line for name in REQUIREMENTS for line in requirement_lines(requirements / name)]
+    lines = [line for path in requirement_files(requirements, device) for line in requirement_lines(path)]
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
 
 
@@ -479,7 +486,7 @@ def set_up(options: argparse.Namespace, stop: StopRequest) -> None:
     check_can_make_environments()
     check_space(folder, device)
     torch = requirement_lines(options.requirements / "torch.txt")[0]
-    digest = requirements_digest(options.requirements)
+    digest = requirements_digest(options.requirements, device)
     progress = Progress({"venv": 5, "torch": 60, "packages": 60 if device == "cpu" else 300, "check": 60})
     with claimed(folder), short_path(folder) as place:
         progress.begin("venv", "Making an environment")
@@ -495,8 +502,8 @@ def set_up(options: argparse.Namespace, stop: StopRequest) -> None:
                 f"is installed, which also works without one but takes about {GIGABYTES['cuda']:g} GB.")
             check_space(folder, "cuda")
         progress.begin("packages", "Looking for the other packages")
-        files = [argument for name in REQUIREMENTS for argument in ("-r", str(options.requirements / name))]
-        pip.install(files, MEGABYTES[comes])
+        files = requirement_files(options.requirements, device)
+        pip.install([argument for path in files for argument in ("-r", str(path))], MEGABYTES[comes])
         progress.begin("check", "Checking the backend")
         checked = check_backend(environment_python(folder), progress, stop)
         shutil.rmtree(pip.temporary)

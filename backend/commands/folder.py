@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .. import device
 from ..capture import Capture, load_capture
 from ..model.object_model import ObjectModel
 from ..objects import read_objects
@@ -75,9 +76,16 @@ class Trained(NamedTuple):
     scene: Scene
     progress: Progress
 
+    @property
+    def trained_on(self) -> str:
+        """The device that the model was trained on, as `backend.device.name_of` calls it."""
+        return recorded(self.folder)["training"].get("device", "cpu")
+
 
 def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
-    """What `train` left in DIR, with the capture it was made from; InputError where one of them is not there."""
+    """What `train` left in DIR, on the device asked for, with the capture it was made from; InputError where one of
+    them is not there."""
+    place = device.pick(options.device)
     folder = Reconstruction(options.folder)
     if not folder.folder.is_dir():
         raise InputError(f"{folder.folder} does not exist; give the folder that `train` was told with --out.")
@@ -86,23 +94,23 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
             f"{folder.folder} is no reconstruction, since it holds no {folder.settings.name}; train first."
         )
     memory = recorded(folder)
-    model, state, warning = load_model(folder.checkpoint)
+    model, state, warning = load_model(folder.checkpoint, place)
     if warning:
         reporter.warning(warning)
     if "training" not in memory:
         raise InputError(
             f"{folder.settings} does not say what {folder.checkpoint} was trained from; train again with --restart."
         )
-    place = Path(options.capture or memory["capture"]["folder"])
-    if not place.is_dir():
-        raise InputError(f"The capture {place} of {folder.folder} is gone; say with --capture where it is now.")
+    source = Path(options.capture or memory["capture"]["folder"])
+    if not source.is_dir():
+        raise InputError(f"The capture {source} of {folder.folder} is gone; say with --capture where it is now.")
     # What it was trained from, not memory["capture"], which a later import of another capture replaces.
     trained_from = memory["training"]["votes"]
     max_size = trained_from["max_size"]
-    capture = load_capture(place, folder.cache, memory_for_files(options), max_size, reporter)
+    capture = load_capture(source, folder.cache, memory_for_files(options), max_size, reporter)
     if digest(capture) != trained_from["capture"]:
         raise InputError(
-            f"The capture {place} is not the one that {folder.folder} was trained on; put that one back, say with "
+            f"The capture {source} is not the one that {folder.folder} was trained on; put that one back, say with "
             "--capture where it is, or train again."
         )
     if options.capture:

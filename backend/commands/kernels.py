@@ -10,8 +10,10 @@ from pathlib import Path
 import llvmlite.binding
 import numba
 import numpy as np
+import torch
 from PIL import Image
 
+from .. import device
 from ..capture import load_capture
 from ..labels import vote as vote_points
 from ..mesh.extract import extract
@@ -33,45 +35,47 @@ STEPS = 220
 """A second or two, and enough for anchors to grow once: after 100 steps, in the first half of the training."""
 
 
-def have_kernels_ready(reporter: StoppingReporter) -> None:
-    """Compile what is not compiled yet on this machine; returns at once where a run before has done it."""
-    mark = _mark()
-    if not mark.exists():
-        try_kernels(reporter)
+def have_kernels_ready(reporter: StoppingReporter, place: torch.device) -> None:
+    """Compile what a device needs and is not compiled yet on this machine; returns at once where a run before has done
+    it, and in the simulator, which compiles nothing."""
+    if not device.simulated() and not _mark(place).exists():
+        try_kernels(reporter, place)
 
 
-def try_kernels(reporter: StoppingReporter) -> None:
-    """Compile all kernels, with progress, and see them run in a training of a few splats."""
+def try_kernels(reporter: StoppingReporter, place: torch.device) -> None:
+    """Compile all kernels that a device needs, with progress, and see them run in a training of a few splats."""
     reporter.status("Compiling the renderer's kernels (once for a machine)")
-    compile_kernels(lambda done, total: reporter.progress(done, total))
+    if place.type == "cpu":
+        compile_kernels(lambda done, total: reporter.progress(done, total))
     reporter.status("Trying them on a few splats")
-    with tempfile.TemporaryDirectory(prefix="objectgs-kernels-") as place:
-        _train_a_little(Path(place), reporter)
+    with tempfile.TemporaryDirectory(prefix="objectgs-kernels-") as folder:
+        _train_a_little(Path(folder), reporter, place)
     # A cache that cannot be written to has no use for the mark either.
     with contextlib.suppress(OSError):
-        mark = _mark()
+        mark = _mark(place)
         mark.parent.mkdir(parents=True, exist_ok=True)
         mark.touch()
 
 
-def _mark() -> Path:
-    """A file beside numba's own that says: the kernels of these sources are there, for this numba and processor."""
-    kernels = f"{digest_up_to('mesh')} {numba.__version__} {llvmlite.binding.get_host_cpu_name()}"
+def _mark(place: torch.device) -> Path:
+    """A file beside numba's own that says: the kernels of these sources are there, for this numba and these devices."""
+    processor = f"{llvmlite.binding.get_host_cpu_name()} {device.name_of(place)}"
+    kernels = f"{digest_up_to('mesh')} {numba.__version__} {processor}"
     folder = Path(numba.config.CACHE_DIR or Path(__file__).parents[1] / "raster" / "__pycache__")
     return folder / f"objectgs-{hashlib.sha256(kernels.encode()).hexdigest()[:16]}.ready"
 
 
-def _train_a_little(place: Path, reporter: StoppingReporter) -> None:
+def _train_a_little(scratch: Path, reporter: StoppingReporter, place: torch.device) -> None:
     """Take a made-up capture through every part, so that each kernel is compiled, cached and seen to run."""
-    capture_folder, folder = place / "capture", Reconstruction(place / "out").create()
+    capture_folder, folder = scratch / "capture", Reconstruction(scratch / "out").create()
     _write_small_capture(capture_folder)
     quiet = Reporter()
     capture = load_capture(capture_folder, folder.cache, reporter=quiet)
     ids = vote_points(capture, reporter=quiet).ids
-    discs = Trainer.start(capture, ids, Settings(offsets=2, primitive="2d"))
+    discs = Trainer.start(capture, ids, Settings(offsets=2, primitive="2d"), place=place)
     for share in (0.0, 1.0):
         discs.step(share)
-    trainer = Trainer.start(capture, ids, Settings(offsets=2))
+    trainer = Trainer.start(capture, ids, Settings(offsets=2), place=place)
     trainer.run(Budget(steps=STEPS), folder.checkpoint, quiet, stop=reporter.stop)
     _mesh_a_little(trainer)
     picture = draw(trainer.model, trainer.scene.camera(0), want_depth=True)

@@ -12,7 +12,7 @@ import numba
 import psutil
 import torch
 
-from .. import __version__
+from .. import __version__, device
 
 _PACKAGES = ("torch", "numpy", "numba", "pycolmap", "scikit-image", "manifold3d", "xatlas")
 
@@ -29,8 +29,14 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def machine_facts() -> dict[str, Any]:
-    """What the figures were measured on."""
+def machine_facts(place: torch.device) -> dict[str, Any]:
+    """What the figures were measured on; place: the device that splats are made and drawn on."""
+    gpu = {}
+    if place.type == "cuda":
+        gpu = {
+            "gpu_memory_gb": round(torch.cuda.get_device_properties(place).total_memory / 1e9, 1),
+            "cuda": torch.version.cuda, "numba-cuda": importlib.metadata.version("numba-cuda"),
+        }  # fmt: skip
     return {
         "objectgs": __version__,
         "python": platform.python_version(),
@@ -38,7 +44,8 @@ def machine_facts() -> dict[str, Any]:
         "cores": cores(),
         "threads": numba.get_num_threads(),
         "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
-        "device": "cpu",
+        "device": device.name_of(place),
+        **gpu,
         **{name: importlib.metadata.version(name) for name in _PACKAGES},
     }
 

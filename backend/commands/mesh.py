@@ -58,7 +58,7 @@ def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Make the meshes that are asked for and are not there yet; each is written as soon as it is done."""
     trained = open_trained(options, reporter)
     folder = trained.folder
-    have_kernels_ready(reporter)
+    have_kernels_ready(reporter, trained.model.device)
     with locked(folder.folder):
         targets = _targets(options, folder, trained.model)
         folder.meshes.mkdir(exist_ok=True)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from .. import device
 from ..capture import Capture
 from ..evaluation import comparison, write_report
 from ..evaluation.mesh_pictures import MESHES_SHOWN, Card, figures_line, mesh_sheet, view_of
@@ -53,7 +54,7 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             "max_size": training["votes"]["max_size"], "strategy": training["votes"]["strategy"],
             **training["settings"],
         },
-        "machine": machine_facts(),
+        "machine": {**machine_facts(model.device), "device": trained.trained_on},
         "left_out": _left_out(trained),
         "stages": memory.get("stages", []),
         "curve": progress.curve,
@@ -155,7 +156,7 @@ def _objects(
 ) -> list[dict[str, Any]]:
     """Every object that the masks show or the model holds; those that no held-out view shows were not measured."""
     model, capture = trained.model, trained.capture
-    anchors = np.bincount(model.anchors.ids, minlength=len(model.object_ids))
+    anchors = np.bincount(device.host(model.anchors.ids), minlength=len(model.object_ids))
     anchors_of = dict(zip(model.object_ids.tolist(), anchors.tolist(), strict=True))
     own = {object_of(key, mesh): mesh for key, mesh in meshes.items()}
     measured = {entry["id"]: entry for entry in evaluated}

@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial import cKDTree
 
+from .. import device
 from ..mesh.zbuffer import draw_mesh
 from ..mesh_file import Mesh, read_mesh
 from ..protocol import InputError, Reporter, read_json
@@ -179,7 +180,7 @@ def texture_score(
         elif labels is None:
             continue
         else:
-            wanted = np.isin(labels.numpy(), classes)
+            wanted = np.isin(device.host(labels), classes)
         if not wanted.any():
             continue
         rows, columns = np.flatnonzero(wanted.any(1)), np.flatnonzero(wanted.any(0))
@@ -200,7 +201,7 @@ def texture_score(
         # A pixel is the mesh's where at least half of it is, and then has the colour of that part.
         covered = wanted & (2 * count >= _SUBPIXELS**2)
         pixels = colours.reshape(*blocks, 3).sum((1, 3))[covered] / count[covered][:, None]
-        error = pixels - photo.numpy()[:, *part].transpose(1, 2, 0)[covered]
+        error = pixels - device.host(photo)[:, *part].transpose(1, 2, 0)[covered]
         score.pixels += int(wanted.sum())
         score.covered += int(covered.sum())
         score.squares += float((error.astype(np.float64) ** 2).sum())

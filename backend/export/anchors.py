@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .. import device
 from ..model.object_model import ObjectModel
 from ..model.splats import Splats
 from ..ply import write_vertices
@@ -25,7 +26,8 @@ def write_anchors(path: Path, model: ObjectModel, splats: Splats, source: np.nda
     numbers = np.bincount(owner, minlength=count)
     opacity = np.bincount(owner, splats.opacities, count) / np.maximum(numbers, 1)
     # No further than the model itself goes when it makes splats of them.
-    extents = np.exp(np.minimum(anchors.rows[:, anchors.layout.extent_columns][:, :3].astype(np.float64), 20.0))
+    logs = device.host(anchors.rows[:, anchors.layout.extent_columns][:, :3])
+    extents = np.exp(np.minimum(logs.astype(np.float64), 20.0))
     kind = position_kind(splats)
     table = np.zeros(
         count,
@@ -36,10 +38,10 @@ def write_anchors(path: Path, model: ObjectModel, splats: Splats, source: np.nda
             *(("opacity", "f4"), ("splats", "u4")),
         ],
     )
-    positions = model.normalization.to_world(anchors.positions)
+    positions = model.normalization.to_world(device.host(anchors.positions))
     for i, axis in enumerate("xyz"):
         table[axis] = positions[:, i]
         table[f"scale_{i}"] = extents[:, i] / model.normalization.scale
-    table["object_id"] = model.object_ids[anchors.ids]
+    table["object_id"] = model.object_ids[device.host(anchors.ids)]
     table["opacity"], table["splats"] = opacity, numbers
     write_vertices(path, table)

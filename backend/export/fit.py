@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from .. import device
 from ..evaluation.metrics import psnr
 from ..model.anchors import SH_C0
 from ..model.object_model import ObjectModel, anchors_in_view
@@ -67,19 +68,19 @@ def agreement(model: ObjectModel, splats: Splats, cameras: Sequence[Camera]) -> 
     """Mean PSNR in dB of `splats` against the model's own pictures through `cameras`; None without cameras."""
 
     def tensor(values: NDArray) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values, np.float32))
+        return device.upload(np.ascontiguousarray(values, np.float32), model.device)
 
     means = tensor(model.normalization.to_scene(splats.means))
     scales = tensor(splats.scales * model.normalization.scale)
     quats, opacities, sh = tensor(splats.quats), tensor(splats.opacities), tensor(splats.sh)
-    ids = torch.zeros(len(splats), dtype=torch.int32)
+    ids = torch.zeros(len(splats), dtype=torch.int32, device=model.device)
     found = []
     for camera in cameras:
         with torch.no_grad():
             drawn = rasterize(means, quats, scales, opacities, sh, ids, camera)
             image = drawn.color + (1 - drawn.alpha) * model.background.detach()[:, None, None]
-            image = image * torch.tensor(camera.gain)[:, None, None]
-        shown = image.clamp(0, 1).permute(1, 2, 0).numpy()
+            image = image * torch.tensor(camera.gain).to(image.device)[:, None, None]
+        shown = device.host(image.clamp(0, 1).permute(1, 2, 0))
         found.append(psnr(shown, draw(model, camera, want_ids=False).image))
     return float(np.mean(found)) if found else None
 
@@ -125,9 +126,10 @@ class _Sums:
         drawn = rasterize(g.means, g.quats, g.scales, g.opacities, black, g.ids, camera, primitive=model.primitive)
         drawn.color[0].sum().backward()
         assert black.grad is not None
-        weight = black.grad[:, 0, 0].numpy() / np.float32(SH_C0)
+        weight = device.host(black.grad[:, 0, 0]) / np.float32(SH_C0)
+        g = g.cpu()
         source = g.source.numpy()
-        slots = seen[source // self.k] * self.k + source % self.k - self.first
+        slots = device.host(seen)[source // self.k] * self.k + source % self.k - self.first
         mine = (weight > 0) & (slots >= 0) & (slots < len(self.weight))
         slots, w = slots[mine], weight[mine]
         means = g.means.numpy()[mine]
@@ -161,7 +163,7 @@ class _Sums:
         pull = np.full(size, RIDGE)
         pull[0] = 1e-6
         sh = np.linalg.solve(normal + np.diag(pull), self.colour[slots] / weight[:, :, None])
-        owners = model.anchors.ids[(slots + self.first) // self.k]
+        owners = device.host(model.anchors.ids)[(slots + self.first) // self.k]
         return Splats(
             means=model.normalization.to_world(self.means[slots]),
             quats=quats.astype(np.float32),

@@ -8,9 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
+from .. import device
 from ..raster.camera import Camera
 from ..raster.kernel import kernel
-from .views import Views, crop
+from .views import Views
 from .zbuffer import draw_mesh
 
 KEPT = 6
@@ -98,7 +99,9 @@ class Photos:
             # The planes are the scene's to keep.
             self._held[index] = None if photo is None else photo._replace(planes=_NO_PLANES)
         photo = self._held[index]
-        return None if photo is None else photo._replace(planes=self.views.scene.target(index)[0].numpy())
+        if photo is None:
+            return None
+        return photo._replace(planes=device.host(self.views.scene.target(index)[0]))
 
 
 def _photo_of(
@@ -109,15 +112,15 @@ def _photo_of(
     if box is None:
         return None
     x, y, width, height = box
-    camera = crop(whole, x, y, width, height)
+    camera = whole.crop(x, y, width, height)
     depth, _, _ = draw_mesh(vertices, faces, camera)
     picture, labels = views.scene.target(index)
-    allowed = _allowed(views, index, None if labels is None else labels.numpy(), classes, box)
+    allowed = _allowed(views, index, None if labels is None else device.host(labels), classes, box)
     clearance = np.empty((height, width), np.float32)
     focal = (camera.K[0, 0] + camera.K[1, 1]) / 2
     _measure_clearance(depth, allowed, _STEP / focal, clearance)
     safe = _SAFE * max(1.0, max(whole.width, whole.height) / _SMALL)
-    return Photo(picture.numpy(), camera, x, y, depth, clearance, safe)
+    return Photo(device.host(picture), camera, x, y, depth, clearance, safe)
 
 
 def _allowed(

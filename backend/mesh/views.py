@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from .. import device
 from ..model.generate import Generated
 from ..model.object_model import ObjectModel
 from ..raster import Camera, Rendered, object_map, rasterize
@@ -56,14 +57,6 @@ class ObjectView:
     visible: np.ndarray
 
 
-def crop(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
-    """The part of a camera's picture whose upper left is the pixel (x, y)."""
-    K = np.array(camera.K, np.float64)
-    K[0, 2] -= x
-    K[1, 2] -= y
-    return replace(camera, K=K, width=width, height=height)
-
-
 class Views:
     """The model through the cameras of `scene` (every view in `indices`), reduced by `downscale`.
 
@@ -105,8 +98,8 @@ class Views:
             return self._maps[index]
         camera = self.camera(index)
         drawn = self._draw(self._scene_splats(camera), camera)
-        ids, probability = object_map(drawn)
-        alpha = drawn.alpha.numpy()
+        ids, probability = (device.host(plane) for plane in object_map(drawn))
+        alpha = device.host(drawn.alpha)
         found = SceneMap(camera, *self._depth(drawn), ids, probability, alpha)
         if self._take(5 * alpha.nbytes):
             self._maps[index] = found
@@ -129,14 +122,14 @@ class Views:
         if rectangle is None:
             return None
         x, y, width, height = rectangle
-        camera = crop(camera, x, y, width, height)
+        camera = camera.crop(x, y, width, height)
         drawn = self._draw(splats, camera)
-        alpha = drawn.alpha.numpy()
+        alpha = device.host(drawn.alpha)
         if not (alpha >= ALPHA_SEEN).any():
             return None
         shown = self._shown(index)[y : y + height, x : x + width] * self._claimed(index)[y : y + height, x : x + width]
         visible = np.clip(shown / np.maximum(alpha, 1e-3), 0, 1).astype(np.float32)
-        color = np.moveaxis(drawn.color.numpy(), 0, 2) / np.maximum(alpha, 1e-3)[..., None]
+        color = np.moveaxis(device.host(drawn.color), 0, 2) / np.maximum(alpha, 1e-3)[..., None]
         return ObjectView(camera, x, y, *self._depth(drawn), alpha, np.ascontiguousarray(color), visible)
 
     def _claimed(self, index: int) -> np.ndarray:
@@ -160,12 +153,12 @@ class Views:
             return np.where(whole.ids == self._classes[0], whole.probability, np.float32(0))
         camera = self.camera(index)
         splats = self._scene_splats(camera)
-        ours = torch.from_numpy(np.isin(splats.ids.numpy(), self._classes).astype(np.int32))
-        labels = torch.ones((camera.height, camera.width), dtype=torch.int32)
+        ours = self._are_ours(splats.ids).int()
+        labels = torch.ones((camera.height, camera.width), dtype=torch.int32, device=ours.device)
         with torch.no_grad():
             drawn = rasterize(*splats[:5], ours, camera, labels, primitive=self.model.primitive)
         assert drawn.weight is not None
-        return drawn.weight.numpy()
+        return device.host(drawn.weight)
 
     def _draw(self, splats: Generated, camera: Camera) -> Rendered:
         with torch.no_grad():
@@ -179,8 +172,8 @@ class Views:
         next. 3D Gaussians reach through the surface, and their mean lies behind it.
         """
         assert drawn.median is not None and drawn.depth is not None
-        alpha, median = drawn.alpha.numpy(), drawn.median.numpy()
-        mean = drawn.depth.numpy() / np.maximum(alpha, 1e-3)
+        alpha, median = device.host(drawn.alpha), device.host(drawn.median)
+        mean = device.host(drawn.depth) / np.maximum(alpha, 1e-3)
         seen = (alpha >= ALPHA_SEEN) & (median > 0)
         depth = mean if self.model.primitive == "2d" else median
         return np.where(seen, depth, np.float32(0)), np.where(seen, np.abs(mean - median), np.float32(0))
@@ -197,11 +190,14 @@ class Views:
             return self._own
         if self.model.explicit:
             splats = self._scene_splats(self.camera(self.indices[0]))
-            ours = torch.from_numpy(np.isin(splats.ids.numpy(), self._classes))
-            self._own = Generated(*(part[ours] for part in splats))
+            self._own = splats.select(self._are_ours(splats.ids))
             return self._own
-        anchors = np.flatnonzero(np.isin(self.model.anchors.ids, self._classes))
+        anchors = self._are_ours(self.model.anchors.ids).nonzero()[:, 0]
         return self.model.generate(anchors, np.zeros(3) if camera is None else camera.centre)
+
+    def _are_ours(self, ids: torch.Tensor) -> torch.Tensor:
+        """Which of the classes `ids` are those at hand, bool."""
+        return torch.isin(ids, torch.tensor(self._classes, dtype=ids.dtype, device=ids.device))
 
     def _turn_to(self, classes: Sequence[int]) -> None:
         classes = tuple(sorted({int(c) for c in classes}))
@@ -222,9 +218,9 @@ def _bytes(view: ObjectView) -> int:
 
 def _rectangle(splats: Generated, camera: Camera) -> tuple[int, int, int, int] | None:
     """x, y, width and height of the part of the picture that the splats may touch; None where they touch none."""
-    points = splats.means.double().numpy() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    points = device.host(splats.means.double()) @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     before = points[:, 2] > camera.near
-    points, scales = points[before], splats.scales.numpy()[before]
+    points, scales = points[before], device.host(splats.scales)[before]
     if not len(points):
         return None
     focal = np.array([camera.K[0, 0], camera.K[1, 1]])

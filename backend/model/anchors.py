@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from scipy.spatial import cKDTree
 
 SH_C0 = 0.28209479177387814
@@ -58,17 +59,21 @@ class Layout:
 
 @dataclass
 class Anchors:
-    """N anchors. positions (N, 3) float32, cell centres in scene units; rows (N, layout.columns) float32 trainable;
-    ids (N,) int32 index into the model's object table; voxel: edge of the finest cell in scene units."""
+    """N anchors, on one device. positions (N, 3) float32, cell centres in scene units; rows (N, layout.columns) float32
+    trainable; ids (N,) int32 index into the model's object table; voxel: edge of the finest cell in scene units."""
 
     layout: Layout
     voxel: float
-    positions: np.ndarray
-    rows: np.ndarray
-    ids: np.ndarray
+    positions: torch.Tensor
+    rows: torch.Tensor
+    ids: torch.Tensor
 
     def __len__(self) -> int:
         return len(self.positions)
+
+    def to(self, place: torch.device) -> Anchors:
+        """The same anchors on another device; those that are there already are shared."""
+        return Anchors(self.layout, self.voxel, self.positions.to(place), self.rows.to(place), self.ids.to(place))
 
 
 def median_spacing(xyz: np.ndarray) -> float:
@@ -126,7 +131,7 @@ def seed_anchors(
         spacing = np.full(n, voxel)
     rows[:, layout.extent_columns] = np.log(spacing)[:, None]
     rows[:, layout.color_columns] = np.tile((color - 0.5) / SH_C0, (1, layout.offsets))
-    return Anchors(layout, voxel, positions, rows, owner)
+    return Anchors(layout, voxel, *(torch.from_numpy(a) for a in (positions, rows, owner)))
 
 
 def new_rows(count: int, layout: Layout, rng: np.random.Generator) -> np.ndarray:

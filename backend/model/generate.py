@@ -7,24 +7,29 @@ quaternion, colour SH coefficients. Splats that are too transparent to be drawn 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numba import prange
 
+from .. import device
 from ..raster.kernel import kernel
 from .anchors import Layout
 from .heads import HIDDEN, Heads
 
 OPACITY_MIN = 1.0 / 255.0
 _RAW_OPACITY_MIN = np.float32(math.atanh(OPACITY_MIN))
-_LOG_EXTENT_MAX = 20.0
+LOG_EXTENT_MAX = 20.0
 _CHUNK = 128
 
 
 class Generated(NamedTuple):
-    """Gaussians as `backend.raster.rasterize` takes them, and `source` (N,) int64: anchor * k + offset of each."""
+    """Gaussians as `backend.raster.rasterize` takes them, and `source` (N,) int64: anchor * k + offset of each.
+
+    made (N,) bool, on the GPU: where it is False there is none, only its place, with opacity 0. None: all are.
+    """
 
     means: torch.Tensor
     quats: torch.Tensor
@@ -33,6 +38,22 @@ class Generated(NamedTuple):
     sh: torch.Tensor
     ids: torch.Tensor
     source: torch.Tensor
+    made: torch.Tensor | None = None
+
+    def select(self, which: torch.Tensor) -> Generated:
+        """Those of a mask (N,), or of indices."""
+        return self._each(lambda part: part[which])
+
+    def cpu(self) -> Generated:
+        """In the processor's memory."""
+        return self._each(lambda part: part.cpu())
+
+    def _each(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Generated:
+        return Generated(*(change(part) for part in self if part is not None))
+
+    def only_made(self) -> Generated:
+        """Without the places that hold none. Waits for the GPU to count them."""
+        return self if self.made is None else self.select(self.made)._replace(made=None)
 
 
 @kernel(parallel=True)
@@ -49,7 +70,7 @@ def _forward(positions, rows, opacity, shape, color, k, features, coefficients, 
             if at == starts[a + 1]:
                 continue
             for i in range(6):
-                extent[i] = math.exp(min(rows[a, 3 * k + i], np.float32(_LOG_EXTENT_MAX)))
+                extent[i] = math.exp(min(rows[a, 3 * k + i], np.float32(LOG_EXTENT_MAX)))
             for j in range(k):
                 raw_opacity = opacity[a, j] + rows[a, n_opacity + j]
                 if not raw_opacity > _RAW_OPACITY_MIN:
@@ -102,7 +123,7 @@ def _backward(rows, k, features, coefficients, starts, splats, grads, out):
             for i in range(g_color.shape[1]):
                 g_color[a, i] = 0.0
             for i in range(6):
-                extent[i] = math.exp(min(rows[a, 3 * k + i], np.float32(_LOG_EXTENT_MAX)))
+                extent[i] = math.exp(min(rows[a, 3 * k + i], np.float32(LOG_EXTENT_MAX)))
             for n in range(starts[a], starts[a + 1]):
                 j = source[n] - a * k
                 alpha = opacities[n]
@@ -179,6 +200,40 @@ class _Generate(torch.autograd.Function):
         return (None, g_rows, None, None, g_hidden.T @ inputs, g_hidden.sum(0), *head_gradients)
 
 
+def _on_gpu(
+    layout: Layout,
+    positions: torch.Tensor,
+    rows: torch.Tensor,
+    ids: torch.Tensor,
+    heads: Heads,
+    seen_from: torch.Tensor | None,
+    present: torch.Tensor | None,
+) -> Generated:
+    """The same equations in torch, with a place for every offset, so that nobody waits for a count."""
+    n, k = len(rows), layout.offsets
+    # One cut: its gradient is put together in one pass.
+    offsets, extents, features, row_opacity, row_shape, row_color = rows.split(
+        [3 * k, 6, layout.features, k, 7 * k, 3 * k], 1
+    )
+    raw_opacity, shape, color = heads(features if seen_from is None else torch.cat([features, seen_from], 1))
+    raw_opacity = raw_opacity + row_opacity
+    made = raw_opacity > float(_RAW_OPACITY_MIN)
+    if present is not None:
+        made = made & present[:, None]
+    # The limit takes no gradient away: an extent beyond it must find back.
+    extent = (extents + (extents.clamp(max=LOG_EXTENT_MAX) - extents).detach()).exp()
+    raw_scale, quats = (shape + row_shape).view(n, k, 7).split([3, 4], 2)
+    means = positions[:, None] + offsets.view(n, k, 3) * extent[:, None, :3]
+    scales = extent[:, None, 3:] * raw_scale.sigmoid()
+    sh = color.view(n, k, -1, 3)
+    sh = torch.cat([sh[:, :, :1] + row_color.view(n, k, 1, 3), sh[:, :, 1:]], 2)
+    return Generated(
+        means.reshape(-1, 3), quats.reshape(-1, 4), scales.reshape(-1, 3),
+        torch.where(made, raw_opacity.tanh(), 0.0).reshape(-1), sh.reshape(n * k, -1, 3),
+        ids[:, None].expand(n, k).reshape(-1), torch.arange(n * k, device=rows.device), made.reshape(-1),
+    )  # fmt: skip
+
+
 def generate(
     layout: Layout,
     positions: torch.Tensor,
@@ -186,18 +241,22 @@ def generate(
     ids: torch.Tensor,
     heads: Heads,
     eye: np.ndarray | None = None,
+    present: torch.Tensor | None = None,
 ) -> Generated:
     """Gaussians of n anchors: positions (n, 3), rows (n, columns), ids (n,) int32; differentiable in rows and heads.
 
-    eye (3,): the camera's centre in scene units, needed in `view` mode alone.
+    eye (3,): the camera's centre in scene units, needed in `view` mode alone. present (n,) bool, on the GPU alone: the
+    other anchors make none.
     """
     seen_from = None
     if heads.mode == "view":
         if eye is None:
             raise ValueError("view mode needs the camera's centre")
-        to_anchor = positions - torch.as_tensor(eye, dtype=positions.dtype)
+        to_anchor = positions - device.upload(np.asarray(eye, np.float32), positions)
         distance = torch.linalg.vector_norm(to_anchor, dim=1, keepdim=True).clamp(min=1e-6)
         seen_from = torch.cat([distance, to_anchor / distance], 1)
+    if device.on_gpu(rows):
+        return _on_gpu(layout, positions, rows, ids, heads, seen_from, present)
     layers = (heads.hidden, heads.opacity, heads.shape, heads.color)
     parameters = [p for layer in layers for p in (layer.weight, layer.bias)]
     *tensors, source = _Generate.apply(positions, rows, seen_from, layout, *parameters)

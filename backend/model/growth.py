@@ -2,6 +2,9 @@
 
 A child takes its parent's ID, a cell holds at most one anchor, and of two objects that want one free cell the one
 with the larger accumulated gradient gets it.
+
+Statistics are gathered where the model lies. Growth itself, once in a hundred steps, thinks on the processor: sorting
+cells is what it does, and only what asks for one travels, not the anchors' rows.
 """
 
 from __future__ import annotations
@@ -9,7 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
+from .. import device
 from .anchors import Anchors, cell_keys, new_rows
 
 LEVELS = (16, 4, 1)
@@ -22,48 +27,79 @@ class GrowthStatistics:
     coordinates) of each offset's splat, and how often it was seen; opacity and views (N,): summed opacity of an
     anchor's splats, and how often the anchor was in view."""
 
-    gradient: np.ndarray
-    visits: np.ndarray
-    opacity: np.ndarray
-    views: np.ndarray
+    gradient: torch.Tensor
+    visits: torch.Tensor
+    opacity: torch.Tensor
+    views: torch.Tensor
 
     @classmethod
-    def zeros(cls, anchors: int, offsets: int) -> GrowthStatistics:
+    def zeros(cls, anchors: int, offsets: int, place: torch.device = device.CPU) -> GrowthStatistics:
         """Cleared sums."""
+
+        def cleared(count: int, kind: torch.dtype) -> torch.Tensor:
+            return torch.zeros(count, dtype=kind, device=place)
+
         return cls(
-            np.zeros(anchors * offsets, np.float32), np.zeros(anchors * offsets, np.int32),
-            np.zeros(anchors, np.float32), np.zeros(anchors, np.int32),
+            cleared(anchors * offsets, torch.float32), cleared(anchors * offsets, torch.int32),
+            cleared(anchors, torch.float32), cleared(anchors, torch.int32),
         )  # fmt: skip
 
     def add(
         self,
-        anchors_seen: np.ndarray,
+        anchors_seen: torch.Tensor,
         offsets: int,
-        source: np.ndarray,
-        opacities: np.ndarray,
-        drawn: np.ndarray,
-        screen_gradient: np.ndarray,
+        source: torch.Tensor,
+        opacities: torch.Tensor,
+        drawn: torch.Tensor | np.ndarray,
+        screen_gradient: torch.Tensor | np.ndarray,
         width: int,
         height: int,
+        usable: torch.Tensor | None = None,
     ) -> None:
         """Take in one step. anchors_seen (n,); source (S,) local anchor * k + offset of each splat; drawn (S,) bool;
-        screen_gradient (S, 2) in pixels."""
+        screen_gradient (S, 2) in pixels; usable (n,) bool, on the GPU alone: the other anchors do not count."""
+        if device.on_gpu(self.gradient):
+            drawn, screen_gradient = torch.as_tensor(drawn), torch.as_tensor(screen_gradient)
+            self._add_on_gpu(anchors_seen, offsets, opacities, drawn, screen_gradient, width, height, usable)
+            return
         size = np.array([width / 2, height / 2], np.float32)
-        norm = np.sqrt(((screen_gradient * size) ** 2).sum(1))
-        place = anchors_seen[source // offsets] * offsets + source % offsets
-        self.gradient[place[drawn]] += norm[drawn]
-        self.visits[place[drawn]] += 1
-        self.opacity += np.bincount(anchors_seen[source // offsets], opacities, minlength=len(self.opacity)).astype(
-            np.float32
-        )
-        self.views[anchors_seen] += 1
+        norm = np.sqrt(((device.host(screen_gradient) * size) ** 2).sum(1))
+        sources, seen, shown = source.numpy(), anchors_seen.numpy(), device.host(drawn)
+        place = seen[sources // offsets] * offsets + sources % offsets
+        gradient, visits, opacity, views = (t.numpy() for t in (self.gradient, self.visits, self.opacity, self.views))
+        gradient[place[shown]] += norm[shown]
+        visits[place[shown]] += 1
+        opacity += np.bincount(seen[sources // offsets], opacities.numpy(), minlength=len(opacity)).astype(np.float32)
+        views[seen] += 1
+
+    def _add_on_gpu(
+        self,
+        anchors_seen: torch.Tensor,
+        offsets: int,
+        opacities: torch.Tensor,
+        drawn: torch.Tensor,
+        screen_gradient: torch.Tensor,
+        width: int,
+        height: int,
+        usable: torch.Tensor | None,
+    ) -> None:
+        """`add`, where every offset of the anchors has a place among the splats."""
+        counted = torch.ones_like(anchors_seen, dtype=torch.bool) if usable is None else usable
+        drawn = drawn.view(-1, offsets) & counted[:, None]
+        norm = torch.hypot(screen_gradient[:, 0] * (width / 2), screen_gradient[:, 1] * (height / 2))
+        norm = torch.where(drawn, norm.view(-1, offsets), 0.0)
+        # Each anchor is there once, so that nothing depends on the order of the sums.
+        self.gradient.view(-1, offsets).index_add_(0, anchors_seen, norm)
+        self.visits.view(-1, offsets).index_add_(0, anchors_seen, drawn.to(self.visits.dtype))
+        self.opacity.index_add_(0, anchors_seen, torch.where(counted, opacities.view(-1, offsets).sum(1), 0.0))
+        self.views.index_add_(0, anchors_seen, counted.to(self.views.dtype))
 
 
 @dataclass(frozen=True)
 class Growth:
     """What one round changed: kept (n,) indices of the anchors that stay, in order; `added` new ones follow them."""
 
-    kept: np.ndarray
+    kept: torch.Tensor
     added: int
     pruned: int
 
@@ -82,17 +118,27 @@ def grow_and_prune(
     A splat of the average gradient >= threshold 2^level asks for the cell of LEVELS[level] voxels that it lies in.
     """
     layout, k = anchors.layout, anchors.layout.offsets
-    enough = statistics.visits >= min_visits
-    gradient = np.where(enough, statistics.gradient / np.maximum(statistics.visits, 1), 0)
+    summed, visits, opacity, views = (
+        device.host(t) for t in (statistics.gradient, statistics.visits, statistics.opacity, statistics.views)
+    )
+    positions = device.host(anchors.positions)
+    enough = visits >= min_visits
+    gradient = np.where(enough, summed / np.maximum(visits, 1), 0)
     wanted = np.flatnonzero(gradient >= threshold)
     parents = wanted // k
-    offsets = anchors.rows[:, layout.offset_columns].reshape(-1, 3)[wanted]
-    extents = np.exp(anchors.rows[parents][:, layout.extent_columns][:, :3])
-    means = anchors.positions[parents] + offsets * extents
+    axes = np.arange(3)
+    columns = np.concatenate(
+        [layout.offset_columns.start + 3 * (wanted % k)[:, None] + axes,
+         np.broadcast_to(layout.extent_columns.start + axes, (len(wanted), 3))], 1
+    )  # fmt: skip
+    numbers = device.host(
+        anchors.rows[device.upload(parents, anchors.rows)[:, None], device.upload(columns, anchors.rows)]
+    )
+    means = positions[parents] + numbers[:, :3] * np.exp(numbers[:, 3:])
 
-    new_positions, new_parents, new_offsets, new_extents = [], [], [], []
+    new_positions, new_children, new_extents = [], [], []
     room = max_anchors - len(anchors)
-    occupied_by = [anchors.positions]
+    occupied_by = [positions]
     for level, voxels in enumerate(LEVELS):
         cell = anchors.voxel * voxels
         here = gradient[wanted] >= threshold * 2.0**level
@@ -102,34 +148,33 @@ def grow_and_prune(
         index = np.flatnonzero(here)[free]
         keys = keys[free]
         # The largest accumulated gradient first; ties by index, so that a seed fixes everything.
-        order = np.lexsort((index, -statistics.gradient[wanted[index]]))
+        order = np.lexsort((index, -summed[wanted[index]]))
         _, first = np.unique(keys[order], axis=0, return_index=True)
         chosen = order[np.sort(first)][: max(room, 0)]
         room -= len(chosen)
-        positions = (keys[chosen] * cell).astype(np.float32)
-        occupied_by.append(positions)
-        new_positions.append(positions)
-        new_parents.append(parents[index[chosen]])
-        new_offsets.append(wanted[index[chosen]] % k)
+        found = (keys[chosen] * cell).astype(np.float32)
+        occupied_by.append(found)
+        new_positions.append(found)
+        new_children.append(index[chosen])
         new_extents.append(np.full(len(chosen), np.log(cell), np.float32))
 
-    parent = np.concatenate(new_parents)
-    slot = np.concatenate(new_offsets)
-    rows = new_rows(len(parent), layout, rng)
+    child = np.concatenate(new_children)
+    parent = device.upload(parents[child], anchors.rows)
+    of_parents = device.host(anchors.rows[parent])
+    rows = new_rows(len(child), layout, rng)
     rows[:, layout.extent_columns] = np.concatenate(new_extents)[:, None]
-    rows[:, layout.feature_columns] = anchors.rows[parent][:, layout.feature_columns]
-    colors = anchors.rows[parent][:, layout.color_columns].reshape(-1, k, 3)[np.arange(len(parent)), slot]
+    rows[:, layout.feature_columns] = of_parents[:, layout.feature_columns]
+    colors = of_parents[:, layout.color_columns].reshape(-1, k, 3)[np.arange(len(child)), wanted[child] % k]
     rows[:, layout.color_columns] = np.tile(colors, (1, k))
 
-    faint = (statistics.views >= min_visits) & (statistics.opacity < min_opacity * np.maximum(statistics.views, 1))
-    kept = np.flatnonzero(~faint)
+    faint = (views >= min_visits) & (opacity < min_opacity * np.maximum(views, 1))
+    kept = device.upload(np.flatnonzero(~faint), anchors.rows)
     pruned = len(anchors) - len(kept)
-    anchors.positions = np.concatenate([anchors.positions[kept], *new_positions])
-    anchors.rows, anchors.ids = (
-        np.concatenate([anchors.rows[kept], rows]),
-        np.concatenate([anchors.ids[kept], anchors.ids[parent]]),
-    )
-    return Growth(kept, len(parent), pruned)
+    born = device.upload(np.concatenate(new_positions), anchors.rows)
+    anchors.positions = torch.cat([anchors.positions[kept], born])
+    anchors.rows = torch.cat([anchors.rows[kept], device.upload(rows, anchors.rows)])
+    anchors.ids = torch.cat([anchors.ids[kept], anchors.ids[parent]])
+    return Growth(kept, len(child), pruned)
 
 
 def _isin_rows(rows: np.ndarray, others: np.ndarray) -> np.ndarray:

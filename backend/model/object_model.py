@@ -8,9 +8,10 @@ import numpy as np
 import torch
 from numba import prange
 
+from .. import device
 from ..raster.kernel import kernel
 from .anchors import Anchors
-from .generate import Generated, generate
+from .generate import LOG_EXTENT_MAX, Generated, generate
 from .heads import Heads
 from .splats import Splats
 
@@ -63,11 +64,23 @@ class ObjectModel:
     primitive: str = "3d"
 
     @property
+    def device(self) -> torch.device:
+        """Where the model lies."""
+        return self.background.device
+
+    def to(self, place: torch.device) -> ObjectModel:
+        """Move the model to another device; returns itself."""
+        self.anchors, self.heads, self.background = (
+            self.anchors.to(place), self.heads.to(place), self.background.detach().to(place)
+        )  # fmt: skip
+        return self
+
+    @property
     def explicit(self) -> bool:
         """Whether the model is plain splats at any moment."""
         return self.heads.mode == "explicit"
 
-    def generate(self, seen: np.ndarray | None = None, eye: np.ndarray | None = None) -> Generated:
+    def generate(self, seen: torch.Tensor | None = None, eye: np.ndarray | None = None) -> Generated:
         """Gaussians of the anchors `seen` ((n,) int64; None: all), without gradients. eye: see `generate`.
 
         A disc gets the third scale that it has where it is taken for a 3D Gaussian.
@@ -75,10 +88,7 @@ class ObjectModel:
         a = self.anchors
         pick = (lambda x: x) if seen is None else (lambda x: x[seen])
         with torch.no_grad():
-            g = generate(
-                a.layout, torch.from_numpy(pick(a.positions)), torch.from_numpy(pick(a.rows)),
-                torch.from_numpy(pick(a.ids)), self.heads, eye,
-            )  # fmt: skip
+            g = generate(a.layout, pick(a.positions), pick(a.rows), pick(a.ids), self.heads, eye).only_made()
             if self.primitive == "2d":
                 g.scales[:, 2] = DISC_THICKNESS * g.scales[:, :2].amin(1)
             return g
@@ -89,6 +99,7 @@ class ObjectModel:
         In `view` mode as seen from `eye` (scene units).
         """
         g = self.generate(eye=eye)
+        g = g.cpu()
         quats = g.quats.double().numpy()
         norm = np.linalg.norm(quats, axis=1, keepdims=True)
         usable = norm[:, 0] > 1e-4
@@ -139,13 +150,53 @@ def _in_view(positions, rows, k, viewmat, intrinsics, width, height, near, seen)
         seen[a] = inside
 
 
+def _in_view_on_gpu(
+    anchors: Anchors, viewmat: np.ndarray, intrinsics: np.ndarray, width: int, height: int, near: float
+) -> torch.Tensor:
+    """The same as `_in_view` in torch: (N,) bool."""
+    k, rows = anchors.layout.offsets, anchors.rows
+    extent = rows[:, anchors.layout.extent_columns].clamp(max=LOG_EXTENT_MAX).exp()
+    largest = rows[:, anchors.layout.offset_columns].abs().view(-1, k, 3).amax(1)
+    reach = torch.linalg.vector_norm(largest * extent[:, :3], dim=1) + 3.4 * extent[:, 3:].amax(1)
+    turned = device.upload(np.ascontiguousarray(viewmat[:3], np.float32), rows)
+    x, y, z = (anchors.positions @ turned[:, :3].T + turned[:, 3]).unbind(1)
+    fx, fy, cx, cy = (float(v) for v in intrinsics)
+    room = -reach - 2.4 / min(fx, fy) * z.clamp(min=near)
+    inside = z + reach > near
+    for across, focal, to_edge in ((x, fx, cx), (x, -fx, width - cx), (y, fy, cy), (y, -fy, height - cy)):
+        inside = inside & ((focal * across + to_edge * z) / np.hypot(focal, to_edge) > room)
+    return inside
+
+
 def anchors_in_view(
     anchors: Anchors, viewmat: np.ndarray, intrinsics: np.ndarray, width: int, height: int, near: float
-) -> np.ndarray:
+) -> torch.Tensor:
     """Indices (n,) int64 of the anchors that may touch the picture; none that does is left out.
 
-    viewmat (4, 4) float64 scene to camera; intrinsics (fx, fy, cx, cy) in pixels.
+    viewmat (4, 4) float64 scene to camera; intrinsics (fx, fy, cx, cy) in pixels. Waits for the GPU to count them.
     """
+    if device.on_gpu(anchors.rows):
+        return _in_view_on_gpu(anchors, viewmat, intrinsics, width, height, near).nonzero()[:, 0]
     seen = np.empty(len(anchors), np.bool_)
-    _in_view(anchors.positions, anchors.rows, anchors.layout.offsets, viewmat, intrinsics, width, height, near, seen)
-    return np.flatnonzero(seen)
+    _in_view(
+        anchors.positions.numpy(), anchors.rows.numpy(), anchors.layout.offsets, viewmat, intrinsics, width, height,
+        near, seen,
+    )  # fmt: skip
+    return torch.from_numpy(np.flatnonzero(seen))
+
+
+def first_anchors_in_view(
+    anchors: Anchors, viewmat: np.ndarray, intrinsics: np.ndarray, width: int, height: int, near: float, limit: int
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The same without waiting for their number, where `limit` bounds it: index (n,) int64, n = min(limit, N), of those
+    in view and then of others; in_view (n,) bool which are; and how many are in view, () int64.
+
+    Where more than `limit` are in view, the last of them are left out.
+    """
+    inside = _in_view_on_gpu(anchors, viewmat, intrinsics, width, height, near)
+    before = inside.cumsum(0)
+    every = torch.arange(len(anchors), device=inside.device)
+    count = before[-1] if len(anchors) else every.sum()
+    place = torch.where(inside, before - 1, count + every - before)
+    index = torch.empty_like(every).scatter_(0, place, every)[:limit]
+    return index, every[:limit] < count, count

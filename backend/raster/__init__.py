@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numba import config
 
 from . import cpu
 from .camera import Camera
@@ -28,50 +29,66 @@ class Rendered(NamedTuple):
     median: torch.Tensor | None
     normals: torch.Tensor | None
     distortion: torch.Tensor | None
-    frame: cpu.Frame
+    frame: Any
 
 
-def _array(tensor: torch.Tensor) -> np.ndarray:
-    return np.ascontiguousarray(tensor.detach().numpy(), np.float32)
+def _renderer(device: torch.device) -> Any:
+    """The module that draws what lies on `device`. In numba's simulator that is the CUDA renderer for everything."""
+    if device.type == "cuda" or config.ENABLE_CUDASIM:
+        from . import cuda
+
+        return cuda
+    return cpu
 
 
-def _tensor(array: np.ndarray | None) -> torch.Tensor | None:
-    return None if array is None else torch.from_numpy(array)
+def _array(renderer: Any, tensor: torch.Tensor, kind: torch.dtype = torch.float32) -> Any:
+    """A tensor as the renderer takes it."""
+    tensor = tensor.detach().to(kind).contiguous()
+    return tensor.numpy() if renderer is cpu else tensor
+
+
+def _tensor(array: Any) -> torch.Tensor | None:
+    """What the renderer made as a tensor."""
+    return torch.from_numpy(array) if isinstance(array, np.ndarray) else array
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means, quats, scales, opacities, sh, ids, camera, labels, wanted, holder):
+        renderer = ctx.renderer = _renderer(means.device)
         ctx.means_type = means.dtype
         if means.dtype == torch.float64:
             # Far from the origin (georeferenced captures) float32 would round positions: count from the camera.
-            means = means - torch.from_numpy(camera.centre)
+            means = means - torch.from_numpy(camera.centre).to(means.device, non_blocking=True)
             camera = camera.at_origin()
-        gaussians = cpu.Gaussians(
-            _array(means), _array(quats), _array(scales), _array(opacities), _array(sh),
-            np.ascontiguousarray(ids.numpy(), np.int32),
-        )  # fmt: skip
-        label_array = None if labels is None else np.ascontiguousarray(labels.numpy(), np.int32)
-        frame = cpu.forward(gaussians, camera, label_array, **wanted)
+        gaussians = renderer.Gaussians(
+            *(_array(renderer, tensor) for tensor in (means, quats, scales, opacities, sh)),
+            _array(renderer, ids, torch.int32),
+        )
+        frame = renderer.forward(
+            gaussians, camera, None if labels is None else _array(renderer, labels, torch.int32), **wanted
+        )
         ctx.frame = frame
         holder.append(frame)
         median = _tensor(frame.median)
         if median is not None:
             ctx.mark_non_differentiable(median)
-        alpha = torch.from_numpy(1.0 - frame.transmittance)
+        alpha = _tensor(1.0 - frame.transmittance)
         return (
-            torch.from_numpy(frame.color), alpha, _tensor(frame.weight), _tensor(frame.depth), _tensor(frame.normals),
+            _tensor(frame.color), alpha, _tensor(frame.weight), _tensor(frame.depth), _tensor(frame.normals),
             _tensor(frame.moments), median,
         )  # fmt: skip
 
     @staticmethod
     def backward(ctx: Any, *gradients):
         # The last plane is the median, which has none.
-        g_color, g_alpha, *others = (None if g is None else _array(g) for g in gradients[:6])
+        renderer = ctx.renderer
+        g_color, g_alpha, *others = (None if g is None else _array(renderer, g) for g in gradients[:6])
         assert g_color is not None and g_alpha is not None
-        out = cpu.backward(ctx.frame, g_color, g_alpha, *others)
+        out = renderer.backward(ctx.frame, g_color, g_alpha, *others)
         arrays = (out.means, out.quats, out.scales, out.opacities, out.sh)
-        g_means, *g_others = (torch.from_numpy(a) for a in arrays)
+        g_means, *g_others = (_tensor(a) for a in arrays)
+        assert g_means is not None
         return (g_means.to(ctx.means_type), *g_others, None, None, None, None, None)
 
 
@@ -101,6 +118,9 @@ def rasterize(
     A disc lies in the plane of the first two axes of its rotation; its third scale has no effect. Its depth in a pixel
     is that where the pixel's ray meets this plane, a 3D Gaussian's that of its centre. Normals and distortion are those
     of discs.
+
+    Tensors on a CUDA device are drawn by the CUDA renderer, and everything returned lies there; the frame's `seen` (N,)
+    and `screen_gradient` (N, 2) then are tensors too.
     """
     if primitive not in ("2d", "3d"):
         raise ValueError(f"primitive is {primitive!r}, expected '2d' or '3d'")
@@ -110,7 +130,7 @@ def rasterize(
         "want_depth": want_depth, "want_median": want_median, "want_normals": want_normals,
         "want_moments": want_distortion, "flat": primitive == "2d",
     }  # fmt: skip
-    holder: list[cpu.Frame] = []
+    holder: list[Any] = []
     color, alpha, weight, depth, normals, moments, median = _Rasterize.apply(
         means, quats, scales, opacities, sh, ids, camera, labels, wanted, holder
     )
@@ -118,6 +138,11 @@ def rasterize(
     return Rendered(color, alpha, weight, depth, median, normals, distortion, holder[0])
 
 
-def object_map(rendered: Rendered) -> tuple[np.ndarray, np.ndarray]:
-    """The most probable ID (H, W) int32 (-1 where nothing is drawn) and its probability (H, W) float32."""
-    return cpu.object_map(rendered.frame)
+def object_map(rendered: Rendered) -> tuple[Any, Any]:
+    """The most probable ID (H, W) int32 (-1 where nothing is drawn) and its probability (H, W) float32: NumPy arrays
+    from the CPU renderer, tensors on the device from the CUDA renderer."""
+    if isinstance(rendered.frame, cpu.Frame):
+        return cpu.object_map(rendered.frame)
+    from . import cuda
+
+    return cuda.object_map(rendered.frame)

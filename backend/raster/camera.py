@@ -35,6 +35,13 @@ class Camera:
         """(3,) float64: where the camera stands in the world."""
         return -np.asarray(self.viewmat[:3, :3].T @ self.viewmat[:3, 3], np.float64)
 
+    def crop(self, x: int, y: int, width: int, height: int) -> Camera:
+        """The camera of a part of the picture, whose upper left is the pixel (x, y)."""
+        K = np.array(self.K, np.float64)
+        K[0, 2] -= x
+        K[1, 2] -= y
+        return replace(self, K=K, width=width, height=height)
+
     def at_origin(self) -> Camera:
         """The same camera moved to the world's origin."""
         viewmat = self.viewmat.copy()

@@ -10,10 +10,11 @@ import numpy as np
 
 from .camera import Camera
 from .cpu_bin import bin_splats, depth_order
-from .cpu_discs import TILT_COLUMNS
 from .cpu_ids import most_probable
-from .cpu_project import GRADIENT_COLUMNS, HALF_H, SPLAT_COLUMNS, project, project_backward
+from .cpu_project import project, project_backward
 from .cpu_tiles import blend, blend_backward
+from .discs import TILT_COLUMNS
+from .splats import GRADIENT_COLUMNS, HALF_H, SPLAT_COLUMNS, view_of
 
 _NO_PLANE = np.zeros((1, 1), np.float32)
 _NO_PLANES = np.zeros((1, 1, 1), np.float32)
@@ -80,10 +81,8 @@ def forward(
     splats = np.empty((count, SPLAT_COLUMNS), np.float32)
     tilts = np.empty((count, TILT_COLUMNS), np.float32) if flat else None
     outlines = np.empty((count, SPLAT_COLUMNS), np.float32) if flat else splats
-    viewmat, intrinsics = camera.arrays()
-    near = float(camera.near)
     project(
-        g.means, g.quats, g.scales, g.opacities, g.sh, viewmat, intrinsics, width, height, near, splats, tilts, outlines
+        g.means, g.quats, g.scales, g.opacities, g.sh, view_of(camera, flat), width, height, splats, tilts, outlines
     )
     tiles, members, places, slots = bin_splats(outlines, depth_order(splats, g.ids), width, height)
 
@@ -142,9 +141,8 @@ def backward(
         np.empty_like(g.sh), np.empty(0, np.int32),
     )  # fmt: skip
     frame.screen_gradient = np.empty((g.means.shape[0], 2), np.float32)
-    viewmat, intrinsics = camera.arrays()
     project_backward(
-        g.means, g.quats, g.scales, g.opacities, g.sh, viewmat, intrinsics, int(camera.width), int(camera.height),
+        g.means, g.quats, g.scales, g.opacities, g.sh, view_of(camera, frame.tilts is not None),
         frame.splats, frame.tilts, frame.slots, rows,
         out.means, out.quats, out.scales, out.opacities, out.sh, frame.screen_gradient,
     )  # fmt: skip

@@ -12,18 +12,13 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from .cpu_project import DEPTH, HALF_H, HALF_W, LOP, SLOPE, A, C, U, V
 from .kernel import kernel
-from .settings import ALPHA_MIN
+from .splats import DEPTH, HALF_H
+from .tiles import order_ties, row_ends, tile_rows
 
 TILE_W = 64
 TILE_H = 32
 
-_LOG2_CUT = np.float32(math.log2(ALPHA_MIN))
-_PER_TILE_W = np.float32(1.0 / TILE_W)
-_PER_TILE_H = np.float32(1.0 / TILE_H)
-_HALF = np.float32(0.5)
-_ZERO = np.float32(0.0)
 _CHUNK, _CHUNKS = 2048, 16
 """Splats that a thread takes at once: at least so many, in at most so many portions."""
 
@@ -79,78 +74,9 @@ def depth_order(splats, ids):
         while last < count and keys[last] == keys[first]:
             last += 1
         if last - first > 1:
-            _order_ties(splats, ids, order, first, last)
+            order_ties(splats, ids, order, first, last)
         first = last
     return order
-
-
-@kernel()
-def _order_ties(splats, ids, order, first, last):
-    """Sort order[first:last] by position, shape, opacity, colour and id; a heap sort, as thousands may tie."""
-    n = last - first
-    for start in range(n // 2 - 1, -1, -1):
-        _sift(splats, ids, order, first, start, n)
-    for end in range(n - 1, 0, -1):
-        order[first], order[first + end] = order[first + end], order[first]
-        _sift(splats, ids, order, first, 0, end)
-
-
-@kernel()
-def _sift(splats, ids, order, first, root, end):
-    while 2 * root + 1 < end:
-        child = 2 * root + 1
-        if child + 1 < end and _before(splats, ids, order[first + child], order[first + child + 1]):
-            child += 1
-        if not _before(splats, ids, order[first + root], order[first + child]):
-            return
-        order[first + root], order[first + child] = order[first + child], order[first + root]
-        root = child
-
-
-@kernel()
-def _before(splats, ids, i, j):
-    for column in range(DEPTH):
-        if splats[i, column] != splats[j, column]:
-            return splats[i, column] < splats[j, column]
-    if ids[i] != ids[j]:
-        return ids[i] < ids[j]
-    return i < j
-
-
-@kernel()
-def _row_ends(splats, n, row, columns, height):
-    """First and last + 1 tile column that splat n's ellipse reaches inside tile row `row`."""
-    v = splats[n, V]
-    anchor = min(max(v, _ZERO), np.float32(height))
-    slope = splats[n, SLOPE]
-    u = splats[n, U] + slope * (v - anchor)
-    half_w, half_h = splats[n, HALF_W], splats[n, HALF_H]
-    box_first = max(math.floor((u - half_w - _HALF) * _PER_TILE_W), 0)
-    box_last = min(math.floor((u + half_w + _HALF) * _PER_TILE_W) + 1, columns)
-    if box_last - box_first < 2:
-        return int(box_first), int(box_last)
-    top = max(np.float32(row * TILE_H), v - half_h)
-    bottom = min(np.float32((row + 1) * TILE_H), v + half_h)
-    # The rightmost point of the ellipse lies at y = v + peak, the leftmost at v - peak; off them the ends only shrink.
-    reach = splats[n, LOP] - _LOG2_CUT
-    peak = slope * reach / (splats[n, C] * half_w)
-    y = min(max(v + peak, top), bottom)
-    half = math.sqrt(max(reach - splats[n, C] * (y - v) * (y - v), _ZERO) / splats[n, A])
-    right = splats[n, U] + slope * (y - anchor) + half
-    y = min(max(v - peak, top), bottom)
-    half = math.sqrt(max(reach - splats[n, C] * (y - v) * (y - v), _ZERO) / splats[n, A])
-    left = splats[n, U] + slope * (y - anchor) - half
-    first = max(math.floor((left - _HALF) * _PER_TILE_W), box_first)
-    last = min(math.floor((right + _HALF) * _PER_TILE_W) + 1, box_last)
-    return int(first), int(last)
-
-
-@njit(inline="always", error_model="numpy")
-def _tile_rows(splats, n, lines):
-    """First and last + 1 tile row that splat n's box reaches."""
-    first = max(math.floor((splats[n, V] - splats[n, HALF_H]) * _PER_TILE_H), 0)
-    last = min(math.floor((splats[n, V] + splats[n, HALF_H]) * _PER_TILE_H) + 1, lines)
-    return int(first), int(last)
 
 
 @kernel(parallel=True)
@@ -171,10 +97,10 @@ def bin_splats(splats, order, width, height):
     for k in prange(chunks):
         for i in range(k * chunk, min(k * chunk + chunk, order.size)):
             s = order[i]
-            top, bottom = _tile_rows(splats, s, lines)
+            top, bottom = tile_rows(splats, s, lines, TILE_H)
             met = 0
             for row in range(top, bottom):
-                first, last = _row_ends(splats, s, row, columns, height)
+                first, last = row_ends(splats, s, row, columns, height, TILE_W, TILE_H)
                 for column in range(first, last):
                     fills[k, row * columns + column] += 1
                 met += max(last - first, 0)
@@ -195,10 +121,10 @@ def bin_splats(splats, order, width, height):
     for k in prange(chunks):
         for i in range(k * chunk, min(k * chunk + chunk, order.size)):
             s = order[i]
-            top, bottom = _tile_rows(splats, s, lines)
+            top, bottom = tile_rows(splats, s, lines, TILE_H)
             slot = slots[s]
             for row in range(top, bottom):
-                first, last = _row_ends(splats, s, row, columns, height)
+                first, last = row_ends(splats, s, row, columns, height, TILE_W, TILE_H)
                 for column in range(first, last):
                     place = fills[k, row * columns + column]
                     fills[k, row * columns + column] = place + 1

@@ -13,11 +13,11 @@ from numba import njit, prange
 
 from . import simd
 from .cpu_bin import TILE_H, TILE_W, spread
-from .cpu_discs import NEAREST, QX, SPOT, SPOT_U
-from .cpu_project import HALF_H, HALF_W, LOP, A, V
 from .cpu_tiles import ROW_SLOTS, STRIDE, disc_rows, live_rows, splat_rows
+from .discs import NEAREST, QX, SPOT, SPOT_U
 from .kernel import kernel
 from .settings import ALPHA_MAX, ALPHA_MIN, STOP
+from .splats import HALF_H, HALF_W, LOP, A, V
 
 _LOG2_CUT = np.float32(math.log2(ALPHA_MIN))
 _ALPHA_MAX = np.float32(ALPHA_MAX)

@@ -16,10 +16,10 @@ from numba import njit, prange
 
 from . import simd
 from .cpu_bin import TILE_H, TILE_W, spread
-from .cpu_discs import MIDDLE, NEAREST, NORMAL_X, NORMAL_Y, NORMAL_Z, Q0, QX, QY, SPOT, SPOT_U
-from .cpu_project import BLUE, DEPTH, GREEN, HALF_H, LOP, RED, SLOPE, A, C, U, V
+from .discs import MIDDLE, NEAREST, NORMAL_X, NORMAL_Y, NORMAL_Z, Q0, QX, QY, SPOT, SPOT_U
 from .kernel import kernel
 from .settings import ALPHA_MAX, ALPHA_MIN, STOP
+from .splats import BLUE, DEPTH, GREEN, HALF_H, LOP, RED, SLOPE, A, C, U, V
 
 STRIDE = TILE_W + simd.LANES
 """A tile row in memory: the last vector of a span may hang over the tile's right edge."""

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from .. import device
 from ..model.object_model import ObjectModel, anchors_in_view
 from . import object_map, rasterize
 from .camera import Camera
@@ -31,14 +32,14 @@ def draw(model: ObjectModel, camera: Camera, want_ids: bool = True, want_depth: 
     with torch.no_grad():
         drawn = rasterize(*g[:6], camera, want_depth=want_depth, primitive=model.primitive)
         image = drawn.color + (1 - drawn.alpha) * model.background.detach()[:, None, None]
-        image = image * torch.tensor(camera.gain)[:, None, None]
-        pixels = image.clamp(0, 1).permute(1, 2, 0).contiguous().numpy()
-    alpha = drawn.alpha.numpy()
+        image = image * torch.tensor(camera.gain).to(image.device)[:, None, None]
+        pixels = device.host(image.clamp(0, 1).permute(1, 2, 0).contiguous())
+    alpha = device.host(drawn.alpha)
     depth = None
     if drawn.depth is not None:
-        depth = drawn.depth.numpy() / np.maximum(alpha, 1e-6) / np.float32(model.normalization.scale)
+        depth = device.host(drawn.depth) / np.maximum(alpha, 1e-6) / np.float32(model.normalization.scale)
     ids = probability = None
     if want_ids:
-        classes, probability = object_map(drawn)
+        classes, probability = (device.host(plane) for plane in object_map(drawn))
         ids = np.where(classes >= 0, model.object_ids[np.maximum(classes, 0)], 0)
     return Picture(pixels, ids, probability, alpha, depth)

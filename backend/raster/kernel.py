@@ -25,8 +25,10 @@ def digest_up_to(package: str) -> str:
     return digest.hexdigest()
 
 
-def kernel(parallel: bool = False, fastmath: bool | set[str] = False) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator: numba.njit with NumPy's division, cached on disk.
+def kernel(
+    parallel: bool = False, fastmath: bool | set[str] = False, inline: bool = False
+) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator: numba.njit with NumPy's division, cached on disk; inline: a part of whatever kernel calls it.
 
     numba renews a function's cache when the function's own file changes, although the code holds constants and
     functions of other files too; here the cache is as old as the content of all files of the function's package and of
@@ -34,7 +36,13 @@ def kernel(parallel: bool = False, fastmath: bool | set[str] = False) -> Callabl
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        dispatcher = njit(parallel=parallel, cache=True, error_model="numpy", fastmath=fastmath)(function)
+        dispatcher = njit(
+            parallel=parallel,
+            cache=True,
+            error_model="numpy",
+            fastmath=fastmath,
+            inline="always" if inline else "never",
+        )(function)
         digest = digest_up_to(function.__module__.split(".")[-2])
         # Without a cache folder, or with another numba inside, numba's own rule stays.
         with contextlib.suppress(AttributeError):

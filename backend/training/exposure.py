@@ -6,9 +6,12 @@ colours are found by alternating least squares. Training then compares the splat
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from ..capture import Capture
+if TYPE_CHECKING:
+    from ..capture import Capture
 
 VARIES_FROM = 0.02
 """Standard deviation of the log gains from which on exposure is said to vary."""

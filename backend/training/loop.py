@@ -1,28 +1,33 @@
-"""The training loop: one view a step, growth now and then, checkpoints, a curve of held-out quality over time."""
+"""The training loop: one view a step, growth now and then, checkpoints, a curve of held-out quality over time.
+
+The model, its moments and the pictures lie on one device, the processor or a GPU, and so does a step: on a GPU the
+processor only says what is to be done and does not wait for numbers, which it reads when it reports or saves.
+"""
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 
-from ..capture import Capture
+from .. import device
 from ..model.anchors import Anchors, median_spacing, seed_anchors
 from ..model.checkpoint import load_checkpoint, save_checkpoint
-from ..model.generate import generate
+from ..model.generate import Generated, generate
 from ..model.growth import GrowthStatistics, grow_and_prune
 from ..model.heads import Heads
-from ..model.object_model import Normalization, ObjectModel, anchors_in_view
+from ..model.object_model import Normalization, ObjectModel, anchors_in_view, first_anchors_in_view
 from ..protocol import Cancelled, InputError, Reporter
-from ..raster import Rendered, rasterize
+from ..raster import Camera, Rendered, rasterize
 from ..stopping import StopRequest
 from .adam import BETA1, BETA2, step_rows, take_rows
 from .losses import image_loss, normal_loss, volume_loss
@@ -40,9 +45,24 @@ from .settings import (
     row_rates,
 )
 
+if TYPE_CHECKING:
+    from ..capture import Capture
+
 CHECKPOINT_SECONDS = 30.0
 _REPORT_SECONDS = 0.5
 _EVALUATIONS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)
+
+MOST_PARTS = 16
+"""A picture that does not fit into the GPU's memory is drawn in so many parts at most."""
+
+_IN_PARTS = (
+    "The GPU's memory is full, so each picture is learned in {parts} parts from here on, and fewer pictures are kept "
+    "there; a smaller --max-size or --max-anchors would be faster."
+)
+_NO_ROOM = (
+    "The GPU's memory is too small, even for a sixteenth of a picture at a time; close programs that use it, or try a "
+    "smaller --max-size or --max-anchors, or --device cpu."
+)
 
 Evaluate = Callable[[ObjectModel, Scene], dict[str, Any]]
 
@@ -82,8 +102,89 @@ class Progress:
     curve: list[dict[str, Any]] = field(default_factory=list)
 
 
+class _Part(NamedTuple):
+    """A picture, or a strip of one: its camera, picture (3, h, w), labels (h, w), the share of the picture's pixels
+    that it has, and by how much more of its pixels are labelled than of the whole picture's."""
+
+    camera: Camera
+    picture: torch.Tensor
+    labels: torch.Tensor | None
+    share: float
+    more_labels: float | torch.Tensor
+
+
+class _Shown(NamedTuple):
+    """What growth needs to know of a drawn part: its anchors (n,), the `source` (S,) of its splats and their opacities
+    (S,), which of them met the picture (S,), and their gradient on the screen (S, 2)."""
+
+    anchors: torch.Tensor
+    source: torch.Tensor
+    opacities: torch.Tensor
+    met: torch.Tensor | np.ndarray
+    screen_gradient: torch.Tensor | np.ndarray
+
+
+class _Learned(NamedTuple):
+    """One view's loss () and gradients: in `rows` (n, columns), copies of those of the anchors `seen` (n,), and in the
+    heads. On the GPU, sound () bool: whether anything may come of them, and usable (n,) bool: of which rows."""
+
+    camera: Camera
+    loss: torch.Tensor
+    seen: torch.Tensor
+    rows: torch.Tensor
+    sound: torch.Tensor | None
+    usable: torch.Tensor | None
+    shown: list[_Shown]
+
+
+class _Limits:
+    """How many anchors to take for a view without waiting for their number: somewhat more than it had in sight last
+    time, which the GPU has reported since. All, for a view that is new."""
+
+    _MARGIN, _STEP = 1.25, 4096
+
+    def __init__(self) -> None:
+        self._reports: dict[int, tuple[torch.Tensor, torch.cuda.Event | None, int]] = {}
+
+    def of(self, view: int, anchors: int) -> int:
+        """The limit for a view where there are so many anchors in all."""
+        if view not in self._reports:
+            return anchors
+        count, arrived, then = self._reports[view]
+        if arrived is not None and not arrived.query():
+            return anchors
+        expected = int(count) * anchors / max(then, 1)
+        return min(anchors, math.ceil(self._MARGIN * expected / self._STEP + 1) * self._STEP)
+
+    def note(self, view: int, count: torch.Tensor, anchors: int) -> None:
+        """The view has `count` () of so many anchors in sight."""
+        if not count.is_cuda:
+            self._reports[view] = (count, None, anchors)
+            return
+        report = torch.empty((), dtype=count.dtype, pin_memory=True).copy_(count, non_blocking=True)
+        arrived = torch.cuda.Event()
+        arrived.record()
+        self._reports[view] = (report, arrived, anchors)
+
+
+def strips(
+    camera: Camera, picture: torch.Tensor, labels: torch.Tensor | None, count: int
+) -> list[tuple[Camera, torch.Tensor, torch.Tensor | None]]:
+    """The picture (3, H, W), its labels (H, W) and its camera in `count` strips across its longer side."""
+    wide = camera.width >= camera.height
+    length = camera.width if wide else camera.height
+    edges = [round(i * length / count) for i in range(count + 1)]
+    found = []
+    for first, last in itertools.pairwise(sorted(set(edges))):
+        part = (slice(None), slice(first, last)) if wide else (slice(first, last), slice(None))
+        size = last - first
+        crop = camera.crop(first, 0, size, camera.height) if wide else camera.crop(0, first, camera.width, size)
+        found.append((crop, picture[:, *part].contiguous(), None if labels is None else labels[part].contiguous()))
+    return found
+
+
 class Trainer:
-    """One model in training. Create with `start` or `resume`, then `run`."""
+    """One model in training, on the device where it lies. Create with `start` or `resume`, then `run`."""
 
     def __init__(self, scene: Scene, settings: Settings, model: ObjectModel, rng: np.random.Generator) -> None:
         self.scene = scene
@@ -92,9 +193,13 @@ class Trainer:
         self.rng = rng
         self.progress = Progress()
         anchors = model.anchors
-        self._first = np.zeros_like(anchors.rows)
-        self._second = np.zeros_like(anchors.rows)
-        self._statistics = GrowthStatistics.zeros(len(anchors), anchors.layout.offsets)
+        self.parts = 1
+        self._first = torch.zeros_like(anchors.rows)
+        self._second = torch.zeros_like(anchors.rows)
+        self._statistics = GrowthStatistics.zeros(len(anchors), anchors.layout.offsets, model.device)
+        self._limits = _Limits()
+        self._skipped = torch.zeros((), dtype=torch.int64, device=model.device)
+        self._splats: int | torch.Tensor = 0
         model.background.requires_grad_(settings.background == "learned")
         groups: list[dict[str, Any]] = [
             {"params": list(getattr(model.heads, name).parameters()), "name": name, "lr": ends[0]}
@@ -102,11 +207,18 @@ class Trainer:
             if name != "background"
         ]
         groups.append({"params": [model.background], "name": "background", "lr": HEAD_RATES["background"][0]})
-        self._head_optimizer = torch.optim.Adam(groups, betas=(BETA1, BETA2), eps=1e-15, foreach=True)
+        self._head_optimizer = torch.optim.Adam(groups, betas=(BETA1, BETA2), eps=1e-15, fused=True)
 
     @classmethod
-    def start(cls, capture: Capture, point_ids: np.ndarray, settings: Settings, memory_mb: float = 2000) -> Trainer:
-        """A fresh model on the capture's points, whose objects are point_ids ((M,) int64)."""
+    def start(
+        cls,
+        capture: Capture,
+        point_ids: np.ndarray,
+        settings: Settings,
+        memory_mb: float = 2000,
+        place: torch.device = device.CPU,
+    ) -> Trainer:
+        """A fresh model on the capture's points, whose objects are point_ids ((M,) int64), on the device `place`."""
         rng = np.random.default_rng(settings.seed)
         xyz = capture.points.xyz
         eyes = np.array([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in capture.views])
@@ -121,15 +233,19 @@ class Trainer:
         grey = {"learned": 0.5, "black": 0.0, "white": 1.0}[settings.background]
         model = ObjectModel(anchors, heads, torch.full((3,), grey), object_ids, normalization, settings.primitive)
         rest = capture.has_masks and bool((np.asarray(point_ids) == 0).mean() >= REST_FROM)
-        scene = Scene(capture, object_ids, normalization, settings.zero_is_object, memory_mb, teach_unlabelled=rest)
-        return cls(scene, settings, model, rng)
+        scene = Scene(
+            capture, object_ids, normalization, settings.zero_is_object, memory_mb, teach_unlabelled=rest, place=place
+        )
+        return cls(scene, settings, model.to(place), rng)
 
     # --- state on disk -------------------------------------------------------------------------------------------
 
     def save(self, folder: Path) -> None:
         """Write everything that the next step depends on."""
         model, anchors, s = self.model, self.model.anchors, self._statistics
-        tensors = {
+        self.progress.skipped += int(self._skipped)
+        self._skipped.zero_()
+        tensors: dict[str, torch.Tensor | np.ndarray] = {
             "anchors.positions": anchors.positions,
             "anchors.rows": anchors.rows,
             "anchors.ids": anchors.ids,
@@ -140,17 +256,17 @@ class Trainer:
             "growth.opacity": s.opacity,
             "growth.views": s.views,
             "object_ids": model.object_ids,
-            "background": model.background.detach().numpy(),
+            "background": model.background,
         }
         for name, value in model.heads.state_dict().items():
-            tensors[f"heads.{name}"] = value.numpy()
+            tensors[f"heads.{name}"] = value
         for i, state in self._head_optimizer.state_dict()["state"].items():
             for name in ("step", "exp_avg", "exp_avg_sq"):
-                tensors[f"head_adam.{i}.{name}"] = state[name].numpy()
+                tensors[f"head_adam.{i}.{name}"] = state[name]
         p = self.progress
         save_checkpoint(
             folder,
-            tensors,
+            {name: device.host(value) for name, value in tensors.items()},
             {
                 "settings": self.settings.as_dict(),
                 "voxel": anchors.voxel,
@@ -163,11 +279,17 @@ class Trainer:
 
     @classmethod
     def resume(
-        cls, capture: Capture, folder: Path, settings: Settings | None = None, memory_mb: float = 2000
+        cls,
+        capture: Capture,
+        folder: Path,
+        settings: Settings | None = None,
+        memory_mb: float = 2000,
+        place: torch.device = device.CPU,
     ) -> tuple[Trainer, str | None] | None:
         """The trainer of the newest whole checkpoint in `folder` and a warning, or None if there is none.
 
-        settings: what is asked for now; raises InputError if the checkpoint was made under others.
+        It goes on on the device `place`, whichever it was saved on. settings: what is asked for now; raises InputError
+        if the checkpoint was made under others.
         """
         found = load_checkpoint(folder)
         if found is None:
@@ -183,23 +305,24 @@ class Trainer:
         model = model_from_checkpoint(tensors, state)
         scene = Scene(
             capture, model.object_ids, model.normalization, stored.zero_is_object, memory_mb,
-            teach_unlabelled=state["teach_unlabelled"],
+            teach_unlabelled=state["teach_unlabelled"], place=place,
         )  # fmt: skip
         rng = np.random.default_rng()
         rng.bit_generator.state = state["rng"]
-        trainer = cls(scene, stored, model, rng)
-        trainer._first, trainer._second = tensors["adam.first"].copy(), tensors["adam.second"].copy()
+        trainer = cls(scene, stored, model.to(place), rng)
+
+        def there(name: str) -> torch.Tensor:
+            return torch.from_numpy(tensors[name].copy()).to(place)
+
+        trainer._first, trainer._second = there("adam.first"), there("adam.second")
         trainer._statistics = GrowthStatistics(
-            *(tensors[f"growth.{name}"].copy() for name in ("gradient", "visits", "opacity", "views"))
+            *(there(f"growth.{name}") for name in ("gradient", "visits", "opacity", "views"))
         )
         optimizer = trainer._head_optimizer
         saved = optimizer.state_dict()
         count = sum(len(group["params"]) for group in saved["param_groups"])
         saved["state"] = {
-            i: {
-                name: torch.from_numpy(tensors[f"head_adam.{i}.{name}"].copy())
-                for name in ("step", "exp_avg", "exp_avg_sq")
-            }
+            i: {name: there(f"head_adam.{i}.{name}") for name in ("step", "exp_avg", "exp_avg_sq")}
             for i in range(count)
             if f"head_adam.{i}.step" in tensors
         }
@@ -246,7 +369,8 @@ class Trainer:
         before = p.seconds
         first_step = p.step
         p.evaluated = sum(1 for share in _EVALUATIONS if share <= budget.share(p.step, p.seconds))
-        smooth = math.nan
+        smooth = torch.full((), math.nan, device=self.model.device)
+        parts = self.parts
         while True:
             p.seconds = before + time.monotonic() - started
             share = budget.share(p.step, p.seconds)
@@ -265,12 +389,15 @@ class Trainer:
                 self.save(checkpoints)
                 raise Cancelled(f"Stopped after {p.step} steps; run the same command again to go on.")
             loss = self.step(share)
-            smooth = loss if math.isnan(smooth) else 0.95 * smooth + 0.05 * loss
+            smooth = torch.where(smooth.isnan(), loss, smooth.lerp(loss, 0.05))
+            if parts == 1 < self.parts:
+                reporter.warning(_IN_PARTS.format(parts=self.parts))
+                parts = self.parts
             now = time.monotonic()
             if now - last_report >= _REPORT_SECONDS:
                 last_report = now
                 p.seconds = before + now - started
-                self._report(budget, reporter, smooth, (now - started) / (p.step - first_step))
+                self._report(budget, reporter, float(smooth), (now - started) / (p.step - first_step))
             if now - last_saved >= checkpoint_seconds:
                 self.save(checkpoints)
                 last_saved = time.monotonic()
@@ -303,87 +430,173 @@ class Trainer:
             miou=latest.get("miou"),
         )
 
-    splats: int = 0
-    """Splats drawn in the latest step."""
+    @property
+    def splats(self) -> int:
+        """Splats drawn in the latest step."""
+        return int(self._splats)
 
-    def step(self, share: float) -> float:
-        """One view forward, backward and update; returns the loss. share: how much of the training is behind."""
-        p, anchors, settings = self.progress, self.model.anchors, self.settings
+    def step(self, share: float) -> torch.Tensor:
+        """One view forward, backward and update; returns the loss, () float32, NaN where nothing came of it.
+
+        share: how much of the training is behind. Where the GPU's memory does not do, the view is learned again in
+        more parts (`parts`).
+        """
+        p = self.progress
         if not p.queue:
             p.queue = self.rng.permutation(self.scene.capture.train_indices).tolist()
-        index = p.queue[-1]
+        learned, full = self._learn_if_it_fits(p.queue[-1], share)
+        while full:
+            self._make_room()
+            learned, full = self._learn_if_it_fits(p.queue[-1], share)
+        # Only now, so that a picture that cannot be read stays the next one.
+        p.queue.pop()
+        p.step += 1
+        if learned is None:
+            return torch.full((), math.nan, device=self.model.device)
+        self._update(learned, share)
+        if GROW_FROM / 2 <= share < GROW_UNTIL:
+            self._grow(learned, share)
+        return learned.loss
+
+    def _learn_if_it_fits(self, index: int, share: float) -> tuple[_Learned | None, bool]:
+        """What `_learn` finds, and whether the GPU's memory was full instead."""
+        try:
+            return self._learn(index, share), False
+        except Exception as error:
+            if not device.is_out_of_memory(error):
+                raise
+            return None, True
+
+    def _make_room(self) -> None:
+        """Prepare for the same view again, at a lower cost in memory."""
+        if self.parts >= MOST_PARTS:
+            raise InputError(_NO_ROOM)
+        self.parts *= 2
+        self._head_optimizer.zero_grad(set_to_none=True)
+        self.scene.forget(shrink=0.5)
+        if self.model.device.type == "cuda":
+            torch.cuda.empty_cache()
+
+    def _learn(self, index: int, share: float) -> _Learned | None:
+        """The loss of view `index` and its gradients; None where the view shows nothing or, on the processor, the loss
+        is not finite."""
+        anchors, on_gpu = self.model.anchors, device.on_gpu(self.model.anchors.rows)
         view = self.scene.capture.views[index]
         downscale = downscale_at(share, max(view.width, view.height))
         picture, labels = self.scene.target(index, downscale)
-        # Only now, so that a picture that cannot be read stays the next one.
-        p.queue.pop()
         camera = self.scene.camera(index, downscale)
-        viewmat, intrinsics = camera.arrays()
-        seen = anchors_in_view(anchors, viewmat, intrinsics, camera.width, camera.height, camera.near)
-        p.step += 1
+        present = None
+        if on_gpu and self.parts == 1:
+            limit = self._limits.of(index, len(anchors))
+            seen, present, count = first_anchors_in_view(anchors, *_frustum(camera), limit)
+            self._limits.note(index, count, len(anchors))
+        else:
+            seen = anchors_in_view(anchors, *_frustum(camera))
         if len(seen) == 0:
-            return math.nan
+            return None
+        self._head_optimizer.zero_grad(set_to_none=True)
+        rows = take_rows(anchors.rows, seen).requires_grad_()
+        loss = torch.zeros((), device=rows.device)
+        self._splats = 0
+        shown = []
+        for part in self._parts_of(camera, picture, labels):
+            chosen = self._chosen(part, seen, rows)
+            of_part, g, drawn = self._loss(part, *chosen, present, share)
+            if not on_gpu and not math.isfinite(float(of_part.detach())):
+                self._skipped += 1
+                return None
+            of_part.backward()
+            loss = loss + of_part.detach()
+            self._splats = self._splats + (len(g.source) if g.made is None else g.made.sum())
+            if GROW_FROM / 2 <= share < GROW_UNTIL and drawn.frame.screen_gradient is not None:
+                shown.append(
+                    _Shown(chosen[0], g.source, g.opacities.detach(), drawn.frame.seen, drawn.frame.screen_gradient)
+                )
+        sound = usable = None
+        if on_gpu:
+            sound = loss.isfinite() if present is None else loss.isfinite() & present.any()
+            usable = sound.expand(len(seen)) if present is None else sound & present
+        return _Learned(camera, loss, seen, rows, sound, usable, shown)
 
-        rows = torch.from_numpy(take_rows(anchors.rows, seen)).requires_grad_()
+    def _parts_of(self, camera: Camera, picture: torch.Tensor, labels: torch.Tensor | None) -> Iterator[_Part]:
+        """What to draw at a time. The parts' losses add up to the picture's, but for SSIM beside the cuts."""
+        if self.parts == 1:
+            yield _Part(camera, picture, labels, 1.0, 1.0)
+            return
+        for crop, cut, cut_labels in strips(camera, picture, labels, self.parts):
+            share = crop.width * crop.height / (camera.width * camera.height)
+            more: float | torch.Tensor = 1.0
+            if labels is not None and cut_labels is not None:
+                more = (cut_labels >= 0).sum() / ((labels >= 0).sum().clamp(min=1) * share)
+            yield _Part(crop, cut, cut_labels, share, more)
+
+    def _chosen(self, part: _Part, seen: torch.Tensor, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The anchors and rows that a part is drawn from, of those of the whole picture."""
+        if self.parts == 1:
+            return seen, rows
+        a = self.model.anchors
+        here = anchors_in_view(
+            Anchors(a.layout, a.voxel, a.positions[seen], rows.detach(), a.ids[seen]), *_frustum(part.camera)
+        )
+        return seen[here], rows.index_select(0, here)
+
+    def _loss(
+        self, part: _Part, seen: torch.Tensor, rows: torch.Tensor, present: torch.Tensor | None, share: float
+    ) -> tuple[torch.Tensor, Generated, Rendered]:
+        """The loss of a part, weighted by its size, and what was drawn for it from the anchors' rows."""
+        anchors, settings = self.model.anchors, self.settings
         g = generate(
-            anchors.layout, torch.from_numpy(anchors.positions[seen]), rows, torch.from_numpy(anchors.ids[seen]),
-            self.model.heads, camera.centre,
+            anchors.layout, anchors.positions[seen], rows, anchors.ids[seen], self.model.heads, part.camera.centre,
+            present,
         )  # fmt: skip
-        self.splats = len(g.source)
         flat = settings.primitive == "2d"
         normal_weight, distortion_weight = (
             weight if flat and share >= SURFACE_FROM else 0.0
             for weight in (settings.normal_weight, settings.distortion_weight)
         )
         drawn = rasterize(
-            *g[:6], camera, labels=labels if settings.semantic_weight else None, primitive=settings.primitive,
-            want_depth=normal_weight > 0, want_normals=normal_weight > 0, want_distortion=distortion_weight > 0,
+            *g[:6], part.camera, labels=part.labels if settings.semantic_weight else None,
+            primitive=settings.primitive, want_depth=normal_weight > 0, want_normals=normal_weight > 0,
+            want_distortion=distortion_weight > 0,
         )  # fmt: skip
         loss = image_loss(
-            drawn.color, drawn.alpha, drawn.weight, self.model.background, picture, labels,
-            settings.ssim_weight, settings.semantic_weight,
+            drawn.color, drawn.alpha, drawn.weight, self.model.background, part.picture, part.labels,
+            settings.ssim_weight, settings.semantic_weight * part.more_labels,
         )  # fmt: skip
         if settings.volume_weight and len(g.scales):
-            loss = loss + settings.volume_weight * (0.5 if flat else 1.0) * volume_loss(g.scales, flat)
+            loss = loss + settings.volume_weight * (0.5 if flat else 1.0) * volume_loss(g.scales, flat, g.made)
         if drawn.normals is not None and drawn.depth is not None:
+            intrinsics = part.camera.arrays()[1]
             loss = loss + normal_weight * normal_loss(drawn.normals, drawn.depth, drawn.alpha, intrinsics)
         if drawn.distortion is not None:
             loss = loss + distortion_weight * drawn.distortion.mean()
-        value = float(loss.detach())
-        if not math.isfinite(value):
-            p.skipped += 1
-            return value
-        self._head_optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        self._update(seen, rows, share)
-        if GROW_FROM / 2 <= share < GROW_UNTIL:
-            self._grow(seen, g.source.numpy(), g.opacities.detach().numpy(), drawn, share)
-        return value
+        return part.share * loss if self.parts > 1 else loss, g, drawn
 
-    def _update(self, seen: np.ndarray, rows: torch.Tensor, share: float) -> None:
-        step = self.progress.step
-        for group in self._head_optimizer.param_groups:
+    def _update(self, learned: _Learned, share: float) -> None:
+        step, optimizer = self.progress.step, self._head_optimizer
+        for group in optimizer.param_groups:
             group["lr"] = rate(HEAD_RATES[group["name"]], share)
-        heads = [parameter for group in self._head_optimizer.param_groups for parameter in group["params"]]
-        if all(parameter.grad is None or bool(torch.isfinite(parameter.grad).all()) for parameter in heads):
-            self._head_optimizer.step()
-        else:
-            self.progress.skipped += 1
-        assert rows.grad is not None
-        self.progress.skipped += int(
-            step_rows(
-                self.model.anchors.rows, self._first, self._second, seen, rows.grad.numpy(),
-                row_rates(self.settings.layout, share), 1 - BETA1**step, 1 - BETA2**step,
-            )
+        parameters = (parameter for group in optimizer.param_groups for parameter in group["params"])
+        gradients = [parameter.grad.flatten() for parameter in parameters if parameter.grad is not None]
+        sound = torch.cat(gradients).isfinite().all()
+        if learned.sound is not None:
+            sound = sound & learned.sound
+        # As torch's gradient scaler does it: the optimiser looks at this on the device and leaves everything as it is.
+        optimizer.found_inf = (~sound).float()  # type: ignore[attr-defined]
+        optimizer.step()
+        assert learned.rows.grad is not None
+        self._skipped += ~sound + step_rows(
+            self.model.anchors.rows, self._first, self._second, learned.seen, learned.rows.grad,
+            row_rates(self.settings.layout, share), 1 - BETA1**step, 1 - BETA2**step, learned.usable,
         )  # fmt: skip
 
-    def _grow(self, seen: np.ndarray, source: np.ndarray, opacities: np.ndarray, drawn: Rendered, share: float) -> None:
-        p, anchors = self.progress, self.model.anchors
-        frame = drawn.frame
-        if frame.screen_gradient is not None:
+    def _grow(self, learned: _Learned, share: float) -> None:
+        p, anchors, camera = self.progress, self.model.anchors, learned.camera
+        for part in learned.shown:
+            usable = learned.usable if self.parts == 1 else None
             self._statistics.add(
-                seen, anchors.layout.offsets, source, opacities, frame.seen, frame.screen_gradient,
-                frame.camera.width, frame.camera.height,
+                part.anchors, anchors.layout.offsets, part.source, part.opacities, part.met, part.screen_gradient,
+                camera.width, camera.height, usable,
             )  # fmt: skip
         if share < GROW_FROM or p.step - p.last_growth < GROW_EVERY:
             return
@@ -392,20 +605,25 @@ class Trainer:
             anchors, self._statistics, GROW_EVERY // 5, self.rng, max_anchors=self.settings.max_anchors
         )
 
-        def follow(moments: np.ndarray) -> np.ndarray:
-            fresh = np.zeros((growth.added, moments.shape[1]), np.float32)
-            return np.concatenate([moments[growth.kept], fresh])
+        def follow(moments: torch.Tensor) -> torch.Tensor:
+            return torch.cat([moments[growth.kept], moments.new_zeros((growth.added, moments.shape[1]))])
 
         self._first, self._second = follow(self._first), follow(self._second)
-        self._statistics = GrowthStatistics.zeros(len(anchors), anchors.layout.offsets)
+        self._statistics = GrowthStatistics.zeros(len(anchors), anchors.layout.offsets, self.model.device)
+
+
+def _frustum(camera: Camera) -> tuple[np.ndarray, np.ndarray, int, int, float]:
+    """What `anchors_in_view` asks for."""
+    return (*camera.arrays(), camera.width, camera.height, camera.near)
 
 
 def model_from_checkpoint(tensors: dict[str, np.ndarray], state: dict[str, Any]) -> ObjectModel:
     """The model that `load_checkpoint` returned the tensors and state of."""
     settings = Settings(**state["settings"])
     anchors = Anchors(
-        settings.layout, float(state["voxel"]), *(tensors[f"anchors.{n}"].copy() for n in ("positions", "rows", "ids"))
-    )
+        settings.layout, float(state["voxel"]),
+        *(torch.from_numpy(tensors[f"anchors.{n}"].copy()) for n in ("positions", "rows", "ids")),
+    )  # fmt: skip
     heads = Heads(settings.layout, settings.mode, settings.sh_degree, torch.Generator())
     heads.load_state_dict(
         {k.removeprefix("heads."): torch.from_numpy(v.copy()) for k, v in tensors.items() if k.startswith("heads.")}
@@ -418,13 +636,14 @@ def model_from_checkpoint(tensors: dict[str, np.ndarray], state: dict[str, Any])
     )  # fmt: skip
 
 
-def load_model(folder: Path) -> tuple[ObjectModel, dict[str, Any], str | None]:
-    """The trained model of a checkpoint folder, its state, and a warning; raises InputError if there is none."""
+def load_model(folder: Path, place: torch.device = device.CPU) -> tuple[ObjectModel, dict[str, Any], str | None]:
+    """The trained model of a checkpoint folder, on the device `place`, its state, and a warning; raises InputError if
+    there is none."""
     found = load_checkpoint(folder)
     if found is None:
         raise InputError(f"{folder} holds no checkpoint; train first.")
     tensors, state, warning = found
-    return model_from_checkpoint(tensors, state), state, warning
+    return model_from_checkpoint(tensors, state).to(place), state, warning
 
 
 def progress_of(state: dict[str, Any]) -> Progress:

@@ -14,8 +14,10 @@ import numpy as np
 import torch
 from numba import njit, prange
 
+from .. import device
 from ..raster import simd
 from ..raster.kernel import kernel
+from . import losses_on_gpu
 
 _RADIUS = 5
 _C1 = 0.01**2
@@ -187,6 +189,12 @@ def _label_loss(weight, labels, floor, scale, g_weight):
 class _ImageLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, color, alpha, weight, background, target, labels, ssim_weight, semantic_weight):
+        if device.on_gpu(color):
+            loss, ctx.gradients = losses_on_gpu.image_loss(
+                color, alpha, weight, background, target, labels, ssim_weight, semantic_weight, _WINDOW,
+                PROBABILITY_FLOOR,
+            )  # fmt: skip
+            return loss
         arrays = [t.detach().numpy() for t in (color, alpha, background)]
         shown = target.numpy()
         image = np.empty_like(shown)
@@ -206,13 +214,15 @@ class _ImageLoss(torch.autograd.Function):
             semantic = _label_loss(
                 weight.detach().numpy(), labels.numpy(), PROBABILITY_FLOOR, semantic_weight, g_weight
             )
-        ctx.gradients = (g_color, g_alpha, g_weight, g_background)
+        ctx.gradients = tuple(
+            None if a is None else torch.from_numpy(a) for a in (g_color, g_alpha, g_weight, g_background)
+        )
         loss = (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim) + semantic_weight * semantic
         return torch.tensor(loss, dtype=torch.float32)
 
     @staticmethod
     def backward(ctx: Any, g):
-        scaled = [None if a is None else torch.from_numpy(a) * g for a in ctx.gradients]
+        scaled = [None if a is None else a * g for a in ctx.gradients]
         return (*scaled, None, None, None, None)
 
 
@@ -246,9 +256,11 @@ class _VolumeLoss(torch.autograd.Function):
         return torch.from_numpy(ctx.gradient) * g, None
 
 
-def volume_loss(scales: torch.Tensor, flat: bool = False) -> torch.Tensor:
+def volume_loss(scales: torch.Tensor, flat: bool = False, made: torch.Tensor | None = None) -> torch.Tensor:
     """Mean volume of the splats, prod(scales) of scales (N, 3), N > 0 (Scaffold-GS equation 9, taken as a mean), or
-    their mean area if they are `flat`."""
+    their mean area if they are `flat`. made (N,) bool, on the GPU alone: the other places hold no splat."""
+    if device.on_gpu(scales):
+        return losses_on_gpu.volume_loss(scales, flat, made)
     return _VolumeLoss.apply(scales, flat)
 
 
@@ -356,6 +368,8 @@ def normal_loss(
     normals (3, H, W), depth and alpha (H, W) as in `Rendered`; intrinsics (fx, fy, cx, cy) in pixels. Counts where the
     pixel and its neighbours are covered and the surface is not seen from its very edge, as a jump in depth would be.
     """
+    if device.on_gpu(depth):
+        return losses_on_gpu.normal_loss(normals, depth, alpha, intrinsics, _SOLID, _GRAZING)
     return _NormalLoss.apply(normals, depth, alpha, intrinsics)
 
 
@@ -367,10 +381,11 @@ def image_loss(
     target: torch.Tensor,
     labels: torch.Tensor | None,
     ssim_weight: float,
-    semantic_weight: float,
+    semantic_weight: float | torch.Tensor,
 ) -> torch.Tensor:
     """Scalar loss of one view: color and target (3, H, W), alpha, weight and labels (H, W), background (3,).
 
     Labels of -1 are ignored. weight is the rendered probability of each pixel's label; None: no semantic term.
+    semantic_weight may be a number on the device where the rest is on the GPU.
     """
     return _ImageLoss.apply(color, alpha, weight, background, target, labels, ssim_weight, semantic_weight)

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-from ..capture import Capture
+from .. import device
 from ..model.object_model import Normalization
 from ..raster import Camera
 from .exposure import measure_gains, varies
+
+if TYPE_CHECKING:
+    from ..capture import Capture
+
+_SHARE_OF_GPU = 0.25
+"""Of the GPU's free memory, at most this share holds targets."""
 
 
 class Scene:
@@ -19,6 +26,7 @@ class Scene:
 
     teach_unlabelled: pixels of ID 0 are taught to show no object; otherwise nothing is taught there.
     Where the photos' exposure varies (`exposure_varies`), `gains` (V, 3) say by how much; else they are 1.
+    Targets lie on the device `place`, as many as memory_mb and the device have room for.
     """
 
     def __init__(
@@ -30,6 +38,7 @@ class Scene:
         memory_mb: float = 2000,
         undo_exposure: bool = True,
         teach_unlabelled: bool = False,
+        place: torch.device = device.CPU,
     ) -> None:
         self.capture = capture
         self.object_ids = object_ids
@@ -39,7 +48,10 @@ class Scene:
         gains = measure_gains(capture) if undo_exposure else np.ones((len(capture.views), 3))
         self.exposure_varies = varies(gains)
         self.gains = gains if self.exposure_varies else np.ones_like(gains)
+        self._place = place
         self._budget = memory_mb * 1e6
+        if place.type == "cuda":
+            self._budget = min(self._budget, _SHARE_OF_GPU * torch.cuda.mem_get_info(place)[0])
         self._held: OrderedDict[tuple[int, int], tuple[torch.Tensor, torch.Tensor | None]] = OrderedDict()
         self._bytes = 0
         self._lock = threading.Lock()
@@ -62,11 +74,9 @@ class Scene:
             if key in self._held:
                 self._held.move_to_end(key)
                 return self._held[key]
-        pixels = self.capture.image(index, downscale)
-        scale = (1 / (255 * self.gains[index])).astype(np.float32)
-        picture = torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1), np.float32) * scale[:, None, None])
+        picture = self._picture(index, downscale)
         mask = self.capture.mask(index, downscale)
-        labels = None if mask is None else torch.from_numpy(self._classes(mask))
+        labels = None if mask is None else self._sent(torch.from_numpy(self._classes(mask)))
         size = picture.numel() * 4 + (0 if labels is None else labels.numel() * 4)
         with self._lock:
             self._held[key] = (picture, labels)
@@ -76,11 +86,26 @@ class Scene:
                 self._bytes -= old.numel() * 4 + (0 if old_labels is None else old_labels.numel() * 4)
         return picture, labels
 
-    def forget(self) -> None:
-        """Give the held pictures' memory back."""
+    def _picture(self, index: int, downscale: int) -> torch.Tensor:
+        pixels = self.capture.image(index, downscale)
+        scale = (1 / (255 * self.gains[index])).astype(np.float32)
+        if self._place.type == "cpu":
+            planes = np.ascontiguousarray(pixels.transpose(2, 0, 1), np.float32)
+            return torch.from_numpy(planes * scale[:, None, None])
+        # As bytes, a quarter of what the planes take.
+        sent = self._sent(torch.from_numpy(np.ascontiguousarray(pixels)))
+        return sent.permute(2, 0, 1).float().contiguous() * device.upload(scale, sent)[:, None, None]
+
+    def _sent(self, values: torch.Tensor) -> torch.Tensor:
+        """`values` on the device; the processor goes on before they are there."""
+        return values if self._place.type == "cpu" else values.pin_memory().to(self._place, non_blocking=True)
+
+    def forget(self, shrink: float = 1.0) -> None:
+        """Give the held pictures' memory back, and hold only `shrink` times as much from now on."""
         with self._lock:
             self._held.clear()
             self._bytes = 0
+            self._budget *= shrink
 
     def _classes(self, mask: np.ndarray) -> np.ndarray:
         place = np.clip(np.searchsorted(self.object_ids, mask), 0, len(self.object_ids) - 1)

@@ -14,6 +14,8 @@ import torch
 from PIL import Image
 
 from backend import arguments
+from backend.capture import load_capture
+from backend.labels import vote
 
 from .asking import Answer
 
@@ -198,3 +200,16 @@ def ask(capsys, request):
         return Answer(code, said.out, said.err)
 
     return run
+
+
+@pytest.fixture
+def tiny(write_capture, tmp_path):
+    """A function that writes a capture of nine small views; it returns the capture and its points' objects."""
+
+    def make(**options):
+        scene = write_capture(views=9, size=(64, 48), **options)
+        capture = load_capture(scene.folder, tmp_path / "cache")
+        ids = vote(capture).ids if capture.has_masks else np.zeros(len(capture.points.xyz), np.int64)
+        return capture, ids
+
+    return make

@@ -18,7 +18,7 @@ import pytest
 import torch
 from PIL import Image
 
-from backend import arguments, commands
+from backend import arguments, commands, device
 from backend.capture import load_capture
 from backend.commands.lock import LOCK
 from backend.export import agreement, fit_splats, read_splats
@@ -110,6 +110,7 @@ def test_the_whole_chain(write_capture, tmp_path, ask, masks):
         report
     )
     assert report["settings"]["steps"] == 20 and report["settings"]["minutes"] is None
+    assert report["machine"]["device"] == device.name_of(device.pick("auto"))
     stages = {stage["name"]: stage for stage in report["stages"]}
     assert list(stages) == ["read", "vote", "train", "export", "evaluate", "render", "report"]
     assert all(stage["seconds"] >= 0 and 50 < stage["peak_rss_mb"] < 5000 for stage in stages.values())
@@ -821,7 +822,9 @@ def test_figures_without_a_finite_value_are_null_in_events(trained, ask, monkeyp
 def test_doctor_takes_a_small_scene_through_everything(ask):
     answer = ask("doctor", "--json")
     assert answer.code == EXIT_DONE and "works" in answer.events[-1]["message"]
-    assert answer.events[-1]["machine"]["device"] == "cpu"
+    if device.why_not_cuda() is not None:
+        assert answer.events[-1]["machine"]["device"] == "cpu"
+        assert f"CUDA is not used: {device.why_not_cuda()}" in answer.messages("status")
 
 
 def test_help_says_what_each_command_does_with_an_example(capsys):

@@ -16,7 +16,7 @@ from backend.mesh.extract import extract, is_watertight
 from backend.mesh.fusion import fuse
 from backend.mesh.marching import march, parts
 from backend.mesh.surface import NoSurface
-from backend.mesh.views import ObjectView, SceneMap, Views, crop
+from backend.mesh.views import ObjectView, SceneMap, Views
 from backend.mesh.winding import Winding
 from backend.mesh.zbuffer import draw_mesh
 from backend.model.generate import Generated
@@ -55,13 +55,13 @@ def sheet(x, class_index, half=0.5, step=0.05, colour=0.5):
 
 def views_of(splats, cameras, explicit=True, mask=None, primitive="3d", **options):
     """`Views` of plain splats; the objects' IDs are ten times their classes."""
-    ids = splats.ids.numpy()
 
     def generate(seen=None, eye=None):
         assert explicit or eye is not None
-        return splats if seen is None else Generated(*(part[torch.from_numpy(seen)] for part in splats))
+        return splats if seen is None else splats.select(seen)
 
-    model = SimpleNamespace(generate=generate, explicit=explicit, primitive=primitive, anchors=SimpleNamespace(ids=ids))
+    anchors = SimpleNamespace(ids=splats.ids)
+    model = SimpleNamespace(generate=generate, explicit=explicit, primitive=primitive, anchors=anchors)
     model.object_ids = np.arange(3) * 10
     capture = SimpleNamespace(mask=lambda index, downscale: mask)
     scene = SimpleNamespace(camera=lambda index, downscale: cameras[index], capture=capture)
@@ -71,7 +71,7 @@ def views_of(splats, cameras, explicit=True, mask=None, primitive="3d", **option
 @pytest.mark.parametrize("explicit", [True, False])
 def test_an_object_is_drawn_unhidden_and_knows_how_much_of_it_is_hidden(explicit):
     near, far = sheet(1.0, 1, half=0.3), sheet(0.0, 2)
-    splats = Generated(*(torch.cat(parts) for parts in zip(near, far)))
+    splats = Generated(*(torch.cat(parts) for parts in zip(near[:7], far[:7])))
     cameras = [camera_at((4, 0, 0)), camera_at((-4, 0, 0)), camera_at((4, 0.5, 0.3))]
     views = views_of(splats, cameras, explicit)
 
@@ -258,7 +258,7 @@ class Exact:
         visible = np.isin(self.scene_map(index).ids, classes)[place].astype(np.float32)
         alpha = hit[place].astype(np.float32)
         depth = np.where(hit, depth, 0)[place].astype(np.float32)
-        camera = crop(self.cameras[index], u.min(), v.min(), depth.shape[1], depth.shape[0])
+        camera = self.cameras[index].crop(u.min(), v.min(), depth.shape[1], depth.shape[0])
         color = np.ones((*depth.shape, 3), np.float32)
         return ObjectView(camera, int(u.min()), int(v.min()), depth, 0 * alpha, alpha, color, visible)
 
@@ -512,7 +512,7 @@ def test_a_speck_is_a_mesh_or_a_sentence():
 
 def test_a_few_splats_are_a_mesh_or_a_sentence():
     cloud = sheet(0.0, 1, half=0.1, step=0.1)
-    splats = Generated(*(part[:3] for part in cloud))
+    splats = cloud.select(slice(3))
     splats.scales[:] = 0.06
     surface = extract(fuse(views_of(splats, around(8)), [1]))
     assert_sound(surface)

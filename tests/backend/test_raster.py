@@ -1,21 +1,39 @@
-"""The CPU kernels against the float64 reference."""
+"""The kernels against the float64 reference: those of the CPU; in numba's simulator (test_cuda.py) and on a GPU
+(tests/gpu) those for CUDA."""
 
 import numpy as np
 import pytest
 import torch
+from numba import config
 
-from backend.raster import Camera, object_map, rasterize
+from backend import raster
+from backend.raster import Camera, object_map
 from backend.raster.reference import rasterize_reference
 
 NAMES = ("means", "quats", "scales", "opacities", "sh")
+DEVICE = torch.device("cpu")
+SIMULATED = bool(config.ENABLE_CUDASIM)
+"""A simulated GPU draws some hundred pixels a second: its pictures are smaller, seen with a shorter focal length."""
+WIDTH, HEIGHT, FOCAL = (19, 13, 18.0) if SIMULATED else (45, 33, 40.0)
 
 
-def camera(width=45, height=33, z=0.0):
+def fewer(values, simulated):
+    """All of a test's parameters, or the places in `simulated` of them."""
+    return [values[i] for i in simulated] if SIMULATED else values
+
+
+def rasterize(**asked):
+    """`backend.raster.rasterize` on DEVICE, for tensors of the CPU."""
+    moved = {k: v.to(DEVICE) if isinstance(v, torch.Tensor) else v for k, v in asked.items()}
+    *planes, frame = raster.rasterize(**moved)
+    return raster.Rendered(*(p if p is None else p.cpu() for p in planes), frame)
+
+
+def camera(width=WIDTH, height=HEIGHT, z=0.0):
     viewmat = np.eye(4)
     viewmat[2, 3] = z
-    return Camera(
-        viewmat, np.array([[40.0, 0, width / 2 + 1.3], [0, 42.0, height / 2 - 0.7], [0, 0, 1]]), width, height
-    )
+    K = np.array([[FOCAL, 0, width / 2 + 1.3], [0, 1.05 * FOCAL, height / 2 - 0.7], [0, 0, 1]])
+    return Camera(viewmat, K, width, height)
 
 
 def random_scene(seed, count=60, coefficients=4, objects=5, size=0.12):
@@ -35,6 +53,11 @@ def random_scene(seed, count=60, coefficients=4, objects=5, size=0.12):
 def as_float32(scene):
     """What both renderers get: the float32 numbers, so that no difference comes from rounding the input."""
     return {k: v if k == "ids" else v.float() for k, v in scene.items()}
+
+
+def mapped(picture):
+    """The object map as NumPy arrays, whichever renderer drew."""
+    return tuple(torch.as_tensor(a).cpu().numpy() for a in object_map(picture))
 
 
 def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolerance=1e-5, primitive="3d"):
@@ -82,7 +105,7 @@ def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolera
             counted = norms[1] > 1e-3 * largest
             ratio = (norms[0] / norms[1])[counted].numpy()
             np.testing.assert_allclose(ratio, 1, rtol=100 * gradient_tolerance, err_msg=name)
-    ids, probability = object_map(got)
+    ids, probability = mapped(got)
     dense = want.probabilities.detach().numpy()
     np.testing.assert_allclose(probability, dense.max(-1), rtol=1e-4, atol=value_tolerance)
     picked = np.take_along_axis(dense, np.maximum(ids, 0)[..., None], -1)[..., 0]
@@ -93,7 +116,7 @@ def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolera
 PRIMITIVES = pytest.mark.parametrize("primitive", ["3d", "2d"])
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", fewer(range(4), [0]))
 @pytest.mark.parametrize(
     ("primitive", "coefficients"), [("3d", 1), ("3d", 4), ("3d", 9), ("3d", 16), ("2d", 1), ("2d", 4)]
 )

@@ -96,7 +96,7 @@ def test_cache_is_renewed_when_any_file_of_the_package_changes(tmp_path):
     script = """
 import sys, numpy as np
 sys.path.insert(0, sys.argv[1])
-from raster.cpu_project import tangent_limits
+from raster.splats import tangent_limits
 print(tangent_limits(1.0, 1.0, 0.0, 0.0, 2, 2)[1], sum(tangent_limits.stats.cache_hits.values()))
 """
 

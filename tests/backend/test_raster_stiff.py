@@ -7,15 +7,26 @@ import numpy as np
 import pytest
 import torch
 
-from backend.raster import Camera, cpu, object_map, rasterize
+from backend.raster import Camera, cpu
 from backend.raster.reference import rasterize_reference
 from backend.raster.settings import ALPHA_MIN, NEAR
-from tests.backend.test_raster import NAMES, as_float32, camera, compare, random_scene
+from tests.backend.test_raster import (
+    FOCAL,
+    HEIGHT,
+    NAMES,
+    SIMULATED,
+    WIDTH,
+    as_float32,
+    camera,
+    compare,
+    fewer,
+    mapped,
+    random_scene,
+    rasterize,
+)
 
-WIDTH, HEIGHT = 45, 33
 
-
-def straight(width=WIDTH, height=HEIGHT, focal=40.0, **kwargs):
+def straight(width=WIDTH, height=HEIGHT, focal=FOCAL, **kwargs):
     """Looks along +z; the point (0, 0, z) falls on the centre of the picture's middle pixel."""
     K = np.array([[focal, 0, width // 2 + 0.5], [0, focal, height // 2 + 0.5], [0, 0, 1]])
     return Camera(np.eye(4), K, width, height, **kwargs)
@@ -65,7 +76,7 @@ def draw(scene, cam, labels=None, seed=0, primitive="3d"):
     sum((p * torch.tensor(rng.normal(size=tuple(p.shape)), dtype=p.dtype)).sum() for p in planes).backward()
     arrays = {f"plane {i}": p.detach().numpy() for i, p in enumerate(planes)}
     arrays |= {name: leaves[name].grad.numpy() for name in NAMES}
-    arrays["object"], arrays["probability"] = object_map(picture)
+    arrays["object"], arrays["probability"] = mapped(picture)
     return arrays
 
 
@@ -129,19 +140,20 @@ def test_scales_whose_determinant_underflows_float32(primitive):
     compare(among_others(one(scale=(1e-30, 0.3, 1e-30), quat=(0.9, 0.3, 0.2, 0.4))), camera(), primitive=primitive)
 
 
-@pytest.mark.parametrize("ratio", [1e3, 1e4, 1e5, 1e6])
-@pytest.mark.parametrize("angle", [0.0, 90.0, 45.0, 30.0, 89.999])
+@pytest.mark.parametrize("ratio", fewer([1e3, 1e4, 1e5, 1e6], [0, 3]))
+@pytest.mark.parametrize("angle", fewer([0.0, 90.0, 45.0, 30.0, 89.999], [2, 4]))
 @pytest.mark.parametrize("thin", [1e-6, 1e-3])
 def test_needle(ratio, angle, thin, primitive):
     if primitive == "2d" and thin > 1e-6:
         thin *= 10  # broad enough for its plane to be drawn
     half = np.deg2rad(angle) / 2
     needle = one(quat=(np.cos(half), 0, 0, np.sin(half)), scale=(thin * ratio, thin, thin), mean=(0.013, -0.021, 2.0))
-    compare(needle, camera(), primitive=primitive)
+    if not SIMULATED:
+        compare(needle, camera(), primitive=primitive)
     compare(among_others(needle), camera(), primitive=primitive)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", fewer(range(5), [0, 1]))
 def test_needles_in_any_direction(seed, primitive):
     rng = np.random.default_rng(seed)
     scene = random_scene(seed, count=20)
@@ -170,7 +182,7 @@ def test_splat_that_misses_the_picture_has_no_gradient(primitive):
     assert_unharmed(one(mean=(50.0, 0, 2.0)), primitive=primitive)
 
 
-@pytest.mark.parametrize("scale", [np.inf, 3e38, 1e20, 1e9])
+@pytest.mark.parametrize("scale", fewer([np.inf, 3e38, 1e20, 1e9], [0, 2]))
 def test_overflowing_scale(scale, primitive):
     """exp() of a log-scale that ran away."""
     for scales in ((scale, 0.1, 0.1), (0.1, scale, 0.1), (scale, scale, scale)):
@@ -186,8 +198,8 @@ def test_opaque_splat_on_a_pixel_centre_is_drawn(primitive):
         assert got.alpha[HEIGHT // 2, WIDTH // 2].item() == pytest.approx(0.99)
 
 
-@pytest.mark.parametrize("scale", [1e-4, 0.1, 1.0])
-@pytest.mark.parametrize("opacity", [0.98, 0.99, 1.0])
+@pytest.mark.parametrize("scale", fewer([1e-4, 0.1, 1.0], [0, 2]))
+@pytest.mark.parametrize("opacity", fewer([0.98, 0.99, 1.0], [0, 2]))
 def test_sixteen_opaque_splats_stacked(scale, opacity, primitive):
     layers = [one(mean=(0, 0, 1 + 0.1 * i), opacity=opacity, scale=(scale,) * 3, id=i % 5) for i in range(16)]
     compare(join(*layers), straight(), gradient_tolerance=BEHIND_OPAQUE, primitive=primitive)
@@ -206,7 +218,7 @@ def test_nothing_visible(opacity, primitive):
     scene["opacities"] = torch.full_like(scene["opacities"], opacity)
     got, _ = compare(scene, camera(), primitive=primitive)
     assert not got.color.any() and not got.alpha.any() and not got.weight.any() and not got.depth.any()
-    ids, probability = object_map(got)
+    ids, probability = mapped(got)
     assert (ids == -1).all() and not probability.any()
 
 
@@ -214,7 +226,7 @@ def test_no_splats(primitive):
     scene = {k: v[:0] for k, v in random_scene(0).items()}
     got, _ = compare(scene, camera(), primitive=primitive)
     assert not got.alpha.any()
-    assert (object_map(got)[0] == -1).all()
+    assert (mapped(got)[0] == -1).all()
 
 
 # Depth
@@ -278,7 +290,7 @@ def test_equal_depths_do_not_depend_on_the_input_order(same, primitive):
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("value", fewer([np.nan, np.inf, -np.inf], [0, 1]))
 def test_splat_that_is_not_finite_is_dropped(name, value, primitive):
     bad = one()
     bad[name].view(-1)[0] = value
@@ -340,14 +352,14 @@ def dense_probabilities(scene, cam, values):
     return np.stack(planes, -1)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", fewer(range(4), [0]))
 def test_object_map_equals_the_dense_computation(seed):
     rng = np.random.default_rng(seed)
-    cam = camera(150, 71)
-    scene = as_float32(random_scene(seed, count=300))
-    values = np.unique(rng.integers(-(2**31), 2**31, 40)).astype(np.int32)
-    scene["ids"] = torch.tensor(rng.choice(values, 300))
-    ids, probability = object_map(rasterize(**scene, camera=cam))
+    count, objects, cam = (80, 8, camera()) if SIMULATED else (300, 40, camera(150, 71))
+    scene = as_float32(random_scene(seed, count=count))
+    values = np.unique(rng.integers(-(2**31), 2**31, objects)).astype(np.int32)
+    scene["ids"] = torch.tensor(rng.choice(values, count))
+    ids, probability = mapped(rasterize(**scene, camera=cam))
     dense = dense_probabilities(scene, cam, values)
     np.testing.assert_allclose(probability, dense.max(-1), rtol=1e-5, atol=1e-7)
     drawn = dense.max(-1) > 0
@@ -358,14 +370,14 @@ def test_object_map_equals_the_dense_computation(seed):
 
 def test_object_map_gives_ties_to_the_smallest_id():
     """Two objects of equal weight, one at either side of the same row of pixels, in both orders of input."""
-    cam = straight(65, 33)
+    cam = straight() if SIMULATED else straight(65, 33)
     left, right = (one(mean=(x, 0, 2.0), scale=(0.5, 0.5, 0.1), opacity=0.2) for x in (-0.1, 0.1))
     for a, b in ((70_000, 9), (9, 70_000)):
         left["ids"][0], right["ids"][0] = a, b
         right["means"] = left["means"].clone()
         # Behind, so that the one in front does not win: (1 - 0.2) * 0.25 = 0.2.
         right["opacities"][0] = 0.25
-        ids, probability = object_map(rasterize(**as_float32(join(left, right)), camera=cam))
+        ids, probability = mapped(rasterize(**as_float32(join(left, right)), camera=cam))
         dense = dense_probabilities(as_float32(join(left, right)), cam, [9, 70_000])
         expected = np.where(dense.max(-1) > 0, np.array([9, 70_000])[dense.argmax(-1)], -1)
         assert np.array_equal(ids, expected)
@@ -373,23 +385,25 @@ def test_object_map_gives_ties_to_the_smallest_id():
 
 
 def test_ten_thousand_objects_and_large_ids():
+    """Simulated, 200: more at any pixel than a GPU adds up at once."""
     rng = np.random.default_rng(0)
-    cam = camera(97, 71)
-    count = 12_000
-    scene = as_float32(random_scene(0, count=count, size=0.02))
-    names = rng.choice(2**31 - 1, 10_000, replace=False).astype(np.int32)
+    objects, count, size, cam = (200, 240, 0.2, camera()) if SIMULATED else (10_000, 12_000, 0.02, camera(97, 71))
+    scene = as_float32(random_scene(0, count=count, size=size))
+    if SIMULATED:
+        scene["opacities"] *= 0.1
+    names = rng.choice(2**31 - 1, objects, replace=False).astype(np.int32)
     assert (names > 65_535).mean() > 0.99
-    which = np.concatenate([np.arange(10_000), rng.integers(0, 10_000, count - 10_000)])
+    which = np.concatenate([np.arange(objects), rng.integers(0, objects, count - objects)])
     scene["ids"] = torch.tensor(names[which])
     picture = rasterize(**scene, camera=cam)
-    ids, probability = object_map(picture)
+    ids, probability = mapped(picture)
     labels = torch.tensor(ids)
     again = rasterize(**scene, camera=cam, labels=labels)
     np.testing.assert_allclose(again.weight, probability, rtol=1e-5, atol=1e-6)
     assert np.isin(ids[ids >= 0], names).all()
     # Renaming the objects, in the same order, renames the map and changes nothing else.
     small = {**scene, "ids": torch.tensor(np.argsort(np.argsort(names)).astype(np.int32)[which])}
-    ids_small, probability_small = object_map(rasterize(**small, camera=cam))
+    ids_small, probability_small = mapped(rasterize(**small, camera=cam))
     assert np.array_equal(ids, np.where(ids_small >= 0, np.sort(names)[ids_small], -1))
     assert np.array_equal(probability, probability_small)
 
@@ -397,7 +411,10 @@ def test_ten_thousand_objects_and_large_ids():
 # Sizes and coordinates
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 40), (67, 1), (63, 31), (64, 32), (65, 33), (129, 65), (127, 3)])
+SIZES = [(1, 1), (1, 40), (67, 1), (63, 31), (64, 32), (65, 33), (129, 65), (127, 3)]
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 18), (15, 15), (16, 16), (17, 33)] if SIMULATED else SIZES)
 def test_odd_sizes(size, primitive):
     compare(random_scene(0, count=40), camera(*size), gradient_tolerance=2e-5, primitive=primitive)
 
@@ -433,6 +450,8 @@ def test_scene_of_another_size(size, primitive):
 
 
 def dense_scene():
+    if SIMULATED:
+        return as_float32(random_scene(5, count=60)), camera()
     return as_float32(random_scene(5, count=3000, size=0.05)), camera(200, 133)
 
 
@@ -442,7 +461,7 @@ def test_same_input_gives_the_same_bits(primitive):
     assert_same_bits(draw(scene, cam, labels, primitive=primitive), draw(scene, cam, labels, primitive=primitive))
 
 
-@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread only")
+@pytest.mark.skipif(SIMULATED or numba.config.NUMBA_NUM_THREADS < 2, reason="one thread only")
 def test_one_and_two_threads_give_the_same_bits(primitive):
     scene, cam = dense_scene()
     labels = torch.zeros(cam.height, cam.width, dtype=torch.int32)
@@ -473,14 +492,14 @@ def facts(scene, cam):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("turn", [1e-6, 1e-4, 1e-3, 1e-2, 0.1])
+@pytest.mark.parametrize("turn", fewer([1e-6, 1e-4, 1e-3, 1e-2, 0.1], [0, 2, 4]))
 def test_disc_seen_almost_from_its_edge(turn):
     # Not in the middle of a pixel, where plane and spot are equal and only one of them is seen by the gradients.
     for mean in ((0.003, 0.002, 2.0), (0.011, -0.023, 2.0), (0.403, 0.001, 2.0)):
         scene = tilted(np.pi / 2 - turn, mean=mean)
         got, _ = compare(scene, straight(), primitive="2d")
         # However thin, it is not smaller than its spot.
-        u, v = int(20 * mean[0] + WIDTH / 2), int(20 * mean[1] + HEIGHT / 2)
+        u, v = int(FOCAL / 2 * mean[0] + WIDTH / 2), int(FOCAL / 2 * mean[1] + HEIGHT / 2)
         assert got.alpha[v, u] > 0.2
         compare(among_others(scene), straight(), primitive="2d")
 
@@ -492,7 +511,7 @@ def test_disc_seen_from_its_very_edge():
     assert draw(as_float32(tilted(np.pi / 2)), straight(), primitive="2d")["plane 1"].max() > 0.5
 
 
-@pytest.mark.parametrize("turn", [0.0, 1e-6, 1e-3, 0.1])
+@pytest.mark.parametrize("turn", fewer([0.0, 1e-6, 1e-3, 0.1], [0, 2]))
 def test_plane_through_the_camera(turn):
     """The distance along the ray to the plane is 0, or nearly, in every pixel or in some."""
     lying = (np.cos(np.pi / 4 + turn), np.sin(np.pi / 4 + turn), 0, 0)
@@ -513,7 +532,7 @@ def test_disc_that_reaches_behind_the_camera():
 def test_disc_is_cut_at_the_near_plane():
     floor = one(mean=(0.003, 0.052, 1.0), quat=(np.sqrt(0.5), np.sqrt(0.5), 0, 0), scale=(4, 4, 1), opacity=0.9)
     got, _ = compare(floor, straight(near=0.2), primitive="2d")
-    assert not got.alpha[-1].any() and got.alpha[-8].all()
+    assert not got.alpha[-1].any() and got.alpha[HEIGHT // 2 + int(FOCAL * 0.052 / 0.22)].all()
     drawn = got.alpha > 0
     assert (got.depth[drawn] / got.alpha[drawn] > 0.2).all()
 
@@ -525,7 +544,7 @@ def test_depth_and_normal_are_those_of_the_plane(angle):
     normal = np.array([0, np.sin(angle), -np.cos(angle)])
     normal *= -np.sign(normal[2])
     y, _ = np.mgrid[:HEIGHT, :WIDTH]
-    wanted = 2 / (1 + (y + 0.5 - HEIGHT // 2 - 0.5) / 40 * normal[1] / normal[2])
+    wanted = 2 / (1 + (y + 0.5 - HEIGHT // 2 - 0.5) / FOCAL * normal[1] / normal[2])
     np.testing.assert_allclose((got.depth / got.alpha).numpy()[inside], wanted[inside], rtol=1e-5)
     np.testing.assert_allclose(got.median.numpy()[inside], wanted[inside], rtol=1e-5)
     for i in range(3):
@@ -558,7 +577,7 @@ def test_what_3d_gaussians_do_not_have():
 
 def test_screen_gradient_is_that_of_a_moving_footprint():
     """Growth follows it: the plane's part must be in it, not the spot's alone."""
-    scene = as_float32(tilted(0.7, scale=(0.15, 0.2, 1)))
+    scene = as_float32(tilted(0.7, scale=(6 / FOCAL, 8 / FOCAL, 1)))
     leaves = {k: v.requires_grad_(k != "ids") for k, v in scene.items()}
     picture = rasterize(**leaves, camera=straight(), primitive="2d")
     pattern = torch.sin(torch.arange(WIDTH) / 5.0)[None, :].expand(HEIGHT, WIDTH)
@@ -566,12 +585,13 @@ def test_screen_gradient_is_that_of_a_moving_footprint():
     columns = torch.arange(WIDTH) + 0.5
     # d/du of sum alpha(x - u) pattern(x) is sum alpha pattern'.
     wanted = (picture.alpha * (torch.cos((columns - 0.5) / 5.0) / 5.0)[None, :]).sum()
-    assert picture.frame.screen_gradient[0, 0] == pytest.approx(wanted.item(), rel=0.03)
+    assert float(picture.frame.screen_gradient[0, 0]) == pytest.approx(wanted.item(), rel=0.03)
 
 
 # The reference itself
 
 
+@pytest.mark.skipif(SIMULATED, reason="is not of the kernels")
 @pytest.mark.parametrize(("primitive", "coefficients"), [("3d", 1), ("3d", 4), ("3d", 9), ("3d", 16), ("2d", 4)])
 def test_gradcheck_of_the_reference(primitive, coefficients):
     scene = random_scene(2, count=4, coefficients=coefficients, size=0.3)

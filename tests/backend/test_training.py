@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from backend.capture import load_capture
-from backend.labels import vote
 from backend.model.anchors import Anchors, Layout, cell_keys, median_spacing, seed_anchors
 from backend.model.checkpoint import CURRENT, PREVIOUS, load_checkpoint, save_checkpoint
 from backend.model.generate import generate
@@ -162,29 +160,29 @@ def test_probability_zero_under_the_logarithm_is_finite():
 
 def test_adam_equals_torch_on_seen_rows_and_leaves_the_others():
     rng = np.random.default_rng(0)
-    values = rng.normal(size=(20, 7)).astype(np.float32)
-    before = values.copy()
-    first, second = np.zeros_like(values), np.zeros_like(values)
-    seen = np.array([1, 4, 19])
-    parameter = torch.tensor(values[seen], requires_grad=True)
+    values = torch.tensor(rng.normal(size=(20, 7)), dtype=torch.float32)
+    before = values.clone()
+    first, second = torch.zeros_like(values), torch.zeros_like(values)
+    seen = torch.tensor([1, 4, 19])
+    parameter = values[seen].requires_grad_()
     optimizer = torch.optim.Adam([parameter], lr=0.01, eps=1e-15)
     rates = np.full(7, 0.01, np.float32)
     for step in range(1, 6):
-        g = rng.normal(size=(3, 7)).astype(np.float32)
+        g = torch.tensor(rng.normal(size=(3, 7)), dtype=torch.float32)
         step_rows(values, first, second, seen, g, rates, 1 - BETA1**step, 1 - BETA2**step)
-        parameter.grad = torch.tensor(g)
+        parameter.grad = g
         optimizer.step()
-    np.testing.assert_allclose(values[seen], parameter.detach().numpy(), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(values[seen], parameter.detach(), rtol=1e-5, atol=1e-6)
     others = np.setdiff1d(np.arange(20), seen)
     assert (values[others] == before[others]).all()
 
 
 def test_adam_skips_a_row_that_is_not_finite():
-    values = np.ones((3, 4), np.float32)
-    first, second = np.zeros_like(values), np.zeros_like(values)
-    g = np.ones((3, 4), np.float32)
+    values = torch.ones(3, 4)
+    first, second = torch.zeros_like(values), torch.zeros_like(values)
+    g = torch.ones(3, 4)
     g[1, 2] = np.nan
-    skipped = step_rows(values, first, second, np.arange(3), g, np.full(4, 0.1, np.float32), 0.1, 0.001)
+    skipped = step_rows(values, first, second, torch.arange(3), g, np.full(4, 0.1, np.float32), 0.1, 0.001)
     assert skipped == 1 and (values[1] == 1).all() and (values[[0, 2]] < 1).all()
 
 
@@ -205,7 +203,7 @@ def test_coincident_points_give_one_finite_anchor(count):
     xyz = np.zeros((count, 3))
     voxel = median_spacing(xyz)
     anchors = seed_anchors(xyz, np.ones((count, 3)), np.zeros(count, int), voxel, Layout(), np.random.default_rng(0))
-    assert len(anchors) == 1 and np.isfinite(anchors.rows).all() and voxel > 0
+    assert len(anchors) == 1 and anchors.rows.isfinite().all() and voxel > 0
 
 
 @pytest.mark.parametrize("mode", ["explicit", "view"])
@@ -258,38 +256,39 @@ def test_no_anchor_that_would_be_drawn_is_left_out_of_a_view():
     rng = np.random.default_rng(5)
     layout = Layout(4, 8)
     n = 400
-    rows = rng.normal(0, 0.5, (n, layout.columns)).astype(np.float32)
-    rows[:, layout.extent_columns] = rng.normal(-2, 0.7, (n, 6))
-    anchors = Anchors(layout, 0.1, rng.normal(0, 3, (n, 3)).astype(np.float32), rows, np.zeros(n, np.int32))
+    rows = torch.tensor(rng.normal(0, 0.5, (n, layout.columns)), dtype=torch.float32)
+    rows[:, layout.extent_columns] = torch.tensor(rng.normal(-2, 0.7, (n, 6)), dtype=torch.float32)
+    positions = torch.tensor(rng.normal(0, 3, (n, 3)), dtype=torch.float32)
+    anchors = Anchors(layout, 0.1, positions, rows, torch.zeros(n, dtype=torch.int32))
     heads = Heads(layout, "explicit", 0, torch.Generator().manual_seed(1))
     camera = Camera(np.eye(4), np.array([[50.0, 0, 30], [0, 60, 20], [0, 0, 1]]), 64, 48)
     with torch.no_grad():
-        g = generate(
-            layout, torch.from_numpy(anchors.positions), torch.from_numpy(rows), torch.from_numpy(anchors.ids), heads
-        )
+        g = generate(layout, positions, rows, anchors.ids, heads)
         drawn = rasterize(*g[:6], camera)
     needed = np.unique(g.source.numpy()[drawn.frame.seen] // 4)
     seen = anchors_in_view(anchors, *camera.arrays(), camera.width, camera.height, camera.near)
-    assert set(needed) <= set(seen)
+    assert set(needed.tolist()) <= set(seen.tolist())
     assert len(seen) < n
 
 
 def grown(gradient, ids=(1, 2), positions=((0.0, 0, 0), (8.0, 0, 0)), offset=(0.0, 0.0, 0.0), opacity=1.0):
     layout = Layout(1, 4)
-    rows = np.zeros((2, layout.columns), np.float32)
-    rows[:, layout.offset_columns] = offset
-    anchors = Anchors(layout, 1.0, np.array(positions, np.float32), rows, np.array(ids, np.int32))
-    statistics = GrowthStatistics(
-        np.array(gradient, np.float32) * 10, np.full(2, 10, np.int32), np.full(2, opacity * 10, np.float32),
-        np.full(2, 10, np.int32),
-    )  # fmt: skip
-    return anchors, grow_and_prune(anchors, statistics, 5, np.random.default_rng(0))
+    rows = torch.zeros(2, layout.columns)
+    rows[:, layout.offset_columns] = torch.tensor(offset)
+    anchors = Anchors(layout, 1.0, torch.tensor(positions), rows, torch.tensor(ids, dtype=torch.int32))
+    return anchors, grow_and_prune(anchors, statistics_of(gradient, opacity), 5, np.random.default_rng(0))
+
+
+def statistics_of(gradient, opacity=1.0):
+    """Ten steps of it."""
+    visits = torch.full((2,), 10, dtype=torch.int32)
+    return GrowthStatistics(torch.tensor(gradient) * 10, visits, torch.full((2,), opacity * 10), visits)
 
 
 def test_a_child_takes_its_parents_id_and_a_free_cell():
     anchors, growth = grown([1.0, 0.0], offset=(2.2, 0, 0))
     assert growth.added >= 1 and growth.pruned == 0
-    assert set(anchors.ids[2:]) == {1}
+    assert set(anchors.ids[2:].tolist()) == {1}
     assert len(np.unique(cell_keys(anchors.positions, 1.0), axis=0)) == len(anchors)
 
 
@@ -297,14 +296,10 @@ def test_of_two_objects_that_want_one_cell_the_larger_gradient_wins():
     positions = ((0.0, 0, 0), (4.0, 0, 0))
     layout = Layout(1, 4)
     for gradient, winner in (([1.0, 2.0], 2), ([2.0, 1.0], 1)):
-        rows = np.zeros((2, layout.columns), np.float32)
-        rows[0, :3], rows[1, :3] = (2.1, 0, 0), (-2.1, 0, 0)
-        anchors = Anchors(layout, 1.0, np.array(positions, np.float32), rows, np.array([1, 2], np.int32))
-        statistics = GrowthStatistics(
-            np.array(gradient, np.float32) * 10, np.full(2, 10, np.int32), np.full(2, 10, np.float32),
-            np.full(2, 10, np.int32),
-        )  # fmt: skip
-        grow_and_prune(anchors, statistics, 5, np.random.default_rng(0))
+        rows = torch.zeros(2, layout.columns)
+        rows[:, 0] = torch.tensor([2.1, -2.1])
+        anchors = Anchors(layout, 1.0, torch.tensor(positions), rows, torch.tensor([1, 2], dtype=torch.int32))
+        grow_and_prune(anchors, statistics_of(gradient), 5, np.random.default_rng(0))
         place = np.flatnonzero((cell_keys(anchors.positions, 1.0) == [2, 0, 0]).all(1))
         assert len(place) == 1 and anchors.ids[place[0]] == winner
 
@@ -346,19 +341,6 @@ def test_a_full_disk_leaves_the_checkpoint_before(tmp_path, monkeypatch):
 
 
 # --- whole trainings -------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def tiny(write_capture, tmp_path):
-    """A capture, its points' objects, and a scene with an offset and scale of one's choice."""
-
-    def make(**options):
-        scene = write_capture(views=9, size=(64, 48), **options)
-        capture = load_capture(scene.folder, tmp_path / "cache")
-        ids = vote(capture).ids if capture.has_masks else np.zeros(len(capture.points.xyz), np.int64)
-        return capture, ids
-
-    return make
 
 
 SMALL = Settings(offsets=4, sh_degree=1)
@@ -450,7 +432,7 @@ def test_normals_and_distortion_are_only_computed_where_they_count(tiny, monkeyp
         (SMALL, 0.9, [False] * 3), (FLAT, 0.1, [False] * 3), (FLAT, 0.9, [True, True, False]), (both, 0.9, [True] * 3),
         (dataclasses.replace(FLAT, normal_weight=0.0), 0.9, [False] * 3),
     ):  # fmt: skip
-        assert np.isfinite(Trainer.start(capture, ids, settings).step(share))
+        assert Trainer.start(capture, ids, settings).step(share).isfinite()
         assert asked.pop() == wanted
 
 

@@ -56,6 +56,7 @@ def root(tmp_path, monkeypatch):
     for name, version in ("torch", "2.13.0"), ("smallnumba", "0.68"):
         wheel(tmp_path / "wheels", name, version)
     (tmp_path / "requirements" / "torch.txt").write_text("torch==2.13.0\n")
+    (tmp_path / "requirements" / "cuda.txt").write_text("smallcuda==0.30\n")
     (tmp_path / "requirements" / "backend.txt").write_text("# Wheels only.\n\nsmallnumba==0.68  # kernels\n")
     (tmp_path / "backend" / "__init__.py").write_text("")
     (tmp_path / "backend" / "__main__.py").write_text(BACKEND)
@@ -122,6 +123,21 @@ def test_set_up_after_one_that_was_killed(root):
     assert environment.inspect(folder).state == "absent" and not folder.exists()
 
 
+def test_only_an_environment_for_nvidia_gpus_holds_their_packages(root):
+    wheel(root / "wheels", "smallcuda", "0.30")
+    for device in ("cpu", "cuda"):
+        folder = root / f"environment-{device}"
+        job = environment.set_up_job(sys.executable, folder, device)
+        run(job)
+        assert job.state is State.DONE, (job.error, job.log)
+        packages = json.loads((folder / "ready.json").read_text())["packages"]
+        assert ("smallcuda" in packages) == (device == "cuda") and "smallnumba" in packages
+    (root / "requirements" / "cuda.txt").write_text("smallcuda==0.31\n")
+    environment._wanted.cache_clear()
+    assert environment.inspect(root / "environment-cuda").state == "outdated"
+    assert environment.inspect(root / "environment-cpu").state == "ready"
+
+
 def test_failed_set_ups_leave_nothing(root):
     folder = root / "environment"
     (root / "requirements" / "backend.txt").write_text("smallnumba==0.69\n")
@@ -170,7 +186,7 @@ def test_states_of_a_broken_environment(root):
     python.parent.mkdir(parents=True)
     python.write_text("")
     (folder / worker.STAMP).write_text("")
-    marker = {"python": "3.11.7", "base": str(python), "packages": {}, "requirements": "old"}
+    marker = {"python": "3.11.7", "base": str(python), "packages": {}, "requirements": "old", "device": "cpu"}
     for at, (text, state) in enumerate([
             ("{", "broken"), ("[]", "broken"), ('{"python": "3.11.7"}', "broken"),
             (json.dumps({**marker, "base": str(root / "gone")}), "broken"), (json.dumps(marker), "outdated")]):
@@ -187,7 +203,8 @@ def test_inspect_is_cheap(root):
     worker.environment_python(folder).parent.mkdir(parents=True)
     worker.environment_python(folder).write_text("")
     (folder / worker.STAMP).write_text("")
-    marker = {"python": "3.11.7", "base": sys.executable, "packages": {}, "requirements": environment._wanted()}
+    marker = {"python": "3.11.7", "base": sys.executable, "packages": {}, "device": "cpu",
+              "requirements": environment._wanted("cpu")}
     (folder / worker.MARKER).write_text(json.dumps(marker))
     assert environment.inspect(folder).state == "ready"
     started = time.perf_counter()
@@ -284,6 +301,6 @@ def test_why_pip_failed(lines, sentence):
 
 def test_requirements_of_this_extension():
     root = Path(worker.__file__).resolve().parents[1]
-    for name in worker.REQUIREMENTS:
-        for line in worker.requirement_lines(root / "requirements" / name):
+    for path in worker.requirement_files(root / "requirements", "cuda"):
+        for line in worker.requirement_lines(path):
             assert line.count("==") == 1 and line == line.replace(" ", ""), line

@@ -51,7 +51,7 @@ def test_zip_holds_what_is_needed_and_nothing_else(package):
     assert tops == {"__init__.py", "blender_manifest.toml", "headless.py", "LICENSE", "README.md", "backend",
                     "objectgs_addon", "operators", "requirements"}
     assert {name for name in names if name.startswith("requirements/")} == {
-        "requirements/backend.txt", "requirements/torch.txt"}
+        "requirements/backend.txt", "requirements/cuda.txt", "requirements/torch.txt"}
     assert {PurePosixPath(name).suffix for name in names} <= {".py", ".toml", ".txt", ".md", ".json", ""}
 
 

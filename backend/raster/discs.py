@@ -1,4 +1,4 @@
-"""2D Gaussians (discs, Huang et al. 2024) on the screen: where a pixel's ray meets the disc's plane, on the CPU.
+"""2D Gaussians (discs, Huang et al. 2024) on the screen: where a pixel's ray meets the disc's plane.
 
 With the centre at (u, v), depth z, and standard deviations along two tangents as the axes of its footprint under the
 perspective's derivative there (b / c, a - b^2 / c and c as for 3D Gaussians, but without blur and without clamp),
@@ -7,7 +7,7 @@ perspective's derivative there (b / c, a - b^2 / c and c as for 3D Gaussians, bu
     Q(x, y) = 1 + qx (x - u) + qy (y - v) = z / (depth at the intersection),
 
 exactly: the disc's own coordinates of the intersection are affine in the pixel once multiplied by Q. So a disc is the
-screen splat of cpu_project.py and, in a row of `tilts`, the two numbers that make Q. Rays that are parallel to the
+screen splat of splats.py and, in a row of `tilts`, the two numbers that make Q. Rays that are parallel to the
 plane have Q = 0, those that meet it behind the camera Q < 0.
 
 The exponent is never smaller than that of a spot around (u, v) on the picture, whose depth is the centre's.

@@ -1,0 +1,153 @@
+"""`cuda_kernel` compiles a function for an NVIDIA GPU with numba-cuda; `launch` runs it on torch's tensors, in torch's
+current stream, without a copy and without waiting.
+
+Only what draws or trains on a GPU imports this module: elsewhere numba-cuda need not be installed. In numba's simulator
+(NUMBA_ENABLE_CUDASIM=1) the same kernels run as Python on the CPU, on tensors of the CPU; numba alone is enough for it.
+A kernel's module says `from numba import cuda`; what a simulated kernel would spend most of its time in should be a
+`device_function`, which the simulator calls compiled.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import math
+import threading
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from numba import config, cuda
+
+from .kernel import digest_up_to, kernel
+
+# Small pictures and few splats make small grids, which is no news to anyone.
+warnings.filterwarnings("ignore", message="Grid size .* will likely result in GPU under-utilization")
+
+WARP = 32
+ALL_LANES = 0xFFFFFFFF
+
+
+def simulated() -> bool:
+    """Whether numba simulates the GPU in this process."""
+    return bool(config.ENABLE_CUDASIM)
+
+
+def cuda_kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator: numba.cuda.jit, cached on disk until anything changes that the kernel may depend on (see `kernel`).
+
+    options go to numba.cuda.jit, e.g. launch_bounds=256 for kernels that are always launched with so many threads.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        if simulated():
+            return function
+        dispatcher = cuda.jit(cache=True, **options)(function)
+        digest = digest_up_to(function.__module__.split(".")[-2])
+        with contextlib.suppress(AttributeError):
+            cache_file = dispatcher._cache._cache_file
+            cache_file._source_stamp = (cache_file._source_stamp, digest)
+        return dispatcher
+
+    return decorate
+
+
+def device_function(function: Callable[..., Any]) -> Any:
+    """Decorator: a function that kernels call, inlined into them. It uses nothing of `cuda`, so that the simulator can
+    call it compiled for the CPU. Functions compiled by `kernel` can be called from CUDA kernels too."""
+    if simulated():
+        return kernel()(function)
+    return cuda.jit(device=True, forceinline=True)(function)
+
+
+def launch(function: Any, blocks: int, threads: int, *arguments: Any) -> None:
+    """Run a kernel on `blocks` blocks of `threads` threads. Arguments are tensors (contiguous, at least one element,
+    all on one device), tuples of tensors, and NumPy scalars, whose type is the kernel's; without any block nothing is
+    done."""
+    if not blocks:
+        return
+    if simulated():
+        from .cuda_simulator import run
+
+        run(function, blocks, threads, tuple(_map_tensors(_host_array, a) for a in arguments))
+        return
+    function[blocks, threads, _stream(torch.cuda.current_stream().cuda_stream)](
+        *(_map_tensors(_device_array, a) for a in arguments)
+    )
+
+
+def launch_for_each(function: Any, count: int, *arguments: Any) -> None:
+    """Run a kernel without shared memory, one thread for each of `count` things: thread i is `cuda.grid(1)`, and does
+    nothing where i >= count."""
+    threads = min(128, WARP * math.ceil(count / WARP)) or WARP
+    launch(function, math.ceil(count / threads), threads, *arguments)
+
+
+def _map_tensors(convert: Callable[[torch.Tensor], Any], argument: Any) -> Any:
+    if isinstance(argument, torch.Tensor):
+        return convert(argument.detach())
+    if isinstance(argument, tuple):
+        return tuple(_map_tensors(convert, a) for a in argument)
+    return argument
+
+
+def _host_array(tensor: torch.Tensor) -> np.ndarray:
+    return tensor.numpy()
+
+
+def _device_array(tensor: torch.Tensor) -> Any:
+    return cuda.as_cuda_array(tensor, sync=False)
+
+
+@functools.cache
+def _stream(pointer: int) -> Any:
+    return cuda.external_stream(pointer) if pointer else 0
+
+
+# What the simulator lacks. Each does in it what is equivalent, at another speed.
+
+if simulated():
+
+    def sync_warp() -> None:
+        """Wait for the other threads of the warp."""
+        threading.current_thread().syncthreads()  # type: ignore[attr-defined]
+
+    @kernel()
+    def any_in_warp(condition):
+        """Whether the condition may hold in a thread of the warp; if not, it holds in none."""
+        return True
+
+    @kernel()
+    def exp2(x):
+        """2^x in float32."""
+        return np.exp2(np.float32(x))
+
+    @kernel()
+    def reciprocal(x):
+        """1 / x in float32."""
+        return np.float32(1.0) / np.float32(x)
+
+else:
+    from numba.cuda import libdevice
+
+    @cuda.jit(device=True, forceinline=True)
+    def sync_warp():
+        """Wait for the other threads of the warp."""
+        cuda.syncwarp(ALL_LANES)
+
+    @cuda.jit(device=True, forceinline=True)
+    def any_in_warp(condition):
+        """Whether the condition may hold in a thread of the warp; if not, it holds in none."""
+        return cuda.any_sync(ALL_LANES, condition)
+
+    @cuda.jit(device=True, forceinline=True)
+    def exp2(x):
+        """2^x in float32, to 2 units in the last place."""
+        return libdevice.exp2f(x)
+
+    @cuda.jit(device=True, forceinline=True)
+    def reciprocal(x):
+        """1 / x in float32, to 2 units in the last place; 1 / 0 is infinite."""
+        return libdevice.fast_fdividef(np.float32(1.0), x)

@@ -1,0 +1,480 @@
+"""A 3D Gaussian to its screen splat and back (EWA splatting, Zwicker et al. 2001), on the CPU and on a GPU.
+
+A screen splat is stored so that a pixel row needs no cancelling terms: with the projected covariance
+[[a, b], [b, c]] (blur included) and dy = y - v,
+
+    log2 alpha(x, y) = lop - A (x - u - s dy)^2 - C dy^2,
+    s = b / c,  A = k / (a - b^2 / c),  C = k / c,  k = log2(e) / 2,
+
+which equals the usual quadratic form but stays exact for long diagonal needles. The ridge x = u + s dy is stored by
+its column U in the picture's row nearest to v, so that a needle whose centre is far away keeps its place. Inputs and
+outputs are float32, the arithmetic between them float64 (and said so: in a kernel, float() of a float32 is a float32):
+this stage is a small share of the time and where determinants underflow.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .camera import Camera
+from .discs import (
+    MIDDLE,
+    NEAREST,
+    NORMAL_X,
+    NORMAL_Y,
+    NORMAL_Z,
+    Q0,
+    QX,
+    QY,
+    SPOT,
+    SPOT_U,
+    disc_footprint,
+    disc_outline,
+    disc_plane,
+)
+from .kernel import kernel
+from .settings import ALPHA_MIN, BLUR, MAX_EXTENT, MIN_QUAT_NORM2, TAN_MARGIN
+
+# Columns of a screen splat.
+U, V, SLOPE, A, C, LOP, RED, GREEN, BLUE, DEPTH, HALF_W, HALF_H = range(12)
+SPLAT_COLUMNS = 12
+# Columns of a gradient row: moments of dL/d(log2 alpha) over the splat's pixels, then colour and depth.
+M0, MY, MYY, MX, MXY, MXX, G_RED, G_GREEN, G_BLUE, G_DEPTH = range(10)
+# Discs: the moments but the first are of the pixels in the plane, over Q^2; moments of dL/dQ there, and of
+# dL/d(log2 alpha) in the spot; and, where normals are asked for, their gradient.
+MQ, MQX, MQY, MSX, MSY = range(10, 15)
+G_NORMAL = 16
+GRADIENT_COLUMNS = 16  # the rest pads a row to one cache line, written as one vector
+
+_MAX_COLOR = 3e38  # what float32 holds
+
+_HALF_LOG2E = 0.5 / math.log(2.0)
+_LN2 = math.log(2.0)
+_LOG2_CUT = math.log2(ALPHA_MIN)
+
+_C0 = 0.28209479177387814
+_C1 = 0.4886025119029199
+_C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
+_C3 = (
+    -0.5900435899266435,
+    2.890611442640554,
+    -0.4570457994644658,
+    0.3731763325901154,
+    -0.4570457994644658,
+    1.445305721320277,
+    -0.5900435899266435,
+)
+
+
+@kernel()
+def sh_basis(x, y, z, count, out):
+    """Real spherical harmonics of degree 0-3 at the unit direction (x, y, z); `count` = 1, 4, 9 or 16."""
+    out[0] = _C0
+    if count > 1:
+        out[1] = -_C1 * y
+        out[2] = _C1 * z
+        out[3] = -_C1 * x
+    if count > 4:
+        xx, yy, zz = x * x, y * y, z * z
+        out[4] = _C2[0] * x * y
+        out[5] = _C2[1] * y * z
+        out[6] = _C2[2] * (2.0 * zz - xx - yy)
+        out[7] = _C2[3] * x * z
+        out[8] = _C2[4] * (xx - yy)
+        if count > 9:
+            out[9] = _C3[0] * y * (3.0 * xx - yy)
+            out[10] = _C3[1] * x * y * z
+            out[11] = _C3[2] * y * (4.0 * zz - xx - yy)
+            out[12] = _C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy)
+            out[13] = _C3[4] * x * (4.0 * zz - xx - yy)
+            out[14] = _C3[5] * z * (xx - yy)
+            out[15] = _C3[6] * x * (xx - 3.0 * yy)
+
+
+@kernel()
+def sh_gradient(x, y, z, count, g):
+    """Gradient of sum_k g[k] Y_k(x, y, z) with respect to the direction, before its normalisation."""
+    gx = gy = gz = 0.0
+    if count > 1:
+        gy -= _C1 * g[1]
+        gz += _C1 * g[2]
+        gx -= _C1 * g[3]
+    if count > 4:
+        gx += _C2[0] * y * g[4] + _C2[2] * -2.0 * x * g[6] + _C2[3] * z * g[7] + _C2[4] * 2.0 * x * g[8]
+        gy += _C2[0] * x * g[4] + _C2[1] * z * g[5] + _C2[2] * -2.0 * y * g[6] - _C2[4] * 2.0 * y * g[8]
+        gz += _C2[1] * y * g[5] + _C2[2] * 4.0 * z * g[6] + _C2[3] * x * g[7]
+    if count > 9:
+        xx, yy, zz = x * x, y * y, z * z
+        gx += (
+            _C3[0] * 6.0 * x * y * g[9]
+            + _C3[1] * y * z * g[10]
+            + _C3[2] * -2.0 * x * y * g[11]
+            + _C3[3] * -6.0 * x * z * g[12]
+            + _C3[4] * (4.0 * zz - 3.0 * xx - yy) * g[13]
+            + _C3[5] * 2.0 * x * z * g[14]
+            + _C3[6] * (3.0 * xx - 3.0 * yy) * g[15]
+        )
+        gy += (
+            _C3[0] * (3.0 * xx - 3.0 * yy) * g[9]
+            + _C3[1] * x * z * g[10]
+            + _C3[2] * (4.0 * zz - xx - 3.0 * yy) * g[11]
+            + _C3[3] * -6.0 * y * z * g[12]
+            + _C3[4] * -2.0 * x * y * g[13]
+            + _C3[5] * -2.0 * y * z * g[14]
+            + _C3[6] * -6.0 * x * y * g[15]
+        )
+        gz += (
+            _C3[1] * x * y * g[10]
+            + _C3[2] * 8.0 * y * z * g[11]
+            + _C3[3] * (6.0 * zz - 3.0 * xx - 3.0 * yy) * g[12]
+            + _C3[4] * 8.0 * x * z * g[13]
+            + _C3[5] * (xx - yy) * g[14]
+        )
+    return gx, gy, gz
+
+
+@kernel()
+def _rotation(qw, qx, qy, qz, R):
+    R[0, 0] = 1.0 - 2.0 * (qy * qy + qz * qz)
+    R[0, 1] = 2.0 * (qx * qy - qw * qz)
+    R[0, 2] = 2.0 * (qx * qz + qw * qy)
+    R[1, 0] = 2.0 * (qx * qy + qw * qz)
+    R[1, 1] = 1.0 - 2.0 * (qx * qx + qz * qz)
+    R[1, 2] = 2.0 * (qy * qz - qw * qx)
+    R[2, 0] = 2.0 * (qx * qz - qw * qy)
+    R[2, 1] = 2.0 * (qy * qz + qw * qx)
+    R[2, 2] = 1.0 - 2.0 * (qx * qx + qy * qy)
+
+
+@kernel()
+def _jacobian(px, py, pz, fx, fy, tan_limits, T, W):
+    """T = J W, with the ray's tangents clamped so that far off-screen splats keep a bounded footprint."""
+    tx = min(max(px / pz, tan_limits[0]), tan_limits[1])
+    ty = min(max(py / pz, tan_limits[2]), tan_limits[3])
+    for i in range(3):
+        T[0, i] = fx / pz * (W[0, i] - tx * W[2, i])
+        T[1, i] = fy / pz * (W[1, i] - ty * W[2, i])
+    return tx, ty
+
+
+@kernel()
+def _footprint(T, R, scales, n, V0, V1):
+    """V = T R diag(scales[n]) as its two rows; returns a, b, c of V V^T + blur and a - b^2 / c."""
+    a = 0.0
+    b = 0.0
+    c = 0.0
+    for j in range(3):
+        scale = np.float64(scales[n, j])
+        V0[j] = (T[0, 0] * R[0, j] + T[0, 1] * R[1, j] + T[0, 2] * R[2, j]) * scale
+        V1[j] = (T[1, 0] * R[0, j] + T[1, 1] * R[1, j] + T[1, 2] * R[2, j]) * scale
+        a += V0[j] * V0[j]
+        b += V0[j] * V1[j]
+        c += V1[j] * V1[j]
+    # The determinant of V V^T is the squared area that V's rows span; a c - b^2 would cancel for diagonal needles.
+    x = V0[1] * V1[2] - V0[2] * V1[1]
+    y = V0[2] * V1[0] - V0[0] * V1[2]
+    z = V0[0] * V1[1] - V0[1] * V1[0]
+    conditional = (x * x + y * y + z * z + BLUR * (a + c + BLUR)) / (c + BLUR)
+    return a + BLUR, b, c + BLUR, conditional
+
+
+@kernel()
+def tangent_limits(fx, fy, cx, cy, width, height):
+    """Clamp limits of x/z and y/z: the field of view with a margin on every side."""
+    limits = np.empty(4)
+    limits[0] = -cx / fx - TAN_MARGIN * 0.5 * width / fx
+    limits[1] = (width - cx) / fx + TAN_MARGIN * 0.5 * width / fx
+    limits[2] = -cy / fy - TAN_MARGIN * 0.5 * height / fy
+    limits[3] = (height - cy) / fy + TAN_MARGIN * 0.5 * height / fy
+    return limits
+
+
+def view_of(camera: Camera, flat: bool) -> np.ndarray:
+    """What the projection needs of a camera, (6, 4) float64: three rows of the matrix from world to camera; fx, fy, cx,
+    cy; the limits of x/z and y/z (none for discs, if `flat`); where the camera stands, and its near plane."""
+    viewmat, intrinsics = camera.arrays()
+    fx, fy, cx, cy = (float(v) for v in intrinsics)
+    limits = tangent_limits(fx, fy, cx, cy, float(camera.width), float(camera.height))
+    if flat:
+        limits = np.array([-np.inf, np.inf, -np.inf, np.inf])
+    return np.concatenate([viewmat[:3], [intrinsics, limits, [*camera.centre, camera.near]]])
+
+
+@kernel(inline=True)
+def project_splat(
+    n, means, quats, scales, opacities, sh, view, width, height, splats, tilts, outlines, R, T, V0, V1, basis
+):  # fmt: skip
+    """Write row n of `splats`; HALF_H < 0 marks a splat that cannot be seen. Arrays as in `project`.
+
+    Room for R (3, 3), T (2, 3), V0 and V1 (3,), basis (16,): float64.
+    """
+    fx, fy, cx, cy = view[3, 0], view[3, 1], view[3, 2], view[3, 3]
+    near = view[5, 3]
+    count = sh.shape[1]
+    splats[n, HALF_H] = -1.0
+    opacity = np.float64(opacities[n])
+    if not opacity > ALPHA_MIN:
+        return
+    mx, my, mz = np.float64(means[n, 0]), np.float64(means[n, 1]), np.float64(means[n, 2])
+    px = view[0, 0] * mx + view[0, 1] * my + view[0, 2] * mz + view[0, 3]
+    py = view[1, 0] * mx + view[1, 1] * my + view[1, 2] * mz + view[1, 3]
+    pz = view[2, 0] * mx + view[2, 1] * my + view[2, 2] * mz + view[2, 3]
+    if not pz > near:
+        return
+    qw, qx, qy, qz = (
+        np.float64(quats[n, 0]),
+        np.float64(quats[n, 1]),
+        np.float64(quats[n, 2]),
+        np.float64(quats[n, 3]),
+    )
+    norm2 = qw * qw + qx * qx + qy * qy + qz * qz
+    if not norm2 > MIN_QUAT_NORM2:
+        return
+    inverse = 1.0 / math.sqrt(norm2)
+    _rotation(qw * inverse, qx * inverse, qy * inverse, qz * inverse, R)
+    u = fx * px / pz + cx
+    v = fy * py / pz + cy
+    lop = math.log2(opacity)
+    reach = lop - _LOG2_CUT
+    middle_u, middle_v = u, v
+    if tilts is None:
+        _jacobian(px, py, pz, fx, fy, view[4], T, view)
+        a, b, c, conditional = _footprint(T, R, scales, n, V0, V1)
+        half_w = math.sqrt(reach * a / _HALF_LOG2E)
+        half_h = math.sqrt(reach * c / _HALF_LOG2E)
+        largest = max(half_w, half_h)
+    else:
+        _jacobian(px, py, pz, fx, fy, view[4], T, view)
+        a, b, c, conditional, area, broad = disc_footprint(T, R, scales, n, V0, V1)
+        nx, ny, nz, _side, _distance, tilt_x, tilt_y = disc_plane(px, py, pz, fx, fy, view, R)
+        largest = math.sqrt(reach * max(a, c) / _HALF_LOG2E)
+        du, dv, out_a, out_b, out_c, out_conditional, bounded = disc_outline(
+            a, b, c, area, broad, tilt_x, tilt_y, reach / _HALF_LOG2E, pz / near
+        )
+        if not bounded:
+            du, dv = 0.5 * width - u, 0.5 * height - v
+            out_a = out_c = out_conditional = 100.0 * (width + height) ** 2
+        middle_u, middle_v = u + du, v + dv
+        half_w = math.sqrt(out_a)
+        half_h = math.sqrt(out_c)
+        out_slope = out_b / out_c
+        outlines[n, U] = middle_u + out_slope * (min(max(middle_v, 0.0), height) - middle_v)
+        outlines[n, V] = middle_v
+        outlines[n, SLOPE] = out_slope
+        outlines[n, A] = reach / out_conditional
+        outlines[n, C] = reach / out_c
+        outlines[n, LOP] = lop
+        outlines[n, HALF_W] = half_w
+        outlines[n, HALF_H] = half_h
+        if not broad:
+            a, b, c, conditional = 1.0, 0.0, _HALF_LOG2E / SPOT, _HALF_LOG2E / SPOT
+            tilt_x = tilt_y = 0.0
+        # Along the ridge, from (u, v) to the picture's row nearest to it.
+        along = tilt_x * b / c + tilt_y
+        tilts[n, Q0] = 1.0 + along * (min(max(v, 0.0), height) - v)
+        tilts[n, QX] = tilt_x
+        tilts[n, QY] = along
+        tilts[n, NEAREST] = near / pz if broad else np.inf
+        tilts[n, SPOT_U] = u
+        tilts[n, MIDDLE] = middle_v
+        tilts[n, NORMAL_X] = nx
+        tilts[n, NORMAL_Y] = ny
+        tilts[n, NORMAL_Z] = nz
+    # Written so that a NaN or an infinity fails every test.
+    if not (
+        middle_u + half_w > 0.0 and middle_u - half_w < width and middle_v + half_h > 0.0 and middle_v - half_h < height
+    ):
+        return
+    if not (largest < MAX_EXTENT):
+        return
+    dx, dy, dz = mx - view[5, 0], my - view[5, 1], mz - view[5, 2]
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    sh_basis(dx / length, dy / length, dz / length, count, basis)
+    finite = True
+    for channel in range(3):
+        value = 0.5
+        for k in range(count):
+            value += basis[k] * sh[n, k, channel]
+        finite = finite and abs(value) < _MAX_COLOR
+        splats[n, RED + channel] = max(value, 0.0)
+    if not finite:
+        return
+    splats[n, U] = u + b / c * (min(max(v, 0.0), height) - v)
+    splats[n, V] = v
+    splats[n, SLOPE] = b / c
+    splats[n, A] = _HALF_LOG2E / conditional
+    splats[n, C] = _HALF_LOG2E / c
+    splats[n, LOP] = lop
+    splats[n, DEPTH] = pz
+    splats[n, HALF_W] = half_w
+    splats[n, HALF_H] = half_h
+
+
+@kernel(inline=True)
+def no_gradient(n, g_means, g_quats, g_scales, g_opacities, g_sh, g_screen):
+    """Zero the gradients of splat n."""
+    for i in range(3):
+        g_means[n, i] = 0.0
+        g_scales[n, i] = 0.0
+        for k in range(g_sh.shape[1]):
+            g_sh[n, k, i] = 0.0
+    for i in range(4):
+        g_quats[n, i] = 0.0
+    g_opacities[n] = 0.0
+    g_screen[n, 0] = 0.0
+    g_screen[n, 1] = 0.0
+
+
+@kernel(inline=True)
+def project_splat_backward(
+    n, g, with_normals, means, quats, scales, opacities, sh, view, splats, tilts,
+    g_means, g_quats, g_scales, g_opacities, g_sh, g_screen, R, T, V0, V1, basis, gR, gT, weights, g_color,
+):  # fmt: skip
+    """From g, the sum of splat n's gradient rows in float64, to the gradients of its parameters (see
+    `project_backward`). Room as in `project_splat`, and gR (3, 3), gT (2, 3), weights (16,), g_color (3,)."""
+    fx, fy = view[3, 0], view[3, 1]
+    axes = 3
+    if tilts is not None:
+        axes = 2
+        g_scales[n, 2] = 0.0
+    count = sh.shape[1]
+    mx, my, mz = np.float64(means[n, 0]), np.float64(means[n, 1]), np.float64(means[n, 2])
+    px = view[0, 0] * mx + view[0, 1] * my + view[0, 2] * mz + view[0, 3]
+    py = view[1, 0] * mx + view[1, 1] * my + view[1, 2] * mz + view[1, 3]
+    pz = view[2, 0] * mx + view[2, 1] * my + view[2, 2] * mz + view[2, 3]
+    qw, qx, qy, qz = (
+        np.float64(quats[n, 0]),
+        np.float64(quats[n, 1]),
+        np.float64(quats[n, 2]),
+        np.float64(quats[n, 3]),
+    )
+    inverse = 1.0 / math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
+    qw, qx, qy, qz = qw * inverse, qx * inverse, qy * inverse, qz * inverse
+    _rotation(qw, qx, qy, qz, R)
+    tx, ty = _jacobian(px, py, pz, fx, fy, view[4], T, view)
+    if tilts is None:
+        _a, b, c, conditional = _footprint(T, R, scales, n, V0, V1)
+    else:
+        _a, b, c, conditional, _area, broad = disc_footprint(T, R, scales, n, V0, V1)
+        if not broad:
+            b, c = 0.0, 1.0
+    slope = b / c
+    quad_a = _HALF_LOG2E / conditional
+    quad_c = _HALF_LOG2E / c
+
+    g_u = 2.0 * quad_a * g[MX]
+    g_v = 2.0 * quad_c * g[MY] - 2.0 * quad_a * slope * g[MX]
+    g_slope = 2.0 * quad_a * g[MXY]
+    g_conditional = g[MXX] * quad_a / conditional
+    g_b = g_slope / c
+    g_c = g[MYY] * quad_c / c
+    if tilts is not None:
+        nx, ny, nz, side, distance, tilt_x, tilt_y = disc_plane(px, py, pz, fx, fy, view, R)
+        g_u += 2.0 * SPOT * g[MSX]
+        g_v += 2.0 * SPOT * g[MSY]
+        g_qx = g_qy = 0.0
+        if broad:
+            g_u -= tilt_x * g[MQ]
+            g_v -= tilt_y * g[MQ]
+            g_qx = g[MQX] + slope * g[MQY]
+            g_qy = g[MQY]
+    g_screen[n, 0] = g_u
+    g_screen[n, 1] = g_v
+    g_opacities[n] = g[M0] / (_LN2 * np.float64(opacities[n]))
+
+    # Covariance to V = T R diag(scale), then to its three factors. What the conditional variance sends back is
+    # along V0 - slope V1; taken apart into a, b and c it would cancel for needles.
+    for i in range(2):
+        for j in range(3):
+            gT[i, j] = 0.0
+    for j in range(axes):
+        scale = np.float64(scales[n, j])
+        across = V0[j] - slope * V1[j]
+        gV0 = 2.0 * g_conditional * across + g_b * V1[j]
+        gV1 = g_b * (across - slope * V1[j]) + 2.0 * (g_c * V1[j] - slope * g_conditional * across)
+        g_scale = 0.0
+        for i in range(3):
+            gM = T[0, i] * gV0 + T[1, i] * gV1
+            g_scale += R[i, j] * gM
+            gR[i, j] = gM * scale
+            gT[0, i] += gV0 * R[i, j] * scale
+            gT[1, i] += gV1 * R[i, j] * scale
+        g_scales[n, j] = g_scale
+    g_px = g_py = g_pz = 0.0
+    if tilts is not None:
+        gn_x = gn_y = gn_z = 0.0
+        if broad:
+            kx, ky = g_qx * pz / (fx * distance), g_qy * pz / (fy * distance)
+            back = (kx * nx + ky * ny) / distance
+            g_px, g_py, g_pz = -back * nx, -back * ny, back * (distance / pz - nz)
+            gn_x, gn_y, gn_z = kx - back * px, ky - back * py, -back * pz
+        if with_normals:
+            gn_x, gn_y, gn_z = gn_x + g[G_NORMAL], gn_y + g[G_NORMAL + 1], gn_z + g[G_NORMAL + 2]
+        for i in range(3):
+            gR[i, 2] = side * (view[0, i] * gn_x + view[1, i] * gn_y + view[2, i] * gn_z)
+
+    # Quaternion, tangent to the unit sphere.
+    gw = 2.0 * (qz * (gR[1, 0] - gR[0, 1]) + qy * (gR[0, 2] - gR[2, 0]) + qx * (gR[2, 1] - gR[1, 2]))
+    gx = 2.0 * (
+        qy * (gR[0, 1] + gR[1, 0]) + qz * (gR[0, 2] + gR[2, 0]) + qw * (gR[2, 1] - gR[1, 2])
+        - 2.0 * qx * (gR[1, 1] + gR[2, 2])
+    )  # fmt: skip
+    gy = 2.0 * (
+        qx * (gR[0, 1] + gR[1, 0]) + qz * (gR[1, 2] + gR[2, 1]) + qw * (gR[0, 2] - gR[2, 0])
+        - 2.0 * qy * (gR[0, 0] + gR[2, 2])
+    )  # fmt: skip
+    gz = 2.0 * (
+        qx * (gR[0, 2] + gR[2, 0]) + qy * (gR[1, 2] + gR[2, 1]) + qw * (gR[1, 0] - gR[0, 1])
+        - 2.0 * qz * (gR[0, 0] + gR[1, 1])
+    )  # fmt: skip
+    along = gw * qw + gx * qx + gy * qy + gz * qz
+    g_quats[n, 0] = (gw - along * qw) * inverse
+    g_quats[n, 1] = (gx - along * qx) * inverse
+    g_quats[n, 2] = (gy - along * qy) * inverse
+    g_quats[n, 3] = (gz - along * qz) * inverse
+
+    # Camera-space position: through the centre, the depth and the Jacobian.
+    to_x = g_u * fx / pz
+    to_y = g_v * fy / pz
+    g_px += to_x
+    g_py += to_y
+    g_pz += g[G_DEPTH] - (to_x * px + to_y * py) / pz
+    g_tx = 0.0
+    g_ty = 0.0
+    for i in range(3):
+        g_tx -= gT[0, i] * fx / pz * view[2, i]
+        g_ty -= gT[1, i] * fy / pz * view[2, i]
+        g_pz -= (gT[0, i] * T[0, i] + gT[1, i] * T[1, i]) / pz
+    if view[4, 0] <= px / pz <= view[4, 1]:
+        g_px += g_tx / pz
+        g_pz -= g_tx * tx / pz
+    if view[4, 2] <= py / pz <= view[4, 3]:
+        g_py += g_ty / pz
+        g_pz -= g_ty * ty / pz
+
+    # Colour: through the SH coefficients and the viewing direction.
+    dx, dy, dz = mx - view[5, 0], my - view[5, 1], mz - view[5, 2]
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    dx, dy, dz = dx / length, dy / length, dz / length
+    sh_basis(dx, dy, dz, count, basis)
+    for channel in range(3):
+        g_color[channel] = g[G_RED + channel] if splats[n, RED + channel] > 0.0 else 0.0
+    for k in range(count):
+        weights[k] = 0.0
+        for channel in range(3):
+            g_sh[n, k, channel] = basis[k] * g_color[channel]
+            weights[k] += g_color[channel] * sh[n, k, channel]
+    sx, sy, sz = sh_gradient(dx, dy, dz, count, weights)
+    radial = sx * dx + sy * dy + sz * dz
+    g_means[n, 0] = view[0, 0] * g_px + view[1, 0] * g_py + view[2, 0] * g_pz + (sx - radial * dx) / length
+    g_means[n, 1] = view[0, 1] * g_px + view[1, 1] * g_py + view[2, 1] * g_pz + (sy - radial * dy) / length
+    g_means[n, 2] = view[0, 2] * g_px + view[1, 2] * g_py + view[2, 2] * g_pz + (sz - radial * dz) / length
+
+
+def gradient_columns(flat: bool, with_normals: bool) -> int:
+    """How many columns of a gradient row are in use."""
+    if not flat:
+        return G_DEPTH + 1
+    return G_NORMAL + 3 if with_normals else MSY + 1

@@ -1,0 +1,320 @@
+"""How fast the CUDA renderer is, in ms and in ns for each (pixel, splat) pair, and what of the GPU it makes use of.
+
+Pairs are counted as in benchmarks/raster.py: pixels inside a splat's bounding box, clipped to the picture. Forward is
+projection, binning and blending of colour, alpha and label weight; backward is all gradients. Scenes are random and
+about 45 deep at every pixel, whatever the number of splats and pixels.
+
+The limits are measured in the same run: a copy within the GPU's memory, and a float32 matrix product without tensor
+cores. A blending kernel's share of arithmetic counts what it computes for every pixel of a tile and every splat that
+the tile goes through (FORWARD_FLOPS, BACKWARD_FLOPS), its share of memory what must be read and written once.
+
+    python benchmarks/gpu.py [--json] [--repeats 10] [--demo build/demo/capture]
+
+--demo names a capture to train on; without it, the demo's where `make demo` has left it. With gsplat installed, its
+renderer draws the same splats in the same run. Without a GPU this says so and ends well.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+ROOT = Path(__file__).resolve().parents[1]
+if str(ROOT) not in sys.path:
+    sys.path.insert(0, str(ROOT))
+
+from backend.raster import Camera  # noqa: E402
+from backend.raster.splats import HALF_H, HALF_W, SPLAT_COLUMNS, U, V  # noqa: E402
+
+SIZES = (
+    (100_000, 640, 480), (300_000, 640, 480), (1_000_000, 640, 480), (100_000, 1280, 720), (1_000_000, 1280, 720),
+    (100_000, 1920, 1080), (1_000_000, 1920, 1080), (3_000_000, 1920, 1080),
+)  # fmt: skip
+MIDDLE = (300_000, 640, 480)
+OBJECTS = (1, 7, 24, 63, 90, 1_000, 10_000)
+DEMO = ROOT / "build" / "demo" / "capture"
+DEMO_SECONDS = (15, 30, 60)
+FORWARD_FLOPS, BACKWARD_FLOPS = 14, 40
+"""Operations for a pixel of a tile and a splat, a fused multiply-add as two: what is done whether it is drawn or not
+and, for about a third of them, what is drawn."""
+
+
+def why_no_gpu() -> str | None:
+    """One sentence, or None where there is a GPU to measure."""
+    if not torch.cuda.is_available():
+        return "torch sees no NVIDIA GPU here, so nothing was measured."
+    try:
+        import numba_cuda  # noqa: F401
+        from numba import cuda
+    except ImportError:
+        return "numba-cuda is not installed, so nothing was measured on the GPU."
+    return None if cuda.is_available() else "numba-cuda cannot use the GPU that torch sees, so nothing was measured."
+
+
+class Scene:
+    """Random splats on the GPU that fill a picture, spread evenly over it and over depths 1 to 4."""
+
+    def __init__(self, count: int, width: int, height: int, objects: int = 8) -> None:
+        from backend.raster import cuda as renderer
+
+        self.renderer = renderer
+        rng = np.random.default_rng(0)
+        size = 2.0 * (50_000 / count * width * height / (640 * 480)) ** 0.5
+        z = rng.uniform(1, 4, count)
+        u, v = rng.uniform(0, width, count), rng.uniform(0, height, count)
+        means = np.stack([(u - width / 2) / width * z, (v - height / 2) / width * z, z], 1)
+        scales = np.exp(rng.normal(0, 0.5, (count, 3))) * size / width * z[:, None]
+        arrays = (means, rng.normal(size=(count, 4)), scales, rng.uniform(0.05, 0.95, count))
+        arrays = (*arrays, rng.normal(0, 0.3, (count, 4, 3)))
+        across = int(np.ceil(np.sqrt(objects)))
+
+        def field(x: np.ndarray, y: np.ndarray) -> torch.Tensor:
+            """Objects lie side by side like fields of a board."""
+            row, column = (y * across / height).astype(np.int32), (x * across / width).astype(np.int32)
+            return torch.from_numpy(np.minimum(row * across + column, objects - 1)).cuda()
+
+        self.gaussians = renderer.Gaussians(
+            *(torch.from_numpy(a.astype(np.float32)).cuda() for a in arrays), ids=field(u, v)
+        )
+        self.camera = Camera(
+            np.eye(4), np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]]), width, height
+        )
+        self.labels = field(*np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5))
+        self.g_color = torch.randn(3, height, width, device="cuda")
+        self.g_alpha, self.g_weight = torch.randn(2, height, width, device="cuda").unbind()
+        self.frame = self.forward()
+
+    def forward(self, **wanted: bool) -> Any:
+        return self.renderer.forward(self.gaussians, self.camera, self.labels, **wanted)
+
+    def backward(self) -> None:
+        self.renderer.backward(self.frame, self.g_color, self.g_alpha, self.g_weight)
+
+    def step(self) -> None:
+        """What the rasterizer does in a training step."""
+        self.renderer.backward(self.forward(), self.g_color, self.g_alpha, self.g_weight)
+
+    def step_discs(self, surface: bool = False) -> None:
+        """The same for the same splats as discs; surface: with depth, normals and distortion."""
+        frame = self.forward(flat=True, want_depth=surface, want_normals=surface, want_moments=surface)
+        more = (self.g_alpha, self.g_color, self.g_color[:2].contiguous()) if surface else ()
+        self.renderer.backward(frame, self.g_color, self.g_alpha, self.g_weight, *more)
+
+    def id_render(self) -> None:
+        """Colour, and the most probable object of every pixel."""
+        self.renderer.object_map(self.renderer.forward(self.gaussians, self.camera))
+
+    @property
+    def pairs(self) -> float:
+        s = self.frame.splats[self.frame.seen].double()
+        across = (s[:, U] + s[:, HALF_W]).clamp(max=self.camera.width) - (s[:, U] - s[:, HALF_W]).clamp(min=0)
+        down = (s[:, V] + s[:, HALF_H]).clamp(max=self.camera.height) - (s[:, V] - s[:, HALF_H]).clamp(min=0)
+        return float((across * down).sum())
+
+    def work(self) -> dict[str, float]:
+        """What a step must do at least: meetings of a tile and a splat, those gone through, operations and bytes of the
+        two blending kernels."""
+        meetings, gone_through = float(self.frame.lists.starts[-1]), float(self.frame.ends.sum())
+        pixels = self.frame.transmittance.numel()
+        staged = gone_through * (4 * SPLAT_COLUMNS + 8)
+        return {
+            "meetings": meetings,
+            "gone_through": gone_through,
+            "forward_flops": gone_through * 256 * FORWARD_FLOPS,
+            "backward_flops": gone_through * 256 * BACKWARD_FLOPS,
+            "forward_bytes": staged + pixels * 4 * 7,
+            "backward_bytes": staged + meetings * (64 + 8) + pixels * 4 * 12,
+        }
+
+
+def timed(jobs: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+    """Median in ms by the GPU's clock; jobs take turns, and the first two turns are not counted."""
+    times: dict[str, list[float]] = {name: [] for name in jobs}
+    for turn in range(repeats + 2):
+        for name, job in jobs.items():
+            begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+            begin.record()
+            job()
+            end.record()
+            end.synchronize()
+            if turn > 1:
+                times[name].append(begin.elapsed_time(end))
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def peak_mb(job: Callable[[], object]) -> float:
+    """By how many MB a job raises the GPU's memory at most."""
+    torch.cuda.synchronize()
+    torch.cuda.empty_cache()
+    torch.cuda.reset_peak_memory_stats()
+    before = torch.cuda.memory_allocated()
+    job()
+    torch.cuda.synchronize()
+    return (torch.cuda.max_memory_allocated() - before) / 1e6
+
+
+def limits(repeats: int) -> dict[str, float]:
+    """What the GPU can do: GB/s, read and written, of a copy; and float32 TFLOP/s of a matrix product."""
+    numbers = torch.empty(2**28, device="cuda")
+    copy = torch.empty_like(numbers)
+    a, b = torch.randn(2, 8192, 8192, device="cuda").unbind()
+    allowed = torch.backends.cuda.matmul.allow_tf32
+    torch.backends.cuda.matmul.allow_tf32 = False
+    try:
+        times = timed({"copy": lambda: copy.copy_(numbers), "product": lambda: a @ b}, repeats)
+    finally:
+        torch.backends.cuda.matmul.allow_tf32 = allowed
+    return {"gb_per_s": 2 * 4 * 2**28 / times["copy"] / 1e6, "tflops": 2 * 8192**3 / times["product"] / 1e9}
+
+
+def kernels_alone(scene: Scene, repeats: int) -> dict[str, float]:
+    """ms of the two blending kernels, by torch's profiler."""
+    from torch.profiler import ProfilerActivity, profile
+
+    scene.step()
+    with profile(activities=[ProfilerActivity.CUDA]) as profiler:
+        for _ in range(repeats):
+            scene.step()
+        torch.cuda.synchronize()
+    found: dict[str, float] = {}
+    for event in profiler.key_averages():
+        for name in ("blend_backward", "blend"):
+            if name in event.key:
+                found[name] = found.get(name, 0.0) + event.device_time_total / 1e3 / repeats
+                break
+    return found
+
+
+def gsplat_step(scene: Scene) -> tuple[Callable[[], object], Callable[[], object]] | None:
+    """gsplat's picture of the scene's splats (colour and alpha only), and that with all gradients; None without it."""
+    try:
+        from gsplat import rasterization
+    except ImportError:
+        return None
+    g = scene.gaussians
+    leaves = [t.clone().requires_grad_() for t in (g.means, g.quats, g.scales, g.opacities, g.sh)]
+    viewmats = torch.from_numpy(scene.camera.viewmat).float().cuda()[None]
+    Ks = torch.from_numpy(scene.camera.K).float().cuda()[None]
+    target = scene.g_color.permute(1, 2, 0)[None].contiguous()
+
+    def forward() -> Any:
+        return rasterization(
+            *leaves, viewmats, Ks, scene.camera.width, scene.camera.height, sh_degree=1, packed=False
+        )  # fmt: skip
+
+    def step() -> None:
+        colors, alphas, _ = forward()
+        ((colors * target).sum() + (alphas[0, ..., 0] * scene.g_alpha).sum()).backward()
+        for leaf in leaves:
+            leaf.grad = None
+
+    return forward, step
+
+
+def demo_quality(capture: Path) -> list[dict[str, float]]:
+    """Training on the GPU by the command itself: quality on the held-out views after so many seconds of training."""
+    curve = []
+    with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as place:
+        for seconds in DEMO_SECONDS:
+            command = [sys.executable, "-m", "backend"]
+            train = ["train", capture, "--out", place, "--minutes", str(seconds / 60), "--device", "cuda"]
+            for words in (train, ["evaluate", place]):
+                done = subprocess.run([*command, *words], cwd=ROOT, capture_output=True, text=True)
+                if done.returncode:
+                    raise SystemExit(f"{' '.join(map(str, words))}\n{done.stderr}")
+            quality = json.loads((Path(place) / "evaluation.json").read_text())["quality"]
+            curve.append({"seconds": seconds, "psnr": quality["psnr"], "miou": quality["miou"]})
+    return curve
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="print one JSON object as the last line, and no table")
+    parser.add_argument("--repeats", type=int, default=10, help="how often each measurement is repeated")
+    parser.add_argument("--demo", type=Path, help="capture to train on")
+    options = parser.parse_args()
+    say = (lambda *_: None) if options.json else print
+    why_not = why_no_gpu()
+    if why_not:
+        print(json.dumps({"gpu": None, "why": why_not}) if options.json else why_not)
+        return
+    gpu = torch.cuda.get_device_name()
+    can = limits(options.repeats)
+    say(f"{gpu}: {can['gb_per_s']:.0f} GB/s, {can['tflops']:.1f} TFLOP/s in float32.")
+
+    say(f"\n{'splats':>9} {'picture':>10} {'deep':>5} {'forward ms':>10} {'backward':>9} {'ns a pair':>9} {'MB':>7}"
+        f" {'as discs':>9} {'gsplat ms':>10} {'step over gsplat':>17}")  # fmt: skip
+    sizes = []
+    for size in SIZES:
+        scene = Scene(*size)
+        jobs: dict[str, Callable[[], object]] = {
+            "forward": scene.forward, "backward": scene.backward, "step": scene.step, "discs": scene.step_discs,
+            "surface": lambda scene=scene: scene.step_discs(surface=True),
+        }  # fmt: skip
+        other = gsplat_step(scene)
+        if other:
+            jobs |= {"gsplat_forward": other[0], "gsplat_step": other[1]}
+        times = timed(jobs, options.repeats)
+        pairs = scene.pairs
+        alone, work = kernels_alone(scene, options.repeats), scene.work()
+        shares = {
+            name: {
+                "ms": ms,
+                "of_arithmetic": work[f"{kind}_flops"] / ms / 1e9 / can["tflops"],
+                "of_memory": work[f"{kind}_bytes"] / ms / 1e6 / can["gb_per_s"],
+            }
+            for name, kind in (("blend", "forward"), ("blend_backward", "backward"))
+            if (ms := alone.get(name))
+        }
+        row = {
+            "splats": size[0], "width": size[1], "height": size[2], "pairs": pairs, "kernels": shares, **work,
+            **{f"{name}_ms": ms for name, ms in times.items()},
+            "forward_ns_per_pair": 1e6 * times["forward"] / pairs,
+            "backward_ns_per_pair": 1e6 * times["backward"] / pairs, "mb": peak_mb(scene.step),
+        }  # fmt: skip
+        sizes.append(row)
+        both = row["forward_ns_per_pair"] + row["backward_ns_per_pair"]
+        beside = f"{times['gsplat_step']:10.2f} {times['step'] / times['gsplat_step']:17.2f}" if other else f"{'-':>10}"
+        say(
+            f"{size[0]:9d} {f'{size[1]}x{size[2]}':>10} {pairs / size[1] / size[2]:5.0f} {times['forward']:10.2f}"
+            f" {times['backward']:9.2f} {both:9.4f} {row['mb']:7.0f} {times['discs']:9.2f} {beside}"
+        )
+        for name, share in shares.items():
+            say(f"{name:>30}: {share['ms']:.2f} ms, {share['of_arithmetic']:.0%} of arithmetic,"
+                f" {share['of_memory']:.0%} of memory")  # fmt: skip
+        del scene, jobs, other
+
+    say(f"\n{'objects':>9} {'step ms':>9} {'ID render ms':>13} {'MB':>7}")
+    scenes = {n: Scene(*MIDDLE, objects=n) for n in OBJECTS}
+    jobs = {f"step {n}": s.step for n, s in scenes.items()} | {f"ids {n}": s.id_render for n, s in scenes.items()}
+    times = timed(jobs, options.repeats)
+    objects = {}
+    for n, scene in scenes.items():
+        objects[str(n)] = {"step_ms": times[f"step {n}"], "id_render_ms": times[f"ids {n}"], "mb": peak_mb(scene.step)}
+        say(f"{n:9d} {times[f'step {n}']:9.2f} {times[f'ids {n}']:13.2f} {objects[str(n)]['mb']:7.0f}")
+    over_one = objects["1000"]["step_ms"] / objects["1"]["step_ms"]
+    say(f"A step at 1,000 objects takes {over_one:.2f} times what it takes at one.")
+
+    capture = options.demo or (DEMO if DEMO.exists() else None)
+    curve = demo_quality(capture) if capture else None
+    if curve:
+        say("\n" + "\n".join(f"{c['seconds']:4.0f} s: {c['psnr']:.1f} dB, mIoU {c['miou']:.3f}" for c in curve))
+    else:
+        say("\nThere is no capture to train on: `make demo` makes one, --demo names another.")
+    if options.json:
+        print(json.dumps({"gpu": gpu, "limits": can, "sizes": sizes, "objects": objects,
+                          "thousand_objects_over_one": over_one, "demo": curve}))  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,159 @@
+"""The CUDA renderer beyond what every renderer is tested for; run in numba's simulator by test_cuda.py."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from numba import cuda
+
+from backend.raster import cpu, cuda_bin
+from backend.raster.cuda_kernel import any_in_warp, cuda_kernel, launch, launch_for_each, simulated
+from backend.raster.cuda_tiles import STAGED
+from tests.backend.test_raster import NAMES, as_float32, camera, random_scene, rasterize
+from tests.backend.test_raster_stiff import assert_same_bits, draw
+
+PLANES = ("want_depth", "want_median", "want_normals", "want_distortion")
+
+
+def test_this_is_the_simulator():
+    assert simulated()
+
+
+@cuda_kernel()
+def turn_around(values, with_barrier):
+    shared = cuda.shared.array(64, np.float32)
+    i = cuda.threadIdx.x
+    shared[i] = values[i]
+    if with_barrier:
+        cuda.syncthreads()
+    values[i] = shared[63 - i]
+
+
+def test_a_lacking_barrier_shows():
+    right, wrong = (torch.arange(64.0) for _ in range(2))
+    launch(turn_around, 1, 64, right, True)
+    assert torch.equal(right, torch.arange(64.0).flip(0))
+    launch(turn_around, 1, 64, wrong, False)
+    assert not torch.equal(wrong, right)
+
+
+@cuda_kernel()
+def fail_in_one_thread(values):
+    cuda.syncthreads()
+    if cuda.threadIdx.x == 5:
+        raise ValueError("thread five")
+    cuda.syncthreads()
+
+
+def test_an_error_in_a_thread_ends_the_kernel():
+    with pytest.raises(ValueError, match="thread five"):
+        launch(fail_in_one_thread, 3, 32, torch.zeros(1))
+
+
+@cuda_kernel()
+def count_up(values):
+    i = cuda.grid(1)
+    if i < values.size:
+        values[i] += 1 if any_in_warp(i >= 0) else 100
+
+
+@pytest.mark.parametrize("count", [0, 1, 31, 32, 129])
+def test_a_thread_for_each(count):
+    values = torch.zeros(max(count, 1))
+    launch_for_each(count_up, count, values)
+    assert values.sum() == count
+
+
+@pytest.mark.parametrize("primitive", ["3d", "2d"])
+def test_too_little_room_for_the_lists(primitive, monkeypatch):
+    """The lists and the picture are made again, and nothing shows it."""
+    made = []
+    tile_lists = cuda_bin.tile_lists
+    monkeypatch.setattr("backend.raster.cuda.tile_lists", lambda *a: made.append(a[-1]) or tile_lists(*a))
+    scene = as_float32(random_scene(0, count=40))
+    pictures = []
+    for last in (10_000, 30):
+        monkeypatch.setattr(cuda_bin, "_last_total", {torch.device("cpu"): last})
+        pictures.append(draw(scene, camera(), primitive=primitive))
+    assert_same_bits(*pictures)
+    needed = cuda_bin._last_total[torch.device("cpu")]
+    assert 40 < needed < 10_000 and made == [int(10_000 * 1.125), int(30 * 1.125), needed]
+
+
+@pytest.mark.parametrize(
+    ("primitive", "wanted"),
+    [("3d", name) for name in ("", "labels", *PLANES[:2])] + [("2d", name) for name in ("", "labels", *PLANES)],
+)
+def test_each_plane_alone_is_as_among_the_others(wanted, primitive):
+    flat = primitive == "2d"
+    cam = camera()
+    labels = torch.tensor(np.random.default_rng(0).integers(-1, 5, (cam.height, cam.width)), dtype=torch.int32)
+    gradients = []
+    planes = []
+    for everything in (False, True):
+        scene = {k: v.requires_grad_(k != "ids") for k, v in as_float32(random_scene(2, count=25)).items()}
+        asked = {name: (everything and (flat or name in PLANES[:2])) or name == wanted for name in PLANES}
+        picture = rasterize(
+            **scene, camera=cam, labels=labels if everything or wanted == "labels" else None, primitive=primitive,
+            **asked,
+        )  # fmt: skip
+        here = [picture.color, picture.alpha]
+        for name, plane in zip(("labels", *PLANES), picture[2:7], strict=True):
+            assert (plane is not None) == ((everything and (flat or name in ("labels", *PLANES[:2]))) or name == wanted)
+            if name == wanted:
+                here.append(plane)
+        planes.append([plane.detach().numpy() for plane in here])
+        rng = np.random.default_rng(1)
+        sum(
+            (p * torch.tensor(rng.normal(size=p.shape), dtype=torch.float32)).sum() for p in here if p.requires_grad
+        ).backward()
+        gradients.append([scene[name].grad.numpy() for name in NAMES])
+    for some, all_of_them in zip(*planes, strict=True):
+        assert np.array_equal(some, all_of_them)
+    for some, all_of_them in zip(*gradients, strict=True):
+        np.testing.assert_allclose(some, all_of_them, rtol=1e-5, atol=1e-6 * np.abs(some).max())
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_meets_the_tiles_that_the_cpu_renderer_would(flat):
+    """Tight bounds: a picture as large as one tile of the CPU's, whose list holds what the 8 small tiles hold."""
+    cam = camera(64, 32)
+    scene = as_float32(random_scene(4, count=50))
+    cpu_frame = cpu.forward(cpu.Gaussians(*(scene[n].numpy() for n in (*NAMES, "ids"))), cam, flat=flat)
+    frame = rasterize(**scene, camera=cam, primitive="2d" if flat else "3d").frame
+    assert np.array_equal(frame.splats.numpy()[cpu_frame.seen], cpu_frame.splats[cpu_frame.seen])
+    assert np.array_equal(frame.seen.numpy(), cpu_frame.seen)
+    used = frame.lists.members[: int(frame.lists.starts[-1])].numpy()
+    assert set(used) == set(cpu_frame.members.tolist())
+    boxes = np.ceil(2 * cpu_frame.splats[cpu_frame.seen][:, 10:12] / 16 + 1).prod(1).sum()
+    assert used.size < boxes
+    # In every tile front to back as on the CPU.
+    rank = np.argsort(np.argsort(cpu_frame.members))
+    place = dict(zip(cpu_frame.members.tolist(), range(len(rank)), strict=True))
+    starts = frame.lists.starts.tolist()
+    for first, last in itertools.pairwise(starts):
+        places = [place[n] for n in used[first:last].tolist()]
+        assert places == sorted(places)
+
+
+def test_more_splats_in_a_tile_than_wait_in_shared_memory():
+    """Faint ones, so that all of them are drawn."""
+    scene = as_float32(random_scene(0, count=STAGED + 150, size=0.3))
+    scene["opacities"] *= 0.02
+    scene["opacities"] += 0.005
+    cam = camera(13, 9)
+    frame = rasterize(**scene, camera=cam).frame
+    assert int(frame.ends[0]) > STAGED
+    other = cpu.forward(cpu.Gaussians(*(scene[n].numpy() for n in (*NAMES, "ids"))), cam)
+    np.testing.assert_allclose(frame.color.numpy(), other.color, atol=1e-5)
+    g_color, g_alpha = torch.ones(3, 9, 13), torch.ones(9, 13)
+    from backend.raster import cuda as renderer
+
+    mine, theirs = renderer.backward(frame, g_color, g_alpha), cpu.backward(other, g_color.numpy(), g_alpha.numpy())
+    for name in NAMES:
+        a, b = getattr(mine, name).numpy(), getattr(theirs, name)
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4 * np.abs(b).max(), err_msg=name)
+    np.testing.assert_allclose(
+        frame.screen_gradient.numpy(), other.screen_gradient, rtol=1e-3, atol=1e-4 * np.abs(other.screen_gradient).max()
+    )

@@ -1,0 +1,600 @@
+"""What runs on a GPU against what runs on the processor, on the same numbers; and choosing between them.
+
+Without a GPU the torch versions run on tensors in the processor's memory, with the processor's renderer.
+"""
+
+import dataclasses
+import math
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from backend import device
+from backend.evaluation.metrics import psnr
+from backend.model.anchors import Anchors, Layout
+from backend.model.generate import generate
+from backend.model.growth import GrowthStatistics, grow_and_prune
+from backend.model.heads import Heads
+from backend.model.object_model import anchors_in_view, first_anchors_in_view
+from backend.protocol import InputError, Reporter
+from backend.raster import Camera, rasterize
+from backend.raster.draw import draw
+from backend.training import loop
+from backend.training.adam import step_rows, take_rows
+from backend.training.loop import Budget, Trainer, strips
+from backend.training.losses import image_loss, normal_loss, volume_loss
+from backend.training.settings import Settings
+
+ROOT = Path(__file__).resolve().parents[2]
+SMALL = Settings(offsets=4, sh_degree=1)
+FLAT = dataclasses.replace(SMALL, primitive="2d", distortion_weight=0.1)
+
+
+@pytest.fixture
+def both(monkeypatch):
+    """A function that calls another on the processor and then as on a GPU, and returns both results."""
+
+    def call(function):
+        found = []
+        for on_gpu in (False, True):
+            monkeypatch.setattr(device, "on_gpu", lambda tensor, answer=on_gpu: answer)
+            found.append(function())
+        return found
+
+    return call
+
+
+@pytest.fixture
+def as_on_gpu(monkeypatch):
+    """Switches between the two versions: as_on_gpu(True) and as_on_gpu(False)."""
+    return lambda answer: monkeypatch.setattr(device, "on_gpu", lambda tensor: answer)
+
+
+def close(got, want, relative=2e-4, absolute=2e-5):
+    """Equal to within float32: `absolute` is of the largest number."""
+    got, want = torch.as_tensor(got).detach(), torch.as_tensor(want).detach()
+    assert got.shape == want.shape
+    largest = float(want.abs().max()) if want.numel() else 0.0
+    np.testing.assert_allclose(got, want, rtol=relative, atol=absolute * largest)
+
+
+def some_anchors(n=300, spread=3.0):
+    layout, rng = Layout(4, 8), np.random.default_rng(5)
+    rows = torch.tensor(rng.normal(0, 0.5, (n, layout.columns)), dtype=torch.float32)
+    rows[:, layout.extent_columns] = torch.tensor(rng.normal(-2, 0.7, (n, 6)), dtype=torch.float32)
+    positions = torch.tensor(rng.normal(0, spread, (n, 3)), dtype=torch.float32)
+    return Anchors(layout, 0.1, positions, rows, torch.tensor(rng.integers(0, 3, n), dtype=torch.int32))
+
+
+CAMERA = Camera(np.eye(4), np.array([[50.0, 0, 30], [0, 60, 20], [0, 0, 1]]), 64, 48)
+FRUSTUM = (*CAMERA.arrays(), CAMERA.width, CAMERA.height, CAMERA.near)
+
+
+# --- one function at a time ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", ["explicit", "view"])
+def test_gaussians_and_their_gradients(both, mode):
+    anchors = some_anchors(200)
+    heads = Heads(anchors.layout, mode, 2, torch.Generator().manual_seed(1))
+    rng = np.random.default_rng(0)
+    weights = [torch.tensor(rng.normal(size=(800, w)), dtype=torch.float32) for w in (3, 4, 3, 1, 27)]
+
+    def made():
+        rows = anchors.rows.clone().requires_grad_()
+        g = generate(
+            anchors.layout, anchors.positions, rows, anchors.ids, heads, np.array([0.1, 0.2, -9.0])
+        ).only_made()
+        parts = (g.means, g.quats, g.scales, g.opacities, g.sh)
+        total = sum((p.reshape(len(p), -1) * w[g.source][:, : p[0].numel()]).sum() for p, w in zip(parts, weights))
+        return g, torch.autograd.grad(total, [rows, *heads.parameters()])
+
+    (want, want_gradients), (got, gradients) = both(made)
+    assert 100 < len(want.source) < 800
+    for name in ("source", "ids"):
+        assert torch.equal(getattr(got, name), getattr(want, name)), name
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        close(getattr(got, name), getattr(want, name), 1e-5, 1e-6)
+    for a, b in zip(gradients, want_gradients, strict=True):
+        close(a, b)
+
+
+def test_absent_anchors_make_no_gaussian(as_on_gpu):
+    as_on_gpu(True)
+    anchors = some_anchors(50)
+    heads = Heads(anchors.layout, "explicit", 0, torch.Generator())
+    present = torch.arange(50) < 30
+    g = generate(anchors.layout, anchors.positions, anchors.rows, anchors.ids, heads, present=present)
+    assert len(g.source) == 200 and (g.made == (g.opacities > 0)).all()
+    assert g.only_made().source.max() < 120 and g.only_made().made is None
+
+
+def test_an_extent_beyond_the_limit_keeps_its_gradient(both):
+    anchors = some_anchors(6)
+    anchors.rows[:, anchors.layout.extent_columns] = 25.0
+    heads = Heads(anchors.layout, "explicit", 0, torch.Generator())
+
+    def gradient():
+        rows = anchors.rows.clone().requires_grad_()
+        generate(anchors.layout, anchors.positions, rows, anchors.ids, heads).only_made().scales.sum().backward()
+        return rows.grad[:, anchors.layout.extent_columns]
+
+    want, got = both(gradient)
+    close(got, want)
+    assert (got[:, 3:] > 0).all()
+
+
+def test_anchors_in_view(both, as_on_gpu):
+    anchors = some_anchors(4000, spread=4.0)
+    want, got = both(lambda: anchors_in_view(anchors, *FRUSTUM))
+    assert torch.equal(got, want) and 100 < len(want) < 3900
+    as_on_gpu(True)
+    for limit in (4000, len(want) + 7, len(want) - 5):
+        index, present, count = first_anchors_in_view(anchors, *FRUSTUM, limit)
+        assert len(index) == limit == len(index.unique()) and int(count) == len(want)
+        assert torch.equal(index[present], want[:limit])
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 33)])
+@pytest.mark.parametrize("weights", [(0.2, 0.1), (0.0, 0.0)])
+def test_image_loss(both, size, weights):
+    rng = np.random.default_rng(3)
+    h, w = size
+    base = [torch.tensor(rng.uniform(0, 1, s), dtype=torch.float32) for s in ((3, h, w), (h, w), (h, w), (3,))]
+    target = torch.tensor(rng.uniform(0, 1, (3, h, w)), dtype=torch.float32)
+    labels = torch.tensor(rng.integers(-1, 3, (h, w)), dtype=torch.int32)
+
+    def loss():
+        leaves = [v.clone().requires_grad_() for v in base]
+        color, alpha, weight, background = leaves
+        if not weights[1]:
+            weight = None
+        value = image_loss(color, alpha, weight, background, target, labels, *weights)
+        (3 * value).backward()
+        return value, [leaf.grad for leaf in leaves if leaf.grad is not None]
+
+    (want, want_gradients), (got, gradients) = both(loss)
+    close(got, want, 1e-5)
+    for a, b in zip(gradients, want_gradients, strict=True):
+        close(a, b, 2e-3)
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_volume_loss(both, as_on_gpu, flat):
+    scales = torch.rand(2500, 3)
+
+    def loss(made=None):
+        leaf = scales.clone().requires_grad_()
+        value = volume_loss(leaf, flat, made)
+        value.backward()
+        return value, leaf.grad
+
+    (want, want_gradient), (got, gradient) = both(loss)
+    close(got, want, 1e-5)
+    close(gradient, want_gradient, 1e-5)
+    as_on_gpu(True)
+    made = torch.rand(2500) < 0.4
+    value, gradient = loss(made)
+    close(value, scales[made][:, : 2 if flat else 3].prod(1).mean(), 1e-5)
+    assert (gradient[~made] == 0).all()
+
+
+def test_normal_loss(both):
+    rng = np.random.default_rng(0)
+    h, w = 19, 31
+    x, y = np.meshgrid(np.arange(w), np.arange(h))
+    alpha = rng.uniform(0.45, 1, (h, w))
+    alpha[:4, :4] = 0
+    depth = (3 + 0.03 * x + 0.02 * y + rng.normal(0, 0.02, (h, w))) * alpha
+    base = [torch.tensor(v, dtype=torch.float32) for v in (rng.normal(size=(3, h, w)) * 0.4, depth, alpha)]
+
+    def loss():
+        leaves = [v.clone().requires_grad_() for v in base]
+        value = normal_loss(*leaves, np.array([20.0, 22.0, 15.3, 8.2]))
+        value.backward()
+        return value, [leaf.grad for leaf in leaves]
+
+    (want, want_gradients), (got, gradients) = both(loss)
+    close(got, want, 1e-4)
+    for a, b in zip(gradients, want_gradients, strict=True):
+        close(a, b, 1e-3, 1e-4)
+
+
+def test_adam_steps_what_is_seen_usable_and_finite(both, monkeypatch):
+    monkeypatch.setattr("backend.training.adam._ROWS_AT_ONCE", 4)
+    rng = np.random.default_rng(0)
+    base = torch.tensor(rng.normal(size=(20, 7)), dtype=torch.float32)
+    seen = torch.tensor([1, 4, 7, 9, 12, 19])
+    g = torch.tensor(rng.normal(size=(6, 7)), dtype=torch.float32)
+    g[2, 3] = math.inf
+
+    def step(usable=None):
+        values, first, second = base.clone(), base * 0.1, base.abs() * 0.01
+        rates = np.linspace(0.01, 0.02, 7).astype(np.float32)
+        skipped = step_rows(values, first, second, seen, g, rates, 0.5, 0.02, usable)
+        return int(skipped), values, first, second
+
+    want, got = both(step)
+    assert want[0] == got[0] == 1
+    for a, b in zip(got[1:], want[1:], strict=True):
+        close(a, b, 3e-5, 1e-7)
+    assert torch.equal(got[1][7], base[7]) and not torch.equal(got[1][9], base[9])
+    skipped, values, first, _ = step(torch.tensor([True, False, False, True, True, True]))
+    assert skipped == 0 and torch.equal(values[4], base[4]) and torch.equal(first[4], base[4] * 0.1)
+    assert torch.equal(values[9], got[1][9])
+
+
+def test_rows_taken(both):
+    values = torch.rand(9, 5)
+    want, got = both(lambda: take_rows(values, torch.tensor([3, 1, 8])))
+    assert torch.equal(got, want) and torch.equal(want, values[[3, 1, 8]])
+
+
+def test_growth_and_its_statistics(both, as_on_gpu):
+    rng = np.random.default_rng(2)
+    anchors = some_anchors(60)
+    heads = Heads(anchors.layout, "explicit", 1, torch.Generator().manual_seed(0))
+    camera = dataclasses.replace(CAMERA, viewmat=np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 6], [0, 0, 0, 1]]))
+
+    def grown():
+        statistics = GrowthStatistics.zeros(60, 4)
+        copy = Anchors(anchors.layout, 0.1, anchors.positions, anchors.rows, anchors.ids)
+        for seed in range(12):
+            seen = torch.tensor(np.random.default_rng(seed).permutation(60)[:40])
+            rows = copy.rows[seen].requires_grad_()
+            g = generate(copy.layout, copy.positions[seen], rows, copy.ids[seen], heads)
+            drawn = rasterize(*g[:6], camera)
+            (drawn.color * torch.tensor(rng_planes[seed])).sum().backward()
+            frame = drawn.frame
+            statistics.add(seen, 4, g.source, g.opacities.detach(), frame.seen, frame.screen_gradient, 64, 48)
+        growth = grow_and_prune(copy, statistics, 3, np.random.default_rng(0), min_opacity=0.2)
+        return statistics, copy, growth
+
+    rng_planes = rng.normal(size=(12, 3, 48, 64)).astype(np.float32)
+    (want, want_anchors, want_growth), (got, got_anchors, growth) = both(grown)
+    assert torch.equal(got.visits, want.visits) and torch.equal(got.views, want.views)
+    assert want.visits.max() > 3
+    close(got.gradient, want.gradient, 1e-3)
+    close(got.opacity, want.opacity, 1e-5)
+    assert want_growth.added > 20 and 0 < want_growth.pruned < 60
+    assert growth.added == want_growth.added and torch.equal(growth.kept, want_growth.kept)
+    close(got_anchors.positions, want_anchors.positions, 1e-6)
+    assert torch.equal(got_anchors.ids, want_anchors.ids)
+
+
+# --- whole trainings -------------------------------------------------------------------------------------------------
+
+
+def trained(capture, ids, settings, steps=150):
+    trainer = Trainer.start(capture, ids, settings)
+    for i in range(steps):
+        trainer.step(i / steps)
+    return trainer
+
+
+def quality(trainer):
+    """PSNR of the taught views, and how much of the objects' pixels shows the right one."""
+    capture = trainer.scene.capture
+    found, right = [], []
+    for index in capture.train_indices:
+        picture = draw(trainer.model, trainer.scene.camera(index))
+        truth = capture.mask(index)
+        found.append(psnr(picture.image, capture.image(index) / 255.0))
+        right.append((picture.ids[truth > 0] == truth[truth > 0]).mean())
+    return float(np.mean(found)), float(np.mean(right))
+
+
+@pytest.mark.parametrize("settings", [SMALL, FLAT], ids=["3d", "2d"])
+def test_training_as_on_a_gpu_is_as_good(tiny, both, settings):
+    capture, ids = tiny()
+    (want, want_right), (got, right) = both(lambda: quality(trained(capture, ids, settings)))
+    assert want > 20 and abs(got - want) < 0.7
+    assert right > 0.95 and abs(right - want_right) < 0.02
+
+
+def test_the_first_steps_are_the_same(tiny, both):
+    capture, ids = tiny()
+
+    def losses():
+        trainer = Trainer.start(capture, ids, SMALL)
+        return [float(trainer.step(0.3)) for _ in range(5)]
+
+    want, got = both(losses)
+    np.testing.assert_allclose(got, want, rtol=2e-3)
+
+
+@pytest.mark.parametrize("first", [False, True])
+def test_a_checkpoint_goes_on_on_the_other_device(tiny, tmp_path, as_on_gpu, first):
+    capture, ids = tiny()
+    as_on_gpu(first)
+    Trainer.start(capture, ids, SMALL).run(Budget(steps=70), tmp_path, Reporter())
+    as_on_gpu(not first)
+    trainer, warning = Trainer.resume(capture, tmp_path, SMALL)
+    assert warning is None and trainer.progress.step == 70
+    begun = trainer.model.anchors.rows.clone()
+    trainer.run(Budget(steps=150), tmp_path, Reporter())
+    assert not torch.equal(begun, trainer.model.anchors.rows[: len(begun)])
+    found, right = quality(trainer)
+    assert found > 20 and right > 0.9
+
+
+class Numbers(TorchDispatchMode):
+    """Counts the operations that make the processor wait for a number from the device."""
+
+    def __init__(self):
+        super().__init__()
+        self.found = []
+
+    def __torch_dispatch__(self, function, types, arguments=(), options=None):
+        name = function.overloadpacket.__name__
+        masks = [
+            index for argument in arguments if isinstance(argument, list | tuple) for index in argument
+            if isinstance(index, torch.Tensor) and index.dtype == torch.bool and name.startswith("index")
+        ]  # fmt: skip
+        if name in ("_local_scalar_dense", "nonzero", "masked_select", "is_nonzero", "equal", "unique") or masks:
+            self.found.append(name)
+        return function(*arguments, **(options or {}))
+
+
+@pytest.mark.parametrize("settings", [SMALL, FLAT, dataclasses.replace(SMALL, mode="view")], ids=["3d", "2d", "view"])
+def test_a_step_on_the_gpu_waits_for_no_number(tiny, as_on_gpu, settings):
+    as_on_gpu(True)
+    capture, ids = tiny()
+    trainer = Trainer.start(capture, ids, settings)
+    for share in (0.3, 0.3, 0.8):
+        trainer.step(share)
+    trainer.progress.last_growth = trainer.progress.step
+    with Numbers() as numbers:
+        for share in (0.3, 0.8):
+            trainer.step(share)
+    assert not numbers.found
+    with Numbers() as numbers:
+        float(trainer.step(0.8))
+    assert numbers.found == ["_local_scalar_dense"]
+
+
+def test_fewer_anchors_are_taken_for_a_view_that_was_seen_before(tiny, as_on_gpu, monkeypatch):
+    as_on_gpu(True)
+    capture, ids = tiny()
+    monkeypatch.setattr(loop._Limits, "_STEP", 8)
+    trainer = Trainer.start(capture, ids, SMALL)
+    anchors = trainer.model.anchors
+    anchors.positions[: len(anchors) // 2] += 1000.0  # out of sight
+    taken = []
+
+    def limited(*args):
+        index, present, count = first_anchors_in_view(*args)
+        taken.append((len(index), int(count)))
+        return index, present, count
+
+    monkeypatch.setattr(loop, "first_anchors_in_view", limited)
+    views = len(capture.train_indices)
+    for _ in range(2 * views):
+        trainer.step(0.9)
+    assert all(limit == len(anchors) for limit, _ in taken[:views])
+    assert all(count <= limit < 0.8 * len(anchors) for limit, count in taken[views:])
+
+
+def test_a_picture_whose_loss_is_not_finite_changes_nothing(tiny, as_on_gpu, monkeypatch):
+    as_on_gpu(True)
+    capture, ids = tiny()
+    trainer = Trainer.start(capture, ids, SMALL)
+    trainer.step(0.9)
+    rows, head = trainer.model.anchors.rows.clone(), trainer.model.heads.hidden.weight.detach().clone()
+    monkeypatch.setattr(loop, "image_loss", lambda *args: image_loss(*args) * math.nan)
+    assert trainer.step(0.9).isnan()
+    assert torch.equal(trainer.model.anchors.rows, rows) and torch.equal(trainer.model.heads.hidden.weight, head)
+    monkeypatch.undo()
+
+
+LOSSES = """
+import sys
+from backend.capture import load_capture
+from backend.labels import vote
+from backend.raster.draw import draw
+from backend.training.loop import Trainer
+from backend.training.settings import Settings
+capture = load_capture(sys.argv[1], sys.argv[2])
+for primitive in ("3d", "2d"):
+    trainer = Trainer.start(capture, vote(capture).ids, Settings(offsets=1, primitive=primitive, voxel=0.3))
+    print(*(float(trainer.step(share)) for share in (0.3, 0.8)))
+    print(draw(trainer.model, trainer.scene.camera(0)).image.mean())
+"""
+
+
+def test_the_whole_loop_runs_in_numbas_simulator(write_capture, tmp_path):
+    """With the CUDA kernels: steps and pictures are those of the processor."""
+    folder = write_capture(views=3, size=(24, 18), points=20).folder
+    found = []
+    for simulate in ("0", "1"):
+        command = [sys.executable, "-c", LOSSES, str(folder), str(tmp_path / "cache")]
+        environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": simulate}
+        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=240)
+        assert done.returncode == 0, done.stderr
+        found.append([float(word) for word in done.stdout.split()])
+    assert len(found[0]) == 6
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-4)
+
+
+# --- out of memory ---------------------------------------------------------------------------------------------------
+
+
+def test_strips_are_the_picture(tiny):
+    camera = dataclasses.replace(CAMERA, gain=(1.0, 1.1, 1.2))
+    picture, labels = torch.rand(3, 48, 64), torch.randint(-1, 3, (48, 64))
+    for count in (1, 2, 3):
+        found = strips(camera, picture, labels, count)
+        assert torch.equal(torch.cat([part for _, part, _ in found], 2), picture)
+        assert torch.equal(torch.cat([part for _, _, part in found], 1), labels)
+        assert all((c.width, c.height) == (p.shape[2], p.shape[1]) for c, p, _ in found)
+    anchors = some_anchors(100)
+    # Small ones: far outside a strip's own field of view the projection of large ones is bounded.
+    anchors.rows[:, anchors.layout.extent_columns] -= 2
+    heads = Heads(anchors.layout, "explicit", 1, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        g = generate(anchors.layout, anchors.positions, anchors.rows, anchors.ids, heads)
+        whole = rasterize(*g[:6], camera).color
+        upright = dataclasses.replace(camera, width=48)
+        parts = [rasterize(*g[:6], c).color for c, _, _ in strips(camera, picture, labels, 2)]
+        lower = [rasterize(*g[:6], c).color for c, _, _ in strips(upright, picture[..., :48], labels[:, :48], 2)]
+    close(torch.cat(parts, 2), whole, 1e-4, 1e-5)
+    assert lower[0].shape == (3, 48, 24)
+
+
+def test_parts_teach_the_same_as_the_whole(tiny, as_on_gpu):
+    """But for SSIM beside the cuts, the volume (a mean over each part's splats) and what reaches in from far off."""
+    as_on_gpu(True)
+    capture, ids = tiny()
+    settings = dataclasses.replace(SMALL, ssim_weight=0.0, volume_weight=0.0)
+    found = []
+    for parts in (1, 2, 4):
+        trainer = Trainer.start(capture, ids, settings)
+        trainer.parts = parts
+        learned = trainer._learn(capture.train_indices[0], 0.9)
+        full = torch.zeros_like(trainer.model.anchors.rows)
+        usable = learned.usable[:, None]
+        full.index_add_(0, learned.seen, torch.where(usable, learned.rows.grad, 0.0))
+        found.append((learned.loss, full, trainer.model.heads.opacity.weight.grad))
+    for loss, rows, head in found[1:]:
+        close(loss, found[0][0], 1e-5)
+        for got, want in ((rows, found[0][1]), (head, found[0][2])):
+            assert (got - want).norm() < 0.01 * want.norm()
+
+
+class Messages(Reporter):
+    def __init__(self):
+        self.warnings = []
+
+    def warning(self, message):
+        self.warnings.append(message)
+
+
+FULL = [
+    torch.cuda.OutOfMemoryError("CUDA out of memory."),
+    RuntimeError("[2] Call to cuMemAlloc results in CUDA_ERROR_OUT_OF_MEMORY"),
+]
+
+
+@pytest.mark.parametrize("error", FULL, ids=["torch", "numba"])
+def test_out_of_memory_is_said_once_and_training_goes_on_in_parts(tiny, tmp_path, as_on_gpu, monkeypatch, error):
+    as_on_gpu(True)
+    capture, ids = tiny()
+
+    def full(*args, **options):
+        if args[6].width > 40:
+            raise error
+        return rasterize(*args, **options)
+
+    monkeypatch.setattr(loop, "rasterize", full)
+    trainer, reporter = Trainer.start(capture, ids, SMALL), Messages()
+    trainer.run(Budget(steps=120), tmp_path, reporter)
+    assert trainer.parts == 2 and trainer.progress.step == 120 and trainer.progress.skipped == 0
+    assert len(reporter.warnings) == 1 and "in 2 parts" in reporter.warnings[0]
+    monkeypatch.undo()
+    found, right = quality(trainer)
+    assert found > 20 and right > 0.9
+
+
+def test_without_any_room_the_training_ends_with_a_sentence_and_a_checkpoint(tiny, tmp_path, as_on_gpu, monkeypatch):
+    as_on_gpu(True)
+    capture, ids = tiny()
+    trainer = Trainer.start(capture, ids, SMALL)
+    calls = iter(range(1000))
+
+    def full(*args, **options):
+        if next(calls) >= 3:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
+        return rasterize(*args, **options)
+
+    monkeypatch.setattr(loop, "rasterize", full)
+    with pytest.raises(InputError, match="GPU's memory is too small"):
+        trainer.run(Budget(steps=20), tmp_path, Reporter())
+    resumed, _ = Trainer.resume(capture, tmp_path, SMALL)
+    assert resumed.progress.step == 3
+
+
+def test_other_errors_are_not_taken_for_a_lack_of_memory(tiny, as_on_gpu, monkeypatch):
+    as_on_gpu(True)
+    capture, ids = tiny()
+
+    def broken(*args, **options):
+        raise RuntimeError("something else")
+
+    monkeypatch.setattr(loop, "rasterize", broken)
+    trainer = Trainer.start(capture, ids, SMALL)
+    with pytest.raises(RuntimeError, match="something else"):
+        trainer.step(0.5)
+    assert trainer.parts == 1 and trainer.progress.step == 0
+
+
+# --- the choice ------------------------------------------------------------------------------------------------------
+
+without_cuda = pytest.mark.skipif(device.why_not_cuda() is None, reason="CUDA works here")
+
+
+@without_cuda
+@pytest.mark.parametrize("command", ["train", "render", "evaluate", "mesh", "report", "doctor"])
+def test_cuda_where_there_is_none_is_refused_with_a_sentence(ask, write_capture, tmp_path, command):
+    arguments = {"train": [write_capture().folder, "--out", tmp_path / "out"], "doctor": []}.get(command, [tmp_path])
+    answer = ask(command, *map(str, arguments), "--device", "cuda", "--json")
+    assert answer.code == 2
+    message = answer.events[-1]["message"]
+    assert message == device.why_not_cuda() and message.endswith(".") and "\n" not in message
+    assert not (tmp_path / "out").exists()
+
+
+@without_cuda
+def test_auto_is_the_processor_where_cuda_does_not_work():
+    assert device.pick("auto") == device.pick("cpu") == torch.device("cpu")
+    with pytest.raises(InputError):
+        device.pick("cuda")
+
+
+@pytest.mark.parametrize(("said", "part"), [
+    ("Found no NVIDIA driver on your system. Please check that you have an NVIDIA GPU", "no NVIDIA driver"),
+    ("The NVIDIA driver on your system is too old (found version 11040).", "too old for CUDA 13.0"),
+    ("CUDA driver version is insufficient for CUDA runtime version", "too old for CUDA 13.0"),
+    ("No CUDA GPUs are available", "shows no GPU"),
+    ("CUDA unknown error - this may be due to an incorrectly set up environment", "does not start"),
+])  # fmt: skip
+def test_what_torch_says_becomes_a_sentence_that_helps(said, part):
+    sentence = device.sentence_for(said, "13.0")
+    assert part in sentence and sentence.endswith(".") and "\n" not in sentence
+
+
+@pytest.mark.parametrize("said", ["CUDA error: out of memory", "CUBLAS_STATUS_ALLOC_FAILED when calling cublasCreate"])
+def test_a_full_gpu_is_known_by_what_is_said(said):
+    assert device.is_out_of_memory(RuntimeError(said))
+    assert not device.is_out_of_memory(RuntimeError("CUDA error: an illegal memory access was encountered"))
+
+
+def test_too_little_memory_is_said_with_figures():
+    assert device.short_of_memory("GPU", 3e9, 8e9) is None
+    assert "0.3 GB of memory free" in device.short_of_memory("GPU", 0.3e9, 8e9)
+    assert "has 0.5 GB of memory," in device.short_of_memory("GPU", 0.4e9, 0.5e9)
+
+
+@without_cuda
+@pytest.mark.skipif(shutil.which("make") is None or shutil.which("nvidia-smi") is not None, reason="no make, or a GPU")
+def test_make_gpu_without_a_gpu_says_so_and_passes_nothing():
+    done = subprocess.run(
+        ["make", "gpu", f"PYTHON={sys.executable}"], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0
+    assert done.stdout.strip().splitlines() == [
+        "There is no NVIDIA GPU here, so nothing was run, and nothing counts as passed."
+    ]
+
+
+def test_training_needs_nothing_that_reads_captures():
+    """So that a machine which has torch and numba alone can measure it."""
+    absent = ("pycolmap", "xatlas", "manifold3d", "fast_simplification", "skimage", "matplotlib", "tqdm")
+    code = f"import sys; sys.modules.update(dict.fromkeys({absent})); import backend.training.loop, backend.raster.draw"
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=120)
