@@ -485,7 +485,8 @@ def blend_backward_kernel(wanted: Wanted) -> Any:
             b += pairs[s, column * (WARP + 1) + lane + 1]
         return a + b
 
-    @cuda_kernel(launch_bounds=THREADS)
+    # Registers for so many blocks on a processor at least; none is spilled for it.
+    @cuda_kernel(launch_bounds=(THREADS, 3 if flat else 4))
     def blend_backward(
         splats, tilts, ids, labels, starts, members, places, ends, columns, color, transmittance, weight, depth,
         normals, moments, g_color, g_alpha, g_weight, g_depth, g_normals, g_moments, rows,

@@ -137,6 +137,31 @@ def test_meets_the_tiles_that_the_cpu_renderer_would(flat):
         assert places == sorted(places)
 
 
+@pytest.fixture
+def memory_full_of_rubbish():
+    """torch fills what it would leave as it was with NaN, or the largest integer."""
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+@pytest.mark.parametrize("primitive", ["3d", "2d"])
+def test_splats_that_no_light_reaches_have_no_gradient(primitive, memory_full_of_rubbish):
+    scene = as_float32(random_scene(0, count=20))
+    scene["means"] = torch.tensor([[0.0, 0.0, 1.0 + 0.1 * i] for i in range(20)])
+    scene["scales"][:] = 50.0
+    scene["quats"] = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(20, 1)
+    scene["opacities"][:] = 0.98
+    leaves = {k: v.requires_grad_(k != "ids") for k, v in scene.items()}
+    picture = rasterize(**leaves, camera=camera(), want_depth=True, primitive=primitive)
+    assert picture.frame.ends.tolist() == [3] * picture.frame.ends.numel()
+    (picture.color.sum() + picture.alpha.sum() + picture.depth.sum()).backward()
+    for name in NAMES:
+        gradient = leaves[name].grad
+        assert torch.isfinite(gradient).all() and not gradient[3:].any(), name
+    assert leaves["opacities"].grad[:2].all()
+
+
 def test_more_splats_in_a_tile_than_wait_in_shared_memory():
     """Faint ones, so that all of them are drawn."""
     scene = as_float32(random_scene(0, count=STAGED + 150, size=0.3))

@@ -28,3 +28,19 @@ def test_simulated(words):
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     assert " passed" in done.stdout
+
+
+def test_the_cpu_renderer_needs_nothing_of_cuda():
+    """numba-cuda may be missing, or of a kind that fails when it is imported."""
+    script = """
+import sys
+sys.modules["numba.cuda"] = None
+from tests.backend.test_raster import as_float32, camera, mapped, random_scene, rasterize
+scene = {k: v.requires_grad_(k != "ids") for k, v in as_float32(random_scene(0)).items()}
+picture = rasterize(**scene, camera=camera())
+picture.color.sum().backward()
+mapped(picture)
+print(type(picture.frame).__module__)
+"""
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stdout.strip()) == (0, "backend.raster.cpu"), done.stderr

@@ -53,9 +53,12 @@ def join(*scenes):
     return {k: torch.cat([s[k] for s in scenes]) for k in scenes[0]}
 
 
+OTHERS = 10 if SIMULATED else 25
+
+
 def among_others(scene, seed=0):
     """The stiff splats with ordinary ones around them, whose gradients must not suffer."""
-    return join(scene, random_scene(seed, count=25))
+    return join(scene, random_scene(seed, count=OTHERS))
 
 
 @pytest.fixture(params=["3d", "2d"])
@@ -87,7 +90,7 @@ def assert_same_bits(a, b):
 
 def assert_unharmed(bad, seed=1, primitive="3d"):
     """A dropped splat leaves the others' picture and gradients bit for bit as they are without it."""
-    others = as_float32(random_scene(seed, count=25))
+    others = as_float32(random_scene(seed, count=OTHERS))
     bad = as_float32(bad)
     alone, together = (
         draw(others, camera(), primitive=primitive),
@@ -268,7 +271,8 @@ def test_coincident_points(primitive):
 
 @pytest.mark.parametrize("same", ["depth", "everything but the id"])
 def test_equal_depths_do_not_depend_on_the_input_order(same, primitive):
-    scene = as_float32(random_scene(3, count=80))
+    count = 30 if SIMULATED else 80
+    scene = as_float32(random_scene(3, count=count))
     if same == "depth":
         scene["means"][:, 2] = 2.0
     else:
@@ -276,8 +280,8 @@ def test_equal_depths_do_not_depend_on_the_input_order(same, primitive):
     labels = torch.tensor(np.random.default_rng(0).integers(0, 5, (HEIGHT, WIDTH)), dtype=torch.int32)
     cam = camera()
     first = draw(scene, cam, labels, primitive=primitive)
-    for seed in range(3):
-        mixed = torch.tensor(np.random.default_rng(seed).permutation(80))
+    for seed in range(1 if SIMULATED else 3):
+        mixed = torch.tensor(np.random.default_rng(seed).permutation(count))
         again = draw({k: v[mixed] for k, v in scene.items()}, cam, labels, primitive=primitive)
         if same == "depth":
             for name in NAMES:
