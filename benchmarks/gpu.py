@@ -33,6 +33,7 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
+from backend.device import why_not_cuda  # noqa: E402
 from backend.raster import Camera  # noqa: E402
 from backend.raster.splats import HALF_H, HALF_W, SPLAT_COLUMNS, U, V  # noqa: E402
 
@@ -47,18 +48,6 @@ DEMO_SECONDS = (15, 30, 60)
 FORWARD_FLOPS, BACKWARD_FLOPS = 14, 40
 """Operations for a pixel of a tile and a splat, a fused multiply-add as two: what is done whether it is drawn or not
 and, for about a third of them, what is drawn."""
-
-
-def why_no_gpu() -> str | None:
-    """One sentence, or None where there is a GPU to measure."""
-    if not torch.cuda.is_available():
-        return "torch sees no NVIDIA GPU here, so nothing was measured."
-    try:
-        import numba_cuda  # noqa: F401
-        from numba import cuda
-    except ImportError:
-        return "numba-cuda is not installed, so nothing was measured on the GPU."
-    return None if cuda.is_available() else "numba-cuda cannot use the GPU that torch sees, so nothing was measured."
 
 
 class Scene:
@@ -244,9 +233,9 @@ def main() -> None:
     parser.add_argument("--demo", type=Path, help="capture to train on")
     options = parser.parse_args()
     say = (lambda *_: None) if options.json else print
-    why_not = why_no_gpu()
+    why_not = why_not_cuda()
     if why_not:
-        print(json.dumps({"gpu": None, "why": why_not}) if options.json else why_not)
+        print(json.dumps({"gpu": None, "why": why_not}) if options.json else f"Nothing was measured. {why_not}")
         return
     gpu = torch.cuda.get_device_name()
     can = limits(options.repeats)

@@ -34,7 +34,7 @@ class Settings:
     zero_is_object: bool = False
     primitive: str = "3d"
     normal_weight: float = 0.05
-    distortion_weight: float = 0.0
+    distortion_weight: float = 10.0
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""

@@ -53,6 +53,11 @@ def sheet(x, class_index, half=0.5, step=0.05, colour=0.5):
     )
 
 
+def together(*parts):
+    """The splats of all parts."""
+    return Generated(*(torch.cat(tensors) for tensors in zip(*(part[:7] for part in parts))))
+
+
 def views_of(splats, cameras, explicit=True, mask=None, primitive="3d", **options):
     """`Views` of plain splats; the objects' IDs are ten times their classes."""
 
@@ -71,7 +76,7 @@ def views_of(splats, cameras, explicit=True, mask=None, primitive="3d", **option
 @pytest.mark.parametrize("explicit", [True, False])
 def test_an_object_is_drawn_unhidden_and_knows_how_much_of_it_is_hidden(explicit):
     near, far = sheet(1.0, 1, half=0.3), sheet(0.0, 2)
-    splats = Generated(*(torch.cat(parts) for parts in zip(near[:7], far[:7])))
+    splats = together(near, far)
     cameras = [camera_at((4, 0, 0)), camera_at((-4, 0, 0)), camera_at((4, 0.5, 0.3))]
     views = views_of(splats, cameras, explicit)
 
@@ -99,7 +104,7 @@ def test_an_object_is_drawn_unhidden_and_knows_how_much_of_it_is_hidden(explicit
 def test_a_depth_is_sure_where_the_light_comes_from_one_place():
     veil, wall = sheet(1.0, 2, half=0.1), sheet(0.0, 2)
     veil = veil._replace(opacities=veil.opacities * 0.3)
-    splats = Generated(*(torch.cat(parts) for parts in zip(veil, wall)))
+    splats = together(veil, wall)
     camera = camera_at((4, 0, 0))
     for primitive in ("2d", "3d"):
         flat = {"quats": torch.tensor([[0.5, 0.5, 0.5, 0.5]]).repeat(len(splats.means), 1)} if primitive == "2d" else {}
@@ -112,7 +117,7 @@ def test_a_depth_is_sure_where_the_light_comes_from_one_place():
         assert found.doubt[found.alpha < 0.5].max() == 0
     # The median of discs is on one of two that share a surface, their mean is between them.
     first, second = sheet(0.03, 2), sheet(0.0, 2)
-    pair = Generated(*(torch.cat(parts) for parts in zip(first, second)))
+    pair = together(first, second)
     pair = pair._replace(
         quats=torch.tensor([[0.5, 0.5, 0.5, 0.5]]).repeat(len(pair.means), 1),
         scales=torch.full_like(pair.scales, 0.025), opacities=pair.opacities * 0.3,

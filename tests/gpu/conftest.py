@@ -2,26 +2,12 @@
 
 import pytest
 
+from backend.device import why_not_cuda
+
 pytest.register_assert_rewrite("tests.backend.test_raster", "tests.backend.test_raster_stiff")
 
 
-def why_no_gpu():
-    """One sentence, or None where the tests can run."""
-    import torch
-
-    if not torch.cuda.is_available():
-        return "torch sees no NVIDIA GPU here, so nothing was tested on one."
-    try:
-        import numba_cuda  # noqa: F401
-        from numba import cuda
-    except ImportError:
-        return "numba-cuda is not installed, so nothing was tested on the GPU: see requirements/cuda.txt."
-    if not cuda.is_available():
-        return "numba-cuda cannot use the GPU that torch sees, so nothing was tested on it."
-    return None
-
-
-WHY_NOT = why_no_gpu()
+WHY_NOT = why_not_cuda()
 collect_ignore_glob = ["test_*.py"] if WHY_NOT else []
 
 
@@ -32,4 +18,4 @@ def pytest_sessionfinish(session, exitstatus):
 
 def pytest_terminal_summary(terminalreporter):
     if WHY_NOT:
-        terminalreporter.write_line(WHY_NOT)
+        terminalreporter.write_line(f"Nothing was tested on a GPU. {WHY_NOT}")
