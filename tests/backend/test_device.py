@@ -585,7 +585,11 @@ def test_too_little_memory_is_said_with_figures():
 @pytest.mark.skipif(shutil.which("make") is None or shutil.which("nvidia-smi") is not None, reason="no make, or a GPU")
 def test_make_gpu_without_a_gpu_says_so_and_passes_nothing():
     done = subprocess.run(
-        ["make", "--no-print-directory", "gpu", f"PYTHON={sys.executable}"], cwd=ROOT, capture_output=True, text=True, timeout=120
+        ["make", "--no-print-directory", "gpu", f"PYTHON={sys.executable}"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
     )
     assert done.returncode == 0
     assert done.stdout.strip().splitlines() == [
