@@ -207,7 +207,7 @@ def parser() -> argparse.ArgumentParser:
         "--normal-weight", type=_weight, metavar="W", help="how smooth a surface flat splats make (0.05)"
     )
     finer.add_argument(
-        "--distortion-weight", type=_weight, metavar="W", help="how much flat splats are drawn to one depth (0)"
+        "--distortion-weight", type=_weight, metavar="W", help="how much flat splats are drawn to one depth (10)"
     )
     finer.add_argument("--unlabelled-is-object", action="store_true", help="ID 0 is an object too, not just unlabelled")
 
