@@ -296,7 +296,7 @@ class Trainer:
             return None
         tensors, state, warning = found
         stored = Settings(**state["settings"])
-        if settings is not None and settings != stored:
+        if settings is not None and settings.in_effect() != stored.in_effect():
             changed = [k for k, v in settings.as_dict().items() if stored.as_dict()[k] != v]
             raise InputError(
                 f"The checkpoint in {folder} was trained with other settings ({', '.join(changed)}); use the same, "

@@ -40,6 +40,11 @@ class Settings:
         """For JSON."""
         return asdict(self)
 
+    def in_effect(self) -> dict[str, Any]:
+        """The choices that matter: 3D Gaussians have no normals and no distortion."""
+        surface = () if self.primitive == "2d" else ("normal_weight", "distortion_weight")
+        return {name: value for name, value in asdict(self).items() if name not in surface}
+
     @property
     def layout(self) -> Layout:
         """Columns of an anchor's row."""

@@ -407,6 +407,15 @@ def test_a_checkpoint_of_other_settings_is_refused(tiny, tmp_path):
         Trainer.resume(capture, tmp_path / "a", FLAT)
 
 
+def test_a_checkpoint_of_3d_gaussians_goes_on_whatever_is_asked_of_flat_ones(tiny, tmp_path):
+    capture, ids = tiny()
+    Trainer.start(capture, ids, SMALL).run(Budget(steps=2), tmp_path, Reporter())
+    trainer, _ = Trainer.resume(capture, tmp_path, dataclasses.replace(SMALL, distortion_weight=3.0, normal_weight=0.0))
+    assert trainer.progress.step == 2
+    with pytest.raises(InputError, match="primitive"):
+        Trainer.resume(capture, tmp_path, FLAT)
+
+
 def test_a_checkpoint_from_before_2d_splats_is_one_of_3d_gaussians(tiny, tmp_path):
     capture, ids = tiny()
     Trainer.start(capture, ids, SMALL).run(Budget(steps=2), tmp_path, Reporter())
@@ -427,10 +436,11 @@ def test_normals_and_distortion_are_only_computed_where_they_count(tiny, monkeyp
         return rasterize(*args, **kwargs)
 
     monkeypatch.setattr("backend.training.loop.rasterize", seen)
-    both = dataclasses.replace(FLAT, distortion_weight=1.0)
+    normals = dataclasses.replace(FLAT, distortion_weight=0.0)
     for settings, share, wanted in (
-        (SMALL, 0.9, [False] * 3), (FLAT, 0.1, [False] * 3), (FLAT, 0.9, [True, True, False]), (both, 0.9, [True] * 3),
-        (dataclasses.replace(FLAT, normal_weight=0.0), 0.9, [False] * 3),
+        (SMALL, 0.9, [False] * 3), (FLAT, 0.1, [False] * 3), (normals, 0.9, [True, True, False]), (FLAT, 0.9, [True] * 3),
+        (dataclasses.replace(FLAT, normal_weight=0.0), 0.9, [False, False, True]),
+        (dataclasses.replace(normals, normal_weight=0.0), 0.9, [False] * 3),
     ):  # fmt: skip
         assert Trainer.start(capture, ids, settings).step(share).isfinite()
         assert asked.pop() == wanted
