@@ -438,7 +438,8 @@ def test_normals_and_distortion_are_only_computed_where_they_count(tiny, monkeyp
     monkeypatch.setattr("backend.training.loop.rasterize", seen)
     normals = dataclasses.replace(FLAT, distortion_weight=0.0)
     for settings, share, wanted in (
-        (SMALL, 0.9, [False] * 3), (FLAT, 0.1, [False] * 3), (normals, 0.9, [True, True, False]), (FLAT, 0.9, [True] * 3),
+        (SMALL, 0.9, [False] * 3), (FLAT, 0.1, [False] * 3), (FLAT, 0.9, [True] * 3),
+        (normals, 0.9, [True, True, False]),
         (dataclasses.replace(FLAT, normal_weight=0.0), 0.9, [False, False, True]),
         (dataclasses.replace(normals, normal_weight=0.0), 0.9, [False] * 3),
     ):  # fmt: skip
