@@ -139,7 +139,8 @@ def test_backend_of_another_version(extension, shown):
     python.parent.mkdir(parents=True)
     python.symlink_to(sys.executable)
     (place / environment_worker.STAMP).write_text("")
-    marker = {"python": "3.11", "base": sys.executable, "requirements": "of another version", "packages": {}}
+    marker = {"python": "3.11", "base": sys.executable, "requirements": "of another version", "packages": {},
+              "device": "cpu"}
     (place / environment_worker.MARKER).write_text(json.dumps(marker))
     assert "was set up for another version of ObjectGS" in refusal(bpy.ops.objectgs.train)
     (place / environment_worker.MARKER).write_text("{")
