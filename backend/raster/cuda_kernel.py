@@ -9,7 +9,6 @@ A kernel's module says `from numba import cuda`; what a simulated kernel would s
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import math
 import threading
@@ -19,20 +18,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import config, cuda
+from numba import cuda
 
-from .kernel import digest_up_to, kernel
+from ..device import simulated
+from .kernel import kernel, renew_with_package
 
 # Small pictures and few splats make small grids, which is no news to anyone.
 warnings.filterwarnings("ignore", message="Grid size .* will likely result in GPU under-utilization")
 
 WARP = 32
 ALL_LANES = 0xFFFFFFFF
-
-
-def simulated() -> bool:
-    """Whether numba simulates the GPU in this process."""
-    return bool(config.ENABLE_CUDASIM)
 
 
 def cuda_kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -45,10 +40,7 @@ def cuda_kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         if simulated():
             return function
         dispatcher = cuda.jit(cache=True, **options)(function)
-        digest = digest_up_to(function.__module__.split(".")[-2])
-        with contextlib.suppress(AttributeError):
-            cache_file = dispatcher._cache._cache_file
-            cache_file._source_stamp = (cache_file._source_stamp, digest)
+        renew_with_package(dispatcher, function)
         return dispatcher
 
     return decorate

@@ -25,6 +25,15 @@ def digest_up_to(package: str) -> str:
     return digest.hexdigest()
 
 
+def renew_with_package(dispatcher: Any, function: Callable[..., Any]) -> None:
+    """Let the cache on disk of a compiled function last as long as the files that `digest_up_to` its package."""
+    digest = digest_up_to(function.__module__.split(".")[-2])
+    # Without a cache folder, or with another numba inside, numba's own rule stays.
+    with contextlib.suppress(AttributeError):
+        cache_file = dispatcher._cache._cache_file
+        cache_file._source_stamp = (cache_file._source_stamp, digest)
+
+
 def kernel(
     parallel: bool = False, fastmath: bool | set[str] = False, inline: bool = False
 ) -> Callable[[Callable[..., Any]], Any]:
@@ -43,11 +52,7 @@ def kernel(
             fastmath=fastmath,
             inline="always" if inline else "never",
         )(function)
-        digest = digest_up_to(function.__module__.split(".")[-2])
-        # Without a cache folder, or with another numba inside, numba's own rule stays.
-        with contextlib.suppress(AttributeError):
-            cache_file = dispatcher._cache._cache_file
-            cache_file._source_stamp = (cache_file._source_stamp, digest)
+        renew_with_package(dispatcher, function)
         return dispatcher
 
     return decorate

@@ -288,8 +288,8 @@ class Trainer:
     ) -> tuple[Trainer, str | None] | None:
         """The trainer of the newest whole checkpoint in `folder` and a warning, or None if there is none.
 
-        It goes on on the device `place`, whichever it was saved on. settings: what is asked for now; raises InputError
-        if the checkpoint was made under others.
+        Training continues on the device `place`, whichever it was saved on. settings: what is asked for now; raises
+        InputError if the checkpoint was made under others.
         """
         found = load_checkpoint(folder)
         if found is None:
