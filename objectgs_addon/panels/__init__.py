@@ -1,0 +1,25 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The ObjectGS tab in the 3D viewport's sidebar, one file a panel, and the line in the status bar."""
+
+import bpy
+
+from .capture import CapturePanel
+from .display import DisplayPanel
+from .jobs import JobsPanel, status_bar
+from .meshes import MeshesPanel
+from .objects import ObjectsPanel
+from .train import SettingsPanel, TrainPanel
+
+CLASSES = (CapturePanel, TrainPanel, SettingsPanel, ObjectsPanel, MeshesPanel, DisplayPanel, JobsPanel)
+
+
+def register():
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+    bpy.types.STATUSBAR_HT_header.append(status_bar)
+
+
+def unregister():
+    bpy.types.STATUSBAR_HT_header.remove(status_bar)
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)

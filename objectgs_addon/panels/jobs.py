@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Everything that runs or waits, and the line in the status bar."""
+
+import bpy
+
+from .. import running
+from ..job_display import summary
+from .tab import Tab, draw_job
+
+
+class JobsPanel(Tab, bpy.types.Panel):
+    bl_idname = "OBJECTGS_PT_jobs"
+    bl_label = "Jobs"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, _context):
+        return bool(running.queue.jobs)
+
+    def draw(self, _context):
+        layout = self.layout
+        for index, job in enumerate(running.queue.jobs):
+            draw_job(layout, job, index)
+        layout.operator("objectgs.clear_jobs", icon="X")
+
+
+def status_bar(bar, _context) -> None:
+    """What runs, with its time left and a button to stop it."""
+    job = running.queue.running
+    if job is not None:
+        row = bar.layout.row(align=True)
+        row.label(text=f"ObjectGS  {summary(job)}", icon="TIME")
+        row.operator("objectgs.stop_job", text="", icon="X", emboss=False)

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Meshes: how they are made, and what is shown."""
+
+import bpy
+
+from .. import running, scene
+from ..folder_state import folder_state
+from ..job_display import write
+from .tab import WithReconstruction, draw_job_of
+
+
+class MeshesPanel(WithReconstruction, bpy.types.Panel):
+    bl_idname = "OBJECTGS_PT_meshes"
+    bl_label = "Meshes"
+
+    def draw(self, context):
+        layout = self.layout
+        root = context.scene.objectgs.active
+        properties = root.objectgs
+        folder = scene.folder_of(root)
+        state = folder_state(folder)
+        job = running.job_of(root)
+        column = layout.column()
+        column.enabled = not running.busy(folder)
+        column.operator("objectgs.extract_meshes", icon="MESH_DATA")
+        column.row().prop(properties, "mesh_objects", expand=True)
+        column.use_property_split = True
+        column.prop(properties, "mesh_faces")
+        column.prop(properties, "texture_size")
+        column.prop(properties, "mesh_closed")
+        column.prop(properties, "mesh_scene")
+        if job is not None and job.kind == "mesh":
+            draw_job_of(layout, job)
+        if state.stale_meshes and not running.busy(folder):
+            write(layout, f"{state.stale_meshes} of {state.meshes} meshes are of another state of the training. "
+                          "Extract Meshes brings them up to date.", "INFO")
+        if not scene.has_shown_meshes(root):
+            return
+        layout.label(text="Show")
+        layout.row().prop(properties, "shown", expand=True)
+        for mesh in scene.scene_meshes(root):
+            row = layout.row(align=True)
+            row.label(text=mesh.name, icon="OUTLINER_OB_MESH")
+            row.prop(mesh, "hide_viewport", text="", emboss=False)
+            row.prop(mesh, "hide_render", text="", emboss=False)
+        layout.operator("objectgs.mark_assets", icon="ASSET_MANAGER")
