@@ -1,7 +1,9 @@
 """objects.json: the objects of a reconstruction as the votes found them, and what the user changed about them.
 
     {"objects": [{"id": 1, "name": "mug", "colour": [59, 125, 216], "points": 812}, ...],
-     "edits": {"1": {"name": "cup", "colour": [255, 0, 0], "merged_into": 2, "left_out": true}, ...}}
+     "edits": {"1": {"name": "cup", "colour": [255, 0, 0], "merged_into": 2, "left_out": true},
+               "4": {"removed": true},
+               "5": {"recolour": {"hue": 0.3}, "transform": [[1, 0, 0, 2], ...], "copies": [[[1, 0, 0, 5], ...]]}, ...}}
 
 A new vote replaces "objects" and keeps "edits". Standard library and NumPy only, so that Blender's own Python can
 import it.
@@ -14,17 +16,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from .protocol import InputError, read_json, write_json
+from .recolour import Recolour
 
 LARGEST_ID = 2**32 - 1
-EDITABLE = ("name", "colour", "merged_into", "left_out")
+EDITABLE = ("name", "colour", "merged_into", "left_out", "removed", "recolour", "transform", "copies")
+
+Matrix = tuple[tuple[float, float, float, float], ...]
+"""Four rows of an affine map of the capture's coordinates, which moves an object from where it was captured."""
 
 
 @dataclass(frozen=True)
 class SceneObject:
     """One object: its ID in the masks, name, sRGB colour 0 .. 255, how many points voted for it, and the user's edits.
 
-    merged_into: the ID of the object that it is shown and meshed with, or None; left_out: not to be reconstructed.
+    merged_into: the ID of the object that it is shown and meshed with, or None; left_out: not to be reconstructed;
+    removed: made, but not to be seen; recolour: of its splats and textures, or None; transform: where it was moved to,
+    or None; copies: where its duplicates are, from where it was captured. Edits of an object that is merged into
+    another have no effect but its name; those of the other count for both.
     """
 
     id: int
@@ -33,6 +44,10 @@ class SceneObject:
     points: int
     merged_into: int | None = None
     left_out: bool = False
+    removed: bool = False
+    recolour: Recolour | None = None
+    transform: Matrix | None = None
+    copies: tuple[Matrix, ...] = ()
 
 
 def read_objects(path: Path) -> list[SceneObject]:
@@ -91,6 +106,10 @@ def _object(entry: Mapping[str, Any]) -> SceneObject:
         points=_integer(entry["points"], 2**31 - 1),
         merged_into=None if into is None else _integer(into, LARGEST_ID),
         left_out=bool(entry.get("left_out", False)),
+        removed=bool(entry.get("removed", False)),
+        recolour=None if (recolour := entry.get("recolour")) is None else Recolour.of(recolour),
+        transform=None if (transform := entry.get("transform")) is None else _matrix(transform),
+        copies=tuple(_matrix(copy) for copy in entry.get("copies") or ()),
     )
 
 
@@ -99,6 +118,16 @@ def _integer(value: Any, largest: int) -> int:
     if not 0 <= number <= largest:
         raise ValueError(f"{value} is not between 0 and {largest}")
     return number
+
+
+def _matrix(value: Any) -> Matrix:
+    matrix = np.array(value, np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.array_equal(matrix[3], (0, 0, 0, 1)):
+        raise ValueError(f"{value} is no affine map of four rows")
+    if abs(np.linalg.det(matrix[:3, :3])) < 1e-30:
+        raise ValueError(f"{value} flattens what it maps")
+    first, second, third, last = (tuple(row) for row in matrix.tolist())
+    return first, second, third, last
 
 
 def _name(text: str) -> str:

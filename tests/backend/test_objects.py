@@ -8,6 +8,7 @@ import pytest
 
 from backend.objects import SceneObject, edit_objects, merged, read_objects, write_objects
 from backend.protocol import InputError
+from backend.recolour import Recolour
 
 MUG = {"id": 1, "name": "mug", "colour": [10, 20, 30], "points": 812}
 BOX = {"id": 2**32 - 1, "name": "box", "colour": [40, 50, 60], "points": 7}
@@ -47,6 +48,28 @@ def test_an_edit_is_taken_back(path):
     assert read_objects(path)[0] == SceneObject(1, "mug", (10, 20, 30), 812, None, True)
     edit_objects(path, {1: dict(left_out=None)})
     assert json.loads(path.read_text())["edits"] == {}
+
+
+MOVED = ((1.0, 0.0, 0.0, 2.0), (0.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, 0.5), (0.0, 0.0, 0.0, 1.0))
+
+
+def test_colour_place_and_copies_are_edits(path):
+    edit_objects(path, {1: dict(removed=True, recolour=Recolour(hue=0.2).stored(), transform=MOVED, copies=[MOVED])})
+    mug = read_objects(path)[0]
+    assert (mug.removed, mug.recolour, mug.transform, mug.copies) == (True, Recolour(hue=0.2), MOVED, (MOVED,))
+    edit_objects(path, {1: dict(removed=None, recolour=None, transform=None, copies=None)})
+    assert read_objects(path)[0] == SceneObject(1, "mug", (10, 20, 30), 812)
+
+
+@pytest.mark.parametrize("edit", [
+    {"recolour": 3}, {"recolour": {"hue": "red"}}, {"transform": [[1, 0], [0, 1]]},
+    {"transform": [[0] * 4] * 3 + [[0, 0, 0, 1]]},
+    {"copies": [1]}, {"transform": [*MOVED[:3], [0, 0, 1, 1]]},
+])  # fmt: skip
+def test_edits_that_make_no_sense_are_named(path, edit):
+    edit_objects(path, {1: edit})
+    with pytest.raises(InputError, match=r"objects\.json"):
+        read_objects(path)
 
 
 def test_only_what_may_be_edited_is(path):
