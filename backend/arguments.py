@@ -83,6 +83,14 @@ in DIR/meshes as PLY with a PNG. Stopped, the same command goes on with what is
 missing. `evaluate` afterwards measures the meshes too.
 """
 
+_FILM = """\
+Draw film frames of the splats, with the edits of DIR/objects.json, as a shot file
+says: multilayer EXR with colour (linear, premultiplied), depth, object IDs and
+Cryptomatte. Blender's panel Film writes shot files; backend/film/shot.py says what
+they hold. Frames that are there already are skipped, so several machines can share
+a folder, each with its own --frames.
+"""
+
 _REPORT = """\
 Write report.md, with pictures, plots and what was left out, and report.json, the
 same for programs. Run `evaluate` before, so that the report says how good it is.
@@ -244,6 +252,13 @@ def parser() -> argparse.ArgumentParser:
         help="side of the texture: 256 to 4096 (from the photos' resolution)",
     )  # fmt: skip
     mesh.add_argument("--restart", action="store_true", help="make meshes anew that are there already")
+    film = command("film", "draw film frames through an animated camera", _FILM, "garden-splats --shot shot.json --out f")
+    film.add_argument("folder", type=Path, metavar="DIR", help="reconstruction folder, as given to train --out")
+    film.add_argument("--shot", type=Path, required=True, metavar="FILE", help="camera and objects, moment by moment")
+    film.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="where splats.0001.exr ... go")
+    film.add_argument("--frames", metavar="LIST", help="only these of the shot's frames, as 1-24 or 1,5,9-12")
+    film.add_argument("--png", action="store_true", help="each frame also as PNG: encoded as a photo, straight alpha")
+    device_option(film)
     result("evaluate", "measure how good the splats are", _EVALUATE, "garden-splats")
     result("report", "write a report with pictures", _REPORT, "garden-splats")
     device_option(command("doctor", "say whether everything works on this computer", _DOCTOR, ""))

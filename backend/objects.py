@@ -108,8 +108,8 @@ def _object(entry: Mapping[str, Any]) -> SceneObject:
         left_out=bool(entry.get("left_out", False)),
         removed=bool(entry.get("removed", False)),
         recolour=None if (recolour := entry.get("recolour")) is None else Recolour.of(recolour),
-        transform=None if (transform := entry.get("transform")) is None else _matrix(transform),
-        copies=tuple(_matrix(copy) for copy in entry.get("copies") or ()),
+        transform=None if (transform := entry.get("transform")) is None else affine_map(transform),
+        copies=tuple(affine_map(copy) for copy in entry.get("copies") or ()),
     )
 
 
@@ -120,7 +120,8 @@ def _integer(value: Any, largest: int) -> int:
     return number
 
 
-def _matrix(value: Any) -> Matrix:
+def affine_map(value: Any) -> Matrix:
+    """Four rows of four numbers as a map; ValueError or TypeError where they are none, or flatten what they map."""
     matrix = np.array(value, np.float64)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.array_equal(matrix[3], (0, 0, 0, 1)):
         raise ValueError(f"{value} is no affine map of four rows")

@@ -101,7 +101,7 @@ class Scene:
 
     def id_render(self) -> None:
         """Colour, and the most probable object of every pixel."""
-        self.renderer.object_map(self.renderer.forward(self.gaussians, self.camera))
+        self.renderer.object_ranks(self.renderer.forward(self.gaussians, self.camera), 1)
 
     @property
     def pairs(self) -> float:

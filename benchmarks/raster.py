@@ -97,7 +97,7 @@ class Scene:
 
     def id_render(self) -> None:
         """Colour, and the most probable object of every pixel."""
-        cpu.object_map(cpu.forward(self.gaussians, self.camera))
+        cpu.object_ranks(cpu.forward(self.gaussians, self.camera), 1)
 
     @property
     def pairs(self) -> float:

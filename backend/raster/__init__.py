@@ -12,7 +12,7 @@ from . import cpu
 from .camera import Camera
 from .cpu import compile_kernels
 
-__all__ = ["Camera", "Rendered", "compile_kernels", "object_map", "rasterize"]
+__all__ = ["Camera", "Rendered", "compile_kernels", "object_map", "object_ranks", "rasterize"]
 
 
 class Rendered(NamedTuple):
@@ -141,8 +141,15 @@ def rasterize(
 def object_map(rendered: Rendered) -> tuple[Any, Any]:
     """The most probable ID (H, W) int32 (-1 where nothing is drawn) and its probability (H, W) float32: NumPy arrays
     from the CPU renderer, tensors on the device from the CUDA renderer."""
+    ids, probabilities = object_ranks(rendered, 1)
+    return ids[0], probabilities[0]
+
+
+def object_ranks(rendered: Rendered, ranks: int) -> tuple[Any, Any]:
+    """The most probable IDs (ranks, H, W) int32, from the most probable down (-1 where there are no more), and their
+    probabilities (ranks, H, W) float32, as `object_map`."""
     if isinstance(rendered.frame, cpu.Frame):
-        return cpu.object_map(rendered.frame)
+        return cpu.object_ranks(rendered.frame, ranks)
     from . import cuda
 
-    return cuda.object_map(rendered.frame)
+    return cuda.object_ranks(rendered.frame, ranks)

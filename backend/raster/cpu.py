@@ -14,6 +14,7 @@ from .cpu_ids import most_probable
 from .cpu_project import project, project_backward
 from .cpu_tiles import blend, blend_backward
 from .discs import TILT_COLUMNS
+from .ranks import add_ranked
 from .splats import GRADIENT_COLUMNS, HALF_H, SPLAT_COLUMNS, view_of
 
 _NO_PLANE = np.zeros((1, 1), np.float32)
@@ -149,9 +150,10 @@ def backward(
     return out
 
 
-def object_map(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """The most probable ID of each pixel (H, W) int32, -1 where nothing is drawn, and its probability (H, W)."""
-    shape = (frame.camera.height, frame.camera.width)
+def object_ranks(frame: Frame, ranks: int) -> tuple[np.ndarray, np.ndarray]:
+    """The most probable IDs of each pixel (ranks, H, W) int32, from the most probable down, -1 where there are no more,
+    and their probabilities (ranks, H, W)."""
+    shape = (ranks, frame.camera.height, frame.camera.width)
     best_id = np.empty(shape, np.int32)
     best_weight = np.empty(shape, np.float32)
     most_probable(frame.splats, frame.tilts, frame.gaussians.ids, frame.tiles, frame.members, best_id, best_weight)
@@ -166,7 +168,7 @@ def compile_kernels(progress: Callable[[int, int], object] | None = None) -> flo
     the kernels, or the user's own cache folder where that is not writable).
     """
     started = time.perf_counter()
-    total = 6
+    total = 7
     report = progress or (lambda done, total: None)
     report(0, total)
     ones = np.ones((1, 4), np.float32)
@@ -182,6 +184,8 @@ def compile_kernels(progress: Callable[[int, int], object] | None = None) -> flo
         report(done + 1, total)
         backward(frame, color, plane, plane)
         report(done + 2, total)
-        object_map(frame)
+        object_ranks(frame, 1)
         report(done + 3, total)
+    add_ranked(np.zeros((2, 2, 1), np.int32), np.zeros((2, 2, 1), np.float32), *object_ranks(frame, 1))
+    report(total, total)
     return time.perf_counter() - started

@@ -1,7 +1,8 @@
-"""The most probable object of every pixel, exactly, at a cost that does not grow with the number of objects.
+"""The most probable objects of every pixel, exactly, at a cost that does not grow with the number of objects.
 
 P_i(x) sums the blending weights of the splats with ID i. The weights are computed once, in depth order, and kept
-for the tile; a second pass adds them up object by object, over the pixels that object reaches, and keeps the largest.
+for the tile; a second pass adds them up object by object, over the pixels that object reaches, and keeps the largest,
+as many as are asked for.
 """
 
 from __future__ import annotations
@@ -29,21 +30,26 @@ _CHECK_EVERY = 32
 
 
 @njit(inline="always", error_model="numpy")
-def _contest(winner_weight, winner, at, weight, owner):
-    """Let `owner` win the pixels from `at` on where its weight is above the best so far."""
-    best = simd.load(winner_weight, at)
-    wins = simd.above(weight, best)
-    simd.store(winner_weight, at, simd.where(wins, weight, best))
-    simd.store(winner, at, simd.where_i(wins, owner, simd.load_i(winner, at)))
+def _contest(winner_weight, winner, ranks, plane, at, weight, owner):
+    """Let `owner` take its place among the best so far of the pixels from `at` on; what it displaces moves down."""
+    moves = simd.above(weight, weight)
+    for rank in range(ranks):
+        place = rank * plane + at
+        best, who = simd.load(winner_weight, place), simd.load_i(winner, place)
+        moves = simd.either(moves, simd.above(weight, best))
+        simd.store(winner_weight, place, simd.where(moves, weight, best))
+        simd.store(winner, place, simd.where_i(moves, owner, who))
+        weight, owner = simd.where(moves, best, weight), simd.where_i(moves, who, owner)
 
 
 @kernel(parallel=True)
 def most_probable(splats, tilts, ids, tiles, members, best_id, best_weight):
-    """Write best_id (H, W) int32 and best_weight (H, W) float32 = max_i P_i; ID -1 and weight 0 where nothing is drawn.
+    """Write best_id (ranks, H, W) int32 and best_weight (ranks, H, W) float32: the objects of largest P_i, from the
+    largest down; ID -1 and weight 0 where there are no more.
 
-    tilts: None, or those of discs. Of objects with equal weight the smallest ID wins.
+    tilts: None, or those of discs. Of objects with equal weight the smallest ID comes first.
     """
-    columns = (best_id.shape[1] + TILE_W - 1) // TILE_W
+    columns = (best_id.shape[2] + TILE_W - 1) // TILE_W
     count = tiles.size - 1
     for index in prange(count):
         _contest_tile(
@@ -53,7 +59,7 @@ def most_probable(splats, tilts, ids, tiles, members, best_id, best_weight):
 
 @kernel()
 def _contest_tile(tile, splats, tilts, ids, tiles, members, best_id, best_weight):
-    height, width = best_id.shape
+    ranks, height, width = best_id.shape
     columns = (width + TILE_W - 1) // TILE_W
     plane = TILE_H * STRIDE
     tile_x = (tile % columns) * TILE_W
@@ -64,8 +70,8 @@ def _contest_tile(tile, splats, tilts, ids, tiles, members, best_id, best_weight
     count = tiles[tile + 1] - first
     T = np.zeros(plane, np.float32)
     current = np.zeros(plane, np.float32)
-    winner_weight = np.zeros(plane, np.float32)
-    winner = np.full(plane, -1, np.int32)
+    winner_weight = np.zeros(ranks * plane, np.float32)
+    winner = np.full(ranks * plane, -1, np.int32)
     live = np.zeros(TILE_H, np.bool_)
     starts = np.empty(ROW_SLOTS, np.int32)
     stops = np.empty(ROW_SLOTS, np.int32)
@@ -160,7 +166,7 @@ def _contest_tile(tile, splats, tilts, ids, tiles, members, best_id, best_weight
                     at = row * STRIDE + x
                     weight = simd.load(kept, at_kept)
                     if alone:
-                        _contest(winner_weight, winner, at, weight, mine)
+                        _contest(winner_weight, winner, ranks, plane, at, weight, mine)
                     else:
                         simd.store(current, at, simd.load(current, at) + weight)
                     at_kept += simd.LANES
@@ -171,11 +177,13 @@ def _contest_tile(tile, splats, tilts, ids, tiles, members, best_id, best_weight
             if not alone:
                 for x in range(left[row], right[row], simd.LANES):
                     at = row * STRIDE + x
-                    _contest(winner_weight, winner, at, simd.load(current, at), mine)
+                    _contest(winner_weight, winner, ranks, plane, at, simd.load(current, at), mine)
                     simd.store(current, at, simd.splat(np.float32(0.0)))
             left[row] = TILE_W
             right[row] = 0
-    for row in range(rows):
-        for x in range(cols):
-            best_id[tile_y + row, tile_x + x] = winner[row * STRIDE + x]
-            best_weight[tile_y + row, tile_x + x] = winner_weight[row * STRIDE + x]
+    for rank in range(ranks):
+        for row in range(rows):
+            for x in range(cols):
+                at = rank * plane + row * STRIDE + x
+                best_id[rank, tile_y + row, tile_x + x] = winner[at]
+                best_weight[rank, tile_y + row, tile_x + x] = winner_weight[at]

@@ -165,10 +165,11 @@ def backward(
     return out
 
 
-def object_map(frame: Frame) -> tuple[torch.Tensor, torch.Tensor]:
-    """The most probable ID of each pixel (H, W) int32, -1 where nothing is drawn, and its probability (H, W)."""
-    best_weight = torch.empty_like(frame.transmittance)
-    best_id = torch.empty_like(best_weight, dtype=torch.int32)
+def object_ranks(frame: Frame, ranks: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """The most probable IDs of each pixel (ranks, H, W) int32, from the most probable down, -1 where there are no more,
+    and their probabilities (ranks, H, W)."""
+    best_weight = frame.transmittance.new_zeros((ranks, *frame.transmittance.shape))
+    best_id = torch.full_like(best_weight, -1, dtype=torch.int32)
     splats, tilts, ids, _ = _drawn(frame.splats, frame.tilts, frame.gaussians.ids, None)
     columns, _ = grid(frame.camera.width, frame.camera.height)
     most_probable(

@@ -1,4 +1,4 @@
-"""The most probable object of every pixel on a GPU, exactly, at a cost that does not grow with the number of objects.
+"""The most probable objects of every pixel on a GPU, exactly, at a cost that does not grow with the number of objects.
 
 P_i(x) sums the blending weights of the splats with ID i. A tile meets few distinct IDs: they are numbered within the
 tile, and every pixel adds up one number for each of up to SLOTS of them in shared memory; a tile that meets more goes
@@ -63,21 +63,28 @@ def _contest_kernel(flat: bool) -> Any:
         return t
 
     @device_function
-    def largest(sums, count, thread, best):
-        """The largest of a pixel's sums so far and its place among all of them; the first of equals."""
-        weight, place = best
+    def rank(sums, names, lowest, count, thread, best_id, best_weight, px, py):
+        """Let a pixel's sums take their places among its best so far; the first of equals stays before the others."""
+        last = best_weight.shape[0] - 1
+        least = best_weight[last, py, px]
         for slot in range(count):
-            if sums[slot, thread] > weight:
-                weight = sums[slot, thread]
-                place = slot
-        return weight, place
+            weight = sums[slot, thread]
+            if weight > least:
+                place = last
+                while place > 0 and weight > best_weight[place - 1, py, px]:
+                    best_weight[place, py, px] = best_weight[place - 1, py, px]
+                    best_id[place, py, px] = best_id[place - 1, py, px]
+                    place -= 1
+                best_weight[place, py, px] = weight
+                best_id[place, py, px] = names[lowest + slot]
+                least = best_weight[last, py, px]
 
     @cuda_kernel(launch_bounds=THREADS)
     def contest(splats, tilts, slots, names, bounds, starts, members, ends, columns, best_id, best_weight):
         stage = cuda.shared.array((_STAGED, stride), np.float32, alignment=16)
         staged_slots = cuda.shared.array(_STAGED, np.int32)
         sums = cuda.shared.array((SLOTS, THREADS), np.float32)
-        height, width = best_id.shape
+        _, height, width = best_id.shape
         thread = cuda.threadIdx.x
         tile = cuda.blockIdx.x
         tile_x = np.int32(tile % columns * TILE)
@@ -87,8 +94,6 @@ def _contest_kernel(flat: bool) -> Any:
         inside = px < width and py < height
         first = starts[tile]
         last = first + ends[tile]
-        name = np.int32(-1)
-        most = _ZERO
         for lowest in range(bounds[tile], bounds[tile + 1], SLOTS):
             count = min(SLOTS, bounds[tile + 1] - lowest)
             for slot in range(count):
@@ -111,12 +116,8 @@ def _contest_kernel(flat: bool) -> Any:
                     stage, staged_slots, np.uint64(here), np.float32(x), np.float32(py) + _HALF, np.int32(lowest), sums,
                     np.uint64(thread), t,
                 )  # fmt: skip
-            most, place = largest(sums, count, np.uint64(thread), (most, -1))
-            if place >= 0:
-                name = names[lowest + place]
-        if inside:
-            best_id[py, px] = name
-            best_weight[py, px] = most
+            if inside:
+                rank(sums, names, lowest, count, np.uint64(thread), best_id, best_weight, px, py)
 
     return contest
 
@@ -153,9 +154,10 @@ def most_probable(
     splats: torch.Tensor, tilts: torch.Tensor | None, ids: torch.Tensor, lists: Lists, ends: torch.Tensor,
     columns: int, best_id: torch.Tensor, best_weight: torch.Tensor,
 ) -> None:  # fmt: skip
-    """Write best_id (H, W) int32 and best_weight (H, W) float32 = max_i P_i; ID -1 and weight 0 where nothing is drawn.
+    """Write into best_id (ranks, H, W) int32, full of -1, and best_weight (ranks, H, W) float32, full of 0, the objects
+    of largest P_i, from the largest down.
 
-    Of objects with equal weight the smallest ID wins. ends (T,): how many members of each tile are drawn.
+    Of objects with equal weight the smallest ID comes first. ends (T,): how many members of each tile are drawn.
     """
     slots, names, bounds = _number(lists, ids, ends)
     launch(

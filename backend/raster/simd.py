@@ -211,6 +211,16 @@ def both(typingctx, a, b):
 
 
 @intrinsic
+def either(typingctx, a, b):
+    """Logical or of two masks."""
+
+    def codegen(context, builder, signature, args):
+        return builder.or_(args[0], args[1])
+
+    return Mask(Mask, Mask), codegen
+
+
+@intrinsic
 def where(typingctx, mask, a, b):
     """a where the mask holds, else b."""
 

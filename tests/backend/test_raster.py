@@ -7,7 +7,7 @@ import torch
 from numba import config
 
 from backend import raster
-from backend.raster import Camera, object_map
+from backend.raster import Camera, object_map, object_ranks
 from backend.raster.reference import rasterize_reference
 
 NAMES = ("means", "quats", "scales", "opacities", "sh")
@@ -60,6 +60,25 @@ def mapped(picture):
     return tuple(torch.as_tensor(a).cpu().numpy() for a in object_map(picture))
 
 
+def ranked(picture, ranks):
+    """The object ranks as NumPy arrays, whichever renderer drew."""
+    return tuple(torch.as_tensor(a).cpu().numpy() for a in object_ranks(picture, ranks))
+
+
+def compare_ranks(ids, probabilities, dense, **tolerance):
+    """What `object_ranks` says against all probabilities, `dense` (H, W, n), of IDs 0 .. n - 1."""
+    ranks, objects = len(ids), dense.shape[-1]
+    largest = np.zeros((ranks, *dense.shape[:2]))
+    largest[:objects] = -np.sort(-np.moveaxis(dense, -1, 0), axis=0)[:ranks]
+    np.testing.assert_allclose(probabilities, largest, **tolerance)
+    assert ((ids >= 0) == (probabilities > 0)).all()
+    picked = np.take_along_axis(np.moveaxis(dense, -1, 0), np.maximum(ids, 0).astype(np.int64), 0)
+    np.testing.assert_allclose(np.where(ids >= 0, picked, 0), probabilities, **tolerance)
+    for a in range(ranks):
+        for b in range(a):
+            assert ((ids[a] != ids[b]) | (ids[a] < 0)).all()
+
+
 def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolerance=1e-5, primitive="3d"):
     """Picture and gradients of a random loss by both renderers; `primitive` "2d": with everything that discs have."""
     scene = as_float32(scene)
@@ -110,6 +129,8 @@ def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolera
     np.testing.assert_allclose(probability, dense.max(-1), rtol=1e-4, atol=value_tolerance)
     picked = np.take_along_axis(dense, np.maximum(ids, 0)[..., None], -1)[..., 0]
     np.testing.assert_allclose(picked, dense.max(-1), rtol=1e-4, atol=value_tolerance)
+    for ranks in (3, objects + 1):
+        compare_ranks(*ranked(got, ranks), dense, rtol=1e-4, atol=value_tolerance)
     return got, want
 
 

@@ -22,6 +22,7 @@ from tests.backend.test_raster import (
     fewer,
     mapped,
     random_scene,
+    ranked,
     rasterize,
 )
 
@@ -386,6 +387,12 @@ def test_object_map_gives_ties_to_the_smallest_id():
         expected = np.where(dense.max(-1) > 0, np.array([9, 70_000])[dense.argmax(-1)], -1)
         assert np.array_equal(ids, expected)
         assert np.array_equal(probability, dense.max(-1))
+        both = (dense > 0).all(-1)
+        ids, probabilities = ranked(rasterize(**as_float32(join(left, right)), camera=cam), 2)
+        equal = dense[..., 0] == dense[..., 1]
+        assert (ids[0] == expected).all() and (ids[1] != expected)[both].all()
+        assert (ids[:, both & equal] == [[9], [70_000]]).all() and ((both & equal).any() or SIMULATED)
+        assert np.array_equal(probabilities.sum(0)[both], dense.sum(-1)[both])
 
 
 def test_ten_thousand_objects_and_large_ids():
