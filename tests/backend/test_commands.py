@@ -22,13 +22,11 @@ from backend import arguments, commands, device
 from backend.capture import load_capture
 from backend.commands.lock import LOCK
 from backend.export import agreement, fit_splats, read_splats
-from backend.export.fit import sh_basis
 from backend.labels import read_points
 from backend.model.checkpoint import CURRENT, PREVIOUS, load_checkpoint
 from backend.objects import edit_objects, read_objects
 from backend.ply import read_vertices
 from backend.protocol import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, EXIT_FAILED, InputError
-from backend.raster.reference import sh_colors
 from backend.training.loop import Trainer
 from backend.training.settings import Settings
 
@@ -848,15 +846,6 @@ def test_help_says_what_each_command_does_with_an_example(capsys):
 
 
 # --- the fit of a view-dependent model -------------------------------------------------------------------------------
-
-
-def test_the_basis_is_the_rasterizers():
-    rng = np.random.default_rng(0)
-    directions = rng.normal(size=(50, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    sh = rng.normal(size=(50, 9, 3)) * 0.1
-    wanted = sh_colors(torch.from_numpy(sh), torch.from_numpy(directions)).numpy()
-    np.testing.assert_allclose(np.einsum("nk,nkc->nc", sh_basis(directions), sh) + 0.5, wanted, atol=1e-5)
 
 
 def test_a_model_that_does_not_look_at_the_view_is_fitted_exactly(write_capture, tmp_path, ask, monkeypatch):
