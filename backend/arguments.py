@@ -252,7 +252,9 @@ def parser() -> argparse.ArgumentParser:
         help="side of the texture: 256 to 4096 (from the photos' resolution)",
     )  # fmt: skip
     mesh.add_argument("--restart", action="store_true", help="make meshes anew that are there already")
-    film = command("film", "draw film frames through an animated camera", _FILM, "garden-splats --shot shot.json --out f")
+    film = command(
+        "film", "draw film frames through an animated camera", _FILM, "garden-splats --shot shot.json --out f"
+    )
     film.add_argument("folder", type=Path, metavar="DIR", help="reconstruction folder, as given to train --out")
     film.add_argument("--shot", type=Path, required=True, metavar="FILE", help="camera and objects, moment by moment")
     film.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="where splats.0001.exr ... go")

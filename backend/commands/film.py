@@ -30,7 +30,9 @@ def film(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     place = device.pick(options.device)
     folder = Reconstruction(options.folder)
     if not folder.splats.is_file():
-        raise InputError(f"{folder.folder} has no {folder.splats.name}; give a folder that `train` was told with --out.")
+        raise InputError(
+            f"{folder.folder} has no {folder.splats.name}; give a folder that `train` was told with --out."
+        )
     shot = read_shot(options.shot)
     frames = chosen_frames(options.frames, shot)
     _make_folder(options.out)
@@ -66,7 +68,9 @@ def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"The folder {folder} cannot be made ({error.strerror}); choose another with --out.") from error
+        raise InputError(
+            f"The folder {folder} cannot be made ({error.strerror}); choose another with --out."
+        ) from error
 
 
 def _is_done(options: argparse.Namespace, frame: Frame, digest: str) -> bool:
@@ -81,9 +85,7 @@ def _plan(missing: int, total: int) -> str:
     return f"Drawing {missing} frame{'' if missing == 1 else 's'}{there}"
 
 
-def _write(
-    options: argparse.Namespace, stage: Stage, shot: Shot, frame: Frame, picture: Picture, digest: str
-) -> None:
+def _write(options: argparse.Namespace, stage: Stage, shot: Shot, frame: Frame, picture: Picture, digest: str) -> None:
     path = frame_path(options.out, frame.number)
     # The PNG comes first, so that one beside a finished EXR is of the same frame.
     if options.png:

@@ -46,7 +46,8 @@ class Stage:
         order = np.argsort(slots, kind="stable")
         ends = np.cumsum(np.bincount(slots, minlength=len(ids)))
         self._parts = {
-            object_id: edited.select(order[ends[i - 1] if i else 0 : ends[i]]) for i, object_id in enumerate(ids.tolist())
+            object_id: edited.select(order[ends[i - 1] if i else 0 : ends[i]])
+            for i, object_id in enumerate(ids.tolist())
         }
         self._slots = {object_id: i for i, object_id in enumerate(ids.tolist())}
         self._moved: dict[int, tuple[bytes, Splats]] = {}
@@ -65,7 +66,9 @@ class Stage:
     def at(self, sample: Sample, only_named: bool) -> Tensors:
         """What `rasterize` takes of the splats at a moment, on the device; ids are places in `names`."""
         wanted = {
-            object_id: maps for object_id in self._parts if (maps := self._maps(object_id, sample, only_named)) is not None
+            object_id: maps
+            for object_id in self._parts
+            if (maps := self._maps(object_id, sample, only_named)) is not None
         }
         key = {object_id: maps.tobytes() for object_id, maps in wanted.items()}
         if self._drawn is None or self._drawn[0] != key:

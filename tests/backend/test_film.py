@@ -1,0 +1,400 @@
+"""Film frames: what is in the files, against the reference renderer; resuming, stopping and bad shots."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import OpenEXR
+import pytest
+import torch
+from PIL import Image
+
+from backend.commands.film import frame_path
+from backend.editing.apply import recoloured, transformed
+from backend.export.ply import read_splats, write_splats
+from backend.film import cryptomatte, exr
+from backend.film.render import FAR, decoded, encoded
+from backend.film.shot import Frame, Placed, Sample, Shot, chosen_frames, read_shot, write_shot
+from backend.model.splats import Splats, concatenate
+from backend.objects import edit_objects, write_objects
+from backend.protocol import EXIT_CANCELLED, EXIT_DONE, InputError, Reconstruction
+from backend.raster import Camera
+from backend.raster.ranks import add_ranked
+from backend.raster.reference import rasterize_reference
+from backend.recolour import Recolour
+
+from .asking import refused
+
+HUGE = 3_000_000_001
+IDS = (0, 1, 2, 7, HUGE)
+NAMES = {1: "mug", 2: "can", 7: "mug", HUGE: "große Kiste"}
+SHOWN_NAMES = ["Unlabelled", "mug (1)", "can", "mug (7)", "große Kiste"]
+WIDTH, HEIGHT = 45, 33
+K = np.array([[40.0, 0, 24.3], [0, 44.0, 15.1], [0, 0, 1]])
+
+
+def some_splats(count=90, seed=0) -> Splats:
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(1.5, 4.0, count)
+    quats = rng.normal(size=(count, 4))
+    scales = np.exp(rng.normal(np.log(0.12), 0.5, (count, 3)))
+    scales[:, 2] = scales.min(1) / 10
+    return Splats(
+        means=np.stack([rng.uniform(-0.5, 0.5, count) * z, rng.uniform(-0.35, 0.35, count) * z, z], 1).astype("f4"),
+        quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype("f4"),
+        scales=scales.astype("f4"),
+        opacities=rng.uniform(0.2, 0.95, count).astype("f4"),
+        sh=rng.normal(0, 0.3, (count, 4, 3)).astype("f4"),
+        object_ids=rng.choice(np.array(IDS), count),
+    )
+
+
+@pytest.fixture
+def folder(tmp_path) -> Reconstruction:
+    """A reconstruction folder of some splats, without a capture."""
+    place = Reconstruction(tmp_path / "made").create()
+    write_splats(place.splats, some_splats())
+    write_objects(
+        place.objects, [{"id": i, "name": name, "colour": [1, 2, 3], "points": 4} for i, name in NAMES.items()]
+    )
+    return place
+
+
+def view(x=0.0) -> np.ndarray:
+    """A camera a little beside the origin, turned a little."""
+    turn = np.array([[np.cos(0.1), 0, np.sin(0.1)], [0, 1, 0], [-np.sin(0.1), 0, np.cos(0.1)]])
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = turn, -turn @ [x, 0.05, -0.2]
+    return out
+
+
+def moved(x=0.0, y=0.0, z=0.0) -> np.ndarray:
+    out = np.eye(4)
+    out[:3, 3] = x, y, z
+    return out
+
+
+def sample(x=0.0, objects=None, clip=(0.05, 100.0), time=1.0) -> Sample:
+    return Sample(time, view(x), K, clip, objects or {})
+
+
+def shot_of(*frames, **settings) -> Shot:
+    """A shot of frames 1, 2, ..., each a list of samples."""
+    return Shot(WIDTH, HEIGHT, [Frame(i, (i - 0.25, i + 0.25), entry) for i, entry in enumerate(frames, 1)], **settings)
+
+
+@pytest.fixture
+def film(folder, tmp_path, ask):
+    """A function that draws a shot and returns the channels of each frame."""
+
+    def draw(shot, *options):
+        write_shot(tmp_path / "shot.json", shot)
+        out = tmp_path / "film"
+        answer = ask("film", folder.folder, "--shot", tmp_path / "shot.json", "--out", out, "--device", "cpu", *options)
+        assert answer.code == EXIT_DONE, answer
+        return [channels(frame_path(out, frame.number)) for frame in shot.frames]
+
+    return draw
+
+
+def channels(path) -> dict[str, np.ndarray]:
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return {name: channel.pixels for name, channel in file.channels().items()}
+
+
+def reference(splats: Splats, at: Sample, primitive="3d") -> tuple[np.ndarray, ...]:
+    """RGBA in linear light, depth and coverages (H, W, IDS) by the float64 reference."""
+    slots = np.searchsorted(IDS, splats.object_ids)
+    arrays = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
+    tensors = [torch.tensor(np.asarray(values, np.float64)) for values in arrays]
+    camera = Camera(at.viewmat, at.K, WIDTH, HEIGHT, near=at.clip[0])
+    drawn = rasterize_reference(*tensors, torch.tensor(slots), camera, len(IDS), primitive)
+    color, alpha = drawn.color.numpy(), drawn.alpha.numpy()
+    straight = np.moveaxis(color / np.maximum(alpha, 1e-12), 0, -1)
+    light = np.where(straight <= 0.04045, straight / 12.92, ((straight + 0.055) / 1.055) ** 2.4) * alpha[..., None]
+    depth = np.where(drawn.median > 0, drawn.median.numpy(), drawn.depth.numpy() / np.maximum(alpha, 1e-12))
+    return np.concatenate([light, alpha[..., None]], -1), np.where(alpha > 0, depth, FAR), drawn.probabilities.numpy()
+
+
+def rgba_of(picture) -> np.ndarray:
+    return np.stack([picture[name].astype(np.float32) for name in "RGBA"], -1)
+
+
+def coverage_of(picture) -> np.ndarray:
+    """(H, W, IDS), from the Cryptomatte channels."""
+    hashes = [np.uint32(cryptomatte.name_bits(name)).view(np.float32) for name in SHOWN_NAMES]
+    found = np.zeros((*picture["A"].shape, len(IDS)))
+    for layer in range(3):
+        for of_id, of_coverage in ("RG", "BA"):
+            names, coverage = (picture[f"CryptoObject{layer:02d}.{side}"] for side in (of_id, of_coverage))
+            for place, value in enumerate(hashes):
+                found[..., place] += np.where(names == value, coverage, 0)
+    return found
+
+
+def assert_same(picture, splats, at, primitive="3d") -> None:
+    """A frame of one sample is what the reference draws."""
+    rgba, depth, coverage = reference(splats, at, primitive)
+    np.testing.assert_allclose(rgba_of(picture), rgba, atol=2e-3, rtol=2e-3)
+    np.testing.assert_allclose(coverage_of(picture), coverage, atol=1e-5)
+    np.testing.assert_allclose(coverage_of(picture).sum(-1), picture["A"], atol=6e-4)
+    # Where the median is a matter of rounding the two may choose neighbours.
+    assert (np.abs(picture["Z"] - depth) <= 1e-4 * depth).mean() > 0.995
+    winner = np.array(IDS, np.uint32)[coverage.argmax(-1)]
+    clear = np.sort(coverage, -1)[..., -1] - np.sort(coverage, -1)[..., -2] > 1e-4
+    assert np.array_equal(picture["IndexOB.X"][clear], winner[clear])
+
+
+@pytest.mark.parametrize("primitive", ["3d", "2d"])
+def test_a_frame_is_what_the_reference_draws(folder, film, primitive):
+    folder.settings.write_text(json.dumps({"training": {"settings": {"primitive": primitive}}}))
+    picture = film(shot_of([sample()]), "--png")[0]
+    splats, _ = read_splats(folder.splats)
+    assert_same(picture, splats, sample(), primitive)
+    rgba = rgba_of(picture)
+    photo = np.asarray(Image.open(frame_path(folder.folder.parent / "film", 1).with_suffix(".png")))
+    straight = encoded(rgba[..., :3] / np.maximum(rgba[..., 3:], 1e-6))
+    solid = rgba[..., 3] > 0.1
+    assert np.abs(photo[..., :3] - 255 * np.clip(straight, 0, 1))[solid].max() < 1.5
+    assert np.abs(photo[..., 3] - 255 * rgba[..., 3]).max() < 0.7
+
+
+def test_edits_and_places(folder, film):
+    """Static edits of objects.json; maps of the shot, copies and visibility, which take the place of its transforms."""
+    recolour = Recolour(hue=0.3, value=0.8)
+    place = moved(0.3, -0.1, 0.2)
+    edit_objects(folder.objects, {
+        1: {"removed": True}, 2: {"recolour": recolour.stored(), "transform": moved(0.2).tolist()},
+        7: {"transform": place.tolist(), "copies": [moved(-0.4).tolist()]},
+    })  # fmt: skip
+    turned = np.array([[0, -1.2, 0, 0.1], [1.2, 0, 0, 0.2], [0, 0, 1.2, 0.3], [0, 0, 0, 1.0]])
+    objects = {2: Placed(maps=np.array([turned, moved(0.0, 0.3)])), HUGE: Placed(visible=False)}
+    splats, _ = read_splats(folder.splats)
+    part = {i: splats.select(splats.object_ids == i) for i in IDS}
+    can = recoloured(part[2], recolour)
+    expected = concatenate([
+        part[0], transformed(can, turned), transformed(can, moved(0.0, 0.3)), transformed(part[7], place),
+        transformed(part[7], moved(-0.4)),
+    ])  # fmt: skip
+    named = shot_of([sample(objects=objects)], only_named=True)
+    pictures = film(
+        shot_of([sample(objects=objects)], [sample()], [sample(0.1, {2: Placed(maps=np.zeros((0, 4, 4)))})])
+    )
+    names = ["Unlabelled", "can", "mug", "große Kiste"]
+    assert list(manifest(folder.folder.parent / "film")) == names, "mug is alone with its name where the other is gone"
+    rgba, _, coverage = reference(expected, sample())
+    np.testing.assert_allclose(rgba_of(pictures[0]), rgba, atol=2e-3, rtol=2e-3)
+    static = concatenate([part[0], transformed(can, moved(0.2)), transformed(part[7], place),
+                          transformed(part[7], moved(-0.4)), part[HUGE]])  # fmt: skip
+    np.testing.assert_allclose(rgba_of(pictures[1]), reference(static, sample())[0], atol=2e-3, rtol=2e-3)
+    gone = static.select(static.object_ids != 2)
+    np.testing.assert_allclose(rgba_of(pictures[2]), reference(gone, sample(0.1))[0], atol=2e-3, rtol=2e-3)
+    alone = expected.select(expected.object_ids == 2)
+    np.testing.assert_allclose(rgba_of(film(named)[0]), reference(alone, sample())[0], atol=2e-3, rtol=2e-3)
+
+
+def test_clip_range_and_depth_scale(folder, film):
+    near, far = film(shot_of([sample(clip=(2.5, 50.0))], [sample(clip=(0.05, 2.5))], depth_scale=10.0))
+    splats, _ = read_splats(folder.splats)
+    depths = splats.means @ view()[2, :3] + view()[2, 3]
+    for picture, kept in ((near, depths > 2.5), (far, depths <= 2.5)):
+        rgba, depth, _ = reference(splats.select(kept), sample())
+        np.testing.assert_allclose(rgba_of(picture), rgba, atol=2e-3, rtol=2e-3)
+        seen = depth < FAR
+        assert (np.abs(picture["Z"] - 10 * depth) <= 1e-3 * depth)[seen].mean() > 0.99
+        assert (picture["Z"][~seen] == np.float32(FAR)).all() and (~seen).any()
+
+
+def test_motion_blur_is_the_mean_of_the_moments(folder, film):
+    moments = [sample(x, {2: Placed(maps=moved(3 * x)[None])}, time=1 + x) for x in (-0.1, -0.03, 0.05)]
+    blurred, *single = film(shot_of(moments, *([moment] for moment in moments)))
+    mean = np.mean([rgba_of(picture) for picture in single], 0)
+    np.testing.assert_allclose(rgba_of(blurred), mean, atol=1e-3, rtol=1e-3)
+    coverage = np.mean([coverage_of(picture) for picture in single], 0)
+    np.testing.assert_allclose(coverage_of(blurred), coverage, atol=1e-6)
+    assert np.array_equal(blurred["Z"], single[1]["Z"])
+    ranked = np.stack([blurred[f"CryptoObject{i:02d}.{side}"] for i in range(3) for side in "GA"])
+    assert (np.diff(ranked, axis=0) <= 0).all()
+
+
+def test_ranked_lists_add_up():
+    rng = np.random.default_rng(0)
+    totals = np.full((3, 4, 8), -1, np.int32), np.zeros((3, 4, 8), np.float32)
+    dense = np.zeros((3, 4, 8))
+    for _ in range(5):
+        ids = np.argsort(rng.random((8, 3, 4)), 0).astype(np.int32)[:4]
+        ids[3, 0] = -1
+        weights = -np.sort(-rng.random((4, 3, 4)), 0).astype(np.float32)
+        add_ranked(*totals, ids, weights)
+        for rank in range(4):
+            for y, x in np.ndindex(3, 4):
+                dense[y, x, ids[rank, y, x]] += weights[rank, y, x] * (ids[rank, y, x] >= 0)
+    ids, weights = totals
+    np.testing.assert_allclose(weights, -np.sort(-dense, -1), rtol=1e-6)
+    np.testing.assert_allclose(np.take_along_axis(dense, np.maximum(ids, 0), -1) * (ids >= 0), weights, rtol=1e-6)
+
+
+def manifest(out) -> dict[str, str]:
+    (entry,) = [value for key, value in header(out).items() if key.endswith("/manifest")]
+    return json.loads(entry)
+
+
+def header(out, number=1) -> dict:
+    with OpenEXR.File(str(frame_path(out, number)), separate_channels=True) as file:
+        return dict(file.header())
+
+
+def test_cryptomatte_is_as_published(folder, film):
+    """The hashes of the specification's own examples and of others' test vectors; names and keys in the header."""
+    for name, expected in (
+        ("bunny", 0x13851A76), ("default", 0x42C9679F), ("test", 0xBA6BD213), ("Hello, world!", 0xC0363E43),
+        ("The quick brown fox jumps over the lazy dog", 0x2E4FF723), ("", 0),
+    ):  # fmt: skip
+        assert cryptomatte.murmur3(name.encode()) == expected, name
+    # Hashes whose bits would be those of a number that is not normal; found by trying.
+    for bits in (cryptomatte.name_bits(f"object {i}") for i in range(3000)):
+        assert 1 <= bits >> 23 & 255 <= 254
+    film(shot_of([sample()], pixel_aspect=1.5))
+    found = header(folder.folder.parent / "film")
+    key = "cryptomatte/" + f"{cryptomatte.murmur3(b'CryptoObject'):08x}"[:7]
+    assert found[f"{key}/name"] == "CryptoObject" and found[f"{key}/hash"] == "MurmurHash3_32"
+    assert found[f"{key}/conversion"] == "uint32_to_float32"
+    wanted = {name: f"{cryptomatte.name_bits(name):08x}" for name in SHOWN_NAMES}
+    assert json.loads(found[f"{key}/manifest"]) == wanted
+    assert found["pixelAspectRatio"] == 1.5 and found["objectgs/frame"] == "1"
+
+
+def test_colours_go_there_and_back():
+    values = np.linspace(0, 1.5, 200, dtype=np.float32)
+    np.testing.assert_allclose(encoded(decoded(values)), values, atol=1e-6)
+    np.testing.assert_allclose(decoded(np.float32([0.0, 0.5, 1.0])), [0.0, 0.2140411, 1.0], atol=1e-6)
+
+
+# --- resuming and stopping --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def shoot(folder, tmp_path, ask):
+    """A function that runs the command on a shot of three frames, or another one."""
+
+    def run(*options, shot=None):
+        write_shot(tmp_path / "shot.json", shot or shot_of([sample()], [sample(0.1)], [sample(0.2), sample(0.21)]))
+        return ask(
+            "film", folder.folder, "--shot", tmp_path / "shot.json", "--out", tmp_path / "film", "--device", "cpu",
+            "--json", *options,
+        )  # fmt: skip
+
+    return run
+
+
+def drawn(answer) -> int:
+    assert answer.code == EXIT_DONE, answer
+    return answer.events[-1]["drawn"]
+
+
+def test_finished_frames_are_skipped_and_others_drawn_again(folder, shoot, tmp_path):
+    out = tmp_path / "film"
+    assert drawn(shoot("--frames", "2-3")) == 2 and not frame_path(out, 1).exists()
+    assert drawn(shoot()) == 1, "as another machine of a farm would leave the rest"
+    before = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
+    assert drawn(shoot()) == 0 and before == {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
+    assert sorted(before) == ["splats.0001.exr", "splats.0002.exr", "splats.0003.exr"]
+    whole = frame_path(out, 2).read_bytes()
+    for broken in (whole[:-1], whole[: len(whole) // 2], whole[:100], b"", b"text", whole + b"0"):
+        frame_path(out, 2).write_bytes(broken)
+        assert exr.digest_of(frame_path(out, 2)) is None
+    assert drawn(shoot()) == 1 and frame_path(out, 2).read_bytes() == whole
+    assert drawn(shoot(shot=shot_of([sample()], [sample(0.15)], [sample(0.2), sample(0.21)]))) == 1
+    edit_objects(folder.objects, {1: {"removed": True}})
+    assert drawn(shoot()) == 3
+    assert drawn(shoot("--png")) == 3 and len(list(out.glob("*.png"))) == 3
+    assert drawn(shoot("--png", "--frames", "1,3")) == 0
+    write_splats(folder.splats, some_splats(seed=1))
+    assert drawn(shoot("--frames", "1")) == 1 and len(list(out.glob("*.png"))) == 2, "the picture of other splats went"
+
+
+def test_stopping_leaves_whole_frames(shoot, tmp_path, monkeypatch):
+    stops = iter([False, False, True])
+    monkeypatch.setattr("backend.stopping.StopRequest.__call__", lambda self: next(stops))
+    answer = shoot()
+    assert answer.code == EXIT_CANCELLED and answer.events[-1]["stopped"] is True
+    shares = [event["done"] for event in answer.events if event["type"] == "progress"]
+    assert shares == [1, 2, 2.5], "between the moments of a frame, too"
+    assert sorted(path.name for path in (tmp_path / "film").iterdir()) == ["splats.0001.exr", "splats.0002.exr"]
+    monkeypatch.undo()
+    assert drawn(shoot()) == 1
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------
+
+
+def test_what_was_written_is_read(tmp_path):
+    objects = {1: Placed(maps=np.array([moved(1), moved(2)])), 2: Placed(visible=False), HUGE: Placed()}
+    moving = {**objects, 1: Placed(maps=moved(3)[None])}
+    shot = shot_of([sample(objects=objects), sample(objects=moving)], [sample()], only_named=True, pixel_aspect=2.0)
+    write_shot(tmp_path / "shot.json", shot)
+    again = read_shot(tmp_path / "shot.json")
+    assert (again.width, again.height, again.only_named, again.pixel_aspect) == (WIDTH, HEIGHT, True, 2.0)
+    for a, b in zip(shot.frames, again.frames, strict=True):
+        assert (a.number, a.shutter) == (b.number, b.shutter)
+        for first, second in zip(a.samples, b.samples, strict=True):
+            assert np.array_equal(first.viewmat, second.viewmat) and np.array_equal(first.K, second.K)
+            stored = [{key: placed.stored() for key, placed in s.objects.items()} for s in (first, second)]
+            assert stored[0] == stored[1] and first.clip == second.clip and first.time == second.time
+
+
+def break_it(path, keys, value):
+    content = json.loads(path.read_text())
+    at = content
+    for key in keys[:-1]:
+        at = at[key]
+    at[keys[-1]] = value
+    path.write_text(json.dumps(content))
+
+
+FIRST = ("frames", 0, "samples", 0)
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "words"),
+    [
+        (("frames",), [], "frames"), (("version",), 9, "version"), (("width",), 0, "width"), (("height",), 2.5, "height"),
+        (("frames", 0, "samples"), [], "samples"), (("frames", 1, "frame"), 1, "ascending"),
+        (("frames", 0, "frame"), -1, "frame"), ((*FIRST, "viewmat"), (2 * np.eye(4)).tolist(), "viewmat"),
+        ((*FIRST, "viewmat"), "no", "viewmat"), ((*FIRST, "K"), np.eye(4).tolist(), "K"),
+        ((*FIRST, "K"), [[1, 0.5, 1], [0, 1, 1], [0, 0, 1]], "skew"), ((*FIRST, "K"), [[0] * 3] * 3, "focal length"),
+        ((*FIRST, "clip"), [2, 1], "clip"), ((*FIRST, "objects"), {"a": {}}, "ID"),
+        ((*FIRST, "objects"), {"1": {"maps": [[1]]}}, "map of object 1"), ((*FIRST, "objects"), {"1": {"maps": 1}}, "list"),
+        (("objects",), {"1": {"visible": 3}}, "visible"), (("depth_scale",), 0, "depth_scale"),
+        (("only_named",), "yes", "only_named"),
+    ],
+)  # fmt: skip
+def test_bad_shots(tmp_path, keys, value, words):
+    path = tmp_path / "shot.json"
+    write_shot(path, shot_of([sample()], [sample()]))
+    break_it(path, keys, value)
+    with pytest.raises(InputError) as caught:
+        read_shot(path)
+    assert str(path) in str(caught.value) and words in str(caught.value) and str(caught.value).endswith(".")
+
+
+def test_bad_requests(folder, tmp_path, ask):
+    path = tmp_path / "shot.json"
+    command = ("film", folder.folder, "--shot", path, "--out", tmp_path / "film")
+    refused(ask(*command), str(path), "does not exist")
+    write_shot(path, shot_of([sample()], [sample()]))
+    for text in ("x", "3-1", "1;2", "", "-4"):
+        refused(ask(*command, f"--frames={text}"), "--frames")
+    refused(ask(*command, "--frames", "7-9"), "none of the frames", "1 to 2")
+    refused(ask("film", tmp_path, "--shot", path, "--out", tmp_path / "film"), "splats.ply")
+    (tmp_path / "file").write_text("in the way")
+    refused(ask(*command[:-1], tmp_path / "file"), "cannot be made")
+    path.write_text("{")
+    refused(ask(*command), str(path), "JSON")
+
+
+def test_ranges_of_frames():
+    shot = shot_of(*([sample()] for _ in range(9)))
+    for text, wanted in (("1-3", [1, 2, 3]), ("2, 5-6,9", [2, 5, 6, 9]), ("8-100", [8, 9]), (None, list(range(1, 10)))):
+        assert [frame.number for frame in chosen_frames(text, shot)] == wanted
