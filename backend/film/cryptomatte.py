@@ -67,7 +67,7 @@ def channels(
     hashes = np.array([*(name_bits(name) for name in names), 0], np.uint32).view(np.float32)
     planes = {}
     for number in range(LAYERS):
-        for side, (of_id, of_coverage) in enumerate(("RG", "BA")):
+        for side, (of_id, of_coverage) in enumerate((("R", "G"), ("B", "A"))):
             rank = 2 * number + side
             planes[f"{layer}{number:02d}.{of_id}"] = hashes[ids[rank]]
             planes[f"{layer}{number:02d}.{of_coverage}"] = np.where(ids[rank] >= 0, coverage[rank], 0).astype(

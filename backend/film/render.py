@@ -7,7 +7,7 @@ once, to the light that a renderer counts in, and only then averaged over the sh
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -44,40 +44,40 @@ def draw_frame(stage: Stage, shot: Shot, frame: Frame, after_sample: Callable[[i
     count, shape = len(frame.samples), (shot.height, shot.width)
     rgba = np.zeros((*shape, 4), np.float32)
     depth = np.full(shape, FAR, np.float32)
-    totals = (np.full((*shape, _KEPT), -1, np.int32), np.zeros((*shape, _KEPT), np.float32)) if count > 1 else None
-    ids, coverage = np.empty((RANKS, 0, 0), np.int32), np.empty((RANKS, 0, 0), np.float32)
+    kept = RANKS if count == 1 else _KEPT
+    ids = np.full((*shape, kept), -1, np.int32)
+    coverage = np.zeros((*shape, kept), np.float32)
     for number, sample in enumerate(frame.samples):
         is_middle = number == frame.middle
         drawn = _draw(stage, shot, sample, is_middle)
         rgba += _light(drawn)
         if is_middle:
             depth = _depth(drawn, shot.depth_scale)
-        ids, coverage = (device.host(plane) for plane in object_ranks(drawn, RANKS if totals is None else _KEPT))
-        if totals is not None:
-            add_ranked(*totals, ids, coverage)
+        add_ranked(ids, coverage, *(device.host(plane) for plane in object_ranks(drawn, kept)))
         after_sample(number + 1)
-    if totals is not None:
-        ids, coverage = (np.ascontiguousarray(np.moveaxis(total[..., :RANKS], -1, 0)) for total in totals)
-        coverage /= np.float32(count)
-        rgba /= np.float32(count)
-    return Picture(rgba, depth, ids, coverage)
+    return Picture(rgba / np.float32(count), depth, _first(ids), _first(coverage) / np.float32(count))
 
 
-def decoded(encoded: NDArray[np.float32]) -> NDArray[np.float32]:
+def _first(ranked: NDArray) -> NDArray:
+    """(H, W, n) as (RANKS, H, W)."""
+    return np.ascontiguousarray(np.moveaxis(ranked[..., :RANKS], -1, 0))
+
+
+def decoded(encoded: NDArray) -> NDArray[np.float32]:
     """sRGB's encoded values as linear light; values above 1 go on along the same curve."""
     return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0.0) + 0.055) / 1.055) ** 2.4).astype(
         np.float32
     )
 
 
-def encoded(linear: NDArray[np.float32]) -> NDArray[np.float32]:
+def encoded(linear: NDArray) -> NDArray[np.float32]:
     """What `decoded` takes back."""
     return np.where(
         linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
     ).astype(np.float32)
 
 
-def as_photo(rgba: NDArray[np.float32]) -> NDArray[np.uint8]:
+def as_photo(rgba: NDArray) -> NDArray[np.uint8]:
     """A frame's (H, W, 4) as a photo holds it: encoded, 8 bits, alpha not multiplied in."""
     alpha = rgba[..., 3:]
     straight = encoded(rgba[..., :3] / np.maximum(alpha, _FAINTEST))
@@ -86,9 +86,10 @@ def as_photo(rgba: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 def _draw(stage: Stage, shot: Shot, sample: Sample, with_depth: bool) -> Rendered:
     camera = Camera(sample.viewmat, sample.K, shot.width, shot.height, near=sample.clip[0])
+    splats: dict[str, Any] = stage.at(sample, shot.only_named)
     with torch.no_grad():
         return rasterize(
-            **stage.at(sample, shot.only_named), camera=camera, want_depth=with_depth, want_median=with_depth,
+            **splats, camera=camera, want_depth=with_depth, want_median=with_depth,
             primitive=stage.primitive,
         )  # fmt: skip
 

@@ -23,6 +23,7 @@ is not drawn. Standard library and NumPy only, so that Blender's own Python can 
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -168,7 +169,7 @@ def _shot(content: Any) -> Shot:
         frames=[_frame(entry, steady) for entry in frames],
     )
     numbers = [frame.number for frame in shot.frames]
-    if any(b <= a for a, b in zip(numbers, numbers[1:])):
+    if any(b <= a for a, b in itertools.pairwise(numbers)):
         raise _Wrong("its frames are not in ascending order")
     return shot
 

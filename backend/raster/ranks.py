@@ -12,7 +12,7 @@ def add_ranked(total_ids, total_weights, ids, weights):
     """Add a picture's lists to the totals, which stay ranked.
 
     total_ids (H, W, n) int32, at first -1, and total_weights (H, W, n) float32, at first 0; ids (ranks, H, W) int32,
-    where -1 ends a pixel's list, and weights (ranks, H, W). The totals are exact while a pixel meets no more than n IDs.
+    where -1 ends a pixel's list, and weights (ranks, H, W). Totals are exact while a pixel meets no more than n IDs.
     """
     height, width, room = total_ids.shape
     for y in prange(height):
