@@ -55,7 +55,9 @@ def draw_frame(stage: Stage, shot: Shot, frame: Frame, after_sample: Callable[[i
             depth = _depth(drawn, shot.depth_scale)
         add_ranked(ids, coverage, *(device.host(plane) for plane in object_ranks(drawn, kept)))
         after_sample(number + 1)
-    return Picture(rgba / np.float32(count), depth, _first(ids), _first(coverage) / np.float32(count))
+    rgba /= np.float32(count)
+    coverage /= np.float32(count)
+    return Picture(rgba, depth, _first(ids), _first(coverage))
 
 
 def _first(ranked: NDArray) -> NDArray:

@@ -1,0 +1,8 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Film frames of a reconstruction: Blender's camera and objects as a shot file, and the compositor that joins the
+frames with Blender's own rendering."""
+
+from .compositing import has_frames, set_up_compositor, show_frames
+from .shooting import shot_of
+
+__all__ = ["has_frames", "set_up_compositor", "shot_of", "show_frames"]
