@@ -13,7 +13,7 @@ from pathlib import Path
 import bpy
 
 from ..backend.protocol import InputError, Reconstruction
-from . import locations, messages, object_edits, previews, scene, view
+from . import film, locations, messages, object_edits, previews, scene, view
 from .jobs import Job, JobQueue, State, run_blocking
 
 INTERVAL = 0.1
@@ -245,8 +245,15 @@ def _import_demo(job: Job, owner) -> bool:
     return False
 
 
+def _show_film(job: Job, owner) -> bool:
+    """Compositors that show the frames' folder show those that are new."""
+    for other in bpy.data.scenes:
+        film.show_frames(other, Path(job.result.get("film", "")))
+    return False
+
+
 _AFTER = {"demo": _import_demo, "import": _show_capture, "vote": _show_votes, "train": _show_result,
-          "mesh": _show_meshes}
+          "mesh": _show_meshes, "film": _show_film}
 
 
 def _push_undo(title: str) -> None:

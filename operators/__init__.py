@@ -6,6 +6,7 @@ def _classes():
     from . import (
         choose_objects,
         extract_meshes,
+        film_frames,
         import_capture,
         make_demo,
         mark_assets,
@@ -14,6 +15,7 @@ def _classes():
         pause_job,
         select_object,
         set_up_backend,
+        set_up_compositor,
         show_preview,
         show_result,
         solo_object,
@@ -23,7 +25,8 @@ def _classes():
     )
 
     modules = (import_capture, make_demo, vote, train, extract_meshes, pause_job, stop_job, show_result, show_preview,
-               select_object, solo_object, merge_objects, choose_objects, mark_assets, orient, set_up_backend)
+               select_object, solo_object, merge_objects, choose_objects, mark_assets, orient, film_frames,
+               set_up_compositor, set_up_backend)
     return [cls for module in modules for cls in module.CLASSES]
 
 

@@ -133,17 +133,23 @@ def chosen_frames(text: str | None, shot: Shot) -> list[Frame]:
     """The frames that `text` names, as 1-24, 1,5,9 or both mixed, in the shot's order; all of them where it is None."""
     if text is None:
         return list(shot.frames)
-    wanted: list[range] = []
+    wanted = frame_ranges(text)
+    found = [frame for frame in shot.frames if any(frame.number in numbers for numbers in wanted)]
+    if not found:
+        there = f"{shot.frames[0].number} to {shot.frames[-1].number}"
+        raise InputError(f"The shot has none of the frames {text}; it has {len(shot.frames)}, from {there}.")
+    return found
+
+
+def frame_ranges(text: str) -> list[range]:
+    """The frames of a list such as 1-24 or 1,5,9-12; InputError where it is none."""
+    found = []
     for word in text.split(","):
         match = re.fullmatch(r"\s*(\d{1,7})\s*(?:-\s*(\d{1,7})\s*)?", word)
         first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, -1)
         if last < first:
             raise InputError(f"--frames {text} makes no sense; give frames as 1-24 or 1,5,9-12.")
-        wanted.append(range(first, last + 1))
-    found = [frame for frame in shot.frames if any(frame.number in numbers for numbers in wanted)]
-    if not found:
-        there = f"{shot.frames[0].number} to {shot.frames[-1].number}"
-        raise InputError(f"The shot has none of the frames {text}; it has {len(shot.frames)}, from {there}.")
+        found.append(range(first, last + 1))
     return found
 
 

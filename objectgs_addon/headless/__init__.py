@@ -19,7 +19,7 @@ from ...backend.protocol import (
     InputError,
     JsonReporter,
 )
-from . import batch, commands
+from . import batch, commands, filming
 from .arguments import UsageError, parse
 from .lines import LineReporter
 
@@ -31,6 +31,7 @@ COMMANDS = {
     "mesh": commands.mesh,
     "build": commands.build,
     "render": commands.render,
+    "film": filming.film,
     "run": commands.run,
     "batch": batch.batch,
 }

@@ -41,6 +41,15 @@ OPTIONS are those of `python -m backend mesh`, whose --help explains them:
 """
 
 
+_FILM = """\
+Draw a reconstruction's splats through the camera of a .blend, frame by frame: color,
+depth and object mattes in FOLDER/splats.0001.exr and so on, with the edits of
+objects.json and objects where the .blend has them. --composite also renders the
+.blend with Blender and joins both by depth. Film frames that are there already are
+skipped, so that several machines can share FOLDER, each with its own --frames.
+"""
+
+
 class UsageError(Exception):
     """The command line makes no sense; the message is one sentence."""
 
@@ -104,6 +113,7 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--apart", action="store_true", help=(
         "pull the objects' meshes apart before, with a light, a ground and a camera for it; the file stays as it is"))
     _picture(render)
+    _film(command("film", "draw film frames through the camera of a .blend", _FILM))
     run = command("run", "everything: from a capture to a .blend and a picture", (
         "Train, make meshes, measure, make DIR/objectgs.blend and render it: DIR/render.png shows the splats,\n"
         "DIR/pulled-apart.png the meshes."), takes="CAPTURE",
@@ -117,6 +127,23 @@ def _parser() -> argparse.ArgumentParser:
     _meshes(batch)
     _picture(batch)
     return top
+
+
+def _film(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("blend", type=Path, metavar="BLEND", help="file with the reconstruction and a camera")
+    sub.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="where the frames go")
+    sub.add_argument("--frames", metavar="LIST", help="as 1-24 or 1,5,9-12 (the file's own range)")
+    sub.add_argument("--subframes", type=_count, metavar="N", help=(
+        "moments that make a frame while the shutter is open (9 where the file has motion blur, else 1)"))
+    sub.add_argument("--png", action="store_true", help="each frame also as PNG with alpha")
+    sub.add_argument("--composite", choices=("png", "exr"), help=(
+        "also render the file with Blender, joined with the splats by depth, as FOLDER/composite.0001.png or .exr"))
+    sub.add_argument("--save", type=Path, metavar="FILE", help="save the .blend with its compositor set up as FILE")
+    sub.add_argument("--dir", type=Path, metavar="DIR", help="the reconstruction folder, if it was moved")
+    sub.add_argument("--camera", metavar="NAME", help="a camera of the file (the scene's own)")
+    sub.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where splats are drawn (auto)")
+    _backend_python(sub)
+    _picture(sub)
 
 
 def _demo(sub: argparse.ArgumentParser) -> None:

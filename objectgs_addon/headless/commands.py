@@ -22,7 +22,7 @@ APART_PICTURE = "pulled-apart.png"
 SAMPLES = 16
 """Rays a pixel in the .blend that is built, unless --samples says otherwise."""
 
-_TITLES = {"import": "Import", "vote": "Vote", "train": "Train", "mesh": "Mesh", "evaluate": "Evaluate",
+_TITLES = {"import": "Import", "vote": "Vote", "train": "Train", "mesh": "Mesh", "evaluate": "Evaluate", "film": "Film",
            "report": "Report"}
 
 
@@ -55,14 +55,14 @@ def backend(options) -> None:
     """One of the backend's own commands on a capture: import, vote or train."""
     find_backend(options.backend_python)
     folder = whole(options.out)
-    _run_backend(options.command, folder, whole(Path(options.source)), "--out", folder, *options.rest)
+    run_backend(options.command, folder, whole(Path(options.source)), "--out", folder, *options.rest)
 
 
 def mesh(options) -> None:
     """The backend's own command on a reconstruction: meshes of its objects."""
     find_backend(options.backend_python)
     folder = whole(Path(options.source))
-    _run_backend("mesh", folder, folder, *options.rest)
+    run_backend("mesh", folder, folder, *options.rest)
 
 
 def build(options) -> None:
@@ -95,14 +95,14 @@ def run(options) -> None:
 
 def reconstruct(capture: Path, folder: Path, options) -> None:
     """Make splats, meshes, a report, a .blend and pictures of `capture` in `folder`, from what is there already."""
-    _run_backend("train", folder, capture, "--out", folder, *options.rest)
+    run_backend("train", folder, capture, "--out", folder, *options.rest)
     if not options.no_meshes:
         try:
-            _run_backend("mesh", folder, folder)
+            run_backend("mesh", folder, folder)
         except InputError as error:  # Splats that no surface can be found in are a result still.
             say(f"Warning: {error}")
-    _run_backend("evaluate", folder, folder)
-    _run_backend("report", folder, folder)
+    run_backend("evaluate", folder, folder)
+    run_backend("report", folder, folder)
     has_meshes = build_blend(folder, folder / BLEND)
     render_picture(folder / BLEND, folder / PICTURE, None, options.engine, options.samples, options.size,
                    _showing("splats"))
@@ -171,7 +171,7 @@ def build_blend(folder: Path, blend: Path) -> bool:
     return has_meshes
 
 
-def _run_backend(command: str, folder: Path, *arguments: object) -> None:
+def run_backend(command: str, folder: Path, *arguments: object) -> None:
     """Run a command of the backend until it ends; raises what main() makes its exit code of."""
     job = locations.backend_job(_TITLES[command], command, folder, command, *map(str, arguments))
     code = run_blocking(job, echo=lambda line: None if job.error else say(line))

@@ -24,19 +24,24 @@ def render_picture(blend: Path, out: Path, camera: str | None = None, engine: st
     """Open `blend` and render its scene into `out`; what is None stays as the file says.
 
     camera: name of a camera object. engine: CYCLES or EEVEE. samples: a pixel. size: (width, height) in pixels.
-    prepare: changes the opened scene when it has its size; engine and samples go on top.
-    `out` is the picture before or the new one, never half.  Raises `InputError`.
+    prepare: changes the opened scene when it has its size; engine and samples go on top. Raises `InputError`.
     """
     if out.suffix.lower() not in FORMATS:
         raise InputError(f"{out.name} has no known picture format; name it .png, .jpg or .exr.")
-    scene = _open(blend)
+    scene = open_blend(blend)
     if size is not None:
         scene.render.resolution_x, scene.render.resolution_y = size
         scene.render.resolution_percentage = 100
     if prepare is not None:
         prepare(scene)
-    _choose_camera(scene, camera, blend)
-    _choose_engine(scene, engine, samples)
+    choose_camera(scene, camera, blend)
+    choose_engine(scene, engine, samples)
+    write_picture(scene, out)
+
+
+def write_picture(scene, out: Path) -> None:
+    """Render the scene as it is into `out`, which is the picture before or the new one, never half. Raises
+    `InputError`."""
     out.parent.mkdir(parents=True, exist_ok=True)
     part = out.with_name(f"{out.stem}.part{out.suffix}")
     try:
@@ -48,7 +53,8 @@ def render_picture(blend: Path, out: Path, camera: str | None = None, engine: st
         part.unlink(missing_ok=True)
 
 
-def _open(blend: Path) -> bpy.types.Scene:
+def open_blend(blend: Path) -> bpy.types.Scene:
+    """Open a .blend without running its scripts; returns its scene. Raises `InputError`."""
     try:
         with quiet():
             bpy.ops.wm.open_mainfile(filepath=str(blend), load_ui=False, use_scripts=False)
@@ -57,7 +63,8 @@ def _open(blend: Path) -> bpy.types.Scene:
     return bpy.context.scene
 
 
-def _choose_camera(scene, name: str | None, blend: Path) -> None:
+def choose_camera(scene, name: str | None, blend: Path) -> None:
+    """Make the camera object of a name the scene's; None: it must have one. Raises `InputError`."""
     cameras = [entry for entry in scene.objects if entry.type == "CAMERA"]
     if name is not None:
         scene.camera = next((entry for entry in cameras if entry.name == name), None)
@@ -69,7 +76,8 @@ def _choose_camera(scene, name: str | None, blend: Path) -> None:
         raise InputError(f"{blend} has no active camera; name one with --camera.")
 
 
-def _choose_engine(scene, engine: str | None, samples: int | None) -> None:
+def choose_engine(scene, engine: str | None, samples: int | None) -> None:
+    """Set the renderer (CYCLES or EEVEE) and its samples a pixel, as far as they are given."""
     if engine == "CYCLES":
         scene.render.engine = "CYCLES"
     elif engine == "EEVEE":

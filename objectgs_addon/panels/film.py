@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Film: frames of the splats through the scene's camera, and the compositor that joins them with renders."""
+
+import bpy
+
+from .. import running, scene
+from ..job_display import write
+from .tab import WithReconstruction, draw_job_of
+
+
+class FilmPanel(WithReconstruction, bpy.types.Panel):
+    bl_idname = "OBJECTGS_PT_film"
+    bl_label = "Film"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context):
+        layout = self.layout
+        owner = context.scene
+        root, settings, render = owner.objectgs.active, owner.objectgs_film, owner.render
+        job = running.job_of(root)
+        column = layout.column()
+        column.enabled = not running.busy(scene.folder_of(root))
+        column.operator("objectgs.film_frames", icon="RENDER_ANIMATION")
+        column.use_property_split = True
+        column.prop(settings, "folder")
+        frames = column.column(align=True)
+        frames.prop(owner, "frame_start", text="Frames")
+        frames.prop(owner, "frame_end", text="End")
+        column.prop(render, "use_motion_blur", text="Motion Blur")
+        blur = column.column(align=True)
+        blur.active = render.use_motion_blur
+        blur.prop(settings, "subframes")
+        blur.prop(render, "motion_blur_shutter", text="Shutter")
+        blur.prop(render, "motion_blur_position", text="Position")
+        column.prop(settings, "png")
+        if job is not None and job.kind == "film":
+            draw_job_of(layout, job)
+        layout.operator("objectgs.set_up_compositor", icon="NODE_COMPOSITING")
+        layout.prop(root, "hide_render", text="Leave Splats to Film Frames", icon="NONE")
+        if root.hide_render:
+            write(layout, "Blender's renderer leaves this reconstruction out; film frames show it.", "INFO")
