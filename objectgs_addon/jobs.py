@@ -49,9 +49,9 @@ FINISHED = (State.DONE, State.STOPPED, State.FAILED)
 class Job:
     """One command of the backend, or another program that speaks as it does.
 
-    title: what the user reads. kind: import, vote, train, evaluate, film, demo, setup, doctor. folder: the
-    reconstruction's, or None. environment: extra variables. if_silent: the sentence where the program ends without any event, which
-    means that it is not what it was taken for.
+    title: what the user reads. kind: import, vote, train, mesh, evaluate, film, demo, setup, doctor. folder: the
+    reconstruction's, or None. environment: extra variables. if_silent: the sentence where the program ends without any
+    event, which means that it is not what it was taken for.
 
     What comes after is live: progress 0..1, seconds_left where known or estimated, message (what it does now),
     warnings and error (sentences), the figures of the training, preview (the newest picture), curve (quality events:

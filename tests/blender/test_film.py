@@ -1,0 +1,499 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Film from Blender: cameras and objects as the shot has them, against Blender's own projection; the compositor, and
+how Blender reads the frames."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+
+import bpy
+import numpy as np
+import pytest
+from bpy_extras.object_utils import world_to_camera_view
+from mathutils import Euler, Matrix
+from objectgs.backend.film.shot import read_shot
+from objectgs.backend.objects import edit_objects
+from objectgs.backend.ply import write_vertices
+from objectgs.backend.protocol import InputError
+from objectgs.objectgs_addon import film
+from objectgs.objectgs_addon import scene as blender_scene
+from objectgs.objectgs_addon.scene import kinds
+from objectgs.objectgs_addon.scene.object_collection import centre_of
+
+import headless
+
+from .building import OBJECTS, look_at, splat_table, write_cameras, write_folder, write_objects, write_points
+
+ORIGIN = np.array([100.0, -200.0, 30.0])
+
+
+@pytest.fixture
+def root(fresh, tmp_path):
+    """A reconstruction far from the origin, on its side, and a camera of the scene's own that sees some of it."""
+    place = write_folder(tmp_path / "table top")
+    upright = np.eye(4)
+    upright[:3, :3] = np.array(Matrix.Rotation(0.7, 3, "X")) @ np.array(Matrix.Rotation(0.3, 3, "Z"))
+    upright[:3, 3] = 1.0, 2.0, 3.0
+    write_cameras(place, [look_at(ORIGIN + np.array([3, 0, 1]), ORIGIN)], origin=ORIGIN, upright=upright)
+    splats = splat_table(np.resize([0, *OBJECTS], 40))
+    for axis, name in enumerate("xyz"):
+        splats[name] += ORIGIN[axis]
+    write_vertices(place / "splats.ply", splats)
+    scene = bpy.context.scene
+    root = blender_scene.show_capture(scene, place)
+    blender_scene.show_result(root, place, scene)
+    parent = kinds.parent_of(root)
+    parent.matrix_world = Matrix.Scale(2.5, 4) @ parent.matrix_world
+    camera = bpy.data.objects.new("Film", bpy.data.cameras.new("Film"))
+    camera.location, camera.rotation_euler = (2.0, -9.0, 8.0), (0.9, 0.1, 0.2)
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    scene.render.resolution_x, scene.render.resolution_y = 640, 360
+    bpy.context.view_layer.update()
+    return root
+
+
+def shoot(root, frames=(1,), samples=1):
+    return film.shot_of(bpy.context.scene, bpy.context.view_layer, root, list(frames), samples)
+
+
+def pivot_of(root, object_id):
+    return kinds.part_of(blender_scene.object_collections(root)[object_id], "object_parent")
+
+
+def splats_of(root, object_id):
+    return kinds.part_of(blender_scene.object_collections(root)[object_id], "splats")
+
+
+def captured(splats) -> np.ndarray:
+    """(n, 3) where the object's splats were captured."""
+    vertices = np.array([vertex.co for vertex in splats.data.vertices], np.float64)
+    return vertices + centre_of(splats.parent) + ORIGIN
+
+
+def seen(shot, sample, points) -> np.ndarray:
+    """(n, 3): pixels and depth of points of the capture."""
+    at = points @ sample.viewmat[:3, :3].T + sample.viewmat[:3, 3]
+    pixels = at @ sample.K.T
+    return np.column_stack([pixels[:, :2] / pixels[:, 2:], shot.depth_scale * at[:, 2]])
+
+
+def seen_by_blender(splats) -> np.ndarray:
+    """The same of an object's splats where they are now, by Blender."""
+    scene = bpy.context.scene
+    percent = scene.render.resolution_percentage
+    size = scene.render.resolution_x * percent // 100, scene.render.resolution_y * percent // 100
+    found = [world_to_camera_view(scene, scene.camera, splats.matrix_world @ vertex.co)
+             for vertex in splats.data.vertices]
+    return np.array([(x * size[0], (1 - y) * size[1], z) for x, y, z in found])
+
+
+def assert_placed(root, shot, sample, object_id, splats, place=0) -> None:
+    """A map of an object brings its splats to where Blender sees them."""
+    at = sample.objects[object_id].maps[place]
+    points = captured(splats_of(root, object_id)) @ at[:3, :3].T + at[:3, 3]
+    ahead = seen_by_blender(splats)
+    close = ahead[:, 2] > 0.5
+    assert close.sum() > 5
+    np.testing.assert_allclose(seen(shot, sample, points)[close], ahead[close], rtol=2e-3, atol=0.02)
+
+
+@pytest.mark.parametrize("fit", ["AUTO", "HORIZONTAL", "VERTICAL"])
+@pytest.mark.parametrize(("size", "aspect"), [
+    ((640, 360), (1.0, 1.0)), ((300, 500), (1.0, 2.0)), ((330, 220), (1.5, 1.0))])
+def test_lenses_are_blenders_own(root, fit, size, aspect):
+    scene = bpy.context.scene
+    scene.render.resolution_x, scene.render.resolution_y = size
+    scene.render.resolution_percentage = 60
+    scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = aspect
+    lens = scene.camera.data
+    lens.sensor_fit, lens.sensor_width, lens.sensor_height, lens.lens = fit, 30.0, 25.0, 28.0
+    lens.shift_x, lens.shift_y = 0.11, -0.07
+    lens.clip_start, lens.clip_end = 0.5, 75.0
+    scene.camera.scale = 2.0, 3.0, 0.5
+    bpy.context.view_layer.update()
+    shot = shoot(root)
+    sample = shot.frames[0].samples[0]
+    assert (shot.width, shot.height) == (size[0] * 60 // 100, size[1] * 60 // 100)
+    assert shot.pixel_aspect == pytest.approx(aspect[0] / aspect[1]) and shot.depth_scale == pytest.approx(2.5)
+    assert sample.clip == pytest.approx((0.2, 30.0))
+    for object_id in OBJECTS:
+        assert np.array_equal(sample.objects[object_id].maps, np.eye(4)[None]), "nothing has been moved"
+        assert_placed(root, shot, sample, object_id, splats_of(root, object_id))
+
+
+def test_cameras_of_the_capture_come_back_as_they_were(root):
+    scene = bpy.context.scene
+    camera = next(thing for thing in root.all_objects if kinds.kind_of(thing) == "camera")
+    blender_scene.use_camera(scene, camera)
+    bpy.context.view_layer.update()
+    shot = shoot(root)
+    sample = shot.frames[0].samples[0]
+    np.testing.assert_allclose(sample.viewmat, look_at(ORIGIN + np.array([3, 0, 1]), ORIGIN), atol=2e-4)
+    np.testing.assert_allclose(sample.K, [[500, 0, 310], [0, 500, 250.5], [0, 0, 1]], atol=1e-3)
+
+
+def test_moving_things_move_in_every_frame(root):
+    """Camera, lens, an object and the whole reconstruction, each with keyframes; the scene is where it was after."""
+    scene = bpy.context.scene
+    pivot, parent = pivot_of(root, 1), kinds.parent_of(root)
+    for frame, amount in ((1, 0.0), (11, 1.0)):
+        scene.camera.location.x = 2.0 + amount
+        scene.camera.keyframe_insert("location", frame=frame)
+        scene.camera.data.lens = 40 + 30 * amount
+        scene.camera.data.keyframe_insert("lens", frame=frame)
+        pivot.rotation_euler = (amount, 0.5 * amount, 0)
+        pivot.scale = (1 + amount, 1, 1 - 0.4 * amount)
+        pivot.keyframe_insert("rotation_euler", frame=frame)
+        pivot.keyframe_insert("scale", frame=frame)
+        parent.scale = [2.5 * (1 + 0.2 * amount)] * 3
+        parent.keyframe_insert("scale", frame=frame)
+    scene.frame_set(3)
+    shot = shoot(root, (1, 6, 11))
+    assert (scene.frame_current, scene.frame_subframe) == (3, 0.0)
+    assert [frame.number for frame in shot.frames] == [1, 6, 11]
+    for frame in shot.frames:
+        scene.frame_set(frame.number)
+        for object_id in OBJECTS:
+            assert_placed(root, shot, frame.samples[0], object_id, splats_of(root, object_id))
+    lenses = [frame.samples[0].K[0, 0] for frame in shot.frames]
+    assert lenses[0] < lenses[1] < lenses[2]
+
+
+def test_what_viewports_hide_moves_nevertheless(root):
+    scene = bpy.context.scene
+    pivot = pivot_of(root, 1)
+    before = splats_of(root, 1).matrix_world.copy()
+    for frame, place in ((1, 0.0), (5, 2.0)):
+        pivot.location.x = place
+        pivot.keyframe_insert("location", frame=frame)
+    scene.frame_set(1)
+    layer = bpy.context.view_layer.layer_collection.children[root.name].children[
+        blender_scene.object_collections(root)[1].name]
+    layer.hide_viewport = True
+    shot = shoot(root, (1, 5))
+    assert layer.hide_viewport and before
+    first, last = (frame.samples[0].objects[1].maps[0] for frame in shot.frames)
+    assert np.linalg.norm(last[:3, 3] - first[:3, 3]) == pytest.approx(2.0, rel=1e-3)
+
+
+def test_what_is_not_rendered_is_not_in_the_shot(root):
+    scene, layer = bpy.context.scene, bpy.context.view_layer.layer_collection.children[root.name]
+    collections = blender_scene.object_collections(root)
+    ids = set(OBJECTS) | {0}
+
+    def shown():
+        return set(shoot(root).frames[0].samples[0].objects)
+
+    assert shown() == ids and shoot(root).only_named
+    root.hide_render = True
+    assert shown() == ids, "the whole reconstruction is hidden where film frames take its place"
+    collections[1].hide_render = True
+    assert shown() == ids - {1}
+    layer.children[collections[2].name].exclude = True
+    assert shown() == ids - {1, 2}
+    collections[1].hide_render = False
+    splats_of(root, 1).hide_render = True
+    assert shown() == ids - {1, 2}
+    pivot_of(root, 0).hide_render = True
+    for frame, hidden in ((1, True), (3, False)):
+        pivot_of(root, 0).hide_render = hidden
+        pivot_of(root, 0).keyframe_insert("hide_render", frame=frame)
+    scene.frame_set(1)
+    objects = [set(frame.samples[0].objects) for frame in shoot(root, (1, 2, 3)).frames]
+    assert objects == [ids - {0, 1, 2}, ids - {0, 1, 2}, ids - {1, 2}]
+
+
+def test_copies_are_drawn_too(root):
+    """A duplicated object, and one more by an empty that shows its collection elsewhere."""
+    scene = bpy.context.scene
+    collection = blender_scene.object_collections(root)[2]
+    pivot, splats = pivot_of(root, 2), splats_of(root, 2)
+    other, copy = pivot.copy(), splats.copy()
+    copy.parent = other
+    other.location.x += 1.5
+    for thing in (other, copy):
+        collection.objects.link(thing)
+    empty = bpy.data.objects.new("elsewhere", None)
+    empty.instance_type, empty.instance_collection = "COLLECTION", blender_scene.object_collections(root)[1]
+    empty.location, empty.rotation_euler = (0.5, 0.25, 1.0), (0, 0, 0.4)
+    scene.collection.objects.link(empty)
+    bpy.context.view_layer.update()
+    shot = shoot(root)
+    sample = shot.frames[0].samples[0]
+    assert len(sample.objects[2].maps) == 2 and len(sample.objects[1].maps) == 2
+    order = [np.array_equal(at, np.eye(4)) for at in sample.objects[2].maps]
+    assert_placed(root, shot, sample, 2, copy, order.index(False))
+    instanced = sample.objects[1].maps[1]
+    points = captured(splats_of(root, 1)) @ instanced[:3, :3].T + instanced[:3, 3]
+    world = empty.matrix_world @ splats_of(root, 1).matrix_world
+    expected = np.array([world_to_camera_view(scene, scene.camera, world @ vertex.co).z
+                         for vertex in splats_of(root, 1).data.vertices])
+    np.testing.assert_allclose(seen(shot, sample, points)[:, 2], expected, rtol=1e-3, atol=1e-3)
+
+
+def test_shutter(root):
+    render = bpy.context.scene.render
+    render.motion_blur_shutter = 0.5
+    for position, opens in (("START", 5.0), ("CENTER", 4.75), ("END", 4.5)):
+        render.motion_blur_position = position
+        (frame,) = shoot(root, (5,), samples=5).frames
+        assert frame.shutter == pytest.approx((opens, opens + 0.5))
+        assert [sample.time for sample in frame.samples] == pytest.approx([opens + 0.05 + 0.1 * i for i in range(5)])
+        assert frame.samples[frame.middle].time == pytest.approx(opens + 0.25)
+    assert shoot(root, (5,)).frames[0].samples[0].time == 5.0
+
+
+def test_what_cannot_be_shot(root):
+    scene = bpy.context.scene
+    for kind, word in (("ORTHO", "orthographic"), ("PANO", "panoramic")):
+        scene.camera.data.type = kind
+        with pytest.raises(InputError, match=word):
+            shoot(root)
+    scene.camera = None
+    with pytest.raises(InputError, match="no camera"):
+        shoot(root)
+    with pytest.raises(InputError, match="below 0"):
+        shoot(root, (-1, 0))
+    bpy.data.objects.remove(kinds.parent_of(root))
+    with pytest.raises(InputError, match="lost the empty"):
+        shoot(root)
+
+
+# --- frames in Blender ------------------------------------------------------------------------------------------------
+
+RED, GREEN, BLUE = (0.8, 0.2, 0.2), (0.1, 0.7, 0.2), (0.1, 0.2, 0.9)
+SIZE = 80
+
+
+def wall_splats() -> np.ndarray:
+    """Two discs, each of several in one place, which hide what is behind them: "mug" to the left, red, oblique, and
+    "can" to the right, green."""
+    table = splat_table([1, 2], degree=0)
+    rotation = Euler((0.0, math.radians(35), 0.0)).to_quaternion()
+    for name, values in {
+        "x": (-3.0, 3.0), "y": (0, 0), "z": (0, 0), "opacity": (8, 8), "scale_0": (0.2, 0.2), "scale_1": (0.2, 0.2),
+        "scale_2": (-9, -9), "rot_0": (rotation.w, 1), "rot_1": (rotation.x, 0), "rot_2": (rotation.y, 0),
+        "rot_3": (rotation.z, 0), **{f"f_dc_{i}": (np.array([RED[i], GREEN[i]]) - 0.5) / 0.28209479 for i in range(3)},
+    }.items():
+        table[name] = values
+    return np.repeat(table, 12)
+
+
+@pytest.fixture(scope="module")
+def shot_blend(tmp_path_factory):
+    """A .blend that looks down at two discs, with a ball before the right one, one behind the left one, and a plane
+    exactly where the left disc is, which is not rendered."""
+    place = tmp_path_factory.mktemp("film") / "wall"
+    place.mkdir()
+    write_cameras(place, [look_at((0, -1, 10.0))])
+    write_points(place, np.random.default_rng(0).normal(size=(9, 3)), np.ones(9, int))
+    write_objects(place, {1: "mug", 2: "can"})
+    write_vertices(place / "splats.ply", wall_splats())
+    (place / "objectgs.json").write_text(json.dumps({"training": {"settings": {"primitive": "2d"}}}))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    root = blender_scene.show_capture(scene, place)
+    blender_scene.show_result(root, place, scene)
+    blender_scene.prepare_render(scene)
+    camera = bpy.data.objects.new("Film", bpy.data.cameras.new("Film"))
+    camera.location = 0, 0, 10
+    camera.data.lens = 40
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    material = bpy.data.materials.new("blue")
+    if material.node_tree is None:
+        material.use_nodes = True
+    tree = material.node_tree
+    tree.nodes.clear()
+    emission, output = tree.nodes.new("ShaderNodeEmission"), tree.nodes.new("ShaderNodeOutputMaterial")
+    emission.inputs["Color"].default_value = (*BLUE, 1)
+    tree.links.new(emission.outputs[0], output.inputs["Surface"])
+    for name, location in (("before", (2.5, 0, 3)), ("behind", (-2.5, 0, -3))):
+        bpy.ops.mesh.primitive_uv_sphere_add(radius=0.8, location=location)
+        bpy.context.object.name = name
+        bpy.context.object.data.materials.append(material)
+    bpy.ops.mesh.primitive_plane_add(size=3, location=(-3, 0, 0), rotation=(0, math.radians(35), 0))
+    bpy.context.object.name, bpy.context.object.hide_render = "plane", True
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples = 4
+    scene.render.resolution_x = scene.render.resolution_y = SIZE
+    scene.frame_start = scene.frame_end = 7
+    path = place.parent / "shot.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    return path
+
+
+@pytest.fixture(scope="module")
+def filmed(shot_blend, backend_python):
+    """The folder that headless.py has left: a film frame, a composite and a .blend with its compositor set up."""
+    out = shot_blend.parent / "film"
+    ran = subprocess.run(
+        [sys.executable, headless.__file__, "film", shot_blend, "--out", out, "--composite", "png", "--png", "--save",
+         out / "joined.blend"], capture_output=True, text=True, timeout=300,
+        env={**os.environ, "OBJECTGS_PYTHON": backend_python})
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    return out
+
+
+def pixels_of(path) -> np.ndarray:
+    """(H, W, 4), as stored; the first row on top."""
+    image = bpy.data.images.load(str(path))
+    try:
+        image.colorspace_settings.name = "Non-Color"
+        image.alpha_mode = "CHANNEL_PACKED"
+        return np.array(image.pixels[:]).reshape(image.size[1], image.size[0], -1)[::-1]
+    finally:
+        bpy.data.images.remove(image)
+
+
+def planes_of(path, python) -> dict[str, np.ndarray]:
+    """The channels of an EXR, read by OpenEXR itself."""
+    script = ("import sys, numpy, OpenEXR\n"
+              "parts = OpenEXR.File(sys.argv[1], separate_channels=True).parts\n"
+              "numpy.savez(sys.argv[2], **{name: channel.pixels for part in parts for name, channel in\n"
+              "                            part.channels.items()})\n")
+    table = path.with_suffix(".npz")
+    subprocess.run([python, "-c", script, path, table], check=True)
+    return dict(np.load(table))
+
+
+def encoded(linear) -> np.ndarray:
+    linear = np.asarray(linear)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+LEFT_BALL, RIGHT_BALL, LEFT_WALL, RIGHT_WALL = (40, 23), (40, 71), (30, 12), (30, 60)
+"""(row, column) of pixels in the middle of what they are called after."""
+
+
+def test_the_composite_is_joined_by_depth(filmed):
+    picture = pixels_of(filmed / "composite.0007.png")
+    splats = pixels_of(filmed / "splats.0007.png")
+    assert picture.shape[:2] == (SIZE, SIZE)
+    for place, colour in ((LEFT_BALL, RED), (LEFT_WALL, RED), (RIGHT_WALL, GREEN), (RIGHT_BALL, encoded(BLUE))):
+        np.testing.assert_allclose(picture[place][:3], colour, atol=0.015, err_msg=str(place))
+        if place != RIGHT_BALL:
+            np.testing.assert_allclose(picture[place], splats[place], atol=0.006)
+
+
+def test_depth_is_blenders_own(shot_blend, filmed, backend_python, tmp_path):
+    """The depth of a disc against Blender's own of a plane in its place, and where there is nothing."""
+    bpy.ops.wm.open_mainfile(filepath=str(shot_blend))
+    scene = bpy.context.scene
+    for thing in scene.objects:
+        thing.hide_render = thing.name != "plane"
+    bpy.context.view_layer.use_pass_z = True
+    settings = scene.render.image_settings
+    if hasattr(settings, "media_type"):
+        settings.media_type = "MULTI_LAYER_IMAGE"
+    settings.file_format, settings.color_depth = "OPEN_EXR_MULTILAYER", "32"
+    scene.render.filepath, scene.cycles.samples = str(tmp_path / "plane.exr"), 1
+    scene.render.film_transparent = True
+    bpy.ops.render.render(write_still=True)
+    planes = planes_of(tmp_path / "plane.exr", backend_python)
+    (of_plane,) = [values for name, values in planes.items() if name.endswith("Depth.Z")]
+    of_disc = planes_of(filmed / "splats.0007.exr", backend_python)["Z"]
+    on_it = of_plane < 1e6
+    inner = on_it.copy()
+    inner[1:-1, 1:-1] &= on_it[:-2, 1:-1] & on_it[2:, 1:-1] & on_it[1:-1, :-2] & on_it[1:-1, 2:]
+    assert inner.sum() > 200
+    # Blender's rays go through somewhere in the pixel, ours through its middle: a pixel is 0.1 deep here.
+    assert np.abs(of_disc - of_plane)[inner].max() < 0.12
+    assert abs((of_disc - of_plane)[inner].mean()) < 0.02
+    assert np.ptp(of_plane[inner]) > 1.0
+    assert of_plane.max() == of_disc.max() == np.float32(1e10)
+
+
+def test_blender_reads_the_mattes(filmed, backend_python):
+    """Blender's Cryptomatte node finds the objects by name, by a hash of its own, and cuts them out."""
+    bpy.ops.wm.open_mainfile(filepath=str(filmed / "joined.blend"))
+    scene = bpy.context.scene
+    tree = scene.compositing_node_group if bpy.app.version >= (5, 0) else scene.node_tree
+    node = next(node for node in tree.nodes if node.type == "CRYPTOMATTE_V2")
+    planes = planes_of(filmed / "splats.0007.exr", backend_python)
+    for name, object_id, place in (("mug", 1, LEFT_WALL), ("can", 2, RIGHT_WALL)):
+        node.matte_id = name
+        assert [entry.name for entry in node.entries] == [name]
+        # Kept as it was computed by Blender, from the name.
+        assert node.entries[0].encoded_hash == planes["CryptoObject00.R"][place]
+        assert planes["IndexOB.X"][place] == object_id
+    node.matte_id = "can"
+    output = next(node for node in tree.nodes if node.type in ("GROUP_OUTPUT", "COMPOSITE"))
+    tree.links.new(node.outputs["Matte"], output.inputs[0])
+    scene.render.filepath, scene.render.use_file_extension = str(filmed / "matte.png"), False
+    scene.frame_set(7)
+    bpy.ops.render.render(write_still=True)
+    matte = pixels_of(filmed / "matte.png")[..., 0]
+    assert matte[RIGHT_WALL] > 0.98 and matte[LEFT_WALL] < 0.02
+
+
+def test_the_compositor_is_set_up_once(shot_blend, filmed):
+    bpy.ops.wm.open_mainfile(filepath=str(shot_blend))
+    scene, layer = bpy.context.scene, bpy.context.view_layer
+    root = next(child for child in scene.collection.children_recursive if kinds.kind_of(child) == "reconstruction")
+    with pytest.raises(InputError, match="no film frames"):
+        film.set_up_compositor(scene, layer, root, filmed.parent)
+    assert not film.has_frames(scene) or bpy.app.version < (5, 0)
+    film.set_up_compositor(scene, layer, root, filmed)
+    assert film.has_frames(scene) and root.hide_render and scene.render.film_transparent and layer.use_pass_z
+    tree = scene.compositing_node_group if bpy.app.version >= (5, 0) else scene.node_tree
+    nodes = [node.name for node in tree.nodes]
+    images = len(bpy.data.images)
+    film.set_up_compositor(scene, layer, root, filmed)
+    film.show_frames(scene, filmed)
+    assert [node.name for node in tree.nodes] == nodes and len(bpy.data.images) == images
+    node = next(node for node in tree.nodes if node.type == "IMAGE")
+    assert (node.frame_start, node.frame_offset, node.frame_duration) == (7, 6, 1)
+    assert node.image.source == "SEQUENCE" and not [link for link in tree.links if not link.is_valid]
+
+
+def test_what_led_to_the_output_is_taken_for_the_rendering(shot_blend, filmed):
+    bpy.ops.wm.open_mainfile(filepath=str(shot_blend))
+    scene, layer = bpy.context.scene, bpy.context.view_layer
+    root = next(child for child in scene.collection.children_recursive if kinds.kind_of(child) == "reconstruction")
+    if bpy.app.version >= (5, 0):
+        tree = scene.compositing_node_group = bpy.data.node_groups.new("mine", "CompositorNodeTree")
+        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+        output = tree.nodes.new("NodeGroupOutput")
+    else:
+        scene.use_nodes = True
+        tree = scene.node_tree
+        tree.nodes.clear()
+        output = tree.nodes.new("CompositorNodeComposite")
+    layers, mine = tree.nodes.new("CompositorNodeRLayers"), tree.nodes.new("CompositorNodeBlur")
+    tree.links.new(layers.outputs["Image"], mine.inputs[0])
+    tree.links.new(mine.outputs[0], output.inputs[0])
+    film.set_up_compositor(scene, layer, root, filmed)
+    assert [link.to_node.type for link in mine.outputs[0].links] == ["ALPHAOVER"]
+    assert sum(node.type == "R_LAYERS" for node in tree.nodes) == 1
+
+
+def test_edits_reach_the_frames_and_refusals_are_one_sentence(shot_blend, backend_python):
+    out = shot_blend.parent / "edited"
+
+    def run(*words):
+        return subprocess.run([sys.executable, headless.__file__, "film", *map(str, words)], capture_output=True,
+                              text=True, timeout=300, env={**os.environ, "OBJECTGS_PYTHON": backend_python})
+
+    objects = shot_blend.parent / "wall" / "objects.json"
+    edit_objects(objects, {1: {"removed": True}})
+    try:
+        ran = run(shot_blend, "--out", out, "--frames", "3,5-6", "--png", "--size", "40x20")
+    finally:
+        edit_objects(objects, {1: {"removed": None}})
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert len(read_shot(out / "shot.0003-0006.json").frames) == 3
+    assert sorted(path.name for path in out.glob("*.exr")) == [f"splats.000{i}.exr" for i in (3, 5, 6)]
+    picture = pixels_of(out / "splats.0003.png")
+    assert picture.shape[:2] == (20, 40) and picture[10, 4, 3] < 0.01 and picture[10, 33, 3] > 0.98
+    for words, said in (
+        ((shot_blend, "--out", out, "--frames", "x"), "--frames"),
+        ((shot_blend, "--out", out, "--dir", out), "--dir"),
+        ((shot_blend, "--out", out, "--camera", "none"), "no camera"),
+        ((out / "nothing.blend", "--out", out), "cannot be opened"),
+    ):
+        ran = run(*words)
+        assert ran.returncode == 2 and said in ran.stderr and ran.stderr.count("\n") == 1, ran.stdout + ran.stderr
