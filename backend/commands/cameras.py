@@ -35,6 +35,14 @@ def write_cameras(folder: Reconstruction, capture: Capture) -> None:
     write_json(folder.cameras, plain(value))
 
 
+def write_no_cameras(folder: Reconstruction, centres: np.ndarray) -> None:
+    """Write cameras.json of splats (N, 3) whose photos nobody has: up is where it is for COLMAP's first camera, mostly,
+    or square to the plane that most of them lie in."""
+    stood = stand_up(np.eye(4)[None], centres)
+    upright = {"rotation": stood.rotation, "translation": stood.translation}
+    write_json(folder.cameras, plain({"capture": None, "origin": stood.origin, "upright": upright, "cameras": []}))
+
+
 def read_upright(folder: Reconstruction) -> Upright:
     """How cameras.json stands the capture up; where there is none, as it is. InputError where it cannot be used."""
     if not folder.cameras.exists():

@@ -15,7 +15,6 @@ from ..export import read_splats
 from ..model.splats import Splats
 from ..objects import Matrix, SceneObject, edit_objects, find_object, merged, read_objects
 from ..protocol import InputError, Reconstruction
-from ..recolour import Recolour
 from ..stopping import StoppingReporter
 from .cameras import read_upright
 
@@ -26,6 +25,8 @@ _NONE: dict[str, Any] = dict.fromkeys(("removed", "floaters", "recolour", "trans
 def edit(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Store the edits that are asked for, then say what is edited."""
     folder = Reconstruction(options.folder)
+    if options.floaters and not options.remove:
+        raise InputError("--floaters goes with --remove, which says whose floaters are meant.")
     wanted = _Edits(folder)
     everything = [word for word in options.reset if word.casefold() == "all"]
     for entry in wanted.objects if everything else wanted.find(options.reset):
@@ -37,12 +38,12 @@ def edit(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     for word, recolour in options.recolor:
         (entry,) = wanted.find([word])
         wanted.change(entry, recolour=replace(recolour, middle=luma_of(wanted.splats_of(entry))).stored())
-    for word, placement in options.move:
+    for word, values in options.move:
         (entry,) = wanted.find([word])
-        wanted.change(entry, transform=wanted.place(entry, placement))
-    for word, placement in options.duplicate:
+        wanted.change(entry, transform=wanted.place(entry, Placement(**values)))
+    for word, values in options.duplicate:
         (entry,) = wanted.find([word])
-        wanted.change(entry, copies=[*wanted.copies(entry), wanted.place(entry, placement)])
+        wanted.change(entry, copies=[*wanted.copies(entry), wanted.place(entry, Placement(**values))])
     if wanted.changes:
         edit_objects(folder.objects, wanted.changes)
     for entry in read_objects(folder.objects):

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..capture import Upright
 from ..editing import apply_edits, transformed
-from ..export import read_splats, write_spz, write_splat, write_splats
+from ..export import read_splats, write_splat, write_splats, write_spz
 from ..model.splats import Splats
 from ..objects import SceneObject, find_object, read_objects
 from ..protocol import InputError, Reconstruction

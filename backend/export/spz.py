@@ -1,4 +1,4 @@
-"""Splats as SPZ, version 3: Niantic's compressed format, a tenth of the PLY's size, with Y up. It has no object IDs.
+"""Splats as SPZ, version 3: Niantic's compressed format, a fifth of the PLY's size, with Y up. It has no object IDs.
 
 A gzip stream of a header of 16 bytes and, splats together, positions, opacities, colours, scales, rotations and
 spherical harmonics, in whole numbers of 8 to 24 bits (https://github.com/nianticlabs/spz).
