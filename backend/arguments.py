@@ -96,15 +96,15 @@ same for programs. Run `evaluate` before, so that the report says how good it is
 _EDIT = """\
 Remove, recolour, move or copy objects: what `export`, `film` and Blender show. Edits
 are kept in objects.json, and what was trained stays as it is, so that each can be
-taken back. Without options, say what is edited. OBJECT is a name, a part of one, or
-an ID. `--list` says them all. Lengths are in the capture's units; x, y and z are
-Blender's axes, z up; turns (rx, ry, rz) are in degrees and about the object's middle.
-A new colour or place takes the one before it back.
+taken back; without options, say what is edited. OBJECT is a name, a part of one, or an
+ID. Lengths are in the capture's units; x, y and z are Blender's axes, z up; turns (rx,
+ry, rz) are in degrees and, as the scale, about the object's middle. A new colour or
+place takes the place of the one before it.
 """
 
 _EXPORT = """\
-Write the splats, with all edits, for other programs: as PLY (exact, with object_id), SPZ
-(a fifth of the size) or .splat (one colour each).
+Write the splats, with all edits, for other programs: as PLY (exact, with object_id),
+SPZ (a fifth of the size) or .splat (one colour each).
 """
 
 _IMPORT_SPLATS = """\
@@ -274,7 +274,7 @@ def parser() -> argparse.ArgumentParser:
     mesh.add_argument("--restart", action="store_true", help="make meshes anew that are there already")
     edit = command(
         "edit", "remove, recolour, move or copy objects", _EDIT,
-        "garden-splats --remove mug --recolor can:hue=0.3,saturation=0.5 --move box:x=0.1,rz=90",
+        "garden-splats --remove mug --recolor can:hue=0.3 --move box:x=0.1,rz=90",
     )  # fmt: skip
     edit.add_argument("folder", type=Path, metavar="DIR", help="reconstruction folder")
     edit.add_argument("--remove", nargs="+", default=[], metavar="OBJECT", help="make objects invisible")
@@ -296,7 +296,6 @@ def parser() -> argparse.ArgumentParser:
     edit.add_argument(
         "--reset", nargs="+", default=[], metavar="OBJECT", help="take all of these edits of objects back, or of `all`"
     )
-    edit.add_argument("--list", action="store_true", help="only say what is edited, as without options")
 
     export = command(
         "export", "write the splats for other programs", _EXPORT, "garden-splats --out mug.spz --objects mug"
