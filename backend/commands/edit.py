@@ -46,8 +46,9 @@ def edit(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         wanted.change(entry, copies=[*wanted.copies(entry), wanted.place(entry, Placement(**values))])
     if wanted.changes:
         edit_objects(folder.objects, wanted.changes)
-    for entry in read_objects(folder.objects):
-        reporter.status(f"{entry.id} {entry.name}: {', '.join(_described(entry)) or 'as captured'}")
+    # As one message, since who shows the state of a job shows only the latest.
+    lines = [f"{e.id} {e.name}: {', '.join(_described(e)) or 'as captured'}" for e in read_objects(folder.objects)]
+    reporter.status("\n".join(lines) or "There are no objects.")
     reporter.done(objects=str(folder.objects), edited=len(wanted.changes))
 
 
