@@ -97,9 +97,9 @@ _EDIT = """\
 Remove, recolour, move or copy objects: what `export`, `film` and Blender show. Edits
 are kept in objects.json, and what was trained stays as it is, so that each can be
 taken back; without options, say what is edited. OBJECT is a name, a part of one, or an
-ID. Lengths are in the capture's units; x, y and z are Blender's axes, z up; turns (rx,
-ry, rz) are in degrees and, as the scale, about the object's middle. A new colour or
-place takes the place of the one before it.
+ID; several KEY=VALUE are parted by commas. Lengths are in the capture's units; x, y and
+z are Blender's axes, z up; turns (rx, ry, rz) are in degrees and, as the scale, about
+the object's middle. A new colour or place takes the place of the one before it.
 """
 
 _EXPORT = """\
@@ -274,23 +274,23 @@ def parser() -> argparse.ArgumentParser:
     mesh.add_argument("--restart", action="store_true", help="make meshes anew that are there already")
     edit = command(
         "edit", "remove, recolour, move or copy objects", _EDIT,
-        "garden-splats --remove mug --recolor can:hue=0.3 --move box:x=0.1,rz=90",
+        "garden-splats --remove mug --recolor can:hue=0.3 --move box:x=0.1",
     )  # fmt: skip
     edit.add_argument("folder", type=Path, metavar="DIR", help="reconstruction folder")
     edit.add_argument("--remove", nargs="+", default=[], metavar="OBJECT", help="make objects invisible")
     edit.add_argument("--floaters", action="store_true", help="with --remove: what floats unlabelled inside them, too")
     edit.add_argument("--restore", nargs="+", default=[], metavar="OBJECT", help="make removed objects visible again")
     edit.add_argument(
-        "--recolor", nargs="+", default=[], type=_recolour, metavar="OBJECT:KEY=VALUE,...",
+        "--recolor", nargs="+", default=[], type=_recolour, metavar="OBJECT:KEY=VALUE",
         help="hue (-0.5 to 0.5: turns of the colour wheel), saturation (0: grey, 1: as it is), value and contrast (1: "
         "as it is), tint=#RRGGBB, replace=#RRGGBB and amount (0 to 1: how much of replace)",
     )  # fmt: skip
     edit.add_argument(
-        "--move", nargs="+", default=[], type=_placement, metavar="OBJECT:KEY=VALUE,...",
+        "--move", nargs="+", default=[], type=_placement, metavar="OBJECT:KEY=VALUE",
         help="from where it was captured: x, y, z, rx, ry, rz, scale",
     )  # fmt: skip
     edit.add_argument(
-        "--duplicate", nargs="+", default=[], type=_placement, metavar="OBJECT:KEY=VALUE,...",
+        "--duplicate", nargs="+", default=[], type=_placement, metavar="OBJECT:KEY=VALUE",
         help="one more, placed like that",
     )  # fmt: skip
     edit.add_argument(
