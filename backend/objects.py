@@ -98,6 +98,27 @@ def merged(objects: Sequence[SceneObject]) -> dict[int, int]:
     return found
 
 
+def find_object(objects: Sequence[SceneObject], word: str, path: Path) -> SceneObject:
+    """The object that a word names: its ID, its name in any case, or a part of one object's name alone. What is merged
+    into another stands for that one. InputError, which lists the objects of `path`, where none or several are meant."""
+    shown, into = {entry.id: entry for entry in objects}, merged(objects)
+    if word.isdecimal() and int(word) in shown:
+        return shown[into[int(word)]]
+    folded = word.casefold()
+    meant = [entry for entry in objects if entry.name.casefold() == folded][:1]
+    meant = meant or [entry for entry in objects if folded and folded in entry.name.casefold()]
+    found = sorted({into[entry.id] for entry in meant})
+    if len(found) == 1:
+        return shown[found[0]]
+    among = found or sorted({target for target in into.values() if not shown[target].left_out})
+    there = ", ".join(f"{i} {shown[i].name}" for i in among[:20]) or "none"
+    if len(among) > 20:
+        there += f" and {len(among) - 20} more"
+    if found:
+        raise InputError(f"{word} may be several objects of {path}: {there}; say which one.")
+    raise InputError(f"{path} has no object {word}; there are: {there}.")
+
+
 def _object(entry: Mapping[str, Any]) -> SceneObject:
     red, green, blue = (_integer(channel, 255) for channel in entry["colour"])
     object_id, into = _integer(entry["id"], LARGEST_ID), entry.get("merged_into")

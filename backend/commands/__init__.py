@@ -10,7 +10,7 @@ import argparse
 from collections.abc import Callable
 
 from ..stopping import StoppingReporter
-from . import check, doctor, evaluate, film, importing, mesh, render, report, train, vote
+from . import check, doctor, edit, evaluate, export, film, import_splats, importing, mesh, render, report, train, vote
 
 COMMANDS: dict[str, Callable[[argparse.Namespace, StoppingReporter], None]] = {
     "check": check.check,
@@ -20,6 +20,9 @@ COMMANDS: dict[str, Callable[[argparse.Namespace, StoppingReporter], None]] = {
     "render": render.render,
     "mesh": mesh.mesh,
     "film": film.film,
+    "edit": edit.edit,
+    "export": export.export,
+    "import-splats": import_splats.import_splats,
     "evaluate": evaluate.evaluate,
     "report": report.report,
     "doctor": doctor.doctor,

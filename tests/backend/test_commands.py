@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import struct
@@ -826,7 +827,8 @@ def test_doctor_takes_a_small_scene_through_everything(ask):
 
 
 def test_help_says_what_each_command_does_with_an_example(capsys):
-    names = ["check", "import", "vote", "train", "render", "evaluate", "report", "doctor"]
+    names = ["check", "import", "vote", "train", "render", "edit", "export", "import-splats", "evaluate", "report"]
+    names.append("doctor")
     texts = {}
     for words in ([], *([name] for name in names)):
         with pytest.raises(SystemExit) as ended:
@@ -835,7 +837,7 @@ def test_help_says_what_each_command_does_with_an_example(capsys):
         texts["".join(words)] = text = capsys.readouterr().out
         assert max(map(len, text.splitlines())) <= 90
     for name in names:
-        assert f"    {name} " in texts[""] and f"example:\n  python -m backend {name}" in texts[name]
+        assert re.search(f"^    {name}\\s", texts[""], re.M) and f"example:\n  python -m backend {name}" in texts[name]
     defaults = Settings()
     train = " ".join(texts["train"].split())
     for option, value in {
