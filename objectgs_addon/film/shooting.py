@@ -3,7 +3,7 @@
 
 What is seen is what Blender would render: the splats of every object whose collections, pivot and parts are not hidden
 for rendering. The reconstruction's own collection does not count, since it is hidden where the compositor joins film
-frames with Blender's rendering.
+frames with Blender's rendering. What stays in Blender where it was captured is where objects.json says.
 """
 
 import math
@@ -58,6 +58,7 @@ def shot_of(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, root: bpy.t
                 progress(done, len(frames))
     finally:
         scene.frame_set(before[0], subframe=before[1])
+    _leave_still_ones([sample for frame in made for sample in frame.samples])
     width, height = _size(scene)
     aspect = scene.render.pixel_aspect_x / scene.render.pixel_aspect_y
     return Shot(width, height, made, pixel_aspect=aspect, depth_scale=scale, only_named=True)
@@ -131,6 +132,16 @@ class _Actor:
             offset = Matrix.Translation(-self.instancer.instance_collection.instance_offset)
             world = _world_of(self.instancer) @ offset @ world
         return np.array(world, np.float64)
+
+
+def _leave_still_ones(samples: Sequence[Sample]) -> None:
+    """Say nothing of where objects are that are where they were captured in all samples."""
+    here = np.eye(4)[None]
+    moving = {object_id for sample in samples for object_id, placed in sample.objects.items()
+              if not np.array_equal(placed.maps, here)}
+    for sample in samples:
+        for object_id in sample.objects.keys() - moving:
+            sample.objects[object_id] = Placed()
 
 
 def _actors(scene, view_layer, root) -> list[_Actor]:
