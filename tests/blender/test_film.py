@@ -497,3 +497,36 @@ def test_edits_reach_the_frames_and_refusals_are_one_sentence(shot_blend, backen
     ):
         ran = run(*words)
         assert ran.returncode == 2 and said in ran.stderr and ran.stderr.count("\n") == 1, ran.stdout + ran.stderr
+
+
+@pytest.fixture
+def registered():
+    extension = headless.extension()
+    extension.register()
+    yield
+    extension.unregister()
+
+
+def test_the_buttons(shot_blend, backend_python, registered, monkeypatch, tmp_path):
+    """Film frames in the folder that the panel names, then the compositor; refusals that say why."""
+    monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
+    bpy.ops.wm.open_mainfile(filepath=str(shot_blend))
+    scene = bpy.context.scene
+    root = next(child for child in scene.collection.children_recursive if kinds.kind_of(child) == "reconstruction")
+    scene.objectgs.active = root
+    scene.objectgs_film.folder = str(tmp_path / "frames")
+    with pytest.raises(RuntimeError, match="no film frames yet"):
+        bpy.ops.objectgs.set_up_compositor()
+    camera, scene.camera = scene.camera, None
+    assert not bpy.ops.objectgs.film_frames.poll()
+    scene.camera = camera
+    scene.render.resolution_percentage = 50
+    scene.render.use_motion_blur, scene.objectgs_film.subframes = True, 3
+    assert bpy.ops.objectgs.film_frames() == {"FINISHED"}
+    (frame,) = read_shot(tmp_path / "frames" / "shot.json").frames
+    assert frame.number == 7 and len(frame.samples) == 3
+    assert [path.name for path in (tmp_path / "frames").glob("*.exr")] == ["splats.0007.exr"]
+    assert bpy.ops.objectgs.set_up_compositor() == {"FINISHED"} and film.has_frames(scene) and root.hide_render
+    camera.data.type = "ORTHO"
+    with pytest.raises(RuntimeError, match="orthographic"):
+        bpy.ops.objectgs.film_frames()
