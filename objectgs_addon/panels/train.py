@@ -19,8 +19,8 @@ class TrainPanel(WithReconstruction, bpy.types.Panel):
         properties = root.objectgs
         folder = scene.folder_of(root)
         job = running.job_of(root)
-        if job is not None and job.kind == "mesh":
-            job = None  # The panel Meshes shows it.
+        if job is not None and job.kind in ("mesh", "film"):
+            job = None  # Their own panels show them.
         active = running.busy(folder)
         column = layout.column()
         column.enabled = not active
