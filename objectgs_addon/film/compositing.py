@@ -141,10 +141,10 @@ def _join(scene, view_layer, tree, image, matte: str) -> None:
     tree.links.new(joined, mattes.inputs["Image"])
 
     nodes = list(tree.nodes)[new:]
-    left = output.node.location.x
+    right = output.node.location.x = max(output.node.location.x, depth.node.location.x + 220.0 * (len(nodes) + 1))
     for index, node in enumerate(nodes):
         node[KIND] = FILM
-        node.location = (left - 220.0 * (len(nodes) - 1 - index), output.node.location.y - 420.0)
+        node.location = (right - 220.0 * (len(nodes) - 1 - index), output.node.location.y - 420.0)
     splats.location.y -= 160.0
     mattes.location = (output.node.location.x, output.node.location.y - 240.0)
 
@@ -165,7 +165,7 @@ def _rendering(scene, view_layer, graph: Graph, tree, output):
     layers = next((node for node in tree.nodes if node.type == "R_LAYERS" and node.layer == view_layer.name), None)
     if layers is None:
         layers = graph.node("CompositorNodeRLayers", scene=scene, layer=view_layer.name)
-        layers.location = (output.node.location.x - 1500.0, output.node.location.y)
+        layers.location = (output.node.location.x - 2000.0, output.node.location.y)
     rendered = output.links[0].from_socket if output.links else layers.outputs["Image"]
     return rendered, layers.outputs["Depth"]
 
