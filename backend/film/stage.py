@@ -119,7 +119,8 @@ class Stage:
 def _digest_of(path: Path, objects: list[SceneObject], primitive: str) -> str:
     with open(path, "rb") as file:
         content = hashlib.file_digest(file, "sha256").hexdigest()
-    return f"{_FORMAT} {content} {objects!r} {primitive}"
+    drawn = [replace(entry, colour=(0, 0, 0), points=0) for entry in objects]
+    return f"{_FORMAT} {content} {drawn!r} {primitive}"
 
 
 def _names(ids: list[int], entries: dict[int, SceneObject]) -> list[str]:

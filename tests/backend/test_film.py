@@ -305,6 +305,8 @@ def test_finished_frames_are_skipped_and_others_drawn_again(folder, shoot, tmp_p
         assert exr.digest_of(frame_path(out, 2)) is None
     assert drawn(shoot()) == 1 and frame_path(out, 2).read_bytes() == whole
     assert drawn(shoot(shot=shot_of([sample()], [sample(0.15)], [sample(0.2), sample(0.21)]))) == 1
+    edit_objects(folder.objects, {1: {"colour": [9, 9, 9]}})
+    assert drawn(shoot("--frames", "1")) == 0, "the colour that stands for an object is not in its pictures"
     edit_objects(folder.objects, {1: {"removed": True}})
     assert drawn(shoot()) == 3
     assert drawn(shoot("--png")) == 3 and len(list(out.glob("*.png"))) == 3
