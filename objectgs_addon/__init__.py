@@ -7,15 +7,15 @@ bpy is imported only where it is needed, since some of these modules serve outsi
 
 def register():
     """Add properties, preferences, lists, panels and handlers."""
-    from . import click_selection, object_list, panels, preferences, properties, running
+    from . import click_selection, drawing, object_list, panels, preferences, properties, running, splat_arrays
 
-    for module in (properties, preferences, object_list, running, click_selection, panels):
+    for module in (properties, preferences, object_list, running, click_selection, splat_arrays, drawing, panels):
         module.register()
 
 
 def unregister():
     """Take them back; background jobs are told to stop and have saved when this returns."""
-    from . import click_selection, object_list, panels, preferences, properties, running
+    from . import click_selection, drawing, object_list, panels, preferences, properties, running, splat_arrays
 
-    for module in (panels, click_selection, running, object_list, preferences, properties):
+    for module in (panels, drawing, splat_arrays, click_selection, running, object_list, preferences, properties):
         module.unregister()

@@ -153,9 +153,13 @@ void main() {
 }
 """
 
+# The viewport takes linear colours, and blends them so.
 _OVER_FRAGMENT = """
 void main() {
-    result = texture(picture, uv);
+    vec4 drawn = texture(picture, uv);
+    vec3 colour = drawn.rgb / max(drawn.a, 1e-6);
+    vec3 high = pow((colour + 0.055) / 1.055, vec3(2.4));
+    result = vec4(mix(high, colour / 12.92, vec3(lessThanEqual(colour, vec3(0.04045)))) * drawn.a, drawn.a);
 }
 """
 
@@ -184,7 +188,7 @@ def splat_shader() -> gpu.types.GPUShader:
 
 
 def over_shader() -> gpu.types.GPUShader:
-    """Lays a premultiplied picture over what is there."""
+    """Lays a premultiplied, encoded picture over what is there."""
     between = gpu.types.GPUStageInterfaceInfo("objectgs_over")
     between.smooth("VEC2", "uv")
     info = gpu.types.GPUShaderCreateInfo()

@@ -5,12 +5,13 @@ import bpy
 
 from .capture import CapturePanel
 from .display import DisplayPanel
+from .drawing import DrawingPanel
 from .jobs import JobsPanel, status_bar
 from .meshes import MeshesPanel
 from .objects import ObjectsPanel
 from .train import SettingsPanel, TrainPanel
 
-CLASSES = (CapturePanel, TrainPanel, SettingsPanel, ObjectsPanel, MeshesPanel, DisplayPanel, JobsPanel)
+CLASSES = (CapturePanel, TrainPanel, SettingsPanel, ObjectsPanel, MeshesPanel, DrawingPanel, DisplayPanel, JobsPanel)
 
 
 def register():

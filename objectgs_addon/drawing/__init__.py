@@ -1,0 +1,10 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Gaussian splats in the 3D viewports as they are: sorted, blended, and with the colours of the direction.
+
+`order` sorts, `renderer` draws arrays with the programs in `shaders`, `gather` makes arrays of Blender's objects, and
+`viewport` draws in the viewports.
+"""
+
+from .viewport import picture, redraw, register, show, unregister
+
+__all__ = ["picture", "redraw", "register", "show", "unregister"]
