@@ -5,17 +5,29 @@ bpy is imported only where it is needed, since some of these modules serve outsi
 """
 
 
-def register():
-    """Add properties, preferences, lists, panels and handlers."""
-    from . import click_selection, drawing, object_list, panels, preferences, properties, running, splat_arrays
+def _modules():
+    from . import (
+        click_selection,
+        drawing,
+        object_list,
+        panels,
+        pick_tool,
+        preferences,
+        properties,
+        running,
+        splat_arrays,
+    )
 
-    for module in (properties, preferences, object_list, running, click_selection, splat_arrays, drawing, panels):
+    return (properties, preferences, object_list, running, click_selection, splat_arrays, drawing, panels, pick_tool)
+
+
+def register():
+    """Add properties, preferences, lists, panels, the tool and handlers."""
+    for module in _modules():
         module.register()
 
 
 def unregister():
     """Take them back; background jobs are told to stop and have saved when this returns."""
-    from . import click_selection, drawing, object_list, panels, preferences, properties, running, splat_arrays
-
-    for module in (panels, drawing, splat_arrays, click_selection, running, object_list, preferences, properties):
+    for module in reversed(_modules()):
         module.unregister()

@@ -103,7 +103,8 @@ class SceneProperties(bpy.types.PropertyGroup):
         name="Draw Splats", default=False, update=drawing.show,
         description="Show splats in the 3D viewports as they are rendered, instead of a preview by points")
     splat_colours: EnumProperty(name="Splat Colors", default="photo", items=[
-        ("photo", "Photo", "Colors of the photos"), ("object", "Object", "Colors that stand for the objects")])
+        ("photo", "Photo", "Colors of the photos"), ("object", "Object", "Colors that stand for the objects")],
+        update=drawing.redraw)
 
 
 CLASSES = (ObjectItem, ReconstructionProperties, SceneProperties)

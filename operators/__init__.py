@@ -6,12 +6,14 @@ def _classes():
     from . import (
         choose_objects,
         extract_meshes,
+        find_objects,
         import_capture,
         make_demo,
         mark_assets,
         merge_objects,
         orient,
         pause_job,
+        pick_object,
         select_object,
         set_up_backend,
         show_preview,
@@ -23,7 +25,8 @@ def _classes():
     )
 
     modules = (import_capture, make_demo, vote, train, extract_meshes, pause_job, stop_job, show_result, show_preview,
-               select_object, solo_object, merge_objects, choose_objects, mark_assets, orient, set_up_backend)
+               select_object, pick_object, find_objects, solo_object, merge_objects, choose_objects, mark_assets,
+               orient, set_up_backend)
     return [cls for module in modules for cls in module.CLASSES]
 
 

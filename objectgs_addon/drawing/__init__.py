@@ -5,6 +5,9 @@
 `viewport` draws in the viewports.
 """
 
-from .viewport import picture, redraw, register, show, unregister
+from .gather import collection_of, shown, splat_parts
+from .viewport import picture, point_at, redraw, register, show, unregister
 
-__all__ = ["picture", "redraw", "register", "show", "unregister"]
+__all__ = [
+    "collection_of", "picture", "point_at", "redraw", "register", "show", "shown", "splat_parts", "unregister",
+]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The order in which splats are drawn: from far to near, by a sort of 16-bit numbers, which takes one pass each byte."""
+"""The order in which splats are drawn, from far to near, by a sort of 16-bit numbers: one pass a byte."""
 
 import numpy as np
 

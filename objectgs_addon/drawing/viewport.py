@@ -13,7 +13,7 @@ from .renderer import Renderer
 
 _renderer: Renderer | None = None
 _handler = None
-pointed_at: int | None = None
+_pointed_at: int | None = None
 """The number of this session of the object's collection that a tool highlights."""
 
 
@@ -44,7 +44,7 @@ def _draw() -> None:
     if not properties.draw_splats or region is None:
         return
     parts = gather.splat_parts(context.view_layer, space)
-    things = gather.gather(parts, properties.splat_colours, pointed_at, space.overlay.show_overlays)
+    things = gather.gather(parts, properties.splat_colours, _pointed_at, space.overlay.show_overlays)
     if not things:
         return
     target = gpu.state.active_framebuffer_get()
@@ -60,6 +60,15 @@ def _draw() -> None:
         renderer().over()
 
 
+def point_at(collection) -> None:
+    """Highlight an object, by its collection, in all viewports; None: no object."""
+    global _pointed_at
+    uid = None if collection is None else collection.session_uid
+    if uid != _pointed_at:
+        _pointed_at = uid
+        redraw()
+
+
 def show(properties, _context=None) -> None:
     """Let the preview of the geometry nodes give way to the drawing in a scene, or come back."""
     for part in properties.id_data.objects:
@@ -68,7 +77,8 @@ def show(properties, _context=None) -> None:
     redraw()
 
 
-def redraw() -> None:
+def redraw(_properties=None, _context=None) -> None:
+    """Let all 3D viewports draw anew."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "VIEW_3D":
