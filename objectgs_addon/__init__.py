@@ -11,18 +11,17 @@ def _modules():
         drawing,
         object_list,
         panels,
-        pick_tool,
         preferences,
         properties,
         running,
         splat_arrays,
     )
 
-    return (properties, preferences, object_list, running, click_selection, splat_arrays, drawing, panels, pick_tool)
+    return (properties, preferences, object_list, running, click_selection, splat_arrays, drawing, panels)
 
 
 def register():
-    """Add properties, preferences, lists, panels, the tool and handlers."""
+    """Add properties, preferences, lists, panels and handlers."""
     for module in _modules():
         module.register()
 

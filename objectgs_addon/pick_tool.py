@@ -76,15 +76,14 @@ def _draw() -> None:
     if not is_active(context):
         point_at(None)
         return
+    kinds = ("mesh",) if context.scene.objectgs.draw_splats else ("mesh", "splats")
     lines = []
-    for part in context.view_layer.objects:
-        drawn = scene.kind_of(part) == "mesh" or (
-            scene.kind_of(part) == "splats" and not context.scene.objectgs.draw_splats)
-        collection = drawing.collection_of(part) if drawn else None
-        if collection is not None and collection.session_uid == _pointed_at and drawing.shown(
-                part, context.view_layer, context.space_data):
-            corners = [part.matrix_world @ Vector(corner) for corner in part.bound_box]
-            lines += [corners[end] for edge in _EDGES for end in edge]
+    for collection in bpy.data.collections:
+        if collection.session_uid == _pointed_at:
+            for part in collection.objects:
+                if scene.kind_of(part) in kinds and drawing.shown(part, context.view_layer, context.space_data):
+                    corners = [part.matrix_world @ Vector(corner) for corner in part.bound_box]
+                    lines += [corners[end] for edge in _EDGES for end in edge]
     if lines:
         shader = gpu.shader.from_builtin("UNIFORM_COLOR")
         shader.uniform_float("color", (1.0, 1.0, 1.0, 1.0))

@@ -40,7 +40,7 @@ def seen_at(context, x: float, y: float) -> Pointed | None:
         seen = None
     thing, depth = _mesh_at(context, _meshes(context), view, x, y)
     if thing is not None and (seen is None or depth < seen.depth):
-        collection = drawing.collection_of(thing)
+        collection = drawing.owners().get(thing)
         return Pointed(collection, None if collection else thing)
     return None if seen is None else Pointed(collections[seen.object_id], None)
 
@@ -50,13 +50,14 @@ def seen_in(context, left: float, bottom: float, right: float, top: float) -> li
     view = view_of(context)
     collections, placed = _splats(context)
     found = [collections[key] for key in ids_in(placed, view, (left, view.height - top, right, view.height - bottom))]
-    meshes = [thing for thing in _meshes(context) if drawing.collection_of(thing) is not None]
-    if meshes:
+    owners = drawing.owners()
+    meshes = _meshes(context)
+    if any(thing in owners for thing in meshes):
         for x in np.linspace(left, right, _GRID):
             for y in np.linspace(bottom, top, _GRID):
                 thing, _ = _mesh_at(context, meshes, view, x, y)
-                if thing is not None:
-                    found.append(drawing.collection_of(thing))
+                if thing in owners:
+                    found.append(owners[thing])
     return list(dict.fromkeys(found))
 
 
@@ -70,8 +71,9 @@ def view_of(context) -> View:
 def _splats(context) -> tuple[dict[int, bpy.types.Collection], list[Placed]]:
     """The shown splats by their object's collection, and the collections by the numbers that stand for them."""
     collections, placed = {}, []
+    owners = drawing.owners()
     for part in drawing.splat_parts(context.view_layer, context.space_data):
-        collection, arrays = drawing.collection_of(part), arrays_of(part.data)
+        collection, arrays = owners.get(part), arrays_of(part.data)
         if collection is not None and arrays is not None and not part.hide_select:
             collections[collection.session_uid] = collection
             placed.append(Placed(collection.session_uid, arrays.cloud, np.array(part.matrix_world)))

@@ -37,14 +37,20 @@ def _import_menu(menu, _context):
 def register():
     import bpy
 
+    from ..objectgs_addon import pick_tool
+
     for cls in _classes():
         bpy.utils.register_class(cls)
     bpy.types.TOPBAR_MT_file_import.append(_import_menu)
+    pick_tool.register()  # Its keys can only be given to operators that are there.
 
 
 def unregister():
     import bpy
 
+    from ..objectgs_addon import pick_tool
+
+    pick_tool.unregister()
     bpy.types.TOPBAR_MT_file_import.remove(_import_menu)
     for cls in reversed(_classes()):
         bpy.utils.unregister_class(cls)

@@ -5,9 +5,9 @@
 `viewport` draws in the viewports.
 """
 
-from .gather import collection_of, shown, splat_parts
+from .gather import owners, shown, splat_parts
 from .viewport import picture, point_at, redraw, register, show, unregister
 
 __all__ = [
-    "collection_of", "picture", "point_at", "redraw", "register", "show", "shown", "splat_parts", "unregister",
+    "owners", "picture", "point_at", "redraw", "register", "show", "shown", "splat_parts", "unregister",
 ]

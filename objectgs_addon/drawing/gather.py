@@ -28,6 +28,12 @@ def shown(part, view_layer, space) -> bool:
     return part.visible_get(view_layer=view_layer, viewport=space)
 
 
+def owners() -> dict[bpy.types.Object, bpy.types.Collection]:
+    """Part -> the object's collection that it lies in; asking each part for its collections would look at all."""
+    return {part: collection for collection in bpy.data.collections if scenes.kind_of(collection) == "object"
+            for part in collection.objects}
+
+
 def gather(parts, colours: str = "photo", pointed_at: int | None = None, marks: bool = True) -> list[Drawn]:
     """Carriers as the renderer takes them; those whose splats are gone are left out.
 
@@ -35,11 +41,12 @@ def gather(parts, colours: str = "photo", pointed_at: int | None = None, marks: 
     this session of a collection under the mouse.
     """
     found = []
+    collections = owners()
     for part in parts:
         arrays = arrays_of(part.data)
         if arrays is None:
             continue
-        collection = collection_of(part)
+        collection = collections.get(part)
         highlight = NONE
         if pointed_at is not None and collection is not None and collection.session_uid == pointed_at:
             highlight = POINTED_AT
@@ -50,17 +57,13 @@ def gather(parts, colours: str = "photo", pointed_at: int | None = None, marks: 
     return found
 
 
-def collection_of(part) -> bpy.types.Collection | None:
-    """The object's collection that a part lies in."""
-    return next((collection for collection in part.users_collection if scenes.kind_of(collection) == "object"), None)
-
-
 def colour_map(collection) -> np.ndarray:
     """(3, 4): matrix and offset of what was asked of an object's colours."""
     return NO_RECOLOUR
 
 
 def hides_splats(view_layer, space) -> bool:
-    """Whether a viewport shows anything solid that may be in front of splats."""
-    return any(thing.type in _HIDES and scenes.kind_of(thing) != "splats" and shown(thing, view_layer, space)
-               for thing in view_layer.objects)
+    """Whether a viewport shows anything that may be in front of splats."""
+    return space.overlay.show_overlays or any(
+        thing.type in _HIDES and scenes.kind_of(thing) != "splats" and shown(thing, view_layer, space)
+        for thing in view_layer.objects)

@@ -173,25 +173,25 @@ class _Sorted:
 
 def _depth_rows(things: Sequence[Drawn], view: View) -> np.ndarray:
     """(n, 4): what gives an object's points their depth in the view."""
-    return np.array([view.viewmat[2] @ thing.matrix for thing in things])
+    return view.viewmat[2] @ np.array([thing.matrix for thing in things])
 
 
 def _objects(things: Sequence[Drawn], view: View) -> np.ndarray:
     """(n, OBJECT_TEXELS, 4) float32: what the shader needs of each object in this view."""
     table = np.zeros((len(things), shaders.OBJECT_TEXELS, 4), np.float32)
+    matrices = np.array([thing.matrix for thing in things])
     eye = np.linalg.inv(view.viewmat)[:3]
-    for row, thing in zip(table, things):
-        row[0:3] = (view.viewmat @ thing.matrix)[:3]
-        # Harmonics turn with the object but are not stretched with it.
-        left, _, right = np.linalg.svd(thing.matrix[:3, :3])
-        back = (left @ right).T
-        if view.orthographic:
-            row[3:6, 3] = back @ eye[:, 2]
-        else:
-            row[3:6, :3] = back @ thing.matrix[:3, :3]
-            row[3:6, 3] = back @ (thing.matrix[:3, 3] - eye[:, 3])
-        row[6:9] = thing.recolour
-        row[9], row[10] = thing.colour, thing.highlight
+    table[:, 0:3] = (view.viewmat @ matrices)[:, :3]
+    # Harmonics turn with the object but are not stretched with it.
+    left, _, right = np.linalg.svd(matrices[:, :3, :3])
+    back = np.swapaxes(left @ right, 1, 2)
+    if view.orthographic:
+        table[:, 3:6, 3] = back @ eye[:, 2]
+    else:
+        table[:, 3:6, :3] = back @ matrices[:, :3, :3]
+        table[:, 3:6, 3] = np.einsum("nij,nj->ni", back, matrices[:, :3, 3] - eye[:, 3])
+    table[:, 6:9] = [thing.recolour for thing in things]
+    table[:, 9], table[:, 10] = [thing.colour for thing in things], [thing.highlight for thing in things]
     return table
 
 
