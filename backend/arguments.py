@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import errno
+import math
 import os
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from . import __version__, lacking
 from .protocol import (
@@ -21,6 +23,7 @@ from .protocol import (
     JsonReporter,
     Reporter,
 )
+from .recolour import Recolour
 from .stopping import StoppingReporter, StopRequest
 
 DEFAULT_MINUTES = 5.0
@@ -35,6 +38,8 @@ for each image in masks/. What is made of it goes into a reconstruction folder.
   python -m backend mesh     garden-splats               make each object's mesh
   python -m backend evaluate garden-splats               how good are they?
   python -m backend report   garden-splats               read garden-splats/report.md
+  python -m backend edit     garden-splats --remove mug  change objects
+  python -m backend export   garden-splats --out all.ply for other programs
 """
 
 _ENDING = """\
@@ -88,6 +93,26 @@ Write report.md, with pictures, plots and what was left out, and report.json, th
 same for programs. Run `evaluate` before, so that the report says how good it is.
 """
 
+_EDIT = """\
+Remove, recolour, move or copy objects: what `export`, `film` and Blender show. Edits
+are kept in objects.json, and what was trained stays as it is, so that each can be
+taken back; without options, say what is edited. OBJECT is a name, a part of one, or an
+ID; several KEY=VALUE are parted by commas. Lengths are in the capture's units; x, y and
+z are Blender's axes, z up; turns (rx, ry, rz) are in degrees and, as the scale, about
+the object's middle. A new colour or place takes the place of the one before it.
+"""
+
+_EXPORT = """\
+Write the splats, with all edits, for other programs: as PLY (exact, with object_id),
+SPZ (a fifth of the size) or .splat (one colour each).
+"""
+
+_IMPORT_SPLATS = """\
+Make a reconstruction of splats that were trained elsewhere. Their objects are those of
+object_id in the file; or, with --capture, of a vote by that capture's masks, where the
+splats are in its coordinates.
+"""
+
 _DOCTOR = """\
 Say which versions and devices are there, and try everything on a tiny scene. The
 first run compiles the kernels, about a minute, so that later commands start at once.
@@ -132,12 +157,15 @@ def parser() -> argparse.ArgumentParser:
             help="cpu, or cuda: an NVIDIA GPU; `doctor` says why one is not used (auto: cuda where it works)",
         )  # fmt: skip
 
-    def capture_options(sub: argparse.ArgumentParser) -> None:
-        sub.add_argument("capture", type=Path, metavar="CAPTURE", help="folder with images/, sparse/0/ and masks/")
+    def size_option(sub: argparse.ArgumentParser) -> None:
         sub.add_argument(
             "--max-size", type=_count, default=1600, metavar="PIXELS",
             help="larger images are reduced to this longest side (1600)",
         )  # fmt: skip
+
+    def capture_options(sub: argparse.ArgumentParser) -> None:
+        sub.add_argument("capture", type=Path, metavar="CAPTURE", help="folder with images/, sparse/0/ and masks/")
+        size_option(sub)
 
     def making_options(sub: argparse.ArgumentParser) -> None:
         capture_options(sub)
@@ -244,6 +272,60 @@ def parser() -> argparse.ArgumentParser:
         help="side of the texture: 256 to 4096 (from the photos' resolution)",
     )  # fmt: skip
     mesh.add_argument("--restart", action="store_true", help="make meshes anew that are there already")
+    edit = command(
+        "edit", "remove, recolour, move or copy objects", _EDIT,
+        "garden-splats --remove mug --recolor can:hue=0.3 --move box:x=0.1",
+    )  # fmt: skip
+    edit.add_argument("folder", type=Path, metavar="DIR", help="reconstruction folder")
+    edit.add_argument("--remove", nargs="+", default=[], metavar="OBJECT", help="make objects invisible")
+    edit.add_argument("--floaters", action="store_true", help="with --remove: what floats unlabelled inside them, too")
+    edit.add_argument("--restore", nargs="+", default=[], metavar="OBJECT", help="make removed objects visible again")
+    edit.add_argument(
+        "--recolor", nargs="+", default=[], type=_recolour, metavar="OBJECT:KEY=VALUE",
+        help="hue (-0.5 to 0.5: turns of the colour wheel), saturation (0: grey, 1: as it is), value and contrast (1: "
+        "as it is), tint=#RRGGBB, replace=#RRGGBB and amount (0 to 1: how much of replace)",
+    )  # fmt: skip
+    edit.add_argument(
+        "--move", nargs="+", default=[], type=_placement, metavar="OBJECT:KEY=VALUE",
+        help="from where it was captured: x, y, z, rx, ry, rz, scale",
+    )  # fmt: skip
+    edit.add_argument(
+        "--duplicate", nargs="+", default=[], type=_placement, metavar="OBJECT:KEY=VALUE",
+        help="one more, placed like that",
+    )  # fmt: skip
+    edit.add_argument(
+        "--reset", nargs="+", default=[], metavar="OBJECT", help="take all of these edits of objects back, or of `all`"
+    )
+
+    export = command(
+        "export", "write the splats for other programs", _EXPORT, "garden-splats --out mug.spz --objects mug"
+    )
+    export.add_argument("folder", type=Path, metavar="DIR", help="reconstruction folder")
+    export.add_argument("--out", type=Path, required=True, metavar="PATH", help="file, or a folder with --per-object")
+    export.add_argument("--format", choices=("ply", "spz", "splat"), help="(by the file's suffix, else ply)")
+    export.add_argument("--objects", nargs="+", metavar="OBJECT", help="names or IDs; without: everything")
+    export.add_argument("--per-object", action="store_true", help="a file for each object")
+    export.add_argument(
+        "--coordinates", choices=("capture", "blender"), default="capture",
+        help="COLMAP's, as photos and cameras have them, or Blender's, z up (capture)",
+    )  # fmt: skip
+    export.add_argument(
+        "--sh-degree", type=int, choices=(0, 1, 2, 3), help="spherical harmonics up to this degree (as trained)"
+    )
+    export.add_argument(
+        "--no-ids", action="store_true", help="PLY without object_id, for programs that stumble over it"
+    )
+
+    imported = command(
+        "import-splats", "make a reconstruction of splats from elsewhere", _IMPORT_SPLATS,
+        "point_cloud.ply --out garden-splats --capture garden",
+    )  # fmt: skip
+    imported.add_argument("ply", type=Path, metavar="PLY", help="splats as 3D Gaussian splatting programs write them")
+    imported.add_argument("--out", type=Path, required=True, metavar="DIR", help="reconstruction folder to make")
+    imported.add_argument("--capture", type=Path, metavar="CAPTURE", help="folder with images/, sparse/0/ and masks/")
+    size_option(imported)
+    memory_option(imported)
+
     result("evaluate", "measure how good the splats are", _EVALUATE, "garden-splats")
     result("report", "write a report with pictures", _REPORT, "garden-splats")
     device_option(command("doctor", "say whether everything works on this computer", _DOCTOR, ""))
@@ -274,6 +356,56 @@ def _named_set(text: str) -> tuple[str, list[str]]:
     if not name.strip() or not found:
         raise argparse.ArgumentTypeError(f"{text!r} is not NAME=ID,ID")
     return name.strip(), found
+
+
+def _keys(text: str, known: Sequence[str]) -> tuple[str, dict[str, str]]:
+    """OBJECT:KEY=VALUE,KEY=VALUE taken apart."""
+    word, _, rest = text.rpartition(":")
+    values = {}
+    for part in rest.split(","):
+        key, _, value = part.partition("=")
+        values[key.strip()] = value.strip()
+    if not word.strip() or not all(values.values()):
+        raise argparse.ArgumentTypeError(f"{text!r} is not OBJECT:KEY=VALUE,KEY=VALUE")
+    if unknown := [key for key in values if key not in known]:
+        raise argparse.ArgumentTypeError(f"{text!r} has an unknown {unknown[0]!r}; there are {', '.join(known)}")
+    return word.strip(), values
+
+
+def _number(key: str, text: str, least: float = -math.inf, most: float = math.inf) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and least <= value <= most):
+        between = f" between {least:g} and {most:g}" if math.isfinite(most) else f" from {least:g} on"
+        wanted = between if math.isfinite(least) else ""
+        raise argparse.ArgumentTypeError(f"{key}={text} is not a number{wanted}")
+    return value
+
+
+def _recolour(text: str) -> tuple[str, Recolour]:
+    ranges = {"hue": (-0.5, 0.5), "amount": (0.0, 1.0)}
+    word, given = _keys(text, ("hue", "saturation", "value", "contrast", "tint", "replace", "amount"))
+    values: dict[str, Any] = {}
+    for key, value in given.items():
+        if key not in ("tint", "replace"):
+            values[key] = _number(key, value, *ranges.get(key, (0.0,)))
+        elif re.fullmatch("#[0-9a-fA-F]{6}", value):
+            values[key] = tuple(channel / 255 for channel in bytes.fromhex(value[1:]))
+        else:
+            raise argparse.ArgumentTypeError(f"{key}={value} is not a colour such as #ff8800")
+    if "replace" in values:
+        values.setdefault("amount", 1.0)
+    return word, Recolour(**values)
+
+
+def _placement(text: str) -> tuple[str, dict[str, float]]:
+    word, given = _keys(text, ("x", "y", "z", "rx", "ry", "rz", "scale"))
+    values = {key: _number(key, value) for key, value in given.items()}
+    if values.get("scale", 1.0) <= 0:
+        raise argparse.ArgumentTypeError(f"scale={given['scale']} is not a number above 0")
+    return word, values
 
 
 def _seed(text: str) -> int:

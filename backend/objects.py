@@ -2,7 +2,7 @@
 
     {"objects": [{"id": 1, "name": "mug", "colour": [59, 125, 216], "points": 812}, ...],
      "edits": {"1": {"name": "cup", "colour": [255, 0, 0], "merged_into": 2, "left_out": true},
-               "4": {"removed": true},
+               "4": {"removed": true, "floaters": true},
                "5": {"recolour": {"hue": 0.3}, "transform": [[1, 0, 0, 2], ...], "copies": [[[1, 0, 0, 5], ...]]}, ...}}
 
 A new vote replaces "objects" and keeps "edits". Standard library and NumPy only, so that Blender's own Python can
@@ -22,7 +22,7 @@ from .protocol import InputError, read_json, write_json
 from .recolour import Recolour
 
 LARGEST_ID = 2**32 - 1
-EDITABLE = ("name", "colour", "merged_into", "left_out", "removed", "recolour", "transform", "copies")
+EDITABLE = ("name", "colour", "merged_into", "left_out", "removed", "floaters", "recolour", "transform", "copies")
 
 Matrix = tuple[tuple[float, float, float, float], ...]
 """Four rows of an affine map of the capture's coordinates, which moves an object from where it was captured."""
@@ -33,8 +33,9 @@ class SceneObject:
     """One object: its ID in the masks, name, sRGB colour 0 .. 255, how many points voted for it, and the user's edits.
 
     merged_into: the ID of the object that it is shown and meshed with, or None; left_out: not to be reconstructed;
-    removed: made, but not to be seen; recolour: of its splats and textures, or None; transform: where it was moved to,
-    or None; copies: where its duplicates are, from where it was captured. Edits of an object that is merged into
+    removed: made, but not to be seen, its copies neither; floaters: then what belongs to no object and lies inside its
+    convex hull is not to be seen either; recolour: of its splats and textures, or None; transform: where it was moved
+    to, or None; copies: where its duplicates are, from where it was captured. Edits of an object that is merged into
     another have no effect but its name; those of the other count for both.
     """
 
@@ -45,6 +46,7 @@ class SceneObject:
     merged_into: int | None = None
     left_out: bool = False
     removed: bool = False
+    floaters: bool = False
     recolour: Recolour | None = None
     transform: Matrix | None = None
     copies: tuple[Matrix, ...] = ()
@@ -96,6 +98,27 @@ def merged(objects: Sequence[SceneObject]) -> dict[int, int]:
     return found
 
 
+def find_object(objects: Sequence[SceneObject], word: str, path: Path) -> SceneObject:
+    """The object that a word names: its ID, its name in any case, or a part of one object's name alone. What is merged
+    into another stands for that one. InputError, which lists the objects of `path`, where none or several are meant."""
+    shown, into = {entry.id: entry for entry in objects}, merged(objects)
+    if word.isdecimal() and int(word) in shown:
+        return shown[into[int(word)]]
+    folded = word.casefold()
+    meant = [entry for entry in objects if entry.name.casefold() == folded][:1]
+    meant = meant or [entry for entry in objects if folded and folded in entry.name.casefold()]
+    found = sorted({into[entry.id] for entry in meant})
+    if len(found) == 1:
+        return shown[found[0]]
+    among = found or sorted({target for target in into.values() if not shown[target].left_out})
+    there = ", ".join(f"{i} {shown[i].name}" for i in among[:20]) or "none"
+    if len(among) > 20:
+        there += f" and {len(among) - 20} more"
+    if found:
+        raise InputError(f"{word} may be several objects of {path}: {there}; say which one.")
+    raise InputError(f"{path} has no object {word}; there are: {there}.")
+
+
 def _object(entry: Mapping[str, Any]) -> SceneObject:
     red, green, blue = (_integer(channel, 255) for channel in entry["colour"])
     object_id, into = _integer(entry["id"], LARGEST_ID), entry.get("merged_into")
@@ -107,6 +130,7 @@ def _object(entry: Mapping[str, Any]) -> SceneObject:
         merged_into=None if into is None else _integer(into, LARGEST_ID),
         left_out=bool(entry.get("left_out", False)),
         removed=bool(entry.get("removed", False)),
+        floaters=bool(entry.get("floaters", False)),
         recolour=None if (recolour := entry.get("recolour")) is None else Recolour.of(recolour),
         transform=None if (transform := entry.get("transform")) is None else _matrix(transform),
         copies=tuple(_matrix(copy) for copy in entry.get("copies") or ()),

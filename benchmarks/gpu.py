@@ -11,12 +11,13 @@ the tile goes through (FORWARD_FLOPS, BACKWARD_FLOPS), its share of memory what 
     python benchmarks/gpu.py [--json] [--repeats 10] [--demo build/demo/capture]
 
 --demo names a capture to train on; without it, the demo's where `make demo` has left it. With gsplat installed, its
-renderer draws the same splats in the same run. Without a GPU this says so and ends well.
+renderer draws the same splats in the same run. Without a GPU, or what training needs, this says so and ends well.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import statistics
 import subprocess
@@ -211,12 +212,14 @@ def gsplat_step(scene: Scene) -> tuple[Callable[[], object], Callable[[], object
 
 
 def demo_quality(capture: Path) -> list[dict[str, float]]:
-    """Training on the GPU by the command itself: quality on the held-out views after so many seconds of training."""
+    """Trainings on the GPU by the command itself, each from the beginning: quality on the held-out views after so many
+    seconds of training."""
     curve = []
     with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as place:
         for seconds in DEMO_SECONDS:
             command = [sys.executable, "-m", "backend"]
-            train = ["train", capture, "--out", place, "--minutes", str(seconds / 60), "--device", "cuda"]
+            minutes = str(seconds / 60)
+            train = ["train", capture, "--out", place, "--minutes", minutes, "--device", "cuda", "--restart"]
             for words in (train, ["evaluate", place]):
                 done = subprocess.run([*command, *words], cwd=ROOT, capture_output=True, text=True)
                 if done.returncode:
@@ -224,6 +227,12 @@ def demo_quality(capture: Path) -> list[dict[str, float]]:
             quality = json.loads((Path(place) / "evaluation.json").read_text())["quality"]
             curve.append({"seconds": seconds, "psnr": quality["psnr"], "miou": quality["miou"]})
     return curve
+
+
+def lacking_for_training() -> list[str]:
+    """Packages that the training command needs and this Python does not have."""
+    packages = ("pycolmap", "scipy", "PIL", "safetensors", "skimage", "xatlas", "manifold3d", "fast_simplification")
+    return [name for name in packages if importlib.util.find_spec(name) is None]
 
 
 def main() -> None:
@@ -295,8 +304,11 @@ def main() -> None:
     say(f"A step at 1,000 objects takes {over_one:.2f} times what it takes at one.")
 
     capture = options.demo or (DEMO if DEMO.exists() else None)
-    curve = demo_quality(capture) if capture else None
-    if curve:
+    lacking = lacking_for_training()
+    curve = demo_quality(capture) if capture and not lacking else None
+    if capture and lacking:
+        say(f"\nNothing was trained: this Python lacks {', '.join(lacking)}.")
+    elif curve:
         say("\n" + "\n".join(f"{c['seconds']:4.0f} s: {c['psnr']:.1f} dB, mIoU {c['miou']:.3f}" for c in curve))
     else:
         say("\nThere is no capture to train on: `make demo` makes one, --demo names another.")

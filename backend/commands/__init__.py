@@ -10,7 +10,7 @@ import argparse
 from collections.abc import Callable
 
 from ..stopping import StoppingReporter
-from . import check, doctor, evaluate, importing, mesh, render, report, train, vote
+from . import check, doctor, edit, evaluate, export, import_splats, importing, mesh, render, report, train, vote
 
 COMMANDS: dict[str, Callable[[argparse.Namespace, StoppingReporter], None]] = {
     "check": check.check,
@@ -19,6 +19,9 @@ COMMANDS: dict[str, Callable[[argparse.Namespace, StoppingReporter], None]] = {
     "train": train.train,
     "render": render.render,
     "mesh": mesh.mesh,
+    "edit": edit.edit,
+    "export": export.export,
+    "import-splats": import_splats.import_splats,
     "evaluate": evaluate.evaluate,
     "report": report.report,
     "doctor": doctor.doctor,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -41,9 +41,8 @@ def open_reconstruction(options: argparse.Namespace, reporter: Reporter) -> Iter
     Leaves cameras.json. Bad input leaves nothing behind.
     """
     folder = Reconstruction(options.out)
-    absent = [path for path in (folder.cache, folder.folder, *folder.folder.parents) if not path.exists()]
     with ExitStack() as held:
-        with _removed_if_refused(absent):
+        with removed_if_refused(folder):
             folder.create()
             held.enter_context(locked(folder.folder))
             with stage(folder, "read"):
@@ -55,8 +54,9 @@ def open_reconstruction(options: argparse.Namespace, reporter: Reporter) -> Iter
 
 
 @contextmanager
-def _removed_if_refused(absent: Sequence[Path]) -> Iterator[None]:
-    """Remove what was made of `absent` (innermost first), unless another process makes use of it."""
+def removed_if_refused(folder: Reconstruction) -> Iterator[None]:
+    """Remove what bad input leaves of a folder that was not there before, unless another process makes use of it."""
+    absent = [path for path in (folder.cache, folder.folder, *folder.folder.parents) if not path.exists()]
     try:
         yield
     except FolderInUse:

@@ -45,8 +45,7 @@ def have_kernels_ready(reporter: StoppingReporter, place: torch.device) -> None:
 def try_kernels(reporter: StoppingReporter, place: torch.device) -> None:
     """Compile all kernels that a device needs, with progress, and see them run in a training of a few splats."""
     reporter.status("Compiling the renderer's kernels (once for a machine)")
-    if place.type == "cpu":
-        compile_kernels(lambda done, total: reporter.progress(done, total))
+    compile_kernels(place, lambda done, total: reporter.progress(done, total))
     reporter.status("Trying them on a few splats")
     with tempfile.TemporaryDirectory(prefix="objectgs-kernels-") as folder:
         _train_a_little(Path(folder), reporter, place)

@@ -29,7 +29,7 @@ from ..mesh.unwrap import unwrap
 from ..mesh.views import Views
 from ..mesh_file import Mesh, write_mesh
 from ..model.object_model import ObjectModel
-from ..objects import merged, read_objects
+from ..objects import find_object, merged, read_objects
 from ..protocol import InputError, Reconstruction, Reporter, read_json, write_atomic, write_json
 from ..stopping import StoppingReporter
 from .folder import Trained, open_trained
@@ -172,14 +172,9 @@ def _targets(options: argparse.Namespace, folder: Reconstruction, model: ObjectM
     into = merged(objects)
     groups = {entry.id: Target(str(entry.id), entry.name, _with_merged(entry.id, into)) for entry in objects}
     shown = [entry.id for entry in objects if into[entry.id] == entry.id and not entry.left_out]
-    names = {entry.name.casefold(): entry.id for entry in reversed(objects)}
 
     def find(word: str) -> int:
-        number = int(word) if word.isdecimal() else names.get(word.casefold())
-        if number not in groups:
-            there = ", ".join(f"{i} {groups[i].name}" for i in shown[:20]) or "none"
-            raise InputError(f"{folder.objects} has no object {word}; there are: {there}.")
-        return into[number]
+        return find_object(objects, word, folder.objects).id
 
     targets: list[Target] = []
     if options.objects:

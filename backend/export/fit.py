@@ -16,9 +16,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from .. import device
+from .. import device, spherical_harmonics
 from ..evaluation.metrics import psnr
-from ..model.anchors import SH_C0
 from ..model.object_model import ObjectModel, anchors_in_view
 from ..model.splats import Splats, concatenate
 from ..protocol import Reporter
@@ -85,16 +84,6 @@ def agreement(model: ObjectModel, splats: Splats, cameras: Sequence[Camera]) -> 
     return float(np.mean(found)) if found else None
 
 
-def sh_basis(directions: NDArray) -> NDArray[np.float32]:
-    """Real spherical harmonics of degree 0 to 2 of unit directions (n, 3): (n, 9)."""
-    x, y, z = directions.T.astype(np.float32)
-    c1, c2, c20 = (float(np.sqrt(value / np.pi)) for value in (3 / 4, 15 / 4, 5 / 16))
-    band_0 = [np.full_like(x, SH_C0)]
-    band_1 = [-c1 * y, c1 * z, -c1 * x]
-    band_2 = [c2 * x * y, -c2 * y * z, c20 * (2 * z * z - x * x - y * y), -c2 * x * z, c2 / 2 * (x * x - y * y)]
-    return np.stack(band_0 + band_1 + band_2, 1)
-
-
 class _Sums:
     """What the views add up to for each offset of the anchors start .. stop - 1, n in all.
 
@@ -126,7 +115,7 @@ class _Sums:
         drawn = rasterize(g.means, g.quats, g.scales, g.opacities, black, g.ids, camera, primitive=model.primitive)
         drawn.color[0].sum().backward()
         assert black.grad is not None
-        weight = device.host(black.grad[:, 0, 0]) / np.float32(SH_C0)
+        weight = device.host(black.grad[:, 0, 0]) / np.float32(spherical_harmonics.C0)
         g = g.cpu()
         source = g.source.numpy()
         slots = device.host(seen)[source // self.k] * self.k + source % self.k - self.first
@@ -134,8 +123,9 @@ class _Sums:
         slots, w = slots[mine], weight[mine]
         means = g.means.numpy()[mine]
         directions = means - camera.centre
-        basis = sh_basis(directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12))
-        colour = np.maximum(g.sh.numpy()[mine, 0] * SH_C0, -0.5)
+        directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
+        basis = spherical_harmonics.basis(directions.astype(np.float32), SH_DEGREE)
+        colour = np.maximum(g.sh.numpy()[mine, 0] * spherical_harmonics.C0, -0.5)
 
         self.means[slots] = means
         self.weight[slots] += w

@@ -30,10 +30,11 @@ def property_names(degree: int) -> list[str]:
     ]
 
 
-def write_splats(path: Path, splats: Splats) -> list[str]:
+def write_splats(path: Path, splats: Splats, with_ids: bool = True) -> list[str]:
     """Write `splats` to `path` atomically; returns warnings about splats that could not be written.
 
-    Binary little-endian, one float32 a property, `object_id` as uint32 at the end; opacity is stored as its logit,
+    Binary little-endian, one float32 a property, `object_id` as uint32 at the end unless `with_ids` is False: some
+    programs count on the other properties being all there are. Opacity is stored as its logit,
     scales as logarithms, `f_rest` all red coefficients first, then green, then blue. Positions are float32, except
     where the splats lie so far from the origin that float32 would move them by more than 1e-6 of their extent: then
     double.
@@ -51,7 +52,7 @@ def write_splats(path: Path, splats: Splats) -> list[str]:
     if len(splats) and (splats.object_ids.min() < 0 or splats.object_ids.max() > 0xFFFFFFFF):
         raise ValueError("object IDs must be from 0 to 2^32 - 1")
 
-    names = property_names(splats.degree)
+    names = [name for name in property_names(splats.degree) if with_ids or name != "object_id"]
     position = position_kind(splats)
     kinds = {"x": position, "y": position, "z": position, "object_id": "u4"}
     dtype = np.dtype([(name, "<" + kinds.get(name, "f4")) for name in names])
@@ -83,7 +84,8 @@ def _rows(splats: Splats, rows: slice, dtype: np.dtype) -> NDArray:
     quats = splats.quats[rows]
     for i in range(4):
         table[f"rot_{i}"] = quats[:, i]
-    table["object_id"] = splats.object_ids[rows]
+    if "object_id" in (dtype.names or ()):
+        table["object_id"] = splats.object_ids[rows]
     return table
 
 

@@ -44,8 +44,10 @@ def vote(
     seed: int = 0,
     occlusion: bool = True,
     reporter: Reporter | None = None,
+    places: np.ndarray | None = None,
 ) -> Votes:
-    """Label the capture's points from its masks.
+    """Label the capture's points from its masks, or other `places` (M,3) in its coordinates, which COLMAP knows nothing
+    about (splats, say).
 
     majority: each view in which the point lies votes with the ID at its pixel, the most frequent wins, ties go to the
     smallest. probability: the ID is drawn in proportion to those votes, from `seed`. correspondence: only views in
@@ -55,9 +57,12 @@ def vote(
     """
     if strategy not in ("majority", "probability", "correspondence"):
         raise ValueError(f"unknown strategy {strategy!r}")
+    if places is not None and strategy == "correspondence":
+        raise ValueError("COLMAP observed no places but its own points, so none correspond to others")
     reporter = reporter or Reporter()
     object_ids = capture.object_ids
-    ballots = _Ballots(len(capture.points.xyz), len(object_ids))
+    voters = capture.points.xyz if places is None else places
+    ballots = _Ballots(len(voters), len(object_ids))
     indices = [i for i in capture.train_indices if capture.views[i].mask_file is not None]
 
     def cast(index: int, points: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
@@ -66,10 +71,13 @@ def vote(
         seen = mask[y, x]
         ballots.add(points, np.where(seen == 0, -1, np.searchsorted(object_ids, seen)))
 
-    xyz = np.ascontiguousarray(capture.points.xyz.T)
+    xyz = np.ascontiguousarray(voters.T, np.float64)
+    nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64)
     reporter.status("Voting")
     for done, index in enumerate(indices, 1):
-        observed = _observed(capture, index) if strategy == "correspondence" or occlusion else None
+        observed = None
+        if strategy == "correspondence" or occlusion:
+            observed = _observed(capture, index) if places is None else nothing
         if strategy == "correspondence":
             assert observed is not None
             cast(index, *observed)
@@ -87,13 +95,13 @@ def vote(
     ids = np.where(chosen < 0, 0, object_ids[chosen] if len(object_ids) else 0).astype(np.int64)
     won = np.bincount(chosen[chosen >= 0], minlength=len(object_ids))
     counts = {int(i): int(n) for i, n in zip(object_ids, won)}
-    warnings = _warnings(capture, counts, int((ids == 0).sum()) if len(object_ids) else 0)
+    warnings = _warnings(capture, counts, int((ids == 0).sum()) if len(object_ids) else 0, len(ids))
     for sentence in warnings:
         reporter.warning(sentence)
     return Votes(ids, margins, counts, ballots.visible, warnings)
 
 
-def _warnings(capture: Capture, counts: dict[int, int], unlabelled: int) -> list[str]:
+def _warnings(capture: Capture, counts: dict[int, int], unlabelled: int, points: int) -> list[str]:
     def listed(ids: list[int]) -> str:
         named = [f"{i} ({capture.names[i]})" if i in capture.names else str(i) for i in ids[:10]]
         return ", ".join(named) + (f" and {len(ids) - 10} more" if len(ids) > 10 else "")
@@ -105,8 +113,8 @@ def _warnings(capture: Capture, counts: dict[int, int], unlabelled: int) -> list
         warnings.append(f"No point was labelled as object {listed(none)}, so training starts without it.")
     if few:
         warnings.append(f"Fewer than {FEW_POINTS} points were labelled as object {listed(few)}.")
-    if 2 * unlabelled > len(capture.points.xyz):
-        warnings.append(f"{unlabelled} of {len(capture.points.xyz)} points were labelled as no object.")
+    if 2 * unlabelled > points:
+        warnings.append(f"{unlabelled} of {points} points were labelled as no object.")
     return warnings
 
 

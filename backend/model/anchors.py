@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-SH_C0 = 0.28209479177387814
+from ..spherical_harmonics import C0
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def seed_anchors(
     else:
         spacing = np.full(n, voxel)
     rows[:, layout.extent_columns] = np.log(spacing)[:, None]
-    rows[:, layout.color_columns] = np.tile((color - 0.5) / SH_C0, (1, layout.offsets))
+    rows[:, layout.color_columns] = np.tile((color - 0.5) / C0, (1, layout.offsets))
     return Anchors(layout, voxel, *(torch.from_numpy(a) for a in (positions, rows, owner)))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +12,6 @@ from numba import config
 
 from . import cpu
 from .camera import Camera
-from .cpu import compile_kernels
 
 __all__ = ["Camera", "Rendered", "compile_kernels", "object_map", "rasterize"]
 
@@ -146,3 +147,45 @@ def object_map(rendered: Rendered) -> tuple[Any, Any]:
     from . import cuda
 
     return cuda.object_map(rendered.frame)
+
+
+_SURFACE = {"want_depth": True, "want_normals": True, "want_distortion": True}
+_KINDS: tuple[tuple[str, bool, dict[str, bool]], ...] = (
+    ("3d", True, {}), ("3d", False, {}), ("2d", True, {}), ("2d", False, {}), ("2d", True, _SURFACE),
+)  # fmt: skip
+"""What training draws, and what shows how far it is: primitive, with labels and a gradient, and which more planes.
+On the CPU a kernel serves all of a primitive."""
+
+
+def compile_kernels(place: torch.device | None = None, progress: Callable[[int, int], object] | None = None) -> float:
+    """Make every kernel that training draws with on a device (None: the CPU) ready, compiled or read from numba's cache
+    on disk; returns the seconds it took.
+
+    progress(done, total) is called before the first and after every kernel. What follows in this process compiles
+    nothing more, on the CPU whatever is asked for; a later process reads the cache (NUMBA_CACHE_DIR, or `__pycache__`
+    beside the kernels, or the user's own cache folder where that is not writable).
+    """
+    started = time.perf_counter()
+    report = progress or (lambda done, total: None)
+    ones = torch.ones((1, 4), device=place)
+    ids = torch.zeros(1, dtype=torch.int32, device=place)
+    labels = torch.zeros((2, 2), dtype=torch.int32, device=place)
+    camera = Camera(np.eye(4), np.eye(3), 2, 2)
+    done, total = 0, 2 * len(_KINDS)
+    report(done, total)
+    for primitive, labelled, wanted in _KINDS:
+        means = ones[:, :3].clone().requires_grad_(labelled)
+        drawn = rasterize(
+            means, ones, ones[:, :3], 0.5 * ones[:, 0], 0 * ones[:, None, :3], ids, camera,
+            labels=labels if labelled else None, primitive=primitive, **wanted,
+        )  # fmt: skip
+        report(done := done + 1, total)
+        if labelled:
+            planes = (drawn.color, drawn.alpha, drawn.weight, drawn.depth, drawn.normals, drawn.distortion)
+            torch.stack([plane.sum() for plane in planes if plane is not None]).sum().backward()
+        else:
+            object_map(drawn)
+        report(done := done + 1, total)
+    if ones.is_cuda:
+        torch.cuda.synchronize()
+    return time.perf_counter() - started

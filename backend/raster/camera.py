@@ -13,7 +13,8 @@ from .settings import NEAR
 class Camera:
     """viewmat (4, 4) float64 world to camera with OpenCV axes; K (3, 3) float64 in pixels, the first pixel's centre at
     (0.5, 0.5); width and height in pixels; near: nearest drawn depth in scene units; gain: how much brighter, channel
-    by channel, the camera's photo is than the scene (a finished picture is multiplied by it)."""
+    by channel, the camera's photo is than the scene (a finished picture is multiplied by it); whole: where the picture
+    that this is a part of begins and ends (left, top, right, bottom), in pixels from this one's corner."""
 
     viewmat: np.ndarray
     K: np.ndarray
@@ -21,6 +22,7 @@ class Camera:
     height: int
     near: float = NEAR
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    whole: tuple[float, float, float, float] | None = None
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
         """viewmat (4, 4) and (fx, fy, cx, cy), contiguous float64."""
@@ -35,12 +37,20 @@ class Camera:
         """(3,) float64: where the camera stands in the world."""
         return -np.asarray(self.viewmat[:3, :3].T @ self.viewmat[:3, 3], np.float64)
 
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Left, top, right and bottom of the whole picture."""
+        return self.whole or (0.0, 0.0, float(self.width), float(self.height))
+
     def crop(self, x: int, y: int, width: int, height: int) -> Camera:
-        """The camera of a part of the picture, whose upper left is the pixel (x, y)."""
+        """The camera of a part of the picture, whose upper left is the pixel (x, y). What it draws is that part of what
+        this one draws: how far beside the picture the perspective is followed goes by the whole."""
         K = np.array(self.K, np.float64)
         K[0, 2] -= x
         K[1, 2] -= y
-        return replace(self, K=K, width=width, height=height)
+        left, top, right, bottom = self.bounds
+        whole = (left - x, top - y, right - x, bottom - y)
+        return replace(self, K=K, width=width, height=height, whole=whole)
 
     def at_origin(self) -> Camera:
         """The same camera moved to the world's origin."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -156,32 +154,3 @@ def object_map(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     best_weight = np.empty(shape, np.float32)
     most_probable(frame.splats, frame.tilts, frame.gaussians.ids, frame.tiles, frame.members, best_id, best_weight)
     return best_id, best_weight
-
-
-def compile_kernels(progress: Callable[[int, int], object] | None = None) -> float:
-    """Make every kernel ready, compiled or read from numba's cache on disk; returns the seconds it took.
-
-    progress(done, total) is called before the first and after every kernel. What follows in this process compiles
-    nothing more, whatever is asked for; a later process reads the cache (NUMBA_CACHE_DIR, or `__pycache__` beside
-    the kernels, or the user's own cache folder where that is not writable).
-    """
-    started = time.perf_counter()
-    total = 6
-    report = progress or (lambda done, total: None)
-    report(0, total)
-    ones = np.ones((1, 4), np.float32)
-    g = Gaussians(
-        ones[:, :3].copy(), ones, ones[:, :3].copy(), ones[0, :1].copy(), np.zeros((1, 1, 3), np.float32),
-        np.zeros(1, np.int32),
-    )  # fmt: skip
-    camera = Camera(np.eye(4), np.eye(3), 2, 2)
-    color, plane = np.ones((3, 2, 2), np.float32), np.ones((2, 2), np.float32)
-    for flat in (False, True):
-        done = 3 if flat else 0
-        frame = forward(g, camera, np.zeros((2, 2), np.int32), flat=flat)
-        report(done + 1, total)
-        backward(frame, color, plane, plane)
-        report(done + 2, total)
-        object_map(frame)
-        report(done + 3, total)
-    return time.perf_counter() - started

@@ -78,9 +78,10 @@ def _footprints(p, axes, camera, blur, tan_margin):
     """
     fx, fy, cx, cy = (float(v) for v in camera.arrays()[1])
     x, y, z = p.unbind(-1)
-    edge_x, edge_y = tan_margin * 0.5 * camera.width / fx, tan_margin * 0.5 * camera.height / fy
-    tx = torch.clamp(x / z, -cx / fx - edge_x, (camera.width - cx) / fx + edge_x)
-    ty = torch.clamp(y / z, -cy / fy - edge_y, (camera.height - cy) / fy + edge_y)
+    left, top, right, bottom = camera.bounds
+    across, down = tan_margin * 0.5 * (right - left), tan_margin * 0.5 * (bottom - top)
+    tx = torch.clamp(x / z, (left - across - cx) / fx, (right + across - cx) / fx)
+    ty = torch.clamp(y / z, (top - down - cy) / fy, (bottom + down - cy) / fy)
     zero = torch.zeros_like(z)
     J = torch.stack([fx / z, zero, -fx * tx / z, zero, fy / z, -fy * ty / z], -1).reshape(-1, 2, 3)
     M = J @ axes

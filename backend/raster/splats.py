@@ -181,13 +181,14 @@ def _footprint(T, R, scales, n, V0, V1):
 
 
 @kernel()
-def tangent_limits(fx, fy, cx, cy, width, height):
-    """Clamp limits of x/z and y/z: the field of view with a margin on every side."""
+def tangent_limits(fx, fy, cx, cy, left, top, right, bottom):
+    """Clamp limits of x/z and y/z: the field of view of the whole picture with a margin on every side."""
     limits = np.empty(4)
-    limits[0] = -cx / fx - TAN_MARGIN * 0.5 * width / fx
-    limits[1] = (width - cx) / fx + TAN_MARGIN * 0.5 * width / fx
-    limits[2] = -cy / fy - TAN_MARGIN * 0.5 * height / fy
-    limits[3] = (height - cy) / fy + TAN_MARGIN * 0.5 * height / fy
+    across, down = TAN_MARGIN * 0.5 * (right - left), TAN_MARGIN * 0.5 * (bottom - top)
+    limits[0] = (left - across - cx) / fx
+    limits[1] = (right + across - cx) / fx
+    limits[2] = (top - down - cy) / fy
+    limits[3] = (bottom + down - cy) / fy
     return limits
 
 
@@ -196,7 +197,7 @@ def view_of(camera: Camera, flat: bool) -> np.ndarray:
     cy; the limits of x/z and y/z (none for discs, if `flat`); where the camera stands, and its near plane."""
     viewmat, intrinsics = camera.arrays()
     fx, fy, cx, cy = (float(v) for v in intrinsics)
-    limits = tangent_limits(fx, fy, cx, cy, float(camera.width), float(camera.height))
+    limits = tangent_limits(fx, fy, cx, cy, *camera.bounds)
     if flat:
         limits = np.array([-np.inf, np.inf, -np.inf, np.inf])
     return np.concatenate([viewmat[:3], [intrinsics, limits, [*camera.centre, camera.near]]])

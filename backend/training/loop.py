@@ -10,7 +10,7 @@ import itertools
 import json
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -122,6 +122,21 @@ class _Shown(NamedTuple):
     opacities: torch.Tensor
     met: torch.Tensor | np.ndarray
     screen_gradient: torch.Tensor | np.ndarray
+
+    @classmethod
+    def together(cls, parts: Sequence[_Shown], offsets: int) -> _Shown:
+        """The parts of a picture as one, on the GPU: a splat that several of them show is met once, and its gradient is
+        the sum of theirs."""
+        anchors = torch.cat([part.anchors for part in parts]).unique()
+        opacities = parts[0].opacities.new_zeros((len(anchors), offsets))
+        met, gradient = torch.zeros_like(opacities, dtype=torch.bool), opacities.new_zeros((len(anchors), offsets, 2))
+        for part in parts:
+            place = torch.searchsorted(anchors, part.anchors)
+            opacities[place] = part.opacities.view(-1, offsets)
+            met[place] |= torch.as_tensor(part.met).view(-1, offsets)
+            gradient[place] += torch.as_tensor(part.screen_gradient).view(-1, offsets, 2)
+        source = torch.arange(met.numel(), device=met.device)
+        return cls(anchors, source, opacities.flatten(), met.flatten(), gradient.view(-1, 2))
 
 
 class _Learned(NamedTuple):
@@ -592,11 +607,12 @@ class Trainer:
 
     def _grow(self, learned: _Learned, share: float) -> None:
         p, anchors, camera = self.progress, self.model.anchors, learned.camera
-        for part in learned.shown:
-            usable = learned.usable if self.parts == 1 else None
+        if learned.shown:
+            whole = len(learned.shown) == 1
+            shown = learned.shown[0] if whole else _Shown.together(learned.shown, anchors.layout.offsets)
             self._statistics.add(
-                part.anchors, anchors.layout.offsets, part.source, part.opacities, part.met, part.screen_gradient,
-                camera.width, camera.height, usable,
+                shown.anchors, anchors.layout.offsets, shown.source, shown.opacities, shown.met, shown.screen_gradient,
+                camera.width, camera.height, learned.usable if whole else None,
             )  # fmt: skip
         if share < GROW_FROM or p.step - p.last_growth < GROW_EVERY:
             return

@@ -41,6 +41,27 @@ OPTIONS are those of `python -m backend mesh`, whose --help explains them:
 """
 
 
+_RESULT_COMMANDS = {
+    "edit": ("remove, recolour, move or copy objects", """\
+Change the objects of the reconstruction in DIR: what build shows and export writes. The
+splats stay as they are, so that each change can be taken back. Without OPTIONS, say what
+is changed. OPTIONS are those of `python -m backend edit`, whose --help explains them:
+--remove mug, --restore mug, --recolor can:hue=0.3, --move box:x=0.1, --duplicate ...,
+--reset all.
+"""),
+    "export": ("write the splats for other programs", """\
+Write the splats of the reconstruction in DIR, with all changes, as PLY, SPZ or .splat.
+OPTIONS are those of `python -m backend export`, whose --help explains them:
+--format F, --objects NAME ..., --per-object, --coordinates blender, --sh-degree N.
+"""),
+}
+
+_IMPORT_SPLATS = """\
+Make a reconstruction of splats that another program trained: PLY is a file of 3D
+Gaussian splats. With --capture, the capture's masks say which object each belongs to.
+"""
+
+
 class UsageError(Exception):
     """The command line makes no sense; the message is one sentence."""
 
@@ -61,7 +82,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
             raise UsageError(f"Unrecognized arguments: {' '.join(rest)}; see headless.py --help.")
         return options
     if not rest or rest[0].startswith("-"):
-        out = "" if options.command == "mesh" else " --out DIR"
+        out = "" if options.takes == "DIR" else " --out DIR"
         raise UsageError(f"{options.takes} must come first: headless.py {options.command} {options.takes}{out}.")
     options.source, *options.rest = rest
     return options
@@ -91,6 +112,17 @@ def _parser() -> argparse.ArgumentParser:
     mesh = command("mesh", "make a textured mesh of each object", _MESH, takes="DIR",
                    usage="headless.py mesh DIR [OPTIONS]")
     _backend_python(mesh)
+    for name, (summary, description) in _RESULT_COMMANDS.items():
+        out = " --out PATH" if name == "export" else ""
+        sub = command(name, summary, description, takes="DIR", usage=f"headless.py {name} DIR{out} [OPTIONS]")
+        if out:
+            sub.add_argument("--out", type=Path, required=True, metavar="PATH",
+                             help="file, or a folder with --per-object")
+        _backend_python(sub)
+    imported = command("import-splats", "make a reconstruction of splats from elsewhere", _IMPORT_SPLATS, takes="PLY",
+                       usage="headless.py import-splats PLY --out DIR [--capture CAPTURE]")
+    imported.add_argument("--capture", type=Path, metavar="CAPTURE", help="folder with images/, sparse/ and masks/")
+    _backend(imported)
     build = command("build", "make a .blend of a reconstruction",
                     "Put a reconstruction's cameras, points, splats and meshes into a new .blend file.")
     build.add_argument("folder", type=Path, metavar="DIR", help="reconstruction folder")

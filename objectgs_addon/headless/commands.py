@@ -22,8 +22,8 @@ APART_PICTURE = "pulled-apart.png"
 SAMPLES = 16
 """Rays a pixel in the .blend that is built, unless --samples says otherwise."""
 
-_TITLES = {"import": "Import", "vote": "Vote", "train": "Train", "mesh": "Mesh", "evaluate": "Evaluate",
-           "report": "Report"}
+_TITLES = {"import": "Import", "vote": "Vote", "train": "Train", "mesh": "Mesh", "edit": "Edit", "export": "Export",
+           "import-splats": "Import splats", "evaluate": "Evaluate", "report": "Report"}
 
 
 class StepFailed(Exception):
@@ -58,11 +58,20 @@ def backend(options) -> None:
     _run_backend(options.command, folder, whole(Path(options.source)), "--out", folder, *options.rest)
 
 
-def mesh(options) -> None:
-    """The backend's own command on a reconstruction: meshes of its objects."""
+def on_result(options) -> None:
+    """One of the backend's own commands on a reconstruction: mesh, edit or export."""
     find_backend(options.backend_python)
     folder = whole(Path(options.source))
-    _run_backend("mesh", folder, folder, *options.rest)
+    out = ("--out", whole(options.out)) if options.command == "export" else ()
+    _run_backend(options.command, folder, folder, *out, *options.rest)
+
+
+def import_splats(options) -> None:
+    """The backend's own command on splats of another program."""
+    find_backend(options.backend_python)
+    folder = whole(options.out)
+    capture = ("--capture", whole(options.capture)) if options.capture else ()
+    _run_backend("import-splats", folder, whole(Path(options.source)), "--out", folder, *capture, *options.rest)
 
 
 def build(options) -> None:

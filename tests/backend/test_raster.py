@@ -136,3 +136,16 @@ def test_median_depth_is_that_of_the_splat_at_half_of_the_light():
         layers["opacities"] = torch.tensor(opacities)
         median = rasterize(**as_float32(layers), camera=cam, want_median=True).median
         np.testing.assert_allclose(median, depth)
+
+
+@PRIMITIVES
+def test_a_part_of_a_picture_is_drawn_as_in_the_whole(primitive):
+    """Splats far beside a narrow part are seen under the same perspective."""
+    scene, whole = as_float32(random_scene(3, size=0.4)), camera()
+    want = rasterize(**scene, camera=whole, primitive=primitive).color
+    x, y, width, height = whole.width // 2, 3, 4, whole.height - 5
+    part = whole.crop(x + 1, y, width, height)
+    compare(random_scene(3), part, primitive=primitive)
+    for cut in (part, whole.crop(x, 1, width + 5, height + 3).crop(1, y - 1, width, height)):
+        got = rasterize(**scene, camera=cut, primitive=primitive).color
+        np.testing.assert_allclose(got, want[:, y : y + height, x + 1 : x + 1 + width], rtol=1e-4, atol=2e-5)

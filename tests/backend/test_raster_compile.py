@@ -57,7 +57,7 @@ def run(script, **environment):
 
 def test_progress_is_reported():
     seen = []
-    assert compile_kernels(lambda done, total: seen.append((done, total))) > 0
+    assert compile_kernels(progress=lambda done, total: seen.append((done, total))) > 0
     assert seen == [(i, len(seen) - 1) for i in range(len(seen))]
 
 
@@ -97,7 +97,7 @@ def test_cache_is_renewed_when_any_file_of_the_package_changes(tmp_path):
 import sys, numpy as np
 sys.path.insert(0, sys.argv[1])
 from raster.splats import tangent_limits
-print(tangent_limits(1.0, 1.0, 0.0, 0.0, 2, 2)[1], sum(tangent_limits.stats.cache_hits.values()))
+print(tangent_limits(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 2.0, 2.0)[1], sum(tangent_limits.stats.cache_hits.values()))
 """
 
     def limit():

@@ -15,6 +15,7 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
+from objectgs.backend.ply import read_vertices  # noqa: E402
 from objectgs.objectgs_addon.headless.batch import fingerprint  # noqa: E402
 
 import headless  # noqa: E402
@@ -64,7 +65,8 @@ def blend(trained, tmp_path_factory):
 def test_help(capsys):
     ran = run("--help")
     assert ran.returncode == 0
-    for command in ("demo", "import", "vote", "train", "mesh", "build", "render", "run", "batch"):
+    for command in ("demo", "import", "vote", "train", "mesh", "edit", "export", "import-splats", "build", "render",
+                    "run", "batch"):
         assert f"\n    {command}" in ran.output
         with pytest.raises(SystemExit) as ended:
             headless.main([command, "--help"])
@@ -84,6 +86,8 @@ def test_help(capsys):
     (("render", "x", "--out", "a.png", "--samples", "0"), "'0'"),
     (("render", "x", "--out", "a.png", "--show", "points"), "points"),
     (("mesh", "--scene"), "DIR must come first: headless.py mesh DIR."),
+    (("edit", "--remove", "mug"), "DIR must come first: headless.py edit DIR."),
+    (("export", "somewhere"), "--out"),
 ])
 def test_arguments_that_make_no_sense(arguments, words, capsys):
     assert headless.main(list(arguments)) == 2
@@ -128,6 +132,30 @@ def test_render_from_any_camera(blend, tmp_path):
         assert size_of(tmp_path / name) == (48, 36)
     assert blend.read_bytes() == before
     assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_objects_are_edited_exported_and_imported_again(trained, backend_python, tmp_path, monkeypatch):
+    folder = shutil.copytree(trained, tmp_path / "made")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
+    first, second, *_ = json.loads((folder / "objects.json").read_text())["objects"]
+    ran = run("edit", "made", "--remove", first["name"], "--recolor", f"{second['id']}:hue=0.3")
+    assert ran.returncode == 0 and f"{first['name']}: removed" in ran.output, ran.output + ran.errors
+    ran = run("export", "made", "--out", "all.ply")
+    assert ran.returncode == 0, ran.output + ran.errors
+    ids = read_vertices(tmp_path / "all.ply")["object_id"]
+    assert first["id"] not in ids and second["id"] in ids
+    ran = run("import-splats", "all.ply", "--out", "again")
+    assert ran.returncode == 0, ran.output + ran.errors
+    ran = run("build", "again")
+    assert ran.returncode == 0, ran.output + ran.errors
+    shown = {thing.name for thing in opened(tmp_path / "again" / "objectgs.blend")
+             if thing.get("objectgs_kind") == "splats"}
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    assert f"object {second['id']} splats" in shown and f"object {first['id']} splats" not in shown
+    assert "no object nobody" in refusal("edit", "made", "--remove", "nobody")
+    assert "not a PLY" in refusal("import-splats", "made/objects.json", "--out", "third")
+    assert not (tmp_path / "third").exists()
 
 
 @pytest.fixture(scope="module")

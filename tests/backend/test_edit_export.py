@@ -1,0 +1,378 @@
+"""The commands that change objects, write splats for other programs and take theirs."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import struct
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+from scipy.spatial.transform import Rotation
+
+from backend.commands.cameras import write_no_cameras
+from backend.editing import apply_edits, transformed
+from backend.editing.place import middle_of
+from backend.export import read_splats, write_splat, write_splats, write_spz
+from backend.model.splats import Splats
+from backend.objects import edit_objects, read_objects, write_objects
+from backend.ply import read_vertices
+from backend.protocol import EXIT_DONE, InputError, Reconstruction, write_json
+from backend.spherical_harmonics import C0
+
+from .asking import refused
+
+NAMES = {1: "mug", 2: "Blue box", 3: "box", 7: "can"}
+UPRIGHT = Rotation.from_euler("xyz", [0.3, 0.8, -0.5]).as_matrix()
+
+
+def some_splats(n=60, degree=2, seed=0):
+    rng = np.random.default_rng(seed)
+    quats = rng.normal(size=(n, 4))
+    return Splats(
+        means=rng.normal((1, 2, 3), 0.5, (n, 3)).astype(np.float32),
+        quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        scales=np.exp(rng.normal(-3, 0.7, (n, 3))),
+        opacities=rng.uniform(0.02, 0.98, n),
+        sh=np.clip(rng.normal(size=(n, (degree + 1) ** 2, 3)) * 0.3, -0.9, 0.9).astype(np.float32),
+        object_ids=np.resize([0, 1, 2, 3, 7], n),
+    )
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A reconstruction with splats of four objects, that stands askew."""
+    made = Reconstruction(tmp_path / "made").create()
+    write_splats(made.splats, some_splats())
+    write_objects(
+        made.objects, [{"id": i, "name": name, "colour": [1, 2, 3], "points": 9} for i, name in NAMES.items()]
+    )
+    stands = {"rotation": UPRIGHT.tolist(), "translation": [0, 0, 1]}
+    write_json(made.cameras, {"capture": None, "origin": [1, 2, 3], "upright": stands, "cameras": []})
+    return made
+
+
+def edited(folder, object_id):
+    return next(entry for entry in read_objects(folder.objects) if entry.id == object_id)
+
+
+# --- edit ------------------------------------------------------------------------------------------------------------
+
+
+def test_objects_are_removed_and_restored_by_name_part_or_id(ask, folder):
+    answer = ask("edit", folder.folder, "--remove", "MUG", "blue", "7", "--floaters", "--json")
+    assert answer.code == EXIT_DONE and answer.events[-1]["edited"] == 3
+    assert [entry.removed and entry.floaters for entry in read_objects(folder.objects)] == [True, True, False, True]
+    (said,) = answer.messages("status")
+    assert "1 mug: removed with floaters\n" in said and "3 box: as captured\n" in said
+    ask("edit", folder.folder, "--restore", "mug", "box")
+    assert [entry.removed for entry in read_objects(folder.objects)] == [False, True, False, True]
+    assert json.loads(folder.objects.read_text())["edits"].keys() == {"2", "7"}
+
+
+def test_without_options_the_edits_are_said_and_nothing_is_written(ask, folder):
+    before = folder.objects.read_bytes()
+    answer = ask("edit", folder.folder)
+    assert answer.code == EXIT_DONE and "7 can: as captured" in answer.out and folder.objects.read_bytes() == before
+
+
+def test_recolouring_takes_the_middle_from_the_splats(ask, folder):
+    splats = read_splats(folder.splats)[0]
+    own = splats.select(splats.object_ids == 7)
+    ask("edit", folder.folder, "--recolor", "can:hue=0.3, saturation=0.5", "mug:replace=#ff0080,tint=#00ff00")
+    can, mug = edited(folder, 7).recolour, edited(folder, 1).recolour
+    assert (can.hue, can.saturation, mug.amount, mug.tint) == (0.3, 0.5, 1.0, (0, 1, 0))
+    assert mug.replace == pytest.approx((1, 0, 128 / 255))
+    luma = np.clip(0.5 + C0 * own.sh[:, 0], 0, 1) @ [0.299, 0.587, 0.114]
+    assert can.middle == pytest.approx((luma * own.opacities).sum() / own.opacities.sum())
+    ask("edit", folder.folder, "--recolor", "can:value=1")
+    assert edited(folder, 7).recolour is None
+
+
+def test_moves_are_along_blenders_axes_and_about_the_objects_middle(ask, folder):
+    splats = read_splats(folder.splats)[0]
+    middle = middle_of(splats.select(splats.object_ids == 7))
+    ask("edit", folder.folder, "--move", "can:x=0.5,z=-1,rz=90,scale=2", "--duplicate", "can:y=1", "can:y=2")
+    can = edited(folder, 7)
+    matrix = np.array(can.transform)
+    # What Blender shows: capture -> upright.
+    shift = UPRIGHT @ ((matrix @ [*middle, 1])[:3] - middle)
+    np.testing.assert_allclose(shift, (0.5, 0, -1), atol=1e-9)
+    np.testing.assert_allclose(UPRIGHT @ matrix[:3, :3] @ UPRIGHT.T, [[0, -2, 0], [2, 0, 0], [0, 0, 2]], atol=1e-9)
+    np.testing.assert_allclose(np.array(can.copies)[:, :3, 3] @ UPRIGHT.T, [[0, 1, 0], [0, 2, 0]], atol=1e-9)
+    assert "moved, scaled by 2, 2 copies" in ask("edit", folder.folder, "--duplicate", "mug:x=1").out
+    ask("edit", folder.folder, "--duplicate", "can:y=3")
+    assert len(edited(folder, 7).copies) == 3
+    ask("edit", folder.folder, "--reset", "can")
+    assert edited(folder, 7).transform is None and edited(folder, 1).copies
+    edit_objects(folder.objects, {1: {"name": "cup"}})
+    ask("edit", folder.folder, "--reset", "ALL")
+    assert json.loads(folder.objects.read_text())["edits"] == {"1": {"name": "cup"}}
+
+
+def test_what_is_merged_into_another_stands_for_that_one(ask, folder):
+    edit_objects(folder.objects, {1: {"merged_into": 7}})
+    ask("edit", folder.folder, "--remove", "mug")
+    assert edited(folder, 7).removed and not edited(folder, 1).removed
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--remove", "jug"], ["has no object jug", "1 mug, 2 Blue box, 3 box, 7 can"]),
+        (["--remove", "mug", "b"], ["b may be several objects", "2 Blue box, 3 box"]),
+        (["--move", "9:x=1"], ["has no object 9"]),
+        (["--recolor", "can:hue=2"], ["hue=2", "between -0.5 and 0.5"]),
+        (["--recolor", "can:tint=red"], ["tint=red", "#ff8800"]),
+        (["--recolor", "can"], ["OBJECT:KEY=VALUE"]),
+        (["--move", "can:up=1"], ["unknown 'up'", "x, y, z"]),
+        (["--move", "can:scale=0"], ["scale=0"]),
+        (["--move", "can:x=nan"], ["x=nan"]),
+        (["--floaters"], ["--remove"]),
+    ],
+)
+def test_what_cannot_be_edited_is_said_and_nothing_is_written(ask, folder, words, said):
+    before = folder.objects.read_bytes()
+    refused(ask("edit", folder.folder, *words), *said)
+    assert folder.objects.read_bytes() == before
+
+
+def test_an_object_without_splats_cannot_be_moved(ask, folder):
+    splats = some_splats()
+    write_splats(folder.splats, splats.select(splats.object_ids != 7))
+    refused(ask("edit", folder.folder, "--remove", "mug", "--move", "can:x=1"), "no splats of can")
+    assert not edited(folder, 1).removed
+    refused(ask("edit", folder.folder.parent), "objects.json does not exist")
+
+
+# --- export ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_export_has_the_edits_and_other_programs_read_it(ask, folder, tmp_path):
+    ask("edit", folder.folder, "--remove", "mug", "--recolor", "can:hue=0.2", "--move", "blue:x=1")
+    answer = ask("export", folder.folder, "--out", tmp_path / "all.ply", "--json")
+    assert answer.code == EXIT_DONE and answer.events[-1]["splats"] == 48
+    wanted = apply_edits(read_splats(folder.splats)[0], read_objects(folder.objects))
+    vertex = PlyData.read(str(tmp_path / "all.ply"))["vertex"]
+    names = [f"f_rest_{i}" for i in range(24)]
+    assert [p.name for p in vertex.properties] == [
+        *"x y z nx ny nz f_dc_0 f_dc_1 f_dc_2".split(), *names, "opacity",
+        *"scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3 object_id".split(),
+    ]  # fmt: skip
+    assert vertex["object_id"].tolist() == wanted.object_ids.tolist() and 1 not in wanted.object_ids
+    np.testing.assert_array_equal(np.stack([vertex[c] for c in "xyz"], 1), wanted.means)
+    rest = np.stack([vertex[name] for name in names], 1).reshape(-1, 3, 8).transpose(0, 2, 1)
+    np.testing.assert_array_equal(rest, wanted.sh[:, 1:])
+
+
+def test_without_edits_the_export_is_splats_ply(ask, folder, tmp_path):
+    ask("export", folder.folder, "--out", tmp_path / "all.ply")
+    assert (tmp_path / "all.ply").read_bytes() == folder.splats.read_bytes()
+    ask("export", folder.folder, "--out", tmp_path / "plain.ply", "--no-ids", "--sh-degree", "1")
+    names = read_vertices(tmp_path / "plain.ply").dtype.names
+    assert names[-1] == "rot_3" and "f_rest_8" in names and "f_rest_9" not in names
+
+
+def test_a_file_for_each_object(ask, folder, tmp_path):
+    edit_objects(folder.objects, {3: {"name": "../BLUE box"}, 1: {"merged_into": 7}})
+    ask("export", folder.folder, "--out", tmp_path / "parts", "--per-object")
+    assert {path.name for path in (tmp_path / "parts").iterdir()} == {
+        "unlabelled.ply", "Blue_box.ply", "BLUE_box_3.ply", "can.ply",
+    }  # fmt: skip
+    assert len(read_splats(tmp_path / "parts" / "can.ply")[0]) == 24
+    ask("export", folder.folder, "--out", tmp_path / "one", "--per-object", "--objects", "can", "--format", "splat")
+    assert [path.name for path in (tmp_path / "one").iterdir()] == ["can.splat"]
+
+
+def test_blenders_coordinates_are_upright(ask, folder, tmp_path):
+    ask("export", folder.folder, "--out", tmp_path / "up.ply", "--coordinates", "blender")
+    found, captured = read_splats(tmp_path / "up.ply")[0], read_splats(folder.splats)[0]
+    np.testing.assert_allclose(found.means, (captured.means - (1, 2, 3)) @ UPRIGHT.T + (0, 0, 1), atol=1e-6)
+    stand = np.eye(4)
+    stand[:3, :3] = UPRIGHT
+    np.testing.assert_allclose(found.sh, transformed(captured, stand).sh, atol=1e-6)
+
+
+def test_a_fit_is_exported_with_its_error(ask, folder, tmp_path):
+    training = {"settings": {"mode": "view"}}
+    write_json(folder.settings, {"training": training, "export": {"psnr_of_export": 34.62}})
+    answer = ask("export", folder.folder, "--out", tmp_path / "all.ply", "--json")
+    assert any("34.6 dB" in sentence for sentence in answer.messages("warning"))
+
+
+def test_exports_that_make_no_sense_are_refused(ask, folder, tmp_path):
+    refused(ask("export", folder.folder, "--out", tmp_path), "is a folder")
+    (tmp_path / "file").touch()
+    refused(ask("export", folder.folder, "--out", tmp_path / "file", "--per-object"), "is a file")
+    refused(ask("export", folder.folder, "--out", tmp_path / "a.ply", "--objects", "jug"), "no object jug")
+    ask("edit", folder.folder, "--remove", "can")
+    refused(ask("export", folder.folder, "--out", tmp_path / "a.ply", "--objects", "can"), "No splats")
+    refused(ask("export", tmp_path / "nothing", "--out", tmp_path / "a.ply"), "splats.ply")
+    assert not (tmp_path / "a.ply").exists()
+
+
+def read_spz(path):
+    """Splats of an SPZ file, taken apart splat by splat as its specification says."""
+    data = gzip.decompress(path.read_bytes())
+    magic, version, count, degree, bits, flags, reserved = struct.unpack_from("<IIIBBBB", data)
+    assert (magic, version, flags, reserved) == (0x5053474E, 3, 0, 0)
+    rest = (degree + 1) ** 2 - 1
+    sizes = [9, 1, 3, 3, 4, 3 * rest]
+    starts = [16 + count * sum(sizes[:i]) for i in range(6)]
+    assert len(data) == starts[5] + count * sizes[5]
+    means, opacities, colours, scales, quats, sh = ([] for _ in range(6))
+    for i in range(count):
+        at = [data[start + i * size : start + (i + 1) * size] for start, size in zip(starts, sizes)]
+        means.append([int.from_bytes(at[0][3 * j : 3 * j + 3], "little", signed=True) / 2**bits for j in range(3)])
+        opacities.append(at[1][0] / 255)
+        colours.append([(value / 255 - 0.5) / 0.15 for value in at[2]])
+        scales.append([np.exp(value / 16 - 10) for value in at[3]])
+        (packed,) = struct.unpack("<I", at[4])
+        xyzw, largest = np.zeros(4), packed >> 30
+        for axis in (3, 2, 1, 0):
+            if axis != largest:
+                xyzw[axis] = (packed & 511) / 511 / np.sqrt(2) * (-1 if packed & 512 else 1)
+                packed >>= 10
+        xyzw[largest] = np.sqrt(1 - (xyzw**2).sum())
+        quats.append(xyzw[[3, 0, 1, 2]])
+        sh.append(np.reshape([(value - 128) / 128 for value in at[5]], (rest, 3)))
+    sh = np.concatenate([np.reshape(colours, (count, 1, 3)), np.reshape(sh, (count, rest, 3))], 1)
+    return Splats(*map(np.array, (means, quats, scales, opacities)), sh, np.zeros(count, np.int64))
+
+
+def assert_close(found, wanted, colour):
+    turned = Rotation.from_quat(found.quats, scalar_first=True).inv() * Rotation.from_quat(
+        wanted.quats, scalar_first=True
+    )
+    assert turned.magnitude().max() < 0.01
+    np.testing.assert_allclose(found.means, wanted.means, atol=1e-5)
+    np.testing.assert_allclose(found.scales, wanted.scales, rtol=0.04)
+    np.testing.assert_allclose(found.opacities, wanted.opacities, atol=0.002)
+    np.testing.assert_allclose(found.sh[:, 0], wanted.sh[:, 0], atol=colour)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_spz_holds_the_splats_y_up(ask, folder, tmp_path, degree):
+    write_splats(folder.splats, some_splats(degree=degree))
+    ask("export", folder.folder, "--out", tmp_path / "all.spz")
+    found = read_spz(tmp_path / "all.spz")
+    wanted = transformed(read_splats(folder.splats)[0], np.diag([1.0, -1, -1, 1]))
+    assert_close(found, wanted, 0.02)
+    np.testing.assert_allclose(found.sh[:, 1:], wanted.sh[:, 1:], atol=0.004)
+    ask("export", folder.folder, "--out", tmp_path / "again.spz")
+    assert (tmp_path / "all.spz").read_bytes() == (tmp_path / "again.spz").read_bytes()
+    ask("export", folder.folder, "--out", tmp_path / "up.spz", "--coordinates", "blender")
+    ask("export", folder.folder, "--out", tmp_path / "up.ply", "--coordinates", "blender")
+    upright = read_splats(tmp_path / "up.ply")[0]
+    np.testing.assert_allclose(read_spz(tmp_path / "up.spz").means, upright.means[:, [0, 2, 1]] * (1, 1, -1), atol=1e-5)
+
+
+def test_another_reader_finds_the_same_in_spz(tmp_path):
+    gsply = pytest.importorskip("gsply")
+    splats = some_splats(degree=3)
+    write_spz(tmp_path / "a.spz", splats)
+    found, mine = gsply.read_spz(tmp_path / "a.spz"), read_spz(tmp_path / "a.spz")
+    np.testing.assert_allclose(found.means, mine.means, atol=1e-6)
+    np.testing.assert_allclose(np.exp(found.scales), mine.scales, rtol=1e-5)
+    np.testing.assert_allclose(found.shN, mine.sh[:, 1:], atol=1e-6)
+    np.testing.assert_allclose(found.sh0, mine.sh[:, 0], atol=1e-5)
+    np.testing.assert_allclose(np.abs((found.quats * mine.quats).sum(1)), 1, atol=1e-5)
+
+
+def test_what_spz_cannot_hold_is_said(tmp_path):
+    splats = some_splats()
+    splats.means += 1e6
+    write_spz(tmp_path / "far.spz", splats)
+    assert np.abs(read_spz(tmp_path / "far.spz").means - splats.means).max() < 0.6
+    splats.means += 1e8
+    with pytest.raises(InputError, match="PLY"):
+        write_spz(tmp_path / "farther.spz", splats)
+    assert not (tmp_path / "farther.spz").exists()
+    splats = some_splats()
+    splats.scales[:3] *= 1e-6
+    assert "3 of 60" in write_spz(tmp_path / "small.spz", splats)[0]
+    assert write_spz(tmp_path / "none.spz", Splats.empty(1)) == []
+
+
+def test_splat_files_have_32_bytes_a_splat(tmp_path):
+    splats = some_splats(degree=0)
+    assert write_splat(tmp_path / "a.splat", splats) == [] and write_splat(tmp_path / "b.splat", some_splats()) != []
+    data = (tmp_path / "a.splat").read_bytes()
+    assert len(data) == 32 * len(splats)
+    rows = [struct.unpack_from("<6f8B", data, 32 * i) for i in range(len(splats))]
+    sizes = [row[9] * np.prod(row[3:6]) ** (1 / 3) for row in rows]
+    assert all(a > 0.9 * b for a, b in pairwise(sizes))
+    first = np.flatnonzero((splats.means == np.float32(rows[0][:3])).all(1))[0]
+    colour = np.clip((0.5 + C0 * splats.sh[first, 0]) * 255, 0, 255)
+    assert rows[0][6:9] == pytest.approx(colour, abs=0.51)
+    assert rows[0][9] == pytest.approx(255 * splats.opacities[first], abs=0.51)
+    assert (np.array(rows[0][10:]) - 128) / 128 == pytest.approx(splats.quats[first], abs=0.009)
+
+
+# --- import ----------------------------------------------------------------------------------------------------------
+
+
+def test_splats_with_ids_become_a_reconstruction(ask, folder, tmp_path):
+    made = Reconstruction(tmp_path / "imported")
+    answer = ask("import-splats", folder.splats, "--out", made.folder, "--json")
+    assert answer.code == EXIT_DONE and answer.events[-1]["objects"] == 4
+    assert made.splats.read_bytes() == folder.splats.read_bytes()
+    assert [(entry.id, entry.name, entry.points) for entry in read_objects(made.objects)] == [
+        (1, "object 1", 12), (2, "object 2", 12), (3, "object 3", 12), (7, "object 7", 12),
+    ]  # fmt: skip
+    assert len(read_vertices(made.points)) == 0 and json.loads(made.cameras.read_text())["cameras"] == []
+    assert ask("edit", made.folder, "--move", "7:z=1").code == EXIT_DONE
+    assert ask("export", made.folder, "--out", tmp_path / "again.ply", "--coordinates", "blender").code == EXIT_DONE
+    refused(ask("render", made.folder), "checkpoint")
+
+
+def test_splats_without_ids_get_them_from_the_masks(ask, write_capture, tmp_path):
+    scene = write_capture(views=9, points=200)
+    splats = some_splats(n=len(scene.xyz), degree=0)
+    splats.means, splats.object_ids = scene.xyz.astype(np.float32), np.zeros(len(scene.xyz), np.int64)
+    write_splats(tmp_path / "foreign.ply", splats, with_ids=False)
+    made = Reconstruction(tmp_path / "imported")
+    answer = ask("import-splats", tmp_path / "foreign.ply", "--out", made.folder, "--capture", scene.folder)
+    assert answer.code == EXIT_DONE
+    assert (read_splats(made.splats)[0].object_ids == scene.point_objects).mean() > 0.95
+    assert [entry.name for entry in read_objects(made.objects)] == ["sphere 1", "sphere 2", "sphere 5"]
+    assert len(read_vertices(made.points)) == len(scene.xyz)
+    assert len(json.loads(made.cameras.read_text())["cameras"]) == 9
+
+
+def test_a_capture_without_masks_leaves_the_files_ids(ask, write_capture, folder, tmp_path):
+    scene = write_capture(views=4, masks=False)
+    answer = ask("import-splats", folder.splats, "--out", tmp_path / "made2", "--capture", scene.folder)
+    assert answer.code == EXIT_DONE and "masks does not exist" in answer.err
+    assert len(read_objects(tmp_path / "made2" / "objects.json")) == 4
+
+
+def test_what_cannot_be_imported_leaves_nothing(ask, write_capture, folder, tmp_path):
+    scene = write_capture(views=4)
+    made = tmp_path / "not" / "there"
+    refused(ask("import-splats", tmp_path / "none.ply", "--out", made), "none.ply")
+    write_splats(tmp_path / "empty.ply", Splats.empty())
+    refused(ask("import-splats", tmp_path / "empty.ply", "--out", made), "holds no splats")
+    refused(ask("import-splats", scene.folder / "labels.json", "--out", made), "not a PLY")
+    far = some_splats()
+    far.means += 1000
+    write_splats(tmp_path / "far.ply", far)
+    refused(ask("import-splats", tmp_path / "far.ply", "--out", made, "--capture", scene.folder), "coordinates")
+    refused(ask("import-splats", folder.splats, "--out", made, "--capture", tmp_path / "gone"), "gone")
+    assert not made.parent.exists()
+    folder.checkpoint.mkdir()
+    refused(ask("import-splats", folder.splats, "--out", folder.folder), "training already")
+
+
+def test_splats_without_cameras_stand_on_their_ground(tmp_path):
+    rng = np.random.default_rng(0)
+    ground = np.column_stack([rng.uniform(-1, 1, 3000), rng.normal(0.5, 0.001, 3000), rng.uniform(-1, 1, 3000)])
+    above = rng.uniform(-0.2, 0.2, (500, 3))
+    folder = Reconstruction(tmp_path)
+    write_no_cameras(folder, np.concatenate([ground, above]))
+    upright = json.loads(folder.cameras.read_text())["upright"]
+    rotation, translation = np.array(upright["rotation"]), np.array(upright["translation"])
+    assert (above @ rotation.T + translation)[:, 2].min() > 0.2
+    assert np.abs((ground @ rotation.T + translation)[:, 2]).max() < 0.05

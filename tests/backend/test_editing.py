@@ -1,0 +1,201 @@
+"""Edits of objects on plain splats, against what the reference renderer shows."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from backend.editing import apply_edits, recoloured, transformed
+from backend.editing.floaters import inside_hull
+from backend.model.splats import Splats, concatenate
+from backend.objects import SceneObject
+from backend.raster.camera import Camera
+from backend.raster.reference import rasterize_reference
+from backend.recolour import Recolour
+
+
+def some_splats(n=30, degree=3, seed=0, ids=(0, 1, 2), dtype=np.float64):
+    rng = np.random.default_rng(seed)
+    quats = rng.normal(size=(n, 4))
+    return Splats(
+        means=rng.normal(0, 0.5, (n, 3)).astype(dtype),
+        quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(dtype),
+        scales=np.exp(rng.normal(-2, 0.7, (n, 3))).astype(dtype),
+        opacities=rng.uniform(0.2, 0.95, n).astype(dtype),
+        sh=(rng.normal(size=(n, (degree + 1) ** 2, 3)) * 0.1).astype(dtype),
+        object_ids=np.resize(ids, n),
+    )
+
+
+def camera(moved=None):
+    """A camera at z = -4, or where a rigid map (4, 4) of the scene takes it."""
+    viewmat = np.eye(4)
+    viewmat[2, 3] = 4.0
+    if moved is not None:
+        viewmat = viewmat @ np.linalg.inv(moved)
+    return Camera(viewmat, np.array([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]]), 40, 30)
+
+
+def picture(splats, view):
+    """(30, 40, 4) float64: colour and alpha."""
+    arrays = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
+    tensors = (torch.from_numpy(np.asarray(array, np.float64)) for array in arrays)
+    drawn = rasterize_reference(*tensors, torch.from_numpy(splats.object_ids), view, 3)
+    return np.concatenate([drawn.color.numpy().transpose(1, 2, 0), drawn.alpha.numpy()[..., None]], 2)
+
+
+def affine(linear, translation=(0.0, 0.0, 0.0)):
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = linear, translation
+    return matrix
+
+
+def rows(matrix):
+    return tuple(tuple(row) for row in np.asarray(matrix, float).tolist())
+
+
+def scene_object(object_id, **edits):
+    return SceneObject(object_id, f"object {object_id}", (1, 2, 3), 10, **edits)
+
+
+def covariances(splats):
+    axes = Rotation.from_quat(splats.quats, scalar_first=True).as_matrix() * splats.scales[:, None]
+    return axes @ axes.transpose(0, 2, 1)
+
+
+def same(a, b):
+    return all(np.array_equal(getattr(a, field.name), getattr(b, field.name)) for field in fields(Splats))
+
+
+TURN = Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix()
+
+
+def test_splats_that_move_with_the_camera_look_the_same():
+    splats, move = some_splats(), affine(TURN, (0.3, -2.0, 5.0))
+    before = picture(splats, camera())
+    assert before[..., 3].max() > 0.5
+    np.testing.assert_allclose(picture(transformed(splats, move), camera(move)), before, atol=1e-10)
+
+
+def test_a_scale_about_the_camera_looks_the_same():
+    splats = some_splats()
+    eye = np.array([0, 0, -4.0])
+    scaled = transformed(splats, affine(2.5 * np.eye(3), eye - 2.5 * eye))
+    np.testing.assert_allclose(picture(scaled, camera()), picture(splats, camera()), atol=1e-10)
+
+
+SHEAR = np.array([[1, 0.5, 0], [0, 1, 0], [0, 0.2, -2.0]])
+
+
+@pytest.mark.parametrize("linear", [3.0 * TURN, np.diag([1.0, 1.0, -1.0]), TURN @ np.diag([1.0, 2.0, 0.3]), SHEAR])
+def test_shapes_follow_any_affine_map(linear):
+    splats = some_splats()
+    moved = transformed(splats, affine(linear, (1, 2, 3)))
+    np.testing.assert_allclose(covariances(moved), linear @ covariances(splats) @ linear.T, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(moved.means, splats.means @ linear.T + (1, 2, 3), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(moved.quats, axis=1), 1, atol=1e-12)
+    assert np.array_equal(moved.opacities, splats.opacities)
+
+
+@pytest.mark.parametrize("linear", [TURN, TURN @ np.diag([1.0, 2.0, 0.5])])
+def test_a_disc_stays_a_disc_whose_third_axis_is_its_normal(linear):
+    splats = some_splats()
+    splats.scales[:, 2] = 1e-6
+    moved = transformed(splats, affine(linear))
+    assert (moved.scales[:, 2] < 1e-5).all() and (moved.scales[:, :2] > 1e-3).all()
+
+
+def test_float32_stays_float32():
+    moved = transformed(recoloured(some_splats(dtype=np.float32), Recolour(hue=0.3)), affine(TURN))
+    assert {getattr(moved, name).dtype for name in ("means", "quats", "scales", "opacities", "sh")} == {np.dtype("f4")}
+
+
+def test_a_recoloured_object_is_its_picture_recoloured():
+    splats, recolour = some_splats(), Recolour(hue=0.3, saturation=0.5, value=0.8, contrast=0.9, tint=(1, 0.9, 0.8))
+    splats.sh *= 0.3  # so that no colour is clamped
+    before, after = picture(splats, camera()), picture(recoloured(splats, recolour), camera())
+    matrix, offset = recolour.affine()
+    np.testing.assert_allclose(after[..., :3], before[..., :3] @ matrix.T + before[..., 3:] * offset, atol=1e-12)
+    assert np.array_equal(after[..., 3], before[..., 3]) and np.abs(after - before).max() > 0.01
+
+
+def test_without_edits_nothing_changes():
+    splats = some_splats(dtype=np.float32)
+    assert same(apply_edits(splats, []), splats)
+    assert same(apply_edits(splats, [scene_object(1), scene_object(2)]), splats)
+
+
+def test_others_stay_bit_for_bit_in_their_order():
+    splats = some_splats(dtype=np.float32)
+    objects = [scene_object(1, recolour=Recolour(hue=0.2), transform=rows(affine(TURN))), scene_object(2, removed=True)]
+    edited = apply_edits(splats, objects)
+    assert edited.object_ids.tolist() == [i for i in splats.object_ids.tolist() if i != 2]
+    assert same(edited.select(edited.object_ids == 0), splats.select(splats.object_ids == 0))
+    own = splats.select(splats.object_ids == 1)
+    assert same(edited.select(edited.object_ids == 1), transformed(recoloured(own, Recolour(hue=0.2)), affine(TURN)))
+
+
+def test_copies_come_last_from_where_it_was_captured():
+    splats, away, further = some_splats(), affine(np.eye(3), (1, 0, 0)), affine(2 * TURN, (0, 3, 0))
+    recolour = Recolour(value=0.5)
+    edited = apply_edits(
+        splats, [scene_object(1, recolour=recolour, transform=rows(away), copies=(rows(further), rows(away)))]
+    )
+    own = recoloured(splats.select(splats.object_ids == 1), recolour)
+    assert len(edited) == len(splats) + 2 * len(own)
+    assert same(edited.select(np.arange(len(splats), len(edited))),
+                concatenate([transformed(own, further), transformed(own, away)]))  # fmt: skip
+    assert same(edited.select(np.flatnonzero(edited.object_ids == 1)[: len(own)]), transformed(own, away))
+
+
+def test_a_merged_object_goes_with_the_other():
+    splats = some_splats(ids=(0, 1, 2, 3))
+    objects = [
+        scene_object(1, merged_into=2, recolour=Recolour(value=0.1), removed=True),
+        scene_object(2, transform=rows(affine(TURN))),
+        scene_object(3, left_out=True),
+    ]
+    edited = apply_edits(splats, objects)
+    assert set(edited.object_ids.tolist()) == {0, 2}
+    pair = splats.select(np.isin(splats.object_ids, (1, 2)))
+    moved = edited.select(edited.object_ids == 2)
+    np.testing.assert_array_equal(moved.means, transformed(pair, affine(TURN)).means)
+    gone = apply_edits(splats, [objects[0], scene_object(2, removed=True), scene_object(9, removed=True)])
+    assert set(gone.object_ids.tolist()) == {0, 3}
+    assert set(apply_edits(splats, [scene_object(1, left_out=True, merged_into=2), scene_object(2)])
+               .object_ids.tolist()) == {0, 2, 3}  # fmt: skip
+
+
+def test_a_removed_object_takes_its_copies_along():
+    assert 1 not in apply_edits(some_splats(), [scene_object(1, removed=True, copies=(rows(np.eye(4)),))]).object_ids
+
+
+def test_floaters_inside_the_hull_go_where_that_is_asked_for():
+    rng = np.random.default_rng(0)
+    ball = rng.normal(size=(300, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    stray, faint = np.array([[50.0, 0, 0]]), np.array([[0, 50.0, 0]])
+    means = np.concatenate([ball, stray, faint]) + 1e6
+    opacities = np.r_[np.ones(301), 0.01]
+    points = np.array([[0, 0, 0], [0.8, 0, 0], [1.1, 0, 0], [20, 0, 0], [0, 20, 0]]) + 1e6
+    assert inside_hull(points, means, opacities).tolist() == [True, True, False, False, False]
+    assert not inside_hull(points, means[:3], opacities[:3]).any()
+    assert not inside_hull(points, np.ones((20, 3)), np.ones(20)).any()
+
+    both = some_splats(n=305, ids=(1,))
+    both.means, both.opacities = np.concatenate([means[:300], points]), np.ones(305)
+    both.object_ids[300:] = [0, 2, 0, 0, 0]
+    kept = apply_edits(both, [scene_object(1, removed=True, floaters=True), scene_object(2)])
+    assert kept.object_ids.tolist() == [2, 0, 0, 0]
+    assert len(apply_edits(both, [scene_object(1, removed=True)])) == 5
+    assert len(apply_edits(both, [scene_object(1, floaters=True)])) == 305
+
+
+def test_no_splats():
+    for edited in (transformed(Splats.empty(2), affine(TURN)), recoloured(Splats.empty(2), Recolour(hue=0.1)),
+                   apply_edits(Splats.empty(2), [scene_object(1, removed=True)])):  # fmt: skip
+        assert len(edited) == 0 and edited.degree == 2
