@@ -114,6 +114,25 @@ class Blender:
         self._tool("xdotool", "mousemove", str(round(x)), str(round(y)))
         time.sleep(0.4)
 
+    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
+        """Press the left button at a place (pixels from the upper left) and let it go at another."""
+        self.move(*start)
+        self._tool("xdotool", "mousedown", "1")
+        for share in (0.2, 0.6, 1.0):
+            self.move(*(a + share * (b - a) for a, b in zip(start, end)))
+        self._tool("xdotool", "mouseup", "1")
+        time.sleep(0.6)
+
+    def hold(self, key: str) -> None:
+        """Press a key and keep it pressed."""
+        self._tool("xdotool", "keydown", key)
+        time.sleep(0.3)
+
+    def release(self, key: str) -> None:
+        """Let a key go that is held."""
+        self._tool("xdotool", "keyup", key)
+        time.sleep(0.3)
+
     def key(self, *keys: str) -> None:
         """Press keys, for instance "ctrl+z"."""
         for name in keys:
