@@ -6,8 +6,9 @@
 """
 
 from .gather import owners, shown, splat_parts
-from .viewport import picture, point_at, redraw, register, show, unregister
+from .viewport import picture, point_at, redraw, register, show, trouble, unregister
 
 __all__ = [
-    "owners", "picture", "point_at", "redraw", "register", "show", "shown", "splat_parts", "unregister",
+    "owners", "picture", "point_at", "redraw", "register", "show", "shown", "splat_parts", "trouble",
+    "unregister",
 ]

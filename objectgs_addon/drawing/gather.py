@@ -14,6 +14,8 @@ NONE = (0.0, 0.0, 0.0, 0.0)
 SELECTED = (1.0, 0.55, 0.1, 0.3)
 POINTED_AT = (1.0, 1.0, 1.0, 0.3)
 
+_recolour_of = getattr(scenes, "recolour_of", lambda _collection: None)
+
 _HIDES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "VOLUME", "POINTCLOUD", "CURVES", "GREASEPENCIL"}
 
 
@@ -58,8 +60,12 @@ def gather(parts, colours: str = "photo", pointed_at: int | None = None, marks: 
 
 
 def colour_map(collection) -> np.ndarray:
-    """(3, 4): matrix and offset of what was asked of an object's colours."""
-    return NO_RECOLOUR
+    """(3, 4): matrix and offset of what was asked of an object's colours, by its collection or None."""
+    recolour = _recolour_of(collection) if collection is not None else None
+    if recolour is None:
+        return NO_RECOLOUR
+    matrix, offset = recolour.affine()
+    return np.hstack([matrix, offset[:, None]])
 
 
 def hides_splats(view_layer, space) -> bool:

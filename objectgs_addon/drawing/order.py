@@ -9,10 +9,11 @@ def back_to_front(depths: np.ndarray, near: float, orthographic: bool) -> np.nda
 
     With perspective, two whose depths differ by less than about a ten-thousandth may come in the order they are given.
     """
-    ahead = np.flatnonzero(depths > near)
-    if len(ahead) == 0:
-        return ahead
-    kept = depths if len(ahead) == len(depths) else depths[ahead]
+    is_ahead = depths > near
+    ahead = None if is_ahead.all() else np.flatnonzero(is_ahead)
+    kept = depths if ahead is None else depths.take(ahead)
+    if len(kept) == 0:
+        return np.zeros(0, np.int64)
     if orthographic:
         least, most = float(kept.min()), float(kept.max())
         keys = ((most - kept) * (65535.0 / max(most - least, 1e-30))).astype(np.uint16)
@@ -22,4 +23,4 @@ def back_to_front(depths: np.ndarray, near: float, orthographic: bool) -> np.nda
         least, most = int(bits.min()), int(bits.max())
         keys = ((most - bits) >> max(0, (most - least).bit_length() - 16)).astype(np.uint16)
     order = np.argsort(keys, kind="stable")
-    return order if kept is depths else ahead[order]
+    return order if ahead is None else ahead.take(order)

@@ -51,8 +51,9 @@ class Renderer:
             return False
         if self._pool is None or not self._pool.holds(things):
             self._pool, self._sorted = _Pool(things), None
-        if self._sorted is None or not self._sorted.is_for(things, view):
-            self._sorted = _Sorted(self._pool, things, view)
+        if self._sorted is None or not self._sorted.holds(things):
+            self._sorted = _Sorted(self._pool, things)
+        self._sorted.sort(things, view)
         if self._sorted.count == 0:
             return False
         with _state(), self._target_of(view.width, view.height).bind():
@@ -123,7 +124,9 @@ class _Pool:
         starts = np.cumsum([0, *(len(arrays.means) for arrays in self._arrays)])
         self.starts = {id(arrays): int(start) for arrays, start in zip(self._arrays, starts)}
         count = int(starts[-1])
-        self.bands = max(arrays.harmonics.shape[1] for arrays in self._arrays)
+        room = shaders.TABLE_WIDTH * gpu.capabilities.max_texture_size_get() // max(count, 1)
+        most = max(arrays.harmonics.shape[1] for arrays in self._arrays)
+        self.bands = max(bands for bands in (1, 4, 9, 16) if bands == 1 or bands <= min(most, room))
         splats = np.zeros((count, shaders.SPLAT_TEXELS, 4), np.float32)
         harmonics = np.zeros((count, self.bands, 4), np.float32)
         for arrays, start in zip(self._arrays, starts):
@@ -131,7 +134,8 @@ class _Pool:
             splats[own, 0, :3], splats[own, 0, 3] = arrays.means, arrays.opacities
             splats[own, 1] = arrays.quats
             splats[own, 2, :3] = arrays.scales
-            harmonics[own, :arrays.harmonics.shape[1], :3] = arrays.harmonics
+            bands = min(arrays.harmonics.shape[1], self.bands)
+            harmonics[own, :bands, :3] = arrays.harmonics[:, :bands]
         self.splats = _table(splats, "RGBA32F")
         self.harmonics = _table(harmonics, "RGBA16F")
 
@@ -147,33 +151,40 @@ class _Pool:
 class _Sorted:
     """The order in which splats are drawn, for one view of objects in their places."""
 
-    def __init__(self, pool: _Pool, things: Sequence[Drawn], view: View) -> None:
-        self._key = _depth_rows(things, view)
+    def __init__(self, pool: _Pool, things: Sequence[Drawn]) -> None:
         self._splats = [thing.splats for thing in things]
-        depths = np.concatenate([
-            thing.splats.means @ row[:3].astype(np.float32) + np.float32(row[3])
-            for thing, row in zip(things, self._key)])
-        order = back_to_front(depths, view.near, view.orthographic)
-        entries = np.empty((len(depths), 2), np.float32)
+        counts = [len(splats.means) for splats in self._splats]
+        self._entries = np.empty((sum(counts), 2), np.float32)
+        self._depths = np.empty(len(self._entries), np.float32)
+        self._parts = []
         first = 0
-        for slot, thing in enumerate(things):
-            start, count = pool.starts[id(thing.splats)], len(thing.splats.means)
-            entries[first:first + count, 0] = np.arange(start, start + count)
-            entries[first:first + count, 1] = slot
+        for slot, (splats, count) in enumerate(zip(self._splats, counts)):
+            start, own = pool.starts[id(splats)], slice(first, first + count)
+            self._entries[own, 0] = np.arange(start, start + count)
+            self._entries[own, 1] = slot
+            self._parts.append(own)
             first += count
+        self._rows: np.ndarray | None = None
+        self.count = 0
+        self.texture: gpu.types.GPUTexture | None = None
+
+    def holds(self, things: Sequence[Drawn]) -> bool:
+        """Whether these are the objects that it sorts."""
+        return len(things) == len(self._splats) and all(
+            thing.splats is splats for thing, splats in zip(things, self._splats))
+
+    def sort(self, things: Sequence[Drawn], view: View) -> None:
+        """Bring the order up to date, if the view or an object has moved."""
+        rows = view.viewmat[2] @ np.array([thing.matrix for thing in things])
+        if self._rows is not None and np.array_equal(rows, self._rows):
+            return
+        self._rows = rows
+        for splats, row, own in zip(self._splats, rows.astype(np.float32), self._parts):
+            np.matmul(splats.means, row[:3], out=self._depths[own])
+            self._depths[own] += row[3]
+        order = back_to_front(self._depths, view.near, view.orthographic)
         self.count = len(order)
-        self.texture = _table(entries[order], "RG32F") if self.count else None
-
-    def is_for(self, things: Sequence[Drawn], view: View) -> bool:
-        """Whether the order is that of these objects in this view."""
-        return (len(things) == len(self._splats)
-                and all(thing.splats is splats for thing, splats in zip(things, self._splats))
-                and np.array_equal(_depth_rows(things, view), self._key))
-
-
-def _depth_rows(things: Sequence[Drawn], view: View) -> np.ndarray:
-    """(n, 4): what gives an object's points their depth in the view."""
-    return view.viewmat[2] @ np.array([thing.matrix for thing in things])
+        self.texture = _table(self._entries.take(order, axis=0), "RG32F") if self.count else None
 
 
 def _objects(things: Sequence[Drawn], view: View) -> np.ndarray:
@@ -200,8 +211,9 @@ def _table(values: np.ndarray, kind: str) -> gpu.types.GPUTexture:
     channels = values.shape[-1]
     texels = values.size // channels
     rows = max(1, -(-texels // shaders.TABLE_WIDTH))
-    filled = np.zeros((rows * shaders.TABLE_WIDTH, channels), np.float32)
+    filled = np.empty((rows * shaders.TABLE_WIDTH, channels), np.float32)
     filled[:texels] = values.reshape(-1, channels)
+    filled[texels:] = 0.0
     return gpu.types.GPUTexture((shaders.TABLE_WIDTH, rows), format=kind, data=_buffer(filled))
 
 

@@ -12,6 +12,7 @@ from . import gather
 from .renderer import Renderer
 
 _renderer: Renderer | None = None
+_trouble: str | None = None
 _handler = None
 _pointed_at: int | None = None
 """The number of this session of the object's collection that a tool highlights."""
@@ -23,6 +24,11 @@ def renderer() -> Renderer:
     if _renderer is None:
         _renderer = Renderer()
     return _renderer
+
+
+def trouble() -> str | None:
+    """Why splats cannot be drawn on this computer, or None."""
+    return _trouble
 
 
 def picture(context_scene, view_layer, view: View, projection: np.ndarray) -> np.ndarray:
@@ -38,10 +44,17 @@ def picture(context_scene, view_layer, view: View, projection: np.ndarray) -> np
 
 
 def _draw() -> None:
+    global _trouble
     context = bpy.context
     space, region = context.space_data, context.region_data
     properties = context.scene.objectgs
-    if not properties.draw_splats or region is None:
+    if not properties.draw_splats or region is None or _trouble is not None:
+        return
+    try:
+        renderer()
+    except Exception as error:  # Drivers differ in what they refuse, and Blender raises no type of its own.
+        _trouble = f"The graphics driver refuses to draw splats: {error}"
+        print(f"ObjectGS: {_trouble}", flush=True)
         return
     parts = gather.splat_parts(context.view_layer, space)
     things = gather.gather(parts, properties.splat_colours, _pointed_at, space.overlay.show_overlays)

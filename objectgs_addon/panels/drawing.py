@@ -3,6 +3,8 @@
 
 import bpy
 
+from .. import drawing
+from ..job_display import write
 from .tab import WithReconstruction
 
 
@@ -14,6 +16,8 @@ class DrawingPanel(WithReconstruction, bpy.types.Panel):
         self.layout.prop(context.scene.objectgs, "draw_splats", text="")
 
     def draw(self, context):
+        if drawing.trouble() is not None:
+            write(self.layout, drawing.trouble(), "ERROR")
         column = self.layout.column()
         column.active = context.scene.objectgs.draw_splats
         column.label(text="Colors")

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from backend.editing.apply import transformed
+from backend.editing.apply import recoloured, transformed
 from backend.export import write_splats
 from backend.model.splats import Splats
 from backend.ply import write_vertices
 from backend.raster import Camera, rasterize
+from backend.recolour import Recolour
 
 from .harness import PACKAGE
 
@@ -129,11 +130,13 @@ def drawn(window, name: str = "0") -> np.ndarray:
     return np.load(path)
 
 
-def backend_draws(without: int = 0) -> np.ndarray:
+def backend_draws(without: int = 0, recolour: Recolour | None = None) -> np.ndarray:
     """(H, W, 4) what the backend makes of it, with object 2 where it was moved to."""
     given = splats()
     parts = [subset(given, given.object_ids == i) for i in (1, 2, 3) if i != without]
     parts = [transformed(part, MOVED) if part.object_ids[0] == 2 else part for part in parts]
+    if recolour is not None:
+        parts = [recoloured(part, recolour) if part.object_ids[0] == 3 else part for part in parts]
     arrays = [np.concatenate([getattr(part, name) for part in parts]).astype(np.float32)
               for name in ("means", "quats", "scales", "opacities", "sh")]
     ids = torch.zeros(len(arrays[0]), dtype=torch.int32)
@@ -165,6 +168,23 @@ def test_the_drawing_is_the_backends_picture(window):
         for part in scene.object_collections(root)[1].objects:
             part.hide_set(False)
     """))
+
+
+def test_recolouring_is_seen(window):
+    """The affine map of an object's colours, in every direction."""
+    window.run(script(f"""
+        gather = importlib.import_module("{PACKAGE}.objectgs_addon.drawing.gather")
+        Recolour = importlib.import_module("{PACKAGE}.backend.recolour").Recolour
+        bpy.app.driver_namespace["before"] = gather._recolour_of
+        gather._recolour_of = lambda block: Recolour(hue=0.3, value=0.8) if scene.object_id_of(block) == 3 else None
+    """))
+    picture = drawn(window)
+    window.run(script(f"""
+        gather = importlib.import_module("{PACKAGE}.objectgs_addon.drawing.gather")
+        gather._recolour_of = bpy.app.driver_namespace.pop("before")
+    """))
+    assert psnr(picture, backend_draws(recolour=Recolour(hue=0.3, value=0.8))) > 40.0
+    assert psnr(picture, drawn(window)) < 30.0
 
 
 def place_of(window, point) -> tuple[float, float]:
