@@ -44,7 +44,7 @@ class PickTool(bpy.types.WorkSpaceTool):
         if not _name:
             return
         font, scale = 0, context.preferences.system.ui_scale
-        blf.size(font, 12 * scale)
+        blf.size(font, 14 * scale)
         blf.enable(font, blf.SHADOW)
         blf.shadow(font, 3, 0.0, 0.0, 0.0, 0.9)
         blf.color(font, 1.0, 1.0, 1.0, 1.0)

@@ -11,7 +11,7 @@ from .renderer import Drawn
 
 NO_RECOLOUR = np.hstack([np.eye(3), np.zeros((3, 1))])
 NONE = (0.0, 0.0, 0.0, 0.0)
-SELECTED = (1.0, 0.55, 0.1, 0.3)
+SELECTED = (1.0, 0.55, 0.1, 0.25)
 POINTED_AT = (1.0, 1.0, 1.0, 0.3)
 
 _recolour_of = getattr(scenes, "recolour_of", lambda _collection: None)

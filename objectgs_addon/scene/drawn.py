@@ -12,7 +12,7 @@ DRAWN_GROUP = "splats_drawn"
 def show_preview(part: bpy.types.Object, is_on: bool) -> None:
     """Switch the geometry nodes' preview of a carrier's splats in viewports; renders keep theirs."""
     preview, drawn = modifier_of(part, SPLATS_GROUP), modifier_of(part, DRAWN_GROUP)
-    if preview is None:
+    if preview is None or part.library is not None:
         return
     if preview.show_viewport != is_on:
         preview.show_viewport = is_on

@@ -267,6 +267,39 @@ def wait(window, expression: str) -> None:
         time.sleep(0.3)
 
 
+def test_a_mesh_in_front_is_picked(window):
+    """And not one behind; where there is nothing, nothing is selected."""
+    x, y = window.run(script("""
+        from bpy_extras.view3d_utils import location_3d_to_region_2d
+        context = window_context()
+        result = list(location_3d_to_region_2d(
+            context["region"], context["area"].spaces.active.region_3d, (-0.5, 0.0, 0.2)))
+    """))
+    picks = []
+    for at in (-1.0, 3.0):
+        window.run(script(f"""
+            import mathutils
+            bpy.ops.mesh.primitive_cube_add(size=0.1)
+            cube = bpy.context.active_object
+            cube.name = "cube"
+            eye, ball = mathutils.Vector((0.3, -3.0, 0.8)), mathutils.Vector((-0.5, 0.0, 0.2))
+            cube.location = ball + (eye - ball).normalized() * -({at})
+            bpy.context.view_layer.update()
+        """))
+        picks.append(window.run(script(f"""
+            with bpy.context.temp_override(**window_context()):
+                bpy.ops.objectgs.pick_object("EXEC_DEFAULT", x={round(x)}, y={round(y)})
+            result = bpy.context.active_object.name
+            bpy.data.objects.remove(bpy.data.objects["cube"])
+        """)))
+    assert picks == ["cube", "left"]
+    window.run("""
+        with bpy.context.temp_override(**window_context()):
+            bpy.ops.objectgs.pick_object("EXEC_DEFAULT", x=5, y=5)
+    """)
+    assert window.run(script("result = selected()")) == []
+
+
 def test_words_find_objects(window):
     window.run(script("""
         with bpy.context.temp_override(**window_context()):
