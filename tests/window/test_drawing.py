@@ -117,21 +117,26 @@ def window(blender, folder):
     return blender
 
 
-def drawn(window, name: str = "0") -> np.ndarray:
-    """(H, W, 4) what the drawing makes of the camera's view."""
-    path = window.place / f"{name}.npy"
+def drawn(window, matrix=None, focal: float = 200.0, orthographic: bool = False) -> np.ndarray:
+    """(H, W, 4) what the drawing makes of the camera's view, or of another."""
+    path = window.place / "drawn.npy"
+    matrix = viewmat() if matrix is None else matrix
     window.run(script(f"""
-        view = picking.View(np.array({viewmat().tolist()}), 200.0, 200.0, 118.0, 92.0, {SIZE[0]}, {SIZE[1]})
-        near, far = 0.01, 100.0
+        view = picking.View(np.array({matrix.tolist()}), {focal}, {focal}, 118.0, 92.0, {SIZE[0]}, {SIZE[1]},
+                            orthographic={orthographic})
+        near, far = 0.01, 2000.0
         projection = np.zeros((4, 4))
         projection[2, 2:] = -(far + near) / (far - near), -2 * far * near / (far - near)
+        if {orthographic}:
+            projection[2, 2:] = -2.0 / (far - near), -(far + near) / (far - near)
         np.save({str(path)!r}, drawing.picture(owner, bpy.context.view_layer, view, projection))
     """))
     return np.load(path)
 
 
-def backend_draws(without: int = 0, recolour: Recolour | None = None) -> np.ndarray:
+def backend_draws(without: int = 0, recolour: Recolour | None = None, camera: Camera | None = None) -> np.ndarray:
     """(H, W, 4) what the backend makes of it, with object 2 where it was moved to."""
+    camera = camera or Camera(viewmat(), np.array(K), *SIZE)
     given = splats()
     parts = [subset(given, given.object_ids == i) for i in (1, 2, 3) if i != without]
     parts = [transformed(part, MOVED) if part.object_ids[0] == 2 else part for part in parts]
@@ -140,7 +145,7 @@ def backend_draws(without: int = 0, recolour: Recolour | None = None) -> np.ndar
     arrays = [np.concatenate([getattr(part, name) for part in parts]).astype(np.float32)
               for name in ("means", "quats", "scales", "opacities", "sh")]
     ids = torch.zeros(len(arrays[0]), dtype=torch.int32)
-    picture = rasterize(*map(torch.from_numpy, arrays), ids, Camera(viewmat(), np.array(K), *SIZE))
+    picture = rasterize(*map(torch.from_numpy, arrays), ids, camera)
     return np.concatenate([picture.color.numpy(), picture.alpha.numpy()[None]]).transpose(1, 2, 0)
 
 
@@ -168,6 +173,15 @@ def test_the_drawing_is_the_backends_picture(window):
         for part in scene.object_collections(root)[1].objects:
             part.hide_set(False)
     """))
+
+
+def test_parallel_projection(window):
+    """It is what a camera sees from very far away."""
+    eye = np.array([200.0, -900.0, 300.0])
+    far = float(np.linalg.norm(eye - (0, 0, 0.2)))
+    lens = np.array([[50.0 * far, 0, 118.0], [0, 50.0 * far, 92.0], [0, 0, 1]])
+    picture = drawn(window, viewmat(eye), 50.0, orthographic=True)
+    assert psnr(picture, backend_draws(camera=Camera(viewmat(eye), lens, *SIZE))) > 35.0
 
 
 def test_recolouring_is_seen(window):
