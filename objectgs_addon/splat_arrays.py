@@ -57,12 +57,10 @@ def _forget(*_) -> None:
 
 
 def _changed(_scene, depsgraph) -> None:
+    # Objects count as changed when they are moved, too, since their modifiers may look at their place.
     for update in depsgraph.updates:
-        if update.is_updated_geometry:
-            block = update.id.original
-            mesh = block.data if isinstance(block, bpy.types.Object) else block
-            if isinstance(mesh, bpy.types.Mesh):
-                _held.pop(mesh.session_uid, None)
+        if update.is_updated_geometry and isinstance(update.id, bpy.types.Mesh):
+            _held.pop(update.id.original.session_uid, None)
 
 
 _forget, _changed = bpy.app.handlers.persistent(_forget), bpy.app.handlers.persistent(_changed)
