@@ -50,6 +50,7 @@ BAND = 5
 SMALLEST_PATCH = 4
 
 _TRIPLES = 600
+_SCORED = 3000
 _REACH = 3.0
 _WIDEST = 16
 
@@ -121,6 +122,8 @@ def _plane(points: NDArray, thin: NDArray, solid: NDArray, size: float, before: 
     usable = lengths > (0.05 * size) ** 2
     normals = normals[usable] / lengths[usable, None]
     found, most = None, FEWEST - 1
+    some, some_thin = (values[:: -(-len(points) // _SCORED)] for values in (points, thin))
+    solid = solid[:: -(-len(solid) // _SCORED)]
     for normal, corner in zip(normals, corners[usable, 0]):
         heights = (solid - corner) @ normal
         if np.median(heights) < 0:
@@ -129,12 +132,13 @@ def _plane(points: NDArray, thin: NDArray, solid: NDArray, size: float, before: 
         parallel = any(abs(other.axes[2] @ normal) > ALIGNED for other in before)
         if parallel or not -within <= lowest <= TOUCHES_WITHIN * size:
             continue
-        inliers = (np.abs((points - corner) @ normal) < within) & (np.abs(thin @ normal) > ALIGNED)
-        if inliers.sum() > most:
-            found, most = (inliers, normal), int(inliers.sum())
+        count = ((np.abs((some - corner) @ normal) < within) & (np.abs(some_thin @ normal) > ALIGNED)).sum()
+        if count > most:
+            found, most = (corner, normal), int(count)
     if found is None:
         return None
-    inliers, normal = found
+    corner, normal = found
+    inliers = (np.abs((points - corner) @ normal) < within) & (np.abs(thin @ normal) > ALIGNED)
     for _ in range(3):
         point = points[inliers].mean(0)
         axes = np.linalg.svd(points[inliers] - point, full_matrices=False)[2]
@@ -146,7 +150,7 @@ def _plane(points: NDArray, thin: NDArray, solid: NDArray, size: float, before: 
 class _Surface:
     """The splats that lie in a plane, seen from straight above on a grid of square cells around the object.
 
-    at (n, 2): their centres in cells. coverage (CELLS, CELLS): alpha; colour (CELLS, CELLS, 3): its mean base colour.
+    at (n, 2): their centres in cells; under and touched (CELLS, CELLS): what the object hides and where it stands.
     """
 
     def __init__(self, plane: _Plane, splats: Splats, centred: NDArray, solid: NDArray, size: float) -> None:
@@ -159,14 +163,13 @@ class _Surface:
         self.inside = ((self.at >= 0) & (self.at < CELLS)).all(1)
         self.splats = splats
         self.base = 0.5 + C0 * splats.sh[:, 0].astype(np.float64)
-        self.coverage, self.colour = self._seen()
         cells = ((footprint - corner) / self.cell).astype(int)
         self.under = _spread(cells)
         # No camera has seen what lies under what touches the plane, whatever splats there are.
         self.touched = _spread(cells[plane.height(solid) < TOUCHES_WITHIN * size])
 
     def _seen(self) -> tuple[NDArray, NDArray]:
-        """Coverage and colour of the cells: each splat counts where its alpha reaches."""
+        """The cells' alpha (CELLS, CELLS) and mean base colour (CELLS, CELLS, 3)."""
         rotations = Rotation.from_quat(self.splats.quats.astype(np.float64), scalar_first=True).as_matrix()
         spread = self.plane.axes[:2] @ rotations * (self.splats.scales[:, None, :] / self.cell)
         covariance = spread @ spread.transpose(0, 2, 1) + 0.1 * np.eye(2)
@@ -203,7 +206,11 @@ class _Surface:
 
     def closed(self, beyond: NDArray) -> tuple[NDArray[np.int64], list[Splats]]:
         """Which splats give way, as indices, and what is put there; the cells `beyond` are none of its own."""
-        covered = gaussian_filter(self.coverage, 1.0) > COVERED
+        coarse = np.unique(self.at[self.inside] // (CELLS // 16), axis=0)
+        if len(coarse) < SURROUNDS * 16 * 16:
+            return np.zeros(0, np.int64), []
+        coverage, colour = self._seen()
+        covered = gaussian_filter(coverage, 1.0) > COVERED
         whole = binary_fill_holes(binary_closing(covered | beyond, iterations=2)) & ~beyond
         hole = whole & (self.touched | (self.under & ~covered))
         enclosed = (whole & self.touched).sum() >= ENCLOSED * (self.touched & ~beyond).sum()
@@ -214,9 +221,9 @@ class _Surface:
         smooth = max(BAND, 0.5 * np.sqrt(target.sum()))
         known = gaussian_filter(good.astype(float), smooth)
         shades = np.stack(
-            [gaussian_filter(np.where(good, self.colour[..., i], 0.0), smooth) for i in range(3)], 2
+            [gaussian_filter(np.where(good, colour[..., i], 0.0), smooth) for i in range(3)], 2
         ) / np.maximum(known, 1e-9)[..., None]  # fmt: skip
-        detail = np.where(good[..., None], self.colour - shades, 0.0)
+        detail = np.where(good[..., None], colour - shades, 0.0)
         parts = [self._copied(part, shift, shades) for part, shift in _patches(target, good, detail)]
         home = np.floor(self.at).astype(int)
         replaced = np.zeros(len(home), bool)
