@@ -3,6 +3,9 @@
 The object stands on, or at, planes that its neighbours' splats lie in. Where it hid such a plane, no photo says how it
 looks; a part of the same plane that does show is put there, with the detail (grain, joints) that fits the hole's rim
 best, and with the colours around the hole, which shade it as its surroundings are.
+
+Only flat ground or walls that belong to one object (or to none) and lie around the whole hole are closed: a rumpled
+cloth, or several sheets of paper that meet under the object, stay as they were trained.
 """
 
 from __future__ import annotations
