@@ -31,12 +31,13 @@ GPU_PYTHONS = $(if $(filter command environment,$(firstword $(origin PYTHON))),$
 # The capture that benchmarks/gpu.py trains on, where there is one.
 CAPTURE ?= $(wildcard build/demo/capture)
 
-.PHONY: help venv demo zip test test-blenders lint benchmarks gpu gpu-with clean
+.PHONY: help venv demo zip test test-window test-blenders lint benchmarks gpu gpu-with clean
 
 help:
 	@echo "make demo           a capture made by Blender becomes objects in a .blend, with a report, in $(DEMO)"
 	@echo "make zip            the extension to install in Blender, in build/"
 	@echo "make test           the tests"
+	@echo "make test-window    the tests that drive a Blender with a window, where there is one"
 	@echo "make test-blenders  the tests of the Blender side in more versions of Blender"
 	@echo "make lint           what a change must pass beside the tests"
 	@echo "make venv           the backend's environment, .venv, alone"
@@ -76,13 +77,15 @@ zip: .venv-bpy/ready
 
 test: .venv/ready .venv-bpy/ready
 	$(BACKEND) -m pytest -n 2 tests/backend
-	$(BLENDER) -m pytest tests/blender
+	$(BLENDER) -m pytest -n 2 tests/blender
+
+test-window: .venv/ready .venv-bpy/ready
 	$(BACKEND) -m pytest tests/window
 
 test-blenders: .venv/ready .venv-bpy-4.2/ready
-	.venv-bpy-4.2/$(BIN)/python -m pytest tests/blender
+	.venv-bpy-4.2/$(BIN)/python -m pytest -n 2 tests/blender
 	@if [ -n "$(PYTHON313)" ]; then \
-		$(MAKE) .venv-bpy-5.2/ready && .venv-bpy-5.2/$(BIN)/python -m pytest tests/blender; \
+		$(MAKE) .venv-bpy-5.2/ready && .venv-bpy-5.2/$(BIN)/python -m pytest -n 2 tests/blender; \
 	else \
 		echo "There is no Python 3.13 here, so Blender 5.2 was left out; PYTHON313 may name one."; \
 	fi

@@ -296,6 +296,10 @@ def parser() -> argparse.ArgumentParser:
     edit.add_argument("folder", type=Path, metavar="DIR", help="reconstruction folder")
     edit.add_argument("--remove", nargs="+", default=[], metavar="OBJECT", help="make objects invisible")
     edit.add_argument("--floaters", action="store_true", help="with --remove: what floats unlabelled inside them, too")
+    edit.add_argument(
+        "--fill", action="store_true",
+        help="with --remove: close the flat ground or wall that they hid, with what is around (marked as invented)",
+    )  # fmt: skip
     edit.add_argument("--restore", nargs="+", default=[], metavar="OBJECT", help="make removed objects visible again")
     edit.add_argument(
         "--recolor", nargs="+", default=[], type=_recolour, metavar="OBJECT:KEY=VALUE",

@@ -2,7 +2,7 @@
 
     {"objects": [{"id": 1, "name": "mug", "colour": [59, 125, 216], "points": 812}, ...],
      "edits": {"1": {"name": "cup", "colour": [255, 0, 0], "merged_into": 2, "left_out": true},
-               "4": {"removed": true, "floaters": true},
+               "4": {"removed": true, "floaters": true, "fill": true},
                "5": {"recolour": {"hue": 0.3}, "transform": [[1, 0, 0, 2], ...], "copies": [[[1, 0, 0, 5], ...]]}, ...}}
 
 A new vote replaces "objects" and keeps "edits". Standard library and NumPy only, so that Blender's own Python can
@@ -22,7 +22,9 @@ from .protocol import InputError, read_json, write_json
 from .recolour import Recolour
 
 LARGEST_ID = 2**32 - 1
-EDITABLE = ("name", "colour", "merged_into", "left_out", "removed", "floaters", "recolour", "transform", "copies")
+EDITABLE = (
+    "name", "colour", "merged_into", "left_out", "removed", "floaters", "fill", "recolour", "transform", "copies",
+)  # fmt: skip
 
 Matrix = tuple[tuple[float, float, float, float], ...]
 """Four rows of an affine map of the capture's coordinates, which moves an object from where it was captured."""
@@ -34,8 +36,9 @@ class SceneObject:
 
     merged_into: the ID of the object that it is shown and meshed with, or None; left_out: not to be reconstructed;
     removed: made, but not to be seen, its copies neither; floaters: then what belongs to no object and lies inside its
-    convex hull is not to be seen either; recolour: of its splats and textures, or None; transform: where it was moved
-    to, or None; copies: where its duplicates are, from where it was captured. Edits of an object that is merged into
+    convex hull is not to be seen either; fill: then the ground or wall that it stands at is closed where it hid it;
+    recolour: of its splats and textures, or None; transform: where it was moved to, or None; copies: where its
+    duplicates are, from where it was captured. Edits of an object that is merged into
     another have no effect but its name; those of the other count for both.
     """
 
@@ -47,6 +50,7 @@ class SceneObject:
     left_out: bool = False
     removed: bool = False
     floaters: bool = False
+    fill: bool = False
     recolour: Recolour | None = None
     transform: Matrix | None = None
     copies: tuple[Matrix, ...] = ()
@@ -131,6 +135,7 @@ def _object(entry: Mapping[str, Any]) -> SceneObject:
         left_out=bool(entry.get("left_out", False)),
         removed=bool(entry.get("removed", False)),
         floaters=bool(entry.get("floaters", False)),
+        fill=bool(entry.get("fill", False)),
         recolour=None if (recolour := entry.get("recolour")) is None else Recolour.of(recolour),
         transform=None if (transform := entry.get("transform")) is None else affine_map(transform),
         copies=tuple(affine_map(copy) for copy in entry.get("copies") or ()),

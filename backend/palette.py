@@ -51,3 +51,8 @@ def to_linear(rgb: Iterable[int]) -> tuple[float, ...]:
     """sRGB 0 .. 255 -> linear 0 .. 1, which is what Blender's colour properties of objects and materials hold."""
     values = [channel / 255.0 for channel in rgb]
     return tuple(v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in values)
+
+
+def to_encoded(linear: Iterable[float]) -> tuple[float, ...]:
+    """Linear 0 .. 1 -> sRGB 0 .. 1, as photos and splats hold their colours."""
+    return tuple(12.92 * v if v <= 0.0031308 else 1.055 * v ** (1 / 2.4) - 0.055 for v in linear)

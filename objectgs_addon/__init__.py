@@ -5,19 +5,29 @@ bpy is imported only where it is needed, since some of these modules serve outsi
 """
 
 
-def register():
-    """Add properties, preferences, lists, panels and handlers."""
-    from . import click_selection, object_list, panels, preferences, properties, running
+def _modules():
+    from . import (
+        click_selection,
+        drawing,
+        object_list,
+        panels,
+        preferences,
+        properties,
+        running,
+        splat_arrays,
+    )
     from .film import properties as film
 
-    for module in (properties, film, preferences, object_list, running, click_selection, panels):
+    return (properties, film, preferences, object_list, running, click_selection, splat_arrays, drawing, panels)
+
+
+def register():
+    """Add properties, preferences, lists, panels and handlers."""
+    for module in _modules():
         module.register()
 
 
 def unregister():
     """Take them back; background jobs are told to stop and have saved when this returns."""
-    from . import click_selection, object_list, panels, preferences, properties, running
-    from .film import properties as film
-
-    for module in (panels, click_selection, running, object_list, preferences, film, properties):
+    for module in reversed(_modules()):
         module.unregister()

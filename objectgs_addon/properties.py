@@ -17,7 +17,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from . import object_edits
+from . import drawing, object_edits
 from .scene import SHOWS, colour_points_by, kind_of, show_kinds, shown_kinds
 
 
@@ -99,6 +99,12 @@ class SceneProperties(bpy.types.PropertyGroup):
     select_whole: BoolProperty(
         name="Select Whole Objects", default=True,
         description="Clicking one part of an object selects all of it, so that it moves as a whole")
+    draw_splats: BoolProperty(
+        name="Draw Splats", default=False, update=drawing.show,
+        description="Show splats in the 3D viewports as they are rendered, instead of a preview by points")
+    splat_colours: EnumProperty(name="Splat Colors", default="photo", items=[
+        ("photo", "Photo", "Colors of the photos"), ("object", "Object", "Colors that stand for the objects")],
+        update=drawing.redraw)
 
 
 CLASSES = (ObjectItem, ReconstructionProperties, SceneProperties)

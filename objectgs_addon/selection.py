@@ -7,18 +7,33 @@ from . import scene
 def select_object(context, root, object_id: int, extend: bool = False) -> bool:
     """Select everything of an object that the view layer shows; False where there is nothing to select."""
     collection = scene.object_collections(root).get(object_id)
-    parts = [part for part in scene.parts_of(collection) if selectable(part)] if collection else []
-    if not parts:
+    return collection is not None and select_collections(context, [collection], extend)
+
+
+def select_collections(context, collections, extend: bool = False) -> bool:
+    """Select everything of objects, by their collections, that the view layer shows; the last becomes active. False,
+    and nothing is changed, where there is nothing to select."""
+    parts = [parts_to_select(collection) for collection in collections]
+    if not any(parts):
         return False
-    layer = context.view_layer
     if not extend:
-        for selected in context.selected_objects:
-            selected.select_set(False)
-    for part in parts:
+        select_nothing(context)
+    for part in (part for own in parts for part in own):
         part.select_set(True)
-    active = next((part for part in parts if scene.kind_of(part) == "object_parent"), parts[0])
-    layer.objects.active = active
+    last = next(own for own in reversed(parts) if own)
+    context.view_layer.objects.active = next(
+        (part for part in last if scene.kind_of(part) == "object_parent"), last[0])
     return True
+
+
+def parts_to_select(collection) -> list:
+    """The parts of an object that can be selected."""
+    return [part for part in scene.parts_of(collection) if selectable(part)]
+
+
+def select_nothing(context) -> None:
+    for selected in context.selected_objects:
+        selected.select_set(False)
 
 
 def selected_ids(context, root) -> list[int]:

@@ -7,12 +7,14 @@ def _classes():
         choose_objects,
         extract_meshes,
         film_frames,
+        find_objects,
         import_capture,
         make_demo,
         mark_assets,
         merge_objects,
         orient,
         pause_job,
+        pick_object,
         select_object,
         set_up_backend,
         set_up_compositor,
@@ -25,8 +27,8 @@ def _classes():
     )
 
     modules = (import_capture, make_demo, vote, train, extract_meshes, pause_job, stop_job, show_result, show_preview,
-               select_object, solo_object, merge_objects, choose_objects, mark_assets, orient, film_frames,
-               set_up_compositor, set_up_backend)
+               select_object, pick_object, find_objects, solo_object, merge_objects, choose_objects, mark_assets,
+               orient, film_frames, set_up_compositor, set_up_backend)
     return [cls for module in modules for cls in module.CLASSES]
 
 
@@ -37,14 +39,20 @@ def _import_menu(menu, _context):
 def register():
     import bpy
 
+    from ..objectgs_addon import pick_tool
+
     for cls in _classes():
         bpy.utils.register_class(cls)
     bpy.types.TOPBAR_MT_file_import.append(_import_menu)
+    pick_tool.register()  # Its keys can only be given to operators that are there.
 
 
 def unregister():
     import bpy
 
+    from ..objectgs_addon import pick_tool
+
+    pick_tool.unregister()
     bpy.types.TOPBAR_MT_file_import.remove(_import_menu)
     for cls in reversed(_classes()):
         bpy.utils.unregister_class(cls)

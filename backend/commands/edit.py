@@ -18,23 +18,24 @@ from ..protocol import InputError, Reconstruction
 from ..stopping import StoppingReporter
 from .cameras import read_upright
 
-_NONE: dict[str, Any] = dict.fromkeys(("removed", "floaters", "recolour", "transform", "copies"))
+_NONE: dict[str, Any] = dict.fromkeys(("removed", "floaters", "fill", "recolour", "transform", "copies"))
 """Takes every edit of an object back that this command makes."""
 
 
 def edit(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Store the edits that are asked for, then say what is edited."""
     folder = Reconstruction(options.folder)
-    if options.floaters and not options.remove:
-        raise InputError("--floaters goes with --remove, which says whose floaters are meant.")
+    for name in ("floaters", "fill"):
+        if getattr(options, name) and not options.remove:
+            raise InputError(f"--{name} goes with --remove, which says what is removed.")
     wanted = _Edits(folder)
     everything = [word for word in options.reset if word.casefold() == "all"]
     for entry in wanted.objects if everything else wanted.find(options.reset):
         wanted.change(entry, **_NONE)
     for entry in wanted.find(options.restore):
-        wanted.change(entry, removed=None, floaters=None)
+        wanted.change(entry, removed=None, floaters=None, fill=None)
     for entry in wanted.find(options.remove):
-        wanted.change(entry, removed=True, floaters=options.floaters or None)
+        wanted.change(entry, removed=True, floaters=options.floaters or None, fill=options.fill or None)
     for word, recolour in options.recolor:
         (entry,) = wanted.find([word])
         wanted.change(entry, recolour=replace(recolour, middle=luma_of(wanted.splats_of(entry))).stored())
@@ -91,7 +92,8 @@ def _described(entry: SceneObject) -> list[str]:
     words = [f"merged into {entry.merged_into}"] if entry.merged_into is not None else []
     words += ["left out"] if entry.left_out else []
     if entry.removed:
-        words.append("removed with floaters" if entry.floaters else "removed")
+        filled = ", its place filled" if entry.fill else ""
+        words.append("removed" + " with floaters" * entry.floaters + filled)
     if entry.recolour:
         stored = entry.recolour.stored() or {}
         words.append("recoloured " + " ".join(f"{key}={_short(value)}" for key, value in stored.items()))

@@ -41,6 +41,8 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         splats = splats.select(np.isin(splats.object_ids, chosen))
     if len(splats) == 0:
         raise InputError(f"No splats of {folder.splats} are left to export; what is removed or left out is not.")
+    if splats.invented.any():
+        reporter.status(f"{splats.invented.sum():,} splats are invented, where removed objects hid what is behind")
     if options.sh_degree is not None:
         splats = splats.with_degree(options.sh_degree)
     splats = _in_coordinates(splats, options.coordinates, read_upright(folder), y_up=kind == "spz")

@@ -14,6 +14,7 @@ from .. import spherical_harmonics
 from ..model.splats import Splats, concatenate
 from ..objects import SceneObject, merged
 from ..recolour import Recolour
+from .fill import filled
 from .floaters import inside_hull
 
 UNIFORM_WITHIN = 1e-6
@@ -24,7 +25,8 @@ _SMALLEST_SCALE = float(np.finfo(np.float32).tiny)
 
 
 def apply_edits(splats: Splats, objects: Sequence[SceneObject]) -> Splats:
-    """The splats as the user wants them: without what is removed or left out, recoloured, moved, and with copies.
+    """The splats as the user wants them: without what is removed or left out, recoloured, moved, with copies, and with
+    what is invented in place of the removed.
 
     Splats of a merged object get the ID of the one it is shown as, whose edits count for both; copies keep the ID of
     what they are copies of and come last. IDs that `objects` does not list stay as they are.
@@ -36,6 +38,9 @@ def apply_edits(splats: Splats, objects: Sequence[SceneObject]) -> Splats:
         if entry.removed and entry.floaters:
             keep &= ~_floaters(splats, _with_id(splats, entry.id, objects))
     edited = replace(splats.select(keep), object_ids=shown[keep])
+    for entry in objects:
+        if entry.removed and entry.fill:
+            edited = filled(edited, splats.select(_with_id(splats, entry.id, objects)))
     copies = []
     for entry in objects:
         mine = np.flatnonzero(edited.object_ids == entry.id)

@@ -12,18 +12,25 @@ STRAY = 3.0
 """Nor do those so many times as far from its middle as three quarters of its splats are: they are wrongly labelled."""
 
 
+def body(means: NDArray, opacities: NDArray) -> NDArray[np.float64]:
+    """Those of an object's centres (n, 3), with opacities (n,), that say where it is: (m, 3)."""
+    means = means[opacities > FAINT].astype(np.float64)
+    if len(means) == 0:
+        return means
+    distances = np.linalg.norm(means - np.median(means, axis=0), axis=1)
+    return means[distances <= STRAY * np.percentile(distances, 75)]
+
+
 def inside_hull(points: NDArray, means: NDArray, opacities: NDArray) -> NDArray[np.bool_]:
     """Which of points (n, 3) lie inside the convex hull of an object's splats, strays among them aside: (n,).
 
     means (m, 3) and opacities (m,) are those of the splats. Fewer than four of them, or flat ones, have no inside.
     """
-    means = means[opacities > FAINT].astype(np.float64)
+    means = body(means, opacities)
     nothing = np.zeros(len(points), bool)
     if len(means) < 4 or len(points) == 0:
         return nothing
     middle = np.median(means, axis=0)
-    distances = np.linalg.norm(means - middle, axis=1)
-    means = means[distances <= STRAY * np.percentile(distances, 75)]
     try:
         # Relative to the middle: far from the origin, the hull of something small would be lost in rounding.
         faces = np.unique(ConvexHull(means - middle).equations, axis=0)

@@ -4,7 +4,8 @@ In `view` mode opacity, shape and colour of a splat change with the camera, and 
 A file holds one opacity, one shape and spherical harmonics, so these are fitted over the training cameras, each view
 counting as much as the splat adds to its picture. What that costs, `agreement` measures. On a capture of a table-top
 the fit is 34.6 dB from the model's own held-out pictures; shapes averaged as covariances give 33.5, degree 1 gives
-32.6, and the model as seen from the middle of the cameras 29.2.
+32.6, and the model as seen from the middle of the cameras 29.2. Degree 3 comes no closer in views that it was not
+fitted to.
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ OPACITY_MARGIN = 1e-7
 SMALLEST_SCALE = float(np.finfo(np.float32).tiny)
 FLOAT32_RELATIVE_ERROR = 2.0**-24
 ROWS_AT_ONCE = 1 << 16
+INVENTED = "invented"
 
 
 def property_names(degree: int) -> list[str]:
@@ -34,7 +35,8 @@ def write_splats(path: Path, splats: Splats, with_ids: bool = True) -> list[str]
     """Write `splats` to `path` atomically; returns warnings about splats that could not be written.
 
     Binary little-endian, one float32 a property, `object_id` as uint32 at the end unless `with_ids` is False: some
-    programs count on the other properties being all there are. Opacity is stored as its logit,
+    programs count on the other properties being all there are. After it, `invented` as uchar where any splat is.
+    Opacity is stored as its logit,
     scales as logarithms, `f_rest` all red coefficients first, then green, then blue. Positions are float32, except
     where the splats lie so far from the origin that float32 would move them by more than 1e-6 of their extent: then
     double.
@@ -53,8 +55,10 @@ def write_splats(path: Path, splats: Splats, with_ids: bool = True) -> list[str]
         raise ValueError("object IDs must be from 0 to 2^32 - 1")
 
     names = [name for name in property_names(splats.degree) if with_ids or name != "object_id"]
+    if with_ids and splats.invented.any():
+        names.append(INVENTED)
     position = position_kind(splats)
-    kinds = {"x": position, "y": position, "z": position, "object_id": "u4"}
+    kinds = {"x": position, "y": position, "z": position, "object_id": "u4", INVENTED: "u1"}
     dtype = np.dtype([(name, "<" + kinds.get(name, "f4")) for name in names])
 
     with atomic_file(path) as file:
@@ -84,8 +88,9 @@ def _rows(splats: Splats, rows: slice, dtype: np.dtype) -> NDArray:
     quats = splats.quats[rows]
     for i in range(4):
         table[f"rot_{i}"] = quats[:, i]
-    if "object_id" in (dtype.names or ()):
-        table["object_id"] = splats.object_ids[rows]
+    for name, values in (("object_id", splats.object_ids), (INVENTED, splats.invented)):
+        if name in (dtype.names or ()):
+            table[name] = values[rows]
     return table
 
 
@@ -146,6 +151,7 @@ def read_splats(path: Path) -> tuple[Splats, list[str]]:
         object_ids = _object_ids(table["object_id"], warnings)
     else:
         object_ids = np.zeros(n, np.int64)
+    invented = table[INVENTED] != 0 if INVENTED in names else np.zeros(n, bool)
 
     keep = _usable(means, quats, scales, opacities, sh)
     keep &= (scales < math.log(np.finfo(np.float32).max)).all(axis=1)
@@ -154,14 +160,14 @@ def read_splats(path: Path) -> tuple[Splats, list[str]]:
             f"{int((~keep).sum())} of {n} splats in {path.name} were dropped: they hold NaN, Inf or a zero quaternion."
         )
         means, quats, scales, opacities, sh = means[keep], quats[keep], scales[keep], opacities[keep], sh[keep]
-        object_ids = object_ids[keep]
+        object_ids, invented = object_ids[keep], invented[keep]
 
     lengths = np.linalg.norm(quats.astype(np.float64), axis=1)
     off = np.abs(lengths - 1.0) > 1e-6
     quats[off] = quats[off] / lengths[off, None]
     scales = np.maximum(np.exp(np.maximum(scales, math.log(SMALLEST_SCALE))), SMALLEST_SCALE)
     opacities = np.clip(1.0 / (1.0 + np.exp(-np.clip(opacities, -80, 80))), OPACITY_MARGIN, 1.0 - OPACITY_MARGIN)
-    return Splats(means, quats, scales, opacities, sh, object_ids), warnings
+    return Splats(means, quats, scales, opacities, sh, object_ids, invented), warnings
 
 
 def _columns(table: NDArray, names: list[str]) -> NDArray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,8 @@ class Splats:
     means (N, 3) world units, float32 or float64; quats (N, 4) unit, w x y z, local to world; scales (N, 3) standard
     deviations > 0, world units, not their logarithms; opacities (N,) in (0, 1), not their logits; sh (N, K, 3) with
     K = (degree + 1)^2 coefficients of the real spherical harmonics for red, green, blue, where
-    colour = max(0, basis(direction) . sh + 0.5); object_ids (N,) int64 in 0 .. 2^32 - 1, 0 = belongs to no object.
+    colour = max(0, basis(direction) . sh + 0.5); object_ids (N,) int64 in 0 .. 2^32 - 1, 0 = belongs to no object;
+    invented (N,) bool: made up to close a hole, and seen in no photo (none where it is not given).
     """
 
     means: NDArray
@@ -26,10 +27,15 @@ class Splats:
     opacities: NDArray
     sh: NDArray
     object_ids: NDArray
+    invented: NDArray = field(default_factory=lambda: np.zeros(0, bool))
 
     def __post_init__(self) -> None:
         n = len(self.means)
-        shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "object_ids": (n,)}
+        if len(self.invented) == 0:
+            self.invented = np.zeros(n, bool)
+        shapes = {
+            "means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "object_ids": (n,), "invented": (n,),
+        }  # fmt: skip
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"splats: {name} has shape {getattr(self, name).shape}, expected {shape}")
@@ -68,6 +74,7 @@ class Splats:
             self.opacities[mask],
             self.sh[mask],
             self.object_ids[mask],
+            self.invented[mask],
         )
 
     def with_degree(self, degree: int) -> Splats:
@@ -76,7 +83,7 @@ class Splats:
         sh = np.zeros((len(self), k, 3), self.sh.dtype)
         keep = min(k, self.sh.shape[1])
         sh[:, :keep] = self.sh[:, :keep]
-        return Splats(self.means, self.quats, self.scales, self.opacities, sh, self.object_ids)
+        return Splats(self.means, self.quats, self.scales, self.opacities, sh, self.object_ids, self.invented)
 
 
 def concatenate(parts: Sequence[Splats]) -> Splats:
@@ -92,4 +99,5 @@ def concatenate(parts: Sequence[Splats]) -> Splats:
         np.concatenate([part.opacities for part in parts]),
         np.concatenate([part.sh for part in parts]),
         np.concatenate([part.object_ids for part in parts]),
+        np.concatenate([part.invented for part in parts]),
     )

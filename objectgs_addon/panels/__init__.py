@@ -5,13 +5,15 @@ import bpy
 
 from .capture import CapturePanel
 from .display import DisplayPanel
+from .drawing import DrawingPanel
 from .film import FilmPanel
 from .jobs import JobsPanel, status_bar
 from .meshes import MeshesPanel
 from .objects import ObjectsPanel
 from .train import SettingsPanel, TrainPanel
 
-CLASSES = (CapturePanel, TrainPanel, SettingsPanel, ObjectsPanel, MeshesPanel, FilmPanel, DisplayPanel, JobsPanel)
+CLASSES = (CapturePanel, TrainPanel, SettingsPanel, ObjectsPanel, MeshesPanel, DrawingPanel, FilmPanel,
+           DisplayPanel, JobsPanel)
 
 
 def register():

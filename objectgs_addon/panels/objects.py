@@ -22,6 +22,7 @@ class ObjectsPanel(WithReconstruction, bpy.types.Panel):
         row.template_list("OBJECTGS_UL_objects", "", properties, "objects", properties, "active_object", rows=8)
         column = row.column(align=True)
         column.operator("objectgs.select_object", text="", icon="RESTRICT_SELECT_OFF")
+        column.operator("objectgs.find_objects", text="", icon="VIEWZOOM")
         column.operator("objectgs.solo_object", text="", icon="SOLO_ON")
         column.separator()
         column.operator("objectgs.merge_objects", text="", icon="AUTOMERGE_ON")

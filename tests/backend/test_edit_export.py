@@ -67,6 +67,7 @@ def test_objects_are_removed_and_restored_by_name_part_or_id(ask, folder):
     assert [entry.removed and entry.floaters for entry in read_objects(folder.objects)] == [True, True, False, True]
     (said,) = answer.messages("status")
     assert "1 mug: removed with floaters\n" in said and "3 box: as captured\n" in said
+    assert "1 mug: removed, its place filled" in ask("edit", folder.folder, "--remove", "mug", "--fill").out
     ask("edit", folder.folder, "--restore", "mug", "box")
     assert [entry.removed for entry in read_objects(folder.objects)] == [False, True, False, True]
     assert json.loads(folder.objects.read_text())["edits"].keys() == {"2", "7"}
@@ -131,6 +132,7 @@ def test_what_is_merged_into_another_stands_for_that_one(ask, folder):
         (["--move", "can:scale=0"], ["scale=0"]),
         (["--move", "can:x=nan"], ["x=nan"]),
         (["--floaters"], ["--remove"]),
+        (["--restore", "mug", "--fill"], ["--remove"]),
     ],
 )
 def test_what_cannot_be_edited_is_said_and_nothing_is_written(ask, folder, words, said):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -16,6 +16,7 @@ from backend.objects import SceneObject
 from backend.raster.camera import Camera
 from backend.raster.reference import rasterize_reference
 from backend.recolour import Recolour
+from backend.spherical_harmonics import C0
 
 
 def some_splats(n=30, degree=3, seed=0, ids=(0, 1, 2), dtype=np.float64):
@@ -44,7 +45,7 @@ def picture(splats, view):
     """(30, 40, 4) float64: colour and alpha."""
     arrays = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
     tensors = (torch.from_numpy(np.asarray(array, np.float64)) for array in arrays)
-    drawn = rasterize_reference(*tensors, torch.from_numpy(splats.object_ids), view, 3)
+    drawn = rasterize_reference(*tensors, torch.zeros(len(splats), dtype=torch.int64), view)
     return np.concatenate([drawn.color.numpy().transpose(1, 2, 0), drawn.alpha.numpy()[..., None]], 2)
 
 
@@ -193,6 +194,100 @@ def test_floaters_inside_the_hull_go_where_that_is_asked_for():
     assert kept.object_ids.tolist() == [2, 0, 0, 0]
     assert len(apply_edits(both, [scene_object(1, removed=True)])) == 5
     assert len(apply_edits(both, [scene_object(1, floaters=True)])) == 305
+
+
+def surface(rng, n, axes, at, colours, object_id, thin=0.002):
+    """Flat splats in a square of side 2, spanned by two rows of axes (3, 3), around `at`; colours by place in it."""
+    flat = rng.uniform(-1, 1, (n, 2))
+    quats = Rotation.from_matrix(axes.T).as_quat(scalar_first=True)
+    return Splats(
+        means=(flat @ axes[:2] + at).astype(np.float32), quats=np.tile(quats, (n, 1)).astype(np.float32),
+        scales=np.tile([0.02, 0.02, thin], (n, 1)), opacities=np.full(n, 0.8),
+        sh=((colours(flat) - 0.5) / C0)[:, None].astype(np.float32), object_ids=np.full(n, object_id),
+    )  # fmt: skip
+
+
+def stripes(flat):
+    """Dark and light stripes along x, and red that grows along x."""
+    light = np.where(np.floor(flat[:, 1] / 0.08) % 2 == 0, 0.35, 0.65)
+    return np.stack([light + 0.2 * flat[:, 0], light, light], 1)
+
+
+def box(rng, low, high, object_id, n=3000):
+    """Splats all over the sides of a box."""
+    low, high = np.array(low), np.array(high)
+    points = rng.uniform(low, high, (n, 3))
+    side = rng.integers(3, size=n)
+    points[np.arange(n), side] = np.where(rng.random(n) < 0.5, low[side], high[side])
+    splats = some_splats(n, 0, ids=(object_id,), dtype=np.float32)
+    splats.means, splats.scales = points.astype(np.float32), np.full((n, 3), 0.01)
+    return splats
+
+
+HERE = np.eye(4)
+
+
+def with_box_on_ground(place=HERE):
+    """A striped ground with a hole, a box over the hole, and something else; and where the hole is (n,) among them."""
+    rng = np.random.default_rng(0)
+    ground = surface(rng, 12000, np.eye(3), np.zeros(3), stripes, 5)
+    hidden = (np.abs(ground.means[:, :2]) < 0.15).all(1)
+    thing = box(rng, (0.6, 0.6, 0), (0.8, 0.8, 0.2), 6)
+    whole = concatenate([ground.select(~hidden), box(rng, (-0.15, -0.15, 0), (0.15, 0.15, 0.3), 1), thing])
+    return transformed(whole, place), transformed(ground.select(hidden), place)
+
+
+@pytest.mark.parametrize("place", [HERE, affine(3 * TURN, (50, -20, 9))])
+def test_the_ground_under_a_removed_object_is_closed_by_what_is_around(place):
+    splats, hidden = with_box_on_ground(place)
+    objects = [scene_object(1, removed=True, fill=True), scene_object(5), scene_object(6)]
+    edited = apply_edits(splats, objects)
+    invented = edited.select(edited.invented)
+    assert len(invented) > 0.7 * len(hidden) and set(invented.object_ids.tolist()) == {5}
+    back = transformed(invented, np.linalg.inv(place))
+    assert np.abs(back.means[:, :2]).max() < 0.2 and np.abs(back.means[:, 2]).max() < 0.005
+    # Each is coloured like what was there: the stripes go on, and so does the red.
+    truth = stripes(back.means[:, :2].astype(np.float64))
+    found = 0.5 + C0 * back.sh[:, 0]
+    assert np.median(np.abs(found - truth)) < 0.04 and (np.abs(found - truth).max(1) < 0.1).mean() > 0.75
+    # Above the hole, straight down, one sees no less than beside it.
+    down = np.diag([1.0, -1, -1, 1])
+    down[2, 3] = 2.0
+    view = Camera(down, np.array([[100.0, 0, 12], [0, 100, 12], [0, 0, 1]]), 24, 24)
+    alphas = []
+    for shown in (apply_edits(splats, [replace(objects[0], fill=False)]), edited):
+        shown = transformed(shown, np.linalg.inv(place))
+        alphas.append(picture(shown.select((np.abs(shown.means[:, :2]) < 0.3).all(1)), view)[..., 3])
+    assert alphas[0][8:16, 8:16].max() < 0.1 and alphas[1].min() > 0.9
+    # What is not at the rim stays as it was, in its order.
+    kept = edited.select(~edited.invented)
+    others = splats.select(splats.object_ids != 1)
+    there = np.isin(others.means, kept.means).all(1)
+    gone = transformed(others.select(~there), np.linalg.inv(place)).means
+    assert same(kept, others.select(there)) and len(gone) < 400
+    assert (np.abs(gone[:, :2]).max(1) < 0.2).all() and (np.abs(gone[:, :2]).max(1) > 0.1).all()
+
+
+def test_a_corner_is_closed_on_both_sides():
+    rng = np.random.default_rng(1)
+    walls = [
+        surface(rng, 12000, np.eye(3), (0, 0, 0), stripes, 5),
+        surface(rng, 12000, np.eye(3)[[1, 2, 0]], (-0.15, 0, 1), stripes, 7),
+    ]
+    both = concatenate(walls)
+    hidden = (np.abs(both.means[:, :2]) < 0.16).all(1) & (both.means[:, 2] < 0.28)
+    splats = concatenate([both.select(~hidden), box(rng, (-0.14, -0.15, 0), (0.15, 0.15, 0.3), 1)])
+    edited = apply_edits(splats, [scene_object(1, removed=True, fill=True)])
+    invented = edited.select(edited.invented)
+    assert (invented.object_ids == 5).sum() > 100 and (invented.object_ids == 7).sum() > 100
+
+
+def test_where_nothing_is_around_nothing_is_invented():
+    splats, _ = with_box_on_ground()
+    for without in (splats.select(splats.object_ids != 5), splats.select(splats.means[:, 0] < 0.1)):
+        edited = apply_edits(without, [scene_object(1, removed=True, fill=True)])
+        assert same(edited, without.select(without.object_ids != 1))
+    assert not apply_edits(splats, [scene_object(1, fill=True)]).invented.any()
 
 
 def test_no_splats():

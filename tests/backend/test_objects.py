@@ -57,7 +57,9 @@ def test_colour_place_and_copies_are_edits(path):
     edit_objects(path, {1: dict(removed=True, recolour=Recolour(hue=0.2).stored(), transform=MOVED, copies=[MOVED])})
     mug = read_objects(path)[0]
     assert (mug.removed, mug.recolour, mug.transform, mug.copies) == (True, Recolour(hue=0.2), MOVED, (MOVED,))
-    edit_objects(path, {1: dict(removed=None, recolour=None, transform=None, copies=None)})
+    edit_objects(path, {1: dict(floaters=True, fill=True)})
+    assert read_objects(path)[0].floaters and read_objects(path)[0].fill
+    edit_objects(path, {1: dict.fromkeys(("removed", "floaters", "fill", "recolour", "transform", "copies"))})
     assert read_objects(path)[0] == SceneObject(1, "mug", (10, 20, 30), 812)
 
 

@@ -115,6 +115,21 @@ def test_round_trip(tmp_path, degree):
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
+def test_what_is_invented_is_marked(tmp_path):
+    splats = some_splats(n=5)
+    splats.invented = np.array([0, 1, 0, 0, 1], bool)
+    write_splats(tmp_path / "a.ply", splats)
+    table = read_vertices(tmp_path / "a.ply")
+    assert table.dtype.names[-2:] == ("object_id", "invented") and table["invented"].tolist() == [0, 1, 0, 0, 1]
+    splats.sh[0, 0, 0] = np.nan
+    write_splats(tmp_path / "a.ply", splats)
+    assert read_splats(tmp_path / "a.ply")[0].invented.tolist() == [True, False, False, True]
+    write_splats(tmp_path / "b.ply", splats, with_ids=False)
+    assert read_vertices(tmp_path / "b.ply").dtype.names[-1] == "rot_3"
+    both = concatenate([splats, some_splats(n=2, degree=2)])
+    assert both.invented.tolist() == [*splats.invented.tolist(), False, False]
+
+
 def test_no_splats(tmp_path):
     write_splats(tmp_path / "a.ply", Splats.empty(2))
     again, warnings = read_splats(tmp_path / "a.ply")

@@ -38,16 +38,16 @@ class Failed(Exception):
 class Blender:
     """One running Blender of `size` pixels. `shots` is where screenshots go, `place` a scratch folder of its own."""
 
-    def __init__(self, command, variables, place: Path, shots: Path, display: str = ":97", size=SIZE) -> None:
-        self.place, self.shots, self.display = place, shots, display
+    def __init__(self, command, variables, place: Path, shots: Path, size=SIZE) -> None:
+        self.place, self.shots, self.display = place, shots, _free_display()
         self.scripts = place / "scripts"
         self.scripts.mkdir(parents=True)
         shots.mkdir(parents=True, exist_ok=True)
         self._count = 0
-        self._screen = subprocess.Popen(["Xvfb", display, "-screen", "0", f"{size[0]}x{size[1]}x24"],
+        self._screen = subprocess.Popen(["Xvfb", self.display, "-screen", "0", f"{size[0]}x{size[1]}x24"],
                                         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        _wait(lambda: Path(f"/tmp/.X11-unix/X{display[1:]}").exists(), 10, "the virtual screen does not start")
-        environment = {**os.environ, **variables, "DISPLAY": display, "LIBGL_ALWAYS_SOFTWARE": "1",
+        _wait(lambda: Path(f"/tmp/.X11-unix/X{self.display[1:]}").exists(), 10, "the virtual screen does not start")
+        environment = {**os.environ, **variables, "DISPLAY": self.display, "LIBGL_ALWAYS_SOFTWARE": "1",
                        "BLENDER_USER_RESOURCES": str(place / "user")}
         (place / "user").mkdir()
         self._log = open(place / "blender.log", "wb")
@@ -114,6 +114,25 @@ class Blender:
         self._tool("xdotool", "mousemove", str(round(x)), str(round(y)))
         time.sleep(0.4)
 
+    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
+        """Press the left button at a place (pixels from the upper left) and let it go at another."""
+        self.move(*start)
+        self._tool("xdotool", "mousedown", "1")
+        for share in (0.2, 0.6, 1.0):
+            self.move(*(a + share * (b - a) for a, b in zip(start, end)))
+        self._tool("xdotool", "mouseup", "1")
+        time.sleep(0.6)
+
+    def hold(self, key: str) -> None:
+        """Press a key and keep it pressed."""
+        self._tool("xdotool", "keydown", key)
+        time.sleep(0.3)
+
+    def release(self, key: str) -> None:
+        """Let a key go that is held."""
+        self._tool("xdotool", "keyup", key)
+        time.sleep(0.3)
+
     def key(self, *keys: str) -> None:
         """Press keys, for instance "ctrl+z"."""
         for name in keys:
@@ -149,6 +168,11 @@ class Blender:
 def missing_tools() -> list[str]:
     """Programs that the harness needs and that are not here."""
     return [tool for tool in ("Xvfb", "xdotool", "import") if shutil.which(tool) is None]
+
+
+def _free_display() -> str:
+    """A screen that nobody uses: other tests may run beside these."""
+    return next(f":{number}" for number in range(97, 1000) if not Path(f"/tmp/.X11-unix/X{number}").exists())
 
 
 def _wait(done, timeout: float, sentence: str, interval: float = 0.1) -> None:

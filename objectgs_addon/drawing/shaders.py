@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The GPU's programs: a splat as a quad with its Gaussian, and the finished picture over the viewport.
+
+Described by GPUShaderCreateInfo, so that OpenGL, Metal and Vulkan take them.
+"""
+
+import gpu
+
+from ...backend.blending import ALPHA_MAX, ALPHA_MIN, BLUR, MAX_EXTENT
+
+TABLE_WIDTH = 4096
+"""Texels in a row of the textures that hold tables."""
+
+SPLAT_TEXELS = 3
+"""Of a splat: mean and opacity, quaternion, scales."""
+
+OBJECT_TEXELS = 12
+"""Of an object: rows of the map to camera space, of the map to directions of view, of the map of colours with what it
+adds; its colour with the share of it; the highlight with the share of it; the rest is free."""
+
+_CONSTANTS = f"""
+#define TABLE_WIDTH {TABLE_WIDTH}
+#define SPLAT_TEXELS {SPLAT_TEXELS}
+#define OBJECT_TEXELS {OBJECT_TEXELS}
+#define ALPHA_MAX {ALPHA_MAX!r}
+#define ALPHA_MIN {ALPHA_MIN!r}
+#define BLUR {BLUR!r}
+#define MAX_EXTENT {MAX_EXTENT!r}
+"""
+
+_SPLAT_VERTEX = _CONSTANTS + """
+vec4 at(sampler2D table, int index) {
+    return texelFetch(table, ivec2(index % TABLE_WIDTH, index / TABLE_WIDTH), 0);
+}
+
+vec3 radiance(int splat, vec3 d) {
+    int first = splat * bands;
+    vec3 c = 0.28209479177387814 * at(harmonics, first).rgb;
+    if (bands > 1) {
+        c += 0.4886025119029199 * (d.z * at(harmonics, first + 2).rgb - d.y * at(harmonics, first + 1).rgb
+                                   - d.x * at(harmonics, first + 3).rgb);
+    }
+    vec3 s = d * d;
+    if (bands > 4) {
+        c += 1.0925484305920792 * (d.x * d.y * at(harmonics, first + 4).rgb - d.y * d.z * at(harmonics, first + 5).rgb
+                                   - d.x * d.z * at(harmonics, first + 7).rgb);
+        c += 0.31539156525252005 * (2.0 * s.z - s.x - s.y) * at(harmonics, first + 6).rgb;
+        c += 0.5462742152960396 * (s.x - s.y) * at(harmonics, first + 8).rgb;
+    }
+    if (bands > 9) {
+        c -= 0.5900435899266435 * d.y * (3.0 * s.x - s.y) * at(harmonics, first + 9).rgb;
+        c += 2.890611442640554 * d.x * d.y * d.z * at(harmonics, first + 10).rgb;
+        c -= 0.4570457994644658 * d.y * (4.0 * s.z - s.x - s.y) * at(harmonics, first + 11).rgb;
+        c += 0.3731763325901154 * d.z * (2.0 * s.z - 3.0 * s.x - 3.0 * s.y) * at(harmonics, first + 12).rgb;
+        c -= 0.4570457994644658 * d.x * (4.0 * s.z - s.x - s.y) * at(harmonics, first + 13).rgb;
+        c += 1.445305721320277 * d.z * (s.x - s.y) * at(harmonics, first + 14).rgb;
+        c -= 0.5900435899266435 * d.x * (s.x - 3.0 * s.y) * at(harmonics, first + 15).rgb;
+    }
+    return 0.5 + c;
+}
+
+void main() {
+    gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
+    beside = vec2(0.0);
+    shape = vec4(0.0);
+    tint = vec4(0.0);
+    vec2 entry = at(order, gl_InstanceID).xy;
+    int splat = int(entry.x + 0.5);
+    int thing = int(entry.y + 0.5) * OBJECT_TEXELS;
+    vec4 place = at(splats, splat * SPLAT_TEXELS);
+    vec4 q = at(splats, splat * SPLAT_TEXELS + 1);
+    vec3 scale = at(splats, splat * SPLAT_TEXELS + 2).xyz;
+    vec4 to_x = at(things, thing);
+    vec4 to_y = at(things, thing + 1);
+    vec4 to_z = at(things, thing + 2);
+    vec4 mean = vec4(place.xyz, 1.0);
+    vec3 p = vec3(dot(to_x, mean), dot(to_y, mean), dot(to_z, mean));
+    float opacity = place.w;
+    bool orthographic = size.w > 0.5;
+    if (!(p.z > size.z) || !(opacity > ALPHA_MIN)) {
+        return;
+    }
+    vec3 axis_x = scale.x * vec3(1.0 - 2.0 * (q.z * q.z + q.w * q.w), 2.0 * (q.y * q.z + q.x * q.w),
+                                 2.0 * (q.y * q.w - q.x * q.z));
+    vec3 axis_y = scale.y * vec3(2.0 * (q.y * q.z - q.x * q.w), 1.0 - 2.0 * (q.y * q.y + q.w * q.w),
+                                 2.0 * (q.z * q.w + q.x * q.y));
+    vec3 axis_z = scale.z * vec3(2.0 * (q.y * q.w + q.x * q.z), 2.0 * (q.z * q.w - q.x * q.y),
+                                 1.0 - 2.0 * (q.y * q.y + q.z * q.z));
+    vec3 along_x = vec3(dot(to_x.xyz, axis_x), dot(to_x.xyz, axis_y), dot(to_x.xyz, axis_z));
+    vec3 along_y = vec3(dot(to_y.xyz, axis_x), dot(to_y.xyz, axis_y), dot(to_y.xyz, axis_z));
+    vec3 along_z = vec3(dot(to_z.xyz, axis_x), dot(to_z.xyz, axis_y), dot(to_z.xyz, axis_z));
+    vec2 slope = vec2(0.0);
+    float per_z = 1.0;
+    if (!orthographic) {
+        per_z = 1.0 / p.z;
+        slope = clamp(p.xy * per_z, limits.xz, limits.yw);
+    }
+    vec3 first = lens.x * per_z * (along_x - slope.x * along_z);
+    vec3 second = lens.y * per_z * (along_y - slope.y * along_z);
+    float a = dot(first, first);
+    float b = dot(first, second);
+    float c = dot(second, second);
+    vec3 area = cross(first, second);
+    float across2 = (dot(area, area) + BLUR * (a + c + BLUR)) / (c + BLUR);
+    a += BLUR;
+    c += BLUR;
+    vec2 extent = sqrt(2.0 * log(opacity / ALPHA_MIN) * vec2(a, c));
+    if (!(max(extent.x, extent.y) < MAX_EXTENT)) {
+        return;
+    }
+
+    vec3 direction = vec3(dot(at(things, thing + 3), mean), dot(at(things, thing + 4), mean),
+                          dot(at(things, thing + 5), mean));
+    vec4 photo = vec4(radiance(splat, normalize(direction)), 1.0);
+    vec3 colour = vec3(dot(at(things, thing + 6), photo), dot(at(things, thing + 7), photo),
+                       dot(at(things, thing + 8), photo));
+    colour = max(colour, 0.0);
+    vec4 own = at(things, thing + 9);
+    // As bright and dark as it is, so that its form is seen.
+    float shade = 0.5 + dot(colour, vec3(0.299, 0.587, 0.114));
+    colour = mix(colour, own.rgb * shade, own.a);
+    vec4 mark = at(things, thing + 10);
+    colour = mix(colour, mark.rgb, mark.a);
+
+    beside = corner * extent;
+    shape = vec4(b / c, 0.5 / across2, 0.5 / c, opacity);
+    vec2 pixel = lens.xy * p.xy * per_z + lens.zw + beside;
+    float depth = (depths.y - depths.x * p.z) * per_z;
+    tint = vec4(colour, 0.5 * depth + 0.5);
+    gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, depth, 1.0);
+}
+"""
+
+_SPLAT_FRAGMENT = _CONSTANTS + """
+void main() {
+    float d = beside.x - shape.x * beside.y;
+    float alpha = shape.w * exp(-(shape.y * d * d + shape.z * beside.y * beside.y));
+    if (alpha < ALPHA_MIN) {
+        discard;
+    }
+    if (hides > 0 && tint.w > texelFetch(depth, ivec2(gl_FragCoord.xy), 0).r) {
+        discard;
+    }
+    alpha = min(alpha, ALPHA_MAX);
+    result = vec4(alpha * tint.rgb, alpha);
+}
+"""
+
+_OVER_VERTEX = """
+void main() {
+    uv = 0.5 * corner + 0.5;
+    gl_Position = vec4(corner, 0.0, 1.0);
+}
+"""
+
+# The viewport takes linear colours, and blends them so.
+_OVER_FRAGMENT = """
+void main() {
+    vec4 drawn = texture(picture, uv);
+    vec3 colour = drawn.rgb / max(drawn.a, 1e-6);
+    vec3 high = pow((colour + 0.055) / 1.055, vec3(2.4));
+    result = vec4(mix(high, colour / 12.92, vec3(lessThanEqual(colour, vec3(0.04045)))) * drawn.a, drawn.a);
+}
+"""
+
+
+def splat_shader() -> gpu.types.GPUShader:
+    """An instance of a quad for each entry of `order`, premultiplied, as the photos are encoded."""
+    between = gpu.types.GPUStageInterfaceInfo("objectgs_splat")
+    between.smooth("VEC2", "beside")
+    between.flat("VEC4", "shape")
+    between.flat("VEC4", "tint")
+    info = gpu.types.GPUShaderCreateInfo()
+    info.push_constant("VEC4", "lens")
+    info.push_constant("VEC4", "size")
+    info.push_constant("VEC4", "limits")
+    info.push_constant("VEC2", "depths")
+    info.push_constant("INT", "bands")
+    info.push_constant("INT", "hides")
+    for place, name in enumerate(("order", "splats", "harmonics", "things", "depth")):
+        info.sampler(place, "FLOAT_2D", name)
+    info.vertex_in(0, "VEC2", "corner")
+    info.vertex_out(between)
+    info.fragment_out(0, "VEC4", "result")
+    info.vertex_source(_SPLAT_VERTEX)
+    info.fragment_source(_SPLAT_FRAGMENT)
+    return gpu.shader.create_from_info(info)
+
+
+def over_shader() -> gpu.types.GPUShader:
+    """Lays a premultiplied, encoded picture over what is there."""
+    between = gpu.types.GPUStageInterfaceInfo("objectgs_over")
+    between.smooth("VEC2", "uv")
+    info = gpu.types.GPUShaderCreateInfo()
+    info.sampler(0, "FLOAT_2D", "picture")
+    info.vertex_in(0, "VEC2", "corner")
+    info.vertex_out(between)
+    info.fragment_out(0, "VEC4", "result")
+    info.vertex_source(_OVER_VERTEX)
+    info.fragment_source(_OVER_FRAGMENT)
+    return gpu.shader.create_from_info(info)

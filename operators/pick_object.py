@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Select objects where they are seen in a viewport: by a click, or all in a box; and show which one is pointed at."""
+
+import time
+
+import bpy
+import gpu
+from bpy.props import BoolProperty, EnumProperty, IntProperty
+from gpu_extras.batch import batch_for_shader
+
+from ..objectgs_addon import pick_tool, pointing, selection
+
+_HIDDEN = {"HIDDEN", "SKIP_SAVE"}
+_REST = 1.0
+"""Pointing rests so many times as long as it took, so that it never fills the time between two pictures."""
+
+
+class _InViewport:
+    @classmethod
+    def poll(cls, context):
+        if context.region_data is None:
+            cls.poll_message_set("Use this in a 3D viewport")
+            return False
+        if context.mode != "OBJECT":
+            cls.poll_message_set("Go to Object Mode first")
+            return False
+        return True
+
+
+class PickObject(_InViewport, bpy.types.Operator):
+    bl_idname = "objectgs.pick_object"
+    bl_label = "Pick Object"
+    bl_description = "Select the object that is seen under the mouse, of splats or a mesh"
+    bl_options = {"REGISTER", "UNDO"}
+
+    toggle: BoolProperty(name="Toggle", description="Add the object to the selection, or take it away",
+                         options={"SKIP_SAVE"})
+    x: IntProperty(name="X", description="Pixels from the left of the viewport", options=_HIDDEN)
+    y: IntProperty(name="Y", description="Pixels from the bottom of the viewport", options=_HIDDEN)
+
+    def invoke(self, context, event):
+        self.x, self.y = event.mouse_region_x, event.mouse_region_y
+        return self.execute(context)
+
+    def execute(self, context):
+        pointed = pointing.seen_at(context, self.x, self.y)
+        if pointed is None:
+            if not self.toggle:
+                selection.select_nothing(context)
+            return {"FINISHED"}
+        parts = [pointed.thing] if pointed.collection is None else selection.parts_to_select(pointed.collection)
+        if self.toggle and parts and all(part.select_get() for part in parts):
+            for part in parts:
+                part.select_set(False)
+        elif pointed.collection is not None:
+            selection.select_collections(context, [pointed.collection], self.toggle)
+        else:
+            if not self.toggle:
+                selection.select_nothing(context)
+            pointed.thing.select_set(True)
+            context.view_layer.objects.active = pointed.thing
+        return {"FINISHED"}
+
+
+class PickBox(_InViewport, bpy.types.Operator):
+    bl_idname = "objectgs.pick_box"
+    bl_label = "Pick Objects in Box"
+    bl_description = "Select the objects of which something is seen in a box"
+    bl_options = {"REGISTER", "UNDO"}
+
+    mode: EnumProperty(name="Mode", options={"SKIP_SAVE"}, items=[
+        ("SET", "Set", "Select these alone"), ("ADD", "Add", "Select these too"),
+        ("SUBTRACT", "Subtract", "Take these away from the selection")])
+    left: IntProperty(options=_HIDDEN)
+    bottom: IntProperty(options=_HIDDEN)
+    right: IntProperty(options=_HIDDEN)
+    top: IntProperty(options=_HIDDEN)
+
+    def invoke(self, context, event):
+        region = context.region
+        self._from = event.mouse_prev_press_x - region.x, event.mouse_prev_press_y - region.y
+        self._to = event.mouse_region_x, event.mouse_region_y
+        self._handler = bpy.types.SpaceView3D.draw_handler_add(self._draw, (), "WINDOW", "POST_PIXEL")
+        context.window_manager.modal_handler_add(self)
+        pick_tool.point_at(None)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context, event):
+        if event.type in {"ESC", "RIGHTMOUSE"}:
+            self._end(context)
+            return {"CANCELLED"}
+        if event.type == "MOUSEMOVE":
+            self._to = event.mouse_region_x, event.mouse_region_y
+            context.area.tag_redraw()
+        if event.type == "LEFTMOUSE" and event.value == "RELEASE":
+            self._to = event.mouse_region_x, event.mouse_region_y
+            self._end(context)
+            (self.left, self.right), (self.bottom, self.top) = (
+                sorted(ends) for ends in zip(self._from, self._to))
+            return self.execute(context)
+        return {"RUNNING_MODAL"}
+
+    def cancel(self, context):
+        self._end(context)
+
+    def execute(self, context):
+        collections = pointing.seen_in(context, self.left, self.bottom, self.right + 1, self.top + 1)
+        if self.mode == "SUBTRACT":
+            for part in (part for collection in collections for part in selection.parts_to_select(collection)):
+                part.select_set(False)
+        elif not selection.select_collections(context, collections, self.mode == "ADD") and self.mode == "SET":
+            selection.select_nothing(context)
+        return {"FINISHED"}
+
+    def _end(self, context) -> None:
+        bpy.types.SpaceView3D.draw_handler_remove(self._handler, "WINDOW")
+        context.area.tag_redraw()
+
+    def _draw(self) -> None:
+        (left, bottom), (right, top) = self._from, self._to
+        corners = [(left, bottom, 0), (right, bottom, 0), (right, top, 0), (left, top, 0), (left, bottom, 0)]
+        shader = gpu.shader.from_builtin("UNIFORM_COLOR")
+        shader.uniform_float("color", (1.0, 1.0, 1.0, 1.0))
+        batch_for_shader(shader, "LINE_STRIP", {"pos": corners}).draw(shader)
+
+
+class PointAt(_InViewport, bpy.types.Operator):
+    bl_idname = "objectgs.point_at"
+    bl_label = "Point at Object"
+    bl_description = "Name and mark the object under the mouse"
+    bl_options = {"INTERNAL"}
+
+    _next = 0.0
+
+    def invoke(self, context, event):
+        began = time.monotonic()
+        if began >= PointAt._next:
+            pick_tool.point_at(pointing.seen_at(context, event.mouse_region_x, event.mouse_region_y))
+            now = time.monotonic()
+            PointAt._next = now + _REST * (now - began)
+        context.area.tag_redraw()
+        return {"PASS_THROUGH"}
+
+
+CLASSES = (PickObject, PickBox, PointAt)
