@@ -18,9 +18,10 @@ _LAYERS = ("raster", "model", "training", "mesh")
 @functools.cache
 def digest_up_to(package: str) -> str:
     """The content of all files that the kernels of `package` may be made of, as a hash."""
-    digest = hashlib.sha256()
+    backend = Path(__file__).parents[1]
+    digest = hashlib.sha256((backend / "blending.py").read_bytes())
     for folder in _LAYERS[: _LAYERS.index(package) + 1]:
-        for path in sorted((Path(__file__).parents[1] / folder).glob("*.py")):
+        for path in sorted((backend / folder).glob("*.py")):
             digest.update(path.read_bytes())
     return digest.hexdigest()
 
@@ -40,8 +41,8 @@ def kernel(
     """Decorator: numba.njit with NumPy's division, cached on disk; inline: a part of whatever kernel calls it.
 
     numba renews a function's cache when the function's own file changes, although the code holds constants and
-    functions of other files too; here the cache is as old as the content of all files of the function's package and of
-    the packages below it.
+    functions of other files too; here the cache is as old as the content of all files of the function's package, of the
+    packages below it, and of the guards that they share with Blender's side.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:

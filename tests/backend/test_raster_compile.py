@@ -55,6 +55,10 @@ def run(script, **environment):
     return [float(word) for word in done.stdout.split()]
 
 
+def copy_backend(place):
+    shutil.copytree(ROOT / "backend", place / "backend", ignore=shutil.ignore_patterns("__pycache__"))
+
+
 def test_progress_is_reported():
     seen = []
     assert compile_kernels(progress=lambda done, total: seen.append((done, total))) > 0
@@ -71,12 +75,12 @@ def test_second_process_compiles_nothing():
 @pytest.mark.skipif(os.name == "nt", reason="the user's cache folder is found another way")
 def test_read_only_installation(tmp_path):
     """Where nothing can be written beside the kernels, the cache goes to the user's own folder."""
-    shutil.copytree(ROOT / "backend" / "raster", tmp_path / "raster", ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "raster" / "__pycache__").write_text("in the way of a cache, whoever runs the test")
+    copy_backend(tmp_path)
+    (tmp_path / "backend" / "raster" / "__pycache__").write_text("in the way of a cache, whoever runs the test")
     script = """
 import sys, numpy as np
 sys.path.insert(0, sys.argv[1])
-from raster.cpu_bin import depth_order
+from backend.raster.cpu_bin import depth_order
 depth_order(np.ones((1, 12), np.float32), np.zeros(1, np.int32))
 print(sum(depth_order.stats.cache_hits.values()))
 """
@@ -91,12 +95,12 @@ print(sum(depth_order.stats.cache_hits.values()))
 
 
 def test_cache_is_renewed_when_any_file_of_the_package_changes(tmp_path):
-    """A guard in settings.py is a constant inside kernels of other files."""
-    shutil.copytree(ROOT / "backend" / "raster", tmp_path / "raster", ignore=shutil.ignore_patterns("__pycache__"))
+    """A guard is a constant inside kernels of other files."""
+    copy_backend(tmp_path)
     script = """
 import sys, numpy as np
 sys.path.insert(0, sys.argv[1])
-from raster.splats import tangent_limits
+from backend.raster.splats import tangent_limits
 print(tangent_limits(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 2.0, 2.0)[1], sum(tangent_limits.stats.cache_hits.values()))
 """
 
@@ -106,8 +110,8 @@ print(tangent_limits(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 2.0, 2.0)[1], sum(tangent_lim
         return [float(word) for word in done.stdout.split()]
 
     assert [limit(), limit()] == [[2.3, 0], [2.3, 1]]
-    settings = tmp_path / "raster" / "settings.py"
-    settings.write_text(settings.read_text().replace("TAN_MARGIN = 0.3", "TAN_MARGIN = 0.5"))
+    guards = tmp_path / "backend" / "blending.py"
+    guards.write_text(guards.read_text().replace("TAN_MARGIN = 0.3", "TAN_MARGIN = 0.5"))
     assert [limit(), limit()] == [[2.5, 0], [2.5, 1]]
 
 
@@ -115,7 +119,7 @@ print(tangent_limits(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 2.0, 2.0)[1], sum(tangent_lim
     ("changed", "renewed"), [("raster/camera.py", True), ("model/heads.py", True), ("training/settings.py", False)]
 )
 def test_a_models_kernels_are_renewed_with_what_lies_below_them(tmp_path, changed, renewed):
-    shutil.copytree(ROOT / "backend", tmp_path / "backend", ignore=shutil.ignore_patterns("__pycache__"))
+    copy_backend(tmp_path)
     script = """
 import numpy as np
 from backend.model.generate import _count
