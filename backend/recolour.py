@@ -79,6 +79,16 @@ class Recolour:
         return scale[:, None] * (self.contrast * matrix), scale * offset
 
 
+def average_luma(colours: np.ndarray, weights: np.ndarray) -> float:
+    """The luma of an object's average colour, 0 .. 1, by which recolouring keeps its shading.
+
+    colours (n, 3): of its splats, encoded; weights (n,): their opacities. `MIDDLE` where there is nothing to see.
+    """
+    if not np.sum(weights) > 0.0:
+        return MIDDLE
+    return float(np.average(np.clip(colours, 0.0, 1.0) @ LUMA, weights=weights))
+
+
 def _turned(turns: float) -> np.ndarray:
     """(3, 3): colours turned around the grey axis; what has no luma keeps none."""
     angle = 2.0 * math.pi * turns

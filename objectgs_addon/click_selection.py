@@ -26,7 +26,8 @@ def _active_changed() -> None:
                 root.objectgs.active_object = index
             break
     if context.scene.objectgs.select_whole:
-        for other in scene.parts_of(scene.object_collections(root)[object_id]):
+        whole = scene.collection_of(part)
+        for other in scene.parts_of(whole) if whole is not None else ():
             if selectable(other):
                 other.select_set(True)
 

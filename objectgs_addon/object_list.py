@@ -19,7 +19,7 @@ class ObjectList(bpy.types.UIList):
         swatch.ui_units_x = 0.8
         swatch.prop(item, "colour", text="")
         name = row.row()
-        name.active = item.chosen and not item.is_merged
+        name.active = item.chosen and not item.is_merged and not item.removed
         name.prop(item, "name", text="", emboss=False)
         numbers = row.row()
         numbers.alignment = "RIGHT"
@@ -27,7 +27,10 @@ class ObjectList(bpy.types.UIList):
         numbers.label(text=_count(item))
         row.prop(item, "chosen", text="", icon="CHECKBOX_HLT" if item.chosen else "CHECKBOX_DEHLT", emboss=False)
         layer = ObjectList.layers.get(object_edits.from_stored(item.object_id))
-        if layer is None:
+        if item.removed:
+            row.operator("objectgs.restore_object", text="", icon="TRASH", emboss=False).object = str(
+                object_edits.from_stored(item.object_id))
+        elif layer is None:
             row.label(text="", icon="LINKED" if item.is_merged else "BLANK1")
         else:
             row.prop(layer, "hide_viewport", text="", emboss=False,
@@ -51,6 +54,8 @@ def describe(item, properties) -> str:
         words.append(f"{item.splats:,} splats")
     if item.faces:
         words.append(f"{item.faces:,} faces")
+    if item.removed:
+        words.append("removed")
     if item.is_merged:
         into = next((other.name for other in properties.objects if other.object_id == item.merged_into), "?")
         words.append(f"part of {into}")

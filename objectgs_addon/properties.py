@@ -21,6 +21,18 @@ from . import drawing, object_edits
 from .scene import SHOWS, colour_points_by, kind_of, show_kinds, shown_kinds
 
 
+def _slider(name: str, default: float, least: float, most: float, description: str):
+    return FloatProperty(name=name, default=default, min=least, soft_max=most, max=most if most <= 1.0 else 10.0,
+                         subtype="FACTOR", options=set(), description=description,
+                         update=object_edits.recolour_changed)
+
+
+def _shade(name: str, default: float, description: str):
+    return FloatVectorProperty(name=name, subtype="COLOR_GAMMA", size=3, min=0.0, soft_max=1.0, max=10.0,
+                               default=(default,) * 3, options=set(), description=description,
+                               update=object_edits.recolour_changed)
+
+
 class ObjectItem(bpy.types.PropertyGroup):
     """A row of the objects list. IDs above 2^31 - 1 are stored as the int32 of the same bits."""
 
@@ -36,6 +48,17 @@ class ObjectItem(bpy.types.PropertyGroup):
     faces: IntProperty(name="Faces", description="Faces of this object's mesh; 0 where it has none")
     is_merged: BoolProperty(name="Merged", description="Shown as a part of another object")
     merged_into: IntProperty(name="Merged into", description="ID of the object that this one is a part of")
+    removed: BoolProperty(name="Removed", description="Not to be seen, until it is restored")
+    floaters: BoolProperty(name="Floaters Too", description="Removed with what floats unlabelled inside it")
+    fill: BoolProperty(name="Fill", description="Exports and films close the ground or wall that it hid")
+    replace: _shade("New Color", 0.5, "Takes the place of the object's own color; its shading stays")
+    amount: _slider("Amount", 0.0, 0.0, 1.0, "How much of the new color")
+    hue: _slider("Hue", 0.0, -0.5, 0.5, "Turns of the color wheel; brightness stays")
+    saturation: _slider("Saturation", 1.0, 0.0, 2.0, "0 is grey, 1 as it is")
+    value: _slider("Brightness", 1.0, 0.0, 2.0, "Times as bright")
+    contrast: _slider("Contrast", 1.0, 0.0, 2.0, "About the object's average brightness; 1 is as it is")
+    tint: _shade("Tint", 1.0, "Each channel is multiplied by this; white is as it is")
+    middle: FloatProperty(name="Average Brightness", description="Of the object's splats; 0 where it is not known yet")
     stored: StringProperty(name="Stored", description="What objects.json says: what a refused edit goes back to")
 
 

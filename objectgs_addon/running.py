@@ -152,6 +152,7 @@ def _carefully(job: Job, action: Callable, *arguments) -> None:
 
 def finish(job: Job) -> None:
     """Show what a job has made: in the scene that asked for it, and wherever else the reconstruction is shown."""
+    object_edits.flush()
     wanted_in = _wanted_in.pop(job, None)
     owner = next((owner for owner in bpy.data.scenes if owner.session_uid == wanted_in), None)
     after = _AFTER.get(job.kind)
@@ -191,6 +192,11 @@ def _show_capture(job: Job, owner) -> bool:
     if roots:
         job.warnings.extend(scene.warnings_of(roots[0]))
     return bool(roots) or _explain(job)
+
+
+def _show_imported(job: Job, owner) -> bool:
+    """Splats of another program, of which cameras and points may be none."""
+    return _show_capture(job, owner) and _show_result(job, owner)
 
 
 def _show_votes(job: Job, owner) -> bool:
@@ -253,7 +259,7 @@ def _show_film(job: Job, owner) -> bool:
 
 
 _AFTER = {"demo": _import_demo, "import": _show_capture, "vote": _show_votes, "train": _show_result,
-          "mesh": _show_meshes, "film": _show_film}
+          "mesh": _show_meshes, "film": _show_film, "import-splats": _show_imported}
 
 
 def _push_undo(title: str) -> None:
@@ -268,10 +274,22 @@ def _undone(*_) -> None:
     """The list was undone or redone: objects.json follows."""
     for root in bpy.data.collections:
         if scene.kind_of(root) == "reconstruction":
-            try:
-                object_edits.store(root)
-            except (InputError, OSError) as error:
-                messages.show(messages.sentence(error), "ERROR")
+            _store(root, object_edits.store)
+
+
+@bpy.app.handlers.persistent
+def _saving(*_) -> None:
+    """objects.json gets what the .blend gets: colours that wait to be written, and where objects are."""
+    for root in bpy.data.collections:
+        if scene.kind_of(root) == "reconstruction" and root.library is None:
+            _store(root, object_edits.store_edits)
+
+
+def _store(root, how) -> None:
+    try:
+        how(root)
+    except (InputError, OSError) as error:
+        messages.show(messages.sentence(error), "ERROR")
 
 
 @bpy.app.handlers.persistent
@@ -291,6 +309,7 @@ def _file_loaded(*_) -> None:
 
 def register():
     bpy.app.handlers.load_post.append(_file_loaded)
+    bpy.app.handlers.save_pre.append(_saving)
     bpy.app.handlers.undo_post.append(_undone)
     bpy.app.handlers.redo_post.append(_undone)
 
@@ -298,7 +317,9 @@ def register():
 def unregister():
     bpy.app.handlers.redo_post.remove(_undone)
     bpy.app.handlers.undo_post.remove(_undone)
+    bpy.app.handlers.save_pre.remove(_saving)
     bpy.app.handlers.load_post.remove(_file_loaded)
+    object_edits.flush()
     if bpy.app.timers.is_registered(_tick):
         bpy.app.timers.unregister(_tick)
     queue.stop_all(timeout=10.0)

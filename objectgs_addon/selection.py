@@ -51,5 +51,12 @@ def selected_ids(context, root) -> list[int]:
     return ids
 
 
+def selected_collections(context, root) -> list:
+    """The collections of the objects and of their duplicates that are selected in the viewport."""
+    found = (scene.collection_of(part) for part in context.selected_objects
+             if scene.root_of(part, context.scene) == root)
+    return list(dict.fromkeys(collection for collection in found if collection is not None))
+
+
 def selectable(part) -> bool:
     return part.visible_get() and not part.hide_select

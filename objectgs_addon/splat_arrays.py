@@ -12,13 +12,14 @@ import bpy
 import numpy as np
 
 from ..backend.picking import Cloud
+from . import scene
 from .scene import carrier
 
 
 @dataclass(frozen=True)
 class SplatArrays:
-    """float32, in the object's space: means (N, 3), quats (N, 4) wxyz, scales (N, 3), opacities (N,), and
-    harmonics (N, K, 3), the coefficients of each band for red, green and blue."""
+    """Of the splats that are not hidden one by one; float32, in the object's space: means (N, 3), quats (N, 4) wxyz,
+    scales (N, 3), opacities (N,), and harmonics (N, K, 3), the coefficients of each band for red, green and blue."""
 
     means: np.ndarray
     quats: np.ndarray
@@ -48,8 +49,10 @@ def _read(mesh) -> SplatArrays:
     coefficients = [base[:, :3]]
     while (name := f"radiance:sh_{len(coefficients)}") in mesh.attributes:
         coefficients.append(carrier.read(mesh, name))
-    return SplatArrays(carrier.read(mesh, "position"), carrier.read(mesh, "rotation"), carrier.read(mesh, "scale"),
-                       np.ascontiguousarray(base[:, 3]), np.stack(coefficients, axis=1))
+    arrays = (carrier.read(mesh, "position"), carrier.read(mesh, "rotation"), carrier.read(mesh, "scale"),
+              np.ascontiguousarray(base[:, 3]), np.stack(coefficients, axis=1))
+    hidden = scene.hidden_splats(mesh)
+    return SplatArrays(*arrays) if hidden is None else SplatArrays(*(values[~hidden] for values in arrays))
 
 
 def _forget(*_) -> None:

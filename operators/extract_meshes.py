@@ -3,7 +3,7 @@
 
 import bpy
 
-from ..objectgs_addon import locations, object_edits, running, scene, selection
+from ..objectgs_addon import locations, object_edits, running, scene
 from . import need
 
 
@@ -25,7 +25,7 @@ class ExtractMeshes(bpy.types.Operator):
         folder = scene.folder_of(root)
         arguments = ["mesh", str(folder), "--faces", str(properties.mesh_faces)]
         if properties.mesh_objects == "selected":
-            ids = _selected(context, root)
+            ids = object_edits.chosen_ids(context, root)
             if not ids:
                 self.report({"ERROR"}, "No object is selected; select one in the viewport or in the list")
                 return {"CANCELLED"}
@@ -43,15 +43,6 @@ class ExtractMeshes(bpy.types.Operator):
             arguments += ["--texture-size", properties.texture_size]
         job = locations.backend_job(f"Meshes of {root.name}", "mesh", folder, *arguments)
         return running.submit(job, context.scene, self.report)
-
-
-def _selected(context, root) -> list[int]:
-    """IDs of the objects selected in the viewport, or that of the active row; merged ones as what they are shown as."""
-    ids = selection.selected_ids(context, root)
-    item = object_edits.active_item(root)
-    if not ids and item is not None:
-        ids = [object_edits.from_stored(item.object_id)]
-    return list(dict.fromkeys(object_edits.shown_as(root, object_id) for object_id in ids if object_id))
 
 
 CLASSES = (ExtractMeshes,)

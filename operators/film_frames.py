@@ -5,7 +5,7 @@ import bpy
 
 from ..backend.film.shot import NAME, write_shot
 from ..backend.protocol import InputError, Reconstruction
-from ..objectgs_addon import film, locations, messages, running, scene
+from ..objectgs_addon import film, locations, messages, object_edits, running, scene
 from ..objectgs_addon.film.properties import folder_of, samples_of
 from . import need
 
@@ -38,6 +38,7 @@ class FilmFrames(bpy.types.Operator):
         manager = context.window_manager
         manager.progress_begin(0, max(len(frames), 1))
         try:
+            object_edits.store_edits(root)
             shot = film.shot_of(owner, context.view_layer, root, frames, samples_of(owner, settings.subframes),
                                 lambda done, _total: manager.progress_update(done))
             folder.mkdir(parents=True, exist_ok=True)

@@ -4,7 +4,7 @@
 import os
 from pathlib import Path
 
-from ..objectgs_addon import jobs, locations, running, scene
+from ..objectgs_addon import jobs, locations, object_edits, running, scene
 from ..objectgs_addon.folder_state import folder_state
 
 
@@ -70,6 +70,18 @@ def training(cls, context) -> bool:
     if folder_state(scene.folder_of(active_root(context))).steps:
         return True
     cls.poll_message_set("There is no training yet whose objects could become meshes; train first")
+    return False
+
+
+def edited(cls, context) -> bool:
+    """Whether the active row, or what it is shown as, has splats or a mesh that could be edited."""
+    if not objects(cls, context):
+        return False
+    root = active_root(context)
+    item = object_edits.shown_item(root)
+    if object_edits.from_stored(item.object_id) in scene.object_collections(root):
+        return True
+    cls.poll_message_set(f"{item.name} has no splats and no mesh yet; train first, or choose another in the list")
     return False
 
 

@@ -19,9 +19,9 @@ from scipy.signal import correlate
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from ..hull import body
 from ..model.splats import Splats, concatenate
 from ..spherical_harmonics import C0
-from .floaters import body
 
 PLANES = 3
 """An object may stand in a corner."""

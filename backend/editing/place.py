@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ..model.splats import Splats
 from ..objects import Matrix
-from ..recolour import LUMA
+from ..recolour import average_luma
 from ..spherical_harmonics import C0
 
 
@@ -44,5 +44,4 @@ def middle_of(splats: Splats) -> NDArray[np.float64]:
 
 def luma_of(splats: Splats) -> float:
     """The luma of the average colour of an object's splats, 0 .. 1, which recolouring keeps its shading by."""
-    colours = np.clip(0.5 + C0 * splats.sh[:, 0], 0.0, 1.0)
-    return float(np.average(colours @ LUMA, weights=splats.opacities))
+    return average_luma(0.5 + C0 * splats.sh[:, 0], splats.opacities)

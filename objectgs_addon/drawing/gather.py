@@ -14,8 +14,6 @@ NONE = (0.0, 0.0, 0.0, 0.0)
 SELECTED = (1.0, 0.55, 0.1, 0.25)
 POINTED_AT = (1.0, 1.0, 1.0, 0.3)
 
-_recolour_of = getattr(scenes, "recolour_of", lambda _collection: None)
-
 _HIDES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "VOLUME", "POINTCLOUD", "CURVES", "GREASEPENCIL"}
 
 
@@ -31,9 +29,9 @@ def shown(part, view_layer, space) -> bool:
 
 
 def owners() -> dict[bpy.types.Object, bpy.types.Collection]:
-    """Part -> the object's collection that it lies in; asking each part for its collections would look at all."""
-    return {part: collection for collection in bpy.data.collections if scenes.kind_of(collection) == "object"
-            for part in collection.objects}
+    """Part -> the object's or the duplicate's collection that it lies in; asking each part would look at all."""
+    return {part: collection for collection in bpy.data.collections
+            if scenes.kind_of(collection) in ("object", "object_copy") for part in collection.objects}
 
 
 def gather(parts, colours: str = "photo", pointed_at: int | None = None, marks: bool = True) -> list[Drawn]:
@@ -61,7 +59,7 @@ def gather(parts, colours: str = "photo", pointed_at: int | None = None, marks: 
 
 def colour_map(collection) -> np.ndarray:
     """(3, 4): matrix and offset of what was asked of an object's colours, by its collection or None."""
-    recolour = _recolour_of(collection) if collection is not None else None
+    recolour = scenes.recolour_of(collection) if collection is not None else None
     if recolour is None:
         return NO_RECOLOUR
     matrix, offset = recolour.affine()

@@ -50,7 +50,7 @@ def pull_apart(target: bpy.types.Scene) -> None:
 
     Large objects stay; what lies around the others, as a room does, is left out. Raises InputError without meshes.
     """
-    found = [(root, scene.object_meshes(root)) for root in reconstructions(target)]
+    found = [(root, _seen_meshes(root)) for root in reconstructions(target)]
     found = [(root, meshes) for root, meshes in found if meshes]
     if not found:
         raise InputError("There are no meshes to pull apart; make them with the mesh command, then build again.")
@@ -83,6 +83,13 @@ def pull_apart(target: bpy.types.Scene) -> None:
     target.cycles.use_denoising = True
     target.cycles.adaptive_threshold = 0.05
     target.cycles.max_bounces = 2
+
+
+def _seen_meshes(root) -> dict[int, list]:
+    """Object ID -> its meshes, of the objects that were not removed."""
+    collections = scene.object_collections(root)
+    return {object_id: meshes for object_id, meshes in scene.object_meshes(root).items()
+            if not scene.is_removed(collections[object_id])}
 
 
 def _corners(box: np.ndarray) -> np.ndarray:

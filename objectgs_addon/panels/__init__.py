@@ -6,13 +6,14 @@ import bpy
 from .capture import CapturePanel
 from .display import DisplayPanel
 from .drawing import DrawingPanel
+from .edits import EditPanel
 from .film import FilmPanel
 from .jobs import JobsPanel, status_bar
 from .meshes import MeshesPanel
 from .objects import ObjectsPanel
 from .train import SettingsPanel, TrainPanel
 
-CLASSES = (CapturePanel, TrainPanel, SettingsPanel, ObjectsPanel, MeshesPanel, DrawingPanel, FilmPanel,
+CLASSES = (CapturePanel, TrainPanel, SettingsPanel, ObjectsPanel, EditPanel, MeshesPanel, DrawingPanel, FilmPanel,
            DisplayPanel, JobsPanel)
 
 

@@ -4,7 +4,21 @@
 from .cameras import use_camera
 from .capture import show_capture, warnings_of
 from .carrier import require_object_mode
-from .kinds import folder_of, from_stored, kind_of, object_collections, object_id_of, parts_of, root_of, to_stored
+from .copies import duplicate, remove_copy
+from .edits import is_removed, recolour, reset_place, show_edits, store_places
+from .floaters import hidden_splats
+from .kinds import (
+    collection_of,
+    copies_of,
+    folder_of,
+    from_stored,
+    kind_of,
+    object_collections,
+    object_id_of,
+    parts_of,
+    root_of,
+    to_stored,
+)
 from .meshes import (
     SHOWS,
     ShownMeshes,
@@ -17,15 +31,20 @@ from .meshes import (
     show_meshes,
     shown_kinds,
 )
+from .objects_file import Objects
 from .orientation import orient_to_ground, scale_to_distance
+from .places import into_capture, into_world, moved_by, place_of
 from .points import colour_points_by
 from .preview import prepare_render
+from .recolouring import luma_of, recolour_of, with_own_textures
 from .result import Shown, result_is_newer, show_objects, show_result
 
 __all__ = [
-    "SHOWS", "Shown", "ShownMeshes", "bounds", "colour_points_by", "folder_of", "from_stored", "has_shown_meshes",
-    "kind_of", "mark_asset", "object_collections", "object_id_of", "object_meshes", "orient_to_ground", "parts_of",
-    "prepare_render", "require_object_mode", "result_is_newer", "root_of", "scale_to_distance", "scene_meshes",
-    "show_capture", "show_kinds", "show_meshes", "show_objects", "show_result", "shown_kinds", "to_stored",
-    "use_camera", "warnings_of",
+    "SHOWS", "Objects", "Shown", "ShownMeshes", "bounds", "collection_of", "colour_points_by", "copies_of",
+    "duplicate", "folder_of", "from_stored", "has_shown_meshes", "hidden_splats", "into_capture", "into_world",
+    "is_removed", "kind_of", "luma_of", "mark_asset", "moved_by", "object_collections", "object_id_of",
+    "object_meshes", "orient_to_ground", "parts_of", "place_of", "prepare_render", "recolour", "recolour_of",
+    "remove_copy", "require_object_mode", "reset_place", "result_is_newer", "root_of", "scale_to_distance",
+    "scene_meshes", "show_capture", "show_edits", "show_kinds", "show_meshes", "show_objects", "show_result",
+    "shown_kinds", "store_places", "to_stored", "use_camera", "warnings_of", "with_own_textures",
 ]

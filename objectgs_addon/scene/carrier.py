@@ -13,6 +13,7 @@ _FIELDS = {
     "FLOAT_VECTOR": ("vector", np.float32, 3),
     "FLOAT_COLOR": ("color", np.float32, 4),
     "QUATERNION": ("value", np.float32, 4),
+    "BOOLEAN": ("value", bool, 1),
 }
 
 

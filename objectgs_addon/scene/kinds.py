@@ -11,6 +11,7 @@ import bpy
 KIND = "objectgs_kind"  # Not "objectgs": before Blender 5.0 a property group of that name would take its place.
 OBJECT_ID = "object_id"
 FOLDER = "objectgs_folder"
+MESH_KEY = "objectgs_mesh"  # On a mesh: its key in meshes.json.
 
 RECONSTRUCTION = "reconstruction"
 PARENT = "parent"
@@ -18,6 +19,7 @@ CAPTURE = "capture"
 CAMERA = "camera"
 POINTS = "points"
 OBJECT = "object"
+COPY = "object_copy"
 OBJECT_PARENT = "object_parent"
 SPLATS = "splats"
 ANCHORS = "anchors"
@@ -114,6 +116,20 @@ def object_collections(root: bpy.types.Collection) -> dict[int, bpy.types.Collec
                 if pivot is not None and pivot.parent == parent:
                     found.setdefault(object_id_of(collection) or 0, collection)
     return found
+
+
+def copies_of(root: bpy.types.Collection) -> dict[int, list[bpy.types.Collection]]:
+    """Object ID -> the collections of its duplicates, in Blender's order; of the objects that have any."""
+    found: dict[int, list[bpy.types.Collection]] = {}
+    for collection in root.children_recursive:
+        if kind_of(collection) == COPY:
+            found.setdefault(object_id_of(collection) or 0, []).append(collection)
+    return found
+
+
+def collection_of(part: bpy.types.Object) -> bpy.types.Collection | None:
+    """The collection of the object, or of the duplicate of one, that a part lies in directly; None in neither."""
+    return next((collection for collection in part.users_collection if kind_of(collection) in (OBJECT, COPY)), None)
 
 
 def root_of(block, scene: bpy.types.Scene) -> bpy.types.Collection | None:

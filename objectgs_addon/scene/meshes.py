@@ -7,21 +7,23 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-from mathutils import Matrix
 
 from ...backend.mesh_file import Mesh, read_mesh
 from ...backend.palette import to_linear
 from ...backend.protocol import InputError, Reconstruction, read_json
 from . import carrier
 from .capture import origin_of
+from .edits import show_edits
 from .kinds import (
     ANCHORS,
     MESH,
+    MESH_KEY,
     MESH_MATERIAL,
     OBJECT_PARENT,
     SPLATS,
     TEXTURE,
     adopt,
+    copies_of,
     kind_of,
     mark,
     object_collections,
@@ -39,10 +41,9 @@ from .object_collection import (
     textures_of,
 )
 from .objects_file import Objects
+from .places import into_world
 from .preview import Graph
 
-KEY = "objectgs_mesh"
-"""On a mesh: its key in meshes.json."""
 WRITTEN = "objectgs_written"
 """On a mesh: when the files that it shows were written."""
 SHOW = "objectgs_show"
@@ -86,6 +87,13 @@ class _Entry:
 
 
 def show_meshes(root: bpy.types.Collection, folder: Path) -> ShownMeshes:
+    """As `update_meshes`, with all edits of the objects."""
+    shown = update_meshes(root, folder)
+    show_edits(root, Objects.read(folder))
+    return shown
+
+
+def update_meshes(root: bpy.types.Collection, folder: Path) -> ShownMeshes:
     """Show the meshes that meshes.json lists, each exactly where its splats are.
 
     What is there is updated in place where its files are newer: transforms, names, modifiers, materials and their
@@ -154,13 +162,14 @@ def show_kinds(root: bpy.types.Collection, which: str) -> None:
 
 def apply_shown(root: bpy.types.Collection, changed) -> None:
     """Show what the reconstruction shows in the collections of IDs whose parts have come or gone."""
-    which, collections = shown_kinds(root), object_collections(root)
+    which, collections, copies = shown_kinds(root), object_collections(root), copies_of(root)
     meshes, whole = object_meshes(root), scene_meshes(root)
     hidden = {} if meshes else {thing: which == "splats" for thing in whole}
     for object_id in set(changed) & set(collections):
         # The unlabelled rest would lie about between the meshes of the others.
         replaced = object_id in meshes or (object_id == 0 and bool(meshes or whole))
-        for thing in parts_of(collections[object_id]):
+        both = (collections[object_id], *copies.get(object_id, ()))
+        for thing in [thing for collection in both for thing in parts_of(collection)]:
             if kind_of(thing) == SPLATS:
                 hidden[thing] = which == "meshes" and replaced
             elif kind_of(thing) == MESH:
@@ -200,16 +209,10 @@ def bounds(meshes: list[bpy.types.Object]) -> np.ndarray:
     for thing in meshes:
         local = np.empty(3 * len(thing.data.vertices), np.float32)
         thing.data.vertices.foreach_get("co", local)
-        matrix = np.array(_world_matrix(thing))
+        matrix = into_world(thing)
         world = local.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
         ends += [world.min(0), world.max(0)]
     return np.stack([np.min(ends, axis=0), np.max(ends, axis=0)])
-
-
-def _world_matrix(thing: bpy.types.Object) -> Matrix:
-    """From what it hangs on, since Blender does not know the place of what is hidden."""
-    above = _world_matrix(thing.parent) @ thing.matrix_parent_inverse if thing.parent is not None else Matrix()
-    return above @ thing.matrix_basis
 
 
 def _hide(hidden: dict[bpy.types.Object, bool]) -> None:
@@ -228,6 +231,8 @@ def _hide(hidden: dict[bpy.types.Object, bool]) -> None:
         for thing in changed[:-1]:
             flags[places[thing]] = hidden[thing]
         things.foreach_set(name, flags)
+        for thing in changed[:-1]:
+            thing.update_tag(refresh={"OBJECT"})  # Else what Blender evaluates hides it again.
         setattr(changed[-1], name, hidden[changed[-1]])
 
 
@@ -285,7 +290,7 @@ def _meshes_of(root, collections) -> dict[str, bpy.types.Object]:
     for collection in (root, *collections.values()):
         for thing in parts_of(collection):
             if kind_of(thing) == MESH and thing.data is not None:
-                found.setdefault(str(thing.get(KEY, "")), thing)
+                found.setdefault(str(thing.get(MESH_KEY, "")), thing)
     return found
 
 
@@ -356,7 +361,7 @@ class _Maker:
             name = collection[NAME] if str(target) == entry.key else self.objects.name(int(entry.key))
         thing = bpy.data.objects.new(f"{name} {MESH}", bpy.data.meshes.new(f"{name} {MESH}"))
         mark(thing, MESH, target)
-        thing[KEY] = entry.key
+        thing[MESH_KEY] = entry.key
         if target is None:
             thing.hide_viewport = thing.hide_render = True
         else:
@@ -375,7 +380,7 @@ class _Maker:
             thing.data.materials.append(material)
             return
         for image in dict.fromkeys(image for material in slots for image in textures_of(material)):
-            if image.get(KEY) == thing.get(KEY):
+            if image.get(MESH_KEY) == thing.get(MESH_KEY):
                 _reload(image, entry.texture)
 
 
@@ -435,7 +440,7 @@ def _load(entry: _Entry, name: str) -> bpy.types.Image:
     # Raw, since Blender goes through every node of the file otherwise.
     image.filepath_raw = _kept(path)
     mark(image, TEXTURE)
-    image[KEY] = entry.key
+    image[MESH_KEY] = entry.key
     return image
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The collection of one object: made with its pivot, renamed, recoloured and taken apart as a whole."""
+"""The collection of one object: made with its pivot, renamed, painted and taken apart as a whole."""
 
 import bpy
 import numpy as np
@@ -75,8 +75,9 @@ def rename(collection, name: str) -> None:
             material.name = thing.name if kind == MESH else name
 
 
-def recolour(collection, rgb: tuple[int, int, int]) -> None:
-    """Give the parts the object's colour, sRGB 0 .. 255, where Blender shows objects or materials by a colour."""
+def paint(collection, rgb: tuple[int, int, int]) -> None:
+    """Give the parts the colour that stands for the object, sRGB 0 .. 255, where Blender shows objects or materials
+    by a colour."""
     colour = (*to_linear(rgb), 1.0)
     for thing in parts_of(collection):
         thing.color = colour

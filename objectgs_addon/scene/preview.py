@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """How points and splats look: geometry-node groups on the mesh carriers, and the materials they use.
 
-A group or material is found again by its custom properties; one of an older version is left to what uses it.
+A group or material is found again by its custom properties; one of an older version is left to what uses it, until that
+is to show what only the new one can.
 """
 
 import math
 
 import bpy
+import numpy as np
 
 from .kinds import SPLATS_MATERIAL, kind_of, mark
 
@@ -96,7 +98,7 @@ class Graph:
             rows[column] = rows.get(column, 0) + 1
 
 
-def _shared(collection, kind: str, version: int, name: str, make):
+def shared(collection, kind: str, version: int, name: str, make):
     """The data-block of this kind and version, made where there is none."""
     for block in collection:
         if kind_of(block) == kind and block.get(VERSION) == version and block.library is None:
@@ -120,6 +122,7 @@ def _geometry_group(name: str, inputs: list[tuple]) -> bpy.types.NodeTree:
             socket.default_value = default
         if minimum is not None:
             socket.min_value = minimum
+        socket.hide_in_modifier = label.startswith("Recolor ")  # The panel has sliders for them.
     return tree
 
 
@@ -150,7 +153,7 @@ POINTS_GROUP = "points_preview"
 
 def points_group() -> bpy.types.NodeTree:
     """The group that shows a mesh carrier's vertices as small octahedra with the chosen colour."""
-    return _shared(bpy.data.node_groups, POINTS_GROUP, 1, "ObjectGS Points", _make_points_group)
+    return shared(bpy.data.node_groups, POINTS_GROUP, 1, "ObjectGS Points", _make_points_group)
 
 
 def _make_points_group(name: str) -> bpy.types.NodeTree:
@@ -184,7 +187,7 @@ def _make_points_group(name: str) -> bpy.types.NodeTree:
 
 def points_material() -> bpy.types.Material:
     """The shared material of point clouds: they shine with their colour."""
-    return _shared(bpy.data.materials, "points_material", 1, "ObjectGS Points", _make_points_material)
+    return shared(bpy.data.materials, "points_material", 1, "ObjectGS Points", _make_points_material)
 
 
 def _make_points_material(name: str) -> bpy.types.Material:
@@ -202,6 +205,12 @@ def _make_points_material(name: str) -> bpy.types.Material:
 SPLATS_GROUP = "splats_preview"
 RENDER_GROUP = "splats_render"
 
+HIDDEN = "objectgs_hidden"
+"""Attribute of the carrier's vertices: splats that are not shown, whatever object they belong to."""
+
+CHANNELS = ("Red", "Green", "Blue")
+OFFSET = "Recolor Offset"
+
 
 def add_splats_modifiers(thing: bpy.types.Object, largest_point: float) -> None:
     """Show a mesh carrier's splats: one modifier for the viewport, one for renders.
@@ -209,11 +218,11 @@ def add_splats_modifiers(thing: bpy.types.Object, largest_point: float) -> None:
     largest_point: radius of the viewport's points at most, in the mesh's units.
     """
     viewport = thing.modifiers.new("ObjectGS Splats", "NODES")
-    viewport.node_group = _shared(bpy.data.node_groups, SPLATS_GROUP, 1, "ObjectGS Splats", _make_splats_group)
+    viewport.node_group = _splats_group(SPLATS_GROUP)
     viewport.show_render = False
     set_input(viewport, "Largest Point", largest_point)
     render = thing.modifiers.new("ObjectGS Render", "NODES")
-    render.node_group = _shared(bpy.data.node_groups, RENDER_GROUP, 1, "ObjectGS Render", _make_render_group)
+    render.node_group = _splats_group(RENDER_GROUP)
     render.show_viewport = False
 
 
@@ -225,6 +234,78 @@ def use_material(thing: bpy.types.Object, material: bpy.types.Material) -> None:
             set_input(modifier, "Material", material)
 
 
+def recolour_splats(thing: bpy.types.Object, affine: tuple | None) -> None:
+    """Show a carrier's splats in other colours: affine is (matrix (3, 3), offset (3,)) of encoded colours, or None."""
+    matrix, offset = affine or (np.eye(3), np.zeros(3))
+    changed = False
+    for modifier in _splats_modifiers(thing):
+        newest = _splats_group(kind_of(modifier.node_group))
+        if modifier.node_group != newest:
+            if affine is None:
+                continue  # It can show nothing else.
+            _exchange(modifier, newest)
+        for name, row in ((OFFSET, offset), *((f"Recolor {channel}", row) for channel, row in zip(CHANNELS, matrix))):
+            set_input(modifier, name, [float(value) for value in row])
+            changed = True
+    if changed:
+        thing.update_tag()
+
+
+def bring_up_to_date(thing: bpy.types.Object) -> None:
+    """Show a carrier's splats by the newest groups; what the user has set of the older ones' inputs stays."""
+    for modifier in _splats_modifiers(thing):
+        newest = _splats_group(kind_of(modifier.node_group))
+        if modifier.node_group != newest:
+            _exchange(modifier, newest)
+
+
+def _splats_modifiers(thing: bpy.types.Object) -> list[bpy.types.NodesModifier]:
+    """The carrier's two modifiers, those of them that the user has left there."""
+    found = (modifier_of(thing, kind) for kind in (SPLATS_GROUP, RENDER_GROUP))
+    return [modifier for modifier in found if modifier is not None]
+
+
+def _exchange(modifier: bpy.types.NodesModifier, group: bpy.types.NodeTree) -> None:
+    values = _inputs_of(modifier)
+    modifier.node_group = group
+    for name, value in values.items():
+        set_input(modifier, name, value)
+
+
+def _inputs_of(modifier: bpy.types.NodesModifier) -> dict:
+    """Label -> value of a geometry-nodes modifier's inputs, its geometry aside."""
+    values = {}
+    for item in modifier.node_group.interface.items_tree:
+        if item.item_type == "SOCKET" and item.in_out == "INPUT" and item.socket_type != "NodeSocketGeometry":
+            if hasattr(modifier, "properties"):  # 5.2 and newer
+                values[item.name] = getattr(modifier.properties.inputs, item.identifier).value
+            else:
+                values[item.name] = modifier[item.identifier]
+    return values
+
+
+def _splats_group(kind: str) -> bpy.types.NodeTree:
+    """The newest group of a kind."""
+    if kind == SPLATS_GROUP:
+        return shared(bpy.data.node_groups, kind, 2, "ObjectGS Splats", _make_splats_group)
+    return shared(bpy.data.node_groups, kind, 2, "ObjectGS Render", _make_render_group)
+
+
+def recolour_inputs() -> list[tuple]:
+    """Inputs of an affine map of encoded colours, which changes nothing unless it is set."""
+    rows = [(f"Recolor {channel}", "NodeSocketVector", tuple(float(i == j) for j in range(3)), None,
+             f"How much of red, green and blue makes the new {channel.lower()}") for i, channel in enumerate(CHANNELS)]
+    return [*rows, (OFFSET, "NodeSocketVector", (0.0, 0.0, 0.0), None, "Added to red, green and blue")]
+
+
+def recoloured(graph: Graph, colour: bpy.types.NodeSocket, given: bpy.types.Node) -> bpy.types.NodeSocket:
+    """An encoded colour under the affine map of the inputs."""
+    rows = [graph.vector("DOT_PRODUCT", colour, given.outputs[f"Recolor {channel}"], output="Value")
+            for channel in CHANNELS]
+    turned = graph.node("ShaderNodeCombineXYZ", dict(enumerate(rows))).outputs[0]
+    return graph.vector("ADD", turned, given.outputs[OFFSET])
+
+
 def _make_splats_group(name: str) -> bpy.types.NodeTree:
     tree = _geometry_group(name, [
         ("Ellipsoids", "NodeSocketBool", False, None, "The splats' true shapes instead of points; slow with many"),
@@ -232,11 +313,12 @@ def _make_splats_group(name: str) -> bpy.types.NodeTree:
         ("Largest Point", "NodeSocketFloat", 1.0, 0.0, "Radius that no point exceeds"),
         ("Minimum Opacity", "NodeSocketFloat", 0.1, 0.0, "Fainter splats have no point"),
         ("Material", "NodeSocketMaterial", None, None, "Material of the points"),
+        *recolour_inputs(),
     ])
     graph = Graph(tree)
     given = graph.node("NodeGroupInput")
     splat = _Splat(graph)
-    raw = graph.vector("MULTIPLY_ADD", splat.base, (SH_C0,) * 3, (0.5,) * 3)
+    raw = recoloured(graph, graph.vector("MULTIPLY_ADD", splat.base, (SH_C0,) * 3, (0.5,) * 3), given)
     points = graph.node("GeometryNodeMeshToPoints", {"Mesh": given.outputs["Geometry"]}).outputs[0]
 
     first, second, third = splat.sides
@@ -244,7 +326,9 @@ def _make_splats_group(name: str) -> bpy.types.NodeTree:
         "MINIMUM", graph.math("MAXIMUM", first, second), third))
     radius = graph.math("MINIMUM", graph.math("MULTIPLY", middle, given.outputs["Point Size"]),
                         given.outputs["Largest Point"])
-    faint = graph.math("LESS_THAN", splat.opacity, given.outputs["Minimum Opacity"])
+    faint = graph.node("FunctionNodeBooleanMath", {
+        0: graph.math("LESS_THAN", splat.opacity, given.outputs["Minimum Opacity"]), 1: splat.hidden},
+        operation="OR").outputs[0]
     clear = graph.node("GeometryNodeDeleteGeometry", {"Geometry": points, "Selection": faint}).outputs[0]
     dots = graph.node("GeometryNodeSetPointRadius", {
         "Points": clear, "Radius": radius}).outputs[0]
@@ -270,6 +354,7 @@ def _make_splats_group(name: str) -> bpy.types.NodeTree:
 def _make_render_group(name: str) -> bpy.types.NodeTree:
     tree = _geometry_group(name, [
         ("Material", "NodeSocketMaterial", None, None, "Material of the splats"),
+        *recolour_inputs(),
     ])
     graph = Graph(tree)
     given = graph.node("NodeGroupInput")
@@ -303,6 +388,7 @@ def _make_render_group(name: str) -> bpy.types.NodeTree:
 
     raw = graph.vector("MULTIPLY_ADD", splat.base, (SH_C0,) * 3, (0.5,) * 3)
     raw = _add_harmonics(graph, raw, graph.vector("NORMALIZE", graph.vector("SCALE", towards, -1.0)))
+    raw = recoloured(graph, raw, given)
     kept = graph.node("FunctionNodeBooleanMath", {0: splat.is_seen, 1: outside}, operation="AND").outputs[0]
     dropped = graph.node("FunctionNodeBooleanMath", {0: kept}, operation="NOT").outputs[0]
     points = graph.node("GeometryNodeMeshToPoints", {"Mesh": given.outputs["Geometry"]}).outputs[0]
@@ -314,7 +400,7 @@ def _make_render_group(name: str) -> bpy.types.NodeTree:
         points = graph.store(points, label, "FLOAT_VECTOR", graph.rotated(wide, splat.rotation))
     points = graph.store(points, "disc_size", "FLOAT_VECTOR", graph.node("ShaderNodeCombineXYZ", {
         0: widened, 1: widened, 2: nearness}).outputs[0])
-    for pattern in ("radiance:*", "rotation", "scale", "object_id"):
+    for pattern in ("radiance:*", "rotation", "scale", "object_id", HIDDEN):
         points = graph.removed(points, pattern)
 
     square = graph.node("GeometryNodeMeshGrid", {
@@ -354,18 +440,34 @@ class _Splat:
         # Alpha falls to 1/255 this many sigmas from the centre.
         ratio = graph.math("MAXIMUM", graph.math("MULTIPLY", self.opacity, 1.0 / SMALLEST_ALPHA), 1.0)
         self.reach = graph.math("SQRT", graph.math("MULTIPLY", graph.math("LOGARITHM", ratio, math.e), 2.0))
-        self.is_seen = graph.math("GREATER_THAN", self.opacity, 1.01 * SMALLEST_ALPHA)
+        self.hidden = graph.attribute(HIDDEN, "BOOLEAN")
+        shown = graph.node("FunctionNodeBooleanMath", {0: self.hidden}, operation="NOT").outputs[0]
+        self.is_seen = graph.node("FunctionNodeBooleanMath", {
+            0: graph.math("GREATER_THAN", self.opacity, 1.01 * SMALLEST_ALPHA), 1: shown}, operation="AND").outputs[0]
+
+
+def linear_channel(graph: Graph, value: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    """sRGB, 0 where it is below, to linear; by nodes that shaders have, too."""
+    value = graph.math("MAXIMUM", value, 0.0)
+    high = graph.math("POWER", graph.math("DIVIDE", graph.math("ADD", value, 0.055), 1.055), 2.4)
+    return _chosen(graph, graph.math("GREATER_THAN", value, 0.04045), high, graph.math("DIVIDE", value, 12.92))
+
+
+def encoded_channel(graph: Graph, value: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    """Linear, 0 where it is below, to sRGB."""
+    value = graph.math("MAXIMUM", value, 0.0)
+    high = graph.math("MULTIPLY_ADD", graph.math("POWER", value, 1.0 / 2.4), 1.055, -0.055)
+    return _chosen(graph, graph.math("GREATER_THAN", value, 0.0031308), high, graph.math("MULTIPLY", value, 12.92))
+
+
+def _chosen(graph: Graph, first: bpy.types.NodeSocket, yes, no) -> bpy.types.NodeSocket:
+    """`yes` where `first` is 1, `no` where it is 0."""
+    return graph.math("MULTIPLY_ADD", first, yes, graph.math("MULTIPLY", graph.math("SUBTRACT", 1.0, first), no))
 
 
 def _linear_colour(graph: Graph, raw: bpy.types.NodeSocket, alpha) -> bpy.types.NodeSocket:
     """What the splats mean is sRGB, and may be below 0; Blender's colours are linear."""
-    channels = {}
-    for index, channel in enumerate(graph.separated(raw)):
-        value = graph.math("MAXIMUM", channel, 0.0)
-        high = graph.math("POWER", graph.math("DIVIDE", graph.math("ADD", value, 0.055), 1.055), 2.4)
-        channels[index] = graph.node("GeometryNodeSwitch", {
-            "Switch": graph.math("GREATER_THAN", value, 0.04045), "False": graph.math("DIVIDE", value, 12.92),
-            "True": high}, input_type="FLOAT").outputs[0]
+    channels = {index: linear_channel(graph, channel) for index, channel in enumerate(graph.separated(raw))}
     return graph.node("FunctionNodeCombineColor", {**channels, "Alpha": alpha}).outputs[0]
 
 
@@ -408,7 +510,7 @@ def splats_material(name: str, colour: tuple[float, ...]) -> bpy.types.Material:
     """A new material for one object's splats; `colour` (linear RGB) is what Solid shows."""
     material, graph = _empty_material(name)
     mark(material, SPLATS_MATERIAL)
-    shader = _shared(bpy.data.node_groups, "splat_shader", 1, "ObjectGS Splat", _make_splat_shader)
+    shader = shared(bpy.data.node_groups, "splat_shader", 1, "ObjectGS Splat", _make_splat_shader)
     group = graph.node("ShaderNodeGroup", node_tree=shader)
     group.width = 200.0
     graph.node("ShaderNodeOutputMaterial", {"Surface": group.outputs[0]}, location=(260.0, 0.0))
@@ -432,7 +534,7 @@ def _make_splat_shader(name: str) -> bpy.types.NodeTree:
 
 def _ellipsoids_material() -> bpy.types.Material:
     """The shared material of ellipsoids, whose colour is an attribute of the instance."""
-    return _shared(bpy.data.materials, "ellipsoids_material", 1, "ObjectGS Ellipsoids", _make_ellipsoids_material)
+    return shared(bpy.data.materials, "ellipsoids_material", 1, "ObjectGS Ellipsoids", _make_ellipsoids_material)
 
 
 def _make_ellipsoids_material(name: str) -> bpy.types.Material:

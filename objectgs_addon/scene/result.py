@@ -12,6 +12,7 @@ from ...backend.palette import to_linear
 from ...backend.protocol import InputError, Reconstruction
 from . import carrier, preview
 from .capture import origin_of
+from .edits import show_edits
 from .kinds import (
     ANCHORS,
     MESH,
@@ -19,6 +20,7 @@ from .kinds import (
     SPLATS,
     adopt,
     capture_of,
+    copies_of,
     folder_of,
     mark,
     object_collections,
@@ -27,8 +29,8 @@ from .kinds import (
     parts_of,
     points_of,
 )
-from .meshes import apply_shown, show_meshes
-from .object_collection import NAME, centre_of, new_collection, pivot_of, recolour, remove, remove_if_empty, rename
+from .meshes import apply_shown, update_meshes
+from .object_collection import NAME, centre_of, new_collection, paint, pivot_of, remove, remove_if_empty, rename
 from .objects_file import Objects
 from .points import positions_of, read_points, show_points
 from .splats import anchor_attributes, ids_of, middle_scale, read_anchors, read_splats, splat_attributes, unique_ids
@@ -93,13 +95,13 @@ def show_result(root: bpy.types.Collection, folder: Path, scene: bpy.types.Scene
         elif anchors is not None:
             remove(part_of(collection, ANCHORS))
         rename(collection, objects.name(object_id))
-        recolour(collection, objects.rgb(object_id))
+        paint(collection, objects.rgb(object_id))
         shown.objects += object_id != 0
     for collection in collections.values():
         for kind in (SPLATS, ANCHORS):
             remove(part_of(collection, kind))
     try:
-        shown.warnings += show_meshes(root, folder).warnings
+        shown.warnings += update_meshes(root, folder).warnings
     except InputError as error:
         shown.warnings.append(str(error))
     apply_shown(root, makers.changed)
@@ -108,6 +110,7 @@ def show_result(root: bpy.types.Collection, folder: Path, scene: bpy.types.Scene
         remove_if_empty(still_there[object_id])
     for collection in new:
         root.children.link(collection)
+    show_edits(root, objects)
     root[GROUPING] = json.dumps(objects.grouping())
     root[SHOWN] = _written(folder)
     return shown
@@ -130,7 +133,8 @@ def _written(folder: Path) -> str:
 def show_objects(root: bpy.types.Collection, folder: Path, scene: bpy.types.Scene) -> None:
     """Bring points and object collections into agreement with points.ply and objects.json, after a vote or an edit.
 
-    Names and colours are set; where merges or left-out objects changed, splats are shown again as `show_result` does.
+    Names, colours and edits are shown; where merges or left-out objects changed, splats are shown again as
+    `show_result` does.
     """
     folder = Path(folder)
     objects = Objects.read(folder)
@@ -142,9 +146,12 @@ def show_objects(root: bpy.types.Collection, folder: Path, scene: bpy.types.Scen
             Reconstruction(folder).splats.is_file()):
         show_result(root, folder, scene)
         return
+    copies = copies_of(root)
     for object_id, collection in object_collections(root).items():
-        rename(collection, objects.name(object_id))
-        recolour(collection, objects.rgb(object_id))
+        for each in (collection, *copies.get(object_id, ())):
+            rename(each, objects.name(object_id))
+            paint(each, objects.rgb(object_id))
+    show_edits(root, objects)
 
 
 def _groups(table: np.ndarray, objects: Objects) -> dict[int, np.ndarray]:

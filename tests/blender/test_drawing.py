@@ -75,7 +75,7 @@ def test_places_marks_and_colours_are_those_of_now(root, monkeypatch):
     thing.parent.location.x += 2.0
     thing.select_set(True)
     bpy.context.view_layer.update()
-    monkeypatch.setattr(gather, "_recolour_of", lambda _collection: Recolour(value=0.5))
+    monkeypatch.setattr(gather.scenes, "recolour_of", lambda _collection: Recolour(value=0.5))
     after = gather.gather([thing], "object")[0]
     assert after.splats is before.splats
     assert np.allclose((after.matrix - before.matrix)[:, 3], (2.0, 0, 0, 0), atol=1e-6)

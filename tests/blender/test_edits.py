@@ -1,0 +1,651 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Edits of objects in Blender: removal, colours, places, duplicates; in objects.json, after undo, and shown again."""
+
+import itertools
+import json
+import math
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from mathutils import Matrix, Vector
+from objectgs.backend.mesh_file import read_mesh
+from objectgs.backend.objects import edit_objects, read_objects
+from objectgs.backend.ply import read_vertices, write_vertices
+from objectgs.backend.recolour import Recolour
+from objectgs.objectgs_addon import drawing, object_edits, selection, visibility
+from objectgs.objectgs_addon import scene as blender_scene
+from objectgs.objectgs_addon.scene import carrier, floaters, kinds, places, preview
+from objectgs.objectgs_addon.splat_arrays import arrays_of
+
+import headless
+
+from .building import HUGE, OBJECTS, look_at, splat_table, tetrahedron, write_cameras, write_folder, write_meshes
+
+ORIGIN = np.array([100.0, -200.0, 30.0])
+RECOLOUR = Recolour(replace=(0.9, 0.2, 0.1), amount=0.6, hue=0.2, saturation=1.4, contrast=1.2, value=0.9,
+                    tint=(1.0, 0.8, 0.6), middle=0.4)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """A folder far from the origin and turned, whose objects 1 and 2 have meshes. To be read only."""
+    place = write_folder(tmp_path_factory.mktemp("made") / "table top")
+    upright = np.eye(4)
+    upright[:3, :3] = np.array(Matrix.Rotation(0.7, 3, "X")) @ np.array(Matrix.Rotation(0.3, 3, "Z"))
+    upright[:3, 3] = 1.0, 2.0, 3.0
+    write_cameras(place, [look_at(ORIGIN + np.array([3, 0, 1]), ORIGIN)], origin=ORIGIN, upright=upright)
+    splats = splat_table(np.resize([0, *OBJECTS], 200), degree=2)
+    for axis, name in enumerate("xyz"):
+        splats[name] += ORIGIN[axis]
+    write_vertices(place / "splats.ply", splats)
+    write_meshes(place, {"1": tetrahedron(ORIGIN + 0.5), "2": tetrahedron(ORIGIN - 0.5, 0.5)})
+    return place
+
+
+@pytest.fixture
+def folder(made, tmp_path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "table top"))
+
+
+@pytest.fixture
+def root(fresh, folder, backend_python, monkeypatch):
+    """The folder shown in a registered extension."""
+    monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
+    extension = headless.extension()
+    extension.register()
+    bpy.ops.objectgs.open_reconstruction(directory=str(folder))
+    yield bpy.context.scene.objectgs.active
+    extension.unregister()
+
+
+def active():
+    """The reconstruction's collection, which undo replaces."""
+    return bpy.context.scene.objectgs.active
+
+
+def entry(root, object_id=1):
+    return next(e for e in read_objects(blender_scene.folder_of(root) / "objects.json") if e.id == object_id)
+
+
+def collection_of(root, object_id=1):
+    return blender_scene.object_collections(root)[object_id]
+
+
+def part(root, kind, object_id=1):
+    return kinds.part_of(collection_of(root, object_id), kind)
+
+
+def item(root, object_id=1):
+    return object_edits.item_of(root, object_id)
+
+
+def activate(root, object_id) -> None:
+    rows = [object_edits.from_stored(row.object_id) for row in root.objectgs.objects]
+    root.objectgs.active_object = rows.index(object_id)
+
+
+def set_sliders(root, recolour=RECOLOUR, object_id=1) -> None:
+    for name in (*object_edits.SLIDERS, *object_edits.COLOURS):
+        setattr(item(root, object_id), name, getattr(recolour, name))
+
+
+def show_again(root) -> None:
+    assert bpy.ops.objectgs.show_result() == {"FINISHED"}
+
+
+def encoded(linear) -> np.ndarray:
+    linear = np.maximum(linear, 0.0)
+    return np.where(linear > 0.0031308, 1.055 * linear ** (1 / 2.4) - 0.055, 12.92 * linear)
+
+
+def evaluated_colours(thing) -> np.ndarray:
+    """(n, 4) of the points that geometry nodes make of a carrier in the viewport."""
+    if "vertices" not in thing.modifiers:
+        # What meshes hold can be read in every Blender.
+        tree = bpy.data.node_groups.new("vertices", "GeometryNodeTree")
+        for way in ("OUTPUT", "INPUT"):
+            tree.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+        graph = preview.Graph(tree)
+        vertices = graph.node("GeometryNodePointsToVertices", {0: graph.node("NodeGroupInput").outputs[0]})
+        graph.node("NodeGroupOutput", {0: vertices.outputs[0]})
+        thing.modifiers.new("vertices", "NODES").node_group = tree
+    return seen_colours(thing)
+
+
+def seen_colours(thing) -> np.ndarray:
+    """(n, 4) the colours of the evaluated mesh's vertices."""
+    evaluated = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    mesh = evaluated.to_mesh()
+    values = np.empty(4 * len(mesh.vertices), np.float32)
+    mesh.attributes["colour"].data.foreach_get("color", values)
+    evaluated.to_mesh_clear()
+    return values.reshape(-1, 4)
+
+
+def show_faint(thing) -> None:
+    preview.set_input(preview.modifier_of(thing, preview.SPLATS_GROUP), "Minimum Opacity", 0.0)
+    thing.update_tag()
+
+
+def rendered_quads(thing) -> np.ndarray:
+    """(n, 3) linear colours of the discs that a render would show, one each."""
+    for modifier in thing.modifiers:
+        modifier.show_viewport = kinds.kind_of(modifier.node_group) == preview.RENDER_GROUP
+    return seen_colours(thing).reshape(-1, 4, 4)[:, 0, :3]
+
+
+def expected(colours, recolour=None) -> np.ndarray:
+    """Encoded colours as they are to be seen."""
+    if recolour is not None:
+        matrix, offset = recolour.affine()
+        colours = colours @ matrix.T + offset
+    return np.maximum(colours, 0.0)
+
+
+# Colours.
+
+
+def test_points_show_exactly_the_map_of_the_encoded_colours(root):
+    splats = part(root, "splats")
+    blender_scene.show_kinds(root, "splats")
+    show_faint(splats)
+    raw = 0.5 + preview.SH_C0 * carrier.read(splats.data, "radiance:base")[:, :3].astype(float)
+    before = carrier.read(splats.data, "radiance:base").copy()
+    assert encoded(evaluated_colours(splats)[:, :3]) == pytest.approx(expected(raw), abs=2e-5)
+    set_sliders(root)
+    wanted = object_edits.recolour_of(item(root))
+    assert wanted.middle == pytest.approx(blender_scene.luma_of(collection_of(root)), abs=1e-5)
+    assert encoded(evaluated_colours(splats)[:, :3]) == pytest.approx(expected(raw, wanted), abs=5e-5)
+    assert np.array_equal(carrier.read(splats.data, "radiance:base"), before), "attributes stay as they are"
+    assert bpy.ops.objectgs.reset_object(what="COLORS") == {"FINISHED"}
+    assert blender_scene.recolour_of(collection_of(root)) is None
+    assert encoded(evaluated_colours(splats)[:, :3]) == pytest.approx(expected(raw), abs=2e-5)
+
+
+def test_renders_show_the_map_of_all_bands(root):
+    camera = next(thing for thing in root.all_objects if blender_scene.kind_of(thing) == "camera")
+    bpy.context.scene.camera = camera
+    blender_scene.show_kinds(root, "splats")
+    splats = part(root, "splats")
+    plain = encoded(rendered_quads(splats))
+    assert len(plain) > 10
+    # Colours below 0 are cut in what is compared with, so only maps of the others can be told.
+    hue = Recolour(hue=0.25, value=0.5, middle=blender_scene.luma_of(collection_of(root)))
+    item(root).hue, item(root).value = hue.hue, hue.value
+    seen = encoded(rendered_quads(splats))
+    positive = (plain > 1e-4).all(1)
+    assert positive.sum() > 5
+    assert seen[positive] == pytest.approx(expected(plain[positive], hue), abs=1e-4)
+
+
+def test_textures_are_mapped_by_the_same_control_and_left_as_they_were(root):
+    mesh = part(root, "mesh")
+    tree = mesh.data.materials[0].node_tree
+    before = sorted((link.from_socket.name, link.to_socket.name) for link in tree.links)
+    set_sliders(root)
+    matrix, offset = object_edits.recolour_of(item(root)).affine()
+    (group,) = [node for node in tree.nodes if node.type == "GROUP"]
+    for row, channel in zip(matrix, ("Red", "Green", "Blue")):
+        assert np.array(group.inputs[f"Recolor {channel}"].default_value) == pytest.approx(row, abs=1e-6)
+    assert np.array(group.inputs["Recolor Offset"].default_value) == pytest.approx(offset, abs=1e-6)
+    (feeds,) = group.inputs["Color"].links
+    assert feeds.from_node.type == "TEX_IMAGE"
+    assert [link.to_socket.name for link in group.outputs[0].links] == ["Base Color"]
+    bpy.ops.objectgs.reset_object(what="COLORS")
+    assert sorted((link.from_socket.name, link.to_socket.name) for link in tree.links) == before
+    assert not [node for node in tree.nodes if node.type == "GROUP"]
+
+
+def test_a_rendered_texture_has_the_mapped_colour(root):
+    """Cycles bakes nothing here: the shader's own nodes give a plane's colour, compared with the map of the texel."""
+    mesh = part(root, "mesh")
+    set_sliders(root)
+    material = mesh.data.materials[0]
+    tree = material.node_tree
+    shader = next(node for node in tree.nodes if node.type == "BSDF_PRINCIPLED")
+    emission = tree.nodes.new("ShaderNodeEmission")
+    tree.links.new(shader.inputs["Base Color"].links[0].from_socket, emission.inputs["Color"])
+    output = next(node for node in tree.nodes if node.type == "OUTPUT_MATERIAL")
+    tree.links.new(emission.outputs[0], output.inputs["Surface"])
+    stage = bpy.data.scenes.new("stage")
+    plane = bpy.data.objects.new("plane", bpy.data.meshes.new("plane"))
+    plane.data.from_pydata([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], [], [(0, 1, 2, 3)])
+    plane.data.uv_layers.new(name="UVMap")
+    plane.data.materials.append(material)
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    camera.location, camera.data.type, camera.data.ortho_scale = (0, 0, 2), "ORTHO", 1.0
+    for thing in (plane, camera):
+        stage.collection.objects.link(thing)
+    stage.camera = camera
+    blender_scene.prepare_render(stage)
+    stage.render.engine, stage.cycles.samples, stage.cycles.use_denoising = "CYCLES", 1, False
+    stage.render.dither_intensity = 0.0
+    stage.render.resolution_x = stage.render.resolution_y = 4
+    picture = blender_scene.folder_of(root) / "plane.png"
+    stage.render.filepath = str(picture)
+    bpy.ops.render.render(write_still=True, scene=stage.name)
+    image = bpy.data.images.load(str(picture))
+    pixels = np.array(image.pixels[:]).reshape(-1, 4)[:, :3]
+    wanted = expected(np.array([[200, 100, 50]]) / 255, object_edits.recolour_of(item(root)))
+    assert pixels == pytest.approx(np.repeat(np.clip(wanted, 0, 1), len(pixels), 0), abs=0.6 / 255)
+
+
+def test_colours_are_stored_and_shown_again_from_the_folder(root, folder):
+    set_sliders(root)
+    stored = entry(root).recolour
+    assert stored.hue == 0.2 and stored.tint == (1.0, 0.8, 0.6) and stored.amount == 0.6
+    assert blender_scene.recolour_of(collection_of(root)) == stored
+    edit_objects(folder / "objects.json", {1: {"recolour": None}, 2: {"recolour": RECOLOUR.stored()}})
+    show_again(root)
+    assert blender_scene.recolour_of(collection_of(root)) is None and not object_edits.recolour_of(item(root)).changes
+    assert blender_scene.recolour_of(collection_of(root, 2)) == RECOLOUR
+    assert object_edits.recolour_of(item(root, 2)) == RECOLOUR
+
+
+def test_older_groups_are_exchanged_when_they_are_to_recolour(root):
+    splats = part(root, "splats")
+    modifier = preview.modifier_of(splats, preview.SPLATS_GROUP)
+    preview.set_input(modifier, "Point Size", 0.25)
+    newest = modifier.node_group
+    older = newest.copy()
+    older[preview.VERSION] = 1
+    for socket in list(older.interface.items_tree):
+        if socket.name.startswith("Recolor "):
+            older.interface.remove(socket)
+    modifier.node_group = older
+    preview.set_input(modifier, "Point Size", 0.25)
+    show_again(root)
+    assert modifier.node_group == older, "nothing is asked of it that it cannot do"
+    item(root).hue = 0.5
+    assert modifier.node_group == newest
+    assert preview._inputs_of(modifier)["Point Size"] == 0.25
+    assert preview._inputs_of(modifier)["Material"] == splats.data.materials[0]
+
+
+# Removal.
+
+
+def test_removed_and_restored(root, folder):
+    collection = collection_of(root)
+    collection.hide_render = True
+    part(root, "object_parent").location.x += 3.0
+    where = part(root, "object_parent").matrix_basis.copy()
+    activate(root, 1)
+    assert bpy.ops.objectgs.remove_object() == {"FINISHED"}
+    assert entry(root).removed and not entry(root).floaters and item(root).removed
+    assert collection.hide_viewport and collection.hide_render and blender_scene.is_removed(collection)
+    assert not part(root, "splats").visible_get()
+    assert not bpy.ops.objectgs.remove_object.poll()
+    show_again(root)
+    assert collection_of(root) == collection and collection.hide_viewport
+    assert bpy.ops.objectgs.restore_object() == {"FINISHED"}
+    assert not entry(root).removed and not item(root).removed
+    assert not collection.hide_viewport and collection.hide_render, "hidden in renders, as it was before"
+    assert part(root, "object_parent").matrix_basis == where
+    assert not bpy.ops.objectgs.restore_object.poll()
+
+
+def test_floaters_go_by_the_backends_rule_and_come_back(root, folder, backend_python):
+    activate(root, 1)
+    bpy.ops.objectgs.remove_object(floaters=True)
+    unlabelled = part(root, "splats", 0)
+    hidden = blender_scene.hidden_splats(unlabelled.data)
+    table = read_vertices(folder / "splats.ply")
+    script = ("import sys, json; from pathlib import Path; from backend.export import read_splats;"
+              "from backend.editing import apply_edits; from backend.objects import read_objects;"
+              "folder = Path(sys.argv[1]); splats = read_splats(folder / 'splats.ply')[0];"
+              "kept = apply_edits(splats, read_objects(folder / 'objects.json'));"
+              "print(json.dumps(kept.means[kept.object_ids == 0].astype(float).tolist()))")
+    ran = subprocess.run([backend_python, "-c", script, folder], cwd=headless.ROOT, capture_output=True, text=True,
+                         check=True)
+    kept = {tuple(row) for row in json.loads(ran.stdout)}
+    rows = table[table["object_id"] == 0]
+    wanted = [tuple(float(row[axis]) for axis in "xyz") not in kept for row in rows]
+    assert 0 < hidden.sum() < len(hidden) and hidden.tolist() == wanted
+    blender_scene.show_kinds(root, "splats")
+    show_faint(unlabelled)
+    assert len(evaluated_colours(unlabelled)) == (~hidden).sum()
+    assert len(arrays_of(unlabelled.data).means) == (~hidden).sum(), "nor drawn and picked"
+    show_again(root)
+    assert np.array_equal(blender_scene.hidden_splats(part(root, "splats", 0).data), hidden)
+    bpy.ops.objectgs.restore_object(object="1")
+    assert blender_scene.hidden_splats(unlabelled.data) is None
+    assert len(evaluated_colours(unlabelled)) == len(rows)
+
+
+def test_the_hull_is_right_where_it_can_be_computed_by_hand():
+    rng = np.random.default_rng(3)
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 2) for z in (0, 3)], float) + 1000.0
+    means = np.concatenate([corners, 1000.0 + rng.uniform(0, 1, (50, 3)) * (1, 2, 3)])
+    points = 1000.0 + rng.uniform(-0.5, 1.5, (500, 3)) * (1, 2, 3)
+    inside = ((points > 1000) & (points < 1000 + np.array([1, 2, 3]))).all(1)
+    assert np.array_equal(floaters.inside_hull(points, means, np.ones(len(means))), inside)
+    assert not floaters.inside_hull(points, corners[:4] * (1, 1, 0), np.ones(4)).any(), "a flat one has no inside"
+    assert not floaters.inside_hull(points, corners[:3], np.ones(3)).any()
+
+
+# Places.
+
+
+def independent(root, local) -> np.ndarray:
+    """(n, 3) capture coordinates of parts' vertices, worked out from Blender's own world."""
+    bpy.context.view_layer.update()
+    parent = next(thing for thing in root.objects if blender_scene.kind_of(thing) == "parent")
+    world = np.array(local.matrix_world, float)
+    back = np.linalg.inv(np.array(parent.matrix_world, float))
+    positions = np.empty(3 * len(local.data.vertices), np.float32)
+    local.data.vertices.foreach_get("co", positions)
+    positions = positions.reshape(-1, 3).astype(float)
+    moved = positions @ (back @ world)[:3, :3].T + (back @ world)[:3, 3]
+    return moved + ORIGIN
+
+
+def test_a_moved_object_is_stored_in_the_captures_coordinates(root, folder, backend_python, tmp_path):
+    parent = next(thing for thing in root.objects if blender_scene.kind_of(thing) == "parent")
+    parent.matrix_world = Matrix.Scale(2.5, 4) @ parent.matrix_world  # The user set a distance.
+    pivot = part(root, "object_parent")
+    pivot.rotation_euler = (0.3, -0.4, 1.2)
+    pivot.location += Vector((0.5, 1.0, -2.0))
+    pivot.scale = (1.5, 1.5, 1.5)
+    assert entry(root).transform is None
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "moved.blend"))
+    assert entry(root).transform is not None and entry(root, 2).transform is None
+    splats = part(root, "splats")
+    blender_scene.show_kinds(root, "splats")
+    ran = subprocess.run([backend_python, "-m", "backend", "export", folder, "--out", tmp_path / "one.ply",
+                          "--objects", "1"], cwd=headless.ROOT, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    table = read_vertices(tmp_path / "one.ply")
+    assert np.stack([table[axis] for axis in "xyz"], 1) == pytest.approx(independent(root, splats), abs=2e-4)
+
+
+def test_what_nobody_moved_is_exactly_where_it_was(root, folder):
+    before = (folder / "objects.json").read_bytes()
+    for collection in blender_scene.object_collections(root).values():
+        assert np.array_equal(blender_scene.place_of(root, collection), np.eye(4))
+    blender_scene.store_places(root)
+    assert (folder / "objects.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("linear", [
+    1.3 * np.array(Matrix.Rotation(1.0, 3, (1, 2, 3))), np.diag([1.0, 2.0, 0.5]),
+    np.array([[1.0, 0.6, 0.0], [0.0, 1.0, 0.0], [0.2, 0.0, 1.0]]), np.diag([-1.0, 1.0, 1.0])])
+def test_places_from_the_folder_are_shown_and_stay_as_they_are(root, folder, linear):
+    place = np.eye(4)
+    place[:3, :3] = linear
+    place[:3, 3] = np.array([0.5, -1.0, 2.0]) + ORIGIN - linear @ ORIGIN
+    edit_objects(folder / "objects.json", {1: {"transform": place.tolist()}})
+    stored = (folder / "objects.json").read_bytes()
+    before = independent(root, part(root, "splats"))
+    show_again(root)
+    after = independent(root, part(root, "splats"))
+    assert after == pytest.approx(before @ place[:3, :3].T + place[:3, 3], abs=2e-4)
+    assert blender_scene.place_of(root, collection_of(root)) == pytest.approx(place, abs=1e-3)
+    blender_scene.store_places(root)
+    show_again(root)
+    assert (folder / "objects.json").read_bytes() == stored
+    part(root, "object_parent").location.x += 1.0
+    show_again(root)
+    moved = independent(root, part(root, "splats"))
+    assert not np.allclose(moved, after, atol=0.1), "what the user moved since stays"
+    blender_scene.store_places(root)
+    assert np.abs(np.array(entry(root).transform) - place).max() > 0.1
+    assert bpy.ops.objectgs.reset_object(what="PLACE") == {"FINISHED"}
+    assert independent(root, part(root, "splats")) == pytest.approx(before, abs=2e-4)
+    assert entry(root).transform is None
+
+
+def test_a_part_that_is_moved_alone_and_pivots_elsewhere_count(root):
+    pivot, splats = part(root, "object_parent"), part(root, "splats")
+    before = independent(root, splats)
+    splats.location.z += 0.5
+    holder = bpy.data.objects.new("holder", None)
+    bpy.context.scene.collection.objects.link(holder)
+    holder.rotation_euler.x, holder.location.y = 0.5, 2.0
+    bpy.context.view_layer.update()
+    pivot.parent = holder
+    after = independent(root, splats)
+    place = blender_scene.place_of(root, collection_of(root))
+    assert after == pytest.approx(before @ place[:3, :3].T + place[:3, 3], abs=2e-4)
+    wanted = np.eye(4)
+    wanted[:3, 3] = 1.0, 0.0, 0.0
+    places.put(root, collection_of(root), wanted)
+    assert independent(root, splats) == pytest.approx(before + np.array([1, 0, 0]), abs=2e-4)
+
+
+# Duplicates.
+
+
+def test_a_duplicate_shares_its_data_and_is_kept(root, folder):
+    activate(root, 1)
+    item(root).hue = 0.25
+    assert bpy.ops.objectgs.duplicate_object() == {"FINISHED"}
+    (copy,) = blender_scene.copies_of(root)[1]
+    assert entry(root).copies == (tuple(tuple(row) for row in np.eye(4).tolist()),)
+    for kind in ("splats", "mesh", "anchors"):
+        assert kinds.part_of(copy, kind).data == part(root, kind).data
+        assert kinds.part_of(copy, kind).parent == kinds.part_of(copy, "object_parent")
+    assert selection.selected_collections(bpy.context, root) == [copy]
+    kinds.part_of(copy, "object_parent").location.x += 4.0
+    part(root, "object_parent").location.y += 1.0
+    blender_scene.store_places(root)
+    ((*_, row),) = (np.array(place).T.tolist() for place in entry(root).copies)
+    assert row[:3] == pytest.approx([4.0, 0.0, 0.0], abs=1e-4)
+    assert entry(root).transform is not None
+    place = independent(root, kinds.part_of(copy, "splats"))
+    splats = read_vertices(folder / "splats.ply")
+    write_vertices(folder / "splats.ply", splats[: len(splats) // 2])
+    show_again(root)
+    (again,) = blender_scene.copies_of(root)[1]
+    assert again == copy and len(kinds.part_of(copy, "splats").data.vertices) == 25
+    assert independent(root, kinds.part_of(copy, "splats")) == pytest.approx(place[:25], abs=1e-4)
+    visibility.toggle_solo(bpy.context.view_layer, root, 2)
+    assert not kinds.part_of(copy, "object_parent").visible_get()
+    visibility.toggle_solo(bpy.context.view_layer, root, 2)
+    assert kinds.part_of(copy, "object_parent").visible_get()
+    item(root).hue = -0.25
+    assert drawing.owners()[kinds.part_of(copy, "splats")] == copy
+    for collection in (copy, collection_of(root)):
+        modifier = preview.modifier_of(kinds.part_of(collection, "splats"), preview.SPLATS_GROUP)
+        row = Recolour(hue=-0.25, middle=item(root).middle).affine()[0][0]
+        assert list(preview._inputs_of(modifier)["Recolor Red"]) == pytest.approx(row, abs=1e-5)
+    blender_scene.show_kinds(root, "splats")
+    assert kinds.part_of(copy, "mesh").hide_viewport and not kinds.part_of(copy, "splats").hide_viewport
+    activate(root, 2)
+    selection.select_collections(bpy.context, [copy])
+    assert bpy.ops.objectgs.remove_object() == {"FINISHED"}
+    assert entry(root).copies == () and not entry(root).removed and not blender_scene.copies_of(root)
+
+
+def test_duplicates_from_the_folder_come_and_go(root, folder):
+    first, second = np.eye(4), np.eye(4)
+    first[0, 3], second[1, 3] = 2.0, 3.0
+    edit_objects(folder / "objects.json", {1: {"copies": [first.tolist(), second.tolist()], "removed": True}})
+    show_again(root)
+    one, two = blender_scene.copies_of(root)[1]
+    assert one.hide_render and two.hide_viewport, "removed with what they are duplicates of"
+    edit_objects(folder / "objects.json", {1: {"copies": [second.tolist()], "removed": None}})
+    show_again(root)
+    assert blender_scene.copies_of(root)[1] == [two] and not two.hide_render
+    for thing in list(two.objects):
+        bpy.data.objects.remove(thing)
+    blender_scene.store_places(root)
+    assert entry(root).copies == () and not blender_scene.copies_of(root)
+
+
+def test_blenders_own_duplicates_become_ours(root):
+    blender_scene.show_kinds(root, "splats")
+    selection.select_object(bpy.context, root, 1)
+    chosen = set(bpy.context.selected_objects)
+    bpy.ops.object.duplicate()
+    twin = next(thing for thing in bpy.context.selected_objects if blender_scene.kind_of(thing) == "object_parent")
+    assert twin not in chosen
+    twin.location.x += 2.0
+    blender_scene.store_places(root)
+    (copy,) = blender_scene.copies_of(root)[1]
+    assert kinds.part_of(copy, "object_parent") == twin
+    assert kinds.part_of(copy, "splats").data == part(root, "splats").data, "its splats are trained with the others"
+    assert len([thing for thing in collection_of(root).objects if blender_scene.kind_of(thing) == "splats"]) == 1
+    assert np.array(entry(root).copies[0])[:3, 3] == pytest.approx([2, 0, 0], abs=1e-4)
+    selection.select_object(bpy.context, root, 2)
+    bpy.ops.object.select_all(action="DESELECT")
+    part(root, "splats", 2).select_set(True)
+    bpy.ops.object.duplicate()
+    bpy.context.selected_objects[0].location.y += 1.0
+    blender_scene.store_places(root)
+    assert np.array(entry(root, 2).copies[0])[:3, 3] == pytest.approx([0, 1, 0], abs=1e-4)
+    place = independent(root, kinds.part_of(blender_scene.copies_of(root)[2][0], "splats"))
+    assert place == pytest.approx(independent(root, part(root, "splats", 2)) + np.array([0, 1, 0]), abs=1e-4)
+
+
+# Undo.
+
+
+def state(root) -> dict:
+    """Everything that edits change."""
+    splats = part(root, "splats")
+    hidden = blender_scene.hidden_splats(part(root, "splats", 0).data)
+    return {
+        "inputs": {m.name: {name: list(value) for name, value in preview._inputs_of(m).items()
+                            if name.startswith("Recolor")} for m in splats.modifiers},
+        "nodes": sorted(node.type for node in part(root, "mesh").data.materials[0].node_tree.nodes),
+        "places": [list(map(list, part(root, "object_parent", i).matrix_basis)) for i in (1, 2)],
+        "flags": [(collection_of(root, i).hide_viewport, collection_of(root, i).hide_render) for i in (1, 2)],
+        "hidden": None if hidden is None else hidden.tolist(),
+        "copies": [len(copies) for copies in blender_scene.copies_of(root).values()],
+        "sliders": object_edits.recolour_of(item(root)).stored(), "removed": item(root).removed,
+        "file": {e.id: (e.removed, e.floaters, e.fill, e.recolour, e.transform, e.copies) for e in read_objects(
+            blender_scene.folder_of(root) / "objects.json")},
+    }
+
+
+def test_undo_and_redo_restore_everything(root, tmp_path):
+    def recolour():
+        set_sliders(active())
+
+    def move():
+        part(active(), "object_parent", 2).location.x += 1.0
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "some.blend"))  # Stores the place.
+
+    def remove():
+        activate(active(), 1)
+        bpy.ops.objectgs.remove_object(floaters=True, fill=True)
+
+    def copy():
+        activate(active(), 2)
+        bpy.ops.objectgs.duplicate_object()
+
+    bpy.ops.ed.undo_push(message="begin")
+    states = [state(active())]
+    for step in (recolour, move, remove, copy):
+        step()
+        bpy.ops.ed.undo_push(message=step.__name__)
+        states.append(state(active()))
+    assert all(before != after for before, after in itertools.pairwise(states))
+    for wanted in reversed(states[:-1]):
+        bpy.ops.ed.undo()
+        assert state(active()) == wanted
+    for wanted in states[1:]:
+        bpy.ops.ed.redo()
+        assert state(active()) == wanted
+    bpy.ops.ed.undo()
+    bpy.ops.ed.undo()
+    wanted = state(active())
+    show_again(active())
+    assert state(active()) == wanted, "the folder has what Blender has"
+
+
+def test_edits_survive_merging_and_splitting(root):
+    part(root, "object_parent").location.x += 1.0
+    item(root).hue = 0.1
+    object_edits.merge(root, [1], 2)
+    assert 1 not in blender_scene.object_collections(root)
+    assert object_edits.split(root, 2) == 1
+    assert blender_scene.place_of(root, collection_of(root))[0, 3] == pytest.approx(1.0, abs=1e-4)
+    assert blender_scene.recolour_of(collection_of(root)).hue == 0.1
+
+
+def test_a_folder_that_cannot_be_written_takes_the_colour_back(root, folder):
+    item(root).hue = 0.1
+    (folder / "objects.json").write_text("{")
+    item(root).hue = 0.3
+    assert item(root).hue == pytest.approx(0.1)
+    assert blender_scene.recolour_of(collection_of(root)).hue == pytest.approx(0.1)
+
+
+# Files.
+
+
+def test_a_blend_built_without_a_window_shows_the_edits(fresh, folder):
+    place = np.eye(4)
+    place[0, 3] = 2.0
+    edit_objects(folder / "objects.json", {
+        1: {"removed": True, "floaters": True}, 2: {"recolour": RECOLOUR.stored(), "copies": [place.tolist()]},
+        HUGE: {"transform": place.tolist()}})
+    ran = subprocess.run([sys.executable, "headless.py", "build", folder], cwd=headless.ROOT, capture_output=True,
+                         text=True)
+    assert ran.returncode == 0, ran.stderr
+    bpy.ops.wm.open_mainfile(filepath=str(folder / "objectgs.blend"))
+    root = next(c for c in bpy.data.collections if blender_scene.kind_of(c) == "reconstruction")
+    assert blender_scene.is_removed(collection_of(root)) and collection_of(root).hide_render
+    assert blender_scene.hidden_splats(part(root, "splats", 0).data) is not None
+    assert blender_scene.recolour_of(collection_of(root, 2)) == RECOLOUR
+    assert len(blender_scene.copies_of(root)[2]) == 1
+    assert blender_scene.place_of(root, collection_of(root, HUGE)) == pytest.approx(place, abs=1e-4)
+
+
+def test_splats_are_exported_with_the_edits_and_imported_again(root, folder, backend_python, tmp_path):
+    activate(root, 1)
+    bpy.ops.objectgs.remove_object()
+    part(root, "object_parent", 2).location.x += 1.0
+    assert bpy.ops.objectgs.export_splats(filepath=str(tmp_path / "all")) == {"FINISHED"}
+    table = read_vertices(tmp_path / "all.ply")
+    assert set(table["object_id"].tolist()) == {0, 2, HUGE}
+    assert np.array(entry(root, 2).transform)[0, 3] == pytest.approx(1.0, abs=1e-4)
+    assert bpy.ops.objectgs.import_splats(
+        filepath=str(tmp_path / "all.ply"), folder=str(tmp_path / "again")) == {"FINISHED"}
+    other = active()
+    assert other != root and set(blender_scene.object_collections(other)) == {0, 2, HUGE}
+
+
+@pytest.mark.parametrize("suffix", ["glb", "usdc", "obj"])
+def test_meshes_are_exported_as_they_are_seen(root, tmp_path, suffix):
+    blender_scene.show_kinds(root, "splats")
+    item(root).hue = 0.3
+    activate(root, 1)
+    bpy.ops.objectgs.duplicate_object()
+    before = {name: len(getattr(bpy.data, name)) for name in ("objects", "meshes", "materials", "images", "scenes")}
+    assert bpy.ops.objectgs.export_meshes(filepath=str(tmp_path / "all"), format=suffix,
+                                          coordinates="capture") == {"FINISHED"}
+    assert (tmp_path / f"all.{suffix}").stat().st_size > 100
+    assert {name: len(getattr(bpy.data, name)) for name in before} == before
+    if suffix == "obj":
+        lines = (tmp_path / "all.obj").read_text().splitlines()
+        places = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], float)
+        expected = read_mesh(blender_scene.folder_of(root) / "meshes" / "1.ply").vertices
+        assert len(places) == 12 and places[:4] == pytest.approx(expected, abs=1e-3)
+        assert "map_Kd" in (tmp_path / "all.mtl").read_text()
+        texture = next(tmp_path.glob("*recolored*.png"))
+        image = bpy.data.images.load(str(texture))
+        wanted = expected_texel = np.array([200, 100, 50]) / 255
+        matrix, offset = object_edits.recolour_of(item(root)).affine()
+        wanted = np.clip(matrix @ expected_texel + offset, 0, 1)
+        assert image.pixels[:3] == pytest.approx(wanted, abs=0.6 / 255)
+    assert bpy.ops.objectgs.export_meshes(filepath=str(tmp_path / "each"), format=suffix,
+                                          per_object=True) == {"FINISHED"}
+    assert {path.name for path in (tmp_path / "each").glob(f"*.{suffix}")} == {f"mug.{suffix}", f"can.{suffix}"}
+
+
+def test_turned_by_a_right_angle(root):
+    """A turn about the middle that can be told by hand."""
+    pivot = part(root, "object_parent")
+    pivot.rotation_euler.z = math.pi / 2
+    place = blender_scene.place_of(root, collection_of(root))
+    assert place[:3, :3] == pytest.approx(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]), abs=1e-6)
+    middle = np.array(pivot["objectgs_centre"]) + ORIGIN
+    assert place[:3, :3] @ middle + place[:3, 3] == pytest.approx(middle, abs=1e-4)
