@@ -72,8 +72,8 @@ def viewmat(eye=(0.3, -3.0, 0.8)) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A reconstruction that holds the splats."""
+def folder(blender, tmp_path_factory):
+    """A reconstruction that holds the splats; one for each Blender, since edits are stored in it."""
     place = tmp_path_factory.mktemp("drawing") / "balls"
     (place / "images").mkdir(parents=True)
     write_splats(place / "splats.ply", splats())
@@ -186,18 +186,18 @@ def test_parallel_projection(window):
 
 def test_recolouring_is_seen(window):
     """The affine map of an object's colours, in every direction."""
-    window.run(script(f"""
-        gather = importlib.import_module("{PACKAGE}.objectgs_addon.drawing.gather")
-        Recolour = importlib.import_module("{PACKAGE}.backend.recolour").Recolour
-        bpy.app.driver_namespace["before"] = gather._recolour_of
-        gather._recolour_of = lambda block: Recolour(hue=0.3, value=0.8) if scene.object_id_of(block) == 3 else None
+    window.run(script("""
+        item = next(item for item in root.objectgs.objects if item.object_id == 3)
+        item.hue, item.value = 0.3, 0.8
     """))
     picture = drawn(window)
-    window.run(script(f"""
-        gather = importlib.import_module("{PACKAGE}.objectgs_addon.drawing.gather")
-        gather._recolour_of = bpy.app.driver_namespace.pop("before")
+    stored = window.run(script("result = scene.recolour_of(scene.object_collections(root)[3]).stored()"))
+    assert (stored["hue"], stored["value"]) == pytest.approx((0.3, 0.8))
+    window.run(script("""
+        item = next(item for item in root.objectgs.objects if item.object_id == 3)
+        item.hue, item.value = 0.0, 1.0
     """))
-    assert psnr(picture, backend_draws(recolour=Recolour(hue=0.3, value=0.8))) > 40.0
+    assert psnr(picture, backend_draws(recolour=Recolour.of(stored))) > 40.0
     assert psnr(picture, drawn(window)) < 30.0
 
 
