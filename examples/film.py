@@ -5,8 +5,9 @@ travels, and a ball of Blender's own behind the table.
     OBJECTGS_PYTHON=.venv/bin/python .venv-bpy/bin/python examples/film.py build/demo --out build/film
     OBJECTGS_PYTHON=.venv/bin/python blender -b -P examples/film.py -- build/demo --out build/film
 
-Leaves film/splats.0001.exr ... (the splats alone), film/composite.0001.png ... (joined with Blender's rendering by
-depth) and joined.blend, whose compositor does the same. The demo itself stays as it is.
+Leaves edited.ply (the edited splats for other programs), film/splats.0001.exr ... (the splats alone),
+film/composite.0001.png ... (joined with Blender's rendering by depth) and joined.blend, whose compositor does the same.
+The demo itself stays as it is.
 """
 
 import argparse
@@ -38,6 +39,7 @@ def main(arguments: list[str]) -> int:
     shutil.copytree(options.demo / "capture" / "images", scene_folder / "capture" / "images", dirs_exist_ok=True)
     for command in (
         ("edit", scene_folder, "--remove", "bowl", "--recolor", "vase:hue=0.35", "--move", "ring:z=0.2,y=-0.05,rz=40"),
+        ("export", scene_folder, "--out", options.out / "edited.ply"),
         ("build", scene_folder, "--blend", blend),
     ):
         code = headless.main([str(word) for word in command])
