@@ -40,6 +40,7 @@ def tick():
 bpy.app.driver_namespace["tick"] = tick
 bpy.app.timers.register(tick)
 """
+BEGUN = "running.queue.running is not None and running.queue.running.step and running.queue.running.progress < 0.9"
 DRAW_OWN = """
 for region in window_context()['area'].regions:
     if region.type == 'UI':
@@ -64,7 +65,7 @@ def measure(
 ) -> dict[str, dict[str, float]]:
     """Gaps of the timer in one Blender: at rest, while training runs, and how long the result takes to come in."""
     place = Path(tempfile.mkdtemp(prefix="objectgs-window-"))
-    blender = harness.Blender(command, variables, place, place / "shots", ":96", size)
+    blender = harness.Blender(command, variables, place, place / "shots", size)
     found: dict[str, dict[str, float]] = {}
     try:
         blender.wait_for("True", timeout=120)
@@ -85,13 +86,13 @@ def measure(
         )
         wait(blender, "owner.objectgs.active is not None")
         blender.run(NAMES + f"root.objectgs.minutes = {seconds / 60}; bpy.ops.objectgs.train()")
-        wait(blender, "running.queue.running is not None and running.queue.running.step")
+        wait(blender, BEGUN)
         blender.run(START)
         wait(blender, "running.queue.running is None or running.queue.running.progress > 0.98", 1.0)
         found["training"] = blender.run(STOP)
         wait(blender, "running.queue.running is None")
         blender.run(NAMES + f"root.objectgs.minutes = {2 * seconds / 60}; bpy.ops.objectgs.train()")
-        wait(blender, "running.queue.running is not None and running.queue.running.step")
+        wait(blender, BEGUN)
         blender.run(NAMES + "running.shown, running.redraw = running.redraw, lambda: None")
         blender.run(START)
         wait(blender, "running.queue.running is None or running.queue.running.progress > 0.98", 1.0)
