@@ -171,14 +171,19 @@ def build_blend(folder: Path, blend: Path) -> bool:
         target.cycles.samples = SAMPLES
     for warning in warnings:
         say(f"Warning: {warning}")
-    blend.parent.mkdir(parents=True, exist_ok=True)
+    save_blend(blend)
+    return has_meshes
+
+
+def save_blend(path: Path) -> None:
+    """Save the file that is open as `path`; InputError where that cannot be written."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with quiet():
-            bpy.ops.wm.save_as_mainfile(filepath=str(blend))
+            bpy.ops.wm.save_as_mainfile(filepath=str(path))
     except RuntimeError as error:
-        raise InputError(f"{blend} could not be written; check its folder and the free space.") from error
-    say(f"Wrote {blend}.")
-    return has_meshes
+        raise InputError(f"{path} could not be written; check its folder and the free space.") from error
+    say(f"Wrote {path}.")
 
 
 def run_backend(command: str, folder: Path, *arguments: object) -> None:

@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """`film`: the splats of a .blend through its camera, frame by frame, and joined with Blender's own rendering."""
 
-import bpy
-
 from ...backend.film.shot import NAME, frame_ranges, write_shot
 from ...backend.protocol import InputError, Reconstruction
 from .. import film as filming
 from .. import scene
 from ..film.properties import samples_of
-from ..quiet import quiet
 from . import apart
-from .commands import find_backend, run_backend, whole
+from .commands import find_backend, run_backend, save_blend, whole
 from .lines import say
 from .picture import choose_camera, choose_engine, open_blend, write_picture
 
@@ -44,7 +41,7 @@ def film(options) -> None:
     if options.composite or options.save:
         filming.set_up_compositor(target, target.view_layers[0], root, out)
     if options.save:
-        _save(whole(options.save))
+        save_blend(whole(options.save))
     if options.composite:
         choose_engine(target, options.engine, options.samples)
         for number in frames:
@@ -58,13 +55,3 @@ def _frames(options, target) -> list[int]:
     if options.frames:
         return sorted({number for numbers in frame_ranges(options.frames) for number in numbers})
     return list(range(target.frame_start, target.frame_end + 1, target.frame_step))
-
-
-def _save(path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        with quiet():
-            bpy.ops.wm.save_as_mainfile(filepath=str(path))
-    except RuntimeError as error:
-        raise InputError(f"{path} could not be written; check its folder and the free space.") from error
-    say(f"Wrote {path}.")
