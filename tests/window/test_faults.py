@@ -157,18 +157,30 @@ def test_result_waits_for_edit_mode(window, folder):
 
 
 def test_result_waits_for_the_end_of_a_render(window, folder):
-    window.run(script("""
-        owner.render.engine = "CYCLES"
-        owner.cycles.samples, owner.cycles.time_limit = 1 << 20, 10.0
-        owner.cycles.use_adaptive_sampling = owner.cycles.use_denoising = False
+    """The render is an engine's that ends when the test says so, or when it is left."""
+    end = window.place / "end-of-render"
+    window.run(script(f"""
+        import os, time
+
+        class Engine(bpy.types.RenderEngine):
+            bl_idname, bl_label = "OBJECTGS_TEST_RENDER", "Test"
+            def render(self, depsgraph):
+                while not os.path.exists({str(end)!r}) and not self.test_break():
+                    time.sleep(0.05)
+
+        bpy.utils.register_class(Engine)
+        owner.render.engine = Engine.bl_idname
     """))
-    go = start_fake(window, folder)
-    window.run(script("call(bpy.ops.render.render)"))
-    soon(window, "bpy.app.is_job_running('RENDER')")
-    go.touch()
-    soon(window, f"{IDLE} and len(running._results)")
-    assert window.run("result = bpy.app.is_job_running('RENDER')")
-    window.shot("faults-rendering")
+    try:
+        go = start_fake(window, folder)
+        window.run(script("call(bpy.ops.render.render)"))
+        soon(window, "bpy.app.is_job_running('RENDER')")
+        go.touch()
+        soon(window, f"{IDLE} and len(running._results)")
+        assert window.run("result = bpy.app.is_job_running('RENDER')")
+        window.shot("faults-rendering")
+    finally:
+        end.touch()
     soon(window, "not bpy.app.is_job_running('RENDER') and not running._results")
     draws(window)
 
