@@ -26,8 +26,6 @@ from .protocol import (
 from .recolour import Recolour
 from .stopping import StoppingReporter, StopRequest
 
-DEFAULT_MINUTES = 5.0
-
 _INTRODUCTION = """\
 From photos to labelled splats and meshes. A capture is a folder with images/, the COLMAP
 model of their cameras in sparse/0, and, for objects, one picture of object IDs
@@ -205,10 +203,14 @@ def parser() -> argparse.ArgumentParser:
     device_option(train)
     length = train.add_mutually_exclusive_group()
     length.add_argument(
-        "--minutes", type=_amount, default=DEFAULT_MINUTES, metavar="M",
-        help=f"train this long in all ({DEFAULT_MINUTES:g})",
-    )  # fmt: skip
+        "--minutes", type=_amount, metavar="M", help="train this long in all (5); with --preset final at most this long"
+    )
     length.add_argument("--steps", type=_count, metavar="N", help="train this many steps in all, however long it takes")
+    train.add_argument(
+        "--preset", choices=("preview", "standard", "final"),
+        help="instead: preview, 600 steps, shows whether all is well; standard, 2500 steps; final goes on until the "
+        "error on held-out views has flattened",
+    )  # fmt: skip
     train.add_argument("--restart", action="store_true", help="forget an earlier training in DIR")
     train.add_argument(
         "--checkpoint-seconds", type=_amount, default=30.0, metavar="S",

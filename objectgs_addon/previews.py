@@ -12,10 +12,12 @@ COMPARISON = "latest"
 """Photo, render and objects side by side, for the Image Editor."""
 RENDER = "render"
 """The render alone, for the panel."""
+CURVE = "curve"
+"""PSNR over the run time, for the panel."""
 
 _icons = None
 _shown: dict[str, tuple[str, int]] = {}
-"""Folder -> picture that its icon shows, and when that was written."""
+"""Folder and name -> picture that its icon shows, and when that was written."""
 
 
 def picture_of(folder: Path, name: str) -> Path | None:
@@ -25,15 +27,15 @@ def picture_of(folder: Path, name: str) -> Path | None:
     return max(found)[1] if found else None
 
 
-def icon_of(folder: Path) -> int:
-    """The number, for layouts, of an icon that shows the newest render; 0 where there is none yet."""
+def icon_of(folder: Path, name: str) -> int:
+    """The number, for layouts, of an icon that shows the newest preview of that name; 0 where there is none yet."""
     global _icons
-    picture = picture_of(folder, RENDER)
+    picture = picture_of(folder, name)
     if picture is None:
         return 0
     if _icons is None:
         _icons = bpy.utils.previews.new()
-    key, state = str(folder), (str(picture), picture.stat().st_mtime_ns)
+    key, state = str(folder / name), (str(picture), picture.stat().st_mtime_ns)
     if _shown.get(key) != state:
         if key in _icons:
             del _icons[key]

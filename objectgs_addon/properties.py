@@ -67,6 +67,11 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
 
     objects: CollectionProperty(type=ObjectItem)
     active_object: IntProperty(name="Active Object", default=0, update=object_edits.active_changed, options=set())
+    length: EnumProperty(name="Length", default="minutes", description="How long to train in all", items=[
+        ("preview", "Preview", "600 steps: a first look, to see whether all is well"),
+        ("standard", "Standard", "2,500 steps"),
+        ("final", "Until It Stops Improving", "Until the error on held-out photos has flattened"),
+        ("minutes", "Minutes", "As long as you say; a finished training can be extended")])
     minutes: FloatProperty(
         name="Minutes", default=5.0, min=0.1, soft_max=120.0, precision=1, step=50,
         description="How long to train in all. More gives a sharper result; a finished training can be extended")

@@ -37,11 +37,13 @@ class Train(bpy.types.Operator):
         properties = root.objectgs
         folder = scene.folder_of(root)
         state = folder_state(folder)
-        if not self.restart and state.trained and state.seconds >= 60.0 * properties.minutes:
+        by_clock = properties.length == "minutes"
+        if by_clock and not self.restart and state.trained and state.seconds >= 60.0 * properties.minutes:
             self.report({"ERROR"}, f"It was trained for {state.seconds / 60:.1f} minutes already; raise Minutes to "
                                    "extend the training, or use Train Anew")
             return {"CANCELLED"}
-        arguments = ["train", str(state.capture), "--out", str(folder), "--minutes", f"{properties.minutes:g}",
+        length = ("--minutes", f"{properties.minutes:g}") if by_clock else ("--preset", properties.length)
+        arguments = ["train", str(state.capture), "--out", str(folder), *length,
                      "--mode", properties.mode, "--sh-degree", str(properties.sh_degree), "--primitive",
                      properties.primitive, "--strategy", properties.strategy, "--max-size", str(properties.max_size)]
         if self.restart:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shutil
-from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import torch
 
 from .. import device
 from ..capture import Capture
-from ..evaluation import IdScores, comparison, psnr, save_picture, thumbnail
+from ..evaluation import IdScores, comparison, curve_picture, psnr, save_picture, thumbnail
 from ..export import agreement, fit_splats, write_anchors, write_splats
 from ..labels.points import read_points
 from ..model.object_model import ObjectModel
@@ -20,13 +20,17 @@ from ..objects import read_objects
 from ..protocol import Cancelled, InputError, Reconstruction, Reporter, plain
 from ..raster.draw import draw
 from ..stopping import StoppingReporter
-from ..training.loop import Budget, Trainer
+from ..training.budget import DEFAULT_SECONDS, PRESETS, Budget, Progress
+from ..training.loop import Evaluate, Trainer
 from ..training.scene import Scene
 from ..training.settings import Settings
 from .folder import described, digest, edited, memory_for_planes, open_reconstruction
 from .kernels import have_kernels_ready
 from .record import record, record_stage, recorded, stage
 from .vote import cast_votes, votes_are_current, votes_key
+
+CURVE_VIEWS = 20
+"""So many held-out views at most are measured while training; `evaluate` measures all."""
 
 _COMPARED_VIEWS = 20
 """On so many views at most the exported splats are compared with the model."""
@@ -35,11 +39,11 @@ _COMPARED_VIEWS = 20
 def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Train, resume or extend; leaves a checkpoint, previews, splats.ply and anchors.ply."""
     place = device.pick(options.device)
-    budget = Budget(options.steps, None if options.steps else 60.0 * options.minutes)
+    budget = _budget(options)
     with open_reconstruction(options, reporter) as (folder, capture):
         trainer = _begun(folder, capture, options, reporter, place)
         progress = trainer.progress
-        if progress.step and budget.share(progress.step, progress.seconds) >= 1:
+        if progress.step and budget.share(progress) >= 1:
             reporter.status(
                 f"Already trained for {progress.step} steps in {progress.seconds:.0f} s; ask for more --minutes or "
                 "--steps to extend it, or --restart to begin anew."
@@ -50,8 +54,9 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
                 capture=described(capture, options.max_size),
                 training={
                     "settings": trainer.settings.as_dict(),
-                    "minutes": None if options.steps else options.minutes,
-                    "steps": options.steps,
+                    "minutes": None if budget.seconds is None else budget.seconds / 60,
+                    "steps": budget.steps,
+                    "preset": options.preset,
                     "device": device.name_of(place),
                     "left_out": trainer.scene.capture.left_out.tolist(),
                     "votes": votes_key(capture, options.max_size, options.strategy, options.seed),
@@ -71,6 +76,17 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         splats=str(folder.splats), psnr=latest.get("psnr"), miou=latest.get("miou"),
         psnr_of_export=export["psnr_of_export"],
     )  # fmt: skip
+
+
+def _budget(options: argparse.Namespace) -> Budget:
+    """How long to train, as asked for."""
+    seconds = None if options.minutes is None else 60.0 * options.minutes
+    if options.preset is None:
+        return Budget(options.steps, None if options.steps else seconds or DEFAULT_SECONDS)
+    if options.steps or (seconds and options.preset != "final"):
+        other = "--steps" if options.steps else "--minutes"
+        raise InputError(f"--preset {options.preset} says how long to train, and so does {other}; leave one out.")
+    return replace(PRESETS[options.preset], seconds=seconds)
 
 
 def _begun(
@@ -171,14 +187,15 @@ def _run(
     record_stage(folder, "train", trainer.progress.seconds)
 
 
-def _held_out(folder: Reconstruction, reporter: StoppingReporter) -> Callable[[ObjectModel, Scene], dict[str, Any]]:
-    """Figures of the held-out views for the curve, and a preview of the first of them."""
+def _held_out(folder: Reconstruction, reporter: StoppingReporter) -> Evaluate:
+    """Figures of the held-out views for the curve, a preview of the first of them, and one of the curve."""
 
-    def measure(model: ObjectModel, scene: Scene) -> dict[str, Any]:
+    def measure(model: ObjectModel, scene: Scene, progress: Progress) -> dict[str, Any]:
         # Without SSIM, which would take most of the time: the clock of the training runs meanwhile.
         found, ids = [], IdScores(scene.zero_is_object)
         capture = scene.capture
-        for place, index in enumerate(capture.test_indices or (0,)):
+        every = max(len(capture.test_indices) // CURVE_VIEWS, 1)
+        for place, index in enumerate(capture.test_indices[::every][:CURVE_VIEWS] or (0,)):
             photo, truth = capture.image(index), capture.mask(index)
             picture = draw(model, scene.camera(index), want_ids=truth is not None or place == 0)
             if place == 0:
@@ -191,8 +208,13 @@ def _held_out(folder: Reconstruction, reporter: StoppingReporter) -> Callable[[O
                 if truth is not None and picture.ids is not None:
                     ids.add(picture.ids, truth)
         scores = ids.result()
-        mean = float(np.mean(found)) if found else None
-        return {"psnr": mean, "miou": scores["miou"], "mbiou": scores["mbiou"]}
+        figures = {
+            "psnr": float(np.mean(found)) if found else None, "miou": scores["miou"], "mbiou": scores["mbiou"],
+        }  # fmt: skip
+        curve = curve_picture([*progress.curve, {"seconds": progress.seconds, **figures}])
+        if curve is not None:
+            save_picture(curve, folder.previews / "curve.png")
+        return figures
 
     return measure
 

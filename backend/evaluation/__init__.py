@@ -1,7 +1,7 @@
 """How good a reconstruction is, on views it has not seen, and the report that says so."""
 
 from .metrics import IdScores, ImageScores, psnr, ssim
-from .pictures import comparison, contact_sheet, id_picture, save_picture, thumbnail
+from .pictures import comparison, contact_sheet, curve_picture, id_picture, save_picture, thumbnail
 from .protocols import evaluate
 from .report import write_report
 
@@ -10,6 +10,7 @@ __all__ = [
     "ImageScores",
     "comparison",
     "contact_sheet",
+    "curve_picture",
     "evaluate",
     "id_picture",
     "psnr",

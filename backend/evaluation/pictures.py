@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +28,10 @@ PAPER = (255, 255, 255)
 INK = (38, 38, 42)
 FAINT_INK = (118, 118, 124)
 RULE = (214, 214, 218)
+
+
+CURVE_SIZE = (320, 240)
+CURVE_PAPER, CURVE_INK, CURVE_LINE = (40, 40, 42), (200, 200, 204), (94, 160, 250)
 
 
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
@@ -72,6 +78,36 @@ def comparison(
         panels.append(("Mask IDs", _resized(id_picture(true_ids, colours), size, Image.Resampling.NEAREST)))
     legend = _legend_entries(ids if true_ids is None else np.concatenate([ids, true_ids]), colours, names)
     return _sheet(panels, len(panels), title, legend)
+
+
+def curve_picture(curve: Sequence[Mapping[str, Any]]) -> Image.Image | None:
+    """PSNR over the run time so far, small, for a panel that is dark; None before there are two measurements. Drawn
+    while a training waits, so it takes a few milliseconds."""
+    found = [(float(entry["seconds"]), float(entry["psnr"])) for entry in curve if entry.get("psnr") is not None]
+    if len(found) < 2:
+        return None
+    width, height = CURVE_SIZE
+    left, top, right, bottom = 34, 22, width - 10, height - 24
+    seconds, values = np.array(found).T
+    low, high = math.floor(values.min()), math.ceil(values.max() + 0.01)
+    picture = Image.new("RGB", CURVE_SIZE, CURVE_PAPER)
+    pen = ImageDraw.Draw(picture)
+
+    def place(second: float, value: float) -> tuple[float, float]:
+        return (
+            left + (right - left) * second / max(seconds[-1], 1e-9),
+            bottom - (bottom - top) * (value - low) / (high - low),
+        )
+
+    for value in range(low, high + 1, max(1, (high - low) // 4)):
+        y = place(0.0, value)[1]
+        pen.line([(left, y), (right, y)], fill=(70, 70, 74))
+        pen.text((left - 6, y), str(value), fill=CURVE_INK, font=_font(12), anchor="rm")
+    pen.line([place(*point) for point in found], fill=CURVE_LINE, width=3, joint="curve")
+    pen.text((left, 4), "PSNR of held-out views, dB", fill=CURVE_INK, font=_font(12))
+    whole = round(seconds[-1])
+    pen.text((right, bottom + 6), f"{whole // 60}:{whole % 60:02d}", fill=CURVE_INK, font=_font(12), anchor="ra")
+    return picture
 
 
 def thumbnail(image: NDArray, longest: int = 256) -> Image.Image:

@@ -12,7 +12,6 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -30,6 +29,7 @@ from ..protocol import Cancelled, InputError, Reporter
 from ..raster import Camera, Rendered, rasterize
 from ..stopping import StopRequest
 from .adam import BETA1, BETA2, step_rows, take_rows
+from .budget import Budget, Progress
 from .losses import image_loss, normal_loss, volume_loss
 from .scene import Scene
 from .settings import (
@@ -50,7 +50,6 @@ if TYPE_CHECKING:
 
 CHECKPOINT_SECONDS = 30.0
 _REPORT_SECONDS = 0.5
-_EVALUATIONS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)
 
 MOST_PARTS = 16
 """A picture that does not fit into the GPU's memory is drawn in so many parts at most."""
@@ -59,47 +58,13 @@ _IN_PARTS = (
     "The GPU's memory is full, so each picture is learned in {parts} parts from here on, and fewer pictures are kept "
     "there; a smaller --max-size or --max-anchors would be faster."
 )
+_FLAT = "More steps no longer make it much better: the rates fall now, from step {steps:,} on"
 _NO_ROOM = (
     "The GPU's memory is too small, even for a sixteenth of a picture at a time; close programs that use it, or try a "
     "smaller --max-size or --max-anchors, or --device cpu."
 )
 
-Evaluate = Callable[[ObjectModel, Scene], dict[str, Any]]
-
-
-@dataclass(frozen=True)
-class Budget:
-    """How long to train in all: so many steps, or so many seconds (schedules then follow the clock)."""
-
-    steps: int | None = None
-    seconds: float | None = None
-
-    def share(self, step: int, seconds: float) -> float:
-        """How much of the budget is spent, 0 to 1."""
-        if self.steps is not None:
-            return min(step / self.steps, 1.0)
-        assert self.seconds is not None
-        return min(seconds / self.seconds, 1.0)
-
-    def remaining(self, step: int, seconds: float, pace: float) -> float:
-        """Seconds left, given the seconds a step takes."""
-        if self.steps is not None:
-            return max(self.steps - step, 0) * pace
-        assert self.seconds is not None
-        return max(self.seconds - seconds, 0.0)
-
-
-@dataclass
-class Progress:
-    """Where a training stands; saved with every checkpoint. `curve` has one entry an evaluation."""
-
-    step: int = 0
-    seconds: float = 0.0
-    last_growth: int = 0
-    skipped: int = 0
-    queue: list[int] = field(default_factory=list)
-    evaluated: int = 0
-    curve: list[dict[str, Any]] = field(default_factory=list)
+Evaluate = Callable[[ObjectModel, Scene, Progress], dict[str, Any]]
 
 
 class _Part(NamedTuple):
@@ -383,14 +348,16 @@ class Trainer:
         started = last_saved = last_report = time.monotonic()
         before = p.seconds
         first_step = p.step
-        p.evaluated = sum(1 for share in _EVALUATIONS if share <= budget.share(p.step, p.seconds))
+        budget.begin(p)
         smooth = torch.full((), math.nan, device=self.model.device)
         parts = self.parts
         while True:
             p.seconds = before + time.monotonic() - started
-            share = budget.share(p.step, p.seconds)
-            if evaluate is not None and p.evaluated < len(_EVALUATIONS) and share >= _EVALUATIONS[p.evaluated]:
-                self._evaluate(evaluate, reporter, share)
+            if evaluate is not None and budget.evaluation_is_due(p):
+                self._evaluate(evaluate, reporter, float(smooth))
+                if budget.settle(p):
+                    reporter.status(_FLAT.format(steps=p.step))
+            share = budget.share(p)
             if share >= 1.0:
                 break
             if stop.paused:
@@ -420,24 +387,23 @@ class Trainer:
         if p.skipped:
             reporter.warning(f"{p.skipped} updates were not finite and were skipped.")
 
-    def _evaluate(self, evaluate: Evaluate, reporter: Reporter, share: float) -> None:
+    def _evaluate(self, evaluate: Evaluate, reporter: Reporter, loss: float) -> None:
         p = self.progress
-        while p.evaluated < len(_EVALUATIONS) and _EVALUATIONS[p.evaluated] <= share:
-            p.evaluated += 1
-        quality = evaluate(self.model, self.scene)
-        p.curve.append({"seconds": round(p.seconds, 2), "step": p.step, **quality})
+        quality = evaluate(self.model, self.scene, p)
+        loss_db = round(-20 * math.log10(loss), 3) if 0 < loss < math.inf else None
+        p.curve.append({"seconds": round(p.seconds, 2), "step": p.step, "loss_db": loss_db, **quality})
         reporter.quality(**p.curve[-1])
 
     def _report(self, budget: Budget, reporter: Reporter, loss: float, pace: float) -> None:
         p = self.progress
-        share = budget.share(p.step, p.seconds)
+        share, left = budget.share(p), budget.remaining(p, pace)
         latest = p.curve[-1] if p.curve else {}
         reporter.progress(
             round(share, 5),
             1.0,
             step=p.step,
             seconds=round(p.seconds, 1),
-            seconds_left=round(budget.remaining(p.step, p.seconds, pace), 1),
+            seconds_left=None if left is None else round(left, 1),
             loss=round(loss, 5) if math.isfinite(loss) else None,
             anchors=len(self.model.anchors),
             splats=self.splats,

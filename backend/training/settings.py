@@ -56,8 +56,14 @@ REST_FROM = 0.05
 scene rather than for gaps in the masks. Objects that are taught nothing there spread over it."""
 
 
-GROW_FROM, GROW_UNTIL, GROW_EVERY = 0.1, 0.5, 100
+GROW_FROM, GROW_UNTIL, GROW_EVERY = 0.1, 0.6, 100
 """Growth runs between these shares of the training, every so many steps; statistics start half way to the first."""
+
+PLATEAU_FROM, PLATEAU_UNTIL = 0.2, 0.8
+"""Between these shares of the training the rates hardly fall. Most is learned there; the fall after it settles what has
+been learned."""
+_FALLEN = {PLATEAU_FROM: 0.25, PLATEAU_UNTIL: 0.3}
+"""How far the rates have fallen at both ends of the plateau, 0 (not at all) to 1."""
 
 SURFACE_FROM = 0.25
 """Share of the training from which on discs are taught normals and depth: before, there is no surface yet."""
@@ -80,8 +86,10 @@ HEAD_RATES = {
 
 
 def rate(ends: tuple[float, float], share: float) -> float:
-    """Learning rate after a share (0 to 1) of the training: exponential from the first end to the last."""
-    return ends[0] * (ends[1] / ends[0]) ** min(max(share, 0.0), 1.0)
+    """Learning rate after a share (0 to 1) of the training: from the first end to the last, exponential before and
+    after the plateau and on it."""
+    fallen = np.interp(share, [0.0, *_FALLEN, 1.0], [0.0, *_FALLEN.values(), 1.0])
+    return float(ends[0] * (ends[1] / ends[0]) ** fallen)
 
 
 def row_rates(layout: Layout, share: float) -> np.ndarray:

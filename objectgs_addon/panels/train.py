@@ -26,21 +26,28 @@ class TrainPanel(WithReconstruction, bpy.types.Panel):
         column.enabled = not active
         column.operator("objectgs.vote", icon="GROUP_VERTEX")
         row = column.row(align=True)
-        row.operator("objectgs.train", icon="PLAY", text=_train_text(folder, properties.minutes))
-        row.prop(properties, "minutes", text="Minutes")
+        row.operator("objectgs.train", icon="PLAY", text=_train_text(folder, properties))
+        row.prop(properties, "length", text="")
+        if properties.length == "minutes":
+            column.prop(properties, "minutes")
         if job is not None:
             draw_job_of(layout, job)
         if not active:
             _explain(layout, root, job)
-        icon = previews.icon_of(folder)
-        if icon:
-            layout.template_icon(icon, scale=8.0)
+        icons = [icon for name in (previews.RENDER, previews.CURVE) if (icon := previews.icon_of(folder, name))]
+        if icons:
+            row = layout.row()
+            for icon in icons:
+                row.template_icon(icon, scale=8.0)
             layout.operator("objectgs.show_preview", icon="IMAGE_DATA")
 
 
-def _train_text(folder, minutes: float) -> str:
-    state = folder_state(folder)
-    return "Go On Training" if state.steps and state.seconds < 60 * minutes else "Train"
+def _train_text(folder, properties) -> str:
+    return "Go On Training" if _goes_on(folder_state(folder), properties) else "Train"
+
+
+def _goes_on(state, properties) -> bool:
+    return bool(state.steps) and (properties.length != "minutes" or state.seconds < 60 * properties.minutes - 0.5)
 
 
 def _explain(layout, root, job) -> None:
@@ -52,7 +59,7 @@ def _explain(layout, root, job) -> None:
         write(layout, f"Another program works on this reconstruction (process {holder}). Its result can be reloaded "
                       "when it is done.", "INFO")
         return
-    if job is None and state.steps and state.seconds < 60 * minutes - 0.5:
+    if job is None and root.objectgs.length == "minutes" and _goes_on(state, root.objectgs):
         write(layout, f"Trained for {duration(state.seconds)} of {duration(60 * minutes)}. "
                       "Go On Training continues from there.", "INFO")
     if scene.result_is_newer(root):

@@ -1,0 +1,134 @@
+"""How long to train: for so many steps, for so long, or until it stops getting better."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from .settings import PLATEAU_FROM, PLATEAU_UNTIL
+
+_EVALUATIONS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)
+"""Shares of a training whose length is known after which it is measured."""
+
+_EVALUATE_AFTER, _EVALUATE_EVERY = 50, 1.07
+"""One whose end is open is measured after so many steps, and whenever there are so many times as many."""
+
+WARM_UP = 600
+"""Steps until the plateau of a training whose end is open: large scenes differ in how long they stay there."""
+
+OCTAVE = 2.0
+"""Flatness is judged by the measurements since there were so many times fewer steps."""
+
+FLAT = 0.35
+"""dB that doubling the steps on the plateau would bring, below which it is flat."""
+
+
+@dataclass
+class Progress:
+    """Where a training stands; saved with every checkpoint.
+
+    last_growth: step of the latest growth. skipped: updates that came to nothing. queue: views still to come.
+    evaluated: how many of the evaluations of a training of known length are behind, or, where the end is open, the
+    step of the latest. settled_from: the step from which the rates fall in a training whose end is open, 0 before.
+    curve: an entry for each evaluation, with seconds, step, loss (dB) and what was measured.
+    """
+
+    step: int = 0
+    seconds: float = 0.0
+    last_growth: int = 0
+    skipped: int = 0
+    queue: list[int] = field(default_factory=list)
+    evaluated: int = 0
+    settled_from: int = 0
+    curve: list[dict[str, Any]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How long to train in all: so many steps, or so many seconds (schedules then follow the clock).
+
+    until_flat: train until more would bring little; `seconds` are then the most, None: as long as it takes.
+    """
+
+    steps: int | None = None
+    seconds: float | None = None
+    until_flat: bool = False
+
+    def share(self, p: Progress) -> float:
+        """How much of the training is behind, 0 to 1. Where the end is open, it stays on the plateau until
+        `settle`."""
+        if self.until_flat:
+            if not p.settled_from:
+                return (PLATEAU_FROM + PLATEAU_UNTIL) / 2 if p.step >= WARM_UP else PLATEAU_FROM * p.step / WARM_UP
+            return min(PLATEAU_UNTIL + (1 - PLATEAU_UNTIL) * (p.step - p.settled_from) / self._settling(p), 1.0)
+        if self.steps is not None:
+            return min(p.step / self.steps, 1.0)
+        assert self.seconds is not None
+        return min(p.seconds / self.seconds, 1.0)
+
+    def remaining(self, p: Progress, pace: float) -> float | None:
+        """Seconds left, given the seconds a step takes; None where nobody knows yet."""
+        if self.until_flat:
+            return max(p.settled_from + self._settling(p) - p.step, 0) * pace if p.settled_from else None
+        if self.steps is not None:
+            return max(self.steps - p.step, 0) * pace
+        assert self.seconds is not None
+        return max(self.seconds - p.seconds, 0.0)
+
+    def begin(self, p: Progress) -> None:
+        """Take over a training that may have been begun under another budget."""
+        p.evaluated = p.step if self.until_flat else bisect_right(_EVALUATIONS, self.share(p))
+
+    def evaluation_is_due(self, p: Progress) -> bool:
+        """Whether it is time to measure; says so once."""
+        share = self.share(p)
+        if self.until_flat:
+            due = p.step >= max(_EVALUATE_AFTER, _EVALUATE_EVERY * p.evaluated)
+            due = due or (share >= 1.0 and p.step > p.evaluated)
+            behind = p.step if due else p.evaluated
+        else:
+            behind = bisect_right(_EVALUATIONS, share)
+            due = behind > p.evaluated
+        p.evaluated = behind
+        return due
+
+    def settle(self, p: Progress) -> bool:
+        """Leave the plateau where it is flat, or where time runs out; whether that is now."""
+        if not self.until_flat or p.settled_from or p.step < WARM_UP:
+            return False
+        out_of_time = self.seconds is not None and p.seconds >= PLATEAU_UNTIL * self.seconds
+        if not out_of_time and gain_of_doubling(p.curve) >= FLAT:
+            return False
+        p.settled_from = p.step
+        return True
+
+    @staticmethod
+    def _settling(p: Progress) -> float:
+        """Steps that the fall of the rates takes."""
+        return (1 - PLATEAU_UNTIL) / PLATEAU_UNTIL * p.settled_from
+
+
+def gain_of_doubling(curve: list[dict[str, Any]]) -> float:
+    """By how many dB the error falls when the steps double: the slope of a line through the latest octave of the
+    curve, PSNR on held-out views or, where there are none, the loss over log2(step). Infinite where the curve does not
+    reach back so far."""
+    last = curve[-1]["step"] if curve else 0
+    if not last or curve[0]["step"] * OCTAVE > last:
+        return math.inf
+    recent = [entry for entry in curve if entry["step"] * OCTAVE >= last]
+    key = "psnr" if all(entry.get("psnr") is not None for entry in recent) else "loss_db"
+    found = [(math.log2(entry["step"]), entry[key]) for entry in recent if entry.get(key) is not None]
+    if len(found) < 5:
+        return math.inf
+    octaves, quality = zip(*found, strict=True)
+    return float(np.polyfit(octaves, quality, 1)[0])
+
+
+DEFAULT_SECONDS = 300.0
+
+PRESETS = {"preview": Budget(steps=600), "standard": Budget(steps=2500), "final": Budget(until_flat=True)}
+"""Lengths by name. Their places on the curve of error against run time are in docs/error-against-time.md."""

@@ -1,0 +1,98 @@
+"""How long a training goes on: steps, minutes, or until it is flat."""
+
+import math
+
+import pytest
+
+from backend.training.budget import PRESETS, WARM_UP, Budget, Progress, gain_of_doubling
+from backend.training.settings import PLATEAU_FROM, PLATEAU_UNTIL, rate
+
+
+def curve_of(steps, psnr, **more):
+    return [{"step": step, "psnr": psnr(step), **more} for step in steps]
+
+
+def walk(budget, psnr, longest=100_000, seconds_a_step=0.05):
+    """What a training does under a budget, measured as `psnr` of the step says; returns the progress at its end."""
+    p = Progress()
+    budget.begin(p)
+    shares = []
+    while p.step < longest:
+        if budget.evaluation_is_due(p):
+            p.curve.append({"step": p.step, "psnr": psnr(p.step), "loss_db": None})
+            budget.settle(p)
+        shares.append(budget.share(p))
+        if shares[-1] >= 1:
+            break
+        p.step += 1
+        p.seconds += seconds_a_step
+    assert shares == sorted(shares)
+    return p
+
+
+def test_the_slope_over_octaves_is_the_gain_of_doubling():
+    steps = range(100, 1700, 100)
+    assert gain_of_doubling(curve_of(steps, lambda s: 20 + 0.7 * math.log2(s))) == pytest.approx(0.7)
+    # What came before the latest octave does not matter.
+    late = curve_of(steps, lambda s: 30.0 if s >= 800 else 0.0)
+    assert gain_of_doubling(late) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_too_little_to_judge_is_not_flat():
+    assert gain_of_doubling([]) == math.inf
+    assert gain_of_doubling(curve_of([900, 950, 1000, 1010, 1020], lambda s: 30.0)) == math.inf
+    assert gain_of_doubling(curve_of([100, 1000], lambda s: 30.0)) == math.inf
+
+
+def test_without_held_out_views_the_loss_decides():
+    steps = range(100, 1700, 100)
+    entries = [{"step": s, "psnr": None, "loss_db": 10 + 2 * math.log2(s)} for s in steps]
+    assert gain_of_doubling(entries) == pytest.approx(2.0)
+
+
+def test_a_curve_that_flattens_ends_the_training_soon_after():
+    flat_from = 3000
+    end = walk(PRESETS["final"], lambda step: 20 + 3 * math.log2(min(step, flat_from) + 1))
+    assert flat_from < end.settled_from < 2.5 * flat_from
+    assert end.step == pytest.approx(end.settled_from / PLATEAU_UNTIL, abs=2)
+    assert end.curve[-1]["step"] == end.step
+
+
+def test_a_curve_that_keeps_rising_is_not_ended():
+    assert walk(PRESETS["final"], lambda step: math.log2(step + 1), longest=20_000).settled_from == 0
+
+
+def test_a_flat_curve_is_not_ended_before_the_warm_up():
+    assert walk(PRESETS["final"], lambda step: 30.0).settled_from >= WARM_UP
+
+
+def test_an_open_end_has_a_most():
+    end = walk(Budget(seconds=200.0, until_flat=True), lambda step: math.log2(step + 1))
+    assert 0.9 * 200 < end.seconds < 1.1 * 200
+    assert end.settled_from
+
+
+def test_remaining_is_unknown_until_the_rates_fall():
+    p = Progress(step=1000, seconds=50.0)
+    assert PRESETS["final"].remaining(p, 0.05) is None
+    p.settled_from = 1000
+    assert PRESETS["final"].remaining(p, 0.05) == pytest.approx(250 * 0.05)
+    assert Budget(steps=3000).remaining(p, 0.05) == pytest.approx(100.0)
+    assert Budget(seconds=80.0).remaining(p, 0.05) == pytest.approx(30.0)
+
+
+def test_a_training_of_known_length_is_measured_ten_times_and_at_its_end():
+    end = walk(Budget(steps=1000), lambda step: 30.0)
+    assert [entry["step"] for entry in end.curve] == [20, 50, 100, 200, 350, 500, 650, 800, 900, 1000]
+
+
+def test_a_finished_training_is_finished_when_asked_again():
+    end = walk(PRESETS["final"], lambda step: 30.0)
+    assert PRESETS["final"].share(end) == 1.0
+
+
+def test_rates_fall_little_on_the_plateau_and_reach_their_end():
+    ends = (1.0, 0.01)
+    assert rate(ends, 0.0) == 1.0 and rate(ends, 1.0) == pytest.approx(0.01)
+    assert rate(ends, PLATEAU_UNTIL) > 0.7 * rate(ends, PLATEAU_FROM)
+    assert rate(ends, PLATEAU_FROM) < 0.4
