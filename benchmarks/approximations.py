@@ -682,6 +682,7 @@ def run(demo: Path, seconds: float) -> tuple[Found, dict[str, Sequence[Choice]],
     """Measure everything that is not there yet. Returns the results, the choices, what the scene is, and failures."""
     import numpy as np
 
+    shared.compile_everything()
     choices = {"raster": raster_choices(), "training": training_choices(), "meshes": mesh_choices()}
     copy = WORK / "reconstruction"
     if not (demo / "checkpoint").is_dir():

@@ -119,6 +119,17 @@ def in_child(call: str, environment: Mapping[str, str] | None = None, **words: A
     return json.loads(done.stdout.splitlines()[-1])
 
 
+def compile_everything() -> None:
+    """Have all kernels of the product ready on disk, so that no measurement waits for one."""
+    from backend.commands.kernels import have_kernels_ready
+    from backend.device import CPU
+    from backend.protocol import Reporter
+    from backend.stopping import StoppingReporter, StopRequest
+
+    print("Kernels are compiled where that was not done yet.", flush=True)
+    have_kernels_ready(StoppingReporter(Reporter(), StopRequest()), CPU)
+
+
 def train_and_measure(trainer: Any, capture: Any, budget: Any) -> dict[str, Any]:
     """Train, and measure what comes of it on the held-out views."""
     import numpy as np
