@@ -459,24 +459,28 @@ class Found:
 def raster_plot(choices: Sequence[Choice], found: Mapping[str, Any]) -> Any:
     """Time against the error of the picture, a panel each."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
 
     panels = [choice for choice in choices if found.get(choice.title)]
     columns = 2
     rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(9.6, 2.75 * rows), layout="constrained")
+    figure = Figure(figsize=(10.4, 2.4 * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for ax, choice in zip(axes, panels):
-        rows_of = found[choice.title]
-        points = {n: (row["times_default"], max(row["picture"], 1e-6)) for n, row in rows_of.items()}
+        points = {n: (row["times_default"], max(row["picture"], 1e-6)) for n, row in found[choice.title].items()}
         _front_panel(ax, points, choice.default)
+        ax.legend(fontsize=7.5, loc="upper left", bbox_to_anchor=(1.0, 1.03), borderaxespad=0.2)
         ax.set_title(choice.title)
         ax.set_yscale("log")
         low, high = (f(y for _, y in points.values()) for f in (min, max))
-        ax.set_ylim(low / 2.2, max(high, 3 * low) * 2.2)
+        ax.set_ylim(min(low / 2, 0.05), max(high * 2, 2))
         if max(x for x, _ in points.values()) > 2.5:
-            ax.set_xscale("log")
-            ax.xaxis.set_major_formatter("{x:g}")
-            ax.xaxis.set_minor_formatter("{x:g}")
+            ax.set_xscale("log", base=2)
+        else:
+            ax.set_xlim(min(0.8, *(x - 0.05 for x, _ in points.values())), None)
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter(NullFormatter())
     for ax in axes[len(panels) :]:
         ax.set_axis_off()
     figure.supxlabel("time of forward and backward, default = 1", fontsize=9)
@@ -485,7 +489,7 @@ def raster_plot(choices: Sequence[Choice], found: Mapping[str, Any]) -> Any:
 
 
 def _front_panel(ax: Any, points: Mapping[str, tuple[float, float]], default: str) -> None:
-    """Points of (time, cost) with their names, the default marked, and the front through the best of them."""
+    """Points of (time, cost), each with a look of its own, the default marked, and the front through the best."""
     best, steps = float("inf"), []
     for x, y in sorted(points.values()):
         if y < best:
@@ -493,25 +497,13 @@ def _front_panel(ax: Any, points: Mapping[str, tuple[float, float]], default: st
             steps.append((x, y))
     if len(steps) > 1:
         ax.plot(*zip(*steps), color="#c9c9d0", linewidth=1.2, drawstyle="steps-post", zorder=1)
+    looks = iter(zip(shared.COLOURS * 2, "os^vDP" + "Xs^vDP"))
     for name, (x, y) in points.items():
         marked = name == default
-        ax.plot(x, y, "o", color=shared.MARKED if marked else shared.COLOURS[0], markersize=6, zorder=3)
-    _label(ax, points, default)
-    ax.margins(x=0.22)
-
-
-def _label(ax: Any, points: Mapping[str, tuple[float, float]], default: str) -> None:
-    """A name at each point; of points that lie on one another the names stand below each other."""
-    stacked: dict[tuple[int, int], int] = {}
-    xs, ys = zip(*points.values())
-    wide, tall = max(max(xs) - min(xs), 1e-9), max(max(ys) - min(ys), 1e-9)
-    for name, (x, y) in sorted(points.items(), key=lambda item: item[1]):
-        cell = round(8 * (x - min(xs)) / wide), round(12 * (y - min(ys)) / tall)
-        level = stacked[cell] = stacked.get(cell, -1) + 1
-        ax.annotate(
-            name, (x, y), xytext=(5, 4 - 9 * level), textcoords="offset points", fontsize=7.5,
-            color=shared.MARKED if name == default else "#3c3c42", fontweight="bold" if name == default else "normal",
-        )  # fmt: skip
+        colour, marker = (shared.MARKED, "*") if marked else next(looks)
+        size = 12 if marked else 6
+        ax.plot(x, y, marker, color=colour, markersize=size, label=name, zorder=4 if marked else 3, alpha=0.9)
+    ax.margins(0.15)
 
 
 def training_plot(choices: Sequence[Choice], found: Mapping[str, Any], seconds: float, noise: Sequence[float]) -> Any:
@@ -519,7 +511,7 @@ def training_plot(choices: Sequence[Choice], found: Mapping[str, Any], seconds: 
     from matplotlib.figure import Figure
 
     panels = [choice for choice in choices if found.get(choice.title)]
-    figure = Figure(figsize=(2.7 * len(panels), 5.4), layout="constrained")
+    figure = Figure(figsize=(2.5 * len(panels), 6.0), layout="constrained")
     axes = figure.subplots(2, len(panels), squeeze=False, sharey="row")
     for column, choice in enumerate(panels):
         for row, (name, text) in enumerate((("psnr", "PSNR (dB)"), ("miou", "mIoU"))):
@@ -541,7 +533,7 @@ def training_plot(choices: Sequence[Choice], found: Mapping[str, Any], seconds: 
                 ax.set_title(choice.title)
             else:
                 ax.set_xlabel("training (s)")
-                ax.legend(fontsize=7.5, loc="lower right", handlelength=1.4)
+                ax.legend(fontsize=7.5, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, handlelength=1.4)
             if not column:
                 ax.set_ylabel(text)
     return figure
@@ -552,7 +544,7 @@ def mesh_plot(choices: Sequence[Choice], found: Mapping[str, Any]) -> Any:
     from matplotlib.figure import Figure
 
     panels = [choice for choice in choices if found.get(choice.title)]
-    figure = Figure(figsize=(3.2 * len(panels), 5.2), layout="constrained")
+    figure = Figure(figsize=(3.3 * len(panels), 5.8), layout="constrained")
     axes = figure.subplots(2, len(panels), squeeze=False)
     for column, choice in enumerate(panels):
         for row, (name, text) in enumerate((("f1_005", "1 - F1 at 5 mm"), ("texture_psnr", "texture, RMSE (8 bits)"))):
@@ -560,11 +552,11 @@ def mesh_plot(choices: Sequence[Choice], found: Mapping[str, Any]) -> Any:
             cost = (lambda v: 1 - v) if row == 0 else (lambda v: 255 * 10 ** (-v / 20))
             points = {n: (entry["seconds"], cost(entry[name])) for n, entry in found[choice.title].items()}
             _front_panel(ax, points, choice.default)
-            ax.margins(y=0.25)
             if not row:
                 ax.set_title(choice.title)
             else:
                 ax.set_xlabel("seconds for three meshes")
+                ax.legend(fontsize=7.5, loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=3)
             if not column:
                 ax.set_ylabel(text)
     return figure
