@@ -1,6 +1,6 @@
 """What mistakes in the masks do to the result: rendered IDs beside the masks that were given, both against the truth.
 
-    python benchmarks/mask_noise.py [--capture build/demo/capture] [--steps 220] [--restart] [--json]
+    python benchmarks/mask_noise.py [--capture build/demo/capture] [--steps 200] [--restart] [--json]
 
 --capture is the demo capture, which brings exact masks in truth/masks. Its masks are replaced by the true ones with
 mistakes of four kinds, from none to about half of them, and the demo is trained with each for so many --steps. Rendered
@@ -271,7 +271,7 @@ def main() -> None:
     """Measure, and write the document and the plot."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--capture", type=Path, default=ROOT / "build/demo/capture", help="the demo capture")
-    parser.add_argument("--steps", type=int, default=220, help="how long to train with each kind of masks")
+    parser.add_argument("--steps", type=int, default=200, help="how long to train with each kind of masks")
     parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="where document and plot go")
     parser.add_argument("--restart", action="store_true", help="forget what earlier runs have left")
     parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
