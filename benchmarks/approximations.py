@@ -345,18 +345,18 @@ def trained(spec: dict[str, Any], capture: str, seconds: float, seed: int) -> di
 
     compile_kernels()
     if "grow_every" in spec:
-        loop.GROW_EVERY = spec["grow_every"]
+        shared.replace(loop, "GROW_EVERY", spec["grow_every"])
     if "pyramid" in spec:
-        loop.downscale_at = lambda share, longest: next((by for until, by in spec["pyramid"] if share < until), 1)
+        steps = spec["pyramid"]
+        shared.replace(loop, "downscale_at", lambda share, _: next((by for until, by in steps if share < until), 1))
     if spec.get("dense_adam"):
-        step_rows = loop.step_rows
 
         def step_all(values, first, second, seen, gradients, *others):
             everything = torch.zeros_like(values)
             everything[seen] = gradients
             return step_rows(values, first, second, torch.arange(len(values)), everything, *others)
 
-        loop.step_rows = step_all
+        step_rows = shared.replace(loop, "step_rows", step_all)
     loaded = load_capture(Path(capture), WORK / "cache")
     ids = vote(loaded).ids if loaded.has_masks else np.zeros(len(loaded.points.xyz), np.int64)
     trainer = loop.Trainer.start(loaded, ids, Settings(seed=seed, **spec.get("settings", {})))
@@ -375,7 +375,7 @@ def meshed(spec: dict[str, Any], folder: str) -> dict[str, Any]:
     from backend.protocol import Reporter
 
     if "voxel_per_pixel" in spec:
-        fusion._VOXEL_PER_PIXEL = spec["voxel_per_pixel"]
+        shared.replace(fusion, "_VOXEL_PER_PIXEL", spec["voxel_per_pixel"])
     words = ["mesh", folder, "--objects", *OBJECTS, "--restart"]
     for name in ("faces", "texture_size"):
         if name in spec:

@@ -25,6 +25,8 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import shared
+
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 NOTHING = 1e-12
 """What adds less than this to every pixel of a part is left out of the exact picture."""
@@ -52,7 +54,8 @@ def exact_part(scene_file: str, part: tuple[int, int, int, int]) -> dict[str, np
     from backend.raster import reference
 
     torch.set_num_threads(1)
-    reference.ALPHA_MIN, reference.STOP = NOTHING, 0.0
+    shared.replace(reference, "ALPHA_MIN", NOTHING)
+    shared.replace(reference, "STOP", 0.0)
     scene = np.load(scene_file)
     camera = camera_of(scene)
     x, y, width, height = part
@@ -155,7 +158,7 @@ def _stop(value: float) -> None:
 def _exp_degree(degree: int) -> None:
     from backend.raster import simd
 
-    simd._EXP2 = exp2_coefficients(degree)
+    shared.replace(simd, "_EXP2", exp2_coefficients(degree))
 
 
 def _tile(size: tuple[int, int]) -> None:
@@ -218,17 +221,16 @@ def _bounds(kind: str) -> None:
                 longest = 0.5 * (a + c) + math.sqrt(0.25 * (a - c) * (a - c) + b * b)
                 splats[n, HALF_W] = splats[n, HALF_H] = 3.0 * math.sqrt(longest)
 
-    cpu_tiles.splat_rows = rows
+    shared.replace(cpu_tiles, "splat_rows", rows)
     if kind != "tiles":
-        cpu_bin.row_ends = ends
+        shared.replace(cpu_bin, "row_ends", ends)
     if kind == "square":
-        project = cpu.project
 
         def project_squares(*arguments: Any) -> None:
             project(*arguments)
             square(arguments[8])
 
-        cpu.project = project_squares
+        project = shared.replace(cpu, "project", project_squares)
 
 
 def _sort(kind: str) -> None:
@@ -273,16 +275,16 @@ def _sort(kind: str) -> None:
         sequence = np.argsort(tile << np.uint64(32) | bits, kind="stable")
         members[:], places[:] = members[sequence], places[sequence]
 
-    cpu.depth_order = order
+    shared.replace(cpu, "depth_order", order)
     if kind in ("tiles", "keys"):
-        bin_splats, sort = cpu.bin_splats, by_tile if kind == "tiles" else by_key
+        sort = by_tile if kind == "tiles" else by_key
 
         def bin_and_sort(splats: np.ndarray, order: np.ndarray, width: int, height: int) -> Any:
             tiles, members, places, slots = bin_splats(splats, order, width, height)
             sort(splats, tiles, members, places)
             return tiles, members, places, slots
 
-        cpu.bin_splats = bin_and_sort
+        bin_splats = shared.replace(cpu, "bin_splats", bin_and_sort)
 
 
 class _Doubled(importlib.machinery.SourceFileLoader):

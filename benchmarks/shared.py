@@ -119,6 +119,16 @@ def in_child(call: str, environment: Mapping[str, str] | None = None, **words: A
     return json.loads(done.stdout.splitlines()[-1])
 
 
+def replace(owner: Any, name: str, value: Any) -> Any:
+    """Give a module's name another value, in this process; returns the old one. RuntimeError where it has no such name,
+    for then nothing would change."""
+    if not hasattr(owner, name):
+        raise RuntimeError(f"{owner.__name__} has no {name} any more, which this benchmark changes")
+    old = getattr(owner, name)
+    setattr(owner, name, value)
+    return old
+
+
 def compile_everything() -> None:
     """Have all kernels of the product ready on disk, so that no measurement waits for one."""
     from backend.commands.kernels import have_kernels_ready
