@@ -21,12 +21,10 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from backend.capture import load_capture  # noqa: E402
-from backend.evaluation import evaluate  # noqa: E402
 from backend.labels import vote  # noqa: E402
-from backend.protocol import Reporter  # noqa: E402
-from backend.raster.draw import draw  # noqa: E402
 from backend.training.loop import Budget, Trainer  # noqa: E402
 from backend.training.settings import Settings  # noqa: E402
+from benchmarks.shared import train_and_measure  # noqa: E402
 
 VARIANTS = ("plain", "explicit", "view")
 
@@ -37,22 +35,7 @@ def train(capture, ids: np.ndarray, variant: str, budget: Budget) -> dict:
     trainer = Trainer.start(capture, ids, Settings(mode=mode))
     if variant == "plain":
         silence(trainer)
-    with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as folder:
-        trainer.run(budget, Path(folder), Reporter())
-
-    def render(index):
-        picture = draw(trainer.model, trainer.scene.camera(index))
-        return picture.image, picture.ids
-
-    quality = evaluate(capture, render, capture.test_indices)["quality"]
-    progress = trainer.progress
-    return {
-        **{name: quality[name] for name in ("psnr", "ssim", "miou", "mbiou")},
-        "steps": progress.step,
-        "steps_per_second": progress.step / progress.seconds,
-        "anchors": len(trainer.model.anchors),
-        "splats": len(trainer.model.generate(eye=np.zeros(3)).source),
-    }
+    return train_and_measure(trainer, capture, budget)
 
 
 def silence(trainer: Trainer) -> None:

@@ -1,0 +1,807 @@
+"""Error against run time for every approximation, and whether the defaults lie on the Pareto front.
+
+    python benchmarks/approximations.py [--demo build/demo] [--seconds 36] [--restart] [--json]
+
+--demo is a reconstruction of the demo capture, as `make demo` leaves it; nothing is written there. The rasterizer's
+choices are compared on its splats in one held-out view, against the exact picture (see raster_variants.py); the
+training's by trainings of equal time, of --seconds and of half of them; those of meshes and textures on three objects
+of the reconstruction, against their true surfaces. Leaves docs/error-against-time.md and plots beside it. What is done
+is kept in build/approximations: a run that was stopped goes on where it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import concurrent.futures
+import json
+import multiprocessing
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+if str(ROOT) not in sys.path:
+    sys.path.insert(0, str(ROOT))
+
+from benchmarks import raster_variants, shared  # noqa: E402
+
+WORK = ROOT / "build" / "approximations"
+TURNS = 40
+SEEDS = 3
+"""Trainings of the defaults, whose spread says what is noise."""
+OBJECTS = ("mug", "teapot", "vase")
+
+TIME_NOISE, ERROR_NOISE = 0.03, 0.02
+"""Times and errors of the rasterizer that differ by less than these parts count as equal."""
+MESH_TIME_NOISE, PSNR_NOISE, SHARE_NOISE = 0.05, 0.1, 0.002
+"""At least so much of a mesh's time, in dB, and in mIoU and F1 counts as noise."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One approximation: its name, the variants by name, as the processes take them, and which is the default."""
+
+    title: str
+    default: str
+    variants: Mapping[str, Mapping[str, Any]]
+    note: str = ""
+
+
+@dataclass
+class Verdict:
+    """Whether the default of a choice lies on the front, and which variants are better in something and worse in
+    nothing."""
+
+    choice: Choice
+    better: list[str] = field(default_factory=list)
+
+
+# --- what is compared ------------------------------------------------------------------------------------------------
+
+
+def raster_choices() -> list[Choice]:
+    """Of the CPU rasterizer. The variant {} is the product as it is."""
+    from backend.blending import ALPHA_MIN, STOP
+    from backend.raster import cpu_bin, simd
+
+    def among(values: Sequence[Any], default: Any, name: str, text: Callable[[Any], str]) -> tuple[str, dict[str, Any]]:
+        names = {value: text(value) for value in sorted({*values, default})}
+        return names[default], {names[v]: {} if v == default else {name: v} for v in names}
+
+    one_in = round(1 / ALPHA_MIN)
+    cuts = among((64, 128, 512, 2048, 10**6), one_in, "one_in", lambda n: f"1/{n:,}")
+    cut_variants = {text: {"alpha_min": 1 / v["one_in"]} if v else {} for text, v in cuts[1].items()}
+    stops = among((0.0, 1e-5, 1e-3, 1e-2), STOP, "stop", lambda t: f"{t:.2g}" if t else "never")
+    degrees = among((1, 2, 3, 4, 7), len(simd._EXP2) - 1, "exp_degree", str)
+    tiles = among(
+        ((16, 16), (32, 32), (64, 16), (64, 64), (128, 32)),
+        (cpu_bin.TILE_W, cpu_bin.TILE_H), "tile", lambda s: f"{s[0]}x{s[1]}",
+    )  # fmt: skip
+    return [
+        Choice("alpha cut-off", cuts[0], cut_variants, "a splat is dropped in pixels where its alpha is less"),
+        Choice("transmittance stop", *stops, "a pixel takes no more splats below this light"),
+        Choice("degree of the exponential", *degrees, "of the polynomial for 2^x between -1/2 and 1/2"),
+        Choice(
+            "bounds",
+            "rows of the ellipse",
+            {
+                "rows of the ellipse": {},
+                "box": {"bounds": "box"},
+                "tiles of the ellipse": {"bounds": "tiles"},
+                "tiles of the box": {"bounds": "box tiles"},
+                "tiles of 3 sigma": {"bounds": "square"},
+            },
+            "the pixels that a splat is evaluated in; whole tiles are of 16x16, as on GPUs; 3 sigma: the published"
+            " rasterizers' square around the longer axis",
+        ),
+        Choice("tile size", *tiles, "pixels that one thread works on at a time"),
+        Choice(
+            "float precision",
+            "float32",
+            {
+                "float32": {},
+                "float64": {"float64": True, "sort": "argsort"},
+                "float64, exponential of degree 11": {"float64": True, "sort": "argsort", "exp_degree": 11},
+            },
+            "of screen splats, planes and gradient rows; splats are projected in float64 in all of them",
+        ),
+        Choice(
+            "sort",
+            "once, all bits",
+            {
+                "once, all bits": {},
+                "once, NumPy": {"sort": "argsort"},
+                "once, 16 bits": {"sort": "16 bits"},
+                "once, 8 bits": {"sort": "8 bits"},
+                "per tile": {"sort": "tiles"},
+                "tile and depth": {"sort": "keys"},
+                "none": {"sort": "none"},
+            },
+            "once: one radix sort of all splats by depth, then tiles take them in that order; tile and depth: one sort"
+            " of all (tile, splat) meetings, as in the published rasterizers, here by NumPy",
+        ),
+    ]  # fmt: skip
+
+
+def training_choices() -> list[Choice]:
+    """Of the training; each variant trains for the same time."""
+    from backend.training.settings import GROW_EVERY, Settings
+
+    settings = Settings()
+    cadences = {f"every {n}": {} if n == GROW_EVERY else {"grow_every": n} for n in sorted({50, 200, GROW_EVERY})}
+
+    def of_setting(name: str, values: Sequence[int], text: str = "{}") -> tuple[str, dict[str, Any]]:
+        default = getattr(settings, name)
+        found = {text.format(v): {} if v == default else {"settings": {name: v}} for v in sorted({*values, default})}
+        return text.format(default), found
+
+    return [
+        Choice("SH degree", *of_setting("sh_degree", (0, 1, 2, 3)), "of the colours"),
+        Choice(
+            "resolution pyramid",
+            "by size",
+            {
+                "by size": {},
+                "half at first": {"pyramid": [[0.25, 2]]},
+                "quarter, then half": {"pyramid": [[0.08, 4], [0.25, 2]]},
+            },
+            "pictures reduced until 8 % and 25 % of the training; by size: not where they have less than 300 pixels"
+            " then, so never on this capture",
+        ),
+        Choice(
+            "Adam",
+            "rows in view",
+            {"rows in view": {}, "all rows": {"dense_adam": True}},
+            "which anchors a step updates",
+        ),
+        Choice(
+            "densification cadence",
+            f"every {GROW_EVERY}",
+            {**cadences, "never": {"grow_every": 10**9}},
+            "steps between two rounds of growth and pruning, between 10 % and 50 % of the training",
+        ),
+        Choice("offsets per anchor", *of_setting("offsets", (5, 10, 20), "k = {}"), "splats that an anchor makes"),
+    ]
+
+
+def mesh_choices() -> list[Choice]:
+    """Of meshes and textures."""
+    from backend.mesh.extract import FACES
+    from backend.mesh.fusion import _VOXEL_PER_PIXEL
+
+    def among(values: Sequence[Any], default: Any, name: str, text: str) -> tuple[str, dict[str, Any]]:
+        return text.format(default), {
+            text.format(v): {} if v == default else {name: v} for v in sorted({*values, default})
+        }
+
+    return [
+        Choice(
+            "TSDF voxel", *among((0.5, 1.0, 1.4), _VOXEL_PER_PIXEL, "voxel_per_pixel", "{} px"),
+            "edge of a voxel in footprints of a pixel on the object",
+        ),
+        Choice("faces", *among((2_000, 5_000, 50_000), FACES, "faces", "{:,}"), "at most, for each object"),
+        Choice(
+            "texture size",
+            "by photos",
+            {"by photos": {}, **{f"{size}": {"texture_size": size} for size in (256, 512, 2048, 4096)}},
+            "pixels along the side; by photos: the smallest from 1024 on that holds what the photos show",
+        ),
+    ]  # fmt: skip
+
+
+# --- the rasterizer --------------------------------------------------------------------------------------------------
+
+
+def write_scene(folder: Path, path: Path) -> None:
+    """The splats that a reconstruction shows in a held-out view, its labels, and gradients to go backward from: those
+    of half the squared error of the picture and of the mean -log of the label's probability."""
+    import numpy as np
+    import torch
+
+    from backend.model.object_model import anchors_in_view
+    from backend.raster import rasterize
+
+    trained = opened(folder)
+    index = trained.capture.test_indices[len(trained.capture.test_indices) // 2]
+    camera, model = trained.scene.camera(index), trained.model
+    viewmat, intrinsics = camera.arrays()
+    seen = anchors_in_view(model.anchors, viewmat, intrinsics, camera.width, camera.height, camera.near)
+    photo, labels = trained.scene.target(index)
+    with torch.no_grad():
+        g = model.generate(seen, camera.centre)
+        drawn = rasterize(*g[:6], camera, labels=labels)
+        picture = drawn.color + (1 - drawn.alpha) * model.background[:, None, None]
+        known = labels >= 0
+        g_color = (picture - photo) / photo.numel()
+        g_weight = torch.where(known, -0.1 / (drawn.weight + 0.01), 0.0) / known.sum()
+    means = g.means.double() - torch.from_numpy(camera.centre)
+    names = dict(zip(raster_variants.PARAMETERS, (means, *g[1:5]), strict=True))
+    np.savez(
+        path,
+        **{name: np.ascontiguousarray(value.detach().numpy(), np.float32) for name, value in names.items()},
+        ids=g.ids.numpy(), objects=len(model.object_ids), viewmat=camera.at_origin().viewmat, K=camera.K,
+        labels=labels.numpy(), g_color=g_color.numpy(), g_weight=g_weight.numpy(), g_alpha=np.zeros_like(g_weight),
+    )  # fmt: skip
+
+
+def opened(folder: Path) -> Any:
+    """A reconstruction, as the product's own commands open it."""
+    from backend.arguments import parser
+    from backend.commands.folder import open_trained
+    from backend.protocol import Reporter
+    from backend.stopping import StoppingReporter, StopRequest
+
+    return open_trained(parser().parse_args(["evaluate", str(folder)]), StoppingReporter(Reporter(), StopRequest()))
+
+
+def write_exact(scene_file: Path, path: Path) -> None:
+    """The exact picture of a scene, in as many processes as there are cores."""
+    import numpy as np
+
+    scene = np.load(scene_file)
+    height, width = scene["labels"].shape
+    parts = raster_variants.parts_of(width, height)
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(os.cpu_count(), mp_context=context) as pool:
+        waiting = {pool.submit(raster_variants.exact_part, str(scene_file), part): part for part in parts}
+
+        def found() -> Any:
+            for done, future in enumerate(concurrent.futures.as_completed(waiting), 1):
+                print(f"exact picture: part {done} of {len(parts)}", flush=True)
+                yield waiting[future], future.result()
+
+        np.savez(path, **raster_variants.join(scene, found()))
+
+
+class Worker:
+    """A variant of the rasterizer in a process of its own."""
+
+    def __init__(self, changes: Mapping[str, Any], kernels: Path, scene: Path, exact: Path) -> None:
+        words = [sys.executable, "-m", "benchmarks.raster_variants", json.dumps(changes), str(scene), str(exact)]
+        self._errors = (kernels.parent / f"{kernels.name}.log").open("w+")
+        self._process = subprocess.Popen(
+            words, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True,
+            env={**os.environ, "NUMBA_CACHE_DIR": str(kernels)},
+        )  # fmt: skip
+
+    def answer(self) -> dict[str, Any]:
+        """The next line of the process; RuntimeError where there is none."""
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            self._errors.seek(0)
+            raise RuntimeError(" | ".join(self._errors.read().strip().splitlines()[-3:]) or "it ended without a word")
+        return json.loads(line)
+
+    def turn(self) -> dict[str, Any]:
+        """The times of one forward and backward."""
+        assert self._process.stdin is not None
+        self._process.stdin.write("\n")
+        self._process.stdin.flush()
+        return self.answer()
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.communicate()
+        self._errors.close()
+
+
+def measure_choice(choice: Choice, scene: Path, exact: Path, kernels: Path) -> dict[str, Any]:
+    """Errors and times of all variants of a choice. They take turns, so that what else the machine does meets all."""
+    workers: dict[str, Worker] = {}
+    found: dict[str, Any] = {}
+    try:
+        for name, changes in choice.variants.items():
+            place = kernels / shared.digest([], sorted(changes.items()))
+            place.mkdir(parents=True, exist_ok=True)
+            workers[name] = Worker(changes, place, scene, exact)
+            # Each one compiles on a core of its own, so no more of them at a time.
+            waiting = [other for other in workers if other not in found]
+            if len(waiting) == os.cpu_count():
+                found[waiting[0]] = workers[waiting[0]].answer()
+        found |= {name: worker.answer() for name, worker in workers.items() if name not in found}
+        times: dict[str, list[dict[str, float]]] = {name: [] for name in workers}
+        for turn in range(TURNS + 2):
+            for name, worker in workers.items():
+                taken = worker.turn()
+                if turn >= 2:
+                    times[name].append(taken)
+    finally:
+        for worker in workers.values():
+            worker.close()
+    for name, rows in times.items():
+        sums = [row["forward_ms"] + row["backward_ms"] for row in rows]
+        low, middle, high = statistics.quantiles(sums, n=4)
+        # Against the default in the same round, since rounds differ more than variants.
+        ratios = [a / b for a, b in zip(sums, [r["forward_ms"] + r["backward_ms"] for r in times[choice.default]])]
+        found[name] |= {
+            "forward_ms": statistics.median(row["forward_ms"] for row in rows),
+            "backward_ms": statistics.median(row["backward_ms"] for row in rows),
+            "step_ms": middle, "step_ms_quartiles": [low, high], "times_default": statistics.median(ratios),
+        }  # fmt: skip
+    return found
+
+
+# --- training --------------------------------------------------------------------------------------------------------
+
+
+def trained(spec: dict[str, Any], capture: str, seconds: float, seed: int) -> dict[str, Any]:
+    """Train a variant for so long, and measure it; in a process of its own, since it changes the loop's constants."""
+    import numpy as np
+    import torch
+
+    from backend.capture import load_capture
+    from backend.labels import vote
+    from backend.raster import compile_kernels
+    from backend.training import loop
+    from backend.training.settings import Settings
+
+    compile_kernels()
+    if "grow_every" in spec:
+        shared.replace(loop, "GROW_EVERY", spec["grow_every"])
+    if "pyramid" in spec:
+        steps = spec["pyramid"]
+        shared.replace(loop, "downscale_at", lambda share, _: next((by for until, by in steps if share < until), 1))
+    if spec.get("dense_adam"):
+
+        def step_all(values, first, second, seen, gradients, *others):
+            everything = torch.zeros_like(values)
+            everything[seen] = gradients
+            return step_rows(values, first, second, torch.arange(len(values)), everything, *others)
+
+        step_rows = shared.replace(loop, "step_rows", step_all)
+    loaded = load_capture(Path(capture), WORK / "cache")
+    ids = vote(loaded).ids if loaded.has_masks else np.zeros(len(loaded.points.xyz), np.int64)
+    trainer = loop.Trainer.start(loaded, ids, Settings(seed=seed, **spec.get("settings", {})))
+    return shared.train_and_measure(trainer, loaded, loop.Budget(seconds=seconds))
+
+
+# --- meshes ----------------------------------------------------------------------------------------------------------
+
+
+def meshed(spec: dict[str, Any], folder: str) -> dict[str, Any]:
+    """Make meshes of OBJECTS in a copy of a reconstruction, and measure them; in a process of its own."""
+    from backend import arguments
+    from backend.evaluation.meshes import evaluate_mesh, mesh_entries
+    from backend.evaluation.truth import load_truth
+    from backend.mesh import fusion
+    from backend.protocol import Reporter
+
+    if "voxel_per_pixel" in spec:
+        shared.replace(fusion, "_VOXEL_PER_PIXEL", spec["voxel_per_pixel"])
+    words = ["mesh", folder, "--objects", *OBJECTS, "--restart"]
+    for name in ("faces", "texture_size"):
+        if name in spec:
+            words += [f"--{name.replace('_', '-')}", str(spec[name])]
+    if arguments.main(words):
+        raise RuntimeError(f"python -m backend {' '.join(words)} failed")
+    reconstruction = opened(Path(folder))
+    capture = reconstruction.capture
+    truth = load_truth(capture, capture.train_indices)
+    meshes = reconstruction.folder.meshes
+    rows = []
+    for entry in mesh_entries(meshes, reconstruction.progress.step, Reporter()).values():
+        figures = evaluate_mesh(meshes, entry, reconstruction.scene, truth, capture.test_indices, Reporter())
+        rows.append({**figures, **entry})
+    return {
+        "seconds": sum(row["seconds"] for row in rows),
+        **{
+            name: statistics.fmean(row[name] for row in rows)
+            for name in ("f1", "f1_005", "chamfer", "texture_psnr", "faces", "texture_size")
+        },
+    }
+
+
+# --- the front -------------------------------------------------------------------------------------------------------
+
+
+def better_than(default: Sequence[float], others: Mapping[str, Sequence[float]], noise: Sequence[float]) -> list[str]:
+    """The variants that are better than the default in something and worse in nothing. All figures are costs; those
+    that differ by no more than `noise` are equal."""
+
+    def beats(costs: Sequence[float]) -> bool:
+        gains = [(mine - cost, n) for mine, cost, n in zip(default, costs, noise, strict=True)]
+        return all(gain >= -n for gain, n in gains) and any(gain > n for gain, n in gains)
+
+    return [name for name, costs in others.items() if beats(costs)]
+
+
+def raster_verdict(choice: Choice, found: Mapping[str, Any]) -> Verdict:
+    """Costs: time and the errors of picture and gradient."""
+    costs = {n: (row["times_default"], row["picture"], row["gradient"]) for n, row in found.items()}
+    mine = costs.pop(choice.default)
+    return Verdict(choice, better_than(mine, costs, [TIME_NOISE, *(ERROR_NOISE * cost for cost in mine[1:])]))
+
+
+def training_costs(rows: Sequence[Mapping[str, Any]]) -> list[float]:
+    """Of a variant's trainings, half time and full time: the lower the better."""
+    return [-row[name] for row in rows for name in ("psnr", "miou")]
+
+
+def training_noise(repeats: Sequence[Sequence[Mapping[str, Any]]]) -> list[float]:
+    """Twice the standard deviation of the default's trainings, but no less than what counts as noise anyway."""
+    columns = list(zip(*(training_costs(rows) for rows in repeats), strict=True))
+    least = (PSNR_NOISE, SHARE_NOISE) * (len(columns) // 2)
+    return [
+        max(2 * statistics.stdev(column) if len(column) > 1 else 0.0, floor)
+        for column, floor in zip(columns, least, strict=True)
+    ]
+
+
+def mesh_verdict(choice: Choice, found: Mapping[str, Any]) -> Verdict:
+    """Costs: time, F1 at 5 mm and the texture's PSNR."""
+    costs = {name: (row["seconds"], -row["f1_005"], -row["texture_psnr"]) for name, row in found.items()}
+    mine = costs.pop(choice.default)
+    return Verdict(choice, better_than(mine, costs, (MESH_TIME_NOISE * mine[0], SHARE_NOISE, PSNR_NOISE)))
+
+
+# --- what comes of it ------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Found:
+    """Results by choice and variant; `noise` of the trainings, as `training_costs` orders their figures."""
+
+    raster: dict[str, dict[str, Any]]
+    training: dict[str, dict[str, Any]]
+    meshes: dict[str, dict[str, Any]]
+    noise: list[float]
+    verdicts: list[Verdict]
+
+
+def raster_plot(choices: Sequence[Choice], found: Mapping[str, Any]) -> Any:
+    """Time against the error of the picture, a panel each."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
+
+    panels = [choice for choice in choices if found.get(choice.title)]
+    columns = 2
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(10.4, 2.4 * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax, choice in zip(axes, panels):
+        points = {n: (row["times_default"], max(row["picture"], 1e-6)) for n, row in found[choice.title].items()}
+        _front_panel(ax, points, choice.default)
+        ax.legend(fontsize=7.5, loc="upper left", bbox_to_anchor=(1.0, 1.03), borderaxespad=0.2)
+        ax.set_title(choice.title)
+        ax.set_yscale("log")
+        low, high = (f(y for _, y in points.values()) for f in (min, max))
+        ax.set_ylim(min(low / 2, 0.05), max(high * 2, 2))
+        if max(x for x, _ in points.values()) > 2.5:
+            ax.set_xscale("log", base=2)
+        else:
+            ax.set_xlim(min(0.8, *(x - 0.05 for x, _ in points.values())), None)
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter(NullFormatter())
+    for ax in axes[len(panels) :]:
+        ax.set_axis_off()
+    figure.supxlabel("time of forward and backward, default = 1", fontsize=9)
+    figure.supylabel("error of the picture (RMSE, steps of 8 bits)", fontsize=9)
+    return figure
+
+
+def _front_panel(ax: Any, points: Mapping[str, tuple[float, float]], default: str) -> None:
+    """Points of (time, cost), each with a look of its own, the default marked, and the front through the best."""
+    best, steps = float("inf"), []
+    for x, y in sorted(points.values()):
+        if y < best:
+            best = y
+            steps.append((x, y))
+    if len(steps) > 1:
+        ax.plot(*zip(*steps), color="#c9c9d0", linewidth=1.2, drawstyle="steps-post", zorder=1)
+    looks = iter(zip(shared.COLOURS * 2, "os^vDP" + "Xs^vDP"))
+    for name, (x, y) in points.items():
+        marked = name == default
+        colour, marker = (shared.MARKED, "*") if marked else next(looks)
+        size = 12 if marked else 6
+        ax.plot(x, y, marker, color=colour, markersize=size, label=name, zorder=4 if marked else 3, alpha=0.9)
+    ax.margins(0.15)
+
+
+def training_plot(choices: Sequence[Choice], found: Mapping[str, Any], seconds: float, noise: Sequence[float]) -> Any:
+    """PSNR and mIoU after half of the time and all of it, a column for each choice."""
+    from matplotlib.figure import Figure
+
+    panels = [choice for choice in choices if found.get(choice.title)]
+    figure = Figure(figsize=(2.5 * len(panels), 6.0), layout="constrained")
+    axes = figure.subplots(2, len(panels), squeeze=False, sharey="row")
+    for column, choice in enumerate(panels):
+        for row, (name, text) in enumerate((("psnr", "PSNR (dB)"), ("miou", "mIoU"))):
+            ax = axes[row, column]
+            colours = iter(shared.COLOURS * 3)
+            for variant, trainings in found[choice.title].items():
+                marked = variant == choice.default
+                y = [training[name] for training in trainings]
+                colour = shared.MARKED if marked else next(colours)
+                ax.plot([seconds / 2, seconds], y, "o-", color=colour, label=variant, linewidth=2.2 if marked else 1.4,
+                        markersize=5, zorder=4 if marked else 3)  # fmt: skip
+                if marked:
+                    n = [noise[row], noise[row + 2]]
+                    low, high = ([v + s * d for v, d in zip(y, n)] for s in (-1, 1))
+                    ax.fill_between([seconds / 2, seconds], low, high, color=colour, alpha=0.13, linewidth=0)
+            ax.set_xlim(seconds * 0.42, seconds * 1.08)
+            ax.set_xticks([seconds / 2, seconds])
+            if not row:
+                ax.set_title(choice.title)
+            else:
+                ax.set_xlabel("training (s)")
+                ax.legend(fontsize=7.5, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, handlelength=1.4)
+            if not column:
+                ax.set_ylabel(text)
+    return figure
+
+
+def mesh_plot(choices: Sequence[Choice], found: Mapping[str, Any]) -> Any:
+    """Time against F1 at 5 mm and against the texture's PSNR, a column for each choice."""
+    from matplotlib.figure import Figure
+
+    panels = [choice for choice in choices if found.get(choice.title)]
+    figure = Figure(figsize=(3.3 * len(panels), 5.8), layout="constrained")
+    axes = figure.subplots(2, len(panels), squeeze=False)
+    for column, choice in enumerate(panels):
+        for row, (name, text) in enumerate((("f1_005", "1 - F1 at 5 mm"), ("texture_psnr", "texture, RMSE (8 bits)"))):
+            ax = axes[row, column]
+            cost = (lambda v: 1 - v) if row == 0 else (lambda v: 255 * 10 ** (-v / 20))
+            points = {n: (entry["seconds"], cost(entry[name])) for n, entry in found[choice.title].items()}
+            _front_panel(ax, points, choice.default)
+            if not row:
+                ax.set_title(choice.title)
+            else:
+                ax.set_xlabel("seconds for three meshes")
+                ax.legend(fontsize=7.5, loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=3)
+            if not column:
+                ax.set_ylabel(text)
+    return figure
+
+
+def document(found: Found, choices: Mapping[str, Sequence[Choice]], scene: Mapping[str, Any], seconds: float) -> str:
+    """docs/error-against-time.md."""
+    off = [verdict for verdict in found.verdicts if verdict.better]
+    on = len(found.verdicts) - len(off)
+    lines = [
+        "# Error against run time",
+        "",
+        "Made by `python benchmarks/approximations.py`; every figure here was measured by it. Defaults are in bold.",
+        "A default lies on the Pareto front where no variant is better in something, time or error, and worse in",
+        "nothing, beyond the noise that is stated.",
+        "",
+        f"**{on} of {len(found.verdicts)} defaults lie on the front**"
+        + ("." if not off else "; the exceptions:"),
+        "",
+        *(f"- {verdict.choice.title}: {_exception(verdict, found)}" for verdict in off),
+        *([""] if off else []),
+        "## The rasterizer",
+        "",
+        f"Forward and backward of {scene['splats']:,} trained splats in one held-out view of the demo,"
+        f" {scene['width']}x{scene['height']}, on {os.cpu_count()} cores. Errors are those against the float64",
+        "reference, in exact order and without any cut-off: of the picture as RMSE in steps of 8 bits and the largest;",
+        "of the gradients as a part of their length, the root mean square over means, rotations, scales, opacities and",
+        f"colours. All variants of a choice take turns {TURNS} times; the median of the ratio to the default's time",
+        f"counts. Noise: {TIME_NOISE:.0%} of the time, {ERROR_NOISE:.0%} of an error.",
+        "",
+        "![Time against error of the picture for each choice of the rasterizer](error-against-time-raster.png)",
+        "",
+    ]  # fmt: skip
+    for choice in choices["raster"]:
+        lines += _section(choice, found, found.raster, ("ms", "time", "RMSE", "largest", "gradient"), _raster_row)
+    lines += [
+        "## Training",
+        "",
+        f"The demo, trained from its points for {seconds / 2:g} s and for {seconds:g} s, schedules following the clock;"
+        f" quality on held-out views. Noise, twice the standard deviation of the default over {SEEDS} seeds and at",
+        f"least {PSNR_NOISE} dB and {SHARE_NOISE}: "
+        + ", ".join(
+            f"{found.noise[2 * i]:.2f} dB and {found.noise[2 * i + 1]:.4f} at {s:g} s"
+            for i, s in enumerate((seconds / 2, seconds))
+        )
+        + ".",
+        "",
+        "![PSNR and mIoU over the time of training for each choice](error-against-time-training.png)",
+        "",
+    ]
+    half, full = f"{seconds / 2:g} s", f"{seconds:g} s"
+    head = (f"PSNR, {half}", f"mIoU, {half}", f"PSNR, {full}", f"mIoU, {full}", "steps", "splats")
+    for choice in choices["training"]:
+        lines += _section(choice, found, found.training, head, _training_row)
+    lines += [
+        "## Meshes and textures",
+        "",
+        f"Of {', '.join(OBJECTS[:-1])} and {OBJECTS[-1]} of the trained demo, by `mesh` with all else as it is;"
+        " F1 against the true surface that training views see, PSNR of the",
+        "textured meshes against held-out photos, means over the three."
+        f" Noise: {MESH_TIME_NOISE:.0%} of the time, {SHARE_NOISE} of F1, {PSNR_NOISE} dB.",
+        "",
+        "![Time against errors of surfaces and textures](error-against-time-meshes.png)",
+        "",
+    ]
+    for choice in choices["meshes"]:
+        lines += _section(choice, found, found.meshes, ("seconds", "F1 at 5 mm", "F1 at 2 cm", "texture"), _mesh_row)
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _exception(verdict: Verdict, found: Found) -> str:
+    names = " and ".join(f"`{name}`" for name in verdict.better)
+    return f"{names} {'is' if len(verdict.better) == 1 else 'are'} better than `{verdict.choice.default}`"
+
+
+def _section(
+    choice: Choice, found: Found, results: Mapping[str, Any], head: Sequence[str], row: Callable[[Any], list[str]]
+) -> list[str]:
+    rows = results.get(choice.title)
+    lines = [f"### {choice.title[0].upper()}{choice.title[1:]}", "", f"{choice.note[0].upper()}{choice.note[1:]}.", ""]
+    if not rows:
+        return [*lines, "Not measured: it failed.", ""]
+    verdict = next(verdict for verdict in found.verdicts if verdict.choice == choice)
+    better = verdict.better
+    body = []
+    for name in choice.variants:
+        if name not in rows:
+            continue
+        place = "default" + ("" if better else ", on the front") if name == choice.default else ""
+        marked = f"**{name}**" if name == choice.default else name
+        body.append([marked, *row(rows[name]), "better" if name in better else place])
+    return [*lines, *shared.table([choice.title, *head, ""], body), ""]
+
+
+def _raster_row(row: Mapping[str, Any]) -> list[str]:
+    return [
+        f"{row['step_ms']:.1f}", f"{row['times_default']:.2f}", f"{row['picture']:.3g}", f"{row['largest']:.3g}",
+        f"{row['gradient']:.3g}",
+    ]  # fmt: skip
+
+
+def _training_row(trainings: Sequence[Mapping[str, Any]]) -> list[str]:
+    quality = [text for t in trainings for text in (f"{t['psnr']:.2f} dB", f"{t['miou']:.4f}")]
+    return [*quality, f"{trainings[-1]['steps']:,}", f"{trainings[-1]['splats']:,}"]
+
+
+def _mesh_row(row: Mapping[str, Any]) -> list[str]:
+    return [f"{row['seconds']:.1f}", f"{row['f1_005']:.4f}", f"{row['f1']:.4f}", f"{row['texture_psnr']:.2f} dB"]
+
+
+# --- all of it -------------------------------------------------------------------------------------------------------
+
+
+def run(demo: Path, seconds: float) -> tuple[Found, dict[str, Sequence[Choice]], dict[str, Any], dict[str, str]]:
+    """Measure everything that is not there yet. Returns the results, the choices, what the scene is, and failures."""
+    import numpy as np
+
+    shared.compile_everything()
+    choices = {"raster": raster_choices(), "training": training_choices(), "meshes": mesh_choices()}
+    copy = WORK / "reconstruction"
+    if not (demo / "checkpoint").is_dir():
+        raise SystemExit(f"{demo} is no trained reconstruction; make one by `make demo`, or name one by --demo.")
+    code = [*shared.sources(), *(ROOT / "benchmarks" / name for name in ("raster_variants.py", "shared.py"))]
+    made_from = shared.digest(code, (demo / "objectgs.json").read_text(), (demo / "splats.ply").stat().st_size, TURNS)
+    marker = WORK / "made-from.txt"
+    if not marker.exists() or marker.read_text() != made_from:
+        shared.forget(WORK)
+        ignored = shutil.ignore_patterns("meshes", "pictures", "previews", "capture", "*.blend*", "*.png")
+        shutil.copytree(demo, copy, ignore=ignored)
+        write_scene(copy, WORK / "scene.npz")
+        marker.write_text(made_from)
+    scene_file, exact_file = WORK / "scene.npz", WORK / "exact.npz"
+    if not exact_file.exists():
+        write_exact(scene_file, exact_file)
+    capture = json.loads((copy / "objectgs.json").read_text())["capture"]["folder"]
+
+    trainings = {shared.digest([], v): v for c in choices["training"] for v in c.variants.values()}
+    meshes = {shared.digest([], v): v for c in choices["meshes"] for v in c.variants.values()}
+    total = len(choices["raster"]) + 2 * (len(trainings) + SEEDS - 1) + len(meshes)
+    results = shared.Results(WORK / "results", made_from, total)
+
+    raster = {}
+    for choice in choices["raster"]:
+        raster[choice.title] = results.get(
+            choice.title,
+            partial(measure_choice, choice, scene_file, exact_file, WORK / "kernels"),
+            lambda found: ", ".join(f"{name} {row['times_default']:.2f}" for name, row in found.items()),
+        )
+
+    def train(spec: Mapping[str, Any], seed: int) -> list[dict[str, Any]]:
+        found = []
+        for length in (seconds / 2, seconds):
+            found.append(
+                results.get(
+                    f"training {json.dumps(spec)}, seed {seed}, {length:g} s",
+                    partial(
+                        shared.in_child, "benchmarks.approximations:trained",
+                        spec=spec, capture=capture, seconds=length, seed=seed,
+                    ),
+                    lambda row: f"{row['psnr']:.2f} dB, mIoU {row['miou']:.4f}, {row['steps']} steps",
+                )
+            )  # fmt: skip
+        return found if all(found) else []
+
+    by_spec = {key: train(spec, 0) for key, spec in trainings.items()}
+    training: dict[str, dict[str, Any]] = {}
+    for choice in choices["training"]:
+        rows = {name: by_spec[shared.digest([], spec)] for name, spec in choice.variants.items()}
+        training[choice.title] = {name: row for name, row in rows.items() if row}
+    repeats = [row for row in (by_spec[shared.digest([], {})], *(train({}, s) for s in range(1, SEEDS))) if row]
+    noise = training_noise(repeats) if repeats else [PSNR_NOISE, SHARE_NOISE] * 2
+
+    by_mesh = {
+        key: results.get(
+            f"meshes {json.dumps(spec)}",
+            partial(shared.in_child, "benchmarks.approximations:meshed", spec=spec, folder=str(copy)),
+            lambda row: f"{row['seconds']:.1f} s, F1 {row['f1_005']:.4f}, {row['texture_psnr']:.2f} dB",
+        )
+        for key, spec in meshes.items()
+    }
+    dressed: dict[str, dict[str, Any]] = {}
+    for choice in choices["meshes"]:
+        rows = {name: by_mesh[shared.digest([], spec)] for name, spec in choice.variants.items()}
+        dressed[choice.title] = {name: row for name, row in rows.items() if row}
+
+    verdicts = []
+    for kind, of, judge in (
+        ("raster", raster, raster_verdict),
+        ("training", training, lambda choice, rows: _training_verdict(choice, rows, noise)),
+        ("meshes", dressed, mesh_verdict),
+    ):
+        for choice in choices[kind]:
+            if choice.default in of[choice.title]:
+                verdicts.append(judge(choice, of[choice.title]))
+            else:
+                of[choice.title] = {}
+    scene = np.load(scene_file)
+    height, width = scene["labels"].shape
+    about = {"splats": len(scene["ids"]), "width": width, "height": height}
+    return Found(raster, training, dressed, noise, verdicts), choices, about, results.failures
+
+
+def _training_verdict(choice: Choice, found: Mapping[str, Any], noise: Sequence[float]) -> Verdict:
+    costs = {name: training_costs(rows) for name, rows in found.items()}
+    return Verdict(choice, better_than(costs.pop(choice.default), costs, noise))
+
+
+def main() -> None:
+    """Measure, write the document and the plots, and say which defaults lie off the front."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--demo", type=Path, default=ROOT / "build/demo", help="a reconstruction of the demo capture")
+    parser.add_argument("--seconds", type=float, default=36.0, help="how long a variant is trained")
+    parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="where document and plots go")
+    parser.add_argument("--restart", action="store_true", help="forget what earlier runs have left")
+    parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
+    options = parser.parse_args()
+    if options.restart:
+        shared.forget(WORK)
+    found, choices, scene, failures = run(options.demo.resolve(), options.seconds)
+    options.docs.mkdir(parents=True, exist_ok=True)
+    with shared.plot_style():
+        for name, figure in (
+            ("raster", raster_plot(choices["raster"], found.raster)),
+            ("training", training_plot(choices["training"], found.training, options.seconds, found.noise)),
+            ("meshes", mesh_plot(choices["meshes"], found.meshes)),
+        ):
+            shared.save_figure(figure, options.docs / f"error-against-time-{name}.png")
+    path = options.docs / "error-against-time.md"
+    path.write_text(document(found, choices, scene, options.seconds))
+    print(f"\nWrote {path} and three plots beside it.")
+    for verdict in found.verdicts:
+        what = f"off the front: {_exception(verdict, found)}" if verdict.better else "on the front"
+        print(f"{verdict.choice.title:26s} {verdict.choice.default:22s} {what}")
+    if options.json:
+        print(
+            json.dumps(
+                {
+                    "raster": found.raster, "training": found.training, "meshes": found.meshes, "noise": found.noise,
+                    "better_than_default": {v.choice.title: v.better for v in found.verdicts}, "failures": failures,
+                }
+            )
+        )  # fmt: skip
+    if failures:
+        raise SystemExit("Not measured: " + "; ".join(failures))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,389 @@
+"""The CPU rasterizer with one of its choices made otherwise, in a process of its own, and the exact picture to compare.
+
+A kernel's constants are frozen when it is compiled, so a variant is a process that changes the modules' constants or
+functions first, with a folder for compiled kernels of its own. `benchmarks/approximations.py` starts these processes
+and lets them take turns:
+
+    python -m benchmarks.raster_variants '{"alpha_min": 0.01}' SCENE.npz EXACT.npz
+
+The exact picture is that of the float64 reference, which draws every splat in exact order: without the cut-off at
+ALPHA_MIN (splats are left out only where they add less than 1e-12 to each pixel) and without STOP. What defines the
+picture, ALPHA_MAX and the blur, is the same everywhere.
+"""
+
+from __future__ import annotations
+
+import importlib.abc
+import importlib.machinery
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks import shared
+
+PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
+NOTHING = 1e-12
+"""What adds less than this to every pixel of a part is left out of the exact picture."""
+_PART = 48
+"""Pixels, at most, along the sides of the parts that the exact picture is drawn in."""
+
+
+# --- the exact picture -----------------------------------------------------------------------------------------------
+
+
+def parts_of(width: int, height: int) -> list[tuple[int, int, int, int]]:
+    """(x, y, width, height) of the parts of a picture."""
+    return [
+        (x, y, min(_PART, width - x), min(_PART, height - y))
+        for y in range(0, height, _PART)
+        for x in range(0, width, _PART)
+    ]
+
+
+def exact_part(scene_file: str, part: tuple[int, int, int, int]) -> dict[str, np.ndarray]:
+    """The exact colour (3, h, w) and label weight (h, w) of a part of the picture; the splats drawn there, and the
+    gradients of those in the order of PARAMETERS."""
+    import torch
+
+    from backend.raster import reference
+
+    torch.set_num_threads(1)
+    shared.replace(reference, "ALPHA_MIN", NOTHING)
+    shared.replace(reference, "STOP", 0.0)
+    scene = np.load(scene_file)
+    camera = camera_of(scene)
+    x, y, width, height = part
+    here = np.s_[y : y + height, x : x + width]
+    camera = camera.crop(x, y, width, height)
+    drawn = np.flatnonzero(_reaches(scene, camera))
+    leaves = {name: torch.from_numpy(scene[name][drawn]).double().requires_grad_() for name in PARAMETERS}
+    picture = reference.rasterize_reference(
+        **leaves, ids=torch.from_numpy(scene["ids"][drawn]), camera=camera, objects=int(scene["objects"])
+    )
+    labels = torch.from_numpy(scene["labels"][here]).long()[..., None]
+    weight = picture.probabilities.gather(-1, labels.clamp(min=0))[..., 0] * (labels[..., 0] >= 0)
+    towards = torch.from_numpy(scene["g_color"][:, *here]).double(), torch.from_numpy(scene["g_weight"][here]).double()
+    ((picture.color * towards[0]).sum() + (weight * towards[1]).sum()).backward()
+    gradients = [leaf.grad if leaf.grad is not None else torch.zeros_like(leaf) for leaf in leaves.values()]
+    return {
+        "color": picture.color.detach().numpy(),
+        "weight": weight.detach().numpy(),
+        "drawn": drawn,
+        **{f"g_{name}": gradient.numpy() for name, gradient in zip(PARAMETERS, gradients, strict=True)},
+    }
+
+
+def _reaches(scene: Any, camera: Any) -> np.ndarray:
+    """(N,) bool: which splats add NOTHING or more to some pixel of the camera's picture."""
+    import torch
+
+    from backend.raster.reference import _footprints, rotation_matrices
+    from backend.raster.settings import BLUR, TAN_MARGIN
+
+    means, quats, scales, opacities = (torch.from_numpy(scene[name]).double() for name in PARAMETERS[:4])
+    W, t = (torch.from_numpy(camera.viewmat[:3, columns]) for columns in (slice(3), 3))
+    p = means @ W.T + t
+    ahead = p[:, 2] > camera.near
+    p = torch.where(ahead[:, None], p, 1.0)
+    axes = W @ rotation_matrices(quats / torch.linalg.vector_norm(quats, dim=-1, keepdim=True)) * scales[:, None, :]
+    a, _, c, _ = _footprints(p, axes, camera, BLUR, TAN_MARGIN)
+    reach = torch.sqrt(2 * torch.log(opacities.clamp(min=2 * NOTHING) / NOTHING))
+    fx, fy, cx, cy = (float(v) for v in camera.arrays()[1])
+    u, v = fx * p[:, 0] / p[:, 2] + cx, fy * p[:, 1] / p[:, 2] + cy
+    across = (u + reach * a.sqrt() > 0) & (u - reach * a.sqrt() < camera.width)
+    down = (v + reach * c.sqrt() > 0) & (v - reach * c.sqrt() < camera.height)
+    return (ahead & across & down).numpy()
+
+
+def join(scene: Any, parts: Iterator[tuple[tuple[int, int, int, int], dict[str, np.ndarray]]]) -> dict[str, np.ndarray]:
+    """The whole exact picture and gradients of its parts."""
+    height, width = scene["labels"].shape
+    whole = {"color": np.zeros((3, height, width)), "weight": np.zeros((height, width))}
+    whole |= {f"g_{name}": np.zeros(scene[name].shape) for name in PARAMETERS}
+    for (x, y, w, h), found in parts:
+        whole["color"][:, y : y + h, x : x + w] = found["color"]
+        whole["weight"][y : y + h, x : x + w] = found["weight"]
+        for name in PARAMETERS:
+            whole[f"g_{name}"][found["drawn"]] += found[f"g_{name}"]
+    return whole
+
+
+def camera_of(scene: Any) -> Any:
+    """The camera that a scene file holds."""
+    from backend.raster import Camera
+
+    height, width = scene["labels"].shape
+    return Camera(scene["viewmat"], scene["K"], width, height)
+
+
+# --- variants --------------------------------------------------------------------------------------------------------
+
+
+def exp2_coefficients(degree: int) -> tuple[float, ...]:
+    """Of the polynomial of `degree` for 2^f on [-1/2, 1/2], highest first: that of the product's kernels at their own
+    degree, otherwise a fit of the relative error at Chebyshev's points, nearly the best there is."""
+    from backend.raster import simd
+
+    if degree == len(simd._EXP2) - 1:
+        return simd._EXP2
+    f = 0.5 * np.cos(np.pi * (np.arange(200) + 0.5) / 200)
+    powers = f[:, None] ** np.arange(degree, -1, -1)
+    return tuple(np.linalg.lstsq(powers / np.exp2(f)[:, None], np.ones(len(f)), rcond=None)[0].tolist())
+
+
+def _set_everywhere(**values: float) -> None:
+    """Give a constant another value, of the type it has, in every module of the rasterizer that knows it."""
+    for name, value in values.items():
+        owners = [m for key, m in list(sys.modules.items()) if key.startswith("backend.raster") and hasattr(m, name)]
+        if not owners:
+            raise RuntimeError(f"no module of the rasterizer has the constant {name} any more")
+        for owner in owners:
+            setattr(owner, name, type(getattr(owner, name))(value))
+
+
+def _alpha_min(value: float) -> None:
+    _set_everywhere(ALPHA_MIN=value, _LOG2_CUT=math.log2(value))
+
+
+def _stop(value: float) -> None:
+    _set_everywhere(STOP=value, _STOP=value)
+
+
+def _exp_degree(degree: int) -> None:
+    from backend.raster import simd
+
+    shared.replace(simd, "_EXP2", exp2_coefficients(degree))
+
+
+def _tile(size: tuple[int, int]) -> None:
+    from backend.raster import simd
+
+    width, height = size
+    _set_everywhere(TILE_W=width, TILE_H=height, STRIDE=width + simd.LANES, ROW_SLOTS=height + simd.LANES)
+
+
+def _bounds(kind: str) -> None:
+    """`box`: tiles and pixels of the ellipse's box; `tiles`, `box tiles` and `square`: every pixel of the tiles of
+    16 x 16 that the ellipse, its box or a square of 3 sigma (of the longer axis) meets."""
+    from numba import njit, prange
+
+    from backend.raster import cpu, cpu_bin, cpu_tiles, simd
+    from backend.raster.splats import HALF_H, HALF_W, LOP, SLOPE, A, C, U, V
+
+    if kind != "box":
+        _tile((16, 16))
+    tile_w, half_log2e = cpu_bin.TILE_W, 0.5 / math.log(2.0)
+    whole = kind != "box"
+    half = np.float32(0.5)
+
+    @njit(inline="always", error_model="numpy")
+    def rows(splats, n, tile_x, tile_y, rows, height, starts, stops, tops, centres):
+        v = splats[n, V]
+        anchor = min(max(v, np.float32(0.0)), np.float32(height))
+        u = splats[n, U] - half - np.float32(tile_x)
+        y0, y1, start, stop = 0, rows, 0, tile_w
+        if not whole:
+            y0 = max(int(math.floor(v - splats[n, HALF_H])) - tile_y, 0)
+            y1 = min(int(math.floor(v + splats[n, HALF_H])) + 1 - tile_y, rows)
+            middle = u + splats[n, SLOPE] * (v - anchor)
+            start = max(int(math.floor(middle - splats[n, HALF_W])), 0)
+            stop = min(int(math.floor(middle + splats[n, HALF_W])) + 2, tile_w)
+        for row in range(y0, y1, simd.LANES):
+            y = simd.ramp(np.float32(tile_y + row) + half)
+            dy = y - simd.splat(v)
+            simd.store(tops, row, simd.splat(splats[n, LOP]) - simd.splat(splats[n, C]) * dy * dy)
+            simd.store(centres, row, simd.splat(u) + simd.splat(splats[n, SLOPE]) * (y - simd.splat(anchor)))
+            simd.store(starts, row, simd.splat_i(np.int32(start)))
+            simd.store(stops, row, simd.splat_i(np.int32(stop)))
+        return y0, y1
+
+    @njit(error_model="numpy")
+    def ends(splats, n, row, columns, height, tile_w, tile_h):
+        anchor = min(max(splats[n, V], np.float32(0.0)), np.float32(height))
+        u = splats[n, U] + splats[n, SLOPE] * (splats[n, V] - anchor)
+        first = max(int(math.floor((u - splats[n, HALF_W] - half) / np.float32(tile_w))), 0)
+        last = min(int(math.floor((u + splats[n, HALF_W] + half) / np.float32(tile_w))) + 1, columns)
+        return first, last
+
+    @njit(parallel=True, error_model="numpy")
+    def square(splats):
+        for n in prange(splats.shape[0]):
+            if splats[n, HALF_H] > 0:
+                c = half_log2e / splats[n, C]
+                b = splats[n, SLOPE] * c
+                a = half_log2e / splats[n, A] + b * b / c
+                longest = 0.5 * (a + c) + math.sqrt(0.25 * (a - c) * (a - c) + b * b)
+                splats[n, HALF_W] = splats[n, HALF_H] = 3.0 * math.sqrt(longest)
+
+    shared.replace(cpu_tiles, "splat_rows", rows)
+    if kind != "tiles":
+        shared.replace(cpu_bin, "row_ends", ends)
+    if kind == "square":
+
+        def project_squares(*arguments: Any) -> None:
+            project(*arguments)
+            square(arguments[8])
+
+        project = shared.replace(cpu, "project", project_squares)
+
+
+def _sort(kind: str) -> None:
+    """`argsort`: NumPy's; `16 bits` or `8 bits` of the depths' range, ties as they come; `none`: in the order of the
+    model; `tiles`: each tile's list by itself; `keys`: one sort of all meetings by tile and depth."""
+    from numba import njit, prange
+
+    from backend.raster import cpu
+    from backend.raster.splats import DEPTH, HALF_H
+
+    def visible(splats: np.ndarray) -> np.ndarray:
+        return np.flatnonzero(splats[:, HALF_H] > 0).astype(np.int32)
+
+    def order(splats: np.ndarray, ids: np.ndarray) -> np.ndarray:
+        found = visible(splats)
+        depths = splats[found, DEPTH]
+        if kind == "argsort":
+            return found[np.argsort(depths, kind="stable")]
+        if kind.endswith("bits") and len(found):
+            steps = 2 ** int(kind.split()[0]) - 1
+            low, high = depths.min(), depths.max()
+            keys = ((depths - low) * (steps / max(high - low, 1e-30))).astype(np.uint16)
+            return found[np.argsort(keys, kind="stable")]
+        return found
+
+    @njit(parallel=True)
+    def by_tile(splats, tiles, members, places):
+        for tile in prange(tiles.size - 1):
+            first, last = tiles[tile], tiles[tile + 1]
+            here, there = members[first:last].copy(), places[first:last].copy()
+            depths = np.empty(last - first, np.float32)
+            for i in range(last - first):
+                depths[i] = splats[here[i], DEPTH]
+            sequence = np.argsort(depths, kind="mergesort")
+            for i in range(last - first):
+                members[first + i] = here[sequence[i]]
+                places[first + i] = there[sequence[i]]
+
+    def by_key(splats: np.ndarray, tiles: np.ndarray, members: np.ndarray, places: np.ndarray) -> None:
+        tile = np.repeat(np.arange(tiles.size - 1, dtype=np.uint64), np.diff(tiles))
+        bits = np.ascontiguousarray(splats[members, DEPTH]).view(np.uint32)
+        sequence = np.argsort(tile << np.uint64(32) | bits, kind="stable")
+        members[:], places[:] = members[sequence], places[sequence]
+
+    shared.replace(cpu, "depth_order", order)
+    if kind in ("tiles", "keys"):
+        sort = by_tile if kind == "tiles" else by_key
+
+        def bin_and_sort(splats: np.ndarray, order: np.ndarray, width: int, height: int) -> Any:
+            tiles, members, places, slots = bin_splats(splats, order, width, height)
+            sort(splats, tiles, members, places)
+            return tiles, members, places, slots
+
+        bin_splats = shared.replace(cpu, "bin_splats", bin_and_sort)
+
+
+class _Doubled(importlib.machinery.SourceFileLoader):
+    """Loads a module of the rasterizer with every float32 as float64."""
+
+    _EXP2 = (
+        ("_INTS", "ir.VectorType(ir.IntType(64), LANES)"),
+        ("[23]", "[52]"),
+        ("12582912.0", "6755399441055744.0"),
+        ("-126.0", "-1022.0"),
+    )
+    _SIMD = (("ir.FloatType()", "ir.DoubleType()"), ("types.float32", "types.float64"), ("}f32", "}f64"))
+
+    def get_code(self, fullname: str) -> Any:
+        source = Path(self.path).read_text()
+        if fullname.endswith(".simd"):
+            head, exp2 = source.split("def exp2(")
+            source = _replaced(head, self._SIMD) + "def exp2(" + _replaced(exp2, self._EXP2)
+        return compile(source.replace("np.float32", "np.float64"), self.path, "exec", dont_inherit=True)
+
+
+def _replaced(text: str, pairs: tuple[tuple[str, str], ...]) -> str:
+    for old, new in pairs:
+        if old not in text:
+            raise RuntimeError(f"backend/raster/simd.py has no {old} to be replaced any more")
+        text = text.replace(old, new)
+    return text
+
+
+class _DoubledFinder(importlib.abc.MetaPathFinder):
+    _NAMES = ("simd", "splats", "discs", "tiles", "cpu", "cpu_bin", "cpu_tiles", "cpu_project", "cpu_ids")
+
+    def find_spec(self, fullname: str, path: Any, target: Any = None) -> Any:
+        package, _, name = fullname.rpartition(".")
+        if package != "backend.raster" or name not in self._NAMES:
+            return None
+        found = importlib.machinery.PathFinder.find_spec(fullname, path)
+        assert found is not None and found.origin is not None
+        found.loader = _Doubled(fullname, found.origin)
+        return found
+
+
+_CHANGES: dict[str, Callable[[Any], None]] = {
+    "alpha_min": _alpha_min,
+    "stop": _stop,
+    "exp_degree": _exp_degree,
+    "tile": _tile,
+    "bounds": _bounds,
+    "sort": _sort,
+}
+
+
+# --- the process -----------------------------------------------------------------------------------------------------
+
+
+def main() -> None:
+    """Say how far the variant is from the exact picture, then time one forward and backward for each line that comes:
+    a JSON object each."""
+    changes, scene_file, exact_file = json.loads(sys.argv[1]), sys.argv[2], sys.argv[3]
+    kind = np.float64 if changes.pop("float64", False) else np.float32
+    if kind is np.float64:
+        sys.meta_path.insert(0, _DoubledFinder())
+    from backend.raster import cpu
+
+    for name, value in changes.items():
+        _CHANGES[name](value)
+    scene, exact = np.load(scene_file), np.load(exact_file)
+    gaussians = cpu.Gaussians(*(np.ascontiguousarray(scene[name], kind) for name in PARAMETERS), ids=scene["ids"])
+    camera, labels = camera_of(scene), scene["labels"]
+    towards = [np.ascontiguousarray(scene[name], kind) for name in ("g_color", "g_alpha", "g_weight")]
+
+    started = time.perf_counter()
+    frame = cpu.forward(gaussians, camera, labels)
+    gradients = cpu.backward(frame, *towards)
+    print(json.dumps({"compile_seconds": time.perf_counter() - started, **errors(frame, gradients, exact)}), flush=True)
+    for _ in sys.stdin:
+        times = [time.perf_counter()]
+        frame = cpu.forward(gaussians, camera, labels)
+        times.append(time.perf_counter())
+        cpu.backward(frame, *towards)
+        times.append(time.perf_counter())
+        print(json.dumps({"forward_ms": 1e3 * (times[1] - times[0]), "backward_ms": 1e3 * (times[2] - times[1])}))
+        sys.stdout.flush()
+
+
+def errors(frame: Any, gradients: Any, exact: Any) -> dict[str, float]:
+    """picture: root of the mean squared error of the colours, in steps of 8 bits; largest: the largest one; gradient:
+    length of the difference as a part of the exact gradient's, the root mean square over PARAMETERS."""
+    picture = 255 * (frame.color - exact["color"])
+    parts = []
+    for name in PARAMETERS:
+        true = exact[f"g_{name}"]
+        parts.append(np.linalg.norm(getattr(gradients, name) - true) / max(np.linalg.norm(true), 1e-300))
+    return {
+        "picture": float(np.sqrt(np.mean(picture**2))),
+        "largest": float(np.abs(picture).max()),
+        "gradient": float(np.sqrt(np.mean(np.square(parts)))),
+    }
+
+
+if __name__ == "__main__":
+    main()

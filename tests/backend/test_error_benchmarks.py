@@ -1,0 +1,78 @@
+"""What the benchmarks of error against time and of mask noise conclude, and what they change in the kernels."""
+
+import importlib.util
+
+import numpy as np
+import pytest
+
+from benchmarks import approximations, mask_noise, raster_variants
+
+
+def test_only_a_variant_that_is_worse_in_nothing_is_better_than_the_default():
+    default, noise = (1.0, 0.3), (0.03, 0.01)
+    others = {
+        "faster": (0.9, 0.305),
+        "faster, further off": (0.9, 0.5),
+        "closer": (1.02, 0.2),
+        "equal but for noise": (0.98, 0.295),
+        "slower": (1.2, 0.3),
+    }
+    assert approximations.better_than(default, others, noise) == ["faster", "closer"]
+
+
+def test_every_choice_has_its_default_among_its_variants_and_no_other_like_it():
+    for choices in (approximations.raster_choices, approximations.training_choices, approximations.mesh_choices):
+        for choice in choices():
+            assert choice.variants[choice.default] == {}
+            assert sum(not changes for changes in choice.variants.values()) == 1
+
+
+@pytest.mark.parametrize("degree, least", [(2, 4e-3), (3, 2e-4), (5, 3e-7), (7, 1e-9)])
+def test_a_polynomial_of_higher_degree_is_closer_to_the_exponential(degree, least):
+    f = np.linspace(-0.5, 0.5, 999)
+    values = np.polyval(raster_variants.exp2_coefficients(degree), f)
+    assert np.abs(values / np.exp2(f) - 1).max() < least
+
+
+def test_the_kernels_can_still_be_read_as_float64():
+    for name in raster_variants._DoubledFinder._NAMES:
+        spec = importlib.util.find_spec(f"backend.raster.{name}")
+        assert raster_variants._Doubled(spec.name, spec.origin).get_code(spec.name)
+
+
+def test_a_constant_that_the_rasterizer_no_longer_has_is_named():
+    with pytest.raises(RuntimeError, match="_NO_SUCH"):
+        raster_variants._set_everywhere(_NO_SUCH=1.0)
+
+
+def test_the_parts_of_a_picture_cover_it_once():
+    covered = np.zeros((100, 130), int)
+    for x, y, width, height in raster_variants.parts_of(130, 100):
+        covered[y : y + height, x : x + width] += 1
+    assert (covered == 1).all()
+
+
+def test_holes_are_what_an_object_encloses_of_itself():
+    true = np.ones((30, 40), int)
+    true[10:16, 10:16] = 2  # stands in front of 1, which has no hole there
+    found = true.copy()
+    found[2:4, 2:6] = 0
+    found[20:22, 20:22] = 2
+    found[25, 30] = 0  # a speck
+    found[0:5, 39] = 0  # at the border, so not enclosed
+    assert mask_noise.holes_of(found, true) == (2, 12)
+
+
+@pytest.mark.parametrize("kind", ["wrong IDs", "holes", "segmenter", "missing masks"])
+def test_mistakes_grow_with_their_level_and_leave_the_truth_as_it_is(kind):
+    true = np.repeat(np.arange(1, 9), 10)[None].repeat(60, 0)
+    before = true.copy()
+    mistake = mask_noise.KINDS[kind][0]
+
+    def wrong(level):
+        given = (mistake(true, level, np.random.default_rng(seed)) for seed in range(40))
+        return np.mean([1.0 if ids is None else (ids != true).mean() for ids in given])
+
+    low, high = wrong(0.1), wrong(0.5)
+    assert 0.01 < low < 0.2 and low < high and (kind == "segmenter" or high == pytest.approx(0.5, abs=0.15))
+    assert (true == before).all()
