@@ -62,10 +62,17 @@ class ObjectItem(bpy.types.PropertyGroup):
     stored: StringProperty(name="Stored", description="What objects.json says: what a refused edit goes back to")
 
 
+class PlanChoice(bpy.types.PropertyGroup):
+    """What the user wants of a decision of the plan; `name` is its key."""
+
+    done: BoolProperty(name="Done", description="Whether training does it")
+
+
 class ReconstructionProperties(bpy.types.PropertyGroup):
     """State of one reconstruction, on its collection."""
 
     objects: CollectionProperty(type=ObjectItem)
+    plan_choices: CollectionProperty(type=PlanChoice)
     active_object: IntProperty(name="Active Object", default=0, update=object_edits.active_changed, options=set())
     minutes: FloatProperty(
         name="Minutes", default=5.0, min=0.1, soft_max=120.0, precision=1, step=50,
@@ -130,7 +137,7 @@ class SceneProperties(bpy.types.PropertyGroup):
         update=drawing.redraw)
 
 
-CLASSES = (ObjectItem, ReconstructionProperties, SceneProperties)
+CLASSES = (ObjectItem, PlanChoice, ReconstructionProperties, SceneProperties)
 
 
 def register():

@@ -27,18 +27,17 @@ def plan(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     folder = Reconstruction(options.out) if options.out else None
     with ExitStack() as held:
         if folder is not None:
-            with removed_if_refused(folder):
-                folder.create()
-                held.enter_context(locked(folder.folder))
+            held.enter_context(removed_if_refused(folder))
+            folder.create()
+            held.enter_context(locked(folder.folder))
         # Pictures that were prepared already may be looked at; nothing is prepared for a plan.
         cache = folder.cache if folder is not None and folder.cameras.exists() else None
-        with removed_if_refused(folder) if folder is not None else ExitStack():
-            capture = load_capture(options.capture, cache, memory_for_files(options), options.max_size, reporter)
-            objects, _ = asked_objects(folder, capture, options)
-            point_ids = voted_ids(folder, capture) if folder is not None else None
-            found = decide(look_at(capture, choices(options), objects, point_ids))
-            if folder is not None:
-                write_plan(folder.plan, found)
+        capture = load_capture(options.capture, cache, memory_for_files(options), options.max_size, reporter)
+        objects, _ = asked_objects(folder, capture, options)
+        point_ids = voted_ids(folder, capture) if folder is not None else None
+        found = decide(look_at(capture, choices(options), objects, point_ids))
+        if folder is not None:
+            write_plan(folder.plan, found)
     for decision in found.decisions:
         reporter.status(decision.sentence())
     reporter.done(plan=found.as_list())

@@ -234,18 +234,13 @@ def _surface(look: Look) -> Decision | None:
     return Decision("surface", "normals and distortion of flat splats", look.choices.meshes, why)
 
 
-def _faint_splats(look: Look) -> Decision:
-    why = "splats of less than 1/255 opacity are not drawn anyway"
-    return Decision("faint-splats", "splats in files that cannot be seen", False, why)
-
-
 DECISIONS: tuple[Callable[[Look], Decision | None], ...] = (
     _votes, _objects, _groups, _rest, _labels, _undistortion, _duplicate_views, _blind_views, _other_views,
-    _unseen_points, _exposure, _pyramid, _meshes, _surface, _faint_splats,
+    _unseen_points, _exposure, _pyramid, _meshes, _surface,
 )  # fmt: skip
 """In the order of `KEYS`; one may build on those before it. None where the capture gives no cause to decide."""
 
-OF_TRAINING = tuple(key for key in KEYS if key not in ("objects", "groups", "undistortion", "meshes", "faint-splats"))
+OF_TRAINING = tuple(key for key in KEYS if key not in ("objects", "groups", "undistortion", "meshes"))
 """What cannot be changed once a training has begun."""
 
 

@@ -18,7 +18,7 @@ from ..protocol import InputError, read_json, write_json
 
 KEYS = (
     "votes", "objects", "groups", "rest", "labels", "undistortion", "duplicate-views", "blind-views", "other-views",
-    "unseen-points", "exposure", "pyramid", "meshes", "surface", "faint-splats",
+    "unseen-points", "exposure", "pyramid", "meshes", "surface",
 )  # fmt: skip
 """What is decided about, in this order."""
 
