@@ -35,6 +35,11 @@ def want(properties, key: str, done: bool) -> None:
     choice.name, choice.done = key, done
 
 
+def sentence_case(text: str) -> str:
+    """A part of a sentence as one of its own."""
+    return text[:1].upper() + text[1:]
+
+
 def arguments(root) -> list[str]:
     """How to train, as options of the backend's commands `plan` and `train`."""
     properties = root.objectgs

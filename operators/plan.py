@@ -37,12 +37,12 @@ class OverrideDecision(bpy.types.Operator):
     bl_description = "Have this otherwise than planned"
     bl_options = {"REGISTER", "UNDO"}
 
-    key: StringProperty(name="Decision", options={"SKIP_SAVE"}, description="Name of the decision in the plan")
+    key: StringProperty(name="Decision", options={"HIDDEN", "SKIP_SAVE"}, description="Its name in the plan")
 
     @classmethod
     def description(cls, context, properties):
         decision = planning.plan_of(scene.folder_of(need.active_root(context)))[properties.key]
-        return cls.bl_description if decision is None else decision.why[:1].upper() + decision.why[1:]
+        return cls.bl_description if decision is None else planning.sentence_case(decision.why)
 
     @classmethod
     def poll(cls, context):

@@ -5,6 +5,7 @@ import bpy
 
 from .. import planning, running, scene
 from ..job_display import write
+from ..planning import sentence_case
 from .tab import WithReconstruction
 
 
@@ -29,16 +30,15 @@ class PlanPanel(WithReconstruction, bpy.types.Panel):
 def _draw(layout, properties, decision) -> None:
     """A decision as a row: ticked where it is done, and why where it is not."""
     done = planning.is_wanted(properties, decision)
-    column = layout.column(align=True)
-    text = decision.what[:1].upper() + decision.what[1:]
+    row = layout.row(align=True)
     if decision.can_override and done is not None:
-        row = column.row()
-        row.alignment = "LEFT"
-        row.operator("objectgs.override_decision", text=text, emboss=False,
+        row.operator("objectgs.override_decision", text="", emboss=False,
                      icon="CHECKBOX_HLT" if done else "CHECKBOX_DEHLT").key = decision.key
     else:
-        write(column, text, {True: "CHECKMARK", False: "X", None: "TIME"}[done])
+        row.label(text="", icon={True: "CHECKMARK", False: "X", None: "TIME"}[done])
+    column = row.column(align=True)
+    write(column, sentence_case(decision.what))
     if not done:
         reason = column.column(align=True)
         reason.active = False
-        write(reason, decision.why[:1].upper() + decision.why[1:], "BLANK1")
+        write(reason, sentence_case(decision.why))
