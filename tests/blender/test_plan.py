@@ -14,6 +14,8 @@ from objectgs.backend.objects import read_objects  # noqa: E402
 from objectgs.backend.planning.plan import Decision, Plan, write_plan  # noqa: E402
 from objectgs.backend.protocol import Reconstruction  # noqa: E402
 from objectgs.objectgs_addon import jobs, locations, planning, running, scene  # noqa: E402
+from objectgs.objectgs_addon.headless import commands  # noqa: E402
+from objectgs.objectgs_addon.headless.arguments import parse  # noqa: E402
 
 
 @pytest.fixture
@@ -84,3 +86,17 @@ def test_a_labels_file_groups_objects(root, tmp_path):
     labels.write_text("[]")
     with pytest.raises(RuntimeError, match="no groups"):
         bpy.ops.objectgs.group_objects(filepath=str(labels))
+
+
+def test_headless_hands_groups_on_from_where_it_was_called(monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(commands, "find_backend", lambda _python: None)
+    monkeypatch.setattr(commands, "run_backend", lambda command, folder, *words: asked.append((command, folder, *words)))
+    commands.plan(parse(["plan", "garden", "--no-meshes"]))
+    commands.plan(parse(["plan", "garden", "--out", "made", "--groups", "g.json", "--keep", "all"]))
+    commands.backend(parse(["vote", "garden", "--out", "made", "--groups", "g.json"]))
+    garden, made, groups = tmp_path / "garden", tmp_path / "made", ("--groups", tmp_path / "g.json")
+    assert asked == [("plan", None, garden, "--no-meshes"),
+                     ("plan", made, garden, "--out", made, *groups, "--keep", "all"),
+                     ("vote", made, garden, "--out", made, *groups)]
