@@ -1,2 +1,2 @@
 """What a scene needs and what it can do without, decided before any work: `plan` holds decisions, `decisions` makes
-them, `groups` reads which objects count as one."""
+them from what `coverage` finds, `choosing` says which objects are made and which are one."""
