@@ -88,7 +88,8 @@ def main() -> None:
     found: dict[str, dict[str, Any]] = {}
     for name, more in trainings(capture, extra, options.needed).items():
         found[name] = measured(capture, [*length_options, *extra, *more])
-        print(f"{name}: done", file=sys.stderr, flush=True)
+        figures = ", ".join(f"{key} {found[name][key]}" for key in ("cpu_seconds", "peak_mb", "psnr", "miou"))
+        print(f"{name}: {figures}", file=sys.stderr, flush=True)
     planned, whole = found["as planned"], found["nothing left out"]
     costs = None if planned["psnr"] is None else whole["psnr"] - planned["psnr"]
     if options.json:
