@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from . import __version__, lacking
+from .planning.plan import EVERYTHING, KEYS
 from .protocol import (
     EXIT_BAD_INPUT,
     EXIT_CANCELLED,
@@ -32,6 +33,7 @@ model of their cameras in sparse/0, and, for objects, one picture of object IDs
 for each image in masks/. What is made of it goes into a reconstruction folder.
 
   python -m backend check    garden                      what is in the capture?
+  python -m backend plan     garden                      what does it need?
   python -m backend train    garden --out garden-splats  make the splats (5 minutes)
   python -m backend mesh     garden-splats               make each object's mesh
   python -m backend evaluate garden-splats               how good are they?
@@ -54,6 +56,13 @@ images without a pose, masks, objects. Nothing is written.
 _IMPORT = """\
 Get a capture ready to be shown: undistort its images once, and leave its cameras in
 cameras.json and its points in points.ply. `vote` and `train` do this by themselves.
+"""
+
+_PLAN = """\
+Say what training would do with a capture and what it would leave out, and why: nothing
+is trained and no image is changed. Takes the options of `train`, whose --keep and
+--leave-out change the plan. With --out, what DIR knows already counts (votes, objects
+that are left out), and the plan is left in DIR/plan.json.
 """
 
 _VOTE = """\
@@ -173,21 +182,41 @@ def parser() -> argparse.ArgumentParser:
         sub.add_argument("capture", type=Path, metavar="CAPTURE", help="folder with images/, sparse/0/ and masks/")
         size_option(sub)
 
-    def making_options(sub: argparse.ArgumentParser) -> None:
+    def making_options(sub: argparse.ArgumentParser, out_required: bool = True) -> None:
         capture_options(sub)
         memory_option(sub)
         sub.add_argument(
-            "--out", type=Path, required=True, metavar="DIR", help="reconstruction folder, made where it is not there"
-        )
+            "--out", type=Path, required=out_required, metavar="DIR",
+            help="reconstruction folder, made where it is not there",
+        )  # fmt: skip
 
-    def vote_options(sub: argparse.ArgumentParser) -> None:
-        making_options(sub)
+    def vote_options(sub: argparse.ArgumentParser, out_required: bool = True) -> None:
+        making_options(sub, out_required)
         sub.add_argument(
             "--strategy", choices=("majority", "probability", "correspondence"), default="majority",
             help="a point's object: the one most masks show there (majority), one drawn as often as masks show it, "
             "or only by masks of images in which COLMAP found the point",
         )  # fmt: skip
         sub.add_argument("--seed", type=_seed, default=0, metavar="N", help="same seed, same result (0)")
+        sub.add_argument(
+            "--only", nargs="+", metavar="OBJECT",
+            help="make these objects, by names or IDs; the others stay part of the unlabelled rest",
+        )  # fmt: skip
+        sub.add_argument(
+            "--groups", type=Path, metavar="FILE",
+            help='IDs that are one object: a labels file that gives them one name, {"1": "chair", "2": "chair"}',
+        )  # fmt: skip
+
+    def plan_options(sub: argparse.ArgumentParser) -> None:
+        group = sub.add_argument_group("what is left out; `plan` says what and why")
+        group.add_argument(
+            "--keep", nargs="+", default=[], choices=(*KEYS, EVERYTHING), metavar="KEY",
+            help=f"do what the plan leaves out: {', '.join(KEYS)}, or {EVERYTHING} of them",
+        )  # fmt: skip
+        group.add_argument(
+            "--leave-out", nargs="+", default=[], choices=KEYS, metavar="KEY", help="leave out what the plan does"
+        )
+        group.add_argument("--no-meshes", action="store_true", help="no meshes will be made of these splats")
 
     check = command("check", "say what a capture holds and what is wrong with it", _CHECK, "garden")
     capture_options(check)
@@ -198,56 +227,66 @@ def parser() -> argparse.ArgumentParser:
     vote = command("vote", "give each point its object, from the masks", _VOTE, "garden --out garden-splats")
     vote_options(vote)
 
-    train = command("train", "make the splats", _TRAIN, "garden --out garden-splats --minutes 10")
-    vote_options(train)
-    device_option(train)
-    length = train.add_mutually_exclusive_group()
-    length.add_argument(
-        "--minutes", type=_amount, metavar="M", help="train this long in all (5); with --preset final at most this long"
-    )
-    length.add_argument("--steps", type=_count, metavar="N", help="train this many steps in all, however long it takes")
-    train.add_argument(
-        "--preset", choices=("preview", "standard", "final"),
-        help="instead: preview, 600 steps, shows whether all is well; standard, 2500 steps; final goes on until the "
-        "error on held-out views has flattened",
-    )  # fmt: skip
-    train.add_argument("--restart", action="store_true", help="forget an earlier training in DIR")
-    train.add_argument(
-        "--checkpoint-seconds", type=_amount, default=30.0, metavar="S",
-        help="the most work that a crash can cost (30)",
-    )  # fmt: skip
-    finer = train.add_argument_group("how the splats are made; the defaults suit most captures")
-    finer.add_argument(
-        "--mode", choices=("explicit", "view"), default="explicit",
-        help="explicit: splats.ply is exactly the model; view: as in the paper, splats change with the camera and "
-        "splats.ply is a fit (explicit)",
-    )  # fmt: skip
-    finer.add_argument(
-        "--primitive", choices=("3d", "2d"), default="3d",
-        help="2d: flat splats, which lie on the surfaces; splats.ply holds them as thin Gaussians (3d)",
-    )  # fmt: skip
-    finer.add_argument(
-        "--sh-degree", type=int, choices=(0, 1, 2, 3), default=1,
-        help="how much colour may change with direction, in explicit mode; 0: not at all (1)",
-    )  # fmt: skip
-    finer.add_argument(
-        "--background", choices=("learned", "black", "white"), default="learned", help="behind all splats (learned)"
-    )
-    finer.add_argument(
-        "--voxel", type=_amount, metavar="SIZE", help="finest detail, in the capture's units (automatic)"
-    )
-    finer.add_argument("--offsets", type=_count, metavar="N", help="splats around each anchor (10)")
-    finer.add_argument("--max-anchors", type=_count, metavar="N", help="growth stops there (200000)")
-    finer.add_argument(
-        "--semantic-weight", type=_weight, metavar="W", help="how much masks count; 0.01 for poor ones (0.1)"
-    )
-    finer.add_argument(
-        "--normal-weight", type=_weight, metavar="W", help="how smooth a surface flat splats make (0.05)"
-    )
-    finer.add_argument(
-        "--distortion-weight", type=_weight, metavar="W", help="how much flat splats are drawn to one depth (10)"
-    )
-    finer.add_argument("--unlabelled-is-object", action="store_true", help="ID 0 is an object too, not just unlabelled")
+    for name, summary, description, example in (
+        ("plan", "say what a capture needs and what it can do without", _PLAN, "garden"),
+        ("train", "make the splats", _TRAIN, "garden --out garden-splats --minutes 10"),
+    ):
+        train = command(name, summary, description, example)
+        vote_options(train, out_required=name == "train")
+        device_option(train)
+        length = train.add_mutually_exclusive_group()
+        length.add_argument(
+            "--minutes", type=_amount, metavar="M",
+            help="train this long in all (5); with --preset final at most this long",
+        )  # fmt: skip
+        length.add_argument(
+            "--steps", type=_count, metavar="N", help="train this many steps in all, however long it takes"
+        )
+        train.add_argument(
+            "--preset", choices=("preview", "standard", "final"),
+            help="instead: preview, 600 steps, shows whether all is well; standard, 2500 steps; final goes on until "
+            "the error on held-out views has flattened",
+        )  # fmt: skip
+        train.add_argument("--restart", action="store_true", help="forget an earlier training in DIR")
+        train.add_argument(
+            "--checkpoint-seconds", type=_amount, default=30.0, metavar="S",
+            help="the most work that a crash can cost (30)",
+        )  # fmt: skip
+        finer = train.add_argument_group("how the splats are made; the defaults suit most captures")
+        finer.add_argument(
+            "--mode", choices=("explicit", "view"), default="explicit",
+            help="explicit: splats.ply is exactly the model; view: as in the paper, splats change with the camera and "
+            "splats.ply is a fit (explicit)",
+        )  # fmt: skip
+        finer.add_argument(
+            "--primitive", choices=("3d", "2d"), default="3d",
+            help="2d: flat splats, which lie on the surfaces; splats.ply holds them as thin Gaussians (3d)",
+        )  # fmt: skip
+        finer.add_argument(
+            "--sh-degree", type=int, choices=(0, 1, 2, 3), default=1,
+            help="how much colour may change with direction, in explicit mode; 0: not at all (1)",
+        )  # fmt: skip
+        finer.add_argument(
+            "--background", choices=("learned", "black", "white"), default="learned", help="behind all splats (learned)"
+        )
+        finer.add_argument(
+            "--voxel", type=_amount, metavar="SIZE", help="finest detail, in the capture's units (automatic)"
+        )
+        finer.add_argument("--offsets", type=_count, metavar="N", help="splats around each anchor (10)")
+        finer.add_argument("--max-anchors", type=_count, metavar="N", help="growth stops there (200000)")
+        finer.add_argument(
+            "--semantic-weight", type=_weight, metavar="W", help="how much masks count; 0.01 for poor ones (0.1)"
+        )
+        finer.add_argument(
+            "--normal-weight", type=_weight, metavar="W", help="how smooth a surface flat splats make (0.05)"
+        )
+        finer.add_argument(
+            "--distortion-weight", type=_weight, metavar="W", help="how much flat splats are drawn to one depth (10)"
+        )
+        finer.add_argument(
+            "--unlabelled-is-object", action="store_true", help="ID 0 is an object too, not just unlabelled"
+        )
+        plan_options(train)
 
     def result(name: str, summary: str, description: str, example: str) -> argparse.ArgumentParser:
         sub = command(name, summary, description, example)

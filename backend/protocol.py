@@ -41,6 +41,7 @@ class Reconstruction:
         self.folder = Path(folder)
         self.settings = self.folder / "objectgs.json"
         self.objects = self.folder / "objects.json"
+        self.plan = self.folder / "plan.json"
         self.cameras = self.folder / "cameras.json"
         self.points = self.folder / "points.ply"
         self.checkpoint = self.folder / "checkpoint"

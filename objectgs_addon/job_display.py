@@ -85,4 +85,4 @@ def write(layout, text: str, icon: str = "NONE") -> None:
     column = layout.column(align=True)
     for line in textwrap.wrap(text, width):
         column.label(text=line, icon=icon)
-        icon = "BLANK1"
+        icon = icon if icon == "NONE" else "BLANK1"

@@ -4,10 +4,12 @@
 import json
 from collections.abc import Iterable
 from contextlib import contextmanager
+from pathlib import Path
 
 import bpy
 
 from ..backend.objects import SceneObject, edit_objects, merged, read_objects
+from ..backend.planning.choosing import grouped, read_groups
 from ..backend.protocol import InputError, Reconstruction
 from ..backend.recolour import Recolour
 from . import messages, scene, selection
@@ -129,6 +131,12 @@ def split(root, object_id: int) -> int:
         from_stored(item.merged_into) == object_id or from_stored(item.object_id) == object_id)]
     _edit(root, {part: {"merged_into": None} for part in apart})
     return len(apart)
+
+
+def group(root, labels: Path) -> None:
+    """Make one object of the IDs that a labels file gives one name; InputError where it is none."""
+    objects = read_objects(Reconstruction(scene.folder_of(root)).objects)
+    _edit(root, grouped(objects, read_groups(labels), labels))
 
 
 def choose(root, chosen: dict[int, bool]) -> None:

@@ -62,10 +62,17 @@ class ObjectItem(bpy.types.PropertyGroup):
     stored: StringProperty(name="Stored", description="What objects.json says: what a refused edit goes back to")
 
 
+class PlanChoice(bpy.types.PropertyGroup):
+    """What the user wants of a decision of the plan; `name` is its key."""
+
+    done: BoolProperty(name="Done", description="Whether training does it")
+
+
 class ReconstructionProperties(bpy.types.PropertyGroup):
     """State of one reconstruction, on its collection."""
 
     objects: CollectionProperty(type=ObjectItem)
+    plan_choices: CollectionProperty(type=PlanChoice)
     active_object: IntProperty(name="Active Object", default=0, update=object_edits.active_changed, options=set())
     length: EnumProperty(name="Length", default="minutes", description="How long to train in all", items=[
         ("preview", "Preview", "600 steps: a first look, to see whether all is well"),
@@ -135,7 +142,7 @@ class SceneProperties(bpy.types.PropertyGroup):
         update=drawing.redraw)
 
 
-CLASSES = (ObjectItem, ReconstructionProperties, SceneProperties)
+CLASSES = (ObjectItem, PlanChoice, ReconstructionProperties, SceneProperties)
 
 
 def register():

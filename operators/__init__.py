@@ -19,6 +19,7 @@ def _classes():
         orient,
         pause_job,
         pick_object,
+        plan,
         remove_object,
         reset_object,
         restore_object,
@@ -33,10 +34,10 @@ def _classes():
         vote,
     )
 
-    modules = (import_capture, make_demo, vote, train, extract_meshes, pause_job, stop_job, show_result, show_preview,
-               select_object, pick_object, find_objects, solo_object, merge_objects, choose_objects, mark_assets,
-               orient, remove_object, restore_object, duplicate_object, reset_object, export_splats, import_splats,
-               export_meshes, film_frames, set_up_compositor, set_up_backend)
+    modules = (import_capture, make_demo, vote, plan, train, extract_meshes, pause_job, stop_job, show_result,
+               show_preview, select_object, pick_object, find_objects, solo_object, merge_objects, choose_objects,
+               mark_assets, orient, remove_object, restore_object, duplicate_object, reset_object, export_splats,
+               import_splats, export_meshes, film_frames, set_up_compositor, set_up_backend)
     return [cls for module in modules for cls in module.CLASSES]
 
 

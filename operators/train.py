@@ -4,7 +4,7 @@
 import bpy
 from bpy.props import BoolProperty
 
-from ..objectgs_addon import locations, running, scene
+from ..objectgs_addon import locations, planning, running, scene
 from ..objectgs_addon.folder_state import folder_state
 from . import need
 
@@ -43,9 +43,7 @@ class Train(bpy.types.Operator):
                                    "extend the training, or use Train Anew")
             return {"CANCELLED"}
         length = ("--minutes", f"{properties.minutes:g}") if by_clock else ("--preset", properties.length)
-        arguments = ["train", str(state.capture), "--out", str(folder), *length,
-                     "--mode", properties.mode, "--sh-degree", str(properties.sh_degree), "--primitive",
-                     properties.primitive, "--strategy", properties.strategy, "--max-size", str(properties.max_size)]
+        arguments = ["train", str(state.capture), "--out", str(folder), *length, *planning.arguments(root)]
         if self.restart:
             arguments.append("--restart")
         job = locations.backend_job(f"Train {root.name}", "train", folder, *arguments)

@@ -9,9 +9,9 @@ import os
 import re
 import threading
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -86,8 +86,9 @@ class Capture:
     """Views sorted by name, points, and their images and ID maps, decoded on demand within a memory budget.
 
     `names` holds the labels' names without 0, `left_out` (n,) int64 the IDs that pass for 0, `warnings` sentences for
-    the user, `counts` what was found. Arrays that the methods return are shared and read-only; all methods may be
-    called from several threads.
+    the user, `counts` what was found. `prepared`: whether `image` and `mask` can be had, or would have to be resampled
+    first. Arrays that the methods return are shared and read-only; all methods
+    may be called from several threads.
     """
 
     def __init__(
@@ -102,6 +103,7 @@ class Capture:
         raw: list[tuple[Camera, Image]],
         colour_masks: bool,
         memory_mb: float,
+        prepared: bool = True,
     ) -> None:
         self.folder = folder
         self.views = views
@@ -113,6 +115,7 @@ class Capture:
         self._raw = raw
         self._colour_masks = colour_masks
         self._held = _Held(memory_mb * 1e6)
+        self.prepared = prepared
         self.left_out = np.zeros(0, np.int64)
         enough = len(views) >= _MIN_VIEWS_TO_HOLD_OUT
         held_out = [i for i in range(len(views)) if enough and i % HOLDOUT_EVERY == 0]
@@ -127,6 +130,19 @@ class Capture:
         other = copy.copy(self)
         other.left_out = np.unique(np.array(list(left_out), np.int64))
         other.names = {i: name for i, name in {**self.names, **names}.items() if i not in other.left_out}
+        return other
+
+    def without_masks(self) -> Capture:
+        """The same capture as if no image had an ID map; decoded files are shared."""
+        other = copy.copy(self)
+        other.views = tuple(replace(view, mask_file=None) for view in self.views)
+        other._ids_of_views = [()] * len(self.views)
+        return other
+
+    def without_training_on(self, names: Collection[str]) -> Capture:
+        """The same capture, where the views of these names are neither trained on nor held out."""
+        other = copy.copy(self)
+        other.train_indices = tuple(i for i in self.train_indices if self.views[i].name not in names)
         return other
 
     def without_left_out(self, ids: np.ndarray) -> np.ndarray:
@@ -147,6 +163,19 @@ class Capture:
     def ids_in(self, index: int) -> tuple[int, ...]:
         """The IDs, 0 among them, that occur in one view's mask, ascending; empty where it has none."""
         return tuple(np.unique(self.without_left_out(np.array(self._ids_of_views[index], np.int64))).tolist())
+
+    def camera_of(self, index: int) -> str:
+        """The model, as COLMAP calls it, of the camera that took a view."""
+        return self._raw[index][0].model
+
+    def is_original(self, index: int) -> bool:
+        """Whether a view's picture is used as it is on disk: no lens bends it, and it is not too large."""
+        view = self.views[index]
+        return _in_place(self._raw[index][0], view.width, view.height)
+
+    def observed(self, index: int) -> np.ndarray:
+        """Which points COLMAP observed in a view: (n,) int64, an index may come twice."""
+        return self._raw[index][1].point_index.astype(np.int64)
 
     def image(self, index: int, downscale: int = 1) -> np.ndarray:
         """A view's pixels: (height // downscale, width // downscale, 3) uint8, the mean over blocks of
@@ -422,7 +451,7 @@ def _in_parallel(work: Callable[[_T], _R], items: Iterable[_T]) -> Iterator[_R]:
 
 def load_capture(
     folder: str | Path,
-    cache: str | Path,
+    cache: str | Path | None,
     memory_mb: float = 2000,
     max_size: int = MAX_SIZE,
     reporter: Reporter | None = None,
@@ -431,20 +460,27 @@ def load_capture(
     labels.json or labels.txt.
 
     Images that are distorted, or longer than `max_size` pixels (0: any size), are resampled once into `cache`; later
-    loads only look whether their sources changed. `memory_mb` bounds what decoded images may take. Raises InputError
-    with one sentence that names the file; a run that is killed leaves no half-written file.
+    loads only look whether their sources changed. Without a cache nothing is resampled or written: such a capture is
+    only `prepared` where no image needs it. `memory_mb` bounds what decoded images may take. Raises InputError with one
+    sentence that names the file; a run that is killed leaves no half-written file.
     """
     reporter = reporter or Reporter()
-    folder, cache = Path(folder), Path(cache)
+    folder, cache = Path(folder), None if cache is None else Path(cache) / "views"
     survey = _survey(folder, max_size, _refuse, reporter)
-    try:
-        (cache / "views").mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"The folder {cache} cannot be written to ({error.strerror}); choose another.") from error
-    reporter.status("Preparing the images")
+    if cache is None:
+        reporter.status("Looking through the masks")
+    else:
+        try:
+            cache.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            what = f"The folder {cache.parent} cannot be written to ({error.strerror}); choose another."
+            raise InputError(what) from error
+        reporter.status("Preparing the images")
     views, ids_of_views = [], []
-    prepared = _in_parallel(lambda source: _prepare(source, survey, cache / "views"), survey.sources)
-    for done, (view, ids) in enumerate(prepared, 1):
+    found = _in_parallel(
+        lambda source: _looked_at(source, survey) if cache is None else _prepare(source, survey, cache), survey.sources
+    )
+    for done, (view, ids) in enumerate(found, 1):
         views.append(view)
         ids_of_views.append(ids)
         reporter.progress(done, len(survey.sources), what="images")
@@ -462,7 +498,36 @@ def load_capture(
         [(source.camera, source.image) for source in survey.sources],
         survey.colour_masks,
         memory_mb,
+        prepared=cache is not None
+        or all(_in_place(source.camera, source.target.width, source.target.height) for source in survey.sources),
     )
+
+
+def _in_place(camera: Camera, width: int, height: int) -> bool:
+    """Whether a camera's image needs no resampling to become a view of this size."""
+    return is_pinhole(camera) and (width, height) == (camera.width, camera.height)
+
+
+def _looked_at(source: _Source, survey: _Survey) -> tuple[View, tuple[int, ...]]:
+    """One view, checked but as it is on disk, and the IDs in its mask."""
+    _checked_size(source, image_size(source.image_path), survey.model.file("cameras"))
+    ids = () if source.mask_path is None else tuple(_distinct(_checked_mask(source, survey.colour_masks)))
+    return _view(source, source.image_path, source.mask_path), ids
+
+
+def _view(source: _Source, image_file: Path, mask_file: Path | None) -> View:
+    target, image = source.target, source.image
+    return View(
+        image.name, image_file, mask_file, target.K.copy(), image.viewmat, target.width, target.height,
+        source.camera.id,
+    )  # fmt: skip
+
+
+def _distinct(ids: np.ndarray) -> list[int]:
+    """The IDs of a mask, ascending; small ones are counted, which is faster than sorting all pixels."""
+    if ids.size and 0 <= ids.min() and ids.max() < 1 << 16:
+        return np.flatnonzero(np.bincount(ids.ravel())).tolist()
+    return np.unique(ids).tolist()
 
 
 def _prepare(source: _Source, survey: _Survey, cache: Path) -> tuple[View, tuple[int, ...]]:
@@ -496,10 +561,7 @@ def _prepare(source: _Source, survey: _Survey, cache: Path) -> tuple[View, tuple
             ) from error
     image_file = cache / stamp["image_file"] if stamp["image_file"] else source.image_path
     mask_file = cache / stamp["mask_file"] if stamp["mask_file"] else source.mask_path
-    view = View(
-        name, image_file, mask_file, target.K.copy(), source.image.viewmat, target.width, target.height, camera.id
-    )
-    return view, tuple(stamp["ids"])
+    return _view(source, image_file, mask_file), tuple(stamp["ids"])
 
 
 def _identity(path: Path) -> list[Any]:
@@ -530,7 +592,7 @@ def _make(source: _Source, survey: _Survey, cache: Path, stem: str, made_from: d
     files: dict[str, str | None] = {"image_file": None, "mask_file": None}
     pixels = read_image(source.image_path)
     _checked_size(source, pixels.size, survey.model.file("cameras"))
-    in_place = is_pinhole(camera) and (target.width, target.height) == pixels.size
+    in_place = _in_place(camera, target.width, target.height)
     if not in_place:
         files["image_file"] = f"{stem}.png"
         write_image(cache / f"{stem}.png", resample_image(pixels, camera, target))
@@ -541,7 +603,7 @@ def _make(source: _Source, survey: _Survey, cache: Path, stem: str, made_from: d
             suffix, data = encode_mask(ids)
             files["mask_file"] = f"{stem}.mask{suffix}"
             write_atomic(cache / f"{stem}.mask{suffix}", data)
-        stamp["ids"] = np.unique(ids).tolist()
+        stamp["ids"] = _distinct(ids)
     for key, name in files.items():
         stamp[key] = name
         stamp[f"{key}_bytes"] = (cache / name).stat().st_size if name else None
@@ -574,7 +636,7 @@ def check_capture(folder: str | Path, max_size: int = MAX_SIZE, reporter: Report
         if source.mask_path is None:
             return wrong, []
         ids = _tolerating(wrong.append, lambda: _checked_mask(source, survey.colour_masks), None)
-        return wrong, [] if ids is None else np.unique(ids).tolist()
+        return wrong, [] if ids is None else _distinct(ids)
 
     views_of: Counter[int] = Counter()
     for done, (wrong, ids) in enumerate(_in_parallel(look, survey.sources), 1):

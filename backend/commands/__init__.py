@@ -10,11 +10,27 @@ import argparse
 from collections.abc import Callable
 
 from ..stopping import StoppingReporter
-from . import check, doctor, edit, evaluate, export, film, import_splats, importing, mesh, render, report, train, vote
+from . import (
+    check,
+    doctor,
+    edit,
+    evaluate,
+    export,
+    film,
+    import_splats,
+    importing,
+    mesh,
+    plan,
+    render,
+    report,
+    train,
+    vote,
+)
 
 COMMANDS: dict[str, Callable[[argparse.Namespace, StoppingReporter], None]] = {
     "check": check.check,
     "import": importing.import_capture,
+    "plan": plan.plan,
     "vote": vote.vote,
     "train": train.train,
     "render": render.render,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +16,10 @@ from .. import device
 from ..capture import Capture, load_capture
 from ..model.object_model import ObjectModel
 from ..objects import read_objects
+from ..planning.decisions import planned_capture
+from ..planning.plan import Plan
 from ..protocol import InputError, Reconstruction, Reporter
+from ..training.exposure import measure_gains
 from ..training.loop import Progress, load_model, progress_of
 from ..training.scene import Scene
 from .cameras import write_cameras
@@ -75,6 +78,7 @@ class Trained(NamedTuple):
     model: ObjectModel
     scene: Scene
     progress: Progress
+    plan: Plan
 
     @property
     def trained_on(self) -> str:
@@ -117,13 +121,21 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
         record(folder, capture=described(capture, max_size))
         write_cameras(folder, capture)
     # What it was trained without, whatever the user has since chosen.
-    capture = edited(capture, folder, memory["training"].get("left_out", ()))
+    plan = plan_of(memory["training"])
+    capture = planned_capture(edited(capture, folder, memory["training"].get("left_out", ())), plan)
+    exposure = plan["exposure"]
+    gains = None if exposure is None else measure_gains(capture) if exposure.done else np.ones((len(capture), 3))
     zero_is_object = state["settings"]["zero_is_object"]
     scene = Scene(
         capture, model.object_ids, model.normalization, zero_is_object, memory_for_planes(options),
-        teach_unlabelled=state["teach_unlabelled"],
+        teach_unlabelled=state["teach_unlabelled"], gains=gains,
     )  # fmt: skip
-    return Trained(folder, capture, model, scene, progress_of(state))
+    return Trained(folder, capture, model, scene, progress_of(state), plan)
+
+
+def plan_of(training: Mapping[str, Any]) -> Plan:
+    """What was planned for a training, as `recorded` has it; nothing for those of older versions."""
+    return Plan.of(training.get("plan", ()))
 
 
 def edited(capture: Capture, folder: Reconstruction, left_out: Iterable[int]) -> Capture:

@@ -21,7 +21,7 @@ from .cameras import write_no_cameras
 from .folder import described, open_reconstruction, removed_if_refused
 from .lock import locked
 from .record import record
-from .vote import object_name
+from .votes import object_name
 
 _SEEN = 0.5
 """Share of the splats that must lie in some view of the capture, or they are hardly in its coordinates."""

@@ -11,12 +11,13 @@ from ..labels.points import write_points
 from ..objects import write_objects
 from ..stopping import StoppingReporter
 from .folder import described, open_reconstruction
+from .plan import keep_plan
 from .record import record, recorded
-from .vote import votes_are_current
+from .votes import votes_are_current
 
 
 def import_capture(options: argparse.Namespace, reporter: StoppingReporter) -> None:
-    """Undistort the images; leave cameras.json, points.ply and the capture's entry in objectgs.json.
+    """Undistort the images; leave cameras.json, points.ply, plan.json and the capture's entry in objectgs.json.
 
     Points keep the objects of a vote on this capture; where there is none, they belong to no object.
     """
@@ -32,6 +33,7 @@ def import_capture(options: argparse.Namespace, reporter: StoppingReporter) -> N
             write_points(folder.points, capture.points, none)
             if folder.objects.exists():
                 write_objects(folder.objects, [])
+        keep_plan(folder, capture, options.max_size)
     reporter.done(
         cameras=str(folder.cameras), points=str(folder.points), views=len(capture.views), masks=capture.has_masks
     )

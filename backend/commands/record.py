@@ -1,8 +1,8 @@
 """objectgs.json: what was asked, so that a later command knows what the files beside it were made from.
 
 `capture` (folder, max_size, digest), `votes` (what points.ply came from), `training` (settings, minutes or steps, the
-IDs that were left out, the votes it began with), `export` (how much splats.ply and anchors.ply hold) and `stages`
-(seconds and peak memory).
+IDs that were left out, the votes it began with, the plan), `export` (how much splats.ply and anchors.ply hold) and
+`stages` (seconds and peak memory).
 """
 
 from __future__ import annotations

@@ -14,17 +14,15 @@ from ..evaluation import comparison, write_report
 from ..evaluation.mesh_pictures import MESHES_SHOWN, Card, figures_line, mesh_sheet, view_of
 from ..evaluation.meshes import digest, mesh_entries, object_of, read_texture
 from ..mesh_file import read_mesh
-from ..objects import read_objects
 from ..protocol import InputError, Reconstruction, Reporter, read_json
 from ..raster.draw import draw
 from ..stopping import StoppingReporter
 from ..training.loop import Progress
-from ..training.settings import downscale_at
 from .evaluate import evaluation_file
 from .folder import Trained, open_trained
 from .machine import machine_facts
 from .record import recorded, stage
-from .vote import object_name
+from .votes import object_name
 
 PICTURES_IN_REPORT = 3
 
@@ -56,6 +54,7 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         },
         "machine": {**machine_facts(model.device), "device": trained.trained_on},
         "left_out": _left_out(trained),
+        "plan": trained.plan.as_list(),
         "stages": memory.get("stages", []),
         "curve": progress.curve,
         "model": {
@@ -171,23 +170,11 @@ def _objects(
 
 
 def _left_out(trained: Trained) -> list[dict[str, str]]:
-    """What was not done, and why this scene did not need it or could not have it."""
+    """What was not done, and why this scene did not need it or could not have it: as planned, and as it turned out."""
     folder, capture, progress = trained.folder, trained.capture, trained.progress
-    memory = recorded(folder)
-    settings = memory["training"]["settings"]
+    settings = recorded(folder)["training"]["settings"]
     counts = capture.counts
-    longest = max(max(view.width, view.height) for view in capture.views)
     cases = [
-        (not capture.has_masks, "votes, the label loss and object scores", "the capture has no masks"),
-        (
-            capture.has_masks and settings["semantic_weight"] == 0, "the label loss",
-            "--semantic-weight 0 was asked for",
-        ),
-        (
-            not any(view.image_file.is_relative_to(folder.cache) for view in capture.views),
-            "undistortion and reduction of the images",
-            f"all are pinhole pictures of at most {memory['training']['votes']['max_size']} pixels already",
-        ),
         (
             counts["unregistered"] > 0, f"{counts['unregistered']} images without a pose",
             "COLMAP could not place them",
@@ -199,18 +186,6 @@ def _left_out(trained: Trained) -> list[dict[str, str]]:
         (
             capture.has_masks and counts["masks"] < counts["used"],
             f"labels of {counts['used'] - counts['masks']} views", "their masks are missing",
-        ),
-        (
-            capture.has_masks and not trained.scene.teach_unlabelled, "teaching of unlabelled pixels",
-            "nearly every point has an object, so they are taken for gaps in the masks",
-        ),
-        (
-            not trained.scene.exposure_varies, "undoing of exposure and white balance",
-            "the photos agree about the points that they share",
-        ),
-        (
-            downscale_at(0.0, longest) == 1, "reduced pictures at the start of training",
-            f"{longest} pixels are few enough to train on from the start",
         ),
         (
             progress.last_growth == 0, "growth and pruning of anchors",
@@ -227,9 +202,5 @@ def _left_out(trained: Trained) -> list[dict[str, str]]:
         (not capture.test_indices, "quality on held-out views", "there are too few views to hold any out"),
         (bool(capture.test_indices), "LPIPS", "it needs a trained network, which is not part of this program"),
     ]  # fmt: skip
-    known = {entry.id: entry.name for entry in read_objects(folder.objects)} if folder.objects.exists() else {}
-    cases += [
-        (True, f"splats of {known.get(i, f'object {i}')}", "they were not wanted when training began")
-        for i in capture.left_out.tolist()
-    ]
-    return [{"what": what, "why": why} for applies, what, why in cases if applies]
+    planned = [{"what": decision.what, "why": decision.reason} for decision in trained.plan.left_out]
+    return planned + [{"what": what, "why": why} for applies, what, why in cases if applies]

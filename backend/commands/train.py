@@ -15,19 +15,22 @@ from ..capture import Capture
 from ..evaluation import IdScores, comparison, curve_picture, psnr, save_picture, thumbnail
 from ..export import agreement, fit_splats, write_anchors, write_splats
 from ..labels.points import read_points
+from ..model.checkpoint import has_checkpoint
 from ..model.object_model import ObjectModel
-from ..objects import read_objects
+from ..planning.coverage import unseen_points
+from ..planning.decisions import OF_TRAINING, decide, planned_capture, planned_settings
+from ..planning.plan import Plan, write_plan
 from ..protocol import Cancelled, InputError, Reconstruction, Reporter, plain
 from ..raster.draw import draw
 from ..stopping import StoppingReporter
 from ..training.budget import DEFAULT_SECONDS, PRESETS, Budget, Progress
 from ..training.loop import Evaluate, Trainer
 from ..training.scene import Scene
-from ..training.settings import Settings
-from .folder import described, digest, edited, memory_for_planes, open_reconstruction
+from .folder import described, digest, memory_for_planes, open_reconstruction, plan_of
 from .kernels import have_kernels_ready
+from .plan import asked_objects, change_objects, choices, look_at, say_plan, settings
 from .record import record, record_stage, recorded, stage
-from .vote import cast_votes, votes_are_current, votes_key
+from .votes import cast_votes, votes_are_current, votes_key
 
 CURVE_VIEWS = 20
 """So many held-out views at most are measured while training; `evaluate` measures all."""
@@ -41,7 +44,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     place = device.pick(options.device)
     budget = _budget(options)
     with open_reconstruction(options, reporter) as (folder, capture):
-        trainer = _begun(folder, capture, options, reporter, place)
+        trainer, plan = _begun(folder, capture, options, reporter, place)
         progress = trainer.progress
         if progress.step and budget.share(progress) >= 1:
             reporter.status(
@@ -59,7 +62,8 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
                     "preset": options.preset,
                     "device": device.name_of(place),
                     "left_out": trainer.scene.capture.left_out.tolist(),
-                    "votes": votes_key(capture, options.max_size, options.strategy, options.seed),
+                    "votes": votes_key(trainer.scene.capture, options.max_size, options.strategy, options.seed),
+                    "plan": plan.as_list(),
                 },
             )
             try:
@@ -95,77 +99,75 @@ def _begun(
     options: argparse.Namespace,
     reporter: StoppingReporter,
     place: torch.device,
-) -> Trainer:
-    """The training to go on with, or a new one, after a vote where the one that is there would differ."""
-    settings = _settings(options)
-    resumed = None if options.restart else _resumed(folder, capture, settings, options, reporter, place)
-    if resumed is not None:
-        return resumed
-    if not votes_are_current(folder, capture, options.max_size, options.strategy, options.seed):
-        cast_votes(folder, capture, options, reporter)
-    capture = edited(capture, folder, _left_out(folder))
-    point_ids = capture.without_left_out(read_points(folder.points).ids)
-    trainer = Trainer.start(capture, point_ids, settings, memory_for_planes(options), place)
+) -> tuple[Trainer, Plan]:
+    """The training to go on with, or a new one, after a vote where the one that is there would differ; and its plan."""
+    resuming = not options.restart and has_checkpoint(folder.checkpoint)
+    voters = capture.without_masks() if "votes" in options.leave_out else capture
+    current = votes_are_current(folder, voters, options.max_size, options.strategy, options.seed)
+    if not (current or resuming):
+        cast_votes(folder, voters, options, reporter)
+    point_ids = read_points(folder.points).ids if current or not resuming else None
+    objects, _ = asked_objects(folder, capture, options)
+    look = look_at(capture, choices(options), objects, point_ids, thorough=True)
+    plan = decide(look)
+    if resuming:
+        plan = plan.settled_by(_plan_before(folder))
+    gains = look.gains if plan.does("exposure") else np.ones_like(look.gains)
+    planned, wanted = planned_capture(look.capture, plan), planned_settings(settings(options), plan)
+    memory = memory_for_planes(options)
+    if resuming:
+        resumed = Trainer.resume(planned, folder.checkpoint, wanted, memory, place, gains)
+        assert resumed is not None
+        trainer, warning = resumed
+        if warning:
+            reporter.warning(warning)
+        _refuse_another(folder, planned, plan, options)
+    else:
+        assert look.point_ids is not None
+        seeds = None if plan.does("unseen-points") else ~unseen_points(planned)
+        trainer = Trainer.start(
+            planned, look.point_ids, wanted, memory, place,
+            seeds=seeds, teach_unlabelled=planned.has_masks and plan.does("rest"), gains=gains,
+        )  # fmt: skip
     if options.restart:
         shutil.rmtree(folder.checkpoint, ignore_errors=True)
-    return trainer
+    change_objects(folder, voters, options)
+    write_plan(folder.plan, plan)
+    say_plan(plan, reporter)
+    return trainer, plan
 
 
-def _resumed(
-    folder: Reconstruction,
-    capture: Capture,
-    settings: Settings,
-    options: argparse.Namespace,
-    reporter: Reporter,
-    place: torch.device,
-) -> Trainer | None:
-    """The training that DIR holds, or None; InputError where it was one of another capture or other choices."""
-    left_out = _left_out(folder)
-    edited_capture = edited(capture, folder, left_out)
-    resumed = Trainer.resume(edited_capture, folder.checkpoint, settings, memory_for_planes(options), place)
-    if resumed is None:
-        return None
-    trainer, warning = resumed
-    if warning:
-        reporter.warning(warning)
+def _plan_before(folder: Reconstruction) -> Plan:
+    """What was planned for the training that DIR holds."""
+    return plan_of(recorded(folder).get("training", {}))
+
+
+def _refuse_another(folder: Reconstruction, capture: Capture, plan: Plan, options: argparse.Namespace) -> None:
+    """InputError where DIR holds the training of another capture, or of other choices."""
     memory = recorded(folder)
     otherwise = "use the same, another --out, or --restart to train anew."
     if "training" not in memory:
         raise InputError(f"{folder.settings} does not say what {folder.checkpoint} was trained from; {otherwise}")
-    votes = memory["training"]["votes"]
+    training = memory["training"]
+    votes = training["votes"]
     if votes["capture"] != digest(capture):
         raise InputError(f"{folder.checkpoint} was trained on another capture than {capture.folder}; {otherwise}")
     if votes["max_size"] != options.max_size:
         raise InputError(f"{folder.checkpoint} was trained with --max-size {votes['max_size']}; {otherwise}")
     if votes["strategy"] != options.strategy:
         raise InputError(f"{folder.checkpoint} was trained with --strategy {votes['strategy']}; {otherwise}")
-    before = memory["training"].get("left_out", [])
+    before, left_out = training.get("left_out", []), capture.left_out.tolist()
     if before != left_out:
         without = f"without {', '.join(map(str, before))}" if before else "with all objects"
         raise InputError(
             f"{folder.checkpoint} was trained {without}, and {folder.objects} leaves out "
             f"{', '.join(map(str, left_out)) or 'none'}; leave out the same, or use --restart to train anew."
         )
-    return trainer
-
-
-def _left_out(folder: Reconstruction) -> list[int]:
-    """The IDs that the user wants no splats of, ascending."""
-    known = read_objects(folder.objects) if folder.objects.exists() else []
-    return [entry.id for entry in known if entry.left_out]
-
-
-def _settings(options: argparse.Namespace) -> Settings:
-    given = {
-        "offsets": options.offsets, "max_anchors": options.max_anchors, "voxel": options.voxel,
-        "semantic_weight": options.semantic_weight, "normal_weight": options.normal_weight,
-        "distortion_weight": options.distortion_weight,
-    }  # fmt: skip
-    return Settings(
-        seed=options.seed, mode=options.mode, sh_degree=options.sh_degree, background=options.background,
-        zero_is_object=options.unlabelled_is_object, primitive=options.primitive,
-        **{k: v for k, v in given.items() if v is not None},
-    )  # fmt: skip
+    if "plan" in training and (otherwise_now := plan.difference(plan_of(training), OF_TRAINING)):
+        raise InputError(
+            f"{folder.checkpoint} was trained by another plan ({', '.join(otherwise_now)}); --keep and --leave-out the "
+            f"same, or use --restart to train anew."
+        )
 
 
 def _run(

@@ -45,6 +45,11 @@ def save_checkpoint(folder: Path, tensors: dict[str, np.ndarray], state: dict[st
         ) from error
 
 
+def has_checkpoint(folder: Path) -> bool:
+    """Whether there are files to go on from, whole or not."""
+    return any((folder / name).exists() for name in (CURRENT, PREVIOUS))
+
+
 def load_checkpoint(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None] | None:
     """Tensors, state and a warning (None if all is well) of the newest checkpoint that is whole; None if there is none.
 

@@ -58,9 +58,14 @@ def measure_gains(capture: Capture) -> np.ndarray:
     return gains
 
 
+def differences(gains: np.ndarray) -> float:
+    """By how much the gains (V, 3) differ: standard deviation of their logarithms, of the channel where it is most."""
+    return float(np.log(gains).std(0).max())
+
+
 def varies(gains: np.ndarray) -> bool:
     """Whether the gains (V, 3) differ by enough to be worth undoing."""
-    return bool(np.log(gains).std(0).max() > VARIES_FROM)
+    return differences(gains) > VARIES_FROM
 
 
 def _observations(capture: Capture, index: int) -> tuple[np.ndarray, np.ndarray]:

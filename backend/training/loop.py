@@ -37,11 +37,11 @@ from .settings import (
     GROW_FROM,
     GROW_UNTIL,
     HEAD_RATES,
-    REST_FROM,
     SURFACE_FROM,
     Settings,
     downscale_at,
     rate,
+    rest_is_taught,
     row_rates,
 )
 
@@ -197,8 +197,16 @@ class Trainer:
         settings: Settings,
         memory_mb: float = 2000,
         place: torch.device = device.CPU,
+        *,
+        seeds: np.ndarray | None = None,
+        teach_unlabelled: bool | None = None,
+        gains: np.ndarray | None = None,
     ) -> Trainer:
-        """A fresh model on the capture's points, whose objects are point_ids ((M,) int64), on the device `place`."""
+        """A fresh model on the capture's points, whose objects are point_ids ((M,) int64), on the device `place`.
+
+        seeds (M,) bool: the points that anchors start from (None: all); teach_unlabelled, gains: as `Scene` has them,
+        None: as the points and photos say.
+        """
         rng = np.random.default_rng(settings.seed)
         xyz = capture.points.xyz
         eyes = np.array([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in capture.views])
@@ -207,14 +215,18 @@ class Trainer:
         scene_xyz = normalization.to_scene(xyz)
         voxel = settings.voxel * normalization.scale if settings.voxel else median_spacing(scene_xyz)
         classes = np.searchsorted(object_ids, point_ids)
-        anchors = seed_anchors(scene_xyz, capture.points.rgb / 255.0, classes, voxel, settings.layout, rng)
+        seeds = np.ones(len(xyz), np.bool_) if seeds is None else seeds
+        anchors = seed_anchors(
+            scene_xyz[seeds], capture.points.rgb[seeds] / 255.0, classes[seeds], voxel, settings.layout, rng
+        )
         generator = torch.Generator().manual_seed(settings.seed)
         heads = Heads(settings.layout, settings.mode, settings.sh_degree, generator)
         grey = {"learned": 0.5, "black": 0.0, "white": 1.0}[settings.background]
         model = ObjectModel(anchors, heads, torch.full((3,), grey), object_ids, normalization, settings.primitive)
-        rest = capture.has_masks and bool((np.asarray(point_ids) == 0).mean() >= REST_FROM)
+        if teach_unlabelled is None:
+            teach_unlabelled = capture.has_masks and rest_is_taught(point_ids)
         scene = Scene(
-            capture, object_ids, normalization, settings.zero_is_object, memory_mb, teach_unlabelled=rest, place=place
+            capture, object_ids, normalization, settings.zero_is_object, memory_mb, teach_unlabelled, place, gains
         )
         return cls(scene, settings, model.to(place), rng)
 
@@ -265,6 +277,7 @@ class Trainer:
         settings: Settings | None = None,
         memory_mb: float = 2000,
         place: torch.device = device.CPU,
+        gains: np.ndarray | None = None,
     ) -> tuple[Trainer, str | None] | None:
         """The trainer of the newest whole checkpoint in `folder` and a warning, or None if there is none.
 
@@ -285,7 +298,7 @@ class Trainer:
         model = model_from_checkpoint(tensors, state)
         scene = Scene(
             capture, model.object_ids, model.normalization, stored.zero_is_object, memory_mb,
-            teach_unlabelled=state["teach_unlabelled"], place=place,
+            state["teach_unlabelled"], place, gains,
         )  # fmt: skip
         rng = np.random.default_rng()
         rng.bit_generator.state = state["rng"]
@@ -463,7 +476,7 @@ class Trainer:
         is not finite."""
         anchors, on_gpu = self.model.anchors, device.on_gpu(self.model.anchors.rows)
         view = self.scene.capture.views[index]
-        downscale = downscale_at(share, max(view.width, view.height))
+        downscale = downscale_at(share, max(view.width, view.height), self.settings.pyramid)
         picture, labels = self.scene.target(index, downscale)
         camera = self.scene.camera(index, downscale)
         present = None

@@ -25,7 +25,8 @@ class Scene:
     """Cameras and targets of a capture for the classes `object_ids` ((C,) int64, ascending, 0 first).
 
     teach_unlabelled: pixels of ID 0 are taught to show no object; otherwise nothing is taught there.
-    Where the photos' exposure varies (`exposure_varies`), `gains` (V, 3) say by how much; else they are 1.
+    gains (V, 3): by how much brighter each photo is than the exposure that the splats are to have; measured where None
+    is given, and 1 where the photos' exposure does not vary (`exposure_varies`).
     Targets lie on the device `place`, as many as memory_mb and the device have room for.
     """
 
@@ -36,18 +37,20 @@ class Scene:
         normalization: Normalization,
         zero_is_object: bool = False,
         memory_mb: float = 2000,
-        undo_exposure: bool = True,
         teach_unlabelled: bool = False,
         place: torch.device = device.CPU,
+        gains: np.ndarray | None = None,
     ) -> None:
         self.capture = capture
         self.object_ids = object_ids
         self.normalization = normalization
         self.zero_is_object = zero_is_object
         self.teach_unlabelled = teach_unlabelled or zero_is_object
-        gains = measure_gains(capture) if undo_exposure else np.ones((len(capture.views), 3))
-        self.exposure_varies = varies(gains)
-        self.gains = gains if self.exposure_varies else np.ones_like(gains)
+        if gains is None:
+            gains = measure_gains(capture)
+            gains = gains if varies(gains) else np.ones_like(gains)
+        self.exposure_varies = bool((gains != 1).any())
+        self.gains = gains
         self._place = place
         self._budget = memory_mb * 1e6
         if place.type == "cuda":

@@ -19,6 +19,7 @@ class Settings:
     background: `learned`, `black` or `white`. zero_is_object: whether pixels of ID 0 are taught as a class.
     primitive: `3d` Gaussians or `2d` discs; for discs, normal_weight: how much the normals are to agree with the depth,
     distortion_weight: how much the splats along a ray are to lie at one depth, and half of volume_weight for the area.
+    pyramid: whether pictures are reduced at the start of the training (None: those that are large).
     """
 
     seed: int = 0
@@ -35,6 +36,7 @@ class Settings:
     primitive: str = "3d"
     normal_weight: float = 0.05
     distortion_weight: float = 10.0
+    pyramid: bool | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -54,6 +56,11 @@ class Settings:
 REST_FROM = 0.05
 """Share of the points that no mask ever gave an object, from which on unlabelled pixels are taken for the rest of the
 scene rather than for gaps in the masks. Objects that are taught nothing there spread over it."""
+
+
+def rest_is_taught(point_ids: np.ndarray) -> bool:
+    """Whether unlabelled pixels show the rest of the scene, where the points' objects are point_ids (M,)."""
+    return bool((np.asarray(point_ids) == 0).mean() >= REST_FROM)
 
 
 GROW_FROM, GROW_UNTIL, GROW_EVERY = 0.1, 0.6, 100
@@ -100,9 +107,15 @@ def row_rates(layout: Layout, share: float) -> np.ndarray:
     return rates
 
 
-def downscale_at(share: float, longest: int) -> int:
-    """Coarse to fine: by how much to reduce pictures of `longest` pixels after a share of the training."""
+_LEAST_PIXELS, _LEAST_OF_SMALL = 300, 50
+"""Pictures are reduced to no less than this, small ones, where that is asked for, to no less than the other."""
+
+
+def downscale_at(share: float, longest: int, pyramid: bool | None = None) -> int:
+    """Coarse to fine: by how much to reduce pictures of `longest` pixels after a share of the training; `pyramid` as in
+    `Settings`."""
     wanted = 4 if share < 0.08 else 2 if share < 0.25 else 1
-    while wanted > 1 and longest // wanted < 300:
+    least = _LEAST_OF_SMALL if pyramid else _LEAST_PIXELS
+    while wanted > 1 and (pyramid is False or longest // wanted < least):
         wanted //= 2
     return wanted

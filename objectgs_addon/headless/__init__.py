@@ -26,6 +26,7 @@ from .lines import LineReporter
 COMMANDS = {
     "demo": commands.demo,
     "import": commands.backend,
+    "plan": commands.plan,
     "vote": commands.backend,
     "train": commands.backend,
     "mesh": commands.on_result,

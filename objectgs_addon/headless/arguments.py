@@ -30,7 +30,7 @@ capture cannot be used, 1 if any failed for another reason.
 
 _TRAIN_OPTIONS = """\
 Every other option behind CAPTURE is one of the backend's train command:
---minutes M or --steps N, --max-size PIXELS, --strategy ... (train --help lists them).
+--minutes M or --steps N, --max-size PIXELS, --only NAME ..., --keep KEY ... (train --help lists them).
 """
 
 
@@ -40,6 +40,12 @@ OPTIONS are those of `python -m backend mesh`, whose --help explains them:
 --objects NAME ..., --set NAME=ID,ID, --scene, --faces N, --open, --texture-size N.
 """
 
+
+_PLAN = """\
+Say what training would do with a capture and what it would leave out, and why; nothing is
+trained. OPTIONS are those of `python -m backend plan`, whose --help explains them:
+--keep KEY ..., --leave-out KEY ..., --only NAME ..., --no-meshes.
+"""
 
 _RESULT_COMMANDS = {
     "edit": ("remove, recolour, move or copy objects", """\
@@ -113,10 +119,17 @@ def _parser() -> argparse.ArgumentParser:
         "Render the built-in demo capture: objects on a table, with masks, a sparse model and the truth.")))
     for name, summary in (("import", "open a capture"), ("vote", "give each point its object, from the masks"),
                           ("train", "make the splats")):
-        _backend(command(
+        sub = command(
             name, summary, f"The backend's {name} command: {summary}.", takes="CAPTURE",
             usage=f"headless.py {name} CAPTURE --out DIR [OPTIONS]",
-            epilog=f"OPTIONS are those of `python -m backend {name}`, whose --help explains them."))
+            epilog=f"OPTIONS are those of `python -m backend {name}`, whose --help explains them.")
+        _backend(sub)
+        if name != "import":
+            _groups(sub)
+    planned = command("plan", "say what a capture needs and what it can do without", _PLAN, takes="CAPTURE",
+                      usage="headless.py plan CAPTURE [--out DIR] [OPTIONS]")
+    _backend(planned, out_required=False)
+    _groups(planned)
     mesh = command("mesh", "make a textured mesh of each object", _MESH, takes="DIR",
                    usage="headless.py mesh DIR [OPTIONS]")
     _backend_python(mesh)
@@ -150,6 +163,7 @@ def _parser() -> argparse.ArgumentParser:
         "DIR/pulled-apart.png the meshes."), takes="CAPTURE",
         usage="headless.py run CAPTURE --out DIR [OPTIONS]", epilog=_TRAIN_OPTIONS)
     _backend(run)
+    _groups(run)
     _meshes(run)
     _picture(run)
     batch = command("batch", "run every capture of a folder", _BATCH, takes="FOLDER",
@@ -192,9 +206,14 @@ def _demo(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--overwrite", action="store_true", help="replace a demo capture with other settings in OUT")
 
 
-def _backend(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for what is made")
+def _backend(sub: argparse.ArgumentParser, out_required: bool = True) -> None:
+    sub.add_argument("--out", type=Path, required=out_required, metavar="DIR", help="folder for what is made")
     _backend_python(sub)
+
+
+def _groups(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--groups", type=Path, metavar="FILE", help=(
+        'IDs that are one object: a labels file that gives them one name, {"1": "chair", "2": "chair"}'))
 
 
 def _meshes(sub: argparse.ArgumentParser) -> None:

@@ -22,8 +22,8 @@ APART_PICTURE = "pulled-apart.png"
 SAMPLES = 16
 """Rays a pixel in the .blend that is built, unless --samples says otherwise."""
 
-_TITLES = {"import": "Import", "vote": "Vote", "train": "Train", "mesh": "Mesh", "edit": "Edit", "export": "Export",
-           "import-splats": "Import splats", "film": "Film", "evaluate": "Evaluate",
+_TITLES = {"import": "Import", "plan": "Plan", "vote": "Vote", "train": "Train", "mesh": "Mesh", "edit": "Edit",
+           "export": "Export", "import-splats": "Import splats", "film": "Film", "evaluate": "Evaluate",
            "report": "Report"}
 
 
@@ -56,7 +56,15 @@ def backend(options) -> None:
     """One of the backend's own commands on a capture: import, vote or train."""
     find_backend(options.backend_python)
     folder = whole(options.out)
-    run_backend(options.command, folder, whole(Path(options.source)), "--out", folder, *options.rest)
+    run_backend(options.command, folder, whole(Path(options.source)), "--out", folder, *_groups(options), *options.rest)
+
+
+def plan(options) -> None:
+    """What training would do with a capture, and what it would leave out."""
+    find_backend(options.backend_python)
+    folder = whole(options.out) if options.out else None
+    out = ("--out", folder) if folder else ()
+    run_backend("plan", folder, whole(Path(options.source)), *out, *_groups(options), *options.rest)
 
 
 def on_result(options) -> None:
@@ -105,7 +113,8 @@ def run(options) -> None:
 
 def reconstruct(capture: Path, folder: Path, options) -> None:
     """Make splats, meshes, a report, a .blend and pictures of `capture` in `folder`, from what is there already."""
-    run_backend("train", folder, capture, "--out", folder, *options.rest)
+    no_meshes = ["--no-meshes"] if options.no_meshes else []
+    run_backend("train", folder, capture, "--out", folder, *no_meshes, *_groups(options), *options.rest)
     if not options.no_meshes:
         try:
             run_backend("mesh", folder, folder)
@@ -120,6 +129,12 @@ def reconstruct(capture: Path, folder: Path, options) -> None:
     if has_meshes:
         _render_apart(folder / BLEND, folder / APART_PICTURE, options)
         say(f"Wrote {folder / APART_PICTURE}.")
+
+
+def _groups(options) -> tuple:
+    """--groups FILE for the backend, which works elsewhere; nothing where it was not given, or is no option."""
+    path = vars(options).get("groups")
+    return ("--groups", whole(path)) if path else ()
 
 
 def _render_apart(blend: Path, out: Path, options) -> None:
@@ -186,7 +201,7 @@ def save_blend(path: Path) -> None:
     say(f"Wrote {path}.")
 
 
-def run_backend(command: str, folder: Path, *arguments: object) -> None:
+def run_backend(command: str, folder: Path | None, *arguments: object) -> None:
     """Run a command of the backend until it ends; raises what main() makes its exit code of."""
     job = locations.backend_job(_TITLES[command], command, folder, command, *map(str, arguments))
     code = run_blocking(job, echo=lambda line: None if job.error else say(line))

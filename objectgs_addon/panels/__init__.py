@@ -11,10 +11,11 @@ from .film import FilmPanel
 from .jobs import JobsPanel, status_bar
 from .meshes import MeshesPanel
 from .objects import ObjectsPanel
+from .plan import PlanPanel
 from .train import SettingsPanel, TrainPanel
 
-CLASSES = (CapturePanel, TrainPanel, SettingsPanel, ObjectsPanel, EditPanel, MeshesPanel, DrawingPanel, FilmPanel,
-           DisplayPanel, JobsPanel)
+CLASSES = (CapturePanel, TrainPanel, PlanPanel, SettingsPanel, ObjectsPanel, EditPanel, MeshesPanel, DrawingPanel,
+           FilmPanel, DisplayPanel, JobsPanel)
 
 
 def register():

@@ -339,8 +339,8 @@ def test_another_capture_does_not_continue_a_training(trained, write_capture, as
 def test_votes_are_cast_once_and_again_when_they_would_differ(write_capture, tmp_path, ask, monkeypatch):
     scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
     cast = []
-    original = commands.vote.vote_points
-    monkeypatch.setattr(commands.vote, "vote_points", lambda *a, **k: (cast.append(a[1]), original(*a, **k))[1])
+    original = commands.votes.vote_points
+    monkeypatch.setattr(commands.votes, "vote_points", lambda *a, **k: (cast.append(a[1]), original(*a, **k))[1])
     train = ("train", scene.folder, "--out", out, "--steps", 1, *SMALL, "--restart")
     assert ask("vote", scene.folder, "--out", out).code == EXIT_DONE
     assert ask(*train).code == EXIT_DONE and cast == ["majority"]

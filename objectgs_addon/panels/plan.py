@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What training will do and what it leaves out, and why."""
+
+import bpy
+
+from .. import planning, running, scene
+from ..job_display import write
+from ..planning import sentence_case
+from .tab import WithReconstruction
+
+
+class PlanPanel(WithReconstruction, bpy.types.Panel):
+    bl_idname = "OBJECTGS_PT_plan"
+    bl_label = "Plan"
+    bl_parent_id = "OBJECTGS_PT_train"
+
+    def draw(self, context):
+        layout = self.layout
+        root = context.scene.objectgs.active
+        folder = scene.folder_of(root)
+        decisions = planning.plan_of(folder).decisions
+        layout.enabled = not running.busy(folder)
+        for decision in decisions:
+            _draw(layout, root.objectgs, decision)
+        row = layout.row(align=True)
+        row.operator("objectgs.plan", icon="FILE_REFRESH", text="Plan Again" if decisions else "Plan")
+        row.operator("objectgs.group_objects", icon="OUTLINER_OB_GROUP_INSTANCE")
+
+
+def _draw(layout, properties, decision) -> None:
+    """A decision as a row: ticked where it is done, and why where it is not."""
+    done = planning.is_wanted(properties, decision)
+    row = layout.row(align=True)
+    if decision.can_override and done is not None:
+        row.operator("objectgs.override_decision", text="", emboss=False,
+                     icon="CHECKBOX_HLT" if done else "CHECKBOX_DEHLT").key = decision.key
+    else:
+        row.label(text="", icon={True: "CHECKMARK", False: "X", None: "TIME"}[done])
+    column = row.column(align=True)
+    write(column, sentence_case(decision.what))
+    if not done:
+        reason = column.column(align=True)
+        reason.active = False
+        write(reason, sentence_case(decision.why))

@@ -1,0 +1,321 @@
+"""The plan: what each decision rests on, how it is overridden, and that training, evaluation and report follow it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from backend.capture import load_capture
+from backend.labels import read_points
+from backend.objects import edit_objects, merged, read_objects
+from backend.planning.choosing import changed, chosen, grouped, read_groups
+from backend.planning.coverage import blind_views, duplicate_views, unseen_points
+from backend.planning.decisions import DECISIONS, Choices, Look, decide, planned_settings
+from backend.planning.plan import KEYS, Decision, Plan, read_plan, write_plan
+from backend.protocol import EXIT_DONE, InputError
+from backend.training.loop import Trainer
+from backend.training.settings import Settings, downscale_at
+
+from .asking import refused
+
+SMALL = ("--offsets", "2")
+
+
+def planned(capture, objects=(), point_ids=None, thorough=False, **choices) -> Plan:
+    return decide(Look(capture, Choices(**choices), objects, point_ids, thorough))
+
+
+def loaded(scene, tmp_path, **options):
+    return load_capture(scene.folder, tmp_path / "cache", **options)
+
+
+# --- a plan ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_plan_is_overridden_only_where_it_can_be(tmp_path):
+    plan = Plan((
+        Decision("votes", "votes", False, "there are no masks", can_override=False),
+        Decision("exposure", "exposure", False, "it does not vary"),
+        Decision("pyramid", "pyramid", True, "they are large"),
+        Decision("labels", "labels", None, "votes will tell"),
+    ))  # fmt: skip
+    assert plan.does("pyramid") and plan.does("labels") and plan.does("never heard of") and not plan.does("exposure")
+    changed_plan = plan.overridden(["exposure", "pyramid"], ["labels"])
+    assert [own.done for own in changed_plan.decisions] == [False, True, True, False]
+    assert [own.overridden for own in changed_plan.decisions] == [False, True, False, True]
+    assert changed_plan["exposure"].reason == "--keep exposure was asked for"
+    assert changed_plan["votes"].reason == "there are no masks"
+    assert [own.done for own in plan.overridden(["all"], []).decisions] == [False, True, True, True]
+    assert plan.overridden(["all"], ["exposure"])["exposure"].done is False
+    with pytest.raises(InputError, match="--keep votes is not possible: there are no masks"):
+        plan.overridden(["votes"], [])
+    with pytest.raises(InputError, match="both name pyramid"):
+        plan.overridden(["pyramid"], ["pyramid"])
+    write_plan(tmp_path / "plan.json", changed_plan)
+    assert read_plan(tmp_path / "plan.json") == Plan(
+        tuple(own if own.key != "pyramid" else plan["pyramid"] for own in changed_plan.decisions)
+    )
+    (tmp_path / "plan.json").write_text('{"decisions": [{"key": "votes"}]}')
+    with pytest.raises(InputError, match="was not written by this program"):
+        read_plan(tmp_path / "plan.json")
+
+
+def test_what_is_known_later_is_done_until_then_and_settled_by_what_was_known():
+    later, known = Decision("labels", "", None, ""), Decision("labels", "", False, "")
+    assert Plan((later,)).does("labels")
+    assert Plan((later,)).settled_by(Plan((known,)))["labels"] == known
+    assert Plan((known,)).settled_by(Plan((later,)))["labels"] == known
+    assert Plan((later,)).settled_by(Plan())["labels"] == later
+
+
+# --- what decisions rest on ------------------------------------------------------------------------------------------
+
+
+def test_a_capture_with_objects_needs_nearly_everything(write_capture, tmp_path):
+    scene = write_capture(views=9, size=(64, 48))
+    plan = planned(loaded(scene, tmp_path), point_ids=scene.point_objects, thorough=True)
+    done = {own.key: own.done for own in plan.decisions}
+    assert done == {
+        "votes": True, "rest": False, "labels": True, "undistortion": False, "exposure": True, "pyramid": False,
+    }  # fmt: skip
+    assert len(DECISIONS) == len(KEYS) and list(done) == [key for key in KEYS if key in done]
+    assert planned_settings(Settings(), plan) == Settings()
+
+
+def test_without_masks_there_is_nothing_about_objects(write_capture, tmp_path):
+    plan = planned(loaded(write_capture(views=9, size=(64, 48), masks=False), tmp_path))
+    assert plan["votes"].done is False and not plan["votes"].can_override
+    assert plan["labels"] is None and plan["rest"] is None
+    with pytest.raises(InputError, match="--keep votes is not possible: the capture has no masks"):
+        planned(loaded(write_capture(name="again", masks=False), tmp_path), keep=["votes"])
+
+
+def test_one_object_is_taught_only_where_something_else_is(write_capture, tmp_path):
+    scene = write_capture(views=9, size=(64, 48), spheres=[(7, np.zeros(3), 1.0)], points=200)
+    beside = loaded(scene, tmp_path)
+    assert planned(beside)["labels"].done is None, "unlabelled pixels may be gaps, or the rest of the scene"
+    ids = scene.point_objects.copy()
+    gaps = planned(beside, point_ids=ids)
+    assert gaps["labels"].done is False and planned_settings(Settings(), gaps).semantic_weight == 0
+    assert planned_settings(Settings(), planned(beside, point_ids=ids, keep=["labels"])).semantic_weight > 0
+    assert planned(beside, settings=Settings(zero_is_object=True))["labels"].done
+    ids[:40] = 0
+    rest = planned(beside, point_ids=ids)
+    assert rest["rest"].done and "20.0%" in rest["rest"].why and rest["labels"].done
+    assert planned(beside, point_ids=ids, leave_out=["rest"])["labels"].done is False
+    for mask in (scene.folder / "masks").iterdir():
+        Image.fromarray(np.full((48, 64), 7, np.uint16)).save(mask)
+    assert planned(loaded(scene, tmp_path))["labels"].done is False
+    assert "--semantic-weight 0" in planned(beside, settings=Settings(semantic_weight=0.0))["labels"].why
+
+
+def test_views_that_repeat_others_are_found(write_capture, tmp_path):
+    scene = write_capture(views=9, size=(64, 48))
+
+    def repeat(at: int, of: int, shift: float = 0.0) -> None:
+        scene.quaternions[at], scene.viewmats[at] = scene.quaternions[of], scene.viewmats[of].copy()
+        scene.viewmats[at][0, 3] += shift
+        scene.seen[at], scene.pixels[at] = scene.seen[of], scene.pixels[of]
+        for part, suffix in (("images", ".png"), ("masks", ".png")):
+            source = scene.folder / part / scene.names[of]
+            shutil.copy(source.with_suffix(suffix), (scene.folder / part / scene.names[at]).with_suffix(suffix))
+
+    for at, of, shift in ((3, 1, 0.0), (4, 1, 1e-4), (6, 5, 0.5)):
+        repeat(at, of, shift)
+    repeat(2, 0)  # A held-out view is there to be measured on, so what repeats it stays.
+    write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
+    assert duplicate_views(loaded(scene, tmp_path)) == [3, 4], "6 stands elsewhere"
+    plan = planned(loaded(scene, tmp_path))
+    assert plan.views_left_out == {"view_003.png", "view_004.png"} and "view_003.png" in plan["duplicate-views"].why
+    assert not planned(loaded(scene, tmp_path), keep=["duplicate-views"]).views_left_out
+
+    pixels = np.asarray(Image.open(scene.folder / "images/view_003.png")).astype(int)
+    Image.fromarray(np.clip(pixels + 4, 0, 255).astype(np.uint8)).save(scene.folder / "images/view_003.png")
+    other = scene.folder / "masks/view_004.png"
+    Image.fromarray(np.full((48, 64), 1, np.uint16)).save(other)
+    assert duplicate_views(loaded(scene, tmp_path)) == [], "another exposure, and another mask"
+
+
+def test_views_and_points_that_nothing_sees_are_found(write_capture, tmp_path):
+    scene = write_capture(views=9, size=(64, 48))
+    away = np.diag([-1.0, 1.0, -1.0, 1.0])
+    for view in (3, 5):
+        scene.quaternions[view] = np.array([0.0, 0, 1, 0])
+        scene.viewmats[view] = away.copy()
+        scene.viewmats[view][2, 3] = -40.0
+        scene.seen[view], scene.pixels[view] = np.zeros(0, int), np.zeros((0, 2))
+    scene.xyz = np.concatenate([scene.xyz, [[0.0, 500.0, 0.0], [2.5, 0.0, 0.0]]])
+    write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
+    capture = loaded(scene, tmp_path)
+    assert blind_views(capture) == [3, 5]
+    assert np.flatnonzero(unseen_points(capture)).tolist() == [len(scene.xyz) - 2]
+    plan = planned(capture)
+    assert plan.views_left_out == {"view_003.png", "view_005.png"} and "1 of" in plan["unseen-points"].why
+    assert plan["duplicate-views"] is None, "two views of nothing are blind rather than alike"
+    ids = np.append(scene.point_objects, [0, 0])
+    seeds = ~unseen_points(capture)
+    anchors = Trainer.start(capture, ids, Settings(offsets=2), seeds=seeds).model.anchors
+    assert len(Trainer.start(capture, ids, Settings(offsets=2)).model.anchors) == len(anchors) + 1
+
+    nothing = capture.without_training_on(set(scene.names) - {"view_003.png"})
+    assert blind_views(nothing) == [] and not unseen_points(nothing).any(), "something is left to train on"
+
+
+def test_chosen_objects_are_told_apart_alone_and_their_other_views_show_the_rest(write_capture, tmp_path):
+    scene = write_capture(views=9, size=(64, 48))
+    mask = scene.folder / "masks/view_003.png"
+    ids = np.array(Image.open(mask))
+    Image.fromarray(np.where(ids == 5, 0, ids).astype(np.uint16)).save(mask)
+    capture = loaded(scene, tmp_path).edited({}, [1, 2])
+    plan = planned(capture)
+    assert "object 1, object 2" in plan["objects"].what and plan["objects"].done is False
+    assert plan["other-views"].done and plan["other-views"].views == ("view_003.png",) and not plan.views_left_out
+    assert planned(capture, leave_out=["other-views"]).views_left_out == {"view_003.png"}
+
+
+def test_pictures(write_capture, tmp_path):
+    size = (640, 480)
+    bent = write_capture(views=3, size=size, model="SIMPLE_RADIAL", params=[640.0, 320.0, 240.0, 0.05])
+    unprepared = load_capture(bent.folder, None)
+    assert not unprepared.prepared and not (tmp_path / "cache").exists()
+    plan = planned(unprepared)
+    assert plan["undistortion"].done and "SIMPLE_RADIAL" in plan["undistortion"].why
+    assert plan["exposure"].done is None and plan["pyramid"].done
+    assert planned_settings(Settings(), planned(unprepared, leave_out=["pyramid"])).pyramid is False
+    assert planned(loaded(bent, tmp_path))["exposure"].done is False
+    with pytest.raises(InputError, match="--leave-out undistortion is not possible"):
+        planned(unprepared, leave_out=["undistortion"])
+    assert [downscale_at(0.0, 640, pyramid) for pyramid in (None, True, False)] == [2, 4, 1]
+    assert [downscale_at(0.0, 320, pyramid) for pyramid in (None, True, False)] == [1, 4, 1]
+    assert downscale_at(1.0, 640, True) == 1
+
+
+def test_flat_splats_have_surfaces_where_meshes_are_made(write_capture, tmp_path):
+    capture = loaded(write_capture(views=3), tmp_path)
+    flat = Settings(primitive="2d")
+    assert planned(capture)["surface"] is None and planned(capture, settings=flat)["surface"].done
+    plan = planned(capture, settings=flat, meshes=False)
+    assert not plan.does("meshes") and planned_settings(flat, plan).normal_weight == 0
+    assert planned_settings(flat, plan).distortion_weight == 0
+    kept = planned(capture, settings=flat, meshes=False, keep=["surface"])
+    assert planned_settings(flat, kept) == flat
+
+
+# --- which objects ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("[]", "no groups"), ('{"one": "chair"}', "'one', which is no ID"), ('{"1": 3}', "the group 3"),
+        ('{"1": " "}', "expected a name"), ('{"9": "chair"}', "none of the IDs that the masks show; there are: 1, 2"),
+    ],
+)  # fmt: skip
+def test_groups_that_make_no_sense_are_refused(tmp_path, content, words):
+    path = tmp_path / "groups.json"
+    path.write_text(content)
+    edit = {"objects": [{"id": i, "name": f"thing {i}", "colour": [0, 0, 0], "points": 1} for i in (1, 2)]}
+    (tmp_path / "objects.json").write_text(json.dumps(edit))
+    with pytest.raises(InputError, match=r"groups\.json") as found:
+        grouped(read_objects(tmp_path / "objects.json"), read_groups(path), path)
+    assert words in str(found.value)
+
+
+def test_only_and_groups_are_edits_that_can_be_taken_back(write_capture, tmp_path, ask):
+    capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"
+    groups = tmp_path / "groups.json"
+    groups.write_text('{"0": "rest", "2": "planet", "5": "planet", "77": "nobody"}')
+    assert ask("vote", capture, "--out", out, "--groups", groups, "--only", "planet").code == EXIT_DONE
+    objects = {entry.id: entry for entry in read_objects(out / "objects.json")}
+    assert merged(list(objects.values())) == {1: 1, 2: 2, 5: 2} and objects[2].name == "planet"
+    assert [i for i, entry in objects.items() if entry.left_out] == [1]
+    plan = read_plan(out / "plan.json")
+    assert "sphere 1" in plan["objects"].what and "2 IDs are grouped into 1" in plan["groups"].why
+    edit_objects(out / "objects.json", {5: {"merged_into": None}, 1: {"left_out": None}})
+    assert read_objects(out / "objects.json")[0].left_out is False
+    assert ask("vote", capture, "--out", out, "--only", "sphere 1", "5").code == EXIT_DONE
+    assert [entry.id for entry in read_objects(out / "objects.json") if entry.left_out] == [2]
+    refused(ask("vote", capture, "--out", out, "--only", "moon"), "no object moon", "objects.json")
+
+
+def test_choosing_takes_what_is_merged_along(tmp_path):
+    (tmp_path / "objects.json").write_text(
+        json.dumps({
+            "objects": [{"id": i, "name": f"thing {i}", "colour": [0, 0, 0], "points": 1} for i in (1, 2, 3)],
+            "edits": {"3": {"merged_into": 1, "left_out": True}},
+        })
+    )  # fmt: skip
+    objects = read_objects(tmp_path / "objects.json")
+    found = changed(objects, chosen(objects, ["thing 3"], tmp_path / "objects.json"))
+    assert [entry.left_out for entry in found] == [False, True, False]
+
+
+# --- the commands ----------------------------------------------------------------------------------------------------
+
+
+def test_plan_says_all_and_writes_only_what_it_is_told_to(write_capture, tmp_path, ask):
+    capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "deep" / "out"
+    before = sorted(path.name for path in tmp_path.rglob("*"))
+    answer = ask("plan", capture, "--minutes", 3, "--primitive", "2d", "--no-meshes", "--keep", "all", "--json")
+    assert answer.code == EXIT_DONE and sorted(path.name for path in tmp_path.rglob("*")) == before
+    plan = Plan.of(answer.events[-1]["plan"])
+    assert plan["pyramid"].overridden and plan["surface"].overridden and not plan.does("meshes")
+    assert len([text for text in answer.messages("status") if text.startswith(("Done: ", "Left out: "))]) > 5
+    refused(ask("plan", capture, "--keep", "everything"), "invalid choice: 'everything'")
+    refused(ask("plan", tmp_path / "none", "--out", out), "does not exist")
+    assert not out.parent.exists()
+    assert ask("plan", capture, "--out", out, "--only", "sphere 2").code == EXIT_DONE
+    assert {path.name for path in out.iterdir()} == {"plan.json"}
+    assert read_plan(out / "plan.json")["objects"].done is False
+    assert ask("import", capture, "--out", out).code == EXIT_DONE
+    assert read_plan(out / "plan.json")["rest"].done is None
+    assert ask("vote", capture, "--out", out).code == EXIT_DONE
+    assert read_plan(out / "plan.json")["rest"].done is False
+
+
+def test_training_follows_its_plan_to_the_report(write_capture, tmp_path, ask):
+    scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
+    shutil.copy(scene.folder / "images/view_001.png", scene.folder / "images/view_002.png")
+    shutil.copy(scene.folder / "masks/view_001.png", scene.folder / "masks/view_002.png")
+    for part in (scene.quaternions, scene.viewmats, scene.seen, scene.pixels):
+        part[2] = part[1]
+    write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
+    train = ("train", scene.folder, "--out", out, *SMALL)
+    began = ask(*train, "--steps", 4, "--keep", "pyramid", "--leave-out", "exposure", "labels", "--json")
+    assert began.code == EXIT_DONE
+    said = began.messages("status")
+    assert any(text.startswith("Left out: training on 1 view, since") for text in said)
+    assert any(text.startswith("Done: reduced pictures") and "--keep pyramid" in text for text in said)
+    training = json.loads((out / "objectgs.json").read_text())["training"]
+    assert Plan.of(training["plan"]) == read_plan(out / "plan.json")
+    kept = ("--keep", "pyramid", "--leave-out")
+    refused(ask(*train, "--steps", 6, *kept, "labels"), "another plan (exposure)", "--restart")
+    refused(ask(*train, "--steps", 6, *kept, "exposure"), "semantic_weight")
+    assert ask(*train, "--steps", 6, *kept, "labels", "exposure").code == EXIT_DONE
+    assert ask("evaluate", out).code == EXIT_DONE and ask("report", out).code == EXIT_DONE
+    report = json.loads((out / "report.json").read_text())
+    left_out = {entry["what"]: entry["why"] for entry in report["left_out"]}
+    assert left_out["the label loss and its ID channel"] == "--leave-out labels was asked for"
+    assert "view_002.png" in left_out["training on 1 view"]
+    assert not report["capture"]["exposure_varies"] and report["quality"]["miou"] is not None
+    assert [own["key"] for own in report["plan"]] == [own.key for own in read_plan(out / "plan.json").decisions]
+
+    assert ask(*train, "--steps", 3, "--restart", "--leave-out", "votes").code == EXIT_DONE
+    assert set(read_points(out / "points.ply").ids.tolist()) == {0}
+    assert ask("evaluate", out, "--json").events[-1].get("miou") is None
+
+
+def test_a_training_of_an_older_version_has_no_plan(write_capture, tmp_path, ask):
+    capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"
+    train = ("train", capture, "--out", out, *SMALL, "--steps")
+    assert ask(*train, 2).code == EXIT_DONE
+    memory = json.loads((out / "objectgs.json").read_text())
+    del memory["training"]["plan"]
+    (out / "objectgs.json").write_text(json.dumps(memory))
+    (out / "plan.json").unlink()
+    assert ask("report", out).code == EXIT_DONE and ask(*train, 3).code == EXIT_DONE
+    assert read_plan(out / "plan.json")["votes"].done

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The plan in Blender: what the panel shows, what the user wants otherwise, and what training is told of it."""
+
+import json
+import shutil
+
+import pytest
+
+import headless
+
+bpy = pytest.importorskip("bpy")
+
+from objectgs.backend.objects import read_objects  # noqa: E402
+from objectgs.backend.planning.plan import Decision, Plan, write_plan  # noqa: E402
+from objectgs.backend.protocol import Reconstruction  # noqa: E402
+from objectgs.objectgs_addon import jobs, locations, planning, running, scene  # noqa: E402
+from objectgs.objectgs_addon.headless import commands  # noqa: E402
+from objectgs.objectgs_addon.headless.arguments import parse  # noqa: E402
+
+
+@pytest.fixture
+def root(fresh, trained, tmp_path):
+    """A reconstruction with a plan, in a registered extension."""
+    extension = headless.extension()
+    extension.register()
+    folder = shutil.copytree(trained, tmp_path / "demo")
+    write_plan(folder / "plan.json", Plan((
+        Decision("votes", "votes", False, "the capture has no masks", can_override=False),
+        Decision("labels", "the label loss", None, "the votes will tell"),
+        Decision("exposure", "undoing of exposure", False, "it does not vary"),
+        Decision("pyramid", "reduced pictures", True, "they are large"),
+        Decision("blind-views", "training on 1 view", False, "it sees nothing", views=("a.png",), wanted=True))))
+    bpy.ops.objectgs.open_reconstruction(directory=str(folder))
+    yield bpy.context.scene.objectgs.active
+    extension.unregister()
+
+
+def test_training_did_leave_a_plan(trained):
+    assert planning.plan_of(trained).does("votes") and not planning.plan_of(trained / "none").decisions
+
+
+def test_what_is_overridden_is_told_to_training_and_undone(root):
+    toggle = bpy.ops.objectgs.override_decision
+    asked = planning.arguments(root)
+    assert asked[asked.index("--keep"):] == ["--keep", "blind-views"], "as the folder has it already"
+    assert toggle(key="exposure") == {"FINISHED"} and toggle(key="pyramid") == {"FINISHED"}
+    asked = planning.arguments(root)
+    assert asked[asked.index("--keep"):] == ["--keep", "exposure", "blind-views", "--leave-out", "pyramid"]
+    assert toggle(key="exposure") == {"FINISHED"} and toggle(key="blind-views") == {"FINISHED"}
+    asked = planning.arguments(root)
+    assert "--keep" not in asked and asked[-2:] == ["--leave-out", "pyramid"]
+    for key in ("votes", "unheard-of"):
+        with pytest.raises(RuntimeError, match="leaves no choice"):
+            toggle(key=key)
+
+
+def test_a_broken_plan_is_none(root):
+    path = Reconstruction(scene.folder_of(root)).plan
+    path.write_text("[]")
+    assert planning.plan_of(scene.folder_of(root)).decisions == () and "--keep" not in planning.arguments(root)
+    path.unlink()
+    assert planning.plan_of(scene.folder_of(root)).decisions == ()
+
+
+def test_plan_and_train_ask_the_backend_for_the_same(root, monkeypatch):
+    asked = []
+    monkeypatch.setattr(locations, "backend_python", lambda: "python")
+    monkeypatch.setattr(locations, "backend_job", lambda title, kind, folder, *words: asked.append(words) or jobs.Job(
+        title=title, kind=kind, folder=folder, command=["true"], cwd=folder))
+    monkeypatch.setattr(running, "submit", lambda *_: {"FINISHED"})
+    bpy.ops.objectgs.override_decision(key="exposure")
+    assert bpy.ops.objectgs.plan() == {"FINISHED"} and bpy.ops.objectgs.train() == {"FINISHED"}
+    wanted = tuple(planning.arguments(root))
+    assert [words[0] for words in asked] == ["plan", "train"]
+    assert all(words[-len(wanted):] == wanted and "exposure" in words for words in asked)
+
+
+def test_a_labels_file_groups_objects(root, tmp_path):
+    path = Reconstruction(scene.folder_of(root)).objects
+    first, second, *_ = [entry.id for entry in read_objects(path)]
+    labels = tmp_path / "groups.json"
+    labels.write_text(json.dumps({str(first): "things", str(second): "things"}))
+    assert bpy.ops.objectgs.group_objects(filepath=str(labels)) == {"FINISHED"}
+    rows = {item.object_id: item for item in root.objectgs.objects}
+    assert rows[first].name == "things" and rows[second].is_merged and rows[second].merged_into == first
+    labels.write_text("[]")
+    with pytest.raises(RuntimeError, match="no groups"):
+        bpy.ops.objectgs.group_objects(filepath=str(labels))
+
+
+def test_headless_hands_groups_on_from_where_it_was_called(monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(commands, "find_backend", lambda _python: None)
+    monkeypatch.setattr(commands, "run_backend", lambda *words: asked.append(words))
+    commands.plan(parse(["plan", "garden", "--no-meshes"]))
+    commands.plan(parse(["plan", "garden", "--out", "made", "--groups", "g.json", "--keep", "all"]))
+    commands.backend(parse(["vote", "garden", "--out", "made", "--groups", "g.json"]))
+    garden, made, groups = tmp_path / "garden", tmp_path / "made", ("--groups", tmp_path / "g.json")
+    assert asked == [("plan", None, garden, "--no-meshes"),
+                     ("plan", made, garden, "--out", made, *groups, "--keep", "all"),
+                     ("vote", made, garden, "--out", made, *groups)]
