@@ -35,7 +35,7 @@ from backend.protocol import Reporter  # noqa: E402
 from backend.raster.draw import draw  # noqa: E402
 from backend.training.loop import Budget, Trainer  # noqa: E402
 from backend.training.settings import Settings  # noqa: E402
-from tests.backend.conftest import Scene, write_model, write_scene  # noqa: E402
+from tests.backend.conftest import Scene, rays_of, write_model, write_scene  # noqa: E402
 
 DOCUMENT = ROOT / "docs" / "stability.md"
 SIZE = (96, 72)
@@ -123,6 +123,20 @@ def enlarged(times: int) -> Change:
     return apply
 
 
+def paint(scene: Scene) -> None:
+    """Give the spheres a pattern that looks the same from everywhere, and what is behind them one colour."""
+    rays = rays_of(scene.lens())
+
+    def painted(view: int, _: np.ndarray) -> np.ndarray:
+        viewmat, depth = scene.viewmats[view], scene.depths[view]
+        there = np.isfinite(depth)
+        xyz = (rays * np.where(there, depth, 1)[..., None] - viewmat[:3, 3]) @ viewmat[:3, :3]
+        pattern = 130 + 90 * np.sin(7 * xyz + scene.ids[view][..., None] * np.array([1.0, 2.0, 3.0]))
+        return np.where(there[..., None], pattern, (40, 60, 90)).astype(np.uint8)
+
+    each_image(painted)(scene)
+
+
 def take_colours(scene: Scene) -> None:
     """Give each point the colour of a photo that shows it, as COLMAP would, and write the model."""
     for name, seen, pixels in zip(scene.names, scene.seen, scene.pixels, strict=True):
@@ -142,6 +156,7 @@ def train(
     """Make a capture, change it, train and measure; `options` as for `write_scene`, `scored`: with IDs."""
     with tempfile.TemporaryDirectory(prefix="objectgs-stability-") as folder:
         scene = write_scene(Path(folder) / "capture", **{"views": VIEWS, "size": SIZE, "points": 200, **options})
+        paint(scene)
         if change is not None:
             change(scene)
         take_colours(scene)
@@ -220,11 +235,12 @@ def exposure() -> list[Row]:
     """Photos brighter and darker, each channel of its own: compared at the common exposure, which is known."""
     rng = np.random.default_rng(0)
     logs = rng.uniform(-0.3, 0.3, (VIEWS, 1)) + rng.uniform(-0.1, 0.1, (VIEWS, 3))
-    plain = train(each_image(lambda view, pixels: (pixels * 0.6).astype(np.uint8)))
+    size = (240, 180)  # a gain is measured on 3 x 3 pixels at each point
+    plain = train(each_image(lambda view, pixels: (pixels * 0.6).astype(np.uint8)), size=size)
     held_out = plain.trainer.scene.capture.test_indices
     trained = plain.trainer.scene.capture.train_indices
     gains = np.exp(logs - logs[list(trained)].mean(0))
-    varied = train(each_image(lambda view, pixels: (pixels * 0.6 * gains[view]).astype(np.uint8)))
+    varied = train(each_image(lambda view, pixels: (pixels * 0.6 * gains[view]).astype(np.uint8)), size=size)
     photos = [plain.trainer.scene.capture.image(i) for i in held_out]
 
     def against_photos(images: list[np.ndarray]) -> float:

@@ -37,6 +37,7 @@ class Scene:
         self.quaternions: list[np.ndarray] = []
         self.viewmats: list[np.ndarray] = []
         self.ids: list[np.ndarray] = []
+        self.depths: list[np.ndarray] = []
         self.xyz = np.zeros((0, 3))
         self.rgb = np.zeros((0, 3), np.uint8)
         self.point_objects = np.zeros(0, np.int64)
@@ -155,6 +156,7 @@ def write_scene(
         scene.viewmats.append(viewmat)
         ids, depth = sphere_ids(rays, viewmat, spheres)
         scene.ids.append(ids)
+        scene.depths.append(depth)
         path = scene.folder / "images" / image_name
         path.parent.mkdir(parents=True, exist_ok=True)
         shade = np.where(np.isfinite(depth), 255 / (1 + depth**2 / 8), 30)
