@@ -191,6 +191,8 @@ def test_the_place_in_the_world_does_not_matter(primitive, scene, place):
 @anything
 @given(scene=scenes(), data=st.data())
 def test_pictures_are_linear_in_the_colours(primitive, scene, data):
+    """Splats at one depth are ordered by their look, so each has a depth of its own."""
+    scene = with_distinct_depths(scene)
     count = len(scene["ids"])
     one, other = (torch.tensor([data.draw(colours) for _ in range(count)]) for _ in range(2))
 
