@@ -360,7 +360,7 @@ def trained(spec: dict[str, Any], capture: str, seconds: float, seed: int) -> di
     loaded = load_capture(Path(capture), WORK / "cache")
     ids = vote(loaded).ids if loaded.has_masks else np.zeros(len(loaded.points.xyz), np.int64)
     trainer = loop.Trainer.start(loaded, ids, Settings(seed=seed, **spec.get("settings", {})))
-    return shared.train_and_measure(trainer, loaded, loop.Budget(seconds=seconds))
+    return shared.train_and_measure(trainer, loaded, budget.Budget(seconds=seconds))
 
 
 # --- meshes ----------------------------------------------------------------------------------------------------------

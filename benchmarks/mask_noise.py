@@ -164,7 +164,8 @@ def measured(capture: str, kind: str, level: float, steps: int) -> dict[str, Any
     from backend.protocol import Reporter
     from backend.raster import compile_kernels
     from backend.raster.draw import draw
-    from backend.training.loop import Budget, Trainer
+    from backend.training.budget import Budget
+    from backend.training.loop import Trainer
     from backend.training.settings import Settings
 
     compile_kernels()

@@ -19,8 +19,9 @@ from ..objects import read_objects
 from ..planning.decisions import planned_capture
 from ..planning.plan import Plan
 from ..protocol import InputError, Reconstruction, Reporter
+from ..training.budget import Progress
 from ..training.exposure import measure_gains
-from ..training.loop import Progress, load_model, progress_of
+from ..training.loop import load_model, progress_of
 from ..training.scene import Scene
 from .cameras import write_cameras
 from .lock import FolderInUse, locked

@@ -28,7 +28,8 @@ from ..raster import compile_kernels
 from ..raster.draw import draw
 from ..raster.kernel import digest_up_to
 from ..stopping import StoppingReporter
-from ..training.loop import Budget, Trainer
+from ..training.budget import Budget
+from ..training.loop import Trainer
 from ..training.settings import Settings
 
 STEPS = 220

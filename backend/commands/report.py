@@ -17,7 +17,7 @@ from ..mesh_file import read_mesh
 from ..protocol import InputError, Reconstruction, Reporter, read_json
 from ..raster.draw import draw
 from ..stopping import StoppingReporter
-from ..training.loop import Progress
+from ..training.budget import Progress
 from .evaluate import evaluation_file
 from .folder import Trained, open_trained
 from .machine import machine_facts
@@ -63,6 +63,7 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             "bytes": folder.splats.stat().st_size if folder.splats.exists() else None,
             "trained_steps": progress.step, "trained_seconds": round(progress.seconds, 1),
             "psnr_of_export": export.get("psnr_of_export"),
+            "skipped_updates": progress.skipped, "skipped_because_of": progress.causes or None,
         },
         "quality": evaluation["quality"],
         "objects": _objects(trained, evaluation["objects"], meshes),

@@ -7,7 +7,7 @@ quaternion, colour SH coefficients. Splats that are too transparent to be drawn 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -189,15 +189,30 @@ class _Generate(torch.autograd.Function):
         out = tuple(np.empty((n, width), np.float32) for width in widths)
         _backward(*ctx.arrays, tuple(np.ascontiguousarray(g.numpy()) for g in gradients[:5]), out)
         g_rows, *g_raw = (torch.from_numpy(a) for a in out)
-        g_hidden = torch.empty_like(hidden)
-        head_gradients = []
-        parts = zip(g_raw, hidden.split(HIDDEN, 1), g_hidden.split(HIDDEN, 1), (w_opacity, w_shape, w_color))
-        for g, h, g_h, weight in parts:
-            g_h.copy_(g @ weight)
-            head_gradients += [g.T @ h, g.sum(0)]
-        g_hidden = torch.ops.aten.threshold_backward(g_hidden, hidden, 0)
+        weights = (w_opacity, w_shape, w_color)
+        g_hidden, of_parameters = _heads_backward(g_raw, inputs, hidden, weights)
+        if not all(g.isfinite().all() for g in of_parameters):
+            # The anchors at fault keep it to themselves; their own rows say so.
+            faulty = ~torch.stack([g.isfinite().all(1) for g in g_raw]).all(0)
+            sound = tuple(torch.where(faulty[:, None], 0.0, g) for g in g_raw)
+            g_hidden, of_parameters = _heads_backward(sound, inputs, hidden, weights)
+            g_hidden[faulty] = math.nan
         g_rows[:, ctx.layout.feature_columns] = (g_hidden @ w_hidden)[:, : ctx.layout.features]
-        return (None, g_rows, None, None, g_hidden.T @ inputs, g_hidden.sum(0), *head_gradients)
+        return (None, g_rows, None, None, *of_parameters)
+
+
+def _heads_backward(
+    g_raw: Sequence[torch.Tensor], inputs: torch.Tensor, hidden: torch.Tensor, weights: tuple[torch.Tensor, ...]
+) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """From the gradients of what the three heads say, each (n, width), to that of their hidden layer before its ReLU
+    (n, 3 HIDDEN), and those of all weights and biases, the hidden layer's first."""
+    g_hidden = torch.empty_like(hidden)
+    of_heads = []
+    for g, h, g_h, weight in zip(g_raw, hidden.split(HIDDEN, 1), g_hidden.split(HIDDEN, 1), weights, strict=True):
+        g_h.copy_(g @ weight)
+        of_heads += [g.T @ h, g.sum(0)]
+    g_hidden = torch.ops.aten.threshold_backward(g_hidden, hidden, 0)
+    return g_hidden, [g_hidden.T @ inputs, g_hidden.sum(0), *of_heads]
 
 
 def _on_gpu(

@@ -64,7 +64,8 @@ class GrowthStatistics:
             return
         size = np.array([width / 2, height / 2], np.float32)
         norm = np.sqrt(((device.host(screen_gradient) * size) ** 2).sum(1))
-        sources, seen, shown = source.numpy(), anchors_seen.numpy(), device.host(drawn)
+        sources, seen = source.numpy(), anchors_seen.numpy()
+        shown = device.host(drawn) & np.isfinite(norm)
         place = seen[sources // offsets] * offsets + sources % offsets
         gradient, visits, opacity, views = (t.numpy() for t in (self.gradient, self.visits, self.opacity, self.views))
         gradient[place[shown]] += norm[shown]
@@ -87,7 +88,9 @@ class GrowthStatistics:
         counted = torch.ones_like(anchors_seen, dtype=torch.bool) if usable is None else usable
         drawn = drawn.view(-1, offsets) & counted[:, None]
         norm = torch.hypot(screen_gradient[:, 0] * (width / 2), screen_gradient[:, 1] * (height / 2))
-        norm = torch.where(drawn, norm.view(-1, offsets), 0.0)
+        norm = norm.view(-1, offsets)
+        drawn = drawn & norm.isfinite()
+        norm = torch.where(drawn, norm, 0.0)
         # Each anchor is there once, so that nothing depends on the order of the sums.
         self.gradient.view(-1, offsets).index_add_(0, anchors_seen, norm)
         self.visits.view(-1, offsets).index_add_(0, anchors_seen, drawn.to(self.visits.dtype))

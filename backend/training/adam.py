@@ -17,6 +17,8 @@ BETA1 = 0.9
 BETA2 = 0.999
 EPSILON = 1e-15
 
+LARGEST_GRADIENT = 1e19
+"""The square of anything larger overflows in the second moment, which then stands still for ever."""
 
 _ROWS_AT_ONCE = 100_000
 """So many rows at a time are stepped on the GPU: what lies between takes five times their room."""
@@ -36,9 +38,9 @@ def step_rows(
     """In place: values, first and second moments (N, D); seen (n,) int64 rows, each once; gradients (n, D); rates (D,)
     float32.
 
-    correction1 = 1 - BETA1**t and correction2 = 1 - BETA2**t for the step count t. A row whose gradient is not finite
-    is left alone; returns how many such rows there were, () int64. usable (n,) bool, on the GPU alone: the others are
-    left alone, too, and not counted.
+    correction1 = 1 - BETA1**t and correction2 = 1 - BETA2**t for the step count t. A row whose gradient is not finite,
+    or beyond LARGEST_GRADIENT, is left alone; returns how many such rows there were, () int64. usable (n,) bool, on the
+    GPU alone: the others are left alone, too, and not counted.
     """
     if not device.on_gpu(values):
         arrays = (t.numpy() for t in (values, first, second, seen, gradients))
@@ -55,7 +57,7 @@ def step_rows(
 
 
 def _step_rows_on_gpu(values, first, second, seen, gradients, rates, correction1, correction2, usable):
-    finite = gradients.isfinite().all(1)
+    finite = gradients.abs().amax(1) < LARGEST_GRADIENT
     counted = torch.ones_like(finite) if usable is None else usable
     stepped = (finite & counted)[:, None]
     old_value, old_first, old_second = values[seen], first[seen], second[seen]
@@ -72,15 +74,16 @@ def _step_rows_on_gpu(values, first, second, seen, gradients, rates, correction1
 def _step_rows(values, first, second, seen, gradients, rates, correction1, correction2):
     bad = np.zeros(seen.size, np.int64)
     b1, b2 = np.float32(BETA1), np.float32(BETA2)
-    one = np.float32(1.0)
+    one, largest = np.float32(1.0), np.float32(LARGEST_GRADIENT)
     c1 = np.float32(1.0 / correction1)
     c2 = np.float32(1.0 / correction2)
     for i in prange(seen.size):
         row = seen[i]
-        check = np.float32(0.0)
+        usable = True
         for j in range(values.shape[1]):
-            check += gradients[i, j] * np.float32(0.0)
-        if check != 0.0:
+            # Written so that NaN fails.
+            usable &= abs(gradients[i, j]) < largest
+        if not usable:
             bad[i] = 1
             continue
         for j in range(values.shape[1]):

@@ -31,7 +31,8 @@ FLAT = 0.35
 class Progress:
     """Where a training stands; saved with every checkpoint.
 
-    last_growth: step of the latest growth. skipped: updates that came to nothing. queue: views still to come.
+    last_growth: step of the latest growth. skipped: updates that were not finite, and faults: how many steps met each
+    cause of them that was found. queue: views still to come.
     evaluated: how many of the evaluations of a training of known length are behind, or, where the end is open, the
     step of the latest. settled_from: the step from which the rates fall in a training whose end is open, 0 before.
     curve: an entry for each evaluation, with seconds, step, loss (dB) and what was measured.
@@ -41,10 +42,17 @@ class Progress:
     seconds: float = 0.0
     last_growth: int = 0
     skipped: int = 0
+    faults: dict[str, int] = field(default_factory=dict)
     queue: list[int] = field(default_factory=list)
     evaluated: int = 0
     settled_from: int = 0
     curve: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def causes(self) -> str:
+        """The faults and their steps, most frequent first, in words."""
+        by_count = sorted(self.faults.items(), key=lambda entry: -entry[1])
+        return ", ".join(f"{what} ({count} {'step' if count == 1 else 'steps'})" for what, count in by_count)
 
 
 @dataclass(frozen=True)

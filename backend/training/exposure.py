@@ -1,7 +1,7 @@
 """How much brighter or bluer each photo is than the others: cameras that set their own exposure and white balance.
 
 COLMAP's points are seen in many photos. Photo i shows point p as gain_i * color_p, channel by channel; gains and
-colours are found by alternating least squares. Training then compares the splats with photos of one common exposure.
+colours are found in turns, as medians and means. Training then compares the splats with photos of one common exposure.
 """
 
 from __future__ import annotations
@@ -45,9 +45,8 @@ def measure_gains(capture: Capture) -> np.ndarray:
             points, colors = observed[i]
             shared = seen[points] > 1
             model = mean[points[shared]]
-            power = (model**2).sum(0)
-            if shared.sum() >= _MIN_OBSERVATIONS and (power > 0).all():
-                gains[i] = np.clip((colors[shared] * model).sum(0) / power, 1 / _LIMIT, _LIMIT)
+            if shared.sum() >= _MIN_OBSERVATIONS and (model.sum(0) > 0).all():
+                gains[i] = np.clip(_ratio(colors[shared], model), 1 / _LIMIT, _LIMIT)
         gains[known] /= np.exp(np.log(gains[known]).mean(0))
     for i in set(range(len(capture.views))) - set(known):
         camera = capture.views[i].camera_id
@@ -66,6 +65,19 @@ def differences(gains: np.ndarray) -> float:
 def varies(gains: np.ndarray) -> bool:
     """Whether the gains (V, 3) differ by enough to be worth undoing."""
     return differences(gains) > VARIES_FROM
+
+
+def _ratio(colors: np.ndarray, model: np.ndarray) -> np.ndarray:
+    """By how much the colours (n, 3) exceed the model's (n, 3): (3,), the median over the points, weighted by the
+    model, so that points at the edge of something, or that shine, do not count by how far off they are."""
+    found = np.ones(3)
+    for c in range(3):
+        lit = model[:, c] > 0
+        ratio, weight = colors[lit, c] / model[lit, c], model[lit, c]
+        order = np.argsort(ratio)
+        passed = np.cumsum(weight[order])
+        found[c] = ratio[order][np.searchsorted(passed, 0.5 * passed[-1])]
+    return found
 
 
 def _observations(capture: Capture, index: int) -> tuple[np.ndarray, np.ndarray]:

@@ -28,6 +28,7 @@ from ..model.object_model import Normalization, ObjectModel, anchors_in_view, fi
 from ..protocol import Cancelled, InputError, Reporter
 from ..raster import Camera, Rendered, rasterize
 from ..stopping import StopRequest
+from . import faults
 from .adam import BETA1, BETA2, step_rows, take_rows
 from .budget import Budget, Progress
 from .losses import image_loss, normal_loss, volume_loss
@@ -63,6 +64,8 @@ _NO_ROOM = (
     "The GPU's memory is too small, even for a sixteenth of a picture at a time; close programs that use it, or try a "
     "smaller --max-size or --max-anchors, or --device cpu."
 )
+
+_PICTURE = "the picture's loss"
 
 Evaluate = Callable[[ObjectModel, Scene, Progress], dict[str, Any]]
 
@@ -179,6 +182,10 @@ class Trainer:
         self._statistics = GrowthStatistics.zeros(len(anchors), anchors.layout.offsets, model.device)
         self._limits = _Limits()
         self._skipped = torch.zeros((), dtype=torch.int64, device=model.device)
+        self._noticed = 0
+        self._closely = False
+        self._fault: faults.Fault | None = None
+        self._to_say: list[str] = []
         self._splats: int | torch.Tensor = 0
         model.background.requires_grad_(settings.background == "learned")
         groups: list[dict[str, Any]] = [
@@ -237,6 +244,7 @@ class Trainer:
         model, anchors, s = self.model, self.model.anchors, self._statistics
         self.progress.skipped += int(self._skipped)
         self._skipped.zero_()
+        self._noticed = 0
         tensors: dict[str, torch.Tensor | np.ndarray] = {
             "anchors.positions": anchors.positions,
             "anchors.rows": anchors.rows,
@@ -384,6 +392,8 @@ class Trainer:
                 self.save(checkpoints)
                 raise Cancelled(f"Stopped after {p.step} steps; run the same command again to go on.")
             loss = self.step(share)
+            while self._to_say:
+                reporter.warning(self._to_say.pop(0))
             smooth = torch.where(smooth.isnan(), loss, smooth.lerp(loss, 0.05))
             if parts == 1 < self.parts:
                 reporter.warning(_IN_PARTS.format(parts=self.parts))
@@ -393,12 +403,14 @@ class Trainer:
                 last_report = now
                 p.seconds = before + now - started
                 self._report(budget, reporter, float(smooth), (now - started) / (p.step - first_step))
+                self._look_out()
             if now - last_saved >= checkpoint_seconds:
                 self.save(checkpoints)
                 last_saved = time.monotonic()
         self.save(checkpoints)
         if p.skipped:
-            reporter.warning(f"{p.skipped} updates were not finite and were skipped.")
+            because = f": {p.causes}" if p.faults else ""
+            reporter.warning(f"{p.skipped} updates were not finite and were skipped{because}.")
 
     def _evaluate(self, evaluate: Evaluate, reporter: Reporter, loss: float) -> None:
         p = self.progress
@@ -443,14 +455,44 @@ class Trainer:
             self._make_room()
             learned, full = self._learn_if_it_fits(p.queue[-1], share)
         # Only now, so that a picture that cannot be read stays the next one.
-        p.queue.pop()
+        index = p.queue.pop()
         p.step += 1
-        if learned is None:
-            return torch.full((), math.nan, device=self.model.device)
-        self._update(learned, share)
-        if GROW_FROM / 2 <= share < GROW_UNTIL:
+        loss = torch.full((), math.nan, device=self.model.device)
+        if learned is not None:
+            self._update(learned, share)
+            loss = learned.loss if learned.sound is None else torch.where(learned.sound, learned.loss, loss)
+        before = len(self.model.anchors)
+        if self._fault is not None:
+            self._settle(self._fault, index)
+        if learned is not None and GROW_FROM / 2 <= share < GROW_UNTIL and len(self.model.anchors) == before:
             self._grow(learned, share)
-        return learned.loss
+        return loss
+
+    def _settle(self, fault: faults.Fault, index: int) -> None:
+        """Count a fault that the step on view `index` met, prepare a sentence if it is the first of its kind, and take
+        hopeless anchors out."""
+        self._fault = None
+        p, model, capture = self.progress, self.model, self.scene.capture
+        if fault.what not in p.faults:
+            owner = None
+            if len(fault.anchors):
+                object_id = int(model.object_ids[int(model.anchors.ids[fault.anchors[0]])])
+                owner = capture.names.get(object_id, f"object {object_id}" if object_id else "no object")
+            self._to_say.append(fault.sentence(p.step, capture.views[index].name, owner))
+        p.faults[fault.what] = p.faults.get(fault.what, 0) + 1
+        if not len(fault.hopeless):
+            return
+        a = model.anchors
+        kept = torch.ones(len(a), dtype=torch.bool, device=model.device)
+        kept[fault.hopeless] = False
+        a.positions, a.rows, a.ids = a.positions[kept], a.rows[kept], a.ids[kept]
+        self._first, self._second = self._first[kept], self._second[kept]
+        self._statistics = GrowthStatistics.zeros(len(a), a.layout.offsets, model.device)
+
+    def _look_out(self) -> None:
+        """On the GPU, where no step waits for its numbers: look closely from now on, while updates are skipped."""
+        skipped = int(self._skipped)
+        self._closely, self._noticed = skipped > self._noticed, skipped
 
     def _learn_if_it_fits(self, index: int, share: float) -> tuple[_Learned | None, bool]:
         """What `_learn` finds, and whether the GPU's memory was full instead."""
@@ -472,8 +514,8 @@ class Trainer:
             torch.cuda.empty_cache()
 
     def _learn(self, index: int, share: float) -> _Learned | None:
-        """The loss of view `index` and its gradients; None where the view shows nothing or, on the processor, the loss
-        is not finite."""
+        """The loss of view `index` and its gradients; None where the view shows nothing or, where one looks closely,
+        the loss is not finite."""
         anchors, on_gpu = self.model.anchors, device.on_gpu(self.model.anchors.rows)
         view = self.scene.capture.views[index]
         downscale = downscale_at(share, max(view.width, view.height), self.settings.pyramid)
@@ -495,9 +537,12 @@ class Trainer:
         shown = []
         for part in self._parts_of(camera, picture, labels):
             chosen = self._chosen(part, seen, rows)
-            of_part, g, drawn = self._loss(part, *chosen, present, share)
-            if not on_gpu and not math.isfinite(float(of_part.detach())):
+            terms, g, drawn = self._terms(part, *chosen, present, share)
+            of_part = self._sum(terms, part)
+            if self._looks_closely and not math.isfinite(float(of_part.detach())):
                 self._skipped += 1
+                named = self._apart(terms, part, drawn)
+                self._fault = faults.of_loss(named, g, chosen[0], anchors.layout.offsets)
                 return None
             of_part.backward()
             loss = loss + of_part.detach()
@@ -534,10 +579,15 @@ class Trainer:
         )
         return seen[here], rows.index_select(0, here)
 
-    def _loss(
+    @property
+    def _looks_closely(self) -> bool:
+        """Whether each step's numbers are looked at before the next: always where that costs no wait."""
+        return self._closely or not device.on_gpu(self.model.anchors.rows)
+
+    def _terms(
         self, part: _Part, seen: torch.Tensor, rows: torch.Tensor, present: torch.Tensor | None, share: float
-    ) -> tuple[torch.Tensor, Generated, Rendered]:
-        """The loss of a part, weighted by its size, and what was drawn for it from the anchors' rows."""
+    ) -> tuple[dict[str, torch.Tensor], Generated, Rendered]:
+        """The terms of a part's loss, each () and weighted, and what was drawn for it from the anchors' rows."""
         anchors, settings = self.model.anchors, self.settings
         g = generate(
             anchors.layout, anchors.positions[seen], rows, anchors.ids[seen], self.model.heads, part.camera.centre,
@@ -553,36 +603,62 @@ class Trainer:
             primitive=settings.primitive, want_depth=normal_weight > 0, want_normals=normal_weight > 0,
             want_distortion=distortion_weight > 0,
         )  # fmt: skip
-        loss = image_loss(
-            drawn.color, drawn.alpha, drawn.weight, self.model.background, part.picture, part.labels,
-            settings.ssim_weight, settings.semantic_weight * part.more_labels,
-        )  # fmt: skip
+        terms = {_PICTURE: self._image_loss(part, drawn, drawn.weight)}
         if settings.volume_weight and len(g.scales):
-            loss = loss + settings.volume_weight * (0.5 if flat else 1.0) * volume_loss(g.scales, flat, g.made)
+            terms["the volume loss"] = (
+                settings.volume_weight * (0.5 if flat else 1.0) * volume_loss(g.scales, flat, g.made)
+            )
         if drawn.normals is not None and drawn.depth is not None:
             intrinsics = part.camera.arrays()[1]
-            loss = loss + normal_weight * normal_loss(drawn.normals, drawn.depth, drawn.alpha, intrinsics)
+            terms["the normal loss"] = normal_weight * normal_loss(drawn.normals, drawn.depth, drawn.alpha, intrinsics)
         if drawn.distortion is not None:
-            loss = loss + distortion_weight * drawn.distortion.mean()
-        return part.share * loss if self.parts > 1 else loss, g, drawn
+            terms["the distortion loss"] = distortion_weight * drawn.distortion.mean()
+        return terms, g, drawn
+
+    def _image_loss(self, part: _Part, drawn: Rendered, weight: torch.Tensor | None) -> torch.Tensor:
+        """The loss () of the picture, and where there is a weight of the labels."""
+        return image_loss(
+            drawn.color, drawn.alpha, weight, self.model.background, part.picture, part.labels,
+            self.settings.ssim_weight, self.settings.semantic_weight * part.more_labels,
+        )  # fmt: skip
+
+    def _sum(self, terms: dict[str, torch.Tensor], part: _Part) -> torch.Tensor:
+        """The loss of a part, weighted by its size."""
+        first, *others = terms.values()
+        loss = sum(others, start=first)
+        return part.share * loss if self.parts > 1 else loss
+
+    def _apart(self, terms: dict[str, torch.Tensor], part: _Part, drawn: Rendered) -> dict[str, torch.Tensor]:
+        """The same terms, those of the picture and of the labels by themselves."""
+        with torch.no_grad():
+            picture = self._image_loss(part, drawn, None)
+        labels = torch.where(picture.isfinite(), terms[_PICTURE].detach(), 0.0)
+        return {**terms, _PICTURE: picture, "the label loss": labels}
 
     def _update(self, learned: _Learned, share: float) -> None:
         step, optimizer = self.progress.step, self._head_optimizer
         for group in optimizer.param_groups:
             group["lr"] = rate(HEAD_RATES[group["name"]], share)
-        parameters = (parameter for group in optimizer.param_groups for parameter in group["params"])
-        gradients = [parameter.grad.flatten() for parameter in parameters if parameter.grad is not None]
-        sound = torch.cat(gradients).isfinite().all()
+        gradients = {
+            group["name"]: [parameter.grad.flatten() for parameter in group["params"] if parameter.grad is not None]
+            for group in optimizer.param_groups
+        }
+        sound = torch.cat([part for parts in gradients.values() for part in parts]).isfinite().all()
         if learned.sound is not None:
             sound = sound & learned.sound
         # As torch's gradient scaler does it: the optimiser looks at this on the device and leaves everything as it is.
         optimizer.found_inf = (~sound).float()  # type: ignore[attr-defined]
         optimizer.step()
         assert learned.rows.grad is not None
-        self._skipped += ~sound + step_rows(
+        skipped = ~sound + step_rows(
             self.model.anchors.rows, self._first, self._second, learned.seen, learned.rows.grad,
             row_rates(self.settings.layout, share), 1 - BETA1**step, 1 - BETA2**step, learned.usable,
         )  # fmt: skip
+        self._skipped += skipped
+        if self._looks_closely and skipped:
+            self._fault = faults.of_rows(
+                learned.rows.grad, learned.rows.detach(), learned.seen, self.settings.layout
+            ) or faults.of_heads(gradients)
 
     def _grow(self, learned: _Learned, share: float) -> None:
         p, anchors, camera = self.progress, self.model.anchors, learned.camera

@@ -37,7 +37,9 @@ class Scene:
         self.quaternions: list[np.ndarray] = []
         self.viewmats: list[np.ndarray] = []
         self.ids: list[np.ndarray] = []
+        self.depths: list[np.ndarray] = []
         self.xyz = np.zeros((0, 3))
+        self.rgb = np.zeros((0, 3), np.uint8)
         self.point_objects = np.zeros(0, np.int64)
         self.seen: list[np.ndarray] = []
         self.pixels: list[np.ndarray] = []
@@ -103,7 +105,7 @@ def write_model(scene: Scene, folder: Path, suffix: str) -> None:
         (folder / "images.bin").write_bytes(data)
         data = struct.pack("<Q", len(scene.xyz))
         for point, xyz in enumerate(scene.xyz):
-            data += struct.pack("<Q3d3BdQ", 10 * point + 3, *xyz, 10, 20, point % 256, 0.5, len(tracks[point]))
+            data += struct.pack("<Q3d3BdQ", 10 * point + 3, *xyz, *scene.rgb[point], 0.5, len(tracks[point]))
             data += b"".join(struct.pack("<II", *entry) for entry in tracks[point])
         (folder / "points3D.bin").write_bytes(data)
         return
@@ -120,62 +122,70 @@ def write_model(scene: Scene, folder: Path, suffix: str) -> None:
     lines = ["# 3D point list"]
     for point, xyz in enumerate(scene.xyz):
         track = " ".join(f"{image} {at}" for image, at in tracks[point])
-        lines.append(f"{10 * point + 3} {' '.join(repr(float(v)) for v in xyz)} 10 20 {point % 256} 0.5 {track}")
+        color = " ".join(map(str, scene.rgb[point]))
+        lines.append(f"{10 * point + 3} {' '.join(repr(float(v)) for v in xyz)} {color} 0.5 {track}")
     (folder / "points3D.txt").write_text("\n".join(lines) + "\n")
+
+
+def write_scene(
+    folder, views=6, size=(96, 72), model="PINHOLE", params=None, masks=True, suffix=".bin", names=None,
+    spheres=SPHERES, points=60, seed=0,
+) -> Scene:  # fmt: skip
+    """Write a capture into a folder.
+
+    views; size (width, height); camera model and params (default PINHOLE with a focal length of the width); masks
+    (False: none); suffix (".bin" or ".txt"); names (one a view); spheres [(id, centre, radius)]; points (each).
+    """
+    rng = np.random.default_rng(seed)
+    scene = Scene(folder)
+    width, height = size
+    params = params or [width, width, width / 2, height / 2]
+    scene.camera = (model, width, height, params)
+    scene.names = names or [f"view_{i:03d}.png" for i in range(views)]
+    directions = rng.normal(size=(len(spheres), points, 3))
+    directions /= np.linalg.norm(directions, axis=2, keepdims=True)
+    scene.xyz = np.concatenate([c + r * d for (_, c, r), d in zip(spheres, directions)])
+    scene.rgb = np.array([(10, 20, i % 256) for i in range(len(scene.xyz))], np.uint8)
+    scene.point_objects = np.repeat([i for i, _, _ in spheres], points)
+    lens = scene.lens()
+    rays = rays_of(lens)
+    for view, image_name in enumerate(scene.names):
+        angle = 2 * np.pi * view / len(scene.names)
+        quaternion, viewmat = look_at(np.array([4 * np.sin(angle), -0.8, 4 * np.cos(angle)]))
+        scene.quaternions.append(quaternion)
+        scene.viewmats.append(viewmat)
+        ids, depth = sphere_ids(rays, viewmat, spheres)
+        scene.ids.append(ids)
+        scene.depths.append(depth)
+        path = scene.folder / "images" / image_name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        shade = np.where(np.isfinite(depth), 255 / (1 + depth**2 / 8), 30)
+        image = np.stack([shade, (ids * 40) % 256, 255 - shade], -1).astype(np.uint8)
+        Image.fromarray(image).save(path, quality=95)
+        if masks:
+            path = (scene.folder / "masks" / image_name).with_suffix(".png")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(ids.astype(np.uint16)).save(path)
+        camera_xyz = scene.xyz @ viewmat[:3, :3].T + viewmat[:3, 3]
+        pixels = np.asarray(lens.img_from_cam(camera_xyz))
+        _, nearest = sphere_ids(camera_xyz / camera_xyz[:, 2:], viewmat, spheres)
+        inside = (pixels >= 0).all(1) & (pixels < size).all(1) & (camera_xyz[:, 2] > 0)
+        seen = np.flatnonzero(inside & (camera_xyz[:, 2] <= nearest * (1 + 1e-6)))
+        scene.seen.append(seen)
+        scene.pixels.append(pixels[seen])
+    if masks:
+        labels = {str(i): f"sphere {i}" for i, _, _ in spheres}
+        (scene.folder / "labels.json").write_text(json.dumps({"0": "unlabelled", **labels}))
+    write_model(scene, scene.folder / "sparse" / "0", suffix)
+    return scene
 
 
 @pytest.fixture
 def write_capture(tmp_path):
-    """A function that writes a capture and returns its `Scene`.
+    """`write_scene` into a folder of the test's own, `name` inside it."""
 
-    Options: views, size (width, height), camera model and params (default PINHOLE with a focal length of the width),
-    masks (False: none), suffix (".bin" or ".txt"), names (one a view), spheres [(id, centre, radius)], points (each).
-    """
-
-    def write(
-        name="capture", views=6, size=(96, 72), model="PINHOLE", params=None, masks=True, suffix=".bin", names=None,
-        spheres=SPHERES, points=60, seed=0,
-    ) -> Scene:  # fmt: skip
-        rng = np.random.default_rng(seed)
-        scene = Scene(tmp_path / name)
-        width, height = size
-        params = params or [width, width, width / 2, height / 2]
-        scene.camera = (model, width, height, params)
-        scene.names = names or [f"view_{i:03d}.png" for i in range(views)]
-        directions = rng.normal(size=(len(spheres), points, 3))
-        directions /= np.linalg.norm(directions, axis=2, keepdims=True)
-        scene.xyz = np.concatenate([c + r * d for (_, c, r), d in zip(spheres, directions)])
-        scene.point_objects = np.repeat([i for i, _, _ in spheres], points)
-        lens = scene.lens()
-        rays = rays_of(lens)
-        for view, image_name in enumerate(scene.names):
-            angle = 2 * np.pi * view / len(scene.names)
-            quaternion, viewmat = look_at(np.array([4 * np.sin(angle), -0.8, 4 * np.cos(angle)]))
-            scene.quaternions.append(quaternion)
-            scene.viewmats.append(viewmat)
-            ids, depth = sphere_ids(rays, viewmat, spheres)
-            scene.ids.append(ids)
-            path = scene.folder / "images" / image_name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            shade = np.where(np.isfinite(depth), 255 / (1 + depth**2 / 8), 30)
-            image = np.stack([shade, (ids * 40) % 256, 255 - shade], -1).astype(np.uint8)
-            Image.fromarray(image).save(path, quality=95)
-            if masks:
-                path = (scene.folder / "masks" / image_name).with_suffix(".png")
-                path.parent.mkdir(parents=True, exist_ok=True)
-                Image.fromarray(ids.astype(np.uint16)).save(path)
-            camera_xyz = scene.xyz @ viewmat[:3, :3].T + viewmat[:3, 3]
-            pixels = np.asarray(lens.img_from_cam(camera_xyz))
-            _, nearest = sphere_ids(camera_xyz / camera_xyz[:, 2:], viewmat, spheres)
-            inside = (pixels >= 0).all(1) & (pixels < size).all(1) & (camera_xyz[:, 2] > 0)
-            seen = np.flatnonzero(inside & (camera_xyz[:, 2] <= nearest * (1 + 1e-6)))
-            scene.seen.append(seen)
-            scene.pixels.append(pixels[seen])
-        if masks:
-            labels = {str(i): f"sphere {i}" for i, _, _ in spheres}
-            (scene.folder / "labels.json").write_text(json.dumps({"0": "unlabelled", **labels}))
-        write_model(scene, scene.folder / "sparse" / "0", suffix)
-        return scene
+    def write(name="capture", **options) -> Scene:
+        return write_scene(tmp_path / name, **options)
 
     # Reached through the fixture, since test folders are no packages to import from.
     write.sphere_ids, write.write_model, write.rays_of = sphere_ids, write_model, rays_of

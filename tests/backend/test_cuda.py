@@ -15,7 +15,7 @@ HERE = Path("tests") / "backend"
 @pytest.mark.parametrize(
     "words",
     [
-        [HERE / "simulated_cuda.py", HERE / "test_raster.py"],
+        [HERE / "simulated_cuda.py", HERE / "test_raster.py", HERE / "test_raster_properties.py"],
         [HERE / "test_raster_stiff.py", "-k", "not 2d and not disc"],
         [HERE / "test_raster_stiff.py", "-k", "2d or disc"],
     ],

@@ -28,7 +28,8 @@ from backend.raster import Camera, rasterize
 from backend.raster.draw import draw
 from backend.training import loop
 from backend.training.adam import step_rows, take_rows
-from backend.training.loop import Budget, Trainer, strips
+from backend.training.budget import Budget
+from backend.training.loop import Trainer, strips
 from backend.training.losses import image_loss, normal_loss, volume_loss
 from backend.training.settings import Settings
 

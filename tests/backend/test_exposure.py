@@ -7,8 +7,9 @@ import numpy as np
 from backend.training.exposure import measure_gains, varies
 
 
-def photos(gains, cameras, held_out=(), points=200, noise=0.0):
-    """A stand-in for a capture: every view shows every point on a 3 x 3 patch of its colour times the view's gain."""
+def photos(gains, cameras, held_out=(), points=200, noise=0.0, hidden=0.0):
+    """A stand-in for a capture: every view shows every point on a 3 x 3 patch of its colour times the view's gain, but
+    for a share `hidden` of them, where something bright is in front."""
     rng = np.random.default_rng(0)
     colors = rng.uniform(0.1, 0.6, (points, 3))
     columns = int(np.ceil(np.sqrt(points)))
@@ -19,6 +20,8 @@ def photos(gains, cameras, held_out=(), points=200, noise=0.0):
         for dx in range(3):
             for dy in range(3):
                 pixels[3 * y + dy, 3 * x + dx] = colors * gains[index] + rng.normal(0, noise, (points, 3))
+        for i in np.random.default_rng(index).permutation(points)[: round(hidden * points)]:
+            pixels[3 * y[i] : 3 * y[i] + 3, 3 * x[i] : 3 * x[i] + 3] = 0.9
         return np.round(np.clip(pixels, 0, 1) * 255).astype(np.uint8)
 
     keypoints = SimpleNamespace(xy=np.stack([3 * x + 1.5, 3 * y + 1.5], 1), point_index=np.arange(points))
@@ -37,6 +40,15 @@ def test_known_gains_are_found():
     truth /= np.exp(np.log(truth).mean(0))
     np.testing.assert_allclose(found, truth, rtol=0.01)
     assert varies(found)
+
+
+def test_points_that_other_things_hide_do_not_count():
+    truth = np.exp(np.random.default_rng(1).normal(0, 0.15, (8, 3)))
+    shares = np.linspace(0, 0.2, 8)
+    views = photos(truth, [1] * 8, noise=0.01)
+    pictures = [photos(truth, [1] * 8, noise=0.01, hidden=share).image for share in shares]
+    views.image = lambda index, downscale=1: pictures[index](index)
+    np.testing.assert_allclose(measure_gains(views), truth / np.exp(np.log(truth).mean(0)), rtol=0.1)
 
 
 def test_equal_photos_do_not_vary():

@@ -302,15 +302,17 @@ def test_splat_that_is_not_finite_is_dropped(name, value, primitive):
     if name == "opacities" and value == -np.inf:
         bad = join(bad, bad)
     assert_unharmed(bad, primitive=primitive)
+    compare(among_others(bad), camera(), primitive=primitive)
 
 
 # Labels
 
 
-def test_no_labelled_pixel():
+def test_no_labelled_pixel(primitive):
     cam = camera()
     scene = {k: v.requires_grad_(k != "ids") for k, v in as_float32(random_scene(0)).items()}
-    picture = rasterize(**scene, camera=cam, labels=torch.full((cam.height, cam.width), -1, dtype=torch.int32))
+    labels = torch.full((cam.height, cam.width), -1, dtype=torch.int32)
+    picture = rasterize(**scene, camera=cam, labels=labels, primitive=primitive)
     assert not picture.weight.any()
     picture.weight.sum().backward()
     assert not any(scene[name].grad.any() for name in NAMES)
@@ -320,12 +322,13 @@ def test_one_class(primitive):
     """With one object the label's probability is the picture's alpha."""
     cam = camera()
     scene = as_float32(random_scene(0, objects=1))
-    picture = rasterize(**scene, camera=cam, labels=torch.zeros(cam.height, cam.width, dtype=torch.int32))
+    labels = torch.zeros(cam.height, cam.width, dtype=torch.int32)
+    picture = rasterize(**scene, camera=cam, labels=labels, primitive=primitive)
     np.testing.assert_allclose(picture.weight, picture.alpha, atol=1e-6)
     compare(random_scene(0, objects=1), cam, objects=1, primitive=primitive)
 
 
-def test_probability_zero_under_the_logarithm():
+def test_probability_zero_under_the_logarithm(primitive):
     cam = camera()
     scene = random_scene(0, count=30)
     labels = torch.full((cam.height, cam.width), 4, dtype=torch.int32)
@@ -333,11 +336,11 @@ def test_probability_zero_under_the_logarithm():
     fast = {k: v.clone().requires_grad_(k != "ids") for k, v in as_float32(scene).items()}
     slow = {k: v if k == "ids" else v.double().requires_grad_() for k, v in as_float32(scene).items()}
     floor = 1e-6
-    picture = rasterize(**fast, camera=cam, labels=labels)
+    picture = rasterize(**fast, camera=cam, labels=labels, primitive=primitive)
     assert not picture.weight[:, :20].any()
     loss = -torch.log(picture.weight.clamp(min=floor)).mean()
     loss.backward()
-    want = rasterize_reference(**slow, camera=cam, objects=5).probabilities[..., 4].clone()
+    want = rasterize_reference(**slow, camera=cam, objects=5, primitive=primitive).probabilities[..., 4].clone()
     want = torch.where(labels == 4, want, torch.zeros(()).double())
     reference = -torch.log(want.clamp(min=floor)).mean()
     reference.backward()
@@ -348,24 +351,24 @@ def test_probability_zero_under_the_logarithm():
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4 * b.abs().max().item(), err_msg=name)
 
 
-def dense_probabilities(scene, cam, values):
+def dense_probabilities(scene, cam, values, primitive="3d"):
     """P (H, W, n) for the n IDs in `values`, from the label weights of the same kernels, one ID at a time."""
     planes = []
     for value in values:
         labels = torch.full((cam.height, cam.width), int(value), dtype=torch.int32)
-        planes.append(rasterize(**scene, camera=cam, labels=labels).weight.numpy())
+        planes.append(rasterize(**scene, camera=cam, labels=labels, primitive=primitive).weight.numpy())
     return np.stack(planes, -1)
 
 
 @pytest.mark.parametrize("seed", fewer(range(4), [0]))
-def test_object_map_equals_the_dense_computation(seed):
+def test_object_map_equals_the_dense_computation(seed, primitive):
     rng = np.random.default_rng(seed)
     count, objects, cam = (80, 8, camera()) if SIMULATED else (300, 40, camera(150, 71))
     scene = as_float32(random_scene(seed, count=count))
     values = np.unique(rng.integers(-(2**31), 2**31, objects)).astype(np.int32)
     scene["ids"] = torch.tensor(rng.choice(values, count))
-    ids, probability = mapped(rasterize(**scene, camera=cam))
-    dense = dense_probabilities(scene, cam, values)
+    ids, probability = mapped(rasterize(**scene, camera=cam, primitive=primitive))
+    dense = dense_probabilities(scene, cam, values, primitive)
     np.testing.assert_allclose(probability, dense.max(-1), rtol=1e-5, atol=1e-7)
     drawn = dense.max(-1) > 0
     assert not (ids[~drawn] + 1).any()
@@ -395,7 +398,7 @@ def test_object_map_gives_ties_to_the_smallest_id():
         assert np.array_equal(probabilities.sum(0)[both], dense.sum(-1)[both])
 
 
-def test_ten_thousand_objects_and_large_ids():
+def test_ten_thousand_objects_and_large_ids(primitive):
     """Simulated, 200: more at any pixel than a GPU adds up at once."""
     rng = np.random.default_rng(0)
     objects, count, size, cam = (200, 240, 0.2, camera()) if SIMULATED else (10_000, 12_000, 0.02, camera(97, 71))
@@ -406,15 +409,15 @@ def test_ten_thousand_objects_and_large_ids():
     assert (names > 65_535).mean() > 0.99
     which = np.concatenate([np.arange(objects), rng.integers(0, objects, count - objects)])
     scene["ids"] = torch.tensor(names[which])
-    picture = rasterize(**scene, camera=cam)
+    picture = rasterize(**scene, camera=cam, primitive=primitive)
     ids, probability = mapped(picture)
     labels = torch.tensor(ids)
-    again = rasterize(**scene, camera=cam, labels=labels)
+    again = rasterize(**scene, camera=cam, labels=labels, primitive=primitive)
     np.testing.assert_allclose(again.weight, probability, rtol=1e-5, atol=1e-6)
     assert np.isin(ids[ids >= 0], names).all()
     # Renaming the objects, in the same order, renames the map and changes nothing else.
     small = {**scene, "ids": torch.tensor(np.argsort(np.argsort(names)).astype(np.int32)[which])}
-    ids_small, probability_small = mapped(rasterize(**small, camera=cam))
+    ids_small, probability_small = mapped(rasterize(**small, camera=cam, primitive=primitive))
     assert np.array_equal(ids, np.where(ids_small >= 0, np.sort(names)[ids_small], -1))
     assert np.array_equal(probability, probability_small)
 

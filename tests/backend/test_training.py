@@ -22,7 +22,8 @@ from backend.raster import Camera, rasterize
 from backend.raster.draw import draw
 from backend.stopping import StopRequest
 from backend.training.adam import BETA1, BETA2, step_rows
-from backend.training.loop import Budget, Trainer
+from backend.training.budget import Budget
+from backend.training.loop import Trainer
 from backend.training.losses import PROBABILITY_FLOOR, image_loss, normal_loss, volume_loss
 from backend.training.settings import Settings
 

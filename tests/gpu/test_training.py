@@ -21,7 +21,8 @@ from backend.protocol import Reporter
 from backend.raster import rasterize
 from backend.raster.draw import draw
 from backend.training import loop
-from backend.training.loop import Budget, Trainer
+from backend.training.budget import Budget
+from backend.training.loop import Trainer
 from backend.training.losses import image_loss, normal_loss, volume_loss
 from backend.training.settings import Settings
 
