@@ -341,6 +341,7 @@ def trained(spec: dict[str, Any], capture: str, seconds: float, seed: int) -> di
     from backend.labels import vote
     from backend.raster import compile_kernels
     from backend.training import loop
+    from backend.training.budget import Budget
     from backend.training.settings import Settings
 
     compile_kernels()
@@ -348,7 +349,7 @@ def trained(spec: dict[str, Any], capture: str, seconds: float, seed: int) -> di
         shared.replace(loop, "GROW_EVERY", spec["grow_every"])
     if "pyramid" in spec:
         steps = spec["pyramid"]
-        shared.replace(loop, "downscale_at", lambda share, _: next((by for until, by in steps if share < until), 1))
+        shared.replace(loop, "downscale_at", lambda share, *_: next((by for until, by in steps if share < until), 1))
     if spec.get("dense_adam"):
 
         def step_all(values, first, second, seen, gradients, *others):
@@ -360,7 +361,7 @@ def trained(spec: dict[str, Any], capture: str, seconds: float, seed: int) -> di
     loaded = load_capture(Path(capture), WORK / "cache")
     ids = vote(loaded).ids if loaded.has_masks else np.zeros(len(loaded.points.xyz), np.int64)
     trainer = loop.Trainer.start(loaded, ids, Settings(seed=seed, **spec.get("settings", {})))
-    return shared.train_and_measure(trainer, loaded, budget.Budget(seconds=seconds))
+    return shared.train_and_measure(trainer, loaded, Budget(seconds=seconds))
 
 
 # --- meshes ----------------------------------------------------------------------------------------------------------

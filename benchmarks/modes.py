@@ -22,7 +22,7 @@ sys.path.insert(0, str(ROOT))
 
 from backend.capture import load_capture  # noqa: E402
 from backend.labels import vote  # noqa: E402
-from backend.training.budget import Budget
+from backend.training.budget import Budget  # noqa: E402
 from backend.training.loop import Trainer  # noqa: E402
 from backend.training.settings import Settings  # noqa: E402
 from benchmarks.shared import train_and_measure  # noqa: E402

@@ -33,7 +33,7 @@ from backend.evaluation import IdScores, psnr  # noqa: E402
 from backend.labels import vote  # noqa: E402
 from backend.protocol import Reporter  # noqa: E402
 from backend.raster.draw import draw  # noqa: E402
-from backend.training.budget import Budget
+from backend.training.budget import Budget  # noqa: E402
 from backend.training.loop import Trainer  # noqa: E402
 from backend.training.settings import Settings  # noqa: E402
 from tests.backend.conftest import Scene, rays_of, write_model, write_scene  # noqa: E402
