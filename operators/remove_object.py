@@ -18,8 +18,7 @@ class RemoveObject(bpy.types.Operator):
 
     floaters: BoolProperty(name="Floaters Too",
                            description="Also what belongs to no object and lies inside the removed one")
-    fill: BoolProperty(name="Fill", description="Films and exports close the flat ground or wall that the object hid; "
-                                                "viewports do not show that")
+    fill: BoolProperty(name="Fill", description="Close the ground or wall that the object hid with what is around it")
 
     @classmethod
     def poll(cls, context):

@@ -58,12 +58,13 @@ _REACH = 3.0
 _WIDEST = 16
 
 
-def filled(splats: Splats, removed: Splats) -> Splats:
-    """`splats`, without those of the object `removed`, with the holes closed that it leaves: splats at a hole's rim
-    give way to invented ones, which carry the IDs of the surface they continue. As it was where there is no hole."""
+def closing(splats: Splats, removed: Splats) -> tuple[NDArray[np.bool_], Splats]:
+    """What closes the holes that an object leaves in `splats`, which are without its own, `removed`: which of them give
+    way at the holes' rims (N,), and the invented ones that come, with the IDs of the surface that they continue."""
+    gone, parts = np.zeros(len(splats), bool), [Splats.empty(splats.degree)]
     solid = body(removed.means, removed.opacities)
     if len(solid) < FEWEST:
-        return splats
+        return gone, parts[0]
     size = float(np.linalg.norm(np.percentile(solid, 95, axis=0) - np.percentile(solid, 5, axis=0)))
     middle = np.median(solid, axis=0)
     centred = splats.means.astype(np.float64) - middle
@@ -80,14 +81,13 @@ def filled(splats: Splats, removed: Splats) -> Splats:
         near = near[~within[near]]
         planes.append(plane)
         flats.append(reach[within[reach] & (splats.object_ids[reach] == owners[counts.argmax()])])
-    gone, parts = np.zeros(len(splats), bool), []
     for plane, flat in zip(planes, flats):
         surface = _Surface(plane, splats.select(flat), centred[flat], solid - middle, size)
         beyond = surface.beyond([other for other in planes if other is not plane])
         replaced, patches = surface.closed(beyond)
         gone[flat[replaced]] = True
         parts += patches
-    return concatenate([splats.select(~gone), *parts]) if parts else splats
+    return gone, concatenate(parts)
 
 
 @dataclass(frozen=True)
