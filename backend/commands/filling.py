@@ -7,29 +7,29 @@ import numpy as np
 from ..editing import Fill, fill_of
 from ..export import read_splats, splat_table
 from ..fill_file import CLOSES, INVENTED, fill_path, forget_old
-from ..objects import SceneObject, read_objects
+from ..objects import read_objects
 from ..ply import read_vertices, write_vertices
 from ..protocol import Reconstruction
 from ..stopping import StoppingReporter
 
 
-def close_places(folder: Reconstruction, reporter: StoppingReporter) -> int:
-    """Leave the file that `fill_path` names, where the edits ask for one; returns how many splats are invented."""
+def close_places(folder: Reconstruction, reporter: StoppingReporter) -> dict[int, int]:
+    """Leave the file that `fill_path` names, where the edits ask for one; returns how many splats are invented for each
+    object whose place is to be closed."""
     if not folder.splats.is_file():
-        return 0  # There may be edits before there are splats.
+        return {}  # There may be edits before there are splats.
     objects = read_objects(folder.objects)
     path = fill_path(folder, objects)
     if path is None:
-        return 0
+        return {}
     if not path.is_file():
         reporter.status("Closing what removed objects hid")
         path.parent.mkdir(parents=True, exist_ok=True)
         write_vertices(path, _table(fill_of(read_splats(folder.splats)[0], objects)))
         forget_old(path)
     table = read_vertices(path)
-    put = table[table[INVENTED] != 0]
-    reporter.status("\n".join(_found(entry, put, objects) for entry in objects if entry.removed and entry.fill))
-    return len(put)
+    closes = table[CLOSES][table[INVENTED] != 0]
+    return {entry.id: int((closes == entry.id).sum()) for entry in objects if entry.removed and entry.fill}
 
 
 def _table(fill: Fill) -> np.ndarray:
@@ -39,13 +39,3 @@ def _table(fill: Fill) -> np.ndarray:
         table[name] = rows[name]
     table[INVENTED], table[CLOSES] = fill.put, fill.closes
     return table
-
-
-def _found(entry: SceneObject, put: np.ndarray, objects: list[SceneObject]) -> str:
-    """What closes the place of one object, in a sentence."""
-    own = put[put[CLOSES] == entry.id]
-    if len(own) == 0:
-        return f"Nothing flat was found around {entry.name} that could close its place"
-    names = {0: "what belongs to no object", **{other.id: other.name for other in objects}}
-    of = [names.get(i, f"object {i}") for i in np.unique(own["object_id"]).tolist()]
-    return f"{len(own):,} invented splats of {' and '.join(of)} close the place of {entry.name}"

@@ -1,10 +1,10 @@
 """Closing the ground or wall that a removed object hid: its surroundings, copied over the hole.
 
-The object stands on, or at, planes that its neighbours' splats lie in, or near where cloth is rumpled. Where it hid such
-a plane, no photo says how it looks; a part of the same surface that does show is put there, with the detail (grain,
-joints) that fits the hole's rim best, and with the colours and the relief around the hole, which shade and bend it as
-its surroundings are. Where several things meet under the object, such as sheets of paper, each is continued to where
-another is nearer.
+The object stands on, or at, planes that its neighbours' splats lie in, or near to where cloth is rumpled. Where it hid
+such a plane, no photo says how it looks; a part of the same surface that does show is put there, with the detail
+(grain, joints) that fits the hole's rim best, and with the colours and the relief around the hole, which shade and bend
+it as its surroundings are. Where several things meet under the object, such as sheets of paper, each is continued by
+straight edges.
 
 Only a surface that lies around the whole hole is closed: the object may stand at its edge, which nobody can tell.
 """
@@ -17,9 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, rfft2
 from scipy.ndimage import (
-    binary_closing, binary_dilation, binary_fill_holes, binary_opening, distance_transform_edt, gaussian_filter,
+    binary_closing,
+    binary_dilation,
+    binary_fill_holes,
+    binary_opening,
+    distance_transform_edt,
+    gaussian_filter,
     map_coordinates,
-)  # fmt: skip
+)
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -89,7 +94,7 @@ def closing(splats: Splats, removed: Splats) -> tuple[NDArray[np.bool_], Splats]
             replaced, patches = surface.closed(surface.beyond([other for other, _ in planes if other is not plane]))
             gone[flat[replaced]] = True
             if patches:
-                gone[around.shell(plane, flat, within * size)] = True
+                gone[around.shell(flat, [each for each, _ in planes], within * size)] = True
             parts += patches
         if len(parts) > 1:
             break
@@ -98,8 +103,8 @@ def closing(splats: Splats, removed: Splats) -> tuple[NDArray[np.bool_], Splats]
 
 class _Around:
     """The splats around a removed object, whose own are at solid (m, 3) from its `middle`. centred (N, 3): all splats
-    from there; far (N,): how far from its nearest one, infinite beyond `NEAR`; near and reach: indices of those that may
-    show its planes, and that planes may be continued from."""
+    from there; far (N,): how far from its nearest one, infinite beyond `NEAR`; near and reach: indices of those that
+    may show its planes, and that planes may be continued from."""
 
     def __init__(self, splats: Splats, solid: NDArray, middle: NDArray, size: float) -> None:
         self.splats, self.solid, self.size = splats, solid, size
@@ -113,7 +118,8 @@ class _Around:
 
     def planes(self, within: float) -> list[tuple[_Plane, NDArray[np.int64]]]:
         """The planes that the object stands on or at, and the indices of the splats of what lies in each."""
-        near, found = self.near, []
+        near = self.near
+        found: list[tuple[_Plane, NDArray[np.int64]]] = []
         while len(found) < PLANES:
             before = [plane for plane, _ in found]
             plane = _plane(self.centred[near], self.thin[near], self.solid, self.size, within, before)
@@ -131,10 +137,10 @@ class _Around:
             near = near[~flat[near]]
         return found
 
-    def shell(self, plane: _Plane, flat: NDArray[np.int64], within: float) -> NDArray[np.int64]:
-        """Splats of what lies in a plane, `flat`, that stand above it where the object was."""
+    def shell(self, flat: NDArray[np.int64], planes: list[_Plane], within: float) -> NDArray[np.int64]:
+        """Splats of what lies in a plane, `flat`, that stand above all planes where the object was."""
         close = np.flatnonzero(self.far < SHELL * self.size)
-        standing = plane.height(self.centred[close]) > within
+        standing = np.all([plane.height(self.centred[close]) > within for plane in planes], axis=0)
         return close[standing & np.isin(self.splats.object_ids[close], np.unique(self.splats.object_ids[flat]))]
 
 
@@ -163,8 +169,8 @@ def _thin_axes(splats: Splats) -> NDArray[np.float64]:
 def _plane(
     points: NDArray, thin: NDArray, solid: NDArray, size: float, within: float, before: list[_Plane]
 ) -> _Plane | None:
-    """The plane that most of points (n, 3) lie `within` of, with the splats' thin axes (n, 3) across it, and the object's own,
-    solid (m, 3), stand on or at; or None. It is not parallel to those found before."""
+    """The plane that most of points (n, 3) lie `within` of, with the splats' thin axes (n, 3) across it, and the
+    object's own, solid (m, 3), stand on or at; or None. It is not parallel to those found before."""
     if len(points) < FEWEST:
         return None
     rng = np.random.default_rng(0)
@@ -227,7 +233,7 @@ class _Surface:
         self.touched = _spread(cells[plane.height(solid) < rough * TOUCHES_WITHIN * size])
 
     def _seen(self) -> tuple[NDArray, NDArray, NDArray]:
-        """The cells' alpha (CELLS, CELLS), mean look (CELLS, CELLS, 4), and which of `owners` one sees most of there."""
+        """The cells' alpha (CELLS, CELLS), mean look (CELLS, CELLS, 4), and which of `owners` one sees most of."""
         rotations = Rotation.from_quat(self.splats.quats.astype(np.float64), scalar_first=True).as_matrix()
         spread = self.plane.axes[:2] @ rotations * (self.splats.scales[:, None, :] / self.cell)
         covariance = spread @ spread.transpose(0, 2, 1) + 0.1 * np.eye(2)
@@ -303,7 +309,7 @@ class _Surface:
         return parts
 
     def _copied(self, part: NDArray, shift: tuple[int, int], shades: NDArray) -> Splats:
-        """The splats that lie where `part` is once it is shifted, put where it is, and shaded and bent as it is there."""
+        """The splats that lie where `part` is once it is shifted, put where it is, shaded and bent as it is there."""
         target = self.at - shift
         home = np.floor(target).astype(int)
         mine = self.inside & ((home >= 0) & (home < CELLS)).all(1)
