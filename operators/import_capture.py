@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Import a capture: cameras with their photos, and the point cloud."""
 
-import itertools
-import re
 from pathlib import Path
 
 import bpy
@@ -62,11 +60,7 @@ def _folder_for(capture: Path) -> Path:
     Numbered where that name belongs to another capture.
     """
     name = capture.name if capture.name.lower() not in ("capture", "colmap", "data") else capture.parent.name
-    name = re.sub(r"[^\w.-]+", "_", name) or "capture"
-    for number in itertools.count(1):
-        folder = locations.reconstructions_folder() / (name if number == 1 else f"{name}-{number}")
-        if folder_state(folder).capture in (None, capture):
-            return folder
+    return locations.new_reconstruction(name, lambda folder: folder_state(folder).capture in (None, capture))
 
 
 CLASSES = (ImportCapture,)

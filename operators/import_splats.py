@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Import Splats: those of other programs, as a reconstruction whose objects can be edited."""
 
-import itertools
-import re
 from pathlib import Path
 
 import bpy
@@ -59,11 +57,7 @@ class ImportSplats(bpy.types.Operator):
 def _folder_for(ply: Path) -> Path:
     """A reconstruction folder that is not there yet, named as the file, or as its folder where that says more."""
     name = ply.parent.name if ply.stem.lower() in ("point_cloud", "splats", "splat") else ply.stem
-    name = re.sub(r"[^\w.-]+", "_", name) or "splats"
-    for number in itertools.count(1):
-        folder = locations.reconstructions_folder() / (name if number == 1 else f"{name}-{number}")
-        if not folder.exists():
-            return folder
+    return locations.new_reconstruction(name, lambda folder: not folder.exists())
 
 
 CLASSES = (ImportSplats,)

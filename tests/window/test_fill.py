@@ -22,7 +22,7 @@ MIDDLE = (0.0, 0.0, 0.0)
 @pytest.fixture(scope="module")
 def folder(blender, tmp_path_factory):
     """A reconstruction of a brown ground, object 2, with a hole under a blue box, object 1."""
-    place = tmp_path_factory.mktemp("fill") / "ground"
+    place = tmp_path_factory.mktemp("fill") / "room"
     place.mkdir()
     rng = np.random.default_rng(0)
     ground = np.column_stack([rng.uniform(-1.5, 1.5, (9000, 2)), np.zeros(9000)])
