@@ -8,6 +8,7 @@ whoever opens the reconstruction's .blend again finds its job by the folder.
 import time
 import traceback
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import bpy
@@ -309,7 +310,7 @@ def _push_undo(title: str) -> None:
 def _undone(*_) -> None:
     """The list was undone or redone: objects.json follows, and what closes places follows that."""
     for root in [root for root in bpy.data.collections if scene.kind_of(root) == "reconstruction"]:
-        for how in (object_edits.store, _show_fill_of, close_places):
+        for how in (object_edits.store, _show_fill_of, partial(close_places, again=False)):
             _store(root, how)
 
 
