@@ -40,7 +40,7 @@ def tick():
 bpy.app.driver_namespace["tick"] = tick
 bpy.app.timers.register(tick)
 """
-BEGUN = "running.queue.running is not None and running.queue.running.step and running.queue.running.progress < 0.9"
+BEGUN = "running.queue.running is not None and running.queue.running.step and running.queue.running.progress < 0.8"
 DRAW_OWN = """
 for region in window_context()['area'].regions:
     if region.type == 'UI':
@@ -88,14 +88,14 @@ def measure(
         blender.run(NAMES + f"root.objectgs.minutes = {seconds / 60}; bpy.ops.objectgs.train()")
         wait(blender, BEGUN)
         blender.run(START)
-        wait(blender, "running.queue.running is None or running.queue.running.progress > 0.98", 1.0)
+        wait(blender, "running.queue.running is None or running.queue.running.progress > 0.9", 1.0)
         found["training"] = blender.run(STOP)
         wait(blender, "running.queue.running is None")
         blender.run(NAMES + f"root.objectgs.minutes = {2 * seconds / 60}; bpy.ops.objectgs.train()")
         wait(blender, BEGUN)
         blender.run(NAMES + "running.shown, running.redraw = running.redraw, lambda: None")
         blender.run(START)
-        wait(blender, "running.queue.running is None or running.queue.running.progress > 0.98", 1.0)
+        wait(blender, "running.queue.running is None or running.queue.running.progress > 0.9", 1.0)
         found["training, undrawn"] = blender.run(STOP)
         wait(blender, "running.queue.running is None")
         blender.run(NAMES + "running.redraw = running.shown")
