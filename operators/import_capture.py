@@ -19,10 +19,11 @@ class ImportCapture(bpy.types.Operator):
 
     directory: StringProperty(name="Capture", subtype="DIR_PATH", description="Folder with images/ and sparse/0")
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
+    # No folder to Blender, whose button for these refuses to open a second file browser.
     folder: StringProperty(
-        name="Save To", subtype="DIR_PATH",
-        description="Reconstruction folder, which may grow to gigabytes; empty: named as the capture, in the folder "
-                    "that the preferences say")
+        name="Save To",
+        description="Path of the reconstruction folder, which may grow to gigabytes; empty: named as the capture, in "
+                    "the folder that the preferences say")
     max_size: IntProperty(name="Image Size", default=1600, min=64, soft_max=8192,
                           description="Larger photos are reduced to this longest side, in pixels")
 
@@ -36,7 +37,7 @@ class ImportCapture(bpy.types.Operator):
 
     def draw(self, _context):
         self.layout.use_property_split = True
-        self.layout.prop(self, "folder")
+        self.layout.prop(self, "folder", placeholder="Automatic")
         self.layout.prop(self, "max_size")
 
     def execute(self, context):
