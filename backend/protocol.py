@@ -70,16 +70,15 @@ class Reconstruction:
 
 
 @contextmanager
-def atomic_file(path: Path) -> Iterator[BinaryIO]:
-    """A file beside `path` to write to; synced and renamed at the end, so that `path` is old or new, never half.
+def atomic_path(path: Path, part: Path) -> Iterator[Path]:
+    """`part`, beside `path`, for what writes files by itself; synced and renamed at the end, so that `path` is old or
+    new, never half.
 
     An OSError names `path`, also where the system names nothing (a full disk).
     """
-    part = path.with_name(path.name + ".part")
     try:
-        with open(part, "wb") as file:
-            yield file
-            file.flush()
+        yield part
+        with open(part, "rb+") as file:
             os.fsync(file.fileno())
         os.replace(part, path)
     except BaseException as error:
@@ -87,6 +86,13 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
         if isinstance(error, OSError):
             error.filename = str(path)
         raise
+
+
+@contextmanager
+def atomic_file(path: Path) -> Iterator[BinaryIO]:
+    """A file to write to, which becomes `path` as with `atomic_path`."""
+    with atomic_path(path, path.with_name(path.name + ".part")) as part, open(part, "wb") as file:
+        yield file
 
 
 def write_atomic(path: Path, data: bytes) -> None:

@@ -49,7 +49,7 @@ FINISHED = (State.DONE, State.STOPPED, State.FAILED)
 class Job:
     """One command of the backend, or another program that speaks as it does.
 
-    title: what the user reads. kind: import, vote, train, mesh, evaluate, film, demo, setup, doctor. folder: the
+    title: what the user reads. kind: import, vote, train, mesh, evaluate, film, fill, demo, setup, doctor. folder: the
     reconstruction's, or None. environment: extra variables. if_silent: the sentence where the program ends without any
     event, which means that it is not what it was taken for.
 

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Where things are: the extension's files, the user's folder, the backend's Python."""
 
+import itertools
 import os
+import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import bpy
@@ -38,6 +41,13 @@ def reconstructions_folder() -> Path:
     """Where reconstructions go unless the user says otherwise."""
     chosen = preferences().reconstructions if preferences() else ""
     return Path(bpy.path.abspath(chosen)) if chosen else user_folder() / "reconstructions"
+
+
+def new_reconstruction(name: str, is_free: Callable[[Path], bool]) -> Path:
+    """A folder for a reconstruction of this name, numbered until `is_free` says that it may be taken."""
+    name = re.sub(r"[^\w.-]+", "_", name) or "capture"
+    numbered = (name if number == 1 else f"{name}-{number}" for number in itertools.count(1))
+    return next(folder for each in numbered if is_free(folder := reconstructions_folder() / each))
 
 
 def backend_python() -> Path | None:

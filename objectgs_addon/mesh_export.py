@@ -13,8 +13,6 @@ from ..backend.protocol import InputError
 from . import scene
 from .quiet import quiet
 
-SUFFIXES = ("glb", "usdc", "obj")
-
 
 def export(root, out: Path, suffix: str, ids: list[int] | None, per_object: bool, in_capture: bool) -> list[Path]:
     """Write the meshes of objects (None: all that have one and are not removed) and of their duplicates.
@@ -44,12 +42,6 @@ def export(root, out: Path, suffix: str, ids: list[int] | None, per_object: bool
         with _stage(root, parts, in_capture):
             _write(path, suffix, in_capture)
     return list(files)
-
-
-def with_suffix(path: Path, suffix: str, is_folder: bool) -> Path:
-    """The path with the format's suffix, or, of a folder, without any."""
-    bare = path.with_suffix("") if path.suffix[1:].lower() in SUFFIXES else path
-    return bare if is_folder else bare.with_name(f"{bare.name}.{suffix}")
 
 
 def _write(path: Path, suffix: str, in_capture: bool) -> None:

@@ -2,7 +2,7 @@
 """The objects list and objects.json: filled from the file, and the user's edits written back to it."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -22,6 +22,9 @@ SLIDERS = ("amount", "hue", "saturation", "value", "contrast")
 COLOURS = ("replace", "tint")
 DIGITS = 6
 """Decimals of a slider's value: Blender's numbers have no more."""
+
+after_edits: list[Callable[[bpy.types.Collection], None]] = []
+"""Called with a reconstruction's collection once an edit that the backend may have to do something for is shown."""
 
 _filling = False
 _unwritten: set[tuple[int, int]] = set()
@@ -72,8 +75,8 @@ def fill(root) -> None:
 def splat_counts(root) -> dict[int, int]:
     """Object ID -> how many splats its collection shows, merged ones included."""
     return {
-        object_id: sum(len(part.data.vertices) for part in scene.parts_of(collection)
-                       if scene.kind_of(part) == "splats")
+        object_id: sum(len(part.data.vertices) - int(scene.invented_splats(part.data).sum())
+                       for part in scene.parts_of(collection) if scene.kind_of(part) == "splats")
         for object_id, collection in scene.object_collections(root).items()
     }
 
@@ -156,6 +159,7 @@ def _edit(root, changes: dict[int, dict]) -> None:
             show(root, owner)
     finally:
         fill(root)
+    _tell(root)
 
 
 def show(root, owner) -> None:
@@ -168,8 +172,8 @@ def show(root, owner) -> None:
 
 
 def remove(root, object_ids: Iterable[int], floaters: bool, fill: bool = False) -> None:
-    """Make objects invisible, until they are restored; floaters: with what floats unlabelled inside them; fill: exports
-    and films close the ground that they hid."""
+    """Make objects invisible, until they are restored; floaters: with what floats unlabelled inside them; fill: and
+    the ground or wall that they hid is closed."""
     change = {"removed": True, "floaters": floaters or None, "fill": fill or None}
     _show_edit(root, dict.fromkeys(object_ids, change))
 
@@ -177,6 +181,11 @@ def remove(root, object_ids: Iterable[int], floaters: bool, fill: bool = False) 
 def restore(root, object_ids: Iterable[int]) -> None:
     """Make removed objects visible again, exactly as they were."""
     _show_edit(root, {object_id: {"removed": None, "floaters": None, "fill": None} for object_id in object_ids})
+
+
+def close_place(root, object_id: int, is_closed: bool) -> None:
+    """Close what a removed object hid, or leave it as it was trained."""
+    _show_edit(root, {object_id: {"fill": is_closed or None}})
 
 
 def reset_colours(root, object_ids: Iterable[int]) -> None:
@@ -194,6 +203,12 @@ def _show_edit(root, changes: dict[int, dict]) -> None:
         scene.show_edits(root, scene.Objects.read(folder))
     finally:
         fill(root)
+    _tell(root)
+
+
+def _tell(root) -> None:
+    for call in after_edits:
+        call(root)
 
 
 def flush() -> None:
@@ -355,6 +370,7 @@ def _row_changed(item, **changes) -> None:
     try:
         for owner in scenes_of(root)[:1]:
             scene.show_objects(root, folder, owner)
+        _tell(root)
     except (InputError, OSError) as error:
         messages.show(messages.sentence(error), "ERROR")
 

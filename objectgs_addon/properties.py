@@ -50,7 +50,7 @@ class ObjectItem(bpy.types.PropertyGroup):
     merged_into: IntProperty(name="Merged into", description="ID of the object that this one is a part of")
     removed: BoolProperty(name="Removed", description="Not to be seen, until it is restored")
     floaters: BoolProperty(name="Floaters Too", description="Removed with what floats unlabelled inside it")
-    fill: BoolProperty(name="Fill", description="Exports and films close the ground or wall that it hid")
+    fill: BoolProperty(name="Fill", description="The ground or wall that it hid is closed with what is around")
     replace: _shade("New Color", 0.5, "Takes the place of the object's own color; its shading stays")
     amount: _slider("Amount", 0.0, 0.0, 1.0, "How much of the new color")
     hue: _slider("Hue", 0.0, -0.5, 0.5, "Turns of the color wheel; brightness stays")

@@ -8,6 +8,7 @@ whoever opens the reconstruction's .blend again finds its job by the folder.
 import time
 import traceback
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import bpy
@@ -28,6 +29,8 @@ _wanted_in: dict[Job, int] = {}
 """Job -> the session's ID of the scene that asked for it, which stays when that is renamed."""
 _results: list[Job] = []
 """Jobs whose result is still to be shown, because something is in the way."""
+_asked_for: dict[Path, Path] = {}
+"""Reconstruction folder -> the file that a job was to make which closes places, when the latest was submitted."""
 _told: set[Job] = set()
 """Those of them for which the user knows why."""
 
@@ -53,6 +56,26 @@ def submit(job: Job, owner, report: Callable[[set, str], None]) -> set:
     if not bpy.app.timers.is_registered(_tick):
         bpy.app.timers.register(_tick, first_interval=0.0, persistent=True)
     return {"FINISHED"}
+
+
+def close_places(root, again: bool = True) -> None:
+    """Have the backend work out what closes the places of removed objects where the folder does not hold that yet;
+    again: also where it was asked for that before, and failed."""
+    folder = scene.folder_of(root)
+    missing = scene.missing_fill(root, scene.Objects.read(folder))
+    is_asked = any(job.kind == "fill" and job.folder == folder and not job.is_finished for job in queue.jobs)
+    owner = next(iter(object_edits.scenes_of(root)), None)
+    if missing is None or is_asked or owner is None or (not again and _asked_for.get(folder) == missing):
+        return
+    _asked_for[folder] = missing
+
+    def tell(_kind, text: str) -> None:
+        messages.show(text, "ERROR")
+
+    if locations.backend_python() is None:
+        tell({"ERROR"}, f"What removed objects hid is not closed: {locations.backend_sentence()}")
+    else:
+        submit(locations.backend_job(f"Fill of {root.name}", "fill", folder, "edit", str(folder)), owner, tell)
 
 
 def job_of(root) -> Job | None:
@@ -158,6 +181,8 @@ def finish(job: Job) -> None:
     after = _AFTER.get(job.kind)
     if after is not None and after(job, owner):
         _push_undo(job.title)
+    for root in _roots_of(job.folder):
+        close_places(root, again=False)
 
 
 def _roots_of(folder: Path | None) -> list:
@@ -233,6 +258,17 @@ def _show_meshes(job: Job, owner) -> bool:
     return bool(roots) or _explain(job)
 
 
+def _show_fill(job: Job, _owner) -> bool:
+    """No undo step: what is shown follows from the edits, and comes and goes with theirs."""
+    for root in _shown_roots(job, None):
+        _show_fill_of(root)
+    return False
+
+
+def _show_fill_of(root) -> None:
+    scene.show_fills(root, scene.Objects.read(scene.folder_of(root)))
+
+
 def _explain(job: Job) -> bool:
     """Say where the result is that has no place in the open file any more; False, since nothing has changed."""
     messages.show(f"{job.title} has ended, but its scene or collection is gone; Open Reconstruction shows "
@@ -259,7 +295,8 @@ def _show_film(job: Job, owner) -> bool:
 
 
 _AFTER = {"demo": _import_demo, "import": _show_capture, "vote": _show_votes, "train": _show_result,
-          "mesh": _show_meshes, "film": _show_film, "import-splats": _show_imported}
+          "mesh": _show_meshes, "film": _show_film, "import-splats": _show_imported,
+          "fill": _show_fill}
 
 
 def _push_undo(title: str) -> None:
@@ -271,10 +308,10 @@ def _push_undo(title: str) -> None:
 
 @bpy.app.handlers.persistent
 def _undone(*_) -> None:
-    """The list was undone or redone: objects.json follows."""
-    for root in bpy.data.collections:
-        if scene.kind_of(root) == "reconstruction":
-            _store(root, object_edits.store)
+    """The list was undone or redone: objects.json follows, and what closes places follows that."""
+    for root in [root for root in bpy.data.collections if scene.kind_of(root) == "reconstruction"]:
+        for how in (object_edits.store, _show_fill_of, partial(close_places, again=False)):
+            _store(root, how)
 
 
 @bpy.app.handlers.persistent
@@ -308,6 +345,7 @@ def _file_loaded(*_) -> None:
 
 
 def register():
+    object_edits.after_edits.append(close_places)
     bpy.app.handlers.load_post.append(_file_loaded)
     bpy.app.handlers.save_pre.append(_saving)
     bpy.app.handlers.undo_post.append(_undone)
@@ -319,10 +357,11 @@ def unregister():
     bpy.app.handlers.undo_post.remove(_undone)
     bpy.app.handlers.save_pre.remove(_saving)
     bpy.app.handlers.load_post.remove(_file_loaded)
+    object_edits.after_edits.remove(close_places)
     object_edits.flush()
     if bpy.app.timers.is_registered(_tick):
         bpy.app.timers.unregister(_tick)
     queue.stop_all(timeout=10.0)
-    for known in (_results, _told, _wanted_in):
+    for known in (_results, _told, _wanted_in, _asked_for):
         known.clear()
     previews.clear()

@@ -5,6 +5,7 @@
 def _classes():
     from . import (
         choose_objects,
+        close_place,
         duplicate_object,
         export_meshes,
         export_splats,
@@ -36,8 +37,9 @@ def _classes():
 
     modules = (import_capture, make_demo, vote, plan, train, extract_meshes, pause_job, stop_job, show_result,
                show_preview, select_object, pick_object, find_objects, solo_object, merge_objects, choose_objects,
-               mark_assets, orient, remove_object, restore_object, duplicate_object, reset_object, export_splats,
-               import_splats, export_meshes, film_frames, set_up_compositor, set_up_backend)
+               mark_assets, orient, remove_object, restore_object, close_place, duplicate_object,
+               reset_object, export_splats, import_splats, export_meshes, film_frames, set_up_compositor,
+               set_up_backend)
     return [cls for module in modules for cls in module.CLASSES]
 
 

@@ -18,14 +18,7 @@ class DuplicateObject(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        if not need.edited(cls, context):
-            return False
-        root = need.active_root(context)
-        item = object_edits.shown_item(root)
-        if not item.removed or selection.selected_collections(context, root):
-            return True
-        cls.poll_message_set(f"{item.name} is removed; restore it first")
-        return False
+        return need.not_removed(cls, context, "; restore it first")
 
     def execute(self, context):
         root = need.active_root(context)

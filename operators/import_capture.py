@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Import a capture: cameras with their photos, and the point cloud."""
 
-import itertools
-import re
 from pathlib import Path
 
 import bpy
@@ -21,10 +19,11 @@ class ImportCapture(bpy.types.Operator):
 
     directory: StringProperty(name="Capture", subtype="DIR_PATH", description="Folder with images/ and sparse/0")
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
+    # No folder to Blender, whose button for these refuses to open a second file browser.
     folder: StringProperty(
-        name="Save To", subtype="DIR_PATH",
-        description="Reconstruction folder, which may grow to gigabytes; empty: named as the capture, in the folder "
-                    "that the preferences say")
+        name="Save To",
+        description="Path of the reconstruction folder, which may grow to gigabytes; empty: named as the capture, in "
+                    "the folder that the preferences say")
     max_size: IntProperty(name="Image Size", default=1600, min=64, soft_max=8192,
                           description="Larger photos are reduced to this longest side, in pixels")
 
@@ -38,7 +37,7 @@ class ImportCapture(bpy.types.Operator):
 
     def draw(self, _context):
         self.layout.use_property_split = True
-        self.layout.prop(self, "folder")
+        self.layout.prop(self, "folder", placeholder="Automatic")
         self.layout.prop(self, "max_size")
 
     def execute(self, context):
@@ -62,11 +61,7 @@ def _folder_for(capture: Path) -> Path:
     Numbered where that name belongs to another capture.
     """
     name = capture.name if capture.name.lower() not in ("capture", "colmap", "data") else capture.parent.name
-    name = re.sub(r"[^\w.-]+", "_", name) or "capture"
-    for number in itertools.count(1):
-        folder = locations.reconstructions_folder() / (name if number == 1 else f"{name}-{number}")
-        if folder_state(folder).capture in (None, capture):
-            return folder
+    return locations.new_reconstruction(name, lambda folder: folder_state(folder).capture in (None, capture))
 
 
 CLASSES = (ImportCapture,)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Import Splats: those of other programs, as a reconstruction whose objects can be edited."""
 
-import itertools
-import re
 from pathlib import Path
 
 import bpy
@@ -21,10 +19,12 @@ class ImportSplats(bpy.types.Operator):
 
     filepath: StringProperty(name="File", subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
-    capture: StringProperty(name="Capture", subtype="DIR_PATH", description=(
-        "Folder with images/, sparse/0 and masks/ that the splats were trained on; empty: the file's own objects"))
-    folder: StringProperty(name="Save To", subtype="DIR_PATH", description=(
-        "Reconstruction folder to make; empty: named as the file, in the folder that the preferences say"))
+    # No folders to Blender, whose button for these refuses to open a second file browser.
+    capture: StringProperty(name="Capture", description=(
+        "Path of the folder with images/, sparse/0 and masks/ that the splats were trained on; empty: the file's own "
+        "objects"))
+    folder: StringProperty(name="Save To", description=(
+        "Path of the reconstruction folder to make; empty: named as the file, in the folder that the preferences say"))
 
     @classmethod
     def poll(cls, _context):
@@ -36,8 +36,8 @@ class ImportSplats(bpy.types.Operator):
 
     def draw(self, _context):
         self.layout.use_property_split = True
-        self.layout.prop(self, "capture")
-        self.layout.prop(self, "folder")
+        self.layout.prop(self, "capture", placeholder="Path, for objects")
+        self.layout.prop(self, "folder", placeholder="Automatic")
 
     def execute(self, context):
         ply = Path(bpy.path.abspath(self.filepath)).resolve()
@@ -59,11 +59,7 @@ class ImportSplats(bpy.types.Operator):
 def _folder_for(ply: Path) -> Path:
     """A reconstruction folder that is not there yet, named as the file, or as its folder where that says more."""
     name = ply.parent.name if ply.stem.lower() in ("point_cloud", "splats", "splat") else ply.stem
-    name = re.sub(r"[^\w.-]+", "_", name) or "splats"
-    for number in itertools.count(1):
-        folder = locations.reconstructions_folder() / (name if number == 1 else f"{name}-{number}")
-        if not folder.exists():
-            return folder
+    return locations.new_reconstruction(name, lambda folder: not folder.exists())
 
 
 CLASSES = (ImportSplats,)

@@ -4,7 +4,7 @@
 import os
 from pathlib import Path
 
-from ..objectgs_addon import jobs, locations, object_edits, running, scene
+from ..objectgs_addon import jobs, locations, object_edits, running, scene, selection
 from ..objectgs_addon.folder_state import folder_state
 
 
@@ -82,6 +82,19 @@ def edited(cls, context) -> bool:
     if object_edits.from_stored(item.object_id) in scene.object_collections(root):
         return True
     cls.poll_message_set(f"{item.name} has no splats and no mesh yet; train first, or choose another in the list")
+    return False
+
+
+def not_removed(cls, context, but: str) -> bool:
+    """As `edited`, and the active row is not removed, unless something is selected in the viewport; but: what to do
+    where it is."""
+    if not edited(cls, context):
+        return False
+    root = active_root(context)
+    item = object_edits.shown_item(root)
+    if not item.removed or selection.selected_collections(context, root):
+        return True
+    cls.poll_message_set(f"{item.name} is removed{but}")
     return False
 
 

@@ -18,19 +18,11 @@ class RemoveObject(bpy.types.Operator):
 
     floaters: BoolProperty(name="Floaters Too",
                            description="Also what belongs to no object and lies inside the removed one")
-    fill: BoolProperty(name="Fill", description="Films and exports close the flat ground or wall that the object hid; "
-                                                "viewports do not show that")
+    fill: BoolProperty(name="Fill", description="Close the ground or wall that the object hid with what is around it")
 
     @classmethod
     def poll(cls, context):
-        if not need.edited(cls, context):
-            return False
-        root = need.active_root(context)
-        item = object_edits.shown_item(root)
-        if not item.removed or selection.selected_collections(context, root):
-            return True
-        cls.poll_message_set(f"{item.name} is removed already")
-        return False
+        return need.not_removed(cls, context, " already")
 
     def execute(self, context):
         root = need.active_root(context)

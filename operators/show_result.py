@@ -7,7 +7,7 @@ import bpy
 from bpy.props import StringProperty
 
 from ..backend.protocol import InputError, Reconstruction
-from ..objectgs_addon import messages, object_edits, scene, view
+from ..objectgs_addon import messages, object_edits, running, scene, view
 from . import need
 
 
@@ -64,6 +64,7 @@ def _show(operator, context, folder: Path, root) -> set:
                 operator.report({"WARNING"}, sentence)
             operator.report({"INFO"}, f"{shown.splats:,} splats of {shown.objects} objects")
             object_edits.fill(root)
+            running.close_places(root)
     except (InputError, OSError) as error:
         operator.report({"ERROR"}, messages.sentence(error))  # Cameras and points are there, and can be undone.
     return {"FINISHED"}

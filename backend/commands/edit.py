@@ -17,13 +17,14 @@ from ..objects import Matrix, SceneObject, edit_objects, find_object, merged, re
 from ..protocol import InputError, Reconstruction
 from ..stopping import StoppingReporter
 from .cameras import read_upright
+from .filling import close_places
 
 _NONE: dict[str, Any] = dict.fromkeys(("removed", "floaters", "fill", "recolour", "transform", "copies"))
 """Takes every edit of an object back that this command makes."""
 
 
 def edit(options: argparse.Namespace, reporter: StoppingReporter) -> None:
-    """Store the edits that are asked for, then say what is edited."""
+    """Store the edits that are asked for, work out what closes the places of the removed, and say what is edited."""
     folder = Reconstruction(options.folder)
     for name in ("floaters", "fill"):
         if getattr(options, name) and not options.remove:
@@ -47,10 +48,14 @@ def edit(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         wanted.change(entry, copies=[*wanted.copies(entry), wanted.place(entry, Placement(**values))])
     if wanted.changes:
         edit_objects(folder.objects, wanted.changes)
+    invented = close_places(folder, reporter)
     # As one message, since who shows the state of a job shows only the latest.
-    lines = [f"{e.id} {e.name}: {', '.join(_described(e)) or 'as captured'}" for e in read_objects(folder.objects)]
+    lines = [
+        f"{e.id} {e.name}: {', '.join(_described(e, invented.get(e.id))) or 'as captured'}"
+        for e in read_objects(folder.objects)
+    ]
     reporter.status("\n".join(lines) or "There are no objects.")
-    reporter.done(objects=str(folder.objects), edited=len(wanted.changes))
+    reporter.done(objects=str(folder.objects), edited=len(wanted.changes), invented=sum(invented.values()))
 
 
 class _Edits:
@@ -87,13 +92,16 @@ class _Edits:
         return read_splats(self.folder.splats)[0]
 
 
-def _described(entry: SceneObject) -> list[str]:
-    """What is edited about an object, in words."""
+def _described(entry: SceneObject, invented: int | None) -> list[str]:
+    """What is edited about an object, in words; invented: how many splats close its place, where that was asked for."""
     words = [f"merged into {entry.merged_into}"] if entry.merged_into is not None else []
     words += ["left out"] if entry.left_out else []
     if entry.removed:
-        filled = ", its place filled" if entry.fill else ""
-        words.append("removed" + " with floaters" * entry.floaters + filled)
+        words.append("removed" + " with floaters" * entry.floaters)
+        if entry.fill and invented == 0:
+            words.append("nothing flat around it that could close its place")
+        elif entry.fill:
+            words.append("its place filled" + f" by {invented:,} invented splats" * bool(invented))
     if entry.recolour:
         stored = entry.recolour.stored() or {}
         words.append("recoloured " + " ".join(f"{key}={_short(value)}" for key, value in stored.items()))

@@ -1,5 +1,5 @@
 """What the user changed about objects, applied to splats."""
 
-from .apply import apply_edits, recoloured, transformed
+from .apply import Fill, apply_edits, fill_of, recoloured, transformed
 
-__all__ = ["apply_edits", "recoloured", "transformed"]
+__all__ = ["Fill", "apply_edits", "fill_of", "recoloured", "transformed"]

@@ -4,7 +4,7 @@ are, bit for bit and in their order, so that pixels without an edited object sta
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +14,7 @@ from .. import spherical_harmonics
 from ..model.splats import Splats, concatenate
 from ..objects import SceneObject, merged
 from ..recolour import Recolour
-from .fill import filled
+from .fill import closing
 from .floaters import inside_hull
 
 UNIFORM_WITHIN = 1e-6
@@ -31,16 +31,7 @@ def apply_edits(splats: Splats, objects: Sequence[SceneObject]) -> Splats:
     Splats of a merged object get the ID of the one it is shown as, whose edits count for both; copies keep the ID of
     what they are copies of and come last. IDs that `objects` does not list stay as they are.
     """
-    known, slots = np.unique(splats.object_ids, return_inverse=True)
-    shown = _shown_as(known, objects)[slots]
-    keep = shown != _DROPPED
-    for entry in objects:
-        if entry.removed and entry.floaters:
-            keep &= ~_floaters(splats, _with_id(splats, entry.id, objects))
-    edited = replace(splats.select(keep), object_ids=shown[keep])
-    for entry in objects:
-        if entry.removed and entry.fill:
-            edited = filled(edited, splats.select(_with_id(splats, entry.id, objects)))
+    edited = _closed(splats, objects)[0]
     copies = []
     for entry in objects:
         mine = np.flatnonzero(edited.object_ids == entry.id)
@@ -55,6 +46,23 @@ def apply_edits(splats: Splats, objects: Sequence[SceneObject]) -> Splats:
         for name in ("means", "quats", "scales", "sh"):
             getattr(edited, name)[mine] = getattr(own, name)
     return concatenate([edited, *copies]) if copies else edited
+
+
+@dataclass(frozen=True)
+class Fill:
+    """What closes the places of removed objects, where it was captured and in its own colours.
+
+    splats: n, of which put (n,) bool come and the others, captured ones, give way; closes (n,): for whose place.
+    """
+
+    splats: Splats
+    put: NDArray[np.bool_]
+    closes: NDArray[np.int64]
+
+
+def fill_of(splats: Splats, objects: Sequence[SceneObject]) -> Fill:
+    """What `apply_edits` closes the places of removed objects with."""
+    return _closed(splats, objects)[1]
 
 
 def transformed(splats: Splats, matrix: ArrayLike) -> Splats:
@@ -88,6 +96,33 @@ def recoloured(splats: Splats, recolour: Recolour) -> Splats:
     sh = splats.sh @ matrix.T
     sh[:, 0] += (0.5 * matrix.sum(1) + offset - 0.5) / spherical_harmonics.C0
     return replace(splats, sh=sh.astype(splats.sh.dtype))
+
+
+def _closed(splats: Splats, objects: Sequence[SceneObject]) -> tuple[Splats, Fill]:
+    """The splats that are to be seen, under the IDs that they are shown as, with what closes the places of the removed;
+    and that alone."""
+    known, slots = np.unique(splats.object_ids, return_inverse=True)
+    shown = _shown_as(known, objects)[slots]
+    keep = shown != _DROPPED
+    for entry in objects:
+        if entry.removed and entry.floaters:
+            keep &= ~_floaters(splats, _with_id(splats, entry.id, objects))
+    edited = replace(splats.select(keep), object_ids=shown[keep])
+    closes = np.zeros(len(edited), np.int64)
+    taken: list[tuple[Splats, int]] = []
+    for entry in objects:
+        if not (entry.removed and entry.fill):
+            continue
+        gone, put = closing(edited, splats.select(_with_id(splats, entry.id, objects)))
+        if len(put) == 0:
+            continue
+        taken.append((edited.select(gone & (closes == 0)), entry.id))
+        edited = concatenate([edited.select(~gone), put])
+        closes = np.append(closes[~gone], np.full(len(put), entry.id))
+    parts = [edited.select(closes != 0), *(part for part, _ in taken)]
+    counts = [len(part) for part in parts]
+    whose = np.concatenate([closes[closes != 0], np.repeat([i for _, i in taken], counts[1:]).astype(np.int64)])
+    return edited, Fill(concatenate(parts), np.arange(sum(counts)) < counts[0], whose)
 
 
 def _shown_as(ids: NDArray[np.int64], objects: Sequence[SceneObject]) -> NDArray[np.int64]:

@@ -1,11 +1,12 @@
 """Closing the ground or wall that a removed object hid: its surroundings, copied over the hole.
 
-The object stands on, or at, planes that its neighbours' splats lie in. Where it hid such a plane, no photo says how it
-looks; a part of the same plane that does show is put there, with the detail (grain, joints) that fits the hole's rim
-best, and with the colours around the hole, which shade it as its surroundings are.
+The object stands on, or at, planes that its neighbours' splats lie in, or near to where cloth is rumpled. Where it hid
+such a plane, no photo says how it looks; a part of the same surface that does show is put there, with the detail
+(grain, joints) that fits the hole's rim best, and with the colours and the relief around the hole, which shade and bend
+it as its surroundings are. Where several things meet under the object, such as sheets of paper, each is continued by
+straight edges.
 
-Only flat ground or walls that belong to one object (or to none) and lie around the whole hole are closed: a rumpled
-cloth, or several sheets of paper that meet under the object, stay as they were trained.
+Only a surface that lies around the whole hole is closed: the object may stand at its edge, which nobody can tell.
 """
 
 from __future__ import annotations
@@ -14,8 +15,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_closing, binary_dilation, binary_fill_holes, gaussian_filter, map_coordinates
-from scipy.signal import correlate
+from scipy.fft import irfft2, rfft2
+from scipy.ndimage import (
+    binary_closing,
+    binary_dilation,
+    binary_fill_holes,
+    binary_opening,
+    distance_transform_edt,
+    gaussian_filter,
+    map_coordinates,
+)
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -27,8 +36,11 @@ PLANES = 3
 """An object may stand in a corner."""
 NEAR = 0.5
 """How far around the object its planes are looked for, relative to its size."""
-FLAT_WITHIN = 0.02
-"""Distance from a plane, relative to the object's size, within which splats lie in it."""
+FLAT_WITHIN = (0.02, 0.04, 0.08)
+"""Distance from a plane, relative to the object's size, within which splats lie in it; larger ones, for what is not
+flat, where smaller ones leave the hole open."""
+PART_OF_IT = 0.5
+"""Share of another object's splats around the removed one that must lie in a plane, or it only stands on it."""
 LOWEST_PERCENT = 3.0
 TOUCHES_WITHIN = 0.1
 """So near to a plane that it stands on, relative to its size, its lowest percent must come, and not below."""
@@ -51,6 +63,11 @@ RIM = 2
 BAND = 5
 """Cells around the hole by which a patch is chosen."""
 SMALLEST_PATCH = 4
+RELIEF_WITHIN = 0.03
+"""Height above or below what is around, relative to the object's size, from which on something lies on the surface."""
+SHELL = 0.06
+"""Distance from the object's own splats, relative to its size, within which splats of the surface that stand above it
+are the object's, wrongly labelled."""
 
 _TRIPLES = 600
 _SCORED = 3000
@@ -58,36 +75,73 @@ _REACH = 3.0
 _WIDEST = 16
 
 
-def filled(splats: Splats, removed: Splats) -> Splats:
-    """`splats`, without those of the object `removed`, with the holes closed that it leaves: splats at a hole's rim
-    give way to invented ones, which carry the IDs of the surface they continue. As it was where there is no hole."""
+def closing(splats: Splats, removed: Splats) -> tuple[NDArray[np.bool_], Splats]:
+    """What closes the holes that an object leaves in `splats`, which are without its own, `removed`: which of them give
+    way at the holes' rims (N,), and the invented ones that come, with the IDs of the surface that they continue."""
+    gone, parts = np.zeros(len(splats), bool), [Splats.empty(splats.degree)]
     solid = body(removed.means, removed.opacities)
     if len(solid) < FEWEST:
-        return splats
+        return gone, parts[0]
     size = float(np.linalg.norm(np.percentile(solid, 95, axis=0) - np.percentile(solid, 5, axis=0)))
     middle = np.median(solid, axis=0)
-    centred = splats.means.astype(np.float64) - middle
-    reach = np.flatnonzero(np.linalg.norm(centred, axis=1) < (1.0 + WINDOW) * size)
-    distances, _ = cKDTree(solid - middle).query(centred[reach], distance_upper_bound=NEAR * size)
-    near = reach[np.isfinite(distances) & (splats.opacities[reach] > 0.3)]
-    thin = np.zeros_like(centred)
-    thin[reach] = _thin_axes(splats.select(reach))
-    planes: list[_Plane] = []
-    flats = []
-    while len(planes) < PLANES and (plane := _plane(centred[near], thin[near], solid - middle, size, planes)):
-        within = np.abs(plane.height(centred)) < FLAT_WITHIN * size
-        owners, counts = np.unique(splats.object_ids[near[within[near]]], return_counts=True)
-        near = near[~within[near]]
-        planes.append(plane)
-        flats.append(reach[within[reach] & (splats.object_ids[reach] == owners[counts.argmax()])])
-    gone, parts = np.zeros(len(splats), bool), []
-    for plane, flat in zip(planes, flats):
-        surface = _Surface(plane, splats.select(flat), centred[flat], solid - middle, size)
-        beyond = surface.beyond([other for other in planes if other is not plane])
-        replaced, patches = surface.closed(beyond)
-        gone[flat[replaced]] = True
-        parts += patches
-    return concatenate([splats.select(~gone), *parts]) if parts else splats
+    around = _Around(splats, solid - middle, middle, size)
+    for within in FLAT_WITHIN:
+        # Where the surface is rough, so are the labels: more of the object's lowest is taken for the surface's.
+        rough = within / FLAT_WITHIN[0]
+        planes = around.planes(within * size)
+        for plane, flat in planes:
+            surface = _Surface(plane, splats.select(flat), around.centred[flat], solid - middle, size, rough)
+            replaced, patches = surface.closed(surface.beyond([other for other, _ in planes if other is not plane]))
+            gone[flat[replaced]] = True
+            if patches:
+                gone[around.shell(flat, [each for each, _ in planes], within * size)] = True
+            parts += patches
+        if len(parts) > 1:
+            break
+    return gone, concatenate(parts)
+
+
+class _Around:
+    """The splats around a removed object, whose own are at solid (m, 3) from its `middle`. centred (N, 3): all splats
+    from there; far (N,): how far from its nearest one, infinite beyond `NEAR`; near and reach: indices of those that
+    may show its planes, and that planes may be continued from."""
+
+    def __init__(self, splats: Splats, solid: NDArray, middle: NDArray, size: float) -> None:
+        self.splats, self.solid, self.size = splats, solid, size
+        self.centred = splats.means.astype(np.float64) - middle
+        self.reach = np.flatnonzero(np.linalg.norm(self.centred, axis=1) < (1.0 + WINDOW) * size)
+        self.far = np.full(len(splats), np.inf)
+        self.far[self.reach] = cKDTree(solid).query(self.centred[self.reach], distance_upper_bound=NEAR * size)[0]
+        self.near = np.flatnonzero(np.isfinite(self.far) & (splats.opacities > 0.3))
+        self.thin = np.zeros_like(self.centred)
+        self.thin[self.reach] = _thin_axes(splats.select(self.reach))
+
+    def planes(self, within: float) -> list[tuple[_Plane, NDArray[np.int64]]]:
+        """The planes that the object stands on or at, and the indices of the splats of what lies in each."""
+        near = self.near
+        found: list[tuple[_Plane, NDArray[np.int64]]] = []
+        while len(found) < PLANES:
+            before = [plane for plane, _ in found]
+            plane = _plane(self.centred[near], self.thin[near], self.solid, self.size, within, before)
+            if plane is None:
+                break
+            flat = np.abs(plane.height(self.centred)) < within
+            ids, counts = np.unique(self.splats.object_ids[near[flat[near]]], return_counts=True)
+            there = self.splats.object_ids[self.near]
+            part = [
+                object_id
+                for object_id, count in zip(ids.tolist(), counts.tolist())
+                if count == counts.max() or count >= max(FEWEST, PART_OF_IT * (there == object_id).sum())
+            ]
+            found.append((plane, self.reach[flat[self.reach] & np.isin(self.splats.object_ids[self.reach], part)]))
+            near = near[~flat[near]]
+        return found
+
+    def shell(self, flat: NDArray[np.int64], planes: list[_Plane], within: float) -> NDArray[np.int64]:
+        """Splats of what lies in a plane, `flat`, that stand above all planes where the object was."""
+        close = np.flatnonzero(self.far < SHELL * self.size)
+        standing = np.all([plane.height(self.centred[close]) > within for plane in planes], axis=0)
+        return close[standing & np.isin(self.splats.object_ids[close], np.unique(self.splats.object_ids[flat]))]
 
 
 @dataclass(frozen=True)
@@ -112,12 +166,13 @@ def _thin_axes(splats: Splats) -> NDArray[np.float64]:
     return np.take_along_axis(axes, splats.scales.argmin(1)[:, None, None], 2)[:, :, 0]
 
 
-def _plane(points: NDArray, thin: NDArray, solid: NDArray, size: float, before: list[_Plane]) -> _Plane | None:
-    """The plane that most of points (n, 3) lie in, with the splats' thin axes (n, 3) across it, and the object's own,
-    solid (m, 3), stand on or at; or None. It is not parallel to those found before."""
+def _plane(
+    points: NDArray, thin: NDArray, solid: NDArray, size: float, within: float, before: list[_Plane]
+) -> _Plane | None:
+    """The plane that most of points (n, 3) lie `within` of, with the splats' thin axes (n, 3) across it, and the
+    object's own, solid (m, 3), stand on or at; or None. It is not parallel to those found before."""
     if len(points) < FEWEST:
         return None
-    within = FLAT_WITHIN * size
     rng = np.random.default_rng(0)
     corners = points[rng.integers(len(points), size=(_TRIPLES, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -153,10 +208,13 @@ def _plane(points: NDArray, thin: NDArray, solid: NDArray, size: float, before: 
 class _Surface:
     """The splats that lie in a plane, seen from straight above on a grid of square cells around the object.
 
-    at (n, 2): their centres in cells; under and touched (CELLS, CELLS): what the object hides and where it stands.
+    at (n, 2): their centres in cells; look (n, 4): base colour, and height above the plane in cells; owners: whose they
+    are; under and touched (CELLS, CELLS): what the object hides and where it stands.
     """
 
-    def __init__(self, plane: _Plane, splats: Splats, centred: NDArray, solid: NDArray, size: float) -> None:
+    def __init__(
+        self, plane: _Plane, splats: Splats, centred: NDArray, solid: NDArray, size: float, rough: float
+    ) -> None:
         footprint = plane.flat(solid)
         low, high = footprint.min(0), footprint.max(0)
         width = WINDOW * float((high - low).max())
@@ -165,14 +223,17 @@ class _Surface:
         self.at = (plane.flat(centred) - corner) / self.cell
         self.inside = ((self.at >= 0) & (self.at < CELLS)).all(1)
         self.splats = splats
-        self.base = 0.5 + C0 * splats.sh[:, 0].astype(np.float64)
+        self.relief = RELIEF_WITHIN * size / self.cell
+        height = plane.height(centred) / self.cell
+        self.look = np.column_stack([0.5 + C0 * splats.sh[:, 0].astype(np.float64), height])
+        self.owners, self.owner = np.unique(splats.object_ids, return_inverse=True)
         cells = ((footprint - corner) / self.cell).astype(int)
         self.under = _spread(cells)
         # No camera has seen what lies under what touches the plane, whatever splats there are.
-        self.touched = _spread(cells[plane.height(solid) < TOUCHES_WITHIN * size])
+        self.touched = _spread(cells[plane.height(solid) < rough * TOUCHES_WITHIN * size])
 
-    def _seen(self) -> tuple[NDArray, NDArray]:
-        """The cells' alpha (CELLS, CELLS) and mean base colour (CELLS, CELLS, 3)."""
+    def _seen(self) -> tuple[NDArray, NDArray, NDArray]:
+        """The cells' alpha (CELLS, CELLS), mean look (CELLS, CELLS, 4), and which of `owners` one sees most of."""
         rotations = Rotation.from_quat(self.splats.quats.astype(np.float64), scalar_first=True).as_matrix()
         spread = self.plane.axes[:2] @ rotations * (self.splats.scales[:, None, :] / self.cell)
         covariance = spread @ spread.transpose(0, 2, 1) + 0.1 * np.eye(2)
@@ -180,8 +241,8 @@ class _Surface:
         radius = np.ceil(_REACH * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).max(1))).clip(1, _WIDEST)
         home = np.floor(self.at).astype(int)
         radius[((home < -_WIDEST) | (home >= CELLS + _WIDEST)).any(1)] = -1
-        logs, weights = np.zeros((CELLS, CELLS)), np.zeros((CELLS, CELLS))
-        colours = np.zeros((CELLS, CELLS, 3))
+        logs, looks = np.zeros((CELLS, CELLS)), np.zeros((CELLS, CELLS, 4))
+        weights = np.zeros((len(self.owners), CELLS, CELLS))
         for dx in range(-_WIDEST, _WIDEST + 1):
             for dy in range(-_WIDEST, _WIDEST + 1):
                 reached = np.flatnonzero(radius >= max(abs(dx), abs(dy)))
@@ -194,9 +255,9 @@ class _Surface:
                 power = np.einsum("ni,nij,nj->n", away, inverse[reached], away)
                 alpha = np.minimum(self.splats.opacities[reached] * np.exp(-0.5 * power), 0.99)
                 np.add.at(logs, cells, np.log1p(-alpha))
-                np.add.at(weights, cells, alpha)
-                np.add.at(colours, cells, alpha[:, None] * self.base[reached])
-        return 1.0 - np.exp(logs), colours / np.maximum(weights, 1e-9)[..., None]
+                np.add.at(weights, (self.owner[reached], *cells), alpha)
+                np.add.at(looks, cells, alpha[:, None] * self.look[reached])
+        return 1.0 - np.exp(logs), looks / np.maximum(weights.sum(0), 1e-9)[..., None], weights.argmax(0)
 
     def beyond(self, others: list[_Plane]) -> NDArray[np.bool_]:
         """The cells (CELLS, CELLS) on the far side of other planes, where this one has nothing to close."""
@@ -212,7 +273,7 @@ class _Surface:
         coarse = np.unique(self.at[self.inside] // (CELLS // 16), axis=0)
         if len(coarse) < SURROUNDS * 16 * 16:
             return np.zeros(0, np.int64), []
-        coverage, colour = self._seen()
+        coverage, look, owner = self._seen()
         covered = gaussian_filter(coverage, 1.0) > COVERED
         whole = binary_fill_holes(binary_closing(covered | beyond, iterations=2)) & ~beyond
         hole = whole & (self.touched | (self.under & ~covered))
@@ -221,35 +282,74 @@ class _Surface:
             return np.zeros(0, np.int64), []
         target = binary_dilation(hole, iterations=RIM) & whole
         good = covered & ~binary_dilation(hole, iterations=RIM + 1)
-        smooth = max(BAND, 0.5 * np.sqrt(target.sum()))
-        known = gaussian_filter(good.astype(float), smooth)
-        shades = np.stack(
-            [gaussian_filter(np.where(good, colour[..., i], 0.0), smooth) for i in range(3)], 2
-        ) / np.maximum(known, 1e-9)[..., None]  # fmt: skip
-        detail = np.where(good[..., None], colour - shades, 0.0)
-        parts = [self._copied(part, shift, shades) for part, shift in _patches(target, good, detail)]
+        bump = np.abs(look[..., 3] - _smoothed(look[..., 3:], good, CELLS / 16)[..., 0]) > self.relief
+        good &= ~binary_opening(bump, iterations=1)
+        open_still, parts = target.copy(), []
+        continued = _continued_owners(owner, good, hole)
+        for i in np.unique(owner[good]):
+            parts += self._continued(target & (continued == i), good & (owner == i), look, open_still)
+        parts += self._continued(open_still.copy(), good, look, open_still)
         home = np.floor(self.at).astype(int)
         replaced = np.zeros(len(home), bool)
-        replaced[self.inside] = target[tuple(home[self.inside].T)]
-        return (np.flatnonzero(replaced) if parts else np.zeros(0, np.int64)), parts
+        replaced[self.inside] = (target & ~open_still)[tuple(home[self.inside].T)]
+        return np.flatnonzero(replaced), parts
+
+    def _continued(self, target: NDArray, good: NDArray, look: NDArray, open_still: NDArray) -> list[Splats]:
+        """What is put onto the cells `target` from those that are good; `open_still` loses what that closes."""
+        if not target.any() or not good.any():
+            return []
+        shades = _smoothed(look, good, max(BAND, 0.5 * np.sqrt(target.sum())))
+        detail = np.where(good[..., None], look - shades, 0.0)[..., :3]
+        parts = []
+        for part, shift in _patches(target, good, detail):
+            copied = self._copied(part, shift, shades)
+            if len(copied):
+                parts.append(copied)
+                open_still &= ~part
+        return parts
 
     def _copied(self, part: NDArray, shift: tuple[int, int], shades: NDArray) -> Splats:
-        """The splats that lie where `part` is once it is shifted, put where it is, and shaded as it is there."""
+        """The splats that lie where `part` is once it is shifted, put where it is, shaded and bent as it is there."""
         target = self.at - shift
         home = np.floor(target).astype(int)
         mine = self.inside & ((home >= 0) & (home < CELLS)).all(1)
         mine[mine] = part[tuple(home[mine].T)]
         copies = self.splats.select(mine)
+        there, here = (
+            np.column_stack([
+                map_coordinates(shades[..., i], (places[mine] - 0.5).T, order=1, mode="nearest") for i in range(4)
+            ])
+            for places in (target, self.at)
+        )  # fmt: skip
+        change = there - here
         sh = copies.sh.copy()
-        for i in range(3):
-            there, here = (
-                map_coordinates(shades[..., i], (places[mine] - 0.5).T, order=1, mode="nearest")
-                for places in (target, self.at)
-            )
-            sh[:, 0, i] += (there - here) / C0
-        back = -self.cell * np.array(shift, np.float64) @ self.plane.axes[:2]
-        means = (copies.means + back).astype(copies.means.dtype)
+        sh[:, 0] += change[:, :3] / C0
+        back = self.cell * np.column_stack([np.tile(-np.array(shift, float), (len(copies), 1)), change[:, 3]])
+        means = (copies.means + back @ self.plane.axes).astype(copies.means.dtype)
         return replace(copies, means=means, sh=sh, invented=np.ones(len(copies), bool))
+
+
+def _continued_owners(owner: NDArray, good: NDArray, hole: NDArray) -> NDArray[np.int64]:
+    """Whose each cell (n, n) of the hole would be if what lies around it had straight edges: of the linear functions
+    that tell the owners of good cells near the hole apart, the largest."""
+    away = distance_transform_edt(~hole)
+    cells = np.argwhere(good & (away < max(BAND, np.sqrt(hole.sum()))))
+    if len(cells) == 0:
+        return owner
+    ids, which = np.unique(owner[tuple(cells.T)], return_inverse=True)
+    terms = np.column_stack([cells, np.ones(len(cells))])
+    functions = np.linalg.lstsq(terms, np.eye(len(ids))[which], rcond=None)[0]
+    places = np.indices(owner.shape).reshape(2, -1)
+    best = (functions[:2].T @ places + functions[2][:, None]).argmax(0)
+    return ids[best].reshape(owner.shape)
+
+
+def _smoothed(values: NDArray, good: NDArray, width: float) -> NDArray:
+    """values (n, n, k) averaged around each cell over those that are good (n, n), by a Gaussian of this width in
+    cells."""
+    known = np.maximum(gaussian_filter(good.astype(float), width), 1e-9)
+    of_good = np.where(good[..., None], values, 0.0)
+    return np.stack([gaussian_filter(of_good[..., i], width) / known for i in range(values.shape[2])], 2)
 
 
 def _spread(cells: NDArray) -> NDArray[np.bool_]:
@@ -280,14 +380,13 @@ def _patches(target: NDArray, good: NDArray, detail: NDArray) -> list[tuple[NDAr
 
 def _best_shift(target: NDArray, good: NDArray, detail: NDArray) -> tuple[int, int] | None:
     """The shift, in cells, that takes all of `target` onto `good` and changes the detail around it least; or None."""
-    bad = np.pad((~good).astype(np.float32), CELLS, constant_values=1.0)
     rows, columns = np.nonzero(target)
     if len(rows) == 0:
         return None
     top, left = rows.min(), columns.min()
     shape = target[top : rows.max() + 1, left : columns.max() + 1].astype(np.float32)
-    misses = correlate(bad, shape, mode="valid", method="fft")
-    at = np.argwhere(misses < 0.5) - CELLS - (top, left)
+    energy = (detail**2).sum(2)
+    at = np.argwhere(_summed(~good, shape, 1.0) < 0.5) - CELLS - (top, left)
     if len(at) == 0:
         return None
     band = np.argwhere(binary_dilation(target, iterations=BAND) & ~target & good)
@@ -298,6 +397,16 @@ def _best_shift(target: NDArray, good: NDArray, detail: NDArray) -> tuple[int, i
     there = (band[None] + at[:, None]).clip(0, CELLS - 1)
     fits = good[there[..., 0], there[..., 1]]
     changes = ((detail[there[..., 0], there[..., 1]] - detail[band[:, 0], band[:, 1]]) ** 2).sum(2)
-    typical = float((detail[good] ** 2).sum(1).mean()) * 2.0
-    best = at[np.where(fits, changes, typical).mean(1).argmin()]
+    changes = np.where(fits, changes, 2.0 * float(energy[good].mean())).mean(1)
+    # Neither plainer than what is around, nor with things in it that are not.
+    strength = _summed(energy, shape, 0.0)[tuple((at + CELLS + (top, left)).T)] / shape.sum()
+    best = at[(changes + np.abs(strength - energy[tuple(band.T)].mean())).argmin()]
     return int(best[0]), int(best[1])
+
+
+def _summed(values: NDArray, shape: NDArray, outside: float) -> NDArray:
+    """The sum of values (n, n), `outside` beside them, over the cells of shape (h, w), for each place of its corner in
+    them with a margin of n cells on each side."""
+    padded = np.pad(values.astype(np.float64), CELLS, constant_values=outside)
+    sums = irfft2(rfft2(padded) * np.conj(rfft2(shape, padded.shape)), padded.shape)
+    return sums[: len(padded) - len(shape) + 1, : len(padded) - shape.shape[1] + 1]

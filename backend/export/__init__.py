@@ -2,8 +2,11 @@
 
 from .anchors import write_anchors
 from .fit import agreement, fit_splats
-from .ply import read_splats, write_splats
+from .ply import read_splats, splat_table, write_splats
 from .splat import write_splat
 from .spz import write_spz
 
-__all__ = ["agreement", "fit_splats", "read_splats", "write_anchors", "write_splat", "write_splats", "write_spz"]
+__all__ = [
+    "agreement", "fit_splats", "read_splats", "splat_table", "write_anchors", "write_splat", "write_splats",
+    "write_spz",
+]  # fmt: skip

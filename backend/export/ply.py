@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..fill_file import INVENTED
 from ..model.splats import Splats
 from ..ply import read_vertices, vertex_header
 from ..protocol import InputError, atomic_file
@@ -18,7 +19,6 @@ OPACITY_MARGIN = 1e-7
 SMALLEST_SCALE = float(np.finfo(np.float32).tiny)
 FLOAT32_RELATIVE_ERROR = 2.0**-24
 ROWS_AT_ONCE = 1 << 16
-INVENTED = "invented"
 
 
 def property_names(degree: int) -> list[str]:
@@ -57,15 +57,25 @@ def write_splats(path: Path, splats: Splats, with_ids: bool = True) -> list[str]
     names = [name for name in property_names(splats.degree) if with_ids or name != "object_id"]
     if with_ids and splats.invented.any():
         names.append(INVENTED)
-    position = position_kind(splats)
-    kinds = {"x": position, "y": position, "z": position, "object_id": "u4", INVENTED: "u1"}
-    dtype = np.dtype([(name, "<" + kinds.get(name, "f4")) for name in names])
+    dtype = _layout(splats, names)
 
     with atomic_file(path) as file:
         file.write(vertex_header(dtype, len(splats)))
         for start in range(0, len(splats), ROWS_AT_ONCE):
             file.write(_rows(splats, slice(start, start + ROWS_AT_ONCE), dtype).tobytes())
     return warnings
+
+
+def splat_table(splats: Splats) -> NDArray:
+    """All splats as `write_splats` writes them, with IDs and with `invented`, whether any is or not."""
+    return _rows(splats, slice(None), _layout(splats, [*property_names(splats.degree), INVENTED]))
+
+
+def _layout(splats: Splats, names: list[str]) -> np.dtype:
+    """The records of a file that holds these properties of `splats`."""
+    position = position_kind(splats)
+    kinds = {"x": position, "y": position, "z": position, "object_id": "u4", INVENTED: "u1"}
+    return np.dtype([(name, "<" + kinds.get(name, "f4")) for name in names])
 
 
 def _rows(splats: Splats, rows: slice, dtype: np.dtype) -> NDArray:
@@ -77,7 +87,7 @@ def _rows(splats: Splats, rows: slice, dtype: np.dtype) -> NDArray:
     sh = splats.sh[rows]
     for channel in range(3):
         table[f"f_dc_{channel}"] = sh[:, 0, channel]
-    rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(means), -1)
+    rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(means), 3 * (sh.shape[1] - 1))
     for i in range(rest.shape[1]):
         table[f"f_rest_{i}"] = rest[:, i]
     opacity = np.clip(splats.opacities[rows].astype(np.float64), OPACITY_MARGIN, 1.0 - OPACITY_MARGIN)

@@ -12,6 +12,8 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
+from ..protocol import atomic_path
+
 DIGEST = "objectgs/digest"
 _MAGIC = bytes.fromhex("762f3101")
 _LINES_A_CHUNK = 16
@@ -26,20 +28,12 @@ def write(path: Path, channels: Mapping[str, NDArray], header: Mapping[str, Any]
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     entries = {**header, DIGEST: digest, "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     planes = {name: np.ascontiguousarray(plane) for name, plane in channels.items()}
-    try:
+    with atomic_path(path, part):
         part.write_bytes(b"")  # OpenEXR says badly why a file cannot be written.
         try:
             OpenEXR.File(entries, planes).write(str(part))
         except RuntimeError as error:
             raise OSError(0, str(error)) from error
-        with open(part, "rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    except BaseException as error:
-        part.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            error.filename = str(path)
-        raise
 
 
 def digest_of(path: Path) -> str | None:

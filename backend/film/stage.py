@@ -20,7 +20,7 @@ from ..objects import SceneObject, read_objects
 from ..protocol import Reconstruction, Reporter
 from .shot import Frame, Placed, Sample, Shot
 
-_FORMAT = 1
+_FORMAT = 2
 """Of what is drawn and written: another number draws all frames anew."""
 
 Tensors = dict[str, torch.Tensor]

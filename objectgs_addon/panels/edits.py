@@ -6,9 +6,9 @@ import math
 import bpy
 from mathutils import Matrix
 
-from .. import object_edits, scene
+from .. import object_edits, running, scene
 from ..job_display import write
-from .tab import WithReconstruction
+from .tab import WithReconstruction, draw_job_of
 
 
 class EditPanel(WithReconstruction, bpy.types.Panel):
@@ -28,15 +28,31 @@ class EditPanel(WithReconstruction, bpy.types.Panel):
         row = layout.row(align=True)
         if item.removed:
             row.operator("objectgs.restore_object", icon="LOOP_BACK")
+            fill = row.operator("objectgs.close_place", icon="MOD_REMESH", depress=item.fill)
+            fill.closed = not item.fill
+            if item.fill:
+                self._draw_fill(layout, root, collection)
         else:
-            row.operator("objectgs.remove_object", icon="TRASH").floaters = False
-            row.operator("objectgs.remove_object", text="With Floaters").floaters = True
+            for text, floaters, fill in (("Remove", False, False), ("With Floaters", True, False),
+                                         ("And Fill", False, True)):
+                operator = row.operator("objectgs.remove_object", text=text)
+                operator.floaters, operator.fill = floaters, fill
         layout.operator("objectgs.duplicate_object", icon="DUPLICATE")
         if collection is None:
             write(layout, "It has no splats and no mesh yet; train first.", "INFO")
             return
         self._draw_colours(layout, item)
         self._draw_place(layout, root, collection)
+
+    def _draw_fill(self, layout, root, collection) -> None:
+        count = None if collection is None else collection.get(scene.INVENTED_COUNT)
+        job = running.job_of(root)
+        if count:
+            write(layout, f"{count:,} invented splats close its place", "CHECKMARK")
+        elif count == 0:
+            write(layout, "Nothing flat was found around it that could close its place", "INFO")
+        elif job is not None and job.kind == "fill":
+            draw_job_of(layout, job)
 
     def _draw_colours(self, layout, item) -> None:
         column = layout.column(align=True)

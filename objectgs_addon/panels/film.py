@@ -22,7 +22,8 @@ class FilmPanel(WithReconstruction, bpy.types.Panel):
         column.enabled = not running.busy(scene.folder_of(root))
         column.operator("objectgs.film_frames", icon="RENDER_ANIMATION")
         column.use_property_split = True
-        column.prop(settings, "folder")
+        column.use_property_decorate = False
+        column.prop(settings, "folder", placeholder="In the reconstruction")
         frames = column.column(align=True)
         frames.prop(owner, "frame_start", text="Frames")
         frames.prop(owner, "frame_end", text="End")

@@ -19,7 +19,7 @@ class TrainPanel(WithReconstruction, bpy.types.Panel):
         properties = root.objectgs
         folder = scene.folder_of(root)
         job = running.job_of(root)
-        if job is not None and job.kind in ("mesh", "film"):
+        if job is not None and job.kind in ("mesh", "film", "fill"):
             job = None  # Their own panels show them.
         active = running.busy(folder)
         column = layout.column()

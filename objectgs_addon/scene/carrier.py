@@ -15,6 +15,8 @@ _FIELDS = {
     "QUATERNION": ("value", np.float32, 4),
     "BOOLEAN": ("value", bool, 1),
 }
+KINDS = frozenset(_FIELDS)
+"""The types of attributes that can be read and written."""
 
 
 def require_object_mode(things) -> None:

@@ -15,6 +15,7 @@ from ...backend.protocol import Reconstruction
 from ...backend.recolour import Recolour
 from . import carrier
 from .copies import COPIES, adopt_duplicates, bring_up_to_date, duplicate, remove_copy
+from .fills import show_fills
 from .floaters import hide_floaters
 from .kinds import OBJECT_PARENT, SPLATS, copies_of, folder_of, object_collections, part_of
 from .objects_file import Objects
@@ -27,11 +28,13 @@ REMOVED = "objectgs_removed"
 
 def show_edits(root: bpy.types.Collection, objects: Objects) -> None:
     """Remove, recolour, place and duplicate objects as objects.json says. What the user moved since stays there, unless
-    objects.json has another place than it had before. Raises InputError where the unlabelled rest is in Edit Mode."""
+    objects.json has another place than it had before. Raises InputError where splats that are to change are in Edit
+    Mode."""
     collections = object_collections(root)
     hulls = [entry.id for entry in objects.entries.values() if entry.removed and entry.floaters]
     if hulls and 0 in collections:
         carrier.require_object_mode([part_of(collections[0], SPLATS)])
+    show_fills(root, objects)
     adopt_duplicates(root)
     bring_up_to_date(root)
     copies = copies_of(root)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ...backend.hull import body, inside
 from . import carrier, preview
+from .fills import given_way, invented_splats
 from .kinds import OBJECT_ID, SPLATS, object_collections, part_of
 from .object_collection import centre_of
 
@@ -34,7 +35,8 @@ def hide_floaters(root: bpy.types.Collection, removed: list[int]) -> None:
         if thing is not None and "radiance:base" in thing.data.attributes:
             hidden |= inside_hull(places, _places(thing), carrier.read(thing.data, "radiance:base")[:, 3])
     # What was merged with the unlabelled rest is not unlabelled.
-    hidden &= carrier.read(unlabelled.data, OBJECT_ID) == 0
+    hidden &= (carrier.read(unlabelled.data, OBJECT_ID) == 0) & ~invented_splats(unlabelled.data)
+    hidden |= given_way(unlabelled.data)
     if np.array_equal(hidden, np.zeros(len(places), bool) if before is None else before):
         return
     carrier.require_object_mode([unlabelled])

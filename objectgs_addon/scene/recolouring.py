@@ -9,6 +9,7 @@ import numpy as np
 
 from ...backend.recolour import Recolour, average_luma
 from . import carrier, preview
+from .fills import invented_splats
 from .kinds import MESH, SPLATS, TEXTURE, kind_of, part_of, parts_of
 from .object_collection import our_materials
 
@@ -45,7 +46,7 @@ def luma_of(collection: bpy.types.Collection) -> float:
     thing = part_of(collection, SPLATS)
     if thing is None or "radiance:base" not in thing.data.attributes:
         return average_luma(np.zeros((0, 3)), np.zeros(0))
-    base = carrier.read(thing.data, "radiance:base").astype(np.float64)
+    base = carrier.read(thing.data, "radiance:base")[~invented_splats(thing.data)].astype(np.float64)
     return average_luma(0.5 + preview.SH_C0 * base[:, :3], base[:, 3])
 
 

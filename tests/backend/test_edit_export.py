@@ -16,6 +16,7 @@ from backend.commands.cameras import write_no_cameras
 from backend.editing import apply_edits, transformed
 from backend.editing.place import middle_of
 from backend.export import read_splats, write_splat, write_splats, write_spz
+from backend.fill_file import fill_path
 from backend.model.splats import Splats
 from backend.objects import edit_objects, read_objects, write_objects
 from backend.ply import read_vertices
@@ -67,10 +68,49 @@ def test_objects_are_removed_and_restored_by_name_part_or_id(ask, folder):
     assert [entry.removed and entry.floaters for entry in read_objects(folder.objects)] == [True, True, False, True]
     (said,) = answer.messages("status")
     assert "1 mug: removed with floaters\n" in said and "3 box: as captured\n" in said
-    assert "1 mug: removed, its place filled" in ask("edit", folder.folder, "--remove", "mug", "--fill").out
+    filled = ask("edit", folder.folder, "--remove", "mug", "--fill").out
+    assert "1 mug: removed, nothing flat around it that could close its place" in filled
     ask("edit", folder.folder, "--restore", "mug", "box")
     assert [entry.removed for entry in read_objects(folder.objects)] == [False, True, False, True]
     assert json.loads(folder.objects.read_text())["edits"].keys() == {"2", "7"}
+
+
+def test_what_closes_a_place_is_left_for_those_who_show_it(ask, folder):
+    """Anew for each state of edits and splats; taking an edit back finds the file of before, and old ones go."""
+    rng = np.random.default_rng(0)
+    ground = np.column_stack([rng.uniform(-1, 1, (9000, 2)), np.zeros(9000)])
+    ground = ground[np.abs(ground).max(1) > 0.15]
+    thing = rng.uniform((-0.15, -0.15, 0), (0.15, 0.15, 0.3), (900, 3))
+    splats = some_splats(len(ground) + len(thing))
+    splats.means = np.concatenate([ground, thing]).astype(np.float32)
+    splats.scales, splats.opacities[:] = np.tile([0.02, 0.02, 0.001], (len(splats), 1)), 0.9
+    splats.quats[:], splats.object_ids = (1, 0, 0, 0), np.repeat([2, 1], [len(ground), len(thing)])
+    write_splats(folder.splats, splats)
+
+    def path():
+        return fill_path(folder, read_objects(folder.objects))
+
+    ask("edit", folder.folder, "--remove", "mug")
+    assert path() is None and not folder.cache.exists(), "nothing is to be closed"
+    answer = ask("edit", folder.folder, "--remove", "mug", "--fill", "--json")
+    first, table = path(), read_vertices(path())
+    count = int(table["invented"].sum())
+    assert count > 50 and answer.events[-1]["invented"] == count and set(table["closes"].tolist()) == {1}
+    assert f"1 mug: removed, its place filled by {count} invented splats" in answer.messages("status")[-1]
+    wanted = apply_edits(read_splats(folder.splats)[0], read_objects(folder.objects))
+    put = read_splats(first)[0]
+    assert np.array_equal(put.select(put.invented).means, wanted.select(wanted.invented).means)
+    written = first.stat().st_mtime_ns
+    ask("edit", folder.folder, "--remove", "can")
+    assert path() != first and path().is_file()
+    ask("edit", folder.folder, "--restore", "can")
+    assert path() == first and first.stat().st_mtime_ns == written
+    for i in range(12):
+        (folder.cache / f"fill-{i}.ply").touch()
+    write_splats(folder.splats, splats.select(np.arange(len(splats)) > 0))
+    assert path() != first
+    ask("edit", folder.folder)
+    assert path().is_file() and len(list(folder.cache.glob("fill-*.ply"))) == 8
 
 
 def test_without_options_the_edits_are_said_and_nothing_is_written(ask, folder):

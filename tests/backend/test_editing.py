@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from backend.editing import apply_edits, recoloured, transformed
+from backend.editing import apply_edits, fill_of, recoloured, transformed
 from backend.editing.floaters import inside_hull
 from backend.model.splats import Splats, concatenate
 from backend.objects import SceneObject
@@ -280,6 +280,47 @@ def test_a_corner_is_closed_on_both_sides():
     edited = apply_edits(splats, [scene_object(1, removed=True, fill=True)])
     invented = edited.select(edited.invented)
     assert (invented.object_ids == 5).sum() > 100 and (invented.object_ids == 7).sum() > 100
+
+
+def test_sheets_that_meet_under_an_object_are_each_continued_to_their_edge():
+    splats, hidden = with_box_on_ground()
+    for part in (splats, hidden):
+        part.object_ids[(part.object_ids == 5) & (part.means[:, 0] > 0.02)] = 8
+    edited = apply_edits(splats, [scene_object(1, removed=True, fill=True)])
+    invented = edited.select(edited.invented)
+    assert len(invented) > 0.7 * len(hidden)
+    assert ((invented.object_ids == 8) == (invented.means[:, 0] > 0.02)).mean() > 0.85
+
+
+def test_rumpled_ground_is_closed_with_its_relief():
+    """A dome higher than what counts as flat; what is put lies on it, not in the plane."""
+
+    def height(flat):
+        return -0.06 * (flat[:, :2] ** 2).sum(1)
+
+    splats, hidden = with_box_on_ground()
+    for part in (splats, hidden):
+        ground = part.object_ids == 5
+        part.means[ground, 2] += height(part.means[ground])
+    edited = apply_edits(splats, [scene_object(1, removed=True, fill=True)])
+    invented = edited.select(edited.invented)
+    assert len(invented) > 0.7 * len(hidden)
+    off = np.abs(invented.means[:, 2] - height(invented.means))
+    assert np.median(off) < 0.006, np.median(off)
+    assert np.abs(height(splats.means[splats.object_ids == 5])).mean() > 0.03
+
+
+def test_what_fill_puts_and_takes_is_what_the_edits_show():
+    splats, _ = with_box_on_ground()
+    objects = [scene_object(1, removed=True, fill=True), scene_object(6, removed=True, fill=True)]
+    fill = fill_of(splats, objects)
+    edited = apply_edits(splats, objects)
+    assert same(fill.splats.select(fill.put), edited.select(edited.invented))
+    assert set(fill.closes.tolist()) == {1, 6} and fill.splats.invented.tolist() == fill.put.tolist()
+    kept = splats.select(np.isin(splats.object_ids, [1, 6], invert=True))
+    taken = fill.splats.select(~fill.put)
+    still = kept.select(~np.isin(kept.means, taken.means).all(1))
+    assert len(taken) and same(still, edited.select(~edited.invented))
 
 
 def test_where_nothing_is_around_nothing_is_invented():

@@ -4,6 +4,7 @@
 import itertools
 import json
 import math
+import os
 import shutil
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from objectgs.backend.ply import read_vertices, write_vertices
 from objectgs.backend.recolour import Recolour
 from objectgs.objectgs_addon import drawing, object_edits, selection, visibility
 from objectgs.objectgs_addon import scene as blender_scene
-from objectgs.objectgs_addon.scene import carrier, floaters, kinds, places, preview
+from objectgs.objectgs_addon.scene import carrier, fills, floaters, kinds, places, preview
 from objectgs.objectgs_addon.splat_arrays import arrays_of
 
 import headless
@@ -649,3 +650,128 @@ def test_turned_by_a_right_angle(root):
     assert place[:3, :3] == pytest.approx(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]), abs=1e-6)
     middle = np.array(pivot["objectgs_centre"]) + ORIGIN
     assert place[:3, :3] @ middle + place[:3, 3] == pytest.approx(middle, abs=1e-4)
+
+
+# What closes the places of removed objects.
+
+
+CLOSING = """
+import json, sys
+from backend.commands.filling import close_places
+from backend.editing import apply_edits
+from backend.export import read_splats
+from backend.objects import edit_objects, read_objects
+from backend.protocol import Reconstruction, Reporter
+from backend.stopping import StoppingReporter, StopRequest
+folder = Reconstruction(sys.argv[1])
+splats = read_splats(folder.splats)[0]
+shown = []
+for ids in ([1], [1, int(sys.argv[2])]):
+    edit_objects(folder.objects, {i: {"removed": True, "fill": True} for i in ids})
+    close_places(folder, StoppingReporter(Reporter(), StopRequest()))
+    kept = apply_edits(splats, read_objects(folder.objects))
+    shown.append(kept.means[kept.object_ids == 2].astype(float).tolist())
+    edit_objects(folder.objects, {i: {"removed": None, "fill": None} for i in ids})
+print(json.dumps(shown))
+"""
+
+
+@pytest.fixture(scope="module")
+def closed(made, tmp_path_factory, backend_python) -> tuple[Path, list[np.ndarray]]:
+    """The folder with a flat ground, object 2, around a box, object 1, and around one more, object 3. The backend has
+    found already what closes it without the first and without both; and where splats of the ground are then."""
+    folder = Path(shutil.copytree(made, tmp_path_factory.mktemp("closed") / "table top"))
+    rng = np.random.default_rng(0)
+    flat = np.column_stack([rng.uniform(-1, 1, (4000, 2)), np.zeros(4000)])
+    flat = flat[np.abs(flat).max(1) > 0.15]
+    box = rng.uniform((-0.15, -0.15, 0), (0.15, 0.15, 0.3), (400, 3))
+    splats = splat_table(np.repeat([2, 1, HUGE], [len(flat), len(box), len(box)]), degree=1)
+    for axis, name in enumerate("xyz"):
+        splats[name] = np.concatenate([flat, box, box + np.array([0.7, 0.7, 0.0])])[:, axis] + ORIGIN[axis]
+    splats["opacity"], splats["rot_0"] = 3.0, 1.0
+    for name, value in (("rot_1", 0), ("rot_2", 0), ("rot_3", 0), ("scale_0", -3), ("scale_1", -3), ("scale_2", -7)):
+        splats[name] = value
+    write_vertices(folder / "splats.ply", splats)
+    ran = subprocess.run([backend_python, "-c", CLOSING, folder, str(HUGE)], cwd=headless.ROOT, capture_output=True,
+                         text=True, check=True)
+    return folder, [np.array(means) for means in json.loads(ran.stdout)]
+
+
+@pytest.fixture
+def ground(closed, folder) -> Path:
+    """That folder as the test's own."""
+    return Path(shutil.copytree(closed[0], folder, dirs_exist_ok=True))
+
+
+def surface(root) -> dict:
+    """Everything that a carrier of splats holds."""
+    mesh = part(root, "splats", 2).data
+    return {name: (kind, values.tobytes()) for name, (kind, values) in fills._attributes(mesh).items()} | {
+        "position": carrier.read(mesh, "position").tobytes()}
+
+
+def test_the_place_of_a_removed_object_is_closed_and_opened_again(ground, closed, root):
+    """By exactly what the backend exports, in what is drawn and picked; also when splats are read again."""
+    captured, count = surface(root), item(root, 2).splats
+    luma = blender_scene.luma_of(collection_of(root, 2))
+    activate(root, 1)
+    assert bpy.ops.objectgs.remove_object(fill=True) == {"FINISHED"}
+    one = surface(root)
+    mesh = part(root, "splats", 2).data
+    assert blender_scene.invented_splats(mesh).sum() == collection_of(root)[blender_scene.INVENTED_COUNT] > 20
+    assert item(root, 2).splats == count and blender_scene.luma_of(collection_of(root, 2)) == luma
+    activate(root, HUGE)
+    bpy.ops.objectgs.remove_object(fill=True)
+    assert set(fills.closed_places(mesh).tolist()) == {0, 1, HUGE}
+    there = blender_scene.into_capture(root, part(root, "splats", 2))
+    drawn = [arrays_of(mesh).means @ there[:3, :3].T + there[:3, 3]]
+    bpy.ops.objectgs.restore_object(object=str(HUGE))
+    drawn.insert(0, arrays_of(mesh).means @ there[:3, :3].T + there[:3, 3])
+    for found, wanted in zip(drawn, closed[1]):
+        assert np.allclose(found, wanted, atol=1e-4) and len(found) < len(mesh.vertices), "some give way"
+    assert surface(root) == one, "the file of before"
+    show_again(root)
+    assert surface(root) == one
+    assert not bpy.ops.objectgs.close_place.poll(), "the active one is not removed"
+    activate(root, 1)
+    bpy.ops.objectgs.close_place(closed=False)
+    assert surface(root) == captured and blender_scene.is_removed(collection_of(root))
+    bpy.ops.objectgs.close_place()
+    assert surface(root) == one
+    bpy.ops.objectgs.restore_object(object="1")
+    assert surface(root) == captured and blender_scene.INVENTED_COUNT not in collection_of(root)
+
+
+def test_until_the_backend_has_found_it_nothing_wrong_is_shown(ground, root, monkeypatch):
+    """What was found for an object goes with its edit at once; the others' stays until there is something newer."""
+    captured = surface(root)
+    object_edits.remove(root, [1, HUGE], False, True)
+    python = os.environ["OBJECTGS_PYTHON"]
+    monkeypatch.setenv("OBJECTGS_PYTHON", str(ground / "no-python"))
+    object_edits.restore(root, [1])
+    assert set(fills.closed_places(part(root, "splats", 2).data).tolist()) == {0, HUGE}
+    assert blender_scene.missing_fill(root, blender_scene.Objects.read(ground)) is not None
+    stale = surface(root)
+    monkeypatch.setenv("OBJECTGS_PYTHON", python)
+    show_again(root)
+    assert blender_scene.missing_fill(root, blender_scene.Objects.read(ground)) is None, "it was asked, and answered"
+    assert surface(root).keys() == stale.keys()
+    object_edits.restore(root, [HUGE])
+    assert surface(root) == captured
+
+
+def test_closed_places_come_and_go_with_undo(ground, root):
+    def now():
+        return surface(active()), item(active()).removed
+
+    bpy.ops.ed.undo_push(message="begin")
+    before = now()
+    activate(active(), 1)
+    bpy.ops.objectgs.remove_object(fill=True)
+    bpy.ops.ed.undo_push(message="remove")
+    after = now()
+    part(active(), "object_parent", 2).location.x += 1.0
+    bpy.ops.ed.undo_push(message="move")
+    for step, wanted in ((bpy.ops.ed.undo, after), (bpy.ops.ed.undo, before), (bpy.ops.ed.redo, after)):
+        step()
+        assert now() == wanted
