@@ -10,47 +10,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import statistics
-import subprocess
 import sys
-import tempfile
-from collections.abc import Callable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
 
-
-def measure(capture: Path, primitive: str, seconds: float, folder: Path) -> dict:
-    """Train, mesh, evaluate; returns what the report says."""
-    minutes = str(seconds / 60)
-    for words in (
-        ("train", capture, "--out", folder, "--minutes", minutes, "--primitive", primitive),
-        ("mesh", folder),
-        ("evaluate", folder),
-        ("report", folder),
-    ):
-        subprocess.run(
-            [sys.executable, "-m", "backend", *map(str, words)], cwd=ROOT, check=True, stdout=subprocess.DEVNULL
-        )
-    report = json.loads((folder / "report.json").read_text())
-    seconds_of = {stage["name"]: stage["seconds"] for stage in report["stages"]}
-    meshes = [entry["mesh"] for entry in report["objects"]]
-
-    def over_objects(name: str, of: Callable[[list[float]], float] = statistics.median) -> float | None:
-        known = [mesh[name] for mesh in meshes if mesh.get(name) is not None]
-        return of(known) if known else None
-
-    return {
-        "steps": report["model"]["trained_steps"],
-        "psnr": report["quality"]["psnr"],
-        "miou": report["quality"]["miou"],
-        "f1": over_objects("f1"),
-        "f1_least": over_objects("f1", min),
-        "f1_005": over_objects("f1_005"),
-        "texture_psnr": over_objects("texture_psnr"),
-        "train_seconds": seconds_of["train"],
-        "mesh_seconds": seconds_of["mesh"],
-    }
+from benchmarks.shared import from_photos_to_report  # noqa: E402
 
 
 def main() -> None:
@@ -62,13 +28,13 @@ def main() -> None:
     options = parser.parse_args()
     found = {}
     for primitive in ("3d", "2d"):
-        with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as folder:
-            found[primitive] = measure(options.capture, primitive, options.seconds, Path(folder) / "out")
+        words = ("--minutes", options.seconds / 60, "--primitive", primitive)
+        found[primitive] = from_photos_to_report(options.capture, *words)
     if options.json:
         print(json.dumps(found))
         return
     print(f"{'':16}" + "".join(f"{primitive:>10}" for primitive in found))
-    for name in found["3d"]:
+    for name in (name for name in found["3d"] if name != "curve"):
         values = [found[primitive][name] for primitive in found]
         print(f"{name:16}" + "".join(f"{'-' if value is None else format(value, '.4g'):>10}" for value in values))
 

@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import shutil
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -163,6 +164,43 @@ def train_and_measure(trainer: Any, capture: Any, budget: Any) -> dict[str, Any]
         "steps_per_second": progress.step / progress.seconds,
         "anchors": len(trainer.model.anchors),
         "splats": len(trainer.model.generate(eye=np.zeros(3)).source),
+    }
+
+
+def from_photos_to_report(capture: Path, *options: object, meshes: bool = True) -> dict[str, Any]:
+    """Train, mesh and evaluate by the commands that a user runs; returns what the report says. F1 is over the true
+    surface that training views see; of it and of the texture's PSNR the median over the objects, of F1 also the least.
+    """
+    with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as scratch:
+        out = Path(scratch) / "out"
+        for words in (
+            ("train", capture, "--out", out, *options),
+            *([("mesh", out)] if meshes else []),
+            ("evaluate", out),
+            ("report", out),
+        ):
+            subprocess.run(
+                [sys.executable, "-m", "backend", *map(str, words)], cwd=ROOT, check=True, stdout=subprocess.DEVNULL
+            )
+        report = json.loads((out / "report.json").read_text())
+    seconds_of = {stage["name"]: stage["seconds"] for stage in report["stages"]}
+    made = [entry["mesh"] for entry in report["objects"] if entry["mesh"]]
+
+    def over_objects(name: str, of: Callable[[list[float]], float] = statistics.median) -> float | None:
+        known = [mesh[name] for mesh in made if mesh.get(name) is not None]
+        return of(known) if known else None
+
+    return {
+        "steps": report["model"]["trained_steps"],
+        "psnr": report["quality"]["psnr"],
+        "miou": report["quality"]["miou"],
+        "f1": over_objects("f1"),
+        "f1_least": over_objects("f1", min),
+        "f1_005": over_objects("f1_005"),
+        "texture_psnr": over_objects("texture_psnr"),
+        "train_seconds": seconds_of["train"],
+        "mesh_seconds": seconds_of.get("mesh"),
+        "curve": report["curve"],
     }
 
 

@@ -296,8 +296,8 @@ def quality(trainer):
 def test_training_as_on_a_gpu_is_as_good(tiny, both, settings):
     capture, ids = tiny()
     (want, want_right), (got, right) = both(lambda: quality(trained(capture, ids, settings)))
-    assert want > 20 and abs(got - want) < 0.7
-    assert right > 0.95 and abs(right - want_right) < 0.02
+    assert want > 20 and got > want - 0.7
+    assert right > 0.95 and right > want_right - 0.02
 
 
 def test_the_first_steps_are_the_same(tiny, both):

@@ -149,6 +149,7 @@ def test_views_and_points_that_nothing_sees_are_found(write_capture, tmp_path):
         scene.viewmats[view][2, 3] = -40.0
         scene.seen[view], scene.pixels[view] = np.zeros(0, int), np.zeros((0, 2))
     scene.xyz = np.concatenate([scene.xyz, [[0.0, 500.0, 0.0], [2.5, 0.0, 0.0]]])
+    scene.rgb = np.concatenate([scene.rgb, np.zeros((2, 3), np.uint8)])
     write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
     capture = loaded(scene, tmp_path)
     assert blind_views(capture) == [3, 5]

@@ -1,0 +1,103 @@
+"""How good a training of each length is: a row for each length and preset, and the curve of error against run time.
+
+    python benchmarks/length.py [--json] [--capture build/demo/capture] [--write]
+
+Each length is a training of its own, from the beginning, by the commands that a user runs. --write leaves the table in
+docs/length.md and the plot in docs/error-over-time.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from benchmarks import shared  # noqa: E402
+
+SECONDS = (15, 30, 60, 120, 300)
+PRESETS = ("preview", "standard", "final")
+OPEN_END = "final"
+"""Its meshes are measured, too."""
+
+_COLUMNS = (
+    ("train_seconds", "seconds", "{:.0f}"), ("steps", "steps", "{:,}"), ("psnr", "PSNR", "{:.2f} dB"),
+    ("miou", "mIoU", "{:.4f}"), ("f1", "F1 at 2 cm", "{:.3f}"), ("f1_005", "F1 at 5 mm", "{:.3f}"),
+    ("texture_psnr", "texture", "{:.1f} dB"),
+)  # fmt: skip
+
+
+def main() -> None:
+    """Print the table, or one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--capture", type=Path, default=ROOT / "build/demo/capture")
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    capture = options.capture.resolve()
+    made_from = shared.digest(shared.sources(), str(capture))
+    results = shared.Results(ROOT / "build" / "length", made_from, len(SECONDS) + len(PRESETS))
+
+    def get(name: str, *words: object, meshes: bool) -> dict[str, Any]:
+        return results.get(
+            name, lambda: shared.from_photos_to_report(capture, *words, meshes=meshes),
+            lambda found: f"{found['steps']} steps, {found['psnr']:.2f} dB, {found['train_seconds']:.0f} s",
+        )  # fmt: skip
+
+    found = {f"{seconds} s": get(f"{seconds} s", "--minutes", seconds / 60, meshes=True) for seconds in SECONDS}
+    found |= {preset: get(preset, "--preset", preset, meshes=preset == OPEN_END) for preset in PRESETS}
+    if results.failures:
+        sys.exit("\n".join(f"{name}: {why}" for name, why in results.failures.items()))
+    lines = table(found)
+    if options.write:
+        (ROOT / "docs" / "length.md").write_text("\n".join(lines) + "\n")
+        shared.save_figure(plot(found), ROOT / "docs" / "error-over-time.png")
+    print(json.dumps(found) if options.json else "\n".join(lines))
+
+
+def table(found: dict[str, dict[str, Any]]) -> list[str]:
+    """The Markdown table, and how the open end compares with the longest training."""
+
+    def cells(row: dict[str, Any]) -> list[str]:
+        return ["" if row[key] is None else form.format(row[key]) for key, _, form in _COLUMNS]
+
+    head = ("training", *(title for _, title, _ in _COLUMNS))
+    lines = shared.table(head, ((name, *cells(row)) for name, row in found.items()))
+    longest, end = found[f"{SECONDS[-1]} s"], found[OPEN_END]
+    lines += [
+        "",
+        f"Until it stops improving: {end['train_seconds'] / longest['train_seconds']:.2f} times as long as the "
+        f"{SECONDS[-1]} s, {end['psnr'] - longest['psnr']:+.2f} dB.",
+    ]
+    return lines
+
+
+def plot(found: dict[str, dict[str, Any]]) -> Any:
+    """PSNR, mIoU and F1 over the seconds of training."""
+    from matplotlib.figure import Figure
+
+    with shared.plot_style():
+        figure = Figure(figsize=(10, 3.2), layout="constrained")
+        panels = (("psnr", "PSNR, dB"), ("miou", "mIoU"), ("f1_005", "F1 of the meshes at 5 mm"))
+        for axes, (key, title), colour in zip(figure.subplots(1, len(panels)), panels, shared.COLOURS, strict=False):
+            clocked = [(found[f"{seconds} s"]["train_seconds"], found[f"{seconds} s"][key]) for seconds in SECONDS]
+            axes.plot(*zip(*clocked, strict=True), color=colour, marker="o", markersize=4, linewidth=2)
+            for name in PRESETS:
+                row = found[name]
+                if row[key] is not None:
+                    axes.plot(row["train_seconds"], row[key], "D", color=shared.MARKED, markersize=5)
+                    axes.annotate(
+                        name, (row["train_seconds"], row[key]), xytext=(4, -11), textcoords="offset points", fontsize=8
+                    )
+            axes.set_title(title)
+            axes.set_xlabel("seconds of training")
+            axes.set_xlim(left=0)
+    return figure
+
+
+if __name__ == "__main__":
+    main()
