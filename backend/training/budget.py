@@ -23,8 +23,8 @@ WARM_UP = 600
 OCTAVE = 2.0
 """Flatness is judged by the measurements since there were so many times fewer steps."""
 
-FLAT = 0.35
-"""dB that doubling the steps on the plateau would bring, below which it is flat."""
+FLAT, PATIENCE = 0.35, 5
+"""The plateau is flat where doubling the steps would bring less than so many dB, by so many measurements in a row."""
 
 
 @dataclass
@@ -109,7 +109,8 @@ class Budget:
         if not self.until_flat or p.settled_from or p.step < WARM_UP:
             return False
         out_of_time = self.seconds is not None and p.seconds >= PLATEAU_UNTIL * self.seconds
-        if not out_of_time and gain_of_doubling(p.curve) >= FLAT:
+        lately = (p.curve[: len(p.curve) - i] for i in range(PATIENCE))
+        if not out_of_time and not all(gain_of_doubling(curve) < FLAT for curve in lately):
             return False
         p.settled_from = p.step
         return True

@@ -53,9 +53,16 @@ def test_without_held_out_views_the_loss_decides():
 def test_a_curve_that_flattens_ends_the_training_soon_after():
     flat_from = 3000
     end = walk(PRESETS["final"], lambda step: 20 + 3 * math.log2(min(step, flat_from) + 1))
-    assert flat_from < end.settled_from < 2.5 * flat_from
+    assert flat_from < end.settled_from < 3 * flat_from
     assert end.step == pytest.approx(end.settled_from / PLATEAU_UNTIL, abs=2)
     assert end.curve[-1]["step"] == end.step
+
+
+def test_one_bad_measurement_does_not_end_a_rising_curve():
+    def psnr(step):
+        return 20 + 2 * math.log2(step + 1) - 5 * (3000 < step < 3200)
+
+    assert walk(PRESETS["final"], psnr, longest=12_000).settled_from == 0
 
 
 def test_a_curve_that_keeps_rising_is_not_ended():
