@@ -132,7 +132,7 @@ def raster_choices() -> list[Choice]:
 
 def training_choices() -> list[Choice]:
     """Of the training; each variant trains for the same time."""
-    from backend.training.settings import GROW_EVERY, Settings
+    from backend.training.settings import GROW_EVERY, GROW_FROM, GROW_UNTIL, Settings
 
     settings = Settings()
     cadences = {f"every {n}": {} if n == GROW_EVERY else {"grow_every": n} for n in sorted({50, 200, GROW_EVERY})}
@@ -165,7 +165,8 @@ def training_choices() -> list[Choice]:
             "densification cadence",
             f"every {GROW_EVERY}",
             {**cadences, "never": {"grow_every": 10**9}},
-            "steps between two rounds of growth and pruning, between 10 % and 50 % of the training",
+            "steps between two rounds of growth and pruning, "
+            f"between {GROW_FROM:.0%} and {GROW_UNTIL:.0%} of the training",
         ),
         Choice("offsets per anchor", *of_setting("offsets", (5, 10, 20), "k = {}"), "splats that an anchor makes"),
     ]

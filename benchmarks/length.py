@@ -1,14 +1,17 @@
 """How good a training of each length is: a row for each length and preset, and the curve of error against run time.
 
     python benchmarks/length.py [--json] [--capture build/demo/capture] [--write]
+    python benchmarks/length.py --expect CAPTURE ...
 
 Each length is a training of its own, from the beginning, by the commands that a user runs. --write leaves the table in
-docs/length.md and the plot in docs/error-over-time.png.
+docs/length.md and the plot in docs/error-over-time.png. --expect measures what backend/expectation.py says: by how much
+so many steps fall short of a training until it stops improving, on each of these captures.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import sys
 from pathlib import Path
@@ -21,6 +24,7 @@ from benchmarks import shared  # noqa: E402
 
 SECONDS = (15, 30, 60, 120, 300)
 PRESETS = ("preview", "standard", "final")
+STEPS = (150, 300, 600, 1250, 2500)
 OPEN_END = "final"
 """Its meshes are measured, too."""
 
@@ -37,7 +41,11 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--capture", type=Path, default=ROOT / "build/demo/capture")
     parser.add_argument("--write", action="store_true")
+    parser.add_argument("--expect", type=Path, nargs="+", metavar="CAPTURE")
     options = parser.parse_args()
+    if options.expect:
+        print(json.dumps(shortfalls(options.expect)))
+        return
     capture = options.capture.resolve()
     made_from = shared.digest(shared.sources(), str(capture))
     results = shared.Results(ROOT / "build" / "length", made_from, len(SECONDS) + len(PRESETS))
@@ -57,6 +65,26 @@ def main() -> None:
         (ROOT / "docs" / "length.md").write_text("\n".join(lines) + "\n")
         shared.save_figure(plot(found), ROOT / "docs" / "error-over-time.png")
     print(json.dumps(found) if options.json else "\n".join(lines))
+
+
+def shortfalls(captures: list[Path]) -> dict[str, dict[str, float]]:
+    """Capture -> steps -> dB that they fall short of a training until it stops improving."""
+    total = len(captures) * (len(STEPS) + 1)
+    found = {}
+    for capture in captures:
+        results = shared.Results(
+            ROOT / "build" / "length", shared.digest(shared.sources(), str(capture.resolve())), total
+        )
+
+        def psnr(name: str, *words: object, capture: Path = capture, results: shared.Results = results) -> float:
+            make = functools.partial(shared.from_photos_to_report, capture.resolve(), *words, meshes=False)
+            return results.get(f"{capture} {name}", make, lambda row: f"{row['steps']} steps, {row['psnr']:.2f} dB")[
+                "psnr"
+            ]
+
+        best = psnr(OPEN_END, "--preset", OPEN_END)
+        found[capture.name] = {str(steps): best - psnr(f"{steps}", "--steps", steps) for steps in STEPS}
+    return found
 
 
 def table(found: dict[str, dict[str, Any]]) -> list[str]:

@@ -23,7 +23,7 @@ WARM_UP = 600
 OCTAVE = 2.0
 """Flatness is judged by the measurements since there were so many times fewer steps."""
 
-FLAT, PATIENCE = 0.35, 5
+FLAT, PATIENCE = 0.5, 5
 """The plateau is flat where doubling the steps would bring less than so many dB, by so many measurements in a row."""
 
 
