@@ -13,6 +13,12 @@ class PlanPanel(WithReconstruction, bpy.types.Panel):
     bl_idname = "OBJECTGS_PT_plan"
     bl_label = "Plan"
     bl_parent_id = "OBJECTGS_PT_train"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw_header_preset(self, context):
+        left_out = len(planning.plan_of(scene.folder_of(context.scene.objectgs.active)).left_out)
+        if left_out:
+            self.layout.label(text=f"{left_out} left out")
 
     def draw(self, context):
         layout = self.layout
