@@ -73,6 +73,11 @@ def training(cls, context) -> bool:
     return False
 
 
+def work_on_capture(cls, context) -> bool:
+    """Whether the backend could begin something with the active reconstruction's capture."""
+    return backend(cls) and reconstruction(cls, context) and idle(cls, context) and capture(cls, context)
+
+
 def edited(cls, context) -> bool:
     """Whether the active row, or what it is shown as, has splats or a mesh that could be edited."""
     if not objects(cls, context):

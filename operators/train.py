@@ -24,8 +24,7 @@ class Train(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return (need.backend(cls) and need.reconstruction(cls, context) and need.idle(cls, context)
-                and need.capture(cls, context))
+        return need.work_on_capture(cls, context)
 
     def invoke(self, context, event):
         if self.restart:

@@ -16,8 +16,7 @@ class Vote(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return (need.backend(cls) and need.reconstruction(cls, context) and need.idle(cls, context)
-                and need.capture(cls, context))
+        return need.work_on_capture(cls, context)
 
     def execute(self, context):
         root = need.active_root(context)
