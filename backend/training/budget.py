@@ -140,4 +140,4 @@ def gain_of_doubling(curve: list[dict[str, Any]]) -> float:
 DEFAULT_SECONDS = 300.0
 
 PRESETS = {"preview": Budget(steps=600), "standard": Budget(steps=2500), "final": Budget(until_flat=True)}
-"""Lengths by name. Their places on the curve of error against run time are in docs/error-against-time.md."""
+"""Lengths by name; `benchmarks/length.py` measures their places on the curve of error against run time."""
