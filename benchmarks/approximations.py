@@ -135,7 +135,8 @@ def training_choices() -> list[Choice]:
     from backend.training.settings import GROW_EVERY, GROW_FROM, GROW_UNTIL, Settings
 
     settings = Settings()
-    cadences = {f"every {n}": {} if n == GROW_EVERY else {"grow_every": n} for n in sorted({50, 200, GROW_EVERY})}
+    steps = (GROW_EVERY // 2, GROW_EVERY, 2 * GROW_EVERY, 4 * GROW_EVERY)
+    cadences = {f"every {n}": {} if n == GROW_EVERY else {"grow_every": n} for n in steps}
 
     def of_setting(name: str, values: Sequence[int], text: str = "{}") -> tuple[str, dict[str, Any]]:
         default = getattr(settings, name)

@@ -44,7 +44,11 @@ def main() -> None:
     parser.add_argument("--expect", type=Path, nargs="+", metavar="CAPTURE")
     options = parser.parse_args()
     if options.expect:
-        print(json.dumps(shortfalls(options.expect)))
+        found = shortfalls(options.expect)
+        print(json.dumps(found))
+        for steps in map(str, STEPS):
+            of_each = [row[steps] for row in found.values()]
+            print(f"{steps}: ({min(of_each):.2f}, {max(of_each):.2f})", file=sys.stderr)
         return
     capture = options.capture.resolve()
     made_from = shared.digest(shared.sources(), str(capture))

@@ -1,10 +1,11 @@
-"""What the plan saves: trainings with all of its omissions, with none, and with each of them taken back.
+"""What the plan saves: trainings with all of its omissions and with none.
 
-    python benchmarks/plan.py [CAPTURE] [--json] [--steps 1500 | --minutes 2] [--needed] [-- TRAIN OPTIONS]
+    python benchmarks/plan.py [CAPTURE] [--json] [--steps 1500 | --minutes 2] [--each] [--needed] [-- TRAIN OPTIONS]
 
-Each is a training of its own, measured on the held-out views. `--needed` also leaves out, one at a time, what the plan
-does, to see what it is needed for. Decisions that depend on what is asked for apply with the options of `train` behind
-`--`, for instance `-- --primitive 2d --no-meshes`, or `-- --only mug`.
+Each is a training of its own, measured on the held-out views. `--each` also takes the omissions back one at a time;
+`--needed` leaves out, one at a time, what the plan does, to see what it is needed for. Decisions that depend on what is
+asked for apply with the options of `train` behind `--`, for instance `-- --primitive 2d --no-meshes`, or
+`-- --only mug`.
 """
 
 from __future__ import annotations
@@ -58,13 +59,13 @@ def measured(capture: Path, options: list[str]) -> dict[str, Any]:
         }
 
 
-def trainings(capture: Path, options: list[str], needed: bool) -> dict[str, list[str]]:
+def trainings(capture: Path, options: list[str], each: bool, needed: bool) -> dict[str, list[str]]:
     """What to train, by what is said of it: options that are added."""
     plan = backend("plan", capture, *options)[0][-1]["plan"]
     open_to_choice = [own for own in plan if own["can_override"]]
     left_out = [own["key"] for own in open_to_choice if own["done"] is False]
     found = {"as planned": [], "nothing left out": ["--keep", "all"]}
-    if len(left_out) > 1:
+    if each and len(left_out) > 1:
         found |= {f"with {key}": ["--keep", key] for key in left_out}
     if needed:
         found |= {f"without {own['key']}": ["--leave-out", own["key"]] for own in open_to_choice if own["done"]}
@@ -79,6 +80,7 @@ def main() -> None:
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--steps", type=int, default=1500)
     length.add_argument("--minutes", type=float)
+    parser.add_argument("--each", action="store_true", help="also with each thing that the plan leaves out")
     parser.add_argument("--needed", action="store_true", help="also without each thing that the plan does")
     words = sys.argv[1:]
     own, extra = (words[: words.index("--")], words[words.index("--") + 1 :]) if "--" in words else (words, [])
@@ -86,7 +88,7 @@ def main() -> None:
     capture = options.capture.resolve()
     length_options = ["--minutes", str(options.minutes)] if options.minutes else ["--steps", str(options.steps)]
     found: dict[str, dict[str, Any]] = {}
-    for name, more in trainings(capture, extra, options.needed).items():
+    for name, more in trainings(capture, extra, options.each, options.needed).items():
         found[name] = measured(capture, [*length_options, *extra, *more])
         figures = ", ".join(f"{key} {found[name][key]}" for key in ("cpu_seconds", "peak_mb", "psnr", "miou"))
         print(f"{name}: {figures}", file=sys.stderr, flush=True)

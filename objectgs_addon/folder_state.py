@@ -14,8 +14,8 @@ LONGEST_HEADER = 1 << 26
 @dataclass(frozen=True)
 class FolderState:
     """exists: the folder is there; imported: cameras and points are; voted: objects are; steps, seconds: of the
-    checkpoint's training (0: none); trained: splats are there; capture: where the photos are, or None; meshes: how
-    many there are; stale_meshes: those of another state of the training."""
+    checkpoint's training (0: none); trained: splats are there; capture: where the photos are, or None; pixels: of a
+    view, on average; meshes: how many there are; stale_meshes: those of another state of the training."""
 
     exists: bool
     imported: bool
@@ -24,6 +24,7 @@ class FolderState:
     seconds: float
     trained: bool
     capture: Path | None
+    pixels: float
     meshes: int
     stale_meshes: int
 
@@ -43,10 +44,11 @@ def folder_state(folder: Path) -> FolderState:
         return before[1]
     steps, seconds = _progress(checkpoint)
     made = _mesh_steps(listed)
+    capture, pixels = _views(paths.cameras)
     state = FolderState(
         exists=stamp[0] is not None, imported=stamp[1] is not None and paths.points.exists(),
         voted=stamp[2] is not None, steps=steps, seconds=seconds, trained=stamp[3] is not None,
-        capture=_capture(paths.cameras), meshes=len(made), stale_meshes=sum(at != steps for at in made))
+        capture=capture, pixels=pixels, meshes=len(made), stale_meshes=sum(at != steps for at in made))
     _known[paths.folder] = (stamp, state)
     return state
 
@@ -58,11 +60,14 @@ def _modified(path: Path) -> int | None:
         return None
 
 
-def _capture(cameras: Path) -> Path | None:
+def _views(cameras: Path) -> tuple[Path | None, float]:
+    """The capture's folder, and how many pixels its views have on average."""
     try:
-        return Path(json.loads(cameras.read_text(encoding="utf-8"))["capture"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+        content = json.loads(cameras.read_text(encoding="utf-8"))
+        sizes = [entry["width"] * entry["height"] for entry in content.get("cameras", ())]
+        return Path(content["capture"]), sum(sizes) / max(len(sizes), 1)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None, 0.0
 
 
 def _mesh_steps(listed: Path) -> list:

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 
 import numpy as np
 
+from .. import device
 from ..capture import Capture, load_capture
 from ..labels.points import read_points
 from ..objects import SceneObject, edit_objects, read_objects
@@ -17,6 +18,7 @@ from ..protocol import Reconstruction, Reporter
 from ..stopping import StoppingReporter
 from ..training.settings import Settings
 from .folder import memory_for_files, removed_if_refused
+from .length import budget_of, expected_of
 from .lock import locked
 from .record import recorded
 from .votes import object_name, votes_are_current
@@ -24,6 +26,7 @@ from .votes import object_name, votes_are_current
 
 def plan(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Say what training would do and leave out; the folder of --out is looked at, too, and gets plan.json."""
+    place, budget = device.pick(options.device), budget_of(options)
     folder = Reconstruction(options.out) if options.out else None
     with ExitStack() as held:
         if folder is not None:
@@ -40,6 +43,8 @@ def plan(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             write_plan(folder.plan, found)
     for decision in found.decisions:
         reporter.status(decision.sentence())
+    if expected := expected_of(budget, capture, place):
+        reporter.status(expected)
     reporter.done(plan=found.as_list())
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import shutil
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,11 +22,12 @@ from ..planning.plan import Plan, write_plan
 from ..protocol import Cancelled, InputError, Reconstruction, Reporter, plain
 from ..raster.draw import draw
 from ..stopping import StoppingReporter
-from ..training.budget import DEFAULT_SECONDS, PRESETS, Budget, Progress
+from ..training.budget import Budget, Progress
 from ..training.loop import Evaluate, Trainer
 from ..training.scene import Scene
 from .folder import described, digest, memory_for_planes, open_reconstruction, plan_of
 from .kernels import have_kernels_ready
+from .length import budget_of, expected_of
 from .plan import asked_objects, change_objects, choices, look_at, say_plan, settings
 from .record import record, record_stage, recorded, stage
 from .votes import cast_votes, votes_are_current, votes_key
@@ -42,7 +42,7 @@ _COMPARED_VIEWS = 20
 def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Train, resume or extend; leaves a checkpoint, previews, splats.ply and anchors.ply."""
     place = device.pick(options.device)
-    budget = _budget(options)
+    budget = budget_of(options)
     with open_reconstruction(options, reporter) as (folder, capture):
         trainer, plan = _begun(folder, capture, options, reporter, place)
         progress = trainer.progress
@@ -66,6 +66,8 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
                     "plan": plan.as_list(),
                 },
             )
+            if expected := expected_of(budget, trainer.scene.capture, place, progress):
+                reporter.status(expected)
             try:
                 _run(trainer, budget, folder, options.checkpoint_seconds, reporter)
             except Cancelled:
@@ -80,17 +82,6 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         splats=str(folder.splats), psnr=latest.get("psnr"), miou=latest.get("miou"),
         psnr_of_export=export["psnr_of_export"],
     )  # fmt: skip
-
-
-def _budget(options: argparse.Namespace) -> Budget:
-    """How long to train, as asked for."""
-    seconds = None if options.minutes is None else 60.0 * options.minutes
-    if options.preset is None:
-        return Budget(options.steps, None if options.steps else seconds or DEFAULT_SECONDS)
-    if options.steps or (seconds and options.preset != "final"):
-        other = "--steps" if options.steps else "--minutes"
-        raise InputError(f"--preset {options.preset} says how long to train, and so does {other}; leave one out.")
-    return replace(PRESETS[options.preset], seconds=seconds)
 
 
 def _begun(
@@ -203,8 +194,9 @@ def _held_out(folder: Reconstruction, reporter: StoppingReporter) -> Evaluate:
             if place == 0:
                 assert picture.ids is not None
                 preview = comparison(photo, picture.image, truth, picture.ids, None, capture.names)
-                render = save_picture(thumbnail(picture.image), folder.previews / "render.png")
-                reporter.preview(save_picture(preview, folder.previews / "latest.png"), render=render)
+                render = save_picture(thumbnail(picture.image), folder.previews / "render.png", quick=True)
+                latest = save_picture(preview, folder.previews / "latest.png", quick=True)
+                reporter.preview(latest, render=render)
             if capture.test_indices:
                 found.append(psnr(picture.image, photo))
                 if truth is not None and picture.ids is not None:
@@ -215,7 +207,7 @@ def _held_out(folder: Reconstruction, reporter: StoppingReporter) -> Evaluate:
         }  # fmt: skip
         curve = curve_picture([*progress.curve, {"seconds": progress.seconds, **figures}])
         if curve is not None:
-            save_picture(curve, folder.previews / "curve.png")
+            save_picture(curve, folder.previews / "curve.png", quick=True)
         return figures
 
     return measure

@@ -9,22 +9,23 @@ from typing import Any
 
 import numpy as np
 
+from ..expectation import PRESET_STEPS
 from .settings import PLATEAU_FROM, PLATEAU_UNTIL
 
 _EVALUATIONS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)
 """Shares of a training whose length is known after which it is measured."""
 
-_EVALUATE_AFTER, _EVALUATE_EVERY = 50, 1.07
+_EVALUATE_AFTER, _EVALUATE_EVERY = 100, 1.08
 """One whose end is open is measured after so many steps, and whenever there are so many times as many."""
 
 WARM_UP = 600
 """Steps until the plateau of a training whose end is open: large scenes differ in how long they stay there."""
 
-OCTAVE = 2.0
-"""Flatness is judged by the measurements since there were so many times fewer steps."""
+AHEAD, WORTH = 1000, 0.25
+"""The plateau is flat where so many more steps would bring less than so many dB."""
 
-FLAT, PATIENCE = 0.5, 5
-"""The plateau is flat where doubling the steps would bring less than so many dB, by so many measurements in a row."""
+OCTAVES = 2.0
+"""What they would bring is judged by the measurements since there were 2 to the power of this times fewer steps."""
 
 
 @dataclass
@@ -109,8 +110,7 @@ class Budget:
         if not self.until_flat or p.settled_from or p.step < WARM_UP:
             return False
         out_of_time = self.seconds is not None and p.seconds >= PLATEAU_UNTIL * self.seconds
-        lately = (p.curve[: len(p.curve) - i] for i in range(PATIENCE))
-        if not out_of_time and not all(gain_of_doubling(curve) < FLAT for curve in lately):
+        if not out_of_time and not gain_ahead(p.curve) < WORTH:
             return False
         p.settled_from = p.step
         return True
@@ -121,23 +121,18 @@ class Budget:
         return (1 - PLATEAU_UNTIL) / PLATEAU_UNTIL * p.settled_from
 
 
-def gain_of_doubling(curve: list[dict[str, Any]]) -> float:
-    """By how many dB the error falls when the steps double: the slope of a line through the latest octave of the
-    curve, PSNR on held-out views or, where there are none, the loss over log2(step). Infinite where the curve does not
-    reach back so far."""
+def gain_ahead(curve: list[dict[str, Any]]) -> float:
+    """By how many dB the error would fall in `AHEAD` more steps on the plateau, where it falls with the logarithm of
+    the steps: PSNR on held-out views or, where there are none, the loss. Infinite where the curve tells too little."""
     last = curve[-1]["step"] if curve else 0
-    if not last or curve[0]["step"] * OCTAVE > last:
-        return math.inf
-    recent = [entry for entry in curve if entry["step"] * OCTAVE >= last]
+    recent = [entry for entry in curve if entry["step"] >= max(WARM_UP, last / 2**OCTAVES)]
     key = "psnr" if all(entry.get("psnr") is not None for entry in recent) else "loss_db"
     found = [(math.log2(entry["step"]), entry[key]) for entry in recent if entry.get(key) is not None]
-    if len(found) < 5:
+    if len(found) < 5 or found[-1][0] - found[0][0] < 1:
         return math.inf
     octaves, quality = zip(*found, strict=True)
-    return float(np.polyfit(octaves, quality, 1)[0])
+    return float(np.polyfit(octaves, quality, 1)[0]) * math.log2(1 + AHEAD / last)
 
 
-DEFAULT_SECONDS = 300.0
-
-PRESETS = {"preview": Budget(steps=600), "standard": Budget(steps=2500), "final": Budget(until_flat=True)}
-"""Lengths by name; `benchmarks/length.py` measures their places on the curve of error against run time."""
+PRESETS = {**{name: Budget(steps=steps) for name, steps in PRESET_STEPS.items()}, "final": Budget(until_flat=True)}
+"""Lengths by name."""

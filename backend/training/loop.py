@@ -228,8 +228,9 @@ class Trainer:
         )
         generator = torch.Generator().manual_seed(settings.seed)
         heads = Heads(settings.layout, settings.mode, settings.sh_degree, generator)
-        grey = {"learned": 0.5, "black": 0.0, "white": 1.0}[settings.background]
-        model = ObjectModel(anchors, heads, torch.full((3,), grey), object_ids, normalization, settings.primitive)
+        shade = {"learned": capture.points.rgb[seeds].mean(axis=0) / 255.0, "black": np.zeros(3), "white": np.ones(3)}
+        background = torch.from_numpy(shade[settings.background].astype(np.float32))
+        model = ObjectModel(anchors, heads, background, object_ids, normalization, settings.primitive)
         if teach_unlabelled is None:
             teach_unlabelled = capture.has_masks and rest_is_taught(point_ids)
         scene = Scene(

@@ -63,7 +63,7 @@ def rest_is_taught(point_ids: np.ndarray) -> bool:
     return bool((np.asarray(point_ids) == 0).mean() >= REST_FROM)
 
 
-GROW_FROM, GROW_UNTIL, GROW_EVERY = 0.1, 0.6, 100
+GROW_FROM, GROW_UNTIL, GROW_EVERY = 0.1, 0.6, 50
 """Growth runs between these shares of the training, every so many steps; statistics start half way to the first."""
 
 PLATEAU_FROM, PLATEAU_UNTIL = 0.2, 0.8

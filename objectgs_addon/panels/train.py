@@ -3,6 +3,7 @@
 
 import bpy
 
+from ...backend.expectation import PRESET_STEPS, expectation
 from .. import jobs, previews, running, scene
 from ..folder_state import folder_state
 from ..job_display import duration, write
@@ -34,6 +35,7 @@ class TrainPanel(WithReconstruction, bpy.types.Panel):
             draw_job_of(layout, job)
         if not active:
             _explain(layout, root, job)
+            _expect(layout, folder_state(folder), properties)
         icons = [icon for name in (previews.RENDER, previews.CURVE) if (icon := previews.icon_of(folder, name))]
         if icons:
             row = layout.row()
@@ -65,6 +67,17 @@ def _explain(layout, root, job) -> None:
     if scene.result_is_newer(root):
         write(layout, "The folder holds another result than the one shown.", "INFO")
         layout.operator("objectgs.show_result", icon="FILE_REFRESH")
+
+
+def _expect(layout, state, properties) -> None:
+    """How good the result is going to be."""
+    seconds = 60 * properties.minutes if properties.length == "minutes" else None
+    expected = expectation(
+        PRESET_STEPS.get(properties.length), seconds, state.pixels, (state.steps, state.seconds))
+    if expected is not None:
+        column = layout.column()
+        column.active = False
+        write(column, expected)
 
 
 class SettingsPanel(WithReconstruction, bpy.types.Panel):

@@ -2,9 +2,10 @@
 
 import math
 
+import numpy as np
 import pytest
 
-from backend.training.budget import PRESETS, WARM_UP, Budget, Progress, gain_of_doubling
+from backend.training.budget import AHEAD, OCTAVES, PRESETS, WARM_UP, WORTH, Budget, Progress, gain_ahead
 from backend.training.settings import PLATEAU_FROM, PLATEAU_UNTIL, rate
 
 
@@ -30,24 +31,27 @@ def walk(budget, psnr, longest=100_000, seconds_a_step=0.05):
     return p
 
 
-def test_the_slope_over_octaves_is_the_gain_of_doubling():
-    steps = range(100, 1700, 100)
-    assert gain_of_doubling(curve_of(steps, lambda s: 20 + 0.7 * math.log2(s))) == pytest.approx(0.7)
-    # What came before the latest octave does not matter.
-    late = curve_of(steps, lambda s: 30.0 if s >= 800 else 0.0)
-    assert gain_of_doubling(late) == pytest.approx(0.0, abs=1e-9)
+def test_the_gain_ahead_follows_the_logarithm_of_the_steps():
+    steps = range(WARM_UP, 4100, 100)
+    ahead = math.log2(1 + AHEAD / steps[-1])
+    assert gain_ahead(curve_of(steps, lambda s: 20 + 0.7 * math.log2(s))) == pytest.approx(0.7 * ahead)
+    # What came before the latest octaves does not matter, nor what came before the plateau.
+    late = curve_of(steps, lambda s: 30.0 if s >= steps[-1] / 2**OCTAVES else 0.0)
+    assert gain_ahead(late) == pytest.approx(0.0, abs=1e-9)
+    early = curve_of(range(100, 2 * WARM_UP + 1, 100), lambda s: 30.0 if s >= WARM_UP else 0.0)
+    assert gain_ahead(early) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_too_little_to_judge_is_not_flat():
-    assert gain_of_doubling([]) == math.inf
-    assert gain_of_doubling(curve_of([900, 950, 1000, 1010, 1020], lambda s: 30.0)) == math.inf
-    assert gain_of_doubling(curve_of([100, 1000], lambda s: 30.0)) == math.inf
+    assert gain_ahead([]) == math.inf
+    assert gain_ahead(curve_of([900, 950, 1000, 1010, 1020], lambda s: 30.0)) == math.inf
+    assert gain_ahead(curve_of([700, 2000], lambda s: 30.0)) == math.inf
 
 
 def test_without_held_out_views_the_loss_decides():
-    steps = range(100, 1700, 100)
+    steps = range(WARM_UP, 1700, 100)
     entries = [{"step": s, "psnr": None, "loss_db": 10 + 2 * math.log2(s)} for s in steps]
-    assert gain_of_doubling(entries) == pytest.approx(2.0)
+    assert gain_ahead(entries) == pytest.approx(2.0 * math.log2(1 + AHEAD / steps[-1]))
 
 
 def test_a_curve_that_flattens_ends_the_training_soon_after():
@@ -62,11 +66,22 @@ def test_one_bad_measurement_does_not_end_a_rising_curve():
     def psnr(step):
         return 20 + 2 * math.log2(step + 1) - 5 * (3000 < step < 3200)
 
-    assert walk(PRESETS["final"], psnr, longest=12_000).settled_from == 0
+    assert walk(PRESETS["final"], psnr, longest=8_000).settled_from == 0
 
 
-def test_a_curve_that_keeps_rising_is_not_ended():
-    assert walk(PRESETS["final"], lambda step: math.log2(step + 1), longest=20_000).settled_from == 0
+def test_it_ends_where_more_steps_are_not_worth_it():
+    where = AHEAD / (2**WORTH - 1)
+    settled = walk(PRESETS["final"], lambda step: math.log2(step + 1), longest=20_000).settled_from
+    assert where <= settled < 1.1 * where
+    assert walk(PRESETS["final"], lambda step: step / AHEAD, longest=20_000).settled_from == 0
+
+
+def test_noise_of_the_measurements_moves_the_end_little():
+    rng = np.random.default_rng(0)
+    where = AHEAD / (2 ** (WORTH / 0.6) - 1)
+    for _ in range(20):
+        end = walk(PRESETS["final"], lambda step: 30 + 0.6 * math.log2(step + 1) + rng.normal(0, 0.1), longest=20_000)
+        assert where / 2 < end.settled_from < 2 * where
 
 
 def test_a_flat_curve_is_not_ended_before_the_warm_up():

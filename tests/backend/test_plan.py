@@ -266,6 +266,7 @@ def test_plan_says_all_and_writes_only_what_it_is_told_to(write_capture, tmp_pat
     plan = Plan.of(answer.events[-1]["plan"])
     assert plan["pyramid"].overridden and plan["surface"].overridden and not plan.does("meshes")
     assert len([text for text in answer.messages("status") if text.startswith(("Done: ", "Left out: "))]) > 5
+    assert answer.messages("status")[-1].startswith("Expected of ")
     refused(ask("plan", capture, "--keep", "everything"), "invalid choice: 'everything'")
     refused(ask("plan", tmp_path / "none", "--out", out), "does not exist")
     assert not out.parent.exists()
@@ -291,6 +292,7 @@ def test_training_follows_its_plan_to_the_report(write_capture, tmp_path, ask):
     said = began.messages("status")
     assert any(text.startswith("Left out: training on 1 view, since") for text in said)
     assert any(text.startswith("Done: reduced pictures") and "--keep pyramid" in text for text in said)
+    assert any(text.startswith("Expected in ") and "dB below" in text for text in said)
     training = json.loads((out / "objectgs.json").read_text())["training"]
     assert Plan.of(training["plan"]) == read_plan(out / "plan.json")
     kept = ("--keep", "pyramid", "--leave-out")

@@ -29,9 +29,11 @@ def test_each_step_is_seen(tmp_path):
     folder.mkdir()
     assert folder_state(folder).exists and not folder_state(folder).imported
     (folder / "points.ply").write_bytes(b"ply")
-    (folder / "cameras.json").write_text(json.dumps({"capture": "/somewhere/else", "cameras": []}))
+    (folder / "cameras.json").write_text(json.dumps({"capture": "/somewhere/else", "cameras": [
+        {"width": 40, "height": 30}, {"width": 20, "height": 10}]}))
     state = folder_state(folder)
     assert state.imported and str(state.capture) == "/somewhere/else" and not state.voted
+    assert state.pixels == (1200 + 200) / 2
     (folder / "objects.json").write_text("{}")
     write_checkpoint(folder, 700, 12.5)
     state = folder_state(folder)

@@ -1,0 +1,55 @@
+"""What is expected of a training before it begins."""
+
+import pytest
+
+from backend import expectation
+from backend.expectation import shortfall
+
+
+@pytest.fixture(autouse=True)
+def measured(monkeypatch):
+    monkeypatch.setattr(expectation, "SHORT_OF_FINAL", {100: (2.0, 4.0), 400: (1.0, 2.0), 1600: (0.0, 1.0)})
+    monkeypatch.setattr(expectation, "NANOSECONDS_A_PIXEL", (500.0, 2000.0))
+
+
+def expected(*arguments):
+    return expectation.expectation(*arguments)
+
+
+def test_between_measurements_the_logarithm_of_the_steps_counts():
+    assert shortfall(400) == pytest.approx((1.0, 2.0))
+    assert shortfall(200) == pytest.approx((1.5, 3.0)) and shortfall(800) == pytest.approx((0.5, 1.5))
+    assert shortfall(10) == (2.0, 4.0) and shortfall(1e6) == (0.0, 1.0)
+
+
+def test_steps_say_how_long_and_how_good():
+    assert expected(400, None, 100_000) == (
+        "Expected in 20 s to 80 s on a CPU: 1.0 to 2.0 dB below a training until it stops improving"
+    )
+    assert expected(1600, None, 100_000) == (
+        "Expected in 80 s to 5.3 min on a CPU: 0.0 to 1.0 dB below a training until it stops improving"
+    )
+
+
+def test_minutes_say_how_many_steps():
+    # 0.05 to 0.2 s a step: the fewest steps decide on the most that is lost.
+    assert expected(None, 80.0, 100_000) == (
+        "Expected of 400 to 1,600 steps on a CPU: 0.0 to 2.0 dB below a training until it stops improving"
+    )
+
+
+def test_what_was_measured_here_counts_more():
+    assert expected(None, 100.0, 100_000, (200, 50.0)) == (
+        "Expected of 400 steps: 1.0 to 2.0 dB below a training until it stops improving"
+    )
+    assert "in 1.7 min:" in expected(400, None, 100_000, (200, 50.0))
+
+
+def test_very_short_trainings_are_below_what_was_measured():
+    assert expected(30, None, None) == "Expected: more than 2.0 dB below a training until it stops improving"
+
+
+def test_nobody_knows_how_fast_another_device_is():
+    assert expected(None, 60.0, None) is None
+    assert expected(400, None, None) == "Expected: 1.0 to 2.0 dB below a training until it stops improving"
+    assert expected(None, None, 100_000) is None
