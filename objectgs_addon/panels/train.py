@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Voting and training, with their settings."""
 
+import math
+
 import bpy
 
 from ...backend.expectation import PRESET_STEPS, expectation
@@ -31,11 +33,12 @@ class TrainPanel(WithReconstruction, bpy.types.Panel):
         row.prop(properties, "length", text="")
         if properties.length == "minutes":
             column.prop(properties, "minutes")
+        if not active:
+            _expect(column, folder_state(folder), properties)
         if job is not None:
             draw_job_of(layout, job)
         if not active:
             _explain(layout, root, job)
-            _expect(layout, folder_state(folder), properties)
         icons = [icon for name in (previews.RENDER, previews.CURVE) if (icon := previews.icon_of(folder, name))]
         if icons:
             row = layout.row()
@@ -70,14 +73,16 @@ def _explain(layout, root, job) -> None:
 
 
 def _expect(layout, state, properties) -> None:
-    """How good the result is going to be."""
+    """How good the result is going to be, where it is not there yet."""
+    steps = PRESET_STEPS.get(properties.length)
     seconds = 60 * properties.minutes if properties.length == "minutes" else None
-    expected = expectation(
-        PRESET_STEPS.get(properties.length), seconds, state.pixels, (state.steps, state.seconds))
+    if state.steps >= (steps or math.inf) or state.seconds >= (seconds or math.inf) - 0.5:
+        return
+    expected = expectation(steps, seconds, state.pixels, (state.steps, state.seconds))
     if expected is not None:
-        column = layout.column()
-        column.active = False
-        write(column, expected)
+        quiet = layout.column()
+        quiet.active = False
+        write(quiet, expected)
 
 
 class SettingsPanel(WithReconstruction, bpy.types.Panel):
