@@ -33,7 +33,7 @@ from ..training.loop import Trainer
 from ..training.settings import Settings
 
 STEPS = 220
-"""A second or two, and enough for anchors to grow once: after 100 steps, in the first half of the training."""
+"""A second or two, and enough for anchors to grow: every 50 steps, in the first half of the training."""
 
 
 def have_kernels_ready(reporter: StoppingReporter, place: torch.device) -> None:
@@ -58,10 +58,12 @@ def try_kernels(reporter: StoppingReporter, place: torch.device) -> None:
 
 
 def _mark(place: torch.device) -> Path:
-    """A file beside numba's own that says: the kernels of these sources are there, for this numba and these devices."""
+    """A file beside numba's own that says: the kernels of these sources, which numba knows by where they lie, are
+    there, for this numba and these devices."""
+    sources = Path(__file__).resolve().parents[1]
     processor = f"{llvmlite.binding.get_host_cpu_name()} {device.name_of(place)}"
-    kernels = f"{digest_up_to('mesh')} {numba.__version__} {processor}"
-    folder = Path(numba.config.CACHE_DIR or Path(__file__).parents[1] / "raster" / "__pycache__")
+    kernels = f"{sources} {digest_up_to('mesh')} {numba.__version__} {processor}"
+    folder = Path(numba.config.CACHE_DIR or sources / "raster" / "__pycache__")
     return folder / f"objectgs-{hashlib.sha256(kernels.encode()).hexdigest()[:16]}.ready"
 
 

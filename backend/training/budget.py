@@ -21,7 +21,7 @@ _EVALUATE_AFTER, _EVALUATE_EVERY = 100, 1.08
 WARM_UP = 600
 """Steps until the plateau of a training whose end is open: large scenes differ in how long they stay there."""
 
-AHEAD, WORTH = 1000, 0.25
+AHEAD, WORTH = 1000, 0.35
 """The plateau is flat where so many more steps would bring less than so many dB."""
 
 OCTAVES = 2.0
