@@ -100,6 +100,7 @@ def measure(
         wait(blender, "running.queue.running is None")
         blender.run(NAMES + "running.redraw = running.shown")
         blender.run(NAMES + DRAW_OWN)
+        time.sleep(10)  # The result of the training before comes in.
         blender.run(START)
         time.sleep(10)
         found["Blender's own, no training"] = blender.run(STOP)
@@ -119,7 +120,7 @@ def train_outside(capture: Path, folder: Path, seconds: float) -> subprocess.Pop
     command = [sys.executable, "-m", "backend", "train", str(capture), "--out", str(folder), "--minutes"]
     return subprocess.Popen(
         [*command, str(seconds / 60)], cwd=harness.ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        start_new_session=True, preexec_fn=lambda: os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0)),
+        process_group=0, preexec_fn=lambda: os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0)),
     )  # fmt: skip
 
 
