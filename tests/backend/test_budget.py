@@ -80,7 +80,7 @@ def test_noise_of_the_measurements_moves_the_end_little():
     rng = np.random.default_rng(0)
     where = AHEAD / (2 ** (WORTH / 0.6) - 1)
     for _ in range(20):
-        end = walk(PRESETS["final"], lambda step: 30 + 0.6 * math.log2(step + 1) + rng.normal(0, 0.1), longest=20_000)
+        end = walk(PRESETS["final"], lambda step: 30 + 0.6 * math.log2(step + 1) + rng.normal(0, 0.2), longest=20_000)
         assert where / 2 < end.settled_from < 2 * where
 
 

@@ -138,9 +138,11 @@ def test_kernels_are_finite_and_equal_the_reference(primitive, scene):
     assert cut.mean() < 0.02
     if not cut.any():
         assert_close(got, want, 1e-4, [name for name in want if name in PLANES])
-        # A covariance of needles is a difference of numbers so far apart that float32 keeps few of its digits.
+        # How needles turn is known less well: off by 0.204 % where this was met.
+        turn = "gradient of quats"
         longest, width = (getattr(scene["scales"], of)(1).values for of in ("max", "median"))
-        assert_close(got, want, 1e-2 if (longest > 1e4 * width).any() else 2e-3)
+        assert_close(got, want, 2e-3, [name for name in want if name != turn])
+        assert_close(got, want, 1e-2 if (longest > 1e4 * width).any() else 2e-3, [turn])
 
 
 @PRIMITIVES
