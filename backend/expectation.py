@@ -20,6 +20,8 @@ and the most of the captures that `benchmarks/length.py --expect` was run on, he
 NANOSECONDS_A_PIXEL = (300.0, 1200.0)
 """What a step takes on a CPU for each pixel of a view, at least and at most, as long as nothing was measured here."""
 
+_FINAL = "a training until it stops improving"
+
 
 def expectation(
     steps: int | None, seconds: float | None, pixels: float | None, trained: tuple[int, float] = (0, 0.0)
@@ -46,9 +48,11 @@ def expectation(
     else:
         return None
     if most < min(SHORT_OF_FINAL):
-        return f"Expected{length}: more than {shortfall(most)[0]:.1f} dB below a training until it stops improving"
-    best, worst = shortfall(most)[0], shortfall(fewest)[1]
-    return f"Expected{length}: {_range(f'{best:.1f}', f'{worst:.1f}')} dB below a training until it stops improving"
+        return f"Expected{length}: more than {shortfall(most)[0]:.1f} dB below {_FINAL}"
+    best, worst = (f"{short:.1f}" for short in (shortfall(most)[0], shortfall(fewest)[1]))
+    if worst == "0.0":
+        return f"Expected{length}: as good as {_FINAL}"
+    return f"Expected{length}: {f'up to {worst}' if best == '0.0' else _range(best, worst)} dB below {_FINAL}"
 
 
 def shortfall(steps: float) -> tuple[float, float]:

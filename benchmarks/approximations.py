@@ -132,11 +132,11 @@ def raster_choices() -> list[Choice]:
 
 def training_choices() -> list[Choice]:
     """Of the training; each variant trains for the same time."""
-    from backend.training.settings import GROW_EVERY, GROW_FROM, GROW_UNTIL, Settings
+    from backend.training.settings import GROW_FROM, GROW_UNTIL, Settings, growth_interval
 
     settings = Settings()
-    steps = (GROW_EVERY // 2, GROW_EVERY, 2 * GROW_EVERY, 4 * GROW_EVERY)
-    cadences = {f"every {n}": {} if n == GROW_EVERY else {"grow_every": n} for n in steps}
+    often = growth_interval(0)
+    cadences = {f"every {n}": {} if n == often else {"grow_every": n} for n in (often // 2, often, 50, 100, 200)}
 
     def of_setting(name: str, values: Sequence[int], text: str = "{}") -> tuple[str, dict[str, Any]]:
         default = getattr(settings, name)
@@ -164,7 +164,7 @@ def training_choices() -> list[Choice]:
         ),
         Choice(
             "densification cadence",
-            f"every {GROW_EVERY}",
+            f"every {often}",
             {**cadences, "never": {"grow_every": 10**9}},
             "steps between two rounds of growth and pruning, "
             f"between {GROW_FROM:.0%} and {GROW_UNTIL:.0%} of the training",
@@ -348,7 +348,7 @@ def trained(spec: dict[str, Any], capture: str, seconds: float, seed: int) -> di
 
     compile_kernels()
     if "grow_every" in spec:
-        shared.replace(loop, "GROW_EVERY", spec["grow_every"])
+        shared.replace(loop, "growth_interval", lambda step: spec["grow_every"])
     if "pyramid" in spec:
         steps = spec["pyramid"]
         shared.replace(loop, "downscale_at", lambda share, *_: next((by for until, by in steps if share < until), 1))

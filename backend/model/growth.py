@@ -3,7 +3,7 @@
 A child takes its parent's ID, a cell holds at most one anchor, and of two objects that want one free cell the one
 with the larger accumulated gradient gets it.
 
-Statistics are gathered where the model lies. Growth itself, once in a hundred steps, thinks on the processor: sorting
+Statistics are gathered where the model lies. Growth itself, once in many steps, thinks on the processor: sorting
 cells is what it does, and only what asks for one travels, not the anchors' rows.
 """
 
@@ -20,10 +20,13 @@ from .anchors import Anchors, cell_keys, new_rows
 LEVELS = (16, 4, 1)
 """Cells tried, in voxels, coarse to fine."""
 
+MIN_VISITS = 5
+"""What was seen less often is not judged yet."""
+
 
 @dataclass
 class GrowthStatistics:
-    """Sums since they were last cleared. gradient and visits (N k,): norm of the screen gradient (normalised device
+    """Sums since they were last judged. gradient and visits (N k,): norm of the screen gradient (normalised device
     coordinates) of each offset's splat, and how often it was seen; opacity and views (N,): summed opacity of an
     anchor's splats, and how often the anchor was in view."""
 
@@ -97,6 +100,18 @@ class GrowthStatistics:
         self.opacity.index_add_(0, anchors_seen, torch.where(counted, opacities.view(-1, offsets).sum(1), 0.0))
         self.views.index_add_(0, anchors_seen, counted.to(self.views.dtype))
 
+    def after(self, growth: Growth, offsets: int) -> GrowthStatistics:
+        """What goes on after a round of growth: the sums of what was seen too seldom to be judged in it."""
+
+        def follow(sums: torch.Tensor, count: torch.Tensor, width: int) -> torch.Tensor:
+            kept = torch.where(count < MIN_VISITS, sums, 0).view(-1, width)[growth.kept]
+            return torch.cat([kept, kept.new_zeros((growth.added, width))]).flatten()
+
+        return GrowthStatistics(
+            follow(self.gradient, self.visits, offsets), follow(self.visits, self.visits, offsets),
+            follow(self.opacity, self.views, 1), follow(self.views, self.views, 1),
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Growth:
@@ -110,7 +125,6 @@ class Growth:
 def grow_and_prune(
     anchors: Anchors,
     statistics: GrowthStatistics,
-    min_visits: int,
     rng: np.random.Generator,
     threshold: float = 2e-4,
     min_opacity: float = 0.005,
@@ -125,7 +139,7 @@ def grow_and_prune(
         device.host(t) for t in (statistics.gradient, statistics.visits, statistics.opacity, statistics.views)
     )
     positions = device.host(anchors.positions)
-    enough = visits >= min_visits
+    enough = visits >= MIN_VISITS
     gradient = np.where(enough, summed / np.maximum(visits, 1), 0)
     wanted = np.flatnonzero(gradient >= threshold)
     parents = wanted // k
@@ -170,7 +184,7 @@ def grow_and_prune(
     colors = of_parents[:, layout.color_columns].reshape(-1, k, 3)[np.arange(len(child)), wanted[child] % k]
     rows[:, layout.color_columns] = np.tile(colors, (1, k))
 
-    faint = (views >= min_visits) & (opacity < min_opacity * np.maximum(views, 1))
+    faint = (views >= MIN_VISITS) & (opacity < min_opacity * np.maximum(views, 1))
     kept = device.upload(np.flatnonzero(~faint), anchors.rows)
     pruned = len(anchors) - len(kept)
     born = device.upload(np.concatenate(new_positions), anchors.rows)

@@ -15,13 +15,14 @@ from .settings import PLATEAU_FROM, PLATEAU_UNTIL
 _EVALUATIONS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)
 """Shares of a training whose length is known after which it is measured."""
 
-_EVALUATE_AFTER, _EVALUATE_EVERY = 100, 1.08
-"""One whose end is open is measured after so many steps, and whenever there are so many times as many."""
+_EVALUATE_AFTER, _EVALUATE_EARLY, _EVALUATE_EVERY = 100, 1.3, 1.08
+"""One whose end is open is measured after so many steps, and whenever there are so many times as many: during the
+warm-up and after it, where the measurements decide."""
 
 WARM_UP = 600
 """Steps until the plateau of a training whose end is open: large scenes differ in how long they stay there."""
 
-AHEAD, WORTH = 1000, 0.35
+AHEAD, WORTH = 1000, 0.28
 """The plateau is flat where so many more steps would bring less than so many dB."""
 
 OCTAVES = 2.0
@@ -96,7 +97,8 @@ class Budget:
         """Whether it is time to measure; says so once."""
         share = self.share(p)
         if self.until_flat:
-            due = p.step >= max(_EVALUATE_AFTER, _EVALUATE_EVERY * p.evaluated)
+            times = _EVALUATE_EARLY if p.step < WARM_UP else _EVALUATE_EVERY
+            due = p.step >= max(_EVALUATE_AFTER, times * p.evaluated)
             due = due or (share >= 1.0 and p.step > p.evaluated)
             behind = p.step if due else p.evaluated
         else:

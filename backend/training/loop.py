@@ -34,13 +34,13 @@ from .budget import Budget, Progress
 from .losses import image_loss, normal_loss, volume_loss
 from .scene import Scene
 from .settings import (
-    GROW_EVERY,
     GROW_FROM,
     GROW_UNTIL,
     HEAD_RATES,
     SURFACE_FROM,
     Settings,
     downscale_at,
+    growth_interval,
     rate,
     rest_is_taught,
     row_rates,
@@ -670,18 +670,16 @@ class Trainer:
                 shown.anchors, anchors.layout.offsets, shown.source, shown.opacities, shown.met, shown.screen_gradient,
                 camera.width, camera.height, learned.usable if whole else None,
             )  # fmt: skip
-        if share < GROW_FROM or p.step - p.last_growth < GROW_EVERY:
+        if share < GROW_FROM or p.step - p.last_growth < growth_interval(p.step):
             return
         p.last_growth = p.step
-        growth = grow_and_prune(
-            anchors, self._statistics, GROW_EVERY // 5, self.rng, max_anchors=self.settings.max_anchors
-        )
+        growth = grow_and_prune(anchors, self._statistics, self.rng, max_anchors=self.settings.max_anchors)
 
         def follow(moments: torch.Tensor) -> torch.Tensor:
             return torch.cat([moments[growth.kept], moments.new_zeros((growth.added, moments.shape[1]))])
 
         self._first, self._second = follow(self._first), follow(self._second)
-        self._statistics = GrowthStatistics.zeros(len(anchors), anchors.layout.offsets, self.model.device)
+        self._statistics = self._statistics.after(growth, anchors.layout.offsets)
 
 
 def _frustum(camera: Camera) -> tuple[np.ndarray, np.ndarray, int, int, float]:

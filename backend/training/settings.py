@@ -63,8 +63,16 @@ def rest_is_taught(point_ids: np.ndarray) -> bool:
     return bool((np.asarray(point_ids) == 0).mean() >= REST_FROM)
 
 
-GROW_FROM, GROW_UNTIL, GROW_EVERY = 0.1, 0.6, 50
-"""Growth runs between these shares of the training, every so many steps; statistics start half way to the first."""
+GROW_FROM, GROW_UNTIL = 0.1, 0.6
+"""Growth runs between these shares of the training; its statistics start half way to the first."""
+
+_GROW_OFTEN, _GROW_SELDOM, _GROW_PART = 25, 100, 0.02
+
+
+def growth_interval(step: int) -> int:
+    """Steps until anchors grow again: often at first, which shortens short trainings; later, when there are more
+    anchors to look through and each round changes less, a part of the steps so far."""
+    return int(min(max(_GROW_OFTEN, _GROW_PART * step), _GROW_SELDOM))
 
 PLATEAU_FROM, PLATEAU_UNTIL = 0.2, 0.8
 """Between these shares of the training the rates hardly fall. Most is learned there; the fall after it settles what has

@@ -248,18 +248,18 @@ def test_growth_and_its_statistics(both, as_on_gpu):
         statistics = GrowthStatistics.zeros(60, 4)
         copy = Anchors(anchors.layout, 0.1, anchors.positions, anchors.rows, anchors.ids)
         for seed in range(12):
-            seen = torch.tensor(np.random.default_rng(seed).permutation(60)[:40])
+            seen = torch.tensor(np.random.default_rng(seed).permutation(60)[:25])
             rows = copy.rows[seen].requires_grad_()
             g = generate(copy.layout, copy.positions[seen], rows, copy.ids[seen], heads)
             drawn = rasterize(*g[:6], camera)
             (drawn.color * torch.tensor(rng_planes[seed])).sum().backward()
             frame = drawn.frame
             statistics.add(seen, 4, g.source, g.opacities.detach(), frame.seen, frame.screen_gradient, 64, 48)
-        growth = grow_and_prune(copy, statistics, 3, np.random.default_rng(0), min_opacity=0.2)
-        return statistics, copy, growth
+        growth = grow_and_prune(copy, statistics, np.random.default_rng(0), min_opacity=0.2)
+        return statistics.after(growth, 4), statistics, copy, growth
 
     rng_planes = rng.normal(size=(12, 3, 48, 64)).astype(np.float32)
-    (want, want_anchors, want_growth), (got, got_anchors, growth) = both(grown)
+    (want_left, want, want_anchors, want_growth), (left, got, got_anchors, growth) = both(grown)
     assert torch.equal(got.visits, want.visits) and torch.equal(got.views, want.views)
     assert want.visits.max() > 3
     close(got.gradient, want.gradient, 1e-3)
@@ -268,6 +268,7 @@ def test_growth_and_its_statistics(both, as_on_gpu):
     assert growth.added == want_growth.added and torch.equal(growth.kept, want_growth.kept)
     close(got_anchors.positions, want_anchors.positions, 1e-6)
     assert torch.equal(got_anchors.ids, want_anchors.ids)
+    assert torch.equal(left.visits, want_left.visits) and 0 < want_left.visits.count_nonzero() < want.visits.numel()
 
 
 # --- whole trainings -------------------------------------------------------------------------------------------------

@@ -27,14 +27,14 @@ def test_steps_say_how_long_and_how_good():
         "Expected in 20 s to 80 s on a CPU: 1.0 to 2.0 dB below a training until it stops improving"
     )
     assert expected(1600, None, 100_000) == (
-        "Expected in 80 s to 5.3 min on a CPU: 0.0 to 1.0 dB below a training until it stops improving"
+        "Expected in 80 s to 5.3 min on a CPU: up to 1.0 dB below a training until it stops improving"
     )
 
 
 def test_minutes_say_how_many_steps():
     # 0.05 to 0.2 s a step: the fewest steps decide on the most that is lost.
     assert expected(None, 80.0, 100_000) == (
-        "Expected of 400 to 1,600 steps on a CPU: 0.0 to 2.0 dB below a training until it stops improving"
+        "Expected of 400 to 1,600 steps on a CPU: up to 2.0 dB below a training until it stops improving"
     )
 
 
@@ -53,3 +53,8 @@ def test_nobody_knows_how_fast_another_device_is():
     assert expected(None, 60.0, None) is None
     assert expected(400, None, None) == "Expected: 1.0 to 2.0 dB below a training until it stops improving"
     assert expected(None, None, 100_000) is None
+
+
+def test_no_loss_is_said_so(monkeypatch):
+    monkeypatch.setattr(expectation, "SHORT_OF_FINAL", {400: (1.0, 2.0), 1600: (0.0, 0.04)})
+    assert expected(1600, None, None) == "Expected: as good as a training until it stops improving"

@@ -14,7 +14,7 @@ import torch
 from backend.model.anchors import Anchors, Layout, cell_keys, median_spacing, seed_anchors
 from backend.model.checkpoint import CURRENT, PREVIOUS, load_checkpoint, save_checkpoint
 from backend.model.generate import generate
-from backend.model.growth import GrowthStatistics, grow_and_prune
+from backend.model.growth import MIN_VISITS, GrowthStatistics, grow_and_prune
 from backend.model.heads import Heads
 from backend.model.object_model import Normalization, anchors_in_view
 from backend.protocol import Cancelled, InputError, Reporter
@@ -277,7 +277,7 @@ def grown(gradient, ids=(1, 2), positions=((0.0, 0, 0), (8.0, 0, 0)), offset=(0.
     rows = torch.zeros(2, layout.columns)
     rows[:, layout.offset_columns] = torch.tensor(offset)
     anchors = Anchors(layout, 1.0, torch.tensor(positions), rows, torch.tensor(ids, dtype=torch.int32))
-    return anchors, grow_and_prune(anchors, statistics_of(gradient, opacity), 5, np.random.default_rng(0))
+    return anchors, grow_and_prune(anchors, statistics_of(gradient, opacity), np.random.default_rng(0))
 
 
 def statistics_of(gradient, opacity=1.0):
@@ -300,7 +300,7 @@ def test_of_two_objects_that_want_one_cell_the_larger_gradient_wins():
         rows = torch.zeros(2, layout.columns)
         rows[:, 0] = torch.tensor([2.1, -2.1])
         anchors = Anchors(layout, 1.0, torch.tensor(positions), rows, torch.tensor([1, 2], dtype=torch.int32))
-        grow_and_prune(anchors, statistics_of(gradient), 5, np.random.default_rng(0))
+        grow_and_prune(anchors, statistics_of(gradient), np.random.default_rng(0))
         place = np.flatnonzero((cell_keys(anchors.positions, 1.0) == [2, 0, 0]).all(1))
         assert len(place) == 1 and anchors.ids[place[0]] == winner
 
@@ -308,6 +308,30 @@ def test_of_two_objects_that_want_one_cell_the_larger_gradient_wins():
 def test_transparent_anchors_are_pruned():
     anchors, growth = grown([0.0, 0.0], opacity=0.001)
     assert growth.pruned == 2 and len(anchors) == 0
+
+
+def test_what_was_seen_too_seldom_to_be_judged_is_judged_later():
+    layout = Layout(2, 4)
+
+    def anchors():
+        positions, ids = torch.tensor([[0.0, 0, 0], [8, 0, 0], [16, 0, 0]]), torch.ones(3, dtype=torch.int32)
+        rows = torch.zeros(3, layout.columns)
+        rows[:, layout.offset_columns] = 2.2
+        return Anchors(layout, 1.0, positions, rows, ids)
+
+    # The first anchor is transparent and goes; of the others, one splat of four was seen often enough.
+    often, seldom = MIN_VISITS, MIN_VISITS - 1
+    visits = torch.tensor([0, 0, often, seldom, seldom, 0], dtype=torch.int32)
+    views = torch.tensor([often, often, seldom], dtype=torch.int32)
+    statistics = GrowthStatistics(1.0 * visits, visits, torch.tensor([0.0, 1, 1]), views)
+    of = anchors()
+    growth = grow_and_prune(of, statistics, np.random.default_rng(0))
+    assert growth.pruned == 1 and growth.added == len(of) - 2 > 0
+    left = statistics.after(growth, 2)
+    none = [0] * growth.added
+    assert left.visits.tolist() == [0, seldom, seldom, 0] + 2 * none and left.views.tolist() == [0, seldom, *none]
+    assert left.gradient.tolist() == left.visits.tolist() and left.opacity.tolist() == [0, 1, *none]
+    assert len(left.visits) == 2 * len(of)
 
 
 # --- checkpoints -----------------------------------------------------------------------------------------------------
