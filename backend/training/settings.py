@@ -74,6 +74,7 @@ def growth_interval(step: int) -> int:
     anchors to look through and each round changes less, a part of the steps so far."""
     return int(min(max(_GROW_OFTEN, _GROW_PART * step), _GROW_SELDOM))
 
+
 PLATEAU_FROM, PLATEAU_UNTIL = 0.2, 0.8
 """Between these shares of the training the rates hardly fall. Most is learned there; the fall after it settles what has
 been learned."""

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from backend.training.budget import AHEAD, OCTAVES, PRESETS, WARM_UP, WORTH, Budget, Progress, gain_ahead
+from backend.training.budget import AHEAD, JUDGED_FROM, OCTAVES, PRESETS, WARM_UP, WORTH, Budget, Progress, gain_ahead
 from backend.training.settings import PLATEAU_FROM, PLATEAU_UNTIL, rate
 
 
@@ -32,13 +32,13 @@ def walk(budget, psnr, longest=100_000, seconds_a_step=0.05):
 
 
 def test_the_gain_ahead_follows_the_logarithm_of_the_steps():
-    steps = range(WARM_UP, 4100, 100)
+    steps = range(JUDGED_FROM, 4100, 100)
     ahead = math.log2(1 + AHEAD / steps[-1])
     assert gain_ahead(curve_of(steps, lambda s: 20 + 0.7 * math.log2(s))) == pytest.approx(0.7 * ahead)
-    # What came before the latest octaves does not matter, nor what came before the plateau.
+    # What came before the latest octaves does not matter, nor what came before it is judged.
     late = curve_of(steps, lambda s: 30.0 if s >= steps[-1] / 2**OCTAVES else 0.0)
     assert gain_ahead(late) == pytest.approx(0.0, abs=1e-9)
-    early = curve_of(range(100, 2 * WARM_UP + 1, 100), lambda s: 30.0 if s >= WARM_UP else 0.0)
+    early = curve_of(range(100, 2 * JUDGED_FROM + 1, 100), lambda s: 30.0 if s >= JUDGED_FROM else 0.0)
     assert gain_ahead(early) == pytest.approx(0.0, abs=1e-9)
 
 
@@ -49,7 +49,7 @@ def test_too_little_to_judge_is_not_flat():
 
 
 def test_without_held_out_views_the_loss_decides():
-    steps = range(WARM_UP, 1700, 100)
+    steps = range(JUDGED_FROM, 1700, 100)
     entries = [{"step": s, "psnr": None, "loss_db": 10 + 2 * math.log2(s)} for s in steps]
     assert gain_ahead(entries) == pytest.approx(2.0 * math.log2(1 + AHEAD / steps[-1]))
 
@@ -85,7 +85,7 @@ def test_noise_of_the_measurements_moves_the_end_little():
 
 
 def test_a_flat_curve_is_not_ended_before_the_warm_up():
-    assert walk(PRESETS["final"], lambda step: 30.0).settled_from >= WARM_UP
+    assert walk(PRESETS["final"], lambda step: 30.0).settled_from >= max(WARM_UP, JUDGED_FROM)
 
 
 def test_an_open_end_has_a_most():
