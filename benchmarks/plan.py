@@ -1,16 +1,17 @@
 """What the plan saves: trainings with all of its omissions and with none.
 
-    python benchmarks/plan.py [CAPTURE] [--json] [--steps 1500 | --minutes 2] [--each] [--needed] [-- TRAIN OPTIONS]
+    python benchmarks/plan.py [CAPTURE ...] [--json] [--steps 1500] [--each] [--needed] [--write] [-- TRAIN OPTIONS]
 
 Each is a training of its own, measured on the held-out views. `--each` also takes the omissions back one at a time;
 `--needed` leaves out, one at a time, what the plan does, to see what it is needed for. Decisions that depend on what is
 asked for apply with the options of `train` behind `--`, for instance `-- --primitive 2d --no-meshes`, or
-`-- --only mug`.
+`-- --only mug`. `--write` leaves the tables in docs/plan.md.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import os
 import subprocess
@@ -21,9 +22,19 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-FIGURES = ("cpu_seconds", "seconds", "read", "vote", "train", "export", "peak_mb", "psnr", "miou", "steps", "splats")
+sys.path.insert(0, str(ROOT))
+
+from benchmarks import shared  # noqa: E402
+
+DEMO = ROOT / "build/demo/capture"
 SAME_PSNR = 0.1
 """What is left out must not cost more than this, in dB."""
+
+_COLUMNS = (
+    ("seconds", "seconds", "{:.0f}"), ("cpu_seconds", "of the processors", "{:.0f}"), ("train", "training", "{:.0f}"),
+    ("peak_mb", "memory", "{:,.0f} MB"), ("psnr", "PSNR", "{:.2f} dB"), ("miou", "mIoU", "{:.4f}"),
+    ("splats", "splats", "{:,}"),
+)  # fmt: skip
 
 
 def backend(*words: object) -> tuple[list[dict[str, Any]], float, float]:
@@ -33,7 +44,7 @@ def backend(*words: object) -> tuple[list[dict[str, Any]], float, float]:
         [sys.executable, "-m", "backend", *map(str, words), "--json"], cwd=ROOT, capture_output=True, text=True
     )
     if done.returncode:
-        sys.exit(done.stdout.splitlines()[-1] if done.stdout else done.stderr)
+        raise RuntimeError(done.stdout.splitlines()[-1] if done.stdout else done.stderr)
     seconds, after = time.monotonic() - started, os.times()
     busy = sum(after[2:4]) - sum(before[2:4])
     return [json.loads(line) for line in done.stdout.splitlines()], seconds, busy
@@ -59,8 +70,8 @@ def measured(capture: Path, options: list[str]) -> dict[str, Any]:
         }
 
 
-def trainings(capture: Path, options: list[str], each: bool, needed: bool) -> dict[str, list[str]]:
-    """What to train, by what is said of it: options that are added."""
+def trainings(capture: Path, options: list[str], each: bool, needed: bool) -> tuple[list[str], dict[str, list[str]]]:
+    """What the plan leaves out, and what to train, by what is said of it: options that are added."""
     plan = backend("plan", capture, *options)[0][-1]["plan"]
     open_to_choice = [own for own in plan if own["can_override"]]
     left_out = [own["key"] for own in open_to_choice if own["done"] is False]
@@ -69,42 +80,74 @@ def trainings(capture: Path, options: list[str], each: bool, needed: bool) -> di
         found |= {f"with {key}": ["--keep", key] for key in left_out}
     if needed:
         found |= {f"without {own['key']}": ["--leave-out", own["key"]] for own in open_to_choice if own["done"]}
-    return found
+    return left_out, found
+
+
+def verdict(found: dict[str, dict[str, Any]]) -> str:
+    """What the omissions save, and what they cost."""
+    planned, whole = found["as planned"], found["nothing left out"]
+    saved = ", ".join(
+        f"{1 - planned[key] / whole[key]:.0%} of the {name}"
+        for key, name in (("seconds", "time"), ("cpu_seconds", "processors' time"), ("peak_mb", "memory"))
+    )
+    if planned["psnr"] is None:
+        return f"Saved: {saved}."
+    costs = whole["psnr"] - planned["psnr"]
+    return f"Saved: {saved}. {-costs:+.2f} dB: {'as good' if costs <= SAME_PSNR else 'worse'} within {SAME_PSNR} dB."
+
+
+def section(capture: Path, left_out: list[str], found: dict[str, dict[str, Any]]) -> list[str]:
+    """A capture's table, in Markdown."""
+
+    def cells(row: dict[str, Any]) -> list[str]:
+        return ["" if row.get(key) is None else form.format(row[key]) for key, _, form in _COLUMNS]
+
+    head = ("", *(title for _, title, _ in _COLUMNS))
+    rows = shared.table(head, ((name, *cells(row)) for name, row in found.items()))
+    name = "demo" if capture == DEMO else capture.name
+    title = f"## {name[0].upper()}{name[1:]}"
+    return [title, "", f"Left out: {', '.join(left_out) or 'nothing'}.", "", *rows, "", verdict(found), ""]
 
 
 def main() -> None:
-    """Print the table, or one JSON object."""
+    """Print the tables, or one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", action="store_true")
-    parser.add_argument("capture", type=Path, nargs="?", default=ROOT / "build/demo/capture")
-    length = parser.add_mutually_exclusive_group()
-    length.add_argument("--steps", type=int, default=1500)
-    length.add_argument("--minutes", type=float)
+    parser.add_argument("capture", type=Path, nargs="*", default=[DEMO])
+    parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--each", action="store_true", help="also with each thing that the plan leaves out")
     parser.add_argument("--needed", action="store_true", help="also without each thing that the plan does")
+    parser.add_argument("--write", action="store_true")
     words = sys.argv[1:]
     own, extra = (words[: words.index("--")], words[words.index("--") + 1 :]) if "--" in words else (words, [])
     options = parser.parse_args(own)
-    capture = options.capture.resolve()
-    length_options = ["--minutes", str(options.minutes)] if options.minutes else ["--steps", str(options.steps)]
-    found: dict[str, dict[str, Any]] = {}
-    for name, more in trainings(capture, extra, options.each, options.needed).items():
-        found[name] = measured(capture, [*length_options, *extra, *more])
-        figures = ", ".join(f"{key} {found[name][key]}" for key in ("cpu_seconds", "peak_mb", "psnr", "miou"))
-        print(f"{name}: {figures}", file=sys.stderr, flush=True)
-    planned, whole = found["as planned"], found["nothing left out"]
-    costs = None if planned["psnr"] is None else whole["psnr"] - planned["psnr"]
-    if options.json:
-        print(json.dumps({"capture": capture.name, "options": extra, "trainings": found, "psnr_lost": costs}))
-        return
-    width = max(map(len, found)) + 2
-    print(" " * width + "".join(f"{name:>12s}" for name in FIGURES))
-    for name, row in found.items():
-        cells = (row.get(figure) for figure in FIGURES)
-        print(f"{name:{width}s}" + "".join(" " * 12 if value is None else f"{value:12,.3f}" for value in cells))
-    if costs is not None:
-        verdict = "as good" if costs <= SAME_PSNR else "worse"
-        print(f"What is left out costs {costs:+.2f} dB: {verdict} within {SAME_PSNR} dB.")
+    captures = [capture.resolve() for capture in options.capture]
+    whole: dict[str, Any] = {}
+    lines = [
+        "# What the plan saves",
+        "",
+        f"Made by `python benchmarks/plan.py CAPTURE ... --write`: trainings of {options.steps:,} steps on "
+        f"{os.cpu_count()} processors, as planned and with nothing left out; quality on held-out views.",
+        "",
+    ]  # fmt: skip
+    for capture in captures:
+        left_out, todo = trainings(capture, extra, options.each, options.needed)
+        results = shared.Results(ROOT / "build" / "plan", shared.digest(shared.sources(), str(capture)), len(todo))
+        found = {}
+        for name, more in todo.items():
+            train = ["--steps", str(options.steps), *extra, *more]
+            found[name] = results.get(
+                f"{capture} {' '.join(train)}",
+                functools.partial(measured, capture, train),
+                lambda row: f"{row['seconds']:.0f} s, {row['peak_mb']:.0f} MB, PSNR {row['psnr']}",
+            )
+        if results.failures:
+            sys.exit("\n".join(results.failures.values()))
+        whole[capture.name] = {"options": extra, "trainings": found}
+        lines += section(capture, left_out, found)
+    if options.write:
+        (ROOT / "docs" / "plan.md").write_text("\n".join(lines).rstrip() + "\n")
+    print(json.dumps(whole) if options.json else "\n".join(lines))
 
 
 if __name__ == "__main__":
