@@ -28,8 +28,9 @@ JUDGED_FROM = 600
 AHEAD, WORTH = 1000, 0.38
 """The plateau is flat where so many more steps would bring less than so many dB."""
 
-OCTAVES = 2.0
-"""What they would bring is judged by the measurements since there were 2 to the power of this times fewer steps."""
+OCTAVES, FEWEST_OCTAVES = 2.0, 1.5
+"""What they would bring is judged by the measurements since there were 2 to the power of this times fewer steps, and not
+by those over a smaller power, whose noise hides how the curve goes."""
 
 
 @dataclass
@@ -133,7 +134,7 @@ def gain_ahead(curve: list[dict[str, Any]]) -> float:
     recent = [entry for entry in curve if entry["step"] >= max(JUDGED_FROM, last / 2**OCTAVES)]
     key = "psnr" if all(entry.get("psnr") is not None for entry in recent) else "loss_db"
     found = [(math.log2(entry["step"]), entry[key]) for entry in recent if entry.get(key) is not None]
-    if len(found) < 5 or found[-1][0] - found[0][0] < 1:
+    if len(found) < 5 or found[-1][0] - found[0][0] < FEWEST_OCTAVES:
         return math.inf
     octaves, quality = zip(*found, strict=True)
     return float(np.polyfit(octaves, quality, 1)[0]) * math.log2(1 + AHEAD / last)

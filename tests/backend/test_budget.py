@@ -38,7 +38,7 @@ def test_the_gain_ahead_follows_the_logarithm_of_the_steps():
     # What came before the latest octaves does not matter, nor what came before it is judged.
     late = curve_of(steps, lambda s: 30.0 if s >= steps[-1] / 2**OCTAVES else 0.0)
     assert gain_ahead(late) == pytest.approx(0.0, abs=1e-9)
-    early = curve_of(range(100, 2 * JUDGED_FROM + 1, 100), lambda s: 30.0 if s >= JUDGED_FROM else 0.0)
+    early = curve_of(range(100, 3 * JUDGED_FROM + 1, 100), lambda s: 30.0 if s >= JUDGED_FROM else 0.0)
     assert gain_ahead(early) == pytest.approx(0.0, abs=1e-9)
 
 
@@ -49,7 +49,7 @@ def test_too_little_to_judge_is_not_flat():
 
 
 def test_without_held_out_views_the_loss_decides():
-    steps = range(JUDGED_FROM, 1700, 100)
+    steps = range(JUDGED_FROM, 3 * JUDGED_FROM, 100)
     entries = [{"step": s, "psnr": None, "loss_db": 10 + 2 * math.log2(s)} for s in steps]
     assert gain_ahead(entries) == pytest.approx(2.0 * math.log2(1 + AHEAD / steps[-1]))
 
