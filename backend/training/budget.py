@@ -29,8 +29,8 @@ AHEAD, WORTH = 1000, 0.38
 """The plateau is flat where so many more steps would bring less than so many dB."""
 
 OCTAVES, FEWEST_OCTAVES = 2.0, 1.5
-"""What they would bring is judged by the measurements since there were 2 to the power of this times fewer steps, and not
-by those over a smaller power, whose noise hides how the curve goes."""
+"""What they would bring is judged by the measurements since there were 2 to the power of this times fewer steps; not by
+those over less than the other power, whose noise hides how the curve goes."""
 
 
 @dataclass
