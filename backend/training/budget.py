@@ -28,7 +28,7 @@ JUDGED_FROM = 600
 AHEAD, WORTH = 1000, 0.38
 """The plateau is flat where so many more steps would bring less than so many dB."""
 
-OCTAVES, FEWEST_OCTAVES = 2.0, 1.5
+OCTAVES, FEWEST_OCTAVES = 2.0, 1.3
 """What they would bring is judged by the measurements since there were 2 to the power of this times fewer steps; not by
 those over less than the other power, whose noise hides how the curve goes."""
 
