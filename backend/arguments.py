@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from . import __version__, lacking
+from .expectation import PRESET_STEPS
 from .planning.plan import EVERYTHING, KEYS
 from .protocol import (
     EXIT_BAD_INPUT,
@@ -244,8 +245,8 @@ def parser() -> argparse.ArgumentParser:
         )
         train.add_argument(
             "--preset", choices=("preview", "standard", "final"),
-            help="instead: preview, 600 steps, shows whether all is well; standard, 2500 steps; final goes on until "
-            "the error on held-out views has flattened",
+            help=f"instead: preview, {PRESET_STEPS['preview']} steps, shows whether all is well; standard, "
+            f"{PRESET_STEPS['standard']} steps; final goes on until the error on held-out views has flattened",
         )  # fmt: skip
         train.add_argument("--restart", action="store_true", help="forget an earlier training in DIR")
         train.add_argument(

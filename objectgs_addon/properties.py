@@ -17,6 +17,7 @@ from bpy.props import (
     StringProperty,
 )
 
+from ..backend.expectation import PRESET_STEPS
 from . import drawing, object_edits
 from .scene import SHOWS, colour_points_by, kind_of, show_kinds, shown_kinds
 
@@ -75,8 +76,8 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
     plan_choices: CollectionProperty(type=PlanChoice)
     active_object: IntProperty(name="Active Object", default=0, update=object_edits.active_changed, options=set())
     length: EnumProperty(name="Length", default="minutes", description="How long to train in all", items=[
-        ("preview", "Preview", "600 steps: a first look, to see whether all is well"),
-        ("standard", "Standard", "2,500 steps"),
+        ("preview", "Preview", f"{PRESET_STEPS['preview']:,} steps: a first look, to see whether all is well"),
+        ("standard", "Standard", f"{PRESET_STEPS['standard']:,} steps"),
         ("final", "Until It Stops Improving", "Until the error on held-out photos has flattened"),
         ("minutes", "Minutes", "As long as you say; a finished training can be extended")])
     minutes: FloatProperty(
