@@ -119,8 +119,8 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
         "Close each mesh where no camera saw the object, such as its underside; the attribute \"invented\" tells "
         "these faces"))
     texture_size: EnumProperty(name="Texture", default="auto", items=[
-        ("auto", "Automatic", "As the photos' resolution asks for"), ("1024", "1024 px", ""), ("2048", "2048 px", ""),
-        ("4096", "4096 px", "")], description="Side of the texture of each mesh")
+        ("auto", "Automatic", "As the photos' resolution asks for"), ("512", "512 px", ""), ("1024", "1024 px", ""),
+        ("2048", "2048 px", ""), ("4096", "4096 px", "")], description="Side of the texture of each mesh")
 
 
 def _is_reconstruction(_scene, collection) -> bool:

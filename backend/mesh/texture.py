@@ -17,7 +17,7 @@ from .photos import Photo, Photos, Samples, add_photo, blend
 from .surface import Surface, neighbours, vertex_normals
 from .views import Views
 
-SIZES = (1024, 2048, 4096)
+SIZES = (512, 1024, 2048, 4096)
 
 _USED = 0.5
 """Share of a texture that charts cover, about."""
@@ -30,7 +30,7 @@ _EMPTY, _SEEN, _UNSEEN = 0, 1, 2
 
 
 def texture_size(surface: Surface, views: Views, classes: Sequence[int]) -> int:
-    """The smallest of 1024, 2048 and 4096 in which a texel is no larger than the pixels that show it best."""
+    """The smallest of SIZES in which a texel is no larger than the pixels that show it best."""
     vertices, faces = _arrays(surface)
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     normal = np.cross(b - a, c - a)
