@@ -67,6 +67,7 @@ def measured(capture: Path, options: list[str]) -> dict[str, Any]:
             "miou": quality.get("miou"),
             "steps": events[-1]["steps"],
             "splats": memory["export"]["splats"],
+            "curve": [(event["seconds"], event["psnr"]) for event in events if event["type"] == "quality"],
         }
 
 
@@ -90,10 +91,21 @@ def verdict(found: dict[str, dict[str, Any]]) -> str:
         f"{1 - planned[key] / whole[key]:.0%} of the {name}"
         for key, name in (("seconds", "time"), ("cpu_seconds", "processors' time"), ("peak_mb", "memory"))
     )
+    text = f"After as many steps: saved {saved}"
     if planned["psnr"] is None:
-        return f"Saved: {saved}."
-    costs = whole["psnr"] - planned["psnr"]
-    return f"Saved: {saved}. {-costs:+.2f} dB: {'as good' if costs <= SAME_PSNR else 'worse'} within {SAME_PSNR} dB."
+        return f"{text}."
+    gain = planned["psnr"] - whole["psnr"]
+    text += f"; {gain:+.2f} dB, {'worse' if gain < -SAME_PSNR else 'as good'} within {SAME_PSNR} dB."
+    if (sooner := as_good_after(planned, whole["psnr"])) is None:
+        return text
+    part = sooner / whole["seconds"]
+    return f"{text} The planned training is as good as the other after {sooner:.0f} s, {part:.0%} of its time."
+
+
+def as_good_after(planned: dict[str, Any], psnr: float) -> float | None:
+    """After how many seconds a training, and what came before it, was measured to be so good; None: never."""
+    before = planned["seconds"] - planned["train"]
+    return next((before + seconds for seconds, found in planned["curve"] if found >= psnr), None)
 
 
 def section(capture: Path, left_out: list[str], found: dict[str, dict[str, Any]]) -> list[str]:
