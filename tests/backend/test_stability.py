@@ -66,8 +66,9 @@ def test_wrong_masks_are_outvoted():
                 out[ids == i] = rng.choice([j for j in (1, 2, 5) if j != i])
         return out
 
-    found = train(each_mask(wrong), **{**SHORT, "steps": 120, "scored": True})
-    assert not found.lost and found.given_miou < 0.7 and found.miou > found.given_miou + 0.1
+    # Of 9 views, a few that are wrong in the same way decide.
+    found = train(each_mask(wrong), **{**SHORT, "views": 18, "steps": 120, "scored": True})
+    assert not found.lost and found.given_miou < 0.7 and found.miou > found.given_miou + 0.2
 
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
