@@ -28,7 +28,7 @@ from benchmarks import shared  # noqa: E402
 
 DEMO = ROOT / "build/demo/capture"
 SAME_PSNR = 0.1
-"""What is left out must not cost more than this, in dB."""
+"""Within so many dB two trainings are equally good."""
 
 _COLUMNS = (
     ("seconds", "seconds", "{:.0f}"), ("cpu_seconds", "of the processors", "{:.0f}"), ("train", "training", "{:.0f}"),
@@ -87,19 +87,19 @@ def trainings(capture: Path, options: list[str], each: bool, needed: bool) -> tu
 def verdict(found: dict[str, dict[str, Any]]) -> str:
     """What the omissions save, and what they cost."""
     planned, whole = found["as planned"], found["nothing left out"]
-    saved = ", ".join(
-        f"{1 - planned[key] / whole[key]:.0%} of the {name}"
-        for key, name in (("seconds", "time"), ("cpu_seconds", "processors' time"), ("peak_mb", "memory"))
+    change = ", ".join(
+        f"{abs(1 - planned[key] / whole[key]):.0%} {'less' if planned[key] <= whole[key] else 'more'} {name}"
+        for key, name in (("seconds", "time"), ("cpu_seconds", "time of the processors"), ("peak_mb", "memory"))
     )
-    text = f"After as many steps: saved {saved}"
+    text = f"As planned, as many steps take {change}"
     if planned["psnr"] is None:
         return f"{text}."
     gain = planned["psnr"] - whole["psnr"]
-    text += f"; {gain:+.2f} dB, {'worse' if gain < -SAME_PSNR else 'as good'} within {SAME_PSNR} dB."
+    text += f"; {gain:+.2f} dB{', worse' if gain < -SAME_PSNR else ', equal' if gain <= SAME_PSNR else ''}."
     if (sooner := as_good_after(planned, whole["psnr"])) is None:
         return text
     part = sooner / whole["seconds"]
-    return f"{text} The planned training is as good as the other after {sooner:.0f} s, {part:.0%} of its time."
+    return f"{text} It is as good as with nothing left out after {sooner:.0f} s, {part:.0%} of the other's time."
 
 
 def as_good_after(planned: dict[str, Any], psnr: float) -> float | None:
