@@ -24,7 +24,7 @@ from benchmarks import shared  # noqa: E402
 
 SECONDS = (15, 30, 60, 120, 300)
 PRESETS = ("preview", "standard", "final")
-STEPS = (150, 300, 600, 1250, 2500)
+STEPS = (150, 300, 600, 1000, 1500)
 OPEN_END = "final"
 """Its meshes are measured, too."""
 
