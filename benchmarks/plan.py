@@ -143,10 +143,10 @@ def main() -> None:
         "",
     ]  # fmt: skip
     for capture in captures:
-        left_out, todo = trainings(capture, extra, options.each, options.needed)
-        results = shared.Results(ROOT / "build" / "plan", shared.digest(shared.sources(), str(capture)), len(todo))
+        left_out, wanted = trainings(capture, extra, options.each, options.needed)
+        results = shared.Results(ROOT / "build" / "plan", shared.digest(shared.sources(), str(capture)), len(wanted))
         found = {}
-        for name, more in todo.items():
+        for name, more in wanted.items():
             train = ["--steps", str(options.steps), *extra, *more]
             found[name] = results.get(
                 f"{capture} {' '.join(train)}",

@@ -5,7 +5,7 @@ import importlib.util
 import numpy as np
 import pytest
 
-from benchmarks import approximations, mask_noise, raster_variants
+from benchmarks import approximations, mask_noise, plan, raster_variants
 
 
 def test_only_a_variant_that_is_worse_in_nothing_is_better_than_the_default():
@@ -18,6 +18,26 @@ def test_only_a_variant_that_is_worse_in_nothing_is_better_than_the_default():
         "slower": (1.2, 0.3),
     }
     assert approximations.better_than(default, others, noise) == ["faster", "closer"]
+
+
+def test_a_training_of_several_seeds_counts_with_its_means():
+    repeats = [[{"psnr": 30.0}, {"psnr": 31.0}], [{"psnr": 32.0}, {"psnr": 35.0}]]
+    assert approximations.mean_training(repeats) == [{"psnr": 31.0}, {"psnr": 33.0}]
+
+
+def test_what_the_plan_saves_is_said_with_what_it_costs():
+    whole = {"seconds": 100.0, "train": 90.0, "cpu_seconds": 150.0, "peak_mb": 1000.0, "psnr": 30.0}
+    curve = [(20.0, 28.0), (40.0, 30.5), (60.0, 32.0)]
+    planned = {"seconds": 80.0, "train": 75.0, "cpu_seconds": 165.0, "peak_mb": 500.0, "psnr": 32.0, "curve": curve}
+
+    def said(psnr):
+        return plan.verdict({"as planned": {**planned, "psnr": psnr}, "nothing left out": whole})
+
+    assert said(32.0) == (
+        "As planned, as many steps take 20% less time, 10% more time of the processors, 50% less memory; +2.00 dB. "
+        "It is as good as with nothing left out after 45 s, 45% of the other's time."
+    )
+    assert "; +0.05 dB, equal." in said(30.05) and "; -0.50 dB, worse." in said(29.5)
 
 
 def test_every_choice_has_its_default_among_its_variants_and_no_other_like_it():
