@@ -1,12 +1,13 @@
 """Error against run time for every approximation, and whether the defaults lie on the Pareto front.
 
-    python benchmarks/approximations.py [--demo build/demo] [--seconds 36] [--restart] [--json]
+    python benchmarks/approximations.py [--demo build/demo] [--steps 750] [--restart] [--json]
 
 --demo is a reconstruction of the demo capture, as `make demo` leaves it; nothing is written there. The rasterizer's
 choices are compared on its splats in one held-out view, against the exact picture (see raster_variants.py); the
-training's by trainings of equal time, of --seconds and of half of them; those of meshes and textures on three objects
-of the reconstruction, against their true surfaces. Leaves docs/error-against-time.md and plots beside it. What is done
-is kept in build/approximations: a run that was stopped goes on where it was.
+training's by trainings of --steps beside the default's, and what the default comes to in the same time (see
+training_variants.py); those of meshes and textures on three objects of the reconstruction, against their true
+surfaces. Leaves docs/error-against-time.md and plots beside it. What is done is kept in build/approximations: a run
+that was stopped goes on where it was.
 """
 
 from __future__ import annotations
@@ -30,12 +31,14 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
-from benchmarks import raster_variants, shared  # noqa: E402
+from benchmarks import raster_variants, shared, training_variants  # noqa: E402
 
 WORK = ROOT / "build" / "approximations"
 TURNS = 40
 SEEDS = 3
-"""Trainings of the defaults, whose spread says what is noise."""
+"""A variant that seems better is trained so many times, and its means count."""
+CURVE = (0.5, 0.7, 1.0, 1.4)
+"""The default is trained for so many times as long, too: what it comes to in a variant's time lies between these."""
 OBJECTS = ("mug", "teapot", "vase")
 AGAIN = "the default again"
 """In a process of its own, it says what is noise in the rasterizer's times."""
@@ -139,7 +142,7 @@ def raster_choices() -> list[Choice]:
 
 
 def training_choices() -> list[Choice]:
-    """Of the training; each variant trains for the same time."""
+    """Of the training; each variant is judged against the default in the same time."""
     from backend.training.settings import GROW_FROM, GROW_UNTIL, Settings, growth_interval
 
     settings = Settings()
@@ -340,41 +343,6 @@ def measure_choice(choice: Choice, scene: Path, exact: Path, kernels: Path) -> d
     return found
 
 
-# --- training --------------------------------------------------------------------------------------------------------
-
-
-def trained(spec: dict[str, Any], capture: str, seconds: float, seed: int) -> dict[str, Any]:
-    """Train a variant for so long, and measure it; in a process of its own, since it changes the loop's constants."""
-    import numpy as np
-    import torch
-
-    from backend.capture import load_capture
-    from backend.labels import vote
-    from backend.raster import compile_kernels
-    from backend.training import loop
-    from backend.training.budget import Budget
-    from backend.training.settings import Settings
-
-    compile_kernels()
-    if "grow_every" in spec:
-        shared.replace(loop, "growth_interval", lambda step: spec["grow_every"])
-    if "pyramid" in spec:
-        steps = spec["pyramid"]
-        shared.replace(loop, "downscale_at", lambda share, *_: next((by for until, by in steps if share < until), 1))
-    if spec.get("dense_adam"):
-
-        def step_all(values, first, second, seen, gradients, *others):
-            everything = torch.zeros_like(values)
-            everything[seen] = gradients
-            return step_rows(values, first, second, torch.arange(len(values)), everything, *others)
-
-        step_rows = shared.replace(loop, "step_rows", step_all)
-    loaded = load_capture(Path(capture), WORK / "cache")
-    ids = vote(loaded).ids if loaded.has_masks else np.zeros(len(loaded.points.xyz), np.int64)
-    trainer = loop.Trainer.start(loaded, ids, Settings(seed=seed, **spec.get("settings", {})))
-    return shared.train_and_measure(trainer, loaded, Budget(seconds=seconds))
-
-
 # --- meshes ----------------------------------------------------------------------------------------------------------
 
 
@@ -432,24 +400,40 @@ def raster_verdict(choice: Choice, found: Mapping[str, Any], time_noise: float) 
     return Verdict(choice, better_than(mine, costs, [time_noise, *(ERROR_NOISE * cost for cost in mine[1:])]))
 
 
-def training_costs(rows: Sequence[Mapping[str, Any]]) -> list[float]:
-    """Of a variant's trainings, half time and full time: the lower the better."""
-    return [-row[name] for row in rows for name in ("psnr", "miou")]
+def training_row(pairs: Sequence[Mapping[str, Any]], curve: Mapping[int, Any], steps: int) -> dict[str, float]:
+    """A variant's figures, means over its seeds, and those of the default in the same time."""
+    time = statistics.fmean(pair["times_default"] for pair in pairs)
+    return {
+        "time": time,
+        **_in_default_time(curve, time * steps),
+        **_mean_figures([pair["variant"] for pair in pairs]),
+    }
 
 
-def training_noise(repeats: Sequence[Sequence[Mapping[str, Any]]]) -> list[float]:
-    """Twice the standard deviation of the default's trainings, but no less than what counts as noise anyway."""
-    columns = list(zip(*(training_costs(rows) for rows in repeats), strict=True))
-    least = (PSNR_NOISE, SHARE_NOISE) * (len(columns) // 2)
-    return [
-        max(2 * statistics.stdev(column) if len(column) > 1 else 0.0, floor)
-        for column, floor in zip(columns, least, strict=True)
-    ]
+def _mean_figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    return {name: statistics.fmean(row[name] for row in rows) for name in (*training_variants.FIGURES, "splats")}
 
 
-def mean_training(repeats: Sequence[Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
-    """The means of a variant's trainings over the seeds, after half time and full time."""
-    return [{name: statistics.fmean(row[name] for row in rows) for name in rows[0]} for rows in zip(*repeats)]
+def _in_default_time(curve: Mapping[int, Any], steps: float) -> dict[str, float]:
+    return {f"{name}_default": value for name, value in training_variants.in_time(curve, steps).items()}
+
+
+def training_gains(row: Mapping[str, float]) -> list[float]:
+    """By how much a variant's figures are better than the default's in the same time."""
+    return [row[name] - row[f"{name}_default"] for name in training_variants.FIGURES]
+
+
+def training_noise(rows: Sequence[Mapping[str, float]]) -> list[float]:
+    """Twice the standard deviation of the default's figures over seeds, but no less than what counts as noise
+    anyway."""
+    spread = (2 * statistics.stdev(row[name] for row in rows) for name in training_variants.FIGURES)
+    return [max(*both) for both in zip(spread, (PSNR_NOISE, SHARE_NOISE), strict=True)]
+
+
+def training_verdict(choice: Choice, found: Mapping[str, Any], noise: Sequence[float]) -> Verdict:
+    """Costs: by how much PSNR and mIoU fall short of the default's in the same time."""
+    costs = {name: [-gain for gain in training_gains(row)] for name, row in found.items() if name != choice.default}
+    return Verdict(choice, better_than([0.0] * len(noise), costs, noise))
 
 
 def mesh_verdict(choice: Choice, found: Mapping[str, Any]) -> Verdict:
@@ -464,15 +448,18 @@ def mesh_verdict(choice: Choice, found: Mapping[str, Any]) -> Verdict:
 
 @dataclass
 class Found:
-    """Results by choice and variant; `time_noise` of the rasterizer, a part; `noise` of the trainings, as
-    `training_costs` orders their figures."""
+    """Results by choice and variant; `time_noise` of the rasterizer, a part; `noise` of the trainings' PSNR and mIoU;
+    `curve`: the default's figures by number of steps, and `seeds` how many of it were trained for `steps`."""
 
     raster: dict[str, dict[str, Any]]
     training: dict[str, dict[str, Any]]
     meshes: dict[str, dict[str, Any]]
     time_noise: float
     noise: list[float]
-    verdicts: list[Verdict]
+    curve: dict[int, dict[str, float]]
+    steps: int
+    seeds: int
+    verdicts: list[Verdict] = field(default_factory=list)
 
 
 def raster_plot(choices: Sequence[Choice], found: Mapping[str, Any]) -> Any:
@@ -525,33 +512,34 @@ def _front_panel(ax: Any, points: Mapping[str, tuple[float, float]], default: st
     ax.margins(0.15)
 
 
-def training_plot(choices: Sequence[Choice], found: Mapping[str, Any], seconds: float, noise: Sequence[float]) -> Any:
-    """PSNR and mIoU after half of the time and all of it, a column for each choice."""
+def training_plot(choices: Sequence[Choice], found: Found) -> Any:
+    """Time against PSNR and mIoU, a column for each choice: the variants, and the default's curve with its noise."""
     from matplotlib.figure import Figure
 
-    panels = [choice for choice in choices if found.get(choice.title)]
+    panels = [choice for choice in choices if found.training.get(choice.title)]
     figure = Figure(figsize=(2.5 * len(panels), 6.0), layout="constrained")
     axes = figure.subplots(2, len(panels), squeeze=False, sharey="row")
+    times = [steps / found.steps for steps in found.curve]
     for column, choice in enumerate(panels):
-        for row, (name, text) in enumerate((("psnr", "PSNR (dB)"), ("miou", "mIoU"))):
+        for row, (name, text) in enumerate(zip(training_variants.FIGURES, ("PSNR (dB)", "mIoU"), strict=True)):
             ax = axes[row, column]
-            colours = iter(shared.COLOURS * 3)
-            for variant, trainings in found[choice.title].items():
+            line = [figures[name] for figures in found.curve.values()]
+            ax.plot(times, line, color=shared.MARKED, linewidth=1.6, zorder=2)
+            low, high = ([value + sign * found.noise[row] for value in line] for sign in (-1, 1))
+            ax.fill_between(times, low, high, color=shared.MARKED, alpha=0.13, linewidth=0)
+            looks = iter(zip(shared.COLOURS * 2, "os^vDP" + "Xs^vDP"))
+            for variant, figures in found.training[choice.title].items():
                 marked = variant == choice.default
-                y = [training[name] for training in trainings]
-                colour = shared.MARKED if marked else next(colours)
-                ax.plot([seconds / 2, seconds], y, "o-", color=colour, label=variant, linewidth=2.2 if marked else 1.4,
-                        markersize=5, zorder=4 if marked else 3)  # fmt: skip
-                if marked:
-                    n = [noise[row], noise[row + 2]]
-                    low, high = ([v + s * d for v, d in zip(y, n)] for s in (-1, 1))
-                    ax.fill_between([seconds / 2, seconds], low, high, color=colour, alpha=0.13, linewidth=0)
-            ax.set_xlim(seconds * 0.42, seconds * 1.08)
-            ax.set_xticks([seconds / 2, seconds])
+                colour, marker = (shared.MARKED, "*") if marked else next(looks)
+                ax.plot(figures["time"], figures[name], marker, color=colour, label=variant, zorder=4 if marked else 3,
+                        markersize=12 if marked else 6)  # fmt: skip
+            ax.set_xscale("log")
+            ax.set_xticks([0.7, 1.0, 1.4], ["0.7", "1", "1.4"])
+            ax.minorticks_off()
             if not row:
                 ax.set_title(choice.title)
             else:
-                ax.set_xlabel("training (s)")
+                ax.set_xlabel("time, default = 1")
                 ax.legend(fontsize=7.5, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, handlelength=1.4)
             if not column:
                 ax.set_ylabel(text)
@@ -581,7 +569,7 @@ def mesh_plot(choices: Sequence[Choice], found: Mapping[str, Any]) -> Any:
     return figure
 
 
-def document(found: Found, choices: Mapping[str, Sequence[Choice]], scene: Mapping[str, Any], seconds: float) -> str:
+def document(found: Found, choices: Mapping[str, Sequence[Choice]], scene: Mapping[str, Any]) -> str:
     """docs/error-against-time.md."""
     off = [verdict for verdict in found.verdicts if verdict.better]
     on = len(found.verdicts) - len(off)
@@ -615,20 +603,19 @@ def document(found: Found, choices: Mapping[str, Sequence[Choice]], scene: Mappi
     lines += [
         "## Training",
         "",
-        f"The demo, trained from its points for {seconds / 2:g} s and for {seconds:g} s, schedules following the clock;"
-        f" quality on held-out views. Noise, twice the standard deviation of the default over {SEEDS} seeds and at",
-        f"least {PSNR_NOISE} dB and {SHARE_NOISE}: "
-        + ", ".join(
-            f"{found.noise[2 * i]:.2f} dB and {found.noise[2 * i + 1]:.4f} at {s:g} s"
-            for i, s in enumerate((seconds / 2, seconds))
-        )
-        + ". The default's figures are means over the seeds; so are those of a variant that seemed better with one.",
+        f"The demo, trained from its points for {found.steps:,} steps; quality on held-out views. Each variant was",
+        "trained beside the default, each on a core of its own, so that the ratio of their times is not touched by",
+        f"what else the machine did. The default, trained for {_listed(list(found.curve))} steps (the",
+        "line in the plot; between these: over the logarithm of the steps), tells what it comes to in a variant's",
+        "time: a variant is better where it comes to more. Noise, twice the standard deviation of the default over",
+        f"{found.seeds} seeds and at least {PSNR_NOISE} dB and {SHARE_NOISE}: {found.noise[0]:.2f} dB and"
+        f" {found.noise[1]:.4f}. The default's figures are",
+        f"means over the seeds, those of a variant that seemed better with one over {SEEDS}.",
         "",
-        "![PSNR and mIoU over the time of training for each choice](error-against-time-training.png)",
+        "![Time against PSNR and mIoU for each choice](error-against-time-training.png)",
         "",
     ]
-    half, full = f"{seconds / 2:g} s", f"{seconds:g} s"
-    head = (f"PSNR, {half}", f"mIoU, {half}", f"PSNR, {full}", f"mIoU, {full}", "steps", "splats")
+    head = ("time", "PSNR", "default in that time", "mIoU", "default in that time", "splats")
     for choice in choices["training"]:
         lines += _section(choice, found, found.training, head, _training_row)
     lines += [
@@ -679,9 +666,16 @@ def _raster_row(row: Mapping[str, Any]) -> list[str]:
     ]  # fmt: skip
 
 
-def _training_row(trainings: Sequence[Mapping[str, Any]]) -> list[str]:
-    quality = [text for t in trainings for text in (f"{t['psnr']:.2f} dB", f"{t['miou']:.4f}")]
-    return [*quality, f"{trainings[-1]['steps']:,.0f}", f"{trainings[-1]['splats']:,.0f}"]
+def _training_row(row: Mapping[str, Any]) -> list[str]:
+    return [
+        f"{row['time']:.2f}", f"{row['psnr']:.2f} dB", f"{row['psnr_default']:.2f} dB", f"{row['miou']:.4f}",
+        f"{row['miou_default']:.4f}", f"{row['splats']:,.0f}",
+    ]  # fmt: skip
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    words = [f"{number:,}" for number in numbers]
+    return f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def _mesh_row(row: Mapping[str, Any]) -> list[str]:
@@ -691,7 +685,7 @@ def _mesh_row(row: Mapping[str, Any]) -> list[str]:
 # --- all of it -------------------------------------------------------------------------------------------------------
 
 
-def run(demo: Path, seconds: float) -> tuple[Found, dict[str, Sequence[Choice]], dict[str, Any], dict[str, str]]:
+def run(demo: Path, steps: int) -> tuple[Found, dict[str, Sequence[Choice]], dict[str, Any], dict[str, str]]:
     """Measure everything that is not there yet. Returns the results, the choices, what the scene is, and failures."""
     import numpy as np
 
@@ -716,7 +710,7 @@ def run(demo: Path, seconds: float) -> tuple[Found, dict[str, Sequence[Choice]],
 
     trainings = {shared.digest([], v): v for c in choices["training"] for v in c.variants.values()}
     meshes = {shared.digest([], v): v for c in choices["meshes"] for v in c.variants.values()}
-    total = len(choices["raster"]) + 2 * (len(trainings) + SEEDS - 1) + len(meshes)
+    total = len(choices["raster"]) + len(CURVE) + len(trainings) - 1 + len(meshes)
     results = shared.Results(WORK / "results", made_from, total)
 
     raster = {}
@@ -729,34 +723,35 @@ def run(demo: Path, seconds: float) -> tuple[Found, dict[str, Sequence[Choice]],
     again = [found.pop(AGAIN)["times_default"] for found in raster.values() if found]
     time_noise = max([TIME_NOISE, *(abs(ratio - 1) for ratio in again)])
 
-    def train(spec: Mapping[str, Any], seed: int) -> list[dict[str, Any]]:
-        found = []
-        for length in (seconds / 2, seconds):
-            found.append(
-                results.get(
-                    f"training {json.dumps(spec)}, seed {seed}, {length:g} s",
-                    partial(
-                        shared.in_child, "benchmarks.approximations:trained",
-                        spec=spec, capture=capture, seconds=length, seed=seed,
-                    ),
-                    lambda row: f"{row['psnr']:.2f} dB, mIoU {row['miou']:.4f}, {row['steps']} steps",
-                )
-            )  # fmt: skip
-        return found if all(found) else []
+    def beside(spec: Mapping[str, Any], seeds: Sequence[int], at: int = steps) -> dict[str, Any]:
+        return results.get(
+            f"training {json.dumps(spec)}, seeds {seeds[0]} and {seeds[1]}, {at} steps",
+            partial(training_variants.side_by_side, spec, capture, str(WORK / "cache"), at, seeds),
+            lambda found: f"{found['variant']['psnr']:.2f} dB in {found['times_default']:.2f} times the default's time,"
+            f" which came to {found['default']['psnr']:.2f} dB",
+        )  # fmt: skip
 
-    by_spec = {key: train(spec, 0) for key, spec in trainings.items()}
-    repeats = [row for row in (by_spec[shared.digest([], {})], *(train({}, s) for s in range(1, SEEDS))) if row]
-    noise = training_noise(repeats) if repeats else [PSNR_NOISE, SHARE_NOISE] * 2
+    pairs = [pair for part in CURVE if (pair := beside({}, (0, 1), round(part * steps)))]
+    defaults = [row for pair in pairs for row in (pair["variant"], pair["default"])]
+    by_spec = {key: beside(spec, (0, 2 + i)) for i, (key, spec) in enumerate(trainings.items()) if spec}
+    defaults += [pair["default"] for pair in by_spec.values() if pair]
+    alike = [row for row in defaults if row["steps"] == steps]
+    noise = training_noise(alike) if len(alike) > 1 else [PSNR_NOISE, SHARE_NOISE]
+    curve = training_variants.curve_of(defaults)
     training: dict[str, dict[str, Any]] = {}
     for choice in choices["training"]:
-        rows = {name: by_spec[shared.digest([], spec)] for name, spec in choice.variants.items()}
-        training[choice.title] = rows = {name: row for name, row in rows.items() if row}
-        if choice.default in rows:
-            rows[choice.default] = mean_training(repeats)
-            for name in _training_verdict(choice, rows, noise).better:
-                results.total += 2 * (SEEDS - 1)
-                more = (train(choice.variants[name], seed) for seed in range(1, SEEDS))
-                rows[name] = mean_training([rows[name], *(row for row in more if row)])
+        rows: dict[str, Any] = {}
+        for name, spec in choice.variants.items():
+            if not spec:
+                rows[name] = {"time": 1.0, **_in_default_time(curve, steps), **_mean_figures(alike)}
+            elif pair := by_spec[shared.digest([], spec)]:
+                rows[name] = training_row([pair], curve, steps)
+        training[choice.title] = rows
+        for name in training_verdict(choice, rows, noise).better:
+            spec = choice.variants[name]
+            results.total += SEEDS - 1
+            more = [pair for seed in range(1, SEEDS) if (pair := beside(spec, (seed, len(trainings) + seed)))]
+            rows[name] = training_row([by_spec[shared.digest([], spec)], *more], curve, steps)
 
     by_mesh = {
         key: results.get(
@@ -771,50 +766,45 @@ def run(demo: Path, seconds: float) -> tuple[Found, dict[str, Sequence[Choice]],
         rows = {name: by_mesh[shared.digest([], spec)] for name, spec in choice.variants.items()}
         dressed[choice.title] = {name: row for name, row in rows.items() if row}
 
-    verdicts = []
+    found = Found(raster, training, dressed, time_noise, noise, curve, steps, len(alike))
     for kind, of, judge in (
         ("raster", raster, lambda choice, rows: raster_verdict(choice, rows, time_noise)),
-        ("training", training, lambda choice, rows: _training_verdict(choice, rows, noise)),
+        ("training", training, lambda choice, rows: training_verdict(choice, rows, noise)),
         ("meshes", dressed, mesh_verdict),
     ):
         for choice in choices[kind]:
             if choice.default in of[choice.title]:
-                verdicts.append(judge(choice, of[choice.title]))
+                found.verdicts.append(judge(choice, of[choice.title]))
             else:
                 of[choice.title] = {}
     scene = np.load(scene_file)
     height, width = scene["labels"].shape
     about = {"splats": len(scene["ids"]), "width": width, "height": height}
-    return Found(raster, training, dressed, time_noise, noise, verdicts), choices, about, results.failures
-
-
-def _training_verdict(choice: Choice, found: Mapping[str, Any], noise: Sequence[float]) -> Verdict:
-    costs = {name: training_costs(rows) for name, rows in found.items()}
-    return Verdict(choice, better_than(costs.pop(choice.default), costs, noise))
+    return found, choices, about, results.failures
 
 
 def main() -> None:
     """Measure, write the document and the plots, and say which defaults lie off the front."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--demo", type=Path, default=ROOT / "build/demo", help="a reconstruction of the demo capture")
-    parser.add_argument("--seconds", type=float, default=36.0, help="how long a variant is trained")
+    parser.add_argument("--steps", type=int, default=750, help="how long a variant is trained")
     parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="where document and plots go")
     parser.add_argument("--restart", action="store_true", help="forget what earlier runs have left")
     parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
     options = parser.parse_args()
     if options.restart:
         shared.forget(WORK)
-    found, choices, scene, failures = run(options.demo.resolve(), options.seconds)
+    found, choices, scene, failures = run(options.demo.resolve(), options.steps)
     options.docs.mkdir(parents=True, exist_ok=True)
     with shared.plot_style():
         for name, figure in (
             ("raster", raster_plot(choices["raster"], found.raster)),
-            ("training", training_plot(choices["training"], found.training, options.seconds, found.noise)),
+            ("training", training_plot(choices["training"], found)),
             ("meshes", mesh_plot(choices["meshes"], found.meshes)),
         ):
             shared.save_figure(figure, options.docs / f"error-against-time-{name}.png")
     path = options.docs / "error-against-time.md"
-    path.write_text(document(found, choices, scene, options.seconds))
+    path.write_text(document(found, choices, scene))
     print(f"\nWrote {path} and three plots beside it.")
     for verdict in found.verdicts:
         what = f"off the front: {_exception(verdict, found)}" if verdict.better else "on the front"

@@ -1,11 +1,14 @@
-"""What the plan saves: trainings with all of its omissions and with none.
+"""What the plan saves: trainings with all of its omissions and with none, and with what is asked for.
 
-    python benchmarks/plan.py [CAPTURE ...] [--json] [--steps 1500] [--each] [--needed] [--write] [-- TRAIN OPTIONS]
+    python benchmarks/plan.py [CAPTURE ...] [--json] [--steps 800] [--write] [-- TRAIN OPTIONS]
+    python benchmarks/plan.py [CAPTURE ...] --each [--needed] [-- TRAIN OPTIONS]
 
-Each is a training of its own, measured on the held-out views. `--each` also takes the omissions back one at a time;
-`--needed` leaves out, one at a time, what the plan does, to see what it is needed for. Decisions that depend on what is
-asked for apply with the options of `train` behind `--`, for instance `-- --primitive 2d --no-meshes`, or
-`-- --only mug`. `--write` leaves the tables in docs/plan.md.
+Each is a training of its own, measured on the held-out views. A capture without masks has one object that is
+everywhere where nothing is left out. Where the omissions come to another quality, the training as planned is repeated
+with fewer or more steps until its quality is the same. Then the whole way to meshes, for one object alone, and without
+meshes. `--write` leaves the tables in docs/plan.md.
+
+`--each` compares the omissions one at a time instead: taken back, and with `--needed` what the plan does left out.
 """
 
 from __future__ import annotations
@@ -13,11 +16,13 @@ from __future__ import annotations
 import argparse
 import functools
 import json
+import math
 import os
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +35,19 @@ DEMO = ROOT / "build/demo/capture"
 SAME_PSNR = 0.1
 """Within so many dB two trainings are equally good."""
 
+DB_AN_OCTAVE, TRIES = 1.5, 4
+"""What twice the steps are taken to bring before two trainings have told, and how many are tried."""
+
+FLAT = ("--primitive", "2d")
+
 _COLUMNS = (
-    ("seconds", "seconds", "{:.0f}"), ("cpu_seconds", "of the processors", "{:.0f}"), ("train", "training", "{:.0f}"),
-    ("peak_mb", "memory", "{:,.0f} MB"), ("psnr", "PSNR", "{:.2f} dB"), ("miou", "mIoU", "{:.4f}"),
+    ("steps", "steps", "{:,}"), ("seconds", "seconds", "{:.0f}"), ("cpu_seconds", "of the processors", "{:.0f}"),
+    ("train", "training", "{:.0f}"), ("peak_mb", "memory", "{:,.0f} MB"), ("psnr", "PSNR", "{:.2f} dB"),
+    ("miou", "mIoU", "{:.4f}"), ("splats", "splats", "{:,}"),
+)  # fmt: skip
+_ASKED_COLUMNS = (
+    ("total", "seconds in all", "{:.0f}"), ("train", "training", "{:.0f}"), ("mesh_seconds", "meshes", "{:.0f}"),
+    ("mesh_mb", "memory", "{:,.0f} MB"), ("psnr", "PSNR", "{:.2f} dB"), ("iou", "IoU of the object", "{:.4f}"),
     ("splats", "splats", "{:,}"),
 )  # fmt: skip
 
@@ -50,75 +65,185 @@ def backend(*words: object) -> tuple[list[dict[str, Any]], float, float]:
     return [json.loads(line) for line in done.stdout.splitlines()], seconds, busy
 
 
-def measured(capture: Path, options: list[str]) -> dict[str, Any]:
-    """One training and its figures."""
+def measured(capture: Path, options: Sequence[str], meshes: bool = False) -> dict[str, Any]:
+    """One training, and its meshes where they are wanted, and their figures; `iou` and `points` by ID."""
     with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as scratch:
         out = Path(scratch) / "out"
         events, seconds, busy = backend("train", capture, "--out", out, *options)
+        dressing = backend("mesh", out)[1] if meshes else 0.0
         quality = backend("evaluate", out)[0][-1]
         memory = json.loads((out / "objectgs.json").read_text())
         stages = {stage["name"]: stage for stage in memory["stages"]}
+        listed = out / "objects.json"
+        scores = json.loads((out / "evaluation.json").read_text())["objects"]
         return {
             "cpu_seconds": busy,
             "seconds": seconds,
+            "total": seconds + dressing,
             **{name: stages[name]["seconds"] for name in ("read", "vote", "train", "export") if name in stages},
+            "mesh_seconds": dressing if meshes else None,
             "peak_mb": stages["train"]["peak_rss_mb"],
+            "mesh_mb": max(stages[name]["peak_rss_mb"] for name in ("train", "mesh") if name in stages),
             "psnr": quality.get("psnr"),
             "miou": quality.get("miou"),
             "steps": events[-1]["steps"],
             "splats": memory["export"]["splats"],
-            "curve": [(event["seconds"], event["psnr"]) for event in events if event["type"] == "quality"],
+            "iou": {str(row["id"]): row["iou"] for row in scores},
+            "objects": json.loads(listed.read_text())["objects"] if listed.exists() else [],
         }
 
 
-def trainings(capture: Path, options: list[str], each: bool, needed: bool) -> tuple[list[str], dict[str, list[str]]]:
-    """What the plan leaves out, and what to train, by what is said of it: options that are added."""
-    plan = backend("plan", capture, *options)[0][-1]["plan"]
-    open_to_choice = [own for own in plan if own["can_override"]]
-    left_out = [own["key"] for own in open_to_choice if own["done"] is False]
-    found = {"as planned": [], "nothing left out": ["--keep", "all"]}
-    if each and len(left_out) > 1:
-        found |= {f"with {key}": ["--keep", key] for key in left_out}
-    if needed:
-        found |= {f"without {own['key']}": ["--leave-out", own["key"]] for own in open_to_choice if own["done"]}
+class Capture:
+    """A capture and the results that it gave. folder: its folder; options: of every training."""
+
+    def __init__(self, folder: Path, options: Sequence[str]) -> None:
+        self.folder, self.options = folder, tuple(options)
+        self.results = shared.Results(ROOT / "build" / "plan", shared.digest(shared.sources(), str(folder)), 0)
+        self.name = "demo" if folder == DEMO else folder.name
+
+    def plan(self, *more: str) -> list[dict[str, Any]]:
+        return backend("plan", self.folder, *self.options, *more)[0][-1]["plan"]
+
+    def train(self, steps: int, *more: str, meshes: bool = False, folder: Path | None = None) -> dict[str, Any]:
+        """The figures of a training, measured once; SystemExit where it fails."""
+        words = ["--steps", str(steps), *self.options, *more]
+        name = f"{self.name}{' with an object that is everywhere' if folder else ''} {' '.join(words)}"
+        self.results.total += 1
+        found = self.results.get(
+            name + (" and meshes" if meshes else ""),
+            functools.partial(measured, folder or self.folder, words, meshes),
+            lambda row: f"{row['total']:.0f} s, {row['peak_mb']:.0f} MB, PSNR {row['psnr']}",
+        )
+        if self.results.failures:
+            sys.exit("\n".join(self.results.failures.values()))
+        return found
+
+
+def with_one_object(capture: Path, folder: Path) -> Path:
+    """A capture without masks as one whose masks show one object everywhere, in `folder`."""
+    import numpy as np
+    from PIL import Image
+
+    for part in capture.iterdir():
+        (folder / part.name).symlink_to(part)
+    images = capture / "images"
+    for image in images.rglob("*"):
+        if image.is_file():
+            path = (folder / "masks" / image.relative_to(images)).with_suffix(".png")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            width, height = Image.open(image).size
+            Image.fromarray(np.ones((height, width), np.uint8)).save(path)
+    return folder
+
+
+def omissions(capture: Capture, steps: int) -> tuple[list[str], dict[str, dict[str, Any]]]:
+    """What the plan leaves out, and the trainings with all of that and with none of it."""
+    plan = capture.plan()
+    has_masks = next(own["done"] for own in plan if own["key"] == "votes")
+    left_out = [own["key"] for own in plan if own["done"] is False and (own["can_override"] or own["key"] == "votes")]
+    planned = capture.train(steps, meshes=True)
+    if has_masks:
+        whole = capture.train(steps, "--keep", "all")
+    else:
+        with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as scratch:
+            whole = capture.train(steps, "--keep", "all", folder=with_one_object(capture.folder, Path(scratch)))
+    found = {"as planned": planned, "nothing left out": whole}
+    if abs(planned["psnr"] - whole["psnr"]) > SAME_PSNR:
+        found["as planned, as good"] = as_good(capture.train, planned, whole["psnr"])
     return left_out, found
+
+
+def as_good(train: Callable[[int], dict[str, Any]], planned: dict[str, Any], psnr: float) -> dict[str, Any]:
+    """The training as planned of as many steps as come to this PSNR, or nearest to it after `TRIES`."""
+    tried = {planned["steps"]: planned}
+    steps = planned["steps"] * 2 ** ((psnr - planned["psnr"]) / DB_AN_OCTAVE)
+    for _ in range(TRIES):
+        latest = train(round(steps))
+        tried[latest["steps"]] = latest
+        if abs(latest["psnr"] - psnr) <= SAME_PSNR:
+            break
+        (a, b), slope = sorted(tried, key=lambda n: abs(tried[n]["psnr"] - psnr))[:2], DB_AN_OCTAVE
+        if (octaves := math.log2(a / b)) and (gain := tried[a]["psnr"] - tried[b]["psnr"]) * octaves > 0:
+            slope = gain / octaves
+        steps = a * 2 ** ((psnr - tried[a]["psnr"]) / slope)
+    return min(tried.values(), key=lambda row: abs(row["psnr"] - psnr))
+
+
+def asked_for(capture: Capture, steps: int) -> dict[str, dict[str, Any]]:
+    """The way to meshes: of everything, and of what was asked for alone. `iou` is that of the object which is asked
+    for, the one with the median number of points."""
+    everything = capture.train(steps, meshes=True)
+    found = {"everything": everything}
+    chosen = None
+    if objects := sorted(everything["objects"], key=lambda entry: entry["points"]):
+        chosen = objects[len(objects) // 2]
+        alone = capture.train(steps, "--only", chosen["name"], meshes=True)
+        found[f"only {chosen['name']}"] = alone
+    found["no meshes"] = {**everything, "total": everything["seconds"], "mesh_seconds": None,
+                          "mesh_mb": everything["peak_mb"]}  # fmt: skip
+    found["flat splats, everything"] = capture.train(steps, *FLAT, meshes=True)
+    found["flat splats, no meshes"] = capture.train(steps, *FLAT, "--no-meshes")
+    for name, row in found.items():
+        found[name] = {**row, "iou": row["iou"].get(str(chosen["id"])) if chosen else None}
+    return found
+
+
+def change(new: dict[str, Any], old: dict[str, Any], names: Mapping[str, str]) -> str:
+    """By how much figures are less or more, in words."""
+    return ", ".join(
+        f"{abs(1 - new[key] / old[key]):.0%} {'less' if new[key] <= old[key] else 'more'} {name}"
+        for key, name in names.items()
+    )
+
+
+_COSTS = {"seconds": "time", "cpu_seconds": "time of the processors", "peak_mb": "memory"}
 
 
 def verdict(found: dict[str, dict[str, Any]]) -> str:
     """What the omissions save, and what they cost."""
     planned, whole = found["as planned"], found["nothing left out"]
-    change = ", ".join(
-        f"{abs(1 - planned[key] / whole[key]):.0%} {'less' if planned[key] <= whole[key] else 'more'} {name}"
-        for key, name in (("seconds", "time"), ("cpu_seconds", "time of the processors"), ("peak_mb", "memory"))
-    )
-    text = f"As planned, as many steps take {change}"
-    if planned["psnr"] is None:
-        return f"{text}."
     gain = planned["psnr"] - whole["psnr"]
-    text += f"; {gain:+.2f} dB{', worse' if gain < -SAME_PSNR else ', equal' if gain <= SAME_PSNR else ''}."
-    if (sooner := as_good_after(planned, whole["psnr"])) is None:
-        return text
-    part = sooner / whole["seconds"]
-    return f"{text} It is as good as with nothing left out after {sooner:.0f} s, {part:.0%} of the other's time."
+    judged = "worse" if gain < -SAME_PSNR else "equal" if gain <= SAME_PSNR else "better"
+    text = f"As planned, as many steps take {change(planned, whole, _COSTS)}; {gain:+.2f} dB, {judged}."
+    if same := found.get("as planned, as good"):
+        text += (
+            f" In {same['steps']:,} steps it takes {change(same, whole, _COSTS)};"
+            f" {same['psnr'] - whole['psnr']:+.2f} dB."
+        )
+    return text
 
 
-def as_good_after(planned: dict[str, Any], psnr: float) -> float | None:
-    """After how many seconds a training, and what came before it, was measured to be so good; None: never."""
-    before = planned["seconds"] - planned["train"]
-    return next((before + seconds for seconds, found in planned["curve"] if found >= psnr), None)
+def asked_verdict(found: dict[str, dict[str, Any]]) -> str:
+    """What is saved by asking for less."""
+    everything = found["everything"]
+    lines = []
+    for name, row in found.items():
+        against = found["flat splats, everything"] if name.startswith("flat splats") else everything
+        if row is not against and name != "everything":
+            saved = change(row, against, {"total": "time", "mesh_mb": "memory"})
+            lines.append(f"{name}: {saved}, {row['psnr'] - against['psnr']:+.2f} dB")
+    return "; ".join(lines) + "."
 
 
-def section(capture: Path, left_out: list[str], found: dict[str, dict[str, Any]]) -> list[str]:
-    """A capture's table, in Markdown."""
+def rows_of(columns: Sequence[tuple[str, str, str]], found: dict[str, dict[str, Any]]) -> list[str]:
+    """A table, in Markdown."""
 
     def cells(row: dict[str, Any]) -> list[str]:
-        return ["" if row.get(key) is None else form.format(row[key]) for key, _, form in _COLUMNS]
+        return ["" if row.get(key) is None else form.format(row[key]) for key, _, form in columns]
 
-    head = ("", *(title for _, title, _ in _COLUMNS))
-    rows = shared.table(head, ((name, *cells(row)) for name, row in found.items()))
-    name = "demo" if capture == DEMO else capture.name
-    title = f"## {name[0].upper()}{name[1:]}"
-    return [title, "", f"Left out: {', '.join(left_out) or 'nothing'}.", "", *rows, "", verdict(found), ""]
+    return shared.table(("", *(title for _, title, _ in columns)), ((name, *cells(row)) for name, row in found.items()))
+
+
+def each_of(capture: Capture, steps: int, needed: bool) -> dict[str, dict[str, Any]]:
+    """The training as planned, and with the decisions overridden one at a time."""
+    open_to_choice = [own for own in capture.plan() if own["can_override"]]
+    found = {"as planned": capture.train(steps), "nothing left out": capture.train(steps, "--keep", "all")}
+    for own in open_to_choice:
+        if own["done"] is False:
+            found[f"with {own['key']}"] = capture.train(steps, "--keep", own["key"])
+        elif own["done"] and needed:
+            found[f"without {own['key']}"] = capture.train(steps, "--leave-out", own["key"])
+    return found
 
 
 def main() -> None:
@@ -126,40 +251,39 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", action="store_true")
     parser.add_argument("capture", type=Path, nargs="*", default=[DEMO])
-    parser.add_argument("--steps", type=int, default=1500)
-    parser.add_argument("--each", action="store_true", help="also with each thing that the plan leaves out")
-    parser.add_argument("--needed", action="store_true", help="also without each thing that the plan does")
+    parser.add_argument("--steps", type=int, default=800)
+    parser.add_argument("--each", action="store_true", help="the omissions one at a time")
+    parser.add_argument("--needed", action="store_true", help="with --each: also without each thing that the plan does")
     parser.add_argument("--write", action="store_true")
     words = sys.argv[1:]
     own, extra = (words[: words.index("--")], words[words.index("--") + 1 :]) if "--" in words else (words, [])
     options = parser.parse_args(own)
-    captures = [capture.resolve() for capture in options.capture]
-    whole: dict[str, Any] = {}
+    found: dict[str, Any] = {}
     lines = [
         "# What the plan saves",
         "",
         f"Made by `python benchmarks/plan.py CAPTURE ... --write`: trainings of {options.steps:,} steps on "
-        f"{os.cpu_count()} processors, as planned and with nothing left out; quality on held-out views.",
+        f"{os.cpu_count()} processors; quality on held-out views.",
         "",
     ]  # fmt: skip
-    for capture in captures:
-        left_out, wanted = trainings(capture, extra, options.each, options.needed)
-        results = shared.Results(ROOT / "build" / "plan", shared.digest(shared.sources(), str(capture)), len(wanted))
-        found = {}
-        for name, more in wanted.items():
-            train = ["--steps", str(options.steps), *extra, *more]
-            found[name] = results.get(
-                f"{capture} {' '.join(train)}",
-                functools.partial(measured, capture, train),
-                lambda row: f"{row['seconds']:.0f} s, {row['peak_mb']:.0f} MB, PSNR {row['psnr']}",
-            )
-        if results.failures:
-            sys.exit("\n".join(results.failures.values()))
-        whole[capture.name] = {"options": extra, "trainings": found}
-        lines += section(capture, left_out, found)
+    for folder in options.capture:
+        capture = Capture(folder.resolve(), extra)
+        lines += [f"## {capture.name[0].upper()}{capture.name[1:]}", ""]
+        if options.each:
+            found[capture.name] = each_of(capture, options.steps, options.needed)
+            lines += [*rows_of(_COLUMNS, found[capture.name]), ""]
+            continue
+        left_out, trainings = omissions(capture, options.steps)
+        asked = asked_for(capture, options.steps)
+        found[capture.name] = {"left_out": left_out, "trainings": trainings, "asked_for": asked}
+        lines += [
+            f"Left out: {', '.join(left_out) or 'nothing'}.", "", *rows_of(_COLUMNS, trainings), "",
+            verdict(trainings), "", "With meshes, and with what was asked for alone:", "",
+            *rows_of(_ASKED_COLUMNS, asked), "", asked_verdict(asked), "",
+        ]  # fmt: skip
     if options.write:
         (ROOT / "docs" / "plan.md").write_text("\n".join(lines).rstrip() + "\n")
-    print(json.dumps(whole) if options.json else "\n".join(lines))
+    print(json.dumps(found) if options.json else "\n".join(lines))
 
 
 if __name__ == "__main__":

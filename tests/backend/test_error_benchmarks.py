@@ -4,8 +4,9 @@ import importlib.util
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from benchmarks import approximations, mask_noise, plan, raster_variants
+from benchmarks import approximations, mask_noise, plan, raster_variants, training_variants
 
 
 def test_only_a_variant_that_is_worse_in_nothing_is_better_than_the_default():
@@ -20,24 +21,69 @@ def test_only_a_variant_that_is_worse_in_nothing_is_better_than_the_default():
     assert approximations.better_than(default, others, noise) == ["faster", "closer"]
 
 
-def test_a_training_of_several_seeds_counts_with_its_means():
-    repeats = [[{"psnr": 30.0}, {"psnr": 31.0}], [{"psnr": 32.0}, {"psnr": 35.0}]]
-    assert approximations.mean_training(repeats) == [{"psnr": 31.0}, {"psnr": 33.0}]
+def a_pair(psnr, miou, times_default):
+    return {"variant": {"psnr": psnr, "miou": miou, "splats": 100}, "times_default": times_default}
+
+
+def test_a_variant_is_compared_with_the_default_in_the_same_time():
+    curve = training_variants.curve_of(
+        {"steps": steps, "psnr": psnr, "miou": 0.9} for steps, psnr in ((50, 29), (100, 30), (100, 32), (200, 33))
+    )
+    assert list(curve) == [50, 100, 200] and curve[100]["psnr"] == 31
+    row = approximations.training_row([a_pair(30.0, 0.90, 1.3), a_pair(31.0, 0.92, 2**0.5 * 2 - 1.3)], curve, 100)
+    assert row["psnr_default"] == pytest.approx(32.0) and row["psnr"] == 30.5 and row["miou"] == pytest.approx(0.91)
+    assert approximations.training_gains(row) == pytest.approx([-1.5, 0.01])
+    with pytest.raises(ValueError, match="outside"):
+        training_variants.in_time(curve, 201)
+
+
+def test_a_faster_variant_is_better_where_the_default_does_not_come_so_far_in_its_time():
+    choice = approximations.Choice("a choice", "default", {"default": {}, "fast": {"x": 1}, "slow": {"x": 2}})
+    rows = {
+        "default": {"psnr": 31.0, "psnr_default": 31.0, "miou": 0.9, "miou_default": 0.9},
+        "fast": {"psnr": 30.5, "psnr_default": 30.0, "miou": 0.9, "miou_default": 0.9},
+        "slow": {"psnr": 31.5, "psnr_default": 32.0, "miou": 0.9, "miou_default": 0.9},
+    }
+    assert approximations.training_verdict(choice, rows, [0.1, 0.002]).better == ["fast"]
 
 
 def test_what_the_plan_saves_is_said_with_what_it_costs():
-    whole = {"seconds": 100.0, "train": 90.0, "cpu_seconds": 150.0, "peak_mb": 1000.0, "psnr": 30.0}
-    curve = [(20.0, 28.0), (40.0, 30.5), (60.0, 32.0)]
-    planned = {"seconds": 80.0, "train": 75.0, "cpu_seconds": 165.0, "peak_mb": 500.0, "psnr": 32.0, "curve": curve}
-
-    def said(psnr):
-        return plan.verdict({"as planned": {**planned, "psnr": psnr}, "nothing left out": whole})
-
-    assert said(32.0) == (
-        "As planned, as many steps take 20% less time, 10% more time of the processors, 50% less memory; +2.00 dB. "
-        "It is as good as with nothing left out after 45 s, 45% of the other's time."
+    whole = {"seconds": 100.0, "cpu_seconds": 150.0, "peak_mb": 1000.0, "psnr": 30.0}
+    planned = {"seconds": 80.0, "cpu_seconds": 165.0, "peak_mb": 500.0, "psnr": 30.05}
+    found = {"as planned": planned, "nothing left out": whole}
+    said = "As planned, as many steps take 20% less time, 10% more time of the processors, 50% less memory; "
+    assert plan.verdict(found) == f"{said}+0.05 dB, equal."
+    planned["psnr"] = 29.5
+    assert plan.verdict(found).endswith("; -0.50 dB, worse.")
+    planned["psnr"] = 32.0
+    found["as planned, as good"] = {**planned, "steps": 400, "seconds": 45.0, "psnr": 29.95}
+    assert plan.verdict(found) == (
+        f"{said}+2.00 dB, better. "
+        "In 400 steps it takes 55% less time, 10% more time of the processors, 50% less memory; -0.05 dB."
     )
-    assert "; +0.05 dB, equal." in said(30.05) and "; -0.50 dB, worse." in said(29.5)
+
+
+@pytest.mark.parametrize("slope", [0.7, 2.5])
+def test_as_many_steps_are_found_as_make_a_training_as_good_as_another(slope):
+    tried = []
+
+    def train(steps):
+        tried.append(steps)
+        return {"steps": steps, "psnr": 33.0 + slope * np.log2(steps / 800)}
+
+    found = plan.as_good(train, {"steps": 800, "psnr": 33.0}, 31.5)
+    assert found["psnr"] == pytest.approx(31.5, abs=plan.SAME_PSNR) and len(tried) <= 2
+
+
+def test_a_capture_without_masks_gets_one_object_everywhere(tmp_path):
+    capture, other = tmp_path / "capture", tmp_path / "other"
+    (capture / "images" / "left").mkdir(parents=True)
+    other.mkdir()
+    Image.new("RGB", (6, 4)).save(capture / "images" / "left" / "0.jpg")
+    plan.with_one_object(capture, other)
+    ids = np.asarray(Image.open(other / "masks" / "left" / "0.png"))
+    assert ids.shape == (4, 6) and (ids == 1).all() and (other / "images" / "left" / "0.jpg").exists()
+    assert not (capture / "masks").exists()
 
 
 def test_every_choice_has_its_default_among_its_variants_and_no_other_like_it():

@@ -1,0 +1,129 @@
+"""Variants of the training, each in a process of its own beside the default's, so that both meet the same machine.
+
+A host's speed may change by a third within minutes; the ratio of two trainings that run at once, each on a core of its
+own, is not touched by that. What they come to doesn't depend on the clock at all: a training of so many steps gives the
+same, bit for bit, however fast it runs.
+"""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from benchmarks import shared
+
+FIGURES = ("psnr", "miou")
+"""What trainings are compared by: the higher the better."""
+
+
+def side_by_side(spec: Mapping[str, Any], capture: str, cache: str, steps: int, seeds: Sequence[int]) -> dict[str, Any]:
+    """Train a variant, with the first seed, beside the default, with the second. Returns the figures of both, as
+    `variant` and `default`, and `times_default`: how many times as long the variant took."""
+    context = multiprocessing.get_context("spawn")
+    children: list[tuple[Any, Connection]] = []
+    try:
+        for core, own, seed in ((0, spec, seeds[0]), (1, {}, seeds[1])):
+            mine, its = context.Pipe()
+            child = context.Process(
+                target=_train, args=(its, core, dict(own), capture, cache, steps, seed), daemon=True
+            )
+            child.start()
+            its.close()
+            children.append((child, mine))
+            _received(mine)  # ready, so that the next one finds the capture prepared
+        for _, pipe in children:
+            pipe.send("go")
+        variant, default = (_received(pipe) for _, pipe in children)
+    finally:
+        for child, _ in children:
+            child.kill()
+            child.join()
+    seconds = [row["steps"] / row["steps_per_second"] for row in (variant, default)]
+    return {"variant": variant, "default": default, "times_default": seconds[0] / seconds[1]}
+
+
+def _received(pipe: Connection) -> Any:
+    try:
+        return pipe.recv()
+    except EOFError:
+        raise RuntimeError("a training ended without a word; what it said last is above") from None
+
+
+def _train(pipe: Connection, core: int, spec: dict[str, Any], capture: str, cache: str, steps: int, seed: int) -> None:
+    """In a process of its own: train when told, send the figures, and keep the core busy until killed, so that the
+    other one has no more of the machine at its end than it had before."""
+    if hasattr(os, "sched_setaffinity"):
+        cores = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {cores[core % len(cores)]})
+    import numpy as np
+
+    from backend.capture import load_capture
+    from backend.commands.machine import set_threads
+    from backend.labels import vote
+    from backend.raster import compile_kernels
+    from backend.training import loop
+    from backend.training.budget import Budget
+    from backend.training.settings import Settings
+
+    set_threads(1)
+    compile_kernels()
+    change(spec)
+    loaded = load_capture(Path(capture), Path(cache))
+    ids = vote(loaded).ids if loaded.has_masks else np.zeros(len(loaded.points.xyz), np.int64)
+    trainer = loop.Trainer.start(loaded, ids, Settings(seed=seed, **spec.get("settings", {})))
+    pipe.send("ready")
+    pipe.recv()
+    pipe.send(shared.train_and_measure(trainer, loaded, Budget(steps=steps)))
+    while True:
+        np.sort(np.random.default_rng(0).random(10**6))
+
+
+def change(spec: Mapping[str, Any]) -> None:
+    """Change the training of this process as a variant has it, but for what `Settings` says."""
+    import torch
+
+    from backend.training import loop
+
+    if "grow_every" in spec:
+        shared.replace(loop, "growth_interval", lambda step: spec["grow_every"])
+    if "pyramid" in spec:
+        sizes = spec["pyramid"]
+        shared.replace(loop, "downscale_at", lambda share, *_: next((by for until, by in sizes if share < until), 1))
+    if spec.get("dense_adam"):
+
+        def step_all(values, first, second, seen, gradients, *others):
+            everything = torch.zeros_like(values)
+            everything[seen] = gradients
+            return step_rows(values, first, second, torch.arange(len(values)), everything, *others)
+
+        step_rows = shared.replace(loop, "step_rows", step_all)
+
+
+def curve_of(rows: Iterable[Mapping[str, Any]]) -> dict[int, dict[str, float]]:
+    """The default's figures by number of steps, means over seeds, shortest first."""
+    by_steps: dict[int, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        by_steps.setdefault(row["steps"], []).append(row)
+    return {
+        steps: {name: sum(row[name] for row in found) / len(found) for name in FIGURES}
+        for steps, found in sorted(by_steps.items())
+    }
+
+
+def in_time(curve: Mapping[int, Mapping[str, float]], steps: float) -> dict[str, float]:
+    """The default's figures after so many of its steps, between those measured in the logarithm of the steps;
+    ValueError where the curve doesn't reach so far, or begins later."""
+    known = sorted(curve)
+    if not known[0] <= steps <= known[-1]:
+        raise ValueError(f"{steps:.0f} steps of the default lie outside of its curve of {known[0]} to {known[-1]}.")
+    later = next(at for at in known if at >= steps)
+    earlier = max((at for at in known if at <= steps), default=later)
+    if later == earlier:
+        return dict(curve[later])
+    part = math.log(steps / earlier) / math.log(later / earlier)
+    return {name: (1 - part) * curve[earlier][name] + part * curve[later][name] for name in FIGURES}
