@@ -36,7 +36,7 @@ from benchmarks import raster_variants, shared, training_variants  # noqa: E402
 WORK = ROOT / "build" / "approximations"
 TURNS = 40
 SEEDS = 3
-"""A variant that seems better is trained so many times, and its means count."""
+"""A variant that seems better by half of what counts as noise is trained so many times, and its means count."""
 CURVE = (0.5, 0.7, 1.0, 1.4)
 """The default is trained for so many times as long, too: what it comes to in a variant's time lies between these."""
 OBJECTS = ("mug", "teapot", "vase")
@@ -48,6 +48,7 @@ TIME_NOISE, ERROR_NOISE = 0.03, 0.02
 of the default do in two processes."""
 MESH_TIME_NOISE, PSNR_NOISE, SHARE_NOISE = 0.05, 0.1, 0.002
 """At least so much of a mesh's time, in dB, and in mIoU and F1 counts as noise."""
+_LEAST_NOISE = (PSNR_NOISE, SHARE_NOISE)
 
 
 @dataclass(frozen=True)
@@ -405,6 +406,7 @@ def training_row(pairs: Sequence[Mapping[str, Any]], curve: Mapping[int, Any], s
     time = statistics.fmean(pair["times_default"] for pair in pairs)
     return {
         "time": time,
+        "seeds": len(pairs),
         **_in_default_time(curve, time * steps),
         **_mean_figures([pair["variant"] for pair in pairs]),
     }
@@ -424,16 +426,20 @@ def training_gains(row: Mapping[str, float]) -> list[float]:
 
 
 def training_noise(rows: Sequence[Mapping[str, float]]) -> list[float]:
-    """Twice the standard deviation of the default's figures over seeds, but no less than what counts as noise
-    anyway."""
-    spread = (2 * statistics.stdev(row[name] for row in rows) for name in training_variants.FIGURES)
-    return [max(*both) for both in zip(spread, (PSNR_NOISE, SHARE_NOISE), strict=True)]
+    """Twice the standard deviation of the default's figures over seeds."""
+    return [2 * statistics.stdev(row[name] for row in rows) for name in training_variants.FIGURES]
 
 
 def training_verdict(choice: Choice, found: Mapping[str, Any], noise: Sequence[float]) -> Verdict:
-    """Costs: by how much PSNR and mIoU fall short of the default's in the same time."""
-    costs = {name: [-gain for gain in training_gains(row)] for name, row in found.items() if name != choice.default}
-    return Verdict(choice, better_than([0.0] * len(noise), costs, noise))
+    """Costs: by how much PSNR and mIoU fall short of the default's in the same time. `noise`: of a single training;
+    means over n seeds have the square root of n less, but no less than what counts as noise anyway."""
+    verdict = Verdict(choice)
+    for name, row in found.items():
+        if name != choice.default:
+            costs = [-gain for gain in training_gains(row)]
+            own = [max(n / row["seeds"] ** 0.5, least) for n, least in zip(noise, _LEAST_NOISE, strict=True)]
+            verdict.better += better_than([0.0] * len(own), {name: costs}, own)
+    return verdict
 
 
 def mesh_verdict(choice: Choice, found: Mapping[str, Any]) -> Verdict:
@@ -607,15 +613,16 @@ def document(found: Found, choices: Mapping[str, Sequence[Choice]], scene: Mappi
         "trained beside the default, each on a core of its own, so that the ratio of their times is not touched by",
         f"what else the machine did. The default, trained for {_listed(list(found.curve))} steps (the",
         "line in the plot; between these: over the logarithm of the steps), tells what it comes to in a variant's",
-        "time: a variant is better where it comes to more. Noise, twice the standard deviation of the default over",
-        f"{found.seeds} seeds and at least {PSNR_NOISE} dB and {SHARE_NOISE}: {found.noise[0]:.2f} dB and"
-        f" {found.noise[1]:.4f}. The default's figures are",
-        f"means over the seeds, those of a variant that seemed better with one over {SEEDS}.",
+        "time: a variant is better where it comes to more. Noise of one training, twice the standard deviation of the",
+        f"default over {found.seeds} seeds: {found.noise[0]:.2f} dB and {found.noise[1]:.4f}. A variant that seemed"
+        " better by half of that was",
+        f"trained with {SEEDS} seeds; means over seeds have accordingly less noise, but at least {PSNR_NOISE} dB and"
+        f" {SHARE_NOISE}.",
         "",
         "![Time against PSNR and mIoU for each choice](error-against-time-training.png)",
         "",
     ]
-    head = ("time", "PSNR", "default in that time", "mIoU", "default in that time", "splats")
+    head = ("time", "PSNR", "default in that time", "mIoU", "default in that time", "splats", "seeds")
     for choice in choices["training"]:
         lines += _section(choice, found, found.training, head, _training_row)
     lines += [
@@ -669,7 +676,7 @@ def _raster_row(row: Mapping[str, Any]) -> list[str]:
 def _training_row(row: Mapping[str, Any]) -> list[str]:
     return [
         f"{row['time']:.2f}", f"{row['psnr']:.2f} dB", f"{row['psnr_default']:.2f} dB", f"{row['miou']:.4f}",
-        f"{row['miou_default']:.4f}", f"{row['splats']:,.0f}",
+        f"{row['miou_default']:.4f}", f"{row['splats']:,.0f}", f"{row['seeds']}",
     ]  # fmt: skip
 
 
@@ -736,18 +743,23 @@ def run(demo: Path, steps: int) -> tuple[Found, dict[str, Sequence[Choice]], dic
     by_spec = {key: beside(spec, (0, 2 + i)) for i, (key, spec) in enumerate(trainings.items()) if spec}
     defaults += [pair["default"] for pair in by_spec.values() if pair]
     alike = [row for row in defaults if row["steps"] == steps]
-    noise = training_noise(alike) if len(alike) > 1 else [PSNR_NOISE, SHARE_NOISE]
+    noise = training_noise(alike) if len(alike) > 1 else list(_LEAST_NOISE)
     curve = training_variants.curve_of(defaults)
     training: dict[str, dict[str, Any]] = {}
     for choice in choices["training"]:
         rows: dict[str, Any] = {}
         for name, spec in choice.variants.items():
             if not spec:
-                rows[name] = {"time": 1.0, **_in_default_time(curve, steps), **_mean_figures(alike)}
+                rows[name] = {
+                    "time": 1.0,
+                    "seeds": len(alike),
+                    **_in_default_time(curve, steps),
+                    **_mean_figures(alike),
+                }
             elif pair := by_spec[shared.digest([], spec)]:
                 rows[name] = training_row([pair], curve, steps)
         training[choice.title] = rows
-        for name in training_verdict(choice, rows, noise).better:
+        for name in training_verdict(choice, rows, [n / 2 for n in noise]).better:
             spec = choice.variants[name]
             results.total += SEEDS - 1
             more = [pair for seed in range(1, SEEDS) if (pair := beside(spec, (seed, len(trainings) + seed)))]

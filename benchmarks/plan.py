@@ -1,14 +1,12 @@
 """What the plan saves: trainings with all of its omissions and with none, and with what is asked for.
 
-    python benchmarks/plan.py [CAPTURE ...] [--json] [--steps 800] [--write] [-- TRAIN OPTIONS]
-    python benchmarks/plan.py [CAPTURE ...] --each [--needed] [-- TRAIN OPTIONS]
+    python benchmarks/plan.py [CAPTURE ...] [--json] [--steps 800] [--needed] [--write] [-- TRAIN OPTIONS]
 
 Each is a training of its own, measured on the held-out views. A capture without masks has one object that is
-everywhere where nothing is left out. Where the omissions come to another quality, the training as planned is repeated
-with fewer or more steps until its quality is the same. Then the whole way to meshes, for one object alone, and without
-meshes. `--write` leaves the tables in docs/plan.md.
-
-`--each` compares the omissions one at a time instead: taken back, and with `--needed` what the plan does left out.
+everywhere where nothing is left out. Where there are several omissions, they are taken back one at a time, too; where
+all of them come to another quality, the training as planned is repeated with fewer or more steps until its quality is
+the same. `--needed` also leaves out, one at a time, what the plan does. Then the whole way to meshes, for one object
+alone, and without meshes. `--write` leaves the tables in docs/plan.md.
 """
 
 from __future__ import annotations
@@ -35,10 +33,12 @@ DEMO = ROOT / "build/demo/capture"
 SAME_PSNR = 0.1
 """Within so many dB two trainings are equally good."""
 
-DB_AN_OCTAVE, TRIES = 1.5, 4
-"""What twice the steps are taken to bring before two trainings have told, and how many are tried."""
+DB_AN_OCTAVE, TRIES, MOST_TIMES = 1.5, 4, 2
+"""What twice the steps are taken to bring before two trainings have told, how many are tried, and how many times as
+many steps at most."""
 
 FLAT = ("--primitive", "2d")
+AS_GOOD = "as planned, as good"
 
 _COLUMNS = (
     ("steps", "steps", "{:,}"), ("seconds", "seconds", "{:.0f}"), ("cpu_seconds", "of the processors", "{:.0f}"),
@@ -101,8 +101,9 @@ class Capture:
         self.results = shared.Results(ROOT / "build" / "plan", shared.digest(shared.sources(), str(folder)), 0)
         self.name = "demo" if folder == DEMO else folder.name
 
-    def plan(self, *more: str) -> list[dict[str, Any]]:
-        return backend("plan", self.folder, *self.options, *more)[0][-1]["plan"]
+    def plan(self) -> list[dict[str, Any]]:
+        """The decisions, as plan.json has them."""
+        return backend("plan", self.folder, *self.options)[0][-1]["plan"]
 
     def train(self, steps: int, *more: str, meshes: bool = False, folder: Path | None = None) -> dict[str, Any]:
         """The figures of a training, measured once; SystemExit where it fails."""
@@ -136,27 +137,34 @@ def with_one_object(capture: Path, folder: Path) -> Path:
     return folder
 
 
-def omissions(capture: Capture, steps: int) -> tuple[list[str], dict[str, dict[str, Any]]]:
+def omissions(capture: Capture, steps: int, needed: bool) -> tuple[list[str], dict[str, dict[str, Any]]]:
     """What the plan leaves out, and the trainings with all of that and with none of it."""
     plan = capture.plan()
     has_masks = next(own["done"] for own in plan if own["key"] == "votes")
-    left_out = [own["key"] for own in plan if own["done"] is False and (own["can_override"] or own["key"] == "votes")]
+    open_to_choice = [own for own in plan if own["can_override"]]
+    left_out = [own["key"] for own in open_to_choice if own["done"] is False]
     planned = capture.train(steps, meshes=True)
     if has_masks:
         whole = capture.train(steps, "--keep", "all")
     else:
+        left_out = ["votes", "labels", *left_out]
         with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as scratch:
             whole = capture.train(steps, "--keep", "all", folder=with_one_object(capture.folder, Path(scratch)))
     found = {"as planned": planned, "nothing left out": whole}
     if abs(planned["psnr"] - whole["psnr"]) > SAME_PSNR:
-        found["as planned, as good"] = as_good(capture.train, planned, whole["psnr"])
+        found[AS_GOOD] = as_good(capture.train, planned, whole["psnr"])
+    if has_masks and len(left_out) > 1:
+        found |= {f"with {key}": capture.train(steps, "--keep", key) for key in left_out}
+    if needed:
+        done = [own["key"] for own in open_to_choice if own["done"]]
+        found |= {f"without {key}": capture.train(steps, "--leave-out", key) for key in done}
     return left_out, found
 
 
 def as_good(train: Callable[[int], dict[str, Any]], planned: dict[str, Any], psnr: float) -> dict[str, Any]:
     """The training as planned of as many steps as come to this PSNR, or nearest to it after `TRIES`."""
     tried = {planned["steps"]: planned}
-    steps = planned["steps"] * 2 ** ((psnr - planned["psnr"]) / DB_AN_OCTAVE)
+    steps = min(2 ** ((psnr - planned["psnr"]) / DB_AN_OCTAVE), MOST_TIMES) * planned["steps"]
     for _ in range(TRIES):
         latest = train(round(steps))
         tried[latest["steps"]] = latest
@@ -165,7 +173,9 @@ def as_good(train: Callable[[int], dict[str, Any]], planned: dict[str, Any], psn
         (a, b), slope = sorted(tried, key=lambda n: abs(tried[n]["psnr"] - psnr))[:2], DB_AN_OCTAVE
         if (octaves := math.log2(a / b)) and (gain := tried[a]["psnr"] - tried[b]["psnr"]) * octaves > 0:
             slope = gain / octaves
-        steps = a * 2 ** ((psnr - tried[a]["psnr"]) / slope)
+        steps = min(a * 2 ** ((psnr - tried[a]["psnr"]) / slope), MOST_TIMES * planned["steps"])
+        if round(steps) in tried:
+            break
     return min(tried.values(), key=lambda row: abs(row["psnr"] - psnr))
 
 
@@ -205,7 +215,7 @@ def verdict(found: dict[str, dict[str, Any]]) -> str:
     gain = planned["psnr"] - whole["psnr"]
     judged = "worse" if gain < -SAME_PSNR else "equal" if gain <= SAME_PSNR else "better"
     text = f"As planned, as many steps take {change(planned, whole, _COSTS)}; {gain:+.2f} dB, {judged}."
-    if same := found.get("as planned, as good"):
+    if same := found.get(AS_GOOD):
         text += (
             f" In {same['steps']:,} steps it takes {change(same, whole, _COSTS)};"
             f" {same['psnr'] - whole['psnr']:+.2f} dB."
@@ -234,26 +244,13 @@ def rows_of(columns: Sequence[tuple[str, str, str]], found: dict[str, dict[str, 
     return shared.table(("", *(title for _, title, _ in columns)), ((name, *cells(row)) for name, row in found.items()))
 
 
-def each_of(capture: Capture, steps: int, needed: bool) -> dict[str, dict[str, Any]]:
-    """The training as planned, and with the decisions overridden one at a time."""
-    open_to_choice = [own for own in capture.plan() if own["can_override"]]
-    found = {"as planned": capture.train(steps), "nothing left out": capture.train(steps, "--keep", "all")}
-    for own in open_to_choice:
-        if own["done"] is False:
-            found[f"with {own['key']}"] = capture.train(steps, "--keep", own["key"])
-        elif own["done"] and needed:
-            found[f"without {own['key']}"] = capture.train(steps, "--leave-out", own["key"])
-    return found
-
-
 def main() -> None:
     """Print the tables, or one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", action="store_true")
     parser.add_argument("capture", type=Path, nargs="*", default=[DEMO])
     parser.add_argument("--steps", type=int, default=800)
-    parser.add_argument("--each", action="store_true", help="the omissions one at a time")
-    parser.add_argument("--needed", action="store_true", help="with --each: also without each thing that the plan does")
+    parser.add_argument("--needed", action="store_true", help="also without each thing that the plan does")
     parser.add_argument("--write", action="store_true")
     words = sys.argv[1:]
     own, extra = (words[: words.index("--")], words[words.index("--") + 1 :]) if "--" in words else (words, [])
@@ -269,11 +266,7 @@ def main() -> None:
     for folder in options.capture:
         capture = Capture(folder.resolve(), extra)
         lines += [f"## {capture.name[0].upper()}{capture.name[1:]}", ""]
-        if options.each:
-            found[capture.name] = each_of(capture, options.steps, options.needed)
-            lines += [*rows_of(_COLUMNS, found[capture.name]), ""]
-            continue
-        left_out, trainings = omissions(capture, options.steps)
+        left_out, trainings = omissions(capture, options.steps, options.needed)
         asked = asked_for(capture, options.steps)
         found[capture.name] = {"left_out": left_out, "trainings": trainings, "asked_for": asked}
         lines += [
