@@ -2,7 +2,8 @@
 
     python benchmarks/plan.py [CAPTURE ...] [--json] [--steps 800] [--needed] [--write] [-- TRAIN OPTIONS]
 
-Each is a training of its own, measured on the held-out views. A capture without masks has one object that is
+Each is a training of its own, measured on the held-out views; where something is left out, with three seeds, of which
+the means count. A capture without masks has one object that is
 everywhere where nothing is left out. Where there are several omissions, they are taken back one at a time, too; where
 all of them come to another quality, the training as planned is repeated with fewer or more steps until its quality is
 the same. `--needed` also leaves out, one at a time, what the plan does. Then the whole way to meshes, for one object
@@ -16,6 +17,7 @@ import functools
 import json
 import math
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -31,7 +33,9 @@ from benchmarks import shared  # noqa: E402
 
 DEMO = ROOT / "build/demo/capture"
 SAME_PSNR = 0.1
-"""Within so many dB two trainings are equally good."""
+"""Within so many dB two trainings are equally good, and within twice the standard error of their difference."""
+
+SEEDS = 3
 
 DB_AN_OCTAVE, TRIES, MOST_TIMES = 1.5, 4, 2
 """What twice the steps are taken to bring before two trainings have told, how many are tried, and how many times as
@@ -43,7 +47,7 @@ AS_GOOD = "as planned, as good"
 _COLUMNS = (
     ("steps", "steps", "{:,}"), ("seconds", "seconds", "{:.0f}"), ("cpu_seconds", "of the processors", "{:.0f}"),
     ("train", "training", "{:.0f}"), ("peak_mb", "memory", "{:,.0f} MB"), ("psnr", "PSNR", "{:.2f} dB"),
-    ("miou", "mIoU", "{:.4f}"), ("splats", "splats", "{:,}"),
+    ("miou", "mIoU", "{:.4f}"), ("splats", "splats", "{:,.0f}"),
 )  # fmt: skip
 _ASKED_COLUMNS = (
     ("total", "seconds in all", "{:.0f}"), ("train", "training", "{:.0f}"), ("mesh_seconds", "meshes", "{:.0f}"),
@@ -119,6 +123,17 @@ class Capture:
             sys.exit("\n".join(self.results.failures.values()))
         return found
 
+    def train_often(self, seeds: int, steps: int, *more: str, **words: Any) -> dict[str, Any]:
+        """The mean figures over so many seeds, and the standard error of the PSNR."""
+        rows = [self.train(steps, *more, *(("--seed", str(seed)) if seed else ()), **words) for seed in range(seeds)]
+        known = {key for key, _, _ in _COLUMNS if rows[0][key] is not None}
+        spread = statistics.stdev(row["psnr"] for row in rows) if seeds > 1 else 0.0
+        return {
+            **{key: statistics.fmean(row[key] for row in rows) for key in known},
+            "steps": rows[0]["steps"],
+            "error": spread / seeds**0.5,
+        }
+
 
 def with_one_object(capture: Path, folder: Path) -> Path:
     """A capture without masks as one whose masks show one object everywhere, in `folder`."""
@@ -143,21 +158,22 @@ def omissions(capture: Capture, steps: int, needed: bool) -> tuple[list[str], di
     has_masks = next(own["done"] for own in plan if own["key"] == "votes")
     open_to_choice = [own for own in plan if own["can_override"]]
     left_out = [own["key"] for own in open_to_choice if own["done"] is False]
-    planned = capture.train(steps, meshes=True)
+    train = functools.partial(capture.train_often, SEEDS if left_out or not has_masks else 1)
+    planned = train(steps)
     if has_masks:
-        whole = capture.train(steps, "--keep", "all")
+        whole = train(steps, "--keep", "all")
     else:
         left_out = ["votes", "labels", *left_out]
         with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as scratch:
-            whole = capture.train(steps, "--keep", "all", folder=with_one_object(capture.folder, Path(scratch)))
+            whole = train(steps, "--keep", "all", folder=with_one_object(capture.folder, Path(scratch)))
     found = {"as planned": planned, "nothing left out": whole}
-    if abs(planned["psnr"] - whole["psnr"]) > SAME_PSNR:
-        found[AS_GOOD] = as_good(capture.train, planned, whole["psnr"])
+    if judged(planned, whole) != "equal":
+        found[AS_GOOD] = as_good(train, planned, whole["psnr"])
     if has_masks and len(left_out) > 1:
-        found |= {f"with {key}": capture.train(steps, "--keep", key) for key in left_out}
+        found |= {f"with {key}": train(steps, "--keep", key) for key in left_out}
     if needed:
         done = [own["key"] for own in open_to_choice if own["done"]]
-        found |= {f"without {key}": capture.train(steps, "--leave-out", key) for key in done}
+        found |= {f"without {key}": train(steps, "--leave-out", key) for key in done}
     return left_out, found
 
 
@@ -212,15 +228,30 @@ _COSTS = {"seconds": "time", "cpu_seconds": "time of the processors", "peak_mb":
 def verdict(found: dict[str, dict[str, Any]]) -> str:
     """What the omissions save, and what they cost."""
     planned, whole = found["as planned"], found["nothing left out"]
-    gain = planned["psnr"] - whole["psnr"]
-    judged = "worse" if gain < -SAME_PSNR else "equal" if gain <= SAME_PSNR else "better"
-    text = f"As planned, as many steps take {change(planned, whole, _COSTS)}; {gain:+.2f} dB, {judged}."
+    text = f"As planned, as many steps take {change(planned, whole, _COSTS)}; {gain_of(planned, whole)}, "
+    text += f"{judged(planned, whole)}."
     if same := found.get(AS_GOOD):
-        text += (
-            f" In {same['steps']:,} steps it takes {change(same, whole, _COSTS)};"
-            f" {same['psnr'] - whole['psnr']:+.2f} dB."
-        )
+        text += f" In {same['steps']:,} steps it takes {change(same, whole, _COSTS)}; {gain_of(same, whole)}."
     return text
+
+
+def error_of(new: dict[str, Any], old: dict[str, Any]) -> float:
+    """The standard error of the difference of two PSNR, dB."""
+    return math.hypot(new["error"], old["error"])
+
+
+def gain_of(new: dict[str, Any], old: dict[str, Any]) -> str:
+    """The difference of two PSNR and its standard error, in words."""
+    error = error_of(new, old)
+    return f"{new['psnr'] - old['psnr']:+.2f}{f' ± {error:.2f}' if error else ''} dB"
+
+
+def judged(new: dict[str, Any], old: dict[str, Any]) -> str:
+    """Whether a training is better than another, equal or worse."""
+    gain = new["psnr"] - old["psnr"]
+    if abs(gain) <= max(SAME_PSNR, 2 * error_of(new, old)):
+        return "equal"
+    return "better" if gain > 0 else "worse"
 
 
 def asked_verdict(found: dict[str, dict[str, Any]]) -> str:

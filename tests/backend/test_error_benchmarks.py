@@ -49,18 +49,19 @@ def test_a_faster_variant_is_better_where_the_default_does_not_come_so_far_in_it
 
 
 def test_what_the_plan_saves_is_said_with_what_it_costs():
-    whole = {"seconds": 100.0, "cpu_seconds": 150.0, "peak_mb": 1000.0, "psnr": 30.0}
-    planned = {"seconds": 80.0, "cpu_seconds": 165.0, "peak_mb": 500.0, "psnr": 30.05}
+    whole = {"seconds": 100.0, "cpu_seconds": 150.0, "peak_mb": 1000.0, "psnr": 30.0, "error": 0.03}
+    planned = {"seconds": 80.0, "cpu_seconds": 165.0, "peak_mb": 500.0, "psnr": 30.05, "error": 0.04}
     found = {"as planned": planned, "nothing left out": whole}
     said = "As planned, as many steps take 20% less time, 10% more time of the processors, 50% less memory; "
-    assert plan.verdict(found) == f"{said}+0.05 dB, equal."
+    assert plan.verdict(found) == f"{said}+0.05 ± 0.05 dB, equal."
     planned["psnr"] = 29.5
-    assert plan.verdict(found).endswith("; -0.50 dB, worse.")
+    assert plan.verdict(found).endswith("; -0.50 ± 0.05 dB, worse.")
+    assert plan.judged({**planned, "error": 0.4}, whole) == "equal"
     planned["psnr"] = 32.0
-    found["as planned, as good"] = {**planned, "steps": 400, "seconds": 45.0, "psnr": 29.95}
+    found[plan.AS_GOOD] = {**planned, "steps": 400, "seconds": 45.0, "psnr": 29.95, "error": 0.0}
     assert plan.verdict(found) == (
-        f"{said}+2.00 dB, better. "
-        "In 400 steps it takes 55% less time, 10% more time of the processors, 50% less memory; -0.05 dB."
+        f"{said}+2.00 ± 0.05 dB, better. "
+        "In 400 steps it takes 55% less time, 10% more time of the processors, 50% less memory; -0.05 ± 0.03 dB."
     )
 
 
