@@ -63,6 +63,8 @@ def test_what_the_plan_saves_is_said_with_what_it_costs():
         f"{said}+2.00 ± 0.05 dB, better. "
         "In 400 steps it takes 55% less time, 10% more time of the processors, 50% less memory; -0.05 ± 0.03 dB."
     )
+    found[plan.EVERYWHERE] = {**whole, "seconds": 160.0, "psnr": 32.5}
+    assert "everywhere" in plan.verdict(found) and plan.verdict(found).endswith("-0.50 ± 0.05 dB, worse.")
 
 
 @pytest.mark.parametrize("slope", [0.7, 2.5])
