@@ -54,7 +54,7 @@ _LEAST_NOISE = (PSNR_NOISE, SHARE_NOISE)
 @dataclass(frozen=True)
 class Choice:
     """One approximation: its name, the variants by name, as the processes take them, and which is the default; why it
-    is that where another is better."""
+    is that even where another is better."""
 
     title: str
     default: str
@@ -652,6 +652,8 @@ def _section(
 ) -> list[str]:
     rows = results.get(choice.title)
     lines = [f"### {choice.title[0].upper()}{choice.title[1:]}", "", f"{choice.note[0].upper()}{choice.note[1:]}.", ""]
+    if choice.why:
+        lines += [f"It stays at {choice.default} even where another is better by a little: {choice.why}.", ""]
     if not rows:
         return [*lines, "Not measured: it failed.", ""]
     verdict = next(verdict for verdict in found.verdicts if verdict.choice == choice)

@@ -70,7 +70,7 @@ def backend(*words: object) -> tuple[list[dict[str, Any]], float, float]:
 
 
 def measured(capture: Path, options: Sequence[str], meshes: bool = False) -> dict[str, Any]:
-    """One training, and its meshes where they are wanted, and their figures; `iou` and `points` by ID."""
+    """One training, and its meshes where they are wanted, and their figures; iou: by ID, objects: of objects.json."""
     with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as scratch:
         out = Path(scratch) / "out"
         events, seconds, busy = backend("train", capture, "--out", out, *options)
