@@ -3,11 +3,12 @@
     python benchmarks/plan.py [CAPTURE ...] [--json] [--steps 800] [--needed] [--write] [-- TRAIN OPTIONS]
 
 Each is a training of its own, measured on the held-out views; where something is left out, with three seeds, of which
-the means count. A capture without masks is compared, too, with itself where one object is everywhere. Where there are
-several omissions, they are taken back one at a time, too; where all of them come to another quality, the training as
-planned is repeated with fewer or more steps until its quality is the same. `--needed` also leaves out, one at a time,
-what the plan does. Then the whole way to meshes, for one object alone, and without meshes. `--write` leaves the tables
-in docs/plan.md.
+the means count. Where there are several omissions, they are taken back one at a time, too; where all of them come to
+another quality, the training as planned is repeated with fewer or more steps until its quality is the same. A capture
+without masks is given empty ones, so that nothing is left out, and such that show one object everywhere. `--needed`
+also leaves out, one at a time, what the plan does. Then the whole way to meshes, for one object alone, in groups, and
+without meshes; and what is left out of a capture with more than it needs (`--surplus` names those for which that is
+measured), and of pinhole pictures. `--write` leaves the tables in docs/plan.md.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks import shared  # noqa: E402
+from benchmarks import plan_captures, shared  # noqa: E402
 
 DEMO = ROOT / "build/demo/capture"
 SAME_PSNR = 0.1
@@ -43,6 +44,12 @@ many steps at most."""
 
 FLAT = ("--primitive", "2d")
 AS_GOOD, EVERYWHERE = "as planned, as good", "with an object everywhere"
+
+SURPLUS = ("duplicate-views", "blind-views", "unseen-points")
+"""What `plan_captures.with_surplus` adds, by the plan's keys."""
+
+GROUPS = 3
+"""Objects are grouped into so many, in turns."""
 
 _COLUMNS = (
     ("steps", "steps", "{:,}"), ("seconds", "seconds", "{:.0f}"), ("cpu_seconds", "of the processors", "{:.0f}"),
@@ -70,7 +77,8 @@ def backend(*words: object) -> tuple[list[dict[str, Any]], float, float]:
 
 
 def measured(capture: Path, options: Sequence[str], meshes: bool = False) -> dict[str, Any]:
-    """One training, and its meshes where they are wanted, and their figures; iou: by ID, objects: of objects.json."""
+    """One training, and its meshes where they are wanted, and their figures; iou: by ID, left_out: the plan's keys,
+    objects: of objects.json."""
     with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as scratch:
         out = Path(scratch) / "out"
         events, seconds, busy = backend("train", capture, "--out", out, *options)
@@ -78,7 +86,7 @@ def measured(capture: Path, options: Sequence[str], meshes: bool = False) -> dic
         quality = backend("evaluate", out)[0][-1]
         memory = json.loads((out / "objectgs.json").read_text())
         stages = {stage["name"]: stage for stage in memory["stages"]}
-        listed = out / "objects.json"
+        listed, plan = out / "objects.json", json.loads((out / "plan.json").read_text())["decisions"]
         scores = json.loads((out / "evaluation.json").read_text())["objects"]
         return {
             "cpu_seconds": busy,
@@ -93,32 +101,54 @@ def measured(capture: Path, options: Sequence[str], meshes: bool = False) -> dic
             "steps": events[-1]["steps"],
             "splats": memory["export"]["splats"],
             "iou": {str(row["id"]): row["iou"] for row in scores},
+            "left_out": [own["key"] for own in plan if own["done"] is False],
             "objects": json.loads(listed.read_text())["objects"] if listed.exists() else [],
         }
 
 
 class Capture:
-    """A capture and the results that it gave. folder: its folder; options: of every training."""
+    """A capture and the results that it gave. folder: its folder; options: of every training; name: of its results."""
 
-    def __init__(self, folder: Path, options: Sequence[str]) -> None:
+    def __init__(self, folder: Path, options: Sequence[str], name: str = "") -> None:
         self.folder, self.options = folder, tuple(options)
-        self.results = shared.Results(ROOT / "build" / "plan", shared.digest(shared.sources(), str(folder)), 0)
-        self.name = "demo" if folder == DEMO else folder.name
+        code = [*shared.sources(), *([Path(plan_captures.__file__)] if name else [])]
+        self.results = shared.Results(ROOT / "build" / "plan", shared.digest(code, str(folder)), 0)
+        self.name = name or ("demo" if folder == DEMO else folder.name)
+
+    def made(self, what: str, make: Callable[..., Path], *arguments: object) -> Capture:
+        """The capture that `make`, of `plan_captures`, makes of this one."""
+        name = f"{self.name} {what}"
+        folder = ROOT / "build" / "plan" / "captures" / name.replace(" ", "-")
+        shared.forget(folder)
+        folder.mkdir(parents=True)
+        return Capture(make(self.folder, folder, *arguments), self.options, name)
 
     def plan(self) -> list[dict[str, Any]]:
         """The decisions, as plan.json has them."""
         return backend("plan", self.folder, *self.options)[0][-1]["plan"]
 
-    def train(self, steps: int, *more: str, meshes: bool = False, folder: Path | None = None) -> dict[str, Any]:
-        """The figures of a training, measured once; SystemExit where it fails."""
+    def train(self, steps: int, *more: str, meshes: bool = False) -> dict[str, Any]:
+        """The figures of a training, measured once."""
         words = ["--steps", str(steps), *self.options, *more]
-        name = f"{self.name}{' with an object that is everywhere' if folder else ''} {' '.join(words)}"
-        self.results.total += 1
-        found = self.results.get(
-            name + (" and meshes" if meshes else ""),
-            functools.partial(measured, folder or self.folder, words, meshes),
+        name = f"{self.name} {' '.join(words)}" + (" and meshes" if meshes else "")
+        return self._once(
+            name,
+            functools.partial(measured, self.folder, words, meshes),
             lambda row: f"{row['total']:.0f} s, {row['peak_mb']:.0f} MB, PSNR {row['psnr']}",
         )
+
+    def prepare(self) -> dict[str, Any]:
+        """How long it takes to import, and what is left on the disk; measured once."""
+        return self._once(
+            f"{self.name} imported", functools.partial(imported, self.folder), lambda row: f"{row['seconds']:.1f} s"
+        )
+
+    def _once(
+        self, name: str, make: Callable[[], dict[str, Any]], line: Callable[[dict[str, Any]], str]
+    ) -> dict[str, Any]:
+        """A result; SystemExit where it fails."""
+        self.results.total += 1
+        found = self.results.get(name, make, line)
         if self.results.failures:
             sys.exit("\n".join(self.results.failures.values()))
         return found
@@ -135,23 +165,6 @@ class Capture:
         }
 
 
-def with_one_object(capture: Path, folder: Path) -> Path:
-    """A capture without masks as one whose masks show one object everywhere, in `folder`."""
-    import numpy as np
-    from PIL import Image
-
-    for part in capture.iterdir():
-        (folder / part.name).symlink_to(part)
-    images = capture / "images"
-    for image in images.rglob("*"):
-        if image.is_file():
-            path = (folder / "masks" / image.relative_to(images)).with_suffix(".png")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            width, height = Image.open(image).size
-            Image.fromarray(np.ones((height, width), np.uint8)).save(path)
-    return folder
-
-
 def omissions(capture: Capture, steps: int, needed: bool) -> tuple[list[str], dict[str, dict[str, Any]]]:
     """What the plan leaves out, and the trainings with all of that and with none of it."""
     plan = capture.plan()
@@ -159,12 +172,18 @@ def omissions(capture: Capture, steps: int, needed: bool) -> tuple[list[str], di
     open_to_choice = [own for own in plan if own["can_override"]]
     left_out = [own["key"] for own in open_to_choice if own["done"] is False]
     train = functools.partial(capture.train_often, SEEDS if left_out or not has_masks else 1)
-    planned, whole = train(steps), train(steps, "--keep", "all")
-    found = {"as planned": planned, "nothing left out": whole}
-    if not has_masks:
+    planned = train(steps)
+    found = {"as planned": planned}
+    if has_masks:
+        whole = train(steps, "--keep", "all")
+    else:
         left_out = ["votes", "labels", *left_out]
-        with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as scratch:
-            found[EVERYWHERE] = train(steps, "--keep", "all", folder=with_one_object(capture.folder, Path(scratch)))
+        # Pixels of no object, as those of a mask that is missing, are not taught, or they would be a label, too.
+        empty = capture.made("with empty masks", plan_captures.with_masks, 0)
+        whole = empty.train_often(SEEDS, steps, "--keep", "all", "--leave-out", "rest")
+        labelled = capture.made("with an object everywhere", plan_captures.with_masks, 1)
+        found[EVERYWHERE] = labelled.train_often(SEEDS, steps, "--keep", "all")
+    found = {"as planned": planned, "nothing left out": whole, **found}
     if judged(planned, whole) != "equal":
         found[AS_GOOD] = as_good(train, planned, whole["psnr"])
     if has_masks and len(left_out) > 1:
@@ -173,6 +192,21 @@ def omissions(capture: Capture, steps: int, needed: bool) -> tuple[list[str], di
         done = [own["key"] for own in open_to_choice if own["done"]]
         found |= {f"without {key}": train(steps, "--leave-out", key) for key in done}
     return left_out, found
+
+
+def surplus_of(capture: Capture, steps: int) -> dict[str, dict[str, Any]]:
+    """The trainings of the same capture with more than it needs: without all of that, with it, and with one part of it
+    at a time; RuntimeError where the plan does not leave it out."""
+    more = capture.made("with more than it needs", plan_captures.with_surplus)
+    if missing := set(SURPLUS) - set(more.train(steps)["left_out"]):
+        raise RuntimeError(f"The plan does not leave {', '.join(sorted(missing))} out of {more.folder}.")
+    train = functools.partial(more.train_often, SEEDS)
+    keep = [word for key in SURPLUS for word in ("--keep", key)]
+    planned, whole = train(steps), train(steps, *keep)
+    found = {"the capture itself": capture.train_often(SEEDS, steps), "as planned": planned, "nothing left out": whole}
+    if judged(planned, whole) != "equal":
+        found[AS_GOOD] = as_good(train, planned, whole["psnr"])
+    return found | {f"with {key}": train(steps, "--keep", key) for key in SURPLUS}
 
 
 def as_good(train: Callable[[int], dict[str, Any]], planned: dict[str, Any], psnr: float) -> dict[str, Any]:
@@ -193,6 +227,16 @@ def as_good(train: Callable[[int], dict[str, Any]], planned: dict[str, Any], psn
     return min(tried.values(), key=lambda row: abs(row["psnr"] - psnr))
 
 
+def imported(folder: Path) -> dict[str, Any]:
+    """How long a capture takes to import, in seconds, and the memory and the room on disk in MB."""
+    with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as scratch:
+        out = Path(scratch) / "out"
+        _, seconds, _ = backend("import", folder, "--out", out)
+        stages = json.loads((out / "objectgs.json").read_text())["stages"]
+        disk = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
+    return {"seconds": seconds, "peak_mb": max(stage["peak_rss_mb"] for stage in stages), "disk_mb": disk / 1e6}
+
+
 def asked_for(capture: Capture, steps: int) -> dict[str, dict[str, Any]]:
     """The way to meshes: of everything, and of what was asked for alone. `iou` is that of the object which is asked
     for, the one with the median number of points."""
@@ -201,8 +245,10 @@ def asked_for(capture: Capture, steps: int) -> dict[str, dict[str, Any]]:
     chosen = None
     if objects := sorted(everything["objects"], key=lambda entry: entry["points"]):
         chosen = objects[len(objects) // 2]
-        alone = capture.train(steps, "--only", chosen["name"], meshes=True)
-        found[f"only {chosen['name']}"] = alone
+        found[f"only {chosen['name']}"] = capture.train(steps, "--only", chosen["name"], meshes=True)
+        file = ROOT / "build" / "plan" / f"groups-of-{capture.name}.json"
+        file.write_text(json.dumps({str(own["id"]): f"group {i % GROUPS}" for i, own in enumerate(objects)}))
+        found[f"in {GROUPS} groups"] = capture.train(steps, "--groups", str(file), meshes=True)
     found["no meshes"] = {**everything, "total": everything["seconds"], "mesh_seconds": None,
                           "mesh_mb": everything["peak_mb"]}  # fmt: skip
     found["flat splats, everything"] = capture.train(steps, *FLAT, meshes=True)
@@ -231,9 +277,9 @@ def verdict(found: dict[str, dict[str, Any]]) -> str:
     if same := found.get(AS_GOOD):
         text += f" In {same['steps']:,} steps it takes {change(same, whole, _COSTS)}; {gain_of(same, whole)}."
     if labelled := found.get(EVERYWHERE):
-        text += " Without masks there are no labels to keep. Against labels of one object that is everywhere, "
-        text += f"whose loss asks for opaque pixels, too: {change(planned, labelled, _COSTS)}; "
-        text += f"{gain_of(planned, labelled)}, {judged(planned, labelled)}."
+        text += " Nothing left out: votes, the ID channel and the label loss with masks that are empty. Labels of one "
+        text += "object that is everywhere are more than that, since their loss asks for opaque pixels; against these: "
+        text += f"{change(planned, labelled, _COSTS)}; {gain_of(planned, labelled)}, {judged(planned, labelled)}."
     return text
 
 
@@ -277,17 +323,65 @@ def rows_of(columns: Sequence[tuple[str, str, str]], found: dict[str, dict[str, 
     return shared.table(("", *(title for _, title, _ in columns)), ((name, *cells(row)) for name, row in found.items()))
 
 
+def heading(level: int, text: str) -> str:
+    """A heading, in Markdown."""
+    return f"{'#' * level} {text[0].upper()}{text[1:]}"
+
+
+def section_of_omissions(capture: Capture, steps: int, needed: bool) -> tuple[dict[str, Any], list[str]]:
+    """What is left out by itself: the figures, and lines of Markdown."""
+    left_out, trainings = omissions(capture, steps, needed)
+    lines = [f"Left out: {', '.join(left_out) or 'nothing'}.", "", *rows_of(_COLUMNS, trainings), "",
+             verdict(trainings), ""]  # fmt: skip
+    return {"left_out": left_out, "trainings": trainings}, lines
+
+
+def section_of_what_is_asked_for(capture: Capture, steps: int) -> tuple[dict[str, Any], list[str]]:
+    """What is left out since it was not asked for."""
+    asked = asked_for(capture, steps)
+    lines = ["With meshes, and with what was asked for alone:", "", *rows_of(_ASKED_COLUMNS, asked), "",
+             asked_verdict(asked), ""]  # fmt: skip
+    return {"asked_for": asked}, lines
+
+
+def section_of_pinholes(capture: Capture) -> tuple[dict[str, Any], list[str]]:
+    """What is saved where pictures need no undistortion; nothing where they do."""
+    if any(own["key"] == "undistortion" and own["done"] for own in capture.plan()):
+        return {}, []
+    plain, bent = capture.prepare(), capture.made("through a lens", plan_captures.through_a_lens).prepare()
+    text = (
+        f"Pictures of a pinhole are not undistorted: import takes {plain['seconds']:.1f} instead of "
+        f"{bent['seconds']:.1f} seconds, {plain['peak_mb']:,.0f} instead of {bent['peak_mb']:,.0f} MB of memory and "
+        f"{plain['disk_mb']:.1f} instead of {bent['disk_mb']:.1f} MB on disk."
+    )
+    return {"undistortion": {"left out": plain, "done": bent}}, [text, ""]
+
+
+def section_of_surplus(capture: Capture, steps: int) -> tuple[dict[str, Any], list[str]]:
+    """What is saved where a capture has more than it needs."""
+    trainings = surplus_of(capture, steps)
+    lines = [
+        heading(3, f"{capture.name}, with more than it needs"), "",
+        "About as many photos again, half of them the same ones as JPEG and half of nothing that was reconstructed, and "
+        f"{plan_captures.UNSEEN:.0%} more points that no photo shows.", "",
+        *rows_of(_COLUMNS, trainings), "", verdict(trainings), "",
+    ]  # fmt: skip
+    return {"surplus": trainings}, lines
+
+
 def main() -> None:
     """Print the tables, or one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", action="store_true")
     parser.add_argument("capture", type=Path, nargs="*", default=[DEMO])
     parser.add_argument("--steps", type=int, default=800)
+    parser.add_argument("--surplus", type=Path, nargs="*", default=[DEMO], metavar="CAPTURE")
     parser.add_argument("--needed", action="store_true", help="also without each thing that the plan does")
     parser.add_argument("--write", action="store_true")
     words = sys.argv[1:]
     own, extra = (words[: words.index("--")], words[words.index("--") + 1 :]) if "--" in words else (words, [])
     options = parser.parse_args(own)
+    surplus = {path.resolve() for path in options.surplus}
     found: dict[str, Any] = {}
     lines = [
         "# What the plan saves",
@@ -298,15 +392,15 @@ def main() -> None:
     ]  # fmt: skip
     for folder in options.capture:
         capture = Capture(folder.resolve(), extra)
-        lines += [f"## {capture.name[0].upper()}{capture.name[1:]}", ""]
-        left_out, trainings = omissions(capture, options.steps, options.needed)
-        asked = asked_for(capture, options.steps)
-        found[capture.name] = {"left_out": left_out, "trainings": trainings, "asked_for": asked}
-        lines += [
-            f"Left out: {', '.join(left_out) or 'nothing'}.", "", *rows_of(_COLUMNS, trainings), "",
-            verdict(trainings), "", "With meshes, and with what was asked for alone:", "",
-            *rows_of(_ASKED_COLUMNS, asked), "", asked_verdict(asked), "",
-        ]  # fmt: skip
+        lines += [heading(2, capture.name), ""]
+        sections = [
+            section_of_omissions(capture, options.steps, options.needed),
+            section_of_what_is_asked_for(capture, options.steps),
+            section_of_pinholes(capture),
+            *([section_of_surplus(capture, options.steps)] if capture.folder in surplus else []),
+        ]
+        found[capture.name] = {key: value for figures, _ in sections for key, value in figures.items()}
+        lines += [line for _, text in sections for line in text]
     if options.write:
         (ROOT / "docs" / "plan.md").write_text("\n".join(lines).rstrip() + "\n")
     print(json.dumps(found) if options.json else "\n".join(lines))

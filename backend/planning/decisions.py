@@ -126,9 +126,11 @@ def _rest(look: Look) -> Decision | None:
     what = "teaching of unlabelled pixels"
     if look.point_ids is None:
         return Decision("rest", what, None, "the votes say how many points have no object")
-    share, taught = float(np.mean(look.point_ids == 0)), rest_is_taught(look.point_ids)
+    # Points that no view shows have no object since nothing voted for them.
+    ids = look.point_ids[~unseen_points(look.capture)]
+    share, taught = float(np.mean(ids == 0)), rest_is_taught(ids)
     meaning = "unlabelled pixels show something else" if taught else "they are taken for gaps in the masks"
-    return Decision("rest", what, taught, f"{share:.1%} of the points have no object, so {meaning}")
+    return Decision("rest", what, taught, f"{share:.1%} of the points in view have no object, so {meaning}")
 
 
 def _labels(look: Look) -> Decision | None:

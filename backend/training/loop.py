@@ -211,28 +211,26 @@ class Trainer:
     ) -> Trainer:
         """A fresh model on the capture's points, whose objects are point_ids ((M,) int64), on the device `place`.
 
-        seeds (M,) bool: the points that anchors start from (None: all); teach_unlabelled, gains: as `Scene` has them,
-        None: as the points and photos say.
+        seeds (M,) bool: the points that anchors start from (None: all), which alone say how large the scene is and how
+        dense; teach_unlabelled, gains: as `Scene` has them, None: as the points and photos say.
         """
         rng = np.random.default_rng(settings.seed)
-        xyz = capture.points.xyz
+        seeds = np.ones(len(capture.points.xyz), np.bool_) if seeds is None else seeds
+        xyz, rgb = capture.points.xyz[seeds], capture.points.rgb[seeds]
         eyes = np.array([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in capture.views])
         normalization = Normalization.of(eyes, xyz)
         object_ids = np.unique(np.concatenate([[0], point_ids])).astype(np.int64)
         scene_xyz = normalization.to_scene(xyz)
         voxel = settings.voxel * normalization.scale if settings.voxel else median_spacing(scene_xyz)
-        classes = np.searchsorted(object_ids, point_ids)
-        seeds = np.ones(len(xyz), np.bool_) if seeds is None else seeds
-        anchors = seed_anchors(
-            scene_xyz[seeds], capture.points.rgb[seeds] / 255.0, classes[seeds], voxel, settings.layout, rng
-        )
+        classes = np.searchsorted(object_ids, point_ids[seeds])
+        anchors = seed_anchors(scene_xyz, rgb / 255.0, classes, voxel, settings.layout, rng)
         generator = torch.Generator().manual_seed(settings.seed)
         heads = Heads(settings.layout, settings.mode, settings.sh_degree, generator)
-        shade = {"learned": capture.points.rgb[seeds].mean(axis=0) / 255.0, "black": np.zeros(3), "white": np.ones(3)}
+        shade = {"learned": rgb.mean(axis=0) / 255.0, "black": np.zeros(3), "white": np.ones(3)}
         background = torch.from_numpy(shade[settings.background].astype(np.float32))
         model = ObjectModel(anchors, heads, background, object_ids, normalization, settings.primitive)
         if teach_unlabelled is None:
-            teach_unlabelled = capture.has_masks and rest_is_taught(point_ids)
+            teach_unlabelled = capture.has_masks and rest_is_taught(point_ids[seeds])
         scene = Scene(
             capture, object_ids, normalization, settings.zero_is_object, memory_mb, teach_unlabelled, place, gains
         )

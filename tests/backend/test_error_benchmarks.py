@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks import approximations, mask_noise, plan, raster_variants, training_variants
+from backend.capture import load_capture
+from backend.planning.coverage import blind_views, duplicate_views, unseen_points
+from benchmarks import approximations, mask_noise, plan, plan_captures, raster_variants, training_variants
 
 
 def test_only_a_variant_that_is_worse_in_nothing_is_better_than_the_default():
@@ -19,6 +21,19 @@ def test_only_a_variant_that_is_worse_in_nothing_is_better_than_the_default():
         "slower": (1.2, 0.3),
     }
     assert approximations.better_than(default, others, noise) == ["faster", "closer"]
+
+
+def test_the_time_of_a_choice_is_the_median_over_sets_of_processes(monkeypatch):
+    sets = iter([1.01, 1.09, 1.03, 1.04, 1.02])
+
+    def measure_set(*_):
+        time = next(sets)
+        return {"a": {"picture": 0.3, "forward_ms": 1.0, "backward_ms": 2.0, "step_ms": 3.0, "times_default": time}}
+
+    monkeypatch.setattr(approximations, "measure_set", measure_set)
+    found = approximations.measure_choice(approximations.Choice("a choice", "a", {}), None, None, None)
+    assert found["a"]["times_default"] == 1.03 and max(found["a"]["times_default_of_sets"]) == 1.09
+    assert approximations._raster_row({**found["a"], "largest": 1.0, "gradient": 0.1})[1] == "1.03 (1.01-1.09)"
 
 
 def a_pair(psnr, miou, times_default):
@@ -79,15 +94,47 @@ def test_as_many_steps_are_found_as_make_a_training_as_good_as_another(slope):
     assert found["psnr"] == pytest.approx(31.5, abs=plan.SAME_PSNR) and len(tried) <= 2
 
 
-def test_a_capture_without_masks_gets_one_object_everywhere(tmp_path):
+def test_a_capture_without_masks_gets_masks_of_one_id(tmp_path):
     capture, other = tmp_path / "capture", tmp_path / "other"
     (capture / "images" / "left").mkdir(parents=True)
     other.mkdir()
     Image.new("RGB", (6, 4)).save(capture / "images" / "left" / "0.jpg")
-    plan.with_one_object(capture, other)
+    plan_captures.with_masks(capture, other, 1)
     ids = np.asarray(Image.open(other / "masks" / "left" / "0.png"))
     assert ids.shape == (4, 6) and (ids == 1).all() and (other / "images" / "left" / "0.jpg").exists()
     assert not (capture / "masks").exists()
+
+
+def test_a_capture_with_more_than_it_needs_holds_the_same_views_out_and_the_rest_is_left_out(write_capture, tmp_path):
+    scene = write_capture(views=9, size=(64, 48))
+    given = load_capture(scene.folder, tmp_path / "cache")
+    folder = tmp_path / "more"
+    folder.mkdir()
+    more = load_capture(plan_captures.with_surplus(scene.folder, folder), tmp_path / "cache of more")
+    pictures = sorted(given.image(i).tobytes() for i in given.test_indices)
+    assert sorted(more.image(i).tobytes() for i in more.test_indices) == sorted(2 * pictures)
+    blind, alike, unseen = blind_views(more), duplicate_views(more), unseen_points(more)
+    assert len(blind) == 14 and len(alike) == 7 and unseen.sum() == round(plan_captures.UNSEEN * len(scene.xyz))
+    left = [i for i in more.train_indices if i not in {*blind, *alike}]
+
+    def places(capture, views):
+        return sorted(tuple(capture.views[i].viewmat[:3, 3].round(6)) for i in views)
+
+    assert places(more, left) == places(given, given.train_indices)
+    assert sorted(map(more.ids_in, left)) == sorted(map(given.ids_in, given.train_indices))
+
+
+def test_a_lens_that_bends_next_to_nothing_shows_the_same(write_capture, tmp_path):
+    scene = write_capture(views=3, size=(64, 48))
+    given = load_capture(scene.folder, tmp_path / "cache")
+    folder = tmp_path / "bent"
+    folder.mkdir()
+    bent = load_capture(plan_captures.through_a_lens(scene.folder, folder), tmp_path / "cache of bent")
+    assert given.is_original(1) and not bent.is_original(1)
+    assert 64 - bent.views[1].width <= 1 and 48 - bent.views[1].height <= 1
+    cut = (given.views[1].K - bent.views[1].K)[:2, 2]
+    moved = given.keypoints(1).xy - cut - bent.keypoints(1).xy
+    assert 1e-6 < np.abs(moved).max() < 0.01
 
 
 def test_every_choice_has_its_default_among_its_variants_and_no_other_like_it():

@@ -7,6 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from backend.capture import load_capture
@@ -159,11 +160,34 @@ def test_views_and_points_that_nothing_sees_are_found(write_capture, tmp_path):
     assert plan["duplicate-views"] is None, "two views of nothing are blind rather than alike"
     ids = np.append(scene.point_objects, [0, 0])
     seeds = ~unseen_points(capture)
-    anchors = Trainer.start(capture, ids, Settings(offsets=2), seeds=seeds).model.anchors
-    assert len(Trainer.start(capture, ids, Settings(offsets=2)).model.anchors) == len(anchors) + 1
+    for chosen_points, highest in ((seeds, 1), (None, 500)):
+        model = Trainer.start(capture, ids, Settings(offsets=2), seeds=chosen_points).model
+        reach = model.normalization.to_world(model.anchors.positions.numpy())[:, 1].max()
+        assert reach == pytest.approx(highest, rel=0.5)
 
     nothing = capture.without_training_on(set(scene.names) - {"view_003.png"})
     assert blind_views(nothing) == [] and not unseen_points(nothing).any(), "something is left to train on"
+
+
+def test_points_that_no_view_shows_say_nothing_about_the_scene(write_capture, tmp_path):
+    scene = write_capture(views=9, size=(64, 48))
+    ids = scene.point_objects
+    alone = Trainer.start(loaded(scene, tmp_path), ids, Settings(offsets=2))
+    assert planned(loaded(scene, tmp_path), point_ids=ids)["rest"].done is False
+
+    far = np.random.default_rng(0).uniform((-50, 400, -50), (50, 500, 50), (len(ids), 3))
+    scene.xyz, scene.rgb = np.concatenate([scene.xyz, far]), np.concatenate([scene.rgb, scene.rgb])
+    ids = np.concatenate([ids, np.zeros_like(ids)])
+    write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
+    crowded = loaded(scene, tmp_path)
+    seeds = ~unseen_points(crowded)
+    assert seeds.sum() == len(seeds) / 2
+    found = Trainer.start(crowded, ids, Settings(offsets=2), seeds=seeds)
+    assert found.model.normalization == alone.model.normalization
+    assert found.model.anchors.voxel == alone.model.anchors.voxel
+    assert torch.equal(found.model.anchors.rows, alone.model.anchors.rows)
+    assert found.scene.teach_unlabelled == alone.scene.teach_unlabelled
+    assert planned(crowded, point_ids=ids)["rest"].done is False, "nothing could vote for them"
 
 
 def test_chosen_objects_are_told_apart_alone_and_their_other_views_show_the_rest(write_capture, tmp_path):
