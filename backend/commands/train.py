@@ -73,9 +73,9 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             except Cancelled:
                 # What a stopped training has come to is there to be seen too, where that takes no time.
                 if trainer.model.explicit and progress.step:
-                    _export(trainer.model, trainer.scene, folder, reporter)
+                    _export(trainer.shown, trainer.scene, folder, reporter)
                 raise
-        export = _export(trainer.model, trainer.scene, folder, reporter)
+        export = _export(trainer.shown, trainer.scene, folder, reporter)
     latest = progress.curve[-1] if progress.curve else {}
     reporter.done(
         steps=progress.step, seconds=round(progress.seconds, 1), anchors=len(trainer.model.anchors),

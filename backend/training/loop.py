@@ -30,6 +30,7 @@ from ..raster import Camera, Rendered, rasterize
 from ..stopping import StopRequest
 from . import faults
 from .adam import BETA1, BETA2, step_rows, take_rows
+from .average import Average
 from .budget import Budget, Progress
 from .losses import image_loss, normal_loss, volume_loss
 from .scene import Scene
@@ -187,6 +188,7 @@ class Trainer:
         self._fault: faults.Fault | None = None
         self._to_say: list[str] = []
         self._splats: int | torch.Tensor = 0
+        self._average: Average | None = Average(model)
         model.background.requires_grad_(settings.background == "learned")
         groups: list[dict[str, Any]] = [
             {"params": list(getattr(model.heads, name).parameters()), "name": name, "lr": ends[0]}
@@ -236,6 +238,12 @@ class Trainer:
         )
         return cls(scene, settings, model.to(place), rng)
 
+    @property
+    def shown(self) -> ObjectModel:
+        """What the training has come to: the mean over its latest steps, or the model itself once it is finished, when
+        steps are so small that one is as good as their mean."""
+        return self.model if self._average is None else self._average.of(self.model)
+
     # --- state on disk -------------------------------------------------------------------------------------------
 
     def save(self, folder: Path) -> None:
@@ -259,6 +267,8 @@ class Trainer:
         }
         for name, value in model.heads.state_dict().items():
             tensors[f"heads.{name}"] = value
+        if self._average is not None:
+            tensors |= self._average.tensors()
         for i, state in self._head_optimizer.state_dict()["state"].items():
             for name in ("step", "exp_avg", "exp_avg_sq"):
                 tensors[f"head_adam.{i}.{name}"] = state[name]
@@ -327,6 +337,7 @@ class Trainer:
             if f"head_adam.{i}.step" in tensors
         }
         optimizer.load_state_dict(saved)
+        trainer._average = Average.from_checkpoint(tensors, trainer.model)
         trainer.progress = Progress(**state["progress"])
         return trainer, warning
 
@@ -373,6 +384,10 @@ class Trainer:
         parts = self.parts
         while True:
             p.seconds = before + time.monotonic() - started
+            if budget.share(p) >= 1.0:
+                self._average = None
+            elif self._average is None:
+                self._average = Average(self.model)
             if evaluate is not None and budget.evaluation_is_due(p):
                 self._evaluate(evaluate, reporter, float(smooth))
                 if budget.settle(p):
@@ -413,7 +428,7 @@ class Trainer:
 
     def _evaluate(self, evaluate: Evaluate, reporter: Reporter, loss: float) -> None:
         p = self.progress
-        quality = evaluate(self.model, self.scene, p)
+        quality = evaluate(self.shown, self.scene, p)
         loss_db = round(-20 * math.log10(loss), 3) if 0 < loss < math.inf else None
         p.curve.append({"seconds": round(p.seconds, 2), "step": p.step, "loss_db": loss_db, **quality})
         reporter.quality(**p.curve[-1])
@@ -459,6 +474,8 @@ class Trainer:
         loss = torch.full((), math.nan, device=self.model.device)
         if learned is not None:
             self._update(learned, share)
+            if self._average is not None:
+                self._average.follow(self.model, p.step)
             loss = learned.loss if learned.sound is None else torch.where(learned.sound, learned.loss, loss)
         before = len(self.model.anchors)
         if self._fault is not None:
@@ -486,6 +503,8 @@ class Trainer:
         kept[fault.hopeless] = False
         a.positions, a.rows, a.ids = a.positions[kept], a.rows[kept], a.ids[kept]
         self._first, self._second = self._first[kept], self._second[kept]
+        if self._average is not None:
+            self._average.take(kept, a.rows[:0])
         self._statistics = GrowthStatistics.zeros(len(a), a.layout.offsets, model.device)
 
     def _look_out(self) -> None:
@@ -677,6 +696,8 @@ class Trainer:
             return torch.cat([moments[growth.kept], moments.new_zeros((growth.added, moments.shape[1]))])
 
         self._first, self._second = follow(self._first), follow(self._second)
+        if self._average is not None:
+            self._average.take(growth.kept, anchors.rows[len(anchors) - growth.added :])
         self._statistics = self._statistics.after(growth, anchors.layout.offsets)
 
 
@@ -705,13 +726,15 @@ def model_from_checkpoint(tensors: dict[str, np.ndarray], state: dict[str, Any])
 
 
 def load_model(folder: Path, place: torch.device = device.CPU) -> tuple[ObjectModel, dict[str, Any], str | None]:
-    """The trained model of a checkpoint folder, on the device `place`, its state, and a warning; raises InputError if
-    there is none."""
+    """What the training of a checkpoint folder has come to, on the device `place`, its state, and a warning; raises
+    InputError if there is none."""
     found = load_checkpoint(folder)
     if found is None:
         raise InputError(f"{folder} holds no checkpoint; train first.")
     tensors, state, warning = found
-    return model_from_checkpoint(tensors, state).to(place), state, warning
+    model = model_from_checkpoint(tensors, state)
+    average = Average.from_checkpoint(tensors, model)
+    return (model if average is None else average.of(model)).to(place), state, warning
 
 
 def progress_of(state: dict[str, Any]) -> Progress:

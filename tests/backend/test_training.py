@@ -22,8 +22,9 @@ from backend.raster import Camera, rasterize
 from backend.raster.draw import draw
 from backend.stopping import StopRequest
 from backend.training.adam import BETA1, BETA2, step_rows
+from backend.training.average import EVERY, LONGEST, SHARE, Average
 from backend.training.budget import Budget
-from backend.training.loop import Trainer
+from backend.training.loop import Trainer, load_model
 from backend.training.losses import PROBABILITY_FLOOR, image_loss, normal_loss, volume_loss
 from backend.training.settings import Settings
 
@@ -484,6 +485,65 @@ def test_normal_loss_makes_normals_agree_with_the_depth(tiny):
         drawn = rasterize(*g[:6], camera, want_depth=True, want_normals=True, primitive="2d")
         found.append(float(normal_loss(drawn.normals, drawn.depth, drawn.alpha, camera.arrays()[1])))
     assert found[1] < 0.8 * found[0]
+
+
+def test_an_unfinished_training_shows_the_mean_of_its_latest_steps(tiny, tmp_path, monkeypatch):
+    capture, ids = tiny()
+    budget, asked, seen = Budget(steps=60), [], []
+    trainer = Trainer.start(capture, ids, SMALL)
+    follow = Average.follow
+    monkeypatch.setattr(Average, "follow", lambda own, model, step: (follow(own, model, step), seen.append(step))[0])
+
+    class StopLater(StopRequest):
+        def __call__(self):
+            asked.append(trainer.progress.step)
+            return len(asked) > 45
+
+    def measure(model, scene, progress):
+        return {"psnr": 0.0, "is_model": model is trainer.model}
+
+    with pytest.raises(Cancelled):
+        trainer.run(budget, tmp_path, Reporter(), measure, stop=StopLater())
+    assert seen == list(range(1, 46)) and trainer.progress.last_growth > 0
+    mean = trainer.shown
+    assert len(mean.anchors) == len(trainer.model.anchors)
+    assert not torch.equal(mean.anchors.rows, trainer.model.anchors.rows)
+    stored, _, _ = load_model(tmp_path)
+    resumed, _ = Trainer.resume(capture, tmp_path, SMALL)
+    assert torch.equal(resumed.model.anchors.rows, trainer.model.anchors.rows), "it goes on from the step itself"
+    for other in (stored, resumed.shown):
+        assert torch.equal(other.anchors.rows, mean.anchors.rows) and torch.equal(other.background, mean.background)
+        pairs = zip(other.heads.parameters(), mean.heads.parameters(), strict=True)
+        assert all(torch.equal(a, b) for a, b in pairs)
+    resumed.run(budget, tmp_path, Reporter(), measure)
+    assert resumed.shown is resumed.model, "its rates have fallen"
+    assert torch.equal(load_model(tmp_path)[0].anchors.rows, resumed.model.anchors.rows)
+    assert not any(entry["is_model"] for entry in trainer.progress.curve)
+
+
+def test_the_mean_follows_what_is_learned_and_leaves_out_the_noise(tiny):
+    capture, ids = tiny()
+    model = Trainer.start(capture, ids, SMALL).model
+    average, rows, rng = Average(model), model.anchors.rows, np.random.default_rng(0)
+    expected, bias = rows.clone().double(), model.heads.opacity.bias
+    for step in range(1, 1001):
+        rows[:] = 3.0 + torch.from_numpy(rng.normal(size=rows.shape))
+        with torch.no_grad():
+            bias.fill_(float(step))
+        average.follow(model, step)
+        if step % EVERY == 0:
+            weight = EVERY / max(min(SHARE * step, LONGEST), EVERY)
+            expected += weight * (rows - expected)
+        if step == EVERY:
+            assert torch.equal(average.of(model).anchors.rows, rows), "of a single one"
+    mean = average.of(model)
+    assert torch.allclose(mean.anchors.rows.double(), expected, atol=1e-4)
+    assert (mean.anchors.rows - 3).std() < 0.25 and 880 < float(mean.heads.opacity.bias.detach().mean()) < 930
+
+    kept = torch.arange(len(rows)) % 2 == 0
+    before = mean.anchors.rows[kept]
+    average.take(kept, rows[:3])
+    assert torch.equal(average.of(model).anchors.rows, torch.cat([before, rows[:3]]))
 
 
 def test_the_clock_ends_a_training_by_minutes(tiny, tmp_path):
