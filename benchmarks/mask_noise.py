@@ -179,7 +179,7 @@ def measured(capture: str, kind: str, level: float, steps: int) -> dict[str, Any
         given, rendered, held_out = Tally(), Tally(), Tally()
         for index, view in enumerate(loaded.views):
             true = np.asarray(Image.open((source / "truth" / "masks" / view.name).with_suffix(".png"))).astype(np.int64)
-            found = draw(trainer.model, trainer.scene.camera(index)).ids
+            found = draw(trainer.shown, trainer.scene.camera(index)).ids
             if index in loaded.test_indices:
                 held_out.add(found, true)
             else:

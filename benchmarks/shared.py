@@ -153,7 +153,7 @@ def train_and_measure(trainer: Any, capture: Any, budget: Any) -> dict[str, Any]
         trainer.run(budget, Path(folder), Reporter())
 
     def render(index: int) -> tuple[Any, Any]:
-        picture = draw(trainer.model, trainer.scene.camera(index))
+        picture = draw(trainer.shown, trainer.scene.camera(index))
         return picture.image, picture.ids
 
     quality = evaluate(capture, render, capture.test_indices)["quality"]
@@ -163,7 +163,7 @@ def train_and_measure(trainer: Any, capture: Any, budget: Any) -> dict[str, Any]
         "steps": progress.step,
         "steps_per_second": progress.step / progress.seconds,
         "anchors": len(trainer.model.anchors),
-        "splats": len(trainer.model.generate(eye=np.zeros(3)).source),
+        "splats": len(trainer.shown.generate(eye=np.zeros(3)).source),
     }
 
 

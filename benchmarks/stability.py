@@ -175,8 +175,8 @@ def train(
 
         trainer.step = step  # type: ignore[method-assign]
         trainer.run(Budget(steps=steps), Path(folder) / "checkpoint", Reporter())
-        model = trainer.model
-        numbers = [model.anchors.rows, model.background, *model.heads.parameters()]
+        model, own = trainer.shown, trainer.model
+        numbers = [own.anchors.rows, own.background, *own.heads.parameters(), model.anchors.rows]
         lost += trainer.progress.skipped + sum(int((~t.isfinite()).sum()) for t in numbers)
         shown = [
             psnr(draw(model, trainer.scene.camera(i), want_ids=False).image, capture.image(i))
@@ -247,7 +247,7 @@ def exposure() -> list[Row]:
     def against_photos(images: list[np.ndarray]) -> float:
         return float(np.mean([psnr(image, photo) for image, photo in zip(images, photos, strict=True)]))
 
-    scene, model = varied.trainer.scene, varied.trainer.model
+    scene, model = varied.trainer.scene, varied.trainer.shown
     as_taken = against_photos([scene.capture.image(i) for i in held_out])
     common = against_photos(
         [draw(model, dataclasses.replace(scene.camera(i), gain=(1.0, 1.0, 1.0)), False).image for i in held_out]

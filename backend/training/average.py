@@ -1,8 +1,8 @@
 """The mean of what is trained over the latest steps.
 
-While the rates are high, each step wobbles around a model that is better than any of them (Polyak and Juditsky 1992,
-"Acceleration of stochastic approximation by averaging"): on the plateau, the mean is about as good as what falling
-rates would come to. So it is the mean that an unfinished training shows, measures and leaves when it is stopped.
+With rates that stay high, each step wobbles around a model that is better than any of them (Polyak and Juditsky 1992,
+"Acceleration of stochastic approximation by averaging"). The mean is better than what falling rates come to in as many
+steps, and it is there at any moment: it is what a training shows, measures and leaves, finished or stopped.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..model.object_model import ObjectModel
 
 EVERY = 4
-"""Of so many steps one counts: looking at all rows takes time, and the mean of more is no better."""
+"""One of so many steps counts: looking at all rows takes time, and the mean of more is no better."""
 
 SHARE, LONGEST = 0.1, 100
 """The mean goes back over this share of the steps so far, which may be far off still, and over so many at most."""
@@ -62,12 +62,13 @@ class Average:
         return {_PREFIX + name: value for name, value in values.items()}
 
     @classmethod
-    def from_checkpoint(cls, tensors: Mapping[str, np.ndarray], model: ObjectModel) -> Average | None:
-        """What `tensors` gave, on the device of the model that it follows; None where there is none among them."""
+    def of_checkpoint(cls, tensors: Mapping[str, np.ndarray], model: ObjectModel) -> Average:
+        """What `tensors` gave, on the device of the model that it follows; of the model alone where there is none among
+        them, as in the checkpoints of trainings whose rates fell."""
+        average = cls(model)
         found = {name.removeprefix(_PREFIX): value for name, value in tensors.items() if name.startswith(_PREFIX)}
         if not found:
-            return None
-        average = cls(model)
+            return average
         average._rows.copy_(torch.from_numpy(found.pop("rows").copy()))
         average._background.copy_(torch.from_numpy(found.pop("background").copy()))
         heads = {name.removeprefix("heads."): torch.from_numpy(value.copy()) for name, value in found.items()}

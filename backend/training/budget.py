@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..expectation import PRESET_STEPS
-from .settings import PLATEAU_FROM, PLATEAU_UNTIL
+from .settings import GROW_UNTIL, PLATEAU_FROM
 
 _EVALUATIONS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)
 """Shares of a training whose length is known after which it is measured."""
@@ -28,7 +28,7 @@ JUDGED_FROM = 600
 AHEAD, WORTH = 1000, 0.38
 """The plateau is flat where so many more steps would bring less than so many dB."""
 
-OCTAVES, FEWEST_OCTAVES = 2.0, 1.3
+OCTAVES, FEWEST_OCTAVES = 1.5, 1.0
 """What they would bring is judged by the measurements since there were 2 to the power of this times fewer steps; not by
 those over less than the other power, whose noise hides how the curve goes."""
 
@@ -40,7 +40,7 @@ class Progress:
     last_growth: step of the latest growth. skipped: updates that were not finite, and faults: how many steps met each
     cause of them that was found. queue: views still to come.
     evaluated: how many of the evaluations of a training of known length are behind, or, where the end is open, the
-    step of the latest. settled_from: the step from which the rates fall in a training whose end is open, 0 before.
+    step of the latest. settled_from: the step after which a training whose end is open was found to be flat, 0 before.
     curve: an entry for each evaluation, with seconds, step, loss (dB) and what was measured.
     """
 
@@ -73,25 +73,39 @@ class Budget:
     until_flat: bool = False
 
     def share(self, p: Progress) -> float:
-        """How much of the training is behind, 0 to 1. Where the end is open, it stays on the plateau until
-        `settle`."""
+        """How much of the training is behind, 0 to 1. Where the end is open, it stays on the plateau, where anchors
+        grow, until `settle`."""
         if self.until_flat:
-            if not p.settled_from:
-                return (PLATEAU_FROM + PLATEAU_UNTIL) / 2 if p.step >= WARM_UP else PLATEAU_FROM * p.step / WARM_UP
-            return min(PLATEAU_UNTIL + (1 - PLATEAU_UNTIL) * (p.step - p.settled_from) / self._settling(p), 1.0)
+            if p.settled_from or (self.seconds is not None and p.seconds >= self.seconds):
+                return 1.0
+            return (PLATEAU_FROM + GROW_UNTIL) / 2 if p.step >= WARM_UP else PLATEAU_FROM * p.step / WARM_UP
         if self.steps is not None:
             return min(p.step / self.steps, 1.0)
         assert self.seconds is not None
         return min(p.seconds / self.seconds, 1.0)
 
     def remaining(self, p: Progress, pace: float) -> float | None:
-        """Seconds left, given the seconds a step takes; None where nobody knows yet."""
+        """Seconds left, given the seconds a step takes, about so many where the end is open; None where nobody knows
+        yet."""
         if self.until_flat:
-            return max(p.settled_from + self._settling(p) - p.step, 0) * pace if p.settled_from else None
+            flat = flat_from(p.curve)
+            left = [] if flat is None else [max(flat - p.step, 0) * pace]
+            left += [] if self.seconds is None else [max(self.seconds - p.seconds, 0.0)]
+            return 0.0 if p.settled_from else min(left, default=None)
         if self.steps is not None:
             return max(self.steps - p.step, 0) * pace
         assert self.seconds is not None
         return max(self.seconds - p.seconds, 0.0)
+
+    def behind(self, p: Progress) -> float:
+        """How much of the training is behind for those who wait for it, 0 to 1: where the end is open, `AHEAD` more
+        steps are taken to come as long as nobody knows."""
+        share = self.share(p)
+        if not self.until_flat or share >= 1.0:
+            return share
+        flat = flat_from(p.curve)
+        steps = p.step / (p.step + AHEAD if flat is None else max(flat, p.step + 1))
+        return steps if self.seconds is None else max(steps, p.seconds / self.seconds)
 
     def begin(self, p: Progress) -> None:
         """Take over a training that may have been begun under another budget."""
@@ -112,32 +126,41 @@ class Budget:
         return due
 
     def settle(self, p: Progress) -> bool:
-        """Leave the plateau where it is flat, or where time runs out; whether that is now."""
-        if not self.until_flat or p.settled_from or p.step < WARM_UP:
-            return False
-        out_of_time = self.seconds is not None and p.seconds >= PLATEAU_UNTIL * self.seconds
-        if not out_of_time and not gain_ahead(p.curve) < WORTH:
+        """End a training whose end is open where it is flat; whether that is now."""
+        if not self.until_flat or p.settled_from or p.step < WARM_UP or not gain_ahead(p.curve) < WORTH:
             return False
         p.settled_from = p.step
         return True
 
-    @staticmethod
-    def _settling(p: Progress) -> float:
-        """Steps that the fall of the rates takes."""
-        return (1 - PLATEAU_UNTIL) / PLATEAU_UNTIL * p.settled_from
-
 
 def gain_ahead(curve: list[dict[str, Any]]) -> float:
-    """By how many dB the error would fall in `AHEAD` more steps on the plateau, where it falls with the logarithm of
-    the steps: PSNR on held-out views or, where there are none, the loss. Infinite where the curve tells too little."""
+    """By how many dB the error would fall in `AHEAD` more steps on the plateau. Infinite where the curve tells too
+    little."""
+    slope = _gain_of_an_octave(curve)
+    return math.inf if slope is None else slope * math.log2(1 + AHEAD / curve[-1]["step"])
+
+
+def flat_from(curve: list[dict[str, Any]]) -> float | None:
+    """After how many steps `AHEAD` more will bring less than `WORTH`, as far as the curve tells; None: not at all."""
+    slope = _gain_of_an_octave(curve)
+    if slope is None:
+        return None
+    return AHEAD / (2 ** (WORTH / slope) - 1) if slope > 0 else float(curve[-1]["step"])
+
+
+def _gain_of_an_octave(curve: list[dict[str, Any]]) -> float | None:
+    """By how many dB the error falls in twice the steps, with whose logarithm it falls: PSNR on held-out views or,
+    where there are none, the loss. None where the curve tells too little."""
     last = curve[-1]["step"] if curve else 0
     recent = [entry for entry in curve if entry["step"] >= max(JUDGED_FROM, last / 2**OCTAVES)]
     key = "psnr" if all(entry.get("psnr") is not None for entry in recent) else "loss_db"
     found = [(math.log2(entry["step"]), entry[key]) for entry in recent if entry.get(key) is not None]
     if len(found) < 5 or found[-1][0] - found[0][0] < FEWEST_OCTAVES:
-        return math.inf
-    octaves, quality = zip(*found, strict=True)
-    return float(np.polyfit(octaves, quality, 1)[0]) * math.log2(1 + AHEAD / last)
+        return None
+    octaves, quality = np.array(found).T
+    first, second = np.triu_indices(len(found), 1)
+    # The median of the slopes between any two measurements (Theil and Sen), which a bad one does not tilt.
+    return float(np.median((quality[second] - quality[first]) / (octaves[second] - octaves[first])))
 
 
 PRESETS = {**{name: Budget(steps=steps) for name, steps in PRESET_STEPS.items()}, "final": Budget(until_flat=True)}

@@ -60,7 +60,7 @@ _IN_PARTS = (
     "The GPU's memory is full, so each picture is learned in {parts} parts from here on, and fewer pictures are kept "
     "there; a smaller --max-size or --max-anchors would be faster."
 )
-_FLAT = "More steps no longer make it much better: the rates fall now, from step {steps:,} on"
+_FLAT = "More steps no longer make it much better: it ends after {steps:,} steps"
 _NO_ROOM = (
     "The GPU's memory is too small, even for a sixteenth of a picture at a time; close programs that use it, or try a "
     "smaller --max-size or --max-anchors, or --device cpu."
@@ -188,7 +188,7 @@ class Trainer:
         self._fault: faults.Fault | None = None
         self._to_say: list[str] = []
         self._splats: int | torch.Tensor = 0
-        self._average: Average | None = Average(model)
+        self._average = Average(model)
         model.background.requires_grad_(settings.background == "learned")
         groups: list[dict[str, Any]] = [
             {"params": list(getattr(model.heads, name).parameters()), "name": name, "lr": ends[0]}
@@ -240,9 +240,8 @@ class Trainer:
 
     @property
     def shown(self) -> ObjectModel:
-        """What the training has come to: the mean over its latest steps, or the model itself once it is finished, when
-        steps are so small that one is as good as their mean."""
-        return self.model if self._average is None else self._average.of(self.model)
+        """What the training has come to: the mean over its latest steps."""
+        return self._average.of(self.model)
 
     # --- state on disk -------------------------------------------------------------------------------------------
 
@@ -264,11 +263,10 @@ class Trainer:
             "growth.views": s.views,
             "object_ids": model.object_ids,
             "background": model.background,
+            **self._average.tensors(),
         }
         for name, value in model.heads.state_dict().items():
             tensors[f"heads.{name}"] = value
-        if self._average is not None:
-            tensors |= self._average.tensors()
         for i, state in self._head_optimizer.state_dict()["state"].items():
             for name in ("step", "exp_avg", "exp_avg_sq"):
                 tensors[f"head_adam.{i}.{name}"] = state[name]
@@ -337,7 +335,7 @@ class Trainer:
             if f"head_adam.{i}.step" in tensors
         }
         optimizer.load_state_dict(saved)
-        trainer._average = Average.from_checkpoint(tensors, trainer.model)
+        trainer._average = Average.of_checkpoint(tensors, trainer.model)
         trainer.progress = Progress(**state["progress"])
         return trainer, warning
 
@@ -384,10 +382,6 @@ class Trainer:
         parts = self.parts
         while True:
             p.seconds = before + time.monotonic() - started
-            if budget.share(p) >= 1.0:
-                self._average = None
-            elif self._average is None:
-                self._average = Average(self.model)
             if evaluate is not None and budget.evaluation_is_due(p):
                 self._evaluate(evaluate, reporter, float(smooth))
                 if budget.settle(p):
@@ -435,10 +429,10 @@ class Trainer:
 
     def _report(self, budget: Budget, reporter: Reporter, loss: float, pace: float) -> None:
         p = self.progress
-        share, left = budget.share(p), budget.remaining(p, pace)
+        left = budget.remaining(p, pace)
         latest = p.curve[-1] if p.curve else {}
         reporter.progress(
-            round(share, 5),
+            round(budget.behind(p), 5),
             1.0,
             step=p.step,
             seconds=round(p.seconds, 1),
@@ -474,8 +468,7 @@ class Trainer:
         loss = torch.full((), math.nan, device=self.model.device)
         if learned is not None:
             self._update(learned, share)
-            if self._average is not None:
-                self._average.follow(self.model, p.step)
+            self._average.follow(self.model, p.step)
             loss = learned.loss if learned.sound is None else torch.where(learned.sound, learned.loss, loss)
         before = len(self.model.anchors)
         if self._fault is not None:
@@ -503,8 +496,7 @@ class Trainer:
         kept[fault.hopeless] = False
         a.positions, a.rows, a.ids = a.positions[kept], a.rows[kept], a.ids[kept]
         self._first, self._second = self._first[kept], self._second[kept]
-        if self._average is not None:
-            self._average.take(kept, a.rows[:0])
+        self._average.take(kept, a.rows[:0])
         self._statistics = GrowthStatistics.zeros(len(a), a.layout.offsets, model.device)
 
     def _look_out(self) -> None:
@@ -696,8 +688,7 @@ class Trainer:
             return torch.cat([moments[growth.kept], moments.new_zeros((growth.added, moments.shape[1]))])
 
         self._first, self._second = follow(self._first), follow(self._second)
-        if self._average is not None:
-            self._average.take(growth.kept, anchors.rows[len(anchors) - growth.added :])
+        self._average.take(growth.kept, anchors.rows[len(anchors) - growth.added :])
         self._statistics = self._statistics.after(growth, anchors.layout.offsets)
 
 
@@ -733,8 +724,7 @@ def load_model(folder: Path, place: torch.device = device.CPU) -> tuple[ObjectMo
         raise InputError(f"{folder} holds no checkpoint; train first.")
     tensors, state, warning = found
     model = model_from_checkpoint(tensors, state)
-    average = Average.from_checkpoint(tensors, model)
-    return (model if average is None else average.of(model)).to(place), state, warning
+    return Average.of_checkpoint(tensors, model).of(model).to(place), state, warning
 
 
 def progress_of(state: dict[str, Any]) -> Progress:
