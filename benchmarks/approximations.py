@@ -690,8 +690,8 @@ def _raster_row(row: Mapping[str, Any]) -> list[str]:
     of_sets = row["times_default_of_sets"]
     spread = f" ({min(of_sets):.2f}-{max(of_sets):.2f})" if min(of_sets) < max(of_sets) else ""
     return [
-        f"{row['step_ms']:.1f}", f"{row['times_default']:.2f}{spread}", f"{row['picture']:.3g}", f"{row['largest']:.3g}",
-        f"{row['gradient']:.3g}",
+        f"{row['step_ms']:.1f}", f"{row['times_default']:.2f}{spread}", f"{row['picture']:.3g}",
+        f"{row['largest']:.3g}", f"{row['gradient']:.3g}",
     ]  # fmt: skip
 
 

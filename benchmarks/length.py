@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import functools
 import json
+import statistics
 import sys
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,9 @@ PRESETS = ("preview", "standard", "final")
 STEPS = (150, 300, 600, 1000, 1500)
 OPEN_END = "final"
 """Its meshes are measured, too."""
+SEEDS = 2
+"""It and the longest are compared by their means over so many seeds: trainings that differ in nothing else are 0.1 dB
+and more apart."""
 
 _COLUMNS = (
     ("train_seconds", "seconds", "{:.0f}"), ("steps", "steps", "{:,}"), ("psnr", "PSNR", "{:.2f} dB"),
@@ -52,7 +56,7 @@ def main() -> None:
         return
     capture = options.capture.resolve()
     made_from = shared.digest(shared.sources(), str(capture))
-    results = shared.Results(ROOT / "build" / "length", made_from, len(SECONDS) + len(PRESETS))
+    results = shared.Results(ROOT / "build" / "length", made_from, len(SECONDS) + len(PRESETS) + 2 * (SEEDS - 1))
 
     def get(name: str, *words: object, meshes: bool) -> dict[str, Any]:
         return results.get(
@@ -62,9 +66,14 @@ def main() -> None:
 
     found = {f"{seconds} s": get(f"{seconds} s", "--minutes", seconds / 60, meshes=True) for seconds in SECONDS}
     found |= {preset: get(preset, "--preset", preset, meshes=preset == OPEN_END) for preset in PRESETS}
+    longest = f"{SECONDS[-1]} s", "--minutes", SECONDS[-1] / 60
+    compared = [
+        [found[name], *(get(f"{name}, seed {seed}", *words, "--seed", seed, meshes=False) for seed in range(1, SEEDS))]
+        for name, *words in (longest, (OPEN_END, "--preset", OPEN_END))
+    ]
     if results.failures:
         sys.exit("\n".join(f"{name}: {why}" for name, why in results.failures.items()))
-    lines = table(found)
+    lines = [*table(found), "", comparison(*compared)]
     if options.write:
         (ROOT / "docs" / "length.md").write_text("\n".join(lines) + "\n")
         shared.save_figure(plot(found), ROOT / "docs" / "error-over-time.png")
@@ -92,20 +101,27 @@ def shortfalls(captures: list[Path]) -> dict[str, dict[str, float]]:
 
 
 def table(found: dict[str, dict[str, Any]]) -> list[str]:
-    """The Markdown table, and how the open end compares with the longest training."""
+    """The Markdown table."""
 
     def cells(row: dict[str, Any]) -> list[str]:
         return ["" if row[key] is None else form.format(row[key]) for key, _, form in _COLUMNS]
 
     head = ("training", *(title for _, title, _ in _COLUMNS))
-    lines = shared.table(head, ((name, *cells(row)) for name, row in found.items()))
-    longest, end = found[f"{SECONDS[-1]} s"], found[OPEN_END]
-    lines += [
-        "",
-        f"Until it stops improving: {end['train_seconds'] / longest['train_seconds']:.2f} times as long as the "
-        f"{SECONDS[-1]} s, {end['psnr'] - longest['psnr']:+.2f} dB.",
-    ]
-    return lines
+    return shared.table(head, ((name, *cells(row)) for name, row in found.items()))
+
+
+def comparison(longest: list[dict[str, Any]], ends: list[dict[str, Any]]) -> str:
+    """How trainings with an open end compare with the longest ones, each of several seeds."""
+
+    def mean(rows: list[dict[str, Any]], key: str) -> float:
+        return statistics.fmean(row[key] for row in rows)
+
+    of_each = (f"{end['psnr']:.2f} against {other['psnr']:.2f}" for end, other in zip(ends, longest, strict=True))
+    times = mean(ends, "train_seconds") / mean(longest, "train_seconds")
+    return (
+        f"Until it stops improving: {times:.2f} times as long as the {SECONDS[-1]} s, "
+        f"{mean(ends, 'psnr') - mean(longest, 'psnr'):+.2f} dB (means over {len(ends)} seeds: {', '.join(of_each)})."
+    )
 
 
 def plot(found: dict[str, dict[str, Any]]) -> Any:

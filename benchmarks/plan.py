@@ -362,8 +362,8 @@ def section_of_surplus(capture: Capture, steps: int) -> tuple[dict[str, Any], li
     trainings = surplus_of(capture, steps)
     lines = [
         heading(3, f"{capture.name}, with more than it needs"), "",
-        "About as many photos again, half of them the same ones as JPEG and half of nothing that was reconstructed, and "
-        f"{plan_captures.UNSEEN:.0%} more points that no photo shows.", "",
+        "About as many photos again, half of them the same ones as JPEG and half of nothing that was reconstructed, "
+        f"and {plan_captures.UNSEEN:.0%} more points that no photo shows.", "",
         *rows_of(_COLUMNS, trainings), "", verdict(trainings), "",
     ]  # fmt: skip
     return {"surplus": trainings}, lines

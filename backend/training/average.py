@@ -46,8 +46,8 @@ class Average:
             mean.lerp_(parameter.detach(), weight)
 
     def take(self, kept: torch.Tensor, new: torch.Tensor) -> None:
-        """Follow a change of the anchors: of the rows so far those of `kept` (mask or indices), then `new` (n, columns),
-        which begin as they are."""
+        """Follow a change of the anchors: of the rows so far those that are `kept` (a mask, or indices), then `new`
+        (n, columns), which begin as they are."""
         self._rows = torch.cat([self._rows[kept], new])
 
     def of(self, model: ObjectModel) -> ObjectModel:
