@@ -1,8 +1,8 @@
 """The mean of what is trained over the latest steps.
 
-With rates that stay high, each step wobbles around a model that is better than any of them (Polyak and Juditsky 1992,
-"Acceleration of stochastic approximation by averaging"). The mean is better than what falling rates come to in as many
-steps, and it is there at any moment: it is what a training shows, measures and leaves, finished or stopped.
+While the rates are high, each step wobbles around a model that is better than any of them (Polyak and Juditsky 1992,
+"Acceleration of stochastic approximation by averaging"): on the plateau, the mean is about as good as what falling
+rates would come to, and it is there at any moment. It is what a training shows, measures and leaves, finished or not.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Average:
     @classmethod
     def of_checkpoint(cls, tensors: Mapping[str, np.ndarray], model: ObjectModel) -> Average:
         """What `tensors` gave, on the device of the model that it follows; of the model alone where there is none among
-        them, as in the checkpoints of trainings whose rates fell."""
+        them, as in the checkpoints of versions without a mean."""
         average = cls(model)
         found = {name.removeprefix(_PREFIX): value for name, value in tensors.items() if name.startswith(_PREFIX)}
         if not found:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..expectation import PRESET_STEPS
-from .settings import GROW_UNTIL, PLATEAU_FROM
+from .settings import PLATEAU_FROM, PLATEAU_UNTIL
 
 _EVALUATIONS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)
 """Shares of a training whose length is known after which it is measured."""
@@ -25,7 +25,7 @@ WARM_UP = 300
 JUDGED_FROM = 600
 """Before so many steps the error falls faster than it will."""
 
-AHEAD, WORTH = 1000, 0.38
+AHEAD, WORTH = 1000, 0.45
 """The plateau is flat where so many more steps would bring less than so many dB."""
 
 OCTAVES, FEWEST_OCTAVES = 1.5, 1.0
@@ -40,7 +40,7 @@ class Progress:
     last_growth: step of the latest growth. skipped: updates that were not finite, and faults: how many steps met each
     cause of them that was found. queue: views still to come.
     evaluated: how many of the evaluations of a training of known length are behind, or, where the end is open, the
-    step of the latest. settled_from: the step after which a training whose end is open was found to be flat, 0 before.
+    step of the latest. settled_from: the step from which the rates fall in a training whose end is open, 0 before.
     curve: an entry for each evaluation, with seconds, step, loss (dB) and what was measured.
     """
 
@@ -73,12 +73,12 @@ class Budget:
     until_flat: bool = False
 
     def share(self, p: Progress) -> float:
-        """How much of the training is behind, 0 to 1. Where the end is open, it stays on the plateau, where anchors
-        grow, until `settle`."""
+        """How much of the training is behind, 0 to 1. Where the end is open, it stays on the plateau until
+        `settle`."""
         if self.until_flat:
-            if p.settled_from or (self.seconds is not None and p.seconds >= self.seconds):
-                return 1.0
-            return (PLATEAU_FROM + GROW_UNTIL) / 2 if p.step >= WARM_UP else PLATEAU_FROM * p.step / WARM_UP
+            if not p.settled_from:
+                return (PLATEAU_FROM + PLATEAU_UNTIL) / 2 if p.step >= WARM_UP else PLATEAU_FROM * p.step / WARM_UP
+            return min(PLATEAU_UNTIL * p.step / p.settled_from, 1.0)
         if self.steps is not None:
             return min(p.step / self.steps, 1.0)
         assert self.seconds is not None
@@ -88,10 +88,10 @@ class Budget:
         """Seconds left, given the seconds a step takes, about so many where the end is open; None where nobody knows
         yet."""
         if self.until_flat:
-            flat = flat_from(p.curve)
-            left = [] if flat is None else [max(flat - p.step, 0) * pace]
-            left += [] if self.seconds is None else [max(self.seconds - p.seconds, 0.0)]
-            return 0.0 if p.settled_from else min(left, default=None)
+            end = expected_end(p)
+            left = [] if end is None else [max(end - p.step, 0) * pace]
+            left += [] if self.seconds is None or p.settled_from else [max(self.seconds - p.seconds, 0.0)]
+            return min(left, default=None)
         if self.steps is not None:
             return max(self.steps - p.step, 0) * pace
         assert self.seconds is not None
@@ -103,9 +103,9 @@ class Budget:
         share = self.share(p)
         if not self.until_flat or share >= 1.0:
             return share
-        flat = flat_from(p.curve)
-        steps = p.step / (p.step + AHEAD if flat is None else max(flat, p.step + 1))
-        return steps if self.seconds is None else max(steps, p.seconds / self.seconds)
+        end = expected_end(p)
+        steps = p.step / (p.step + AHEAD if end is None else max(end, p.step + 1))
+        return steps if self.seconds is None else min(max(steps, p.seconds / self.seconds), 1.0)
 
     def begin(self, p: Progress) -> None:
         """Take over a training that may have been begun under another budget."""
@@ -126,11 +126,22 @@ class Budget:
         return due
 
     def settle(self, p: Progress) -> bool:
-        """End a training whose end is open where it is flat; whether that is now."""
-        if not self.until_flat or p.settled_from or p.step < WARM_UP or not gain_ahead(p.curve) < WORTH:
+        """Leave the plateau where it is flat, or where time runs out; whether that is now."""
+        if not self.until_flat or p.settled_from or p.step < WARM_UP:
+            return False
+        out_of_time = self.seconds is not None and p.seconds >= PLATEAU_UNTIL * self.seconds
+        if not out_of_time and not gain_ahead(p.curve) < WORTH:
             return False
         p.settled_from = p.step
         return True
+
+
+def expected_end(p: Progress) -> float | None:
+    """After how many steps a training whose end is open will be over; None as long as nobody knows."""
+    if p.settled_from:
+        return p.settled_from / PLATEAU_UNTIL
+    flat = flat_from(p.curve)
+    return None if flat is None else max(flat, p.step) / PLATEAU_UNTIL
 
 
 def gain_ahead(curve: list[dict[str, Any]]) -> float:

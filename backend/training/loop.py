@@ -60,7 +60,7 @@ _IN_PARTS = (
     "The GPU's memory is full, so each picture is learned in {parts} parts from here on, and fewer pictures are kept "
     "there; a smaller --max-size or --max-anchors would be faster."
 )
-_FLAT = "More steps no longer make it much better: it ends after {steps:,} steps"
+_FLAT = "More steps no longer make it much better: the rates fall now, from step {steps:,} on"
 _NO_ROOM = (
     "The GPU's memory is too small, even for a sixteenth of a picture at a time; close programs that use it, or try a "
     "smaller --max-size or --max-anchors, or --device cpu."

@@ -1,4 +1,4 @@
-"""What a training can be told, and how its rates go."""
+"""What a training can be told, and how its rates fall as it goes on."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def rest_is_taught(point_ids: np.ndarray) -> bool:
     return bool((np.asarray(point_ids) == 0).mean() >= REST_FROM)
 
 
-GROW_FROM, GROW_UNTIL = 0.1, 0.8
+GROW_FROM, GROW_UNTIL = 0.1, 0.6
 """Growth runs between these shares of the training; its statistics start half way to the first."""
 
 _GROW_OFTEN, _GROW_SELDOM, _GROW_PART = 25, 100, 0.02
@@ -75,36 +75,36 @@ def growth_interval(step: int) -> int:
     return int(min(max(_GROW_OFTEN, _GROW_PART * step), _GROW_SELDOM))
 
 
-PLATEAU_FROM = 0.2
-"""From this share of the training on the rates hardly fall any more: the mean over the latest steps is better than what
-comes of rates that do."""
-_FALLEN = 0.83
-"""How far the rates have fallen there, 0 (not at all) to 1."""
+PLATEAU_FROM, PLATEAU_UNTIL = 0.2, 0.8
+"""Between these shares of the training the rates hardly fall. Most is learned there; the fall after it settles what has
+been learned."""
+_FALLEN = {PLATEAU_FROM: 0.25, PLATEAU_UNTIL: 0.3}
+"""How far the rates have fallen at both ends of the plateau, 0 (not at all) to 1."""
 
 SURFACE_FROM = 0.25
 """Share of the training from which on discs are taught normals and depth: before, there is no surface yet."""
 
 _ROW_RATES = {
-    "offset_columns": (4e-2, 1e-2),
-    "extent_columns": (2.8e-2, 1.4e-2),
-    "feature_columns": (3e-2, 1.5e-2),
-    "opacity_columns": (8e-2, 4e-2),
-    "shape_columns": (4e-2, 2e-2),
-    "color_columns": (4e-2, 2e-2),
+    "offset_columns": (4e-2, 4e-4),
+    "extent_columns": (2.8e-2, 2.8e-3),
+    "feature_columns": (3e-2, 3e-3),
+    "opacity_columns": (8e-2, 8e-3),
+    "shape_columns": (4e-2, 4e-3),
+    "color_columns": (4e-2, 4e-3),
 }
 HEAD_RATES = {
-    "hidden": (4e-3, 1.3e-3),
-    "opacity": (2e-3, 5e-4),
-    "shape": (4e-3, 1.3e-3),
-    "color": (8e-3, 1.7e-3),
-    "background": (1e-2, 2.5e-3),
+    "hidden": (4e-3, 1e-4),
+    "opacity": (2e-3, 2e-5),
+    "shape": (4e-3, 1e-4),
+    "color": (8e-3, 5e-5),
+    "background": (1e-2, 1e-4),
 }
 
 
 def rate(ends: tuple[float, float], share: float) -> float:
-    """Learning rate after a share (0 to 1) of the training: from the first end to the last, exponential before the
-    plateau and on it."""
-    fallen = np.interp(share, [0.0, PLATEAU_FROM, 1.0], [0.0, _FALLEN, 1.0])
+    """Learning rate after a share (0 to 1) of the training: from the first end to the last, exponential before and
+    after the plateau and on it."""
+    fallen = np.interp(share, [0.0, *_FALLEN, 1.0], [0.0, *_FALLEN.values(), 1.0])
     return float(ends[0] * (ends[1] / ends[0]) ** fallen)
 
 
