@@ -113,7 +113,7 @@ def test_remaining_is_unknown_until_the_curve_tells():
     p, final = Progress(step=1000, seconds=50.0), PRESETS["final"]
     assert final.remaining(p, 0.05) is None and final.behind(p) == 1000 / (1000 + AHEAD)
     assert Budget(seconds=80.0, until_flat=True).remaining(p, 0.05) == pytest.approx(30.0)
-    p.curve = curve_of(range(JUDGED_FROM, 1400, 100), lambda step: math.log2(step))
+    p.curve = curve_of(range(JUDGED_FROM, 1600, 100), lambda step: math.log2(step))
     end = AHEAD / (2**WORTH - 1) / PLATEAU_UNTIL
     assert final.remaining(p, 0.05) == pytest.approx((end - 1000) * 0.05)
     assert final.behind(p) == pytest.approx(1000 / end)
