@@ -381,6 +381,7 @@ def main() -> None:
     words = sys.argv[1:]
     own, extra = (words[: words.index("--")], words[words.index("--") + 1 :]) if "--" in words else (words, [])
     options = parser.parse_args(own)
+    shared.compile_everything()
     surplus = {path.resolve() for path in options.surplus}
     found: dict[str, Any] = {}
     lines = [
