@@ -75,7 +75,7 @@ reconstruction folder. `train` does this by itself where it is not done yet.
 _TRAIN = """\
 Make the splats. Leaves splats.ply, which splat viewers and Blender read, a
 checkpoint to go on from, and previews/, which show how it looks now.
-Stopped at any moment, it leaves them about as good as if it had been meant to end there.
+Stopped, it leaves what it has come to, the mean over its latest steps.
 Run again with more --minutes or --steps, it goes on where it stopped.
 """
 

@@ -1,8 +1,8 @@
 """The mean of what is trained over the latest steps.
 
 While the rates are high, each step wobbles around a model that is better than any of them (Polyak and Juditsky 1992,
-"Acceleration of stochastic approximation by averaging"): on the plateau, the mean is about as good as what falling
-rates would come to, and it is there at any moment. It is what a training shows, measures and leaves, finished or not.
+"Acceleration of stochastic approximation by averaging"), and the mean is there at any moment. It is what a training
+shows, measures and leaves, finished or not. Rates that fall are still needed: without, flat splats come out worse.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..model.object_model import ObjectModel
 
 EVERY = 4
-"""One of so many steps counts: looking at all rows takes time, and the mean of more is no better."""
+"""One of so many steps counts: looking at all rows takes time."""
 
 SHARE, LONGEST = 0.1, 100
 """The mean goes back over this share of the steps so far, which may be far off still, and over so many at most."""

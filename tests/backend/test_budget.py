@@ -94,9 +94,14 @@ def test_it_ends_where_more_steps_are_not_worth_it():
 def test_noise_of_the_measurements_moves_the_end_little():
     rng = np.random.default_rng(0)
     where = AHEAD / (2 ** (WORTH / 0.6) - 1)
-    for _ in range(20):
-        end = walk(PRESETS["final"], lambda step: 30 + 0.6 * math.log2(step + 1) + rng.normal(0, 0.05), longest=20_000)
-        assert 0.7 * where < end.settled_from < 1.4 * where
+    for noise, times in ((0.05, 1.4), (0.2, 2.0)):
+        for _ in range(20):
+            end = walk(
+                PRESETS["final"],
+                lambda step, noise=noise: 30 + 0.6 * math.log2(step + 1) + rng.normal(0, noise),
+                longest=20_000,
+            )
+            assert where / times < end.settled_from < times * where
 
 
 def test_a_flat_curve_is_not_ended_before_the_warm_up():

@@ -286,7 +286,7 @@ def quality(trainer):
     capture = trainer.scene.capture
     found, right = [], []
     for index in capture.train_indices:
-        picture = draw(trainer.model, trainer.scene.camera(index))
+        picture = draw(trainer.shown, trainer.scene.camera(index))
         truth = capture.mask(index)
         found.append(psnr(picture.image, capture.image(index) / 255.0))
         right.append((picture.ids[truth > 0] == truth[truth > 0]).mean())

@@ -146,7 +146,7 @@ def quality(trainer):
     capture = trainer.scene.capture
     squares, right = [], []
     for index in capture.test_indices:
-        picture = draw(trainer.model, trainer.scene.camera(index))
+        picture = draw(trainer.shown, trainer.scene.camera(index))
         truth = capture.mask(index)
         squares.append(((picture.image - capture.image(index) / 255.0) ** 2).mean())
         right.append((picture.ids[truth > 0] == truth[truth > 0]).mean())
