@@ -25,12 +25,16 @@ WARM_UP = 300
 JUDGED_FROM = 600
 """Before so many steps the error falls faster than it will."""
 
-AHEAD, WORTH = 1000, 0.44
+AHEAD, WORTH = 1000, 0.37
 """The plateau is flat where so many more steps would bring less than so many dB."""
 
 OCTAVES, FEWEST_OCTAVES = 1.5, 1.25
 """What they would bring is judged by the measurements since there were 2 to the power of this times fewer steps; not by
 those over less than the other power, whose noise hides how the curve goes."""
+
+SETTLING_FROM = 0.9
+"""A training whose end is open leaves the plateau after this share of its steps, later than others: what it has come to
+on the plateau is as good as with rates that fall sooner, in as many steps."""
 
 
 @dataclass
@@ -78,7 +82,8 @@ class Budget:
         if self.until_flat:
             if not p.settled_from:
                 return (PLATEAU_FROM + PLATEAU_UNTIL) / 2 if p.step >= WARM_UP else PLATEAU_FROM * p.step / WARM_UP
-            return min(PLATEAU_UNTIL * p.step / p.settled_from, 1.0)
+            settling = (p.step - p.settled_from) / (p.settled_from / SETTLING_FROM - p.settled_from)
+            return min(PLATEAU_UNTIL + (1 - PLATEAU_UNTIL) * settling, 1.0)
         if self.steps is not None:
             return min(p.step / self.steps, 1.0)
         assert self.seconds is not None
@@ -117,7 +122,7 @@ class Budget:
         if self.until_flat:
             times = _EVALUATE_EARLY if p.step < JUDGED_FROM else _EVALUATE_EVERY
             due = p.step >= max(_EVALUATE_AFTER, times * p.evaluated)
-            due = due or (share >= 1.0 and p.step > p.evaluated)
+            due = due or self._out_of_time(p) or (share >= 1.0 and p.step > p.evaluated)
             behind = p.step if due else p.evaluated
         else:
             behind = bisect_right(_EVALUATIONS, share)
@@ -129,34 +134,36 @@ class Budget:
         """Leave the plateau where it is flat, or where time runs out; whether that is now."""
         if not self.until_flat or p.settled_from or p.step < WARM_UP:
             return False
-        out_of_time = self.seconds is not None and p.seconds >= PLATEAU_UNTIL * self.seconds
-        if not out_of_time and not gain_ahead(p.curve) < WORTH:
+        flat = flat_from(p.curve)
+        if not self._out_of_time(p) and (flat is None or p.step < flat):
             return False
         p.settled_from = p.step
         return True
+
+    def _out_of_time(self, p: Progress) -> bool:
+        """Whether the plateau has to be left now for the training to end in time."""
+        if self.seconds is None or p.settled_from or p.step < WARM_UP:
+            return False
+        return p.seconds >= SETTLING_FROM * self.seconds
 
 
 def expected_end(p: Progress) -> float | None:
     """After how many steps a training whose end is open will be over; None as long as nobody knows."""
     if p.settled_from:
-        return p.settled_from / PLATEAU_UNTIL
+        return p.settled_from / SETTLING_FROM
     flat = flat_from(p.curve)
-    return None if flat is None else max(flat, p.step) / PLATEAU_UNTIL
-
-
-def gain_ahead(curve: list[dict[str, Any]]) -> float:
-    """By how many dB the error would fall in `AHEAD` more steps on the plateau. Infinite where the curve tells too
-    little."""
-    slope = _gain_of_an_octave(curve)
-    return math.inf if slope is None else slope * math.log2(1 + AHEAD / curve[-1]["step"])
+    return None if flat is None else max(flat, p.step) / SETTLING_FROM
 
 
 def flat_from(curve: list[dict[str, Any]]) -> float | None:
-    """After how many steps `AHEAD` more will bring less than `WORTH`, as far as the curve tells; None: not at all."""
-    slope = _gain_of_an_octave(curve)
-    if slope is None:
+    """After how many steps on the plateau `AHEAD` more bring less than `WORTH`, where an octave brings the same as it
+    did of late: n such that octave * log2(1 + AHEAD / n) = WORTH, 0 where it brings nothing. None where the curve tells
+    too little."""
+    octave = _gain_of_an_octave(curve)
+    if octave is None:
         return None
-    return AHEAD / (2 ** (WORTH / slope) - 1) if slope > 0 else float(curve[-1]["step"])
+    # An octave that brings next to nothing is one that brings nothing.
+    return AHEAD / (2 ** (WORTH / octave) - 1) if octave > WORTH / 100 else 0.0
 
 
 def _gain_of_an_octave(curve: list[dict[str, Any]]) -> float | None:

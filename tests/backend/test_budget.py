@@ -10,12 +10,12 @@ from backend.training.budget import (
     JUDGED_FROM,
     OCTAVES,
     PRESETS,
+    SETTLING_FROM,
     WARM_UP,
     WORTH,
     Budget,
     Progress,
     flat_from,
-    gain_ahead,
 )
 from backend.training.settings import PLATEAU_FROM, PLATEAU_UNTIL, rate
 
@@ -43,34 +43,43 @@ def walk(budget, psnr, longest=100_000, seconds_a_step=0.05):
     return p
 
 
-def test_the_gain_ahead_follows_the_logarithm_of_the_steps():
+def flat_at(octave):
+    """After how many steps more are not worth it where twice the steps bring so many dB."""
+    return AHEAD / (2 ** (WORTH / octave) - 1)
+
+
+def test_where_it_is_flat_follows_the_logarithm_of_the_steps():
     steps = range(JUDGED_FROM, 4100, 100)
-    ahead = math.log2(1 + AHEAD / steps[-1])
-    assert gain_ahead(curve_of(steps, lambda s: 20 + 0.7 * math.log2(s))) == pytest.approx(0.7 * ahead)
+    assert flat_from(curve_of(steps, lambda s: 20 + 0.7 * math.log2(s))) == pytest.approx(flat_at(0.7))
     # What came before the latest octaves does not matter, nor what came before it is judged.
     late = curve_of(steps, lambda s: 30.0 if s >= steps[-1] / 2**OCTAVES else 0.0)
-    assert gain_ahead(late) == pytest.approx(0.0, abs=1e-9)
+    assert flat_from(late) == 0.0
     early = curve_of(range(100, 3 * JUDGED_FROM + 1, 100), lambda s: 30.0 if s >= JUDGED_FROM else 0.0)
-    assert gain_ahead(early) == pytest.approx(0.0, abs=1e-9)
+    assert flat_from(early) == 0.0
+
+
+@pytest.mark.parametrize("octave", [1e-9, 1e-3, 0.0, -1e-9, -1.0])
+def test_what_hardly_rises_is_flat(octave):
+    assert flat_from(curve_of(range(JUDGED_FROM, 4100, 100), lambda s: 30 + octave * math.log2(s))) < 1
 
 
 def test_too_little_to_judge_is_not_flat():
-    assert gain_ahead([]) == math.inf
-    assert gain_ahead(curve_of([900, 950, 1000, 1010, 1020], lambda s: 30.0)) == math.inf
-    assert gain_ahead(curve_of([700, 2000], lambda s: 30.0)) == math.inf
+    assert flat_from([]) is None
+    assert flat_from(curve_of([900, 950, 1000, 1010, 1020], lambda s: 30.0)) is None
+    assert flat_from(curve_of([700, 2000], lambda s: 30.0)) is None
 
 
 def test_without_held_out_views_the_loss_decides():
     steps = range(JUDGED_FROM, 3 * JUDGED_FROM, 100)
     entries = [{"step": s, "psnr": None, "loss_db": 10 + 2 * math.log2(s)} for s in steps]
-    assert gain_ahead(entries) == pytest.approx(2.0 * math.log2(1 + AHEAD / steps[-1]))
+    assert flat_from(entries) == pytest.approx(flat_at(2.0))
 
 
 def test_a_curve_that_flattens_ends_the_training_soon_after():
     flat = 3000
     end = walk(PRESETS["final"], lambda step: 20 + 3 * math.log2(min(step, flat) + 1))
     assert flat < end.settled_from < 2.5 * flat
-    assert end.step == pytest.approx(end.settled_from / PLATEAU_UNTIL, abs=2)
+    assert end.step == pytest.approx(end.settled_from / SETTLING_FROM, abs=2)
     assert end.curve[-1]["step"] == end.step
 
 
@@ -78,12 +87,11 @@ def test_one_bad_measurement_does_not_end_a_rising_curve():
     def psnr(step):
         return 20 + 2 * math.log2(step + 1) - 5 * (3000 < step < 3200)
 
-    flat = AHEAD / (2 ** (WORTH / 2) - 1)
-    assert walk(PRESETS["final"], psnr, longest=int(0.95 * flat)).settled_from == 0
+    assert walk(PRESETS["final"], psnr, longest=int(0.95 * flat_at(2.0))).settled_from == 0
 
 
 def test_it_ends_where_more_steps_are_not_worth_it():
-    where = AHEAD / (2**WORTH - 1)
+    where = flat_at(1.0)
     known = curve_of(range(JUDGED_FROM, 2000, 100), lambda step: math.log2(step))
     assert flat_from(known) == pytest.approx(where)
     settled = walk(PRESETS["final"], lambda step: math.log2(step + 1), longest=20_000).settled_from
@@ -93,7 +101,7 @@ def test_it_ends_where_more_steps_are_not_worth_it():
 
 def test_noise_of_the_measurements_moves_the_end_little():
     rng = np.random.default_rng(0)
-    where = AHEAD / (2 ** (WORTH / 0.6) - 1)
+    where = flat_at(0.6)
     for noise, times in ((0.05, 1.4), (0.2, 2.0)):
         for _ in range(20):
             end = walk(
@@ -110,7 +118,7 @@ def test_a_flat_curve_is_not_ended_before_the_warm_up():
 
 def test_an_open_end_has_a_most():
     end = walk(Budget(seconds=100.0, until_flat=True), lambda step: math.log2(step + 1))
-    assert 0.9 * 100 < end.seconds < 1.1 * 100
+    assert end.seconds == pytest.approx(100, rel=0.001)
     assert end.settled_from
 
 
@@ -119,13 +127,14 @@ def test_remaining_is_unknown_until_the_curve_tells():
     assert final.remaining(p, 0.05) is None and final.behind(p) == 1000 / (1000 + AHEAD)
     assert Budget(seconds=80.0, until_flat=True).remaining(p, 0.05) == pytest.approx(30.0)
     p.curve = curve_of(range(JUDGED_FROM, 1600, 100), lambda step: math.log2(step))
-    end = AHEAD / (2**WORTH - 1) / PLATEAU_UNTIL
+    end = flat_at(1.0) / SETTLING_FROM
     assert final.remaining(p, 0.05) == pytest.approx((end - 1000) * 0.05)
     assert final.behind(p) == pytest.approx(1000 / end)
     p.settled_from = 960
-    assert final.remaining(p, 0.05) == pytest.approx((960 / PLATEAU_UNTIL - 1000) * 0.05)
+    assert final.remaining(p, 0.05) == pytest.approx((960 / SETTLING_FROM - 1000) * 0.05)
     falling = Progress(step=2000, curve=curve_of(range(JUDGED_FROM, 2000, 100), lambda step: -step))
-    assert final.remaining(falling, 0.05) == pytest.approx(500 * 0.05) and final.behind(falling) == PLATEAU_UNTIL
+    assert final.remaining(falling, 0.05) == pytest.approx((2000 / SETTLING_FROM - 2000) * 0.05)
+    assert final.behind(falling) == SETTLING_FROM
     assert Budget(steps=3000).remaining(p, 0.05) == pytest.approx(100.0)
     assert Budget(seconds=80.0).remaining(p, 0.05) == pytest.approx(30.0)
 
