@@ -9,6 +9,7 @@ cells is what it does, and only what asks for one travels, not the anchors' rows
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -161,12 +162,13 @@ def grow_and_prune(
         here = gradient[wanted] >= threshold * 2.0**level
         keys = cell_keys(means[here], cell)
         taken = cell_keys(np.concatenate(occupied_by), cell)
-        free = ~_isin_rows(keys, taken)
+        cells = _numbered(np.concatenate([taken, keys]))
+        free = ~np.isin(cells[len(taken) :], cells[: len(taken)])
         index = np.flatnonzero(here)[free]
-        keys = keys[free]
+        keys, cells = keys[free], cells[len(taken) :][free]
         # The largest accumulated gradient first; ties by index, so that a seed fixes everything.
         order = np.lexsort((index, -summed[wanted[index]]))
-        _, first = np.unique(keys[order], axis=0, return_index=True)
+        _, first = np.unique(cells[order], return_index=True)
         chosen = order[np.sort(first)][: max(room, 0)]
         room -= len(chosen)
         found = (keys[chosen] * cell).astype(np.float32)
@@ -194,11 +196,10 @@ def grow_and_prune(
     return Growth(kept, len(child), pruned)
 
 
-def _isin_rows(rows: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Which rows (n, 3) int64 occur among others (m, 3)."""
-    everything = np.concatenate([others, rows])
-    _, inverse = np.unique(everything, axis=0, return_inverse=True)
-    inverse = inverse.reshape(-1)
-    present = np.zeros(inverse.max(initial=-1) + 1, np.bool_)
-    present[inverse[: len(others)]] = True
-    return present[inverse[len(others) :]]
+def _numbered(rows: np.ndarray) -> np.ndarray:
+    """(n,) int64: a number for each of the rows (n, 3) int64, the same for those that are equal and only for them."""
+    low, high = rows.min(0, initial=0), rows.max(0, initial=0)
+    spans = [int(last) - int(first) + 1 for first, last in zip(low, high, strict=True)]
+    if math.prod(spans) >= 2**63:
+        return np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)
+    return (rows - low) @ np.array([spans[1] * spans[2], spans[2], 1], np.int64)

@@ -19,11 +19,9 @@ _EVALUATE_AFTER, _EVALUATE_EARLY, _EVALUATE_EVERY = 100, 1.3, 1.08
 """One whose end is open is measured after so many steps, and whenever there are so many times as many: at first, and
 where the measurements decide."""
 
-WARM_UP = 300
-"""Steps until the plateau of a training whose end is open: large scenes differ in how long they stay there."""
-
-JUDGED_FROM = 600
-"""Before so many steps the error falls faster than it will."""
+WARM_UP = 600
+"""Steps until the plateau of a training whose end is open: large scenes differ in how long they stay there. Before, the
+error falls faster than it will. Anchors that grow sooner become more and no better."""
 
 AHEAD, WORTH = 1000, 0.37
 """The plateau is flat where so many more steps would bring less than so many dB."""
@@ -120,7 +118,7 @@ class Budget:
         """Whether it is time to measure; says so once."""
         share = self.share(p)
         if self.until_flat:
-            times = _EVALUATE_EARLY if p.step < JUDGED_FROM else _EVALUATE_EVERY
+            times = _EVALUATE_EARLY if p.step < WARM_UP else _EVALUATE_EVERY
             due = p.step >= max(_EVALUATE_AFTER, times * p.evaluated)
             due = due or self._out_of_time(p) or (share >= 1.0 and p.step > p.evaluated)
             behind = p.step if due else p.evaluated
@@ -170,7 +168,7 @@ def _gain_of_an_octave(curve: list[dict[str, Any]]) -> float | None:
     """By how many dB the error falls in twice the steps, with whose logarithm it falls: PSNR on held-out views or,
     where there are none, the loss. None where the curve tells too little."""
     last = curve[-1]["step"] if curve else 0
-    recent = [entry for entry in curve if entry["step"] >= max(JUDGED_FROM, last / 2**OCTAVES)]
+    recent = [entry for entry in curve if entry["step"] >= max(WARM_UP, last / 2**OCTAVES)]
     key = "psnr" if all(entry.get("psnr") is not None for entry in recent) else "loss_db"
     found = [(math.log2(entry["step"]), entry[key]) for entry in recent if entry.get(key) is not None]
     if len(found) < 5 or found[-1][0] - found[0][0] < FEWEST_OCTAVES:

@@ -7,7 +7,6 @@ import pytest
 
 from backend.training.budget import (
     AHEAD,
-    JUDGED_FROM,
     OCTAVES,
     PRESETS,
     SETTLING_FROM,
@@ -49,18 +48,18 @@ def flat_at(octave):
 
 
 def test_where_it_is_flat_follows_the_logarithm_of_the_steps():
-    steps = range(JUDGED_FROM, 4100, 100)
+    steps = range(WARM_UP, 4100, 100)
     assert flat_from(curve_of(steps, lambda s: 20 + 0.7 * math.log2(s))) == pytest.approx(flat_at(0.7))
     # What came before the latest octaves does not matter, nor what came before it is judged.
     late = curve_of(steps, lambda s: 30.0 if s >= steps[-1] / 2**OCTAVES else 0.0)
     assert flat_from(late) == 0.0
-    early = curve_of(range(100, 3 * JUDGED_FROM + 1, 100), lambda s: 30.0 if s >= JUDGED_FROM else 0.0)
+    early = curve_of(range(100, 3 * WARM_UP + 1, 100), lambda s: 30.0 if s >= WARM_UP else 0.0)
     assert flat_from(early) == 0.0
 
 
 @pytest.mark.parametrize("octave", [1e-9, 1e-3, 0.0, -1e-9, -1.0])
 def test_what_hardly_rises_is_flat(octave):
-    assert flat_from(curve_of(range(JUDGED_FROM, 4100, 100), lambda s: 30 + octave * math.log2(s))) < 1
+    assert flat_from(curve_of(range(WARM_UP, 4100, 100), lambda s: 30 + octave * math.log2(s))) < 1
 
 
 def test_too_little_to_judge_is_not_flat():
@@ -70,7 +69,7 @@ def test_too_little_to_judge_is_not_flat():
 
 
 def test_without_held_out_views_the_loss_decides():
-    steps = range(JUDGED_FROM, 3 * JUDGED_FROM, 100)
+    steps = range(WARM_UP, 3 * WARM_UP, 100)
     entries = [{"step": s, "psnr": None, "loss_db": 10 + 2 * math.log2(s)} for s in steps]
     assert flat_from(entries) == pytest.approx(flat_at(2.0))
 
@@ -92,7 +91,7 @@ def test_one_bad_measurement_does_not_end_a_rising_curve():
 
 def test_it_ends_where_more_steps_are_not_worth_it():
     where = flat_at(1.0)
-    known = curve_of(range(JUDGED_FROM, 2000, 100), lambda step: math.log2(step))
+    known = curve_of(range(WARM_UP, 2000, 100), lambda step: math.log2(step))
     assert flat_from(known) == pytest.approx(where)
     settled = walk(PRESETS["final"], lambda step: math.log2(step + 1), longest=20_000).settled_from
     assert where <= settled < 1.1 * where
@@ -113,7 +112,7 @@ def test_noise_of_the_measurements_moves_the_end_little():
 
 
 def test_a_flat_curve_is_not_ended_before_the_warm_up():
-    assert walk(PRESETS["final"], lambda step: 30.0).settled_from >= max(WARM_UP, JUDGED_FROM)
+    assert walk(PRESETS["final"], lambda step: 30.0).settled_from >= WARM_UP
 
 
 def test_an_open_end_has_a_most():
@@ -126,13 +125,13 @@ def test_remaining_is_unknown_until_the_curve_tells():
     p, final = Progress(step=1000, seconds=50.0), PRESETS["final"]
     assert final.remaining(p, 0.05) is None and final.behind(p) == 1000 / (1000 + AHEAD)
     assert Budget(seconds=80.0, until_flat=True).remaining(p, 0.05) == pytest.approx(30.0)
-    p.curve = curve_of(range(JUDGED_FROM, 1600, 100), lambda step: math.log2(step))
+    p.curve = curve_of(range(WARM_UP, 1600, 100), lambda step: math.log2(step))
     end = flat_at(1.0) / SETTLING_FROM
     assert final.remaining(p, 0.05) == pytest.approx((end - 1000) * 0.05)
     assert final.behind(p) == pytest.approx(1000 / end)
     p.settled_from = 960
     assert final.remaining(p, 0.05) == pytest.approx((960 / SETTLING_FROM - 1000) * 0.05)
-    falling = Progress(step=2000, curve=curve_of(range(JUDGED_FROM, 2000, 100), lambda step: -step))
+    falling = Progress(step=2000, curve=curve_of(range(WARM_UP, 2000, 100), lambda step: -step))
     assert final.remaining(falling, 0.05) == pytest.approx((2000 / SETTLING_FROM - 2000) * 0.05)
     assert final.behind(falling) == SETTLING_FROM
     assert Budget(steps=3000).remaining(p, 0.05) == pytest.approx(100.0)

@@ -294,6 +294,14 @@ def test_a_child_takes_its_parents_id_and_a_free_cell():
     assert len(np.unique(cell_keys(anchors.positions, 1.0), axis=0)) == len(anchors)
 
 
+@pytest.mark.parametrize("far", [(0.0, 8, 0), (-8.0, 0, -8), (1e9, -1e9, 1e9), (1e18, 1e18, 1e18)])
+def test_where_anchors_lie_changes_nothing_elsewhere(far):
+    anchors, growth = grown([1.0, 0.0], positions=((0.0, 0, 0), far), offset=(2.2, 0, 0))
+    near, alone = grown([1.0, 0.0], offset=(2.2, 0, 0))
+    assert growth.added == alone.added > 0
+    assert anchors.positions[2:].tolist() == near.positions[2:].tolist()
+
+
 def test_of_two_objects_that_want_one_cell_the_larger_gradient_wins():
     positions = ((0.0, 0, 0), (4.0, 0, 0))
     layout = Layout(1, 4)
