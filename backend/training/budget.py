@@ -130,17 +130,17 @@ class Budget:
 
     def settle(self, p: Progress) -> bool:
         """Leave the plateau where it is flat, or where time runs out; whether that is now."""
-        if not self.until_flat or p.settled_from or p.step < WARM_UP:
+        if not self.until_flat or p.settled_from:
             return False
         flat = flat_from(p.curve)
-        if not self._out_of_time(p) and (flat is None or p.step < flat):
+        if not self._out_of_time(p) and (flat is None or p.step < max(flat, WARM_UP)):
             return False
         p.settled_from = p.step
         return True
 
     def _out_of_time(self, p: Progress) -> bool:
         """Whether the plateau has to be left now for the training to end in time."""
-        if self.seconds is None or p.settled_from or p.step < WARM_UP:
+        if self.seconds is None or p.settled_from or not p.step:
             return False
         return p.seconds >= SETTLING_FROM * self.seconds
 
