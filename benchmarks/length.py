@@ -138,8 +138,13 @@ def plot(found: dict[str, dict[str, Any]]) -> Any:
                 row = found[name]
                 if row[key] is not None:
                     axes.plot(row["train_seconds"], row[key], "D", color=shared.MARKED, markersize=5)
+                    below = -11 if name != OPEN_END else 5  # it is near the one before
                     axes.annotate(
-                        name, (row["train_seconds"], row[key]), xytext=(4, -11), textcoords="offset points", fontsize=8
+                        name,
+                        (row["train_seconds"], row[key]),
+                        xytext=(4, below),
+                        textcoords="offset points",
+                        fontsize=8,
                     )
             axes.set_title(title)
             axes.set_xlabel("seconds of training")
