@@ -23,10 +23,10 @@ WARM_UP = 600
 """Steps until the plateau of a training whose end is open: large scenes differ in how long they stay there. Before, the
 error falls faster than it will. Anchors that grow sooner become more and no better."""
 
-AHEAD, WORTH = 1000, 0.37
+AHEAD, WORTH = 1000, 0.33
 """The plateau is flat where so many more steps would bring less than so many dB."""
 
-OCTAVES, FEWEST_OCTAVES = 1.5, 1.25
+OCTAVES, FEWEST_OCTAVES = 2, 1.25
 """What they would bring is judged by the measurements since there were 2 to the power of this times fewer steps; not by
 those over less than the other power, whose noise hides how the curve goes."""
 

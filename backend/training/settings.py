@@ -90,13 +90,13 @@ _ROW_RATES = {
     "feature_columns": (3e-2, 3e-3),
     "opacity_columns": (8e-2, 8e-3),
     "shape_columns": (4e-2, 4e-3),
-    "color_columns": (4e-2, 4e-3),
+    "color_columns": (2e-2, 2e-3),
 }
 HEAD_RATES = {
     "hidden": (4e-3, 1e-4),
     "opacity": (2e-3, 2e-5),
     "shape": (4e-3, 1e-4),
-    "color": (8e-3, 5e-5),
+    "color": (4e-3, 2.5e-5),
     "background": (1e-2, 1e-4),
 }
 
