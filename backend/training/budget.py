@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..expectation import PRESET_STEPS
-from .settings import PLATEAU_FROM, PLATEAU_UNTIL
+from .settings import GROW_UNTIL, PLATEAU_FROM, PLATEAU_UNTIL
 
 _EVALUATIONS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)
 """Shares of a training whose length is known after which it is measured."""
@@ -23,12 +23,16 @@ WARM_UP = 600
 """Steps until the plateau of a training whose end is open: large scenes differ in how long they stay there. Before, the
 error falls faster than it will. Anchors that grow sooner become more and no better."""
 
-AHEAD, WORTH = 1000, 0.33
+AHEAD, WORTH = 1000, 0.36
 """The plateau is flat where so many more steps would bring less than so many dB."""
 
 OCTAVES, FEWEST_OCTAVES = 2, 1.25
 """What they would bring is judged by the measurements since there were 2 to the power of this times fewer steps; not by
 those over less than the other power, whose noise hides how the curve goes."""
+
+GROWN_AFTER, GROWN_BY = 0.5, 1.01
+"""Growth ends where anchors have become less than so many times as many since there were 2 to the power of the first
+fewer steps: from then on it only moves them, which takes time and disturbs the others."""
 
 SETTLING_FROM = 0.9
 """A training whose end is open leaves the plateau after this share of its steps, later than others: what it has come to
@@ -42,8 +46,9 @@ class Progress:
     last_growth: step of the latest growth. skipped: updates that were not finite, and faults: how many steps met each
     cause of them that was found. queue: views still to come.
     evaluated: how many of the evaluations of a training of known length are behind, or, where the end is open, the
-    step of the latest. settled_from: the step from which the rates fall in a training whose end is open, 0 before.
-    curve: an entry for each evaluation, with seconds, step, loss (dB) and what was measured.
+    step of the latest. grown: whether its anchors have become as many as they will. settled_from: the step from which
+    its rates fall, 0 before.
+    curve: an entry for each evaluation, with seconds, step, number of anchors, loss (dB) and what was measured.
     """
 
     step: int = 0
@@ -53,6 +58,7 @@ class Progress:
     faults: dict[str, int] = field(default_factory=dict)
     queue: list[int] = field(default_factory=list)
     evaluated: int = 0
+    grown: bool = False
     settled_from: int = 0
     curve: list[dict[str, Any]] = field(default_factory=list)
 
@@ -76,10 +82,12 @@ class Budget:
 
     def share(self, p: Progress) -> float:
         """How much of the training is behind, 0 to 1. Where the end is open, it stays on the plateau until
-        `settle`."""
+        `settle`, first where anchors grow and then where they do not."""
         if self.until_flat:
+            if not p.settled_from and p.step < WARM_UP:
+                return PLATEAU_FROM * p.step / WARM_UP
             if not p.settled_from:
-                return (PLATEAU_FROM + PLATEAU_UNTIL) / 2 if p.step >= WARM_UP else PLATEAU_FROM * p.step / WARM_UP
+                return (GROW_UNTIL + (PLATEAU_UNTIL if p.grown else PLATEAU_FROM)) / 2
             settling = (p.step - p.settled_from) / (p.settled_from / SETTLING_FROM - p.settled_from)
             return min(PLATEAU_UNTIL + (1 - PLATEAU_UNTIL) * settling, 1.0)
         if self.steps is not None:
@@ -129,9 +137,11 @@ class Budget:
         return due
 
     def settle(self, p: Progress) -> bool:
-        """Leave the plateau where it is flat, or where time runs out; whether that is now."""
+        """End growth where it is over, and leave the plateau where it is flat or time runs out; whether it is left
+        now."""
         if not self.until_flat or p.settled_from:
             return False
+        p.grown = p.grown or _grown(p.curve)
         flat = flat_from(p.curve)
         if not self._out_of_time(p) and (flat is None or p.step < max(flat, WARM_UP)):
             return False
@@ -162,6 +172,14 @@ def flat_from(curve: list[dict[str, Any]]) -> float | None:
         return None
     # An octave that brings next to nothing is one that brings nothing.
     return AHEAD / (2 ** (WORTH / octave) - 1) if octave > WORTH / 100 else 0.0
+
+
+def _grown(curve: list[dict[str, Any]]) -> bool:
+    """Whether anchors hardly become more. Curves of older trainings may not count them."""
+    counted = [(entry["step"], entry["anchors"]) for entry in curve if "anchors" in entry]
+    last, now = counted[-1] if counted else (0, 0)
+    before = [anchors for step, anchors in counted if WARM_UP <= step <= last / 2**GROWN_AFTER]
+    return bool(before) and now < GROWN_BY * before[-1]
 
 
 def _gain_of_an_octave(curve: list[dict[str, Any]]) -> float | None:

@@ -424,7 +424,8 @@ class Trainer:
         p = self.progress
         quality = evaluate(self.shown, self.scene, p)
         loss_db = round(-20 * math.log10(loss), 3) if 0 < loss < math.inf else None
-        p.curve.append({"seconds": round(p.seconds, 2), "step": p.step, "loss_db": loss_db, **quality})
+        came_to = {"seconds": round(p.seconds, 2), "step": p.step, "anchors": len(self.model.anchors)}
+        p.curve.append({**came_to, "loss_db": loss_db, **quality})
         reporter.quality(**p.curve[-1])
 
     def _report(self, budget: Budget, reporter: Reporter, loss: float, pace: float) -> None:

@@ -16,21 +16,22 @@ from backend.training.budget import (
     Progress,
     flat_from,
 )
-from backend.training.settings import PLATEAU_FROM, PLATEAU_UNTIL, rate
+from backend.training.settings import GROW_UNTIL, PLATEAU_FROM, PLATEAU_UNTIL, rate
 
 
 def curve_of(steps, psnr, **more):
     return [{"step": step, "psnr": psnr(step), **more} for step in steps]
 
 
-def walk(budget, psnr, longest=100_000, seconds_a_step=0.05):
-    """What a training does under a budget, measured as `psnr` of the step says; returns the progress at its end."""
+def walk(budget, psnr, longest=100_000, seconds_a_step=0.05, anchors=lambda step: step):
+    """What a training does under a budget, measured as `psnr` of the step says, with so many `anchors`; returns the
+    progress at its end."""
     p = Progress()
     budget.begin(p)
     shares, behind = [], []
     while p.step < longest:
         if budget.evaluation_is_due(p):
-            p.curve.append({"step": p.step, "psnr": psnr(p.step), "loss_db": None})
+            p.curve.append({"step": p.step, "psnr": psnr(p.step), "loss_db": None, "anchors": anchors(p.step)})
             budget.settle(p)
         shares.append(budget.share(p))
         behind.append(budget.behind(p))
@@ -113,6 +114,32 @@ def test_noise_of_the_measurements_moves_the_end_little():
 
 def test_a_flat_curve_is_not_ended_before_the_warm_up():
     assert walk(PRESETS["final"], lambda step: 30.0).settled_from >= WARM_UP
+
+
+def test_growth_goes_on_as_long_as_anchors_become_more():
+    def until(anchors):
+        """The step of the first measurement after which nothing grows, None: anchors grow to the end."""
+        budget, p = PRESETS["final"], Progress()
+        while p.step < 20_000:
+            p.step += 1
+            if budget.evaluation_is_due(p):
+                p.curve.append({"step": p.step, "psnr": math.log2(p.step) ** 2, "anchors": anchors(p.step)})
+                assert not budget.settle(p)
+                if budget.share(p) > GROW_UNTIL:
+                    return p.step
+        return None
+
+    assert until(lambda step: 1000 * step**0.1) is None
+    assert until(lambda step: min(step, 5000)) == pytest.approx(5000 * math.sqrt(2), rel=0.1)
+    # They become fewer at first, where many start in the wrong place; before the warm-up is over, this ends nothing.
+    assert WARM_UP < until(lambda step: 1e6 / step) < 1.6 * WARM_UP
+    # What does not grow any more does not begin again.
+    assert walk(PRESETS["final"], math.log1p, 5000, anchors=lambda step: 1000 + 500 * (step > 2500)).grown
+
+
+def test_curves_that_do_not_count_anchors_leave_growth_on():
+    p = Progress(step=3000, curve=curve_of(range(WARM_UP, 3000, 300), lambda step: step))
+    assert not PRESETS["final"].settle(p) and not p.grown
 
 
 def test_an_open_end_has_a_most():
