@@ -64,6 +64,7 @@ def trainer_of(folder: Path, splats: int) -> loop.Trainer:
     chosen = np.sort(np.random.default_rng(0).permutation(len(anchors))[: round(keep * len(anchors))])
     anchors.positions, anchors.rows, anchors.ids = anchors.positions[chosen], anchors.rows[chosen], anchors.ids[chosen]
     trainer._first, trainer._second = trainer._first[chosen], trainer._second[chosen]
+    trainer._average.take(torch.from_numpy(chosen), anchors.rows[:0])
     for step in range(60):
         trainer.step(0.7 + 0.001 * step)
     return trainer
