@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import os
 import statistics
 import subprocess
 import sys
@@ -22,17 +21,16 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-# A thread that waits must not keep the other's core busy (GNU OpenMP spins for milliseconds); read once, by torch.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-
-import numba
-import numpy as np
-import psutil
-import torch
-
 ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
+
+import backend  # noqa: E402, F401, I001 - says how threads wait, before torch is loaded
+
+import numba  # noqa: E402
+import numpy as np  # noqa: E402
+import psutil  # noqa: E402
+import torch  # noqa: E402
 
 from backend.raster import Camera, compile_kernels, cpu  # noqa: E402
 from backend.raster.reference import rasterize_reference  # noqa: E402

@@ -21,8 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
-# A thread that waits must not keep the other's core busy; read once, by torch, here and in every process started here.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+import backend  # noqa: E402, F401 - says how threads wait, before torch is loaded
 
 GREY = "#8a8a92"
 COLOURS = ("#3b7dd8", "#d9731a", "#2a9d6f", "#b0479e", "#7a6a2f", "#5b5bd6")

@@ -72,7 +72,7 @@ def trainer_of(folder: Path, splats: int) -> loop.Trainer:
 
 def measure(trainer: loop.Trainer, steps: int) -> dict:
     """Step time (median, ms) and the share of each part."""
-    from backend.model.generate import _Generate
+    from backend.model.generate_on_cpu import Generate
     from backend.raster import _Rasterize
     from backend.training.losses import _ImageLoss
 
@@ -82,7 +82,7 @@ def measure(trainer: loop.Trainer, steps: int) -> dict:
     watch.wrap(loop, "image_loss", "loss")
     watch.wrap(_ImageLoss, "backward", "loss")
     watch.wrap(loop, "generate", "heads")
-    watch.wrap(_Generate, "backward", "heads")
+    watch.wrap(Generate, "backward", "heads")
     watch.wrap(loop.Trainer, "_update", "optimizer")
     # What the heads' own layers spend in the backward pass is what autograd spends beyond the functions above.
     whole = {"seconds": 0.0}

@@ -14,6 +14,9 @@ from scipy.spatial import cKDTree
 
 from ..spherical_harmonics import C0
 
+LOG_EXTENT_MAX = 20.0
+"""Logarithms of extents beyond this are taken for it."""
+
 
 @dataclass(frozen=True)
 class Layout:

@@ -10,8 +10,8 @@ from numba import prange
 
 from .. import device
 from ..raster.kernel import kernel
-from .anchors import Anchors
-from .generate import LOG_EXTENT_MAX, Generated, generate
+from .anchors import LOG_EXTENT_MAX, Anchors
+from .generate import Generated, generate
 from .heads import Heads
 from .splats import Splats
 
@@ -127,14 +127,14 @@ def _in_view(positions, rows, k, viewmat, intrinsics, width, height, near, seen)
     for a in prange(positions.shape[0]):
         reach = 0.0
         for i in range(3):
-            extent = np.exp(min(rows[a, 3 * k + i], np.float32(20.0)))
+            extent = np.exp(min(rows[a, 3 * k + i], np.float32(LOG_EXTENT_MAX)))
             largest = 0.0
             for j in range(k):
                 largest = max(largest, abs(rows[a, 3 * j + i]))
             reach += (largest * extent) ** 2
         width3 = 0.0
         for i in range(3):
-            width3 = max(width3, np.exp(min(rows[a, 3 * k + 3 + i], np.float32(20.0))))
+            width3 = max(width3, np.exp(min(rows[a, 3 * k + 3 + i], np.float32(LOG_EXTENT_MAX))))
         reach = np.sqrt(reach) + 3.4 * width3
         x, y, z = positions[a, 0], positions[a, 1], positions[a, 2]
         px = viewmat[0, 0] * x + viewmat[0, 1] * y + viewmat[0, 2] * z + viewmat[0, 3]

@@ -114,6 +114,17 @@ def load(typingctx, array, index):
 
 
 @intrinsic
+def spread(typingctx, array, index):
+    """All lanes equal to element `index` of a contiguous float32 array; no bounds check."""
+
+    def codegen(context, builder, signature, args):
+        view = context.make_array(signature.args[0])(context, builder, args[0])
+        return _broadcast(builder, builder.load(builder.gep(view.data, [args[1]])), _FLOATS)
+
+    return Floats(array, types.intp), codegen
+
+
+@intrinsic
 def load_i(typingctx, array, index):
     """LANES neighbours of a contiguous int32 array, from `index` on; no bounds check."""
 

@@ -23,7 +23,7 @@ WARM_UP = 600
 """Steps until the plateau of a training whose end is open: large scenes differ in how long they stay there. Before, the
 error falls faster than it will. Anchors that grow sooner become more and no better."""
 
-AHEAD, WORTH = 1000, 0.40
+AHEAD, WORTH = 1000, 0.36
 """The plateau is flat where so many more steps would bring less than so many dB."""
 
 OCTAVES, FEWEST_OCTAVES = 2, 1.25

@@ -1,6 +1,7 @@
 """Losses against autograd, growth rules, checkpoints, and whole trainings on tiny captures."""
 
 import dataclasses
+import math
 import signal
 import subprocess
 import sys
@@ -208,17 +209,27 @@ def test_coincident_points_give_one_finite_anchor(count):
     assert len(anchors) == 1 and anchors.rows.isfinite().all() and voxel > 0
 
 
-@pytest.mark.parametrize("mode", ["explicit", "view"])
-def test_generated_gaussians_have_the_gradients_of_their_equations(mode):
-    layout = Layout(3, 5)
+@pytest.mark.parametrize(
+    ("mode", "sh_degree", "layout", "n"),
+    [
+        ("explicit", 1, Layout(3, 5), 6),
+        ("view", 1, Layout(3, 5), 6),
+        ("explicit", 0, Layout(1, 8), 50),
+        ("explicit", 3, Layout(20, 16), 40),
+        ("view", 1, Layout(), 1500),
+        ("explicit", 2, Layout(), 1500),
+    ],
+)
+def test_generated_gaussians_have_the_gradients_of_their_equations(mode, sh_degree, layout, n):
     rng = np.random.default_rng(1)
-    rows = torch.tensor(rng.normal(0, 0.5, (6, layout.columns)), dtype=torch.float32, requires_grad=True)
-    positions = torch.tensor(rng.normal(size=(6, 3)), dtype=torch.float32)
-    ids = torch.arange(6, dtype=torch.int32)
-    heads = Heads(layout, mode, 1, torch.Generator().manual_seed(0))
+    rows = torch.tensor(rng.normal(0, 0.5, (n, layout.columns)), dtype=torch.float32, requires_grad=True)
+    positions = torch.tensor(rng.normal(size=(n, 3)), dtype=torch.float32)
+    ids = torch.arange(n, dtype=torch.int32)
+    heads = Heads(layout, mode, sh_degree, torch.Generator().manual_seed(0))
+    k = layout.offsets
     eye = np.array([0.1, 0.2, -3.0])
     g = generate(layout, positions, rows, ids, heads, eye)
-    assert 0 < len(g.source) < 18 and (g.ids == g.source // 3).all()
+    assert 0 < len(g.source) < n * k and (g.ids == g.source // k).all()
 
     again = rows.detach().clone().requires_grad_()
     features = again[:, layout.feature_columns]
@@ -230,15 +241,15 @@ def test_generated_gaussians_have_the_gradients_of_their_equations(mode):
     extent = torch.exp(again[:, layout.extent_columns])
     opacity = torch.tanh(raw_o + again[:, layout.opacity_columns]).reshape(-1)
     shape = (raw_s + again[:, layout.shape_columns]).reshape(-1, 7)
-    offsets = again[:, layout.offset_columns].reshape(6, 3, 3)
+    offsets = again[:, layout.offset_columns].reshape(n, k, 3)
     want = {
         "means": (positions[:, None] + offsets * extent[:, None, :3]).reshape(-1, 3),
         "quats": shape[:, 3:],
-        "scales": (extent[:, 3:].repeat_interleave(3, 0)) * torch.sigmoid(shape[:, :3]),
+        "scales": (extent[:, 3:].repeat_interleave(k, 0)) * torch.sigmoid(shape[:, :3]),
         "opacities": opacity,
-        "sh": raw_c.reshape(18, heads.coefficients, 3),
+        "sh": raw_c.reshape(n * k, heads.coefficients, 3),
     }
-    dc = again[:, layout.color_columns].reshape(18, 1, 3)
+    dc = again[:, layout.color_columns].reshape(n * k, 1, 3)
     want["sh"] = torch.cat([want["sh"][:, :1] + dc, want["sh"][:, 1:]], 1)
     loss = loss_want = 0
     for name, value in want.items():
@@ -252,6 +263,27 @@ def test_generated_gaussians_have_the_gradients_of_their_equations(mode):
     want_gradients = torch.autograd.grad(loss_want, [again, *heads.parameters()])
     for a, b in zip(head_gradients, want_gradients):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5 * float(b.abs().max()))
+
+
+def test_a_gradient_that_is_not_finite_stays_with_its_anchor():
+    layout, n = Layout(4, 8), 40
+    rng = np.random.default_rng(2)
+    rows = torch.tensor(rng.normal(0, 0.5, (n, layout.columns)), dtype=torch.float32, requires_grad=True)
+    rows.data[7, layout.feature_columns] = math.nan  # makes no splat, so nothing may come of it
+    positions, ids = torch.zeros(n, 3), torch.zeros(n, dtype=torch.int32)
+    heads = Heads(layout, "explicit", 1, torch.Generator().manual_seed(0))
+    g = generate(layout, positions, rows, ids, heads)
+    at_fault = int(g.source[10]) // layout.offsets
+    others = (g.source // layout.offsets != at_fault).float()
+    assert 7 not in g.source // layout.offsets
+    of_others = torch.autograd.grad((g.scales.sum(1) * others).sum(), [*heads.parameters()], retain_graph=True)
+    g_scales = torch.ones_like(g.scales)
+    g_scales[10, 1] = math.inf
+    found, *of_heads = torch.autograd.grad(g.scales, [rows, *heads.parameters()], g_scales)
+    for got, want in zip(of_heads, of_others):
+        np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-6)
+    assert found[at_fault, layout.feature_columns].isnan().all()
+    assert found[[i for i in range(n) if i != at_fault]].isfinite().all()
 
 
 def test_no_anchor_that_would_be_drawn_is_left_out_of_a_view():
