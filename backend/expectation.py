@@ -13,7 +13,7 @@ DEFAULT_SECONDS = 300.0
 PRESET_STEPS = {"preview": 600, "standard": 1500}
 """Lengths by name; `benchmarks/length.py` measures their places on the curve of error against run time."""
 
-SHORT_OF_FINAL = {164: (5.1, 5.1), 450: (1.9, 1.9), 600: (1.3, 1.3), 779: (0.9, 0.9), 1500: (0.2, 0.2)}
+SHORT_OF_FINAL = {248: (3.6, 3.6), 488: (1.7, 1.7), 600: (1.2, 1.2), 1114: (0.5, 0.5), 1500: (0.2, 0.2)}
 """Steps -> by how many dB, PSNR of held-out views, trainings of so many fell short of one with an open end: the least
 and the most of the captures that were measured, here those of the demo in docs/length.md."""
 
