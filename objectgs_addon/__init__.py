@@ -15,10 +15,12 @@ def _modules():
         properties,
         running,
         splat_arrays,
+        writing,
     )
     from .film import properties as film
 
-    return (properties, film, preferences, object_list, running, click_selection, splat_arrays, drawing, panels)
+    return (writing, properties, film, preferences, object_list, running, click_selection, splat_arrays, drawing,
+            panels)
 
 
 def register():

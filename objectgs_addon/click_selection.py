@@ -3,12 +3,13 @@
 
 import bpy
 
-from . import object_edits, scene
+from . import object_edits, scene, writing
 from .selection import selectable
 
 _owner = object()
 
 
+@writing.allowed
 def _active_changed() -> None:
     """Called by Blender when another object becomes active."""
     context = bpy.context

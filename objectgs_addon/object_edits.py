@@ -12,7 +12,7 @@ from ..backend.objects import SceneObject, edit_objects, merged, read_objects
 from ..backend.planning.choosing import grouped, read_groups
 from ..backend.protocol import InputError, Reconstruction
 from ..backend.recolour import Recolour
-from . import messages, scene, selection
+from . import messages, scene, selection, writing
 from .scene import from_stored, to_stored
 
 WRITE_AFTER = 0.4
@@ -348,6 +348,7 @@ def recolour_changed(item, _context) -> None:
     bpy.app.timers.register(_flush_later, first_interval=WRITE_AFTER)
 
 
+@writing.allowed
 def _flush_later() -> None:
     flush()
 

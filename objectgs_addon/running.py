@@ -14,7 +14,7 @@ from pathlib import Path
 import bpy
 
 from ..backend.protocol import InputError, Reconstruction
-from . import film, locations, messages, object_edits, previews, scene, view
+from . import film, locations, messages, object_edits, previews, scene, view, writing
 from .jobs import Job, JobQueue, State, run_blocking
 
 INTERVAL = 0.1
@@ -89,6 +89,7 @@ def busy(folder: Path) -> bool:
     return job is not None and not job.is_finished
 
 
+@writing.allowed
 def _tick() -> float | None:
     changed = queue.poll()
     for job in changed:
@@ -307,6 +308,7 @@ def _push_undo(title: str) -> None:
 
 
 @bpy.app.handlers.persistent
+@writing.allowed
 def _undone(*_) -> None:
     """The list was undone or redone: objects.json follows, and what closes places follows that."""
     for root in [root for root in bpy.data.collections if scene.kind_of(root) == "reconstruction"]:
@@ -315,6 +317,7 @@ def _undone(*_) -> None:
 
 
 @bpy.app.handlers.persistent
+@writing.allowed
 def _saving(*_) -> None:
     """objects.json gets what the .blend gets: colours that wait to be written, and where objects are."""
     for root in bpy.data.collections:
@@ -330,6 +333,7 @@ def _store(root, how) -> None:
 
 
 @bpy.app.handlers.persistent
+@writing.allowed
 def _file_loaded(*_) -> None:
     """A file made without a window knows its reconstructions but not which one is worked on, nor their objects."""
     for owner in bpy.data.scenes:

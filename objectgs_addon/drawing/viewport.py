@@ -6,6 +6,7 @@ import gpu
 import numpy as np
 
 from ...backend.picking import View
+from .. import writing
 from ..scene import kind_of
 from ..scene.drawn import show_preview
 from . import gather
@@ -99,6 +100,7 @@ def redraw(_properties=None, _context=None) -> None:
 
 
 @bpy.app.handlers.persistent
+@writing.allowed
 def _changed(scene, _depsgraph) -> None:
     """New splats come with their preview."""
     if scene.objectgs.draw_splats:

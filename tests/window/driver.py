@@ -3,8 +3,9 @@
 
     blender --python driver.py -- FOLDER
 
-FOLDER/<n>.py is executed in the main thread, from a timer, as a user's own action would be; the value of its variable
-`result` comes back as FOLDER/<n>.json, or the traceback if it fails.
+FOLDER/<n>.py is executed in the main thread, from a timer, as a user's own action would be: it may write even where
+Blender forbids that to timers. The value of its variable `result` comes back as FOLDER/<n>.json, or the traceback if
+it fails.
 """
 
 import json
@@ -39,6 +40,11 @@ def _execute(script: Path) -> dict:
 
 
 def _look() -> float:
+    # What Blender calls to read a property may write.
+    return bpy.data.window_managers[0].driver_look
+
+
+def _execute_next(_manager) -> float:
     global _next
     script = FOLDER / f"{_next}.py"
     if script.exists():
@@ -50,4 +56,5 @@ def _look() -> float:
     return 0.05
 
 
+bpy.types.WindowManager.driver_look = bpy.props.FloatProperty(get=_execute_next)
 bpy.app.timers.register(_look, first_interval=0.5, persistent=True)

@@ -185,6 +185,60 @@ def test_result_waits_for_the_end_of_a_render(window, folder):
     draws(window)
 
 
+def test_result_comes_where_blender_forgot_to_allow_writing(window, folder):
+    """As after a render that began in the middle of a drawing: Blender 4 lets timers write no more."""
+    window.run(script("""
+        import sys, time
+        names = bpy.app.driver_namespace
+        names.update(drawn=0, began=False, draws=False)
+
+        class Engine(bpy.types.RenderEngine):
+            bl_idname, bl_label = "OBJECTGS_TEST_OVERLAP", "Test"
+            def render(self, depsgraph):
+                names["began"] = True
+                while names["draws"]:
+                    time.sleep(0.01)
+
+        def draw(panel, context):
+            if names["draws"]:
+                sys.setswitchinterval(0.005)
+                until = time.monotonic() + 10.0
+                while not names["began"] and time.monotonic() < until:
+                    time.sleep(0.01)
+                names["drawn"] += 1
+
+        bpy.utils.register_class(Engine)
+        bpy.types.VIEW3D_HT_header.append(draw)
+        owner.render.engine = Engine.bl_idname
+        # The engine's thread waits for Python until the drawing has begun.
+        sys.setswitchinterval(60.0)
+        names["draws"] = True
+        call(bpy.ops.render.render)
+        with bpy.context.temp_override(**window_context()):
+            bpy.ops.wm.redraw_timer(type="DRAW_WIN", iterations=1)
+        bpy.types.VIEW3D_HT_header.remove(draw)
+        names["draws"] = False
+
+        def write():
+            try:
+                bpy.data.objects[0].color = (1, 1, 1, 1)
+                names["refused"] = ""
+            except AttributeError as error:
+                names["refused"] = str(error)
+
+        names["write"] = write
+    """))
+    soon(window, "not bpy.app.is_job_running('RENDER')")
+    window.run("bpy.app.timers.register(bpy.app.driver_namespace['write'])")
+    soon(window, "'refused' in bpy.app.driver_namespace")
+    if not window.run("result = bpy.app.driver_namespace['refused']"):
+        pytest.skip("this Blender does not forget it")
+    go = start_fake(window, folder)
+    go.touch()
+    soon(window, f"{IDLE} and not running._results")
+    draws(window)
+
+
 def test_undo_while_a_job_runs(window, folder):
     """Undo to before the reconstruction came, and redo, harm neither the job nor what it brings."""
     go = start_fake(window, folder)
