@@ -33,6 +33,9 @@ def test_the_time_of_a_choice_is_the_median_over_sets_of_processes(monkeypatch):
     monkeypatch.setattr(approximations, "measure_set", measure_set)
     found = approximations.measure_choice(approximations.Choice("a choice", "a", {}), None, None, None)
     assert found["a"]["times_default"] == 1.03 and max(found["a"]["times_default_of_sets"]) == 1.09
+    sets = iter([1.01, 1.0, 1.0, 1.01])
+    more = approximations.measure_choice(approximations.Choice("a choice", "a", {}), None, None, None, 4)
+    assert approximations.joined([found, more])["a"]["times_default"] == 1.01
     assert approximations._raster_row({**found["a"], "largest": 1.0, "gradient": 0.1})[1] == "1.03 (1.01-1.09)"
 
 
