@@ -331,8 +331,9 @@ def heading(level: int, text: str) -> str:
 def section_of_omissions(capture: Capture, steps: int, needed: bool) -> tuple[dict[str, Any], list[str]]:
     """What is left out by itself: the figures, and lines of Markdown."""
     left_out, trainings = omissions(capture, steps, needed)
+    found = verdict(trainings) if left_out else f"{verdict(trainings)} Both did the same: what they differ by is noise."
     lines = [f"Left out: {', '.join(left_out) or 'nothing'}.", "", *rows_of(_COLUMNS, trainings), "",
-             verdict(trainings), ""]  # fmt: skip
+             found, ""]  # fmt: skip
     return {"left_out": left_out, "trainings": trainings}, lines
 
 
