@@ -35,7 +35,7 @@ def allowed(function: Callable) -> Callable:
         def call() -> None:
             try:
                 found.append((function(*arguments), None))
-            except Exception as error:
+            except BaseException as error:
                 found.append((None, error))
 
         _waiting.calls.append(call)
