@@ -31,7 +31,7 @@ def test_the_time_of_a_choice_is_the_median_over_sets_of_processes(monkeypatch):
         return {"a": {"picture": 0.3, "forward_ms": 1.0, "backward_ms": 2.0, "step_ms": 3.0, "times_default": time}}
 
     monkeypatch.setattr(approximations, "measure_set", measure_set)
-    found = approximations.measure_choice(approximations.Choice("a choice", "a", {}), None, None, None)
+    found = approximations.measure_choice(approximations.Choice("a choice", "a", {}), None, None, None, 5)
     assert found["a"]["times_default"] == 1.03 and max(found["a"]["times_default_of_sets"]) == 1.09
     sets = iter([1.01, 1.0, 1.0, 1.01])
     more = approximations.measure_choice(approximations.Choice("a choice", "a", {}), None, None, None, 4)
