@@ -93,7 +93,7 @@ test-blenders: .venv/ready .venv-bpy-4.2/ready
 
 lint: .venv/ready
 	$(BACKEND) -m ruff check .
-	$(BACKEND) -m ruff format --check backend tests/backend benchmarks
+	$(BACKEND) -m ruff format --check .
 	$(BACKEND) -m mypy
 
 benchmarks: .venv/ready
@@ -114,7 +114,7 @@ gpu:
 	echo "There is no NVIDIA GPU here, so nothing was run, and nothing counts as passed."
 
 gpu-with:
-	$(GPU_PYTHON) -c "import sys; from backend import device; sys.exit(device.why_not_cuda())"
+	$(GPU_PYTHON) -c "import sys; from backend.raster import devices; sys.exit(devices.why_not_cuda())"
 	$(GPU_PYTHON) -m pytest tests/gpu
 	$(GPU_PYTHON) benchmarks/gpu.py $(if $(CAPTURE),--demo "$(CAPTURE)")
 

@@ -4,22 +4,23 @@
     blender -b -P headless.py -- COMMAND ...
     python headless.py COMMAND ...            (a Python that has the bpy wheel)
 
-`--help` lists the commands; they live in objectgs_addon/headless. Exit codes: 0 done, 2 bad input (one sentence says
-what), 130 cancelled, 1 anything else.
+`--help` lists the commands, which are in objectgs_addon/headless. Exit codes: 0 done, 2 bad input, 130 cancelled,
+1 any other failure.
 """
 
 import importlib
 import importlib.util
 import sys
 from pathlib import Path
+from types import ModuleType
 
 ROOT = Path(__file__).resolve().parent
 
 
-def extension():
-    """The extension's root package: the one Blender has loaded from this folder, or else loaded as `objectgs`.
+def extension() -> ModuleType:
+    """The extension's root package: the one that Blender has loaded from this folder, or else loaded as `objectgs`.
 
-    Loaded by its place, so Blender's module search path stays as it is.
+    It is loaded by path, so that Blender's module search path is unchanged.
     """
     init = ROOT / "__init__.py"
     for module in list(sys.modules.values()):
@@ -27,6 +28,7 @@ def extension():
         if file and Path(file).name == init.name and Path(file).resolve() == init:
             return module
     spec = importlib.util.spec_from_file_location("objectgs", init, submodule_search_locations=[str(ROOT)])
+    assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules["objectgs"] = module
     spec.loader.exec_module(module)
@@ -39,9 +41,9 @@ def main(arguments: list[str]) -> int:
 
 
 def _arguments() -> list[str]:
-    """What stands behind `--`; a plain Python needs no `--`, Blender's own options stand before it."""
+    """The arguments after `--`, which separates them from Blender's own; a plain Python needs none."""
     if "--" in sys.argv:
-        return sys.argv[sys.argv.index("--") + 1:]
+        return sys.argv[sys.argv.index("--") + 1 :]
     return sys.argv[1:] if Path(sys.argv[0]).name == Path(__file__).name else []
 
 

@@ -3,18 +3,8 @@
 import os
 import sys
 
-# A thread that waits for the next kernel should be there at once: on Linux, where GNU's OpenMP lets it spin a moment, a
-# training step takes a sixth less time. Elsewhere torch's and numba's threads come from libraries that spin for longer
-# and would take the cores from each other, so there they sleep. It is read once, when these load.
+# Threads that wait for the next kernel should respond at once. On Linux, GNU's OpenMP lets them spin briefly, which
+# makes a training step a sixth faster. Elsewhere torch and numba use different libraries, whose threads spin longer and
+# block each other's cores, so there they sleep. The libraries read this once, when they are loaded.
 if sys.platform != "linux":
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-
-__version__ = "0.1.0"
-
-
-def lacking(error: ModuleNotFoundError) -> str:
-    """The sentence for a Python that does not have the backend's packages."""
-    return (
-        f"The Python {sys.executable} lacks the package {error.name}, which the compute backend needs; "
-        "set up the backend, or choose a Python that has its packages."
-    )

@@ -3,17 +3,17 @@
 import json
 import sys
 
-from . import lacking
+from .shared.errors import describe_missing_package
 
 if __name__ == "__main__":
     try:
-        from .arguments import main
+        from .cli.main import main
 
         sys.exit(main())
     except ModuleNotFoundError as error:
-        # What the reporters themselves need is not there.
+        # A package that the command line itself needs is missing.
         if "--json" in sys.argv:
-            print(json.dumps({"type": "error", "message": lacking(error)}))
+            print(json.dumps({"type": "error", "message": describe_missing_package(error)}))
         else:
-            print(f"error: {lacking(error)}", file=sys.stderr)
+            print(f"error: {describe_missing_package(error)}", file=sys.stderr)
         sys.exit(2)

@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
-from benchmarks import raster_variants, shared, training_variants  # noqa: E402
+from benchmarks import raster_variants, shared, training_variants
 
 WORK = ROOT / "build" / "approximations"
 TURNS, SETS = 40, 5
@@ -84,8 +84,9 @@ class Verdict:
 
 def raster_choices() -> list[Choice]:
     """Of the CPU rasterizer. The variant {} is the product as it is."""
-    from backend.blending import ALPHA_MIN, STOP
-    from backend.raster import cpu_bin, simd
+    from backend.raster import simd
+    from backend.raster.cpu import binning as cpu_bin
+    from backend.shared.splats.blending import ALPHA_MIN, TRANSMITTANCE_THRESHOLD
 
     def among(values: Sequence[Any], default: Any, name: str, text: Callable[[Any], str]) -> tuple[str, dict[str, Any]]:
         names = {value: text(value) for value in sorted({*values, default})}
@@ -94,7 +95,7 @@ def raster_choices() -> list[Choice]:
     one_in = round(1 / ALPHA_MIN)
     cuts = among((64, 128, 512, 2048, 10**6), one_in, "one_in", lambda n: f"1/{n:,}")
     cut_variants = {text: {"alpha_min": 1 / v["one_in"]} if v else {} for text, v in cuts[1].items()}
-    stops = among((0.0, 1e-5, 1e-3, 1e-2), STOP, "stop", lambda t: f"{t:.2g}" if t else "never")
+    stops = among((0.0, 1e-5, 1e-3, 1e-2), TRANSMITTANCE_THRESHOLD, "stop", lambda t: f"{t:.2g}" if t else "never")
     degrees = among((1, 2, 3, 4, 7), len(simd._EXP2) - 1, "exp_degree", str)
     tiles = among(
         ((16, 16), (32, 32), (64, 16), (64, 64), (128, 32)),
@@ -163,7 +164,7 @@ def training_choices() -> list[Choice]:
         return text.format(default), found
 
     return [
-        Choice("SH degree", *of_setting("sh_degree", (0, 1, 2, 3)), "of the colours"),
+        Choice("SH degree", *of_setting("sh_degree", (0, 1, 2, 3)), "of the colors"),
         Choice(
             "resolution pyramid",
             "by size",
@@ -199,8 +200,8 @@ def training_choices() -> list[Choice]:
 
 def mesh_choices() -> list[Choice]:
     """Of meshes and textures."""
-    from backend.mesh.extract import FACES
-    from backend.mesh.fusion import _VOXEL_PER_PIXEL
+    from backend.mesh.field.extract import FACES
+    from backend.mesh.field.fusion import _VOXEL_PER_PIXEL
 
     def among(values: Sequence[Any], default: Any, name: str, text: str) -> tuple[str, dict[str, Any]]:
         return text.format(default), {
@@ -241,30 +242,32 @@ def write_scene(folder: Path, path: Path) -> None:
     seen = anchors_in_view(model.anchors, viewmat, intrinsics, camera.width, camera.height, camera.near)
     photo, labels = trained.scene.target(index)
     with torch.no_grad():
-        g = model.generate(seen, camera.centre)
+        g = model.generate(seen, camera.center)
         drawn = rasterize(*g[:6], camera, labels=labels)
         picture = drawn.color + (1 - drawn.alpha) * model.background[:, None, None]
         known = labels >= 0
         g_color = (picture - photo) / photo.numel()
-        g_weight = torch.where(known, -0.1 / (drawn.weight + 0.01), 0.0) / known.sum()
-    means = g.means.double() - torch.from_numpy(camera.centre)
+        g_label_probability = torch.where(known, -0.1 / (drawn.label_probability + 0.01), 0.0) / known.sum()
+    means = g.means.double() - torch.from_numpy(camera.center)
     names = dict(zip(raster_variants.PARAMETERS, (means, *g[1:5]), strict=True))
     np.savez(
         path,
         **{name: np.ascontiguousarray(value.detach().numpy(), np.float32) for name, value in names.items()},
-        ids=g.ids.numpy(), objects=len(model.object_ids), viewmat=camera.at_origin().viewmat, K=camera.K,
-        labels=labels.numpy(), g_color=g_color.numpy(), g_weight=g_weight.numpy(), g_alpha=np.zeros_like(g_weight),
+        ids=g.ids.numpy(), objects=len(model.classes), viewmat=camera.at_origin().viewmat, K=camera.K,
+        labels=labels.numpy(), g_color=g_color.numpy(), g_label_probability=g_label_probability.numpy(),
+        g_alpha=np.zeros_like(g_label_probability),
     )  # fmt: skip
 
 
 def opened(folder: Path) -> Any:
     """A reconstruction, as the product's own commands open it."""
-    from backend.arguments import parser
+    from backend.cli.parser import build_parser
     from backend.commands.folder import open_trained
-    from backend.protocol import Reporter
-    from backend.stopping import StoppingReporter, StopRequest
+    from backend.shared.events import Reporter
+    from backend.shared.stopping import StoppingReporter, StopRequest
 
-    return open_trained(parser().parse_args(["evaluate", str(folder)]), StoppingReporter(Reporter(), StopRequest()))
+    options = build_parser().parse_args(["evaluate", str(folder)])
+    return open_trained(options, StoppingReporter(Reporter(), StopRequest()))
 
 
 def write_exact(scene_file: Path, path: Path) -> None:
@@ -385,11 +388,11 @@ def measure_set(choice: Choice, scene: Path, exact: Path, kernels: Path) -> dict
 
 def meshed(spec: dict[str, Any], folder: str) -> dict[str, Any]:
     """Make meshes of OBJECTS in a copy of a reconstruction, and measure them; in a process of its own."""
-    from backend import arguments
+    from backend.cli import main as arguments
     from backend.evaluation.meshes import evaluate_mesh, mesh_entries
     from backend.evaluation.truth import load_truth
-    from backend.mesh import fusion
-    from backend.protocol import Reporter
+    from backend.mesh.field import fusion
+    from backend.shared.events import Reporter
 
     if "voxel_per_pixel" in spec:
         shared.replace(fusion, "_VOXEL_PER_PIXEL", spec["voxel_per_pixel"])
@@ -545,12 +548,12 @@ def _front_panel(ax: Any, points: Mapping[str, tuple[float, float]], default: st
             steps.append((x, y))
     if len(steps) > 1:
         ax.plot(*zip(*steps), color="#c9c9d0", linewidth=1.2, drawstyle="steps-post", zorder=1)
-    looks = iter(zip(shared.COLOURS * 2, "os^vDP" + "Xs^vDP"))
+    looks = iter(zip(shared.COLORS * 2, "os^vDP" + "Xs^vDP"))
     for name, (x, y) in points.items():
         marked = name == default
-        colour, marker = (shared.MARKED, "*") if marked else next(looks)
+        color, marker = (shared.MARKED, "*") if marked else next(looks)
         size = 12 if marked else 6
-        ax.plot(x, y, marker, color=colour, markersize=size, label=name, zorder=4 if marked else 3, alpha=0.9)
+        ax.plot(x, y, marker, color=color, markersize=size, label=name, zorder=4 if marked else 3, alpha=0.9)
     ax.margins(0.15)
 
 
@@ -569,11 +572,11 @@ def training_plot(choices: Sequence[Choice], found: Found) -> Any:
             ax.plot(times, line, color=shared.MARKED, linewidth=1.6, zorder=2)
             low, high = ([value + sign * found.noise[row] for value in line] for sign in (-1, 1))
             ax.fill_between(times, low, high, color=shared.MARKED, alpha=0.13, linewidth=0)
-            looks = iter(zip(shared.COLOURS * 2, "os^vDP" + "Xs^vDP"))
+            looks = iter(zip(shared.COLORS * 2, "os^vDP" + "Xs^vDP"))
             for variant, figures in found.training[choice.title].items():
                 marked = variant == choice.default
-                colour, marker = (shared.MARKED, "*") if marked else next(looks)
-                ax.plot(figures["time"], figures[name], marker, color=colour, label=variant, zorder=4 if marked else 3,
+                color, marker = (shared.MARKED, "*") if marked else next(looks)
+                ax.plot(figures["time"], figures[name], marker, color=color, label=variant, zorder=4 if marked else 3,
                         markersize=12 if marked else 6)  # fmt: skip
             ax.set_xscale("log")
             ax.set_xticks([0.7, 1.0, 1.4], ["0.7", "1", "1.4"])
@@ -633,7 +636,7 @@ def document(found: Found, choices: Mapping[str, Sequence[Choice]], scene: Mappi
         f" {scene['width']}x{scene['height']}, on {os.cpu_count()} cores. Errors are those against the float64",
         "reference, in exact order and without any cut-off: of the picture as RMSE in steps of 8 bits and the largest;",
         "of the gradients as a part of their length, the root mean square over means, rotations, scales, opacities and",
-        f"colours. All variants of a choice take turns, {TURNS // SETS} times in each of {SETS} sets of processes; the"
+        f"colors. All variants of a choice take turns, {TURNS // SETS} times in each of {SETS} sets of processes; the"
         " median over",
         "the sets of the median ratio to the default's time counts, and in brackets are the least and the greatest of",
         f"the sets; where a variant seemed better, {MORE_SETS} more sets were timed, and all count."
@@ -831,16 +834,16 @@ def run(demo: Path, steps: int) -> tuple[Found, dict[str, Sequence[Choice]], dic
         for key, rows in turns.items()
         if rows
     }
-    dressed: dict[str, dict[str, Any]] = {}
+    textured: dict[str, dict[str, Any]] = {}
     for choice in choices["meshes"]:
         keys = {name: shared.digest([], spec) for name, spec in choice.variants.items()}
-        dressed[choice.title] = {name: by_mesh[key] for name, key in keys.items() if key in by_mesh}
+        textured[choice.title] = {name: by_mesh[key] for name, key in keys.items() if key in by_mesh}
 
-    found = Found(raster, training, dressed, time_noise, noise, curve, steps, len(alike))
+    found = Found(raster, training, textured, time_noise, noise, curve, steps, len(alike))
     for kind, of, judge in (
         ("raster", raster, lambda choice, rows: raster_verdict(choice, rows, time_noise)),
         ("training", training, lambda choice, rows: training_verdict(choice, rows, noise)),
-        ("meshes", dressed, mesh_verdict),
+        ("meshes", textured, mesh_verdict),
     ):
         for choice in choices[kind]:
             if choice.default in of[choice.title]:

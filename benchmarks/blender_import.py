@@ -34,7 +34,7 @@ def extension():
         module = importlib.util.module_from_spec(spec)
         sys.modules["objectgs"] = module
         spec.loader.exec_module(module)
-    names = ("objectgs_addon.scene", "backend.ply", "backend.mesh_file")
+    names = ("objectgs_addon.scene", "backend.shared.formats.ply", "backend.shared.formats.mesh_ply")
     return tuple(importlib.import_module(f"objectgs.{name}") for name in names)
 
 
@@ -65,7 +65,7 @@ def write_result(folder: Path, splats: int, objects: int, write_vertices) -> Non
     )  # fmt: skip
     write_vertices(folder / "points.ply", points)
     entries = [
-        {"id": i, "name": f"thing {i}", "colour": [200, 100, i % 256], "points": 1} for i in range(1, objects + 1)
+        {"id": i, "name": f"thing {i}", "color": [200, 100, i % 256], "points": 1} for i in range(1, objects + 1)
     ]
     (folder / "objects.json").write_text(json.dumps({"objects": entries, "edits": {}}))
     camera = {"name": "a.png", "image": "a.png", "mask": None, "width": 640, "height": 480, "held_out": False,
@@ -127,7 +127,7 @@ def measure(splats: int, objects: int, repeats: int) -> dict:
                 elif name == "switch":
                     scene.show_kinds(root, "splats")
                 else:
-                    scene.show_result(root, folder, owner)
+                    scene.show_result(root, folder)
                 times[name].append(time.perf_counter() - start)
     return {"splats": splats, "objects": objects, **{k: round(statistics.median(v), 2) for k, v in times.items()}}
 

@@ -1,7 +1,7 @@
 """How fast the CUDA renderer is, in ms and in ns for each (pixel, splat) pair, and what of the GPU it makes use of.
 
 Pairs are counted as in benchmarks/raster.py: pixels inside a splat's bounding box, clipped to the picture. Forward is
-projection, binning and blending of colour, alpha and label weight; backward is all gradients. Scenes are random and
+projection, binning and blending of color, alpha and label probability; backward is all gradients. Scenes are random and
 about 45 deep at every pixel, whatever the number of splats and pixels.
 
 The limits are measured in the same run: a copy within the GPU's memory, and a float32 matrix product without tensor
@@ -34,9 +34,9 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
-from backend.device import why_not_cuda  # noqa: E402
-from backend.raster import Camera  # noqa: E402
-from backend.raster.splats import HALF_H, HALF_W, SPLAT_COLUMNS, U, V  # noqa: E402
+from backend.raster import Camera
+from backend.raster.devices import why_not_cuda
+from backend.raster.splats import HALF_H, HALF_W, SPLAT_COLUMNS, U, V
 
 SIZES = (
     (100_000, 640, 480), (300_000, 640, 480), (1_000_000, 640, 480), (100_000, 1280, 720), (1_000_000, 1280, 720),
@@ -55,7 +55,7 @@ class Scene:
     """Random splats on the GPU that fill a picture, spread evenly over it and over depths 1 to 4."""
 
     def __init__(self, count: int, width: int, height: int, objects: int = 8) -> None:
-        from backend.raster import cuda as renderer
+        from backend.raster.cuda import renderer
 
         self.renderer = renderer
         rng = np.random.default_rng(0)
@@ -81,27 +81,27 @@ class Scene:
         )
         self.labels = field(*np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5))
         self.g_color = torch.randn(3, height, width, device="cuda")
-        self.g_alpha, self.g_weight = torch.randn(2, height, width, device="cuda").unbind()
+        self.g_alpha, self.g_label_probability = torch.randn(2, height, width, device="cuda").unbind()
         self.frame = self.forward()
 
     def forward(self, **wanted: bool) -> Any:
         return self.renderer.forward(self.gaussians, self.camera, self.labels, **wanted)
 
     def backward(self) -> None:
-        self.renderer.backward(self.frame, self.g_color, self.g_alpha, self.g_weight)
+        self.renderer.backward(self.frame, self.g_color, self.g_alpha, self.g_label_probability)
 
     def step(self) -> None:
         """What the rasterizer does in a training step."""
-        self.renderer.backward(self.forward(), self.g_color, self.g_alpha, self.g_weight)
+        self.renderer.backward(self.forward(), self.g_color, self.g_alpha, self.g_label_probability)
 
     def step_discs(self, surface: bool = False) -> None:
         """The same for the same splats as discs; surface: with depth, normals and distortion."""
         frame = self.forward(flat=True, want_depth=surface, want_normals=surface, want_moments=surface)
         more = (self.g_alpha, self.g_color, self.g_color[:2].contiguous()) if surface else ()
-        self.renderer.backward(frame, self.g_color, self.g_alpha, self.g_weight, *more)
+        self.renderer.backward(frame, self.g_color, self.g_alpha, self.g_label_probability, *more)
 
     def id_render(self) -> None:
-        """Colour, and the most probable object of every pixel."""
+        """Color, and the most probable object of every pixel."""
         self.renderer.object_ranks(self.renderer.forward(self.gaussians, self.camera), 1)
 
     @property
@@ -112,18 +112,18 @@ class Scene:
         return float((across * down).sum())
 
     def work(self) -> dict[str, float]:
-        """What a step must do at least: meetings of a tile and a splat, those gone through, operations and bytes of the
-        two blending kernels."""
-        meetings, gone_through = float(self.frame.lists.starts[-1]), float(self.frame.ends.sum())
+        """The least work of a step: intersections of tiles and splats, those blended, operations and bytes of the two
+        blending kernels."""
+        intersections, blended = float(self.frame.intersections.isect_offsets[-1]), float(self.frame.isect_counts.sum())
         pixels = self.frame.transmittance.numel()
-        staged = gone_through * (4 * SPLAT_COLUMNS + 8)
+        staged = blended * (4 * SPLAT_COLUMNS + 8)
         return {
-            "meetings": meetings,
-            "gone_through": gone_through,
-            "forward_flops": gone_through * 256 * FORWARD_FLOPS,
-            "backward_flops": gone_through * 256 * BACKWARD_FLOPS,
+            "intersections": intersections,
+            "blended": blended,
+            "forward_flops": blended * 256 * FORWARD_FLOPS,
+            "backward_flops": blended * 256 * BACKWARD_FLOPS,
             "forward_bytes": staged + pixels * 4 * 7,
-            "backward_bytes": staged + meetings * (64 + 8) + pixels * 4 * 12,
+            "backward_bytes": staged + intersections * (64 + 8) + pixels * 4 * 12,
         }
 
 
@@ -186,7 +186,7 @@ def kernels_alone(scene: Scene, repeats: int) -> dict[str, float]:
 
 
 def gsplat_step(scene: Scene) -> tuple[Callable[[], object], Callable[[], object]] | None:
-    """gsplat's picture of the scene's splats (colour and alpha only), and that with all gradients; None without it."""
+    """gsplat's picture of the scene's splats (color and alpha only), and that with all gradients; None without it."""
     try:
         from gsplat import rasterization
     except ImportError:

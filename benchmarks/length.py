@@ -4,8 +4,9 @@
     python benchmarks/length.py --expect CAPTURE ...
 
 Each length is a training of its own, from the beginning, by the commands that a user runs. --write leaves the table in
-docs/length.md and the plot in docs/error-over-time.png. --expect measures what backend/expectation.py says: by how much
-so many steps fall short of a training until it stops improving, on each of these captures.
+docs/length.md and the plot in docs/error-over-time.png. --expect measures what
+backend/shared/expectation.py says: by how much so many steps fall short of a training that goes on until it converges,
+on each of these captures.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks import shared  # noqa: E402
+from benchmarks import shared
 
 SECONDS = (15, 30, 60, 120, 300)
 PRESETS = ("preview", "standard", "final")
@@ -133,9 +134,9 @@ def plot(found: dict[str, dict[str, Any]]) -> Any:
     with shared.plot_style():
         figure = Figure(figsize=(10, 3.2), layout="constrained")
         panels = (("psnr", "PSNR, dB"), ("miou", "mIoU"), ("f1_005", "F1 of the meshes at 5 mm"))
-        for axes, (key, title), colour in zip(figure.subplots(1, len(panels)), panels, shared.COLOURS, strict=False):
+        for axes, (key, title), color in zip(figure.subplots(1, len(panels)), panels, shared.COLORS, strict=False):
             clocked = [(found[f"{seconds} s"]["train_seconds"], found[f"{seconds} s"][key]) for seconds in SECONDS]
-            axes.plot(*zip(*clocked, strict=True), color=colour, marker="o", markersize=4, linewidth=2)
+            axes.plot(*zip(*clocked, strict=True), color=color, marker="o", markersize=4, linewidth=2)
             for name in PRESETS:
                 row = found[name]
                 if row[key] is not None:

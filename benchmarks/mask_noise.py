@@ -1,11 +1,11 @@
-"""What mistakes in the masks do to the result: rendered IDs beside the masks that were given, both against the truth.
+"""Measures the effect of errors in masks: compares the given masks and the rendered IDs with the exact masks.
 
     python benchmarks/mask_noise.py [--capture build/demo/capture] [--steps 200] [--restart] [--json]
 
---capture is the demo capture, which brings exact masks in truth/masks. Its masks are replaced by the true ones with
-mistakes of four kinds, from none to about half of them, and the demo is trained with each for so many --steps. Rendered
-IDs and masks are compared on the same views, those that were trained on, and the rendered IDs on the held-out ones too.
-Leaves docs/mask-noise.md and a plot beside it. What is done is kept in build/mask-noise.
+--capture is the demo capture, with exact masks in truth/masks. They get errors of four kinds, from none to about half
+of the labels, and the demo is trained with each for --steps. Masks and rendered IDs are compared on the training views,
+and rendered IDs also on the held-out views. Writes docs/mask-noise.md and its plot; results are kept in
+build/mask-noise.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
-from benchmarks import shared  # noqa: E402
+from benchmarks import shared
 
 WORK = ROOT / "build" / "mask-noise"
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5)
 SPECK = 3
-"""A hole of fewer pixels counts as an edge's roughness, in masks and renders alike."""
+"""Smaller holes, in pixels, count as rough edges, in masks and renders alike."""
 
 
-# --- mistakes --------------------------------------------------------------------------------------------------------
+# --- errors --------------------------------------------------------------------------------------------------------
 
 
 def segmenter(ids: np.ndarray, level: float, rng: np.random.Generator) -> np.ndarray:
-    """The demo's own mistakes (`--mask-noise`), at most as poor as it knows."""
+    """The errors of the demo's `--mask-noise`; level 0.5 is its maximum."""
     path = ROOT / "objectgs_addon" / "demo" / "mask_noise.py"
-    # By its file, since the package around it belongs to Blender.
+    # Loaded as a file, since its package requires Blender.
     spec = importlib.util.spec_from_file_location("objectgs_mask_noise", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -53,7 +53,7 @@ def segmenter(ids: np.ndarray, level: float, rng: np.random.Generator) -> np.nda
 
 
 def wrong_ids(ids: np.ndarray, level: float, rng: np.random.Generator) -> np.ndarray:
-    """Each object of a view, by this chance, carries another one's ID."""
+    """Each object of a view has another object's ID, with probability `level`."""
     present = np.unique(ids[ids > 0])
     result = ids.copy()
     for value in present:
@@ -63,12 +63,12 @@ def wrong_ids(ids: np.ndarray, level: float, rng: np.random.Generator) -> np.nda
 
 
 def missing(ids: np.ndarray, level: float, rng: np.random.Generator) -> np.ndarray | None:
-    """A view has no mask, by this chance."""
+    """A view has no mask, with probability `level`."""
     return None if rng.random() < level else ids
 
 
 def holes(ids: np.ndarray, level: float, rng: np.random.Generator) -> np.ndarray:
-    """Discs of 2 to 7 pixels' radius without a label, until this part of the picture is."""
+    """Unlabeled discs with a radius of 2 to 7 pixels, until they cover the fraction `level` of the image."""
     rows, columns = np.mgrid[: ids.shape[0], : ids.shape[1]]
     gone = np.zeros(ids.shape, bool)
     while gone.mean() < level:
@@ -77,28 +77,28 @@ def holes(ids: np.ndarray, level: float, rng: np.random.Generator) -> np.ndarray
     return np.where(gone, 0, ids)
 
 
-Mistake = Callable[[np.ndarray, float, np.random.Generator], "np.ndarray | None"]
-KINDS: dict[str, tuple[Mistake, str]] = {
+Disturbance = Callable[[np.ndarray, float, np.random.Generator], "np.ndarray | None"]
+KINDS: dict[str, tuple[Disturbance, str]] = {
     "segmenter": (
         segmenter,
-        "borders that wander, objects too large, too small, exchanged or missing, as --mask-noise",
+        "shifted borders, and objects that are too large, too small, exchanged or missing, as with --mask-noise",
     ),
-    "wrong IDs": (wrong_ids, "so many of the objects in a view carry another object's ID"),
-    "holes": (holes, "so much of each mask is cut out as discs without a label"),
-    "missing masks": (missing, "so many views have no mask"),
+    "wrong IDs": (wrong_ids, "part of the objects in a view have the ID of another object"),
+    "holes": (holes, "part of each mask is replaced by unlabeled discs"),
+    "missing masks": (missing, "part of the views have no mask"),
 }
 
 
 def disturbed_capture(source: Path, kind: str, level: float, folder: Path) -> None:
-    """A copy of the demo capture in `folder`, with mistakes in its true masks."""
+    """Copy the demo capture to `folder`, with errors in its exact masks."""
     shutil.copytree(source / "images", folder / "images")
     shutil.copytree(source / "sparse", folder / "sparse")
     shutil.copy(source / "labels.json", folder / "labels.json")
-    mistake = KINDS[kind][0]
+    disturb = KINDS[kind][0]
     for path in sorted((source / "truth" / "masks").rglob("*.png")):
         rng = np.random.default_rng([zlib.crc32(f"{kind} {path.name}".encode()), round(1000 * level)])
         true = np.asarray(Image.open(path))
-        given = mistake(true, level, rng) if level else true
+        given = disturb(true, level, rng) if level else true
         if given is not None:
             target = folder / "masks" / path.relative_to(source / "truth" / "masks")
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -109,8 +109,10 @@ def disturbed_capture(source: Path, kind: str, level: float, folder: Path) -> No
 
 
 def holes_of(found: np.ndarray, true: np.ndarray) -> tuple[int, int]:
-    """How many holes of SPECK pixels or more the objects of an ID map (H, W) have, and of how many pixels: what an
-    object's region encloses on all sides, and the truth says is that object's."""
+    """The number of holes of at least SPECK pixels in the objects of an ID map (H, W), and their pixels.
+
+    A hole is enclosed by an object's region on all sides and belongs to the object in the exact masks.
+    """
     count = pixels = 0
     for value in np.unique(true[true > 0]):
         region = found == value
@@ -123,50 +125,53 @@ def holes_of(found: np.ndarray, true: np.ndarray) -> tuple[int, int]:
 
 
 class Tally:
-    """ID maps of several views against the truth."""
+    """Compares ID maps of several views with the exact masks."""
 
     def __init__(self) -> None:
         from backend.evaluation import IdScores
 
         self._scores = IdScores()
-        self._views = self._holes = self._hole_pixels = self._labelled = self._unlabelled = 0
+        self._views = self._holes = self._hole_pixels = self._labeled = self._unlabeled = 0
 
     def add(self, found: np.ndarray | None, true: np.ndarray) -> None:
-        """Count a view; None: it has no ID map, so all of it is unlabelled."""
+        """Add a view; None if it has no ID map, so that all of it is unlabeled."""
         found = np.zeros_like(true) if found is None else found
         self._scores.add(found, true)
         count, pixels = holes_of(found, true)
         self._views += 1
         self._holes += count
         self._hole_pixels += pixels
-        self._labelled += int((true > 0).sum())
-        self._unlabelled += int(((found <= 0) & (true > 0)).sum())
+        self._labeled += int((true > 0).sum())
+        self._unlabeled += int(((found <= 0) & (true > 0)).sum())
 
     def result(self) -> dict[str, float]:
-        """miou and error (part of the labelled pixels with another ID or none), holes for each view and the part of the
-        labelled pixels in them, and the part without a label."""
+        """miou and error (part of the labeled pixels with another ID or none), holes for each view and the part of the
+        labeled pixels in them, and the part without a label."""
         scores = self._scores.result()
         return {
             "miou": scores["miou"],
             "mbiou": scores["mbiou"],
             "error": 1 - scores["accuracy"],
             "holes": self._holes / self._views,
-            "hole_share": self._hole_pixels / self._labelled,
-            "unlabelled": self._unlabelled / self._labelled,
+            "hole_share": self._hole_pixels / self._labeled,
+            "unlabeled": self._unlabeled / self._labeled,
         }
 
 
 def measured(capture: str, kind: str, level: float, steps: int) -> dict[str, Any]:
-    """Train with such masks; `masks` and `rendered` on the views that were trained on, `held_out` rendered there. In a
-    process of its own."""
+    """Train with erroneous masks; call it in a separate process.
+
+    Returns the scores of the masks and of the rendered IDs on the training views, and of the rendered IDs on the
+    held-out views.
+    """
     from backend.capture import load_capture
     from backend.labels import vote
-    from backend.protocol import Reporter
+    from backend.model.draw import draw
     from backend.raster import compile_kernels
-    from backend.raster.draw import draw
+    from backend.shared.events import Reporter
     from backend.training.budget import Budget
-    from backend.training.loop import Trainer
     from backend.training.settings import Settings
+    from backend.training.trainer import Trainer
 
     compile_kernels()
     source = Path(capture)
@@ -188,11 +193,11 @@ def measured(capture: str, kind: str, level: float, steps: int) -> dict[str, Any
     return {"masks": given.result(), "rendered": rendered.result(), "held_out": held_out.result()}
 
 
-# --- what comes of it ------------------------------------------------------------------------------------------------
+# --- results ------------------------------------------------------------------------------------------------
 
 
 def plot(found: dict[str, dict[float, dict[str, Any]]]) -> Any:
-    """mIoU and holes of masks and renders over the level of the mistakes, a column for each kind."""
+    """Plot mIoU and holes of masks and renders over the level of errors, one column per kind."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(2.65 * len(found), 5.2), layout="constrained")
@@ -203,18 +208,18 @@ def plot(found: dict[str, dict[float, dict[str, Any]]]) -> Any:
             (("miou", "mIoU against the truth", 1), ("hole_share", "pixels in holes (%)", 100))
         ):
             ax = axes[row, column]
-            for who, label, colour, style in (
-                ("masks", "masks given", shared.GREY, "o--"),
+            for who, label, color, style in (
+                ("masks", "masks given", shared.GRAY, "o--"),
                 ("rendered", "rendered, same views", shared.MARKED, "o-"),
-                ("held_out", "rendered, held-out views", shared.COLOURS[0], "o-"),
+                ("held_out", "rendered, held-out views", shared.COLORS[0], "o-"),
             ):
                 y = [factor * entry[who][name] for entry in levels.values()]
-                ax.plot(x, y, style, color=colour, label=label, markersize=4, linewidth=1.8)
+                ax.plot(x, y, style, color=color, label=label, markersize=4, linewidth=1.8)
             ax.set_ylim(bottom=0 if row else None)
             if not row:
                 ax.set_title(kind)
             else:
-                ax.set_xlabel("level of mistakes (%)")
+                ax.set_xlabel("level of errors (%)")
             if not column:
                 ax.set_ylabel(text)
                 if not row:
@@ -229,22 +234,22 @@ def document(found: dict[str, dict[float, dict[str, Any]]], steps: int, views: t
     with_holes = [e for e in entries if e[2]["masks"]["holes"] > 0]
     fewer = [e for e in with_holes if e[2]["rendered"]["holes"] < e[2]["masks"]["holes"]]
     lines = [
-        "# Mistakes in the masks",
+        "# Errors in masks",
         "",
-        "Made by `python benchmarks/mask_noise.py`; every figure here was measured by it. The demo's exact masks get",
-        f"mistakes before each training of {steps} steps; masks and rendered IDs are then compared with the exact ones",
-        f"on the {views[0]} views that were trained on, rendered IDs on the {views[1]} held-out views as well.",
+        "Made by `python benchmarks/mask_noise.py`; all figures here are its output. The demo's exact masks get",
+        f"errors before each training of {steps} steps; then masks and rendered IDs are compared with the exact masks",
+        f"on the {views[0]} training views, and rendered IDs also on the {views[1]} held-out views.",
         "",
         f"- The rendered IDs are closer to the truth than the masks (mIoU) in {len(closer)} of {len(entries)} cases"
         f"{_named(entries, closer)}.",
-        f"- The paper says that its results have fewer holes than the masks: so it is in {len(fewer)} of"
+        f"- The paper states that its results have fewer holes than the masks. This holds in {len(fewer)} of"
         f" {len(with_holes)} cases whose masks have holes{_named(with_holes, fewer)}.",
         "",
-        "![mIoU and holes of masks and rendered IDs over the level of mistakes](mask-noise.png)",
+        "![mIoU and holes of masks and rendered IDs over the level of errors](mask-noise.png)",
         "",
-        f"A hole is what an object's region encloses on all sides though the truth says that it is the object's, of"
-        f" {SPECK} pixels or more; their number is that in a view. *Wrong*: the part of the labelled pixels with"
-        " another ID, or none.",
+        f"A hole is a region of {SPECK} pixels or more that an object's region encloses on all sides, and that belongs"
+        " to the object in the exact masks; the number is per view. *Wrong*: fraction of the labeled pixels with"
+        " another ID or none.",
         "",
     ]
     head = ("level", "masks: mIoU", "wrong", "holes", "rendered: mIoU", "wrong", "holes", "held out: mIoU", "wrong")
@@ -263,24 +268,24 @@ def document(found: dict[str, dict[float, dict[str, Any]]], steps: int, views: t
 
 
 def _named(all_of: Sequence[tuple[str, float, Any]], good: Sequence[tuple[str, float, Any]]) -> str:
-    """The cases where it is otherwise, in words."""
+    """The exceptions, in words."""
     bad = [f"{kind} {level:.0%}" for kind, level, entry in all_of if (kind, level, entry) not in good]
-    return f"; not with {', '.join(bad)}" if bad else ""
+    return f"; exceptions: {', '.join(bad)}" if bad else ""
 
 
 def main() -> None:
     """Measure, and write the document and the plot."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--capture", type=Path, default=ROOT / "build/demo/capture", help="the demo capture")
-    parser.add_argument("--steps", type=int, default=200, help="how long to train with each kind of masks")
-    parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="where document and plot go")
-    parser.add_argument("--restart", action="store_true", help="forget what earlier runs have left")
+    parser.add_argument("--steps", type=int, default=200, help="number of training steps with each kind of masks")
+    parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="folder for document and plot")
+    parser.add_argument("--restart", action="store_true", help="discard the results of earlier runs")
     parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
     options = parser.parse_args()
     capture = options.capture.resolve()
     truths = sorted((capture / "truth" / "masks").rglob("*.png"))
     if not truths:
-        raise SystemExit(f"{capture} brings no true masks; make the demo capture by `make demo`.")
+        raise SystemExit(f"{capture} has no exact masks; make the demo capture by `make demo`.")
     if options.restart:
         shared.forget(WORK)
     shared.compile_everything()
@@ -289,7 +294,7 @@ def main() -> None:
 
     def case(kind: str, level: float) -> dict[str, Any]:
         return results.get(
-            f"{kind} {level:.0%}" if level else "no mistakes",
+            f"{kind} {level:.0%}" if level else "no errors",
             partial(
                 shared.in_child, "benchmarks.mask_noise:measured",
                 capture=str(capture), kind=kind, level=level, steps=options.steps,

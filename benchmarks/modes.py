@@ -2,7 +2,7 @@
 
     python benchmarks/modes.py [--json] [--capture build/demo/capture] [--seconds 150 | --steps 600]
 
-`plain` is the same pipeline with the heads silenced: every splat has its own colour, opacity, scale and rotation and
+`plain` is the same pipeline with the heads silenced: every splat has its own color, opacity, scale and rotation and
 nothing is shared, as in 3D Gaussian splatting. Quality is on the held-out views.
 """
 
@@ -20,12 +20,12 @@ import torch
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from backend.capture import load_capture  # noqa: E402
-from backend.labels import vote  # noqa: E402
-from backend.training.budget import Budget  # noqa: E402
-from backend.training.loop import Trainer  # noqa: E402
-from backend.training.settings import Settings  # noqa: E402
-from benchmarks.shared import train_and_measure  # noqa: E402
+from backend.capture import load_capture
+from backend.labels import vote
+from backend.training.budget import Budget
+from backend.training.settings import Settings
+from backend.training.trainer import Trainer
+from benchmarks.shared import train_and_measure
 
 VARIANTS = ("plain", "explicit", "view")
 

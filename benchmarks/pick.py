@@ -1,7 +1,8 @@
-"""How well and how fast a click finds its object: `backend.picking` against exact IDs, the renderer and the clock.
+"""How well and how fast `backend.shared.splats.picking` finds the object under a click, against exact IDs, the renderer
+and the clock.
 
 The splats of a reconstruction of a capture that brings its truth (`make demo`). `agrees_with_truth` is the share of
-random pixels of held-out views whose picked ID is the true one, those left aside at whose neighbours truth differs;
+random pixels of held-out views whose picked ID is the true one, those left aside at whose neighbors truth differs;
 `agrees_with_renderer` the share of all of them that show what `raster.object_map` says. Times are of single picks at
 `splats` splats, which are the reconstruction's, repeated side by side with all copies in the picture.
 
@@ -22,9 +23,10 @@ from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from backend.export import read_splats
-from backend.picking import Cloud, Placed, View, ids_in, pick
-from backend.protocol import Reconstruction, read_json
 from backend.raster import Camera, object_map, rasterize
+from backend.shared.formats.json_file import read_json
+from backend.shared.reconstruction.folder import Reconstruction
+from backend.shared.splats.picking import Cloud, PickObject, View, ids_in, pick
 
 PIXELS = 100
 VIEWS = 10
@@ -83,14 +85,14 @@ def measure(folder: Path, wanted: int) -> dict:
     }
 
 
-def placed(splats, matrix: np.ndarray | None = None) -> list[Placed]:
+def placed(splats, matrix: np.ndarray | None = None) -> list[PickObject]:
     """Each object's splats in the world."""
     matrix = np.eye(4) if matrix is None else matrix
     found = []
     for object_id in np.unique(splats.object_ids):
         own = splats.object_ids == object_id
         cloud = Cloud(splats.means[own], splats.quats[own], splats.scales[own], splats.opacities[own])
-        found.append(Placed(int(object_id), cloud, matrix))
+        found.append(PickObject(int(object_id), cloud, matrix))
     return found
 
 
@@ -115,7 +117,7 @@ def rendered_ids(splats, view: View) -> np.ndarray:
 
 
 def windows_agree(ids: np.ndarray) -> np.ndarray:
-    """(H, W) whether a pixel's neighbours all have its ID; not so at the border."""
+    """(H, W) whether a pixel's neighbors all have its ID; not so at the border."""
     windows = np.lib.stride_tricks.sliding_window_view(ids, (3, 3))
     agree = np.zeros(ids.shape, bool)
     agree[1:-1, 1:-1] = (windows == ids[1:-1, 1:-1, None, None]).all((2, 3))
@@ -128,7 +130,7 @@ def clock(splats, view: View, wanted: int) -> tuple[list[float], float, float]:
     side = 1.2 * np.linalg.norm(np.percentile(splats.means, 95, 0) - np.percentile(splats.means, 5, 0))
     rng = np.random.default_rng(1)
     started = time.perf_counter()
-    objects: list[Placed] = []
+    objects: list[PickObject] = []
     for copy in range(copies):
         matrix = np.eye(4)
         if copy:

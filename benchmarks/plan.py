@@ -1,14 +1,14 @@
-"""What the plan saves: trainings with all of its omissions and with none, and with what is asked for.
+"""Measures what the plan saves: trainings with all of its omissions, with none, and with parts of the result only.
 
     python benchmarks/plan.py [CAPTURE ...] [--json] [--steps 800] [--needed] [--write] [-- TRAIN OPTIONS]
 
-Each is a training of its own, measured on the held-out views; where something is left out, with three seeds, of which
-the means count. Where there are several omissions, they are taken back one at a time, too; where all of them come to
-another quality, the training as planned is repeated with fewer or more steps until its quality is the same. A capture
-without masks is given empty ones, so that nothing is left out, and such that show one object everywhere. `--needed`
-also leaves out, one at a time, what the plan does. Then the whole way to meshes, for one object alone, in groups, and
-without meshes; and what is left out of a capture with more than it needs (`--surplus` names those for which that is
-measured), and of pinhole pictures. `--write` leaves the tables in docs/plan.md.
+Each training is measured on the held-out views; if the plan omits something, the figures are means over three seeds.
+Several omissions are also undone one at a time. If the omissions change the quality, the training as planned is
+repeated with fewer or more steps until its quality is the same. A capture without masks is also trained with empty
+masks, so that nothing is omitted, and with masks that show one object everywhere. `--needed` also omits, one at a time,
+what the plan does. Further trainings lead to meshes: of everything, of one object, in groups, and without meshes. At
+last, redundant data is added to the captures that `--surplus` names, and pinhole images are undistorted. `--write`
+writes the tables to docs/plan.md.
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks import plan_captures, shared  # noqa: E402
+from benchmarks import plan_captures, shared
 
 DEMO = ROOT / "build/demo/capture"
 SAME_PSNR = 0.1
-"""Within so many dB two trainings are equally good, and within twice the standard error of their difference."""
+"""Two trainings are equally good within this difference, in dB, or twice the standard error of the difference."""
 
 SEEDS = 3
 
 DB_AN_OCTAVE, TRIES, MOST_TIMES = 1.5, 4, 2
-"""What twice the steps are taken to bring before two trainings have told, how many are tried, and how many times as
-many steps at most."""
+"""Assumed gain of twice the steps, in dB, until it is measured; largest number of trainings with other steps; largest
+factor of the steps."""
 
 FLAT = ("--primitive", "2d")
 AS_GOOD, EVERYWHERE = "as planned, as good", "with an object everywhere"
 
 SURPLUS = ("duplicate-views", "blind-views", "unseen-points")
-"""What `plan_captures.with_surplus` adds, by the plan's keys."""
+"""The plan's keys of the data that `plan_captures.with_surplus` adds."""
 
 GROUPS = 3
-"""Objects are grouped into so many, in turns."""
+"""Number of groups, to which objects are assigned in turn."""
 
 _COLUMNS = (
     ("steps", "steps", "{:,}"), ("seconds", "seconds", "{:.0f}"), ("cpu_seconds", "of the processors", "{:.0f}"),
@@ -64,7 +64,7 @@ _ASKED_COLUMNS = (
 
 
 def backend(*words: object) -> tuple[list[dict[str, Any]], float, float]:
-    """Run a command; its events, and how long it took on the clock and on the processors."""
+    """Run a command; returns its events, the seconds of wall time and the seconds of processor time."""
     before, started = os.times(), time.monotonic()
     done = subprocess.run(
         [sys.executable, "-m", "backend", *map(str, words), "--json"], cwd=ROOT, capture_output=True, text=True
@@ -77,8 +77,8 @@ def backend(*words: object) -> tuple[list[dict[str, Any]], float, float]:
 
 
 def measured(capture: Path, options: Sequence[str], meshes: bool = False) -> dict[str, Any]:
-    """One training, and its meshes where they are wanted, and their figures; iou: by ID, left_out: the plan's keys,
-    objects: of objects.json."""
+    """Train, optionally extract meshes, and return the figures; iou: by ID, left_out: the plan's keys, objects: of
+    objects.json."""
     with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as scratch:
         out = Path(scratch) / "out"
         events, seconds, busy = backend("train", capture, "--out", out, *options)
@@ -107,7 +107,7 @@ def measured(capture: Path, options: Sequence[str], meshes: bool = False) -> dic
 
 
 class Capture:
-    """A capture and the results that it gave. folder: its folder; options: of every training; name: of its results."""
+    """A capture and its results. folder: its folder; options: of every training; name: of its results."""
 
     def __init__(self, folder: Path, options: Sequence[str], name: str = "") -> None:
         self.folder, self.options = folder, tuple(options)
@@ -116,7 +116,7 @@ class Capture:
         self.name = name or ("demo" if folder == DEMO else folder.name)
 
     def made(self, what: str, make: Callable[..., Path], *arguments: object) -> Capture:
-        """The capture that `make`, of `plan_captures`, makes of this one."""
+        """Make a capture from this one with a function of `plan_captures`."""
         name = f"{self.name} {what}"
         folder = ROOT / "build" / "plan" / "captures" / name.replace(" ", "-")
         shared.forget(folder)
@@ -138,7 +138,7 @@ class Capture:
         )
 
     def prepare(self) -> dict[str, Any]:
-        """How long it takes to import, and what is left on the disk; measured once."""
+        """The seconds of an import, and its memory and disk space; measured once."""
         return self._once(
             f"{self.name} imported", functools.partial(imported, self.folder), lambda row: f"{row['seconds']:.1f} s"
         )
@@ -146,7 +146,7 @@ class Capture:
     def _once(
         self, name: str, make: Callable[[], dict[str, Any]], line: Callable[[dict[str, Any]], str]
     ) -> dict[str, Any]:
-        """A result; SystemExit where it fails."""
+        """Return a result; raises SystemExit if it fails."""
         self.results.total += 1
         found = self.results.get(name, make, line)
         if self.results.failures:
@@ -154,7 +154,7 @@ class Capture:
         return found
 
     def train_often(self, seeds: int, steps: int, *more: str, **words: Any) -> dict[str, Any]:
-        """The mean figures over so many seeds, and the standard error of the PSNR."""
+        """Means of the figures over seeds, and the standard error of the PSNR."""
         rows = [self.train(steps, *more, *(("--seed", str(seed)) if seed else ()), **words) for seed in range(seeds)]
         known = {key for key, _, _ in _COLUMNS if rows[0][key] is not None}
         spread = statistics.stdev(row["psnr"] for row in rows) if seeds > 1 else 0.0
@@ -166,7 +166,7 @@ class Capture:
 
 
 def omissions(capture: Capture, steps: int, needed: bool) -> tuple[list[str], dict[str, dict[str, Any]]]:
-    """What the plan leaves out, and the trainings with all of that and with none of it."""
+    """Return the keys that the plan omits, and the trainings with and without these omissions."""
     plan = capture.plan()
     has_masks = next(own["done"] for own in plan if own["key"] == "votes")
     open_to_choice = [own for own in plan if own["can_override"]]
@@ -178,11 +178,11 @@ def omissions(capture: Capture, steps: int, needed: bool) -> tuple[list[str], di
         whole = train(steps, "--keep", "all")
     else:
         left_out = ["votes", "labels", *left_out]
-        # Pixels of no object, as those of a mask that is missing, are not taught, or they would be a label, too.
+        # Without supervision of unlabeled pixels, which would be a label too, as when masks are missing.
         empty = capture.made("with empty masks", plan_captures.with_masks, 0)
         whole = empty.train_often(SEEDS, steps, "--keep", "all", "--leave-out", "rest")
-        labelled = capture.made("with an object everywhere", plan_captures.with_masks, 1)
-        found[EVERYWHERE] = labelled.train_often(SEEDS, steps, "--keep", "all")
+        labeled = capture.made("with an object everywhere", plan_captures.with_masks, 1)
+        found[EVERYWHERE] = labeled.train_often(SEEDS, steps, "--keep", "all")
     found = {"as planned": planned, "nothing left out": whole, **found}
     if judged(planned, whole) != "equal":
         found[AS_GOOD] = as_good(train, planned, whole["psnr"])
@@ -195,8 +195,10 @@ def omissions(capture: Capture, steps: int, needed: bool) -> tuple[list[str], di
 
 
 def surplus_of(capture: Capture, steps: int) -> dict[str, dict[str, Any]]:
-    """The trainings of the same capture with more than it needs: without all of that, with it, and with one part of it
-    at a time; RuntimeError where the plan does not leave it out."""
+    """Train on a capture with redundant data: without all of it, with all of it, and with one kind at a time.
+
+    Raises RuntimeError if the plan does not omit the redundant data.
+    """
     more = capture.made("with more than it needs", plan_captures.with_surplus)
     if missing := set(SURPLUS) - set(more.train(steps)["left_out"]):
         raise RuntimeError(f"The plan does not leave {', '.join(sorted(missing))} out of {more.folder}.")
@@ -210,7 +212,7 @@ def surplus_of(capture: Capture, steps: int) -> dict[str, dict[str, Any]]:
 
 
 def as_good(train: Callable[[int], dict[str, Any]], planned: dict[str, Any], psnr: float) -> dict[str, Any]:
-    """The training as planned of as many steps as come to this PSNR, or nearest to it after `TRIES`."""
+    """Repeat the training as planned with other steps until it has this PSNR; the nearest of `TRIES` otherwise."""
     tried = {planned["steps"]: planned}
     steps = min(2 ** ((psnr - planned["psnr"]) / DB_AN_OCTAVE), MOST_TIMES) * planned["steps"]
     for _ in range(TRIES):
@@ -228,7 +230,7 @@ def as_good(train: Callable[[int], dict[str, Any]], planned: dict[str, Any], psn
 
 
 def imported(folder: Path) -> dict[str, Any]:
-    """How long a capture takes to import, in seconds, and the memory and the room on disk in MB."""
+    """Import a capture; returns the seconds, and memory and disk space in MB."""
     with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as scratch:
         out = Path(scratch) / "out"
         _, seconds, _ = backend("import", folder, "--out", out)
@@ -238,8 +240,10 @@ def imported(folder: Path) -> dict[str, Any]:
 
 
 def asked_for(capture: Capture, steps: int) -> dict[str, dict[str, Any]]:
-    """The way to meshes: of everything, and of what was asked for alone. `iou` is that of the object which is asked
-    for, the one with the median number of points."""
+    """Train and extract meshes of everything and of parts.
+
+    `iou` is that of the object which is extracted alone, the one with the median number of points.
+    """
     everything = capture.train(steps, meshes=True)
     found = {"everything": everything}
     chosen = None
@@ -259,7 +263,7 @@ def asked_for(capture: Capture, steps: int) -> dict[str, dict[str, Any]]:
 
 
 def change(new: dict[str, Any], old: dict[str, Any], names: Mapping[str, str]) -> str:
-    """By how much figures are less or more, in words."""
+    """The relative differences of figures, in words."""
     return ", ".join(
         f"{abs(1 - new[key] / old[key]):.0%} {'less' if new[key] <= old[key] else 'more'} {name}"
         for key, name in names.items()
@@ -270,16 +274,16 @@ _COSTS = {"seconds": "time", "cpu_seconds": "time of the processors", "peak_mb":
 
 
 def verdict(found: dict[str, dict[str, Any]]) -> str:
-    """What the omissions save, and what they cost."""
+    """The effect of the omissions on cost and quality, in words."""
     planned, whole = found["as planned"], found["nothing left out"]
     text = f"As planned, as many steps take {change(planned, whole, _COSTS)}; {gain_of(planned, whole)}, "
     text += f"{judged(planned, whole)}."
     if same := found.get(AS_GOOD):
         text += f" In {same['steps']:,} steps it takes {change(same, whole, _COSTS)}; {gain_of(same, whole)}."
-    if labelled := found.get(EVERYWHERE):
+    if labeled := found.get(EVERYWHERE):
         text += " Nothing left out: votes, the ID channel and the label loss with masks that are empty. Labels of one "
         text += "object that is everywhere are more than that, since their loss asks for opaque pixels; against these: "
-        text += f"{change(planned, labelled, _COSTS)}; {gain_of(planned, labelled)}, {judged(planned, labelled)}."
+        text += f"{change(planned, labeled, _COSTS)}; {gain_of(planned, labeled)}, {judged(planned, labeled)}."
     return text
 
 
@@ -303,7 +307,7 @@ def judged(new: dict[str, Any], old: dict[str, Any]) -> str:
 
 
 def asked_verdict(found: dict[str, dict[str, Any]]) -> str:
-    """What is saved by asking for less."""
+    """The savings of extracting less, in words."""
     everything = found["everything"]
     lines = []
     for name, row in found.items():
@@ -329,7 +333,7 @@ def heading(level: int, text: str) -> str:
 
 
 def section_of_omissions(capture: Capture, steps: int, needed: bool) -> tuple[dict[str, Any], list[str]]:
-    """What is left out by itself: the figures, and lines of Markdown."""
+    """What the plan omits: the figures, and lines of Markdown."""
     left_out, trainings = omissions(capture, steps, needed)
     found = verdict(trainings) if left_out else f"{verdict(trainings)} Both did the same: what they differ by is noise."
     lines = [f"Left out: {', '.join(left_out) or 'nothing'}.", "", *rows_of(_COLUMNS, trainings), "",
@@ -338,20 +342,20 @@ def section_of_omissions(capture: Capture, steps: int, needed: bool) -> tuple[di
 
 
 def section_of_what_is_asked_for(capture: Capture, steps: int) -> tuple[dict[str, Any], list[str]]:
-    """What is left out since it was not asked for."""
+    """What the user omits: the figures, and lines of Markdown."""
     asked = asked_for(capture, steps)
-    lines = ["With meshes, and with what was asked for alone:", "", *rows_of(_ASKED_COLUMNS, asked), "",
+    lines = ["With meshes, and with parts of the result only:", "", *rows_of(_ASKED_COLUMNS, asked), "",
              asked_verdict(asked), ""]  # fmt: skip
     return {"asked_for": asked}, lines
 
 
 def section_of_pinholes(capture: Capture) -> tuple[dict[str, Any], list[str]]:
-    """What is saved where pictures need no undistortion; nothing where they do."""
+    """The savings if images need no undistortion: the figures, and lines of Markdown; empty if they need it."""
     if any(own["key"] == "undistortion" and own["done"] for own in capture.plan()):
         return {}, []
     plain, bent = capture.prepare(), capture.made("through a lens", plan_captures.through_a_lens).prepare()
     text = (
-        f"Pictures of a pinhole are not undistorted: import takes {plain['seconds']:.1f} instead of "
+        f"Pinhole images are not undistorted: import takes {plain['seconds']:.1f} instead of "
         f"{bent['seconds']:.1f} seconds, {plain['peak_mb']:,.0f} instead of {bent['peak_mb']:,.0f} MB of memory and "
         f"{plain['disk_mb']:.1f} instead of {bent['disk_mb']:.1f} MB on disk."
     )
@@ -359,12 +363,12 @@ def section_of_pinholes(capture: Capture) -> tuple[dict[str, Any], list[str]]:
 
 
 def section_of_surplus(capture: Capture, steps: int) -> tuple[dict[str, Any], list[str]]:
-    """What is saved where a capture has more than it needs."""
+    """The savings for a capture with redundant data: the figures, and lines of Markdown."""
     trainings = surplus_of(capture, steps)
     lines = [
         heading(3, f"{capture.name}, with more than it needs"), "",
-        "About as many photos again, half of them the same ones as JPEG and half of nothing that was reconstructed, "
-        f"and {plan_captures.UNSEEN:.0%} more points that no photo shows.", "",
+        "About twice as many photos: of those added, half are JPEG copies, and half show nothing reconstructed; "
+        f"also {plan_captures.UNSEEN:.0%} more points, which no photo shows.", "",
         *rows_of(_COLUMNS, trainings), "", verdict(trainings), "",
     ]  # fmt: skip
     return {"surplus": trainings}, lines

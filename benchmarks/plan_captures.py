@@ -1,4 +1,4 @@
-"""Captures made of others, so that a plan has something to leave out: what `benchmarks/plan.py` trains on."""
+"""Makes captures from others, so that a plan has something to omit, for `benchmarks/plan.py`."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from PIL import Image
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from backend.protocol import HOLDOUT_EVERY  # noqa: E402
+from backend.capture.capture import HOLDOUT_EVERY
 
 UNSEEN = 0.3
-"""So many points more, as a part, that no view shows."""
+"""Number of added points outside all views, as a fraction of the points."""
 
 LENS = 1e-5
-"""The radial distortion of a lens that moves nothing by a hundredth of a pixel in a picture of 1,000."""
+"""A radial distortion that moves no pixel of an image of 1,000 pixels by a hundredth of a pixel."""
 
 
 def with_masks(capture: Path, folder: Path, value: int) -> Path:
-    """In `folder`, a capture without masks as one whose masks hold this ID in every pixel; 0 is no object."""
+    """Copy a capture without masks to `folder`, with masks that have this ID in every pixel; 0 is no object."""
     for part in capture.iterdir():
         (folder / part.name).symlink_to(part)
     images = capture / "images"
@@ -38,7 +38,7 @@ def with_masks(capture: Path, folder: Path, value: int) -> Path:
 
 
 def through_a_lens(capture: Path, folder: Path) -> Path:
-    """In `folder`, the same capture of pinhole pictures, taken through a lens that bends them by next to nothing."""
+    """Copy a capture of pinhole images to `folder`, with cameras that have a negligible distortion."""
     model = _model(capture)
     for camera in model.cameras.values():
         fx, fy, cx, cy = camera.calibration_matrix()[[0, 1, 0, 1], [0, 1, 2, 2]]
@@ -52,22 +52,22 @@ def through_a_lens(capture: Path, folder: Path) -> Path:
 
 
 def with_surplus(capture: Path, folder: Path, seed: int = 0) -> Path:
-    """In `folder`, a capture with more than it needs: about as many photos again, half of them the same photos as JPEG,
-    the others of nothing that was reconstructed, and `UNSEEN` points outside of every photo.
+    """Copy a capture to `folder` with redundant data: about as many photos again, half of them the same photos as
+    JPEG, the others of nothing that was reconstructed, and points outside every photo (`UNSEEN`).
 
-    The same photos are held out as before, each of them twice, and the same ones are trained on.
+    The same photos are held out, each of them twice, and the same photos are trained on.
     """
     rng = np.random.default_rng(seed)
     model = _model(capture)
     images = sorted(model.images.values(), key=lambda image: image.name)
     held_out = images[::HOLDOUT_EVERY]
     trained = [image for i, image in enumerate(images) if i % HOLDOUT_EVERY]
-    # Every eighth of all is held out, which these come to when each of them is there twice.
+    # Every 8th photo of the new capture is held out: exactly these, when each of them occurs twice.
     room = 2 * len(held_out) * (HOLDOUT_EVERY - 1) - len(trained)
-    copies = trained[: room // 2]
-    blind = [trained[i % len(trained)] for i in range(room - len(copies))]
+    jpegs = trained[: room // 2]
+    blind = [trained[i % len(trained)] for i in range(room - len(jpegs))]
     rest: list[tuple[Any, Callable[..., None]]] = [(image, _same) for image in trained]
-    rest += [(image, _as_jpeg) for image in copies] + [(image, _of_nothing) for image in blind]
+    rest += [(image, _as_jpeg) for image in jpegs] + [(image, _as_wall) for image in blind]
     rest = [rest[i] for i in rng.permutation(len(rest))]
     twice = [(image, _same) for image in held_out for _ in range(2)]
     every = HOLDOUT_EVERY - 1
@@ -77,17 +77,17 @@ def with_surplus(capture: Path, folder: Path, seed: int = 0) -> Path:
     sparse.mkdir(parents=True)
     model.write_text(str(sparse))
     xyz = np.array([point.xyz for point in model.points3D.values()])
-    lines, looks = [], []
+    lines, poses = [], []
     for place, (image, make) in enumerate(order):
         rotation, shift = _pose(image)
         name = f"{place:04d}{'.jpg' if make is _as_jpeg else Path(image.name).suffix}"
-        if make is _of_nothing:
+        if make is _as_wall:
             turn = _away_from(xyz, rotation, shift, image.camera, rng)
             rotation, shift = turn @ rotation, turn @ shift
-        looks.append((rotation, shift, image.camera))
+        poses.append((rotation, shift, image.camera))
         make(capture, image.name, folder, name, rng)
         lines.append(f"{place + 1} {_numbers([*_quaternion(rotation), *shift])} {image.camera_id} {name}")
-        seen = [] if make is _of_nothing else [p for p in image.points2D if p.has_point3D()]
+        seen = [] if make is _as_wall else [p for p in image.points2D if p.has_point3D()]
         lines.append(" ".join(f"{p.xy[0]:.3f} {p.xy[1]:.3f} {p.point3D_id}" for p in seen))
     (sparse / "images.txt").write_text("\n".join(lines) + "\n")
     points = [
@@ -95,7 +95,7 @@ def with_surplus(capture: Path, folder: Path, seed: int = 0) -> Path:
         for i, point in model.points3D.items()
     ]
     first = max(model.points3D) + 1
-    for i, far in enumerate(_unseen(xyz, looks, round(UNSEEN * len(xyz)), rng)):
+    for i, far in enumerate(_unseen(xyz, poses, round(UNSEEN * len(xyz)), rng)):
         points.append(f"{first + i} {_numbers(far)} 128 128 128 1.0")
     (sparse / "points3D.txt").write_text("\n".join(points) + "\n")
     if (capture / "labels.json").exists():
@@ -128,7 +128,7 @@ def _as_jpeg(capture: Path, old: str, folder: Path, new: str, rng: np.random.Gen
     _copy_mask(capture, old, folder, new)
 
 
-def _of_nothing(capture: Path, old: str, folder: Path, new: str, rng: np.random.Generator) -> None:
+def _as_wall(capture: Path, old: str, folder: Path, new: str, rng: np.random.Generator) -> None:
     """A photo of a wall: one shade and noise."""
     target = folder / "images" / new
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -149,20 +149,20 @@ def _place(source: Path, target: Path) -> None:
 
 
 def _away_from(xyz: np.ndarray, rotation: np.ndarray, shift: np.ndarray, camera: Any, rng: np.random.Generator) -> Any:
-    """A turn (3, 3) of the camera after which none of the points lies in or near its picture."""
+    """A rotation (3, 3) of the camera after which none of the points is in or near its image."""
     seen = xyz @ rotation.T + shift
     for _ in range(1000):
         turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
         turn *= np.sign(np.linalg.det(turn))
-        if not _in_picture(seen @ turn.T, camera).any():
+        if not _in_image(seen @ turn.T, camera).any():
             return turn
-    raise RuntimeError("a camera of this capture has points on all sides, so it cannot look at nothing")
+    raise RuntimeError("a camera of this capture has points on all sides, so no rotation avoids them")
 
 
 def _unseen(
-    xyz: np.ndarray, looks: list[tuple[np.ndarray, np.ndarray, Any]], count: int, rng: np.random.Generator
+    xyz: np.ndarray, poses: list[tuple[np.ndarray, np.ndarray, Any]], count: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Points (count, 3) around the scene that lie in or near none of the pictures: rotation, shift, camera of each."""
+    """Points (count, 3) around the scene, outside all images and their surroundings; poses: rotation, shift, camera."""
     middle = np.median(xyz, axis=0)
     size = np.quantile(np.linalg.norm(xyz - middle, axis=1), 0.9)
     found = np.zeros((0, 3))
@@ -170,16 +170,16 @@ def _unseen(
         towards = rng.normal(size=(4 * count, 3))
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         some = middle + towards * size * rng.uniform(1, 6, (len(towards), 1))
-        for rotation, shift, camera in looks:
-            some = some[~_in_picture(some @ rotation.T + shift, camera)]
+        for rotation, shift, camera in poses:
+            some = some[~_in_image(some @ rotation.T + shift, camera)]
         found = np.concatenate([found, some])
         if len(found) >= count:
             return found[:count]
-    raise RuntimeError("the photos of this capture show everything around it, so nothing is unseen")
+    raise RuntimeError("the photos of this capture cover all directions, so no point is unseen")
 
 
-def _in_picture(points: np.ndarray, camera: Any) -> np.ndarray:
-    """Which of the points (n, 3) of camera space lie in the picture, or within a quarter of its size: (n,) bool."""
+def _in_image(points: np.ndarray, camera: Any) -> np.ndarray:
+    """Which of the points (n, 3) in camera space are in the image or within a quarter of its size: (n,) bool."""
     K = camera.calibration_matrix()
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         pixels = (points @ K.T)[:, :2] / points[:, 2:]

@@ -16,7 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks.shared import from_photos_to_report  # noqa: E402
+from benchmarks.shared import from_photos_to_report
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """How fast the rasterizer is, in ns for each (pixel, splat) pair.
 
 A pair is a pixel inside a splat's bounding box, clipped to the picture: what a renderer without exact spans or early
-stops would compute. Forward is projection, binning and blending of colour, alpha and label weight; backward is all
+stops would compute. Forward is projection, binning and blending of color, alpha and label probability; backward is all
 gradients. Scenes are random: splats of a few pixels, 40 to 50 deep at every pixel, opacities 0.05 to 0.95.
 The reference is the float64 torch renderer of the tests, which blends every splat into every pixel; it is timed
 on a small picture, beside the kernels on that very picture, so the factor grows with the scene.
@@ -25,16 +25,17 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
-import backend  # noqa: E402, F401, I001 - says how threads wait, before torch is loaded
+import backend  # noqa: F401, I001 - says how threads wait, before torch is loaded
 
-import numba  # noqa: E402
-import numpy as np  # noqa: E402
-import psutil  # noqa: E402
-import torch  # noqa: E402
+import numba
+import numpy as np
+import psutil
+import torch
 
-from backend.raster import Camera, compile_kernels, cpu  # noqa: E402
-from backend.raster.reference import rasterize_reference  # noqa: E402
-from backend.raster.splats import HALF_H, HALF_W, U, V  # noqa: E402
+from backend.raster import Camera, compile_kernels
+from backend.raster.cpu import renderer as cpu
+from backend.raster.reference import rasterize_reference
+from backend.raster.splats import HALF_H, HALF_W, U, V
 
 SIZES = ((40_000, 320, 240, 1.2), (50_000, 640, 480, 2.0), (200_000, 1280, 960, 2.0))
 MIDDLE = SIZES[1]
@@ -71,18 +72,18 @@ class Scene:
         self.labels = rng.integers(0, objects, (height, width)).astype(np.int32) if scattered else field(x, y)
         shape = (height, width)
         self.g_color = rng.normal(size=(3, *shape)).astype(np.float32)
-        self.g_alpha, self.g_weight = (rng.normal(size=shape).astype(np.float32) for _ in range(2))
+        self.g_alpha, self.g_label_probability = (rng.normal(size=shape).astype(np.float32) for _ in range(2))
         self.frame = self.forward()
 
     def forward(self) -> cpu.Frame:
         return cpu.forward(self.gaussians, self.camera, self.labels)
 
     def backward(self) -> None:
-        cpu.backward(self.frame, self.g_color, self.g_alpha, self.g_weight)
+        cpu.backward(self.frame, self.g_color, self.g_alpha, self.g_label_probability)
 
     def step(self) -> None:
         """What the rasterizer does in a training step."""
-        cpu.backward(self.forward(), self.g_color, self.g_alpha, self.g_weight)
+        cpu.backward(self.forward(), self.g_color, self.g_alpha, self.g_label_probability)
 
     def step_discs(self, surface: bool = False) -> None:
         """The same step for the same splats as discs; surface: with depth, normals and distortion and their gradients
@@ -91,10 +92,10 @@ class Scene:
             self.gaussians, self.camera, self.labels, surface, False, surface, surface, flat=True
         )  # fmt: skip
         three = (self.g_alpha, self.g_color, self.g_color[:2].copy()) if surface else ()
-        cpu.backward(frame, self.g_color, self.g_alpha, self.g_weight, *three)
+        cpu.backward(frame, self.g_color, self.g_alpha, self.g_label_probability, *three)
 
     def id_render(self) -> None:
-        """Colour, and the most probable object of every pixel."""
+        """Color, and the most probable object of every pixel."""
         cpu.object_ranks(cpu.forward(self.gaussians, self.camera), 1)
 
     @property
@@ -126,7 +127,7 @@ def against_reference(repeats: int) -> dict[str, float]:
     scene = Scene(*SMALL)
     g = scene.gaussians
     names = ("means", "quats", "scales", "opacities", "sh")
-    target = [torch.from_numpy(a).double() for a in (scene.g_color, scene.g_alpha, scene.g_weight)]
+    target = [torch.from_numpy(a).double() for a in (scene.g_color, scene.g_alpha, scene.g_label_probability)]
     labels = torch.from_numpy(scene.labels).long()[..., None]
 
     def reference() -> None:

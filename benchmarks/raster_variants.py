@@ -7,8 +7,8 @@ and lets them take turns:
     python -m benchmarks.raster_variants '{"alpha_min": 0.01}' SCENE.npz EXACT.npz
 
 The exact picture is that of the float64 reference, which draws every splat in exact order: without the cut-off at
-ALPHA_MIN (splats are left out only where they add less than 1e-12 to each pixel) and without STOP. What defines the
-picture, ALPHA_MAX and the blur, is the same everywhere.
+ALPHA_MIN (splats are left out only where they add less than 1e-12 to each pixel) and without TRANSMITTANCE_THRESHOLD.
+The constants that define the image, ALPHA_MAX and EPS_2D, are the same everywhere.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def parts_of(width: int, height: int) -> list[tuple[int, int, int, int]]:
 
 
 def exact_part(scene_file: str, part: tuple[int, int, int, int]) -> dict[str, np.ndarray]:
-    """The exact colour (3, h, w) and label weight (h, w) of a part of the picture; the splats drawn there, and the
+    """The exact color (3, h, w) and label probability (h, w) of a part of the picture; the splats drawn there, and the
     gradients of those in the order of PARAMETERS."""
     import torch
 
@@ -55,7 +55,7 @@ def exact_part(scene_file: str, part: tuple[int, int, int, int]) -> dict[str, np
 
     torch.set_num_threads(1)
     shared.replace(reference, "ALPHA_MIN", NOTHING)
-    shared.replace(reference, "STOP", 0.0)
+    shared.replace(reference, "TRANSMITTANCE_THRESHOLD", 0.0)
     scene = np.load(scene_file)
     camera = camera_of(scene)
     x, y, width, height = part
@@ -68,12 +68,15 @@ def exact_part(scene_file: str, part: tuple[int, int, int, int]) -> dict[str, np
     )
     labels = torch.from_numpy(scene["labels"][here]).long()[..., None]
     weight = picture.probabilities.gather(-1, labels.clamp(min=0))[..., 0] * (labels[..., 0] >= 0)
-    towards = torch.from_numpy(scene["g_color"][:, *here]).double(), torch.from_numpy(scene["g_weight"][here]).double()
+    towards = (
+        torch.from_numpy(scene["g_color"][:, *here]).double(),
+        torch.from_numpy(scene["g_label_probability"][here]).double(),
+    )
     ((picture.color * towards[0]).sum() + (weight * towards[1]).sum()).backward()
     gradients = [leaf.grad if leaf.grad is not None else torch.zeros_like(leaf) for leaf in leaves.values()]
     return {
         "color": picture.color.detach().numpy(),
-        "weight": weight.detach().numpy(),
+        "label_probability": weight.detach().numpy(),
         "drawn": drawn,
         **{f"g_{name}": gradient.numpy() for name, gradient in zip(PARAMETERS, gradients, strict=True)},
     }
@@ -84,7 +87,7 @@ def _reaches(scene: Any, camera: Any) -> np.ndarray:
     import torch
 
     from backend.raster.reference import _footprints, rotation_matrices
-    from backend.raster.settings import BLUR, TAN_MARGIN
+    from backend.raster.settings import EPS_2D, TAN_MARGIN
 
     means, quats, scales, opacities = (torch.from_numpy(scene[name]).double() for name in PARAMETERS[:4])
     W, t = (torch.from_numpy(camera.viewmat[:3, columns]) for columns in (slice(3), 3))
@@ -92,7 +95,7 @@ def _reaches(scene: Any, camera: Any) -> np.ndarray:
     ahead = p[:, 2] > camera.near
     p = torch.where(ahead[:, None], p, 1.0)
     axes = W @ rotation_matrices(quats / torch.linalg.vector_norm(quats, dim=-1, keepdim=True)) * scales[:, None, :]
-    a, _, c, _ = _footprints(p, axes, camera, BLUR, TAN_MARGIN)
+    a, _, c, _ = _footprints(p, axes, camera, EPS_2D, TAN_MARGIN)
     reach = torch.sqrt(2 * torch.log(opacities.clamp(min=2 * NOTHING) / NOTHING))
     fx, fy, cx, cy = (float(v) for v in camera.arrays()[1])
     u, v = fx * p[:, 0] / p[:, 2] + cx, fy * p[:, 1] / p[:, 2] + cy
@@ -104,11 +107,11 @@ def _reaches(scene: Any, camera: Any) -> np.ndarray:
 def join(scene: Any, parts: Iterator[tuple[tuple[int, int, int, int], dict[str, np.ndarray]]]) -> dict[str, np.ndarray]:
     """The whole exact picture and gradients of its parts."""
     height, width = scene["labels"].shape
-    whole = {"color": np.zeros((3, height, width)), "weight": np.zeros((height, width))}
+    whole = {"color": np.zeros((3, height, width)), "label_probability": np.zeros((height, width))}
     whole |= {f"g_{name}": np.zeros(scene[name].shape) for name in PARAMETERS}
     for (x, y, w, h), found in parts:
         whole["color"][:, y : y + h, x : x + w] = found["color"]
-        whole["weight"][y : y + h, x : x + w] = found["weight"]
+        whole["label_probability"][y : y + h, x : x + w] = found["label_probability"]
         for name in PARAMETERS:
             whole[f"g_{name}"][found["drawn"]] += found[f"g_{name}"]
     return whole
@@ -152,7 +155,7 @@ def _alpha_min(value: float) -> None:
 
 
 def _stop(value: float) -> None:
-    _set_everywhere(STOP=value, _STOP=value)
+    _set_everywhere(TRANSMITTANCE_THRESHOLD=value, _TRANSMITTANCE_THRESHOLD=value)
 
 
 def _exp_degree(degree: int) -> None:
@@ -173,7 +176,10 @@ def _bounds(kind: str) -> None:
     16 x 16 that the ellipse, its box or a square of 3 sigma (of the longer axis) meets."""
     from numba import njit, prange
 
-    from backend.raster import cpu, cpu_bin, cpu_tiles, simd
+    from backend.raster import simd
+    from backend.raster.cpu import binning as cpu_bin
+    from backend.raster.cpu import blending, blending_backward
+    from backend.raster.cpu import renderer as cpu
     from backend.raster.splats import HALF_H, HALF_W, LOP, SLOPE, A, C, U, V
 
     if kind != "box":
@@ -183,7 +189,7 @@ def _bounds(kind: str) -> None:
     half = np.float32(0.5)
 
     @njit(inline="always", error_model="numpy")
-    def rows(splats, n, tile_x, tile_y, rows, height, starts, stops, tops, centres):
+    def rows(splats, n, tile_x, tile_y, rows, height, starts, stops, tops, centers):
         v = splats[n, V]
         anchor = min(max(v, np.float32(0.0)), np.float32(height))
         u = splats[n, U] - half - np.float32(tile_x)
@@ -198,7 +204,7 @@ def _bounds(kind: str) -> None:
             y = simd.ramp(np.float32(tile_y + row) + half)
             dy = y - simd.splat(v)
             simd.store(tops, row, simd.splat(splats[n, LOP]) - simd.splat(splats[n, C]) * dy * dy)
-            simd.store(centres, row, simd.splat(u) + simd.splat(splats[n, SLOPE]) * (y - simd.splat(anchor)))
+            simd.store(centers, row, simd.splat(u) + simd.splat(splats[n, SLOPE]) * (y - simd.splat(anchor)))
             simd.store(starts, row, simd.splat_i(np.int32(start)))
             simd.store(stops, row, simd.splat_i(np.int32(stop)))
         return y0, y1
@@ -221,7 +227,8 @@ def _bounds(kind: str) -> None:
                 longest = 0.5 * (a + c) + math.sqrt(0.25 * (a - c) * (a - c) + b * b)
                 splats[n, HALF_W] = splats[n, HALF_H] = 3.0 * math.sqrt(longest)
 
-    shared.replace(cpu_tiles, "splat_rows", rows)
+    for module in (blending, blending_backward):
+        shared.replace(module, "splat_rows", rows)
     if kind != "tiles":
         shared.replace(cpu_bin, "row_ends", ends)
     if kind == "square":
@@ -235,10 +242,10 @@ def _bounds(kind: str) -> None:
 
 def _sort(kind: str) -> None:
     """`argsort`: NumPy's; `16 bits` or `8 bits` of the depths' range, ties as they come; `none`: in the order of the
-    model; `tiles`: each tile's list by itself; `keys`: one sort of all meetings by tile and depth."""
+    model; `tiles`: each tile's intersections alone; `keys`: one sort of all intersections by tile and depth."""
     from numba import njit, prange
 
-    from backend.raster import cpu
+    from backend.raster.cpu import renderer as cpu
     from backend.raster.splats import DEPTH, HALF_H
 
     def visible(splats: np.ndarray) -> np.ndarray:
@@ -257,32 +264,32 @@ def _sort(kind: str) -> None:
         return found
 
     @njit(parallel=True)
-    def by_tile(splats, tiles, members, places):
-        for tile in prange(tiles.size - 1):
-            first, last = tiles[tile], tiles[tile + 1]
-            here, there = members[first:last].copy(), places[first:last].copy()
+    def by_tile(splats, isect_offsets, isect_ids, isect_rows):
+        for tile in prange(isect_offsets.size - 1):
+            first, last = isect_offsets[tile], isect_offsets[tile + 1]
+            here, there = isect_ids[first:last].copy(), isect_rows[first:last].copy()
             depths = np.empty(last - first, np.float32)
             for i in range(last - first):
                 depths[i] = splats[here[i], DEPTH]
             sequence = np.argsort(depths, kind="mergesort")
             for i in range(last - first):
-                members[first + i] = here[sequence[i]]
-                places[first + i] = there[sequence[i]]
+                isect_ids[first + i] = here[sequence[i]]
+                isect_rows[first + i] = there[sequence[i]]
 
-    def by_key(splats: np.ndarray, tiles: np.ndarray, members: np.ndarray, places: np.ndarray) -> None:
-        tile = np.repeat(np.arange(tiles.size - 1, dtype=np.uint64), np.diff(tiles))
-        bits = np.ascontiguousarray(splats[members, DEPTH]).view(np.uint32)
+    def by_key(splats: np.ndarray, isect_offsets: np.ndarray, isect_ids: np.ndarray, isect_rows: np.ndarray) -> None:
+        tile = np.repeat(np.arange(isect_offsets.size - 1, dtype=np.uint64), np.diff(isect_offsets))
+        bits = np.ascontiguousarray(splats[isect_ids, DEPTH]).view(np.uint32)
         sequence = np.argsort(tile << np.uint64(32) | bits, kind="stable")
-        members[:], places[:] = members[sequence], places[sequence]
+        isect_ids[:], isect_rows[:] = isect_ids[sequence], isect_rows[sequence]
 
     shared.replace(cpu, "depth_order", order)
     if kind in ("tiles", "keys"):
         sort = by_tile if kind == "tiles" else by_key
 
         def bin_and_sort(splats: np.ndarray, order: np.ndarray, width: int, height: int) -> Any:
-            tiles, members, places, slots = bin_splats(splats, order, width, height)
-            sort(splats, tiles, members, places)
-            return tiles, members, places, slots
+            isect_offsets, isect_ids, isect_rows, row_offsets = bin_splats(splats, order, width, height)
+            sort(splats, isect_offsets, isect_ids, isect_rows)
+            return isect_offsets, isect_ids, isect_rows, row_offsets
 
         bin_splats = shared.replace(cpu, "bin_splats", bin_and_sort)
 
@@ -315,11 +322,11 @@ def _replaced(text: str, pairs: tuple[tuple[str, str], ...]) -> str:
 
 
 class _DoubledFinder(importlib.abc.MetaPathFinder):
-    _NAMES = ("simd", "splats", "discs", "tiles", "cpu", "cpu_bin", "cpu_tiles", "cpu_project", "cpu_ids")
+    _SHARED = ("simd", "splats", "spherical_harmonics", "discs", "tile_intersection")
 
     def find_spec(self, fullname: str, path: Any, target: Any = None) -> Any:
         package, _, name = fullname.rpartition(".")
-        if package != "backend.raster" or name not in self._NAMES:
+        if package != "backend.raster.cpu" and (package != "backend.raster" or name not in self._SHARED):
             return None
         found = importlib.machinery.PathFinder.find_spec(fullname, path)
         assert found is not None and found.origin is not None
@@ -347,14 +354,14 @@ def main() -> None:
     kind = np.float64 if changes.pop("float64", False) else np.float32
     if kind is np.float64:
         sys.meta_path.insert(0, _DoubledFinder())
-    from backend.raster import cpu
+    from backend.raster.cpu import renderer as cpu
 
     for name, value in changes.items():
         _CHANGES[name](value)
     scene, exact = np.load(scene_file), np.load(exact_file)
     gaussians = cpu.Gaussians(*(np.ascontiguousarray(scene[name], kind) for name in PARAMETERS), ids=scene["ids"])
     camera, labels = camera_of(scene), scene["labels"]
-    towards = [np.ascontiguousarray(scene[name], kind) for name in ("g_color", "g_alpha", "g_weight")]
+    towards = [np.ascontiguousarray(scene[name], kind) for name in ("g_color", "g_alpha", "g_label_probability")]
 
     started = time.perf_counter()
     frame = cpu.forward(gaussians, camera, labels)
@@ -371,7 +378,7 @@ def main() -> None:
 
 
 def errors(frame: Any, gradients: Any, exact: Any) -> dict[str, float]:
-    """picture: root of the mean squared error of the colours, in steps of 8 bits; largest: the largest one; gradient:
+    """picture: root of the mean squared error of the colors, in steps of 8 bits; largest: the largest one; gradient:
     length of the difference as a part of the exact gradient's, the root mean square over PARAMETERS."""
     picture = 255 * (frame.color - exact["color"])
     parts = []

@@ -1,4 +1,4 @@
-"""What several benchmarks share: results that outlive a run that was stopped, work in processes of their own, the
+"""Functions of several benchmarks: results that are kept when a run is stopped, work in separate processes, the
 quality of a training, and plots for docs/."""
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
-import backend  # noqa: E402, F401 - says how threads wait, before torch is loaded
+import backend  # noqa: F401 - sets how threads wait, before torch is loaded
 
-GREY = "#8a8a92"
-COLOURS = ("#3b7dd8", "#d9731a", "#2a9d6f", "#b0479e", "#7a6a2f", "#5b5bd6")
+GRAY = "#8a8a92"
+COLORS = ("#3b7dd8", "#d9731a", "#2a9d6f", "#b0479e", "#7a6a2f", "#5b5bd6")
 MARKED = "#c8322b"
-"""The colour of the default in every plot."""
+"""The color of the default in every plot."""
 
 _STYLE: dict[str, Any] = {
     "font.size": 9,
@@ -47,7 +47,7 @@ _STYLE: dict[str, Any] = {
 
 
 def digest(paths: Iterable[Path], *words: object) -> str:
-    """Tells the content of files, and what else a result depends on, from others."""
+    """A digest of the content of files and of anything else that a result depends on."""
     sha = hashlib.sha256(repr(words).encode())
     for path in sorted(paths):
         sha.update(path.name.encode() + b"\0" + path.read_bytes())
@@ -55,14 +55,14 @@ def digest(paths: Iterable[Path], *words: object) -> str:
 
 
 def sources() -> list[Path]:
-    """The files that decide what the backend computes: all but what it says of earlier measurements."""
+    """The files that determine the backend's results: all except the module that states earlier measurements."""
     return sorted(path for path in (ROOT / "backend").rglob("*.py") if path.name != "expectation.py")
 
 
 class Results:
-    """Results by name in a folder, each one computed once for the same code and input; one line is printed for each.
+    """Results by name in a folder; each is computed once for the same code and input, and printed as one line.
 
-    made_from: `digest` of what all of them depend on. total: how many are to come, for the lines.
+    made_from: `digest` of everything that the results depend on. total: expected number of results, to be printed.
     """
 
     def __init__(self, folder: Path, made_from: str, total: int) -> None:
@@ -72,7 +72,7 @@ class Results:
         folder.mkdir(parents=True, exist_ok=True)
 
     def get(self, name: str, make: Callable[[], dict[str, Any]], line: Callable[[dict[str, Any]], str]) -> Any:
-        """The result `name`, from disk where it is there; {} where it fails, which `failures` then holds."""
+        """Return the result `name`, from disk if it is current; {} if `make` fails, with the reason in `failures`."""
         path = self.folder / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.json"
         stored = json.loads(path.read_text()) if path.exists() else {}
         again = stored.get("made_from") == self.made_from
@@ -91,20 +91,22 @@ class Results:
         spent = int(time.monotonic() - self._started)
         print(
             f"[{self._done:3d}/{self.total} {spent // 60:3d}:{spent % 60:02d}] {name}: {text or line(result)}"
-            + (" (from before)" if again else ""),
+            + (" (from an earlier run)" if again else ""),
             flush=True,
         )
         return result
 
 
 def forget(folder: Path) -> None:
-    """Remove what earlier runs have left."""
+    """Remove the results of earlier runs."""
     shutil.rmtree(folder, ignore_errors=True)
 
 
 def in_child(call: str, environment: Mapping[str, str] | None = None, **words: Any) -> dict[str, Any]:
-    """What `module:function`, called with `words` (as JSON goes) in a process of its own, returns; RuntimeError with
-    the end of what it said where it fails."""
+    """Call `module:function` with the keywords `words`, as JSON, in a separate process and return its result.
+
+    Raises RuntimeError with the end of its error output if it fails.
+    """
     module, function = call.split(":")
     script = (
         f"import json, sys; from {module} import {function} as call; "
@@ -120,33 +122,35 @@ def in_child(call: str, environment: Mapping[str, str] | None = None, **words: A
 
 
 def replace(owner: Any, name: str, value: Any) -> Any:
-    """Give a module's name another value, in this process; returns the old one. RuntimeError where it has no such name,
-    for then nothing would change."""
+    """Replace the value of a module's name in this process; returns the old value.
+
+    Raises RuntimeError if the module has no such name, since nothing would change.
+    """
     if not hasattr(owner, name):
-        raise RuntimeError(f"{owner.__name__} has no {name} any more, which this benchmark changes")
+        raise RuntimeError(f"{owner.__name__} no longer has {name}, which this benchmark changes")
     old = getattr(owner, name)
     setattr(owner, name, value)
     return old
 
 
 def compile_everything() -> None:
-    """Have all kernels of the product ready on disk, so that no measurement waits for one."""
-    from backend.commands.kernels import have_kernels_ready
-    from backend.device import CPU
-    from backend.protocol import Reporter
-    from backend.stopping import StoppingReporter, StopRequest
+    """Compile all kernels to disk, so that no measurement includes compilation."""
+    from backend.commands.setup.kernels import ensure_kernels
+    from backend.raster.devices import CPU
+    from backend.shared.events import Reporter
+    from backend.shared.stopping import StoppingReporter, StopRequest
 
-    print("Kernels are compiled where that was not done yet.", flush=True)
-    have_kernels_ready(StoppingReporter(Reporter(), StopRequest()), CPU)
+    print("Compiling missing kernels", flush=True)
+    ensure_kernels(StoppingReporter(Reporter(), StopRequest()), CPU)
 
 
 def train_and_measure(trainer: Any, capture: Any, budget: Any) -> dict[str, Any]:
-    """Train, and measure what comes of it on the held-out views."""
+    """Train, and measure the result on the held-out views."""
     import numpy as np
 
     from backend.evaluation import evaluate
-    from backend.protocol import Reporter
-    from backend.raster.draw import draw
+    from backend.model.draw import draw
+    from backend.shared.events import Reporter
 
     with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as folder:
         trainer.run(budget, Path(folder), Reporter())
@@ -167,8 +171,10 @@ def train_and_measure(trainer: Any, capture: Any, budget: Any) -> dict[str, Any]
 
 
 def from_photos_to_report(capture: Path, *options: object, meshes: bool = True) -> dict[str, Any]:
-    """Train, mesh and evaluate by the commands that a user runs; returns what the report says. F1 is over the true
-    surface that training views see; of it and of the texture's PSNR the median over the objects, of F1 also the least.
+    """Train, mesh and evaluate with the commands that a user runs; returns figures of the report.
+
+    F1 is measured on the true surface that training views see. F1 and the texture's PSNR are medians over the objects;
+    `f1_least` is the least F1.
     """
     with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as scratch:
         out = Path(scratch) / "out"
@@ -204,7 +210,7 @@ def from_photos_to_report(capture: Path, *options: object, meshes: bool = True) 
 
 
 def plot_style() -> AbstractContextManager[None]:
-    """Within it, figures look like those of docs/."""
+    """A context in which figures have the style of docs/."""
     from matplotlib import rc_context
 
     return rc_context(_STYLE)
@@ -216,7 +222,7 @@ def save_figure(figure: Any, path: Path) -> None:
 
     from PIL import Image
 
-    from backend.evaluation.mesh_pictures import save_sheet
+    from backend.evaluation.mesh_sheet import save_sheet
 
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=130)
@@ -225,7 +231,7 @@ def save_figure(figure: Any, path: Path) -> None:
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
-    """Lines of a Markdown table: first column to the left, the others to the right."""
+    """Lines of a Markdown table; the first column is left-aligned, the others right-aligned."""
     head = list(head)
     lines = ["| " + " | ".join(head) + " |", "|" + "|".join(["---"] + ["---:"] * (len(head) - 1)) + "|"]
     return [*lines, *("| " + " | ".join(row) + " |" for row in rows)]

@@ -2,7 +2,7 @@
 
     python benchmarks/stability.py [--json] [--write] [--only CASE ...]
 
-Captures of coloured spheres are made for each case, and trained for a fixed number of steps, so that the machine's load
+Captures of colored spheres are made for each case, and trained for a fixed number of steps, so that the machine's load
 changes nothing but the seconds. No step may lose its numbers, in any case; what else is expected stands in the table.
 With --write the table goes to docs/stability.md. Exit code 1 if an expectation did not hold.
 """
@@ -28,15 +28,15 @@ from PIL import Image
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from backend.capture import load_capture  # noqa: E402
-from backend.evaluation import IdScores, psnr  # noqa: E402
-from backend.labels import vote  # noqa: E402
-from backend.protocol import Reporter  # noqa: E402
-from backend.raster.draw import draw  # noqa: E402
-from backend.training.budget import Budget  # noqa: E402
-from backend.training.loop import Trainer  # noqa: E402
-from backend.training.settings import Settings  # noqa: E402
-from tests.backend.conftest import Scene, rays_of, write_model, write_scene  # noqa: E402
+from backend.capture import load_capture
+from backend.evaluation import IdScores, psnr
+from backend.labels import vote
+from backend.model.draw import draw
+from backend.shared.events import Reporter
+from backend.training.budget import Budget
+from backend.training.settings import Settings
+from backend.training.trainer import Trainer
+from tests.backend.conftest import Scene, rays_of, write_model, write_scene
 
 DOCUMENT = ROOT / "docs" / "stability.md"
 SIZE = (96, 72)
@@ -125,7 +125,7 @@ def enlarged(times: int) -> Change:
 
 
 def paint(scene: Scene) -> None:
-    """Give the spheres a pattern that looks the same from everywhere, and what is behind them one colour."""
+    """Give the spheres a pattern that looks the same from everywhere, and what is behind them one color."""
     rays = rays_of(scene.lens())
 
     def painted(view: int, _: np.ndarray) -> np.ndarray:
@@ -138,8 +138,8 @@ def paint(scene: Scene) -> None:
     each_image(painted)(scene)
 
 
-def take_colours(scene: Scene) -> None:
-    """Give each point the colour of a photo that shows it, as COLMAP would, and write the model."""
+def take_colors(scene: Scene) -> None:
+    """Give each point the color of a photo that shows it, as COLMAP would, and write the model."""
     for name, seen, pixels in zip(scene.names, scene.seen, scene.pixels, strict=True):
         x, y = pixels.astype(np.int64).T
         scene.rgb[seen] = np.asarray(Image.open(scene.folder / "images" / name))[y, x]
@@ -160,7 +160,7 @@ def train(
         paint(scene)
         if change is not None:
             change(scene)
-        take_colours(scene)
+        take_colors(scene)
         capture = load_capture(scene.folder, Path(folder) / "cache", max_size=max_size)
         ids = vote(capture).ids if capture.has_masks else np.zeros(len(capture.points.xyz), np.int64)
         trainer = Trainer.start(capture, ids, settings)
@@ -358,7 +358,7 @@ def large() -> list[Row]:
     places = np.stack(np.meshgrid(*3 * [np.linspace(-1.1, 1.1, side)], indexing="ij"), -1).reshape(-1, 3)[:2000]
     spheres = [(i + 1, p + rng.uniform(-0.02, 0.02, 3), 0.06) for i, p in enumerate(places)]
     found = train(views=12, size=(320, 240), steps=200, spheres=spheres, points=5)
-    objects = len(found.trainer.model.object_ids) - 1
+    objects = len(found.trainer.model.classes) - 1
     rows.append(
         row(
             "2,000 objects", "all that the masks show are learned; mIoU at least 0.5",

@@ -20,11 +20,12 @@ import torch
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from backend.capture import load_capture  # noqa: E402
-from backend.labels import vote  # noqa: E402
-from backend.model.anchors import median_spacing  # noqa: E402
-from backend.training import loop  # noqa: E402
-from backend.training.settings import Settings  # noqa: E402
+from backend.capture import load_capture
+from backend.labels import vote
+from backend.model.anchors import median_spacing
+from backend.training import step
+from backend.training.settings import Settings
+from backend.training.trainer import Trainer
 
 PARTS = ("raster", "heads", "loss", "optimizer")
 
@@ -49,41 +50,41 @@ class Stopwatch:
         setattr(owner, name, timed)
 
 
-def trainer_of(folder: Path, splats: int) -> loop.Trainer:
+def trainer_of(folder: Path, splats: int) -> Trainer:
     """A trainer on the capture, warmed up, with about `splats` splats: from finer cells where there are too few."""
     capture = load_capture(folder, Path(tempfile.mkdtemp(prefix="objectgs-benchmark-")))
     ids = vote(capture).ids if capture.has_masks else np.zeros(len(capture.points.xyz), np.int64)
     for fineness in (1.0, 0.6, 0.3):
-        trainer = loop.Trainer.start(capture, ids, Settings(voxel=fineness * median_spacing(capture.points.xyz)))
-        for step in range(450):
-            trainer.step(0.15 + 0.45 * step / 450)
+        trainer = Trainer.start(capture, ids, Settings(voxel=fineness * median_spacing(capture.points.xyz)))
+        for done in range(450):
+            trainer.step(0.15 + 0.45 * done / 450)
         if trainer.splats >= splats:
             break
     anchors = trainer.model.anchors
     keep = min(1.0, splats / max(trainer.splats, 1))
     chosen = np.sort(np.random.default_rng(0).permutation(len(anchors))[: round(keep * len(anchors))])
     anchors.positions, anchors.rows, anchors.ids = anchors.positions[chosen], anchors.rows[chosen], anchors.ids[chosen]
-    trainer._first, trainer._second = trainer._first[chosen], trainer._second[chosen]
+    trainer._exp_avg, trainer._exp_avg_sq = trainer._exp_avg[chosen], trainer._exp_avg_sq[chosen]
     trainer._average.take(torch.from_numpy(chosen), anchors.rows[:0])
-    for step in range(60):
-        trainer.step(0.7 + 0.001 * step)
+    for done in range(60):
+        trainer.step(0.7 + 0.001 * done)
     return trainer
 
 
-def measure(trainer: loop.Trainer, steps: int) -> dict:
+def measure(trainer: Trainer, steps: int) -> dict:
     """Step time (median, ms) and the share of each part."""
     from backend.model.generate_on_cpu import Generate
     from backend.raster import _Rasterize
-    from backend.training.losses import _ImageLoss
+    from backend.training.losses.on_cpu import _ImageLoss
 
     watch = Stopwatch()
-    watch.wrap(loop, "rasterize", "raster")
+    watch.wrap(step, "rasterize", "raster")
     watch.wrap(_Rasterize, "backward", "raster")
-    watch.wrap(loop, "image_loss", "loss")
+    watch.wrap(step, "image_loss", "loss")
     watch.wrap(_ImageLoss, "backward", "loss")
-    watch.wrap(loop, "generate", "heads")
+    watch.wrap(step, "generate", "heads")
     watch.wrap(Generate, "backward", "heads")
-    watch.wrap(loop.Trainer, "_update", "optimizer")
+    watch.wrap(Trainer, "_update", "optimizer")
     # What the heads' own layers spend in the backward pass is what autograd spends beyond the functions above.
     whole = {"seconds": 0.0}
     inner = torch.Tensor.backward

@@ -63,19 +63,19 @@ def _train(pipe: Connection, core: int, spec: dict[str, Any], capture: str, cach
     import numpy as np
 
     from backend.capture import load_capture
-    from backend.commands.machine import set_threads
+    from backend.commands.setup.machine import set_threads
     from backend.labels import vote
     from backend.raster import compile_kernels
-    from backend.training import loop
     from backend.training.budget import Budget
     from backend.training.settings import Settings
+    from backend.training.trainer import Trainer
 
     set_threads(1)
     compile_kernels()
     change(spec)
     loaded = load_capture(Path(capture), Path(cache))
     ids = vote(loaded).ids if loaded.has_masks else np.zeros(len(loaded.points.xyz), np.int64)
-    trainer = loop.Trainer.start(loaded, ids, Settings(seed=seed, **spec.get("settings", {})))
+    trainer = Trainer.start(loaded, ids, Settings(seed=seed, **spec.get("settings", {})))
     pipe.send("ready")
     pipe.recv()
     pipe.send(shared.train_and_measure(trainer, loaded, Budget(steps=steps)))
@@ -87,21 +87,21 @@ def change(spec: Mapping[str, Any]) -> None:
     """Change the training of this process as a variant has it, but for what `Settings` says."""
     import torch
 
-    from backend.training import loop
+    from backend.training import growth_strategy, step, trainer
 
     if "grow_every" in spec:
-        shared.replace(loop, "growth_interval", lambda step: spec["grow_every"])
+        shared.replace(growth_strategy, "growth_interval", lambda step: spec["grow_every"])
     if "pyramid" in spec:
         sizes = spec["pyramid"]
-        shared.replace(loop, "downscale_at", lambda share, *_: next((by for until, by in sizes if share < until), 1))
+        shared.replace(step, "downscale_at", lambda done, *_: next((by for until, by in sizes if done < until), 1))
     if spec.get("dense_adam"):
 
-        def step_all(values, first, second, seen, gradients, *others):
+        def step_all(values, exp_avg, exp_avg_sq, seen, gradients, *others):
             everything = torch.zeros_like(values)
             everything[seen] = gradients
-            return step_rows(values, first, second, torch.arange(len(values)), everything, *others)
+            return step_rows(values, exp_avg, exp_avg_sq, torch.arange(len(values)), everything, *others)
 
-        step_rows = shared.replace(loop, "step_rows", step_all)
+        step_rows = shared.replace(trainer, "step_rows", step_all)
 
 
 def curve_of(rows: Iterable[Mapping[str, Any]]) -> dict[int, dict[str, float]]:

@@ -52,7 +52,7 @@ running_redraw = running.redraw
 bpy.app.driver_namespace["draw"] = draw
 bpy.app.timers.register(draw)
 """
-STOP = """
+TRANSMITTANCE_THRESHOLD = """
 bpy.app.timers.unregister(bpy.app.driver_namespace["tick"])
 gaps = sorted(bpy.app.driver_namespace["gaps"])
 result = {"ticks": len(gaps), "median_ms": 1000 * gaps[len(gaps) // 2], "p99_ms": 1000 * gaps[int(0.99 * len(gaps))],
@@ -80,7 +80,7 @@ def measure(
         time.sleep(2)
         blender.run(START)
         time.sleep(10)
-        found["at rest"] = blender.run(STOP)
+        found["at rest"] = blender.run(TRANSMITTANCE_THRESHOLD)
         blender.run(
             NAMES + f"bpy.ops.objectgs.import_capture(directory={str(capture)!r}, folder={str(place / 'out')!r})"
         )
@@ -89,27 +89,27 @@ def measure(
         wait(blender, BEGUN)
         blender.run(START)
         wait(blender, "running.queue.running is None or running.queue.running.progress > 0.9", 1.0)
-        found["training"] = blender.run(STOP)
+        found["training"] = blender.run(TRANSMITTANCE_THRESHOLD)
         wait(blender, "running.queue.running is None")
         blender.run(NAMES + f"root.objectgs.minutes = {2 * seconds / 60}; bpy.ops.objectgs.train()")
         wait(blender, BEGUN)
         blender.run(NAMES + "running.shown, running.redraw = running.redraw, lambda: None")
         blender.run(START)
         wait(blender, "running.queue.running is None or running.queue.running.progress > 0.9", 1.0)
-        found["training, undrawn"] = blender.run(STOP)
+        found["training, undrawn"] = blender.run(TRANSMITTANCE_THRESHOLD)
         wait(blender, "running.queue.running is None")
         blender.run(NAMES + "running.redraw = running.shown")
         blender.run(NAMES + DRAW_OWN)
         time.sleep(10)  # The result of the training before comes in.
         blender.run(START)
         time.sleep(10)
-        found["Blender's own, no training"] = blender.run(STOP)
+        found["Blender's own, no training"] = blender.run(TRANSMITTANCE_THRESHOLD)
         outside = train_outside(capture, place / "outside", seconds)
         time.sleep(10)  # Reading the capture.
         blender.run(START)
         while outside.poll() is None:
             time.sleep(1)
-        found["Blender's own"] = blender.run(STOP)
+        found["Blender's own"] = blender.run(TRANSMITTANCE_THRESHOLD)
     finally:
         blender.close()
     return found

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A film shot of the demo without a window: one object removed, one recoloured, one moved, one turning, a camera that
-travels, and a ball of Blender's own behind the table.
+"""A film shot of the demo without a window: one object is removed, one recolored, one moved and one rotating; the
+camera travels, and behind the table is a ball that Blender renders.
 
     OBJECTGS_PYTHON=.venv/bin/python .venv-bpy/bin/python examples/film.py build/demo --out build/film
     OBJECTGS_PYTHON=.venv/bin/python blender -b -P examples/film.py -- build/demo --out build/film
 
 Leaves edited.ply (the edited splats for other programs), film/splats.0001.exr ... (the splats alone),
-film/composite.0001.png ... (joined with Blender's rendering by depth) and joined.blend, whose compositor does the same.
-The demo itself stays as it is.
+film/composite.0001.png ... (combined with Blender's rendering by depth) and joined.blend, whose compositor does the
+same. The demo itself is not changed.
 """
 
 import argparse
@@ -26,7 +26,7 @@ KEPT = ("splats.ply", "points.ply", "anchors.ply", "cameras.json", "objects.json
 
 def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(description="A film shot of the demo without a window.")
-    parser.add_argument("demo", type=Path, help="what `make demo` has left")
+    parser.add_argument("demo", type=Path, help="reconstruction folder of `make demo`")
     parser.add_argument("--out", type=Path, required=True, help="folder for the shot")
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--size", default="640x360")
@@ -46,13 +46,27 @@ def main(arguments: list[str]) -> int:
         if code:
             return code
     make_shot(blend, options.frames)
-    return headless.main([
-        "film", str(blend), "--out", str(options.out / "film"), "--size", options.size, "--composite", "png", "--png",
-        "--samples", "32", "--save", str(options.out / "joined.blend")])
+    return headless.main(
+        [
+            "film",
+            str(blend),
+            "--out",
+            str(options.out / "film"),
+            "--size",
+            options.size,
+            "--composite",
+            "png",
+            "--png",
+            "--samples",
+            "32",
+            "--save",
+            str(options.out / "joined.blend"),
+        ]
+    )
 
 
 def make_shot(blend: Path, frames: int) -> None:
-    """Add camera, ball and light to what `build` has made, and let the camera and the monkey move."""
+    """Add a camera, a ball and a light to the file that `build` has made, and animate camera and monkey."""
     bpy.ops.wm.open_mainfile(filepath=str(blend.absolute()))
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = 1, frames
@@ -63,7 +77,7 @@ def make_shot(blend: Path, frames: int) -> None:
     camera = bpy.data.objects.new("Film", lens)
     scene.collection.objects.link(camera)
     scene.camera = camera
-    monkey = next(thing for thing in scene.objects if thing.name == "monkey" and thing.type == "EMPTY")
+    monkey = next(obj for obj in scene.objects if obj.name == "monkey" and obj.type == "EMPTY")
     for frame, angle, length, turn in ((1, -0.3, 36.0, 0.0), (frames, 0.3, 44.0, 0.8)):
         camera.location = 1.55 * math.cos(angle), 1.55 * math.sin(angle), 0.55
         towards = Vector((0.0, 0.0, 0.1)) - camera.location
@@ -100,7 +114,7 @@ def make_shot(blend: Path, frames: int) -> None:
 
 
 def load_headless():
-    """headless.py beside this folder, as a module."""
+    """Load headless.py, in the parent folder, as a module."""
     spec = importlib.util.spec_from_file_location("headless", ROOT / "headless.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -108,5 +122,5 @@ def load_headless():
 
 
 if __name__ == "__main__":
-    own = sys.argv[sys.argv.index("--") + 1:] if "--" in sys.argv else sys.argv[1:]
+    own = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
     sys.exit(main(own))

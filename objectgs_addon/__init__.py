@@ -1,35 +1,44 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What ObjectGS holds and shows inside Blender, and the demo capture that Blender renders itself.
+"""ObjectGS inside Blender, and the demo capture that Blender renders itself.
 
-bpy is imported only where it is needed, since some of these modules serve outside of Blender too.
+Some packages of this folder also work without bpy, so it is not imported here.
 """
 
+from __future__ import annotations
 
-def _modules():
-    from . import (
-        click_selection,
-        drawing,
-        object_list,
-        panels,
-        preferences,
-        properties,
-        running,
-        splat_arrays,
-        writing,
-    )
+from types import ModuleType
+
+
+def _modules() -> tuple[ModuleType, ...]:
+    from . import drawing, panels
+    from .blender import older_files, writing
+    from .drawing import splat_arrays
     from .film import properties as film
+    from .panels import preferences
+    from .running import running
+    from .state import click_selection, properties
 
-    return (writing, properties, film, preferences, object_list, running, click_selection, splat_arrays, drawing,
-            panels)
+    return (
+        writing,
+        older_files,
+        properties,
+        film,
+        preferences,
+        running,
+        click_selection,
+        splat_arrays,
+        drawing,
+        panels,
+    )
 
 
-def register():
-    """Add properties, preferences, lists, panels and handlers."""
+def register() -> None:
+    """Register properties, preferences, panels and handlers."""
     for module in _modules():
         module.register()
 
 
-def unregister():
-    """Take them back; background jobs are told to stop and have saved when this returns."""
+def unregister() -> None:
+    """Unregister them; background jobs are stopped and have saved when this returns."""
     for module in reversed(_modules()):
         module.unregister()

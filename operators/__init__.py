@@ -1,74 +1,101 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What can be done: one file a verb. Each reads the context, calls objectgs_addon and reports."""
+"""Operators, one module for each verb: they read the context, call objectgs_addon and report to the user."""
+
+from __future__ import annotations
+
+from typing import Any
 
 
-def _classes():
-    from . import (
-        choose_objects,
-        close_place,
-        duplicate_object,
-        export_meshes,
-        export_splats,
-        extract_meshes,
-        film_frames,
-        find_objects,
+def _classes() -> list[type]:
+    from .capture import (
+        analyze_capture,
+        assign_objects,
+        group_objects,
         import_capture,
-        import_splats,
         make_demo,
+        orient,
+        override_decision,
+    )
+    from .film import film_frames, set_up_compositor
+    from .meshes import export_meshes, extract_meshes
+    from .objects import (
+        choose_objects,
+        duplicate_object,
+        fill_hole,
         mark_assets,
         merge_objects,
-        orient,
-        pause_job,
-        pick_object,
-        plan,
         remove_object,
         reset_object,
         restore_object,
-        select_object,
-        set_up_backend,
-        set_up_compositor,
-        show_preview,
-        show_result,
-        solo_object,
-        stop_job,
-        train,
-        vote,
     )
+    from .selection import pick_object, select_by_name, select_object, solo_object
+    from .setup import set_up_backend
+    from .splats import export_splats, import_splats
+    from .training import pause_job, remove_finished_jobs, show_preview, show_result, stop_job, train
 
-    modules = (import_capture, make_demo, vote, plan, train, extract_meshes, pause_job, stop_job, show_result,
-               show_preview, select_object, pick_object, find_objects, solo_object, merge_objects, choose_objects,
-               mark_assets, orient, remove_object, restore_object, close_place, duplicate_object,
-               reset_object, export_splats, import_splats, export_meshes, film_frames, set_up_compositor,
-               set_up_backend)
+    modules = (
+        import_capture,
+        make_demo,
+        assign_objects,
+        analyze_capture,
+        override_decision,
+        group_objects,
+        train,
+        extract_meshes,
+        pause_job,
+        stop_job,
+        remove_finished_jobs,
+        show_result,
+        show_preview,
+        select_object,
+        pick_object,
+        select_by_name,
+        solo_object,
+        merge_objects,
+        choose_objects,
+        mark_assets,
+        orient,
+        remove_object,
+        restore_object,
+        fill_hole,
+        duplicate_object,
+        reset_object,
+        export_splats,
+        import_splats,
+        export_meshes,
+        film_frames,
+        set_up_compositor,
+        set_up_backend,
+    )
     return [cls for module in modules for cls in module.CLASSES]
 
 
-def _import_menu(menu, _context):
+def _import_menu(menu: Any, _context: Any) -> None:
     menu.layout.operator("objectgs.import_capture", text="ObjectGS Capture (COLMAP)")
     menu.layout.operator("objectgs.import_splats", text="3D Gaussian Splats (.ply)")
 
 
-def _export_menu(menu, _context):
+def _export_menu(menu: Any, _context: Any) -> None:
     menu.layout.operator("objectgs.export_splats", text="ObjectGS Splats (.ply, .spz, .splat)")
     menu.layout.operator("objectgs.export_meshes", text="ObjectGS Meshes (.glb, .usdc, .obj)")
 
 
-def register():
+def register() -> None:
     import bpy
 
-    from ..objectgs_addon import pick_tool
+    from ..objectgs_addon.picking import tool as pick_tool
 
     for cls in _classes():
         bpy.utils.register_class(cls)
     bpy.types.TOPBAR_MT_file_import.append(_import_menu)
     bpy.types.TOPBAR_MT_file_export.append(_export_menu)
-    pick_tool.register()  # Its keys can only be given to operators that are there.
+    pick_tool.register()  # Its keymap needs registered operators.
 
 
-def unregister():
+def unregister() -> None:
     import bpy
 
-    from ..objectgs_addon import pick_tool
+    from ..objectgs_addon.picking import tool as pick_tool
 
     pick_tool.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_export_menu)

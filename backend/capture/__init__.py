@@ -1,6 +1,8 @@
-"""COLMAP model, images and masks -> one Capture of undistorted pinhole views with ID maps."""
+"""Captures: images, ID masks and COLMAP models, read as undistorted pinhole views."""
 
-from .capture import Capture, Keypoints, Points, View, check_capture, load_capture
-from .upright import Upright, stand_up
+from .capture import Capture, Keypoints, Points, View
+from .prepare import load_capture
+from .survey import check_capture
+from .upright import Upright, compute_upright
 
-__all__ = ["Capture", "Keypoints", "Points", "Upright", "View", "check_capture", "load_capture", "stand_up"]
+__all__ = ["Capture", "Keypoints", "Points", "Upright", "View", "check_capture", "compute_upright", "load_capture"]

@@ -1,4 +1,4 @@
-"""Finds and reads a capture's files: images, ID masks in every accepted format, and the labels' names."""
+"""Finds and reads a capture's files: images, ID masks in all accepted formats, and label names."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from PIL import Image as PilImage
 
-from ..protocol import InputError, write_atomic
+from ..shared.errors import InputError
+from ..shared.formats.atomic import write_atomic
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm", ".pgm"}
 MASK_SUFFIXES = (".png", ".npy", ".npz", ".tif", ".tiff", ".bmp")
@@ -25,10 +26,10 @@ _OPENING_ERRORS = (OSError, ValueError, SyntaxError, EOFError, MemoryError, PilI
 
 
 class Files:
-    """The files under a folder, found by the name that a COLMAP model gives them.
+    """The files below a folder, found by the names in a COLMAP model.
 
-    A name is looked up exactly, then with Unicode composed (macOS writes it decomposed), then with backslashes as
-    separators (models made on Windows), then without regard to case; only an unambiguous match counts.
+    A name is matched exactly, then in composed Unicode (macOS writes it decomposed), then with backslashes as
+    separators (models made on Windows), then case-insensitively. An ambiguous match counts as none.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -46,7 +47,7 @@ class Files:
             self._levels.append(index)
 
     def find(self, name: str) -> Path | None:
-        """The file that `name` means, or None."""
+        """The file with this name, or None."""
         for level, index in enumerate(self._levels):
             matches = index.get(_folded(name, level), [])
             if len(matches) == 1:
@@ -56,7 +57,7 @@ class Files:
         return None
 
     def first(self, names: Iterable[str]) -> Path | None:
-        """The first of `names` that there is."""
+        """The first existing file of `names`, or None."""
         return next((path for name in names if (path := self.find(name)) is not None), None)
 
 
@@ -69,7 +70,7 @@ def _folded(name: str, level: int) -> str:
 
 
 def mask_names(image_name: str) -> tuple[list[str], list[str]]:
-    """Where the mask of an image may lie below masks/: accepted names, and names that are lossy and refused."""
+    """Names that an image's mask may have below masks/: accepted ones, and lossy ones that are refused."""
     stem = re.sub(r"\.[^./\\]*$", "", image_name)
     accepted = [image_name + suffix for suffix in MASK_SUFFIXES] + [stem + suffix for suffix in MASK_SUFFIXES]
     return accepted, [name + suffix for name in (image_name, stem) for suffix in LOSSY_SUFFIXES]
@@ -79,13 +80,13 @@ def mask_names(image_name: str) -> tuple[list[str], list[str]]:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height from an image's header; raises InputError that names the file."""
+    """Read the width and height from an image's header; raises InputError that names the file."""
     with _opened(path) as image:
         return image.size
 
 
 def read_image(path: Path) -> PilImage.Image:
-    """An image as 8-bit RGB: alpha is dropped, grey and 16-bit converted; orientation tags ignored, as in COLMAP."""
+    """Read an image as 8-bit RGB, without alpha; orientation tags are ignored, as in COLMAP. Raises InputError."""
     with _opened(path) as image:
         try:
             image.load()
@@ -97,7 +98,7 @@ def read_image(path: Path) -> PilImage.Image:
             if image.mode == "P" and "transparency" in image.info:
                 return image.convert("RGBA").convert("RGB")
             if image.mode in ("RGBA", "RGBX"):
-                # Not convert(): in some versions that treats colours below alpha 0 as black.
+                # Not convert(): some versions turn fully transparent pixels black.
                 return PilImage.merge("RGB", image.split()[:3])
             return image.convert("RGB")
         except _OPENING_ERRORS as error:
@@ -117,14 +118,14 @@ def _unreadable(path: Path, error: BaseException) -> InputError:
     if isinstance(error, OSError) and error.strerror:
         return InputError(f"{path} cannot be read ({error.strerror}); put it back, or check it and its permissions.")
     why = f" ({error})" if isinstance(error, PilImage.DecompressionBombError) else ""
-    return InputError(f"{path} cannot be read as an image{why}: it is damaged or of an unknown format; replace it.")
+    return InputError(f"{path} cannot be read as an image{why}: it is damaged or its format is unknown; replace it.")
 
 
 # Masks
 
 
-def is_colour_mask(path: Path) -> bool:
-    """Whether a mask file has three channels that differ, so that its IDs are coded in red, green and blue."""
+def is_color_mask(path: Path) -> bool:
+    """Whether a mask file has three channels that differ, so that its IDs are encoded as colors."""
     if path.suffix.lower() in (".npy", ".npz"):
         return False
     with _opened(path) as image:
@@ -138,30 +139,39 @@ def is_colour_mask(path: Path) -> bool:
 
 
 def is_three_channel(path: Path) -> bool:
-    """Whether a mask file has three channels, so that it may be grey or colour-coded."""
+    """Whether a mask file has three channels, and so may be gray or encode IDs as colors."""
     if path.suffix.lower() in (".npy", ".npz"):
         return False
     with _opened(path) as image:
         return image.mode in ("RGB", "RGBA")
 
 
-def read_mask(path: Path, colour: bool | None = None) -> np.ndarray:
-    """An ID map (h, w) as uint8, uint16 or uint32.
+def read_mask(path: Path, color: bool | None = None) -> np.ndarray:
+    """Read an ID map.
 
-    8/16-bit grey: the value is the ID. Palette: the index is the ID. Three channels: where they are equal in the whole
-    capture the grey value is the ID, else R + 256 G + 65536 B (alpha is ignored); `colour` says which, None looks at
-    this file alone. .npy and .npz (its only array, or the one named `ids`, `mask` or `masks`): integers, or floats that
-    are integers. Raises InputError that names the file.
+    8-bit or 16-bit gray: the value is the ID. Palette: the index is the ID. Three channels: the gray value is the ID
+    if the channels are equal in the whole capture, otherwise R + 256 G + 65536 B; alpha is ignored. .npy and .npz (its
+    only array, or the one named `ids`, `mask` or `masks`): integers, or floats with integer values.
+
+    Args:
+        path: The mask.
+        color: Whether three channels encode colors; None to decide by this file alone.
+
+    Returns:
+        (h, w) uint8, uint16 or uint32, the smallest type that holds the IDs.
+
+    Raises:
+        InputError: The file is not an ID map; the message names it.
     """
     suffix = path.suffix.lower()
     if suffix in LOSSY_SUFFIXES:
         raise InputError(f"{path} is a JPEG, whose compression changes IDs; save the mask as PNG.")
-    ids = _array_mask(path) if suffix in (".npy", ".npz") else _image_mask(path, colour)
+    ids = _array_mask(path) if suffix in (".npy", ".npz") else _image_mask(path, color)
     return compact(ids)
 
 
 def compact(ids: np.ndarray) -> np.ndarray:
-    """The same IDs in the smallest unsigned type."""
+    """Convert IDs to the smallest unsigned type that holds them."""
     largest = int(ids.max()) if ids.size else 0
     return ids.astype(np.uint8 if largest < 256 else np.uint16 if largest < 65536 else np.uint32, copy=False)
 
@@ -177,7 +187,7 @@ def _array_mask(path: Path) -> np.ndarray:
                 loaded = loaded[names[0]]
     except InputError:
         raise
-    except Exception as error:  # NumPy and zipfile raise many kinds on damaged files
+    except Exception as error:  # NumPy and zipfile raise many types on damaged files
         if isinstance(error, OSError) and error.strerror:
             raise _unreadable(path, error) from error
         raise InputError(f"{path} cannot be read as a NumPy array: it is damaged or not one; replace it.") from error
@@ -197,7 +207,7 @@ def _array_mask(path: Path) -> np.ndarray:
     return ids.astype(np.uint32)
 
 
-def _image_mask(path: Path, colour: bool | None) -> np.ndarray:
+def _image_mask(path: Path, color: bool | None) -> np.ndarray:
     with _opened(path) as image:
         tile = getattr(image, "tile", None)
         raw_mode = str(tile[0][3]) if tile else ""
@@ -210,7 +220,7 @@ def _image_mask(path: Path, colour: bool | None) -> np.ndarray:
         mode = image.mode
     if mode in ("L", "P", "1", "I;16", "I;16B", "I;16L", "I"):
         if mode == "L" and image.format == "PNG" and ("L;2" in raw_mode or "L;4" in raw_mode):
-            # Pillow stretches 2- and 4-bit grey to the full range.
+            # Pillow scales 2-bit and 4-bit gray to the full range.
             values = values // (85 if "L;2" in raw_mode else 17)
         if mode == "I" and int(values.min()) < 0:
             raise _not_ids(path, "it holds negative values")
@@ -221,23 +231,23 @@ def _image_mask(path: Path, colour: bool | None) -> np.ndarray:
         if "16" in raw_mode:
             raise _not_ids(path, "it has 16 bits for each of three channels")
         red, green, blue = (values[..., channel].astype(np.uint32) for channel in range(3))
-        if colour is None:
-            colour = bool((red != green).any() or (red != blue).any())
-        if not colour:
+        if color is None:
+            color = bool((red != green).any() or (red != blue).any())
+        if not color:
             return red
         ids = red + (green << 8) + (blue << 16)
         if ids.size > 4096 and (ids[:, 1:] == ids[:, :-1]).mean() < 0.3:
-            raise _not_ids(path, "hardly any neighbouring pixels are equal, so it looks like a picture")
+            raise _not_ids(path, "hardly any neighboring pixels are equal, so it is probably a photo")
         return ids
     raise _not_ids(path, f"its pixels are of Pillow's mode {mode}")
 
 
 def _not_ids(path: Path, why: str) -> InputError:
-    return InputError(f"{path} is not an ID map: {why}; expected one whole number a pixel, 0 where unlabelled.")
+    return InputError(f"{path} is not an ID map: {why}; expected one integer per pixel, 0 for unlabeled.")
 
 
 def encode_mask(ids: np.ndarray) -> tuple[str, bytes]:
-    """The suffix and the bytes of a file that `read_mask` reads back: PNG up to 16 bits, else .npz."""
+    """Encode an ID map for `read_mask`: the suffix and the bytes of a file, PNG up to 16 bits, else .npz."""
     ids = compact(ids)
     buffer = io.BytesIO()
     if ids.dtype == np.uint32:
@@ -258,8 +268,18 @@ def write_image(path: Path, image: PilImage.Image) -> None:
 
 
 def read_names(folder: Path) -> dict[int, str]:
-    """Names of the IDs, without 0: from labels.json ({"1": "mug"}, {"mug": 1} or [{"id": 1, "name": "mug"}]) or
-    labels.txt (lines `1 mug`, `1: mug` or `1,mug`); empty where there is neither."""
+    """Read the label names of a capture.
+
+    Args:
+        folder: The capture, with labels.json ({"1": "mug"}, {"mug": 1} or [{"id": 1, "name": "mug"}]) or labels.txt
+            (lines `1 mug`, `1: mug` or `1,mug`).
+
+    Returns:
+        Names by ID, without 0; empty if there is no such file.
+
+    Raises:
+        InputError: The file is not a list of labels.
+    """
     as_json, as_text = folder / "labels.json", folder / "labels.txt"
     try:
         if as_json.is_file():

@@ -1,4 +1,4 @@
-"""Turns any COLMAP camera into a pinhole camera: the target's intrinsics, and the resampling onto it."""
+"""Replaces a COLMAP camera by a pinhole camera: its intrinsics, and the resampling of images and masks."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import pycolmap
 from PIL import Image as PilImage
 from scipy.ndimage import map_coordinates
 
-from ..protocol import InputError
+from ..shared.errors import InputError
 from .colmap import Camera
 
 MAX_TAN = math.tan(math.radians(60.0))
-"""A pinhole view reaches at most 60 degrees to each side: beyond, pixels stretch without bound."""
+"""A pinhole view extends at most 60 degrees to each side, since pixels stretch without bound beyond."""
 
 _POLYNOMIAL = {"SIMPLE_RADIAL": 3, "RADIAL": 3, "OPENCV": 4, "FULL_OPENCV": 4}
 _STRIP = 1 << 18
@@ -24,7 +24,7 @@ _STEP = 1e-5
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A pinhole camera: K (3,3) float64 in pixels, the first pixel's centre at (0.5, 0.5)."""
+    """A pinhole camera: K (3, 3) float64, in pixels; the center of the first pixel is at (0.5, 0.5)."""
 
     K: np.ndarray
     width: int
@@ -39,7 +39,7 @@ def is_pinhole(camera: Camera) -> bool:
 
 
 def to_pycolmap(camera: Camera) -> pycolmap.Camera:
-    """The same camera as pycolmap's; parameters must have been validated."""
+    """Convert a camera with valid parameters to pycolmap's type."""
     return pycolmap.Camera(
         camera_id=camera.id,
         model=getattr(pycolmap.CameraModelId, camera.model),
@@ -50,15 +50,15 @@ def to_pycolmap(camera: Camera) -> pycolmap.Camera:
 
 
 def distort(camera: pycolmap.Camera, xy: np.ndarray) -> np.ndarray:
-    """Normalised pinhole coordinates (n,2) to the camera's pixels (n,2); NaN where the model has no answer."""
+    """Project normalized pinhole coordinates (n, 2) to the camera's pixels (n, 2); NaN where undefined."""
     rays = np.column_stack([xy, np.ones(len(xy))])
     return np.asarray(camera.img_from_cam(rays), np.float64).reshape(-1, 2)
 
 
 def undistort(camera: pycolmap.Camera, pixels: np.ndarray, tolerance: float = 0.1) -> np.ndarray:
-    """Pixels (n,2) to normalised pinhole coordinates (n,2); NaN where the inverse does not project back.
+    """Convert pixels (n, 2) to normalized pinhole coordinates (n, 2); NaN where the inverse does not converge.
 
-    The inverse is iterative and can end on a wrong root or nowhere, so it is checked to `tolerance` pixels.
+    The inverse is iterative and may find a wrong root, so the result must project back within `tolerance` pixels.
     """
     if len(pixels) == 0:
         return np.zeros((0, 2))
@@ -70,10 +70,18 @@ def undistort(camera: pycolmap.Camera, pixels: np.ndarray, tolerance: float = 0.
 
 
 def pinhole_for(camera: Camera, file: Path, max_size: int) -> Pinhole:
-    """The pinhole camera that replaces `camera`: the largest upright rectangle without blank pixels.
+    """Compute the pinhole camera that replaces a camera: the largest upright rectangle without blank pixels.
 
-    The focal lengths are kept, then everything is reduced to `max_size` pixels on the longer side (0 keeps it).
-    Raises InputError that names `file` when the camera's parameters cannot be a real lens.
+    Args:
+        camera: The camera as COLMAP wrote it.
+        file: The file that error messages name.
+        max_size: Limit of the longer side, in pixels; 0 for none. Up to this limit the focal lengths are kept.
+
+    Returns:
+        The pinhole camera.
+
+    Raises:
+        InputError: No real lens has these parameters.
     """
     who = f"{file} gives camera {camera.id} ({camera.model})"
     if camera.model == "EQUIRECTANGULAR":
@@ -105,7 +113,7 @@ def pinhole_for(camera: Camera, file: Path, max_size: int) -> Pinhole:
             f"{who} a distortion that no real lens has (of {camera.width}x{camera.height} pixels {max(width, 0)}x"
             f"{max(height, 0)} would remain); {degenerate}."
         )
-    # What the floor took away is taken from both ends, so that the rectangle stays inside.
+    # The remainder of the floor is removed on both sides, so that the rectangle stays inside.
     cx, cy = -x0 * fx - ((x1 - x0) * fx - width) / 2, -y0 * fy - ((y1 - y0) * fy - height) / 2
     return _limited(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64), width, height, max_size)
 
@@ -119,10 +127,10 @@ def _limited(K: np.ndarray, width: int, height: int, max_size: int) -> Pinhole:
 
 
 def _inner_box(lens: pycolmap.Camera, width: int, height: int, fx: float, fy: float) -> tuple[float, ...] | None:
-    """The rectangle (x0, y0, x1, y1), in normalised coordinates, in which every ray meets the image.
+    """The rectangle (x0, y0, x1, y1), in normalized coordinates, all of whose rays lie in the image.
 
-    Rays are followed outwards from the image's centre until they leave the image or the projection folds over
-    (its Jacobian's determinant is no longer positive): what lies beyond the fold lands in the image a second time.
+    Rays are followed outward from the image's center until they leave the image or the projection folds over (the
+    determinant of its Jacobian is no longer positive): points beyond the fold project into the image a second time.
     """
     middle = undistort(lens, np.array([[width / 2, height / 2]]))[0]
     if not np.isfinite(middle).all() or np.abs(middle).max() > MAX_TAN:
@@ -146,14 +154,14 @@ def _inner_box(lens: pycolmap.Camera, width: int, height: int, fx: float, fy: fl
     edge = middle + low[:, None] * ray
     pixel = distort(lens, edge)
     near = 1e-3 * max(width, height)
-    # Each side is where the rays that leave through it are nearest; a side that no ray reaches is bound by the limit.
+    # Each side is at the nearest ray that leaves through it, or at the limit if no ray does.
     x0 = max([-MAX_TAN, *edge[pixel[:, 0] < near, 0]])
     x1 = min([MAX_TAN, *edge[pixel[:, 0] > width - near, 0]])
     y0 = max([-MAX_TAN, *edge[pixel[:, 1] < near, 1]])
     y1 = min([MAX_TAN, *edge[pixel[:, 1] > height - near, 1]])
     if not (x0 < middle[0] < x1 and y0 < middle[1] < y1):
         return None
-    # Where rays end at a fold instead of a side, the rectangle shrinks about the middle until none ends inside it.
+    # Rays may end at a fold instead of a side: the rectangle shrinks about its center until no ray ends inside.
     sides = np.where(edge > middle, [x1, y1], [x0, y0]) - middle
     shrink = min(1.0, float(np.max((edge - middle) / sides, 1).min()))
     along = np.linspace(0, 1, 65)[:, None]
@@ -161,7 +169,7 @@ def _inner_box(lens: pycolmap.Camera, width: int, height: int, fx: float, fy: fl
         low_corner, high_corner = middle + ([x0, y0] - middle) * shrink, middle + ([x1, y1] - middle) * shrink
         other = np.array([high_corner[0], low_corner[1]]), np.array([low_corner[0], high_corner[1]])
         border = np.concatenate([a + (b - a) * along for a in (low_corner, high_corner) for b in other])
-        # Half a pixel of slack: that far out, the outermost pixel itself is what is seen.
+        # Half a pixel of slack: that far out, the outermost pixel is still sampled.
         if _valid(lens, border, width, height, fx, fy, slack=0.5).all():
             return *map(float, low_corner), *map(float, high_corner)
         shrink *= 0.99
@@ -171,7 +179,7 @@ def _inner_box(lens: pycolmap.Camera, width: int, height: int, fx: float, fy: fl
 def _valid(
     lens: pycolmap.Camera, xy: np.ndarray, width: int, height: int, fx: float, fy: float, slack: float = 0.0
 ) -> np.ndarray:
-    """Which normalised coordinates (..., 2) land in the image, or `slack` pixels outside, without a fold."""
+    """Which normalized coordinates (..., 2) project into the image, or `slack` pixels outside, without a fold."""
     shape, flat = xy.shape[:-1], xy.reshape(-1, 2)
     right, down = np.array([_STEP, 0.0]), np.array([0.0, _STEP])
     with np.errstate(invalid="ignore", over="ignore"):
@@ -179,13 +187,13 @@ def _valid(
         dx = (distort(lens, flat + right) - at) / _STEP
         dy = (distort(lens, flat + down) - at) / _STEP
         determinant = (dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0]) / (fx * fy)
-        # 1% of the area at the axis: rays this dense are the rim of a fold.
+        # Below 1% of the area at the axis, rays are at the rim of a fold.
         good = (determinant > 0.01) & (at >= -slack).all(1) & (at <= np.array([width, height]) + slack).all(1)
     return good.reshape(shape)
 
 
 def _covered(lens: pycolmap.Camera, box: tuple[float, ...], camera: Camera) -> float:
-    """The share of the image's area that the rectangle `box` takes."""
+    """The fraction of the image's area that the rectangle `box` covers."""
     x0, y0, x1, y1 = box
     s = np.linspace(0, 1, 65)[:-1]
     x = np.concatenate([x0 + (x1 - x0) * s, np.full(64, x1), x1 - (x1 - x0) * s, np.full(64, x0)])
@@ -196,9 +204,15 @@ def _covered(lens: pycolmap.Camera, box: tuple[float, ...], camera: Camera) -> f
 
 
 def source_pixels(camera: Camera, target: Pinhole, supersample: int = 1) -> np.ndarray:
-    """Where each target pixel's centre lies in the camera's image: (2, h, w) float32, rows (y) first, in pixels.
+    """The position of each target pixel's center in the camera's image.
 
-    `supersample` n asks for n times n samples a pixel: (2, n h, n w).
+    Args:
+        camera: The camera that took the image.
+        target: The pinhole camera.
+        supersample: Number n of samples per pixel along each axis.
+
+    Returns:
+        (2, n h, n w) float32, in pixels, y before x; -1 where undefined.
     """
     lens = to_pycolmap(camera)
     width, height = target.width * supersample, target.height * supersample
@@ -217,16 +231,16 @@ def source_pixels(camera: Camera, target: Pinhole, supersample: int = 1) -> np.n
 
 
 def resample_image(image: PilImage.Image, camera: Camera, target: Pinhole) -> PilImage.Image:
-    """An RGB image of `camera` as `target` sees it; bilinear, averaged where the target is coarser."""
+    """Resample an RGB image of `camera` to `target`: bilinear, with averaging where the target is coarser."""
     if is_pinhole(camera):
         return image.resize((target.width, target.height), PilImage.Resampling.HAMMING)
-    # Coarser than the source: first average whole blocks, then 2x2 samples a pixel for what is left.
+    # If coarser than the source: average whole blocks, then take 2 x 2 samples per pixel for the remaining factor.
     fx = to_pycolmap(camera).focal_length_x
     ratio = fx / target.K[0, 0]
     block = max(1, math.floor(ratio + 1e-6))
     supersample = 2 if ratio / block > 1.2 else 1
     source = image.reduce(block) if block > 1 else image
-    # Sample positions in pixel edges' coordinates; an array's index i is the centre i + 0.5.
+    # Positions are relative to pixel edges; the array index i is the center i + 0.5.
     at = source_pixels(camera, target, supersample) / np.float32(block) - np.float32(0.5)
     planes = np.asarray(source)
     out = np.empty((*at.shape[1:], 3), np.uint8)
@@ -238,9 +252,9 @@ def resample_image(image: PilImage.Image, camera: Camera, target: Pinhole) -> Pi
 
 
 def resample_mask(mask: np.ndarray, camera: Camera, target: Pinhole) -> np.ndarray:
-    """An ID map (h, w) of `camera` as `target` sees it: nearest, so that no ID is invented.
+    """Resample an ID map (h, w) of `camera` to `target`, with nearest-neighbor lookup, which adds no ID.
 
-    The map may have any size of the camera's aspect ratio; the result has the target's size.
+    The map may have any size with the camera's aspect ratio; the result has the target's size.
     """
     rows, columns = mask.shape
     if is_pinhole(camera):

@@ -1,7 +1,7 @@
-"""Which way is up in a capture, and where its ground lies: COLMAP's frame is arbitrary, Blender wants Z up.
+"""Estimates the up direction and the ground of a capture: COLMAP's frame is arbitrary, Blender has Z up.
 
-Up is what the cameras say (photos are taken level, more or less), made exact by the largest level plane of the points
-where there is one: a floor, or the top of a table.
+The up direction is estimated from the cameras, since most photos are taken level, and refined by the largest
+horizontal plane of the points if there is one, such as a floor or the top of a table.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 
 LEVEL_WITHIN = np.cos(np.radians(25.0))
-"""The plane's normal may differ so much from what the cameras call up: more, and it is a wall or a slope."""
-PLANE_SHARE = 0.12
-"""Of the points, a plane must hold so many, and 4 standard deviations more, since the best of thousands is picked."""
+"""Largest angle, as its cosine, between the plane's normal and the cameras' up; beyond, it is a wall or a slope."""
+PLANE_FRACTION = 0.12
+"""Least fraction of the points in the plane, plus 4 standard deviations, since the best of thousands is chosen."""
 PLANE_CONTRAST = 2.0
-"""So many times as dense as just above and below it points must be in a plane; in a shapeless cloud it is up to 1.5."""
+"""Least density of points in the plane, relative to just above and below it; a shapeless cloud reaches 1.5."""
 PLANE_THICKNESS = 0.01
-"""Distance from the plane, as a share of the scene's size, within which a point belongs to it."""
+"""Largest distance of the plane's points from it, as a fraction of the scene's size."""
 UPRIGHT_WITHIN = np.radians(2.0)
 ON_GROUND_WITHIN = 0.02
-"""A capture this near to upright, and its ground this near to 0 as a share of the scene's size, is left as it is."""
+"""A capture within this angle of upright stays unchanged, as does a ground within this fraction of the size of 0."""
 LOWEST_PERCENT = 2.0
 
 _TRIPLES = 4000
@@ -28,35 +28,43 @@ _POINTS_SCORED = 4000
 _FEWEST_IN_PLANE = 12
 _FLOAT32_RELATIVE_ERROR = 2.0**-24
 _AGREE = 0.3
-"""Length of the mean of the cameras' unit up vectors, below which they cancel out and say nothing."""
+"""Least length of the mean of the cameras' unit up vectors; below, they cancel out and give no direction."""
 
 
 @dataclass(frozen=True)
 class Upright:
-    """world = rotation @ (capture - origin) + translation: Z up, ground at z = 0. origin (3,), rotation (3, 3) proper,
-    translation (3,), all float64 and finite."""
+    """The transform to a world with Z up and the ground at z = 0: world = rotation @ (capture - origin) + translation.
+
+    origin (3,), rotation (3, 3) proper, translation (3,), all float64 and finite.
+    """
 
     origin: np.ndarray
     rotation: np.ndarray
     translation: np.ndarray
 
 
-def stand_up(viewmats: np.ndarray, xyz: np.ndarray) -> Upright:
-    """How to stand a capture up. viewmats (V, 4, 4) world to camera, OpenCV axes; xyz (M, 3) points.
+def compute_upright(viewmats: np.ndarray, xyz: np.ndarray) -> Upright:
+    """Compute the transform that makes a capture upright.
 
-    The rotation is the smallest that brings up to +Z, so the heading stays; the identity where the capture is upright
-    already. The origin is 0, except where the capture lies so far out that float32 coordinates would suffer.
+    Args:
+        viewmats: (V, 4, 4), world to camera, OpenCV axes.
+        xyz: (M, 3), points.
+
+    Returns:
+        The transform. Its rotation is the smallest that takes up to +Z, which keeps the heading, and the identity if
+        the capture is upright already. Its origin is 0, unless the capture is so far from 0 that float32 coordinates
+        would be inaccurate.
     """
-    centres = -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    centers = -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
     xyz = xyz[np.isfinite(xyz).all(1)]
     middle = np.median(xyz, axis=0)
     distances = np.linalg.norm(xyz - middle, axis=1)
     reach = float(np.percentile(distances, 90))
-    size = max(2 * reach, float(np.median(np.linalg.norm(centres - middle, axis=1))))
+    size = max(2 * reach, float(np.median(np.linalg.norm(centers - middle, axis=1))))
     origin = _origin(middle, size)
     near = xyz[distances <= 3 * reach] - origin
     up = _cameras_up(viewmats)
-    plane = _level_plane(near, up, PLANE_THICKNESS * size, centres - origin)
+    plane = _level_plane(near, up, PLANE_THICKNESS * size, centers - origin)
     if plane is not None:
         up = plane[0]
     rotation = _smallest_rotation(up)
@@ -71,24 +79,24 @@ def stand_up(viewmats: np.ndarray, xyz: np.ndarray) -> Upright:
 
 
 def _origin(middle: np.ndarray, size: float) -> np.ndarray:
-    """0, or the middle of a far-away capture, rounded to what the scene's size makes a round number."""
+    """0, or for a capture far from 0 its center, rounded to the order of magnitude of the scene's size."""
     far = float(np.abs(middle).max())
     if far * _FLOAT32_RELATIVE_ERROR <= 1e-6 * size or far == 0:
         return np.zeros(3)
-    # A scene without any size is as large as its coordinates are exact.
+    # The least size is the precision of the coordinates.
     step = 10.0 ** np.floor(np.log10(max(size, far * 1e-9)))
     return np.round(middle / step) * step
 
 
 def _cameras_up(viewmats: np.ndarray) -> np.ndarray:
-    """Up (3,) by the cameras alone.
+    """Estimate up (3,) from the cameras alone.
 
-    Their own up vectors lean forward where they look down, which only a full circle around the scene evens out. Their
-    right vectors are level however the cameras are pitched, so up is what is square to them all, where they differ
-    enough to say. Cameras that were turned on their side count less with every pass.
+    The cameras' up vectors tilt when the cameras look down, which averages out only over a full circle around the
+    scene. Their right vectors are horizontal at any pitch, so up is orthogonal to all of them, if they differ enough.
+    Iterative reweighting suppresses cameras that were turned on their side.
     """
     ups, rights, backs = -viewmats[:, 1, :3], viewmats[:, 0, :3], -viewmats[:, 2, :3]
-    # Pictures straight down have their up vectors in any heading: then up is what they all look away from.
+    # Cameras that look straight down have up vectors of any heading: then up is opposite to the view directions.
     mean = _robust_mean(ups if np.linalg.norm(ups.mean(0)) >= _AGREE else backs)
     length = float(np.linalg.norm(mean))
     if length < 1e-6:
@@ -104,7 +112,7 @@ def _cameras_up(viewmats: np.ndarray) -> np.ndarray:
 
 
 def _robust_mean(vectors: np.ndarray) -> np.ndarray:
-    """The mean of unit vectors (n, 3), those far from it counting less."""
+    """The mean of unit vectors (n, 3), with less weight for outliers."""
     mean = vectors.mean(0)
     for _ in range(10):
         weights = 1 / np.maximum(np.linalg.norm(vectors - mean, axis=1), 0.05)
@@ -115,8 +123,10 @@ def _robust_mean(vectors: np.ndarray) -> np.ndarray:
 def _level_plane(
     xyz: np.ndarray, up: np.ndarray, thickness: float, cameras: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """The level plane below most of the cameras (V, 3) that holds most of the points xyz (M, 3), if it holds enough:
-    its normal (3,) and which points it holds (M,) bool."""
+    """Find the horizontal plane below most of the cameras (V, 3) with the most of the points xyz (M, 3).
+
+    Returns its normal (3,) and a mask of its points (M,) bool; None if it has too few points.
+    """
     if len(xyz) < _FEWEST_IN_PLANE or thickness <= 0:
         return None
     rng = np.random.default_rng(0)
@@ -124,7 +134,7 @@ def _level_plane(
     a, b, c = some[rng.integers(0, len(some), (3, _TRIPLES))]
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
-    # Three points closer together than the plane is thick tell nothing of its slope.
+    # Three points closer together than the plane is thick do not determine its slope.
     keep = lengths > thickness**2
     normals, a = normals[keep] / lengths[keep, None], a[keep]
     normals *= np.sign(normals @ up)[:, None]
@@ -142,13 +152,13 @@ def _level_plane(
         middle = xyz[held_points].mean(0)
         _, extents, axes = np.linalg.svd(xyz[held_points] - middle, full_matrices=False)
         if len(axes) < 3 or extents[1] <= 4 * extents[2]:
-            return None  # Points in a line or a heap: no plane.
+            return None  # Points in a line or a cluster: no plane.
         normal = axes[2] * (1 if axes[2] @ up >= 0 else -1)
         offset = float(middle @ normal)
     away = np.abs(xyz @ normal - offset)
     held_points = away <= thickness
     count = int(held_points.sum())
-    expected = PLANE_SHARE * len(xyz)
+    expected = PLANE_FRACTION * len(xyz)
     around = int(((away > thickness) & (away <= 3 * thickness)).sum())
     if normal @ up < LEVEL_WITHIN or count < expected + 4 * np.sqrt(expected) or count < PLANE_CONTRAST * around / 2:
         return None
@@ -156,11 +166,11 @@ def _level_plane(
 
 
 def _smallest_rotation(up: np.ndarray) -> np.ndarray:
-    """The rotation (3, 3) that brings the unit vector `up` to +Z about the axis square to both."""
+    """The rotation (3, 3) that takes the unit vector `up` to +Z, about the axis orthogonal to both."""
     x, y, z = up
     level = x * x + y * y
     if z < 0 and level < 1e-24:
         return np.diag([1.0, -1.0, -1.0])
-    # 1 / (1 + z), of which little is left where z is near -1.
+    # 1 / (1 + z), without the cancellation near z = -1.
     k = (1 - z) / level if z < 0 else 1 / (1 + z)
     return np.array([[1 - x * x * k, -x * y * k, -x], [-x * y * k, 1 - y * y * k, -y], [x, y, z]])

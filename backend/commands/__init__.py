@@ -1,7 +1,6 @@
-"""What each command does. It takes the parsed options and a reporter, and leaves files in the reconstruction folder.
+"""The commands, one module each: functions of the parsed options and a reporter.
 
-A module for each command; `folder`, `lock`, `record` and `machine` are what they share. Importing this brings in torch
-and the rest, so `backend.arguments` does it only once there is something to do.
+Importing this package imports torch, so `backend.cli.main` does it only after parsing the command line.
 """
 
 from __future__ import annotations
@@ -9,27 +8,15 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 
-from ..stopping import StoppingReporter
-from . import (
-    check,
-    doctor,
-    edit,
-    evaluate,
-    export,
-    film,
-    import_splats,
-    importing,
-    mesh,
-    plan,
-    render,
-    report,
-    train,
-    vote,
-)
+from ..shared.stopping import StoppingReporter
+from .capture import check, import_capture, import_splats, plan, vote
+from .objects import edit, export, film, mesh
+from .setup import doctor
+from .training import evaluate, render, report, train
 
 COMMANDS: dict[str, Callable[[argparse.Namespace, StoppingReporter], None]] = {
     "check": check.check,
-    "import": importing.import_capture,
+    "import": import_capture.import_capture,
     "plan": plan.plan,
     "vote": vote.vote,
     "train": train.train,

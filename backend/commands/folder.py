@@ -5,27 +5,30 @@ from __future__ import annotations
 import argparse
 import hashlib
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from .. import device
 from ..capture import Capture, load_capture
 from ..model.object_model import ObjectModel
-from ..objects import read_objects
 from ..planning.decisions import planned_capture
-from ..planning.plan import Plan
-from ..protocol import InputError, Reconstruction, Reporter
-from ..training.budget import Progress
+from ..raster import devices
+from ..shared.errors import InputError
+from ..shared.events import Reporter
+from ..shared.reconstruction.folder import Reconstruction
+from ..shared.reconstruction.lock import FolderInUse, locked
+from ..shared.reconstruction.objects import read_objects
+from ..shared.reconstruction.plan import Plan
+from ..shared.reconstruction.record import CaptureRecord, TrainingRecord, read_record, update_record
+from ..training.budget import TrainingProgress
 from ..training.exposure import measure_gains
-from ..training.loop import load_model, progress_of
 from ..training.scene import Scene
-from .cameras import write_cameras
-from .lock import FolderInUse, locked
-from .record import record, recorded, stage
+from ..training.state import load_model, progress_of
+from .cameras import write_capture_cameras
+from .stages import stage
 
 
 def memory_for_files(options: argparse.Namespace) -> float:
@@ -53,7 +56,7 @@ def open_reconstruction(options: argparse.Namespace, reporter: Reporter) -> Iter
                 capture = load_capture(
                     options.capture, folder.cache, memory_for_files(options), options.max_size, reporter
                 )
-                write_cameras(folder, capture)
+                write_capture_cameras(folder, capture)
         yield folder, capture
 
 
@@ -78,19 +81,20 @@ class Trained(NamedTuple):
     capture: Capture
     model: ObjectModel
     scene: Scene
-    progress: Progress
+    progress: TrainingProgress
     plan: Plan
+    training: TrainingRecord
 
     @property
     def trained_on(self) -> str:
-        """The device that the model was trained on, as `backend.device.name_of` calls it."""
-        return recorded(self.folder)["training"].get("device", "cpu")
+        """The device that the model was trained on, as `backend.raster.devices.name_of` calls it."""
+        return self.training.device
 
 
 def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
     """What `train` left in DIR, on the device asked for, with the capture it was made from; InputError where one of
     them is not there."""
-    place = device.pick(options.device)
+    device = devices.pick(options.device)
     folder = Reconstruction(options.folder)
     if not folder.folder.is_dir():
         raise InputError(f"{folder.folder} does not exist; give the folder that `train` was told with --out.")
@@ -98,45 +102,47 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
         raise InputError(
             f"{folder.folder} is no reconstruction, since it holds no {folder.settings.name}; train first."
         )
-    memory = recorded(folder)
-    model, state, warning = load_model(folder.checkpoint, place)
+    record = read_record(folder)
+    model, state, warning = load_model(folder.checkpoint, device)
     if warning:
         reporter.warning(warning)
-    if "training" not in memory:
+    training = record.training
+    if training is None:
         raise InputError(
             f"{folder.settings} does not say what {folder.checkpoint} was trained from; train again with --restart."
         )
-    source = Path(options.capture or memory["capture"]["folder"])
+    if options.capture is None and record.capture is None:
+        raise InputError(f"{folder.settings} does not say where the capture is; say with --capture where it is now.")
+    source = Path(options.capture or (record.capture.folder if record.capture else ""))
     if not source.is_dir():
         raise InputError(f"The capture {source} of {folder.folder} is gone; say with --capture where it is now.")
-    # What it was trained from, not memory["capture"], which a later import of another capture replaces.
-    trained_from = memory["training"]["votes"]
-    max_size = trained_from["max_size"]
+    # What it was trained from, not record.capture, which a later import of another capture replaces.
+    max_size = training.votes.max_size
     capture = load_capture(source, folder.cache, memory_for_files(options), max_size, reporter)
-    if digest(capture) != trained_from["capture"]:
+    if digest(capture) != training.votes.capture:
         raise InputError(
             f"The capture {source} is not the one that {folder.folder} was trained on; put that one back, say with "
             "--capture where it is, or train again."
         )
     if options.capture:
-        record(folder, capture=described(capture, max_size))
-        write_cameras(folder, capture)
+        update_record(folder, capture=capture_record(capture, max_size))
+        write_capture_cameras(folder, capture)
     # What it was trained without, whatever the user has since chosen.
-    plan = plan_of(memory["training"])
-    capture = planned_capture(edited(capture, folder, memory["training"].get("left_out", ())), plan)
+    plan = plan_of(training)
+    capture = planned_capture(edited(capture, folder, training.left_out), plan)
     exposure = plan["exposure"]
     gains = None if exposure is None else measure_gains(capture) if exposure.done else np.ones((len(capture), 3))
     zero_is_object = state["settings"]["zero_is_object"]
     scene = Scene(
-        capture, model.object_ids, model.normalization, zero_is_object, memory_for_planes(options),
-        teach_unlabelled=state["teach_unlabelled"], gains=gains,
+        capture, model.classes, model.normalization, zero_is_object, memory_for_planes(options),
+        supervise_background=state["supervise_background"], gains=gains,
     )  # fmt: skip
-    return Trained(folder, capture, model, scene, progress_of(state), plan)
+    return Trained(folder, capture, model, scene, progress_of(state), plan, training)
 
 
-def plan_of(training: Mapping[str, Any]) -> Plan:
-    """What was planned for a training, as `recorded` has it; nothing for those of older versions."""
-    return Plan.of(training.get("plan", ()))
+def plan_of(training: TrainingRecord | None) -> Plan:
+    """The plan of a training; nothing for those of older versions."""
+    return Plan.of(training.plan or () if training else ())
 
 
 def edited(capture: Capture, folder: Reconstruction, left_out: Iterable[int]) -> Capture:
@@ -154,6 +160,6 @@ def digest(capture: Capture) -> str:
     return sha.hexdigest()[:16]
 
 
-def described(capture: Capture, max_size: int) -> dict[str, Any]:
+def capture_record(capture: Capture, max_size: int) -> CaptureRecord:
     """A capture as objectgs.json holds it."""
-    return {"folder": str(capture.folder.resolve()), "max_size": max_size, "digest": digest(capture)}
+    return CaptureRecord(str(capture.folder.resolve()), max_size, digest(capture))

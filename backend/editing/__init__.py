@@ -1,5 +1,5 @@
-"""What the user changed about objects, applied to splats."""
+"""The user's edits of objects, applied to splats."""
 
-from .apply import Fill, apply_edits, fill_of, recoloured, transformed
+from .apply import Fill, apply_edits, compute_fill, recolored, transformed
 
-__all__ = ["Fill", "apply_edits", "fill_of", "recoloured", "transformed"]
+__all__ = ["Fill", "apply_edits", "compute_fill", "recolored", "transformed"]

@@ -1,5 +1,5 @@
-"""The edits of objects.json on plain splats: what is exported and filmed. Splats that nothing is done to stay as they
-are, bit for bit and in their order, so that pixels without an edited object stay the same."""
+"""Applying the edits in objects.json to splats for export and film. Splats without edits stay bitwise the same and in
+their order, so that pixels without an edited object stay the same."""
 
 from __future__ import annotations
 
@@ -10,36 +10,40 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from .. import spherical_harmonics
 from ..model.splats import Splats, concatenate
-from ..objects import SceneObject, merged
-from ..recolour import Recolour
-from .fill import closing
+from ..shared.color.recolor import Recolor
+from ..shared.reconstruction.objects import SceneObject, merged
+from ..shared.splats import spherical_harmonics
+from .fill import fill_hole
 from .floaters import inside_hull
 
 UNIFORM_WITHIN = 1e-6
-"""Stretches that differ less than this, relative to the largest, are one scale: a matrix may come from float32."""
+"""Scales along the axes that differ less than this, relative to the largest, are uniform: matrices may be float32."""
 
 _DROPPED = -1
 _SMALLEST_SCALE = float(np.finfo(np.float32).tiny)
 
 
 def apply_edits(splats: Splats, objects: Sequence[SceneObject]) -> Splats:
-    """The splats as the user wants them: without what is removed or left out, recoloured, moved, with copies, and with
-    what is invented in place of the removed.
+    """Apply the user's edits: remove, fill holes, recolor, transform and duplicate.
 
-    Splats of a merged object get the ID of the one it is shown as, whose edits count for both; copies keep the ID of
-    what they are copies of and come last. IDs that `objects` does not list stay as they are.
+    Args:
+        splats: The captured splats.
+        objects: The objects with their edits; splats with other IDs stay as they are.
+
+    Returns:
+        The edited splats. Splats of a merged object have the ID of the object that it is merged into, whose edits count
+        for both. Duplicates have the ID of the original and come last.
     """
-    edited = _closed(splats, objects)[0]
+    edited = _remove_and_fill(splats, objects)[0]
     copies = []
     for entry in objects:
         mine = np.flatnonzero(edited.object_ids == entry.id)
-        if len(mine) == 0 or not (entry.recolour or entry.transform or entry.copies):
+        if len(mine) == 0 or not (entry.recolor or entry.transform or entry.copies):
             continue
         own = edited.select(mine)
-        if entry.recolour:
-            own = recoloured(own, entry.recolour)
+        if entry.recolor:
+            own = recolored(own, entry.recolor)
         copies += [transformed(own, place) for place in entry.copies]
         if entry.transform:
             own = transformed(own, entry.transform)
@@ -50,24 +54,33 @@ def apply_edits(splats: Splats, objects: Sequence[SceneObject]) -> Splats:
 
 @dataclass(frozen=True)
 class Fill:
-    """What closes the places of removed objects, where it was captured and in its own colours.
+    """The filling of the holes of removed objects, untransformed and in the captured colors.
 
-    splats: n, of which put (n,) bool come and the others, captured ones, give way; closes (n,): for whose place.
+    splats: n splats; put (n,) bool: these are new, the others are captured ones that they replace; fills (n,): the IDs
+    of the removed objects.
     """
 
     splats: Splats
     put: NDArray[np.bool_]
-    closes: NDArray[np.int64]
+    fills: NDArray[np.int64]
 
 
-def fill_of(splats: Splats, objects: Sequence[SceneObject]) -> Fill:
-    """What `apply_edits` closes the places of removed objects with."""
-    return _closed(splats, objects)[1]
+def compute_fill(splats: Splats, objects: Sequence[SceneObject]) -> Fill:
+    """Return the filling of the holes of removed objects, as `apply_edits` uses it."""
+    return _remove_and_fill(splats, objects)[1]
 
 
 def transformed(splats: Splats, matrix: ArrayLike) -> Splats:
-    """The splats moved by an affine map (4, 4). Where it stretches, shapes follow exactly, and colours turn with the
-    rotation that is nearest to it."""
+    """Transform splats by an affine map.
+
+    Args:
+        splats: The splats.
+        matrix: (4, 4). If it scales the axes differently, the shapes follow exactly, and the spherical harmonics rotate
+            by the nearest rotation.
+
+    Returns:
+        The transformed splats.
+    """
     matrix = np.asarray(matrix, np.float64)
     linear = matrix[:3, :3]
     left, stretches, right = np.linalg.svd(linear)
@@ -75,7 +88,7 @@ def transformed(splats: Splats, matrix: ArrayLike) -> Splats:
     if len(splats) == 0:
         return splats
     if np.ptp(stretches) <= UNIFORM_WITHIN * stretches.max():
-        # A Gaussian is its own reflection through its centre, which makes of a reflection a rotation.
+        # A Gaussian is symmetric about its center, so that a reflection acts as a rotation.
         proper = Rotation.from_matrix(turn * np.sign(np.linalg.det(turn)))
         quats = (proper * _rotations(splats.quats)).as_quat(scalar_first=True)
         scales = splats.scales * stretches.mean()
@@ -86,21 +99,20 @@ def transformed(splats: Splats, matrix: ArrayLike) -> Splats:
         means=(splats.means @ linear.T + matrix[:3, 3]).astype(splats.means.dtype),
         quats=quats.astype(splats.quats.dtype),
         scales=np.maximum(scales, _SMALLEST_SCALE).astype(splats.scales.dtype),
-        sh=spherical_harmonics.rotated(splats.sh, turn),
+        sh=spherical_harmonics.rotate(splats.sh, turn),
     )
 
 
-def recoloured(splats: Splats, recolour: Recolour) -> Splats:
-    """The splats with other colours, from every direction."""
-    matrix, offset = recolour.affine()
+def recolored(splats: Splats, recolor: Recolor) -> Splats:
+    """Return the splats recolored, in all view directions."""
+    matrix, offset = recolor.affine()
     sh = splats.sh @ matrix.T
     sh[:, 0] += (0.5 * matrix.sum(1) + offset - 0.5) / spherical_harmonics.C0
     return replace(splats, sh=sh.astype(splats.sh.dtype))
 
 
-def _closed(splats: Splats, objects: Sequence[SceneObject]) -> tuple[Splats, Fill]:
-    """The splats that are to be seen, under the IDs that they are shown as, with what closes the places of the removed;
-    and that alone."""
+def _remove_and_fill(splats: Splats, objects: Sequence[SceneObject]) -> tuple[Splats, Fill]:
+    """Return the visible splats, with the IDs that they are shown as and with filled holes, and the filling alone."""
     known, slots = np.unique(splats.object_ids, return_inverse=True)
     shown = _shown_as(known, objects)[slots]
     keep = shown != _DROPPED
@@ -108,25 +120,25 @@ def _closed(splats: Splats, objects: Sequence[SceneObject]) -> tuple[Splats, Fil
         if entry.removed and entry.floaters:
             keep &= ~_floaters(splats, _with_id(splats, entry.id, objects))
     edited = replace(splats.select(keep), object_ids=shown[keep])
-    closes = np.zeros(len(edited), np.int64)
+    fills = np.zeros(len(edited), np.int64)
     taken: list[tuple[Splats, int]] = []
     for entry in objects:
         if not (entry.removed and entry.fill):
             continue
-        gone, put = closing(edited, splats.select(_with_id(splats, entry.id, objects)))
+        gone, put = fill_hole(edited, splats.select(_with_id(splats, entry.id, objects)))
         if len(put) == 0:
             continue
-        taken.append((edited.select(gone & (closes == 0)), entry.id))
+        taken.append((edited.select(gone & (fills == 0)), entry.id))
         edited = concatenate([edited.select(~gone), put])
-        closes = np.append(closes[~gone], np.full(len(put), entry.id))
-    parts = [edited.select(closes != 0), *(part for part, _ in taken)]
+        fills = np.append(fills[~gone], np.full(len(put), entry.id))
+    parts = [edited.select(fills != 0), *(part for part, _ in taken)]
     counts = [len(part) for part in parts]
-    whose = np.concatenate([closes[closes != 0], np.repeat([i for _, i in taken], counts[1:]).astype(np.int64)])
+    whose = np.concatenate([fills[fills != 0], np.repeat([i for _, i in taken], counts[1:]).astype(np.int64)])
     return edited, Fill(concatenate(parts), np.arange(sum(counts)) < counts[0], whose)
 
 
 def _shown_as(ids: NDArray[np.int64], objects: Sequence[SceneObject]) -> NDArray[np.int64]:
-    """For each ID the one it is shown as, `_DROPPED` where it is not to be seen."""
+    """Return for each ID the one that it is shown as, `_DROPPED` if it is not visible."""
     entries = {entry.id: entry for entry in objects}
     into = merged(objects)
     found = []
@@ -139,15 +151,15 @@ def _shown_as(ids: NDArray[np.int64], objects: Sequence[SceneObject]) -> NDArray
 
 
 def _with_id(splats: Splats, object_id: int, objects: Sequence[SceneObject]) -> NDArray[np.bool_]:
-    """Which splats are shown as an object, those merged into it among them: (N,)."""
+    """Find the splats of an object, including those merged into it: (N,)."""
     return np.isin(splats.object_ids, [i for i, target in merged(objects).items() if target == object_id])
 
 
 def _floaters(splats: Splats, mine: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which splats belong to no object and lie inside the hull of those that `mine` picks: (N,)."""
-    unlabelled = np.flatnonzero(splats.object_ids == 0)
+    """Find the splats of no object inside the convex hull of those that `mine` selects: (N,)."""
+    unlabeled = np.flatnonzero(splats.object_ids == 0)
     found = np.zeros(len(splats), bool)
-    found[unlabelled] = inside_hull(splats.means[unlabelled], splats.means[mine], splats.opacities[mine])
+    found[unlabeled] = inside_hull(splats.means[unlabeled], splats.means[mine], splats.opacities[mine])
     return found
 
 

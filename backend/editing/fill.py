@@ -1,12 +1,11 @@
-"""Closing the ground or wall that a removed object hid: its surroundings, copied over the hole.
+"""Filling the hole that a removed object leaves in the ground or a wall, with copies of the surroundings.
 
-The object stands on, or at, planes that its neighbours' splats lie in, or near to where cloth is rumpled. Where it hid
-such a plane, no photo says how it looks; a part of the same surface that does show is put there, with the detail
-(grain, joints) that fits the hole's rim best, and with the colours and the relief around the hole, which shade and bend
-it as its surroundings are. Where several things meet under the object, such as sheets of paper, each is continued by
-straight edges.
+The object stands on, or at, planes that the splats of its neighbors lie in, or near to, as in rumpled cloth. No photo
+shows the part of such a plane that the object hid. It is filled with a patch of the visible part, whose detail (grain,
+joints) fits the rim of the hole best, with the colors and the relief around the hole. Where several objects meet under
+the removed one, such as sheets of paper, each is continued with straight edges.
 
-Only a surface that lies around the whole hole is closed: the object may stand at its edge, which nobody can tell.
+A hole is filled only where the surface surrounds it, since the object may stand at the edge of the surface.
 """
 
 from __future__ import annotations
@@ -28,46 +27,46 @@ from scipy.ndimage import (
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from ..hull import body
 from ..model.splats import Splats, concatenate
-from ..spherical_harmonics import C0
+from ..shared.splats.convex_hull import reliable_centers
+from ..shared.splats.spherical_harmonics import C0
 
 PLANES = 3
-"""An object may stand in a corner."""
+"""Largest number of planes: an object may stand in a corner."""
 NEAR = 0.5
-"""How far around the object its planes are looked for, relative to its size."""
+"""Distance from the object within which planes are searched, relative to its size."""
 FLAT_WITHIN = (0.02, 0.04, 0.08)
-"""Distance from a plane, relative to the object's size, within which splats lie in it; larger ones, for what is not
-flat, where smaller ones leave the hole open."""
+"""Distance from a plane, relative to the object's size, within which splats lie in it. The larger ones, for surfaces
+that are not flat, are tried if the hole stays open with the smaller ones."""
 PART_OF_IT = 0.5
-"""Share of another object's splats around the removed one that must lie in a plane, or it only stands on it."""
+"""Smallest fraction of another object's splats near the removed one in a plane; with less, it only stands on it."""
 LOWEST_PERCENT = 3.0
 TOUCHES_WITHIN = 0.1
-"""So near to a plane that it stands on, relative to its size, its lowest percent must come, and not below."""
+"""Largest distance of its lowest percent from a plane that the object stands on, relative to its size."""
 FEWEST = 60
-"""Fewer splats than this make no plane."""
+"""Smallest number of splats that make a plane."""
 ALIGNED = 0.7
-"""Cosine, at least, between a plane's normal and the axis along which a splat in it is thinnest."""
+"""Smallest cosine between a plane's normal and the thinnest axis of a splat in it."""
 COVERED = 0.3
-"""Alpha, seen from straight above, from which on a plane is no hole: much of what makes it opaque lies deeper."""
+"""Smallest alpha, seen along its normal, where a plane has no hole: the splats that make it opaque may lie deeper."""
 WINDOW = 3.0
 """Width of the surroundings that a patch may come from, relative to the object's footprint."""
 CELLS = 128
 """Cells across the window."""
 SURROUNDS = 0.2
-"""Share of the window that a plane must cover, or it is a side of something small."""
+"""Smallest fraction of the window that a plane covers; with less, it is the side of a small object."""
 ENCLOSED = 0.5
-"""Share of what the object touches that must lie within the plane, or it stands at its edge, which nobody can tell."""
+"""Smallest fraction of the touched cells that the surface surrounds; with less, the object stands at its edge."""
 RIM = 2
-"""Cells around the hole that are replaced too: what is seen there is half the object's own."""
+"""Cells around the hole that are replaced, too, since they are mixed with the object."""
 BAND = 5
 """Cells around the hole by which a patch is chosen."""
 SMALLEST_PATCH = 4
 RELIEF_WITHIN = 0.03
-"""Height above or below what is around, relative to the object's size, from which on something lies on the surface."""
+"""Smallest height of a bump on the surface above or below its surroundings, relative to the object's size."""
 SHELL = 0.06
 """Distance from the object's own splats, relative to its size, within which splats of the surface that stand above it
-are the object's, wrongly labelled."""
+are mislabeled ones of the object."""
 
 _TRIPLES = 600
 _SCORED = 3000
@@ -75,23 +74,31 @@ _REACH = 3.0
 _WIDEST = 16
 
 
-def closing(splats: Splats, removed: Splats) -> tuple[NDArray[np.bool_], Splats]:
-    """What closes the holes that an object leaves in `splats`, which are without its own, `removed`: which of them give
-    way at the holes' rims (N,), and the invented ones that come, with the IDs of the surface that they continue."""
+def fill_hole(splats: Splats, removed: Splats) -> tuple[NDArray[np.bool_], Splats]:
+    """Fill the holes that a removed object leaves.
+
+    Args:
+        splats: The N splats of the scene without the object.
+        removed: The splats of the object.
+
+    Returns:
+        (N,) bool: the splats at the rims of the holes that the filling replaces, and the filling splats, which are
+        unobserved and have the IDs of the surface that they continue.
+    """
     gone, parts = np.zeros(len(splats), bool), [Splats.empty(splats.degree)]
-    solid = body(removed.means, removed.opacities)
+    solid = reliable_centers(removed.means, removed.opacities)
     if len(solid) < FEWEST:
         return gone, parts[0]
     size = float(np.linalg.norm(np.percentile(solid, 95, axis=0) - np.percentile(solid, 5, axis=0)))
     middle = np.median(solid, axis=0)
     around = _Around(splats, solid - middle, middle, size)
     for within in FLAT_WITHIN:
-        # Where the surface is rough, so are the labels: more of the object's lowest is taken for the surface's.
+        # Labels of a rough surface are rough, too: more of the object's lowest splats may belong to it.
         rough = within / FLAT_WITHIN[0]
         planes = around.planes(within * size)
         for plane, flat in planes:
-            surface = _Surface(plane, splats.select(flat), around.centred[flat], solid - middle, size, rough)
-            replaced, patches = surface.closed(surface.beyond([other for other, _ in planes if other is not plane]))
+            surface = _Surface(plane, splats.select(flat), around.centered[flat], solid - middle, size, rough)
+            replaced, patches = surface.fill_hole(surface.beyond([other for other, _ in planes if other is not plane]))
             gone[flat[replaced]] = True
             if patches:
                 gone[around.shell(flat, [each for each, _ in planes], within * size)] = True
@@ -102,30 +109,33 @@ def closing(splats: Splats, removed: Splats) -> tuple[NDArray[np.bool_], Splats]
 
 
 class _Around:
-    """The splats around a removed object, whose own are at solid (m, 3) from its `middle`. centred (N, 3): all splats
-    from there; far (N,): how far from its nearest one, infinite beyond `NEAR`; near and reach: indices of those that
-    may show its planes, and that planes may be continued from."""
+    """The splats around a removed object, whose own centers, relative to its `middle`, are solid (m, 3).
+
+    centered (N, 3): the centers of all splats relative to `middle`; far (N,): their distances from the nearest of
+    `solid`, infinite beyond `NEAR`; near: indices of the splats that planes are found from; reach: indices of those
+    that planes may be continued from.
+    """
 
     def __init__(self, splats: Splats, solid: NDArray, middle: NDArray, size: float) -> None:
         self.splats, self.solid, self.size = splats, solid, size
-        self.centred = splats.means.astype(np.float64) - middle
-        self.reach = np.flatnonzero(np.linalg.norm(self.centred, axis=1) < (1.0 + WINDOW) * size)
+        self.centered = splats.means.astype(np.float64) - middle
+        self.reach = np.flatnonzero(np.linalg.norm(self.centered, axis=1) < (1.0 + WINDOW) * size)
         self.far = np.full(len(splats), np.inf)
-        self.far[self.reach] = cKDTree(solid).query(self.centred[self.reach], distance_upper_bound=NEAR * size)[0]
+        self.far[self.reach] = cKDTree(solid).query(self.centered[self.reach], distance_upper_bound=NEAR * size)[0]
         self.near = np.flatnonzero(np.isfinite(self.far) & (splats.opacities > 0.3))
-        self.thin = np.zeros_like(self.centred)
+        self.thin = np.zeros_like(self.centered)
         self.thin[self.reach] = _thin_axes(splats.select(self.reach))
 
     def planes(self, within: float) -> list[tuple[_Plane, NDArray[np.int64]]]:
-        """The planes that the object stands on or at, and the indices of the splats of what lies in each."""
+        """Find the planes that the object stands on or at, and the indices of the splats of the surface in each."""
         near = self.near
         found: list[tuple[_Plane, NDArray[np.int64]]] = []
         while len(found) < PLANES:
             before = [plane for plane, _ in found]
-            plane = _plane(self.centred[near], self.thin[near], self.solid, self.size, within, before)
+            plane = _plane(self.centered[near], self.thin[near], self.solid, self.size, within, before)
             if plane is None:
                 break
-            flat = np.abs(plane.height(self.centred)) < within
+            flat = np.abs(plane.height(self.centered)) < within
             ids, counts = np.unique(self.splats.object_ids[near[flat[near]]], return_counts=True)
             there = self.splats.object_ids[self.near]
             part = [
@@ -138,30 +148,30 @@ class _Around:
         return found
 
     def shell(self, flat: NDArray[np.int64], planes: list[_Plane], within: float) -> NDArray[np.int64]:
-        """Splats of what lies in a plane, `flat`, that stand above all planes where the object was."""
+        """Find splats with the IDs of those in a plane, `flat`, that stand above all planes where the object was."""
         close = np.flatnonzero(self.far < SHELL * self.size)
-        standing = np.all([plane.height(self.centred[close]) > within for plane in planes], axis=0)
+        standing = np.all([plane.height(self.centered[close]) > within for plane in planes], axis=0)
         return close[standing & np.isin(self.splats.object_ids[close], np.unique(self.splats.object_ids[flat]))]
 
 
 @dataclass(frozen=True)
 class _Plane:
-    """A plane through `point` (3,); axes (3, 3): two rows in it, the third its normal, towards the object."""
+    """A plane through `point` (3,); axes (3, 3): two rows in it, the third its normal towards the object."""
 
     point: NDArray
     axes: NDArray
 
     def height(self, points: NDArray) -> NDArray:
-        """How far points (n, 3) are above it: (n,)."""
+        """Return the heights (n,) of points (n, 3) above the plane."""
         return (points - self.point) @ self.axes[2]
 
     def flat(self, points: NDArray) -> NDArray:
-        """Points (n, 3) in it: (n, 2)."""
+        """Return the coordinates (n, 2) of points (n, 3) in the plane."""
         return (points - self.point) @ self.axes[:2].T
 
 
 def _thin_axes(splats: Splats) -> NDArray[np.float64]:
-    """The direction in which each splat is thinnest: (N, 3)."""
+    """Return the thinnest axis of each splat, (N, 3)."""
     axes = Rotation.from_quat(splats.quats.astype(np.float64), scalar_first=True).as_matrix()
     return np.take_along_axis(axes, splats.scales.argmin(1)[:, None, None], 2)[:, :, 0]
 
@@ -169,8 +179,9 @@ def _thin_axes(splats: Splats) -> NDArray[np.float64]:
 def _plane(
     points: NDArray, thin: NDArray, solid: NDArray, size: float, within: float, before: list[_Plane]
 ) -> _Plane | None:
-    """The plane that most of points (n, 3) lie `within` of, with the splats' thin axes (n, 3) across it, and the
-    object's own, solid (m, 3), stand on or at; or None. It is not parallel to those found before."""
+    """Find the plane that the object's own centers, solid (m, 3), stand on or at, with most of points (n, 3) within the
+    distance `within` and their thin axes (n, 3) along its normal; None if there is none. It is not parallel to those
+    in `before`."""
     if len(points) < FEWEST:
         return None
     rng = np.random.default_rng(0)
@@ -206,34 +217,34 @@ def _plane(
 
 
 class _Surface:
-    """The splats that lie in a plane, seen from straight above on a grid of square cells around the object.
+    """The splats that lie in a plane, seen along its normal on a grid of square cells around the object.
 
-    at (n, 2): their centres in cells; look (n, 4): base colour, and height above the plane in cells; owners: whose they
-    are; under and touched (CELLS, CELLS): what the object hides and where it stands.
+    at (n, 2): their centers in cells; look (n, 4): base color, and height above the plane in cells; owners: their
+    object IDs; under, touched (CELLS, CELLS): the cells that the object hides, and those that it touches.
     """
 
     def __init__(
-        self, plane: _Plane, splats: Splats, centred: NDArray, solid: NDArray, size: float, rough: float
+        self, plane: _Plane, splats: Splats, centered: NDArray, solid: NDArray, size: float, rough: float
     ) -> None:
         footprint = plane.flat(solid)
         low, high = footprint.min(0), footprint.max(0)
         width = WINDOW * float((high - low).max())
         self.plane, self.cell = plane, width / CELLS
         self.corner = corner = 0.5 * (low + high) - 0.5 * width
-        self.at = (plane.flat(centred) - corner) / self.cell
+        self.at = (plane.flat(centered) - corner) / self.cell
         self.inside = ((self.at >= 0) & (self.at < CELLS)).all(1)
         self.splats = splats
         self.relief = RELIEF_WITHIN * size / self.cell
-        height = plane.height(centred) / self.cell
-        self.look = np.column_stack([0.5 + C0 * splats.sh[:, 0].astype(np.float64), height])
+        height = plane.height(centered) / self.cell
+        self.appearance = np.column_stack([0.5 + C0 * splats.sh[:, 0].astype(np.float64), height])
         self.owners, self.owner = np.unique(splats.object_ids, return_inverse=True)
         cells = ((footprint - corner) / self.cell).astype(int)
-        self.under = _spread(cells)
-        # No camera has seen what lies under what touches the plane, whatever splats there are.
-        self.touched = _spread(cells[plane.height(solid) < rough * TOUCHES_WITHIN * size])
+        self.under = _fill_footprint(cells)
+        # No camera has seen the plane where the object touches it, whatever splats lie there.
+        self.touched = _fill_footprint(cells[plane.height(solid) < rough * TOUCHES_WITHIN * size])
 
-    def _seen(self) -> tuple[NDArray, NDArray, NDArray]:
-        """The cells' alpha (CELLS, CELLS), mean look (CELLS, CELLS, 4), and which of `owners` one sees most of."""
+    def _render_top(self) -> tuple[NDArray, NDArray, NDArray]:
+        """Return the cells' alpha (CELLS, CELLS), mean appearance (CELLS, CELLS, 4), and the main one of `owners`."""
         rotations = Rotation.from_quat(self.splats.quats.astype(np.float64), scalar_first=True).as_matrix()
         spread = self.plane.axes[:2] @ rotations * (self.splats.scales[:, None, :] / self.cell)
         covariance = spread @ spread.transpose(0, 2, 1) + 0.1 * np.eye(2)
@@ -241,7 +252,7 @@ class _Surface:
         radius = np.ceil(_REACH * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).max(1))).clip(1, _WIDEST)
         home = np.floor(self.at).astype(int)
         radius[((home < -_WIDEST) | (home >= CELLS + _WIDEST)).any(1)] = -1
-        logs, looks = np.zeros((CELLS, CELLS)), np.zeros((CELLS, CELLS, 4))
+        logs, appearances = np.zeros((CELLS, CELLS)), np.zeros((CELLS, CELLS, 4))
         weights = np.zeros((len(self.owners), CELLS, CELLS))
         for dx in range(-_WIDEST, _WIDEST + 1):
             for dy in range(-_WIDEST, _WIDEST + 1):
@@ -256,11 +267,11 @@ class _Surface:
                 alpha = np.minimum(self.splats.opacities[reached] * np.exp(-0.5 * power), 0.99)
                 np.add.at(logs, cells, np.log1p(-alpha))
                 np.add.at(weights, (self.owner[reached], *cells), alpha)
-                np.add.at(looks, cells, alpha[:, None] * self.look[reached])
-        return 1.0 - np.exp(logs), looks / np.maximum(weights.sum(0), 1e-9)[..., None], weights.argmax(0)
+                np.add.at(appearances, cells, alpha[:, None] * self.appearance[reached])
+        return 1.0 - np.exp(logs), appearances / np.maximum(weights.sum(0), 1e-9)[..., None], weights.argmax(0)
 
     def beyond(self, others: list[_Plane]) -> NDArray[np.bool_]:
-        """The cells (CELLS, CELLS) on the far side of other planes, where this one has nothing to close."""
+        """Find the cells (CELLS, CELLS) on the far side of other planes, where this one has no hole to fill."""
         flat = np.stack(np.meshgrid(*2 * [np.arange(CELLS) + 0.5], indexing="ij"), 2) * self.cell + self.corner
         places = flat @ self.plane.axes[:2] + self.plane.point
         found = np.zeros((CELLS, CELLS), bool)
@@ -268,12 +279,12 @@ class _Surface:
             found |= other.height(places) < 0.0
         return found
 
-    def closed(self, beyond: NDArray) -> tuple[NDArray[np.int64], list[Splats]]:
-        """Which splats give way, as indices, and what is put there; the cells `beyond` are none of its own."""
+    def fill_hole(self, beyond: NDArray) -> tuple[NDArray[np.int64], list[Splats]]:
+        """Return the indices of the replaced splats, and the filling; the cells `beyond` are not in the plane."""
         coarse = np.unique(self.at[self.inside] // (CELLS // 16), axis=0)
         if len(coarse) < SURROUNDS * 16 * 16:
             return np.zeros(0, np.int64), []
-        coverage, look, owner = self._seen()
+        coverage, appearance, owner = self._render_top()
         covered = gaussian_filter(coverage, 1.0) > COVERED
         whole = binary_fill_holes(binary_closing(covered | beyond, iterations=2)) & ~beyond
         hole = whole & (self.touched | (self.under & ~covered))
@@ -282,34 +293,36 @@ class _Surface:
             return np.zeros(0, np.int64), []
         target = binary_dilation(hole, iterations=RIM) & whole
         good = covered & ~binary_dilation(hole, iterations=RIM + 1)
-        bump = np.abs(look[..., 3] - _smoothed(look[..., 3:], good, CELLS / 16)[..., 0]) > self.relief
+        bump = np.abs(appearance[..., 3] - _smooth(appearance[..., 3:], good, CELLS / 16)[..., 0]) > self.relief
         good &= ~binary_opening(bump, iterations=1)
         open_still, parts = target.copy(), []
         continued = _continued_owners(owner, good, hole)
         for i in np.unique(owner[good]):
-            parts += self._continued(target & (continued == i), good & (owner == i), look, open_still)
-        parts += self._continued(open_still.copy(), good, look, open_still)
+            parts += self._continue_surface(target & (continued == i), good & (owner == i), appearance, open_still)
+        parts += self._continue_surface(open_still.copy(), good, appearance, open_still)
         home = np.floor(self.at).astype(int)
         replaced = np.zeros(len(home), bool)
         replaced[self.inside] = (target & ~open_still)[tuple(home[self.inside].T)]
         return np.flatnonzero(replaced), parts
 
-    def _continued(self, target: NDArray, good: NDArray, look: NDArray, open_still: NDArray) -> list[Splats]:
-        """What is put onto the cells `target` from those that are good; `open_still` loses what that closes."""
+    def _continue_surface(
+        self, target: NDArray, good: NDArray, appearance: NDArray, open_still: NDArray
+    ) -> list[Splats]:
+        """Fill the cells `target` with copies of good ones, and remove those that are filled from `open_still`."""
         if not target.any() or not good.any():
             return []
-        shades = _smoothed(look, good, max(BAND, 0.5 * np.sqrt(target.sum())))
-        detail = np.where(good[..., None], look - shades, 0.0)[..., :3]
+        shades = _smooth(appearance, good, max(BAND, 0.5 * np.sqrt(target.sum())))
+        detail = np.where(good[..., None], appearance - shades, 0.0)[..., :3]
         parts = []
         for part, shift in _patches(target, good, detail):
-            copied = self._copied(part, shift, shades)
+            copied = self._copy_patch(part, shift, shades)
             if len(copied):
                 parts.append(copied)
                 open_still &= ~part
         return parts
 
-    def _copied(self, part: NDArray, shift: tuple[int, int], shades: NDArray) -> Splats:
-        """The splats that lie where `part` is once it is shifted, put where it is, shaded and bent as it is there."""
+    def _copy_patch(self, part: NDArray, shift: tuple[int, int], shades: NDArray) -> Splats:
+        """Copy the splats at `part` plus `shift` to `part`, with the color and the relief there."""
         target = self.at - shift
         home = np.floor(target).astype(int)
         mine = self.inside & ((home >= 0) & (home < CELLS)).all(1)
@@ -326,12 +339,14 @@ class _Surface:
         sh[:, 0] += change[:, :3] / C0
         back = self.cell * np.column_stack([np.tile(-np.array(shift, float), (len(copies), 1)), change[:, 3]])
         means = (copies.means + back @ self.plane.axes).astype(copies.means.dtype)
-        return replace(copies, means=means, sh=sh, invented=np.ones(len(copies), bool))
+        return replace(copies, means=means, sh=sh, unobserved=np.ones(len(copies), bool))
 
 
 def _continued_owners(owner: NDArray, good: NDArray, hole: NDArray) -> NDArray[np.int64]:
-    """Whose each cell (n, n) of the hole would be if what lies around it had straight edges: of the linear functions
-    that tell the owners of good cells near the hole apart, the largest."""
+    """Continue the owners (n, n) of the good cells near the hole into it with straight edges.
+
+    A linear function of the position is fitted to each owner's cells; the largest one decides.
+    """
     away = distance_transform_edt(~hole)
     cells = np.argwhere(good & (away < max(BAND, np.sqrt(hole.sum()))))
     if len(cells) == 0:
@@ -344,24 +359,23 @@ def _continued_owners(owner: NDArray, good: NDArray, hole: NDArray) -> NDArray[n
     return ids[best].reshape(owner.shape)
 
 
-def _smoothed(values: NDArray, good: NDArray, width: float) -> NDArray:
-    """values (n, n, k) averaged around each cell over those that are good (n, n), by a Gaussian of this width in
-    cells."""
+def _smooth(values: NDArray, good: NDArray, width: float) -> NDArray:
+    """Smooth values (n, n, k) over the good cells (n, n) with a Gaussian of this width in cells."""
     known = np.maximum(gaussian_filter(good.astype(float), width), 1e-9)
     of_good = np.where(good[..., None], values, 0.0)
     return np.stack([gaussian_filter(of_good[..., i], width) / known for i in range(values.shape[2])], 2)
 
 
-def _spread(cells: NDArray) -> NDArray[np.bool_]:
-    """The cells (CELLS, CELLS) among and within cells (n, 2)."""
+def _fill_footprint(cells: NDArray) -> NDArray[np.bool_]:
+    """Return the cells (CELLS, CELLS) between and within cells (n, 2)."""
     found = np.zeros((CELLS, CELLS), bool)
     found[tuple(cells.clip(0, CELLS - 1).T)] = True
     return binary_fill_holes(binary_closing(found, iterations=6))
 
 
 def _patches(target: NDArray, good: NDArray, detail: NDArray) -> list[tuple[NDArray, tuple[int, int]]]:
-    """The cells to fill, target (n, n), in parts, each with the shift to the part of `good` whose detail fits its rim
-    best; cells that nothing fits are left out."""
+    """Split the cells to fill, target (n, n), into parts, each with the shift to the part of `good` whose detail fits
+    its rim best; cells that no part fits are left out."""
     shift = _best_shift(target, good, detail)
     if shift is not None:
         return [(target, shift)]
@@ -379,14 +393,14 @@ def _patches(target: NDArray, good: NDArray, detail: NDArray) -> list[tuple[NDAr
 
 
 def _best_shift(target: NDArray, good: NDArray, detail: NDArray) -> tuple[int, int] | None:
-    """The shift, in cells, that takes all of `target` onto `good` and changes the detail around it least; or None."""
+    """Find the shift in cells that moves all of `target` onto `good` and changes the detail around it least, if any."""
     rows, columns = np.nonzero(target)
     if len(rows) == 0:
         return None
     top, left = rows.min(), columns.min()
     shape = target[top : rows.max() + 1, left : columns.max() + 1].astype(np.float32)
     energy = (detail**2).sum(2)
-    at = np.argwhere(_summed(~good, shape, 1.0) < 0.5) - CELLS - (top, left)
+    at = np.argwhere(_correlate(~good, shape, 1.0) < 0.5) - CELLS - (top, left)
     if len(at) == 0:
         return None
     band = np.argwhere(binary_dilation(target, iterations=BAND) & ~target & good)
@@ -398,15 +412,15 @@ def _best_shift(target: NDArray, good: NDArray, detail: NDArray) -> tuple[int, i
     fits = good[there[..., 0], there[..., 1]]
     changes = ((detail[there[..., 0], there[..., 1]] - detail[band[:, 0], band[:, 1]]) ** 2).sum(2)
     changes = np.where(fits, changes, 2.0 * float(energy[good].mean())).mean(1)
-    # Neither plainer than what is around, nor with things in it that are not.
-    strength = _summed(energy, shape, 0.0)[tuple((at + CELLS + (top, left)).T)] / shape.sum()
+    # With as much detail as the surroundings: neither plainer, nor with something on it.
+    strength = _correlate(energy, shape, 0.0)[tuple((at + CELLS + (top, left)).T)] / shape.sum()
     best = at[(changes + np.abs(strength - energy[tuple(band.T)].mean())).argmin()]
     return int(best[0]), int(best[1])
 
 
-def _summed(values: NDArray, shape: NDArray, outside: float) -> NDArray:
-    """The sum of values (n, n), `outside` beside them, over the cells of shape (h, w), for each place of its corner in
-    them with a margin of n cells on each side."""
+def _correlate(values: NDArray, shape: NDArray, outside: float) -> NDArray:
+    """Sum values (n, n), `outside` beyond them, over the cells of shape (h, w), for each position of its corner, with a
+    margin of n cells on each side."""
     padded = np.pad(values.astype(np.float64), CELLS, constant_values=outside)
     sums = irfft2(rfft2(padded) * np.conj(rfft2(shape, padded.shape)), padded.shape)
     return sums[: len(padded) - len(shape) + 1, : len(padded) - shape.shape[1] + 1]

@@ -1,4 +1,4 @@
-"""What floats around an object without belonging to one, and is to go with it."""
+"""Floaters: splats of no object around a removed one, which are removed with it."""
 
 from __future__ import annotations
 
@@ -6,21 +6,27 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from ..hull import body, inside
+from ..shared.splats.convex_hull import points_inside, reliable_centers
 
 
 def inside_hull(points: NDArray, means: NDArray, opacities: NDArray) -> NDArray[np.bool_]:
-    """Which of points (n, 3) lie inside the convex hull of an object's splats, strays among them aside: (n,).
+    """Find points inside the convex hull of an object's splats, without its outliers.
 
-    means (m, 3) and opacities (m,) are those of the splats. Fewer than four of them, or flat ones, have no inside.
+    Args:
+        points: (n, 3).
+        means: (m, 3) centers of the object's splats.
+        opacities: (m,) of the object's splats.
+
+    Returns:
+        (n,) bool; all False if the splats are coplanar or fewer than four.
     """
-    means = body(means, opacities)
+    means = reliable_centers(means, opacities)
     if len(means) < 4 or len(points) == 0:
         return np.zeros(len(points), bool)
     middle = np.median(means, axis=0)
     try:
-        # Relative to the middle: far from the origin, the hull of something small would be lost in rounding.
+        # Relative to the middle, since far from the origin the hull of a small object would be lost in rounding.
         planes = np.unique(ConvexHull(means - middle).equations, axis=0)
     except (QhullError, ValueError):
         return np.zeros(len(points), bool)
-    return inside(points - middle, planes)
+    return points_inside(points - middle, planes)

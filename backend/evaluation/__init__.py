@@ -1,7 +1,7 @@
-"""How good a reconstruction is, on views it has not seen, and the report that says so."""
+"""Quality of a reconstruction on held-out views, and the report about it."""
 
+from .images import comparison, contact_sheet, curve_image, id_image, save_image, thumbnail
 from .metrics import IdScores, ImageScores, psnr, ssim
-from .pictures import comparison, contact_sheet, curve_picture, id_picture, save_picture, thumbnail
 from .protocols import evaluate
 from .report import write_report
 
@@ -10,11 +10,11 @@ __all__ = [
     "ImageScores",
     "comparison",
     "contact_sheet",
-    "curve_picture",
+    "curve_image",
     "evaluate",
-    "id_picture",
+    "id_image",
     "psnr",
-    "save_picture",
+    "save_image",
     "ssim",
     "thumbnail",
     "write_report",

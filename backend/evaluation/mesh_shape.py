@@ -1,4 +1,4 @@
-"""Whether a mesh is sound: closed, manifold, in how many parts, and where it cuts through itself."""
+"""Topology of a mesh: whether it is watertight and manifold, its components and its self-intersections."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from scipy.sparse.csgraph import connected_components
 _ROWS_AT_ONCE = 512
 _PAIRS_AT_ONCE = 2_000_000
 _ROUNDING = 1e-14
-"""A volume this small beside the product of its edges is 0: the corners lie in one plane."""
+"""Volumes up to this fraction of the product of their edges are 0: the corners are coplanar."""
 _TOUCHING = 1e-9
-"""Coplanar faces that overlap by less than this, as a part of their own size, only touch."""
+"""Coplanar faces that overlap by less than this fraction of their own size only touch."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,12 @@ class Shape:
 
 
 def shape_of(vertices: np.ndarray, faces: np.ndarray) -> Shape:
-    """vertices (V, 3), faces (F, 3) with F > 0; faces are neighbours where they name the same vertices."""
+    """Compute the topology of a mesh.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3) indices, F > 0. Faces are neighbors if they have the same vertex indices.
+    """
     used, faces = np.unique(faces, return_inverse=True)
     faces = faces.reshape(-1, 3)
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
@@ -62,10 +67,17 @@ def _closed(start: np.ndarray, end: np.ndarray, vertices: int) -> tuple[bool, in
 
 
 def self_intersecting(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Which faces cut through, or lie on, another one: (F,) bool. vertices (V, 3), faces (F, 3).
+    """Find the faces that intersect or overlap another face.
 
-    Faces that share a corner or an edge, by position, only count where they meet beyond it. Faces without area do not
+    Faces that share a corner or an edge, by position, count only if they meet elsewhere, too. Faces without area do not
     count.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3) indices.
+
+    Returns:
+        (F,) bool.
     """
     found = np.zeros(len(faces), bool)
     if not len(faces):
@@ -132,7 +144,7 @@ def _meet(p: np.ndarray, q: np.ndarray, p_names: np.ndarray, q_names: np.ndarray
     p_shared, q_shared = equal.any(2), equal.any(1)
     q_sides = _sides(p, q, q_shared)
     apart = (q_sides > 0).all(1) | (q_sides < 0).all(1)
-    # A single corner off the plane, of a face that shares the other two: neighbours along an edge, not folded.
+    # A single corner off the plane, of a face that shares the other two: neighbors along an edge, not folded.
     apart |= (p_shared.sum(1) == 2) & (q_sides != 0).any(1)
     out = np.zeros(len(p), bool)
     at = np.flatnonzero(~apart)

@@ -1,11 +1,11 @@
-"""How good meshes are: against true surfaces where the capture brings them, as objects to work with, and their texture
-on held-out views."""
+"""Evaluation of meshes: against true surfaces where the capture has them, their topology, and their texture on held-out
+views."""
 
 from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,26 +14,28 @@ import numpy as np
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from .. import device
-from ..mesh.zbuffer import draw_mesh
-from ..mesh_file import Mesh, read_mesh
-from ..protocol import InputError, Reporter, read_json
+from ..mesh.texture.zbuffer import draw_mesh
+from ..raster import devices
+from ..shared.errors import InputError
+from ..shared.events import Reporter
+from ..shared.formats.mesh_ply import Mesh, read_mesh
+from ..shared.reconstruction.meshes import MeshEntry, read_meshes
 from ..training.scene import Scene
 from .mesh_shape import Shape, shape_of
 from .truth import TrueMesh, Truth
 
 THRESHOLDS = (0.02, 0.005)
-"""Distances, in the capture's units, up to which a point of one surface counts as found in the other: the one that
-papers on object meshes use, and a stricter one."""
+"""Largest distances between corresponding points of two surfaces, in the capture's units: the one that papers on object
+meshes use, and a stricter one."""
 SAMPLES = 30_000
-_NEIGHBOURS = 6
+_NEIGHBORS = 6
 _SUBPIXELS = 3
 
 
 class SampledSurface:
     """A triangle mesh to measure distances to and from.
 
-    points (SAMPLES, 3): even over the area, the same ones each time; normals (SAMPLES, 3) unit.
+    points (SAMPLES, 3): uniform over the area, with a fixed seed; normals (SAMPLES, 3): unit normals.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, samples: int = SAMPLES) -> None:
@@ -52,15 +54,15 @@ class SampledSurface:
         self.points = np.einsum("nc,ncx->nx", weights, self._corners[face])
         normals = cross / double_area[:, None]
         self.normals = normals[face]
-        # Each face's middle too, so that the nearest ones of these are of the nearest faces.
+        # With the center of each face, so that the nearest anchors belong to the nearest faces.
         self.anchors = np.concatenate([self.points, self._corners.mean(1)])
         self.anchor_normals = np.concatenate([self.normals, normals])
         self._face = np.concatenate([face, np.arange(len(ends))])
         self._tree = cKDTree(self.anchors)
 
     def distances(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far points (n, 3) are from this surface, (n,), and the index in `anchors` of the nearest, (n,)."""
-        _, near = self._tree.query(points, min(_NEIGHBOURS, len(self.anchors)), workers=-1)
+        """Return the distances (n,) of points (n, 3) from this surface, and the nearest of `anchors`, (n,)."""
+        _, near = self._tree.query(points, min(_NEIGHBORS, len(self.anchors)), workers=-1)
         near = near.reshape(len(points), -1)
         best = np.full(len(points), np.inf)
         for column in near.T:
@@ -69,7 +71,7 @@ class SampledSurface:
 
 
 def _to_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Squared distances of points (n, 3) from triangles (n, 3, 3), which have an area."""
+    """Return the squared distances (n,) of points (n, 3) from triangles (n, 3, 3) that have an area."""
     edges = np.roll(corners, -1, axis=1) - corners
     normal = np.cross(edges[:, 0], -edges[:, 2])
     within = np.ones(len(points), bool)
@@ -86,10 +88,16 @@ def _to_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def agreement(accuracy: np.ndarray, completeness: np.ndarray) -> dict[str, float | None]:
-    """Chamfer distance (the mean of the two mean distances), and precision, recall and F1 at each of THRESHOLDS.
+    """Compute the chamfer distance, and precision, recall and F1 at each of THRESHOLDS.
 
-    accuracy (n,): distances of the mesh's points from the truth; completeness (m,): of the truth's points from the
-    mesh. All None where a side has no points.
+    The chamfer distance is the mean of the two mean distances.
+
+    Args:
+        accuracy: (n,) distances of the mesh's points from the truth.
+        completeness: (m,) distances of the truth's points from the mesh.
+
+    Returns:
+        The figures by name; all None if n or m is 0.
     """
     names = ["precision", "recall", "f1"]
     out: dict[str, float | None] = dict.fromkeys(["chamfer", *names, *(f"{name}_005" for name in names)])
@@ -107,18 +115,28 @@ def agreement(accuracy: np.ndarray, completeness: np.ndarray) -> dict[str, float
 
 
 def against_truth(mesh: Mesh, true: TrueMesh, truth: Truth, ids: Sequence[int]) -> dict[str, float | None]:
-    """`agreement` over the truth's surface that at least two views see, the same over all of it (names that end in
-    "_all"), and `seen`, that part's share of the area.
+    """Compare a mesh with the true surface of the objects `ids`.
 
-    The seen part of the mesh is what at least two views would see of it, were it alone, less the points whose nearest
-    true point is unseen: the back of a wall that nobody walked around is right or wrong over all of the surface only.
+    The seen part of the truth is what at least two views see. The seen part of the mesh is what at least two views
+    would see of it without the rest of the scene, less the points whose nearest true point is unseen: the back of a
+    wall that no camera saw counts only in the figures over the whole surface.
+
+    Args:
+        mesh: The mesh to measure.
+        true: The true surface.
+        truth: The truth that `true` is from.
+        ids: The IDs of its objects.
+
+    Returns:
+        `agreement` over the seen parts, the same over the whole surfaces (names that end in "_all"), and `seen`, the
+        seen fraction of the true surface's area.
     """
     made, wanted = SampledSurface(mesh.vertices, mesh.faces), SampledSurface(true.vertices, true.faces)
     seen = truth.seen(wanted.anchors, wanted.anchor_normals, ids)
     accuracy, nearest = wanted.distances(made.points)
     completeness, _ = made.distances(wanted.points)
     seen_points = seen[: len(wanted.points)]
-    counted = seen[nearest] & truth.sees_of(made.points, made.normals, mesh.vertices, mesh.faces)
+    counted = seen[nearest] & truth.seen_alone(made.points, made.normals, mesh.vertices, mesh.faces)
     return {
         **agreement(accuracy[counted], completeness[seen_points]),
         **{f"{name}_all": value for name, value in agreement(accuracy, completeness).items()},
@@ -127,7 +145,7 @@ def against_truth(mesh: Mesh, true: TrueMesh, truth: Truth, ids: Sequence[int]) 
 
 
 def read_texture(path: Path) -> np.ndarray:
-    """A mesh's texture (S, S, 3) uint8 sRGB."""
+    """Read a mesh's texture (S, S, 3) uint8 sRGB. Raises InputError if the file cannot be read."""
     try:
         with Image.open(path) as picture:
             return np.asarray(picture.convert("RGB"))
@@ -136,7 +154,7 @@ def read_texture(path: Path) -> np.ndarray:
 
 
 def sample_texture(texture: np.ndarray, uvs: np.ndarray) -> np.ndarray:
-    """Colours 0 .. 1 (n, 3) float32 at uvs (n, 2), bilinear; (0, 0) is the texture's lower left."""
+    """Sample a texture bilinearly at uvs (n, 2), (0, 0) at its lower left: colors (n, 3) float32, 0 .. 1."""
     height, width = texture.shape[:2]
     x = np.clip(uvs[:, 0] * width - 0.5, 0, width - 1)
     y = np.clip((1 - uvs[:, 1]) * height - 0.5, 0, height - 1)
@@ -150,15 +168,15 @@ def sample_texture(texture: np.ndarray, uvs: np.ndarray) -> np.ndarray:
 
 @dataclass
 class TextureScore:
-    """Pixels of the object's masks, those of them that the mesh covers, and the squared error summed over these and
-    their three channels."""
+    """The number of pixels in the object's masks, the number of these that the mesh covers, and the sum of the squared
+    errors over the covered pixels and their three channels."""
 
     pixels: int = 0
     covered: int = 0
     squares: float = 0.0
 
     def figures(self) -> dict[str, float | None]:
-        """texture_psnr in dB over all covered pixels of all views together, texture_coverage; None: not measured."""
+        """Return texture_psnr in dB over the covered pixels of all views, and texture_coverage; None: not measured."""
         if not self.covered:
             return {"texture_psnr": None, "texture_coverage": 0.0 if self.pixels else None}
         mean = max(self.squares / (3 * self.covered), 1e-10)
@@ -168,11 +186,11 @@ class TextureScore:
 def texture_score(
     mesh: Mesh, texture: np.ndarray, scene: Scene, ids: Sequence[int] | None, indices: Sequence[int]
 ) -> TextureScore:
-    """The textured mesh alone beside the photos `indices`, at the common exposure, where their masks show one of `ids`
-    (None: everywhere)."""
+    """Compare renders of the textured mesh alone with the photos `indices`, at the common exposure, where their masks
+    show one of `ids` (None: everywhere)."""
     score = TextureScore()
     vertices = scene.normalization.to_scene(mesh.vertices)
-    classes = None if ids is None else np.flatnonzero(np.isin(scene.object_ids, ids))
+    classes = None if ids is None else scene.classes.classes_among(ids)
     for index in indices:
         photo, labels = scene.target(index)
         if classes is None:
@@ -180,7 +198,7 @@ def texture_score(
         elif labels is None:
             continue
         else:
-            wanted = np.isin(device.host(labels), classes)
+            wanted = np.isin(devices.host(labels), classes)
         if not wanted.any():
             continue
         rows, columns = np.flatnonzero(wanted.any(1)), np.flatnonzero(wanted.any(0))
@@ -193,54 +211,46 @@ def texture_score(
         camera = replace(scene.camera(index), K=K, width=width * _SUBPIXELS, height=height * _SUBPIXELS)
         _, face, weights = draw_mesh(vertices, mesh.faces, camera)
         drawn = face >= 0
-        colours = np.zeros((*face.shape, 3), np.float32)
+        colors = np.zeros((*face.shape, 3), np.float32)
         uvs = np.einsum("nc,ncx->nx", weights[drawn], mesh.uvs[face[drawn]])
-        colours[drawn] = sample_texture(texture, uvs)
+        colors[drawn] = sample_texture(texture, uvs)
         blocks = (height, _SUBPIXELS, width, _SUBPIXELS)
         count = drawn.reshape(blocks).sum((1, 3))
-        # A pixel is the mesh's where at least half of it is, and then has the colour of that part.
+        # The mesh covers a pixel if it covers at least half of it; the color is that of the covered part.
         covered = wanted & (2 * count >= _SUBPIXELS**2)
-        pixels = colours.reshape(*blocks, 3).sum((1, 3))[covered] / count[covered][:, None]
-        error = pixels - device.host(photo)[:, *part].transpose(1, 2, 0)[covered]
+        pixels = colors.reshape(*blocks, 3).sum((1, 3))[covered] / count[covered][:, None]
+        error = pixels - devices.host(photo)[:, *part].transpose(1, 2, 0)[covered]
         score.pixels += int(wanted.sum())
         score.covered += int(covered.sum())
         score.squares += float((error.astype(np.float64) ** 2).sum())
     return score
 
 
-def mesh_entries(folder: Path, trained_steps: int, reporter: Reporter) -> dict[str, dict[str, Any]]:
-    """What meshes.json in `folder` says of each mesh, by its key: objects by their IDs, then sets and the whole scene.
+def mesh_entries(folder: Path, trained_steps: int, reporter: Reporter) -> dict[str, MeshEntry]:
+    """The meshes of the present state of the model: objects by their IDs, then sets and the whole scene.
 
-    Each has `ids`, of the objects that it shows, or None: the whole scene. Those of another state of the model are left
-    out with a warning.
+    Args:
+        folder: `meshes` of a reconstruction folder.
+        trained_steps: of the model. Meshes of another state are left out with a warning.
+
+    Raises:
+        InputError: meshes.json cannot be used.
     """
-    path = folder / "meshes.json"
-    if not path.exists():
-        return {}
-    record = read_json(path)
-    entries = record.get("meshes") if isinstance(record, dict) else None
-    if not isinstance(entries, dict) or not all(
-        isinstance(entry, dict) and "ids" in entry for entry in entries.values()
-    ):
-        raise InputError(f"{path} does not list meshes as expected; delete it and make the meshes again.")
-    current = {key: entry for key, entry in entries.items() if entry.get("trained_steps") == trained_steps}
+    entries = read_meshes(folder)
+    current = [entry for entry in entries.values() if entry.trained_steps == trained_steps]
     if len(current) < len(entries):
         reporter.warning(
             f"{len(entries) - len(current)} of {len(entries)} meshes in {folder} are of an earlier state of the model "
             "and are left out; run `mesh` again."
         )
-    return dict(sorted(current.items(), key=lambda item: (object_of(*item) is None, object_of(*item) or 0, item[0])))
+    current.sort(key=lambda entry: (entry.object_id is None, entry.object_id or 0, entry.key))
+    return {entry.key: entry for entry in current}
 
 
-def object_of(key: str, entry: Mapping[str, Any]) -> int | None:
-    """The ID of the object whose own mesh an entry of meshes.json is; None for a set or the whole scene."""
-    return int(key) if key.isdecimal() and int(key) in (entry["ids"] or ()) else None
-
-
-def digest(folder: Path, entry: Mapping[str, Any]) -> str:
-    """Tells a mesh's files from those of another run."""
+def digest(folder: Path, entry: MeshEntry) -> str:
+    """A hash of a mesh's files, which tells them from those of another run."""
     sha = hashlib.sha256()
-    for name in (entry.get("file"), entry.get("texture")):
+    for name in (entry.file, entry.texture):
         if name and (folder / name).exists():
             sha.update((folder / name).read_bytes())
     return sha.hexdigest()[:16]
@@ -248,7 +258,7 @@ def digest(folder: Path, entry: Mapping[str, Any]) -> str:
 
 def evaluate_mesh(
     folder: Path,
-    entry: Mapping[str, Any],
+    entry: MeshEntry,
     scene: Scene,
     truth: Truth | None,
     indices: Sequence[int],
@@ -259,17 +269,17 @@ def evaluate_mesh(
 
     Lengths are in the capture's units. A file that cannot be read is a warning.
     """
-    ids = entry["ids"]
+    ids = entry.ids
     names = [*agreement(np.zeros(0), np.zeros(0))]
     out: dict[str, Any] = {
-        **dict.fromkeys(["vertices", "faces", "invented", *Shape.__dataclass_fields__]),
+        **dict.fromkeys(["vertices", "faces", "unobserved", *Shape.__dataclass_fields__]),
         **dict.fromkeys([*names, *(f"{name}_all" for name in names), "seen", "texture_psnr", "texture_coverage"]),
-        "why": entry.get("why"),
+        "why": entry.why,
     }
-    if not entry.get("file"):
+    if not entry.file:
         return out
     try:
-        mesh = read_mesh(folder / entry["file"])
+        mesh = read_mesh(folder / entry.file)
     except InputError as error:
         reporter.warning(str(error))
         return {**out, "why": "its file cannot be read"}
@@ -279,7 +289,7 @@ def evaluate_mesh(
     if not np.isfinite(mesh.vertices).all() or not (area > 0).any():
         return {**out, "why": "it has no surface"}
     out |= vars(shape_of(mesh.vertices, mesh.faces))
-    out["invented"] = float(mesh.invented.mean())
+    out["unobserved"] = float(mesh.unobserved.mean())
     true = None if truth is None else truth.of(list(truth.meshes) if ids is None else ids)
     if true is not None and truth is not None:
         out |= against_truth(mesh, true, truth, list(truth.meshes) if ids is None else ids)

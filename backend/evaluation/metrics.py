@@ -1,4 +1,4 @@
-"""How good renders and object IDs are: PSNR and SSIM, IoU, boundary IoU, Dice and pixel accuracy."""
+"""Metrics of renders and object IDs: PSNR, SSIM, IoU, boundary IoU, Dice and pixel accuracy."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 BOUNDARY_FRACTION = 0.02
-"""Width of the boundary band of mBIoU, as a part of the image diagonal."""
+"""Width of the boundary band of mBIoU, as a fraction of the image diagonal."""
 
 
 def _as_float(image: NDArray) -> NDArray[np.float64]:
@@ -26,17 +26,35 @@ def _pair(a: NDArray, b: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 def psnr(a: NDArray, b: NDArray) -> float:
-    """Peak signal-to-noise ratio in dB of two images (h, w, 3), float in [0, 1] or uint8; infinite for equal ones."""
+    """Compute the peak signal-to-noise ratio of two images, -10 log10(mean((a - b)^2)).
+
+    Args:
+        a, b: Images of the same shape (h, w, 3), float in [0, 1] or uint8.
+
+    Returns:
+        The ratio in dB; infinite if the images are equal.
+
+    Raises:
+        ValueError: If the shapes differ.
+    """
     a, b = _pair(a, b)
     error = float(np.mean((a - b) ** 2))
     return math.inf if error == 0.0 else -10.0 * math.log10(error)
 
 
 def ssim(a: NDArray, b: NDArray) -> float:
-    """Structural similarity of two images (h, w, 3), float in [0, 1] or uint8; 1 when they are equal.
+    """Compute the structural similarity of two images (Wang et al. 2004), as papers on splats report it.
 
-    As in Wang et al. 2004 and as splat papers report it: Gaussian window of 11 x 11 with sigma 1.5, C1 = 0.01^2,
-    C2 = 0.03^2, zeros beyond the image border, the mean over all pixels and channels.
+    Gaussian window of 11 x 11 pixels with sigma 1.5, C1 = 0.01^2, C2 = 0.03^2, zeros beyond the image border.
+
+    Args:
+        a, b: Images of the same shape (h, w, 3), float in [0, 1] or uint8.
+
+    Returns:
+        The mean over all pixels and channels; 1 if the images are equal.
+
+    Raises:
+        ValueError: If the shapes differ.
     """
     a, b = _pair(a, b)
     offsets = np.arange(-5, 6)
@@ -57,17 +75,17 @@ def ssim(a: NDArray, b: NDArray) -> float:
 
 
 def boundary_distance(height: int, width: int) -> int:
-    """Width in pixels of the boundary band of an image: 2% of its diagonal, at least 1."""
+    """Return the width in pixels of the boundary band of an image: 2% of its diagonal, at least 1."""
     return max(1, round(BOUNDARY_FRACTION * math.hypot(height, width)))
 
 
 def boundaries(labels: NDArray, distance: int) -> NDArray[np.bool_]:
-    """(h, w) bool: the pixels that lie in the boundary band of the mask of their own label.
+    """Find the pixels in the boundary band of their own label's mask, (h, w) bool (Cheng et al. 2021).
 
-    The band of a mask is the mask minus its erosion by a square of 2 `distance` + 1 pixels; beyond the image border
-    counts as outside of the mask, so that a mask has a band there too (both as Cheng et al. 2021 publish it). A pixel
-    is outside of the erosion of its own mask exactly when another label, or the border, lies in the square
-    around it: so a minimum and a maximum filter find the bands of all masks at once, however many there are.
+    The band of a mask is the mask minus its erosion by a square of 2 `distance` + 1 pixels. Pixels beyond the image
+    border are outside of every mask, so that a mask has a band there, too. A pixel is outside of the erosion of its own
+    mask if and only if another label or the border lies in the square around it. Therefore a minimum and a maximum
+    filter find the bands of all masks at once.
     """
     size = 2 * distance + 1
     _, compact = np.unique(labels, return_inverse=True)
@@ -78,14 +96,14 @@ def boundaries(labels: NDArray, distance: int) -> NDArray[np.bool_]:
 
 
 class IdScores:
-    """Adds up how well predicted object IDs agree with true ones, view by view.
+    """Accumulates the agreement of predicted and true object IDs over views.
 
-    Pixels whose true ID is 0 are unlabelled: they count nowhere, whatever is predicted there (unless `zero_is_class`,
-    which makes 0 an object like the others). For each object, intersections and unions are summed over the pixels of
-    all views together and divided once; miou, mbiou and dice are then the plain means over the objects that occur in
-    the truth (a predicted ID that never occurs there has no score of its own, but its pixels are misses of the objects
-    it covers). For boundary IoU, what is predicted on unlabelled pixels is replaced by "unlabelled", as in the truth,
-    before the bands are taken. accuracy is the part of all labelled pixels whose ID is right.
+    Pixels with the true ID 0 are unlabeled and are not counted, whatever is predicted there, unless `zero_is_class`
+    makes 0 an object like the others. For each object, intersections and unions are summed over the pixels of all views
+    and divided once. miou, mbiou and dice are the means over the objects that occur in the truth. A predicted ID that
+    does not occur there has no score of its own, but its pixels are misses of the objects that they cover. For the
+    boundary IoU, predictions on unlabeled pixels are replaced by "unlabeled" before the bands are computed. accuracy is
+    the fraction of the labeled pixels with the right ID.
     """
 
     _COLUMNS = ("intersection", "predicted", "truth", "band_intersection", "band_predicted", "band_truth")
@@ -96,7 +114,7 @@ class IdScores:
         self._sums = np.zeros((0, len(self._COLUMNS)), np.int64)
 
     def add(self, predicted: NDArray, truth: NDArray) -> None:
-        """Count one view; both (h, w), any integer IDs."""
+        """Add one view; `predicted` and `truth` are integer IDs (h, w)."""
         if predicted.shape != truth.shape or predicted.ndim != 2:
             raise ValueError(f"two ID images (h, w) of one size were expected, not {predicted.shape} and {truth.shape}")
         if predicted.dtype.kind not in "iub" or truth.dtype.kind not in "iub":
@@ -129,7 +147,7 @@ class IdScores:
         self._add_sums(ids, np.stack(columns, axis=1))
 
     def merge(self, other: IdScores) -> None:
-        """Add what another one has counted."""
+        """Add the views that `other` has accumulated."""
         if other.zero_is_class != self.zero_is_class:
             raise ValueError("scores with and without 0 as a class cannot be added up")
         self._add_sums(other._ids, other._sums)
@@ -142,7 +160,7 @@ class IdScores:
         self._ids, self._sums = merged, total
 
     def table(self) -> list[dict[str, Any]]:
-        """For each object that occurs in the truth, by ID: id, iou, biou, dice, pixels (true ones, all views)."""
+        """Return a row for each object in the truth, by ID: id, iou, biou, dice, pixels (true ones of all views)."""
         rows = []
         for i, sums in zip(self._ids.tolist(), self._sums.tolist()):
             same, predicted, truth, band_same, band_predicted, band_truth = sums
@@ -160,9 +178,9 @@ class IdScores:
         return rows
 
     def result(self) -> dict[str, Any]:
-        """miou, mbiou, dice, accuracy in 0 .. 1 and objects {id: iou}; None for a number if nothing was labelled."""
+        """Return miou, mbiou, dice, accuracy, 0 .. 1, None if nothing was labeled, and objects {ID: IoU}."""
         rows = self.table()
-        labelled = sum(row["pixels"] for row in rows)
+        labeled = sum(row["pixels"] for row in rows)
         right = int(self._sums[:, 0].sum())
 
         def mean(key: str) -> float | None:
@@ -172,27 +190,27 @@ class IdScores:
             "miou": mean("iou"),
             "mbiou": mean("biou"),
             "dice": mean("dice"),
-            "accuracy": right / labelled if labelled else None,
+            "accuracy": right / labeled if labeled else None,
             "objects": {row["id"]: row["iou"] for row in rows},
         }
 
 
 class ImageScores:
-    """Means of PSNR and SSIM over views, each view counting once."""
+    """Accumulates the means of PSNR and SSIM over views."""
 
     def __init__(self) -> None:
         self._psnr: list[float] = []
         self._ssim: list[float] = []
 
     def add(self, render: NDArray, truth: NDArray) -> tuple[float, float]:
-        """Count one view, both (h, w, 3); returns its own (psnr in dB, ssim). The render is clipped to [0, 1]."""
+        """Add one view (h, w, 3) and return its own PSNR in dB and SSIM; the render is clipped to [0, 1]."""
         render = np.clip(_as_float(render), 0.0, 1.0)
         self._psnr.append(psnr(render, truth))
         self._ssim.append(ssim(render, truth))
         return self._psnr[-1], self._ssim[-1]
 
     def result(self) -> dict[str, float | None]:
-        """psnr in dB and ssim; None if there was no view."""
+        """Return the mean psnr in dB and ssim; None if there was no view."""
         if not self._psnr:
             return {"psnr": None, "ssim": None}
         return {"psnr": float(np.mean(self._psnr)), "ssim": float(np.mean(self._ssim))}

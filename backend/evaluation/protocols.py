@@ -1,4 +1,4 @@
-"""What is measured on which views."""
+"""Evaluation of renders on the views of a capture."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..protocol import Reporter
+from ..shared.events import Reporter
 from .metrics import IdScores, ImageScores
 
 
@@ -18,7 +18,7 @@ class _View(Protocol):
 
 
 class EvaluatedCapture(Protocol):
-    """What of a capture is needed here."""
+    """The part of a capture that `evaluate` needs."""
 
     @property
     def views(self) -> Sequence[_View]: ...
@@ -40,11 +40,18 @@ def evaluate(
     reporter: Reporter | None = None,
     zero_is_class: bool = False,
 ) -> dict[str, Any]:
-    """Compare renders of the views `indices` (held-out ones, for figures that are to be published) with the capture.
+    """Compare renders with the images and masks of a capture.
 
-    `render(i)` gives the image (h, w, 3) float in [0, 1] and the object IDs (h, w) int64. Returns {"quality": {psnr,
-    ssim, lpips, miou, mbiou, dice, accuracy}, "objects": [{id, name, iou, biou, dice, pixels}], "views": [{name, psnr,
-    ssim, miou}]}. Without masks, or where no pixel is labelled, the ID scores are None; lpips is not measured: None.
+    Args:
+        capture: The capture with the true images and masks.
+        render: Returns the image (h, w, 3), float in [0, 1], and the object IDs (h, w) int64 of view `i`.
+        indices: The views to measure; held-out views for results that are to be published.
+        reporter: Receives the progress, and a warning for each render with NaN or Inf.
+        zero_is_class: Count the ID 0 as an object, instead of as unlabeled.
+
+    Returns:
+        {"quality": {psnr, ssim, lpips, miou, mbiou, dice, accuracy}, "objects": [{id, name, iou, biou, dice, pixels}],
+        "views": [{name, psnr, ssim, miou}]}. The ID scores are None if no pixel is labeled; lpips is always None.
     """
     reporter = reporter or Reporter()
     images = ImageScores()

@@ -1,4 +1,4 @@
-"""The true surfaces that a synthetic capture brings along, and which parts of them its cameras see.
+"""The true surfaces in a synthetic capture, and the parts of them that its cameras see.
 
 truth/objects.json           {"objects": [{"id": 1, "mesh": "meshes/1_mug.ply"}, ...]}
 truth/meshes/*.ply           triangles in the capture's frame, faces turned to the outside
@@ -16,15 +16,16 @@ import numpy as np
 from PIL import Image
 
 from ..capture import Capture
-from ..mesh.zbuffer import draw_mesh
-from ..ply import LONGEST_HEADER, read_vertices
-from ..protocol import InputError, read_json
+from ..mesh.texture.zbuffer import draw_mesh
 from ..raster import Camera
+from ..shared.errors import InputError
+from ..shared.formats.json_file import read_json
+from ..shared.formats.ply import LONGEST_HEADER, read_vertices
 
 VIEWS_TO_COUNT = 2
-"""So many views must see a piece of surface before a reconstruction can be blamed for it."""
+"""Number of views that must see a piece of surface for it to count."""
 _PIXELS_DEEP = 1.5
-"""A point may differ from the depth at its pixel by so many times the pixel's width there: surfaces are slanted."""
+"""Largest distance of a point from the depth at its pixel, in widths of the pixel there, since surfaces are slanted."""
 _BYTES_HELD = 400_000_000
 _FACES = "property list uchar int vertex_indices"
 
@@ -46,7 +47,7 @@ class _View:
 
 
 class Truth:
-    """True surfaces by object ID, and what the views `indices` of `capture` see of them."""
+    """True surfaces by object ID, and the parts of them that the views `indices` of `capture` see."""
 
     def __init__(self, meshes: dict[int, TrueMesh], capture: Capture, indices: Sequence[int]) -> None:
         self.meshes = meshes
@@ -56,7 +57,7 @@ class Truth:
         self._bytes = 0
 
     def of(self, ids: Collection[int]) -> TrueMesh | None:
-        """The surface of one object or several together; None where the truth lacks one of them."""
+        """Return the joint surface of the objects `ids`; None if the truth lacks one of them."""
         if not ids or not all(i in self.meshes for i in ids):
             return None
         parts = [self.meshes[i] for i in ids]
@@ -65,15 +66,26 @@ class Truth:
         return TrueMesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
 
     def seen(self, points: np.ndarray, normals: np.ndarray, ids: Collection[int]) -> np.ndarray:
-        """Which points (n, 3) of the objects `ids`, with outward normals (n, 3), at least two views see: (n,) bool.
+        """Find the points of the objects `ids` that at least `VIEWS_TO_COUNT` views see.
 
-        A view sees a point that it looks at from outside, whose pixel shows one of `ids` and lies as deep as the point.
+        A view sees a point if it faces the outside of the surface, and the point's pixel shows one of `ids` at the
+        depth of the point.
+
+        Args:
+            points: (n, 3) in the capture's world.
+            normals: (n, 3), outward.
+            ids: Object IDs.
+
+        Returns:
+            (n,) bool.
         """
         views = map(self._view, self._indices)
         return _seen(points, normals, ((view, np.where(np.isin(view.ids, list(ids)), view.depth, 0)) for view in views))
 
-    def sees_of(self, points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """The same for points of another surface, vertices (V, 3) and faces (F, 3), that stands there alone."""
+    def seen_alone(
+        self, points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray
+    ) -> np.ndarray:
+        """As `seen`, for points of another surface, vertices (V, 3) and faces (F, 3), without the rest of the scene."""
 
         def drawn(view: _View) -> np.ndarray:
             fx, fy, cx, cy = view.intrinsics
@@ -94,7 +106,7 @@ class Truth:
 
 
 def _seen(points: np.ndarray, normals: np.ndarray, looks: Iterable[tuple[_View, np.ndarray]]) -> np.ndarray:
-    """Which points at least two of the views see, each given with the depth (H, W) of what counts, 0 elsewhere."""
+    """Find the points that at least `VIEWS_TO_COUNT` views see; each comes with a depth map (H, W), 0: nothing."""
     views = np.zeros(len(points), np.int32)
     for view, depth in looks:
         fx, fy, cx, cy = view.intrinsics
@@ -113,7 +125,18 @@ def _seen(points: np.ndarray, normals: np.ndarray, looks: Iterable[tuple[_View, 
 
 
 def load_truth(capture: Capture, indices: Sequence[int]) -> Truth | None:
-    """The truth of a capture, seen by its views `indices`; None where it brings none."""
+    """Read the true surfaces of a synthetic capture.
+
+    Args:
+        capture: The capture.
+        indices: The views that decide which parts of the surfaces count.
+
+    Returns:
+        The truth, or None if the capture has none.
+
+    Raises:
+        InputError: If a file of the truth cannot be used.
+    """
     listed = capture.folder / "truth" / "objects.json"
     if not listed.exists():
         return None
@@ -135,10 +158,10 @@ def _read_mesh(path: Path) -> TrueMesh:
     row = np.dtype([("corners", "u1"), ("vertices", "<i4", 3)])
     start = end + table.nbytes
     if len(counts) != 1 or _FACES not in lines or len(data) != start + counts[0] * row.itemsize:
-        raise InputError(f"{path} is no mesh of triangles as the demo writes it; make the capture again.")
+        raise InputError(f"{path} is not a triangle mesh as the demo writes it; make the capture again.")
     faces = np.frombuffer(data[start:], row)["vertices"]
     if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
-        raise InputError(f"{path} has faces of vertices that it does not hold; make the capture again.")
+        raise InputError(f"{path} has faces with vertices that it does not contain; make the capture again.")
     return TrueMesh(vertices, faces.astype(np.int32))
 
 
@@ -154,7 +177,7 @@ def _read_view(capture: Capture, index: int) -> _View:
     except (OSError, ValueError) as error:
         raise InputError(f"{depth_file} or {ids_file} cannot be read ({error}); make the capture again.") from error
     if depth.ndim != 2 or ids.shape != depth.shape:
-        raise InputError(f"{depth_file} and {ids_file} are not of one size; make the capture again.")
+        raise InputError(f"{depth_file} and {ids_file} differ in size; make the capture again.")
     # The truth has the size of the images on disk, the capture's views may be smaller.
     across, down = depth.shape[1] / view.width, depth.shape[0] / view.height
     K = capture.K(index)

@@ -1,4 +1,4 @@
-"""Files that other programs read."""
+"""Writing splats for other programs, and reading theirs."""
 
 from .anchors import write_anchors
 from .fit import agreement, fit_splats

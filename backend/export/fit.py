@@ -1,11 +1,10 @@
-"""A view-dependent model as plain splats: what the cameras see of each splat, averaged, and its colour fitted.
+"""Fitting of plain splats to a view-dependent model.
 
-In `view` mode opacity, shape and colour of a splat change with the camera, and in some views it is not there at all.
-A file holds one opacity, one shape and spherical harmonics, so these are fitted over the training cameras, each view
-counting as much as the splat adds to its picture. What that costs, `agreement` measures. On a capture of a table-top
-the fit is 34.6 dB from the model's own held-out pictures; shapes averaged as covariances give 33.5, degree 1 gives
-32.6, and the model as seen from the middle of the cameras 29.2. Degree 3 comes no closer in views that it was not
-fitted to.
+In `view` mode, opacity, shape and color of a splat change with the camera, and in some views it does not exist. A file
+has one opacity, one shape and spherical harmonics for each splat, so these are fitted over the training cameras, each
+weighted by the splat's contribution to the image. `agreement` measures the loss. On a capture of a table top, the PSNR
+of the fit to the model's own renders of held-out views is 34.6 dB. It is 33.5 dB if covariances are averaged directly,
+32.6 dB with degree 1, and 29.2 dB for the model as seen from the center of the cameras. Degree 3 is not better.
 """
 
 from __future__ import annotations
@@ -17,22 +16,22 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from .. import device, spherical_harmonics
 from ..evaluation.metrics import psnr
+from ..model.draw import draw
 from ..model.object_model import ObjectModel, anchors_in_view
 from ..model.splats import Splats, concatenate
-from ..protocol import Reporter
-from ..raster import Camera, rasterize
-from ..raster.draw import draw
+from ..raster import Camera, devices, rasterize
 from ..raster.reference import rotation_matrices
+from ..shared.events import Reporter
+from ..shared.splats import spherical_harmonics
 
 SH_DEGREE = 2
 
 MAX_VIEWS = 200
-"""So many cameras are enough to know a splat from all its sides; of more, these are taken evenly."""
+"""Largest number of cameras, chosen evenly, which is enough to see each splat from all sides."""
 
 RIDGE = 0.002
-"""Pull of the higher bands to zero, as a share of what a splat's views weigh: one seen from few sides stays tame."""
+"""Regularization of the higher bands, as a fraction of the weight of a splat's views, for splats with few views."""
 
 _ANCHORS_AT_ONCE = 50_000
 _SPLATS_AT_ONCE = 50_000
@@ -44,10 +43,16 @@ _UPPER_3 = np.triu_indices(3)
 def fit_splats(
     model: ObjectModel, cameras: Sequence[Camera], reporter: Reporter | None = None
 ) -> tuple[Splats, NDArray[np.int64]]:
-    """The plain splats in world units that look most like `model` through `cameras` (scene units), and source (N,):
-    anchor * offsets + offset of each.
+    """Fit plain splats to a view-dependent model.
 
-    Splats that no camera sees are left out: nothing has taught them.
+    Args:
+        model: The model.
+        cameras: The training cameras in scene units.
+        reporter: Receives the progress.
+
+    Returns:
+        The N splats in world units, and (N,) int64 the offset that each one is of, as anchor * offsets + offset. Splats
+        that no camera sees are left out, since they were not trained.
     """
     reporter = reporter or Reporter()
     taken = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), MAX_VIEWS)).astype(int))
@@ -65,10 +70,19 @@ def fit_splats(
 
 
 def agreement(model: ObjectModel, splats: Splats, cameras: Sequence[Camera]) -> float | None:
-    """Mean PSNR in dB of `splats` against the model's own pictures through `cameras`; None without cameras."""
+    """Measure how well plain splats reproduce a model.
+
+    Args:
+        model: The model.
+        splats: The fitted splats in world units.
+        cameras: The cameras in scene units.
+
+    Returns:
+        The mean PSNR in dB of renders of `splats` against those of `model`; None without cameras.
+    """
 
     def tensor(values: NDArray) -> torch.Tensor:
-        return device.upload(np.ascontiguousarray(values, np.float32), model.device)
+        return devices.upload(np.ascontiguousarray(values, np.float32), model.device)
 
     means = tensor(model.normalization.to_scene(splats.means))
     scales = tensor(splats.scales * model.normalization.scale)
@@ -80,17 +94,18 @@ def agreement(model: ObjectModel, splats: Splats, cameras: Sequence[Camera]) -> 
             drawn = rasterize(means, quats, scales, opacities, sh, ids, camera)
             image = drawn.color + (1 - drawn.alpha) * model.background.detach()[:, None, None]
             image = image * torch.tensor(camera.gain).to(image.device)[:, None, None]
-        shown = device.host(image.clamp(0, 1).permute(1, 2, 0))
+        shown = devices.host(image.clamp(0, 1).permute(1, 2, 0))
         found.append(psnr(shown, draw(model, camera, want_ids=False).image))
     return float(np.mean(found)) if found else None
 
 
 class _Sums:
-    """What the views add up to for each offset of the anchors start .. stop - 1, n in all.
+    """Sums over the views for each of the n offsets of the anchors start .. stop - 1.
 
-    weight (n,): how many pixels the splat fills, over all views. With these weights: opacity (n,), shape (n, 6) the
-    upper part of the covariances' logarithm (their mean keeps a thin splat thin), and the least squares of the colour,
-    normal (n, 45) the upper part of its matrix and colour (n, 9, 3) its right side. means (n, 3) hold in every view.
+    weight (n,): the number of pixels that the splat covers in all views. Weighted with it: opacity (n,), shape (n, 6),
+    the upper triangle of the covariance's logarithm, whose mean keeps a thin splat thin, and the normal equations of
+    the color: normal (n, 45), the upper triangle of the matrix, and color (n, 9, 3), the right side. means (n, 3) are
+    the same in all views.
     """
 
     def __init__(self, model: ObjectModel, start: int, stop: int) -> None:
@@ -103,44 +118,44 @@ class _Sums:
         self.means = np.zeros((n, 3), np.float32)
         self.shape = np.zeros((n, len(_UPPER_3[0])), np.float32)
         self.normal = np.zeros((n, len(_UPPER[0])), np.float32)
-        self.colour = np.zeros((n, (SH_DEGREE + 1) ** 2, 3), np.float32)
+        self.color = np.zeros((n, (SH_DEGREE + 1) ** 2, 3), np.float32)
 
     def add(self, camera: Camera) -> None:
-        """Count what one camera sees."""
+        """Add the view of one camera."""
         model = self.model
         viewmat, intrinsics = camera.arrays()
         seen = anchors_in_view(model.anchors, viewmat, intrinsics, camera.width, camera.height, camera.near)
-        g = model.generate(seen, camera.centre)
-        # With black splats, the gradient of the picture's sum by their colours is how many pixels each of them fills.
+        g = model.generate(seen, camera.center)
+        # The gradient of the image's sum with respect to a splat's color is the number of pixels that the splat covers.
         black = torch.zeros_like(g.sh).requires_grad_()
         drawn = rasterize(g.means, g.quats, g.scales, g.opacities, black, g.ids, camera, primitive=model.primitive)
         drawn.color[0].sum().backward()
         assert black.grad is not None
-        weight = device.host(black.grad[:, 0, 0]) / np.float32(spherical_harmonics.C0)
+        weight = devices.host(black.grad[:, 0, 0]) / np.float32(spherical_harmonics.C0)
         g = g.cpu()
         source = g.source.numpy()
-        slots = device.host(seen)[source // self.k] * self.k + source % self.k - self.first
+        slots = devices.host(seen)[source // self.k] * self.k + source % self.k - self.first
         mine = (weight > 0) & (slots >= 0) & (slots < len(self.weight))
         slots, w = slots[mine], weight[mine]
         means = g.means.numpy()[mine]
-        directions = means - camera.centre
+        directions = means - camera.center
         directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
         basis = spherical_harmonics.basis(directions.astype(np.float32), SH_DEGREE)
-        colour = np.maximum(g.sh.numpy()[mine, 0] * spherical_harmonics.C0, -0.5)
+        color = np.maximum(g.sh.numpy()[mine, 0] * spherical_harmonics.C0, -0.5)
 
         self.means[slots] = means
         self.weight[slots] += w
         self.opacity[slots] += w * g.opacities.numpy()[mine]
         self.shape[slots] += w[:, None] * _log_covariances(g.quats[mine], g.scales[mine])
         self.normal[slots] += w[:, None] * basis[:, _UPPER[0]] * basis[:, _UPPER[1]]
-        self.colour[slots] += (w[:, None] * basis)[:, :, None] * colour[:, None, :]
+        self.color[slots] += (w[:, None] * basis)[:, :, None] * color[:, None, :]
 
     def used(self) -> NDArray[np.int64]:
-        """The slots, from this part's first on, of splats that some camera sees: (n,), ascending."""
+        """Return the slots of the splats that a camera sees, relative to the first one: (n,), ascending."""
         return np.flatnonzero(self.weight > 0)
 
     def splats(self) -> Splats:
-        """The fitted splats, in world units, in the order of `used`."""
+        """Return the fitted splats in world units, in the order of `used`."""
         used = self.used()
         pieces = np.split(used, range(_SPLATS_AT_ONCE, len(used), _SPLATS_AT_ONCE))
         return concatenate([self._fitted(piece) for piece in pieces])
@@ -153,27 +168,27 @@ class _Sums:
         normal[:, _UPPER[0], _UPPER[1]] = normal[:, _UPPER[1], _UPPER[0]] = self.normal[slots] / weight
         pull = np.full(size, RIDGE)
         pull[0] = 1e-6
-        sh = np.linalg.solve(normal + np.diag(pull), self.colour[slots] / weight[:, :, None])
-        owners = device.host(model.anchors.ids)[(slots + self.first) // self.k]
+        sh = np.linalg.solve(normal + np.diag(pull), self.color[slots] / weight[:, :, None])
+        owners = devices.host(model.anchors.ids)[(slots + self.first) // self.k]
         return Splats(
             means=model.normalization.to_world(self.means[slots]),
             quats=quats.astype(np.float32),
             scales=scales / model.normalization.scale,
             opacities=(self.opacity[slots] / weight[:, 0]).astype(np.float32),
             sh=sh.astype(np.float32),
-            object_ids=model.object_ids[owners],
+            object_ids=model.classes.ids_of(owners),
         )
 
 
 def _log_covariances(quats: torch.Tensor, scales: torch.Tensor) -> NDArray[np.float32]:
-    """The upper part of the logarithm of each covariance: quats (n, 4) of any length, scales (n, 3) -> (n, 6)."""
+    """Return the upper triangle (n, 6) of each covariance's logarithm; quats (n, 4) of any length, scales (n, 3)."""
     axes = rotation_matrices(torch.nn.functional.normalize(quats))
     logs = 2 * torch.log(scales.clamp(min=_SMALLEST))
     return ((axes * logs[:, None, :]) @ axes.transpose(1, 2)).numpy()[:, _UPPER_3[0], _UPPER_3[1]]
 
 
 def _axes(shape: NDArray) -> tuple[NDArray, NDArray]:
-    """Unit quaternions (n, 4) wxyz and scales (n, 3) of covariances; `shape` (n, 6): their logarithms' upper parts."""
+    """Return unit quaternions (n, 4) wxyz and scales (n, 3); shape (n, 6): see `_log_covariances`."""
     logs = np.zeros((len(shape), 3, 3))
     logs[:, _UPPER_3[0], _UPPER_3[1]] = logs[:, _UPPER_3[1], _UPPER_3[0]] = shape
     values, axes = np.linalg.eigh(logs)

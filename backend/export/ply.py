@@ -1,4 +1,4 @@
-"""Splats as the PLY file that 3D Gaussian splatting programs exchange, with one property more: `object_id`."""
+"""Splats as the PLY file that programs for 3D Gaussian splatting exchange, with the additional property `object_id`."""
 
 from __future__ import annotations
 
@@ -8,17 +8,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fill_file import INVENTED
 from ..model.splats import Splats
-from ..ply import read_vertices, vertex_header
-from ..protocol import InputError, atomic_file
+from ..shared.errors import InputError
+from ..shared.formats.atomic import atomic_file
+from ..shared.formats.ply import read_vertices, vertex_header
+from ..shared.reconstruction.fill import UNOBSERVED
 
 OPACITY_MARGIN = 1e-7
-"""Opacities are kept this far from 0 and 1, so that their logits are finite in float32."""
+"""Smallest distance of opacities from 0 and 1, so that their logits are finite in float32."""
 
 SMALLEST_SCALE = float(np.finfo(np.float32).tiny)
 FLOAT32_RELATIVE_ERROR = 2.0**-24
 ROWS_AT_ONCE = 1 << 16
+
+_FORMER_UNOBSERVED = "invented"
+"""Of the property `unobserved`, in files that older versions wrote."""
 
 
 def property_names(degree: int) -> list[str]:
@@ -32,15 +36,22 @@ def property_names(degree: int) -> list[str]:
 
 
 def write_splats(path: Path, splats: Splats, with_ids: bool = True) -> list[str]:
-    """Write `splats` to `path` atomically; returns warnings about splats that could not be written.
+    """Write splats as PLY, atomically.
 
-    Binary little-endian, one float32 a property, `object_id` as uint32 at the end unless `with_ids` is False: some
-    programs count on the other properties being all there are. After it, `invented` as uchar where any splat is.
-    Opacity is stored as its logit,
-    scales as logarithms, `f_rest` all red coefficients first, then green, then blue. Positions are float32, except
-    where the splats lie so far from the origin that float32 would move them by more than 1e-6 of their extent: then
-    double.
-    Splats with NaN or Inf, or a zero quaternion, are left out.
+    Binary little-endian, float32 properties: opacity as its logit, scales as logarithms, `f_rest` with all red
+    coefficients first, then green, then blue. Positions are double if float32 would change them by more than 1e-6 of
+    the splats' extent. After them come `object_id` as uint32 and, if any splat is unobserved, `unobserved` as uchar.
+
+    Args:
+        path: The file to write.
+        splats: The splats. Those with NaN, Inf or a zero quaternion are left out.
+        with_ids: Write `object_id` and `unobserved`, which some programs do not accept.
+
+    Returns:
+        Warnings about splats that were left out.
+
+    Raises:
+        ValueError: If an object ID is not in 0 .. 2^32 - 1.
     """
     path = Path(path)
     keep = _usable(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
@@ -55,8 +66,8 @@ def write_splats(path: Path, splats: Splats, with_ids: bool = True) -> list[str]
         raise ValueError("object IDs must be from 0 to 2^32 - 1")
 
     names = [name for name in property_names(splats.degree) if with_ids or name != "object_id"]
-    if with_ids and splats.invented.any():
-        names.append(INVENTED)
+    if with_ids and splats.unobserved.any():
+        names.append(UNOBSERVED)
     dtype = _layout(splats, names)
 
     with atomic_file(path) as file:
@@ -67,19 +78,19 @@ def write_splats(path: Path, splats: Splats, with_ids: bool = True) -> list[str]
 
 
 def splat_table(splats: Splats) -> NDArray:
-    """All splats as `write_splats` writes them, with IDs and with `invented`, whether any is or not."""
-    return _rows(splats, slice(None), _layout(splats, [*property_names(splats.degree), INVENTED]))
+    """Return all splats as the records that `write_splats` writes, always with IDs and `unobserved`."""
+    return _rows(splats, slice(None), _layout(splats, [*property_names(splats.degree), UNOBSERVED]))
 
 
 def _layout(splats: Splats, names: list[str]) -> np.dtype:
-    """The records of a file that holds these properties of `splats`."""
+    """Return the type of the records with these properties of `splats`."""
     position = position_kind(splats)
-    kinds = {"x": position, "y": position, "z": position, "object_id": "u4", INVENTED: "u1"}
+    kinds = {"x": position, "y": position, "z": position, "object_id": "u4", UNOBSERVED: "u1"}
     return np.dtype([(name, "<" + kinds.get(name, "f4")) for name in names])
 
 
 def _rows(splats: Splats, rows: slice, dtype: np.dtype) -> NDArray:
-    """The records of some rows, in the layout of the file."""
+    """Return the records of some splats."""
     means = splats.means[rows]
     table = np.zeros(len(means), dtype)
     for axis, name in enumerate("xyz"):
@@ -98,14 +109,14 @@ def _rows(splats: Splats, rows: slice, dtype: np.dtype) -> NDArray:
     quats = splats.quats[rows]
     for i in range(4):
         table[f"rot_{i}"] = quats[:, i]
-    for name, values in (("object_id", splats.object_ids), (INVENTED, splats.invented)):
+    for name, values in (("object_id", splats.object_ids), (UNOBSERVED, splats.unobserved)):
         if name in (dtype.names or ()):
             table[name] = values[rows]
     return table
 
 
 def _usable(means: NDArray, quats: NDArray, scales: NDArray, opacities: NDArray, sh: NDArray) -> NDArray:
-    """(N,) bool: everything finite and the quaternion not zero."""
+    """Find the splats with finite values and a quaternion that is not zero, (N,) bool."""
     keep = np.isfinite(opacities)
     for values in (means, quats, scales, sh):
         keep &= np.isfinite(values.reshape(len(keep), math.prod(values.shape[1:]))).all(axis=1)
@@ -114,7 +125,7 @@ def _usable(means: NDArray, quats: NDArray, scales: NDArray, opacities: NDArray,
 
 
 def position_kind(splats: Splats) -> str:
-    """`f8` where float32 positions would be off by more than 1e-6 of the extent of the splats, else `f4`."""
+    """Return `f8` if float32 would change positions by more than 1e-6 of the splats' extent, else `f4`."""
     if len(splats) == 0 or splats.means.dtype != np.float64:
         return "f4"
     extent = float(np.ptp(splats.means, axis=0).max() + splats.scales.max())
@@ -122,12 +133,20 @@ def position_kind(splats: Splats) -> str:
 
 
 def read_splats(path: Path) -> tuple[Splats, list[str]]:
-    """Read a splat PLY of ours or of another program; returns the splats and warnings about what was dropped.
+    """Read a PLY file of splats, of this or another program.
 
-    Properties may come in any order and of any number type; unknown ones are skipped; without `object_id` every splat
-    gets 0. Rows with NaN or Inf or a zero quaternion are dropped and counted in the warnings. Positions keep the
-    file's precision; scales and opacities are float64, so that writing what was read gives the same file again.
-    Raises InputError that names the file when it is missing, cut short, ASCII, or holds no splats.
+    Properties may have any order and number type; unknown ones are ignored. Without `object_id`, all IDs are 0.
+    Positions keep the precision of the file; scales and opacities are float64, so that writing the splats again gives
+    the same file.
+
+    Args:
+        path: The file to read.
+
+    Returns:
+        The splats without those with NaN, Inf or a zero quaternion, and warnings about these.
+
+    Raises:
+        InputError: If the file is missing, truncated, ASCII, or not one of splats.
     """
     path = Path(path)
     table = read_vertices(path)
@@ -157,11 +176,9 @@ def read_splats(path: Path) -> tuple[Splats, list[str]]:
         for k in range(1, coefficients):
             sh[:, k, channel] = table[rest_names[channel * (coefficients - 1) + k - 1]]
     warnings: list[str] = []
-    if "object_id" in names:
-        object_ids = _object_ids(table["object_id"], warnings)
-    else:
-        object_ids = np.zeros(n, np.int64)
-    invented = table[INVENTED] != 0 if INVENTED in names else np.zeros(n, bool)
+    object_ids = _object_ids(table["object_id"], warnings) if "object_id" in names else np.zeros(n, np.int64)
+    marked = next((name for name in (UNOBSERVED, _FORMER_UNOBSERVED) if name in names), None)
+    unobserved = np.zeros(n, bool) if marked is None else table[marked] != 0
 
     keep = _usable(means, quats, scales, opacities, sh)
     keep &= (scales < math.log(np.finfo(np.float32).max)).all(axis=1)
@@ -170,18 +187,18 @@ def read_splats(path: Path) -> tuple[Splats, list[str]]:
             f"{int((~keep).sum())} of {n} splats in {path.name} were dropped: they hold NaN, Inf or a zero quaternion."
         )
         means, quats, scales, opacities, sh = means[keep], quats[keep], scales[keep], opacities[keep], sh[keep]
-        object_ids, invented = object_ids[keep], invented[keep]
+        object_ids, unobserved = object_ids[keep], unobserved[keep]
 
     lengths = np.linalg.norm(quats.astype(np.float64), axis=1)
     off = np.abs(lengths - 1.0) > 1e-6
     quats[off] = quats[off] / lengths[off, None]
     scales = np.maximum(np.exp(np.maximum(scales, math.log(SMALLEST_SCALE))), SMALLEST_SCALE)
     opacities = np.clip(1.0 / (1.0 + np.exp(-np.clip(opacities, -80, 80))), OPACITY_MARGIN, 1.0 - OPACITY_MARGIN)
-    return Splats(means, quats, scales, opacities, sh, object_ids, invented), warnings
+    return Splats(means, quats, scales, opacities, sh, object_ids, unobserved), warnings
 
 
 def _columns(table: NDArray, names: list[str]) -> NDArray:
-    """(N, len(names)) float64 where the file has double or 32-bit integers, else float32."""
+    """Return columns (N, len(names)), float64 if the file has double or 32-bit integers, else float32."""
     kind = np.result_type(np.float32, *(table.dtype[name] for name in names))
     out = np.empty((len(table), len(names)), kind)
     for i, name in enumerate(names):
@@ -190,7 +207,7 @@ def _columns(table: NDArray, names: list[str]) -> NDArray:
 
 
 def _object_ids(column: NDArray, warnings: list[str]) -> NDArray:
-    """IDs as int64; what is no ID (negative, too large, NaN) becomes 0 and is counted."""
+    """Return IDs as int64; values that are not IDs (negative, too large, NaN) become 0, with a warning."""
     if column.dtype.kind == "f":
         values = column.astype(np.float64)
         good = np.isfinite(values) & (values >= 0) & (values <= 0xFFFFFFFF)
@@ -200,5 +217,5 @@ def _object_ids(column: NDArray, warnings: list[str]) -> NDArray:
         good = ids >= 0
         ids = np.where(good, ids, 0)
     if not good.all():
-        warnings.append(f"{int((~good).sum())} splats have an object_id that is no ID; they were given 0.")
+        warnings.append(f"{int((~good).sum())} splats have an invalid object_id; it was set to 0.")
     return ids

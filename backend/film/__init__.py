@@ -1,5 +1,4 @@
-"""Film frames of the splats: a shot file and a reconstruction become multilayer EXR files, one a frame.
+"""Film frames of splats: a shot file and a reconstruction become one multilayer EXR file for each frame.
 
-`shot` says what a shot file holds (NumPy only, so that Blender's own Python can write one), `stage` puts the edited
-splats of a moment together, `render` draws them, `cryptomatte` and `exr` are the formats.
+`stage` combines the edited splats of a moment, `render` draws them, `cryptomatte` and `exr` write the formats.
 """

@@ -1,7 +1,8 @@
-"""Cryptomatte 1.2: object mattes with soft edges in ordinary channels, which compositing programs pick by name.
+"""Cryptomatte 1.2: object mattes with soft edges in ordinary channels, which compositing programs select by name.
 
-Of the published specification (Friedman and Jones, 2015): each name is hashed to a float; each pixel lists the hashes
-of what covers it most with how much, two of these pairs in a layer of four channels; the header has the names.
+In the specification (Friedman and Jones, 2015), each name is hashed to a float. Each pixel has a list of the hashes of
+the objects that cover it most, with their coverage; a layer of four channels has two such pairs. The header has the
+names.
 """
 
 from __future__ import annotations
@@ -14,13 +15,13 @@ from numpy.typing import NDArray
 
 LAYERS = 3
 RANKS = 2 * LAYERS
-"""How many objects of a pixel have a matte."""
+"""Number of objects with a matte in each pixel."""
 
 _MASK = 0xFFFFFFFF
 
 
 def murmur3(data: bytes) -> int:
-    """MurmurHash3_x86_32 with seed 0."""
+    """Compute MurmurHash3_x86_32 with the seed 0."""
 
     def turned(value: int, bits: int) -> int:
         return (value << bits | value >> 32 - bits) & _MASK
@@ -41,14 +42,14 @@ def murmur3(data: bytes) -> int:
 
 
 def name_bits(name: str) -> int:
-    """The bits of the float that stands for a name: its hash, kept off zeros, infinities and NaN by its exponent."""
+    """Return the bits of a name's float: its hash, with an exponent that avoids zeros, infinities and NaN."""
     value = murmur3(name.encode())
     exponent = min(max(value >> 23 & 255, 1), 254)
     return value & 0x807FFFFF | exponent << 23
 
 
 def header(layer: str, names: Sequence[str]) -> dict[str, str]:
-    """What the file's header says about the mattes in `layer`: how names were hashed, and all of them."""
+    """Return the attributes of the EXR header for the mattes in `layer`, with the manifest of all names."""
     manifest = {name: f"{name_bits(name):08x}" for name in names}
     key = f"cryptomatte/{murmur3(layer.encode()):08x}"[: len("cryptomatte/") + 7]
     return {
@@ -62,8 +63,17 @@ def header(layer: str, names: Sequence[str]) -> dict[str, str]:
 def channels(
     layer: str, names: Sequence[str], ids: NDArray[np.int32], coverage: NDArray[np.float32]
 ) -> Mapping[str, NDArray[np.float32]]:
-    """The channels of `layer` by name. ids (RANKS, H, W): places in `names`, from what covers most down, or -1;
-    coverage (RANKS, H, W)."""
+    """Return the channels of mattes.
+
+    Args:
+        layer: The name of the layer.
+        names: The names of the objects.
+        ids: (RANKS, H, W) indices in `names`, by descending coverage, -1: none.
+        coverage: (RANKS, H, W) of each object, 0 .. 1.
+
+    Returns:
+        Channel name -> (H, W) float32.
+    """
     hashes = np.array([*(name_bits(name) for name in names), 0], np.uint32).view(np.float32)
     planes = {}
     for number in range(LAYERS):

@@ -1,35 +1,42 @@
-"""Film frames as multilayer OpenEXR files: lossless, whole or not there, with what they were made of in the header."""
+"""Film frames as multilayer OpenEXR files: lossless, written atomically, with a digest of their source."""
 
 from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from ..protocol import atomic_path
+from ..shared.formats.atomic import atomic_path
 
 DIGEST = "objectgs/digest"
 _MAGIC = bytes.fromhex("762f3101")
 _LINES_A_CHUNK = 16
-"""Of the compression that `write` uses."""
+"""Lines in a chunk of the compression that `write` uses."""
 
 
 def write(path: Path, channels: Mapping[str, NDArray], header: Mapping[str, Any], digest: str) -> None:
-    """Write channels (H, W) by name (float16, float32 or uint32) to `path`, under another name until it is whole.
+    """Write an EXR file atomically; several processes may write the same file.
 
-    Several processes may write the same file: the last one stays. An OSError names `path`.
+    Args:
+        path: The file to write.
+        channels: Channel name -> (H, W) float16, float32 or uint32.
+        header: Additional attributes of the header.
+        digest: The digest of the frame's source, which `digest_of` returns.
+
+    Raises:
+        OSError: If the file cannot be written.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     entries = {**header, DIGEST: digest, "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     planes = {name: np.ascontiguousarray(plane) for name, plane in channels.items()}
     with atomic_path(path, part):
-        part.write_bytes(b"")  # OpenEXR says badly why a file cannot be written.
+        part.write_bytes(b"")  # OpenEXR's own error does not tell why a file cannot be written.
         try:
             OpenEXR.File(entries, planes).write(str(part))
         except RuntimeError as error:
@@ -37,9 +44,9 @@ def write(path: Path, channels: Mapping[str, NDArray], header: Mapping[str, Any]
 
 
 def digest_of(path: Path) -> str | None:
-    """The digest of a file that `write` made and that is whole; None where it is cut short, another or not there."""
+    """Return the digest in a complete file of `write`; None if the file is truncated, missing or of another program."""
     try:
-        with open(path, "rb") as file:
+        with path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size
             if file.read(4) != _MAGIC:
                 return None
@@ -56,8 +63,8 @@ def digest_of(path: Path) -> str | None:
         return None
 
 
-def _attributes(file):
-    """Name and content of each attribute of a header, up to its end."""
+def _attributes(file: BinaryIO) -> Iterator[tuple[str, bytes]]:
+    """Iterate over the names and values of the attributes in a header."""
 
     def text() -> str:
         letters = bytearray()

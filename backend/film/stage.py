@@ -1,4 +1,4 @@
-"""The edited splats of a moment: what objects.json says about colours and removals, what the shot says about places."""
+"""The edited splats of a moment: colors and removals from objects.json, transforms from the shot."""
 
 from __future__ import annotations
 
@@ -12,36 +12,40 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from .. import device
 from ..editing.apply import apply_edits, transformed
 from ..export.ply import read_splats
 from ..model.splats import Splats, concatenate
-from ..objects import SceneObject, read_objects
-from ..protocol import Reconstruction, Reporter
-from .shot import Frame, Placed, Sample, Shot
+from ..raster import devices
+from ..shared.class_table import ClassTable
+from ..shared.events import Reporter
+from ..shared.reconstruction.folder import Reconstruction
+from ..shared.reconstruction.objects import SceneObject, read_objects
+from ..shared.reconstruction.shot import Frame, Placed, Sample, Shot
 
 _FORMAT = 2
-"""Of what is drawn and written: another number draws all frames anew."""
+"""Version of the renders and files: another number renders all frames anew."""
 
 Tensors = dict[str, torch.Tensor]
 
 
 class Stage:
-    """The splats of a reconstruction, ready to be placed. names: of the objects, by the small integers that stand for
-    them in pictures; ids (n,) uint32: their IDs."""
+    """The splats of a reconstruction with their edits, to be drawn under the transforms of a moment.
 
-    def __init__(self, folder: Reconstruction, primitive: str, place: torch.device, reporter: Reporter) -> None:
+    names: of the objects, by their class indices, which images contain.
+    """
+
+    def __init__(self, folder: Reconstruction, primitive: str, device: torch.device, reporter: Reporter) -> None:
         splats, warnings = read_splats(folder.splats)
         for warning in warnings:
             reporter.warning(warning)
         objects = read_objects(folder.objects) if folder.objects.exists() else []
         self.primitive = primitive
-        self._place = place
+        self._device = device
         self._digest = _digest_of(folder.splats, objects, primitive)
         self._entries = {entry.id: entry for entry in objects}
         edited = apply_edits(splats, [replace(entry, transform=None, copies=()) for entry in objects])
-        ids, slots = np.unique(edited.object_ids, return_inverse=True)
-        self.ids = ids.astype(np.uint32)
+        self.classes = ClassTable(edited.object_ids)
+        ids, slots = self.classes.ids, self.classes.classes_of(edited.object_ids)
         self.names = _names(ids.tolist(), self._entries)
         order = np.argsort(slots, kind="stable")
         ends = np.cumsum(np.bincount(slots, minlength=len(ids)))
@@ -49,12 +53,11 @@ class Stage:
             object_id: edited.select(order[ends[i - 1] if i else 0 : ends[i]])
             for i, object_id in enumerate(ids.tolist())
         }
-        self._slots = {object_id: i for i, object_id in enumerate(ids.tolist())}
         self._moved: dict[int, tuple[bytes, Splats]] = {}
         self._drawn: tuple[Any, Splats, Tensors] | None = None
 
     def digest(self, shot: Shot, frame: Frame) -> str:
-        """Changes with anything that the frame's picture depends on."""
+        """Return a digest of everything that the frame's image depends on."""
         samples = [
             [sample.viewmat.tolist(), sample.K.tolist(), sample.clip,
              {str(key): sample.objects[key].stored() for key in sorted(sample.objects)}]
@@ -64,7 +67,15 @@ class Stage:
         return hashlib.sha256((self._digest + json.dumps(facts)).encode()).hexdigest()
 
     def at(self, sample: Sample, only_named: bool) -> Tensors:
-        """What `rasterize` takes of the splats at a moment, on the device; ids are places in `names`."""
+        """Return the splats at a moment.
+
+        Args:
+            sample: The moment with its camera, transforms and visibility.
+            only_named: Leave out objects that the sample does not list.
+
+        Returns:
+            Arguments of `rasterize` on the device; ids are indices in `names`.
+        """
         wanted = {
             object_id: maps
             for object_id in self._parts
@@ -80,11 +91,11 @@ class Stage:
         near_enough = depths <= sample.clip[1]
         if near_enough.all():
             return tensors
-        kept = torch.from_numpy(near_enough).to(self._place)
+        kept = torch.from_numpy(near_enough).to(self._device)
         return {name: values[kept] for name, values in tensors.items()}
 
     def _maps(self, object_id: int, sample: Sample, only_named: bool) -> NDArray[np.float64] | None:
-        """Where the object is, (n, 4, 4); None where it is not to be seen."""
+        """Return the transforms (n, 4, 4) of an object and its duplicates; None if it is not visible."""
         placed = sample.objects.get(object_id)
         if placed is None:
             placed = Placed(visible=not only_named)
@@ -97,7 +108,7 @@ class Stage:
         return np.array([own, *(entry.copies if entry is not None else ())])
 
     def _moved_to(self, object_id: int, maps: NDArray[np.float64]) -> Splats:
-        """The object at each of its places; the last answer is kept, as most objects stay where they are."""
+        """Return the splats of an object under each of its transforms; the last ones are cached."""
         key = maps.tobytes()
         if object_id not in self._moved or self._moved[object_id][0] != key:
             part = self._parts[object_id]
@@ -106,24 +117,23 @@ class Stage:
         return self._moved[object_id][1]
 
     def _tensors(self, splats: Splats) -> Tensors:
-        slots = np.array([self._slots[i] for i in np.unique(splats.object_ids).tolist()], np.int32)
-        ids = slots[np.unique(splats.object_ids, return_inverse=True)[1]] if len(splats) else np.zeros(0, np.int32)
+        ids = self.classes.classes_of(splats.object_ids).astype(np.int32)
         arrays = {
             "quats": splats.quats, "scales": splats.scales, "opacities": splats.opacities, "sh": splats.sh,
         }  # fmt: skip
-        tensors = {name: device.upload(values.astype(np.float32), self._place) for name, values in arrays.items()}
+        tensors = {name: devices.upload(values.astype(np.float32), self._device) for name, values in arrays.items()}
         means = splats.means if splats.means.dtype == np.float64 else splats.means.astype(np.float32)
-        return {"means": device.upload(means, self._place), **tensors, "ids": device.upload(ids, self._place)}
+        return {"means": devices.upload(means, self._device), **tensors, "ids": devices.upload(ids, self._device)}
 
 
 def _digest_of(path: Path, objects: list[SceneObject], primitive: str) -> str:
-    with open(path, "rb") as file:
+    with path.open("rb") as file:
         content = hashlib.file_digest(file, "sha256").hexdigest()
-    drawn = [replace(entry, colour=(0, 0, 0), points=0) for entry in objects]
+    drawn = [replace(entry, color=(0, 0, 0), points=0) for entry in objects]
     return f"{_FORMAT} {content} {drawn!r} {primitive}"
 
 
 def _names(ids: list[int], entries: dict[int, SceneObject]) -> list[str]:
-    """A name for each object; equal ones get their ID behind them, since mattes are picked by name."""
-    names = [entries[i].name if i in entries else "Unlabelled" if i == 0 else f"object {i}" for i in ids]
+    """Return a name for each object; equal names get their ID, since mattes are selected by name."""
+    names = [entries[i].name if i in entries else "Unlabeled" if i == 0 else f"object {i}" for i in ids]
     return [f"{name} ({i})" if names.count(name) > 1 else name for name, i in zip(names, ids)]

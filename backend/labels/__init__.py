@@ -1,6 +1,6 @@
-"""Votes of the ID masks on each point of the cloud, and the labelled point cloud on disk."""
+"""Assigns points their objects by votes of the ID masks, and stores the labeled points."""
 
-from .points import LabelledPoints, read_points, write_points
+from .points import LabeledPoints, read_points, write_points
 from .voting import Votes, vote
 
-__all__ = ["LabelledPoints", "Votes", "read_points", "vote", "write_points"]
+__all__ = ["LabeledPoints", "Votes", "read_points", "vote", "write_points"]

@@ -1,8 +1,8 @@
-"""A surface moved to where the photographs agree about it: multi-view stereo in a thin layer around it.
+"""Refinement of a surface by multi-view stereo in a thin layer around it.
 
-Each vertex tries places along its normal. A patch around it is looked up in the photos that show it best; where the
-surface is right they show the same. What the patches say is averaged over their neighbours, as their confidence
-deserves, and so carried on to where the photos show no texture.
+Each vertex is tried at several positions along its normal. A patch around it is sampled from the photos that show it
+best; at the right position they agree. The offsets are averaged over neighbors, weighted by their confidence, which
+also moves vertices where the photos show no texture.
 """
 
 from __future__ import annotations
@@ -15,40 +15,50 @@ from numba import prange
 from scipy.sparse import csr_matrix, diags
 from scipy.sparse.linalg import cg
 
-from ..protocol import Reporter
 from ..raster.kernel import kernel
-from .photos import Photo, Photos, look
-from .surface import Surface, neighbours, vertex_normals
+from ..shared.events import Reporter
+from .surface import Surface, neighbors, vertex_normals
+from .texture.photos import Photo, Photos, look
 from .views import Views
 
 _REACHES = (1.5, 1.0)
-"""How far a vertex may move in each round, in pixels' sizes on it."""
+"""Largest offset of a vertex in each round, in sizes of a pixel on the surface."""
 
 _PHOTOS = 6
 _PLACES = 9
 _PATCH = 5
-"""Places tried, over twice the reach; rows and columns of a patch, a pixel's size apart."""
+"""Number of positions tried, over twice the reach; rows and columns of a patch, one pixel apart."""
 
 _OUTSIDE = 1.0
-"""Clearance below which a pixel may show another thing."""
+"""Clearance, in pixels, up to which a pixel may show something else."""
 
 _AT_ONCE = 50_000
-"""Vertices whose patches are looked up together."""
+"""Number of vertices whose patches are sampled together."""
 
 _NONE = 255
 _NOISE = (2.5 / 255) ** 2
 _STIFFNESS = 3.0
 _STAY = 0.05
 _TURN = 0.5
-"""Cosine of the angle by which a face may turn."""
+"""Cosine of the largest angle by which a face may turn."""
 
 _UNFOLDED = 40
 _SHARED = 3
-"""Rounds in which neighbours average what their patches say."""
+"""Rounds in which neighbors average the costs of their patches."""
 
 
 def refine(surface: Surface, views: Views, classes: Sequence[int], reporter: Reporter | None = None) -> Surface:
-    """The surface (scene units) with its vertices moved along their normals, by a few pixels' sizes at most."""
+    """Move the vertices of a surface along their normals, by a few pixels at most, to where the photos agree.
+
+    Args:
+        surface: The surface in scene units.
+        views: The training views.
+        classes: The class indices of the surface's objects.
+        reporter: Receives the progress.
+
+    Returns:
+        The surface with moved vertices and the same faces.
+    """
     reporter = reporter or Reporter()
     for step, reach in enumerate(_REACHES):
         surface = replace(surface, vertices=_moved(surface, views, classes, reach, reporter, step))
@@ -60,7 +70,7 @@ def _moved(
 ) -> np.ndarray:
     photos = Photos(views, surface.vertices, surface.faces, classes)
     vertices, faces = photos.vertices, photos.faces
-    near = neighbours(vertices, faces)
+    near = neighbors(vertices, faces)
     mean = (diags(1 / np.maximum(np.asarray(near.sum(1)).ravel(), 1e-30)) @ near).tocsr()
     normals = vertex_normals(vertices, faces)
     for _ in range(5):
@@ -103,7 +113,7 @@ def _moved(
 
 
 def _without_folds(vertices: np.ndarray, faces: np.ndarray, way: np.ndarray, mean: csr_matrix) -> np.ndarray:
-    """`way` (V, 3), which the vertices go, smoothed wherever faces would turn over."""
+    """Smooth the offsets `way` (V, 3) of the vertices where faces would fold over."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     before = np.cross(b - a, c - a)
     even = mean.copy()
@@ -125,12 +135,12 @@ def _without_folds(vertices: np.ndarray, faces: np.ndarray, way: np.ndarray, mea
 
 def _seen_by(photo: Photo) -> tuple[np.ndarray, ...]:
     viewmat, intrinsics = photo.camera.arrays()
-    return photo.camera.centre, viewmat, intrinsics, photo.depth, photo.clearance
+    return photo.camera.center, viewmat, intrinsics, photo.depth, photo.clearance
 
 
 def _settled(cost: np.ndarray, away: np.ndarray, near: csr_matrix) -> np.ndarray:
-    """How far each vertex moves, (V,) in pixels' sizes, from the patches' disagreement (V, P) at the places `away`;
-    NaN: not known."""
+    """Compute the offset of each vertex, (V,) in pixels, from the disagreement of its patches (V, P) at the offsets
+    `away` (P,); NaN: not known."""
     ties = np.maximum(np.asarray(near.sum(1)).ravel(), 1e-30)
     mean = diags(1 / ties) @ near
     known = np.isfinite(cost).all(1).astype(np.float64)
@@ -145,7 +155,7 @@ def _settled(cost: np.ndarray, away: np.ndarray, near: csr_matrix) -> np.ndarray
     spacing = away[1] - away[0]
     wanted = np.clip(away[best] + spacing * np.clip((before - after) / (2 * bend), -1, 1), away[0], away[-1])
     sure = np.where(weight > 0, np.minimum(bend / (spacing**2 * (np.minimum(at, cost.min(1)) + _NOISE)), 10), 0)
-    # sure (d - wanted) + stay d + stiffness (d - mean of the neighbours' d) = 0, times `ties`: symmetric.
+    # sure (d - wanted) + stay d + stiffness (d - mean of the neighbors' d) = 0, times `ties`: symmetric.
     diagonal = ties * (sure + _STAY + _STIFFNESS)
     system = diags(diagonal) - _STIFFNESS * near
     solved, _ = cg(system, ties * sure * wanted, rtol=1e-4, maxiter=300, M=diags(1 / diagonal))
@@ -177,7 +187,7 @@ def _choose(vertices, normals, index, eye, viewmat, intrinsics, depth, clearance
 
 @kernel(parallel=True)
 def _look_up(
-    vertices, normals, pixel, away, chosen, index, eye, viewmat, intrinsics, depth, clearance, planes, corner, patches
+    vertices, normals, pixel, away, chosen, index, _eye, viewmat, intrinsics, depth, clearance, planes, corner, patches
 ):
     fx, fy, cx, cy = intrinsics
     height, width = depth.shape
@@ -227,7 +237,7 @@ def _look_up(
 
 @kernel(parallel=True)
 def _disagreement(patches, cost):
-    """Variance over the photos, of colours in 0..1, mean over the patch: cost (V, P); NaN where too little is seen."""
+    """Variance over the photos, of colors in 0..1, mean over the patch: cost (V, P); NaN where too little is seen."""
     count, photos, places, points, _ = patches.shape
     for n in prange(count):
         for place in range(places):

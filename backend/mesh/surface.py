@@ -1,4 +1,4 @@
-"""A surface without looks: what fusion makes and texturing dresses."""
+"""An untextured triangle mesh, the result of fusion and the input of texturing."""
 
 from __future__ import annotations
 
@@ -10,22 +10,27 @@ from scipy.sparse import coo_matrix, csr_matrix
 
 @dataclass
 class Surface:
-    """vertices (V, 3) float64 in scene units; faces (F, 3) int32, counter-clockwise from outside; invented (F,) bool:
-    faces that close what no camera saw."""
+    """A triangle mesh: vertices (V, 3) float64 in scene units; faces (F, 3) int32, counter-clockwise from outside;
+    unobserved (F,) bool: faces that close the mesh where no camera saw the object."""
 
     vertices: np.ndarray
     faces: np.ndarray
-    invented: np.ndarray
+    unobserved: np.ndarray
 
     def normals(self) -> np.ndarray:
-        """Unit normals of the vertices, (V, 3) float64."""
+        """Return the unit normals of the vertices, (V, 3) float64."""
         return vertex_normals(self.vertices, self.faces)
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(V, 3) float64 unit normals: faces count by their angle at the vertex (Thuermer and Wuethrich 1998).
+    """Compute vertex normals, weighted by the faces' angles at the vertex (Thuermer and Wuethrich 1998).
 
-    (0, 0, 1) where only degenerate faces meet, or none.
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3) indices, counter-clockwise from outside.
+
+    Returns:
+        (V, 3) float64 unit normals; (0, 0, 1) for vertices without a face that has an area.
     """
     corners = vertices[faces]
     ahead = np.roll(corners, -1, 1) - corners
@@ -41,8 +46,8 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.where(length > 1e-9, sums / np.maximum(length, 1e-9), [0.0, 0.0, 1.0])
 
 
-def neighbours(vertices: np.ndarray, faces: np.ndarray) -> csr_matrix:
-    """(V, V): how closely vertices are tied, 1 / length of the edge between them; 0 without one."""
+def neighbors(vertices: np.ndarray, faces: np.ndarray) -> csr_matrix:
+    """Return the weighted adjacency matrix (V, V): 1 / length of the edge between two vertices; 0 without an edge."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges = np.concatenate([edges, edges[:, ::-1]])
     length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
@@ -51,4 +56,4 @@ def neighbours(vertices: np.ndarray, faces: np.ndarray) -> csr_matrix:
 
 
 class NoSurface(Exception):
-    """There is no surface to be had; the message says in one plain sentence why."""
+    """No surface can be extracted; the message is a sentence that gives the reason."""

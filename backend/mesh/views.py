@@ -1,4 +1,4 @@
-"""What each view sees: of the whole scene, and of one object alone and unhidden."""
+"""Renders of the whole scene, and of objects alone and unoccluded, in each view."""
 
 from __future__ import annotations
 
@@ -8,30 +8,32 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from .. import device
 from ..model.generate import Generated
 from ..model.object_model import ObjectModel
-from ..raster import Camera, Rendered, object_map, rasterize
+from ..raster import Camera, Rendered, devices, object_map, rasterize
 from ..training.scene import Scene
 
 ALPHA_SEEN = 0.5
-"""From this alpha on a pixel has a depth."""
+"""Smallest alpha of a pixel that has a depth."""
 
 _REACH = 3.4
-"""Standard deviations to which a splat is drawn, at most: sqrt(2 ln 255), and a little."""
+"""Radius of a splat in standard deviations: sqrt(2 ln 255) and a margin."""
 _BORDER = 2.0
-"""Pixels that the renderer's blur adds to a splat's reach."""
+"""Pixels that the blur of the renderer adds to the radius of a splat."""
 
 
 @dataclass(frozen=True)
 class SceneMap:
-    """The whole scene in one view: depth (H, W) float32 along z in scene units, 0 where nothing is; doubt (H, W)
-    float32, how far off that may be, likewise; ids (H, W) int32, the class index of the most probable object, -1 where
-    nothing is drawn; probability (H, W) float32 of that object; alpha (H, W) float32."""
+    """The whole scene in one view.
+
+    depth (H, W) float32 along z in scene units, 0 where alpha is too small; depth_uncertainty (H, W) float32, the
+    expected error of the depth in the same units; ids (H, W) int32, the class index of the most probable object, -1
+    where nothing is drawn; probability (H, W) float32 of that object; alpha (H, W) float32.
+    """
 
     camera: Camera
     depth: np.ndarray
-    doubt: np.ndarray
+    depth_uncertainty: np.ndarray
     ids: np.ndarray
     probability: np.ndarray
     alpha: np.ndarray
@@ -42,26 +44,30 @@ class ObjectView:
     """An object's own splats in one view, drawn without the rest of the scene, in a rectangle around them.
 
     camera: the view's, cropped to the rectangle; x, y: the rectangle's upper left in the view, in pixels; depth (h, w)
-    float32 along z in scene units, 0 where alpha < 0.5; doubt (h, w) float32, how far off that may be, likewise; alpha
-    (h, w) float32; color (h, w, 3) float32, not multiplied by alpha, at the capture's common exposure; visible (h, w)
-    float32: which share, 0..1, of the object's own light reaches the camera in the whole scene.
+    float32 along z in scene units, 0 where alpha < 0.5; depth_uncertainty (h, w) float32, the expected error of the
+    depth; alpha (h, w) float32; color (h, w, 3) float32, not multiplied by alpha, at the capture's common exposure;
+    visible (h, w) float32, 0 .. 1: the fraction of the object's own light that reaches the camera in the whole scene.
     """
 
     camera: Camera
     x: int
     y: int
     depth: np.ndarray
-    doubt: np.ndarray
+    depth_uncertainty: np.ndarray
     alpha: np.ndarray
     color: np.ndarray
     visible: np.ndarray
 
 
 class Views:
-    """The model through the cameras of `scene` (every view in `indices`), reduced by `downscale`.
+    """Renders of a model through the cameras of a scene.
 
-    What was drawn is kept as long as it fits into `memory_mb`: the scene's maps for good, the objects' views until
-    another object is asked for.
+    Args:
+        model: The trained model.
+        scene: The scene with the cameras and photos.
+        indices: The views to use.
+        downscale: The factor by which renders are smaller than the photos.
+        memory_mb: Room for a cache of renders. Maps of the scene are kept, views of objects until the object changes.
     """
 
     def __init__(
@@ -84,29 +90,29 @@ class Views:
         self._own: Generated | None = None
 
     def camera(self, index: int) -> Camera:
-        """View `index`'s camera in scene units."""
+        """Return the camera of view `index` in scene units."""
         return self.scene.camera(index, self.downscale)
 
     def splats(self, classes: Sequence[int]) -> Generated:
-        """The Gaussians of the objects `classes` in scene units, as seen from the origin where that matters."""
+        """Return the Gaussians of the objects `classes` in scene units, as seen from the origin if that matters."""
         self._turn_to(classes)
         return self._own_splats(None)
 
     def scene_map(self, index: int) -> SceneMap:
-        """What view `index` sees of the whole scene."""
+        """Render the whole scene in view `index`."""
         if index in self._maps:
             return self._maps[index]
         camera = self.camera(index)
         drawn = self._draw(self._scene_splats(camera), camera)
-        ids, probability = (device.host(plane) for plane in object_map(drawn))
-        alpha = device.host(drawn.alpha)
+        ids, probability = (devices.host(plane) for plane in object_map(drawn))
+        alpha = devices.host(drawn.alpha)
         found = SceneMap(camera, *self._depth(drawn), ids, probability, alpha)
         if self._take(5 * alpha.nbytes):
             self._maps[index] = found
         return found
 
     def object_view(self, index: int, classes: Sequence[int]) -> ObjectView | None:
-        """What view `index` would see of the objects `classes` (indices) alone; None where they are out of view."""
+        """Render the objects `classes` (class indices) alone in view `index`; None if they are out of view."""
         self._turn_to(classes)
         if index not in self._views:
             view = self._object_view(index)
@@ -124,31 +130,31 @@ class Views:
         x, y, width, height = rectangle
         camera = camera.crop(x, y, width, height)
         drawn = self._draw(splats, camera)
-        alpha = device.host(drawn.alpha)
+        alpha = devices.host(drawn.alpha)
         if not (alpha >= ALPHA_SEEN).any():
             return None
         shown = self._shown(index)[y : y + height, x : x + width] * self._claimed(index)[y : y + height, x : x + width]
         visible = np.clip(shown / np.maximum(alpha, 1e-3), 0, 1).astype(np.float32)
-        color = np.moveaxis(device.host(drawn.color), 0, 2) / np.maximum(alpha, 1e-3)[..., None]
+        color = np.moveaxis(devices.host(drawn.color), 0, 2) / np.maximum(alpha, 1e-3)[..., None]
         return ObjectView(camera, x, y, *self._depth(drawn), alpha, np.ascontiguousarray(color), visible)
 
     def _claimed(self, index: int) -> np.ndarray:
-        """Where the photo's mask leaves room for the objects at hand, (H, W) bool.
+        """Return the pixels (H, W) bool where the photo's mask allows the current objects.
 
-        Training teaches no object where a mask says 0, so there any object's splats may have painted the background;
-        a mask that shows an object elsewhere says that this is not it.
+        Where a mask is 0, training supervises no object, so that splats of any object may show the background there. If
+        the mask shows an object elsewhere, these pixels are not part of it.
         """
         camera = self.camera(index)
         mask = self.scene.capture.mask(index, self.downscale)
-        known = self.model.object_ids[[c for c in self._classes if c]]
+        known = self.model.classes.ids_of([c for c in self._classes if c])
         if mask is None or len(known) < len(self._classes) or not np.isin(mask, known).any():
             return np.ones((camera.height, camera.width), bool)
         return mask != 0
 
     def _shown(self, index: int) -> np.ndarray:
-        """How much of each pixel's light in view `index` comes from the objects at hand, (H, W)."""
+        """Return the fraction (H, W) of each pixel's light in view `index` that comes from the current objects."""
         if len(self._classes) == 1:
-            # The scene's own map answers for one object: elsewhere another one is more probable.
+            # For one object the scene's map is enough: elsewhere another one is more probable.
             whole = self.scene_map(index)
             return np.where(whole.ids == self._classes[0], whole.probability, np.float32(0))
         camera = self.camera(index)
@@ -157,30 +163,30 @@ class Views:
         labels = torch.ones((camera.height, camera.width), dtype=torch.int32, device=ours.device)
         with torch.no_grad():
             drawn = rasterize(*splats[:5], ours, camera, labels, primitive=self.model.primitive)
-        assert drawn.weight is not None
-        return device.host(drawn.weight)
+        assert drawn.label_probability is not None
+        return devices.host(drawn.label_probability)
 
     def _draw(self, splats: Generated, camera: Camera) -> Rendered:
         with torch.no_grad():
             return rasterize(*splats[:6], camera, want_depth=True, want_median=True, primitive=self.model.primitive)
 
     def _depth(self, drawn: Rendered) -> tuple[np.ndarray, np.ndarray]:
-        """Depth (h, w) of what was drawn, 0 where too little is, and how far off it may be (h, w), both along z.
+        """Return the depth (h, w), 0 where alpha is too small, and its uncertainty (h, w), both along z.
 
-        Where the light of a pixel comes from one surface, its median and its mean depth agree. The mean of discs, each
-        met where the pixel's ray meets its plane, is the surface that they share; the median jumps from one to the
-        next. 3D Gaussians reach through the surface, and their mean lies behind it.
+        The uncertainty is the difference of the median and the mean depth, which agree if the light of a pixel comes
+        from one surface. For 2D Gaussians, intersected with the pixel's ray, the mean is their common surface, whereas
+        the median jumps from one to the next. 3D Gaussians extend through the surface, and their mean lies behind it.
         """
         assert drawn.median is not None and drawn.depth is not None
-        alpha, median = device.host(drawn.alpha), device.host(drawn.median)
-        mean = device.host(drawn.depth) / np.maximum(alpha, 1e-3)
+        alpha, median = devices.host(drawn.alpha), devices.host(drawn.median)
+        mean = devices.host(drawn.depth) / np.maximum(alpha, 1e-3)
         seen = (alpha >= ALPHA_SEEN) & (median > 0)
         depth = mean if self.model.primitive == "2d" else median
         return np.where(seen, depth, np.float32(0)), np.where(seen, np.abs(mean - median), np.float32(0))
 
     def _scene_splats(self, camera: Camera) -> Generated:
         if not self.model.explicit:
-            return self.model.generate(eye=camera.centre)
+            return self.model.generate(eye=camera.center)
         if self._all is None:
             self._all = self.model.generate()
         return self._all
@@ -193,10 +199,10 @@ class Views:
             self._own = splats.select(self._are_ours(splats.ids))
             return self._own
         anchors = self._are_ours(self.model.anchors.ids).nonzero()[:, 0]
-        return self.model.generate(anchors, np.zeros(3) if camera is None else camera.centre)
+        return self.model.generate(anchors, np.zeros(3) if camera is None else camera.center)
 
     def _are_ours(self, ids: torch.Tensor) -> torch.Tensor:
-        """Which of the classes `ids` are those at hand, bool."""
+        """Return which of the class indices `ids` are current, bool."""
         return torch.isin(ids, torch.tensor(self._classes, dtype=ids.dtype, device=ids.device))
 
     def _turn_to(self, classes: Sequence[int]) -> None:
@@ -213,23 +219,25 @@ class Views:
 
 
 def _bytes(view: ObjectView) -> int:
-    return view.depth.nbytes + view.doubt.nbytes + view.alpha.nbytes + view.color.nbytes + view.visible.nbytes
+    return (
+        view.depth.nbytes + view.depth_uncertainty.nbytes + view.alpha.nbytes + view.color.nbytes + view.visible.nbytes
+    )
 
 
 def _rectangle(splats: Generated, camera: Camera) -> tuple[int, int, int, int] | None:
-    """x, y, width and height of the part of the picture that the splats may touch; None where they touch none."""
-    points = device.host(splats.means.double()) @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    """Return x, y, width and height of the part of the image that the splats may cover; None if they cover none."""
+    points = devices.host(splats.means.double()) @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     before = points[:, 2] > camera.near
-    points, scales = points[before], device.host(splats.scales)[before]
+    points, scales = points[before], devices.host(splats.scales)[before]
     if not len(points):
         return None
     focal = np.array([camera.K[0, 0], camera.K[1, 1]])
-    centres = points[:, :2] / points[:, 2:] * focal + camera.K[:2, 2]
-    # Beside the axis a footprint is stretched along the radius.
+    centers = points[:, :2] / points[:, 2:] * focal + camera.K[:2, 2]
+    # Off the optical axis, a footprint is stretched along the radius.
     slant = 1 + (points[:, :2] / points[:, 2:]) ** 2
     reach = _REACH * scales.max(1)[:, None] * focal * np.sqrt(slant) / points[:, 2:] + _BORDER
     size = np.array([camera.width, camera.height])
-    low, high = centres - reach, centres + reach
+    low, high = centers - reach, centers + reach
     inside = ((high > 0) & (low < size)).all(1)
     if not inside.any():
         return None

@@ -1,7 +1,7 @@
-"""Scaffold-style anchors that each carry an object ID (Lu et al. 2024; ObjectGS section 3.2).
+"""Anchors as in Scaffold-GS (Lu et al. 2024), each with an object ID (ObjectGS section 3.2).
 
-All trainable numbers of an anchor lie in one row of one matrix, so that the optimiser touches a visible anchor once
-and a checkpoint is a handful of tensors.
+All trainable numbers of an anchor lie in one row of one matrix, so that the optimizer accesses a visible anchor once,
+and a checkpoint consists of few tensors.
 """
 
 from __future__ import annotations
@@ -12,17 +12,22 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from ..spherical_harmonics import C0
+from ..shared.splats.spherical_harmonics import C0
 
 LOG_EXTENT_MAX = 20.0
-"""Logarithms of extents beyond this are taken for it."""
+"""Upper limit of the logarithm of an extent."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Columns of an anchor's row: `offsets` k offsets in units of the anchor's extent, log extents (3 for the offsets,
-    3 for the splats' scales), the `features` of the heads, and per offset a residual to what the heads say:
-    opacity, scale and rotation, base colour."""
+    """The columns of an anchor's row: offsets in units of the anchor's extent, log extents (3 for the offsets, 3 for
+    the splats' scales), features for the heads, and per offset a residual that is added to the heads' output: opacity,
+    scale and rotation, base color.
+
+    Attributes:
+        offsets: k, splats per anchor.
+        features: length of an anchor's feature.
+    """
 
     offsets: int = 10
     features: int = 32
@@ -62,8 +67,15 @@ class Layout:
 
 @dataclass
 class Anchors:
-    """N anchors, on one device. positions (N, 3) float32, cell centres in scene units; rows (N, layout.columns) float32
-    trainable; ids (N,) int32 index into the model's object table; voxel: edge of the finest cell in scene units."""
+    """N anchors, on one device.
+
+    Attributes:
+        layout: the columns of `rows`.
+        voxel: edge of the finest cell in scene units.
+        positions: (N, 3) float32, cell centers in scene units.
+        rows: (N, layout.columns) float32, trainable.
+        ids: (N,) int32, class index in the model's `ClassTable`.
+    """
 
     layout: Layout
     voxel: float
@@ -74,15 +86,19 @@ class Anchors:
     def __len__(self) -> int:
         return len(self.positions)
 
-    def to(self, place: torch.device) -> Anchors:
-        """The same anchors on another device; those that are there already are shared."""
-        return Anchors(self.layout, self.voxel, self.positions.to(place), self.rows.to(place), self.ids.to(place))
+    def to(self, device: torch.device) -> Anchors:
+        """The anchors on another device; tensors that are there already are shared."""
+        return Anchors(self.layout, self.voxel, self.positions.to(device), self.rows.to(device), self.ids.to(device))
 
 
 def median_spacing(xyz: np.ndarray) -> float:
-    """Median distance of points (M, 3) to their nearest other point; coincident points are counted once.
+    """Median distance of points to their nearest neighbor.
 
-    Falls back to 1/100 of the extent, and to 1, where fewer than two different points exist.
+    Args:
+        xyz: (M, 3); coincident points are counted once.
+
+    Returns:
+        1/100 of the extent where the median is too small; 1 where there are fewer than two different points.
     """
     distinct = np.unique(xyz, axis=0)
     if len(distinct) < 2:
@@ -94,17 +110,26 @@ def median_spacing(xyz: np.ndarray) -> float:
 
 
 def cell_keys(xyz: np.ndarray, cell: float) -> np.ndarray:
-    """Integer cell of each position: (M, 3) int64, cells of edge `cell` centred on its multiples."""
+    """The cell of each position: (M, 3) int64, for cells of edge `cell` centered on its multiples."""
     return np.round(np.asarray(xyz, np.float64) / cell).astype(np.int64)
 
 
 def seed_anchors(
     xyz: np.ndarray, rgb: np.ndarray, ids: np.ndarray, voxel: float, layout: Layout, rng: np.random.Generator
 ) -> Anchors:
-    """One anchor for each occupied voxel.
+    """Place one anchor in each voxel that contains points.
 
-    xyz (M, 3) scene units, rgb (M, 3) in [0, 1], ids (M,) object index. An anchor takes the majority ID of its points
-    (ties: the ID of the point nearest to the cell's centre) and the mean colour of the points that carry it.
+    Args:
+        xyz: (M, 3) in scene units.
+        rgb: (M, 3) in [0, 1].
+        ids: (M,) class index.
+        voxel: edge of a voxel in scene units.
+        layout: of the anchors' rows.
+        rng: for the offsets.
+
+    Returns:
+        Anchors with the majority class of their points (ties: that of the point nearest to the cell's center) and the
+        mean color of the points of that class.
     """
     keys = cell_keys(xyz, voxel)
     cells, inverse = np.unique(keys, axis=0, return_inverse=True)
@@ -126,9 +151,9 @@ def seed_anchors(
     color = np.stack([np.bincount(inverse[mine], rgb[mine, c], minlength=n) / count for c in range(3)], 1)
 
     rows = new_rows(n, layout, rng)
-    neighbours = min(4, n)
-    if neighbours > 1:
-        spacing = cKDTree(positions).query(positions, k=neighbours)[0][:, 1:].mean(1)
+    neighbors = min(4, n)
+    if neighbors > 1:
+        spacing = cKDTree(positions).query(positions, k=neighbors)[0][:, 1:].mean(1)
         spacing = np.clip(spacing, voxel, 20 * voxel)
     else:
         spacing = np.full(n, voxel)
@@ -138,7 +163,7 @@ def seed_anchors(
 
 
 def new_rows(count: int, layout: Layout, rng: np.random.Generator) -> np.ndarray:
-    """Rows (count, columns) float32 of fresh anchors: scattered offsets, everything else 0."""
+    """Rows (count, columns) float32 of new anchors: random offsets, everything else 0."""
     rows = np.zeros((count, layout.columns), np.float32)
     rows[:, layout.offset_columns] = rng.normal(0, 0.5, (count, 3 * layout.offsets))
     return rows

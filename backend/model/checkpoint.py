@@ -1,4 +1,4 @@
-"""A training's state on disk: safetensors, written beside and renamed, the one before kept."""
+"""A training's state on disk: safetensors, written to a temporary file and renamed; the previous one is kept."""
 
 from __future__ import annotations
 
@@ -11,17 +11,20 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from ..protocol import InputError
-
-CURRENT = "model.safetensors"
-PREVIOUS = "previous.safetensors"
-FORMAT = 1
+from ..shared.errors import InputError
+from ..shared.reconstruction.checkpoint import CURRENT, FORMAT, PREVIOUS
 
 
 def save_checkpoint(folder: Path, tensors: dict[str, np.ndarray], state: dict[str, Any]) -> None:
-    """Write `tensors` and the JSON-able `state`. At every moment one whole checkpoint lies in `folder`.
+    """Write a checkpoint. At every moment `folder` holds a whole one, once the first is written.
 
-    Raises InputError that names the file when the disk refuses; what was there before still loads.
+    Args:
+        folder: created if necessary.
+        tensors: by name.
+        state: JSON-serializable.
+
+    Raises:
+        InputError: the file cannot be written; the previous checkpoint still loads.
     """
     folder.mkdir(parents=True, exist_ok=True)
     data = save(
@@ -30,30 +33,34 @@ def save_checkpoint(folder: Path, tensors: dict[str, np.ndarray], state: dict[st
     )
     part = folder / (CURRENT + ".part")
     try:
-        with open(part, "wb") as file:
+        with part.open("wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
         if (folder / CURRENT).exists():
-            os.replace(folder / CURRENT, folder / PREVIOUS)
-        os.replace(part, folder / CURRENT)
+            (folder / CURRENT).replace(folder / PREVIOUS)
+        part.replace(folder / CURRENT)
     except OSError as error:
         part.unlink(missing_ok=True)
         raise InputError(
             f"The checkpoint {folder / CURRENT} could not be written ({error.strerror}); free some space and run "
-            "the same command again, it goes on from the checkpoint before."
+            "the same command again to continue from the previous checkpoint."
         ) from error
 
 
 def has_checkpoint(folder: Path) -> bool:
-    """Whether there are files to go on from, whole or not."""
+    """Whether `folder` holds files of a checkpoint, whole or damaged."""
     return any((folder / name).exists() for name in (CURRENT, PREVIOUS))
 
 
 def load_checkpoint(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None] | None:
-    """Tensors, state and a warning (None if all is well) of the newest checkpoint that is whole; None if there is none.
+    """Read the newest whole checkpoint.
 
-    Raises InputError when there are files but none can be read.
+    Returns:
+        Its tensors, its state, and a warning or None; None if there is no checkpoint.
+
+    Raises:
+        InputError: there are files, but none can be read.
     """
     broken = None
     for name in (CURRENT, PREVIOUS):
@@ -62,7 +69,7 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]
             continue
         try:
             with safe_open(path, framework="numpy") as file:
-                tensors = {key: file.get_tensor(key) for key in file.keys()}
+                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - no dict
                 state = json.loads(file.metadata()["state"])
         except (SafetensorError, OSError, ValueError, KeyError, TypeError):
             broken = path
@@ -71,10 +78,10 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]
             raise InputError(f"{path} was written by another version of ObjectGS; train again with --restart.")
         warning = None
         if broken is not None:
-            warning = f"{broken} is cut short or damaged; going on from the checkpoint before it ({path.name})."
+            warning = f"{broken} is cut short or damaged; continuing from the previous checkpoint ({path.name})."
         elif name == PREVIOUS:
-            warning = f"{folder / CURRENT} is missing; going on from the checkpoint before it ({path.name})."
+            warning = f"{folder / CURRENT} is missing; continuing from the previous checkpoint ({path.name})."
         return tensors, state, warning
     if broken is not None:
-        raise InputError(f"{broken} is cut short or damaged and there is no older one; train again with --restart.")
+        raise InputError(f"{broken} is cut short or damaged, and there is no older one; train again with --restart.")
     return None

@@ -1,7 +1,7 @@
 """Anchors and heads -> Gaussians, differentiable (ObjectGS equations 2 and 3).
 
-For offset j of an anchor at x with extents l, l': mean = x + o_j l, opacity = tanh, scale = l' sigmoid, rotation a
-quaternion, colour SH coefficients. Splats that are too transparent to be drawn are not made.
+For offset j of an anchor at x with extents l, l': mean = x + o_j l, opacity = tanh(.), scale = l' sigmoid(.), rotation
+a quaternion, color as SH coefficients. Splats that are too transparent to be drawn are not generated.
 """
 
 from __future__ import annotations
@@ -12,16 +12,19 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from .. import device
+from ..raster import devices
 from .anchors import LOG_EXTENT_MAX, Layout
 from .generate_on_cpu import RAW_OPACITY_MIN, Generate
 from .heads import Heads
 
 
 class Generated(NamedTuple):
-    """Gaussians as `backend.raster.rasterize` takes them, and `source` (N,) int64: anchor * k + offset of each.
+    """Gaussians as `backend.raster.rasterize` takes them.
 
-    made (N,) bool, on the GPU: where it is False there is none, only its place, with opacity 0. None: all are.
+    Attributes:
+        source: (N,) int64, anchor * k + offset of each.
+        made: (N,) bool, on the GPU, where every offset has an entry: False for those without a Gaussian, whose opacity
+            is 0. None: all entries are Gaussians.
     """
 
     means: torch.Tensor
@@ -34,18 +37,18 @@ class Generated(NamedTuple):
     made: torch.Tensor | None = None
 
     def select(self, which: torch.Tensor) -> Generated:
-        """Those of a mask (N,), or of indices."""
+        """The Gaussians of a mask (N,), or of indices."""
         return self._each(lambda part: part[which])
 
     def cpu(self) -> Generated:
-        """In the processor's memory."""
+        """The Gaussians in the CPU's memory."""
         return self._each(lambda part: part.cpu())
 
     def _each(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Generated:
         return Generated(*(change(part) for part in self if part is not None))
 
     def only_made(self) -> Generated:
-        """Without the places that hold none. Waits for the GPU to count them."""
+        """The entries that are Gaussians. Waits for the GPU to count them."""
         return self if self.made is None else self.select(self.made)._replace(made=None)
 
 
@@ -58,9 +61,9 @@ def _on_gpu(
     seen_from: torch.Tensor | None,
     present: torch.Tensor | None,
 ) -> Generated:
-    """The same equations in torch, with a place for every offset, so that nobody waits for a count."""
+    """The same equations in torch, with an entry for every offset, so that nothing waits for a count."""
     n, k = len(rows), layout.offsets
-    # One cut: its gradient is put together in one pass.
+    # A single split, whose gradient is assembled in one pass.
     offsets, extents, features, row_opacity, row_shape, row_color = rows.split(
         [3 * k, 6, layout.features, k, 7 * k, 3 * k], 1
     )
@@ -69,7 +72,7 @@ def _on_gpu(
     made = raw_opacity > float(RAW_OPACITY_MIN)
     if present is not None:
         made = made & present[:, None]
-    # The limit takes no gradient away: an extent beyond it must find back.
+    # The limit passes the gradient, so that an extent beyond it can return.
     extent = (extents + (extents.clamp(max=LOG_EXTENT_MAX) - extents).detach()).exp()
     raw_scale, quats = (shape + row_shape).view(n, k, 7).split([3, 4], 2)
     means = positions[:, None] + offsets.view(n, k, 3) * extent[:, None, :3]
@@ -92,19 +95,25 @@ def generate(
     eye: np.ndarray | None = None,
     present: torch.Tensor | None = None,
 ) -> Generated:
-    """Gaussians of n anchors: positions (n, 3), rows (n, columns), ids (n,) int32; differentiable in rows and heads.
+    """Generate the Gaussians of n anchors (ObjectGS equations 2 and 3), differentiable in rows and heads.
 
-    eye (3,): the camera's centre in scene units, needed in `view` mode alone. present (n,) bool, on the GPU alone: the
-    other anchors make none.
+    Args:
+        layout: of the rows.
+        positions: (n, 3) float32, in scene units.
+        rows: (n, columns) float32.
+        ids: (n,) int32 class index.
+        heads: of the model.
+        eye: (3,), the camera's center in scene units; needed only in view mode.
+        present: (n,) bool, only on the GPU: the other anchors generate none.
     """
     seen_from = None
     if heads.mode == "view":
         if eye is None:
-            raise ValueError("view mode needs the camera's centre")
-        to_anchor = positions - device.upload(np.asarray(eye, np.float32), positions)
+            raise ValueError("view mode needs the camera's center")
+        to_anchor = positions - devices.upload(np.asarray(eye, np.float32), positions)
         distance = torch.linalg.vector_norm(to_anchor, dim=1, keepdim=True).clamp(min=1e-6)
         seen_from = torch.cat([distance, to_anchor / distance], 1)
-    if device.on_gpu(rows):
+    if devices.on_gpu(rows):
         return _on_gpu(layout, positions, rows, ids, heads, seen_from, present)
     layers = (heads.hidden, heads.opacity, heads.shape, heads.color)
     parameters = [p for layer in layers for p in (layer.weight, layer.bias)]

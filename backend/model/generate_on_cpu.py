@@ -1,7 +1,7 @@
-"""Anchors and heads -> Gaussians on the processor, with the gradient written by hand.
+"""Anchors and heads -> Gaussians on the CPU, with a hand-written gradient.
 
-Most offsets make no splat, so what the shape and colour heads say is worked out splat by splat, and so is its gradient:
-nothing is computed, kept or read for offsets that make none, and nothing of an anchor's row is copied on the way.
+Most offsets generate no splat, so the output of the shape and color heads is computed splat by splat, and so is its
+gradient: nothing is computed, stored or read for the other offsets, and anchors' rows are not copied.
 """
 
 from __future__ import annotations
@@ -20,19 +20,20 @@ from .anchors import LOG_EXTENT_MAX, Layout
 from .heads import HIDDEN
 
 RAW_OPACITY_MIN = np.float32(math.atanh(1.0 / 255.0))
-"""Splats that are more transparent than a 255th are not made."""
+"""Splats with an opacity below 1/255 are not generated."""
 
 _CHUNK = 32
-"""So many anchors at a time go through the offsets one by one, so that an offset's weights stay at hand."""
+"""Anchors per chunk, which goes through the offsets one by one, so that an offset's weights stay in the cache."""
 
-_PARTS = 32
-"""The heads' gradients are summed in so many parts, however many threads there are, so that sums don't depend on it."""
+_PARTIAL_SUMS = 32
+"""The heads' gradients are summed in this number of parts, so that sums do not depend on the number of threads."""
 
-_AT_ONCE = 4
-"""So many sums are made side by side, as none of them has to wait for the one before."""
+_UNROLL = 4
+"""Independent sums that are computed side by side, so that none waits for the previous one."""
 
-_SHAPE, _COLOR = _AT_ONCE, _AT_ONCE + 8
-"""Where the gradients of an offset's shape and colour begin after that of its opacity, at multiples of the former."""
+_SHAPE, _COLOR = _UNROLL, _UNROLL + 8
+"""Columns at which the gradients of an offset's shape and color begin, after that of its opacity; multiples of
+_UNROLL."""
 
 _LOG2_E = np.float32(math.log2(math.e))
 _UNITS = 3 * HIDDEN
@@ -46,7 +47,7 @@ def _exp(x):
 
 
 @kernel()
-def _listen(values, at, count, weights, row, sums):
+def _add_hidden(values, at, count, weights, row, sums):
     """sums (_UNITS,) += values[at : at + count] @ weights[row : row + count], with weights (inputs, _UNITS)."""
     h0, h1, h2 = load(sums, 0), load(sums, LANES), load(sums, 2 * LANES)
     h3, h4, h5 = load(sums, 3 * LANES), load(sums, 4 * LANES), load(sums, 5 * LANES)
@@ -68,26 +69,26 @@ def _listen(values, at, count, weights, row, sums):
 
 
 @kernel()
-def _say(hidden, at, layer, j, said):
-    """said[:] = what a head says of offset j, where its hidden units are hidden[at : at + HIDDEN].
+def _head_output(hidden, at, layer, j, output):
+    """output[:] = a head's output for offset j, from its hidden units hidden[at : at + HIDDEN].
 
-    layer: as `_by_offset` makes it."""
+    layer: as `_by_offset` returns it."""
     for block in range(layer.shape[1]):
         start = (j * layer.shape[1] + block) * (HIDDEN + 1) * LANES
         one, two = load(layer, start + HIDDEN * LANES), splat(np.float32(0.0))
         three, four = two, two
-        for i in range(0, HIDDEN, _AT_ONCE):
+        for i in range(0, HIDDEN, _UNROLL):
             row = start + i * LANES
             one += spread(hidden, at + i) * load(layer, row)
             two += spread(hidden, at + i + 1) * load(layer, row + LANES)
             three += spread(hidden, at + i + 2) * load(layer, row + 2 * LANES)
             four += spread(hidden, at + i + 3) * load(layer, row + 3 * LANES)
-        store(said, block * LANES, (one + two) + (three + four))
+        store(output, block * LANES, (one + two) + (three + four))
 
 
 @kernel(parallel=True)
 def _count(rows, seen_from, weights, biases, opacity_layer, k, features, hidden, opacity, counts):
-    """The hidden units of each anchor, its offsets' opacities before tanh, and how many of them make a splat."""
+    """Compute the hidden units of each anchor, its offsets' opacities before tanh, and the number of its splats."""
     columns = rows.shape[1]
     n_opacity = 3 * k + 6 + features
     extra = seen_from.shape[1]
@@ -95,19 +96,19 @@ def _count(rows, seen_from, weights, biases, opacity_layer, k, features, hidden,
     count = rows.shape[0]
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
         sums = np.empty(_UNITS, np.float32)
-        said = np.empty(opacity_layer.shape[1] * LANES, np.float32)
+        output = np.empty(opacity_layer.shape[1] * LANES, np.float32)
         for a in range(chunk * _CHUNK, min(chunk * _CHUNK + _CHUNK, count)):
             sums[:] = biases
-            _listen(rows, a * columns + 3 * k + 6, features, weights, 0, sums)
-            _listen(seen_from, a * extra, extra, weights, features, sums)
+            _add_hidden(rows, a * columns + 3 * k + 6, features, weights, 0, sums)
+            _add_hidden(seen_from, a * extra, extra, weights, features, sums)
             for i in range(0, _UNITS, LANES):
                 units = load(sums, i)
                 # Written so that NaN stays.
                 store(hidden, a * _UNITS + i, where(above(zero, units), zero, units))
-            _say(hidden, a * _UNITS, opacity_layer, 0, said)
+            _head_output(hidden, a * _UNITS, opacity_layer, 0, output)
             kept = 0
             for j in range(k):
-                opacity[a, j] = said[j] + rows[a, n_opacity + j]
+                opacity[a, j] = output[j] + rows[a, n_opacity + j]
                 if opacity[a, j] > RAW_OPACITY_MIN:
                     kept += 1
             counts[a] = kept
@@ -136,8 +137,8 @@ def _forward(positions, rows, opacity, hidden, shape_layer, color_layer, k, feat
             for a in range(first, last):
                 if not opacity[a, j] > RAW_OPACITY_MIN:
                     continue
-                _say(hidden, a * _UNITS + HIDDEN, shape_layer, j, shape)
-                _say(hidden, a * _UNITS + 2 * HIDDEN, color_layer, j, color)
+                _head_output(hidden, a * _UNITS + HIDDEN, shape_layer, j, shape)
+                _head_output(hidden, a * _UNITS + 2 * HIDDEN, color_layer, j, color)
                 at = places[a - first]
                 places[a - first] += 1
                 source[at] = a * k + j
@@ -161,12 +162,12 @@ def _forward(positions, rows, opacity, hidden, shape_layer, color_layer, k, feat
 
 
 @kernel()
-def _learn(raw, column, hidden, at, weights, row, g_hidden, to, g_weights):
-    """One splat's share in the gradients of a head of which _AT_ONCE outputs, in the weights' rows from `row` on, have
-    the gradients raw[column:]; its hidden units are the HIDDEN from `at` on, their gradients those from `to` on."""
+def _head_gradient(raw, column, hidden, at, weights, row, g_hidden, to, g_weights):
+    """Add the contribution of a splat to the gradients of a head: _UNROLL of its outputs, in the weights' rows from
+    `row` on, have the gradients raw[column:]; the hidden units are hidden[at:], their gradients g_hidden[to:]."""
     h0, h1 = load(hidden, at), load(hidden, at + LANES)
     g0, g1 = load(g_hidden, to), load(g_hidden, to + LANES)
-    for c in range(_AT_ONCE):
+    for c in range(_UNROLL):
         g = spread(raw, column + c)
         w = (row + c) * HIDDEN
         g0 += g * load(weights, w)
@@ -178,13 +179,13 @@ def _learn(raw, column, hidden, at, weights, row, g_hidden, to, g_weights):
 
 
 @kernel()
-def _learn_hidden(g_hidden, count, inputs, weights, g_inputs, g_weights):
-    """What `count` anchors, whose hidden units have the gradients g_hidden (_CHUNK, _UNITS), add to g_weights (_UNITS,
-    width) of the hidden layer, whose inputs lie in `inputs` (_CHUNK, width), and the gradients of these, to g_inputs
-    (_CHUNK, width); width a multiple of LANES."""
+def _hidden_gradient(g_hidden, count, inputs, weights, g_inputs, g_weights):
+    """Add the contribution of `count` anchors, whose hidden units have the gradients g_hidden (_CHUNK, _UNITS), to
+    g_weights (_UNITS, width) of the hidden layer, and write the gradients of its inputs (_CHUNK, width) to g_inputs;
+    width is a multiple of LANES."""
     width = inputs.shape[1]
     for block in range(0, width, LANES):
-        for c in range(0, _UNITS, _AT_ONCE):
+        for c in range(0, _UNITS, _UNROLL):
             row = c * width + block
             one, two = load(g_weights, row), load(g_weights, row + width)
             three, four = load(g_weights, row + 2 * width), load(g_weights, row + 3 * width)
@@ -202,7 +203,7 @@ def _learn_hidden(g_hidden, count, inputs, weights, g_inputs, g_weights):
         for a in range(count):
             one = splat(np.float32(0.0))
             two, three, four = one, one, one
-            for c in range(0, _UNITS, _AT_ONCE):
+            for c in range(0, _UNITS, _UNROLL):
                 at, row = a * _UNITS + c, c * width + block
                 one += spread(g_hidden, at) * load(weights, row)
                 two += spread(g_hidden, at + 1) * load(weights, row + width)
@@ -215,7 +216,7 @@ def _learn_hidden(g_hidden, count, inputs, weights, g_inputs, g_weights):
 def _backward(rows, seen_from, hidden, weights, by_offset, k, features, coefficients, starts, splats, grads, out):
     scales, opacities, source, extents = splats
     g_means, g_quats, g_scales, g_opacities, g_sh = grads
-    g_rows, g_weights, g_biases, g_by_offset, g_said = out
+    g_rows, g_weights, g_biases, g_by_offset, g_head_biases = out
     n_features = 3 * k + 6
     n_opacity = n_features + features
     n_shape = n_opacity + k
@@ -223,18 +224,23 @@ def _backward(rows, seen_from, hidden, weights, by_offset, k, features, coeffici
     count, width, extra = rows.shape[0], weights.shape[1], seen_from.shape[1]
     outputs = by_offset.shape[1]
     zero = splat(np.float32(0.0))
-    for part in prange(_PARTS):
+    for part in prange(_PARTIAL_SUMS):
         raw = np.zeros((_CHUNK, k, outputs), np.float32)
         made = np.empty((_CHUNK, k), np.bool_)
         faulty = np.empty(_CHUNK, np.bool_)
         inputs, g_inputs = np.zeros((_CHUNK, width), np.float32), np.empty((_CHUNK, width), np.float32)
         g_hidden = np.empty((_CHUNK, _UNITS), np.float32)
-        of_weights, of_biases, of_offset, of_said = g_weights[part], g_biases[part], g_by_offset[part], g_said[part]
+        of_weights, of_biases, of_offset, of_head_biases = (
+            g_weights[part],
+            g_biases[part],
+            g_by_offset[part],
+            g_head_biases[part],
+        )
         of_weights[:] = 0.0
         of_biases[:] = 0.0
         of_offset[:] = 0.0
-        of_said[:] = 0.0
-        begin, end = part * count // _PARTS, (part + 1) * count // _PARTS
+        of_head_biases[:] = 0.0
+        begin, end = part * count // _PARTIAL_SUMS, (part + 1) * count // _PARTIAL_SUMS
         for first in range(begin, end, _CHUNK):
             last = min(first + _CHUNK, end)
             made[:] = False
@@ -258,8 +264,8 @@ def _backward(rows, seen_from, hidden, weights, by_offset, k, features, coeffici
                         g_rows[a, 3 * j + i] = g_means[n, i] * extents[a, i]
                         g_rows[a, 3 * k + i] += g_means[n, i] * rows[a, 3 * j + i] * extents[a, i]
                         g_rows[a, 3 * k + 3 + i] += g_scales[n, i] * scales[n, i]
-                        share = scales[n, i] / extents[a, 3 + i]
-                        raw[at, j, _SHAPE + i] = g_scales[n, i] * scales[n, i] * (np.float32(1.0) - share)
+                        sigmoid = scales[n, i] / extents[a, 3 + i]
+                        raw[at, j, _SHAPE + i] = g_scales[n, i] * scales[n, i] * (np.float32(1.0) - sigmoid)
                         g_rows[a, n_shape + 7 * j + i] = raw[at, j, _SHAPE + i]
                         g_rows[a, n_color + 3 * j + i] = g_sh[n, 0, i]
                     for i in range(4):
@@ -271,8 +277,9 @@ def _backward(rows, seen_from, hidden, weights, by_offset, k, features, coeffici
                     for i in range(0, outputs, LANES):
                         x = load(raw, (at * k + j) * outputs + i)
                         sound += x - x
-                # What is not finite leaves NaN. The heads learn nothing of such an anchor; its own row says so.
-                faulty[a - first] = not total(sound) == 0.0
+                # Numbers that are not finite leave NaN. Such an anchor adds nothing to the heads' gradients, and its
+                # row's gradient becomes NaN.
+                faulty[a - first] = not total(sound) == 0.0  # noqa: SIM201 - true of NaN
                 if faulty[a - first]:
                     made[a - first] = False
                 if faulty[a - first] or starts[a] == starts[a + 1]:
@@ -284,17 +291,19 @@ def _backward(rows, seen_from, hidden, weights, by_offset, k, features, coeffici
                     at, to, column = a * _UNITS, (a - first) * _UNITS, ((a - first) * k + j) * outputs
                     row = j * outputs
                     for c in range(0, outputs, LANES):
-                        store(of_said, row + c, load(of_said, row + c) + load(raw, column + c))
-                    for c in range(0, _COLOR + 3 * coefficients, _AT_ONCE):
+                        store(of_head_biases, row + c, load(of_head_biases, row + c) + load(raw, column + c))
+                    for c in range(0, _COLOR + 3 * coefficients, _UNROLL):
                         head = 0 if c < _SHAPE else HIDDEN if c < _COLOR else 2 * HIDDEN
-                        _learn(raw, column + c, hidden, at + head, by_offset, row + c, g_hidden, to + head, of_offset)
+                        _head_gradient(
+                            raw, column + c, hidden, at + head, by_offset, row + c, g_hidden, to + head, of_offset
+                        )
             for a in range(first, last):
                 for i in range(0, _UNITS, LANES):
                     to = (a - first) * _UNITS + i
                     g_units = keep(above(load(hidden, a * _UNITS + i), zero), load(g_hidden, to))
                     store(g_hidden, to, g_units)
                     store(of_biases, i, load(of_biases, i) + g_units)
-            _learn_hidden(g_hidden, last - first, inputs, weights, g_inputs, of_weights)
+            _hidden_gradient(g_hidden, last - first, inputs, weights, g_inputs, of_weights)
             for a in range(first, last):
                 for i in range(features):
                     g_rows[a, n_features + i] = np.float32(np.nan) if faulty[a - first] else g_inputs[a - first, i]
@@ -336,29 +345,30 @@ class Generate(torch.autograd.Function):
         k, _, coefficients, *_ = ctx.arrays
         sizes = (1, 7, 3 * coefficients)
         of_offsets = [weights.view(k, m, HIDDEN) for m, weights in zip(sizes, of_heads, strict=True)]
-        by_offset = torch.cat([pad(w, (0, 0, 0, -w.shape[1] % _AT_ONCE)) for w in of_offsets], 1)
+        by_offset = torch.cat([pad(w, (0, 0, 0, -w.shape[1] % _UNROLL)) for w in of_offsets], 1)
         by_offset = pad(by_offset, (0, 0, 0, -by_offset.shape[1] % LANES))
         weights = pad(w_hidden, (0, -w_hidden.shape[1] % LANES))
         g_rows = torch.empty_like(rows)
         sums = [
-            torch.empty(_PARTS, *shape) for shape in (weights.shape, (_UNITS,), by_offset.shape, by_offset.shape[:2])
+            torch.empty(_PARTIAL_SUMS, *shape)
+            for shape in (weights.shape, (_UNITS,), by_offset.shape, by_offset.shape[:2])
         ]
         _backward(
             rows.detach().numpy(), seen_from.numpy(), hidden.numpy(), weights.numpy(), by_offset.numpy(), *ctx.arrays,
             tuple(np.ascontiguousarray(g.numpy()) for g in gradients[:5]),
             tuple(t.numpy() for t in (g_rows, *sums)),
         )  # fmt: skip
-        of_hidden, of_biases, of_weights, of_said = (parts.sum(0) for parts in sums)
+        of_hidden, of_biases, of_weights, of_head_biases = (parts.sum(0) for parts in sums)
         of_parameters = [of_hidden[:, : w_hidden.shape[1]], of_biases]
         for start, m in zip((0, _SHAPE, _COLOR), sizes, strict=True):
             part = slice(start, start + m)
-            of_parameters += [of_weights[:, part].reshape(-1, HIDDEN), of_said[:, part].reshape(-1)]
+            of_parameters += [of_weights[:, part].reshape(-1, HIDDEN), of_head_biases[:, part].reshape(-1)]
         return (None, g_rows, None, None, *of_parameters)
 
 
 def _by_offset(weights: torch.Tensor, biases: torch.Tensor, k: int) -> np.ndarray:
-    """A layer (k * m, HIDDEN) with its biases (k * m,) as (k, blocks, HIDDEN + 1, LANES): what LANES outputs of an
-    offset need lies together, the biases last."""
+    """Rearrange a layer (k * m, HIDDEN) and its biases (k * m,) to (k, blocks, HIDDEN + 1, LANES), so that the
+    weights of LANES outputs of an offset are adjacent, the biases last."""
     m = len(biases) // k
     layer = torch.cat([weights, biases[:, None]], 1).view(k, m, HIDDEN + 1)
     layer = pad(layer, (0, 0, 0, -m % LANES)).view(k, -1, LANES, HIDDEN + 1)

@@ -1,10 +1,10 @@
-"""Where anchors are added and taken away (Scaffold-GS section 3.3, with IDs as ObjectGS section 3.2).
+"""Growing and pruning of anchors (Scaffold-GS section 3.3, with IDs as in ObjectGS section 3.2).
 
-A child takes its parent's ID, a cell holds at most one anchor, and of two objects that want one free cell the one
+A new anchor takes its parent's ID. A cell holds at most one anchor; if two objects compete for a free cell, the one
 with the larger accumulated gradient gets it.
 
-Statistics are gathered where the model lies. Growth itself, once in many steps, thinks on the processor: sorting
-cells is what it does, and only what asks for one travels, not the anchors' rows.
+Statistics are gathered on the model's device. Growth itself, once in many steps, sorts cells on the CPU; of the
+anchors' rows only those of splats that ask for a cell are copied there.
 """
 
 from __future__ import annotations
@@ -15,21 +15,26 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from .. import device
+from ..raster import devices
 from .anchors import Anchors, cell_keys, new_rows
 
 LEVELS = (16, 4, 1)
-"""Cells tried, in voxels, coarse to fine."""
+"""Edges of the cells that are tried, in voxels, coarse to fine."""
 
 MIN_VISITS = 5
-"""What was seen less often is not judged yet."""
+"""Splats and anchors that were seen less often are not judged yet."""
 
 
 @dataclass
 class GrowthStatistics:
-    """Sums since they were last judged. gradient and visits (N k,): norm of the screen gradient (normalised device
-    coordinates) of each offset's splat, and how often it was seen; opacity and views (N,): summed opacity of an
-    anchor's splats, and how often the anchor was in view."""
+    """Sums since the splats and anchors were last judged.
+
+    Attributes:
+        gradient: (N k,) float32, norm of the screen gradient (normalized device coordinates) of each offset's splat.
+        visits: (N k,) int32, the number of views that the splat was drawn in.
+        opacity: (N,) float32, opacity of an anchor's splats.
+        views: (N,) int32, the number of views that the anchor was in.
+    """
 
     gradient: torch.Tensor
     visits: torch.Tensor
@@ -37,11 +42,11 @@ class GrowthStatistics:
     views: torch.Tensor
 
     @classmethod
-    def zeros(cls, anchors: int, offsets: int, place: torch.device = device.CPU) -> GrowthStatistics:
+    def zeros(cls, anchors: int, offsets: int, device: torch.device = devices.CPU) -> GrowthStatistics:
         """Cleared sums."""
 
         def cleared(count: int, kind: torch.dtype) -> torch.Tensor:
-            return torch.zeros(count, dtype=kind, device=place)
+            return torch.zeros(count, dtype=kind, device=device)
 
         return cls(
             cleared(anchors * offsets, torch.float32), cleared(anchors * offsets, torch.int32),
@@ -60,16 +65,26 @@ class GrowthStatistics:
         height: int,
         usable: torch.Tensor | None = None,
     ) -> None:
-        """Take in one step. anchors_seen (n,); source (S,) local anchor * k + offset of each splat; drawn (S,) bool;
-        screen_gradient (S, 2) in pixels; usable (n,) bool, on the GPU alone: the other anchors do not count."""
-        if device.on_gpu(self.gradient):
+        """Add the statistics of a view.
+
+        Args:
+            anchors_seen: (n,) int64, the anchors in view.
+            offsets: k, splats per anchor.
+            source: (S,) int64, index in anchors_seen * k + offset of each splat.
+            opacities: (S,).
+            drawn: (S,) bool, the splats that touch the image.
+            screen_gradient: (S, 2), per pixel.
+            width, height: of the image in pixels.
+            usable: (n,) bool, only on the GPU: the other anchors do not count.
+        """
+        if devices.on_gpu(self.gradient):
             drawn, screen_gradient = torch.as_tensor(drawn), torch.as_tensor(screen_gradient)
             self._add_on_gpu(anchors_seen, offsets, opacities, drawn, screen_gradient, width, height, usable)
             return
         size = np.array([width / 2, height / 2], np.float32)
-        norm = np.sqrt(((device.host(screen_gradient) * size) ** 2).sum(1))
+        norm = np.sqrt(((devices.host(screen_gradient) * size) ** 2).sum(1))
         sources, seen = source.numpy(), anchors_seen.numpy()
-        shown = device.host(drawn) & np.isfinite(norm)
+        shown = devices.host(drawn) & np.isfinite(norm)
         place = seen[sources // offsets] * offsets + sources % offsets
         gradient, visits, opacity, views = (t.numpy() for t in (self.gradient, self.visits, self.opacity, self.views))
         gradient[place[shown]] += norm[shown]
@@ -88,21 +103,21 @@ class GrowthStatistics:
         height: int,
         usable: torch.Tensor | None,
     ) -> None:
-        """`add`, where every offset of the anchors has a place among the splats."""
+        """`add`, where every offset of the anchors has an entry among the splats."""
         counted = torch.ones_like(anchors_seen, dtype=torch.bool) if usable is None else usable
         drawn = drawn.view(-1, offsets) & counted[:, None]
         norm = torch.hypot(screen_gradient[:, 0] * (width / 2), screen_gradient[:, 1] * (height / 2))
         norm = norm.view(-1, offsets)
         drawn = drawn & norm.isfinite()
         norm = torch.where(drawn, norm, 0.0)
-        # Each anchor is there once, so that nothing depends on the order of the sums.
+        # Each anchor occurs once, so the result does not depend on the order of the sums.
         self.gradient.view(-1, offsets).index_add_(0, anchors_seen, norm)
         self.visits.view(-1, offsets).index_add_(0, anchors_seen, drawn.to(self.visits.dtype))
         self.opacity.index_add_(0, anchors_seen, torch.where(counted, opacities.view(-1, offsets).sum(1), 0.0))
         self.views.index_add_(0, anchors_seen, counted.to(self.views.dtype))
 
     def after(self, growth: Growth, offsets: int) -> GrowthStatistics:
-        """What goes on after a round of growth: the sums of what was seen too seldom to be judged in it."""
+        """The statistics after a round of growth, which keep what was seen too rarely to be judged."""
 
         def follow(sums: torch.Tensor, count: torch.Tensor, width: int) -> torch.Tensor:
             kept = torch.where(count < MIN_VISITS, sums, 0).view(-1, width)[growth.kept]
@@ -116,7 +131,7 @@ class GrowthStatistics:
 
 @dataclass(frozen=True)
 class Growth:
-    """What one round changed: kept (n,) indices of the anchors that stay, in order; `added` new ones follow them."""
+    """The changes of one round: `kept` (n,) indices of the anchors that stay, in order, then `added` new ones."""
 
     kept: torch.Tensor
     added: int
@@ -131,15 +146,24 @@ def grow_and_prune(
     min_opacity: float = 0.005,
     max_anchors: int = 10**9,
 ) -> Growth:
-    """Add anchors where splats still move much and drop transparent ones, in place.
+    """Add anchors where splats have large gradients and remove transparent ones, in place (Scaffold-GS section 3.3).
 
-    A splat of the average gradient >= threshold 2^level asks for the cell of LEVELS[level] voxels that it lies in.
+    A splat with an average gradient >= threshold * 2^level asks for an anchor in the cell of LEVELS[level] voxels that
+    it lies in.
+
+    Args:
+        anchors: changed in place.
+        statistics: since the previous round.
+        rng: for the offsets of new anchors.
+        threshold: average norm of the screen gradient.
+        min_opacity: anchors whose splats have less opacity in all, on average over the views, are removed.
+        max_anchors: no anchors are added beyond this number.
     """
     layout, k = anchors.layout, anchors.layout.offsets
     summed, visits, opacity, views = (
-        device.host(t) for t in (statistics.gradient, statistics.visits, statistics.opacity, statistics.views)
+        devices.host(t) for t in (statistics.gradient, statistics.visits, statistics.opacity, statistics.views)
     )
-    positions = device.host(anchors.positions)
+    positions = devices.host(anchors.positions)
     enough = visits >= MIN_VISITS
     gradient = np.where(enough, summed / np.maximum(visits, 1), 0)
     wanted = np.flatnonzero(gradient >= threshold)
@@ -149,8 +173,8 @@ def grow_and_prune(
         [layout.offset_columns.start + 3 * (wanted % k)[:, None] + axes,
          np.broadcast_to(layout.extent_columns.start + axes, (len(wanted), 3))], 1
     )  # fmt: skip
-    numbers = device.host(
-        anchors.rows[device.upload(parents, anchors.rows)[:, None], device.upload(columns, anchors.rows)]
+    numbers = devices.host(
+        anchors.rows[devices.upload(parents, anchors.rows)[:, None], devices.upload(columns, anchors.rows)]
     )
     means = positions[parents] + numbers[:, :3] * np.exp(numbers[:, 3:])
 
@@ -166,7 +190,7 @@ def grow_and_prune(
         free = ~np.isin(cells[len(taken) :], cells[: len(taken)])
         index = np.flatnonzero(here)[free]
         keys, cells = keys[free], cells[len(taken) :][free]
-        # The largest accumulated gradient first; ties by index, so that a seed fixes everything.
+        # The largest accumulated gradient first; ties by index, so that the seed determines the result.
         order = np.lexsort((index, -summed[wanted[index]]))
         _, first = np.unique(cells[order], return_index=True)
         chosen = order[np.sort(first)][: max(room, 0)]
@@ -178,8 +202,8 @@ def grow_and_prune(
         new_extents.append(np.full(len(chosen), np.log(cell), np.float32))
 
     child = np.concatenate(new_children)
-    parent = device.upload(parents[child], anchors.rows)
-    of_parents = device.host(anchors.rows[parent])
+    parent = devices.upload(parents[child], anchors.rows)
+    of_parents = devices.host(anchors.rows[parent])
     rows = new_rows(len(child), layout, rng)
     rows[:, layout.extent_columns] = np.concatenate(new_extents)[:, None]
     rows[:, layout.feature_columns] = of_parents[:, layout.feature_columns]
@@ -187,17 +211,17 @@ def grow_and_prune(
     rows[:, layout.color_columns] = np.tile(colors, (1, k))
 
     faint = (views >= MIN_VISITS) & (opacity < min_opacity * np.maximum(views, 1))
-    kept = device.upload(np.flatnonzero(~faint), anchors.rows)
+    kept = devices.upload(np.flatnonzero(~faint), anchors.rows)
     pruned = len(anchors) - len(kept)
-    born = device.upload(np.concatenate(new_positions), anchors.rows)
+    born = devices.upload(np.concatenate(new_positions), anchors.rows)
     anchors.positions = torch.cat([anchors.positions[kept], born])
-    anchors.rows = torch.cat([anchors.rows[kept], device.upload(rows, anchors.rows)])
+    anchors.rows = torch.cat([anchors.rows[kept], devices.upload(rows, anchors.rows)])
     anchors.ids = torch.cat([anchors.ids[kept], anchors.ids[parent]])
     return Growth(kept, len(child), pruned)
 
 
 def _numbered(rows: np.ndarray) -> np.ndarray:
-    """(n,) int64: a number for each of the rows (n, 3) int64, the same for those that are equal and only for them."""
+    """Number the rows (n, 3) int64 so that equal rows, and only those, have equal numbers: (n,) int64."""
     low, high = rows.min(0, initial=0), rows.max(0, initial=0)
     spans = [int(last) - int(first) + 1 for first, last in zip(low, high, strict=True)]
     if math.prod(spans) >= 2**63:

@@ -8,82 +8,95 @@ import numpy as np
 import torch
 from numba import prange
 
-from .. import device
+from ..raster import devices
 from ..raster.kernel import kernel
+from ..shared.class_table import ClassTable
 from .anchors import LOG_EXTENT_MAX, Anchors
 from .generate import Generated, generate
 from .heads import Heads
 from .splats import Splats
 
 DISC_THICKNESS = 1e-3
-"""A disc's third scale in files, as a share of the smaller of the other two."""
+"""A disc's third scale in files, as a fraction of the smaller of the other two."""
 
 
 @dataclass(frozen=True)
 class Normalization:
-    """scene = (world - centre) * scale: keeps float32 exact for georeferenced, tiny and huge captures alike."""
+    """scene = (world - center) * scale, so that float32 suffices for georeferenced, tiny and huge captures alike."""
 
-    centre: tuple[float, float, float]
+    center: tuple[float, float, float]
     scale: float
 
     def to_scene(self, xyz: np.ndarray) -> np.ndarray:
         """World positions (M, 3) -> scene units, float64."""
-        return (np.asarray(xyz, np.float64) - np.array(self.centre)) * self.scale
+        return (np.asarray(xyz, np.float64) - np.array(self.center)) * self.scale
 
     def to_world(self, xyz: np.ndarray) -> np.ndarray:
         """Scene positions (M, 3) -> world units, float64."""
-        return np.asarray(xyz, np.float64) / self.scale + np.array(self.centre)
+        return np.asarray(xyz, np.float64) / self.scale + np.array(self.center)
 
     def viewmat(self, viewmat: np.ndarray) -> np.ndarray:
-        """A world-to-camera matrix (4, 4) for scene coordinates, camera space scaled alike."""
+        """Convert a world-to-camera matrix (4, 4) to scene units, both of the world and of camera space."""
         out = np.array(viewmat, np.float64)
-        out[:3, 3] = (out[:3, 3] + out[:3, :3] @ np.array(self.centre)) * self.scale
+        out[:3, 3] = (out[:3, 3] + out[:3, :3] @ np.array(self.center)) * self.scale
         return out
 
     @classmethod
-    def of(cls, camera_centres: np.ndarray, points: np.ndarray) -> Normalization:
-        """Centred on the points' median; the median distance of points from there becomes 1 at most, of cameras 2."""
-        centre = np.median(points, axis=0)
-        spread = np.median(np.linalg.norm(points - centre, axis=1))
-        reach = np.median(np.linalg.norm(camera_centres - centre, axis=1)) / 2
+    def of(cls, camera_centers: np.ndarray, points: np.ndarray) -> Normalization:
+        """Center on the median of the points; their median distance becomes at most 1, that of the cameras 2."""
+        center = np.median(points, axis=0)
+        spread = np.median(np.linalg.norm(points - center, axis=1))
+        reach = np.median(np.linalg.norm(camera_centers - center, axis=1)) / 2
         size = max(spread, reach)
         scale = 1.0 / size if np.isfinite(size) and size > 0 else 1.0
-        return cls((float(centre[0]), float(centre[1]), float(centre[2])), float(scale))
+        return cls((float(center[0]), float(center[1]), float(center[2])), float(scale))
 
 
 @dataclass
 class ObjectModel:
-    """anchors and heads in scene units; background (3,) linear-in-display RGB; object_ids (C,) int64: the ID behind
-    each class index; normalization to the capture's world; primitive: "3d" Gaussians or "2d" discs."""
+    """A trained model.
+
+    Attributes:
+        anchors, heads: in scene units.
+        background: (3,) RGB in display space, 0 .. 1.
+        classes: the object IDs of the anchors' class indices; class 0 is "no object".
+        normalization: between the capture's world and scene units.
+        primitive: "3d" Gaussians or "2d" discs.
+    """
 
     anchors: Anchors
     heads: Heads
     background: torch.Tensor
-    object_ids: np.ndarray
+    classes: ClassTable
     normalization: Normalization
     primitive: str = "3d"
 
     @property
     def device(self) -> torch.device:
-        """Where the model lies."""
+        """The device that the model lies on."""
         return self.background.device
 
-    def to(self, place: torch.device) -> ObjectModel:
+    def to(self, device: torch.device) -> ObjectModel:
         """Move the model to another device; returns itself."""
         self.anchors, self.heads, self.background = (
-            self.anchors.to(place), self.heads.to(place), self.background.detach().to(place)
+            self.anchors.to(device), self.heads.to(device), self.background.detach().to(device)
         )  # fmt: skip
         return self
 
     @property
     def explicit(self) -> bool:
-        """Whether the model is plain splats at any moment."""
+        """Whether the model can be exported as plain splats without loss."""
         return self.heads.mode == "explicit"
 
     def generate(self, seen: torch.Tensor | None = None, eye: np.ndarray | None = None) -> Generated:
-        """Gaussians of the anchors `seen` ((n,) int64; None: all), without gradients. eye: see `generate`.
+        """Generate Gaussians without gradients.
 
-        A disc gets the third scale that it has where it is taken for a 3D Gaussian.
+        Args:
+            seen: (n,) int64, the anchors; None: all.
+            eye: (3,), the camera's center in scene units; needed only in view mode.
+
+        Returns:
+            In scene units; discs have the third scale of the thin 3D Gaussians that stand for them in files.
         """
         a = self.anchors
         pick = (lambda x: x) if seen is None else (lambda x: x[seen])
@@ -94,9 +107,13 @@ class ObjectModel:
             return g
 
     def splats(self, eye: np.ndarray | None = None) -> tuple[Splats, np.ndarray]:
-        """The whole model as plain splats in world units, and source (N,) int64: anchor * offsets + offset of each.
+        """The whole model as plain splats.
 
-        In `view` mode as seen from `eye` (scene units).
+        Args:
+            eye: (3,), the camera's center in scene units; needed only in view mode.
+
+        Returns:
+            Splats in world units, and source (N,) int64: anchor * offsets + offset of each.
         """
         g = self.generate(eye=eye)
         g = g.cpu()
@@ -109,7 +126,7 @@ class ObjectModel:
             scales=(g.scales.double().numpy() / self.normalization.scale),
             opacities=g.opacities.numpy(),
             sh=g.sh.numpy(),
-            object_ids=self.object_ids[g.ids.numpy()],
+            object_ids=self.classes.ids_of(g.ids.numpy()),
         )
         source = g.source.numpy()
         return (splats, source) if usable.all() else (splats.select(usable), source[usable])
@@ -144,7 +161,7 @@ def _in_view(positions, rows, k, viewmat, intrinsics, width, height, near, seen)
         for p in range(4):
             side = px if p < 2 else py
             distance = (planes[p, 0] * side + planes[p, 1] * pz) / np.sqrt(planes[p, 0] ** 2 + planes[p, 1] ** 2)
-            # The blur, or a disc's spot, adds up to 2.4 pixels at the border.
+            # The anti-aliasing blur, or a disc's minimum footprint, adds up to 2.4 pixels at the border.
             margin = 2.4 * max(pz, near) / min(fx, fy)
             inside = inside and distance > -reach - margin
         seen[a] = inside
@@ -158,7 +175,7 @@ def _in_view_on_gpu(
     extent = rows[:, anchors.layout.extent_columns].clamp(max=LOG_EXTENT_MAX).exp()
     largest = rows[:, anchors.layout.offset_columns].abs().view(-1, k, 3).amax(1)
     reach = torch.linalg.vector_norm(largest * extent[:, :3], dim=1) + 3.4 * extent[:, 3:].amax(1)
-    turned = device.upload(np.ascontiguousarray(viewmat[:3], np.float32), rows)
+    turned = devices.upload(np.ascontiguousarray(viewmat[:3], np.float32), rows)
     x, y, z = (anchors.positions @ turned[:, :3].T + turned[:, 3]).unbind(1)
     fx, fy, cx, cy = (float(v) for v in intrinsics)
     room = -reach - 2.4 / min(fx, fy) * z.clamp(min=near)
@@ -171,11 +188,19 @@ def _in_view_on_gpu(
 def anchors_in_view(
     anchors: Anchors, viewmat: np.ndarray, intrinsics: np.ndarray, width: int, height: int, near: float
 ) -> torch.Tensor:
-    """Indices (n,) int64 of the anchors that may touch the picture; none that does is left out.
+    """Find the anchors that may touch the image, conservatively. Waits for the GPU to count them.
 
-    viewmat (4, 4) float64 scene to camera; intrinsics (fx, fy, cx, cy) in pixels. Waits for the GPU to count them.
+    Args:
+        anchors: of a model.
+        viewmat: (4, 4) float64, scene to camera.
+        intrinsics: fx, fy, cx, cy in pixels.
+        width, height: of the image in pixels.
+        near: near plane in scene units.
+
+    Returns:
+        (n,) int64 indices, ascending.
     """
-    if device.on_gpu(anchors.rows):
+    if devices.on_gpu(anchors.rows):
         return _in_view_on_gpu(anchors, viewmat, intrinsics, width, height, near).nonzero()[:, 0]
     seen = np.empty(len(anchors), np.bool_)
     _in_view(
@@ -188,10 +213,14 @@ def anchors_in_view(
 def first_anchors_in_view(
     anchors: Anchors, viewmat: np.ndarray, intrinsics: np.ndarray, width: int, height: int, near: float, limit: int
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The same without waiting for their number, where `limit` bounds it: index (n,) int64, n = min(limit, N), of those
-    in view and then of others; in_view (n,) bool which are; and how many are in view, () int64.
+    """`anchors_in_view` on a GPU, without waiting for it.
 
-    Where more than `limit` are in view, the last of them are left out.
+    Args:
+        limit: upper bound of the number of anchors in view; if there are more, the last of them are left out.
+
+    Returns:
+        index (n,) int64, n = min(limit, N): first the anchors in view, then others; in_view (n,) bool: which are in
+        view; () int64: the number of anchors in view.
     """
     inside = _in_view_on_gpu(anchors, viewmat, intrinsics, width, height, near)
     before = inside.cumsum(0)

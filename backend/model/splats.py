@@ -1,4 +1,4 @@
-"""Explicit Gaussians as plain arrays: what is exported, imported and shown."""
+"""Explicit Gaussians as plain arrays, for export, import and display."""
 
 from __future__ import annotations
 
@@ -14,11 +14,15 @@ from numpy.typing import NDArray
 class Splats:
     """N Gaussians in world coordinates.
 
-    means (N, 3) world units, float32 or float64; quats (N, 4) unit, w x y z, local to world; scales (N, 3) standard
-    deviations > 0, world units, not their logarithms; opacities (N,) in (0, 1), not their logits; sh (N, K, 3) with
-    K = (degree + 1)^2 coefficients of the real spherical harmonics for red, green, blue, where
-    colour = max(0, basis(direction) . sh + 0.5); object_ids (N,) int64 in 0 .. 2^32 - 1, 0 = belongs to no object;
-    invented (N,) bool: made up to close a hole, and seen in no photo (none where it is not given).
+    Attributes:
+        means: (N, 3) in world units, float32 or float64.
+        quats: (N, 4) unit quaternions w, x, y, z, local to world.
+        scales: (N, 3) standard deviations > 0 in world units, not their logarithms.
+        opacities: (N,) in (0, 1), not their logits.
+        sh: (N, K, 3), K = (degree + 1)^2 coefficients of the real spherical harmonics for red, green, blue;
+            color = max(0, basis(direction) . sh + 0.5).
+        object_ids: (N,) int64 in 0 .. 2^32 - 1; 0 belongs to no object.
+        unobserved: (N,) bool, generated to fill a hole and seen in no image; all False if not given.
     """
 
     means: NDArray
@@ -27,14 +31,15 @@ class Splats:
     opacities: NDArray
     sh: NDArray
     object_ids: NDArray
-    invented: NDArray = field(default_factory=lambda: np.zeros(0, bool))
+    unobserved: NDArray = field(default_factory=lambda: np.zeros(0, bool))
 
     def __post_init__(self) -> None:
         n = len(self.means)
-        if len(self.invented) == 0:
-            self.invented = np.zeros(n, bool)
+        if len(self.unobserved) == 0:
+            self.unobserved = np.zeros(n, bool)
         shapes = {
-            "means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "object_ids": (n,), "invented": (n,),
+            "means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "object_ids": (n,),
+            "unobserved": (n,),
         }  # fmt: skip
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
@@ -50,12 +55,12 @@ class Splats:
 
     @property
     def degree(self) -> int:
-        """Degree of the spherical harmonics: 0 is one colour from everywhere."""
+        """Degree of the spherical harmonics; 0: the color does not depend on the direction."""
         return math.isqrt(self.sh.shape[1]) - 1
 
     @classmethod
     def empty(cls, degree: int = 0) -> Splats:
-        """No splats, with room for spherical harmonics of `degree`."""
+        """Zero splats with spherical harmonics of `degree`."""
         return cls(
             means=np.zeros((0, 3), np.float32),
             quats=np.zeros((0, 4), np.float32),
@@ -66,7 +71,7 @@ class Splats:
         )
 
     def select(self, mask: NDArray) -> Splats:
-        """The splats that a boolean mask (N,) or an array of indices picks, in that order; a copy."""
+        """Copy the splats of a boolean mask (N,) or of an array of indices, in that order."""
         return Splats(
             self.means[mask],
             self.quats[mask],
@@ -74,20 +79,20 @@ class Splats:
             self.opacities[mask],
             self.sh[mask],
             self.object_ids[mask],
-            self.invented[mask],
+            self.unobserved[mask],
         )
 
     def with_degree(self, degree: int) -> Splats:
-        """The same splats with higher bands of spherical harmonics cut off, or filled with zeros."""
+        """The splats with higher bands of spherical harmonics removed, or filled with zeros."""
         k = (degree + 1) ** 2
         sh = np.zeros((len(self), k, 3), self.sh.dtype)
         keep = min(k, self.sh.shape[1])
         sh[:, :keep] = self.sh[:, :keep]
-        return Splats(self.means, self.quats, self.scales, self.opacities, sh, self.object_ids, self.invented)
+        return Splats(self.means, self.quats, self.scales, self.opacities, sh, self.object_ids, self.unobserved)
 
 
 def concatenate(parts: Sequence[Splats]) -> Splats:
-    """All of `parts` in order; lower degrees are filled up to the highest one among them."""
+    """Concatenate splats; lower degrees are filled with zeros up to the highest one among them."""
     if not parts:
         return Splats.empty()
     degree = max(part.degree for part in parts)
@@ -99,5 +104,5 @@ def concatenate(parts: Sequence[Splats]) -> Splats:
         np.concatenate([part.opacities for part in parts]),
         np.concatenate([part.sh for part in parts]),
         np.concatenate([part.object_ids for part in parts]),
-        np.concatenate([part.invented for part in parts]),
+        np.concatenate([part.unobserved for part in parts]),
     )

@@ -1,4 +1,4 @@
-"""One interface to every renderer: Gaussians, a camera and what is wanted -> what was wanted, differentiable."""
+"""The differentiable rasterizer of 3D Gaussians and discs: one interface to the CPU and the CUDA renderer."""
 
 from __future__ import annotations
 
@@ -10,22 +10,26 @@ import numpy as np
 import torch
 from numba import config
 
-from . import cpu
 from .camera import Camera
+from .cpu import renderer as cpu
 
 __all__ = ["Camera", "Rendered", "compile_kernels", "object_map", "object_ranks", "rasterize"]
 
 
 class Rendered(NamedTuple):
-    """color (3, H, W) premultiplied, without background; alpha (H, W); weight (H, W): probability of the pixel's label;
-    depth (H, W): expected depth times alpha; median (H, W): the depth at which half of the light is taken, 0 where less
-    is, without gradient; normals (3, H, W): mean normal in camera space, towards the camera, times alpha; distortion
-    (H, W): sum_{i<j} w_i w_j (1 / z_i - 1 / z_j)^2 over the weights w; frame: the renderer's own record, for
-    `object_map` and growth. What was not asked for is None."""
+    """A rendered image; planes that were not requested are None.
+
+    color (3, H, W): premultiplied, without background. alpha (H, W). label_probability (H, W): probability of the
+    pixel's label. depth (H, W): expected depth times alpha. median (H, W): the depth at which the transmittance falls
+    below one half, 0 where it does not; without gradient. normals (3, H, W): mean normal in camera space, towards the
+    camera, times alpha. distortion (H, W): sum_{i<j} w_i w_j (1 / z_i - 1 / z_j)^2 over the blending weights w. frame:
+    the renderer's own record, for `object_map` and for growth: its `seen` (N,) marks the visible splats, and its
+    `screen_gradient` (N, 2), after the backward pass, is the gradient with respect to their centers in pixels.
+    """
 
     color: torch.Tensor
     alpha: torch.Tensor
-    weight: torch.Tensor | None
+    label_probability: torch.Tensor | None
     depth: torch.Tensor | None
     median: torch.Tensor | None
     normals: torch.Tensor | None
@@ -34,33 +38,45 @@ class Rendered(NamedTuple):
 
 
 def _renderer(device: torch.device) -> Any:
-    """The module that draws what lies on `device`. In numba's simulator that is the CUDA renderer for everything."""
+    """The renderer module for tensors on `device`; in numba's simulator, the CUDA renderer for all."""
     if device.type == "cuda" or config.ENABLE_CUDASIM:
-        from . import cuda
+        from .cuda import renderer as cuda
 
         return cuda
     return cpu
 
 
 def _array(renderer: Any, tensor: torch.Tensor, kind: torch.dtype = torch.float32) -> Any:
-    """A tensor as the renderer takes it."""
+    """Convert a tensor to what the renderer takes: an array on the CPU, else a tensor."""
     tensor = tensor.detach().to(kind).contiguous()
     return tensor.numpy() if renderer is cpu else tensor
 
 
 def _tensor(array: Any) -> torch.Tensor | None:
-    """What the renderer made as a tensor."""
+    """Convert the renderer's array or tensor to a tensor."""
     return torch.from_numpy(array) if isinstance(array, np.ndarray) else array
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, means, quats, scales, opacities, sh, ids, camera, labels, wanted, holder):
+    def forward(
+        ctx: Any,
+        means: torch.Tensor,
+        quats: torch.Tensor,
+        scales: torch.Tensor,
+        opacities: torch.Tensor,
+        sh: torch.Tensor,
+        ids: torch.Tensor,
+        camera: Camera,
+        labels: torch.Tensor | None,
+        wanted: dict[str, bool],
+        holder: list[Any],
+    ) -> tuple[torch.Tensor | None, ...]:
         renderer = ctx.renderer = _renderer(means.device)
         ctx.means_type = means.dtype
         if means.dtype == torch.float64:
-            # Far from the origin (georeferenced captures) float32 would round positions: count from the camera.
-            means = means - torch.from_numpy(camera.centre).to(means.device, non_blocking=True)
+            # Far from the origin (georeferenced captures) float32 would round positions: subtract the camera's.
+            means = means - torch.from_numpy(camera.center).to(means.device, non_blocking=True)
             camera = camera.at_origin()
         gaussians = renderer.Gaussians(
             *(_array(renderer, tensor) for tensor in (means, quats, scales, opacities, sh)),
@@ -76,13 +92,13 @@ class _Rasterize(torch.autograd.Function):
             ctx.mark_non_differentiable(median)
         alpha = _tensor(1.0 - frame.transmittance)
         return (
-            _tensor(frame.color), alpha, _tensor(frame.weight), _tensor(frame.depth), _tensor(frame.normals),
-            _tensor(frame.moments), median,
+            _tensor(frame.color), alpha, _tensor(frame.label_probability), _tensor(frame.depth),
+            _tensor(frame.normals), _tensor(frame.moments), median,
         )  # fmt: skip
 
     @staticmethod
-    def backward(ctx: Any, *gradients):
-        # The last plane is the median, which has none.
+    def backward(ctx: Any, *gradients: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
+        # The last plane is the median, which has no gradient.
         renderer = ctx.renderer
         g_color, g_alpha, *others = (None if g is None else _array(renderer, g) for g in gradients[:6])
         assert g_color is not None and g_alpha is not None
@@ -108,20 +124,34 @@ def rasterize(
     want_distortion: bool = False,
     primitive: str = "3d",
 ) -> Rendered:
-    """Draw 3D Gaussians (Kerbl et al. 2023) or, with primitive "2d", discs (Huang et al. 2024), differentiable in the
-    first five arguments.
+    """Render 3D Gaussians (Kerbl et al. 2023) or discs (Huang et al. 2024), differentiable in the first five arguments.
 
-    means (N, 3), quats (N, 4) wxyz of any length, scales (N, 3) linear, opacities (N,) in (0, 1), sh (N, K, 3) with
-    K = 1, 4, 9 or 16 (colour = 0.5 + SH, clamped at 0): float32. Means in float64 are taken relative to the camera
-    before they are rounded, for scenes far from the origin. ids (N,) int32. labels (H, W) int32: also return the
-    probability that each pixel shows its label (the paper's P at the label); nothing is computed that is not asked for.
+    Only what is requested is computed. Tensors on a CUDA device are rendered by the CUDA renderer, and everything
+    returned is on that device, the frame's `seen` and `screen_gradient` included.
 
-    A disc lies in the plane of the first two axes of its rotation; its third scale has no effect. Its depth in a pixel
-    is that where the pixel's ray meets this plane, a 3D Gaussian's that of its centre. Normals and distortion are those
-    of discs.
+    Args:
+        means: centers (N, 3), float32. In float64 they are made relative to the camera before they are rounded, for
+            scenes far from the origin.
+        quats: rotations (N, 4) wxyz of any length, float32.
+        scales: standard deviations (N, 3), linear, float32. A disc spans the first two axes of its rotation; its third
+            scale has no effect.
+        opacities: (N,) in (0, 1), float32.
+        sh: spherical harmonics (N, K, 3) with K = 1, 4, 9 or 16, float32; color = 0.5 + SH, clamped at 0.
+        ids: (N,) int32, the object of each splat.
+        camera: the view.
+        labels: (H, W) int32; requests the probability that each pixel shows its label.
+        want_depth: requests the depth: in a pixel, a disc has that of the ray's intersection with its plane, a 3D
+            Gaussian that of its center.
+        want_median: requests the median depth.
+        want_normals: requests the normals, for discs only.
+        want_distortion: requests the distortion, for discs only.
+        primitive: "3d" for 3D Gaussians, "2d" for discs.
 
-    Tensors on a CUDA device are drawn by the CUDA renderer, and everything returned lies there; the frame's `seen` (N,)
-    and `screen_gradient` (N, 2) then are tensors too.
+    Returns:
+        The image and the requested planes.
+
+    Raises:
+        ValueError: if `primitive` is unknown, or normals or distortion are requested of 3D Gaussians.
     """
     if primitive not in ("2d", "3d"):
         raise ValueError(f"primitive is {primitive!r}, expected '2d' or '3d'")
@@ -132,26 +162,41 @@ def rasterize(
         "want_moments": want_distortion, "flat": primitive == "2d",
     }  # fmt: skip
     holder: list[Any] = []
-    color, alpha, weight, depth, normals, moments, median = _Rasterize.apply(
+    color, alpha, label_probability, depth, normals, moments, median = _Rasterize.apply(
         means, quats, scales, opacities, sh, ids, camera, labels, wanted, holder
     )
     distortion = None if moments is None else alpha * moments[1] - moments[0] ** 2
-    return Rendered(color, alpha, weight, depth, median, normals, distortion, holder[0])
+    return Rendered(color, alpha, label_probability, depth, median, normals, distortion, holder[0])
 
 
 def object_map(rendered: Rendered) -> tuple[Any, Any]:
-    """The most probable ID (H, W) int32 (-1 where nothing is drawn) and its probability (H, W) float32: NumPy arrays
-    from the CPU renderer, tensors on the device from the CUDA renderer."""
+    """Find the most probable object of every pixel.
+
+    Args:
+        rendered: what `rasterize` returned.
+
+    Returns:
+        The ID (H, W) int32, -1 where nothing is drawn, and its probability (H, W) float32: the sum of the blending
+        weights of its splats. NumPy arrays from the CPU renderer, tensors on the device from the CUDA renderer.
+    """
     ids, probabilities = object_ranks(rendered, 1)
     return ids[0], probabilities[0]
 
 
 def object_ranks(rendered: Rendered, ranks: int) -> tuple[Any, Any]:
-    """The most probable IDs (ranks, H, W) int32, from the most probable down (-1 where there are no more), and their
-    probabilities (ranks, H, W) float32, as `object_map`."""
+    """Rank the most probable objects of every pixel.
+
+    Args:
+        rendered: what `rasterize` returned.
+        ranks: number of objects per pixel.
+
+    Returns:
+        The IDs (ranks, H, W) int32 in descending order of probability, -1 where there are no more, and their
+        probabilities (ranks, H, W) float32; arrays or tensors, as in `object_map`.
+    """
     if isinstance(rendered.frame, cpu.Frame):
         return cpu.object_ranks(rendered.frame, ranks)
-    from . import cuda
+    from .cuda import renderer as cuda
 
     return cuda.object_ranks(rendered.frame, ranks)
 
@@ -160,39 +205,47 @@ _SURFACE = {"want_depth": True, "want_normals": True, "want_distortion": True}
 _KINDS: tuple[tuple[str, bool, dict[str, bool]], ...] = (
     ("3d", True, {}), ("3d", False, {}), ("2d", True, {}), ("2d", False, {}), ("2d", True, _SURFACE),
 )  # fmt: skip
-"""What training draws, and what shows how far it is: primitive, with labels and a gradient, and which more planes.
-On the CPU a kernel serves all of a primitive."""
+"""What training and its previews render: primitive, whether with labels and a gradient, and the further planes. On the
+CPU, one kernel serves all variants of a primitive."""
 
 
-def compile_kernels(place: torch.device | None = None, progress: Callable[[int, int], object] | None = None) -> float:
-    """Make every kernel that training draws with on a device (None: the CPU) ready, compiled or read from numba's cache
-    on disk; returns the seconds it took.
+def compile_kernels(device: torch.device | None = None, progress: Callable[[int, int], object] | None = None) -> float:
+    """Compile every kernel that training renders with, or load it from numba's cache on disk.
 
-    progress(done, total) is called before the first and after every kernel. What follows in this process compiles
-    nothing more, on the CPU whatever is asked for; a later process reads the cache (NUMBA_CACHE_DIR, or `__pycache__`
-    beside the kernels, or the user's own cache folder where that is not writable).
+    Afterwards nothing is compiled in this process, on the CPU whatever is requested. Later processes read the cache: in
+    NUMBA_CACHE_DIR, in `__pycache__` beside the kernels, or in the user's cache folder where that is not writable.
+
+    Args:
+        device: the device to compile for; None: the CPU.
+        progress: called as progress(done, total) before the first and after every kernel.
+
+    Returns:
+        The seconds it took.
     """
     started = time.perf_counter()
-    report = progress or (lambda done, total: None)
-    ones = torch.ones((1, 4), device=place)
-    ids = torch.zeros(1, dtype=torch.int32, device=place)
-    labels = torch.zeros((2, 2), dtype=torch.int32, device=place)
+    ones = torch.ones((1, 4), device=device)
+    ids = torch.zeros(1, dtype=torch.int32, device=device)
+    labels = torch.zeros((2, 2), dtype=torch.int32, device=device)
     camera = Camera(np.eye(4), np.eye(3), 2, 2)
-    done, total = 0, 2 * len(_KINDS)
-    report(done, total)
-    for primitive, labelled, wanted in _KINDS:
-        means = ones[:, :3].clone().requires_grad_(labelled)
+
+    def report(done: int) -> None:
+        if progress:
+            progress(done, 2 * len(_KINDS))
+
+    report(0)
+    for index, (primitive, labeled, wanted) in enumerate(_KINDS):
+        means = ones[:, :3].clone().requires_grad_(labeled)
         drawn = rasterize(
             means, ones, ones[:, :3], 0.5 * ones[:, 0], 0 * ones[:, None, :3], ids, camera,
-            labels=labels if labelled else None, primitive=primitive, **wanted,
+            labels=labels if labeled else None, primitive=primitive, **wanted,
         )  # fmt: skip
-        report(done := done + 1, total)
-        if labelled:
-            planes = (drawn.color, drawn.alpha, drawn.weight, drawn.depth, drawn.normals, drawn.distortion)
+        report(2 * index + 1)
+        if labeled:
+            planes = (drawn.color, drawn.alpha, drawn.label_probability, drawn.depth, drawn.normals, drawn.distortion)
             torch.stack([plane.sum() for plane in planes if plane is not None]).sum().backward()
         else:
             object_map(drawn)
-        report(done := done + 1, total)
+        report(2 * index + 2)
     if ones.is_cuda:
         torch.cuda.synchronize()
     return time.perf_counter() - started

@@ -1,4 +1,4 @@
-"""A pinhole camera as the renderers take it."""
+"""The pinhole camera that the renderers take."""
 
 from __future__ import annotations
 
@@ -11,10 +11,14 @@ from .settings import NEAR
 
 @dataclass(frozen=True)
 class Camera:
-    """viewmat (4, 4) float64 world to camera with OpenCV axes; K (3, 3) float64 in pixels, the first pixel's centre at
-    (0.5, 0.5); width and height in pixels; near: nearest drawn depth in scene units; gain: how much brighter, channel
-    by channel, the camera's photo is than the scene (a finished picture is multiplied by it); whole: where the picture
-    that this is a part of begins and ends (left, top, right, bottom), in pixels from this one's corner."""
+    """A pinhole camera.
+
+    viewmat (4, 4) float64: world to camera, OpenCV axes (x right, y down, z forward). K (3, 3) float64: intrinsics in
+    pixels; the center of the first pixel is (0.5, 0.5). width, height: in pixels. near: depth of the near plane in
+    scene units. gain: per-channel brightness of the camera's photo relative to the scene; a rendered image is
+    multiplied by it. whole: bounds (left, top, right, bottom) of the image that this one is a crop of, in pixels from
+    this one's upper left corner; None: not a crop.
+    """
 
     viewmat: np.ndarray
     K: np.ndarray
@@ -25,7 +29,11 @@ class Camera:
     whole: tuple[float, float, float, float] | None = None
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        """viewmat (4, 4) and (fx, fy, cx, cy), contiguous float64."""
+        """The view and the intrinsics as arrays.
+
+        Returns:
+            viewmat (4, 4) and (fx, fy, cx, cy), contiguous float64.
+        """
         K = self.K
         return (
             np.ascontiguousarray(self.viewmat, np.float64),
@@ -33,18 +41,27 @@ class Camera:
         )
 
     @property
-    def centre(self) -> np.ndarray:
-        """(3,) float64: where the camera stands in the world."""
+    def center(self) -> np.ndarray:
+        """Position of the camera in the world, (3,) float64."""
         return -np.asarray(self.viewmat[:3, :3].T @ self.viewmat[:3, 3], np.float64)
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
-        """Left, top, right and bottom of the whole picture."""
+        """Left, top, right and bottom of the uncropped image in pixels, from this one's upper left corner."""
         return self.whole or (0.0, 0.0, float(self.width), float(self.height))
 
     def crop(self, x: int, y: int, width: int, height: int) -> Camera:
-        """The camera of a part of the picture, whose upper left is the pixel (x, y). What it draws is that part of what
-        this one draws: how far beside the picture the perspective is followed goes by the whole."""
+        """The camera of a part of the image; it draws exactly that part.
+
+        The projection is clamped beyond the bounds of the whole image, not of the part (see `bounds`).
+
+        Args:
+            x, y: the part's upper left pixel.
+            width, height: the part's size in pixels.
+
+        Returns:
+            The camera of the part.
+        """
         K = np.array(self.K, np.float64)
         K[0, 2] -= x
         K[1, 2] -= y
@@ -53,7 +70,7 @@ class Camera:
         return replace(self, K=K, width=width, height=height, whole=whole)
 
     def at_origin(self) -> Camera:
-        """The same camera moved to the world's origin."""
+        """The same camera, moved to the origin of the world."""
         viewmat = self.viewmat.copy()
         viewmat[:3, 3] = 0.0
         return replace(self, viewmat=viewmat)

@@ -1,16 +1,16 @@
-"""2D Gaussians (discs, Huang et al. 2024) on the screen: where a pixel's ray meets the disc's plane.
+"""Projecting discs (2D Gaussians, Huang et al. 2024): where a pixel's ray meets the disc's plane.
 
-With the centre at (u, v), depth z, and standard deviations along two tangents as the axes of its footprint under the
-perspective's derivative there (b / c, a - b^2 / c and c as for 3D Gaussians, but without blur and without clamp),
+With the center at (u, v), depth z, and the covariance [[a, b], [b, c]] of the footprint under the projection's
+derivative there (as for 3D Gaussians, but without low-pass filter and clamping),
 
     log2 alpha(x, y) = lop - (A d^2 + C dy^2) / Q^2,   d = x - u - s dy,   dy = y - v,
     Q(x, y) = 1 + qx (x - u) + qy (y - v) = z / (depth at the intersection),
 
-exactly: the disc's own coordinates of the intersection are affine in the pixel once multiplied by Q. So a disc is the
-screen splat of splats.py and, in a row of `tilts`, the two numbers that make Q. Rays that are parallel to the
-plane have Q = 0, those that meet it behind the camera Q < 0.
+exactly: multiplied by Q, the intersection's coordinates in the disc are affine in the pixel. A disc is therefore a
+screen splat (splats.py) plus the numbers that determine Q, in a row of `tilts`. Rays parallel to the plane have Q = 0;
+rays that meet it behind the camera have Q < 0.
 
-The exponent is never smaller than that of a spot around (u, v) on the picture, whose depth is the centre's.
+The exponent is never smaller than that of a spot around (u, v) in the image, whose depth is the center's.
 """
 
 from __future__ import annotations
@@ -20,22 +20,25 @@ import math
 import numpy as np
 
 from .kernel import kernel
-from .settings import DISC_BLUR, MIN_DISC_WIDTH
+from .settings import EPS_2D_DISC, MIN_DISC_WIDTH
 
-# Columns of a disc's row in `tilts`: Q at the point of the ridge d = 0 that the splat's column U stands for, Q's change
-# with x, and along the ridge with y; the smallest 1 / Q that is drawn; u; the middle of the rows it may reach (they
-# end HALF_H from there); the normal in camera space, towards the camera.
+# Columns of a disc's row in `tilts`: Q at the point of the ridge d = 0 that the splat's column U refers to; Q's slope
+# in x, and along the ridge in y; the smallest 1 / Q that is drawn; u; the middle of the rows it may cover (which extend
+# HALF_H from there); the normal in camera space, towards the camera.
 Q0, QX, QY, NEAREST, SPOT_U, MIDDLE, NORMAL_X, NORMAL_Y, NORMAL_Z = range(9)
 TILT_COLUMNS = 12
 
-SPOT = 0.5 / math.log(2.0) / DISC_BLUR
-"""The spot's log2 alpha falls by this a square pixel."""
+SPOT = 0.5 / math.log(2.0) / EPS_2D_DISC
+"""Decrease of the spot's log2 alpha per square pixel."""
 
 
 @kernel()
 def disc_footprint(T, R, scales, n, V0, V1):
-    """V = T (R's first two columns, times scales[n]) as its rows; returns a, b, c of V V^T, a - b^2 / c, V's
-    determinant, and whether the disc is seen broadly enough for its plane to be drawn."""
+    """V = T (first two columns of R, times scales[n]) as its rows.
+
+    Returns a, b, c of V V^T, a - b^2 / c, V's determinant, and whether the disc is broad enough in the image for its
+    plane to be drawn.
+    """
     for j in range(2):
         scale = np.float64(scales[n, j])
         V0[j] = (T[0, 0] * R[0, j] + T[0, 1] * R[1, j] + T[0, 2] * R[2, j]) * scale
@@ -50,8 +53,11 @@ def disc_footprint(T, R, scales, n, V0, V1):
 
 @kernel()
 def disc_plane(px, py, pz, fx, fy, W, R):
-    """Normal towards the camera (3 numbers), 1 or -1: the side of R's third column that it is, its product with the
-    centre (< 0, the distance from the plane), and qx, qy."""
+    """The disc's plane.
+
+    Returns the normal towards the camera (3 numbers); 1 or -1, its sign relative to the third column of R; its product
+    with the center (< 0), minus the camera's distance from the plane; and qx, qy.
+    """
     nx = W[0, 0] * R[0, 2] + W[0, 1] * R[1, 2] + W[0, 2] * R[2, 2]
     ny = W[1, 0] * R[0, 2] + W[1, 1] * R[1, 2] + W[1, 2] * R[2, 2]
     nz = W[2, 0] * R[0, 2] + W[2, 1] * R[1, 2] + W[2, 2] * R[2, 2]
@@ -64,12 +70,13 @@ def disc_plane(px, py, pz, fx, fy, W, R):
 
 @kernel()
 def disc_outline(a, b, c, area, broad, qx, qy, reach2, farthest):
-    """The ellipse around everything of a disc that is drawn: its centre from (u, v), a, b, c, and a - b^2 / c.
+    """The ellipse around all that is drawn of a disc.
 
-    reach2: at how many squared standard deviations the disc ends. farthest: Q is drawn up to there. The last result is
-    false where the disc reaches behind the camera, and may be anywhere in the picture.
+    reach2: squared standard deviations up to which the disc is drawn; farthest: value of Q up to which it is drawn.
+    Returns the ellipse's center relative to (u, v), a, b, c, a - b^2 / c, and whether it is bounded: a disc that
+    reaches behind the camera may cover any part of the image.
     """
-    spot2 = reach2 * DISC_BLUR
+    spot2 = reach2 * EPS_2D_DISC
     if not broad:
         return 0.0, 0.0, spot2, 0.0, spot2, spot2, True
     along_x = a * qx + b * qy
@@ -82,10 +89,10 @@ def disc_outline(a, b, c, area, broad, qx, qy, reach2, farthest):
     out_b = reach2 * b / rest + du * dv
     out_c = reach2 * c / rest + dv * dv
     out_area2 = (reach2 * area) ** 2 / (rest * rest * rest)
-    # The spot adds nothing to a disc that is broader than it all around the centre.
+    # The spot adds nothing to a disc that is broader than it in every direction.
     narrow2 = area * area / (0.5 * (a + c) + math.sqrt(0.25 * (a - c) * (a - c) + b * b))
     slack = math.sqrt(spot2 * (qx * qx + qy * qy))
-    if not (1.0 + slack < farthest and slack < 1.0 and narrow2 * (1.0 - slack) * (1.0 - slack) > DISC_BLUR):
+    if not (1.0 + slack < farthest and slack < 1.0 and narrow2 * (1.0 - slack) * (1.0 - slack) > EPS_2D_DISC):
         more = (math.sqrt(spot2) + math.sqrt(du * du + dv * dv)) ** 2
         out_area2 += more * (out_a + out_c) + more * more
         out_a += more

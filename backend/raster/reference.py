@@ -1,6 +1,6 @@
-"""The readable renderer: plain torch in any float type, differentiable by autograd, the oracle for all others.
+"""The reference renderer: plain torch in any float type, differentiable by autograd; the oracle of the tests.
 
-Every splat is blended into every pixel in one depth order, without tiles; slow, and meant for tests.
+Every splat is blended into every pixel in one depth order, without tiles, which is slow.
 """
 
 from __future__ import annotations
@@ -14,19 +14,22 @@ from .camera import Camera
 from .settings import (
     ALPHA_MAX,
     ALPHA_MIN,
-    BLUR,
-    DISC_BLUR,
+    EPS_2D,
+    EPS_2D_DISC,
     MAX_EXTENT,
     MIN_DISC_WIDTH,
     MIN_QUAT_NORM2,
-    STOP,
     TAN_MARGIN,
+    TRANSMITTANCE_THRESHOLD,
 )
 
 
-class ReferencePicture(NamedTuple):
-    """color (3, H, W), alpha, depth, median and distortion (H, W), normals (3, H, W; 0 for 3D Gaussians) as in
-    `Rendered`; probabilities (H, W, n), one channel an ID."""
+class ReferenceRender(NamedTuple):
+    """What the reference renderer returns.
+
+    color (3, H, W), alpha, depth, median and distortion (H, W), normals (3, H, W; 0 for 3D Gaussians) as in `Rendered`;
+    probabilities (H, W, n): one channel per ID.
+    """
 
     color: torch.Tensor
     alpha: torch.Tensor
@@ -38,7 +41,7 @@ class ReferencePicture(NamedTuple):
 
 
 def rotation_matrices(quats: torch.Tensor) -> torch.Tensor:
-    """(N, 4) wxyz, unit -> (N, 3, 3)."""
+    """Rotation matrices (N, 3, 3) of unit quaternions (N, 4) wxyz."""
     w, x, y, z = quats.unbind(-1)
     return torch.stack(
         [
@@ -51,7 +54,7 @@ def rotation_matrices(quats: torch.Tensor) -> torch.Tensor:
 
 
 def sh_colors(sh: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-    """(N, K, 3) coefficients and (N, 3) unit directions -> (N, 3): 0.5 + sum of real SH, clamped at 0."""
+    """Colors (N, 3) of SH coefficients (N, K, 3) in unit directions (N, 3): 0.5 + sum of real SH, clamped at 0."""
     x, y, z = directions.unbind(-1)
     one = torch.ones_like(x)
     basis = [one / (2 * math.sqrt(math.pi))]
@@ -70,11 +73,13 @@ def sh_colors(sh: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
     return torch.clamp(0.5 + (torch.stack(basis, -1)[:, :, None] * sh).sum(1), min=0)
 
 
-def _footprints(p, axes, camera, blur, tan_margin):
-    """Projected covariances by the perspective's Jacobian: a, b, c (N,) of [[a, b], [b, c]] and a - b^2 / c.
+def _footprints(
+    p: torch.Tensor, axes: torch.Tensor, camera: Camera, blur: float, tan_margin: float
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Project covariances by the perspective's Jacobian: a, b, c (N,) of [[a, b], [b, c]] and a - b^2 / c.
 
-    p (N, 3) centres and axes (N, 3, 2 or 3) standard deviations in camera space; the Jacobian follows the direction of
-    view only so far beyond the picture.
+    p (N, 3): centers in camera space; axes (N, 3, 2 or 3): standard deviations; blur: variance of the low-pass filter;
+    tan_margin: margin beyond the image, as a fraction of its half size, up to which the Jacobian follows the direction.
     """
     fx, fy, cx, cy = (float(v) for v in camera.arrays()[1])
     x, y, z = p.unbind(-1)
@@ -95,9 +100,13 @@ def _footprints(p, axes, camera, blur, tan_margin):
     return a, b, c, (area2 + blur * (a + c - blur)) / c
 
 
-def _disc_power(rays, p, R, scales, spot, near):
-    """Half the squared distance in standard deviations of each ray (H, W, 3) from a disc's centre, by where the ray
-    meets the disc's plane or, where it is less, that on the picture (`spot`); and the depth there."""
+def _disc_power(
+    rays: torch.Tensor, p: torch.Tensor, R: torch.Tensor, scales: torch.Tensor, spot: torch.Tensor, near: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Half the squared distance of each ray (H, W, 3) from a disc's center, in standard deviations, and its depth.
+
+    The distance is measured where the ray meets the disc's plane or, where that is smaller, in the image (`spot`).
+    """
     t1, t2, normal = R.unbind(-1)
     inverse = (rays @ normal) / (p @ normal)
     ahead = (inverse > 0) & (1 / torch.where(inverse > 0, inverse, 1) >= near)
@@ -118,9 +127,17 @@ def rasterize_reference(
     camera: Camera,
     objects: int = 1,
     primitive: str = "3d",
-) -> ReferencePicture:
-    """Draw 3D Gaussians or, with primitive "2d", discs; shapes as in `backend.raster.rasterize`, ids in
-    0 .. objects - 1."""
+) -> ReferenceRender:
+    """Render 3D Gaussians or, with primitive "2d", discs.
+
+    Args:
+        means, quats, scales, opacities, sh, camera, primitive: as in `backend.raster.rasterize`.
+        ids: (N,) in 0 .. objects - 1.
+        objects: number of IDs.
+
+    Returns:
+        The image, in the float type of means.
+    """
     dtype = means.dtype
     flat = primitive == "2d"
     height, width = camera.height, camera.width
@@ -130,7 +147,7 @@ def rasterize_reference(
     eye = -(W.T @ t)
     if flat:
         scales = scales[:, :2]
-    # Splats that the guards drop are left out before any division, so that no NaN gradient passes a mask.
+    # Splats below the thresholds are removed before any division, so that no NaN gradient passes a mask.
     z = (means @ W.T + t)[:, 2]
     kept = (
         (z > camera.near) & (opacities > ALPHA_MIN) & torch.isfinite(opacities) & ((quats**2).sum(-1) > MIN_QUAT_NORM2)
@@ -148,7 +165,7 @@ def rasterize_reference(
         a, b, c, conditional = _footprints(p, axes, camera, 0.0, math.inf)
         broad = c * conditional > MIN_DISC_WIDTH**2 * (a + c)
     else:
-        a, b, c, conditional = _footprints(p, axes, camera, BLUR, TAN_MARGIN)
+        a, b, c, conditional = _footprints(p, axes, camera, EPS_2D, TAN_MARGIN)
     extent2 = 2 * torch.log(opacities / ALPHA_MIN) * torch.maximum(a, c)
     directions = means - eye
     colors = sh_colors(sh, directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True))
@@ -168,14 +185,14 @@ def rasterize_reference(
         dy = (lines - v[n])[:, None]
         depths = z[n].expand(height, width)
         if flat:
-            power = ((columns[None, :] - u[n]) ** 2 + dy**2) / (2 * DISC_BLUR)
+            power = ((columns[None, :] - u[n]) ** 2 + dy**2) / (2 * EPS_2D_DISC)
             if broad[n]:
                 power, depths = _disc_power(rays, p[n], R[n], scales[n], power, camera.near)
         else:
             d = columns[None, :] - u[n] - b[n] / c[n] * dy
             power = 0.5 * (d * d / conditional[n] + dy * dy / c[n])
         raw = opacities[n] * torch.exp(-power)
-        drawn = (raw >= ALPHA_MIN) & (T >= STOP)
+        drawn = (raw >= ALPHA_MIN) & (T >= TRANSMITTANCE_THRESHOLD)
         alpha = torch.where(drawn, torch.clamp(raw, max=ALPHA_MAX), torch.zeros_like(raw))
         w = alpha * T
         color = color + w * colors[n][:, None, None]
@@ -192,4 +209,4 @@ def rasterize_reference(
         T = after
     # sum_{i<j} w_i w_j (1 / z_i - 1 / z_j)^2
     distortion = (1 - T) * inverse2 - inverse**2
-    return ReferencePicture(color, 1 - T, depth, median, normals, distortion, probabilities)
+    return ReferenceRender(color, 1 - T, depth, median, normals, distortion, probabilities)

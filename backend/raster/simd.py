@@ -1,11 +1,11 @@
 """Sixteen float32 lanes as one value inside numba kernels.
 
-numba's own vectoriser keeps a tile's planes in memory and cannot vectorise a loop whose trip count is a splat's
-pixel span. These types lower to LLVM vectors instead, which every target LLVM knows (AVX, AVX-512, NEON, plain
-scalars) accepts, so a kernel says exactly what is in a register and no compiler is needed on the user's machine.
+numba's own vectorizer keeps a tile's planes in memory and cannot vectorize a loop whose trip count is a splat's pixel
+span. These types are LLVM vectors instead, which LLVM compiles for every target (AVX, AVX-512, NEON, scalar code), so a
+kernel states what is held in registers, and no compiler is needed on the user's machine.
 
-Lanes: `Floats` (float), `Ints` (int), `Mask` (bool). Arithmetic operators work between equal lane types;
-a scalar is widened with `splat` (float32) or `splat_i` (int32).
+Lanes: `Floats` (float), `Ints` (int), `Mask` (bool). Arithmetic operators take equal lane types; `splat` (float32) and
+`splat_i` (int32) broadcast a scalar.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def _address(context, builder, array_type, array, index, vector):
 
 @intrinsic
 def load(typingctx, array, index):
-    """LANES neighbours of a contiguous float32 array, from `index` on; no bounds check."""
+    """LANES neighbors of a contiguous float32 array, from `index` on; no bounds check."""
 
     def codegen(context, builder, signature, args):
         pointer = _address(context, builder, signature.args[0], args[0], args[1], _FLOATS)
@@ -126,7 +126,7 @@ def spread(typingctx, array, index):
 
 @intrinsic
 def load_i(typingctx, array, index):
-    """LANES neighbours of a contiguous int32 array, from `index` on; no bounds check."""
+    """LANES neighbors of a contiguous int32 array, from `index` on; no bounds check."""
 
     def codegen(context, builder, signature, args):
         pointer = _address(context, builder, signature.args[0], args[0], args[1], _INTS)
@@ -137,7 +137,7 @@ def load_i(typingctx, array, index):
 
 @intrinsic
 def store(typingctx, array, index, value):
-    """Write LANES neighbours of a contiguous float32 or int32 array, from `index` on; no bounds check."""
+    """Write LANES neighbors of a contiguous float32 or int32 array, from `index` on; no bounds check."""
 
     def codegen(context, builder, signature, args):
         pointer = _address(context, builder, signature.args[0], args[0], args[1], signature.args[2].vector)

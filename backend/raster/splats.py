@@ -1,15 +1,15 @@
-"""A 3D Gaussian to its screen splat and back (EWA splatting, Zwicker et al. 2001), on the CPU and on a GPU.
+"""Projecting a 3D Gaussian or disc to its screen splat, and the gradient; for the CPU and the GPU.
 
-A screen splat is stored so that a pixel row needs no cancelling terms: with the projected covariance
-[[a, b], [b, c]] (blur included) and dy = y - v,
+3D Gaussians follow EWA splatting (Zwicker et al. 2001). A screen splat is stored such that no terms cancel within a
+pixel row: with the projected covariance [[a, b], [b, c]] (low-pass filter included) and dy = y - v,
 
     log2 alpha(x, y) = lop - A (x - u - s dy)^2 - C dy^2,
     s = b / c,  A = k / (a - b^2 / c),  C = k / c,  k = log2(e) / 2,
 
 which equals the usual quadratic form but stays exact for long diagonal needles. The ridge x = u + s dy is stored by
-its column U in the picture's row nearest to v, so that a needle whose centre is far away keeps its place. Inputs and
-outputs are float32, the arithmetic between them float64 (and said so: in a kernel, float() of a float32 is a float32):
-this stage is a small share of the time and where determinants underflow.
+its column U in the image row nearest to v, so that a needle whose center is far away keeps its position. Inputs and
+outputs are float32. The arithmetic between them is float64, because this stage takes a small fraction of the time and
+determinants underflow here; conversions are explicit, as float() of a float32 is a float32 in a kernel.
 """
 
 from __future__ import annotations
@@ -35,15 +35,16 @@ from .discs import (
     disc_plane,
 )
 from .kernel import kernel
-from .settings import ALPHA_MIN, BLUR, MAX_EXTENT, MIN_QUAT_NORM2, TAN_MARGIN
+from .settings import ALPHA_MIN, EPS_2D, MAX_EXTENT, MIN_QUAT_NORM2, TAN_MARGIN
+from .spherical_harmonics import sh_basis, sh_gradient
 
 # Columns of a screen splat.
 U, V, SLOPE, A, C, LOP, RED, GREEN, BLUE, DEPTH, HALF_W, HALF_H = range(12)
 SPLAT_COLUMNS = 12
-# Columns of a gradient row: moments of dL/d(log2 alpha) over the splat's pixels, then colour and depth.
+# Columns of a gradient row: moments of dL/d(log2 alpha) over the splat's pixels, then color and depth.
 M0, MY, MYY, MX, MXY, MXX, G_RED, G_GREEN, G_BLUE, G_DEPTH = range(10)
-# Discs: the moments but the first are of the pixels in the plane, over Q^2; moments of dL/dQ there, and of
-# dL/d(log2 alpha) in the spot; and, where normals are asked for, their gradient.
+# Discs: all moments but the first are of the pixels in the plane, over Q^2; then moments of dL/dQ there, moments of
+# dL/d(log2 alpha) in the spot and, where requested, the normal's gradient.
 MQ, MQX, MQY, MSX, MSY = range(10, 15)
 G_NORMAL = 16
 GRADIENT_COLUMNS = 16  # the rest pads a row to one cache line, written as one vector
@@ -53,86 +54,6 @@ _MAX_COLOR = 3e38  # what float32 holds
 _HALF_LOG2E = 0.5 / math.log(2.0)
 _LN2 = math.log(2.0)
 _LOG2_CUT = math.log2(ALPHA_MIN)
-
-_C0 = 0.28209479177387814
-_C1 = 0.4886025119029199
-_C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
-_C3 = (
-    -0.5900435899266435,
-    2.890611442640554,
-    -0.4570457994644658,
-    0.3731763325901154,
-    -0.4570457994644658,
-    1.445305721320277,
-    -0.5900435899266435,
-)
-
-
-@kernel()
-def sh_basis(x, y, z, count, out):
-    """Real spherical harmonics of degree 0-3 at the unit direction (x, y, z); `count` = 1, 4, 9 or 16."""
-    out[0] = _C0
-    if count > 1:
-        out[1] = -_C1 * y
-        out[2] = _C1 * z
-        out[3] = -_C1 * x
-    if count > 4:
-        xx, yy, zz = x * x, y * y, z * z
-        out[4] = _C2[0] * x * y
-        out[5] = _C2[1] * y * z
-        out[6] = _C2[2] * (2.0 * zz - xx - yy)
-        out[7] = _C2[3] * x * z
-        out[8] = _C2[4] * (xx - yy)
-        if count > 9:
-            out[9] = _C3[0] * y * (3.0 * xx - yy)
-            out[10] = _C3[1] * x * y * z
-            out[11] = _C3[2] * y * (4.0 * zz - xx - yy)
-            out[12] = _C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy)
-            out[13] = _C3[4] * x * (4.0 * zz - xx - yy)
-            out[14] = _C3[5] * z * (xx - yy)
-            out[15] = _C3[6] * x * (xx - 3.0 * yy)
-
-
-@kernel()
-def sh_gradient(x, y, z, count, g):
-    """Gradient of sum_k g[k] Y_k(x, y, z) with respect to the direction, before its normalisation."""
-    gx = gy = gz = 0.0
-    if count > 1:
-        gy -= _C1 * g[1]
-        gz += _C1 * g[2]
-        gx -= _C1 * g[3]
-    if count > 4:
-        gx += _C2[0] * y * g[4] + _C2[2] * -2.0 * x * g[6] + _C2[3] * z * g[7] + _C2[4] * 2.0 * x * g[8]
-        gy += _C2[0] * x * g[4] + _C2[1] * z * g[5] + _C2[2] * -2.0 * y * g[6] - _C2[4] * 2.0 * y * g[8]
-        gz += _C2[1] * y * g[5] + _C2[2] * 4.0 * z * g[6] + _C2[3] * x * g[7]
-    if count > 9:
-        xx, yy, zz = x * x, y * y, z * z
-        gx += (
-            _C3[0] * 6.0 * x * y * g[9]
-            + _C3[1] * y * z * g[10]
-            + _C3[2] * -2.0 * x * y * g[11]
-            + _C3[3] * -6.0 * x * z * g[12]
-            + _C3[4] * (4.0 * zz - 3.0 * xx - yy) * g[13]
-            + _C3[5] * 2.0 * x * z * g[14]
-            + _C3[6] * (3.0 * xx - 3.0 * yy) * g[15]
-        )
-        gy += (
-            _C3[0] * (3.0 * xx - 3.0 * yy) * g[9]
-            + _C3[1] * x * z * g[10]
-            + _C3[2] * (4.0 * zz - xx - 3.0 * yy) * g[11]
-            + _C3[3] * -6.0 * y * z * g[12]
-            + _C3[4] * -2.0 * x * y * g[13]
-            + _C3[5] * -2.0 * y * z * g[14]
-            + _C3[6] * -6.0 * x * y * g[15]
-        )
-        gz += (
-            _C3[1] * x * y * g[10]
-            + _C3[2] * 8.0 * y * z * g[11]
-            + _C3[3] * (6.0 * zz - 3.0 * xx - 3.0 * yy) * g[12]
-            + _C3[4] * 8.0 * x * z * g[13]
-            + _C3[5] * (xx - yy) * g[14]
-        )
-    return gx, gy, gz
 
 
 @kernel()
@@ -150,7 +71,7 @@ def _rotation(qw, qx, qy, qz, R):
 
 @kernel()
 def _jacobian(px, py, pz, fx, fy, tan_limits, T, W):
-    """T = J W, with the ray's tangents clamped so that far off-screen splats keep a bounded footprint."""
+    """T = J W, with the ray's tangents clamped so that the footprints of distant off-screen splats stay bounded."""
     tx = min(max(px / pz, tan_limits[0]), tan_limits[1])
     ty = min(max(py / pz, tan_limits[2]), tan_limits[3])
     for i in range(3):
@@ -176,13 +97,13 @@ def _footprint(T, R, scales, n, V0, V1):
     x = V0[1] * V1[2] - V0[2] * V1[1]
     y = V0[2] * V1[0] - V0[0] * V1[2]
     z = V0[0] * V1[1] - V0[1] * V1[0]
-    conditional = (x * x + y * y + z * z + BLUR * (a + c + BLUR)) / (c + BLUR)
-    return a + BLUR, b, c + BLUR, conditional
+    conditional = (x * x + y * y + z * z + EPS_2D * (a + c + EPS_2D)) / (c + EPS_2D)
+    return a + EPS_2D, b, c + EPS_2D, conditional
 
 
 @kernel()
 def tangent_limits(fx, fy, cx, cy, left, top, right, bottom):
-    """Clamp limits of x/z and y/z: the field of view of the whole picture with a margin on every side."""
+    """Limits of x/z and y/z: the field of view of the whole image with a margin on every side."""
     limits = np.empty(4)
     across, down = TAN_MARGIN * 0.5 * (right - left), TAN_MARGIN * 0.5 * (bottom - top)
     limits[0] = (left - across - cx) / fx
@@ -193,23 +114,31 @@ def tangent_limits(fx, fy, cx, cy, left, top, right, bottom):
 
 
 def view_of(camera: Camera, flat: bool) -> np.ndarray:
-    """What the projection needs of a camera, (6, 4) float64: three rows of the matrix from world to camera; fx, fy, cx,
-    cy; the limits of x/z and y/z (none for discs, if `flat`); where the camera stands, and its near plane."""
+    """The camera as the projection kernels take it.
+
+    Args:
+        camera: the camera.
+        flat: for discs, whose projection is not clamped.
+
+    Returns:
+        (6, 4) float64: three rows of the world-to-camera matrix; fx, fy, cx, cy; the limits of x/z and y/z; the
+        camera's position and near plane.
+    """
     viewmat, intrinsics = camera.arrays()
     fx, fy, cx, cy = (float(v) for v in intrinsics)
     limits = tangent_limits(fx, fy, cx, cy, *camera.bounds)
     if flat:
         limits = np.array([-np.inf, np.inf, -np.inf, np.inf])
-    return np.concatenate([viewmat[:3], [intrinsics, limits, [*camera.centre, camera.near]]])
+    return np.concatenate([viewmat[:3], [intrinsics, limits, [*camera.center, camera.near]]])
 
 
 @kernel(inline=True)
 def project_splat(
     n, means, quats, scales, opacities, sh, view, width, height, splats, tilts, outlines, R, T, V0, V1, basis
 ):  # fmt: skip
-    """Write row n of `splats`; HALF_H < 0 marks a splat that cannot be seen. Arrays as in `project`.
+    """Write row n of `splats`; HALF_H < 0 marks a splat that is not visible. Arrays as in `project`.
 
-    Room for R (3, 3), T (2, 3), V0 and V1 (3,), basis (16,): float64.
+    Scratch space: R (3, 3), T (2, 3), V0 and V1 (3,), basis (16,), float64.
     """
     fx, fy, cx, cy = view[3, 0], view[3, 1], view[3, 2], view[3, 3]
     near = view[5, 3]
@@ -272,7 +201,7 @@ def project_splat(
         if not broad:
             a, b, c, conditional = 1.0, 0.0, _HALF_LOG2E / SPOT, _HALF_LOG2E / SPOT
             tilt_x = tilt_y = 0.0
-        # Along the ridge, from (u, v) to the picture's row nearest to it.
+        # Along the ridge, from (u, v) to the image row nearest to it.
         along = tilt_x * b / c + tilt_y
         tilts[n, Q0] = 1.0 + along * (min(max(v, 0.0), height) - v)
         tilts[n, QX] = tilt_x
@@ -283,7 +212,7 @@ def project_splat(
         tilts[n, NORMAL_X] = nx
         tilts[n, NORMAL_Y] = ny
         tilts[n, NORMAL_Z] = nz
-    # Written so that a NaN or an infinity fails every test.
+    # Written such that a NaN or an infinity fails every test.
     if not (
         middle_u + half_w > 0.0 and middle_u - half_w < width and middle_v + half_h > 0.0 and middle_v - half_h < height
     ):
@@ -333,8 +262,11 @@ def project_splat_backward(
     n, g, with_normals, means, quats, scales, opacities, sh, view, splats, tilts,
     g_means, g_quats, g_scales, g_opacities, g_sh, g_screen, R, T, V0, V1, basis, gR, gT, weights, g_color,
 ):  # fmt: skip
-    """From g, the sum of splat n's gradient rows in float64, to the gradients of its parameters (see
-    `project_backward`). Room as in `project_splat`, and gR (3, 3), gT (2, 3), weights (16,), g_color (3,)."""
+    """Propagate g, the sum of splat n's gradient rows in float64, to the gradients of its parameters.
+
+    Arguments as in `project_backward`; scratch space as in `project_splat`, and gR (3, 3), gT (2, 3), weights (16,),
+    g_color (3,).
+    """
     fx, fy = view[3, 0], view[3, 1]
     axes = 3
     if tilts is not None:
@@ -385,8 +317,8 @@ def project_splat_backward(
     g_screen[n, 1] = g_v
     g_opacities[n] = g[M0] / (_LN2 * np.float64(opacities[n]))
 
-    # Covariance to V = T R diag(scale), then to its three factors. What the conditional variance sends back is
-    # along V0 - slope V1; taken apart into a, b and c it would cancel for needles.
+    # Covariance to V = T R diag(scale), then to its three factors. The conditional variance's gradient is along
+    # V0 - slope V1; split into a, b and c it would cancel for needles.
     for i in range(2):
         for j in range(3):
             gT[i, j] = 0.0
@@ -436,7 +368,7 @@ def project_splat_backward(
     g_quats[n, 2] = (gy - along * qy) * inverse
     g_quats[n, 3] = (gz - along * qz) * inverse
 
-    # Camera-space position: through the centre, the depth and the Jacobian.
+    # Camera-space position: through the center, the depth and the Jacobian.
     to_x = g_u * fx / pz
     to_y = g_v * fy / pz
     g_px += to_x
@@ -455,7 +387,7 @@ def project_splat_backward(
         g_py += g_ty / pz
         g_pz -= g_ty * ty / pz
 
-    # Colour: through the SH coefficients and the viewing direction.
+    # Color: through the SH coefficients and the viewing direction.
     dx, dy, dz = mx - view[5, 0], my - view[5, 1], mz - view[5, 2]
     length = math.sqrt(dx * dx + dy * dy + dz * dz)
     dx, dy, dz = dx / length, dy / length, dz / length
@@ -475,7 +407,7 @@ def project_splat_backward(
 
 
 def gradient_columns(flat: bool, with_normals: bool) -> int:
-    """How many columns of a gradient row are in use."""
+    """Number of columns of a gradient row that are in use."""
     if not flat:
         return G_DEPTH + 1
     return G_NORMAL + 3 if with_normals else MSY + 1

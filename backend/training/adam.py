@@ -1,7 +1,7 @@
-"""Adam on the rows that a step saw, in one pass over memory.
+"""Adam on the rows that a step used, in one pass over memory.
 
-A row that was not seen keeps its value and moments (Mallick et al. 2024, "Taming 3DGS"), so a step costs what is
-visible, not what exists.
+A row that was not used keeps its value and moments (Mallick et al. 2024, "Taming 3DGS"), so the cost of a step depends
+on the visible anchors, not on all.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numba import prange
 
-from .. import device
+from ..raster import devices
 from ..raster.kernel import kernel
 
 BETA1 = 0.9
@@ -18,16 +18,16 @@ BETA2 = 0.999
 EPSILON = 1e-15
 
 LARGEST_GRADIENT = 1e19
-"""The square of anything larger overflows in the second moment, which then stands still for ever."""
+"""The square of a larger gradient overflows in exp_avg_sq, after which the number would never change again."""
 
 _ROWS_AT_ONCE = 100_000
-"""So many rows at a time are stepped on the GPU: what lies between takes five times their room."""
+"""Rows per batch on the GPU: intermediate results take five times their memory."""
 
 
 def step_rows(
     values: torch.Tensor,
-    first: torch.Tensor,
-    second: torch.Tensor,
+    exp_avg: torch.Tensor,
+    exp_avg_sq: torch.Tensor,
     seen: torch.Tensor,
     gradients: torch.Tensor,
     rates: np.ndarray,
@@ -35,43 +35,51 @@ def step_rows(
     correction2: float,
     usable: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """In place: values, first and second moments (N, D); seen (n,) int64 rows, each once; gradients (n, D); rates (D,)
-    float32.
+    """Take one step of Adam in place (Kingma and Ba 2015, algorithm 1).
 
-    correction1 = 1 - BETA1**t and correction2 = 1 - BETA2**t for the step count t. A row whose gradient is not finite,
-    or beyond LARGEST_GRADIENT, is left alone; returns how many such rows there were, () int64. usable (n,) bool, on the
-    GPU alone: the others are left alone, too, and not counted.
+    Args:
+        values: (N, D) float32.
+        exp_avg, exp_avg_sq: (N, D) float32, the moments.
+        seen: (n,) int64, the rows to step, each once.
+        gradients: (n, D), of those rows.
+        rates: (D,) float32, the learning rate of each column.
+        correction1, correction2: 1 - BETA1**t and 1 - BETA2**t for the step count t.
+        usable: (n,) bool, only on the GPU: the other rows are left as they are.
+
+    Returns:
+        The number () int64 of usable rows that were left as they are because their gradient is not finite, or beyond
+        LARGEST_GRADIENT.
     """
-    if not device.on_gpu(values):
-        arrays = (t.numpy() for t in (values, first, second, seen, gradients))
+    if not devices.on_gpu(values):
+        arrays = (t.numpy() for t in (values, exp_avg, exp_avg_sq, seen, gradients))
         return torch.tensor(_step_rows(*arrays, rates, correction1, correction2))
     bad = torch.zeros((), dtype=torch.int64, device=values.device)
-    steps = device.upload(rates, values)
+    steps = devices.upload(rates, values)
     for start in range(0, len(seen), _ROWS_AT_ONCE):
         part = slice(start, start + _ROWS_AT_ONCE)
         bad += _step_rows_on_gpu(
-            values, first, second, seen[part], gradients[part], steps, correction1, correction2,
+            values, exp_avg, exp_avg_sq, seen[part], gradients[part], steps, correction1, correction2,
             None if usable is None else usable[part],
         )  # fmt: skip
     return bad
 
 
-def _step_rows_on_gpu(values, first, second, seen, gradients, rates, correction1, correction2, usable):
+def _step_rows_on_gpu(values, exp_avg, exp_avg_sq, seen, gradients, rates, correction1, correction2, usable):
     finite = gradients.abs().amax(1) < LARGEST_GRADIENT
     counted = torch.ones_like(finite) if usable is None else usable
     stepped = (finite & counted)[:, None]
-    old_value, old_first, old_second = values[seen], first[seen], second[seen]
-    m = torch.lerp(gradients, old_first, BETA1)
-    v = (BETA2 * old_second).addcmul_(gradients, gradients, value=1 - BETA2)
+    old_value, old_exp_avg, old_exp_avg_sq = values[seen], exp_avg[seen], exp_avg_sq[seen]
+    m = torch.lerp(gradients, old_exp_avg, BETA1)
+    v = (BETA2 * old_exp_avg_sq).addcmul_(gradients, gradients, value=1 - BETA2)
     change = (m / correction1).div_((v / correction2).sqrt_().add_(EPSILON)).mul_(rates)
     values.index_copy_(0, seen, torch.where(stepped, old_value - change, old_value))
-    first.index_copy_(0, seen, torch.where(stepped, m, old_first))
-    second.index_copy_(0, seen, torch.where(stepped, v, old_second))
+    exp_avg.index_copy_(0, seen, torch.where(stepped, m, old_exp_avg))
+    exp_avg_sq.index_copy_(0, seen, torch.where(stepped, v, old_exp_avg_sq))
     return (counted & ~finite).sum()
 
 
 @kernel(parallel=True)
-def _step_rows(values, first, second, seen, gradients, rates, correction1, correction2):
+def _step_rows(values, exp_avg, exp_avg_sq, seen, gradients, rates, correction1, correction2):
     bad = np.zeros(seen.size, np.int64)
     b1, b2 = np.float32(BETA1), np.float32(BETA2)
     one, largest = np.float32(1.0), np.float32(LARGEST_GRADIENT)
@@ -88,17 +96,17 @@ def _step_rows(values, first, second, seen, gradients, rates, correction1, corre
             continue
         for j in range(values.shape[1]):
             g = gradients[i, j]
-            m = b1 * first[row, j] + (one - b1) * g
-            v = b2 * second[row, j] + (one - b2) * g * g
-            first[row, j] = m
-            second[row, j] = v
+            m = b1 * exp_avg[row, j] + (one - b1) * g
+            v = b2 * exp_avg_sq[row, j] + (one - b2) * g * g
+            exp_avg[row, j] = m
+            exp_avg_sq[row, j] = v
             values[row, j] -= rates[j] * (m * c1) / (np.sqrt(v * c2) + np.float32(EPSILON))
     return bad.sum()
 
 
 def take_rows(values: torch.Tensor, seen: torch.Tensor) -> torch.Tensor:
-    """values[seen], the rows (n, D) of values (N, D) that a step works on; seen (n,) int64."""
-    return values[seen] if device.on_gpu(values) else torch.from_numpy(_take_rows(values.numpy(), seen.numpy()))
+    """Gather values[seen], (n, D), of values (N, D) and seen (n,) int64."""
+    return values[seen] if devices.on_gpu(values) else torch.from_numpy(_take_rows(values.numpy(), seen.numpy()))
 
 
 @kernel(parallel=True)

@@ -1,8 +1,8 @@
-"""The mean of what is trained over the latest steps.
+"""The running mean of the model over the latest steps.
 
-While the rates are high, each step wobbles around a model that is better than any of them (Polyak and Juditsky 1992,
-"Acceleration of stochastic approximation by averaging"), and the mean is there at any moment. It is what a training
-shows, measures and leaves, finished or not. Rates that fall are still needed: without, flat splats come out worse.
+While learning rates are high, the model oscillates around one that is better than any single step (Polyak and Juditsky
+1992, "Acceleration of stochastic approximation by averaging"). The mean is what a training displays, evaluates and
+exports, whether finished or stopped. Decaying rates are still needed: without them, 2D splats become worse.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
     from ..model.object_model import ObjectModel
 
 EVERY = 4
-"""One of so many steps counts: looking at all rows takes time."""
+"""Steps between two models that count, as going through all rows takes time."""
 
-SHARE, LONGEST = 0.1, 100
-"""The mean goes back over this share of the steps so far, which may be far off still, and over so many at most."""
+FRACTION, MAX_STEPS = 0.1, 100
+"""The mean covers this fraction of the steps so far, as early ones may be far off, and at most this number."""
 
 _PREFIX = "mean."
 
 
 class Average:
-    """The mean of the models that `follow` was given; at first that of `model` alone."""
+    """The running mean of the models passed to `follow`; at first `model` itself."""
 
     def __init__(self, model: ObjectModel) -> None:
         self._rows = model.anchors.rows.clone()
@@ -36,35 +36,34 @@ class Average:
         self._background = model.background.detach().clone()
 
     def follow(self, model: ObjectModel, step: int) -> None:
-        """Take in the model after a step, where that is one that counts."""
+        """Include the model after a step, if the step counts."""
         if step % EVERY:
             return
-        weight = EVERY / max(min(SHARE * step, LONGEST), EVERY)
+        weight = EVERY / max(min(FRACTION * step, MAX_STEPS), EVERY)
         self._rows.lerp_(model.anchors.rows, weight)
         self._background.lerp_(model.background.detach(), weight)
         for mean, parameter in zip(self._heads.parameters(), model.heads.parameters(), strict=True):
             mean.lerp_(parameter.detach(), weight)
 
     def take(self, kept: torch.Tensor, new: torch.Tensor) -> None:
-        """Follow a change of the anchors: of the rows so far those that are `kept` (a mask, or indices), then `new`
-        (n, columns), which begin as they are."""
+        """Follow a change of the anchors: keep the rows `kept` (a mask, or indices), then append `new` (n, columns)."""
         self._rows = torch.cat([self._rows[kept], new])
 
     def of(self, model: ObjectModel) -> ObjectModel:
-        """The mean as a model, where `model` is the one that it follows."""
+        """The mean as a model; `model` is the one that it follows."""
         anchors = replace(model.anchors, rows=self._rows)
         return replace(model, anchors=anchors, heads=self._heads, background=self._background)
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """For a checkpoint."""
+        """The mean as tensors of a checkpoint."""
         heads = {f"heads.{name}": value for name, value in self._heads.state_dict().items()}
         values = {"rows": self._rows, "background": self._background, **heads}
         return {_PREFIX + name: value for name, value in values.items()}
 
     @classmethod
-    def of_checkpoint(cls, tensors: Mapping[str, np.ndarray], model: ObjectModel) -> Average:
-        """What `tensors` gave, on the device of the model that it follows; of the model alone where there is none among
-        them, as in the checkpoints of versions without a mean."""
+    def from_checkpoint(cls, tensors: Mapping[str, np.ndarray], model: ObjectModel) -> Average:
+        """The mean in a checkpoint's tensors, on the device of the model that it follows; the model itself where the
+        checkpoint is of a version without a mean."""
         average = cls(model)
         found = {name.removeprefix(_PREFIX): value for name, value in tensors.items() if name.startswith(_PREFIX)}
         if not found:

@@ -1,7 +1,8 @@
-"""How much brighter or bluer each photo is than the others: cameras that set their own exposure and white balance.
+"""Measure the gain of each image, for cameras with automatic exposure and white balance.
 
-COLMAP's points are seen in many photos. Photo i shows point p as gain_i * color_p, channel by channel; gains and
-colours are found in turns, as medians and means. Training then compares the splats with photos of one common exposure.
+COLMAP observes its points in many images. Image i shows point p as gain_i * color_p, channel by channel; gains and
+colors are estimated alternately, as medians and means. Training then compares the splats with images of one common
+exposure.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from ..capture import Capture
 
 VARIES_FROM = 0.02
-"""Standard deviation of the log gains from which on exposure is said to vary."""
+"""The exposure varies if the standard deviation of the log gains exceeds this."""
 
 _ROUNDS = 10
 _MIN_OBSERVATIONS = 30
@@ -22,10 +23,17 @@ _LIMIT = 4.0
 
 
 def measure_gains(capture: Capture) -> np.ndarray:
-    """(V, 3) float64 gains in display space, geometric mean 1 over the training views, from those views alone.
+    """Measure the gains of all views from the training views alone.
 
-    A held-out view's gain is read off its neighbours: between the training views before and after it of the same
-    camera, in the order of their names. Views with too few points, or without such neighbours, have gain 1.
+    A held-out view's gain is interpolated between the training views of the same camera before and after it, in the
+    order of their names.
+
+    Returns:
+        (V, 3) float64 in display space, with a geometric mean of 1 over the training views; 1 for views with too few
+        points, or without such neighbors.
+
+    Raises:
+        InputError: an image cannot be read.
     """
     gains = np.ones((len(capture.views), 3))
     observed = {i: _observations(capture, i) for i in capture.train_indices}
@@ -58,18 +66,18 @@ def measure_gains(capture: Capture) -> np.ndarray:
 
 
 def differences(gains: np.ndarray) -> float:
-    """By how much the gains (V, 3) differ: standard deviation of their logarithms, of the channel where it is most."""
+    """The largest standard deviation, over the channels, of the logarithms of the gains (V, 3)."""
     return float(np.log(gains).std(0).max())
 
 
 def varies(gains: np.ndarray) -> bool:
-    """Whether the gains (V, 3) differ by enough to be worth undoing."""
+    """Whether the gains (V, 3) differ by enough to be compensated."""
     return differences(gains) > VARIES_FROM
 
 
 def _ratio(colors: np.ndarray, model: np.ndarray) -> np.ndarray:
-    """By how much the colours (n, 3) exceed the model's (n, 3): (3,), the median over the points, weighted by the
-    model, so that points at the edge of something, or that shine, do not count by how far off they are."""
+    """The ratio (3,) of the colors (n, 3) to the model's (n, 3): the median over the points, weighted by the model's
+    color, and so robust against points at edges or on shiny surfaces."""
     found = np.ones(3)
     for c in range(3):
         lit = model[:, c] > 0
@@ -81,7 +89,7 @@ def _ratio(colors: np.ndarray, model: np.ndarray) -> np.ndarray:
 
 
 def _observations(capture: Capture, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Point index (n,) and colour (n, 3) in [0, 1], the mean of 3 x 3 pixels, of the points observed in a view."""
+    """The points observed in a view: their indices (n,) and colors (n, 3) in [0, 1], the mean of 3 x 3 pixels."""
     keypoints = capture.keypoints(index)
     pixels = capture.image(index)
     height, width = pixels.shape[:2]

@@ -1,4 +1,4 @@
-"""What a training can be told, and how its rates fall as it goes on."""
+"""The settings of a training, and its schedules: learning rates, growth and resolution over its progress."""
 
 from __future__ import annotations
 
@@ -12,14 +12,22 @@ from ..model.anchors import Layout
 
 @dataclass(frozen=True)
 class Settings:
-    """Choices that make the model what it is; a checkpoint only continues under the same ones.
+    """Choices that the model depends on; a checkpoint continues only under the same ones.
 
-    mode: `explicit` or `view`; sh_degree: of explicit colour; offsets: splats an anchor; voxel: edge of an anchor's
-    cell in world units (None: the median spacing of the points); max_anchors: growth stops there.
-    background: `learned`, `black` or `white`. zero_is_object: whether pixels of ID 0 are taught as a class.
-    primitive: `3d` Gaussians or `2d` discs; for discs, normal_weight: how much the normals are to agree with the depth,
-    distortion_weight: how much the splats along a ray are to lie at one depth, and half of volume_weight for the area.
-    pyramid: whether pictures are reduced at the start of the training (None: those that are large).
+    Attributes:
+        mode: `explicit` or `view`, see `Heads`.
+        sh_degree: of the colors in explicit mode.
+        offsets: splats per anchor.
+        voxel: edge of an anchor's cell in world units; None: the median spacing of the points.
+        max_anchors: growth stops there.
+        background: `learned`, `black` or `white`.
+        semantic_weight, ssim_weight, volume_weight: of the terms of the loss. Discs take half of volume_weight, for
+            their area.
+        zero_is_object: whether pixels of ID 0 are supervised as a class.
+        primitive: `3d` Gaussians or `2d` discs.
+        normal_weight: of the loss that aligns the normals of discs with the depth.
+        distortion_weight: of the loss that gathers the discs along a ray at one depth.
+        pyramid: whether images are reduced at the start of the training; None: large ones are.
     """
 
     seed: int = 0
@@ -39,50 +47,57 @@ class Settings:
     pyramid: bool | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """The settings as JSON."""
         return asdict(self)
 
     def in_effect(self) -> dict[str, Any]:
-        """The choices that matter: 3D Gaussians have no normals and no distortion."""
+        """The settings that have an effect: for 3D Gaussians, normal_weight and distortion_weight have none."""
         surface = () if self.primitive == "2d" else ("normal_weight", "distortion_weight")
         return {name: value for name, value in asdict(self).items() if name not in surface}
 
     @property
     def layout(self) -> Layout:
-        """Columns of an anchor's row."""
+        """The columns of an anchor's row."""
         return Layout(offsets=self.offsets)
 
 
-REST_FROM = 0.05
-"""Share of the points that no mask ever gave an object, from which on unlabelled pixels are taken for the rest of the
-scene rather than for gaps in the masks. Objects that are taught nothing there spread over it."""
+BACKGROUND_FROM = 0.05
+"""Unlabeled pixels are taken for background, rather than for gaps in the masks, if at least this fraction of the points
+belongs to no object. Without supervision there, objects would spread over the background."""
 
 
-def rest_is_taught(point_ids: np.ndarray) -> bool:
-    """Whether unlabelled pixels show the rest of the scene, where the points' objects are point_ids (M,)."""
-    return bool((np.asarray(point_ids) == 0).mean() >= REST_FROM)
+def background_is_masked(point_ids: np.ndarray) -> bool:
+    """Decide whether unlabeled pixels show the background.
+
+    Args:
+        point_ids: (M,) object ID of each point, 0 where it belongs to none.
+
+    Returns:
+        Whether such pixels should be supervised to show no object.
+    """
+    return bool((np.asarray(point_ids) == 0).mean() >= BACKGROUND_FROM)
 
 
 GROW_FROM, GROW_UNTIL = 0.1, 0.6
-"""Growth runs between these shares of the training; its statistics start half way to the first."""
+"""Anchors grow between these values of the progress; statistics are gathered from half the first one on."""
 
-_GROW_OFTEN, _GROW_SELDOM, _GROW_PART = 25, 100, 0.02
+_MIN_INTERVAL, _MAX_INTERVAL, _INTERVAL_FRACTION = 25, 100, 0.02
 
 
 def growth_interval(step: int) -> int:
-    """Steps until anchors grow again: often at first, which shortens short trainings; later, when there are more
-    anchors to look through and each round changes less, a part of the steps so far."""
-    return int(min(max(_GROW_OFTEN, _GROW_PART * step), _GROW_SELDOM))
+    """Steps until anchors grow again: few at first, which shortens short trainings; later a fraction of the steps so
+    far, as there are more anchors to go through and each round changes less."""
+    return int(min(max(_MIN_INTERVAL, _INTERVAL_FRACTION * step), _MAX_INTERVAL))
 
 
 PLATEAU_FROM, PLATEAU_UNTIL = 0.2, 0.8
-"""Between these shares of the training the rates hardly fall. Most is learned there; the fall after it settles what has
-been learned."""
-_FALLEN = {PLATEAU_FROM: 0.25, PLATEAU_UNTIL: 0.3}
-"""How far the rates have fallen at both ends of the plateau, 0 (not at all) to 1."""
+"""Between these values of the progress the learning rates hardly fall. Most is learned there; the decay afterwards
+refines it."""
+_DECAY = {PLATEAU_FROM: 0.25, PLATEAU_UNTIL: 0.3}
+"""How far the rates have fallen at both ends of the plateau, from 0 (not at all) to 1."""
 
 SURFACE_FROM = 0.25
-"""Share of the training from which on discs are taught normals and depth: before, there is no surface yet."""
+"""Progress from which the normals and depth of discs are supervised: before, there is no surface yet."""
 
 _ROW_RATES = {
     "offset_columns": (4e-2, 4e-4),
@@ -101,30 +116,38 @@ HEAD_RATES = {
 }
 
 
-def rate(ends: tuple[float, float], share: float) -> float:
-    """Learning rate after a share (0 to 1) of the training: from the first end to the last, exponential before and
-    after the plateau and on it."""
-    fallen = np.interp(share, [0.0, *_FALLEN, 1.0], [0.0, *_FALLEN.values(), 1.0])
+def rate(ends: tuple[float, float], progress: float) -> float:
+    """The learning rate at a progress of 0 .. 1: from the first end to the last, exponential before, on and after the
+    plateau."""
+    fallen = np.interp(progress, [0.0, *_DECAY, 1.0], [0.0, *_DECAY.values(), 1.0])
     return float(ends[0] * (ends[1] / ends[0]) ** fallen)
 
 
-def row_rates(layout: Layout, share: float) -> np.ndarray:
-    """Learning rate of each column of the anchors' rows: (columns,) float32."""
+def row_rates(layout: Layout, progress: float) -> np.ndarray:
+    """The learning rate of each column of the anchors' rows: (columns,) float32."""
     rates = np.zeros(layout.columns, np.float32)
     for name, ends in _ROW_RATES.items():
-        rates[getattr(layout, name)] = rate(ends, share)
+        rates[getattr(layout, name)] = rate(ends, progress)
     return rates
 
 
-_LEAST_PIXELS, _LEAST_OF_SMALL = 300, 50
-"""Pictures are reduced to no less than this, small ones, where that is asked for, to no less than the other."""
+_MIN_PIXELS, _MIN_PIXELS_OF_SMALL = 300, 50
+"""Images are not reduced below the first number of pixels; not below the second where `pyramid` asks for reduction."""
 
 
-def downscale_at(share: float, longest: int, pyramid: bool | None = None) -> int:
-    """Coarse to fine: by how much to reduce pictures of `longest` pixels after a share of the training; `pyramid` as in
-    `Settings`."""
-    wanted = 4 if share < 0.08 else 2 if share < 0.25 else 1
-    least = _LEAST_OF_SMALL if pyramid else _LEAST_PIXELS
-    while wanted > 1 and (pyramid is False or longest // wanted < least):
-        wanted //= 2
-    return wanted
+def downscale_at(progress: float, longest: int, pyramid: bool | None = None) -> int:
+    """The factor by which images are reduced, coarse to fine.
+
+    Args:
+        progress: of the training, 0 .. 1.
+        longest: pixels of the longer side of an image.
+        pyramid: as in `Settings`.
+
+    Returns:
+        4, 2 or 1.
+    """
+    factor = 4 if progress < 0.08 else 2 if progress < 0.25 else 1
+    least = _MIN_PIXELS_OF_SMALL if pyramid else _MIN_PIXELS
+    while factor > 1 and (pyramid is False or longest // factor < least):
+        factor //= 2
+    return factor

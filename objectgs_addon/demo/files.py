@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Writers for the files of a capture: PNG, PLY and COLMAP's binary model.  No bpy here."""
 
+from __future__ import annotations
+
 import struct
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,16 +14,16 @@ PINHOLE = 1  # COLMAP's number for the camera model
 
 
 def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Write `pixels` as PNG: (H, W) uint8 or uint16 greyscale, or (H, W, 3) uint8 RGB; equal bytes for equal pixels."""
+    """Write `pixels` as PNG: (H, W) uint8 or uint16 grayscale, or (H, W, 3) uint8 RGB; equal bytes for equal pixels."""
     height, width = pixels.shape[:2]
-    colour = 2 if pixels.ndim == 3 else 0
-    if colour == 2 and (pixels.shape[2] != 3 or pixels.dtype != np.uint8):
+    color = 2 if pixels.ndim == 3 else 0
+    if color == 2 and (pixels.shape[2] != 3 or pixels.dtype != np.uint8):
         raise ValueError("RGB pictures are written as 8-bit with 3 channels")
     depth = {np.dtype(np.uint8): 8, np.dtype(np.uint16): 16}[pixels.dtype]
     big_endian = np.ascontiguousarray(pixels.astype(pixels.dtype.newbyteorder(">")))
     rows = big_endian.view(np.uint8).reshape(height, -1)
     lines = np.zeros((height, rows.shape[1] + 1), np.uint8)
-    if colour == 2:  # filter 2 ("up") halves the size of pictures; ID maps compress better without
+    if color == 2:  # filter 2 ("up") halves the size of pictures; ID maps compress better without
         lines[:, 0] = 2
         lines[0, 1:] = rows[0]
         lines[1:, 1:] = rows[1:] - rows[:-1]
@@ -30,16 +33,16 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
-    header = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0)
     chunks = [chunk(b"IHDR", header)]
-    if colour == 2:
+    if color == 2:
         chunks.append(chunk(b"sRGB", b"\0"))
     chunks += [chunk(b"IDAT", zlib.compress(lines.tobytes(), 6)), chunk(b"IEND", b"")]
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
 
 
 def write_ply(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
-    """Write a triangle mesh as binary PLY: `vertices` (V, 3) metres, `triangles` (F, 3) indices."""
+    """Write a triangle mesh as binary PLY: `vertices` (V, 3) meters, `triangles` (F, 3) indices."""
     header = (
         "ply\nformat binary_little_endian 1.0\n"
         f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
@@ -68,7 +71,16 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
     return q if q[0] >= 0 else -q
 
 
-def write_colmap(folder: Path, intrinsics, size, names, rotations, translations, observations, points) -> None:
+def write_colmap(
+    folder: Path,
+    intrinsics: Any,
+    size: Any,
+    names: Any,
+    rotations: Any,
+    translations: Any,
+    observations: Any,
+    points: Any,
+) -> None:
     """Write cameras.bin, images.bin and points3D.bin for one PINHOLE camera.
 
     intrinsics: (fx, fy, cx, cy) pixels; size: (width, height); rotations (V, 3, 3) and translations (V, 3): world to

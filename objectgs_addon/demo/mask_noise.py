@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Mistakes of a segmentation network, made on true ID maps.  No bpy here."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 
 
-def _smooth(shape, cell: int, rng) -> np.ndarray:
+def _smooth(shape: Any, cell: int, rng: Any) -> np.ndarray:
     """Random field in about -1..1 that varies over `cell` pixels."""
     rows, cols = shape[0] // cell + 3, shape[1] // cell + 3
     coarse = rng.uniform(-1, 1, (rows, cols))
@@ -27,12 +31,12 @@ def _grow(region: np.ndarray, pixels: int) -> np.ndarray:
     return region
 
 
-def disturb(ids: np.ndarray, amount: float, rng) -> np.ndarray:
+def disturb(ids: np.ndarray, amount: float, rng: Any) -> np.ndarray:
     """Copy of an ID map (H, W) with mistakes; `amount` from 0 (none) to 1 (poor).
 
     All borders wander by up to 4 * amount pixels in smooth waves.  Then each object of the view, by chance and apart
     from the others: with probability amount it is 1 to 3 pixels too large or too small (what it leaves is 0,
-    unlabelled); with probability 0.15 * amount it carries another object's ID; with 0.10 * amount it is missing (0).
+    unlabeled); with probability 0.15 * amount it carries another object's ID; with 0.10 * amount it is missing (0).
     These two happen only to what covers less than a fifth of the picture: networks seldom lose a wall.
     """
     if amount <= 0:
@@ -53,10 +57,10 @@ def disturb(ids: np.ndarray, amount: float, rng) -> np.ndarray:
             result[_grow(region, pixels)] = value
         elif chance[0] < amount:
             result[region & _grow(~region, pixels)] = 0
-        if region.mean() > .2:
+        if region.mean() > 0.2:
             continue
-        if chance[1] < .15 * amount:
+        if chance[1] < 0.15 * amount:
             result[region] = other
-        elif chance[2] < .10 * amount:
+        elif chance[2] < 0.10 * amount:
             result[region] = 0
     return result

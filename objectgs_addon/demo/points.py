@@ -6,14 +6,17 @@ Detections are drawn at pixels with texture, and a track goes to the other views
 points are triangulated from them, so that their noise in space is what the noise in the pictures makes of it.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-NOISE = .5  # pixels, standard deviation of an observation
-TOLERANCE = .008  # metres of depth within which a spot counts as seen
-ANGLE = 38.0  # degrees between two views of one spot up to which it is recognised
-OUTLIERS = .03  # fraction of points that are wrong matches
+NOISE = 0.5  # pixels, standard deviation of an observation
+TOLERANCE = 0.008  # meters of depth within which a spot counts as seen
+ANGLE = 38.0  # degrees between two views of one spot up to which it is recognized
+OUTLIERS = 0.03  # fraction of points that are wrong matches
 
 
 @dataclass
@@ -28,8 +31,8 @@ class Cloud:
     object_id: np.ndarray
 
 
-def project(points: np.ndarray, view, intrinsics) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel positions (N, 2) and depth (N,) in metres of world points (N, 3) in a view."""
+def project(points: np.ndarray, view: Any, intrinsics: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Pixel positions (N, 2) and depth (N,) in meters of world points (N, 3) in a view."""
     local = points @ view.rotation.T + view.translation
     fx, fy, cx, cy = intrinsics
     depth = local[:, 2]
@@ -37,19 +40,19 @@ def project(points: np.ndarray, view, intrinsics) -> tuple[np.ndarray, np.ndarra
     return np.stack([fx * local[:, 0] / safe + cx, fy * local[:, 1] / safe + cy], 1), depth
 
 
-def _lift(xy, depth, view, intrinsics) -> np.ndarray:
+def _lift(xy: Any, depth: Any, view: Any, intrinsics: Any) -> np.ndarray:
     fx, fy, cx, cy = intrinsics
     local = np.stack([(xy[:, 0] - cx) / fx * depth, (xy[:, 1] - cy) / fy * depth, depth], 1)
     return (local - view.translation) @ view.rotation
 
 
-def _seeds(picture, depth, count, rng) -> np.ndarray:
+def _seeds(picture: Any, depth: Any, count: Any, rng: Any) -> np.ndarray:
     """(count, 2) pixel rows and columns, drawn where there is texture and away from steps in depth."""
-    grey = picture.astype(np.float32).mean(2)
-    gy, gx = np.gradient(grey)
+    gray = picture.astype(np.float32).mean(2)
+    gy, gx = np.gradient(gray)
     weight = np.hypot(gx, gy) + 1.0
     step = np.maximum(*[np.abs(g) for g in np.gradient(depth)])
-    weight[step > .03] = 0
+    weight[step > 0.03] = 0
     weight[:2], weight[-2:], weight[:, :2], weight[:, -2:] = 0, 0, 0, 0
     weight = np.minimum(weight, 40.0).ravel()
     # Gumbel's trick draws without replacement, weighted
@@ -57,24 +60,24 @@ def _seeds(picture, depth, count, rng) -> np.ndarray:
         keys = np.log(weight) + rng.gumbel(size=weight.size)
     keep = np.argpartition(-keys, count)[:count]
     keep = keep[weight[keep] > 0]
-    return np.stack(np.unravel_index(keep, grey.shape), 1)
+    return np.stack(np.unravel_index(keep, gray.shape), 1)
 
 
-def make(views, intrinsics, pictures, depths, ids, rng, target: int = 13_500) -> Cloud:
-    """About `target` points (fewer from few or small views) of `views` with pictures, depths (metres) and ID maps."""
+def make(views: Any, intrinsics: Any, pictures: Any, depths: Any, ids: Any, rng: Any, target: int = 13_500) -> Cloud:
+    """About `target` points (fewer from few or small views) of `views` with pictures, depths (meters) and ID maps."""
     height, width = depths[0].shape
     target = min(target, len(views) * height * width // 40)
     per_view = max(1, int(np.ceil(target * 1.8 / len(views))))
     spots, source, label = [], [], []
     for v, view in enumerate(views):
         at = _seeds(pictures[v], depths[v], min(per_view, height * width - 1), rng)
-        xy = at[:, ::-1] + .5
+        xy = at[:, ::-1] + 0.5
         spots.append(_lift(xy, depths[v][at[:, 0], at[:, 1]].astype(float), view, intrinsics))
         source.append(np.full(len(at), v))
         label.append(ids[v][at[:, 0], at[:, 1]])
     spots, source, label = np.concatenate(spots), np.concatenate(source), np.concatenate(label)
     seen = _seen(spots, source, label, views, intrinsics, depths, ids)
-    luck = rng.random(len(spots))[:, None] * .5 + .35  # some spots are found again easily, others not
+    luck = rng.random(len(spots))[:, None] * 0.5 + 0.35  # some spots are found again easily, others not
     seen &= rng.random(seen.shape) < luck
     seen[np.arange(len(spots)), source] = True
     cap = max(8, int(3.2 * target * 2.2 / len(views)))
@@ -90,9 +93,9 @@ def make(views, intrinsics, pictures, depths, ids, rng, target: int = 13_500) ->
 
     outlier = rng.random(len(spots)) < OUTLIERS
     wrong = spots.copy()
-    first = np.array([v.centre for v in views])[seen.argmax(1)]
+    first = np.array([v.center for v in views])[seen.argmax(1)]
     along = spots - first
-    shift = rng.choice([-1, 1], len(spots)) * rng.uniform(.02, .15, len(spots)) / np.linalg.norm(along, axis=1)
+    shift = rng.choice([-1, 1], len(spots)) * rng.uniform(0.02, 0.15, len(spots)) / np.linalg.norm(along, axis=1)
     wrong[outlier] += (along * shift[:, None])[outlier]
     noise = np.where(outlier, 3 * NOISE, NOISE)[point, None]
     xy = np.empty((len(point), 2))
@@ -104,28 +107,28 @@ def make(views, intrinsics, pictures, depths, ids, rng, target: int = 13_500) ->
     keep = inside & (np.bincount(point[inside], minlength=len(spots))[point] >= 3)
     xyz, error = _triangulate(wrong, point[keep], view_of[keep], xy[keep], views, intrinsics)
     # what a real reconstruction filters too: points that the observations do not fix
-    bad = ~np.isfinite(error) | (error > 4.0) | (np.linalg.norm(xyz - wrong, axis=1) > .05)
+    bad = ~np.isfinite(error) | (error > 4.0) | (np.linalg.norm(xyz - wrong, axis=1) > 0.05)
     kept = np.flatnonzero(~bad & (np.bincount(point[keep], minlength=len(spots)) >= 3))
     return _pack(kept, point[keep], view_of[keep], xy[keep], xyz, error, outlier, label, views, pictures, rng)
 
 
-def _seen(spots, source, label, views, intrinsics, depths, ids):
+def _seen(spots: Any, source: Any, label: Any, views: Any, intrinsics: Any, depths: Any, ids: Any) -> Any:
     """(N, V) bool: which views see which spots."""
     height, width = depths[0].shape
-    centres = np.array([v.centre for v in views])
-    rays = spots[:, None, :] - centres[None]
+    centers = np.array([v.center for v in views])
+    rays = spots[:, None, :] - centers[None]
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
     similar = np.einsum("nvc,nc->nv", rays, rays[np.arange(len(spots)), source]) > np.cos(np.radians(ANGLE))
     seen = np.zeros((len(spots), len(views)), bool)
     for v, view in enumerate(views):
         xy, depth = project(spots, view, intrinsics)
-        inside = (depth > .01) & (xy > 2).all(1) & (xy < [width - 2, height - 2]).all(1)
+        inside = (depth > 0.01) & (xy > 2).all(1) & (xy < [width - 2, height - 2]).all(1)
         col, row = np.where(inside[:, None], xy, 0).astype(int).T
         seen[:, v] = inside & (np.abs(depths[v][row, col] - depth) < TOLERANCE) & (ids[v][row, col] == label)
     return seen & similar
 
 
-def _triangulate(start, point, view_of, xy, views, intrinsics, rounds: int = 4):
+def _triangulate(start: Any, point: Any, view_of: Any, xy: Any, views: Any, intrinsics: Any, rounds: int = 4) -> Any:
     """Least-squares points (P, 3) from observations, and their mean reprojection error in pixels."""
     fx, fy, cx, cy = intrinsics
     rotation = np.stack([v.rotation for v in views])[view_of]
@@ -151,13 +154,25 @@ def _triangulate(start, point, view_of, xy, views, intrinsics, rounds: int = 4):
     raise AssertionError("unreachable")
 
 
-def _pack(kept, point, view_of, xy, xyz, error, outlier, label, views, pictures, rng) -> Cloud:
+def _pack(
+    kept: Any,
+    point: Any,
+    view_of: Any,
+    xy: Any,
+    xyz: Any,
+    error: Any,
+    outlier: Any,
+    label: Any,
+    views: Any,
+    pictures: Any,
+    rng: Any,
+) -> Cloud:
     number = np.full(len(xyz), -1)
     number[kept] = np.arange(len(kept))
     rows = number[point] >= 0
     point, view_of, xy = number[point[rows]], view_of[rows], xy[rows]
     height, width = pictures[0].shape[:2]
-    colour = np.zeros((len(kept), 3))
+    color = np.zeros((len(kept), 3))
     slot = np.zeros(len(point), int)
     observations = []
     for v in range(len(views)):
@@ -172,9 +187,9 @@ def _pack(kept, point, view_of, xy, xyz, error, outlier, label, views, pictures,
         slot[here] = back[: len(here)]
         col = np.clip(xy[here, 0].astype(int), 0, width - 1)
         row = np.clip(xy[here, 1].astype(int), 0, height - 1)
-        np.add.at(colour, point[here], pictures[v][row, col].astype(float))
+        np.add.at(color, point[here], pictures[v][row, col].astype(float))
     count = np.bincount(point, minlength=len(kept))
-    rgb = np.round(colour / np.maximum(count, 1)[:, None]).astype(np.uint8)
+    rgb = np.round(color / np.maximum(count, 1)[:, None]).astype(np.uint8)
     order = np.argsort(point, kind="stable")
     pairs = np.stack([view_of + 1, slot], 1)[order]
     tracks = np.split(pairs, np.cumsum(count)[:-1]) if len(kept) else []

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rendering with Cycles on the CPU: pictures, and exact IDs and depth at pixel centres."""
+"""Rendering with Cycles on the CPU: pictures, and exact IDs and depth at pixel centers."""
+
+from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...backend.protocol import Cancelled
-from ..quiet import quiet
+from ...backend.shared.errors import Cancelled
+from ..blender.quiet import quiet
 from .scene import FOCAL, View
 
 UNDENOISED = 8
@@ -18,7 +21,7 @@ UNDENOISED = 8
 class Renderer:
     """Renders views of a scene through files in `folder`, which must exist."""
 
-    def __init__(self, scene, width: int, height: int, samples: int, seed: int, folder: Path):
+    def __init__(self, scene: bpy.types.Scene, width: int, height: int, samples: int, seed: int, folder: Path) -> None:
         self.scene, self.folder, self.samples, self.seed = scene, folder, samples, seed
         render = scene.render
         render.engine = "CYCLES"
@@ -38,7 +41,7 @@ class Renderer:
         cycles.sample_clamp_indirect = 4.0
         data = bpy.data.cameras.new("demo")
         data.sensor_fit, data.sensor_width, data.lens = "HORIZONTAL", 36.0, 36.0 * FOCAL
-        data.clip_start, data.clip_end = .01, 100.0
+        data.clip_start, data.clip_end = 0.01, 100.0
         self.camera = bpy.data.objects.new("demo camera", data)
         scene.collection.objects.link(self.camera)
         scene.camera = self.camera
@@ -46,7 +49,7 @@ class Renderer:
         meshes = {o.data for o in scene.collection.all_objects if isinstance(o.data, bpy.types.Mesh)}
         self.looks = {mesh: list(mesh.materials) for mesh in meshes}
 
-    def _dress(self, looks) -> None:
+    def _assign_materials(self, looks: Any) -> None:
         """Set the meshes' materials."""
         for mesh, materials in looks.items():
             for slot, material in enumerate(materials):
@@ -54,16 +57,16 @@ class Renderer:
 
     def close(self) -> None:
         """Free what was made for rendering beside the scene's own objects."""
-        self._dress(self.looks)
+        self._assign_materials(self.looks)
         bpy.data.materials.remove(self.override)
 
     def for_pictures(self) -> None:
         """Settings for `picture`."""
-        self._dress(self.looks)
+        self._assign_materials(self.looks)
         cycles = self.scene.cycles
         cycles.samples, cycles.seed = self.samples, self.seed
         # Measured at 42 dB between two seeds: half the noise is that of edges in the textures, so the rays go there
-        cycles.use_adaptive_sampling, cycles.adaptive_threshold, cycles.adaptive_min_samples = True, .03, 4
+        cycles.use_adaptive_sampling, cycles.adaptive_threshold, cycles.adaptive_min_samples = True, 0.03, 4
         cycles.pixel_filter_type = "BOX"
         cycles.denoising_input_passes, cycles.denoising_prefilter = "RGB_ALBEDO_NORMAL", "NONE"
         cycles.use_denoising = True
@@ -73,28 +76,28 @@ class Renderer:
             cycles.use_denoising, cycles.samples = False, UNDENOISED * self.samples
 
     def for_truth(self) -> None:
-        """Settings for `truth`: one ray through each pixel's centre (Cycles ignores the width of its box filter)."""
-        self._dress({mesh: [self.override] * len(looks) for mesh, looks in self.looks.items()})
+        """Settings for `truth`: one ray through each pixel's center (Cycles ignores the width of its box filter)."""
+        self._assign_materials({mesh: [self.override] * len(looks) for mesh, looks in self.looks.items()})
         cycles = self.scene.cycles
         cycles.samples, cycles.seed, cycles.use_adaptive_sampling = 1, 0, False
-        cycles.pixel_filter_type, cycles.filter_width = "GAUSSIAN", .01
+        cycles.pixel_filter_type, cycles.filter_width = "GAUSSIAN", 0.01
         cycles.use_denoising = False
 
     def picture(self, view: View) -> np.ndarray:
         """(H, W, 3) uint8 sRGB, as the view transform "Standard" without dithering gives."""
         linear = np.clip(self._render(view), 0, 1)
-        encoded = np.where(linear <= .0031308, 12.92 * linear, 1.055 * np.power(linear, 1 / 2.4) - .055)
+        encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1 / 2.4) - 0.055)
         return np.round(encoded * 255).astype(np.uint8)
 
     def truth(self, view: View) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W) uint16 IDs and (H, W) float32 depth along the camera's axis in metres."""
+        """(H, W) uint16 IDs and (H, W) float32 depth along the camera's axis in meters."""
         values = self._render(view)
         return np.round(values[..., 0]).astype(np.uint16), np.ascontiguousarray(values[..., 1])
 
     def _render(self, view: View) -> np.ndarray:
         pose = np.eye(4)
         pose[:3, :3] = view.rotation.T * [1, -1, -1]  # OpenCV's axes to Blender's
-        pose[:3, 3] = view.centre
+        pose[:3, 3] = view.center
         self.camera.matrix_world = Matrix(pose.tolist())
         path = self.folder / "view.exr"
         path.unlink(missing_ok=True)
@@ -126,11 +129,11 @@ def _id_and_depth() -> bpy.types.Material:
     tree.nodes.clear()
     index = tree.nodes.new("ShaderNodeObjectInfo").outputs["Object Index"]
     depth = tree.nodes.new("ShaderNodeCameraData").outputs["View Z Depth"]
-    colour = tree.nodes.new("ShaderNodeCombineXYZ")
+    color = tree.nodes.new("ShaderNodeCombineXYZ")
     glow, output = tree.nodes.new("ShaderNodeEmission"), tree.nodes.new("ShaderNodeOutputMaterial")
-    tree.links.new(index, colour.inputs[0])
-    tree.links.new(depth, colour.inputs[1])
-    tree.links.new(colour.outputs[0], glow.inputs["Color"])
+    tree.links.new(index, color.inputs[0])
+    tree.links.new(depth, color.inputs[1])
+    tree.links.new(color.outputs[0], glow.inputs["Color"])
     tree.links.new(glow.outputs[0], output.inputs["Surface"])
     material.cycles.emission_sampling = "NONE"  # or every triangle becomes a lamp, 0.5 s more a view
     return material

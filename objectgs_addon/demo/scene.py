@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The demo's scene: objects on a round table in a room, soft light, and cameras on two rings."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import bpy
 import numpy as np
@@ -12,7 +15,7 @@ from . import materials, shapes
 
 FOCAL = 1.08  # focal length / picture width
 LOOK_AT = np.array([0.0, 0.0, 0.07])
-RINGS = ((1.40, 0.47), (1.16, 0.98))  # radius, height in metres
+RINGS = ((1.40, 0.47), (1.16, 0.98))  # radius, height in meters
 
 
 @dataclass
@@ -26,15 +29,15 @@ class Thing:
 
 @dataclass
 class View:
-    """One camera: picture name, `rotation` (3, 3) and `translation` (3,) from world to camera (OpenCV axes, metres)."""
+    """One camera: picture name, `rotation` (3, 3) and `translation` (3,) from world to camera (OpenCV axes, meters)."""
 
     name: str
     rotation: np.ndarray
     translation: np.ndarray
 
     @property
-    def centre(self) -> np.ndarray:
-        """Camera position in the world, metres."""
+    def center(self) -> np.ndarray:
+        """Camera position in the world, meters."""
         return -self.rotation.T @ self.translation
 
 
@@ -47,50 +50,52 @@ def build(objects: int, seed: int) -> tuple[bpy.types.Scene, list[Thing]]:
     """A new scene with `objects` things on a table in a backdrop; IDs 1..N, then table and backdrop."""
     scene = bpy.data.scenes.new("ObjectGS demo")
     kinds = list(shapes.MAKERS)
-    things, sizes = [], []
+    objs, sizes = [], []
     for i in range(objects):
         kind, round_ = kinds[i % len(kinds)], i // len(kinds)
         name = kind if round_ == 0 else f"{kind}_{round_ + 1}"
         mesh = shapes.make(kind, scene)
         rng = rng_for(seed, 1, i)
         if round_:
-            mesh.transform(Matrix.Scale(float(rng.uniform(.75, .95)), 4))
+            mesh.transform(Matrix.Scale(float(rng.uniform(0.75, 0.95)), 4))
         mesh.materials.append(materials.material(kind, rng))
-        thing = Thing(i + 1, name, bpy.data.objects.new(name, mesh))
-        scene.collection.objects.link(thing.object)
-        things.append(thing)
+        obj = Thing(i + 1, name, bpy.data.objects.new(name, mesh))
+        scene.collection.objects.link(obj.object)
+        objs.append(obj)
         sizes.append(_size(mesh))
     places, spread, scale = _arrange(np.array(sizes), seed)
-    for thing, (x, y, turn) in zip(things, places):
+    for obj, (x, y, turn) in zip(objs, places):
         matrix = Matrix.Translation((x, y, 0)) @ Matrix.Rotation(turn, 4, "Z") @ Matrix.Scale(scale, 4)
-        thing.object.matrix_world = matrix
-    for name, mesh, looks in (("table", shapes.table(max(.62, spread + .06)), [materials.table]),
-                              ("backdrop", shapes.backdrop(2.6), [materials.floor, materials.wall])):
+        obj.object.matrix_world = matrix
+    for name, mesh, looks in (
+        ("table", shapes.table(max(0.62, spread + 0.06)), [materials.table]),
+        ("backdrop", shapes.backdrop(2.6), [materials.floor, materials.wall]),
+    ):
         for i, look in enumerate(looks):
-            mesh.materials.append(look(rng_for(seed, 2, len(things), i)))
-        thing = Thing(len(things) + 1, name, bpy.data.objects.new(name, mesh))
-        scene.collection.objects.link(thing.object)
-        things.append(thing)
-    for thing in things:
-        thing.object.pass_index = thing.id
-    room = things[-1].object  # the world's light comes through it
+            mesh.materials.append(look(rng_for(seed, 2, len(objs), i)))
+        obj = Thing(len(objs) + 1, name, bpy.data.objects.new(name, mesh))
+        scene.collection.objects.link(obj.object)
+        objs.append(obj)
+    for obj in objs:
+        obj.object.pass_index = obj.id
+    room = objs[-1].object  # the world's light comes through it
     room.visible_diffuse = room.visible_glossy = room.visible_shadow = False
     _light(scene)
-    return scene, things
+    return scene, objs
 
 
-def _size(mesh) -> tuple[float, float]:
-    """Radius around the z axis and height, metres."""
+def _size(mesh: bpy.types.Mesh) -> tuple[float, float]:
+    """Radius around the z axis and height, meters."""
     points = np.empty(len(mesh.vertices) * 3, np.float32)
     mesh.vertices.foreach_get("co", points)
     points = points.reshape(-1, 3)
     return float(np.hypot(points[:, 0], points[:, 1]).max()), float(points[:, 2].max())
 
 
-def _arrange(sizes: np.ndarray, seed: int):
+def _arrange(sizes: np.ndarray, seed: int) -> Any:
     """Places (x, y, turn) without overlap, dense, high things inside; the radius used; and a common scale."""
     rng = rng_for(seed, 3)
-    scale, limit = 1.0, .44
+    scale, limit = 1.0, 0.44
     while True:
         radius, height = sizes[:, 0] * scale, sizes[:, 1]
         best = None
@@ -99,28 +104,28 @@ def _arrange(sizes: np.ndarray, seed: int):
             if placed is None:
                 continue
             # dense around the middle, and the high things inside
-            cost = float((np.hypot(*placed.T) * (height + .05)).sum())
+            cost = float((np.hypot(*placed.T) * (height + 0.05)).sum())
             if best is None or cost < best[0]:
                 best = (cost, placed)
         if best is not None:
             places = np.column_stack([best[1], rng.uniform(0, 2 * math.pi, len(sizes))])
             spread = float((np.hypot(*best[1].T) + radius).max())
             return [tuple(map(float, p)) for p in places], spread, scale
-        if scale * sizes[:, 1].min() > .085 and limit > .5:
-            scale *= .95
+        if scale * sizes[:, 1].min() > 0.085 and limit > 0.5:
+            scale *= 0.95
         else:
             limit *= 1.04
 
 
-def _scatter(radius, height, limit, rng):
+def _scatter(radius: Any, height: Any, limit: Any, rng: Any) -> Any:
     placed = np.zeros((len(radius), 2))
     done: list[int] = []
     for i in np.argsort(-radius):
         for _ in range(200):
-            r = (limit - radius[i] * .6) * math.sqrt(rng.random())
+            r = (limit - radius[i] * 0.6) * math.sqrt(rng.random())
             a = rng.uniform(0, 2 * math.pi)
             spot = np.array([r * math.cos(a), r * math.sin(a)])
-            if all(np.hypot(*(spot - placed[j])) > radius[i] + radius[j] + .006 for j in done):
+            if all(np.hypot(*(spot - placed[j])) > radius[i] + radius[j] + 0.006 for j in done):
                 placed[i] = spot
                 done.append(i)
                 break
@@ -129,26 +134,26 @@ def _scatter(radius, height, limit, rng):
     return placed
 
 
-def _light(scene) -> None:
+def _light(scene: bpy.types.Scene) -> None:
     world = bpy.data.worlds.new("demo")
     if world.node_tree is None:
         world.use_nodes = True
     tree = world.node_tree
     tree.nodes.clear()
     background = tree.nodes.new("ShaderNodeBackground")
-    background.inputs[0].default_value = (.86, .93, 1.0, 1.0)
-    background.inputs[1].default_value = .62
+    background.inputs[0].default_value = (0.86, 0.93, 1.0, 1.0)
+    background.inputs[1].default_value = 0.62
     output = tree.nodes.new("ShaderNodeOutputWorld")
     tree.links.new(background.outputs[0], output.inputs[0])
     world.cycles.sampling_method = "NONE"  # an even sky is met best by the rays that bounce off
     scene.world = world
-    for place, power, size, colour in (((1.5, -1.2, 2.6), 85.0, 1.5, (1.0, .93, .82)),):
+    for place, power, size, color in (((1.5, -1.2, 2.6), 85.0, 1.5, (1.0, 0.93, 0.82)),):
         lamp = bpy.data.lights.new("demo", "AREA")
-        lamp.energy, lamp.size, lamp.color = power, size, colour
-        thing = bpy.data.objects.new("demo light", lamp)
-        thing.matrix_world = Matrix.Translation(place) @ Vector(place).to_track_quat("Z", "Y").to_matrix().to_4x4()
-        thing.visible_camera = False
-        scene.collection.objects.link(thing)
+        lamp.energy, lamp.size, lamp.color = power, size, color
+        obj = bpy.data.objects.new("demo light", lamp)
+        obj.matrix_world = Matrix.Translation(place) @ Vector(place).to_track_quat("Z", "Y").to_matrix().to_4x4()
+        obj.visible_camera = False
+        scene.collection.objects.link(obj)
 
 
 def cameras(views: int, seed: int) -> list[View]:
@@ -159,20 +164,20 @@ def cameras(views: int, seed: int) -> list[View]:
     for i in range(views):
         ring = 0 if i < low else 1
         count, j = (low, i) if ring == 0 else (views - low, i - low)
-        angle = 2 * math.pi * (j + .5 * ring) / count + rng.normal(0, .02)
+        angle = 2 * math.pi * (j + 0.5 * ring) / count + rng.normal(0, 0.02)
         radius, height = RINGS[ring]
-        radius, height = radius * (1 + rng.normal(0, .02)), height + rng.normal(0, .015)
-        centre = np.array([radius * math.cos(angle), radius * math.sin(angle), height])
-        target = LOOK_AT + rng.normal(0, .012, 3)
-        forward = target - centre
+        radius, height = radius * (1 + rng.normal(0, 0.02)), height + rng.normal(0, 0.015)
+        center = np.array([radius * math.cos(angle), radius * math.sin(angle), height])
+        target = LOOK_AT + rng.normal(0, 0.012, 3)
+        forward = target - center
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, [0, 0, 1])
         right /= np.linalg.norm(right)
-        roll = rng.normal(0, .01)
+        roll = rng.normal(0, 0.01)
         down = np.cross(forward, right)
         right, down = (math.cos(roll) * right + math.sin(roll) * down, math.cos(roll) * down - math.sin(roll) * right)
         rotation = np.stack([right, down, forward])
-        result.append(View(f"{i:04d}.png", rotation, -rotation @ centre))
+        result.append(View(f"{i:04d}.png", rotation, -rotation @ center))
     return result
 
 
@@ -181,19 +186,19 @@ def intrinsics(width: int, height: int) -> tuple[float, float, float, float]:
     return FOCAL * width, FOCAL * width, width / 2, height / 2
 
 
-def triangles(thing: Thing) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) in world metres and triangles (F, 3) of a thing."""
-    mesh = thing.object.data
+def triangles(obj: Thing) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) in world meters and triangles (F, 3) of a thing."""
+    mesh = obj.object.data
     mesh.calc_loop_triangles()
     points = np.empty(len(mesh.vertices) * 3, np.float32)
     mesh.vertices.foreach_get("co", points)
     faces = np.empty(len(mesh.loop_triangles) * 3, np.int32)
     mesh.loop_triangles.foreach_get("vertices", faces)
-    matrix = np.array(thing.object.matrix_world)
+    matrix = np.array(obj.object.matrix_world)
     return points.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3], faces.reshape(-1, 3)
 
 
-def remove(scene) -> None:
+def remove(scene: bpy.types.Scene) -> None:
     """Take the scene and all that was made for it out of the open file."""
     objects = list(scene.collection.all_objects)
     data = {o.data for o in objects if o.data is not None}

@@ -1,14 +1,22 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Gaussian splats in the 3D viewports as they are: sorted, blended, and with the colours of the direction.
+"""Gaussian splats in the 3D viewports: sorted, alpha-blended, with view-dependent colors.
 
-`order` sorts, `renderer` draws arrays with the programs in `shaders`, `gather` makes arrays of Blender's objects, and
-`viewport` draws in the viewports.
+`gather` lists the objects to draw, `splat_arrays` holds their splats as arrays, `order` sorts them, `renderer` draws
+them with the programs in `shaders`, and `viewport` adds the result to the viewports.
 """
 
-from .gather import owners, shown, splat_parts
-from .viewport import picture, point_at, redraw, register, show, trouble, unregister
+from .gather import collections_by_part, shown, splat_parts
+from .viewport import failure, picture, point_at, redraw, register, show, unregister
 
 __all__ = [
-    "owners", "picture", "point_at", "redraw", "register", "show", "shown", "splat_parts", "trouble",
+    "collections_by_part",
+    "failure",
+    "picture",
+    "point_at",
+    "redraw",
+    "register",
+    "show",
+    "shown",
+    "splat_parts",
     "unregister",
 ]

@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a viewport shows of the splats in a scene."""
+"""Which splats of a scene a viewport shows, and how."""
+
+from __future__ import annotations
+
+from typing import Any
 
 import bpy
 import numpy as np
 
-from ...backend.palette import to_encoded
+from ...backend.shared.color.palette import to_encoded
 from .. import scene as scenes
-from ..splat_arrays import arrays_of
-from .renderer import Drawn
+from .renderer import DrawnObject
+from .splat_arrays import arrays_of
 
-NO_RECOLOUR = np.hstack([np.eye(3), np.zeros((3, 1))])
+NO_RECOLOR = np.hstack([np.eye(3), np.zeros((3, 1))])
 NONE = (0.0, 0.0, 0.0, 0.0)
 SELECTED = (1.0, 0.55, 0.1, 0.25)
 POINTED_AT = (1.0, 1.0, 1.0, 0.3)
@@ -18,30 +22,37 @@ _HIDES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "VOLUME", "POINTCLOUD", "C
 
 
 def splat_parts(view_layer: bpy.types.ViewLayer, space: bpy.types.SpaceView3D | None = None) -> list[bpy.types.Object]:
-    """The mesh carriers of splats that a view layer, or a viewport, shows."""
+    """The mesh carriers of splats that a view layer, or one of its viewports, shows."""
     return [part for part in view_layer.objects if scenes.kind_of(part) == "splats" and shown(part, view_layer, space)]
 
 
-def shown(part, view_layer, space) -> bool:
+def shown(part: bpy.types.Object, view_layer: bpy.types.ViewLayer, space: bpy.types.SpaceView3D) -> bool:
     if space is None:
         return part.visible_get(view_layer=view_layer)
     return part.visible_get(view_layer=view_layer, viewport=space)
 
 
-def owners() -> dict[bpy.types.Object, bpy.types.Collection]:
-    """Part -> the object's or the duplicate's collection that it lies in; asking each part would look at all."""
-    return {part: collection for collection in bpy.data.collections
-            if scenes.kind_of(collection) in ("object", "object_copy") for part in collection.objects}
+def collections_by_part() -> dict[bpy.types.Object, bpy.types.Collection]:
+    """Part -> collection of its object or duplicate; one pass, since Blender searches all collections for each part."""
+    return {
+        part: collection
+        for collection in bpy.data.collections
+        if scenes.kind_of(collection) in ("object", "object_copy")
+        for part in collection.objects
+    }
 
 
-def gather(parts, colours: str = "photo", pointed_at: int | None = None, marks: bool = True) -> list[Drawn]:
-    """Carriers as the renderer takes them; those whose splats are gone are left out.
+def gather(parts: Any, colors: str = "photo", pointed_at: int | None = None, marks: bool = True) -> list[DrawnObject]:
+    """Convert carriers to what the renderer draws; those whose attributes are missing are left out.
 
-    colours: "photo", or "object" for the objects' own colours; marks: show what is selected; pointed_at: the number of
-    this session of a collection under the mouse.
+    Args:
+        parts: mesh carriers of splats.
+        colors: "photo", or "object" for the objects' own colors.
+        pointed_at: session UID of the collection under the mouse, or None.
+        marks: highlight selected objects.
     """
     found = []
-    collections = owners()
+    collections = collections_by_part()
     for part in parts:
         arrays = arrays_of(part.data)
         if arrays is None:
@@ -52,22 +63,23 @@ def gather(parts, colours: str = "photo", pointed_at: int | None = None, marks: 
             highlight = POINTED_AT
         elif marks and part.select_get():
             highlight = SELECTED
-        colour = (*to_encoded(part.color[:3]), 1.0) if colours == "object" else NONE
-        found.append(Drawn(arrays, np.array(part.matrix_world), colour_map(collection), colour, highlight))
+        color = (*to_encoded(part.color[:3]), 1.0) if colors == "object" else NONE
+        found.append(DrawnObject(arrays, np.array(part.matrix_world), color_map(collection), color, highlight))
     return found
 
 
-def colour_map(collection) -> np.ndarray:
-    """(3, 4): matrix and offset of what was asked of an object's colours, by its collection or None."""
-    recolour = scenes.recolour_of(collection) if collection is not None else None
-    if recolour is None:
-        return NO_RECOLOUR
-    matrix, offset = recolour.affine()
+def color_map(collection: bpy.types.Collection) -> np.ndarray:
+    """(3, 4): matrix and offset by which the object of a collection is recolored; None: not recolored."""
+    recolor = scenes.recolor_of(collection) if collection is not None else None
+    if recolor is None:
+        return NO_RECOLOR
+    matrix, offset = recolor.affine()
     return np.hstack([matrix, offset[:, None]])
 
 
-def hides_splats(view_layer, space) -> bool:
-    """Whether a viewport shows anything that may be in front of splats."""
+def may_hide_splats(view_layer: bpy.types.ViewLayer, space: bpy.types.SpaceView3D) -> bool:
+    """Whether a viewport shows anything that may occlude splats."""
     return space.overlay.show_overlays or any(
-        thing.type in _HIDES and scenes.kind_of(thing) != "splats" and shown(thing, view_layer, space)
-        for thing in view_layer.objects)
+        obj.type in _HIDES and scenes.kind_of(obj) != "splats" and shown(obj, view_layer, space)
+        for obj in view_layer.objects
+    )

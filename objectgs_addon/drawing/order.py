@@ -1,13 +1,21 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The order in which splats are drawn, from far to near, by a sort of 16-bit numbers: one pass a byte."""
+"""Back-to-front order of splats, by a radix sort of 16-bit keys."""
 
 import numpy as np
 
 
 def back_to_front(depths: np.ndarray, near: float, orthographic: bool) -> np.ndarray:
-    """Indices of the splats that are deeper than `near`, the deepest first. depths: (N,) float32.
+    """Sort splats by depth.
 
-    With perspective, two whose depths differ by less than about a ten-thousandth may come in the order they are given.
+    In perspective, splats whose depths differ by less than about 1e-4 of the depth may keep their given order.
+
+    Args:
+        depths: (N,) float32.
+        near: splats that are not deeper are left out.
+        orthographic: quantize depths linearly instead of logarithmically.
+
+    Returns:
+        Indices of the splats, the deepest first.
     """
     is_ahead = depths > near
     ahead = None if is_ahead.all() else np.flatnonzero(is_ahead)
@@ -18,7 +26,7 @@ def back_to_front(depths: np.ndarray, near: float, orthographic: bool) -> np.nda
         least, most = float(kept.min()), float(kept.max())
         keys = ((most - kept) * (65535.0 / max(most - least, 1e-30))).astype(np.uint16)
     else:
-        # Positive floats are ordered as their bits are, which are nearly their logarithms.
+        # The bits of positive floats have the floats' order, and are nearly proportional to their logarithms.
         bits = np.ascontiguousarray(kept, np.float32).view(np.uint32)
         least, most = int(bits.min()), int(bits.max())
         keys = ((most - bits) >> max(0, (most - least).bit_length() - 16)).astype(np.uint16)

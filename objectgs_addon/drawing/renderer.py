@@ -1,70 +1,83 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Draws splats into a picture on the GPU, as the backend's renderers blend them."""
+"""Rendering of splats on the GPU, with the same blending as the backend's rasterizers."""
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import bpy
 import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
-from ...backend.picking import View
-from ..splat_arrays import SplatArrays
+from ...backend.shared.splats.picking import View
 from . import shaders
 from .order import back_to_front
+from .splat_arrays import SplatArrays
 
 
 @dataclass(frozen=True)
-class Drawn:
-    """An object to draw: its splats, their map to the world (4, 4), the affine map of its colours (3, 4), and what
-    covers them: `colour` and `highlight`, encoded RGB with the share (4,)."""
+class DrawnObject:
+    """An object to draw.
+
+    matrix: (4, 4) object to world; recolor: (3, 4) affine map of colors; color, highlight: sRGB-encoded RGB that covers
+    the splats' colors, and its opacity.
+    """
 
     splats: SplatArrays
     matrix: np.ndarray
-    recolour: np.ndarray
-    colour: tuple[float, float, float, float]
+    recolor: np.ndarray
+    color: tuple[float, float, float, float]
     highlight: tuple[float, float, float, float]
 
 
 class Renderer:
-    """GPU programs and the tables of what was drawn last. Only to be used where a GPU context is active."""
+    """GPU programs, and the textures of the objects drawn last. Needs an active GPU context."""
 
     def __init__(self) -> None:
         self._splat = shaders.splat_shader()
         self._over = shaders.over_shader()
         square = {"corner": [(-1, -1), (1, -1), (-1, 1), (1, 1)]}
-        self._quads = {shader: batch_for_shader(shader, "TRI_STRIP", square)
-                       for shader in (self._splat, self._over)}
+        self._quads = {shader: batch_for_shader(shader, "TRI_STRIP", square) for shader in (self._splat, self._over)}
         self._nothing = gpu.types.GPUTexture((1, 1), format="R32F", data=_buffer(np.ones(1)))
         self._target: gpu.types.GPUOffScreen | None = None
         self._pool: _Pool | None = None
         self._sorted: _Sorted | None = None
 
-    def draw(self, things: Sequence[Drawn], view: View, projection: np.ndarray, depth: np.ndarray | None) -> bool:
-        """Draw into the renderer's own picture; False where there is nothing to draw.
+    def draw(self, objs: Sequence[DrawnObject], view: View, projection: np.ndarray, depth: np.ndarray | None) -> bool:
+        """Draw into the renderer's own image.
 
-        projection (4, 4): OpenGL's, which `depth` (height, width), if any, was drawn with: 0 at the near plane, 1 at
-        the far one; splats behind it are hidden.
+        Args:
+            objs: the objects to draw.
+            view: camera and image size.
+            projection: (4, 4) OpenGL projection matrix of the view.
+            depth: (height, width) depth buffer under this projection, 0 at the near plane and 1 at the far plane, which
+                hides splats behind it; or None.
+
+        Returns:
+            False if there is nothing to draw.
         """
-        things = [thing for thing in things if len(thing.splats.means)]
-        if not things:
+        objs = [obj for obj in objs if len(obj.splats.means)]
+        if not objs:
             return False
-        if self._pool is None or not self._pool.holds(things):
-            self._pool, self._sorted = _Pool(things), None
-        if self._sorted is None or not self._sorted.holds(things):
-            self._sorted = _Sorted(self._pool, things)
-        self._sorted.sort(things, view)
+        if self._pool is None or not self._pool.holds(objs):
+            self._pool, self._sorted = _Pool(objs), None
+        if self._sorted is None or not self._sorted.holds(objs):
+            self._sorted = _Sorted(self._pool, objs)
+        self._sorted.sort(objs, view)
         if self._sorted.count == 0:
             return False
-        with _state(), self._target_of(view.width, view.height).bind():
+        with _KeptState(), self._target_of(view.width, view.height).bind():
             target = gpu.state.active_framebuffer_get()
             target.clear(color=(0.0, 0.0, 0.0, 0.0))
-            self._write(things, view, projection, depth)
+            self._write(objs, view, projection, depth)
         return True
 
-    def over(self) -> None:
-        """Lay the picture over the active framebuffer."""
-        with _state():
+    def composite(self) -> None:
+        """Blend the image over the active framebuffer."""
+        with _KeptState():
             gpu.state.depth_test_set("NONE")
             gpu.state.blend_set("ALPHA_PREMULT")
             self._over.bind()
@@ -72,7 +85,7 @@ class Renderer:
             self._quads[self._over].draw(self._over)
 
     def pixels(self) -> np.ndarray:
-        """(height, width, 4) float32 of the picture, premultiplied, the top row first."""
+        """The image as (height, width, 4) float32, premultiplied, the top row first."""
         width, height = self._target.width, self._target.height
         with self._target.bind():
             read = gpu.state.active_framebuffer_get().read_color(0, 0, width, height, 4, 0, "FLOAT")
@@ -80,7 +93,7 @@ class Renderer:
         return np.array(read, np.float32).reshape(height, width, 4)[::-1]
 
     def free(self) -> None:
-        """Give the GPU's memory back."""
+        """Free GPU memory."""
         if self._target is not None:
             self._target.free()
         self._target = self._pool = self._sorted = None
@@ -92,7 +105,9 @@ class Renderer:
             self._target = gpu.types.GPUOffScreen(width, height, format="RGBA16F")
         return self._target
 
-    def _write(self, things, view: View, projection: np.ndarray, depth: np.ndarray | None) -> None:
+    def _write(
+        self, objs: Iterable[bpy.types.Object], view: View, projection: np.ndarray, depth: np.ndarray | None
+    ) -> None:
         hiding = self._nothing
         if depth is not None:
             hiding = gpu.types.GPUTexture(depth.shape[::-1], format="R32F", data=_buffer(depth))
@@ -107,20 +122,20 @@ class Renderer:
         shader.uniform_float("depths", (float(projection[2, 2]), float(projection[2, 3])))
         shader.uniform_int("bands", self._pool.bands)
         shader.uniform_int("hides", int(depth is not None))
-        things_table = _table(_objects(things, view), "RGBA32F")
+        objects_table = _table(_objects(objs, view), "RGBA32F")
         shader.uniform_sampler("order", self._sorted.texture)
         shader.uniform_sampler("splats", self._pool.splats)
         shader.uniform_sampler("harmonics", self._pool.harmonics)
-        shader.uniform_sampler("things", things_table)
+        shader.uniform_sampler("objects", objects_table)
         shader.uniform_sampler("depth", hiding)
         self._quads[shader].draw_instanced(shader, instance_count=self._sorted.count)
 
 
 class _Pool:
-    """The splats of several meshes in textures, one behind the other."""
+    """The splats of several meshes, concatenated in textures."""
 
-    def __init__(self, things: Sequence[Drawn]) -> None:
-        self._arrays = list({id(thing.splats): thing.splats for thing in things}.values())
+    def __init__(self, objs: Sequence[DrawnObject]) -> None:
+        self._arrays = list({id(obj.splats): obj.splats for obj in objs}.values())
         starts = np.cumsum([0, *(len(arrays.means) for arrays in self._arrays)])
         self.starts = {id(arrays): int(start) for arrays, start in zip(self._arrays, starts)}
         count = int(starts[-1])
@@ -139,9 +154,9 @@ class _Pool:
         self.splats = _table(splats, "RGBA32F")
         self.harmonics = _table(harmonics, "RGBA16F")
 
-    def holds(self, things: Sequence[Drawn]) -> bool:
-        """Whether all of these are here, and not many others."""
-        wanted = {id(thing.splats): thing.splats for thing in things}
+    def holds(self, objs: Sequence[DrawnObject]) -> bool:
+        """Whether it contains the splats of all of these objects, and not many others."""
+        wanted = {id(obj.splats): obj.splats for obj in objs}
         if not all(key in self.starts for key in wanted):
             return False
         used = sum(len(arrays.means) for arrays in wanted.values())
@@ -149,10 +164,10 @@ class _Pool:
 
 
 class _Sorted:
-    """The order in which splats are drawn, for one view of objects in their places."""
+    """The drawing order of splats, for one view and placement of objects."""
 
-    def __init__(self, pool: _Pool, things: Sequence[Drawn]) -> None:
-        self._splats = [thing.splats for thing in things]
+    def __init__(self, pool: _Pool, objs: Sequence[DrawnObject]) -> None:
+        self._splats = [obj.splats for obj in objs]
         counts = [len(splats.means) for splats in self._splats]
         self._entries = np.empty((sum(counts), 2), np.float32)
         self._depths = np.empty(len(self._entries), np.float32)
@@ -168,14 +183,13 @@ class _Sorted:
         self.count = 0
         self.texture: gpu.types.GPUTexture | None = None
 
-    def holds(self, things: Sequence[Drawn]) -> bool:
+    def holds(self, objs: Sequence[DrawnObject]) -> bool:
         """Whether these are the objects that it sorts."""
-        return len(things) == len(self._splats) and all(
-            thing.splats is splats for thing, splats in zip(things, self._splats))
+        return len(objs) == len(self._splats) and all(obj.splats is splats for obj, splats in zip(objs, self._splats))
 
-    def sort(self, things: Sequence[Drawn], view: View) -> None:
-        """Bring the order up to date, if the view or an object has moved."""
-        rows = view.viewmat[2] @ np.array([thing.matrix for thing in things])
+    def sort(self, objs: Sequence[DrawnObject], view: View) -> None:
+        """Update the order if the view or an object has moved."""
+        rows = view.viewmat[2] @ np.array([obj.matrix for obj in objs])
         if self._rows is not None and np.array_equal(rows, self._rows):
             return
         self._rows = rows
@@ -187,13 +201,13 @@ class _Sorted:
         self.texture = _table(self._entries.take(order, axis=0), "RG32F") if self.count else None
 
 
-def _objects(things: Sequence[Drawn], view: View) -> np.ndarray:
-    """(n, OBJECT_TEXELS, 4) float32: what the shader needs of each object in this view."""
-    table = np.zeros((len(things), shaders.OBJECT_TEXELS, 4), np.float32)
-    matrices = np.array([thing.matrix for thing in things])
+def _objects(objs: Sequence[DrawnObject], view: View) -> np.ndarray:
+    """(n, OBJECT_TEXELS, 4) float32: the shader's data of each object in this view."""
+    table = np.zeros((len(objs), shaders.OBJECT_TEXELS, 4), np.float32)
+    matrices = np.array([obj.matrix for obj in objs])
     eye = np.linalg.inv(view.viewmat)[:3]
     table[:, 0:3] = (view.viewmat @ matrices)[:, :3]
-    # Harmonics turn with the object but are not stretched with it.
+    # Harmonics rotate with the object, but are not scaled with it.
     left, _, right = np.linalg.svd(matrices[:, :3, :3])
     back = np.swapaxes(left @ right, 1, 2)
     if view.orthographic:
@@ -201,8 +215,8 @@ def _objects(things: Sequence[Drawn], view: View) -> np.ndarray:
     else:
         table[:, 3:6, :3] = back @ matrices[:, :3, :3]
         table[:, 3:6, 3] = np.einsum("nij,nj->ni", back, matrices[:, :3, 3] - eye[:, 3])
-    table[:, 6:9] = [thing.recolour for thing in things]
-    table[:, 9], table[:, 10] = [thing.colour for thing in things], [thing.highlight for thing in things]
+    table[:, 6:9] = [obj.recolor for obj in objs]
+    table[:, 9], table[:, 10] = [obj.color for obj in objs], [obj.highlight for obj in objs]
     return table
 
 
@@ -222,13 +236,13 @@ def _buffer(values: np.ndarray) -> gpu.types.Buffer:
     return gpu.types.Buffer("FLOAT", flat.size, flat)
 
 
-class _state:
-    """Leaves blending and depth tests as they were."""
+class _KeptState:
+    """Restores the state of blending and depth tests."""
 
-    def __enter__(self):
+    def __enter__(self) -> None:
         self._before = gpu.state.blend_get(), gpu.state.depth_test_get(), gpu.state.depth_mask_get()
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: Any) -> None:
         blend, test, mask = self._before
         gpu.state.blend_set(blend)
         gpu.state.depth_test_set(test)

@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The GPU's programs: a splat as a quad with its Gaussian, and the finished picture over the viewport.
+"""GPU programs: a splat as a quad with its Gaussian, and the finished image over the viewport.
 
-Described by GPUShaderCreateInfo, so that OpenGL, Metal and Vulkan take them.
+They are described by GPUShaderCreateInfo, so that they work with OpenGL, Metal and Vulkan.
 """
 
 import gpu
 
-from ...backend.blending import ALPHA_MAX, ALPHA_MIN, BLUR, MAX_EXTENT
+from ...backend.shared.splats.blending import ALPHA_MAX, ALPHA_MIN, EPS_2D, MAX_EXTENT
 
 TABLE_WIDTH = 4096
-"""Texels in a row of the textures that hold tables."""
+"""Texels per row of textures that hold tables."""
 
 SPLAT_TEXELS = 3
-"""Of a splat: mean and opacity, quaternion, scales."""
+"""Texels per splat: mean and opacity, quaternion, scales."""
 
 OBJECT_TEXELS = 12
-"""Of an object: rows of the map to camera space, of the map to directions of view, of the map of colours with what it
-adds; its colour with the share of it; the highlight with the share of it; the rest is free."""
+"""Texels per object: three rows each of the map to camera space, of the map to view directions and of the affine map of
+colors; the color and the highlight, each with its opacity; one is unused."""
 
 _CONSTANTS = f"""
 #define TABLE_WIDTH {TABLE_WIDTH}
@@ -24,11 +24,13 @@ _CONSTANTS = f"""
 #define OBJECT_TEXELS {OBJECT_TEXELS}
 #define ALPHA_MAX {ALPHA_MAX!r}
 #define ALPHA_MIN {ALPHA_MIN!r}
-#define BLUR {BLUR!r}
+#define EPS_2D {EPS_2D!r}
 #define MAX_EXTENT {MAX_EXTENT!r}
 """
 
-_SPLAT_VERTEX = _CONSTANTS + """
+_SPLAT_VERTEX = (
+    _CONSTANTS
+    + """
 vec4 at(sampler2D table, int index) {
     return texelFetch(table, ivec2(index % TABLE_WIDTH, index / TABLE_WIDTH), 0);
 }
@@ -66,16 +68,16 @@ void main() {
     tint = vec4(0.0);
     vec2 entry = at(order, gl_InstanceID).xy;
     int splat = int(entry.x + 0.5);
-    int thing = int(entry.y + 0.5) * OBJECT_TEXELS;
-    vec4 place = at(splats, splat * SPLAT_TEXELS);
+    int object = int(entry.y + 0.5) * OBJECT_TEXELS;
+    vec4 mean_opacity = at(splats, splat * SPLAT_TEXELS);
     vec4 q = at(splats, splat * SPLAT_TEXELS + 1);
     vec3 scale = at(splats, splat * SPLAT_TEXELS + 2).xyz;
-    vec4 to_x = at(things, thing);
-    vec4 to_y = at(things, thing + 1);
-    vec4 to_z = at(things, thing + 2);
-    vec4 mean = vec4(place.xyz, 1.0);
+    vec4 to_x = at(objects, object);
+    vec4 to_y = at(objects, object + 1);
+    vec4 to_z = at(objects, object + 2);
+    vec4 mean = vec4(mean_opacity.xyz, 1.0);
     vec3 p = vec3(dot(to_x, mean), dot(to_y, mean), dot(to_z, mean));
-    float opacity = place.w;
+    float opacity = mean_opacity.w;
     bool orthographic = size.w > 0.5;
     if (!(p.z > size.z) || !(opacity > ALPHA_MIN)) {
         return;
@@ -101,37 +103,40 @@ void main() {
     float b = dot(first, second);
     float c = dot(second, second);
     vec3 area = cross(first, second);
-    float across2 = (dot(area, area) + BLUR * (a + c + BLUR)) / (c + BLUR);
-    a += BLUR;
-    c += BLUR;
+    float across2 = (dot(area, area) + EPS_2D * (a + c + EPS_2D)) / (c + EPS_2D);
+    a += EPS_2D;
+    c += EPS_2D;
     vec2 extent = sqrt(2.0 * log(opacity / ALPHA_MIN) * vec2(a, c));
     if (!(max(extent.x, extent.y) < MAX_EXTENT)) {
         return;
     }
 
-    vec3 direction = vec3(dot(at(things, thing + 3), mean), dot(at(things, thing + 4), mean),
-                          dot(at(things, thing + 5), mean));
+    vec3 direction = vec3(dot(at(objects, object + 3), mean), dot(at(objects, object + 4), mean),
+                          dot(at(objects, object + 5), mean));
     vec4 photo = vec4(radiance(splat, normalize(direction)), 1.0);
-    vec3 colour = vec3(dot(at(things, thing + 6), photo), dot(at(things, thing + 7), photo),
-                       dot(at(things, thing + 8), photo));
-    colour = max(colour, 0.0);
-    vec4 own = at(things, thing + 9);
-    // As bright and dark as it is, so that its form is seen.
-    float shade = 0.5 + dot(colour, vec3(0.299, 0.587, 0.114));
-    colour = mix(colour, own.rgb * shade, own.a);
-    vec4 mark = at(things, thing + 10);
-    colour = mix(colour, mark.rgb, mark.a);
+    vec3 color = vec3(dot(at(objects, object + 6), photo), dot(at(objects, object + 7), photo),
+                       dot(at(objects, object + 8), photo));
+    color = max(color, 0.0);
+    vec4 own = at(objects, object + 9);
+    // Keeps the brightness, so that shapes remain visible.
+    float shade = 0.5 + dot(color, vec3(0.299, 0.587, 0.114));
+    color = mix(color, own.rgb * shade, own.a);
+    vec4 mark = at(objects, object + 10);
+    color = mix(color, mark.rgb, mark.a);
 
     beside = corner * extent;
     shape = vec4(b / c, 0.5 / across2, 0.5 / c, opacity);
     vec2 pixel = lens.xy * p.xy * per_z + lens.zw + beside;
     float depth = (depths.y - depths.x * p.z) * per_z;
-    tint = vec4(colour, 0.5 * depth + 0.5);
+    tint = vec4(color, 0.5 * depth + 0.5);
     gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, depth, 1.0);
 }
 """
+)
 
-_SPLAT_FRAGMENT = _CONSTANTS + """
+_SPLAT_FRAGMENT = (
+    _CONSTANTS
+    + """
 void main() {
     float d = beside.x - shape.x * beside.y;
     float alpha = shape.w * exp(-(shape.y * d * d + shape.z * beside.y * beside.y));
@@ -145,6 +150,7 @@ void main() {
     result = vec4(alpha * tint.rgb, alpha);
 }
 """
+)
 
 _OVER_VERTEX = """
 void main() {
@@ -153,19 +159,19 @@ void main() {
 }
 """
 
-# The viewport takes linear colours, and blends them so.
+# The viewport blends linear colors.
 _OVER_FRAGMENT = """
 void main() {
     vec4 drawn = texture(picture, uv);
-    vec3 colour = drawn.rgb / max(drawn.a, 1e-6);
-    vec3 high = pow((colour + 0.055) / 1.055, vec3(2.4));
-    result = vec4(mix(high, colour / 12.92, vec3(lessThanEqual(colour, vec3(0.04045)))) * drawn.a, drawn.a);
+    vec3 color = drawn.rgb / max(drawn.a, 1e-6);
+    vec3 high = pow((color + 0.055) / 1.055, vec3(2.4));
+    result = vec4(mix(high, color / 12.92, vec3(lessThanEqual(color, vec3(0.04045)))) * drawn.a, drawn.a);
 }
 """
 
 
 def splat_shader() -> gpu.types.GPUShader:
-    """An instance of a quad for each entry of `order`, premultiplied, as the photos are encoded."""
+    """Draws a quad for each entry of `order`; the output is premultiplied and sRGB-encoded."""
     between = gpu.types.GPUStageInterfaceInfo("objectgs_splat")
     between.smooth("VEC2", "beside")
     between.flat("VEC4", "shape")
@@ -177,8 +183,8 @@ def splat_shader() -> gpu.types.GPUShader:
     info.push_constant("VEC2", "depths")
     info.push_constant("INT", "bands")
     info.push_constant("INT", "hides")
-    for place, name in enumerate(("order", "splats", "harmonics", "things", "depth")):
-        info.sampler(place, "FLOAT_2D", name)
+    for slot, name in enumerate(("order", "splats", "harmonics", "objects", "depth")):
+        info.sampler(slot, "FLOAT_2D", name)
     info.vertex_in(0, "VEC2", "corner")
     info.vertex_out(between)
     info.fragment_out(0, "VEC4", "result")
@@ -188,7 +194,7 @@ def splat_shader() -> gpu.types.GPUShader:
 
 
 def over_shader() -> gpu.types.GPUShader:
-    """Lays a premultiplied, encoded picture over what is there."""
+    """Blends a premultiplied, sRGB-encoded image over the framebuffer."""
     between = gpu.types.GPUStageInterfaceInfo("objectgs_over")
     between.smooth("VEC2", "uv")
     info = gpu.types.GPUShaderCreateInfo()

@@ -1,38 +1,51 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Nodes in a scene's compositor that join film frames of splats with Blender's own rendering, by depth.
+"""Compositor nodes that combine film frames of splats with Blender's own rendering, by depth.
 
     frames of splats (EXR) --- Depth --------> nearer than Blender's? ---- yes: 1, no: 0
                            `-- Combined -> behind -> Blender's rendering over it -> in front -> output
     Cryptomatte of the same files, for mattes of single objects
 
-Splats lie behind Blender's rendering where that is nearer, and before it elsewhere, and what is before lets through
-what its alpha lets through. Blender 4.2 to 4.5 keep a scene's nodes in the scene, 5.0 and newer in a node group.
+Splats are behind Blender's rendering where that is nearer, and in front of it elsewhere; both are blended by alpha.
+Blender 4.2 to 4.5 store the compositor nodes in the scene, 5.0 and newer in a node group.
 """
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import Any
 
 import bpy
 
-from ...backend.protocol import InputError
+from ...backend.shared.errors import InputError
 from ..scene.kinds import KIND, kind_of, mark
-from ..scene.preview import Graph
+from ..scene.shading.graph import Graph
 
 FILM = "film"
-"""Kind of the nodes' image and of the nodes."""
+"""The kind of our nodes and of their image."""
 
 PATTERN = "splats.{:04d}.exr"
 NEAREST_IN = 1
-"""Pixels around one whose nearest depth counts for Blender's rendering, so that its soft edges are as near as what
-they belong to."""
+"""Radius in pixels of the minimum filter on the depth of Blender's rendering, so that antialiased edges have the depth
+of the object in front."""
 
 
-def set_up_compositor(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, root: bpy.types.Collection,
-                      folder: Path, matte: str = "") -> None:
-    """Make the scene's compositor join the film frames in `folder` with its rendering, which from now on leaves the
-    reconstruction out. matte: the name of an object that the Cryptomatte node begins with.
+def set_up_compositor(
+    scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, root: bpy.types.Collection, folder: Path, matte: str = ""
+) -> None:
+    """Make the scene's compositor combine film frames with its rendering, which no longer shows the reconstruction.
 
-    Whatever led to the compositor's output is taken for Blender's rendering. Where the nodes are there already, they
-    only get the folder's frames. Raises InputError where `folder` has none.
+    The present input of the compositor's output is taken as Blender's rendering. If the nodes exist already, they only
+    get the frames of `folder`.
+
+    Args:
+        scene: its compositor is changed.
+        view_layer: its depth is used.
+        root: the reconstruction's collection, which is hidden in renders.
+        folder: of the film frames.
+        matte: name of the object that the Cryptomatte node shows first.
+
+    Raises:
+        InputError: `folder` has no film frames.
     """
     frames = _frames_in(folder)
     if not frames:
@@ -54,7 +67,7 @@ def has_frames(scene: bpy.types.Scene) -> bool:
 
 
 def show_frames(scene: bpy.types.Scene, folder: Path) -> None:
-    """Let the compositor, where it shows film frames of `folder`, show those that are there now."""
+    """Update the compositor to the present frames of `folder`, if it shows frames of this folder."""
     tree = _tree_if_any(scene)
     node = _image_node(tree) if tree is not None else None
     frames = _frames_in(folder)
@@ -63,17 +76,17 @@ def show_frames(scene: bpy.types.Scene, folder: Path) -> None:
 
 
 def _frames_in(folder: Path) -> list[int]:
-    """Numbers of the frames there, ascending."""
+    """The numbers of the frames in a folder, ascending."""
     words = [path.name.split(".") for path in folder.glob("splats.*.exr")]
     return sorted(int(word[1]) for word in words if len(word) == 3 and word[1].isdecimal())
 
 
-def _tree_if_any(scene):
+def _tree_if_any(scene: bpy.types.Scene) -> Any:
     return scene.compositing_node_group if hasattr(scene, "compositing_node_group") else scene.node_tree
 
 
-def _tree(scene) -> bpy.types.NodeTree:
-    """The scene's compositor nodes, with what Blender itself begins with where there are none."""
+def _tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
+    """The scene's compositor nodes; if there are none, with Blender's initial ones."""
     if not hasattr(scene, "compositing_node_group"):  # 4.2 to 4.5
         scene.use_nodes = True
         return scene.node_tree
@@ -84,13 +97,13 @@ def _tree(scene) -> bpy.types.NodeTree:
     return tree
 
 
-def _image_node(tree):
+def _image_node(tree: bpy.types.NodeTree) -> Any:
     return next((node for node in tree.nodes if node.get(KIND) == FILM and node.type == "IMAGE"), None)
 
 
 def _load(folder: Path, frames: list[int]) -> bpy.types.Image:
     path = str(folder / PATTERN.format(frames[0]))
-    # Of its own, so that nothing else of the file changes with it.
+    # An image of its own, since other images in the file must not change with it.
     image = bpy.data.images.load(path)
     image.source = "SEQUENCE"
     image.name = "Splats"
@@ -98,12 +111,12 @@ def _load(folder: Path, frames: list[int]) -> bpy.types.Image:
     return image
 
 
-def _path(image) -> Path:
+def _path(image: bpy.types.Image) -> Path:
     return Path(bpy.path.abspath(image.filepath)) if image is not None else Path()
 
 
-def _use(tree, folder: Path, frames: list[int]) -> None:
-    """Let our nodes read the frames of a folder, each at its own number."""
+def _use(tree: bpy.types.NodeTree, folder: Path, frames: list[int]) -> None:
+    """Let our nodes read the frames of a folder, each at the frame of its number."""
     first, last = frames[0], frames[-1]
     for node in tree.nodes:
         if node.get(KIND) != FILM or node.type not in ("IMAGE", "CRYPTOMATTE_V2"):
@@ -116,7 +129,13 @@ def _use(tree, folder: Path, frames: list[int]) -> None:
         node.use_auto_refresh = True
 
 
-def _join(scene, view_layer, tree, image, matte: str) -> None:
+def _join(
+    scene: bpy.types.Scene,
+    view_layer: bpy.types.ViewLayer,
+    tree: bpy.types.NodeTree,
+    image: bpy.types.Image,
+    matte: str,
+) -> None:
     graph = Graph(tree)
     output = _output(scene, tree)
     rendered, depth = _rendering(scene, view_layer, graph, tree, output)
@@ -149,8 +168,8 @@ def _join(scene, view_layer, tree, image, matte: str) -> None:
     mattes.location = (output.node.location.x, output.node.location.y - 240.0)
 
 
-def _output(scene, tree) -> bpy.types.NodeSocket:
-    """The socket that takes the finished picture."""
+def _output(scene: bpy.types.Scene, tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:
+    """The input socket of the compositor's output."""
     is_group = hasattr(scene, "compositing_node_group")
     node = next((node for node in tree.nodes if node.type == ("GROUP_OUTPUT" if is_group else "COMPOSITE")), None)
     if node is None:
@@ -159,8 +178,10 @@ def _output(scene, tree) -> bpy.types.NodeSocket:
     return node.inputs[0]
 
 
-def _rendering(scene, view_layer, graph: Graph, tree, output):
-    """What has led to the output so far, or the rendering of the view layer; and that rendering's depth."""
+def _rendering(
+    scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, graph: Graph, tree: bpy.types.NodeTree, output: Any
+) -> Any:
+    """The present input of the output, or else the rendering of the view layer; and the depth of this rendering."""
     view_layer.use_pass_z = True
     layers = next((node for node in tree.nodes if node.type == "R_LAYERS" and node.layer == view_layer.name), None)
     if layers is None:
@@ -170,13 +191,13 @@ def _rendering(scene, view_layer, graph: Graph, tree, output):
     return rendered, layers.outputs["Depth"]
 
 
-def _math(graph: Graph, operation: str, *values) -> bpy.types.NodeSocket:
-    """Output of a Math node: compositors have had shaders' since Blender 5.0."""
+def _math(graph: Graph, operation: str, *values: Any) -> bpy.types.NodeSocket:
+    """Output of a Math node; from Blender 5.0 on, the compositor uses the shaders' nodes."""
     kind = "ShaderNodeMath" if bpy.app.version >= (5, 0) else "CompositorNodeMath"
     return graph.node(kind, dict(enumerate(values)), operation=operation).outputs[0]
 
 
-def _over(graph: Graph, factor, background, foreground) -> bpy.types.NodeSocket:
-    """Output of an Alpha Over node, whose sockets had no names of their own before Blender 5.0."""
+def _over(graph: Graph, factor: Any, background: Any, foreground: Any) -> bpy.types.NodeSocket:
+    """Output of an Alpha Over node, whose sockets have had unique names since Blender 5.0."""
     keys = ("Factor", "Background", "Foreground") if bpy.app.version >= (5, 0) else (0, 1, 2)
     return graph.node("CompositorNodeAlphaOver", dict(zip(keys, (factor, background, foreground)))).outputs[0]

@@ -1,27 +1,21 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""ObjectGS without a window: the commands of headless.py.
+"""ObjectGS without a window: runs the commands of headless.py and returns their exit codes."""
 
-`arguments` says what can be asked, `commands` and `batch` do it; this module turns what happens into an exit code.
-"""
+from __future__ import annotations
 
 import contextlib
 import os
 import signal
 import sys
 import traceback
+from collections.abc import Iterator
+from typing import Any
 
-from ...backend.protocol import (
-    EXIT_BAD_INPUT,
-    EXIT_CANCELLED,
-    EXIT_DONE,
-    EXIT_FAILED,
-    Cancelled,
-    InputError,
-    JsonReporter,
-)
+from ...backend.shared.console import ConsoleReporter
+from ...backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, EXIT_FAILED, Cancelled, InputError
+from ...backend.shared.events import JsonReporter, Reporter
 from . import batch, commands, filming
 from .arguments import UsageError, parse
-from .lines import LineReporter
 
 COMMANDS = {
     "demo": commands.demo,
@@ -43,7 +37,7 @@ COMMANDS = {
 
 def main(arguments: list[str]) -> int:
     """Run one command line and return the exit code."""
-    reporter = JsonReporter() if "--json" in arguments else LineReporter()
+    reporter: Reporter = JsonReporter() if "--json" in arguments else ConsoleReporter()
     try:
         options = parse(arguments)
         options.reporter = reporter
@@ -58,7 +52,7 @@ def main(arguments: list[str]) -> int:
         reporter.error(str(error))
         return EXIT_BAD_INPUT
     except BrokenPipeError:
-        # Nobody reads any more. Python would complain once again when it flushes at exit.
+        # The reader is gone. Python would raise again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_CANCELLED
     except commands.StepFailed as error:
@@ -74,15 +68,16 @@ def main(arguments: list[str]) -> int:
 
 
 @contextlib.contextmanager
-def _stoppable():
-    """Ctrl-C and SIGTERM raise KeyboardInterrupt; Blender would take the first for itself, the second ends it.
+def _stoppable() -> Iterator[None]:
+    """Raise KeyboardInterrupt for Ctrl-C, which Blender would handle itself, and SIGTERM, which would end Blender.
 
-    A reader that went away ends Blender too, where a plain Python raises BrokenPipeError.
+    SIGPIPE is ignored, so that a missing reader raises BrokenPipeError as in a plain Python, and does not end Blender.
     """
-    def stop(*_):
+
+    def stop(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    wanted = {signal.SIGINT: stop, signal.SIGTERM: stop}
+    wanted: dict[int, Any] = {signal.SIGINT: stop, signal.SIGTERM: stop}
     if hasattr(signal, "SIGPIPE"):
         wanted[signal.SIGPIPE] = signal.SIG_IGN
     before = {number: signal.signal(number, handler) for number, handler in wanted.items()}

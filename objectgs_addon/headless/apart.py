@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The objects' meshes pulled apart, for a picture: lifted and moved outward from the middle, in soft light."""
+"""An image of the objects' meshes pulled apart: lifted and moved outward from the center, in soft light."""
+
+from __future__ import annotations
 
 import math
 
@@ -7,20 +9,20 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
-from ...backend.protocol import InputError
+from ...backend.shared.errors import InputError
 from .. import scene
-from ..scene.preview import Graph
+from ..scene.shading.graph import Graph
 
 SIZE = (960, 600)
 SAMPLES = 32
-"""What makes a good picture within half a minute on two cores."""
+"""Samples per pixel for a good image within half a minute on two cores."""
 LARGE = 2.5
-"""What is so many times as large as the middle object stays where it is, as the table does."""
+"""Objects larger than the median size times this, such as a table, are not moved."""
 
 OUTWARD = 0.7
-"""How far objects move away from the middle, relative to their distance from it."""
+"""Outward movement of objects, relative to their distance from the center."""
 LIFT = 0.35
-"""How far they are lifted, relative to the size of the middle object."""
+"""Upward movement of objects, relative to the median size."""
 
 LENS = 60.0
 SENSOR = 36.0
@@ -31,24 +33,27 @@ GROUND = (0.78, 0.78, 0.78)
 SKY = 0.5
 SUN = 2.2
 SUN_ANGLE = math.radians(20.0)
-"""How wide the sun is: the shadows' softness."""
+"""Angular diameter of the sun, which softens the shadows."""
 
 
 def reconstructions(target: bpy.types.Scene) -> list[bpy.types.Collection]:
-    """The collections of the reconstructions that lie in a scene."""
+    """The collections of the reconstructions in a scene."""
     return [child for child in target.collection.children_recursive if scene.kind_of(child) == "reconstruction"]
 
 
 def add_even_light(target: bpy.types.Scene) -> None:
-    """Even white light from everywhere, which shows a texture's own colours; what is behind stays black."""
+    """Add even white light from all directions, which shows a texture's own colors, with a black background."""
     world = target.world = bpy.data.worlds.new("ObjectGS Light")
     _light_evenly(world, 1.0, behind=0.0)
 
 
 def pull_apart(target: bpy.types.Scene) -> None:
-    """Make a picture of a scene: its objects' meshes apart, with light, ground and camera. It is not meant to be saved.
+    """Pull the objects' meshes of a scene apart, with light, ground and camera, for rendering and not for saving.
 
-    Large objects stay; what lies around the others, as a room does, is left out. Raises InputError without meshes.
+    Large objects are not moved; those around the others, such as a room, are hidden.
+
+    Raises:
+        InputError: there are no meshes.
     """
     found = [(root, _seen_meshes(root)) for root in reconstructions(target)]
     found = [(root, meshes) for root, meshes in found if meshes]
@@ -57,24 +62,24 @@ def pull_apart(target: bpy.types.Scene) -> None:
     root, meshes = found[0]
     scene.show_kinds(root, "meshes")
     target.view_layers[0].update()
-    boxes = {object_id: scene.bounds(things) for object_id, things in meshes.items()}
+    boxes = {object_id: scene.bounds(objs) for object_id, objs in meshes.items()}
     sizes = {object_id: float(np.linalg.norm(high - low)) for object_id, (low, high) in boxes.items()}
     middle_size = float(np.median(list(sizes.values())))
     large = {object_id for object_id, size in sizes.items() if size > LARGE * middle_size}
     moved = sorted(set(boxes) - large)
     middles = np.array([boxes[object_id].mean(0) for object_id in moved])
-    around = {object_id for object_id in large if _holds(boxes[object_id], middles)}
-    _show_only(target, [thing for object_id, things in meshes.items() if object_id not in around for thing in things])
+    around = {object_id for object_id in large if _contains(boxes[object_id], middles)}
+    _show_only(target, [obj for object_id, objs in meshes.items() if object_id not in around for obj in objs])
 
-    centre = np.append(np.median(middles[:, :2], axis=0), 0.0)
+    center = np.append(np.median(middles[:, :2], axis=0), 0.0)
     shown = {object_id: boxes[object_id] for object_id in large - around}
     for object_id, middle in zip(moved, middles):
-        step = OUTWARD * (middle - centre) * (1.0, 1.0, 0.0) + (0.0, 0.0, LIFT * middle_size)
+        step = OUTWARD * (middle - center) * (1.0, 1.0, 0.0) + (0.0, 0.0, LIFT * middle_size)
         _move(meshes[object_id], step)
         shown[object_id] = boxes[object_id] + step
     low = min(box[0][2] for box in [*shown.values(), *(boxes[object_id] for object_id in moved)])
     extent = float(np.linalg.norm(np.ptp(np.concatenate(list(shown.values())), axis=0)))
-    _add_ground(target, Vector((*centre[:2], low)), 40.0 * extent)
+    _add_ground(target, Vector((*center[:2], low)), 40.0 * extent)
     target.render.pixel_aspect_x = target.render.pixel_aspect_y = 1.0
     corners = np.stack([_corners(shown[object_id]) for object_id in moved])
     toward = _best_direction(root, corners)
@@ -85,37 +90,40 @@ def pull_apart(target: bpy.types.Scene) -> None:
     target.cycles.max_bounces = 2
 
 
-def _seen_meshes(root) -> dict[int, list]:
-    """Object ID -> its meshes, of the objects that were not removed."""
+def _seen_meshes(root: bpy.types.Collection) -> dict[int, list[bpy.types.Object]]:
+    """Object ID -> meshes, for objects that are not removed."""
     collections = scene.object_collections(root)
-    return {object_id: meshes for object_id, meshes in scene.object_meshes(root).items()
-            if not scene.is_removed(collections[object_id])}
+    return {
+        object_id: meshes
+        for object_id, meshes in scene.object_meshes(root).items()
+        if not scene.is_removed(collections[object_id])
+    }
 
 
 def _corners(box: np.ndarray) -> np.ndarray:
-    """(8, 3)."""
+    """The corners (8, 3) of a box (2, 3)."""
     return np.array([[box[i][0], box[j][1], box[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 
 
-def _holds(box: np.ndarray, places: np.ndarray) -> bool:
-    """Whether most of the places (n, 3) lie in a box."""
-    return float(((places > box[0]) & (places < box[1])).all(1).mean()) > 0.5
+def _contains(box: np.ndarray, points: np.ndarray) -> bool:
+    """Whether most of the points (n, 3) are in a box (2, 3)."""
+    return float(((points > box[0]) & (points < box[1])).all(1).mean()) > 0.5
 
 
-def _show_only(target, meshes) -> None:
+def _show_only(target: bpy.types.Scene, meshes: list[bpy.types.Object]) -> None:
     shown = set(meshes)
-    for thing in target.objects:
-        thing.hide_render = thing not in shown
+    for obj in target.objects:
+        obj.hide_render = obj not in shown
 
 
-def _move(things, step: np.ndarray) -> None:
-    for thing in things:
-        thing.matrix_world = Matrix.Translation(step) @ thing.matrix_world
+def _move(objs: list[bpy.types.Object], step: np.ndarray) -> None:
+    for obj in objs:
+        obj.matrix_world = Matrix.Translation(step) @ obj.matrix_world
 
 
-def _add_ground(target, place: Vector, size: float) -> None:
+def _add_ground(target: bpy.types.Scene, center: Vector, size: float) -> None:
     mesh = bpy.data.meshes.new("Ground")
-    corners = [place + size * Vector(corner) for corner in ((-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0))]
+    corners = [center + size * Vector(corner) for corner in ((-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0))]
     mesh.from_pydata(corners, [], [(0, 1, 2, 3)])
     material = bpy.data.materials.new("Ground")
     if material.node_tree is None:
@@ -128,11 +136,11 @@ def _add_ground(target, place: Vector, size: float) -> None:
     target.collection.objects.link(bpy.data.objects.new("Ground", mesh))
 
 
-def _best_direction(root, corners: np.ndarray) -> Vector:
-    """The direction to look, from the side of one of the photos, in which most of the boxes (n, 8, 3) is to be seen."""
-    centre = (corners.min((0, 1)) + corners.max((0, 1))) / 2
-    eyes = [thing.matrix_world.translation for thing in root.all_objects if scene.kind_of(thing) == "camera"]
-    sides = [Vector((eye.x - centre[0], eye.y - centre[1])) for eye in eyes[:: max(1, len(eyes) // 50)]]
+def _best_direction(root: bpy.types.Collection, corners: np.ndarray) -> Vector:
+    """The view direction, from the side of one of the photos, with the most visible area of the boxes (n, 8, 3)."""
+    center = (corners.min((0, 1)) + corners.max((0, 1))) / 2
+    eyes = [obj.matrix_world.translation for obj in root.all_objects if scene.kind_of(obj) == "camera"]
+    sides = [Vector((eye.x - center[0], eye.y - center[1])) for eye in eyes[:: max(1, len(eyes) // 50)]]
     sides = [side.normalized() for side in sides if side.length > 1e-6] or [Vector((0.0, -1.0))]
     directions = [-Vector((*(side * math.cos(ELEVATION)), math.sin(ELEVATION))) for side in sides]
 
@@ -140,55 +148,55 @@ def _best_direction(root, corners: np.ndarray) -> Vector:
         seen = (corners @ np.array(toward.to_track_quat("-Z", "Y").to_matrix()))[..., :2]
         low, high = seen.min(1), seen.max(1)
         both = np.clip(np.minimum(high[:, None], high) - np.maximum(low[:, None], low), 0.0, None).prod(2)
-        return float(2.0 * np.trace(both) - both.sum())  # each with itself, less each pair, twice
+        return float(2.0 * np.trace(both) - both.sum())  # The area of all boxes minus that of all overlaps, times two.
 
     return max(directions, key=in_view)
 
 
-def _add_camera(target, toward: Vector, corners: np.ndarray) -> None:
-    """A camera that looks `toward` and has all `corners` (n, 3) in view."""
-    centre = Vector((corners.min(0) + corners.max(0)) / 2)
+def _add_camera(target: bpy.types.Scene, toward: Vector, corners: np.ndarray) -> None:
+    """Add a camera that looks `toward` and has all `corners` (n, 3) in view."""
+    center = Vector((corners.min(0) + corners.max(0)) / 2)
     rotation = toward.to_track_quat("-Z", "Y")
-    # Coordinates to the right, up and towards the camera; the nearest place from which all of them fit.
-    seen = (corners - np.array(centre)) @ np.array(rotation.to_matrix())
+    # Coordinates to the right, up and toward the camera; find the nearest position from which all corners fit.
+    seen = (corners - np.array(center)) @ np.array(rotation.to_matrix())
     half = np.array([1.0, target.render.resolution_y / target.render.resolution_x]) * SENSOR / LENS / 2.0 / MARGIN
     x = y = 0.0
     for _ in range(20):
         need = np.abs(seen[:, :2] - (x, y)) / half + seen[:, 2:]
         distance = need.max()
-        # The middle of what the picture shows, not of the box.
+        # Center the projected corners, not the box.
         screen = (seen[:, :2] - (x, y)) / (distance - seen[:, 2:])
         shift = (screen.min(0) + screen.max(0)) / 2.0 * distance
         x, y = x + shift[0], y + shift[1]
     camera = bpy.data.cameras.new("Apart")
     camera.sensor_fit, camera.sensor_width, camera.lens = "HORIZONTAL", SENSOR, LENS
     camera.clip_start, camera.clip_end = 0.01 * distance, 100.0 * distance
-    thing = bpy.data.objects.new("Apart", camera)
-    thing.rotation_mode = "QUATERNION"
-    thing.rotation_quaternion = rotation
-    thing.location = centre + rotation @ Vector((x, y, distance))
-    target.collection.objects.link(thing)
-    target.camera = thing
+    obj = bpy.data.objects.new("Apart", camera)
+    obj.rotation_mode = "QUATERNION"
+    obj.rotation_quaternion = rotation
+    obj.location = center + rotation @ Vector((x, y, distance))
+    target.collection.objects.link(obj)
+    target.camera = obj
 
 
-def _add_light(target, toward: Vector) -> None:
-    """A wide sun from behind the camera's left shoulder, and a sky."""
+def _add_light(target: bpy.types.Scene, toward: Vector) -> None:
+    """Add a soft sun from behind the camera on the left, and a sky."""
     heading = math.atan2(toward.y, toward.x)
     sun = bpy.data.lights.new("Apart", "SUN")
     sun.energy, sun.angle = SUN, SUN_ANGLE
-    thing = bpy.data.objects.new("Apart Sun", sun)
+    obj = bpy.data.objects.new("Apart Sun", sun)
     aside = heading - math.radians(50.0)
     down = Vector((math.cos(aside), math.sin(aside), -1.4))
-    thing.rotation_mode = "QUATERNION"
-    thing.rotation_quaternion = down.to_track_quat("-Z", "Y")
-    target.collection.objects.link(thing)
+    obj.rotation_mode = "QUATERNION"
+    obj.rotation_quaternion = down.to_track_quat("-Z", "Y")
+    target.collection.objects.link(obj)
     target.world = bpy.data.worlds.new("Apart")
     _light_evenly(target.world, SKY, behind=SKY)
     target.render.film_transparent = False
 
 
 def _light_evenly(world: bpy.types.World, strength: float, behind: float) -> None:
-    """White light of a strength from everywhere; the camera sees it with the strength `behind`."""
+    """Light a scene evenly with white light; `behind` is its strength as a background."""
     if world.node_tree is None:
         world.use_nodes = True
     world.node_tree.nodes.clear()

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The command line of headless.py: what can be asked."""
+"""The command line of headless.py."""
+
+from __future__ import annotations
 
 import argparse
 import re
 from pathlib import Path
+from typing import NoReturn
 
 _INTRODUCTION = """\
-ObjectGS without a window: from captures to .blend files and pictures.
+ObjectGS without a window: from captures to .blend files and images.
 
   blender -b -P headless.py -- run   garden --out garden-splats --minutes 10
   blender -b -P headless.py -- batch captures --out results --minutes 10
@@ -16,20 +19,20 @@ A Python that has the bpy wheel does the same: python headless.py run ...
 
 _ENDING = """\
 `COMMAND --help` lists a command's options. Ctrl+C or SIGTERM stops at any time;
-the same command goes on from there. Exit codes: 0 done, 2 the input cannot be
+the same command continues from there. Exit codes: 0 done, 2 the input cannot be
 used (one sentence says why), 130 cancelled, 1 anything else.
 """
 
 _BATCH = """\
-Run every capture in FOLDER (each sub-folder with images/ or sparse/), each into
-DIR/<name>, and leave a summary in DIR/batch.md and DIR/batch.json. One that
-fails does not stop the others. The same command later goes on with what is not
-done; what was finished with the same settings is skipped. Exit code 2 if any
-capture cannot be used, 1 if any failed for another reason.
+Run every capture in FOLDER (each subfolder with images/ or sparse/), each into
+DIR/<name>, and write a summary to DIR/batch.md and DIR/batch.json. A failure does
+not stop the other captures. The same command continues later; captures that were
+finished with the same settings are skipped. Exit code 2 if any capture cannot be
+used, 1 if any failed for another reason.
 """
 
 _TRAIN_OPTIONS = """\
-Every other option behind CAPTURE is one of the backend's train command:
+All other options after CAPTURE are those of the backend's train command:
 --minutes M or --steps N, --max-size PIXELS, --only NAME ..., --keep KEY ... (train --help lists them).
 """
 
@@ -42,53 +45,64 @@ OPTIONS are those of `python -m backend mesh`, whose --help explains them:
 
 
 _PLAN = """\
-Say what training would do with a capture and what it would leave out, and why; nothing is
-trained. OPTIONS are those of `python -m backend plan`, whose --help explains them:
+Print what training would do with a capture, what it would leave out, and why, without
+training. OPTIONS are those of `python -m backend plan`, whose --help explains them:
 --keep KEY ..., --leave-out KEY ..., --only NAME ..., --no-meshes.
 """
 
 _RESULT_COMMANDS = {
-    "edit": ("remove, recolour, move or copy objects", """\
-Change the objects of the reconstruction in DIR: what build shows and export writes. The
-splats stay as they are, so that each change can be taken back. Without OPTIONS, say what
-is changed. OPTIONS are those of `python -m backend edit`, whose --help explains them:
+    "edit": (
+        "remove, recolor, move or duplicate objects",
+        """\
+Edit the objects of the reconstruction in DIR, as build shows and export writes them. The
+splats are unchanged, so that each edit can be undone. Without OPTIONS, print the
+edits. OPTIONS are those of `python -m backend edit`, whose --help explains them:
 --remove mug, --restore mug, --recolor can:hue=0.3, --move box:x=0.1, --duplicate ...,
 --reset all.
-"""),
-    "export": ("write the splats for other programs", """\
-Write the splats of the reconstruction in DIR, with all changes, as PLY, SPZ or .splat.
+""",
+    ),
+    "export": (
+        "write the splats for other programs",
+        """\
+Write the splats of the reconstruction in DIR, with all edits, as PLY, SPZ or .splat.
 OPTIONS are those of `python -m backend export`, whose --help explains them:
 --format F, --objects NAME ..., --per-object, --coordinates blender, --sh-degree N.
-"""),
+""",
+    ),
 }
 
 _IMPORT_SPLATS = """\
-Make a reconstruction of splats that another program trained: PLY is a file of 3D
-Gaussian splats. With --capture, the capture's masks say which object each belongs to.
+Make a reconstruction of splats that were trained by another program: PLY is a file of
+3D Gaussian splats. With --capture, the masks of the capture assign each splat to an object.
 """
 
 _FILM = """\
-Draw a reconstruction's splats through the camera of a .blend, frame by frame: color,
-depth and object mattes in FOLDER/splats.0001.exr and so on, with the edits of
-objects.json and objects where the .blend has them. --composite also renders the
-.blend with Blender and joins both by depth. Film frames that are there already are
-skipped, so that several machines can share FOLDER, each with its own --frames.
+Render the splats of a reconstruction through the camera of a .blend, frame by frame:
+color, depth and object mattes in FOLDER/splats.0001.exr and so on, with the edits of
+objects.json and the objects' transforms in the .blend. --composite also renders the
+.blend with Blender and combines both by depth. Existing film frames are skipped, so
+that several machines can share FOLDER, each with its own --frames.
 """
 
 
 class UsageError(Exception):
-    """The command line makes no sense; the message is one sentence."""
+    """The command line is not valid; the message is one sentence."""
 
 
 class _Parser(argparse.ArgumentParser):
-    def error(self, message):
+    def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message[:1].upper()}{message[1:]}; see headless.py --help.")
 
 
 def parse(arguments: list[str]) -> argparse.Namespace:
-    """The options of a command line, `command` and, where options are handed on to the backend, `rest` among them.
+    """Parse a command line.
 
-    Raises `UsageError`; prints and raises SystemExit for --help.
+    Returns:
+        The options, with `command` and, for commands that pass options to the backend, `rest`.
+
+    Raises:
+        UsageError: the command line is not valid.
+        SystemExit: after --help.
     """
     options, rest = _parser().parse_known_args(arguments)
     if options.takes is None:
@@ -104,70 +118,131 @@ def parse(arguments: list[str]) -> argparse.Namespace:
 
 def _parser() -> argparse.ArgumentParser:
     how = argparse.RawDescriptionHelpFormatter
-    top = _Parser(prog="headless.py", description=_INTRODUCTION, epilog=_ENDING, formatter_class=how,
-                  allow_abbrev=False)
+    top = _Parser(
+        prog="headless.py", description=_INTRODUCTION, epilog=_ENDING, formatter_class=how, allow_abbrev=False
+    )
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND", title="commands")
 
-    def command(name: str, summary: str, description: str, usage: str | None = None, takes: str | None = None,
-                epilog: str | None = None) -> argparse.ArgumentParser:
-        sub = commands.add_parser(name, help=summary, description=description, usage=usage, epilog=epilog,
-                                  formatter_class=how, allow_abbrev=False)
+    def command(
+        name: str,
+        summary: str,
+        description: str,
+        usage: str | None = None,
+        takes: str | None = None,
+        epilog: str | None = None,
+    ) -> argparse.ArgumentParser:
+        sub = commands.add_parser(
+            name,
+            help=summary,
+            description=description,
+            usage=usage,
+            epilog=epilog,
+            formatter_class=how,
+            allow_abbrev=False,
+        )
         sub.set_defaults(takes=takes)
         return sub
 
-    _demo(command("demo", "render the demo capture", (
-        "Render the built-in demo capture: objects on a table, with masks, a sparse model and the truth.")))
-    for name, summary in (("import", "open a capture"), ("vote", "give each point its object, from the masks"),
-                          ("train", "make the splats")):
+    _demo(
+        command(
+            "demo",
+            "render the demo capture",
+            "Render the built-in demo capture: objects on a table, with masks, a sparse model and the ground truth.",
+        )
+    )
+    for name, summary in (
+        ("import", "open a capture"),
+        ("vote", "assign an object to each point by a vote of the masks"),
+        ("train", "train the splats"),
+    ):
         sub = command(
-            name, summary, f"The backend's {name} command: {summary}.", takes="CAPTURE",
+            name,
+            summary,
+            f"The backend's {name} command: {summary}.",
+            takes="CAPTURE",
             usage=f"headless.py {name} CAPTURE --out DIR [OPTIONS]",
-            epilog=f"OPTIONS are those of `python -m backend {name}`, whose --help explains them.")
+            epilog=f"OPTIONS are those of `python -m backend {name}`, whose --help explains them.",
+        )
         _backend(sub)
         if name != "import":
             _groups(sub)
-    planned = command("plan", "say what a capture needs and what it can do without", _PLAN, takes="CAPTURE",
-                      usage="headless.py plan CAPTURE [--out DIR] [OPTIONS]")
+    planned = command(
+        "plan",
+        "analyze which parts of training a capture needs",
+        _PLAN,
+        takes="CAPTURE",
+        usage="headless.py plan CAPTURE [--out DIR] [OPTIONS]",
+    )
     _backend(planned, out_required=False)
     _groups(planned)
-    mesh = command("mesh", "make a textured mesh of each object", _MESH, takes="DIR",
-                   usage="headless.py mesh DIR [OPTIONS]")
+    mesh = command(
+        "mesh", "make a textured mesh of each object", _MESH, takes="DIR", usage="headless.py mesh DIR [OPTIONS]"
+    )
     _backend_python(mesh)
     for name, (summary, description) in _RESULT_COMMANDS.items():
         out = " --out PATH" if name == "export" else ""
         sub = command(name, summary, description, takes="DIR", usage=f"headless.py {name} DIR{out} [OPTIONS]")
         if out:
-            sub.add_argument("--out", type=Path, required=True, metavar="PATH",
-                             help="file, or a folder with --per-object")
+            sub.add_argument(
+                "--out", type=Path, required=True, metavar="PATH", help="file, or a folder with --per-object"
+            )
         _backend_python(sub)
-    imported = command("import-splats", "make a reconstruction of splats from elsewhere", _IMPORT_SPLATS, takes="PLY",
-                       usage="headless.py import-splats PLY --out DIR [--capture CAPTURE]")
+    imported = command(
+        "import-splats",
+        "make a reconstruction of splats of another program",
+        _IMPORT_SPLATS,
+        takes="PLY",
+        usage="headless.py import-splats PLY --out DIR [--capture CAPTURE]",
+    )
     imported.add_argument("--capture", type=Path, metavar="CAPTURE", help="folder with images/, sparse/ and masks/")
     _backend(imported)
-    build = command("build", "make a .blend of a reconstruction",
-                    "Put a reconstruction's cameras, points, splats and meshes into a new .blend file.")
+    build = command(
+        "build",
+        "make a .blend of a reconstruction",
+        "Put a reconstruction's cameras, points, splats and meshes into a new .blend file.",
+    )
     build.add_argument("folder", type=Path, metavar="DIR", help="reconstruction folder")
     build.add_argument("--blend", type=Path, metavar="FILE", help="file to write (DIR/objectgs.blend)")
-    render = command("render", "make a picture of a .blend", "Render a picture of a .blend file that build has made.")
-    render.add_argument("source", type=Path, metavar="DIR_OR_BLEND",
-                        help="reconstruction folder with its objectgs.blend, or any .blend file")
-    render.add_argument("--out", type=Path, required=True, metavar="PICTURE", help="file.png, .jpg or .exr")
+    render = command("render", "render an image of a .blend", "Render an image of a .blend file made by build.")
+    render.add_argument(
+        "source",
+        type=Path,
+        metavar="DIR_OR_BLEND",
+        help="reconstruction folder with its objectgs.blend, or any .blend file",
+    )
+    render.add_argument("--out", type=Path, required=True, metavar="IMAGE", help="file.png, .jpg or .exr")
     render.add_argument("--camera", metavar="NAME", help="a camera of the file (the scene's own)")
-    render.add_argument("--show", choices=("splats", "meshes", "both"), help="what of the objects (as in the file)")
-    render.add_argument("--apart", action="store_true", help=(
-        "pull the objects' meshes apart before, with a light, a ground and a camera for it; the file stays as it is"))
+    render.add_argument("--show", choices=("splats", "meshes", "both"), help="parts of the objects (as in the file)")
+    render.add_argument(
+        "--apart",
+        action="store_true",
+        help=("pull the objects' meshes apart, with a light, a ground and a camera; the file is unchanged"),
+    )
     _picture(render)
-    _film(command("film", "draw film frames through the camera of a .blend", _FILM))
-    run = command("run", "everything: from a capture to a .blend and a picture", (
-        "Train, make meshes, measure, make DIR/objectgs.blend and render it: DIR/render.png shows the splats,\n"
-        "DIR/pulled-apart.png the meshes."), takes="CAPTURE",
-        usage="headless.py run CAPTURE --out DIR [OPTIONS]", epilog=_TRAIN_OPTIONS)
+    _film(command("film", "render film frames through the camera of a .blend", _FILM))
+    run = command(
+        "run",
+        "all steps from a capture to a .blend and images",
+        (
+            "Train, make meshes, evaluate, make DIR/objectgs.blend and render it: DIR/render.png shows the splats,\n"
+            "DIR/pulled-apart.png the meshes."
+        ),
+        takes="CAPTURE",
+        usage="headless.py run CAPTURE --out DIR [OPTIONS]",
+        epilog=_TRAIN_OPTIONS,
+    )
     _backend(run)
     _groups(run)
     _meshes(run)
     _picture(run)
-    batch = command("batch", "run every capture of a folder", _BATCH, takes="FOLDER",
-                    usage="headless.py batch FOLDER --out DIR [OPTIONS]", epilog=_TRAIN_OPTIONS)
+    batch = command(
+        "batch",
+        "run every capture of a folder",
+        _BATCH,
+        takes="FOLDER",
+        usage="headless.py batch FOLDER --out DIR [OPTIONS]",
+        epilog=_TRAIN_OPTIONS,
+    )
     _backend(batch)
     _meshes(batch)
     _picture(batch)
@@ -176,17 +251,28 @@ def _parser() -> argparse.ArgumentParser:
 
 def _film(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("blend", type=Path, metavar="BLEND", help="file with the reconstruction and a camera")
-    sub.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="where the frames go")
+    sub.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="folder of the frames")
     sub.add_argument("--frames", metavar="LIST", help="as 1-24 or 1,5,9-12 (the file's own range)")
-    sub.add_argument("--subframes", type=_count, metavar="N", help=(
-        "moments that make a frame while the shutter is open (9 where the file has motion blur, else 1)"))
-    sub.add_argument("--png", action="store_true", help="each frame also as PNG with alpha")
-    sub.add_argument("--composite", choices=("png", "exr"), help=(
-        "also render the file with Blender, joined with the splats by depth, as FOLDER/composite.0001.png or .exr"))
-    sub.add_argument("--save", type=Path, metavar="FILE", help="save the .blend with its compositor set up as FILE")
+    sub.add_argument(
+        "--subframes",
+        type=_count,
+        metavar="N",
+        help="subframes while the shutter is open (9 if the file has motion blur, else 1)",
+    )
+    sub.add_argument("--png", action="store_true", help="also write each frame as PNG with alpha")
+    sub.add_argument(
+        "--composite",
+        choices=("png", "exr"),
+        help=(
+            "also render the file with Blender, combined with the splats by depth: FOLDER/composite.0001.png or .exr"
+        ),
+    )
+    sub.add_argument("--save", type=Path, metavar="FILE", help="save the .blend, with its compositor set up, as FILE")
     sub.add_argument("--dir", type=Path, metavar="DIR", help="the reconstruction folder, if it was moved")
     sub.add_argument("--camera", metavar="NAME", help="a camera of the file (the scene's own)")
-    sub.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where splats are drawn (auto)")
+    sub.add_argument(
+        "--device", choices=("auto", "cpu", "cuda"), default="auto", help="device that renders the splats (auto)"
+    )
     _backend_python(sub)
     _picture(sub)
 
@@ -194,40 +280,54 @@ def _film(sub: argparse.ArgumentParser) -> None:
 def _demo(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("out", type=Path, metavar="OUT", help="folder to make")
     sub.add_argument("--objects", type=int, default=8, help="objects on the table, 1 to 60 (default 8)")
-    sub.add_argument("--views", type=int, default=48, help="pictures on two rings (default 48)")
+    sub.add_argument("--views", type=int, default=48, help="images on two rings (default 48)")
     sub.add_argument("--width", type=int, default=320, help="pixels (default 320)")
     sub.add_argument("--height", type=int, default=240, help="pixels (default 240)")
-    sub.add_argument("--seed", type=int, default=0, help="same seed, same capture (default 0)")
-    sub.add_argument("--mask-noise", type=float, default=0.0, metavar="X", help=(
-        "mistakes in masks/, 0 (none, default) to 1 (poor): borders wander up to 4X pixels; an object of a view is "
-        "1-3 pixels too large or small with probability X, has a wrong ID with 0.15 X, is missing with 0.10 X"))
-    sub.add_argument("--samples", type=int, default=20, help="rays a pixel at most, denoised (default 20)")
+    sub.add_argument("--seed", type=int, default=0, help="random seed (default 0)")
+    sub.add_argument(
+        "--mask-noise",
+        type=float,
+        default=0.0,
+        metavar="X",
+        help=(
+            "noise of masks/, 0 (none, default) to 1 (poor): borders move by up to 4X pixels; an object of a view is "
+            "1-3 pixels too large or small with probability X, has a wrong ID with 0.15 X, is missing with 0.10 X"
+        ),
+    )
+    sub.add_argument("--samples", type=int, default=20, help="maximum samples per pixel, denoised (default 20)")
     sub.add_argument("--json", action="store_true", help="print events as JSON lines, for other programs")
     sub.add_argument("--overwrite", action="store_true", help="replace a demo capture with other settings in OUT")
 
 
 def _backend(sub: argparse.ArgumentParser, out_required: bool = True) -> None:
-    sub.add_argument("--out", type=Path, required=out_required, metavar="DIR", help="folder for what is made")
+    sub.add_argument("--out", type=Path, required=out_required, metavar="DIR", help="reconstruction folder")
     _backend_python(sub)
 
 
 def _groups(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--groups", type=Path, metavar="FILE", help=(
-        'IDs that are one object: a labels file that gives them one name, {"1": "chair", "2": "chair"}'))
+    sub.add_argument(
+        "--groups",
+        type=Path,
+        metavar="FILE",
+        help=('labels file; IDs with the same name are one object: {"1": "chair", "2": "chair"}'),
+    )
 
 
 def _meshes(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--no-meshes", action="store_true", help="make no meshes: splats only")
+    sub.add_argument("--no-meshes", action="store_true", help="make splats only")
 
 
 def _backend_python(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--backend-python", metavar="PATH", help=(
-        "the Python that has the compute backend (the variable OBJECTGS_PYTHON, or what the preferences say)"))
+    sub.add_argument(
+        "--backend-python",
+        metavar="PATH",
+        help=("Python of the compute backend (the variable OBJECTGS_PYTHON, or that of the preferences)"),
+    )
 
 
 def _picture(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--engine", choices=("CYCLES", "EEVEE"), help="the renderer (the file's own)")
-    sub.add_argument("--samples", type=_count, metavar="N", help="samples a pixel (the file's own)")
+    sub.add_argument("--engine", choices=("CYCLES", "EEVEE"), help="render engine (the file's own)")
+    sub.add_argument("--samples", type=_count, metavar="N", help="samples per pixel (the file's own)")
     sub.add_argument("--size", type=_size, metavar="WxH", help="pixels (the file's own)")
 
 

@@ -1,149 +1,221 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the commands of headless.py do, one function each; `batch` has a module of its own."""
+"""The commands of headless.py, except `film` and `batch`."""
 
+from __future__ import annotations
+
+import argparse
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import bpy
 
-from ...backend.protocol import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError, Reconstruction
-from ...backend.stopping import StopRequest
-from .. import demo_capture, locations, scene, view
-from ..jobs import run_blocking
-from ..quiet import quiet
+from ...backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError
+from ...backend.shared.events import Reporter
+from ...backend.shared.reconstruction.folder import Reconstruction
+from ...backend.shared.stopping import StopRequest
+from .. import scene
+from ..blender.quiet import quiet
+from ..demo import capture as demo_capture
+from ..environment import locations
+from ..process.blocking import run_blocking
+from ..state import viewports as view
 from . import apart
-from .lines import say
 from .picture import render_picture
 
 BLEND = "objectgs.blend"
 PICTURE = "render.png"
 APART_PICTURE = "pulled-apart.png"
 SAMPLES = 16
-"""Rays a pixel in the .blend that is built, unless --samples says otherwise."""
+"""Samples per pixel of a built .blend."""
 
-_TITLES = {"import": "Import", "plan": "Plan", "vote": "Vote", "train": "Train", "mesh": "Mesh", "edit": "Edit",
-           "export": "Export", "import-splats": "Import splats", "film": "Film", "evaluate": "Evaluate",
-           "report": "Report"}
+_TITLES = {
+    "import": "Import",
+    "plan": "Plan",
+    "vote": "Vote",
+    "train": "Train",
+    "mesh": "Mesh",
+    "edit": "Edit",
+    "export": "Export",
+    "import-splats": "Import splats",
+    "film": "Film",
+    "evaluate": "Evaluate",
+    "report": "Report",
+}
 
 
 class StepFailed(Exception):
-    """A step failed for a reason that is not the input; the message is one sentence."""
+    """A step failed for a reason other than its input; the message is one sentence."""
 
 
 def sentence(error: OSError) -> str:
-    """A file that cannot be used, in one sentence."""
+    """Describe a file error in one sentence."""
     return f"{error.filename} cannot be used ({error.strerror}); check it, its permissions and the free space."
 
 
-def whole(path: Path) -> Path:
-    """A path that stays right in another working directory; links are left as they are."""
-    return Path(os.path.abspath(path.expanduser()))
+def absolute(path: Path) -> Path:
+    """The absolute path, with links unresolved."""
+    # resolve() would follow links.
+    return Path(os.path.abspath(path.expanduser()))  # noqa: PTH100
 
 
-def demo(options) -> None:
+def demo(options: argparse.Namespace) -> None:
     """Render the demo capture."""
     _empty_file()
     settings = demo_capture.Settings(
-        objects=options.objects, views=options.views, width=options.width, height=options.height, seed=options.seed,
-        mask_noise=options.mask_noise, samples=options.samples)
+        objects=options.objects,
+        views=options.views,
+        width=options.width,
+        height=options.height,
+        seed=options.seed,
+        mask_noise=options.mask_noise,
+        samples=options.samples,
+    )
     stop = StopRequest()
     with stop.listening(read_stdin=options.json):
         demo_capture.make(options.out, settings, options.overwrite, options.reporter, stop)
 
 
-def backend(options) -> None:
-    """One of the backend's own commands on a capture: import, vote or train."""
+def backend(options: argparse.Namespace) -> None:
+    """Run the backend's import, vote or train command on a capture."""
     find_backend(options.backend_python)
-    folder = whole(options.out)
-    run_backend(options.command, folder, whole(Path(options.source)), "--out", folder, *_groups(options), *options.rest)
+    folder = absolute(options.out)
+    run_backend(
+        options.reporter,
+        options.command,
+        folder,
+        absolute(Path(options.source)),
+        "--out",
+        folder,
+        *_groups(options),
+        *options.rest,
+    )
 
 
-def plan(options) -> None:
-    """What training would do with a capture, and what it would leave out."""
+def plan(options: argparse.Namespace) -> None:
+    """Run the backend's plan command on a capture."""
     find_backend(options.backend_python)
-    folder = whole(options.out) if options.out else None
+    folder = absolute(options.out) if options.out else None
     out = ("--out", folder) if folder else ()
-    run_backend("plan", folder, whole(Path(options.source)), *out, *_groups(options), *options.rest)
+    run_backend(
+        options.reporter, "plan", folder, absolute(Path(options.source)), *out, *_groups(options), *options.rest
+    )
 
 
-def on_result(options) -> None:
-    """One of the backend's own commands on a reconstruction: mesh, edit or export."""
+def on_result(options: argparse.Namespace) -> None:
+    """Run the backend's mesh, edit or export command on a reconstruction."""
     find_backend(options.backend_python)
-    folder = whole(Path(options.source))
-    out = ("--out", whole(options.out)) if options.command == "export" else ()
-    run_backend(options.command, folder, folder, *out, *options.rest)
+    folder = absolute(Path(options.source))
+    out = ("--out", absolute(options.out)) if options.command == "export" else ()
+    run_backend(options.reporter, options.command, folder, folder, *out, *options.rest)
 
 
-def import_splats(options) -> None:
-    """The backend's own command on splats of another program."""
+def import_splats(options: argparse.Namespace) -> None:
+    """Run the backend's import-splats command on splats of another program."""
     find_backend(options.backend_python)
-    folder = whole(options.out)
-    capture = ("--capture", whole(options.capture)) if options.capture else ()
-    run_backend("import-splats", folder, whole(Path(options.source)), "--out", folder, *capture, *options.rest)
+    folder = absolute(options.out)
+    capture = ("--capture", absolute(options.capture)) if options.capture else ()
+    run_backend(
+        options.reporter,
+        "import-splats",
+        folder,
+        absolute(Path(options.source)),
+        "--out",
+        folder,
+        *capture,
+        *options.rest,
+    )
 
 
-def build(options) -> None:
-    """A .blend of a reconstruction."""
-    folder = whole(options.folder)
-    build_blend(folder, whole(options.blend) if options.blend else folder / BLEND)
+def build(options: argparse.Namespace) -> None:
+    """Build a .blend of a reconstruction."""
+    folder = absolute(options.folder)
+    build_blend(folder, absolute(options.blend) if options.blend else folder / BLEND, options.reporter)
 
 
-def render(options) -> None:
-    """A picture of a .blend."""
-    source = whole(options.source)
+def render(options: argparse.Namespace) -> None:
+    """Render an image of a .blend."""
+    source = absolute(options.source)
     blend = source / BLEND if source.is_dir() else source
     if not blend.is_file():
-        raise InputError(f"There is no file {blend}; make it with the build command.")
+        raise InputError(f"{blend} does not exist; make it with the build command.")
     if options.apart and options.camera:
-        raise InputError("--apart brings a camera of its own; leave --camera out.")
+        raise InputError("--apart adds its own camera; omit --camera.")
     if options.apart:
-        _render_apart(blend, whole(options.out), options)
+        _render_apart(blend, absolute(options.out), options)
     else:
-        render_picture(blend, whole(options.out), options.camera, options.engine, options.samples, options.size,
-                       _showing(options.show) if options.show else None)
-    say(f"Wrote {options.out}.")
+        render_picture(
+            options.reporter,
+            blend,
+            absolute(options.out),
+            options.camera,
+            options.engine,
+            options.samples,
+            options.size,
+            _showing(options.show) if options.show else None,
+        )
+    options.reporter.status(f"Wrote {options.out}.")
 
 
-def run(options) -> None:
-    """Everything for one capture: train, evaluate, report, build and render."""
+def run(options: argparse.Namespace) -> None:
+    """Train, evaluate, report, build and render one capture."""
     find_backend(options.backend_python)
-    reconstruct(whole(Path(options.source)), whole(options.out), options)
+    reconstruct(absolute(Path(options.source)), absolute(options.out), options)
 
 
-def reconstruct(capture: Path, folder: Path, options) -> None:
-    """Make splats, meshes, a report, a .blend and pictures of `capture` in `folder`, from what is there already."""
+def reconstruct(capture: Path, folder: Path, options: argparse.Namespace) -> None:
+    """Make splats, meshes, a report, a .blend and images of `capture` in `folder`, continuing earlier work."""
     no_meshes = ["--no-meshes"] if options.no_meshes else []
-    run_backend("train", folder, capture, "--out", folder, *no_meshes, *_groups(options), *options.rest)
+    run_backend(
+        options.reporter, "train", folder, capture, "--out", folder, *no_meshes, *_groups(options), *options.rest
+    )
     if not options.no_meshes:
         try:
-            run_backend("mesh", folder, folder)
-        except InputError as error:  # Splats that no surface can be found in are a result still.
-            say(f"Warning: {error}")
-    run_backend("evaluate", folder, folder)
-    run_backend("report", folder, folder)
-    has_meshes = build_blend(folder, folder / BLEND)
-    render_picture(folder / BLEND, folder / PICTURE, None, options.engine, options.samples, options.size,
-                   _showing("splats"))
-    say(f"Wrote {folder / PICTURE}.")
+            run_backend(options.reporter, "mesh", folder, folder)
+        except InputError as error:  # Splats without a surface are still a result.
+            options.reporter.warning(str(error))
+    run_backend(options.reporter, "evaluate", folder, folder)
+    run_backend(options.reporter, "report", folder, folder)
+    has_meshes = build_blend(folder, folder / BLEND, options.reporter)
+    render_picture(
+        options.reporter,
+        folder / BLEND,
+        folder / PICTURE,
+        None,
+        options.engine,
+        options.samples,
+        options.size,
+        _showing("splats"),
+    )
+    options.reporter.status(f"Wrote {folder / PICTURE}.")
     if has_meshes:
         _render_apart(folder / BLEND, folder / APART_PICTURE, options)
-        say(f"Wrote {folder / APART_PICTURE}.")
+        options.reporter.status(f"Wrote {folder / APART_PICTURE}.")
 
 
-def _groups(options) -> tuple:
-    """--groups FILE for the backend, which works elsewhere; nothing where it was not given, or is no option."""
+def _groups(options: argparse.Namespace) -> tuple[object, ...]:
+    """The option --groups for the backend, with an absolute path; empty if it was not given."""
     path = vars(options).get("groups")
-    return ("--groups", whole(path)) if path else ()
+    return ("--groups", absolute(path)) if path else ()
 
 
-def _render_apart(blend: Path, out: Path, options) -> None:
-    render_picture(blend, out, None, options.engine or "CYCLES", options.samples or apart.SAMPLES,
-                   options.size or apart.SIZE, apart.pull_apart)
+def _render_apart(blend: Path, out: Path, options: argparse.Namespace) -> None:
+    render_picture(
+        options.reporter,
+        blend,
+        out,
+        None,
+        options.engine or "CYCLES",
+        options.samples or apart.SAMPLES,
+        options.size or apart.SIZE,
+        apart.pull_apart,
+    )
 
 
-def _showing(which: str):
-    """What makes an opened .blend show splats, meshes or both in its picture."""
+def _showing(which: str) -> Callable[[bpy.types.Scene], None]:
+    """A function that makes a scene show splats, meshes or both."""
+
     def prepare(target: bpy.types.Scene) -> None:
         for root in apart.reconstructions(target):
             scene.show_kinds(root, which)
@@ -152,59 +224,84 @@ def _showing(which: str):
 
 
 def find_backend(python: str | None) -> None:
-    """Settle which Python runs the backend: `python`, OBJECTGS_PYTHON, or what the preferences and the set-up say."""
+    """Choose the Python of the backend: `python`, OBJECTGS_PYTHON, or that of the preferences or the set-up.
+
+    Raises:
+        InputError: there is none.
+    """
     wanted = python or os.environ.get("OBJECTGS_PYTHON")
     if wanted:
-        found = shutil.which(os.path.expanduser(wanted))
+        found = shutil.which(Path(wanted).expanduser())
         if found is None:
             raise InputError(f"There is no Python at {wanted}; check --backend-python or OBJECTGS_PYTHON.")
-        os.environ["OBJECTGS_PYTHON"] = os.path.abspath(found)
+        os.environ["OBJECTGS_PYTHON"] = str(absolute(Path(found)))
     elif locations.backend_python() is None:
-        raise InputError("The compute backend is not set up; name a Python that has it with --backend-python or "
-                         "OBJECTGS_PYTHON, or set it up in the preferences of ObjectGS.")
+        raise InputError(
+            "The compute backend is not set up; name a Python that has it with --backend-python or "
+            "OBJECTGS_PYTHON, or set it up in the preferences of ObjectGS."
+        )
 
 
-def build_blend(folder: Path, blend: Path) -> bool:
-    """Put the reconstruction in `folder` into a new file and save it as `blend`; whether objects have meshes there."""
+def build_blend(folder: Path, blend: Path, reporter: Reporter) -> bool:
+    """Show the reconstruction in `folder` in a new file and save it as `blend`.
+
+    Returns:
+        Whether objects have meshes.
+
+    Raises:
+        InputError: there is no reconstruction, or the file cannot be written.
+    """
     files = Reconstruction(folder)
-    if not (folder / "cameras.json").is_file():
-        raise InputError(f"{folder} holds no reconstruction; make one with the import or train command.")
+    if not files.cameras.is_file():
+        raise InputError(f"{folder} contains no reconstruction; make one with the import or train command.")
     _empty_file()
     target = bpy.context.scene
     with quiet():
         root = scene.show_capture(target, folder)
         warnings = scene.warnings_of(root)
         if files.splats.exists():
-            warnings += scene.show_result(root, folder, target).warnings
+            warnings += scene.show_result(root, folder).warnings
             view.hide_points(root)
         scene.prepare_render(target)
         has_meshes = bool(scene.object_meshes(root))
         if has_meshes or scene.scene_meshes(root):
             apart.add_even_light(target)
-        # Works on every machine; EEVEE needs a display, or draws on the processor.
+        # Cycles works on every machine; EEVEE needs a display.
         target.render.engine = "CYCLES"
         target.cycles.samples = SAMPLES
     for warning in warnings:
-        say(f"Warning: {warning}")
-    save_blend(blend)
+        reporter.warning(warning)
+    save_blend(blend, reporter)
     return has_meshes
 
 
-def save_blend(path: Path) -> None:
-    """Save the file that is open as `path`; InputError where that cannot be written."""
+def save_blend(path: Path, reporter: Reporter) -> None:
+    """Save the open file as `path`. Raises InputError if that cannot be written."""
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with quiet():
             bpy.ops.wm.save_as_mainfile(filepath=str(path))
     except RuntimeError as error:
         raise InputError(f"{path} could not be written; check its folder and the free space.") from error
-    say(f"Wrote {path}.")
+    reporter.status(f"Wrote {path}.")
 
 
-def run_backend(command: str, folder: Path | None, *arguments: object) -> None:
-    """Run a command of the backend until it ends; raises what main() makes its exit code of."""
+def run_backend(reporter: Reporter, command: str, folder: Path | None, *arguments: object) -> None:
+    """Run a command of the backend.
+
+    Args:
+        reporter: takes its messages, warnings and progress.
+        command: name of the command.
+        folder: the reconstruction folder, or None.
+        arguments: of the command.
+
+    Raises:
+        InputError: the input is refused.
+        Cancelled: the user cancelled.
+        StepFailed: it failed for another reason.
+    """
     job = locations.backend_job(_TITLES[command], command, folder, command, *map(str, arguments))
-    code = run_blocking(job, echo=lambda line: None if job.error else say(line))
+    code = run_blocking(job, reporter)
     if code == EXIT_DONE:
         return
     if code == EXIT_CANCELLED:
@@ -215,5 +312,5 @@ def run_backend(command: str, folder: Path | None, *arguments: object) -> None:
 
 
 def _empty_file() -> None:
-    """A new file without objects; the user's preferences stay as they are."""
+    """Open a new file without objects, keeping the user's preferences."""
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)

@@ -1,21 +1,28 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`film`: the splats of a .blend through its camera, frame by frame, and joined with Blender's own rendering."""
+"""`film`: renders the splats of a .blend through its camera and combines them with Blender's own rendering."""
 
-from ...backend.film.shot import NAME, frame_ranges, write_shot
-from ...backend.protocol import InputError, Reconstruction
+from __future__ import annotations
+
+import argparse
+
+import bpy
+
+from ...backend.shared.errors import InputError
+from ...backend.shared.reconstruction.folder import Reconstruction
+from ...backend.shared.reconstruction.shot import NAME, frame_ranges, write_shot
 from .. import film as filming
 from .. import scene
 from ..film.properties import samples_of
 from . import apart
-from .commands import find_backend, run_backend, save_blend, whole
-from .lines import say
+from .commands import absolute, find_backend, run_backend, save_blend
 from .picture import choose_camera, choose_engine, open_blend, write_picture
 
 
-def film(options) -> None:
-    """Film frames of a .blend, and composites where they are asked for."""
+def film(options: argparse.Namespace) -> None:
+    """Render film frames of a .blend and, with --composite, combine them with Blender's rendering."""
+    reporter = options.reporter
     find_backend(options.backend_python)
-    blend, out = whole(options.blend), whole(options.out)
+    blend, out = absolute(options.blend), absolute(options.out)
     target = open_blend(blend)
     if options.size is not None:
         target.render.resolution_x, target.render.resolution_y = options.size
@@ -26,32 +33,43 @@ def film(options) -> None:
         raise InputError(f"{blend} has no reconstruction; make one with the build command, or append one to it.")
     root = found[0]
     if len(found) > 1:
-        say(f"Warning: {blend} has {len(found)} reconstructions; {root.name} is drawn.")
-    folder = whole(options.dir) if options.dir else scene.folder_of(root)
+        reporter.warning(f"{blend} has {len(found)} reconstructions; {root.name} is rendered.")
+    folder = absolute(options.dir) if options.dir else scene.folder_of(root)
     if not Reconstruction(folder).splats.is_file():
-        raise InputError(f"The reconstruction folder {folder} has no splats.ply; say with --dir where it is now.")
+        raise InputError(f"The reconstruction folder {folder} has no splats.ply; name its present location with --dir.")
     frames = _frames(options, target)
     shot = filming.shot_of(target, target.view_layers[0], root, frames, options.subframes or samples_of(target))
     out.mkdir(parents=True, exist_ok=True)
     # Machines that share the folder must not write the same file.
     path = out / (f"shot.{frames[0]:04d}-{frames[-1]:04d}.json" if options.frames else NAME)
     write_shot(path, shot)
-    run_backend("film", folder, folder, "--shot", path, "--out", out, "--device", options.device,
-                *(["--png"] if options.png else []))
+    run_backend(
+        reporter,
+        "film",
+        folder,
+        folder,
+        "--shot",
+        path,
+        "--out",
+        out,
+        "--device",
+        options.device,
+        *(["--png"] if options.png else []),
+    )
     if options.composite or options.save:
         filming.set_up_compositor(target, target.view_layers[0], root, out)
     if options.save:
-        save_blend(whole(options.save))
+        save_blend(absolute(options.save), reporter)
     if options.composite:
-        choose_engine(target, options.engine, options.samples)
+        choose_engine(target, options.engine, options.samples, reporter)
         for number in frames:
             target.frame_set(number)
             path = out / f"composite.{number:04d}.{options.composite}"
             write_picture(target, path)
-            say(f"Wrote {path}.")
+            reporter.status(f"Wrote {path}.")
 
 
-def _frames(options, target) -> list[int]:
+def _frames(options: argparse.Namespace, target: bpy.types.Scene) -> list[int]:
     if options.frames:
         return sorted({number for numbers in frame_ranges(options.frames) for number in numbers})
     return list(range(target.frame_start, target.frame_end + 1, target.frame_step))

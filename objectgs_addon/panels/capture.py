@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where a reconstruction comes from: import, and the folder it is in."""
+"""Import of captures, and the folder of the reconstruction."""
+
+from __future__ import annotations
 
 import bpy
 
-from .. import jobs, locations, running, scene
-from ..folder_state import folder_state
-from ..job_display import write
+from .. import scene
+from ..environment import locations
+from ..process import jobs
+from ..running import running
+from ..running.job_display import write
+from ..state.folder_state import folder_state
 from .tab import Tab, draw_job
 
 
@@ -13,7 +18,7 @@ class CapturePanel(Tab, bpy.types.Panel):
     bl_idname = "OBJECTGS_PT_capture"
     bl_label = "ObjectGS"
 
-    def draw(self, context):
+    def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         if locations.backend_python() is None:
             box = layout.box()
@@ -33,13 +38,16 @@ class CapturePanel(Tab, bpy.types.Panel):
             _draw_folder(layout, active)
 
 
-def _draw_folder(layout, root) -> None:
-    """Where the reconstruction is, and what is wrong with it."""
+def _draw_folder(layout: bpy.types.UILayout, root: bpy.types.Collection) -> None:
+    """Draw the reconstruction's folder, or a message if it is missing."""
     folder = scene.folder_of(root)
-    state = folder_state(folder)
-    if not state.exists:
-        write(layout, f"The folder {folder} is gone. What is in this file stays as it is; to train or vote, put the "
-                      "folder back or import the capture again.", "ERROR")
+    if not folder_state(folder).exists:
+        write(
+            layout,
+            f"The folder {folder} is missing. The contents of this file are kept; to assign objects or train, put the "
+            "folder back or import the capture again.",
+            "ERROR",
+        )
         return
     row = layout.row(align=True)
     row.label(text=folder.name, icon="FILE_FOLDER")

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Film: frames of the splats through the scene's camera, and the compositor that joins them with renders."""
+"""Film frames of the splats through the scene's camera, and the compositor that combines them with renders."""
+
+from __future__ import annotations
 
 import bpy
 
-from .. import running, scene
-from ..job_display import write
+from .. import scene
+from ..running import running
+from ..running.job_display import write
 from .tab import WithReconstruction, draw_job_of
 
 
@@ -13,7 +16,7 @@ class FilmPanel(WithReconstruction, bpy.types.Panel):
     bl_label = "Film"
     bl_options = {"DEFAULT_CLOSED"}
 
-    def draw(self, context):
+    def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         owner = context.scene
         root, settings, render = owner.objectgs.active, owner.objectgs_film, owner.render
@@ -25,7 +28,7 @@ class FilmPanel(WithReconstruction, bpy.types.Panel):
         column.use_property_decorate = False
         column.prop(settings, "folder", placeholder="In the reconstruction")
         frames = column.column(align=True)
-        frames.prop(owner, "frame_start", text="Frames")
+        frames.prop(owner, "frame_start", text="Frame Start")
         frames.prop(owner, "frame_end", text="End")
         column.prop(render, "use_motion_blur", text="Motion Blur")
         blur = column.column(align=True)
@@ -37,6 +40,6 @@ class FilmPanel(WithReconstruction, bpy.types.Panel):
         if job is not None and job.kind == "film":
             draw_job_of(layout, job)
         layout.operator("objectgs.set_up_compositor", icon="NODE_COMPOSITING")
-        layout.prop(root, "hide_render", text="Leave Splats to Film Frames", icon="NONE")
+        layout.prop(root, "hide_render", text="Disable in Renders", icon="NONE")
         if root.hide_render:
-            write(layout, "Blender's renderer leaves this reconstruction out; film frames show it.", "INFO")
+            write(layout, "Blender does not render this reconstruction; film frames show it.", "INFO")

@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Everything that runs or waits, and the line in the status bar."""
+"""All running and waiting jobs, and the line in the status bar."""
+
+from __future__ import annotations
+
+from typing import Any
 
 import bpy
 
-from .. import running
-from ..job_display import summary
+from ..running import running
+from ..running.job_display import summary
 from .tab import Tab, draw_job
 
 
@@ -14,18 +18,18 @@ class JobsPanel(Tab, bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}
 
     @classmethod
-    def poll(cls, _context):
+    def poll(cls, _context: bpy.types.Context) -> bool:
         return bool(running.queue.jobs)
 
-    def draw(self, _context):
+    def draw(self, _context: bpy.types.Context) -> None:
         layout = self.layout
         for index, job in enumerate(running.queue.jobs):
             draw_job(layout, job, index)
-        layout.operator("objectgs.clear_jobs", icon="X")
+        layout.operator("objectgs.remove_finished_jobs", icon="X")
 
 
-def status_bar(bar, _context) -> None:
-    """What runs, with its time left and a button to stop it."""
+def status_bar(bar: Any, _context: bpy.types.Context) -> None:
+    """Draw the running job with its time left and a button to stop it."""
     job = running.queue.running
     if job is not None:
         row = bar.layout.row(align=True)

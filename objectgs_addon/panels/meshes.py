@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshes: how they are made, and what is shown."""
+"""Extraction and display of meshes."""
+
+from __future__ import annotations
 
 import bpy
 
-from .. import running, scene
-from ..folder_state import folder_state
-from ..job_display import write
+from .. import scene
+from ..running import running
+from ..running.job_display import write
+from ..state.folder_state import folder_state
 from .tab import WithReconstruction, draw_job_of
 
 
@@ -13,7 +16,7 @@ class MeshesPanel(WithReconstruction, bpy.types.Panel):
     bl_idname = "OBJECTGS_PT_meshes"
     bl_label = "Meshes"
 
-    def draw(self, context):
+    def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         root = context.scene.objectgs.active
         properties = root.objectgs
@@ -32,8 +35,12 @@ class MeshesPanel(WithReconstruction, bpy.types.Panel):
         if job is not None and job.kind == "mesh":
             draw_job_of(layout, job)
         if state.stale_meshes and not running.busy(folder):
-            write(layout, f"{state.stale_meshes} of {state.meshes} meshes are of another state of the training. "
-                          "Extract Meshes brings them up to date.", "INFO")
+            write(
+                layout,
+                f"{state.stale_meshes} of {state.meshes} meshes were made at another step of the training. "
+                "Extract Meshes updates them.",
+                "INFO",
+            )
         if not scene.has_shown_meshes(root):
             return
         layout.label(text="Show")

@@ -1,11 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What training will do and what it leaves out, and why."""
+"""The decisions on what training does and leaves out, with their reasons."""
+
+from __future__ import annotations
+
+from typing import Any
 
 import bpy
 
-from .. import planning, running, scene
-from ..job_display import write
-from ..planning import sentence_case
+from ...backend.shared.reconstruction.plan import Decision
+from .. import scene
+from ..running import running
+from ..running.job_display import write
+from ..state import planning
+from ..state.planning import sentence_case
 from .tab import WithReconstruction
 
 
@@ -15,31 +22,31 @@ class PlanPanel(WithReconstruction, bpy.types.Panel):
     bl_parent_id = "OBJECTGS_PT_train"
     bl_options = {"DEFAULT_CLOSED"}
 
-    def draw_header_preset(self, context):
+    def draw_header_preset(self, context: bpy.types.Context) -> None:
         left_out = len(planning.plan_of(scene.folder_of(context.scene.objectgs.active)).left_out)
         if left_out:
             self.layout.label(text=f"{left_out} left out")
 
-    def draw(self, context):
+    def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         root = context.scene.objectgs.active
         folder = scene.folder_of(root)
-        decisions = planning.plan_of(folder).decisions
         layout.enabled = not running.busy(folder)
-        for decision in decisions:
-            _draw(layout, root.objectgs, decision)
+        for decision in planning.plan_of(folder).decisions:
+            _draw_decision(layout, root.objectgs, decision)
         row = layout.row(align=True)
-        row.operator("objectgs.plan", icon="FILE_REFRESH", text="Plan Again" if decisions else "Plan")
+        row.operator("objectgs.analyze_capture", icon="FILE_REFRESH")
         row.operator("objectgs.group_objects", icon="OUTLINER_OB_GROUP_INSTANCE")
 
 
-def _draw(layout, properties, decision) -> None:
-    """A decision as a row: ticked where it is done, and why where it is not."""
+def _draw_decision(layout: bpy.types.UILayout, properties: Any, decision: Decision) -> None:
+    """A decision as a row, with its reason unless it is carried out."""
     done = planning.is_wanted(properties, decision)
     row = layout.row(align=True)
     if decision.can_override and done is not None:
-        row.operator("objectgs.override_decision", text="", emboss=False,
-                     icon="CHECKBOX_HLT" if done else "CHECKBOX_DEHLT").key = decision.key
+        row.operator(
+            "objectgs.override_decision", text="", emboss=False, icon="CHECKBOX_HLT" if done else "CHECKBOX_DEHLT"
+        ).key = decision.key
     else:
         row.label(text="", icon={True: "CHECKMARK", False: "X", None: "TIME"}[done])
     column = row.column(align=True)

@@ -1,8 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the panels share: the tab they are in, and a job with its progress."""
+"""Shared parts of the panels: their tab, and a job with its progress."""
 
-from .. import running
-from ..job_display import draw_over, draw_running
+from __future__ import annotations
+
+import bpy
+
+from ..process.jobs import Job
+from ..running import running
+from ..running.job_display import draw_over, draw_running
 
 
 class Tab:
@@ -13,20 +18,20 @@ class Tab:
 
 class WithReconstruction(Tab):
     @classmethod
-    def poll(cls, context):
+    def poll(cls, context: bpy.types.Context) -> bool:
         return context.scene.objectgs.active is not None
 
 
-def draw_job_of(layout, job) -> None:
-    """A reconstruction's job in the panel of what it does."""
+def draw_job_of(layout: bpy.types.UILayout, job: Job) -> None:
+    """Draw a reconstruction's job in the panel of its operator."""
     if job.is_finished:
         draw_over(layout, job)
     else:
         draw_job(layout, job, running.queue.jobs.index(job))
 
 
-def draw_job(layout, job, index: int) -> None:
-    """A job of the queue in a box."""
+def draw_job(layout: bpy.types.UILayout, job: Job, index: int) -> None:
+    """Draw a job of the queue in a box."""
     box = layout.box()
     if job.is_finished:
         draw_over(box, job)

@@ -1,44 +1,52 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Voting and training, with their settings."""
+"""Assignment of objects and training, with their settings."""
+
+from __future__ import annotations
 
 import math
+from pathlib import Path
+from typing import Any
 
 import bpy
 
-from ...backend.expectation import PRESET_STEPS, expectation
-from .. import jobs, previews, running, scene
-from ..folder_state import folder_state
-from ..job_display import duration, write
+from ...backend.shared.durations import clock
+from ...backend.shared.expectation import PRESET_STEPS, expectation
+from ...backend.shared.reconstruction.lock import lock_holder
+from .. import scene
+from ..process.jobs import Job
+from ..running import previews, running
+from ..running.job_display import write
+from ..state.folder_state import FolderState, folder_state
 from .tab import WithReconstruction, draw_job_of
 
 
 class TrainPanel(WithReconstruction, bpy.types.Panel):
     bl_idname = "OBJECTGS_PT_train"
-    bl_label = "Vote and Train"
+    bl_label = "Train"
 
-    def draw(self, context):
+    def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         root = context.scene.objectgs.active
         properties = root.objectgs
         folder = scene.folder_of(root)
         job = running.job_of(root)
         if job is not None and job.kind in ("mesh", "film", "fill"):
-            job = None  # Their own panels show them.
+            job = None  # Other panels show these.
         active = running.busy(folder)
         column = layout.column()
         column.enabled = not active
-        column.operator("objectgs.vote", icon="GROUP_VERTEX")
+        column.operator("objectgs.assign_objects", icon="GROUP_VERTEX")
         row = column.row(align=True)
         row.operator("objectgs.train", icon="PLAY", text=_train_text(folder, properties))
         row.prop(properties, "length", text="")
         if properties.length == "minutes":
             column.prop(properties, "minutes")
         if not active:
-            _expect(column, folder_state(folder), properties)
+            _draw_expectation(column, folder_state(folder), properties)
         if job is not None:
             draw_job_of(layout, job)
         if not active:
-            _explain(layout, root, job)
+            _draw_folder_state(layout, root, job)
         icons = [icon for name in (previews.RENDER, previews.CURVE) if (icon := previews.icon_of(folder, name))]
         if icons:
             row = layout.row()
@@ -47,42 +55,49 @@ class TrainPanel(WithReconstruction, bpy.types.Panel):
             layout.operator("objectgs.show_preview", icon="IMAGE_DATA")
 
 
-def _train_text(folder, properties) -> str:
-    return "Go On Training" if _goes_on(folder_state(folder), properties) else "Train"
+def _train_text(folder: Path, properties: Any) -> str:
+    return "Resume" if _can_resume(folder_state(folder), properties) else "Train"
 
 
-def _goes_on(state, properties) -> bool:
+def _can_resume(state: FolderState, properties: Any) -> bool:
     return bool(state.steps) and (properties.length != "minutes" or state.seconds < 60 * properties.minutes - 0.5)
 
 
-def _explain(layout, root, job) -> None:
-    """What the folder holds that this Blender has not seen come about."""
+def _draw_folder_state(layout: bpy.types.UILayout, root: bpy.types.Collection, job: Job | None) -> None:
+    """What the folder holds that no job of this Blender has made."""
     folder, minutes = scene.folder_of(root), root.objectgs.minutes
     state = folder_state(folder)
-    holder = jobs.lock_holder(folder)
+    holder = lock_holder(folder)
     if holder is not None:
-        write(layout, f"Another program works on this reconstruction (process {holder}). Its result can be reloaded "
-                      "when it is done.", "INFO")
+        process = f" (process {holder})" if holder else ""
+        write(
+            layout,
+            f"Another program{process} is using this reconstruction. Reload the result when it is done.",
+            "INFO",
+        )
         return
-    if job is None and root.objectgs.length == "minutes" and _goes_on(state, root.objectgs):
-        write(layout, f"Trained for {duration(state.seconds)} of {duration(60 * minutes)}. "
-                      "Go On Training continues from there.", "INFO")
+    if job is None and root.objectgs.length == "minutes" and _can_resume(state, root.objectgs):
+        write(
+            layout,
+            f"Trained for {clock(state.seconds)} of {clock(60 * minutes)}. Resume continues from there.",
+            "INFO",
+        )
     if scene.result_is_newer(root):
-        write(layout, "The folder holds another result than the one shown.", "INFO")
+        write(layout, "The result in the folder differs from the one shown.", "INFO")
         layout.operator("objectgs.show_result", icon="FILE_REFRESH")
 
 
-def _expect(layout, state, properties) -> None:
-    """How good the result is going to be, where it is not there yet."""
+def _draw_expectation(layout: bpy.types.UILayout, state: FolderState, properties: Any) -> None:
+    """The expected quality of a training that is not finished."""
     steps = PRESET_STEPS.get(properties.length)
     seconds = 60 * properties.minutes if properties.length == "minutes" else None
     if state.steps >= (steps or math.inf) or state.seconds >= (seconds or math.inf) - 0.5:
         return
     expected = expectation(steps, seconds, state.pixels, (state.steps, state.seconds))
     if expected is not None:
-        quiet = layout.column()
-        quiet.active = False
-        write(quiet, expected)
+        column = layout.column()
+        column.active = False
+        write(column, expected)
 
 
 class SettingsPanel(WithReconstruction, bpy.types.Panel):
@@ -91,7 +106,7 @@ class SettingsPanel(WithReconstruction, bpy.types.Panel):
     bl_parent_id = "OBJECTGS_PT_train"
     bl_options = {"DEFAULT_CLOSED"}
 
-    def draw(self, context):
+    def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.use_property_split = True
         properties = context.scene.objectgs.active.objectgs
@@ -102,4 +117,4 @@ class SettingsPanel(WithReconstruction, bpy.types.Panel):
         layout.prop(properties, "primitive")
         layout.prop(properties, "strategy")
         layout.prop(properties, "max_size")
-        layout.operator("objectgs.train", text="Train Anew", icon="LOOP_BACK").restart = True
+        layout.operator("objectgs.train", text="Retrain", icon="LOOP_BACK").restart = True

@@ -4,13 +4,15 @@
 from .cameras import use_camera
 from .capture import show_capture, warnings_of
 from .carrier import require_object_mode
-from .copies import duplicate, remove_copy
-from .edits import is_removed, recolour, reset_place, show_edits, store_places
-from .fills import INVENTED_COUNT, invented_splats, missing_fill, show_fills
-from .floaters import hidden_splats
+from .edits.duplicates import duplicate, remove_duplicate
+from .edits.fills import UNOBSERVED_COUNT, missing_fill, show_fills, unobserved_splats
+from .edits.floaters import hidden_splats
+from .edits.placement import distance_moved, matrix_to_capture, matrix_to_world, placement_of
+from .edits.recolor import luma_of, recolor_of, with_own_textures
+from .edits.show import is_removed, recolor, reset_placement, show_edits, store_placements
 from .kinds import (
     collection_of,
-    copies_of,
+    duplicates_of,
     folder_of,
     from_stored,
     kind_of,
@@ -20,12 +22,11 @@ from .kinds import (
     root_of,
     to_stored,
 )
-from .meshes import (
+from .meshes.assets import bounds, mark_asset
+from .meshes.show import (
     SHOWS,
     ShownMeshes,
-    bounds,
     has_shown_meshes,
-    mark_asset,
     object_meshes,
     scene_meshes,
     show_kinds,
@@ -34,19 +35,61 @@ from .meshes import (
 )
 from .objects_file import Objects
 from .orientation import orient_to_ground, scale_to_distance
-from .places import into_capture, into_world, moved_by, place_of
-from .points import colour_points_by
-from .preview import prepare_render
-from .recolouring import luma_of, recolour_of, with_own_textures
+from .points import color_points_by
 from .result import Shown, result_is_newer, show_objects, show_result
+from .shading.render_settings import prepare_render
 
 __all__ = [
-    "INVENTED_COUNT", "SHOWS", "Objects", "Shown", "ShownMeshes", "bounds", "collection_of", "colour_points_by",
-    "copies_of", "duplicate", "folder_of", "from_stored", "has_shown_meshes", "hidden_splats", "into_capture",
-    "into_world", "invented_splats", "is_removed", "kind_of", "luma_of", "mark_asset", "missing_fill", "moved_by",
-    "object_collections", "object_id_of", "object_meshes", "orient_to_ground", "parts_of", "place_of",
-    "prepare_render", "recolour", "recolour_of", "remove_copy", "require_object_mode", "reset_place",
-    "result_is_newer", "root_of", "scale_to_distance", "scene_meshes", "show_capture", "show_edits", "show_fills",
-    "show_kinds", "show_meshes", "show_objects", "show_result", "shown_kinds", "store_places", "to_stored",
-    "use_camera", "warnings_of", "with_own_textures",
+    "SHOWS",
+    "UNOBSERVED_COUNT",
+    "Objects",
+    "Shown",
+    "ShownMeshes",
+    "bounds",
+    "collection_of",
+    "color_points_by",
+    "distance_moved",
+    "duplicate",
+    "duplicates_of",
+    "folder_of",
+    "from_stored",
+    "has_shown_meshes",
+    "hidden_splats",
+    "is_removed",
+    "kind_of",
+    "luma_of",
+    "mark_asset",
+    "matrix_to_capture",
+    "matrix_to_world",
+    "missing_fill",
+    "object_collections",
+    "object_id_of",
+    "object_meshes",
+    "orient_to_ground",
+    "parts_of",
+    "placement_of",
+    "prepare_render",
+    "recolor",
+    "recolor_of",
+    "remove_duplicate",
+    "require_object_mode",
+    "reset_placement",
+    "result_is_newer",
+    "root_of",
+    "scale_to_distance",
+    "scene_meshes",
+    "show_capture",
+    "show_edits",
+    "show_fills",
+    "show_kinds",
+    "show_meshes",
+    "show_objects",
+    "show_result",
+    "shown_kinds",
+    "store_placements",
+    "to_stored",
+    "unobserved_splats",
+    "use_camera",
+    "warnings_of",
+    "with_own_textures",
 ]

@@ -2,15 +2,13 @@
 """cameras.json as Blender cameras that see exactly what the capture's pinhole cameras saw."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...backend.protocol import InputError, read_json
+from ...backend.shared.reconstruction.cameras import Cameras, CameraView
 from .kinds import CAMERA, KIND, kind_of, mark
 
 SENSOR_WIDTH = 36.0
@@ -19,94 +17,33 @@ DISPLAY_SIZE = 0.4
 """Size of a camera's frame relative to the median distance from a camera to its nearest."""
 
 
-@dataclass(frozen=True)
-class View:
-    """One camera: image (absolute), pixels, K (3, 3) with pixel centres at +0.5, viewmat (4, 4) capture -> OpenCV."""
-
-    name: str
-    image: Path
-    width: int
-    height: int
-    K: np.ndarray
-    viewmat: np.ndarray
-    held_out: bool
-
-    @property
-    def aspect(self) -> float:
-        """Width of a pixel over its height, so that one focal length serves both axes: fy / fx."""
-        return float(self.K[1, 1] / self.K[0, 0])
-
-
-@dataclass(frozen=True)
-class Cameras:
-    """origin (3,): subtracted from the capture's coordinates in Blender; upright (4, 4): from there to Z up."""
-
-    origin: np.ndarray
-    upright: np.ndarray
-    views: list[View]
-
-
-def read_cameras(folder: Path) -> Cameras:
-    """cameras.json of a reconstruction folder; InputError says what is wrong and what to do."""
-    path = folder / "cameras.json"
-    if not path.is_file():
-        raise InputError(f"{folder} has no cameras.json; run Import again.")
-    content = read_json(path)
-    try:
-        upright = np.eye(4)
-        upright[:3, :3] = _matrix(content["upright"]["rotation"], (3, 3))
-        upright[:3, 3] = _matrix(content["upright"]["translation"], (3,))
-        views = [_view(entry, folder) for entry in content["cameras"]]
-        return Cameras(_matrix(content["origin"], (3,)), upright, views)
-    except (KeyError, TypeError, ValueError, OverflowError, np.linalg.LinAlgError) as error:
-        raise InputError(f"{path} does not list cameras as expected ({error!r}); run Import again.") from error
-
-
-def _view(entry: Any, folder: Path) -> View:
-    view = View(
-        name=str(entry["name"]), image=folder / entry["image"], width=int(entry["width"]), height=int(entry["height"]),
-        K=_matrix(entry["K"], (3, 3)), viewmat=_matrix(entry["viewmat"], (4, 4)), held_out=bool(entry["held_out"]))
-    if view.width < 1 or view.height < 1 or view.K[0, 0] <= 0 or view.K[1, 1] <= 0:
-        raise ValueError(f"camera {view.name} has no size or no focal length")
-    np.linalg.inv(view.viewmat)
-    view.name.encode()  # Blender takes no text that is not valid Unicode, which JSON's escapes need not be.
-    return view
-
-
-def _matrix(value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    array = np.array(value, np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(f"{shape} finite numbers were expected")
-    return array
-
-
 def show_cameras(capture: bpy.types.Collection, parent: bpy.types.Object, cameras: Cameras) -> list[str]:
     """Make or update the cameras in `capture`, children of `parent`; returns warnings.
 
     A camera is known again by the image's name; one that is not in `cameras` any more is removed.
     """
-    there = {thing["objectgs_image"]: thing for thing in capture.objects if kind_of(thing) == CAMERA}
+    there = {obj["objectgs_image"]: obj for obj in capture.objects if kind_of(obj) == CAMERA}
     poses = [_pose(view, cameras.origin) for view in cameras.views]
     display = DISPLAY_SIZE * _spacing(np.array([pose[:3, 3] for pose in poses]))
     for view, pose in zip(cameras.views, poses):
-        thing = there.pop(view.name, None)
-        if thing is None or thing.data is None:
-            thing = bpy.data.objects.new(view.name, bpy.data.cameras.new(view.name))
-            mark(thing, CAMERA)
-            thing["objectgs_image"] = view.name
-            thing.data.display_size = display
-            thing.rotation_mode = "QUATERNION"
-            thing.parent = parent
-            capture.objects.link(thing)
-        _place(thing, pose)
-        _set_lens(thing.data, view)
-        _set_background(thing.data, view)
-        thing["held_out"] = view.held_out
-        thing["width"], thing["height"] = view.width, view.height
-        thing["pixel_aspect"] = view.aspect
-    for thing in there.values():
-        data = thing.data
-        bpy.data.objects.remove(thing)
+        obj = there.pop(view.name, None)
+        if obj is None or obj.data is None:
+            obj = bpy.data.objects.new(view.name, bpy.data.cameras.new(view.name))
+            mark(obj, CAMERA)
+            obj["objectgs_image"] = view.name
+            obj.data.display_size = display
+            obj.rotation_mode = "QUATERNION"
+            obj.parent = parent
+            capture.objects.link(obj)
+        _place(obj, pose)
+        _set_lens(obj.data, view)
+        _set_background(obj.data, view)
+        obj["held_out"] = view.held_out
+        obj["width"], obj["height"] = view.width, view.height
+        obj["pixel_aspect"] = view.aspect
+    for obj in there.values():
+        data = obj.data
+        bpy.data.objects.remove(obj)
         if data is not None and data.users == 0:
             bpy.data.cameras.remove(data)
     return _warnings(cameras.views)
@@ -123,7 +60,7 @@ def use_camera(scene: bpy.types.Scene, camera: bpy.types.Object) -> None:
     scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = max(aspect, 1.0), max(1.0 / aspect, 1.0)
 
 
-def _pose(view: View, origin: np.ndarray) -> np.ndarray:
+def _pose(view: CameraView, origin: np.ndarray) -> np.ndarray:
     """(4, 4) from Blender's camera axes (x right, y up, looking along -z) to the reconstruction's coordinates."""
     pose = np.linalg.inv(view.viewmat)
     pose[:3, 3] -= origin
@@ -131,15 +68,15 @@ def _pose(view: View, origin: np.ndarray) -> np.ndarray:
     return pose
 
 
-def _place(thing: bpy.types.Object, pose: np.ndarray) -> None:
+def _place(obj: bpy.types.Object, pose: np.ndarray) -> None:
     location, rotation, _scale = Matrix(pose.tolist()).decompose()
-    thing.location = location
-    if thing.rotation_mode != "QUATERNION":
-        thing.rotation_mode = "QUATERNION"
-    thing.rotation_quaternion = rotation
+    obj.location = location
+    if obj.rotation_mode != "QUATERNION":
+        obj.rotation_mode = "QUATERNION"
+    obj.rotation_quaternion = rotation
 
 
-def _set_lens(camera: bpy.types.Camera, view: View) -> None:
+def _set_lens(camera: bpy.types.Camera, view: CameraView) -> None:
     """The exact K: Blender's shifts are in widths of the picture, its lens in units of the sensor's width."""
     camera.type = "PERSP"
     camera.sensor_fit = "HORIZONTAL"
@@ -150,10 +87,12 @@ def _set_lens(camera: bpy.types.Camera, view: View) -> None:
     camera.shift_y = (view.K[1, 2] - view.height / 2.0) / view.aspect / view.width
 
 
-def _set_background(camera: bpy.types.Camera, view: View) -> None:
+def _set_background(camera: bpy.types.Camera, view: CameraView) -> None:
     """The photo behind the view; Blender reads the file when it first draws it."""
-    ours = next((entry for entry in camera.background_images
-                 if entry.image is not None and entry.image.get(KIND) == "photo"), None)
+    ours = next(
+        (entry for entry in camera.background_images if entry.image is not None and entry.image.get(KIND) == "photo"),
+        None,
+    )
     if not view.image.is_file():
         if ours is not None:
             camera.background_images.remove(ours)
@@ -168,32 +107,35 @@ def _set_background(camera: bpy.types.Camera, view: View) -> None:
         ours.image[KIND] = "photo"
 
 
-def _spacing(centres: np.ndarray) -> float:
+def _spacing(centers: np.ndarray) -> float:
     """Median distance from a camera to its nearest; of one camera, or of many in one place, 1."""
-    if len(centres) < 2:
+    if len(centers) < 2:
         return 1.0
-    some = centres[:: max(1, len(centres) // 500)]
+    some = centers[:: max(1, len(centers) // 500)]
     nearest = np.empty(len(some))
-    for index, centre in enumerate(some):
-        apart = np.linalg.norm(centres - centre, axis=1)
-        apart = apart[apart > 1e-9 * (1.0 + np.abs(centre).max())]
+    for index, center in enumerate(some):
+        apart = np.linalg.norm(centers - center, axis=1)
+        apart = apart[apart > 1e-9 * (1.0 + np.abs(center).max())]
         nearest[index] = apart.min() if len(apart) else np.nan
     found = nearest[np.isfinite(nearest)]
     return float(np.median(found)) if len(found) else 1.0
 
 
-def _warnings(views: Sequence[View]) -> list[str]:
+def _warnings(views: Sequence[CameraView]) -> list[str]:
     warnings = []
     aspects = [view.aspect for view in views]
     if aspects and max(aspects) / min(aspects) - 1.0 > LARGEST_ASPECT_ERROR:
         warnings.append(
             "The capture's cameras have pixels of different shapes, but a Blender scene has one; select a camera and "
-            "use its size before rendering through it.")
+            "use its size before rendering through it."
+        )
     skewed = [view.name for view in views if abs(view.K[0, 1]) > 1e-6 * view.K[0, 0]]
     if skewed:
         warnings.append(f"{len(skewed)} cameras are skewed ({skewed[0]} is one), which Blender's cameras cannot be.")
     missing = [view.image for view in views if not view.image.is_file()]
     if missing:
-        warnings.append(f"{len(missing)} of {len(views)} images are missing, {missing[0]} for one; their cameras have "
-                        "no background. Run Import again.")
+        warnings.append(
+            f"{len(missing)} of {len(views)} images are missing, {missing[0]} for one; their cameras have "
+            "no background. Run Import again."
+        )
     return warnings

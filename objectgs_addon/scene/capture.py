@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """A reconstruction's collection with its capture: the parent that stands it up, cameras and points."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import Any
 
 import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...backend.protocol import InputError
+from ...backend.shared.errors import InputError
+from ...backend.shared.reconstruction.cameras import read_cameras
 from . import carrier
-from .cameras import read_cameras, show_cameras, use_camera
+from .cameras import show_cameras, use_camera
 from .kinds import (
     CAMERA,
     CAPTURE,
@@ -36,8 +40,9 @@ UPRIGHT = "objectgs_upright"
 WARNINGS = "objectgs_warnings"
 
 
-def show_capture(scene: bpy.types.Scene, folder: Path, root: bpy.types.Collection | None = None,
-                 name: str | None = None) -> bpy.types.Collection:
+def show_capture(
+    scene: bpy.types.Scene, folder: Path, root: bpy.types.Collection | None = None, name: str | None = None
+) -> bpy.types.Collection:
     """Show the cameras and points of a reconstruction folder in `scene`; returns the reconstruction's collection.
 
     `root` is updated where it is given, or else the scene's collection of the same folder; without either a new one
@@ -51,8 +56,14 @@ def show_capture(scene: bpy.types.Scene, folder: Path, root: bpy.types.Collectio
     table = read_points(folder)
     objects = Objects.read(folder)
     if root is None:
-        root = next((child for child in scene.collection.children_recursive
-                     if kind_of(child) == RECONSTRUCTION and folder_of(child) == folder), None)
+        root = next(
+            (
+                child
+                for child in scene.collection.children_recursive
+                if kind_of(child) == RECONSTRUCTION and folder_of(child) == folder
+            ),
+            None,
+        )
     if root is not None:
         carrier.require_object_mode([points_of(root)])
 
@@ -77,9 +88,9 @@ def show_capture(scene: bpy.types.Scene, folder: Path, root: bpy.types.Collectio
         root.children.link(capture)
     if is_new or not any(root in other.collection.children_recursive for other in bpy.data.scenes):
         scene.collection.children.link(root)
-    ours = [thing for thing in capture.objects if kind_of(thing) == CAMERA]
+    ours = [obj for obj in capture.objects if kind_of(obj) == CAMERA]
     if ours and (scene.camera is None or scene.camera in ours):
-        use_camera(scene, scene.camera or min(ours, key=lambda thing: thing["objectgs_image"]))
+        use_camera(scene, scene.camera or min(ours, key=lambda obj: obj["objectgs_image"]))
     return root
 
 
@@ -94,7 +105,7 @@ def origin_of(root: bpy.types.Collection) -> np.ndarray:
     return np.array(root.get(ORIGIN, (0.0, 0.0, 0.0)), np.float64)
 
 
-def _stand_up(root: bpy.types.Collection, upright: np.ndarray, views) -> bpy.types.Object:
+def _stand_up(root: bpy.types.Collection, upright: np.ndarray, views: Any) -> bpy.types.Object:
     """The parent empty, made where there is none; one that the user has moved stays where it is."""
     parent = parent_of(root)
     wanted = Matrix(upright.tolist())
@@ -102,13 +113,13 @@ def _stand_up(root: bpy.types.Collection, upright: np.ndarray, views) -> bpy.typ
         parent = bpy.data.objects.new(root.name, None)
         mark(parent, PARENT)
         parent.empty_display_type = "ARROWS"
-        centres = np.array([-view.viewmat[:3, :3].T @ view.viewmat[:3, 3] for view in views]).reshape(-1, 3)
-        parent.empty_display_size = 0.15 * float(np.linalg.norm(np.ptp(centres, axis=0))) if len(centres) > 1 else 1.0
+        centers = np.array([-view.viewmat[:3, :3].T @ view.viewmat[:3, 3] for view in views]).reshape(-1, 3)
+        parent.empty_display_size = 0.15 * float(np.linalg.norm(np.ptp(centers, axis=0))) if len(centers) > 1 else 1.0
         root.objects.link(parent)
-        for thing in root.all_objects:
-            of_all = kind_of(thing) == MESH and object_id_of(thing) is None
-            if thing.parent is None and (of_all or kind_of(thing) in (CAMERA, POINTS, OBJECT_PARENT)):
-                thing.parent = parent
+        for obj in root.all_objects:
+            of_all = kind_of(obj) == MESH and object_id_of(obj) is None
+            if obj.parent is None and (of_all or kind_of(obj) in (CAMERA, POINTS, OBJECT_PARENT)):
+                obj.parent = parent
     elif list(parent.get(UPRIGHT, ())) != _numbers(parent.matrix_basis):
         return parent
     parent.matrix_basis = wanted

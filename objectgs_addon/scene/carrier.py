@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Meshes of loose vertices that carry a value of each kind for each vertex, filled without loops."""
 
+from __future__ import annotations
+
+from collections.abc import Iterable
+
 import bpy
 import numpy as np
 
-from ...backend.protocol import InputError
+from ...backend.shared.errors import InputError
 
 # Attribute type -> its field in foreach_set, NumPy type and numbers for each vertex.
 _FIELDS = {
@@ -19,15 +23,15 @@ KINDS = frozenset(_FIELDS)
 """The types of attributes that can be read and written."""
 
 
-def require_object_mode(things) -> None:
+def require_object_mode(objs: Iterable[bpy.types.Object]) -> None:
     """Raise InputError where one of the objects is in Edit Mode or another mode that works on its mesh.
 
     Edit Mode would overwrite what is written to the mesh when it is left.
     """
-    for thing in things:
-        if thing is not None and (thing.mode != "OBJECT" or getattr(thing.data, "is_editmode", False)):
-            mode = "Edit" if thing.mode == "OBJECT" else thing.mode.replace("_", " ").title()
-            raise InputError(f"{thing.name} is in {mode} Mode; leave it and try again.")
+    for obj in objs:
+        if obj is not None and (obj.mode != "OBJECT" or getattr(obj.data, "is_editmode", False)):
+            mode = "Edit" if obj.mode == "OBJECT" else obj.mode.replace("_", " ").title()
+            raise InputError(f"{obj.name} is in {mode} Mode; leave it and try again.")
 
 
 def fill(mesh: bpy.types.Mesh, positions: np.ndarray, attributes: dict[str, tuple[str, np.ndarray]]) -> None:

@@ -4,7 +4,10 @@
 Nothing is ever found by its name, since users rename things and Blender numbers names that are taken.
 """
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import Any
 
 import bpy
 
@@ -19,7 +22,7 @@ CAPTURE = "capture"
 CAMERA = "camera"
 POINTS = "points"
 OBJECT = "object"
-COPY = "object_copy"
+DUPLICATE = "object_copy"
 OBJECT_PARENT = "object_parent"
 SPLATS = "splats"
 ANCHORS = "anchors"
@@ -30,19 +33,19 @@ MESH_MATERIAL = "mesh_material"
 TEXTURE = "mesh_texture"
 
 
-def kind_of(block) -> str | None:
+def kind_of(block: bpy.types.ID) -> str | None:
     """What a collection, object, mesh, material or node group is to this extension; None where it is not ours."""
     kind = block.get(KIND) if block is not None else None
     return kind if isinstance(kind, str) else None
 
 
-def object_id_of(block) -> int | None:
+def object_id_of(block: bpy.types.ID) -> int | None:
     """ID 0 .. 2^32 - 1 of the object that a collection or an object belongs to, or None."""
     value = block.get(OBJECT_ID) if kind_of(block) is not None else None
     return from_stored(value) if isinstance(value, int) else None
 
 
-def mark(block, kind: str, object_id: int | None = None) -> None:
+def mark(block: bpy.types.ID, kind: str, object_id: int | None = None) -> None:
     """Say what `block` is."""
     block[KIND] = kind
     if object_id is not None:
@@ -66,12 +69,12 @@ def folder_of(root: bpy.types.Collection) -> Path:
 
 def parts_of(collection: bpy.types.Collection) -> list[bpy.types.Object]:
     """Our objects that lie directly in `collection`."""
-    return [thing for thing in collection.objects if kind_of(thing) is not None]
+    return [obj for obj in collection.objects if kind_of(obj) is not None]
 
 
 def part_of(collection: bpy.types.Collection, kind: str) -> bpy.types.Object | None:
     """The first object of a kind that lies directly in `collection`, or None."""
-    return next((thing for thing in collection.objects if kind_of(thing) == kind), None)
+    return next((obj for obj in collection.objects if kind_of(obj) == kind), None)
 
 
 def parent_of(root: bpy.types.Collection) -> bpy.types.Object | None:
@@ -79,12 +82,14 @@ def parent_of(root: bpy.types.Collection) -> bpy.types.Object | None:
     return part_of(root, PARENT)
 
 
-def adopt(collection: bpy.types.Collection, root: bpy.types.Collection, kinds, object_id: int | None = None) -> None:
+def adopt(
+    collection: bpy.types.Collection, root: bpy.types.Collection, kinds: Any, object_id: int | None = None
+) -> None:
     """Move parts that lie about in `root` itself into `collection`: those of a collection that the user dissolved."""
-    for thing in list(root.objects):
-        if kind_of(thing) in kinds and (object_id is None or object_id_of(thing) == object_id):
-            collection.objects.link(thing)
-            root.objects.unlink(thing)
+    for obj in list(root.objects):
+        if kind_of(obj) in kinds and (object_id is None or object_id_of(obj) == object_id):
+            collection.objects.link(obj)
+            root.objects.unlink(obj)
 
 
 def capture_of(root: bpy.types.Collection) -> bpy.types.Collection | None:
@@ -118,21 +123,23 @@ def object_collections(root: bpy.types.Collection) -> dict[int, bpy.types.Collec
     return found
 
 
-def copies_of(root: bpy.types.Collection) -> dict[int, list[bpy.types.Collection]]:
+def duplicates_of(root: bpy.types.Collection) -> dict[int, list[bpy.types.Collection]]:
     """Object ID -> the collections of its duplicates, in Blender's order; of the objects that have any."""
     found: dict[int, list[bpy.types.Collection]] = {}
     for collection in root.children_recursive:
-        if kind_of(collection) == COPY:
+        if kind_of(collection) == DUPLICATE:
             found.setdefault(object_id_of(collection) or 0, []).append(collection)
     return found
 
 
 def collection_of(part: bpy.types.Object) -> bpy.types.Collection | None:
     """The collection of the object, or of the duplicate of one, that a part lies in directly; None in neither."""
-    return next((collection for collection in part.users_collection if kind_of(collection) in (OBJECT, COPY)), None)
+    return next(
+        (collection for collection in part.users_collection if kind_of(collection) in (OBJECT, DUPLICATE)), None
+    )
 
 
-def root_of(block, scene: bpy.types.Scene) -> bpy.types.Collection | None:
+def root_of(block: bpy.types.ID, scene: bpy.types.Scene) -> bpy.types.Collection | None:
     """The reconstruction's collection in `scene` that an object or a collection belongs to, or None."""
     roots = [child for child in scene.collection.children_recursive if kind_of(child) == RECONSTRUCTION]
     if isinstance(block, bpy.types.Collection):

@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What objects.json says about showing objects: names, colours, which are merged and which are left out."""
+"""What objects.json says about showing objects: names, colors, which are merged and which are left out."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from ...backend.objects import SceneObject, merged, read_objects
-from ...backend.palette import UNLABELLED, colours_of, to_linear
-from ...backend.protocol import Reconstruction
+from ...backend.shared.color.palette import UNLABELED, colors_of, to_linear
+from ...backend.shared.reconstruction.folder import Reconstruction
+from ...backend.shared.reconstruction.objects import SceneObject, merged, read_objects
 
 _LINEAR = np.array([to_linear((value,))[0] for value in range(256)], np.float32)
 
 
-def linear_colours(rgb: np.ndarray) -> np.ndarray:
+def linear_colors(rgb: np.ndarray) -> np.ndarray:
     """(n, 3) uint8 sRGB -> (n, 4) float32 linear, opaque."""
-    colours = np.ones((len(rgb), 4), np.float32)
-    colours[:, :3] = _LINEAR[rgb]
-    return colours
+    colors = np.ones((len(rgb), 4), np.float32)
+    colors[:, :3] = _LINEAR[rgb]
+    return colors
 
 
 @dataclass(frozen=True)
@@ -45,24 +45,24 @@ class Objects:
         """The object's name; IDs that objects.json does not know get one, too."""
         if object_id in self.entries:
             return self.entries[object_id].name
-        return "Unlabelled" if object_id == 0 else f"object {object_id}"
+        return "Unlabeled" if object_id == 0 else f"object {object_id}"
 
     def rgb(self, object_id: int) -> tuple[int, int, int]:
-        """The object's colour, sRGB 0 .. 255."""
+        """The object's color, sRGB 0 .. 255."""
         if object_id in self.entries:
-            red, green, blue = self.entries[object_id].colour
+            red, green, blue = self.entries[object_id].color
             return red, green, blue
-        red, green, blue = (int(value) for value in colours_of([object_id])[0])
+        red, green, blue = (int(value) for value in colors_of([object_id])[0])
         return red, green, blue
 
-    def colours(self, ids: np.ndarray) -> np.ndarray:
-        """(n,) IDs -> (n, 4) float32 linear: an object's colour is that of what it is shown as, grey if left out."""
+    def colors(self, ids: np.ndarray) -> np.ndarray:
+        """(n,) IDs -> (n, 4) float32 linear: an object's color is that of what it is shown as, gray if left out."""
         if len(ids) == 0:
             return np.zeros((0, 4), np.float32)
         known, inverse = np.unique(ids, return_inverse=True)
         shown = [self.shown_as(int(object_id)) for object_id in known]
-        rgb = np.array([UNLABELLED if target is None else self.rgb(target) for target in shown], np.uint8)
-        return linear_colours(rgb)[inverse.reshape(-1)]
+        rgb = np.array([UNLABELED if target is None else self.rgb(target) for target in shown], np.uint8)
+        return linear_colors(rgb)[inverse.reshape(-1)]
 
     def grouping(self) -> dict[str, int | None]:
         """ID (as text) -> what it is shown as, of those that are not shown as themselves."""

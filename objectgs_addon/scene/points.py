@@ -1,21 +1,25 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The capture's point cloud: a mesh carrier whose vertices are shown as points in one of two colours."""
+"""The capture's point cloud: a mesh carrier whose vertices are shown as points in one of two colors."""
 
 from pathlib import Path
 
 import bpy
 import numpy as np
 
-from ...backend.ply import read_vertices
-from ...backend.protocol import InputError, Reconstruction
-from . import carrier, preview
+from ...backend.shared.errors import InputError
+from ...backend.shared.formats.ply import read_vertices
+from ...backend.shared.reconstruction.folder import Reconstruction
+from . import carrier
 from .kinds import POINTS, mark, part_of, points_of
-from .objects_file import Objects, linear_colours
+from .objects_file import Objects, linear_colors
+from .shading.materials import points_material
+from .shading.modifiers import modifier_of, set_input
+from .shading.node_groups import POINTS_GROUP, points_group
 
 SIZE = 0.004
 """Radius of a point relative to the diagonal of the box that holds the middle 90 percent of the points."""
 
-COLOURINGS = ("photo", "object")
+COLORINGS = ("photo", "object")
 
 
 def read_points(folder: Path) -> np.ndarray:
@@ -35,54 +39,64 @@ def positions_of(table: np.ndarray, origin: np.ndarray) -> np.ndarray:
     return np.stack([table[axis].astype(np.float64) - origin[i] for i, axis in enumerate("xyz")], axis=1)
 
 
-def show_points(capture: bpy.types.Collection, parent: bpy.types.Object, name: str, table: np.ndarray,
-                origin: np.ndarray, objects: Objects) -> None:
+def show_points(
+    capture: bpy.types.Collection,
+    parent: bpy.types.Object,
+    name: str,
+    table: np.ndarray,
+    origin: np.ndarray,
+    objects: Objects,
+) -> None:
     """Make or update the point cloud's object in `capture`."""
     positions = positions_of(table, origin)
-    thing = part_of(capture, POINTS)
-    if thing is None:
+    obj = part_of(capture, POINTS)
+    if obj is None:
         mesh = bpy.data.meshes.new(name)
-        thing = bpy.data.objects.new(name, mesh)
-        mark(thing, POINTS)
-        thing.parent = parent
-        thing.hide_render = True
-        mesh.materials.append(preview.points_material())
-        modifier = thing.modifiers.new("ObjectGS Points", "NODES")
-        modifier.node_group = preview.points_group()
-        preview.set_input(modifier, "Size", SIZE * _diagonal(positions))
-        preview.set_input(modifier, "Material", mesh.materials[0])
-        capture.objects.link(thing)
+        obj = bpy.data.objects.new(name, mesh)
+        mark(obj, POINTS)
+        obj.parent = parent
+        obj.hide_render = True
+        mesh.materials.append(points_material())
+        modifier = obj.modifiers.new("ObjectGS Points", "NODES")
+        modifier.node_group = points_group()
+        set_input(modifier, "Size", SIZE * _diagonal(positions))
+        set_input(modifier, "Material", mesh.materials[0])
+        capture.objects.link(obj)
     ids = table["object_id"].astype(np.int64)
-    margins = table["margin"] if "margin" in table.dtype.names else np.zeros(len(table), np.float32)
+    margins = table["margin"] if "margin" in (table.dtype.names or ()) else np.zeros(len(table), np.float32)
     photo = np.stack([table[channel] for channel in ("red", "green", "blue")], axis=1)
-    active = thing.data.attributes.active_color_name
-    carrier.fill(thing.data, positions, {
-        "photo": ("FLOAT_COLOR", linear_colours(photo)),
-        "object": ("FLOAT_COLOR", objects.colours(ids)),
-        "object_id": ("INT", carrier.stored_ids(ids)),
-        "margin": ("FLOAT", margins),
-    })
-    _activate(thing, active if active in COLOURINGS else "photo")
+    active = obj.data.attributes.active_color_name
+    carrier.fill(
+        obj.data,
+        positions,
+        {
+            "photo": ("FLOAT_COLOR", linear_colors(photo)),
+            "object": ("FLOAT_COLOR", objects.colors(ids)),
+            "object_id": ("INT", carrier.stored_ids(ids)),
+            "margin": ("FLOAT", margins),
+        },
+    )
+    _activate(obj, active if active in COLORINGS else "photo")
 
 
-def colour_points_by(root: bpy.types.Collection, by: str) -> None:
-    """Show the point cloud in its colours of the photos ("photo") or of its objects ("object")."""
-    if by not in COLOURINGS:
-        raise ValueError(f"points cannot be coloured by {by}")
-    thing = points_of(root)
-    if thing is None:
+def color_points_by(root: bpy.types.Collection, by: str) -> None:
+    """Show the point cloud in its colors of the photos ("photo") or of its objects ("object")."""
+    if by not in COLORINGS:
+        raise ValueError(f"points cannot be colored by {by}")
+    obj = points_of(root)
+    if obj is None:
         return
-    modifier = preview.modifier_of(thing, preview.POINTS_GROUP)
+    modifier = modifier_of(obj, POINTS_GROUP)
     if modifier is not None:
-        preview.set_input(modifier, "By Object", by == "object")
-    if by in thing.data.attributes:
-        _activate(thing, by)
-    thing.update_tag()
+        set_input(modifier, "By Object", by == "object")
+    if by in obj.data.attributes:
+        _activate(obj, by)
+    obj.update_tag()
 
 
-def _activate(thing: bpy.types.Object, by: str) -> None:
-    """The active colour is what Solid shows with its color set to Attribute."""
-    thing.data.attributes.active_color_name = by
+def _activate(obj: bpy.types.Object, by: str) -> None:
+    """The active color is what Solid shows with its color set to Attribute."""
+    obj.data.attributes.active_color_name = by
 
 
 def _diagonal(positions: np.ndarray) -> float:

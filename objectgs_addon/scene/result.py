@@ -1,18 +1,23 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The objects of a reconstruction: a collection for each, with its splats and anchors, new or updated in place."""
 
+from __future__ import annotations
+
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import bpy
 import numpy as np
 
-from ...backend.palette import to_linear
-from ...backend.protocol import InputError, Reconstruction
-from . import carrier, preview
+from ...backend.shared.color.palette import to_linear
+from ...backend.shared.errors import InputError
+from ...backend.shared.reconstruction.folder import Reconstruction
+from . import carrier
 from .capture import origin_of
-from .edits import show_edits
+from .edits.show import show_edits
 from .kinds import (
     ANCHORS,
     MESH,
@@ -20,7 +25,7 @@ from .kinds import (
     SPLATS,
     adopt,
     capture_of,
-    copies_of,
+    duplicates_of,
     folder_of,
     mark,
     object_collections,
@@ -29,11 +34,13 @@ from .kinds import (
     parts_of,
     points_of,
 )
-from .meshes import apply_shown, update_meshes
-from .object_collection import NAME, centre_of, new_collection, paint, pivot_of, remove, remove_if_empty, rename
+from .meshes.show import apply_shown, update_meshes
+from .object_collection import NAME, center_of, ensure_pivot, new_collection, paint, remove, remove_if_empty, rename
 from .objects_file import Objects
 from .points import positions_of, read_points, show_points
-from .splats import anchor_attributes, ids_of, middle_scale, read_anchors, read_splats, splat_attributes, unique_ids
+from .shading.materials import splats_material
+from .shading.modifiers import add_splats_modifiers, use_material
+from .splats import anchor_attributes, ids_of, median_scale, read_anchors, read_splats, splat_attributes, unique_ids
 
 GROUPING = "objectgs_grouping"
 SHOWN = "objectgs_shown"
@@ -45,7 +52,7 @@ LARGEST_POINT = 3.0
 
 @dataclass
 class Shown:
-    """What `show_result` put into Blender: how many objects (the unlabelled rest is none), splats and anchors."""
+    """What `show_result` put into Blender: how many objects (the unlabeled rest is none), splats and anchors."""
 
     objects: int = 0
     splats: int = 0
@@ -53,7 +60,7 @@ class Shown:
     warnings: list[str] = field(default_factory=list)
 
 
-def show_result(root: bpy.types.Collection, folder: Path, scene: bpy.types.Scene) -> Shown:
+def show_result(root: bpy.types.Collection, folder: Path) -> Shown:
     """Show splats.ply, anchors.ply and the meshes: each object in its collection, merged ones in that of the other.
 
     What is there is updated in place: transforms, modifiers, materials, visibility and the place of collections stay
@@ -72,7 +79,7 @@ def show_result(root: bpy.types.Collection, folder: Path, scene: bpy.types.Scene
     splat_groups = _groups(splats, objects)
     anchor_groups = {} if anchors is None else _groups(anchors, objects)
     parent = parent_of(root)
-    makers = _Makers(objects, LARGEST_POINT * middle_scale(splats))
+    makers = _Makers(objects, LARGEST_POINT * median_scale(splats))
     shown = Shown(warnings=warnings + more)
     new = []
     for object_id in sorted(set(splat_groups) | set(anchor_groups)):
@@ -84,13 +91,19 @@ def show_result(root: bpy.types.Collection, folder: Path, scene: bpy.types.Scene
             adopt(collection, root, (OBJECT_PARENT, SPLATS, ANCHORS, MESH), object_id)
             new.append(collection)
         positions = positions_of(own_splats, origin)
-        pivot = pivot_of(collection, parent, object_id, positions)
-        carrier.fill(makers.part(collection, SPLATS, object_id, pivot).data, positions - centre_of(pivot),
-                     splat_attributes(own_splats))
+        pivot = ensure_pivot(collection, parent, object_id, positions)
+        carrier.fill(
+            makers.part(collection, SPLATS, object_id, pivot).data,
+            positions - center_of(pivot),
+            splat_attributes(own_splats),
+        )
         shown.splats += len(own_splats)
         if own_anchors is not None:
-            carrier.fill(makers.part(collection, ANCHORS, object_id, pivot).data,
-                         positions_of(own_anchors, origin) - centre_of(pivot), anchor_attributes(own_anchors))
+            carrier.fill(
+                makers.part(collection, ANCHORS, object_id, pivot).data,
+                positions_of(own_anchors, origin) - center_of(pivot),
+                anchor_attributes(own_anchors),
+            )
             shown.anchors += len(own_anchors)
         elif anchors is not None:
             remove(part_of(collection, ANCHORS))
@@ -130,10 +143,10 @@ def _written(folder: Path) -> str:
         return ""
 
 
-def show_objects(root: bpy.types.Collection, folder: Path, scene: bpy.types.Scene) -> None:
+def show_objects(root: bpy.types.Collection, folder: Path) -> None:
     """Bring points and object collections into agreement with points.ply and objects.json, after a vote or an edit.
 
-    Names, colours and edits are shown; where merges or left-out objects changed, splats are shown again as
+    Names, colors and edits are shown; where merges or left-out objects changed, splats are shown again as
     `show_result` does.
     """
     folder = Path(folder)
@@ -142,11 +155,14 @@ def show_objects(root: bpy.types.Collection, folder: Path, scene: bpy.types.Scen
     if capture is not None and parent is not None and Reconstruction(folder).points.is_file():
         carrier.require_object_mode([points_of(root)])
         show_points(capture, parent, f"{root.name} points", read_points(folder), origin_of(root), objects)
-    if GROUPING in root and root[GROUPING] != json.dumps(objects.grouping()) and (
-            Reconstruction(folder).splats.is_file()):
-        show_result(root, folder, scene)
+    if (
+        GROUPING in root
+        and root[GROUPING] != json.dumps(objects.grouping())
+        and (Reconstruction(folder).splats.is_file())
+    ):
+        show_result(root, folder)
         return
-    copies = copies_of(root)
+    copies = duplicates_of(root)
     for object_id, collection in object_collections(root).items():
         for each in (collection, *copies.get(object_id, ())):
             rename(each, objects.name(object_id))
@@ -167,7 +183,7 @@ def _groups(table: np.ndarray, objects: Objects) -> dict[int, np.ndarray]:
     as_bytes = table.view(np.uint8).reshape(len(table), table.dtype.itemsize)
     rows = as_bytes[np.argsort(group, kind="stable")].reshape(-1).view(table.dtype)
     ends = np.cumsum(np.bincount(group, minlength=len(targets)))
-    return {target: rows[ends[i - 1] if i else 0:ends[i]] for i, target in enumerate(targets)}
+    return {target: rows[ends[i - 1] if i else 0 : ends[i]] for i, target in enumerate(targets)}
 
 
 class _Makers:
@@ -180,38 +196,40 @@ class _Makers:
         """IDs of the objects whose splats are new."""
         self._made: dict[str, bpy.types.Object] = {}
 
-    def part(self, collection, kind: str, object_id: int, pivot) -> bpy.types.Object:
+    def part(
+        self, collection: bpy.types.Collection, kind: str, object_id: int, pivot: bpy.types.Object
+    ) -> bpy.types.Object:
         """The carrier of a kind in `collection`, made where there is none."""
-        thing = part_of(collection, kind)
-        if thing is not None:
-            if thing.parent is None:
-                thing.parent = pivot  # The user deleted the one before.
-            return thing
+        obj = part_of(collection, kind)
+        if obj is not None:
+            if obj.parent is None:
+                obj.parent = pivot  # The user deleted the one before.
+            return obj
         name = f"{collection[NAME]} {kind}"
         mesh = bpy.data.meshes.new(name)
         first = self._made.get(kind)
         if first is None:
-            thing = self._made[kind] = bpy.data.objects.new(name, mesh)
+            obj = self._made[kind] = bpy.data.objects.new(name, mesh)
         else:
-            thing = first.copy()
-            thing.name, thing.data = name, mesh
-        mark(thing, kind, object_id)
+            obj = first.copy()
+            obj.name, obj.data = name, mesh
+        mark(obj, kind, object_id)
         if kind == SPLATS:
-            self._dress(thing, first, collection[NAME], to_linear(self.objects.rgb(object_id)))
+            self._update_appearance(obj, first, collection[NAME], to_linear(self.objects.rgb(object_id)))
             self.changed.add(object_id)
         elif first is None:
             # Blender visits every object of the file for each of these settings; copies have them.
-            thing.hide_render = thing.hide_viewport = True
-        thing.parent = pivot
-        collection.objects.link(thing)
-        return thing
+            obj.hide_render = obj.hide_viewport = True
+        obj.parent = pivot
+        collection.objects.link(obj)
+        return obj
 
-    def _dress(self, thing, first, name: str, colour) -> None:
+    def _update_appearance(self, obj: bpy.types.Object, first: Any, name: str, color: Sequence[float]) -> None:
         if first is None:
-            material = preview.splats_material(name, colour)
-            preview.add_splats_modifiers(thing, self.largest_point)
+            material = splats_material(name, color)
+            add_splats_modifiers(obj, self.largest_point)
         else:
             material = first.data.materials[0].copy()
-            material.name, material.diffuse_color = name, (*colour, 1.0)
-        thing.data.materials.append(material)
-        preview.use_material(thing, material)
+            material.name, material.diffuse_color = name, (*color, 1.0)
+        obj.data.materials.append(material)
+        use_material(obj, material)

@@ -1,17 +1,35 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """splats.ply and anchors.ply as the attributes of mesh carriers."""
 
+from __future__ import annotations
+
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ...backend.ply import read_vertices
-from ...backend.protocol import InputError, Reconstruction
+from ...backend.shared.errors import InputError
+from ...backend.shared.formats.ply import read_vertices
+from ...backend.shared.reconstruction.folder import Reconstruction
 from .carrier import stored_ids
 
-_NEEDED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
-           "rot_0", "rot_1", "rot_2", "rot_3")
+_NEEDED = (
+    "x",
+    "y",
+    "z",
+    "f_dc_0",
+    "f_dc_1",
+    "f_dc_2",
+    "opacity",
+    "scale_0",
+    "scale_1",
+    "scale_2",
+    "rot_0",
+    "rot_1",
+    "rot_2",
+    "rot_3",
+)
 LARGEST_LOG_SCALE = 80.0
 ROWS_AT_ONCE = 1 << 14
 """Few enough to stay in the processor's cache while their columns are looked at."""
@@ -49,7 +67,7 @@ def read_anchors(folder: Path) -> tuple[np.ndarray | None, list[str]]:
 
 def ids_of(table: np.ndarray) -> np.ndarray:
     """(n,) int64 object IDs; 0 where the file names none."""
-    if "object_id" not in table.dtype.names:
+    if "object_id" not in (table.dtype.names or ()):
         return np.zeros(len(table), np.int64)
     ids = table["object_id"]
     if ids.dtype.kind == "f":
@@ -66,7 +84,7 @@ def unique_ids(ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.flatnonzero(counts), (np.cumsum(counts > 0) - 1)[ids]
 
 
-def middle_scale(table: np.ndarray) -> float:
+def median_scale(table: np.ndarray) -> float:
     """Of a sample of splats: the median of their middle scales; 1 without splats."""
     if len(table) == 0:
         return 1.0
@@ -114,25 +132,29 @@ def _columns(table: np.ndarray, *names: str) -> np.ndarray:
     return values
 
 
-def _rest_count(names, path: Path | None = None) -> int:
+def _rest_count(names: Any, path: Path | None = None) -> int:
     """How many properties f_rest_* there are."""
     count = sum(name.startswith("f_rest_") for name in names)
-    if path is not None and (count % 3 or math.isqrt(count // 3 + 1) ** 2 != count // 3 + 1
-                             or any(f"f_rest_{i}" not in names for i in range(count))):
+    if path is not None and (
+        count % 3
+        or math.isqrt(count // 3 + 1) ** 2 != count // 3 + 1
+        or any(f"f_rest_{i}" not in names for i in range(count))
+    ):
         raise InputError(f"{path} has {count} properties f_rest_*; 0, 9, 24 or 45, numbered from 0, were expected.")
     return count
 
 
-def _without_unusable(table: np.ndarray, names, file: str, what: str) -> tuple[np.ndarray, list[str]]:
+def _without_unusable(table: np.ndarray, names: Any, file: str, what: str) -> tuple[np.ndarray, list[str]]:
     keep = np.empty(len(table), bool)
     for start in range(0, len(table), ROWS_AT_ONCE):
-        rows = table[start:start + ROWS_AT_ONCE]
+        rows = table[start : start + ROWS_AT_ONCE]
         good = np.isfinite(sum(rows[name].astype(np.float64) for name in names))
         if "rot_0" in names:
             good &= np.maximum.reduce([np.abs(rows[f"rot_{i}"]) for i in range(4)]) > 1e-12
             good &= np.maximum.reduce([rows[f"scale_{i}"] for i in range(3)]) < LARGEST_LOG_SCALE
-        keep[start:start + ROWS_AT_ONCE] = good
+        keep[start : start + ROWS_AT_ONCE] = good
     if keep.all():
         return table, []
-    return table[keep], [f"{int((~keep).sum())} of {len(table)} {what} in {file} were left out: they hold NaN, "
-                         "infinity or no rotation."]
+    return table[keep], [
+        f"{int((~keep).sum())} of {len(table)} {what} in {file} were left out: they hold NaN, infinity or no rotation."
+    ]

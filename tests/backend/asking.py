@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 
-from backend.protocol import EXIT_BAD_INPUT
+from backend.shared.errors import EXIT_BAD_INPUT
 
 TYPES = {"status", "progress", "preview", "quality", "warning", "error", "done"}
 

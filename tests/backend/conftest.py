@@ -1,4 +1,4 @@
-"""Tiny synthetic captures (coloured spheres seen by a ring of cameras, with exact masks and tracks), and commands."""
+"""Tiny synthetic captures (colored spheres seen by a ring of cameras, with exact masks and tracks), and commands."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import pytest
 import torch
 from PIL import Image
 
-from backend import arguments
 from backend.capture import load_capture
+from backend.cli import main as arguments
 from backend.labels import vote
 
 from .asking import Answer
@@ -50,7 +50,7 @@ class Scene:
 
 
 def rays_of(lens: pycolmap.Camera) -> np.ndarray:
-    """The viewing direction of each pixel's centre, (h, w, 3), z = 1."""
+    """The viewing direction of each pixel's center, (h, w, 3), z = 1."""
     x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     xy = np.asarray(lens.cam_from_img(np.stack([x.ravel(), y.ravel()], 1)))
     return np.column_stack([xy, np.ones(len(xy))]).reshape(lens.height, lens.width, 3)
@@ -59,8 +59,8 @@ def rays_of(lens: pycolmap.Camera) -> np.ndarray:
 def sphere_ids(rays: np.ndarray, viewmat: np.ndarray, spheres: list) -> tuple[np.ndarray, np.ndarray]:
     """The ID that each ray (..., 3) meets first (0: none), and how far along the ray (infinite: none)."""
     best, ids = np.full(rays.shape[:-1], np.inf), np.zeros(rays.shape[:-1], np.int64)
-    for object_id, centre, radius in spheres:
-        c = viewmat[:3, :3] @ centre + viewmat[:3, 3]
+    for object_id, center, radius in spheres:
+        c = viewmat[:3, :3] @ center + viewmat[:3, 3]
         a, b = (rays * rays).sum(-1), rays @ c
         root = b * b - a * (c @ c - radius * radius)
         with np.errstate(invalid="ignore"):
@@ -134,7 +134,7 @@ def write_scene(
     """Write a capture into a folder.
 
     views; size (width, height); camera model and params (default PINHOLE with a focal length of the width); masks
-    (False: none); suffix (".bin" or ".txt"); names (one a view); spheres [(id, centre, radius)]; points (each).
+    (False: none); suffix (".bin" or ".txt"); names (one a view); spheres [(id, center, radius)]; points (each).
     """
     rng = np.random.default_rng(seed)
     scene = Scene(folder)
@@ -175,7 +175,7 @@ def write_scene(
         scene.pixels.append(pixels[seen])
     if masks:
         labels = {str(i): f"sphere {i}" for i, _, _ in spheres}
-        (scene.folder / "labels.json").write_text(json.dumps({"0": "unlabelled", **labels}))
+        (scene.folder / "labels.json").write_text(json.dumps({"0": "unlabeled", **labels}))
     write_model(scene, scene.folder / "sparse" / "0", suffix)
     return scene
 
@@ -193,15 +193,9 @@ def write_capture(tmp_path):
 
 
 @pytest.fixture
-def ask(capsys, request):
+def ask(capsys):
     """Runs a command in this process; `--json` in the arguments for events."""
     threads = numba.get_num_threads(), torch.get_num_threads()
-
-    def restore():
-        numba.set_num_threads(threads[0])
-        torch.set_num_threads(threads[1])
-
-    request.addfinalizer(restore)
 
     def run(*words) -> Answer:
         capsys.readouterr()
@@ -209,7 +203,9 @@ def ask(capsys, request):
         said = capsys.readouterr()
         return Answer(code, said.out, said.err)
 
-    return run
+    yield run
+    numba.set_num_threads(threads[0])
+    torch.set_num_threads(threads[1])
 
 
 @pytest.fixture

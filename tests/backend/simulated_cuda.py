@@ -7,9 +7,10 @@ import pytest
 import torch
 from numba import cuda
 
-from backend.raster import cpu, cuda_bin
-from backend.raster.cuda_kernel import any_in_warp, cuda_kernel, launch, launch_for_each, simulated
-from backend.raster.cuda_tiles import STAGED
+from backend.raster.cpu import renderer as cpu
+from backend.raster.cuda import binning as cuda_bin
+from backend.raster.cuda.blending import STAGED
+from backend.raster.cuda.kernel import any_in_warp, cuda_kernel, launch, launch_for_each, simulated
 from tests.backend.test_raster import NAMES, as_float32, camera, random_scene, rasterize
 from tests.backend.test_raster_stiff import assert_same_bits, draw
 
@@ -30,7 +31,7 @@ def turn_around(values, with_barrier):
     values[i] = shared[63 - i]
 
 
-def test_a_lacking_barrier_shows():
+def test_a_missing_barrier_gives_a_wrong_result():
     right, wrong = (torch.arange(64.0) for _ in range(2))
     launch(turn_around, 1, 64, right, True)
     assert torch.equal(right, torch.arange(64.0).flip(0))
@@ -66,11 +67,13 @@ def test_a_thread_for_each(count):
 
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
-def test_too_little_room_for_the_lists(primitive, monkeypatch):
-    """The lists and the picture are made again, and nothing shows it."""
+def test_too_little_capacity_for_the_intersections(primitive, monkeypatch):
+    """The intersections and the image are computed again, with the same result."""
     made = []
-    tile_lists = cuda_bin.tile_lists
-    monkeypatch.setattr("backend.raster.cuda.tile_lists", lambda *a: made.append(a[-1]) or tile_lists(*a))
+    tile_intersections = cuda_bin.tile_intersections
+    monkeypatch.setattr(
+        "backend.raster.cuda.renderer.tile_intersections", lambda *a: made.append(a[-1]) or tile_intersections(*a)
+    )
     scene = as_float32(random_scene(0, count=40))
     pictures = []
     for last in (10_000, 30):
@@ -116,37 +119,37 @@ def test_each_plane_alone_is_as_among_the_others(wanted, primitive):
 
 
 @pytest.mark.parametrize("flat", [False, True])
-def test_meets_the_tiles_that_the_cpu_renderer_would(flat):
-    """Tight bounds: a picture as large as one tile of the CPU's, whose list holds what the 8 small tiles hold."""
+def test_meets_the_same_tiles_as_the_cpu_renderer(flat):
+    """Tight bounds: in an image as large as one tile of the CPU's, that tile has the splats of the 8 small tiles."""
     cam = camera(64, 32)
     scene = as_float32(random_scene(4, count=50))
     cpu_frame = cpu.forward(cpu.Gaussians(*(scene[n].numpy() for n in (*NAMES, "ids"))), cam, flat=flat)
     frame = rasterize(**scene, camera=cam, primitive="2d" if flat else "3d").frame
     assert np.array_equal(frame.splats.numpy()[cpu_frame.seen], cpu_frame.splats[cpu_frame.seen])
     assert np.array_equal(frame.seen.numpy(), cpu_frame.seen)
-    used = frame.lists.members[: int(frame.lists.starts[-1])].numpy()
-    assert set(used) == set(cpu_frame.members.tolist())
+    used = frame.intersections.isect_ids[: int(frame.intersections.isect_offsets[-1])].numpy()
+    assert set(used) == set(cpu_frame.isect_ids.tolist())
     boxes = np.ceil(2 * cpu_frame.splats[cpu_frame.seen][:, 10:12] / 16 + 1).prod(1).sum()
     assert used.size < boxes
     # In every tile front to back as on the CPU.
-    rank = np.argsort(np.argsort(cpu_frame.members))
-    place = dict(zip(cpu_frame.members.tolist(), range(len(rank)), strict=True))
-    starts = frame.lists.starts.tolist()
+    rank = np.argsort(np.argsort(cpu_frame.isect_ids))
+    place = dict(zip(cpu_frame.isect_ids.tolist(), range(len(rank)), strict=True))
+    starts = frame.intersections.isect_offsets.tolist()
     for first, last in itertools.pairwise(starts):
         places = [place[n] for n in used[first:last].tolist()]
         assert places == sorted(places)
 
 
 @pytest.fixture
-def memory_full_of_rubbish():
-    """torch fills what it would leave as it was with NaN, or the largest integer."""
+def uninitialized_memory_filled():
+    """torch fills uninitialized memory with NaN, or the largest integer."""
     torch.use_deterministic_algorithms(True)
     yield
     torch.use_deterministic_algorithms(False)
 
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
-def test_splats_that_no_light_reaches_have_no_gradient(primitive, memory_full_of_rubbish):
+def test_splats_below_the_transmittance_threshold_have_no_gradient(primitive, uninitialized_memory_filled):
     scene = as_float32(random_scene(0, count=20))
     scene["means"] = torch.tensor([[0.0, 0.0, 1.0 + 0.1 * i] for i in range(20)])
     scene["scales"][:] = 50.0
@@ -154,7 +157,7 @@ def test_splats_that_no_light_reaches_have_no_gradient(primitive, memory_full_of
     scene["opacities"][:] = 0.98
     leaves = {k: v.requires_grad_(k != "ids") for k, v in scene.items()}
     picture = rasterize(**leaves, camera=camera(), want_depth=True, primitive=primitive)
-    assert picture.frame.ends.tolist() == [3] * picture.frame.ends.numel()
+    assert picture.frame.isect_counts.tolist() == [3] * picture.frame.isect_counts.numel()
     (picture.color.sum() + picture.alpha.sum() + picture.depth.sum()).backward()
     for name in NAMES:
         gradient = leaves[name].grad
@@ -162,18 +165,18 @@ def test_splats_that_no_light_reaches_have_no_gradient(primitive, memory_full_of
     assert leaves["opacities"].grad[:2].all()
 
 
-def test_more_splats_in_a_tile_than_wait_in_shared_memory():
+def test_more_splats_in_a_tile_than_fit_in_shared_memory():
     """Faint ones, so that all of them are drawn."""
     scene = as_float32(random_scene(0, count=STAGED + 150, size=0.3))
     scene["opacities"] *= 0.02
     scene["opacities"] += 0.005
     cam = camera(13, 9)
     frame = rasterize(**scene, camera=cam).frame
-    assert int(frame.ends[0]) > STAGED
+    assert int(frame.isect_counts[0]) > STAGED
     other = cpu.forward(cpu.Gaussians(*(scene[n].numpy() for n in (*NAMES, "ids"))), cam)
     np.testing.assert_allclose(frame.color.numpy(), other.color, atol=1e-5)
     g_color, g_alpha = torch.ones(3, 9, 13), torch.ones(9, 13)
-    from backend.raster import cuda as renderer
+    from backend.raster.cuda import renderer
 
     mine, theirs = renderer.backward(frame, g_color, g_alpha), cpu.backward(other, g_color.numpy(), g_alpha.numpy())
     for name in NAMES:

@@ -1,4 +1,4 @@
-"""How long a training goes on: steps, minutes, or until it is flat."""
+"""How long a training takes: steps, minutes, or until it has converged."""
 
 import math
 
@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from backend.training.budget import (
-    AHEAD,
+    DECAY_FROM,
+    LOOKAHEAD,
     OCTAVES,
     PRESETS,
-    SETTLING_FROM,
     WARM_UP,
-    WORTH,
+    WORTHWHILE_DB,
     Budget,
-    Progress,
-    flat_from,
+    TrainingProgress,
+    convergence_step,
 )
 from backend.training.settings import GROW_UNTIL, PLATEAU_FROM, PLATEAU_UNTIL, rate
 
@@ -24,62 +24,62 @@ def curve_of(steps, psnr, **more):
 
 
 def walk(budget, psnr, longest=100_000, seconds_a_step=0.05, anchors=lambda step: step):
-    """What a training does under a budget, measured as `psnr` of the step says, with so many `anchors`; returns the
-    progress at its end."""
-    p = Progress()
+    """The progress at the end of a training under a budget, with the `psnr` and number of `anchors` of each step."""
+    p = TrainingProgress()
     budget.begin(p)
-    shares, behind = [], []
+    progress, displayed = [], []
     while p.step < longest:
         if budget.evaluation_is_due(p):
             p.curve.append({"step": p.step, "psnr": psnr(p.step), "loss_db": None, "anchors": anchors(p.step)})
-            budget.settle(p)
-        shares.append(budget.share(p))
-        behind.append(budget.behind(p))
-        if shares[-1] >= 1:
+            budget.check_convergence(p)
+        progress.append(budget.progress(p))
+        displayed.append(budget.displayed_progress(p))
+        if progress[-1] >= 1:
             break
         p.step += 1
         p.seconds += seconds_a_step
-    assert shares == sorted(shares) and min(behind) == 0 and max(behind) <= 1 and (behind[-1] == 1) == (shares[-1] == 1)
+    assert progress == sorted(progress) and min(displayed) == 0 and max(displayed) <= 1
+    assert (displayed[-1] == 1) == (progress[-1] == 1)
     return p
 
 
-def flat_at(octave):
-    """After how many steps more are not worth it where twice the steps bring so many dB."""
-    return AHEAD / (2 ** (WORTH / octave) - 1)
+def converged_after(octave):
+    """The step from which on more are not worthwhile where an octave of steps gains `octave` dB."""
+    return LOOKAHEAD / (2 ** (WORTHWHILE_DB / octave) - 1)
 
 
-def test_where_it_is_flat_follows_the_logarithm_of_the_steps():
+def test_convergence_follows_the_logarithm_of_the_steps():
     steps = range(WARM_UP, 4100, 100)
-    assert flat_from(curve_of(steps, lambda s: 20 + 0.7 * math.log2(s))) == pytest.approx(flat_at(0.7))
+    assert convergence_step(curve_of(steps, lambda s: 20 + 0.7 * math.log2(s))) == pytest.approx(converged_after(0.7))
     # What came before the latest octaves does not matter, nor what came before it is judged.
     late = curve_of(steps, lambda s: 30.0 if s >= steps[-1] / 2**OCTAVES else 0.0)
-    assert flat_from(late) == 0.0
+    assert convergence_step(late) == 0.0
     early = curve_of(range(100, 3 * WARM_UP + 1, 100), lambda s: 30.0 if s >= WARM_UP else 0.0)
-    assert flat_from(early) == 0.0
+    assert convergence_step(early) == 0.0
 
 
 @pytest.mark.parametrize("octave", [1e-9, 1e-3, 0.0, -1e-9, -1.0])
-def test_what_hardly_rises_is_flat(octave):
-    assert flat_from(curve_of(range(WARM_UP, 4100, 100), lambda s: 30 + octave * math.log2(s))) < 1
+def test_a_curve_that_hardly_rises_has_converged(octave):
+    assert convergence_step(curve_of(range(WARM_UP, 4100, 100), lambda s: 30 + octave * math.log2(s))) < 1
 
 
-def test_too_little_to_judge_is_not_flat():
-    assert flat_from([]) is None
-    assert flat_from(curve_of([900, 950, 1000, 1010, 1020], lambda s: 30.0)) is None
-    assert flat_from(curve_of([700, 2000], lambda s: 30.0)) is None
+def test_a_short_curve_has_not_converged():
+    assert convergence_step([]) is None
+    assert convergence_step(curve_of([900, 950, 1000, 1010, 1020], lambda s: 30.0)) is None
+    assert convergence_step(curve_of([700, 2000], lambda s: 30.0)) is None
 
 
 def test_without_held_out_views_the_loss_decides():
     steps = range(WARM_UP, 3 * WARM_UP, 100)
     entries = [{"step": s, "psnr": None, "loss_db": 10 + 2 * math.log2(s)} for s in steps]
-    assert flat_from(entries) == pytest.approx(flat_at(2.0))
+    assert convergence_step(entries) == pytest.approx(converged_after(2.0))
 
 
 def test_a_curve_that_flattens_ends_the_training_soon_after():
     flat = 3000
     end = walk(PRESETS["final"], lambda step: 20 + 3 * math.log2(min(step, flat) + 1))
-    assert flat < end.settled_from < 2.5 * flat
-    assert end.step == pytest.approx(end.settled_from / SETTLING_FROM, abs=2)
+    assert flat < end.converged_at < 2.5 * flat
+    assert end.step == pytest.approx(end.converged_at / DECAY_FROM, abs=2)
     assert end.curve[-1]["step"] == end.step
 
 
@@ -87,21 +87,21 @@ def test_one_bad_measurement_does_not_end_a_rising_curve():
     def psnr(step):
         return 20 + 2 * math.log2(step + 1) - 5 * (3000 < step < 3200)
 
-    assert walk(PRESETS["final"], psnr, longest=int(0.95 * flat_at(2.0))).settled_from == 0
+    assert walk(PRESETS["final"], psnr, longest=int(0.95 * converged_after(2.0))).converged_at == 0
 
 
 def test_it_ends_where_more_steps_are_not_worth_it():
-    where = flat_at(1.0)
+    where = converged_after(1.0)
     known = curve_of(range(WARM_UP, 2000, 100), lambda step: math.log2(step))
-    assert flat_from(known) == pytest.approx(where)
-    settled = walk(PRESETS["final"], lambda step: math.log2(step + 1), longest=20_000).settled_from
+    assert convergence_step(known) == pytest.approx(where)
+    settled = walk(PRESETS["final"], lambda step: math.log2(step + 1), longest=20_000).converged_at
     assert where <= settled < 1.1 * where
-    assert walk(PRESETS["final"], lambda step: step / AHEAD, longest=20_000).settled_from == 0
+    assert walk(PRESETS["final"], lambda step: step / LOOKAHEAD, longest=20_000).converged_at == 0
 
 
 def test_noise_of_the_measurements_moves_the_end_little():
     rng = np.random.default_rng(0)
-    where = flat_at(0.6)
+    where = converged_after(0.6)
     for noise, times in ((0.05, 1.4), (0.2, 2.0)):
         for _ in range(20):
             end = walk(
@@ -109,23 +109,23 @@ def test_noise_of_the_measurements_moves_the_end_little():
                 lambda step, noise=noise: 30 + 0.6 * math.log2(step + 1) + rng.normal(0, noise),
                 longest=20_000,
             )
-            assert where / times < end.settled_from < times * where
+            assert where / times < end.converged_at < times * where
 
 
-def test_a_flat_curve_is_not_ended_before_the_warm_up():
-    assert walk(PRESETS["final"], lambda step: 30.0).settled_from >= WARM_UP
+def test_no_training_converges_before_the_warm_up():
+    assert walk(PRESETS["final"], lambda step: 30.0).converged_at >= WARM_UP
 
 
 def test_growth_goes_on_as_long_as_anchors_become_more():
     def until(anchors):
         """The step of the first measurement after which nothing grows, None: anchors grow to the end."""
-        budget, p = PRESETS["final"], Progress()
+        budget, p = PRESETS["final"], TrainingProgress()
         while p.step < 20_000:
             p.step += 1
             if budget.evaluation_is_due(p):
                 p.curve.append({"step": p.step, "psnr": math.log2(p.step) ** 2, "anchors": anchors(p.step)})
-                assert not budget.settle(p)
-                if budget.share(p) > GROW_UNTIL:
+                assert not budget.check_convergence(p)
+                if budget.progress(p) > GROW_UNTIL:
                     return p.step
         return None
 
@@ -138,30 +138,30 @@ def test_growth_goes_on_as_long_as_anchors_become_more():
 
 
 def test_curves_that_do_not_count_anchors_leave_growth_on():
-    p = Progress(step=3000, curve=curve_of(range(WARM_UP, 3000, 300), lambda step: step))
-    assert not PRESETS["final"].settle(p) and not p.grown
+    p = TrainingProgress(step=3000, curve=curve_of(range(WARM_UP, 3000, 300), lambda step: step))
+    assert not PRESETS["final"].check_convergence(p) and not p.grown
 
 
-def test_an_open_end_has_a_most():
+def test_a_training_until_converged_ends_at_its_time_limit():
     for a_step in (0.05, 1.0):
-        end = walk(Budget(seconds=100.0, until_flat=True), lambda step: math.log2(step + 1), seconds_a_step=a_step)
+        end = walk(Budget(seconds=100.0, until_converged=True), lambda step: math.log2(step + 1), seconds_a_step=a_step)
         assert end.seconds == pytest.approx(100, abs=3 * a_step)
-        assert end.settled_from
+        assert end.converged_at
 
 
 def test_remaining_is_unknown_until_the_curve_tells():
-    p, final = Progress(step=1000, seconds=50.0), PRESETS["final"]
-    assert final.remaining(p, 0.05) is None and final.behind(p) == 1000 / (1000 + AHEAD)
-    assert Budget(seconds=80.0, until_flat=True).remaining(p, 0.05) == pytest.approx(30.0)
+    p, final = TrainingProgress(step=1000, seconds=50.0), PRESETS["final"]
+    assert final.remaining(p, 0.05) is None and final.displayed_progress(p) == 1000 / (1000 + LOOKAHEAD)
+    assert Budget(seconds=80.0, until_converged=True).remaining(p, 0.05) == pytest.approx(30.0)
     p.curve = curve_of(range(WARM_UP, 1600, 100), lambda step: math.log2(step))
-    end = flat_at(1.0) / SETTLING_FROM
+    end = converged_after(1.0) / DECAY_FROM
     assert final.remaining(p, 0.05) == pytest.approx((end - 1000) * 0.05)
-    assert final.behind(p) == pytest.approx(1000 / end)
-    p.settled_from = 960
-    assert final.remaining(p, 0.05) == pytest.approx((960 / SETTLING_FROM - 1000) * 0.05)
-    falling = Progress(step=2000, curve=curve_of(range(WARM_UP, 2000, 100), lambda step: -step))
-    assert final.remaining(falling, 0.05) == pytest.approx((2000 / SETTLING_FROM - 2000) * 0.05)
-    assert final.behind(falling) == SETTLING_FROM
+    assert final.displayed_progress(p) == pytest.approx(1000 / end)
+    p.converged_at = 960
+    assert final.remaining(p, 0.05) == pytest.approx((960 / DECAY_FROM - 1000) * 0.05)
+    falling = TrainingProgress(step=2000, curve=curve_of(range(WARM_UP, 2000, 100), lambda step: -step))
+    assert final.remaining(falling, 0.05) == pytest.approx((2000 / DECAY_FROM - 2000) * 0.05)
+    assert final.displayed_progress(falling) == DECAY_FROM
     assert Budget(steps=3000).remaining(p, 0.05) == pytest.approx(100.0)
     assert Budget(seconds=80.0).remaining(p, 0.05) == pytest.approx(30.0)
 
@@ -173,7 +173,7 @@ def test_a_training_of_known_length_is_measured_ten_times_and_at_its_end():
 
 def test_a_finished_training_is_finished_when_asked_again():
     end = walk(PRESETS["final"], lambda step: 30.0)
-    assert PRESETS["final"].share(end) == 1.0
+    assert PRESETS["final"].progress(end) == 1.0
 
 
 def test_rates_fall_little_on_the_plateau_and_reach_their_end():

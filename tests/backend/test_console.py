@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from backend import console
-from backend.console import ConsoleReporter, clock
+from backend.shared import console
+from backend.shared.console import ConsoleReporter, clock
 
 
 class Terminal(io.StringIO):

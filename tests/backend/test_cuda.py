@@ -43,4 +43,4 @@ mapped(picture)
 print(type(picture.frame).__module__)
 """
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
-    assert (done.returncode, done.stdout.strip()) == (0, "backend.raster.cpu"), done.stderr
+    assert (done.returncode, done.stdout.strip()) == (0, "backend.raster.cpu.renderer"), done.stderr

@@ -16,22 +16,23 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from backend import device
 from backend.evaluation.metrics import psnr
 from backend.model.anchors import Anchors, Layout
+from backend.model.draw import draw
 from backend.model.generate import generate
 from backend.model.growth import GrowthStatistics, grow_and_prune
 from backend.model.heads import Heads
 from backend.model.object_model import anchors_in_view, first_anchors_in_view
-from backend.protocol import InputError, Reporter
-from backend.raster import Camera, rasterize
-from backend.raster.draw import draw
-from backend.training import loop
+from backend.raster import Camera, devices, rasterize
+from backend.shared.errors import InputError
+from backend.shared.events import Reporter
+from backend.training import step
 from backend.training.adam import step_rows, take_rows
 from backend.training.budget import Budget
-from backend.training.loop import Trainer, strips
-from backend.training.losses import image_loss, normal_loss, volume_loss
+from backend.training.losses.on_cpu import image_loss, normal_loss, volume_loss
 from backend.training.settings import Settings
+from backend.training.step import strips
+from backend.training.trainer import Trainer
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = Settings(offsets=4, sh_degree=1)
@@ -45,7 +46,7 @@ def both(monkeypatch):
     def call(function):
         found = []
         for on_gpu in (False, True):
-            monkeypatch.setattr(device, "on_gpu", lambda tensor, answer=on_gpu: answer)
+            monkeypatch.setattr(devices, "on_gpu", lambda tensor, answer=on_gpu: answer)
             found.append(function())
         return found
 
@@ -55,7 +56,7 @@ def both(monkeypatch):
 @pytest.fixture
 def as_on_gpu(monkeypatch):
     """Switches between the two versions: as_on_gpu(True) and as_on_gpu(False)."""
-    return lambda answer: monkeypatch.setattr(device, "on_gpu", lambda tensor: answer)
+    return lambda answer: monkeypatch.setattr(devices, "on_gpu", lambda tensor: answer)
 
 
 def close(got, want, relative=2e-4, absolute=2e-5):
@@ -154,10 +155,10 @@ def test_image_loss(both, size, weights):
 
     def loss():
         leaves = [v.clone().requires_grad_() for v in base]
-        color, alpha, weight, background = leaves
+        color, alpha, label_probability, background = leaves
         if not weights[1]:
-            weight = None
-        value = image_loss(color, alpha, weight, background, target, labels, *weights)
+            label_probability = None
+        value = image_loss(color, alpha, label_probability, background, target, labels, *weights)
         (3 * value).backward()
         return value, [leaf.grad for leaf in leaves if leaf.grad is not None]
 
@@ -217,18 +218,18 @@ def test_adam_steps_what_is_seen_usable_and_finite(both, monkeypatch):
     g[2, 3] = math.inf
 
     def step(usable=None):
-        values, first, second = base.clone(), base * 0.1, base.abs() * 0.01
+        values, exp_avg, exp_avg_sq = base.clone(), base * 0.1, base.abs() * 0.01
         rates = np.linspace(0.01, 0.02, 7).astype(np.float32)
-        skipped = step_rows(values, first, second, seen, g, rates, 0.5, 0.02, usable)
-        return int(skipped), values, first, second
+        skipped = step_rows(values, exp_avg, exp_avg_sq, seen, g, rates, 0.5, 0.02, usable)
+        return int(skipped), values, exp_avg, exp_avg_sq
 
     want, got = both(step)
     assert want[0] == got[0] == 1
     for a, b in zip(got[1:], want[1:], strict=True):
         close(a, b, 3e-5, 1e-7)
     assert torch.equal(got[1][7], base[7]) and not torch.equal(got[1][9], base[9])
-    skipped, values, first, _ = step(torch.tensor([True, False, False, True, True, True]))
-    assert skipped == 0 and torch.equal(values[4], base[4]) and torch.equal(first[4], base[4] * 0.1)
+    skipped, values, exp_avg, _ = step(torch.tensor([True, False, False, True, True, True]))
+    assert skipped == 0 and torch.equal(values[4], base[4]) and torch.equal(exp_avg[4], base[4] * 0.1)
     assert torch.equal(values[9], got[1][9])
 
 
@@ -365,7 +366,7 @@ def test_a_step_on_the_gpu_waits_for_no_number(tiny, as_on_gpu, settings):
 def test_fewer_anchors_are_taken_for_a_view_that_was_seen_before(tiny, as_on_gpu, monkeypatch):
     as_on_gpu(True)
     capture, ids = tiny()
-    monkeypatch.setattr(loop._Limits, "_STEP", 8)
+    monkeypatch.setattr(step._Limits, "_STEP", 8)
     trainer = Trainer.start(capture, ids, SMALL)
     anchors = trainer.model.anchors
     anchors.positions[: len(anchors) // 2] += 1000.0  # out of sight
@@ -376,7 +377,7 @@ def test_fewer_anchors_are_taken_for_a_view_that_was_seen_before(tiny, as_on_gpu
         taken.append((len(index), int(count)))
         return index, present, count
 
-    monkeypatch.setattr(loop, "first_anchors_in_view", limited)
+    monkeypatch.setattr(step, "first_anchors_in_view", limited)
     views = len(capture.train_indices)
     for _ in range(2 * views):
         trainer.step(0.9)
@@ -390,7 +391,7 @@ def test_a_picture_whose_loss_is_not_finite_changes_nothing(tiny, as_on_gpu, mon
     trainer = Trainer.start(capture, ids, SMALL)
     trainer.step(0.9)
     rows, head = trainer.model.anchors.rows.clone(), trainer.model.heads.hidden.weight.detach().clone()
-    monkeypatch.setattr(loop, "image_loss", lambda *args: image_loss(*args) * math.nan)
+    monkeypatch.setattr(step, "image_loss", lambda *args: image_loss(*args) * math.nan)
     assert trainer.step(0.9).isnan()
     assert torch.equal(trainer.model.anchors.rows, rows) and torch.equal(trainer.model.heads.hidden.weight, head)
     monkeypatch.undo()
@@ -400,8 +401,8 @@ LOSSES = """
 import sys
 from backend.capture import load_capture
 from backend.labels import vote
-from backend.raster.draw import draw
-from backend.training.loop import Trainer
+from backend.model.draw import draw
+from backend.training.trainer import Trainer
 from backend.training.settings import Settings
 capture = load_capture(sys.argv[1], sys.argv[2])
 for primitive in ("3d", "2d"):
@@ -456,13 +457,13 @@ def test_parts_teach_the_same_as_the_whole(tiny, as_on_gpu):
     found = []
     for parts in (1, 2, 4):
         trainer = Trainer.start(capture, ids, settings)
-        trainer.parts = parts
-        learned = trainer._learn(capture.train_indices[0], 0.09)
+        trainer._view_step.parts = parts
+        learned = trainer._view_step.compute(capture.train_indices[0], 0.09)
         full = torch.zeros_like(trainer.model.anchors.rows)
         usable = learned.usable[:, None]
         full.index_add_(0, learned.seen, torch.where(usable, learned.rows.grad, 0.0))
         trainer._grow(learned, 0.09)
-        statistics = trainer._statistics
+        statistics = trainer._growth.statistics
         found.append((learned.loss, full, trainer.model.heads.opacity.weight.grad, statistics))
     for loss, rows, head, statistics in found[1:]:
         close(loss, found[0][0], 1e-5)
@@ -495,7 +496,7 @@ def test_out_of_memory_is_said_once_and_training_goes_on_in_parts(tiny, tmp_path
             raise error
         return rasterize(*args, **options)
 
-    monkeypatch.setattr(loop, "rasterize", full)
+    monkeypatch.setattr(step, "rasterize", full)
     trainer, reporter = Trainer.start(capture, ids, SMALL), Messages()
     trainer.run(Budget(steps=120), tmp_path, reporter)
     assert trainer.parts == 2 and trainer.progress.step == 120 and trainer.progress.skipped == 0
@@ -516,7 +517,7 @@ def test_without_any_room_the_training_ends_with_a_sentence_and_a_checkpoint(tin
             raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
         return rasterize(*args, **options)
 
-    monkeypatch.setattr(loop, "rasterize", full)
+    monkeypatch.setattr(step, "rasterize", full)
     with pytest.raises(InputError, match="GPU's memory is too small"):
         trainer.run(Budget(steps=20), tmp_path, Reporter())
     resumed, _ = Trainer.resume(capture, tmp_path, SMALL)
@@ -530,7 +531,7 @@ def test_other_errors_are_not_taken_for_a_lack_of_memory(tiny, as_on_gpu, monkey
     def broken(*args, **options):
         raise RuntimeError("something else")
 
-    monkeypatch.setattr(loop, "rasterize", broken)
+    monkeypatch.setattr(step, "rasterize", broken)
     trainer = Trainer.start(capture, ids, SMALL)
     with pytest.raises(RuntimeError, match="something else"):
         trainer.step(0.5)
@@ -539,7 +540,7 @@ def test_other_errors_are_not_taken_for_a_lack_of_memory(tiny, as_on_gpu, monkey
 
 # --- the choice ------------------------------------------------------------------------------------------------------
 
-without_cuda = pytest.mark.skipif(device.why_not_cuda() is None, reason="CUDA works here")
+without_cuda = pytest.mark.skipif(devices.why_not_cuda() is None, reason="CUDA works here")
 
 
 @without_cuda
@@ -549,39 +550,39 @@ def test_cuda_where_there_is_none_is_refused_with_a_sentence(ask, write_capture,
     answer = ask(command, *map(str, arguments), "--device", "cuda", "--json")
     assert answer.code == 2
     message = answer.events[-1]["message"]
-    assert message == device.why_not_cuda() and message.endswith(".") and "\n" not in message
+    assert message == devices.why_not_cuda() and message.endswith(".") and "\n" not in message
     assert not (tmp_path / "out").exists()
 
 
 @without_cuda
-def test_auto_is_the_processor_where_cuda_does_not_work():
-    assert device.pick("auto") == device.pick("cpu") == torch.device("cpu")
+def test_auto_is_the_cpu_where_cuda_does_not_work():
+    assert devices.pick("auto") == devices.pick("cpu") == torch.device("cpu")
     with pytest.raises(InputError):
-        device.pick("cuda")
+        devices.pick("cuda")
 
 
-@pytest.mark.parametrize(("said", "part"), [
+@pytest.mark.parametrize(("error", "part"), [
     ("Found no NVIDIA driver on your system. Please check that you have an NVIDIA GPU", "no NVIDIA driver"),
     ("The NVIDIA driver on your system is too old (found version 11040).", "too old for CUDA 13.0"),
     ("CUDA driver version is insufficient for CUDA runtime version", "too old for CUDA 13.0"),
     ("No CUDA GPUs are available", "shows no GPU"),
     ("CUDA unknown error - this may be due to an incorrectly set up environment", "does not start"),
 ])  # fmt: skip
-def test_what_torch_says_becomes_a_sentence_that_helps(said, part):
-    sentence = device.sentence_for(said, "13.0")
+def test_torchs_errors_are_explained(error, part):
+    sentence = devices.explain_cuda_error(error, "13.0")
     assert part in sentence and sentence.endswith(".") and "\n" not in sentence
 
 
-@pytest.mark.parametrize("said", ["CUDA error: out of memory", "CUBLAS_STATUS_ALLOC_FAILED when calling cublasCreate"])
-def test_a_full_gpu_is_known_by_what_is_said(said):
-    assert device.is_out_of_memory(RuntimeError(said))
-    assert not device.is_out_of_memory(RuntimeError("CUDA error: an illegal memory access was encountered"))
+@pytest.mark.parametrize("error", ["CUDA error: out of memory", "CUBLAS_STATUS_ALLOC_FAILED when calling cublasCreate"])
+def test_out_of_memory_errors_are_recognized(error):
+    assert devices.is_out_of_memory(RuntimeError(error))
+    assert not devices.is_out_of_memory(RuntimeError("CUDA error: an illegal memory access was encountered"))
 
 
-def test_too_little_memory_is_said_with_figures():
-    assert device.short_of_memory("GPU", 3e9, 8e9) is None
-    assert "0.3 GB of memory free" in device.short_of_memory("GPU", 0.3e9, 8e9)
-    assert "has 0.5 GB of memory," in device.short_of_memory("GPU", 0.4e9, 0.5e9)
+def test_low_memory_is_explained_with_figures():
+    assert devices.explain_low_memory("GPU", 3e9, 8e9) is None
+    assert "0.3 GB of memory free" in devices.explain_low_memory("GPU", 0.3e9, 8e9)
+    assert "has 0.5 GB of memory," in devices.explain_low_memory("GPU", 0.4e9, 0.5e9)
 
 
 @without_cuda
@@ -602,6 +603,8 @@ def test_make_gpu_without_a_gpu_says_so_and_passes_nothing():
 
 def test_training_needs_nothing_that_reads_captures():
     """So that a machine which has torch and numba alone can measure it."""
-    absent = ("pycolmap", "xatlas", "manifold3d", "fast_simplification", "skimage", "matplotlib", "tqdm")
-    code = f"import sys; sys.modules.update(dict.fromkeys({absent})); import backend.training.loop, backend.raster.draw"
+    absent = ("pycolmap", "xatlas", "manifold3d", "fast_simplification", "skimage", "matplotlib")
+    code = (
+        f"import sys; sys.modules.update(dict.fromkeys({absent})); import backend.training.trainer, backend.model.draw"
+    )
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=120)

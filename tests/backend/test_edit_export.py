@@ -12,16 +12,19 @@ import pytest
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
-from backend.commands.cameras import write_no_cameras
+from backend.commands.cameras import write_splat_cameras
 from backend.editing import apply_edits, transformed
-from backend.editing.place import middle_of
+from backend.editing.placement import middle_of
 from backend.export import read_splats, write_splat, write_splats, write_spz
-from backend.fill_file import fill_path
 from backend.model.splats import Splats
-from backend.objects import edit_objects, read_objects, write_objects
-from backend.ply import read_vertices
-from backend.protocol import EXIT_DONE, InputError, Reconstruction, write_json
-from backend.spherical_harmonics import C0
+from backend.shared.errors import EXIT_DONE, InputError
+from backend.shared.formats.json_file import write_json
+from backend.shared.formats.ply import read_vertices
+from backend.shared.reconstruction.fill import fill_path
+from backend.shared.reconstruction.folder import Reconstruction
+from backend.shared.reconstruction.objects import edit_objects, read_objects, write_objects
+from backend.shared.reconstruction.record import ExportRecord, TrainingRecord, VotesRecord, update_record
+from backend.shared.splats.spherical_harmonics import C0
 
 from .asking import refused
 
@@ -47,9 +50,7 @@ def folder(tmp_path):
     """A reconstruction with splats of four objects, that stands askew."""
     made = Reconstruction(tmp_path / "made").create()
     write_splats(made.splats, some_splats())
-    write_objects(
-        made.objects, [{"id": i, "name": name, "colour": [1, 2, 3], "points": 9} for i, name in NAMES.items()]
-    )
+    write_objects(made.objects, [{"id": i, "name": name, "color": [1, 2, 3], "points": 9} for i, name in NAMES.items()])
     stands = {"rotation": UPRIGHT.tolist(), "translation": [0, 0, 1]}
     write_json(made.cameras, {"capture": None, "origin": [1, 2, 3], "upright": stands, "cameras": []})
     return made
@@ -69,37 +70,37 @@ def test_objects_are_removed_and_restored_by_name_part_or_id(ask, folder):
     (said,) = answer.messages("status")
     assert "1 mug: removed with floaters\n" in said and "3 box: as captured\n" in said
     filled = ask("edit", folder.folder, "--remove", "mug", "--fill").out
-    assert "1 mug: removed, nothing flat around it that could close its place" in filled
+    assert "1 mug: removed, nothing flat around it to fill its hole with" in filled
     ask("edit", folder.folder, "--restore", "mug", "box")
     assert [entry.removed for entry in read_objects(folder.objects)] == [False, True, False, True]
     assert json.loads(folder.objects.read_text())["edits"].keys() == {"2", "7"}
 
 
-def test_what_closes_a_place_is_left_for_those_who_show_it(ask, folder):
+def test_fills_of_holes_are_cached_for_those_who_show_them(ask, folder):
     """Anew for each state of edits and splats; taking an edit back finds the file of before, and old ones go."""
     rng = np.random.default_rng(0)
     ground = np.column_stack([rng.uniform(-1, 1, (9000, 2)), np.zeros(9000)])
     ground = ground[np.abs(ground).max(1) > 0.15]
-    thing = rng.uniform((-0.15, -0.15, 0), (0.15, 0.15, 0.3), (900, 3))
-    splats = some_splats(len(ground) + len(thing))
-    splats.means = np.concatenate([ground, thing]).astype(np.float32)
+    obj = rng.uniform((-0.15, -0.15, 0), (0.15, 0.15, 0.3), (900, 3))
+    splats = some_splats(len(ground) + len(obj))
+    splats.means = np.concatenate([ground, obj]).astype(np.float32)
     splats.scales, splats.opacities[:] = np.tile([0.02, 0.02, 0.001], (len(splats), 1)), 0.9
-    splats.quats[:], splats.object_ids = (1, 0, 0, 0), np.repeat([2, 1], [len(ground), len(thing)])
+    splats.quats[:], splats.object_ids = (1, 0, 0, 0), np.repeat([2, 1], [len(ground), len(obj)])
     write_splats(folder.splats, splats)
 
     def path():
         return fill_path(folder, read_objects(folder.objects))
 
     ask("edit", folder.folder, "--remove", "mug")
-    assert path() is None and not folder.cache.exists(), "nothing is to be closed"
+    assert path() is None and not folder.cache.exists(), "no hole is to be filled"
     answer = ask("edit", folder.folder, "--remove", "mug", "--fill", "--json")
     first, table = path(), read_vertices(path())
-    count = int(table["invented"].sum())
-    assert count > 50 and answer.events[-1]["invented"] == count and set(table["closes"].tolist()) == {1}
-    assert f"1 mug: removed, its place filled by {count} invented splats" in answer.messages("status")[-1]
+    count = int(table["unobserved"].sum())
+    assert count > 50 and answer.events[-1]["new_splats"] == count and set(table["fills"].tolist()) == {1}
+    assert f"1 mug: removed, its hole filled with {count} new splats" in answer.messages("status")[-1]
     wanted = apply_edits(read_splats(folder.splats)[0], read_objects(folder.objects))
     put = read_splats(first)[0]
-    assert np.array_equal(put.select(put.invented).means, wanted.select(wanted.invented).means)
+    assert np.array_equal(put.select(put.unobserved).means, wanted.select(wanted.unobserved).means)
     written = first.stat().st_mtime_ns
     ask("edit", folder.folder, "--remove", "can")
     assert path() != first and path().is_file()
@@ -119,17 +120,17 @@ def test_without_options_the_edits_are_said_and_nothing_is_written(ask, folder):
     assert answer.code == EXIT_DONE and "7 can: as captured" in answer.out and folder.objects.read_bytes() == before
 
 
-def test_recolouring_takes_the_middle_from_the_splats(ask, folder):
+def test_recoloring_takes_the_middle_from_the_splats(ask, folder):
     splats = read_splats(folder.splats)[0]
     own = splats.select(splats.object_ids == 7)
     ask("edit", folder.folder, "--recolor", "can:hue=0.3, saturation=0.5", "mug:replace=#ff0080,tint=#00ff00")
-    can, mug = edited(folder, 7).recolour, edited(folder, 1).recolour
+    can, mug = edited(folder, 7).recolor, edited(folder, 1).recolor
     assert (can.hue, can.saturation, mug.amount, mug.tint) == (0.3, 0.5, 1.0, (0, 1, 0))
     assert mug.replace == pytest.approx((1, 0, 128 / 255))
     luma = np.clip(0.5 + C0 * own.sh[:, 0], 0, 1) @ [0.299, 0.587, 0.114]
     assert can.middle == pytest.approx((luma * own.opacities).sum() / own.opacities.sum())
     ask("edit", folder.folder, "--recolor", "can:value=1")
-    assert edited(folder, 7).recolour is None
+    assert edited(folder, 7).recolor is None
 
 
 def test_moves_are_along_blenders_axes_and_about_the_objects_middle(ask, folder):
@@ -200,8 +201,8 @@ def test_the_export_has_the_edits_and_other_programs_read_it(ask, folder, tmp_pa
     vertex = PlyData.read(str(tmp_path / "all.ply"))["vertex"]
     names = [f"f_rest_{i}" for i in range(24)]
     assert [p.name for p in vertex.properties] == [
-        *"x y z nx ny nz f_dc_0 f_dc_1 f_dc_2".split(), *names, "opacity",
-        *"scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3 object_id".split(),
+        *["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"], *names, "opacity",
+        *["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "object_id"],
     ]  # fmt: skip
     assert vertex["object_id"].tolist() == wanted.object_ids.tolist() and 1 not in wanted.object_ids
     np.testing.assert_array_equal(np.stack([vertex[c] for c in "xyz"], 1), wanted.means)
@@ -221,7 +222,7 @@ def test_a_file_for_each_object(ask, folder, tmp_path):
     edit_objects(folder.objects, {3: {"name": "../BLUE box"}, 1: {"merged_into": 7}})
     ask("export", folder.folder, "--out", tmp_path / "parts", "--per-object")
     assert {path.name for path in (tmp_path / "parts").iterdir()} == {
-        "unlabelled.ply", "Blue_box.ply", "BLUE_box_3.ply", "can.ply",
+        "unlabeled.ply", "Blue_box.ply", "BLUE_box_3.ply", "can.ply",
     }  # fmt: skip
     assert len(read_splats(tmp_path / "parts" / "can.ply")[0]) == 24
     ask("export", folder.folder, "--out", tmp_path / "one", "--per-object", "--objects", "can", "--format", "splat")
@@ -238,8 +239,8 @@ def test_blenders_coordinates_are_upright(ask, folder, tmp_path):
 
 
 def test_a_fit_is_exported_with_its_error(ask, folder, tmp_path):
-    training = {"settings": {"mode": "view"}}
-    write_json(folder.settings, {"training": training, "export": {"psnr_of_export": 34.62}})
+    training = TrainingRecord({"mode": "view"}, VotesRecord("majority", None, 1600, "0f", None))
+    update_record(folder, training=training, export=ExportRecord(splats=9, anchors=3, psnr_of_export=34.62))
     answer = ask("export", folder.folder, "--out", tmp_path / "all.ply", "--json")
     assert any("34.6 dB" in sentence for sentence in answer.messages("warning"))
 
@@ -264,12 +265,12 @@ def read_spz(path):
     sizes = [9, 1, 3, 3, 4, 3 * rest]
     starts = [16 + count * sum(sizes[:i]) for i in range(6)]
     assert len(data) == starts[5] + count * sizes[5]
-    means, opacities, colours, scales, quats, sh = ([] for _ in range(6))
+    means, opacities, colors, scales, quats, sh = ([] for _ in range(6))
     for i in range(count):
         at = [data[start + i * size : start + (i + 1) * size] for start, size in zip(starts, sizes)]
         means.append([int.from_bytes(at[0][3 * j : 3 * j + 3], "little", signed=True) / 2**bits for j in range(3)])
         opacities.append(at[1][0] / 255)
-        colours.append([(value / 255 - 0.5) / 0.15 for value in at[2]])
+        colors.append([(value / 255 - 0.5) / 0.15 for value in at[2]])
         scales.append([np.exp(value / 16 - 10) for value in at[3]])
         (packed,) = struct.unpack("<I", at[4])
         xyzw, largest = np.zeros(4), packed >> 30
@@ -280,11 +281,11 @@ def read_spz(path):
         xyzw[largest] = np.sqrt(1 - (xyzw**2).sum())
         quats.append(xyzw[[3, 0, 1, 2]])
         sh.append(np.reshape([(value - 128) / 128 for value in at[5]], (rest, 3)))
-    sh = np.concatenate([np.reshape(colours, (count, 1, 3)), np.reshape(sh, (count, rest, 3))], 1)
+    sh = np.concatenate([np.reshape(colors, (count, 1, 3)), np.reshape(sh, (count, rest, 3))], 1)
     return Splats(*map(np.array, (means, quats, scales, opacities)), sh, np.zeros(count, np.int64))
 
 
-def assert_close(found, wanted, colour):
+def assert_close(found, wanted, color):
     turned = Rotation.from_quat(found.quats, scalar_first=True).inv() * Rotation.from_quat(
         wanted.quats, scalar_first=True
     )
@@ -292,7 +293,7 @@ def assert_close(found, wanted, colour):
     np.testing.assert_allclose(found.means, wanted.means, atol=1e-5)
     np.testing.assert_allclose(found.scales, wanted.scales, rtol=0.04)
     np.testing.assert_allclose(found.opacities, wanted.opacities, atol=0.002)
-    np.testing.assert_allclose(found.sh[:, 0], wanted.sh[:, 0], atol=colour)
+    np.testing.assert_allclose(found.sh[:, 0], wanted.sh[:, 0], atol=color)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
@@ -347,8 +348,8 @@ def test_splat_files_have_32_bytes_a_splat(tmp_path):
     sizes = [row[9] * np.prod(row[3:6]) ** (1 / 3) for row in rows]
     assert all(a > 0.9 * b for a, b in pairwise(sizes))
     first = np.flatnonzero((splats.means == np.float32(rows[0][:3])).all(1))[0]
-    colour = np.clip((0.5 + C0 * splats.sh[first, 0]) * 255, 0, 255)
-    assert rows[0][6:9] == pytest.approx(colour, abs=0.51)
+    color = np.clip((0.5 + C0 * splats.sh[first, 0]) * 255, 0, 255)
+    assert rows[0][6:9] == pytest.approx(color, abs=0.51)
     assert rows[0][9] == pytest.approx(255 * splats.opacities[first], abs=0.51)
     assert (np.array(rows[0][10:]) - 128) / 128 == pytest.approx(splats.quats[first], abs=0.009)
 
@@ -405,7 +406,7 @@ def test_what_cannot_be_imported_leaves_nothing(ask, write_capture, folder, tmp_
     refused(ask("import-splats", folder.splats, "--out", made, "--capture", tmp_path / "gone"), "gone")
     assert not made.parent.exists()
     folder.checkpoint.mkdir()
-    refused(ask("import-splats", folder.splats, "--out", folder.folder), "training already")
+    refused(ask("import-splats", folder.splats, "--out", folder.folder), "already contains a training")
 
 
 def test_splats_without_cameras_stand_on_their_ground(tmp_path):
@@ -413,7 +414,7 @@ def test_splats_without_cameras_stand_on_their_ground(tmp_path):
     ground = np.column_stack([rng.uniform(-1, 1, 3000), rng.normal(0.5, 0.001, 3000), rng.uniform(-1, 1, 3000)])
     above = rng.uniform(-0.2, 0.2, (500, 3))
     folder = Reconstruction(tmp_path)
-    write_no_cameras(folder, np.concatenate([ground, above]))
+    write_splat_cameras(folder, np.concatenate([ground, above]))
     upright = json.loads(folder.cameras.read_text())["upright"]
     rotation, translation = np.array(upright["rotation"]), np.array(upright["translation"])
     assert (above @ rotation.T + translation)[:, 2].min() > 0.2

@@ -9,14 +9,14 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from backend.editing import apply_edits, fill_of, recoloured, transformed
+from backend.editing import apply_edits, compute_fill, recolored, transformed
 from backend.editing.floaters import inside_hull
 from backend.model.splats import Splats, concatenate
-from backend.objects import SceneObject
 from backend.raster.camera import Camera
 from backend.raster.reference import rasterize_reference
-from backend.recolour import Recolour
-from backend.spherical_harmonics import C0
+from backend.shared.color.recolor import Recolor
+from backend.shared.reconstruction.objects import SceneObject
+from backend.shared.splats.spherical_harmonics import C0
 
 
 def some_splats(n=30, degree=3, seed=0, ids=(0, 1, 2), dtype=np.float64):
@@ -42,7 +42,7 @@ def camera(moved=None):
 
 
 def picture(splats, view):
-    """(30, 40, 4) float64: colour and alpha."""
+    """(30, 40, 4) float64: color and alpha."""
     arrays = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
     tensors = (torch.from_numpy(np.asarray(array, np.float64)) for array in arrays)
     drawn = rasterize_reference(*tensors, torch.zeros(len(splats), dtype=torch.int64), view)
@@ -111,15 +111,15 @@ def test_a_disc_stays_a_disc_whose_third_axis_is_its_normal(linear):
 
 
 def test_float32_stays_float32():
-    moved = transformed(recoloured(some_splats(dtype=np.float32), Recolour(hue=0.3)), affine(TURN))
+    moved = transformed(recolored(some_splats(dtype=np.float32), Recolor(hue=0.3)), affine(TURN))
     assert {getattr(moved, name).dtype for name in ("means", "quats", "scales", "opacities", "sh")} == {np.dtype("f4")}
 
 
-def test_a_recoloured_object_is_its_picture_recoloured():
-    splats, recolour = some_splats(), Recolour(hue=0.3, saturation=0.5, value=0.8, contrast=0.9, tint=(1, 0.9, 0.8))
-    splats.sh *= 0.3  # so that no colour is clamped
-    before, after = picture(splats, camera()), picture(recoloured(splats, recolour), camera())
-    matrix, offset = recolour.affine()
+def test_a_recolored_object_is_its_picture_recolored():
+    splats, recolor = some_splats(), Recolor(hue=0.3, saturation=0.5, value=0.8, contrast=0.9, tint=(1, 0.9, 0.8))
+    splats.sh *= 0.3  # so that no color is clamped
+    before, after = picture(splats, camera()), picture(recolored(splats, recolor), camera())
+    matrix, offset = recolor.affine()
     np.testing.assert_allclose(after[..., :3], before[..., :3] @ matrix.T + before[..., 3:] * offset, atol=1e-12)
     assert np.array_equal(after[..., 3], before[..., 3]) and np.abs(after - before).max() > 0.01
 
@@ -132,21 +132,21 @@ def test_without_edits_nothing_changes():
 
 def test_others_stay_bit_for_bit_in_their_order():
     splats = some_splats(dtype=np.float32)
-    objects = [scene_object(1, recolour=Recolour(hue=0.2), transform=rows(affine(TURN))), scene_object(2, removed=True)]
+    objects = [scene_object(1, recolor=Recolor(hue=0.2), transform=rows(affine(TURN))), scene_object(2, removed=True)]
     edited = apply_edits(splats, objects)
     assert edited.object_ids.tolist() == [i for i in splats.object_ids.tolist() if i != 2]
     assert same(edited.select(edited.object_ids == 0), splats.select(splats.object_ids == 0))
     own = splats.select(splats.object_ids == 1)
-    assert same(edited.select(edited.object_ids == 1), transformed(recoloured(own, Recolour(hue=0.2)), affine(TURN)))
+    assert same(edited.select(edited.object_ids == 1), transformed(recolored(own, Recolor(hue=0.2)), affine(TURN)))
 
 
 def test_copies_come_last_from_where_it_was_captured():
     splats, away, further = some_splats(), affine(np.eye(3), (1, 0, 0)), affine(2 * TURN, (0, 3, 0))
-    recolour = Recolour(value=0.5)
+    recolor = Recolor(value=0.5)
     edited = apply_edits(
-        splats, [scene_object(1, recolour=recolour, transform=rows(away), copies=(rows(further), rows(away)))]
+        splats, [scene_object(1, recolor=recolor, transform=rows(away), copies=(rows(further), rows(away)))]
     )
-    own = recoloured(splats.select(splats.object_ids == 1), recolour)
+    own = recolored(splats.select(splats.object_ids == 1), recolor)
     assert len(edited) == len(splats) + 2 * len(own)
     assert same(edited.select(np.arange(len(splats), len(edited))),
                 concatenate([transformed(own, further), transformed(own, away)]))  # fmt: skip
@@ -156,7 +156,7 @@ def test_copies_come_last_from_where_it_was_captured():
 def test_a_merged_object_goes_with_the_other():
     splats = some_splats(ids=(0, 1, 2, 3))
     objects = [
-        scene_object(1, merged_into=2, recolour=Recolour(value=0.1), removed=True),
+        scene_object(1, merged_into=2, recolor=Recolor(value=0.1), removed=True),
         scene_object(2, transform=rows(affine(TURN))),
         scene_object(3, left_out=True),
     ]
@@ -196,14 +196,14 @@ def test_floaters_inside_the_hull_go_where_that_is_asked_for():
     assert len(apply_edits(both, [scene_object(1, floaters=True)])) == 305
 
 
-def surface(rng, n, axes, at, colours, object_id, thin=0.002):
-    """Flat splats in a square of side 2, spanned by two rows of axes (3, 3), around `at`; colours by place in it."""
+def surface(rng, n, axes, at, colors, object_id, thin=0.002):
+    """Flat splats in a square of side 2, spanned by two rows of axes (3, 3), around `at`; colors by place in it."""
     flat = rng.uniform(-1, 1, (n, 2))
     quats = Rotation.from_matrix(axes.T).as_quat(scalar_first=True)
     return Splats(
         means=(flat @ axes[:2] + at).astype(np.float32), quats=np.tile(quats, (n, 1)).astype(np.float32),
         scales=np.tile([0.02, 0.02, thin], (n, 1)), opacities=np.full(n, 0.8),
-        sh=((colours(flat) - 0.5) / C0)[:, None].astype(np.float32), object_ids=np.full(n, object_id),
+        sh=((colors(flat) - 0.5) / C0)[:, None].astype(np.float32), object_ids=np.full(n, object_id),
     )  # fmt: skip
 
 
@@ -232,8 +232,8 @@ def with_box_on_ground(place=HERE):
     rng = np.random.default_rng(0)
     ground = surface(rng, 12000, np.eye(3), np.zeros(3), stripes, 5)
     hidden = (np.abs(ground.means[:, :2]) < 0.15).all(1)
-    thing = box(rng, (0.6, 0.6, 0), (0.8, 0.8, 0.2), 6)
-    whole = concatenate([ground.select(~hidden), box(rng, (-0.15, -0.15, 0), (0.15, 0.15, 0.3), 1), thing])
+    obj = box(rng, (0.6, 0.6, 0), (0.8, 0.8, 0.2), 6)
+    whole = concatenate([ground.select(~hidden), box(rng, (-0.15, -0.15, 0), (0.15, 0.15, 0.3), 1), obj])
     return transformed(whole, place), transformed(ground.select(hidden), place)
 
 
@@ -242,11 +242,11 @@ def test_the_ground_under_a_removed_object_is_closed_by_what_is_around(place):
     splats, hidden = with_box_on_ground(place)
     objects = [scene_object(1, removed=True, fill=True), scene_object(5), scene_object(6)]
     edited = apply_edits(splats, objects)
-    invented = edited.select(edited.invented)
-    assert len(invented) > 0.7 * len(hidden) and set(invented.object_ids.tolist()) == {5}
-    back = transformed(invented, np.linalg.inv(place))
+    unobserved = edited.select(edited.unobserved)
+    assert len(unobserved) > 0.7 * len(hidden) and set(unobserved.object_ids.tolist()) == {5}
+    back = transformed(unobserved, np.linalg.inv(place))
     assert np.abs(back.means[:, :2]).max() < 0.2 and np.abs(back.means[:, 2]).max() < 0.005
-    # Each is coloured like what was there: the stripes go on, and so does the red.
+    # Each is colored like what was there: the stripes go on, and so does the red.
     truth = stripes(back.means[:, :2].astype(np.float64))
     found = 0.5 + C0 * back.sh[:, 0]
     assert np.median(np.abs(found - truth)) < 0.04 and (np.abs(found - truth).max(1) < 0.1).mean() > 0.75
@@ -260,7 +260,7 @@ def test_the_ground_under_a_removed_object_is_closed_by_what_is_around(place):
         alphas.append(picture(shown.select((np.abs(shown.means[:, :2]) < 0.3).all(1)), view)[..., 3])
     assert alphas[0][8:16, 8:16].max() < 0.1 and alphas[1].min() > 0.9
     # What is not at the rim stays as it was, in its order.
-    kept = edited.select(~edited.invented)
+    kept = edited.select(~edited.unobserved)
     others = splats.select(splats.object_ids != 1)
     there = np.isin(others.means, kept.means).all(1)
     gone = transformed(others.select(~there), np.linalg.inv(place)).means
@@ -278,8 +278,8 @@ def test_a_corner_is_closed_on_both_sides():
     hidden = (np.abs(both.means[:, :2]) < 0.16).all(1) & (both.means[:, 2] < 0.28)
     splats = concatenate([both.select(~hidden), box(rng, (-0.14, -0.15, 0), (0.15, 0.15, 0.3), 1)])
     edited = apply_edits(splats, [scene_object(1, removed=True, fill=True)])
-    invented = edited.select(edited.invented)
-    assert (invented.object_ids == 5).sum() > 100 and (invented.object_ids == 7).sum() > 100
+    unobserved = edited.select(edited.unobserved)
+    assert (unobserved.object_ids == 5).sum() > 100 and (unobserved.object_ids == 7).sum() > 100
 
 
 def test_sheets_that_meet_under_an_object_are_each_continued_to_their_edge():
@@ -287,9 +287,9 @@ def test_sheets_that_meet_under_an_object_are_each_continued_to_their_edge():
     for part in (splats, hidden):
         part.object_ids[(part.object_ids == 5) & (part.means[:, 0] > 0.02)] = 8
     edited = apply_edits(splats, [scene_object(1, removed=True, fill=True)])
-    invented = edited.select(edited.invented)
-    assert len(invented) > 0.7 * len(hidden)
-    assert ((invented.object_ids == 8) == (invented.means[:, 0] > 0.02)).mean() > 0.85
+    unobserved = edited.select(edited.unobserved)
+    assert len(unobserved) > 0.7 * len(hidden)
+    assert ((unobserved.object_ids == 8) == (unobserved.means[:, 0] > 0.02)).mean() > 0.85
 
 
 def test_rumpled_ground_is_closed_with_its_relief():
@@ -303,9 +303,9 @@ def test_rumpled_ground_is_closed_with_its_relief():
         ground = part.object_ids == 5
         part.means[ground, 2] += height(part.means[ground])
     edited = apply_edits(splats, [scene_object(1, removed=True, fill=True)])
-    invented = edited.select(edited.invented)
-    assert len(invented) > 0.7 * len(hidden)
-    off = np.abs(invented.means[:, 2] - height(invented.means))
+    unobserved = edited.select(edited.unobserved)
+    assert len(unobserved) > 0.7 * len(hidden)
+    off = np.abs(unobserved.means[:, 2] - height(unobserved.means))
     assert np.median(off) < 0.006, np.median(off)
     assert np.abs(height(splats.means[splats.object_ids == 5])).mean() > 0.03
 
@@ -313,25 +313,25 @@ def test_rumpled_ground_is_closed_with_its_relief():
 def test_what_fill_puts_and_takes_is_what_the_edits_show():
     splats, _ = with_box_on_ground()
     objects = [scene_object(1, removed=True, fill=True), scene_object(6, removed=True, fill=True)]
-    fill = fill_of(splats, objects)
+    fill = compute_fill(splats, objects)
     edited = apply_edits(splats, objects)
-    assert same(fill.splats.select(fill.put), edited.select(edited.invented))
-    assert set(fill.closes.tolist()) == {1, 6} and fill.splats.invented.tolist() == fill.put.tolist()
+    assert same(fill.splats.select(fill.put), edited.select(edited.unobserved))
+    assert set(fill.fills.tolist()) == {1, 6} and fill.splats.unobserved.tolist() == fill.put.tolist()
     kept = splats.select(np.isin(splats.object_ids, [1, 6], invert=True))
     taken = fill.splats.select(~fill.put)
     still = kept.select(~np.isin(kept.means, taken.means).all(1))
-    assert len(taken) and same(still, edited.select(~edited.invented))
+    assert len(taken) and same(still, edited.select(~edited.unobserved))
 
 
-def test_where_nothing_is_around_nothing_is_invented():
+def test_where_nothing_is_around_nothing_is_unobserved():
     splats, _ = with_box_on_ground()
     for without in (splats.select(splats.object_ids != 5), splats.select(splats.means[:, 0] < 0.1)):
         edited = apply_edits(without, [scene_object(1, removed=True, fill=True)])
         assert same(edited, without.select(without.object_ids != 1))
-    assert not apply_edits(splats, [scene_object(1, fill=True)]).invented.any()
+    assert not apply_edits(splats, [scene_object(1, fill=True)]).unobserved.any()
 
 
 def test_no_splats():
-    for edited in (transformed(Splats.empty(2), affine(TURN)), recoloured(Splats.empty(2), Recolour(hue=0.1)),
+    for edited in (transformed(Splats.empty(2), affine(TURN)), recolored(Splats.empty(2), Recolor(hue=0.1)),
                    apply_edits(Splats.empty(2), [scene_object(1, removed=True)])):  # fmt: skip
         assert len(edited) == 0 and edited.degree == 2

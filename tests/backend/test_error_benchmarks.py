@@ -1,6 +1,6 @@
 """What the benchmarks of error against time and of mask noise conclude, and what they change in the kernels."""
 
-import importlib.util
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -55,7 +55,7 @@ def test_a_variant_is_compared_with_the_default_in_the_same_time():
         training_variants.in_time(curve, 201)
 
 
-@pytest.mark.parametrize("seeds, better", [(1, ["fast"]), (4, ["fast", "a little"])])
+@pytest.mark.parametrize(("seeds", "better"), [(1, ["fast"]), (4, ["fast", "a little"])])
 def test_a_faster_variant_is_better_where_the_default_does_not_come_so_far_in_its_time(seeds, better):
     choice = approximations.Choice("a choice", "default", {})
 
@@ -147,7 +147,7 @@ def test_every_choice_has_its_default_among_its_variants_and_no_other_like_it():
             assert sum(not changes for changes in choice.variants.values()) == 1
 
 
-@pytest.mark.parametrize("degree, least", [(2, 4e-3), (3, 2e-4), (5, 3e-7), (7, 1e-9)])
+@pytest.mark.parametrize(("degree", "least"), [(2, 4e-3), (3, 2e-4), (5, 3e-7), (7, 1e-9)])
 def test_a_polynomial_of_higher_degree_is_closer_to_the_exponential(degree, least):
     f = np.linspace(-0.5, 0.5, 999)
     values = np.polyval(raster_variants.exp2_coefficients(degree), f)
@@ -155,9 +155,13 @@ def test_a_polynomial_of_higher_degree_is_closer_to_the_exponential(degree, leas
 
 
 def test_the_kernels_can_still_be_read_as_float64():
-    for name in raster_variants._DoubledFinder._NAMES:
-        spec = importlib.util.find_spec(f"backend.raster.{name}")
-        assert raster_variants._Doubled(spec.name, spec.origin).get_code(spec.name)
+    finder, folder = raster_variants._DoubledFinder(), Path(raster_variants.__file__).parents[1] / "backend" / "raster"
+    names = [f"backend.raster.{name}" for name in finder._SHARED]
+    names += [f"backend.raster.cpu.{path.stem}" for path in (folder / "cpu").glob("[!_]*.py")]
+    for name in names:
+        spec = finder.find_spec(name, [str(folder / "cpu" if ".cpu." in name else folder)])
+        assert isinstance(spec.loader, raster_variants._Doubled)
+        assert spec.loader.get_code(spec.name)
 
 
 def test_a_constant_that_the_rasterizer_no_longer_has_is_named():

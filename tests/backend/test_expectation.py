@@ -2,8 +2,8 @@
 
 import pytest
 
-from backend import expectation
-from backend.expectation import shortfall
+from backend.shared import expectation
+from backend.shared.expectation import shortfall
 
 
 @pytest.fixture(autouse=True)

@@ -8,7 +8,7 @@ from backend.training.exposure import measure_gains, varies
 
 
 def photos(gains, cameras, held_out=(), points=200, noise=0.0, hidden=0.0):
-    """A stand-in for a capture: every view shows every point on a 3 x 3 patch of its colour times the view's gain, but
+    """A stand-in for a capture: every view shows every point on a 3 x 3 patch of its color times the view's gain, but
     for a share `hidden` of them, where something bright is in front."""
     rng = np.random.default_rng(0)
     colors = rng.uniform(0.1, 0.6, (points, 3))
@@ -55,7 +55,7 @@ def test_equal_photos_do_not_vary():
     assert not varies(measure_gains(photos(np.ones((8, 3)), [1] * 8, noise=0.02)))
 
 
-def test_a_held_out_view_takes_its_neighbours_gain_and_its_own_pixels_do_not_count():
+def test_a_held_out_view_takes_its_neighbors_gain_and_its_own_pixels_do_not_count():
     truth = np.array([[1.0] * 3, [1.1] * 3, [3.0] * 3, [1.3] * 3, [0.8] * 3])
     cameras = [1, 1, 1, 1, 2]
     found = measure_gains(photos(truth, cameras, held_out=(2,)))

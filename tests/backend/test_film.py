@@ -10,26 +10,28 @@ import pytest
 import torch
 from PIL import Image
 
-from backend.commands.film import frame_path
-from backend.editing.apply import recoloured, transformed
+from backend.commands.objects.film import frame_path
+from backend.editing.apply import recolored, transformed
 from backend.export.ply import read_splats, write_splats
 from backend.film import cryptomatte, exr
 from backend.film.render import FAR, decoded, encoded
-from backend.film.shot import Frame, Placed, Sample, Shot, chosen_frames, read_shot, write_shot
 from backend.model.splats import Splats, concatenate
-from backend.objects import edit_objects, write_objects
-from backend.protocol import EXIT_CANCELLED, EXIT_DONE, InputError, Reconstruction
 from backend.raster import Camera
-from backend.raster.ranks import add_ranked
+from backend.raster.ranked_ids import add_ranked
 from backend.raster.reference import rasterize_reference
-from backend.recolour import Recolour
+from backend.shared.color.recolor import Recolor
+from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE, InputError
+from backend.shared.reconstruction.folder import Reconstruction
+from backend.shared.reconstruction.objects import edit_objects, write_objects
+from backend.shared.reconstruction.record import TrainingRecord, VotesRecord, update_record
+from backend.shared.reconstruction.shot import Frame, Placed, Sample, Shot, chosen_frames, read_shot, write_shot
 
 from .asking import refused
 
 HUGE = 3_000_000_001
 IDS = (0, 1, 2, 7, HUGE)
 NAMES = {1: "mug", 2: "can", 7: "mug", HUGE: "große Kiste"}
-SHOWN_NAMES = ["Unlabelled", "mug (1)", "can", "mug (7)", "große Kiste"]
+SHOWN_NAMES = ["Unlabeled", "mug (1)", "can", "mug (7)", "große Kiste"]
 WIDTH, HEIGHT = 45, 33
 K = np.array([[40.0, 0, 24.3], [0, 44.0, 15.1], [0, 0, 1]])
 
@@ -56,7 +58,7 @@ def folder(tmp_path) -> Reconstruction:
     place = Reconstruction(tmp_path / "made").create()
     write_splats(place.splats, some_splats())
     write_objects(
-        place.objects, [{"id": i, "name": name, "colour": [1, 2, 3], "points": 4} for i, name in NAMES.items()]
+        place.objects, [{"id": i, "name": name, "color": [1, 2, 3], "points": 4} for i, name in NAMES.items()]
     )
     return place
 
@@ -139,7 +141,7 @@ def assert_same(picture, splats, at, primitive="3d") -> None:
     np.testing.assert_allclose(rgba_of(picture), rgba, atol=2e-3, rtol=2e-3)
     np.testing.assert_allclose(coverage_of(picture), coverage, atol=1e-5)
     np.testing.assert_allclose(coverage_of(picture).sum(-1), picture["A"], atol=6e-4)
-    # Where the median is a matter of rounding the two may choose neighbours.
+    # Where the median is a matter of rounding the two may choose neighbors.
     assert (np.abs(picture["Z"] - depth) <= 1e-4 * depth).mean() > 0.995
     winner = np.array(IDS, np.uint32)[coverage.argmax(-1)]
     clear = np.sort(coverage, -1)[..., -1] - np.sort(coverage, -1)[..., -2] > 1e-4
@@ -148,7 +150,8 @@ def assert_same(picture, splats, at, primitive="3d") -> None:
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
 def test_a_frame_is_what_the_reference_draws(folder, film, primitive):
-    folder.settings.write_text(json.dumps({"training": {"settings": {"primitive": primitive}}}))
+    votes = VotesRecord("majority", None, 1600, "0f", None)
+    update_record(folder, training=TrainingRecord({"primitive": primitive}, votes))
     picture = film(shot_of([sample()]), "--png")[0]
     splats, _ = read_splats(folder.splats)
     assert_same(picture, splats, sample(), primitive)
@@ -162,17 +165,17 @@ def test_a_frame_is_what_the_reference_draws(folder, film, primitive):
 
 def test_edits_and_places(folder, film):
     """Static edits of objects.json; maps of the shot, copies and visibility, which take the place of its transforms."""
-    recolour = Recolour(hue=0.3, value=0.8)
+    recolor = Recolor(hue=0.3, value=0.8)
     place = moved(0.3, -0.1, 0.2)
     edit_objects(folder.objects, {
-        1: {"removed": True}, 2: {"recolour": recolour.stored(), "transform": moved(0.2).tolist()},
+        1: {"removed": True}, 2: {"recolor": recolor.stored(), "transform": moved(0.2).tolist()},
         7: {"transform": place.tolist(), "copies": [moved(-0.4).tolist()]},
     })  # fmt: skip
     turned = np.array([[0, -1.2, 0, 0.1], [1.2, 0, 0, 0.2], [0, 0, 1.2, 0.3], [0, 0, 0, 1.0]])
     objects = {2: Placed(maps=np.array([turned, moved(0.0, 0.3)])), HUGE: Placed(visible=False)}
     splats, _ = read_splats(folder.splats)
     part = {i: splats.select(splats.object_ids == i) for i in IDS}
-    can = recoloured(part[2], recolour)
+    can = recolored(part[2], recolor)
     expected = concatenate([
         part[0], transformed(can, turned), transformed(can, moved(0.0, 0.3)), transformed(part[7], place),
         transformed(part[7], moved(-0.4)),
@@ -181,7 +184,7 @@ def test_edits_and_places(folder, film):
     pictures = film(
         shot_of([sample(objects=objects)], [sample()], [sample(0.1, {2: Placed(maps=np.zeros((0, 4, 4)))})])
     )
-    names = ["Unlabelled", "can", "mug", "große Kiste"]
+    names = ["Unlabeled", "can", "mug", "große Kiste"]
     assert list(manifest(folder.folder.parent / "film")) == names, "mug is alone with its name where the other is gone"
     np.testing.assert_allclose(rgba_of(pictures[0]), reference(expected, sample())[0], atol=2e-3, rtol=2e-3)
     static = concatenate([part[0], transformed(can, moved(0.2)), transformed(part[7], place),
@@ -264,7 +267,7 @@ def test_cryptomatte_is_as_published(folder, film):
     assert found["pixelAspectRatio"] == 1.5 and found["objectgs/frame"] == "1"
 
 
-def test_colours_go_there_and_back():
+def test_colors_go_there_and_back():
     values = np.linspace(0, 1.5, 200, dtype=np.float32)
     np.testing.assert_allclose(encoded(decoded(values)), values, atol=1e-6)
     np.testing.assert_allclose(decoded(np.float32([0.0, 0.5, 1.0])), [0.0, 0.2140411, 1.0], atol=1e-6)
@@ -305,8 +308,8 @@ def test_finished_frames_are_skipped_and_others_drawn_again(folder, shoot, tmp_p
         assert exr.digest_of(frame_path(out, 2)) is None
     assert drawn(shoot()) == 1 and frame_path(out, 2).read_bytes() == whole
     assert drawn(shoot(shot=shot_of([sample()], [sample(0.15)], [sample(0.2), sample(0.21)]))) == 1
-    edit_objects(folder.objects, {1: {"colour": [9, 9, 9]}})
-    assert drawn(shoot("--frames", "1")) == 0, "the colour that stands for an object is not in its pictures"
+    edit_objects(folder.objects, {1: {"color": [9, 9, 9]}})
+    assert drawn(shoot("--frames", "1")) == 0, "the color that stands for an object is not in its pictures"
     edit_objects(folder.objects, {1: {"removed": True}})
     assert drawn(shoot()) == 3
     assert drawn(shoot("--png")) == 3 and len(list(out.glob("*.png"))) == 3
@@ -317,7 +320,7 @@ def test_finished_frames_are_skipped_and_others_drawn_again(folder, shoot, tmp_p
 
 def test_stopping_leaves_whole_frames(shoot, tmp_path, monkeypatch):
     stops = iter([False, False, True])
-    monkeypatch.setattr("backend.stopping.StopRequest.__call__", lambda self: next(stops))
+    monkeypatch.setattr("backend.shared.stopping.StopRequest.__call__", lambda self: next(stops))
     answer = shoot()
     assert answer.code == EXIT_CANCELLED and answer.events[-1]["stopped"] is True
     shares = [event["done"] for event in answer.events if event["type"] == "progress"]
@@ -392,7 +395,7 @@ def test_bad_requests(folder, tmp_path, ask):
     refused(ask(*command, "--frames", "7-9"), "none of the frames", "1 to 2")
     refused(ask("film", tmp_path, "--shot", path, "--out", tmp_path / "film"), "splats.ply")
     (tmp_path / "file").write_text("in the way")
-    refused(ask(*command[:-1], tmp_path / "file"), "cannot be made")
+    refused(ask(*command[:-1], tmp_path / "file"), "cannot be created")
     path.write_text("{")
     refused(ask(*command), str(path), "JSON")
 

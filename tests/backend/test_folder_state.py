@@ -10,7 +10,7 @@ from backend.model.checkpoint import save_checkpoint
 
 def test_blender_reads_how_far_a_training_is(tmp_path):
     root = headless.extension().__name__
-    folder_state = importlib.import_module(f"{root}.objectgs_addon.folder_state").folder_state
+    folder_state = importlib.import_module(f"{root}.objectgs_addon.state.folder_state").folder_state
     save_checkpoint(tmp_path / "checkpoint", {"a": np.zeros(3, np.float32)}, {"progress": {"step": 3, "seconds": 0.5}})
     state = folder_state(tmp_path)
     assert (state.steps, state.seconds) == (3, 0.5)

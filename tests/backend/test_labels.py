@@ -1,4 +1,4 @@
-"""Votes: known answers on synthetic scenes, what the strategies promise, and the labelled PLY."""
+"""Votes: known answers on synthetic scenes, what the strategies promise, and the labeled PLY."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import pytest
 from backend.capture import Keypoints, Points, View, load_capture
 from backend.labels import read_points, vote, write_points
 from backend.labels.voting import _Ballots
-from backend.protocol import InputError, Reporter
+from backend.shared.errors import InputError
+from backend.shared.events import Reporter
 
 STRATEGIES = ["majority", "probability", "correspondence"]
 
@@ -76,7 +77,7 @@ def test_majority_wins_and_ties_go_to_the_smallest():
     assert votes.counts == {2: 0, 5: 1}
 
 
-def test_unlabelled_wins_only_where_nothing_else_voted():
+def test_unlabeled_wins_only_where_nothing_else_voted():
     assert vote(given(plain(0, 0, 0, 7), [[0, 0, 1.0]])).ids.tolist() == [7]
     votes = vote(given(plain(0, 0, 0), [[0, 0, 1.0]]))
     assert votes.ids.tolist() == [0] and votes.margins.tolist() == [0.0] and votes.visible.tolist() == [3]
@@ -174,7 +175,7 @@ def test_unknown_strategy():
         vote(given(plain(1), [[0, 0, 1.0]]), "loudest")  # type: ignore[arg-type]
 
 
-def test_without_masks_nothing_is_labelled(write_capture, tmp_path):
+def test_without_masks_nothing_is_labeled(write_capture, tmp_path):
     capture = load_capture(write_capture(masks=False).folder, tmp_path / "cache")
     for strategy in STRATEGIES:
         votes = vote(capture, strategy)
@@ -248,7 +249,7 @@ def test_many_points_views_and_ids_stay_fast_and_small():
     assert seconds < 15 and peak < 1e9, (seconds, peak)
 
 
-# The labelled point cloud
+# The labeled point cloud
 
 
 def test_points_survive_the_file(tmp_path):

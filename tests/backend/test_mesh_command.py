@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from backend.commands import mesh as command
+from backend.commands.objects import mesh as command
 from backend.mesh.surface import NoSurface
-from backend.mesh_file import read_mesh
-from backend.objects import edit_objects
-from backend.protocol import EXIT_CANCELLED, EXIT_DONE, Cancelled
+from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE, Cancelled
+from backend.shared.formats.mesh_ply import read_mesh
+from backend.shared.reconstruction.objects import edit_objects
 
 from .asking import refused
 
@@ -50,17 +51,17 @@ def test_each_object_becomes_a_mesh_in_its_place(trained, ask, write_capture):
     assert answer.code == EXIT_DONE and answer.events[-1]["made"] == 3
     shares = [event["done"] / event["total"] for event in answer.events if event.get("what") == "meshes"]
     assert shares == sorted(shares) and shares[-1] == pytest.approx(1, abs=0.02) and len(shares) > 10
-    for object_id, centre, radius in ((1, (-0.7, 0, 0), 0.5), (2, (0.7, 0.1, 0), 0.45), (5, (0, -0.2, 0.9), 0.35)):
+    for object_id, center, radius in ((1, (-0.7, 0, 0), 0.5), (2, (0.7, 0.1, 0), 0.45), (5, (0, -0.2, 0.9), 0.35)):
         entry = entries(trained)[str(object_id)]
         assert entry["name"] == f"sphere {object_id}" and entry["ids"] == [object_id] and entry["trained_steps"] == 250
         found = read_mesh(trained / "meshes" / entry["file"])
         assert len(found.faces) == entry["faces"] <= 2000 and len(found.vertices) == entry["vertices"]
-        assert entry["watertight"] is True and entry["invented"] == pytest.approx(found.invented.mean(), abs=1e-3)
-        distance = np.linalg.norm(found.vertices - centre, axis=1)
+        assert entry["watertight"] is True and entry["unobserved"] == pytest.approx(found.unobserved.mean(), abs=1e-3)
+        distance = np.linalg.norm(found.vertices - center, axis=1)
         assert abs(np.median(distance) - radius) < 0.1 * radius, "where and as large as the sphere is"
-        outward = (found.normals * (found.vertices - centre)).sum(1) / distance
+        outward = (found.normals * (found.vertices - center)).sum(1) / distance
         assert np.median(outward) > 0.9
-        assert 0 <= found.uvs.min() and found.uvs.max() <= 1
+        assert found.uvs.min() >= 0 and found.uvs.max() <= 1
         with Image.open(trained / "meshes" / found.texture) as texture:
             assert texture.size == (256, 256)
             assert np.asarray(texture).std() > 1
@@ -88,7 +89,7 @@ def test_merged_objects_sets_and_the_scene(trained, ask):
         (("--objects", "teapot"), ("no object teapot", "sphere 5")),
         (("--set", "1=1,2"), ("--set 1=",)),
         (("--set", "pair"), ("NAME=ID,ID",)),
-        (("--faces", "3"), ("from 100 on",)),
+        (("--faces", "3"), ("of at least 100",)),
         (("--texture-size", "1000"), ("1000",)),
     ],
 )
@@ -108,12 +109,12 @@ class Stub:
             if len(self.made) == self._stop_at:
                 raise Cancelled("Stopped.")
             self.made.append(target.key)
-            entry = {"name": target.name, **command._origin(target, options, trained)}
+            entry = command._entry_of(target, options, trained)
             if target.key in without:
-                return {**entry, "why": f"Nobody saw {target.name}."}
+                return replace(entry, why=f"Nobody saw {target.name}.")
             for suffix in ("ply", "png"):
                 (trained.folder.meshes / f"{target.key}.{suffix}").write_bytes(b"")
-            return {**entry, "file": f"{target.key}.ply", "texture": f"{target.key}.png"}
+            return replace(entry, file=f"{target.key}.ply", texture=f"{target.key}.png")
 
         monkeypatch.setattr(command, "_make", make)
 

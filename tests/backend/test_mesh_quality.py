@@ -15,22 +15,24 @@ import torch
 from PIL import Image
 
 from backend.capture import load_capture
-from backend.evaluation.mesh_pictures import Card, camera_for, draw_card, mesh_sheet, save_sheet, view_of
 from backend.evaluation.mesh_shape import self_intersecting, shape_of
+from backend.evaluation.mesh_sheet import Card, camera_for, draw_card, mesh_sheet, save_sheet, view_of
 from backend.evaluation.meshes import (
     SampledSurface,
     agreement,
     evaluate_mesh,
     mesh_entries,
-    object_of,
     sample_texture,
     texture_score,
 )
 from backend.evaluation.truth import load_truth
-from backend.mesh_file import Mesh, write_mesh
 from backend.model.object_model import Normalization
-from backend.protocol import EXIT_DONE, InputError, Reporter
 from backend.raster import Camera
+from backend.shared.class_table import ClassTable
+from backend.shared.errors import EXIT_DONE, InputError
+from backend.shared.events import Reporter
+from backend.shared.formats.mesh_ply import Mesh, write_mesh
+from backend.shared.reconstruction.meshes import MeshEntry
 
 
 def box(low=(0, 0, 0), high=(1, 1, 1)):
@@ -43,9 +45,9 @@ def box(low=(0, 0, 0), high=(1, 1, 1)):
     return vertices, np.array(faces, np.int32)
 
 
-def sphere(radius=1.0, centre=(0, 0, 0), detail=64):
+def sphere(radius=1.0, center=(0, 0, 0), detail=64):
     made = manifold3d.Manifold.sphere(radius, detail).to_mesh()
-    return np.array(made.vert_properties[:, :3], float) + centre, np.array(made.tri_verts, np.int32)
+    return np.array(made.vert_properties[:, :3], float) + center, np.array(made.tri_verts, np.int32)
 
 
 def joined(*meshes):
@@ -54,7 +56,7 @@ def joined(*meshes):
     return np.concatenate([vertices for vertices, _ in meshes]), np.concatenate(faces)
 
 
-def dressed(vertices, faces, uvs=None, texture="", invented=None):
+def textured(vertices, faces, uvs=None, texture="", unobserved=None):
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = np.zeros_like(vertices)
@@ -64,7 +66,7 @@ def dressed(vertices, faces, uvs=None, texture="", invented=None):
     return Mesh(
         vertices, normals.astype(np.float32), np.full((len(vertices), 3), 90, np.uint8), faces,
         np.zeros((len(faces), 3, 2), np.float32) if uvs is None else uvs,
-        np.zeros(len(faces), bool) if invented is None else invented, texture,
+        np.zeros(len(faces), bool) if unobserved is None else unobserved, texture,
     )  # fmt: skip
 
 
@@ -118,13 +120,13 @@ def test_crossing_boxes_cut_each_other_and_near_ones_do_not():
 @pytest.mark.parametrize(
     ("last", "cuts"),
     [
-        ((1, 1, 0), False),  # flat neighbours
+        ((1, 1, 0), False),  # flat neighbors
         ((0.3, 0.3, 0), True),  # folded back onto itself
         ((1, 1, 0.5), False),
         ((0.3, 0.3, 1e-3), False),
     ],
 )
-def test_neighbours_cut_where_they_are_folded_flat(last, cuts):
+def test_neighbors_cut_where_they_are_folded_flat(last, cuts):
     vertices = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), last], float)
     assert self_intersecting(vertices, np.array([(0, 1, 2), (2, 1, 3)])).tolist() == [cuts, cuts]
 
@@ -241,8 +243,8 @@ def write_truth(scene, write_capture, spheres):
         np.save(truth / "depth" / name.replace(".png", ".npy"), np.where(ids > 0, depth, 0).astype(np.float32))
         Image.fromarray(ids.astype(np.uint16)).save(truth / "masks" / name)
     rows = []
-    for i, centre, radius in spheres:
-        vertices, faces = sphere(radius, centre)
+    for i, center, radius in spheres:
+        vertices, faces = sphere(radius, center)
         table = np.empty(len(faces), [("n", "u1"), ("v", "<i4", 3)])
         table["n"], table["v"] = 3, faces
         header = (
@@ -254,7 +256,7 @@ def write_truth(scene, write_capture, spheres):
             header.encode() + vertices.astype("<f4").tobytes() + table.tobytes()
         )
         rows.append({"id": i, "name": f"sphere {i}", "mesh": f"meshes/{i}.ply"})
-    (truth / "objects.json").write_text(json.dumps({"unit": "metre", "objects": rows}))
+    (truth / "objects.json").write_text(json.dumps({"unit": "meter", "objects": rows}))
 
 
 SPHERES = [(1, (0.0, 0.0, 0.0), 0.5), (5, (0.0, 0.0, 1.2), 0.3)]
@@ -278,8 +280,8 @@ def test_a_point_is_seen_where_two_views_show_it(true_capture):
     # Two cameras: only what both look at, and not behind the other sphere.
     nine = load_truth(capture, [1, 2])
     two = nine.seen(points, normals, [1])
-    centres = [-viewmat[:3, :3].T @ viewmat[:3, 3] for viewmat in (scene.viewmats[1], scene.viewmats[2])]
-    facing = [((centre - points) * normals).sum(1) > 0 for centre in centres]
+    centers = [-viewmat[:3, :3].T @ viewmat[:3, 3] for viewmat in (scene.viewmats[1], scene.viewmats[2])]
+    facing = [((center - points) * normals).sum(1) > 0 for center in centers]
     assert not two[~(facing[0] & facing[1])].any()
     assert two[facing[0] & facing[1]].mean() > 0.7
     assert not load_truth(capture, [1]).seen(points, normals, [1]).any(), "one view is not two"
@@ -293,12 +295,12 @@ def test_hidden_parts_count_only_where_all_counts(true_capture, tmp_path):
     truth = load_truth(capture, capture.train_indices)
     vertices, faces = sphere(0.5)
     low = vertices[faces][:, :, 1].min(1) > 0.44
-    without = dressed(vertices, faces[~low])
+    without = textured(vertices, faces[~low])
     write_mesh(tmp_path / "1.ply", without)
     scene = FakeScene([], [])
 
     def measured(name):
-        return evaluate_mesh(tmp_path, {"file": name, "ids": [1]}, scene, truth, [], Reporter())
+        return evaluate_mesh(tmp_path, MeshEntry("1", "ball", (1,), file=name), scene, truth, [], Reporter())
 
     found = measured("1.ply")
     assert found["f1"] > 0.999 and found["f1_005"] > 0.99 and not found["watertight"]
@@ -307,20 +309,20 @@ def test_hidden_parts_count_only_where_all_counts(true_capture, tmp_path):
     # A bulge where nobody looks is forgiven over the seen part alone.
     bulged = vertices.copy()
     bulged[vertices[:, 1] > 0.47] *= 1.2
-    write_mesh(tmp_path / "2.ply", dressed(bulged, faces))
+    write_mesh(tmp_path / "2.ply", textured(bulged, faces))
     found = measured("2.ply")
     assert found["precision"] > 0.995 and found["precision_all"] < 0.97
     # Where everybody looks it is not.
     bulged = vertices.copy()
     bulged[vertices[:, 1] < -0.3] *= 1.2
-    write_mesh(tmp_path / "3.ply", dressed(bulged, faces))
+    write_mesh(tmp_path / "3.ply", textured(bulged, faces))
     assert measured("3.ply")["precision"] < 0.9
     # A wall inside that nobody can see is wrong over all of the surface alone; one outside is seen.
     inner = joined((vertices, faces), sphere(0.4))
-    write_mesh(tmp_path / "4.ply", dressed(*inner))
+    write_mesh(tmp_path / "4.ply", textured(*inner))
     found = measured("4.ply")
     assert found["precision"] > 0.999 and found["precision_all"] < 0.7
-    write_mesh(tmp_path / "5.ply", dressed(*joined((vertices, faces), sphere(0.56))))
+    write_mesh(tmp_path / "5.ply", textured(*joined((vertices, faces), sphere(0.56))))
     assert measured("5.ply")["precision"] < 0.05
 
 
@@ -353,7 +355,7 @@ def test_a_capture_without_truth_has_none_and_a_broken_one_is_named(true_capture
 class FakeScene:
     """Cameras along +z from the origin, a photo and labels each."""
 
-    object_ids = np.array([0, 4, 9])
+    classes = ClassTable([0, 4, 9])
     normalization = Normalization((10.0, 0.0, 0.0), 0.5)
 
     def __init__(self, photos, labels):
@@ -374,7 +376,7 @@ def poster(share=1.0):
     seen = np.array([(-1, -0.75, 2), (right, -0.75, 2), (right, 0.75, 2), (-1, 0.75, 2)])
     faces = np.array([(0, 1, 2), (0, 2, 3)], np.int32)
     uv = np.array([(0, 1), (share, 1), (share, 0), (0, 0)], np.float32)
-    return dressed(FakeScene.normalization.to_world(seen), faces, uv[faces])
+    return textured(FakeScene.normalization.to_world(seen), faces, uv[faces])
 
 
 ramp = np.stack(np.meshgrid(np.arange(400), np.arange(300)), -1) / [400, 300]
@@ -429,21 +431,23 @@ def test_what_cannot_be_measured_is_none(true_capture, tmp_path):
     heard = Warnings()
 
     def measured(entry):
-        return evaluate_mesh(tmp_path, {"ids": [4], **entry}, FakeScene([photo], [None]), None, [0], heard)
+        return evaluate_mesh(
+            tmp_path, MeshEntry("4", "box", (4,), **entry), FakeScene([photo], [None]), None, [0], heard
+        )
 
     absent = measured({"why": "too few views show it"})
     assert absent.pop("why") == "too few views show it" and set(absent.values()) == {None}
     gone = measured({"file": "4.ply"})
     assert "4.ply" in heard.said[-1] and gone["faces"] is None and gone["why"]
-    write_mesh(tmp_path / "4.ply", dressed(*box(), texture="4.png"))
+    write_mesh(tmp_path / "4.ply", textured(*box(), texture="4.png"))
     found = measured({"file": "4.ply", "texture": "4.png"})
     assert "4.png" in heard.said[-1] and found["texture_psnr"] is None
     assert found["faces"] == 12 and found["watertight"] is True and found["f1"] is None and found["chamfer_all"] is None
-    empty = dressed(*box())
-    empty.faces, empty.uvs, empty.invented = empty.faces[:0], empty.uvs[:0], empty.invented[:0]
+    empty = textured(*box())
+    empty.faces, empty.uvs, empty.unobserved = empty.faces[:0], empty.uvs[:0], empty.unobserved[:0]
     write_mesh(tmp_path / "4.ply", empty)
     assert measured({"file": "4.ply"})["why"] == "it has no surface"
-    flat = dressed(*box())
+    flat = textured(*box())
     flat.vertices[:] = 1
     picture = np.asarray(draw_card(Card("", "", flat, None, true_capture[0].views[1]), 40)[0])
     assert (picture == picture[0, 0]).all()
@@ -459,11 +463,11 @@ def test_meshes_of_another_state_are_left_out(tmp_path):
     (tmp_path / "meshes.json").write_text(json.dumps({"trained_steps": 20, "meshes": entries}))
     found = mesh_entries(tmp_path, 20, heard)
     assert list(found) == ["2", "10", "77", "scene"], "objects by ID, then a set called 77 and the scene"
-    assert [object_of(key, entry) for key, entry in found.items()] == [2, 10, None, None]
+    assert [entry.object_id for entry in found.values()] == [2, 10, None, None]
     [said] = heard.said
     assert "1 of 5 meshes" in said and "earlier state" in said
     assert list(mesh_entries(tmp_path, 15, heard)) == ["old"]
-    for broken in ([1], {"1": {"file": "1.ply"}}, {"1": 7}):
+    for broken in ([1], {"1": 7}, {"one": {"ids": ["x"]}}):
         (tmp_path / "meshes.json").write_text(json.dumps({"trained_steps": 20, "meshes": broken}))
         with pytest.raises(InputError, match=r"meshes\.json"):
             mesh_entries(tmp_path, 20, heard)
@@ -489,7 +493,7 @@ def test_a_room_is_shown_from_within(true_capture):
     capture, _ = true_capture
     vertices, _ = box((-9, -9, -9), (9, 9, 9))
     camera = camera_for(vertices, capture.views[1], 300)
-    assert camera.centre == pytest.approx(-capture.views[1].viewmat[:3, :3].T @ capture.views[1].viewmat[:3, 3])
+    assert camera.center == pytest.approx(-capture.views[1].viewmat[:3, :3].T @ capture.views[1].viewmat[:3, 3])
 
 
 def test_the_view_that_shows_most_is_taken(true_capture):
@@ -499,26 +503,26 @@ def test_the_view_that_shows_most_is_taken(true_capture):
     assert view_of(capture, None, [3, 4]).name == capture.views[3].name
 
 
-def test_panels_show_surface_wires_invented_faces_and_texture(true_capture):
+def test_panels_show_surface_wires_unobserved_faces_and_texture(true_capture):
     capture, _ = true_capture
     vertices, faces = box()
     uvs = np.zeros((12, 3, 2), np.float32)
     blue = np.zeros((4, 4, 3), np.uint8) + np.uint8([10, 20, 250])
-    card = Card("box", "", dressed(vertices, faces, uvs), blue, capture.views[1])
-    surface, wires, textured = (np.asarray(picture).astype(int) for picture in draw_card(card, 120))
+    card = Card("box", "", textured(vertices, faces, uvs), blue, capture.views[1])
+    surface, wires, texture = (np.asarray(picture).astype(int) for picture in draw_card(card, 120))
     assert (surface[0, 0] == surface[-1, -1]).all() and surface.shape == (120, 120, 3)
     drawn = (surface != surface[0, 0]).any(2)
     assert 0.2 < drawn.mean() < 0.8
-    grey = surface[drawn]
-    assert np.ptp(grey, axis=1).max() < 40 and np.ptp(grey[:, 0]) > 20, "grey, and lit from a side"
-    assert (np.abs(textured - [10, 20, 250]).max(2) <= 1).sum() > 0.9 * drawn.sum()
+    gray = surface[drawn]
+    assert np.ptp(gray, axis=1).max() < 40 and np.ptp(gray[:, 0]) > 20, "gray, and lit from a side"
+    assert (np.abs(texture - [10, 20, 250]).max(2) <= 1).sum() > 0.9 * drawn.sum()
     assert (wires != surface)[drawn].any()
-    card.mesh.invented[:] = True
+    card.mesh.unobserved[:] = True
     orange = np.asarray(draw_card(card, 120)[1]).astype(int)[drawn]
     assert (orange[:, 0] - orange[:, 2] > 40).mean() > 0.7 > (wires[drawn][:, 0] - wires[drawn][:, 2] > 40).mean()
     card.texture = None
     plain = np.asarray(draw_card(card, 120)[2]).astype(int)
-    assert (np.abs(plain - 90).max(2) <= 1).sum() > 0.9 * drawn.sum(), "vertex colours, where there is no texture"
+    assert (np.abs(plain - 90).max(2) <= 1).sum() > 0.9 * drawn.sum(), "vertex colors, where there is no texture"
 
 
 def test_a_sheet_holds_every_mesh_and_stays_small(true_capture, tmp_path):
@@ -528,7 +532,7 @@ def test_a_sheet_holds_every_mesh_and_stays_small(true_capture, tmp_path):
     vertices, faces = box()
     uvs = rng.random((12, 3, 2)).astype(np.float32)
     cards = [
-        Card("a" * 200, "F1", dressed(vertices, faces, uvs), noise, capture.views[1]),
+        Card("a" * 200, "F1", textured(vertices, faces, uvs), noise, capture.views[1]),
         Card("none", "", why="x " * 99),
     ]
     one, two = mesh_sheet(cards[:1]), mesh_sheet(cards)
@@ -566,13 +570,14 @@ def test_evaluate_and_report_say_how_good_the_meshes_are(write_capture, tmp_path
     folder.mkdir()
     Image.fromarray(np.full((8, 8, 3), 128, np.uint8)).save(folder / "1.png")
     vertices, faces = sphere(0.51)
-    write_mesh(folder / "1.ply", dressed(vertices, faces, texture="1.png"))
-    write_mesh(folder / "scene.ply", dressed(*joined(sphere(0.5), sphere(0.3, (0, 0, 1.2)))))
+    write_mesh(folder / "1.ply", textured(vertices, faces, texture="1.png"))
+    write_mesh(folder / "scene.ply", textured(*joined(sphere(0.5), sphere(0.3, (0, 0, 1.2)))))
     record = {
         "trained_steps": 12,
         "meshes": {
             "1": {"ids": [1], "name": "sphere 1", "trained_steps": 12, "file": "1.ply", "texture": "1.png",
-                  "vertices": len(vertices), "faces": len(faces), "watertight": True, "invented": 0.0, "seconds": 1.0},
+                  "vertices": len(vertices), "faces": len(faces), "watertight": True, "unobserved": 0.0,
+                  "seconds": 1.0},
             "5": {"ids": [5], "name": "sphere 5", "trained_steps": 12, "why": "too few views show it"},
             "scene": {"ids": None, "name": "the whole scene", "trained_steps": 12, "file": "scene.ply", "texture": "",
                       "vertices": 1, "faces": 1, "watertight": True},

@@ -11,17 +11,19 @@ import torch
 import trimesh
 from scipy.ndimage import zoom
 
-from backend.mesh.blocks import SAMPLES, Blocks
-from backend.mesh.extract import extract, is_watertight
-from backend.mesh.fusion import fuse
-from backend.mesh.marching import march, parts
+from backend.mesh.field.blocks import SAMPLES, Blocks
+from backend.mesh.field.extract import extract, is_watertight
+from backend.mesh.field.fusion import fuse
+from backend.mesh.field.marching import march, parts
+from backend.mesh.field.winding import Winding
 from backend.mesh.surface import NoSurface
+from backend.mesh.texture.zbuffer import draw_mesh
 from backend.mesh.views import ObjectView, SceneMap, Views
-from backend.mesh.winding import Winding
-from backend.mesh.zbuffer import draw_mesh
 from backend.model.generate import Generated
-from backend.protocol import Cancelled, Reporter
 from backend.raster import Camera, rasterize
+from backend.shared.class_table import ClassTable
+from backend.shared.errors import Cancelled
+from backend.shared.events import Reporter
 
 
 def camera_at(eye, width=64, height=48, focal=60.0):
@@ -37,7 +39,7 @@ def camera_at(eye, width=64, height=48, focal=60.0):
     return Camera(viewmat, K, width, height)
 
 
-def sheet(x, class_index, half=0.5, step=0.05, colour=0.5):
+def sheet(x, class_index, half=0.5, step=0.05, color=0.5):
     """Opaque splats on the plane at `x`, facing along x."""
     grid = np.arange(-half, half + 1e-6, step)
     y, z = (a.ravel() for a in np.meshgrid(grid, grid))
@@ -47,7 +49,7 @@ def sheet(x, class_index, half=0.5, step=0.05, colour=0.5):
         torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
         torch.tensor([[0.002, step / 2, step / 2]]).repeat(n, 1),
         torch.full((n,), 0.97),
-        torch.full((n, 1, 3), colour),
+        torch.full((n, 1, 3), color),
         torch.full((n,), class_index, dtype=torch.int32),
         torch.arange(n),
     )
@@ -67,7 +69,7 @@ def views_of(splats, cameras, explicit=True, mask=None, primitive="3d", **option
 
     anchors = SimpleNamespace(ids=splats.ids)
     model = SimpleNamespace(generate=generate, explicit=explicit, primitive=primitive, anchors=anchors)
-    model.object_ids = np.arange(3) * 10
+    model.classes = ClassTable([0, 10, 20])
     capture = SimpleNamespace(mask=lambda index, downscale: mask)
     scene = SimpleNamespace(camera=lambda index, downscale: cameras[index], capture=capture)
     return Views(model, scene, range(len(cameras)), **options)
@@ -112,9 +114,9 @@ def test_a_depth_is_sure_where_the_light_comes_from_one_place():
             flat["scales"] = torch.full_like(splats.scales, 0.025)
         found = views_of(splats._replace(**flat), [camera], primitive=primitive).object_view(0, [2])
         y, x = 24 - found.y, 32 - found.x
-        assert found.doubt[y, x] > 0.2, primitive
-        assert found.doubt[y, x - 6] < 0.02 and found.depth[y, x - 6] == pytest.approx(4.0, abs=0.01)
-        assert found.doubt[found.alpha < 0.5].max() == 0
+        assert found.depth_uncertainty[y, x] > 0.2, primitive
+        assert found.depth_uncertainty[y, x - 6] < 0.02 and found.depth[y, x - 6] == pytest.approx(4.0, abs=0.01)
+        assert found.depth_uncertainty[found.alpha < 0.5].max() == 0
     # The median of discs is on one of two that share a surface, their mean is between them.
     first, second = sheet(0.03, 2), sheet(0.0, 2)
     pair = together(first, second)
@@ -127,7 +129,7 @@ def test_a_depth_is_sure_where_the_light_comes_from_one_place():
     assert 3.973 < depth < 3.997
 
 
-def test_what_a_mask_leaves_unlabelled_beside_an_object_is_not_the_object():
+def test_what_a_mask_leaves_unlabeled_beside_an_object_is_not_the_object():
     mask = np.zeros((48, 64), np.int32)
     mask[:, :32] = 20
     splats = sheet(0.0, 2)
@@ -175,8 +177,8 @@ def test_views_stay_within_their_memory():
 # --- shapes that are seen exactly ------------------------------------------------------------------------------------
 
 
-def ball(centre=(0, 0, 0), radius=0.5):
-    return lambda p: np.linalg.norm(p - np.array(centre), axis=-1) - radius
+def ball(center=(0, 0, 0), radius=0.5):
+    return lambda p: np.linalg.norm(p - np.array(center), axis=-1) - radius
 
 
 def box(low, high):
@@ -229,7 +231,7 @@ class Exact:
             rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.shape)], -1)
             rays = (rays @ camera.viewmat[:3, :3]).reshape(-1, 3)
             length = np.linalg.norm(rays, axis=1)
-            self._alone[index] = np.array([self.trace(s, camera.centre, rays / length[:, None]) for s in self.shapes])
+            self._alone[index] = np.array([self.trace(s, camera.center, rays / length[:, None]) for s in self.shapes])
             self._alone[index] = (self._alone[index] / length).reshape(len(self.shapes), *u.shape)
         return self._alone[index]
 
@@ -293,7 +295,7 @@ def holes(surface):
 def assert_sound(surface):
     """Closed, two-manifold, turned outside, finite, without loose vertices."""
     assert len(surface.faces) and np.isfinite(surface.vertices).all()
-    assert len(surface.invented) == len(surface.faces)
+    assert len(surface.unobserved) == len(surface.faces)
     assert len(np.unique(surface.faces)) == len(surface.vertices)
     assert is_watertight(surface.faces)
     solid = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
@@ -303,7 +305,7 @@ def assert_sound(surface):
 
 def errors(surface, shape, seen_only=True):
     """Distances of the vertices from the true surface."""
-    keep = np.unique(surface.faces[~surface.invented]) if seen_only else slice(None)
+    keep = np.unique(surface.faces[~surface.unobserved]) if seen_only else slice(None)
     return np.abs(shape(surface.vertices[keep]))
 
 
@@ -317,7 +319,7 @@ def test_vertices_lie_exactly_on_a_ball():
     assert np.abs(surface.vertices.mean(0) - [0.03, -0.02, 0.05]).max() < 0.1 * field.voxel
     assert volume(surface) == pytest.approx(4 / 3 * np.pi * 0.5**3, rel=0.02)
     assert holes(surface) == 0
-    assert surface.invented.mean() < 0.02
+    assert surface.unobserved.mean() < 0.02
 
 
 def test_a_box_far_from_the_origin_keeps_its_place():
@@ -359,14 +361,14 @@ def test_what_stands_on_a_table_gets_a_flat_base_where_it_stands():
     field = fuse(views, [0])
     surface = extract(field)
     assert_sound(surface)
-    base = surface.faces[surface.invented]
+    base = surface.faces[surface.unobserved]
     assert len(base)
     assert np.abs(surface.vertices[base][..., 2]).mean() < 0.5 * field.voxel
     assert surface.vertices[:, 2].min() > -1.2 * field.voxel
     assert volume(surface) == pytest.approx(0.6 * 0.6 * 0.7, rel=0.06)
 
     open_surface = extract(field, closed=False)
-    assert not open_surface.invented.any()
+    assert not open_surface.unobserved.any()
     assert not is_watertight(open_surface.faces)
     assert open_surface.vertices[:, 2].min() > -field.voxel
     down = np.cross(*(open_surface.vertices[open_surface.faces[:, i]] - open_surface.vertices[open_surface.faces[:, 0]]
@@ -383,11 +385,11 @@ def test_a_sheet_has_no_hole_where_something_stands_on_it():
     surface = extract(field)
     assert_sound(surface)
     assert holes(surface) == 0
-    centres = surface.vertices[surface.faces].mean(1)
+    centers = surface.vertices[surface.faces].mean(1)
     normals = np.cross(*(surface.vertices[surface.faces[:, i]] - surface.vertices[surface.faces[:, 0]] for i in (1, 2)))
-    cover = (np.abs(centres[:, :2]) < 0.2).all(1) & (normals[:, 2] > 0)
-    assert cover.sum() > 10 and surface.invented[cover].all()
-    assert np.abs(centres[cover, 2]).max() < field.voxel
+    cover = (np.abs(centers[:, :2]) < 0.2).all(1) & (normals[:, 2] > 0)
+    assert cover.sum() > 10 and surface.unobserved[cover].all()
+    assert np.abs(centers[cover, 2]).max() < field.voxel
     assert np.ptp(surface.vertices[:, 2]) < 6 * field.voxel
 
 
@@ -423,7 +425,7 @@ def test_a_poster_becomes_a_thin_flat_slab():
     surface = extract(field)
     assert_sound(surface)
     assert np.ptp(surface.vertices[:, 1]) < 6 * field.voxel
-    front = surface.vertices[np.unique(surface.faces[~surface.invented])]
+    front = surface.vertices[np.unique(surface.faces[~surface.unobserved])]
     inner = np.abs(front[:, 0]) < 0.4
     assert np.abs(front[inner & (np.abs(front[:, 2]) < 0.3), 1]).max() < 0.3 * field.voxel
     assert surface.vertices[:, 0].max() == pytest.approx(0.5, abs=2 * field.voxel)
@@ -445,13 +447,13 @@ def test_views_that_know_how_far_off_they_may_be_do_not_pierce_a_sheet():
             view = super().object_view(index, classes)
             wrong = self.wrong(index)[view.y :, view.x :][: view.alpha.shape[0], : view.alpha.shape[1]]
             depth = np.where(view.depth > 0, view.depth + wrong, 0).astype(np.float32)
-            return replace(view, depth=depth, doubt=np.abs(wrong) * self.said)
+            return replace(view, depth=depth, depth_uncertainty=np.abs(wrong) * self.said)
 
         def scene_map(self, index):
             scene = super().scene_map(index)
             wrong = self.wrong(index)
             depth = np.where(scene.depth > 0, scene.depth + wrong, 0).astype(np.float32)
-            return replace(scene, depth=depth, doubt=np.abs(wrong) * self.said)
+            return replace(scene, depth=depth, depth_uncertainty=np.abs(wrong) * self.said)
 
     poster = box((-0.5, -0.01, -0.4), (0.5, 0.0, 0.4))
     cameras = [camera_at((x, 2.2, z), 128, 96, 120.0) for x in (-0.9, -0.3, 0.3, 0.9) for z in (-0.5, 0, 0.5)]
@@ -482,7 +484,7 @@ def test_one_or_two_views_give_the_side_that_they_saw(count):
     surface = extract(fuse(Exact([shape], around(6)[:count]), [0]))
     assert_sound(surface)
     assert errors(surface, shape).mean() < 0.02
-    assert 0.15 < surface.invented.mean() < 0.8
+    assert 0.15 < surface.unobserved.mean() < 0.8
     assert np.linalg.norm(surface.vertices, axis=1).max() < 0.6
 
 
@@ -540,7 +542,7 @@ def test_memory_grows_with_the_surface_and_is_kept():
     assert_sound(extract(fuse(views, [0], memory_mb=0.1)))
 
 
-def test_the_budget_of_faces_holds_and_invented_faces_stay_marked():
+def test_the_budget_of_faces_holds_and_unobserved_faces_stay_marked():
     cup = box((-0.3, -0.3, 0.0), (0.3, 0.3, 0.7))
     views = Exact([cup, box((-1.5, -1.5, -0.2), (1.5, 1.5, 0.0))], around(12, heights=(0.8, 1.4, 2.2)))
     field = fuse(views, [0])
@@ -548,10 +550,10 @@ def test_the_budget_of_faces_holds_and_invented_faces_stay_marked():
         surface = extract(field, faces=budget)
         assert_sound(surface)
         assert budget // 2 < len(surface.faces) <= budget
-        centres = surface.vertices[surface.faces].mean(1)
-        inner = (np.abs(centres[:, :2]) < 0.22).all(1)
-        assert surface.invented[inner & (centres[:, 2] < 0.1)].all()
-        assert not surface.invented[inner & (centres[:, 2] > 0.4)].any()
+        centers = surface.vertices[surface.faces].mean(1)
+        inner = (np.abs(centers[:, :2]) < 0.22).all(1)
+        assert surface.unobserved[inner & (centers[:, 2] < 0.1)].all()
+        assert not surface.unobserved[inner & (centers[:, 2] > 0.4)].any()
         assert errors(surface, cup).mean() < 0.3 * field.voxel
     assert len(extract(field, closed=False, faces=500).faces) <= 500
 

@@ -1,4 +1,4 @@
-"""Meshes drawn, unwrapped and dressed: against geometry worked out by hand and scenes of known colours."""
+"""Meshes drawn, unwrapped and dressed: against geometry worked out by hand and scenes of known colors."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ import pytest
 import torch
 import trimesh
 
-from backend.mesh.atlas import fill, find_texels
 from backend.mesh.refine import refine
 from backend.mesh.surface import Surface
-from backend.mesh.texture import dress, texture_size
-from backend.mesh.unwrap import unwrap
-from backend.mesh.zbuffer import draw_mesh
-from backend.protocol import Cancelled, Reporter
+from backend.mesh.texture.atlas import fill, find_texels
+from backend.mesh.texture.bake import bake_texture, texture_size
+from backend.mesh.texture.unwrap import unwrap
+from backend.mesh.texture.zbuffer import draw_mesh
 from backend.raster import Camera
+from backend.shared.class_table import ClassTable
+from backend.shared.errors import Cancelled
+from backend.shared.events import Reporter
 
 
 def camera_at(eye, target=(0.0, 0.0, 0.0), width=64, height=48, focal=60.0) -> Camera:
@@ -44,8 +46,8 @@ def test_each_pixel_sees_what_a_ray_hits_first():
     nearest, hit = np.full(len(rays), np.inf), np.full(len(rays), -1)
     for f, (a, b, c) in enumerate(corners):
         normal = np.cross(b - a, c - a)
-        t = ((a - camera.centre) @ normal) / (rays @ normal)
-        p = camera.centre + t[:, None] * rays
+        t = ((a - camera.center) @ normal) / (rays @ normal)
+        p = camera.center + t[:, None] * rays
         inside = np.all([np.cross(q - o, p - o) @ normal >= 0 for o, q in ((a, b), (b, c), (c, a))], axis=0)
         closer = inside & (t > 0) & (t < nearest)
         nearest[closer], hit[closer] = t[closer], f
@@ -54,7 +56,7 @@ def test_each_pixel_sees_what_a_ray_hits_first():
     np.testing.assert_allclose(depth.ravel()[same], nearest[same], rtol=1e-6)
     assert (depth[face < 0] == 0).all()
     points = np.einsum("nij,ni->nj", corners[face.ravel()[same]], weights.reshape(-1, 3)[same].astype(np.float64))
-    np.testing.assert_allclose(points, camera.centre + nearest[same, None] * rays[same], atol=1e-5)
+    np.testing.assert_allclose(points, camera.center + nearest[same, None] * rays[same], atol=1e-5)
 
 
 def test_faces_that_reach_behind_the_camera_or_have_no_area():
@@ -104,7 +106,7 @@ def test_layout_is_free_of_overlaps_and_proportional_to_area(size):
     assert flat.sum() > 0.35
     ratio = flat / mesh.area_faces
     assert ratio.std() / ratio.mean() < 0.35
-    # A texel whose centre lies in two faces would be an overlap: then the areas add up to more than what is covered.
+    # A texel whose center lies in two faces would be an overlap: then the areas add up to more than what is covered.
     texels = find_texels(uvs, 512, 0, 512)
     covered = (texels.weights >= 0).all(1).sum() / 512**2
     np.testing.assert_allclose(covered, flat.sum(), rtol=0.02)
@@ -164,11 +166,11 @@ LOUD = np.array([1.0, 0.0, 1.0], np.float32)
 
 
 class StubViews:
-    """Photos of a mesh of known colours, behind another of one loud colour; class 1 is the first, class 2 the other."""
+    """Photos of a mesh of known colors, behind another of one loud color; class 1 is the first, class 2 the other."""
 
     def __init__(self, mesh, other=None, eyes=24, size=160, masks=True, below=False):
         self.downscale = 1
-        self.model = SimpleNamespace(object_ids=np.array([0, 7, 9]))
+        self.model = SimpleNamespace(classes=ClassTable([0, 7, 9]))
         self.scene = self
         angles = np.arange(eyes) * 2.4
         heights = np.linspace(-0.9 if below else 0.1, 0.9, eyes)
@@ -242,12 +244,12 @@ def psnr(a, b):
     return 10 * np.log10(1 / np.mean((a - b) ** 2))
 
 
-def test_photos_give_the_surface_its_colours_back():
+def test_photos_give_the_surface_its_colors_back():
     mesh = trimesh.creation.icosphere(3, 1.0)
     views = StubViews(mesh, below=True)
     surface = surface_of(mesh)
     uvs = unwrap(surface, 512)
-    texture, colors = dress(surface, uvs, 512, views, [1])
+    texture, colors = bake_texture(surface, uvs, 512, views, [1])
     assert texture.shape == (512, 512, 3) and texture.dtype == np.uint8
     for index in views.held_out:
         image, shown = looked_up(texture, uvs, mesh, views.cameras[index])
@@ -272,7 +274,7 @@ def test_gloss_that_moves_with_the_camera_stays_off_the_texture():
         picture += 0.35 * np.exp(-away)[..., None].astype(np.float32)
     surface = surface_of(mesh)
     uvs = unwrap(surface, 512)
-    texture, _ = dress(surface, uvs, 512, views, [1])
+    texture, _ = bake_texture(surface, uvs, 512, views, [1])
     texels = find_texels(uvs, 512, 0, 512)
     points = np.einsum("nij,ni->nj", mesh.vertices[mesh.faces[texels.face]], texels.weights)
     wrong = np.abs(texture.reshape(-1, 3)[texels.place] / 255 - colors_at(points))
@@ -288,7 +290,7 @@ def test_nothing_of_an_object_in_front_comes_in(masks):
     views = StubViews(mesh, other, masks=masks)
     surface = surface_of(mesh)
     uvs = unwrap(surface, 512)
-    texture, _ = dress(surface, uvs, 512, views, [1])
+    texture, _ = bake_texture(surface, uvs, 512, views, [1])
     texels = find_texels(uvs, 512, 0, 512)
     points = np.einsum("nij,ni->nj", mesh.vertices[mesh.faces[texels.face]], texels.weights)
     color = texture.reshape(-1, 3)[texels.place] / 255
@@ -305,14 +307,14 @@ def test_nothing_of_an_object_in_front_comes_in(masks):
     assert (color[bottom] >= sides.min(0) - 0.1).all() and (color[bottom] <= sides.max(0) + 0.1).all()
 
 
-def test_a_part_behind_another_does_not_take_its_colours():
+def test_a_part_behind_another_does_not_take_its_colors():
     box = trimesh.creation.box((1.6, 1.6, 1.6)).subdivide().subdivide().subdivide()
     ball = trimesh.creation.icosphere(3, 0.5)
     ball.vertices += [1.5, 0.2, 0.3]
     mesh = trimesh.util.concatenate([box, ball])
     surface = surface_of(mesh)
     uvs = unwrap(surface, 512)
-    texture, _ = dress(surface, uvs, 512, StubViews(mesh, below=True), [1])
+    texture, _ = bake_texture(surface, uvs, 512, StubViews(mesh, below=True), [1])
     texels = find_texels(uvs, 512, 0, 512)
     points = np.einsum("nij,ni->nj", mesh.vertices[mesh.faces[texels.face]], texels.weights)
     behind = (points[:, 0] > 0.79) & (points[:, 0] < 0.81) & (np.abs(points[:, 1:] - [0.2, 0.3]) < 0.5).all(1)
@@ -321,18 +323,18 @@ def test_a_part_behind_another_does_not_take_its_colours():
     assert wrong[behind].mean() < 0.03 and np.quantile(wrong, 0.99) < 0.12
 
 
-def test_what_no_photo_shows_has_the_splats_colours_and_a_stop_is_heard():
+def test_what_no_photo_shows_has_the_splats_colors_and_a_stop_is_heard():
     mesh = trimesh.creation.icosphere(2, 1.0)
     views = StubViews(mesh, eyes=6)
     views.labels = [np.where(label == 1, 2, label) for label in views.labels]
     surface = surface_of(mesh)
     uvs = unwrap(surface, 64)
-    texture, _ = dress(surface, uvs, 64, views, [1])
+    texture, _ = bake_texture(surface, uvs, 64, views, [1])
     np.testing.assert_allclose(
         texture.reshape(-1, 3) / 255, np.broadcast_to([0.25, 0.5, 0.75], (64 * 64, 3)), atol=0.01
     )
     views.indices = ()
-    texture, colors = dress(surface, uvs, 64, views, [1])
+    texture, colors = bake_texture(surface, uvs, 64, views, [1])
     assert np.ptp(texture) <= 1 and np.ptp(colors) == 0
 
     class Stopping(Reporter):
@@ -341,7 +343,7 @@ def test_what_no_photo_shows_has_the_splats_colours_and_a_stop_is_heard():
 
     views.indices = (1,)
     with pytest.raises(Cancelled):
-        dress(surface, uvs, 64, views, [1], Stopping())
+        bake_texture(surface, uvs, 64, views, [1], Stopping())
 
 
 def test_a_surface_moves_to_where_the_photos_agree():
@@ -378,10 +380,10 @@ def test_a_surface_stays_where_the_photos_say_nothing():
 def test_size_follows_the_photos():
     mesh = trimesh.creation.icosphere(2, 1.0)
     views = StubViews(mesh, eyes=7, size=80)
-    assert texture_size(surface_of(mesh), views, [1]) == 512
+    assert texture_size(surface_of(mesh), views) == 512
     for factor, size in ((2, 512), (4, 1024), (8, 2048), (16, 4096), (40, 4096)):
         views.cameras = [
             Camera(c.viewmat, np.diag([factor, factor, 1.0]) @ c.K, c.width * factor, c.height * factor)
             for c in StubViews(mesh, eyes=7, size=80).cameras
         ]
-        assert texture_size(surface_of(mesh), views, [1]) == size
+        assert texture_size(surface_of(mesh), views) == size

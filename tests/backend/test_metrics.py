@@ -10,7 +10,7 @@ import pytest
 
 from backend.evaluation import IdScores, ImageScores, evaluate, psnr, ssim
 from backend.evaluation.metrics import boundaries, boundary_distance
-from backend.protocol import Reporter
+from backend.shared.events import Reporter
 
 
 def slow_ssim(a, b):
@@ -47,11 +47,11 @@ def slow_scores(views, zero_is_class=False):
     """The scores by a loop over every ID and every view with full-size masks."""
     ids = sorted({int(i) for _, truth in views for i in np.unique(truth)} - (set() if zero_is_class else {0}))
     iou, biou, dice = {}, {}, {}
-    right = labelled = 0
+    right = labeled = 0
     for predicted, truth in views:
         counted = np.ones(truth.shape, bool) if zero_is_class else truth != 0
         right += int(((predicted == truth) & counted).sum())
-        labelled += int(counted.sum())
+        labeled += int(counted.sum())
     for i in ids:
         same = either = both = band_same = band_either = 0
         for predicted, truth in views:
@@ -69,7 +69,7 @@ def slow_scores(views, zero_is_class=False):
         "miou": np.mean(list(iou.values())),
         "mbiou": np.mean(list(biou.values())),
         "dice": np.mean(list(dice.values())),
-        "accuracy": right / labelled,
+        "accuracy": right / labeled,
         "objects": iou,
     }
 
@@ -83,9 +83,9 @@ def scores(*views, **options):
 
 def blobs(rng, height, width, ids):
     """A label image of a few patches, so that masks have an inside."""
-    centres = rng.random((len(ids), 2)) * (height, width)
+    centers = rng.random((len(ids), 2)) * (height, width)
     y, x = np.mgrid[:height, :width]
-    nearest = ((y[..., None] - centres[:, 0]) ** 2 + (x[..., None] - centres[:, 1]) ** 2).argmin(-1)
+    nearest = ((y[..., None] - centers[:, 0]) ** 2 + (x[..., None] - centers[:, 1]) ** 2).argmin(-1)
     return np.asarray(ids)[nearest]
 
 
@@ -194,7 +194,7 @@ def test_boundary_distance_is_two_percent_of_the_diagonal():
     assert boundary_distance(1, 1) == 1
 
 
-def test_unlabelled_pixels_count_nowhere():
+def test_unlabeled_pixels_count_nowhere():
     rng = np.random.default_rng(6)
     truth = blobs(rng, 40, 50, [0, 1, 2, 3])
     predicted = np.roll(truth, 2, 1)
@@ -207,7 +207,7 @@ def test_unlabelled_pixels_count_nowhere():
     assert scores((predicted, truth)) != expected
 
 
-def test_predicting_nothing_on_labelled_pixels_is_a_miss():
+def test_predicting_nothing_on_labeled_pixels_is_a_miss():
     truth = np.full((10, 10), 4)
     predicted = truth.copy()
     predicted[:, :5] = 0
@@ -234,7 +234,7 @@ def test_ids_that_agree_in_16_bits_are_told_apart():
     assert scores((np.full((6, 6), 7), truth))["miou"] == 0.0
 
 
-def test_nothing_labelled_gives_none_and_not_zero():
+def test_nothing_labeled_gives_none_and_not_zero():
     result = scores((np.ones((5, 5), int), np.zeros((5, 5), int)))
     assert result == {"miou": None, "mbiou": None, "dice": None, "accuracy": None, "objects": {}}
     assert ImageScores().result() == {"psnr": None, "ssim": None}

@@ -6,12 +6,12 @@ import json
 
 import pytest
 
-from backend.objects import SceneObject, edit_objects, merged, read_objects, write_objects
-from backend.protocol import InputError
-from backend.recolour import Recolour
+from backend.shared.color.recolor import Recolor
+from backend.shared.errors import InputError
+from backend.shared.reconstruction.objects import SceneObject, edit_objects, merged, read_objects, write_objects
 
-MUG = {"id": 1, "name": "mug", "colour": [10, 20, 30], "points": 812}
-BOX = {"id": 2**32 - 1, "name": "box", "colour": [40, 50, 60], "points": 7}
+MUG = {"id": 1, "name": "mug", "color": [10, 20, 30], "points": 812}
+BOX = {"id": 2**32 - 1, "name": "box", "color": [40, 50, 60], "points": 7}
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def test_objects_are_as_the_votes_found_them(path):
 
 
 def test_edits_are_seen_and_outlive_a_vote(path):
-    edit_objects(path, {1: dict(name="cup", colour=(255, 0, 0))})
+    edit_objects(path, {1: dict(name="cup", color=(255, 0, 0))})
     edit_objects(path, {1: dict(merged_into=2**32 - 1, left_out=True)})
     edited = SceneObject(1, "cup", (255, 0, 0), 812, 2**32 - 1, True)
     assert read_objects(path)[0] == edited
@@ -53,18 +53,18 @@ def test_an_edit_is_taken_back(path):
 MOVED = ((1.0, 0.0, 0.0, 2.0), (0.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, 0.5), (0.0, 0.0, 0.0, 1.0))
 
 
-def test_colour_place_and_copies_are_edits(path):
-    edit_objects(path, {1: dict(removed=True, recolour=Recolour(hue=0.2).stored(), transform=MOVED, copies=[MOVED])})
+def test_color_place_and_copies_are_edits(path):
+    edit_objects(path, {1: dict(removed=True, recolor=Recolor(hue=0.2).stored(), transform=MOVED, copies=[MOVED])})
     mug = read_objects(path)[0]
-    assert (mug.removed, mug.recolour, mug.transform, mug.copies) == (True, Recolour(hue=0.2), MOVED, (MOVED,))
+    assert (mug.removed, mug.recolor, mug.transform, mug.copies) == (True, Recolor(hue=0.2), MOVED, (MOVED,))
     edit_objects(path, {1: dict(floaters=True, fill=True)})
     assert read_objects(path)[0].floaters and read_objects(path)[0].fill
-    edit_objects(path, {1: dict.fromkeys(("removed", "floaters", "fill", "recolour", "transform", "copies"))})
+    edit_objects(path, {1: dict.fromkeys(("removed", "floaters", "fill", "recolor", "transform", "copies"))})
     assert read_objects(path)[0] == SceneObject(1, "mug", (10, 20, 30), 812)
 
 
 @pytest.mark.parametrize("edit", [
-    {"recolour": 3}, {"recolour": {"hue": "red"}}, {"transform": [[1, 0], [0, 1]]},
+    {"recolor": 3}, {"recolor": {"hue": "red"}}, {"transform": [[1, 0], [0, 1]]},
     {"transform": [[0] * 4] * 3 + [[0, 0, 0, 1]]},
     {"copies": [1]}, {"transform": [*MOVED[:3], [0, 0, 1, 1]]},
 ])  # fmt: skip
@@ -107,8 +107,8 @@ def test_merges_in_a_circle_end():
     "text",
     ["", "{", "[]", "{}", '{"objects": 3}', '{"objects": [{"id": 1}]}', '{"objects": [], "edits": []}',
      '{"objects": [], "edits": {"1": 2}}',
-     '{"objects": [{"id": 1, "name": "a", "colour": [1, 2], "points": 1}]}',
-     '{"objects": [{"id": 1, "name": "a", "colour": [1, 2, 3], "points": 1}], "edits": {"1": {"merged_into": "x"}}}'],
+     '{"objects": [{"id": 1, "name": "a", "color": [1, 2], "points": 1}]}',
+     '{"objects": [{"id": 1, "name": "a", "color": [1, 2, 3], "points": 1}], "edits": {"1": {"merged_into": "x"}}}'],
 )  # fmt: skip
 def test_broken_files_are_one_sentence(tmp_path, text):
     path = tmp_path / "objects.json"

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from backend.picking import BLOCK, Cloud, Placed, View, ids_in, pick
 from backend.raster import Camera, object_map, rasterize
+from backend.shared.splats.picking import BLOCK, Cloud, PickObject, View, ids_in, pick
 
 SIZE = (64, 48)
 
@@ -24,16 +24,16 @@ def splats(count: int, seed: int = 0) -> tuple[np.ndarray, ...]:
     return means, rng.normal(size=(count, 4)), scales, rng.uniform(0.0, 1.0, count), ids
 
 
-def objects_of(means, quats, scales, opacities, ids, matrix=None) -> list[Placed]:
+def objects_of(means, quats, scales, opacities, ids, matrix=None) -> list[PickObject]:
     matrix = np.eye(4) if matrix is None else matrix
     return [
-        Placed(int(i), Cloud(means[ids == i], quats[ids == i], scales[ids == i], opacities[ids == i]), matrix)
+        PickObject(int(i), Cloud(means[ids == i], quats[ids == i], scales[ids == i], opacities[ids == i]), matrix)
         for i in np.unique(ids)
     ]
 
 
 def view(distance: float = 3.0, **options) -> View:
-    """From `distance` along z, looking at the middle, turned a little, with the principal point off the centre."""
+    """From `distance` along z, looking at the middle, turned a little, with the principal point off the center."""
     turned = np.array([[0.96, 0.28, 0, 0], [-0.28, 0.96, 0, 0], [0, 0, 1, distance], [0, 0, 0, 1]])
     return View(turned, 55.0, 60.0, 30.0, 26.0, *SIZE, **options)
 
@@ -50,7 +50,7 @@ def drawn(view: View, means, quats, scales, opacities, ids) -> tuple[np.ndarray,
     return found, probability, picture.alpha.numpy()
 
 
-def assert_agrees(objects: list[Placed], view: View, ids: np.ndarray, probability: np.ndarray) -> None:
+def assert_agrees(objects: list[PickObject], view: View, ids: np.ndarray, probability: np.ndarray) -> None:
     """Every third pixel's pick is what is drawn, and weighs as much."""
     asked = 0
     for y in range(1, SIZE[1], 3):
@@ -60,8 +60,8 @@ def assert_agrees(objects: list[Placed], view: View, ids: np.ndarray, probabilit
             if seen is None:
                 assert ids[y, x] == -1
                 continue
-            assert seen.weight == pytest.approx(probability[y, x], abs=2e-4)
-            assert seen.object_id == ids[y, x] or abs(seen.weight - probability[y, x]) < 1e-5
+            assert seen.probability == pytest.approx(probability[y, x], abs=2e-4)
+            assert seen.object_id == ids[y, x] or abs(seen.probability - probability[y, x]) < 1e-5
     assert asked > 300
 
 
@@ -88,19 +88,20 @@ def test_an_object_moved_turned_and_stretched_is_picked_where_it_is():
 
 
 def test_a_splat_in_front_hides_what_it_covers_and_hidden_ones_are_not_there():
-    front = Placed(7, one_splat((0, 0, -1), 0.2, 0.999), np.eye(4))
-    behind = Placed(9, one_splat((0, 0, 1), 0.4, 0.999), np.eye(4))
+    front = PickObject(7, one_splat((0, 0, -1), 0.2, 0.999), np.eye(4))
+    behind = PickObject(9, one_splat((0, 0, 1), 0.4, 0.999), np.eye(4))
     middle = View(np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1.0]]), 60, 60, 32, 24, *SIZE)
     seen = pick([behind, front], middle, 32, 24)
-    assert seen.object_id == 7 and seen.depth == pytest.approx(2.0) and seen.weight == pytest.approx(0.99)
-    assert pick([behind, Placed(7, front.cloud, np.eye(4), hidden=True)], middle, 32, 24).object_id == 9
+    assert seen.object_id == 7 and seen.depth == pytest.approx(2.0) and seen.probability == pytest.approx(0.99)
+    assert pick([behind, PickObject(7, front.cloud, np.eye(4), hidden=True)], middle, 32, 24).object_id == 9
     # Two see-through splats of one object together outweigh the one between them.
-    parts = [Placed(1, one_splat((0, 0, z), 0.5, 0.4), np.eye(4)) for z in (0, 1)]
-    between = Placed(2, one_splat((0, 0, 0.5), 0.5, 0.5), np.eye(4))
+    parts = [PickObject(1, one_splat((0, 0, z), 0.5, 0.4), np.eye(4)) for z in (0, 1)]
+    between = PickObject(2, one_splat((0, 0, 0.5), 0.5, 0.5), np.eye(4))
     assert pick([*parts, between], middle, 32, 24).object_id == 1
     assert pick([between], middle, 2, 2) is None and pick([], middle, 2, 2) is None
     assert (
-        pick([Placed(1, Cloud(*(np.zeros((0, n)) for n in (3, 4, 3)), np.zeros(0)), np.eye(4))], middle, 2, 2) is None
+        pick([PickObject(1, Cloud(*(np.zeros((0, n)) for n in (3, 4, 3)), np.zeros(0)), np.eye(4))], middle, 2, 2)
+        is None
     )
 
 
@@ -111,20 +112,20 @@ def one_splat(place, size: float, opacity: float) -> Cloud:
 def test_parallel_projection():
     """A splat's size is the same at every depth, and what is nearer hides what is behind."""
     flat = View(np.eye(4), 20.0, 20.0, 32.0, 24.0, *SIZE, near=-50.0, orthographic=True)
-    far = Placed(1, one_splat((0.5, 0, 30.0), 0.25, 0.9), np.eye(4))
+    far = PickObject(1, one_splat((0.5, 0, 30.0), 0.25, 0.9), np.eye(4))
     reach = np.sqrt(2 * np.log(0.9 * 255) * ((0.25 * 20) ** 2 + 0.3))
     assert pick([far], flat, 42 + reach - 0.1, 24).object_id == 1
     assert pick([far], flat, 42 + reach + 0.1, 24) is None
-    near = Placed(2, one_splat((0.5, 0, -30.0), 0.1, 0.9), np.eye(4))
+    near = PickObject(2, one_splat((0.5, 0, -30.0), 0.1, 0.9), np.eye(4))
     assert pick([far, near], flat, 42, 24).object_id == 2
 
 
 def test_rectangles():
     """Small objects in large rectangles are found, hidden ones are not."""
     camera = View(np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1.0]]), 600, 600, 320, 240, 640, 480)
-    wall = Placed(5, one_splat((0, 0, 1), 5.0, 0.999), np.eye(4))
-    speck = Placed(6, one_splat((0.41, 0.2, 0), 0.002, 0.999), np.eye(4))
-    lost = Placed(8, one_splat((0.41, 0.2, 9), 0.02, 0.999), np.eye(4))
+    wall = PickObject(5, one_splat((0, 0, 1), 5.0, 0.999), np.eye(4))
+    speck = PickObject(6, one_splat((0.41, 0.2, 0), 0.002, 0.999), np.eye(4))
+    lost = PickObject(8, one_splat((0.41, 0.2, 9), 0.02, 0.999), np.eye(4))
     everything = [wall, speck, lost]
     assert ids_in(everything, camera, (0, 0, 640, 480)) == {5, 6}
     assert ids_in(everything, camera, (0, 0, 200, 480)) == {5}
@@ -161,5 +162,5 @@ def test_what_no_renderer_draws_is_left_out():
 
 
 def test_blender_can_import_it():
-    code = "import sys; import backend.picking; sys.exit(bool({'torch', 'numba'} & set(sys.modules)))"
+    code = "import sys; import backend.shared.splats.picking; sys.exit(bool({'torch', 'numba'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -12,14 +12,14 @@ from PIL import Image
 
 from backend.capture import load_capture
 from backend.labels import read_points
-from backend.objects import edit_objects, merged, read_objects
-from backend.planning.choosing import changed, chosen, grouped, read_groups
 from backend.planning.coverage import blind_views, duplicate_views, unseen_points
-from backend.planning.decisions import DECISIONS, Choices, Look, decide, planned_settings
-from backend.planning.plan import KEYS, Decision, Plan, read_plan, write_plan
-from backend.protocol import EXIT_DONE, InputError
-from backend.training.loop import Trainer
+from backend.planning.decisions import DECISIONS, Choices, PlanningContext, decide, planned_settings
+from backend.shared.errors import EXIT_DONE, InputError
+from backend.shared.grouping import changed, chosen, grouped, read_groups
+from backend.shared.reconstruction.objects import edit_objects, merged, read_objects
+from backend.shared.reconstruction.plan import KEYS, Decision, Plan, read_plan, write_plan
 from backend.training.settings import Settings, downscale_at
+from backend.training.trainer import Trainer
 
 from .asking import refused
 
@@ -27,7 +27,7 @@ SMALL = ("--offsets", "2")
 
 
 def planned(capture, objects=(), point_ids=None, thorough=False, **choices) -> Plan:
-    return decide(Look(capture, Choices(**choices), objects, point_ids, thorough))
+    return decide(PlanningContext(capture, Choices(**choices), objects, point_ids, thorough))
 
 
 def loaded(scene, tmp_path, **options):
@@ -98,7 +98,7 @@ def test_without_masks_there_is_nothing_about_objects(write_capture, tmp_path):
 def test_one_object_is_taught_only_where_something_else_is(write_capture, tmp_path):
     scene = write_capture(views=9, size=(64, 48), spheres=[(7, np.zeros(3), 1.0)], points=200)
     beside = loaded(scene, tmp_path)
-    assert planned(beside)["labels"].done is None, "unlabelled pixels may be gaps, or the rest of the scene"
+    assert planned(beside)["labels"].done is None, "unlabeled pixels may be gaps, or the rest of the scene"
     ids = scene.point_objects.copy()
     gaps = planned(beside, point_ids=ids)
     assert gaps["labels"].done is False and planned_settings(Settings(), gaps).semantic_weight == 0
@@ -165,7 +165,7 @@ def test_views_and_points_that_nothing_sees_are_found(write_capture, tmp_path):
         reach = model.normalization.to_world(model.anchors.positions.numpy())[:, 1].max()
         assert reach == pytest.approx(highest, rel=0.5)
 
-    nothing = capture.without_training_on(set(scene.names) - {"view_003.png"})
+    nothing = capture.excluding_from_training(set(scene.names) - {"view_003.png"})
     assert blind_views(nothing) == [] and not unseen_points(nothing).any(), "something is left to train on"
 
 
@@ -186,7 +186,7 @@ def test_points_that_no_view_shows_say_nothing_about_the_scene(write_capture, tm
     assert found.model.normalization == alone.model.normalization
     assert found.model.anchors.voxel == alone.model.anchors.voxel
     assert torch.equal(found.model.anchors.rows, alone.model.anchors.rows)
-    assert found.scene.teach_unlabelled == alone.scene.teach_unlabelled
+    assert found.scene.supervise_background == alone.scene.supervise_background
     assert planned(crowded, point_ids=ids)["rest"].done is False, "nothing could vote for them"
 
 
@@ -243,7 +243,7 @@ def test_flat_splats_have_surfaces_where_meshes_are_made(write_capture, tmp_path
 def test_groups_that_make_no_sense_are_refused(tmp_path, content, words):
     path = tmp_path / "groups.json"
     path.write_text(content)
-    edit = {"objects": [{"id": i, "name": f"thing {i}", "colour": [0, 0, 0], "points": 1} for i in (1, 2)]}
+    edit = {"objects": [{"id": i, "name": f"thing {i}", "color": [0, 0, 0], "points": 1} for i in (1, 2)]}
     (tmp_path / "objects.json").write_text(json.dumps(edit))
     with pytest.raises(InputError, match=r"groups\.json") as found:
         grouped(read_objects(tmp_path / "objects.json"), read_groups(path), path)
@@ -270,7 +270,7 @@ def test_only_and_groups_are_edits_that_can_be_taken_back(write_capture, tmp_pat
 def test_choosing_takes_what_is_merged_along(tmp_path):
     (tmp_path / "objects.json").write_text(
         json.dumps({
-            "objects": [{"id": i, "name": f"thing {i}", "colour": [0, 0, 0], "points": 1} for i in (1, 2, 3)],
+            "objects": [{"id": i, "name": f"thing {i}", "color": [0, 0, 0], "points": 1} for i in (1, 2, 3)],
             "edits": {"3": {"merged_into": 1, "left_out": True}},
         })
     )  # fmt: skip
@@ -315,7 +315,7 @@ def test_training_follows_its_plan_to_the_report(write_capture, tmp_path, ask):
     assert began.code == EXIT_DONE
     said = began.messages("status")
     assert any(text.startswith("Left out: training on 1 view, since") for text in said)
-    assert any(text.startswith("Done: reduced pictures") and "--keep pyramid" in text for text in said)
+    assert any(text.startswith("Done: reduced images") and "--keep pyramid" in text for text in said)
     assert any(text.startswith("Expected in ") and "dB below" in text for text in said)
     training = json.loads((out / "objectgs.json").read_text())["training"]
     assert Plan.of(training["plan"]) == read_plan(out / "plan.json")

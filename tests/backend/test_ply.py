@@ -9,8 +9,8 @@ import pytest
 
 from backend.export import read_splats, write_splats
 from backend.model.splats import Splats, concatenate
-from backend.ply import read_vertices, write_vertices
-from backend.protocol import InputError
+from backend.shared.errors import InputError
+from backend.shared.formats.ply import read_vertices, write_vertices
 
 
 def some_splats(n=5, degree=1, seed=0, dtype=np.float32):
@@ -73,8 +73,8 @@ def test_the_bytes_of_one_splat(tmp_path):
         object_ids=np.array([2**32 - 1]),
     )
     assert write_splats(tmp_path / "splats.ply", splats) == []
-    names = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2".split() + [f"f_rest_{i}" for i in range(9)]
-    names += "opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"] + [f"f_rest_{i}" for i in range(9)]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     header = "ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
     header += "".join(f"property float {name}\n" for name in names) + "property uint object_id\nend_header\n"
     rest = [3, 6, 9, 4, 7, 10, 5, 8, 11]
@@ -115,19 +115,19 @@ def test_round_trip(tmp_path, degree):
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
-def test_what_is_invented_is_marked(tmp_path):
+def test_what_is_unobserved_is_marked(tmp_path):
     splats = some_splats(n=5)
-    splats.invented = np.array([0, 1, 0, 0, 1], bool)
+    splats.unobserved = np.array([0, 1, 0, 0, 1], bool)
     write_splats(tmp_path / "a.ply", splats)
     table = read_vertices(tmp_path / "a.ply")
-    assert table.dtype.names[-2:] == ("object_id", "invented") and table["invented"].tolist() == [0, 1, 0, 0, 1]
+    assert table.dtype.names[-2:] == ("object_id", "unobserved") and table["unobserved"].tolist() == [0, 1, 0, 0, 1]
     splats.sh[0, 0, 0] = np.nan
     write_splats(tmp_path / "a.ply", splats)
-    assert read_splats(tmp_path / "a.ply")[0].invented.tolist() == [True, False, False, True]
+    assert read_splats(tmp_path / "a.ply")[0].unobserved.tolist() == [True, False, False, True]
     write_splats(tmp_path / "b.ply", splats, with_ids=False)
     assert read_vertices(tmp_path / "b.ply").dtype.names[-1] == "rot_3"
     both = concatenate([splats, some_splats(n=2, degree=2)])
-    assert both.invented.tolist() == [*splats.invented.tolist(), False, False]
+    assert both.unobserved.tolist() == [*splats.unobserved.tolist(), False, False]
 
 
 def test_no_splats(tmp_path):

@@ -94,8 +94,15 @@ def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolera
     )  # fmt: skip
     want = rasterize_reference(**slow, camera=cam, objects=objects, primitive=primitive)
     index = labels.long().clamp(min=0)[..., None]
-    want_weight = torch.where(labels >= 0, want.probabilities.gather(-1, index)[..., 0], torch.zeros(()).double())
-    pairs = [(got.color, want.color), (got.alpha, want.alpha), (got.weight, want_weight), (got.depth, want.depth)]
+    want_label_probability = torch.where(
+        labels >= 0, want.probabilities.gather(-1, index)[..., 0], torch.zeros(()).double()
+    )
+    pairs = [
+        (got.color, want.color),
+        (got.alpha, want.alpha),
+        (got.label_probability, want_label_probability),
+        (got.depth, want.depth),
+    ]
     if flat:
         pairs += [(got.normals, want.normals), (got.distortion, want.distortion)]
     g = [torch.tensor(rng.normal(size=tuple(a.shape))) for a, _ in pairs]

@@ -1,6 +1,7 @@
 """Kernels are compiled once for a machine; later processes start from numba's cache."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from backend.raster import compile_kernels
+from backend.raster.kernel import digest_of_code
 
 ROOT = Path(__file__).parents[2]
 
@@ -34,11 +36,11 @@ for coefficients in (1, 4, 9, 16):
                 )
                 (picture.color.sum() + (picture.normals.sum() if flat else 0)).backward()
                 object_map(picture)
-from backend.raster import cpu, cpu_bin, cpu_ids, cpu_project, cpu_tiles
+from backend.raster.cpu import binning, blending, blending_backward, ids, projection
 for variants, kernels in (
-    (1, (cpu_bin.depth_order, cpu_bin.bin_splats)),
-    (2, (cpu_project.project, cpu_project.project_backward, cpu_tiles.blend, cpu_tiles.blend_backward,
-         cpu_ids.most_probable)),
+    (1, (binning.depth_order, binning.bin_splats)),
+    (2, (projection.project, projection.project_backward, blending.blend, blending_backward.blend_backward,
+         ids.most_probable)),
 ):
     for kernel in kernels:
         assert len(kernel.signatures) == variants, (kernel, kernel.signatures)
@@ -76,11 +78,12 @@ def test_second_process_compiles_nothing():
 def test_read_only_installation(tmp_path):
     """Where nothing can be written beside the kernels, the cache goes to the user's own folder."""
     copy_backend(tmp_path)
-    (tmp_path / "backend" / "raster" / "__pycache__").write_text("in the way of a cache, whoever runs the test")
+    for folder in ("raster", "raster/cpu"):
+        (tmp_path / "backend" / folder / "__pycache__").write_text("in the way of a cache, whoever runs the test")
     script = """
 import sys, numpy as np
 sys.path.insert(0, sys.argv[1])
-from backend.raster.cpu_bin import depth_order
+from backend.raster.cpu.binning import depth_order
 depth_order(np.ones((1, 12), np.float32), np.zeros(1, np.int32))
 print(sum(depth_order.stats.cache_hits.values()))
 """
@@ -95,7 +98,7 @@ print(sum(depth_order.stats.cache_hits.values()))
 
 
 def test_cache_is_renewed_when_any_file_of_the_package_changes(tmp_path):
-    """A guard is a constant inside kernels of other files."""
+    """A constant of one file is compiled into kernels of other files."""
     copy_backend(tmp_path)
     script = """
 import sys, numpy as np
@@ -110,22 +113,22 @@ print(tangent_limits(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 2.0, 2.0)[1], sum(tangent_lim
         return [float(word) for word in done.stdout.split()]
 
     assert [limit(), limit()] == [[2.3, 0], [2.3, 1]]
-    guards = tmp_path / "backend" / "blending.py"
-    guards.write_text(guards.read_text().replace("TAN_MARGIN = 0.3", "TAN_MARGIN = 0.5"))
+    constants = tmp_path / "backend" / "shared" / "splats" / "blending.py"
+    constants.write_text(constants.read_text().replace("TAN_MARGIN = 0.3", "TAN_MARGIN = 0.5"))
     assert [limit(), limit()] == [[2.5, 0], [2.5, 1]]
 
 
 @pytest.mark.parametrize(
     ("changed", "renewed"), [("raster/camera.py", True), ("model/heads.py", True), ("training/settings.py", False)]
 )
-def test_a_models_kernels_are_renewed_with_what_lies_below_them(tmp_path, changed, renewed):
+def test_a_models_kernels_are_renewed_with_the_layers_below(tmp_path, changed, renewed):
     copy_backend(tmp_path)
     script = """
 import numpy as np
-from backend.model.generate_on_cpu import _say
+from backend.model.generate_on_cpu import _head_output
 layer = np.zeros((1, 1, 33, 16), np.float32)
-_say(np.zeros(32, np.float32), 0, layer, 0, np.zeros(16, np.float32))
-print(sum(_say.stats.cache_hits.values()))
+_head_output(np.zeros(32, np.float32), 0, layer, 0, np.zeros(16, np.float32))
+print(sum(_head_output.stats.cache_hits.values()))
 """
 
     def hits():
@@ -135,5 +138,36 @@ print(sum(_say.stats.cache_hits.values()))
 
     assert [hits(), hits()] == [0, 1]
     path = tmp_path / "backend" / changed
-    path.write_text(path.read_text() + "# changed\n")
+    path.write_text(path.read_text() + "CHANGED = 1\n")
     assert hits() == (0 if renewed else 1)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "changes"),
+    [
+        ("@kernel()\ndef sh_basis", "# A comment.\n\n\n@kernel()\ndef sh_basis", False),
+        ('"""Real spherical harmonics of', '"""Real harmonics of', False),
+        ("    gx = gy = gz = 0.0\n", "    # A comment.\n    gx = gy = gz = 0.0\n", False),
+        (
+            "def sh_gradient(x, y, z, count, g):\n",
+            'def sh_gradient(x, y, z, count, g):\n    """A docstring."""\n',
+            False,
+        ),
+        ("if count > 9:", "if count > 8:", True),
+        ("_C0 = 0.282", "_C0 = 0.283", True),
+        ("out[1] = -_C1 * y", "out[1] = -_C1 / y", True),
+        ("out[2] = _C1 * z", "out[2] = _C1 * x", True),
+    ],
+)
+def test_only_code_changes_a_kernels_digest(old, new, changes):
+    """Not its comments and docstrings."""
+    path = ROOT / "backend" / "raster" / "spherical_harmonics.py"
+    text = path.read_text()
+    without_docstring = re.sub(r'(def sh_gradient\(.*\n) +""".*"""\n', r"\1", text)
+    assert old in without_docstring
+
+    def digest(source):
+        return digest_of_code(compile(source, path, "exec"))
+
+    assert digest(without_docstring) == digest(text)
+    assert (digest(without_docstring.replace(old, new)) != digest(text)) == changes

@@ -40,7 +40,7 @@ widths = st.one_of(powers(-2, 0), powers(-9, 4), st.just(0.0))
 opacities = st.one_of(st.floats(0.02, 0.98), st.sampled_from([0.0, 1.0, -0.5, 1.5]))
 directions = st.tuples(*4 * [st.floats(-1, 1)])
 lengths = st.one_of(st.just(1.0), powers(-6, 6))
-colours = st.tuples(*3 * [st.floats(0, 2)])
+colors = st.tuples(*3 * [st.floats(0, 2)])
 
 
 @st.composite
@@ -53,7 +53,7 @@ def splats(draw):
         "quats": (turn * length).tolist(),
         "scales": [draw(widths) for _ in range(3)],
         "opacities": draw(opacities),
-        "sh": [[(c - 0.5) / C0 for c in draw(colours)], *[[draw(st.floats(-0.3, 0.3))] * 3 for _ in range(3)]],
+        "sh": [[(c - 0.5) / C0 for c in draw(colors)], *[[draw(st.floats(-0.3, 0.3))] * 3 for _ in range(3)]],
         "ids": draw(st.integers(0, OBJECTS - 1)),
     }
 
@@ -84,7 +84,7 @@ def drawn(scene, cam=CAMERA, primitive="3d", gradient=True, labels=LABELS):
     )
 
 
-PLANES = ("color", "alpha", "weight", "depth", "normals", "distortion")
+PLANES = ("color", "alpha", "label_probability", "depth", "normals", "distortion")
 
 
 def planes_and_gradients(planes, leaves, gradient=True):
@@ -105,7 +105,7 @@ def by_reference(scene, cam, primitive):
     leaves = {k: v.clone() if k == "ids" else v.double().requires_grad_() for k, v in scene.items()}
     want = rasterize_reference(**leaves, camera=cam, objects=OBJECTS, primitive=primitive)
     planes = {name: getattr(want, name) for name in ("color", "alpha", "depth")}
-    planes["weight"] = want.probabilities.gather(-1, LABELS.long()[..., None])[..., 0]
+    planes["label_probability"] = want.probabilities.gather(-1, LABELS.long()[..., None])[..., 0]
     if primitive == "2d":
         planes |= {"normals": want.normals, "distortion": want.distortion}
     return planes_and_gradients({name: planes[name] for name in PLANES if name in planes}, leaves)
@@ -168,7 +168,7 @@ def test_the_unit_of_length_does_not_matter(primitive, scene, power):
     here = drawn(scene, primitive=primitive)
     larger = {**scene, "means": scene["means"] * unit, "scales": scene["scales"] * unit}
     there = drawn(larger, dataclasses.replace(CAMERA, near=NEAR * unit), primitive)
-    for name in ("color", "alpha", "weight", "normals"):
+    for name in ("color", "alpha", "label_probability", "normals"):
         assert name not in here or np.array_equal(there[name], here[name]), name
     assert np.array_equal(there["depth"], here["depth"] * unit)
 
@@ -194,14 +194,14 @@ def test_the_place_in_the_world_does_not_matter(primitive, scene, place):
 @PRIMITIVES
 @anything
 @given(scene=scenes(), data=st.data())
-def test_pictures_are_linear_in_the_colours(primitive, scene, data):
+def test_pictures_are_linear_in_the_colors(primitive, scene, data):
     """Splats at one depth are ordered by their look, so each has a depth of its own."""
     scene = with_distinct_depths(scene)
     count = len(scene["ids"])
-    one, other = (torch.tensor([data.draw(colours) for _ in range(count)]) for _ in range(2))
+    one, other = (torch.tensor([data.draw(colors) for _ in range(count)]) for _ in range(2))
 
-    def picture(colour):
-        return drawn({**scene, "sh": ((colour - 0.5) / C0)[:, None].float()}, primitive=primitive, gradient=False)
+    def picture(color):
+        return drawn({**scene, "sh": ((color - 0.5) / C0)[:, None].float()}, primitive=primitive, gradient=False)
 
     total = picture(one + 2 * other)["color"]
     np.testing.assert_allclose(total, picture(one)["color"] + 2 * picture(other)["color"], atol=1e-5)
@@ -215,7 +215,7 @@ def test_the_weights_and_what_passes_are_all_of_the_light(primitive, scene):
     white = {**scene, "sh": torch.full((len(scene["ids"]), 1, 3), 0.5 / C0), "ids": torch.zeros_like(scene["ids"])}
     found = drawn(white, primitive=primitive, gradient=False, labels=torch.zeros_like(LABELS))
     assert ((found["alpha"] >= 0) & (found["alpha"] <= 1)).all()
-    for plane in (*found["color"], found["weight"]):
+    for plane in (*found["color"], found["label_probability"]):
         np.testing.assert_allclose(plane, found["alpha"], atol=2e-6)
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from backend.raster import Camera, cpu
+from backend.raster import Camera
+from backend.raster.cpu import renderer as cpu
 from backend.raster.reference import rasterize_reference
 from backend.raster.settings import ALPHA_MIN, NEAR
 from tests.backend.test_raster import (
@@ -28,7 +29,7 @@ from tests.backend.test_raster import (
 
 
 def straight(width=WIDTH, height=HEIGHT, focal=FOCAL, **kwargs):
-    """Looks along +z; the point (0, 0, z) falls on the centre of the picture's middle pixel."""
+    """Looks along +z; the point (0, 0, z) falls on the center of the picture's middle pixel."""
     K = np.array([[focal, 0, width // 2 + 0.5], [0, focal, height // 2 + 0.5], [0, 0, 1]])
     return Camera(np.eye(4), K, width, height, **kwargs)
 
@@ -171,7 +172,7 @@ def test_huge_splat_off_the_picture(primitive):
         compare(among_others(one(mean=mean, scale=(scale, scale / 3, scale))), straight(), primitive=primitive)
 
 
-def test_long_diagonal_needle_centred_off_the_picture(primitive):
+def test_long_diagonal_needle_centered_off_the_picture(primitive):
     half = np.pi / 8
     quat = (np.cos(half), 0, 0, np.sin(half))
     for distance in (10.0, 1e3, 1e5):
@@ -196,7 +197,7 @@ def test_overflowing_scale(scale, primitive):
 # Opacity
 
 
-def test_opaque_splat_on_a_pixel_centre_is_drawn(primitive):
+def test_opaque_splat_on_a_pixel_center_is_drawn(primitive):
     for opacity in (0.999, 1.0, 1.7):
         got, _ = compare(one(opacity=opacity, scale=(1e-4,) * 3), straight(), primitive=primitive)
         assert got.alpha[HEIGHT // 2, WIDTH // 2].item() == pytest.approx(0.99)
@@ -221,7 +222,7 @@ def test_nothing_visible(opacity, primitive):
     scene = random_scene(0)
     scene["opacities"] = torch.full_like(scene["opacities"], opacity)
     got, _ = compare(scene, camera(), primitive=primitive)
-    assert not got.color.any() and not got.alpha.any() and not got.weight.any() and not got.depth.any()
+    assert not got.color.any() and not got.alpha.any() and not got.label_probability.any() and not got.depth.any()
     ids, probability = mapped(got)
     assert (ids == -1).all() and not probability.any()
 
@@ -246,7 +247,7 @@ def test_depth_around_the_near_plane(near, primitive):
         assert got.frame.seen[0] == (float(z) > near)
 
 
-def test_splat_at_the_camera_centre_is_dropped(primitive):
+def test_splat_at_the_camera_center_is_dropped(primitive):
     viewmat = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     cam = camera()
     pose = np.eye(4)
@@ -308,13 +309,13 @@ def test_splat_that_is_not_finite_is_dropped(name, value, primitive):
 # Labels
 
 
-def test_no_labelled_pixel(primitive):
+def test_no_labeled_pixel(primitive):
     cam = camera()
     scene = {k: v.requires_grad_(k != "ids") for k, v in as_float32(random_scene(0)).items()}
     labels = torch.full((cam.height, cam.width), -1, dtype=torch.int32)
     picture = rasterize(**scene, camera=cam, labels=labels, primitive=primitive)
-    assert not picture.weight.any()
-    picture.weight.sum().backward()
+    assert not picture.label_probability.any()
+    picture.label_probability.sum().backward()
     assert not any(scene[name].grad.any() for name in NAMES)
 
 
@@ -324,7 +325,7 @@ def test_one_class(primitive):
     scene = as_float32(random_scene(0, objects=1))
     labels = torch.zeros(cam.height, cam.width, dtype=torch.int32)
     picture = rasterize(**scene, camera=cam, labels=labels, primitive=primitive)
-    np.testing.assert_allclose(picture.weight, picture.alpha, atol=1e-6)
+    np.testing.assert_allclose(picture.label_probability, picture.alpha, atol=1e-6)
     compare(random_scene(0, objects=1), cam, objects=1, primitive=primitive)
 
 
@@ -337,8 +338,8 @@ def test_probability_zero_under_the_logarithm(primitive):
     slow = {k: v if k == "ids" else v.double().requires_grad_() for k, v in as_float32(scene).items()}
     floor = 1e-6
     picture = rasterize(**fast, camera=cam, labels=labels, primitive=primitive)
-    assert not picture.weight[:, :20].any()
-    loss = -torch.log(picture.weight.clamp(min=floor)).mean()
+    assert not picture.label_probability[:, :20].any()
+    loss = -torch.log(picture.label_probability.clamp(min=floor)).mean()
     loss.backward()
     want = rasterize_reference(**slow, camera=cam, objects=5, primitive=primitive).probabilities[..., 4].clone()
     want = torch.where(labels == 4, want, torch.zeros(()).double())
@@ -352,11 +353,11 @@ def test_probability_zero_under_the_logarithm(primitive):
 
 
 def dense_probabilities(scene, cam, values, primitive="3d"):
-    """P (H, W, n) for the n IDs in `values`, from the label weights of the same kernels, one ID at a time."""
+    """P (H, W, n) for the n IDs in `values`, from the label probabilities of the same kernels, one ID at a time."""
     planes = []
     for value in values:
         labels = torch.full((cam.height, cam.width), int(value), dtype=torch.int32)
-        planes.append(rasterize(**scene, camera=cam, labels=labels, primitive=primitive).weight.numpy())
+        planes.append(rasterize(**scene, camera=cam, labels=labels, primitive=primitive).label_probability.numpy())
     return np.stack(planes, -1)
 
 
@@ -377,7 +378,7 @@ def test_object_map_equals_the_dense_computation(seed, primitive):
 
 
 def test_object_map_gives_ties_to_the_smallest_id():
-    """Two objects of equal weight, one at either side of the same row of pixels, in both orders of input."""
+    """Two objects of equal probability, one at either side of the same row of pixels, in both orders of input."""
     cam = straight() if SIMULATED else straight(65, 33)
     left, right = (one(mean=(x, 0, 2.0), scale=(0.5, 0.5, 0.1), opacity=0.2) for x in (-0.1, 0.1))
     for a, b in ((70_000, 9), (9, 70_000)):
@@ -413,7 +414,7 @@ def test_ten_thousand_objects_and_large_ids(primitive):
     ids, probability = mapped(picture)
     labels = torch.tensor(ids)
     again = rasterize(**scene, camera=cam, labels=labels, primitive=primitive)
-    np.testing.assert_allclose(again.weight, probability, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(again.label_probability, probability, rtol=1e-5, atol=1e-6)
     assert np.isin(ids[ids >= 0], names).all()
     # Renaming the objects, in the same order, renames the map and changes nothing else.
     small = {**scene, "ids": torch.tensor(np.argsort(np.argsort(names)).astype(np.int32)[which])}

@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from backend.evaluation import comparison, contact_sheet, id_picture, save_picture, write_report
-from backend.evaluation.report import complete, curve_plot, duration, objects_plot
-from backend.palette import UNLABELLED, colours_of, object_colours, to_linear
-from backend.protocol import Reconstruction
+from backend.evaluation import comparison, contact_sheet, id_image, save_image, write_report
+from backend.evaluation.report import complete
+from backend.evaluation.report_plots import plot_curve, plot_objects
+from backend.evaluation.report_text import duration
+from backend.shared.color.palette import UNLABELED, colors_of, object_colors, to_linear
+from backend.shared.reconstruction.folder import Reconstruction
 
 
 def a_report():
@@ -110,8 +112,8 @@ def test_a_wrong_entry_is_named_and_nothing_is_written(reconstruction, change, w
 
 
 def test_report_md_shows_figures_pictures_and_what_was_left_out(reconstruction):
-    grey = Image.new("RGB", (40, 30), (128, 128, 128))
-    write_report(reconstruction, a_report(), [("View a.png", grey), ("View ../b", grey)], title="Demo")
+    gray = Image.new("RGB", (40, 30), (128, 128, 128))
+    write_report(reconstruction, a_report(), [("View a.png", gray), ("View ../b", gray)], title="Demo")
     text = reconstruction.report_md.read_text(encoding="utf-8")
     for wanted in (
         "# Demo",
@@ -139,7 +141,7 @@ def with_meshes():
     mesh = {
         "vertices": 10_000, "faces": 19_998, "watertight": True, "manifold": True, "chamfer": 0.00251,
         "precision": 0.9, "recall": 0.8, "f1": 0.847, "f1_005": 0.61, "f1_all": 0.7, "texture_psnr": 26.34,
-        "texture_coverage": 0.995, "components": 1, "self_intersections": 0, "invented": 0.125,
+        "texture_coverage": 0.995, "components": 1, "self_intersections": 0, "unobserved": 0.125,
     }  # fmt: skip
     leaky = {**mesh, "watertight": False, "manifold": False, "f1": math.nan, "texture_psnr": 20.0, "faces": 500}
     return {
@@ -171,7 +173,7 @@ def test_meshes_have_a_section_with_their_figures_and_why_there_is_none(reconstr
     assert rows["ring"].count("**no**") == 2 and " — |" in rows["ring"]
     assert "one view shows it" in rows[r"po\|ster"] and "20,000" in rows["whole scene"]
     assert "not asked for" not in section
-    assert "![Each mesh: surface, wires and texture](pictures/meshes.png)" in section
+    assert "![Each mesh: surface, wireframe and texture](pictures/meshes.png)" in section
     assert (np.asarray(Image.open(reconstruction.pictures / "meshes.png")) == np.asarray(sheet)).all()
     write_report(reconstruction, a_report())
     assert not (reconstruction.pictures / "meshes.png").exists(), "no picture of meshes that are gone"
@@ -195,11 +197,11 @@ def test_names_cannot_break_the_tables(reconstruction):
     assert len(re.findall(r"(?<!\\)\|", row)) == 6
 
 
-def test_a_swatch_has_the_colour_of_its_object(reconstruction):
-    write_report(reconstruction, a_report(), colours={2: (1, 2, 3)})
+def test_a_swatch_has_the_color_of_its_object(reconstruction):
+    write_report(reconstruction, a_report(), colors={2: (1, 2, 3)})
     swatches = reconstruction.pictures / "swatches"
     assert Image.open(swatches / "2.png").getpixel((4, 4)) == (1, 2, 3)
-    assert Image.open(swatches / "70000.png").getpixel((4, 4)) == object_colours([70_000])[70_000]
+    assert Image.open(swatches / "70000.png").getpixel((4, 4)) == object_colors([70_000])[70_000]
 
 
 def test_of_many_objects_the_worst_are_shown_and_the_rest_counted(reconstruction):
@@ -214,14 +216,14 @@ def test_of_many_objects_the_worst_are_shown_and_the_rest_counted(reconstruction
 
 def test_the_plot_over_run_time_has_a_panel_for_each_measure():
     curve = complete(a_report())["curve"]
-    both = curve_plot(curve)
-    one = curve_plot([{**point, "miou": None} for point in curve])
+    both = plot_curve(curve)
+    one = plot_curve([{**point, "miou": None} for point in curve])
     assert both is not None and one is not None
     assert both.width > 1.8 * one.width
-    for colour in ((0x3B, 0x7D, 0xD8), (0xD9, 0x73, 0x1A)):
-        assert (np.asarray(both) == colour).all(-1).sum() > 100, colour
-    assert curve_plot([]) is None
-    assert curve_plot([{"seconds": 1.0, "psnr": None, "miou": None}]) is None
+    for color in ((0x3B, 0x7D, 0xD8), (0xD9, 0x73, 0x1A)):
+        assert (np.asarray(both) == color).all(-1).sum() > 100, color
+    assert plot_curve([]) is None
+    assert plot_curve([{"seconds": 1.0, "psnr": None, "miou": None}]) is None
 
 
 def test_the_objects_plot_has_bars_as_long_as_the_iou():
@@ -230,13 +232,13 @@ def test_the_objects_plot_has_bars_as_long_as_the_iou():
         {"id": 2, "name": "$b$", "iou": 0.2},
         {"id": 3, "name": "c", "iou": None},
     ]
-    picture = np.asarray(objects_plot(objects, {1: (255, 0, 0), 2: (0, 0, 255), 3: (0, 255, 0)}))
+    picture = np.asarray(plot_objects(objects, {1: (255, 0, 0), 2: (0, 0, 255), 3: (0, 255, 0)}))
     red, blue, green = (
-        (picture == np.array(colour)).all(-1).any(0).sum() for colour in ((255, 0, 0), (0, 0, 255), (0, 255, 0))
+        (picture == np.array(color)).all(-1).any(0).sum() for color in ((255, 0, 0), (0, 0, 255), (0, 255, 0))
     )
     assert red / blue == pytest.approx(4.0, rel=0.05)
     assert green == 0
-    assert objects_plot([objects[2]], {}) is None
+    assert plot_objects([objects[2]], {}) is None
 
 
 def test_durations():
@@ -245,35 +247,35 @@ def test_durations():
     ]  # fmt: skip
 
 
-def test_colours_depend_on_the_id_alone_and_differ():
-    few, many = object_colours([0, 5, 2**32 - 1]), object_colours(range(2000))
-    assert few[0] == UNLABELLED and few[5] == many[5]
-    assert all(isinstance(channel, int) for colour in few.values() for channel in colour)
+def test_colors_depend_on_the_id_alone_and_differ():
+    few, many = object_colors([0, 5, 2**32 - 1]), object_colors(range(2000))
+    assert few[0] == UNLABELED and few[5] == many[5]
+    assert all(isinstance(channel, int) for color in few.values() for channel in color)
     first = np.array([many[i] for i in range(13)], int)
     apart = np.abs(first[:, None] - first[None]).sum(-1) + 999 * np.eye(13, dtype=int)
     assert apart.min() > 60
     later = np.array([many[i] for i in range(30, 2000)], int)
     assert (np.abs(np.diff(later, axis=0)).sum(1) > 30).mean() > 0.99
-    assert len({tuple(colour) for colour in later.tolist()}) > 1950
-    assert colours_of([]).shape == (0, 3)
+    assert len({tuple(color) for color in later.tolist()}) > 1950
+    assert colors_of([]).shape == (0, 3)
 
 
-def test_colours_for_blender_are_linear():
+def test_colors_for_blender_are_linear():
     assert to_linear((0, 255, 188)) == pytest.approx((0.0, 1.0, 0.5029), abs=1e-4)
 
 
-def test_id_pictures_use_given_colours_and_the_palette_elsewhere():
+def test_id_pictures_use_given_colors_and_the_palette_elsewhere():
     ids = np.array([[0, 7], [2**32 - 1, 7]])
-    picture = id_picture(ids, {7: (9, 8, 7)})
-    palette = object_colours([0, 2**32 - 1])
+    picture = id_image(ids, {7: (9, 8, 7)})
+    palette = object_colors([0, 2**32 - 1])
     assert picture.dtype == np.uint8
     assert picture.tolist() == [[list(palette[0]), [9, 8, 7]], [list(palette[2**32 - 1]), [9, 8, 7]]]
 
 
 def panels(sheet):
-    """Which pure colours the sheet holds, and how many pixels of each."""
-    colours, counts = np.unique(np.asarray(sheet).reshape(-1, 3), axis=0, return_counts=True)
-    return {tuple(colour): int(count) for colour, count in zip(colours.tolist(), counts)}
+    """Which pure colors the sheet holds, and how many pixels of each."""
+    colors, counts = np.unique(np.asarray(sheet).reshape(-1, 3), axis=0, return_counts=True)
+    return {tuple(color): int(count) for color, count in zip(colors.tolist(), counts)}
 
 
 def test_a_comparison_shows_all_four_pictures_unchanged():
@@ -282,8 +284,8 @@ def test_a_comparison_shows_all_four_pictures_unchanged():
     ids, true_ids = np.full((60, 80), 3), np.full((60, 80), 70_000)
     sheet = comparison(truth, render, true_ids, ids, {3: (1, 2, 250), 70_000: (250, 2, 250)}, {3: "cup"}, "A title")
     found = panels(sheet)
-    for colour in ((200, 10, 10), (0, 255, 0), (1, 2, 250), (250, 2, 250)):
-        assert found.get(colour, 0) >= 60 * 80, colour
+    for color in ((200, 10, 10), (0, 255, 0), (1, 2, 250), (250, 2, 250)):
+        assert found.get(color, 0) >= 60 * 80, color
     without = comparison(truth, render, None, ids)
     assert without.width < sheet.width
     assert panels(without).get((250, 2, 250), 0) == 0
@@ -308,11 +310,11 @@ def test_a_contact_sheet_holds_each_picture():
 
 
 def test_pictures_are_saved_small(tmp_path):
-    flat = save_picture(Image.new("RGB", (900, 700), (1, 2, 3)), tmp_path / "flat.png")
+    flat = save_image(Image.new("RGB", (900, 700), (1, 2, 3)), tmp_path / "flat.png")
     assert flat.suffix == ".png" and Image.open(flat).getpixel((0, 0)) == (1, 2, 3)
     y, x = np.mgrid[:600, :1800]
     rng = np.random.default_rng(0)
     photo = 120 + 60 * np.sin(x / 40)[..., None] + 50 * np.cos(y / 30)[..., None] + rng.normal(0, 4, (600, 1800, 3))
-    saved = save_picture(Image.fromarray(np.clip(photo, 0, 255).astype(np.uint8)), tmp_path / "photo.png")
+    saved = save_image(Image.fromarray(np.clip(photo, 0, 255).astype(np.uint8)), tmp_path / "photo.png")
     assert saved.suffix == ".jpg" and saved.stat().st_size < 300_000
     assert sorted(path.name for path in tmp_path.iterdir()) == ["flat.png", "photo.jpg"]

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from backend.raster.reference import sh_colors
-from backend.spherical_harmonics import basis, rotated, rotation
+from backend.shared.splats.spherical_harmonics import basis, rotate, rotation_blocks
 
 RNG = np.random.default_rng(0)
 DIRECTIONS = RNG.normal(size=(200, 3))
@@ -31,12 +31,12 @@ def test_there_is_no_fourth_degree():
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_what_turns_with_its_viewer_keeps_its_colour(degree, mirrored):
+def test_what_turns_with_its_viewer_keeps_its_color(degree, mirrored):
     for turn in Rotation.random(20, rng=1).as_matrix():
         turn = turn @ np.diag([1, -1 if mirrored else 1, 1])
         sh = RNG.normal(size=(5, (degree + 1) ** 2, 3))
         before = np.einsum("dk,nkc->dnc", basis(DIRECTIONS, degree), sh)
-        after = np.einsum("dk,nkc->dnc", basis(DIRECTIONS @ turn.T, degree), rotated(sh, turn))
+        after = np.einsum("dk,nkc->dnc", basis(DIRECTIONS @ turn.T, degree), rotate(sh, turn))
         np.testing.assert_allclose(after, before, atol=1e-13)
-        for block in rotation(turn, degree):
+        for block in rotation_blocks(turn, degree):
             np.testing.assert_allclose(block @ block.T, np.eye(len(block)), atol=1e-13)

@@ -7,8 +7,8 @@ import torch
 from backend.model.anchors import Anchors, Layout, seed_anchors
 from backend.model.generate import generate
 from backend.model.heads import Heads
-from backend.protocol import InputError
 from backend.raster import Camera, rasterize
+from backend.shared.errors import InputError
 from backend.training.settings import Settings
 from benchmarks.stability import each_image, each_mask, elsewhere, train
 from tests.backend.conftest import SPHERES
@@ -28,13 +28,13 @@ def here():
 def test_units_and_place_of_a_capture_do_not_matter(here, scale, offset):
     there = train(elsewhere(scale, offset), **SHORT)
     assert not there.lost and abs(there.psnr - here.psnr) < 0.1
-    expected = scale * np.array(here.trainer.model.normalization.centre) + offset
-    np.testing.assert_allclose(there.trainer.model.normalization.centre, expected, rtol=1e-6, atol=1e-6 * scale)
+    expected = scale * np.array(here.trainer.model.normalization.center) + offset
+    np.testing.assert_allclose(there.trainer.model.normalization.center, expected, rtol=1e-6, atol=1e-6 * scale)
 
 
 @pytest.mark.parametrize("value", [0, 255])
 @pytest.mark.parametrize("options", [SHORT, FLAT], ids=["3d", "2d"])
-def test_images_of_one_colour(options, value):
+def test_images_of_one_color(options, value):
     found = train(each_image(lambda _, pixels: np.full_like(pixels, value)), **options)
     assert not found.lost and found.psnr > 10
 
@@ -73,7 +73,7 @@ def test_wrong_masks_are_outvoted():
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
 @pytest.mark.parametrize("mode", ["explicit", "view"])
-def test_an_anchor_at_the_camera_centre(mode, primitive):
+def test_an_anchor_at_the_camera_center(mode, primitive):
     layout = Layout(4, 8)
     rng = np.random.default_rng(0)
     eye = np.array([0.3, -0.2, 1.0])

@@ -15,10 +15,11 @@ from pathlib import Path
 import psutil
 import pytest
 
-from backend import arguments
+from backend.cli import main as arguments
 from backend.model.checkpoint import load_checkpoint
-from backend.protocol import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled, Reporter
-from backend.stopping import StoppingReporter, StopRequest
+from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled
+from backend.shared.events import Reporter
+from backend.shared.stopping import StoppingReporter, StopRequest
 
 ROOT = Path(__file__).resolve().parents[2]
 

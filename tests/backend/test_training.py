@@ -14,20 +14,22 @@ import torch
 
 from backend.model.anchors import Anchors, Layout, cell_keys, median_spacing, seed_anchors
 from backend.model.checkpoint import CURRENT, PREVIOUS, load_checkpoint, save_checkpoint
+from backend.model.draw import draw
 from backend.model.generate import generate
 from backend.model.growth import MIN_VISITS, GrowthStatistics, grow_and_prune
 from backend.model.heads import Heads
 from backend.model.object_model import Normalization, anchors_in_view
-from backend.protocol import Cancelled, InputError, Reporter
 from backend.raster import Camera, rasterize
-from backend.raster.draw import draw
-from backend.stopping import StopRequest
+from backend.shared.errors import Cancelled, InputError
+from backend.shared.events import Reporter
+from backend.shared.stopping import StopRequest
 from backend.training.adam import BETA1, BETA2, step_rows
-from backend.training.average import EVERY, LONGEST, SHARE, Average
+from backend.training.average import EVERY, FRACTION, MAX_STEPS, Average
 from backend.training.budget import Budget
-from backend.training.loop import Trainer, load_model
-from backend.training.losses import PROBABILITY_FLOOR, image_loss, normal_loss, volume_loss
+from backend.training.losses.on_cpu import PROBABILITY_FLOOR, image_loss, normal_loss, volume_loss
 from backend.training.settings import Settings
+from backend.training.state import load_model
+from backend.training.trainer import Trainer
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -62,10 +64,10 @@ def test_image_loss_and_gradients_equal_autograd(size):
     got = image_loss(*fast, target.float(), labels, 0.2, 0.1)
     color, alpha, weight, background = slow
     shown = color + (1 - alpha) * background[:, None, None]
-    labelled = labels >= 0
-    semantic = -torch.log((weight[labelled] + PROBABILITY_FLOOR) / (1 + PROBABILITY_FLOOR)).mean()
+    labeled = labels >= 0
+    semantic = -torch.log((weight[labeled] + PROBABILITY_FLOOR) / (1 + PROBABILITY_FLOOR)).mean()
     want = 0.8 * (shown - target).abs().mean() + 0.2 * (1 - slow_ssim(shown, target))
-    if labelled.any():
+    if labeled.any():
         want = want + 0.1 * semantic
     assert float(got.detach()) == pytest.approx(float(want.detach()), rel=1e-4)
     got.backward()
@@ -165,14 +167,14 @@ def test_adam_equals_torch_on_seen_rows_and_leaves_the_others():
     rng = np.random.default_rng(0)
     values = torch.tensor(rng.normal(size=(20, 7)), dtype=torch.float32)
     before = values.clone()
-    first, second = torch.zeros_like(values), torch.zeros_like(values)
+    exp_avg, exp_avg_sq = torch.zeros_like(values), torch.zeros_like(values)
     seen = torch.tensor([1, 4, 19])
     parameter = values[seen].requires_grad_()
     optimizer = torch.optim.Adam([parameter], lr=0.01, eps=1e-15)
     rates = np.full(7, 0.01, np.float32)
     for step in range(1, 6):
         g = torch.tensor(rng.normal(size=(3, 7)), dtype=torch.float32)
-        step_rows(values, first, second, seen, g, rates, 1 - BETA1**step, 1 - BETA2**step)
+        step_rows(values, exp_avg, exp_avg_sq, seen, g, rates, 1 - BETA1**step, 1 - BETA2**step)
         parameter.grad = g
         optimizer.step()
     np.testing.assert_allclose(values[seen], parameter.detach(), rtol=1e-5, atol=1e-6)
@@ -182,10 +184,10 @@ def test_adam_equals_torch_on_seen_rows_and_leaves_the_others():
 
 def test_adam_skips_a_row_that_is_not_finite():
     values = torch.ones(3, 4)
-    first, second = torch.zeros_like(values), torch.zeros_like(values)
+    exp_avg, exp_avg_sq = torch.zeros_like(values), torch.zeros_like(values)
     g = torch.ones(3, 4)
     g[1, 2] = np.nan
-    skipped = step_rows(values, first, second, torch.arange(3), g, np.full(4, 0.1, np.float32), 0.1, 0.001)
+    skipped = step_rows(values, exp_avg, exp_avg_sq, torch.arange(3), g, np.full(4, 0.1, np.float32), 0.1, 0.001)
     assert skipped == 1 and (values[1] == 1).all() and (values[[0, 2]] < 1).all()
 
 
@@ -197,7 +199,7 @@ def test_one_anchor_a_voxel_with_the_majority_id():
     ids = np.array([2, 2, 1, 3, 1])
     anchors = seed_anchors(xyz, np.zeros((5, 3)), ids, 1.0, Layout(4, 8), np.random.default_rng(0))
     assert len(anchors) == 2
-    assert anchors.ids.tolist() == [2, 3]  # majority; then the tie goes to the point nearest to the centre
+    assert anchors.ids.tolist() == [2, 3]  # majority; then the tie goes to the point nearest to the center
     assert len(np.unique(cell_keys(anchors.positions, 1.0), axis=0)) == 2
 
 
@@ -501,7 +503,7 @@ def test_normals_and_distortion_are_only_computed_where_they_count(tiny, monkeyp
         asked.append([kwargs[f"want_{what}"] for what in ("depth", "normals", "distortion")])
         return rasterize(*args, **kwargs)
 
-    monkeypatch.setattr("backend.training.loop.rasterize", seen)
+    monkeypatch.setattr("backend.training.step.rasterize", seen)
     normals = dataclasses.replace(FLAT, distortion_weight=0.0)
     for settings, share, wanted in (
         (SMALL, 0.9, [False] * 3), (FLAT, 0.1, [False] * 3), (FLAT, 0.9, [True] * 3),
@@ -572,7 +574,7 @@ def test_the_mean_follows_what_is_learned_and_leaves_out_the_noise(tiny):
             bias.fill_(float(step))
         average.follow(model, step)
         if step % EVERY == 0:
-            weight = EVERY / max(min(SHARE * step, LONGEST), EVERY)
+            weight = EVERY / max(min(FRACTION * step, MAX_STEPS), EVERY)
             expected += weight * (rows - expected)
         if step == EVERY:
             assert torch.equal(average.of(model).anchors.rows, rows), "of a single one"
@@ -602,10 +604,10 @@ def test_a_capture_without_masks_trains_as_one_scene(tiny):
     for i in range(60):
         trainer.step(i / 60)
     assert mean_loss(trainer, 8, 1.0) < before
-    assert trainer.model.object_ids.tolist() == [0]
+    assert trainer.model.classes.ids.tolist() == [0]
 
 
-def test_unlabelled_pixels_are_taught_where_many_points_have_no_object(tiny):
+def test_unlabeled_pixels_are_taught_where_many_points_have_no_object(tiny):
     capture, ids = tiny()
     gaps = Trainer.start(capture, ids, SMALL)
     bare = ids.copy()

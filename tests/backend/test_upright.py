@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from backend.capture import load_capture, stand_up
+from backend.capture import compute_upright, load_capture
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
@@ -38,12 +38,12 @@ def room(rng, arc=360.0, pitch=25.0, roll=2.0, views=40, floor=3000, ceiling=250
     flat = rng.uniform(-3, 3, (floor, 3)) * [1, 1, 0]
     above = rng.uniform(-3, 3, (ceiling, 3)) * [1, 1, 0] + [0, 0, 4.5]
     wall = rng.uniform(-3, 3, (1500, 3)) * [0, 1, 0.6] + [-3, 0, 1.8]
-    things = rng.normal(0, 0.25, (1500, 3)) + rng.choice([[0.5, 0.3, 0.4], [-0.6, 0, 0.5], [0, -0.7, 0.3]], 1500)
-    things[:, 2] = np.abs(things[:, 2])
+    objs = rng.normal(0, 0.25, (1500, 3)) + rng.choice([[0.5, 0.3, 0.4], [-0.6, 0, 0.5], [0, -0.7, 0.3]], 1500)
+    objs[:, 2] = np.abs(objs[:, 2])
     stray = rng.normal(0, 40, (100, 3))
     return (
         viewmats,
-        np.concatenate([flat, above, wall, things]) + rng.normal(0, 0.01, (floor + ceiling + 3000, 3)),
+        np.concatenate([flat, above, wall, objs]) + rng.normal(0, 0.01, (floor + ceiling + 3000, 3)),
         stray,
     )
 
@@ -75,14 +75,14 @@ def test_a_room_turned_at_random_stands_on_its_floor(seed):
     viewmats, xyz, stray = room(rng, **options)
     turn, scale, shift = Rotation.random(random_state=seed).as_matrix(), 10 ** rng.uniform(-4, 3), rng.normal(0, 1, 3)
     viewmats, xyz = moved(viewmats, np.concatenate([xyz, stray]), turn, scale, scale * shift)
-    stood = stand_up(viewmats, xyz)
+    stood = compute_upright(viewmats, xyz)
     assert degrees_between(proper(stood), turn[:, 2]) < 0.5
     floor = xyz[:3000] @ stood.rotation.T + stood.translation
     assert (stood.origin == 0).all() and np.abs(np.median(floor[:, 2])) < 0.02 * scale
     # The smallest rotation that does it: its axis is square to Z and to what becomes Z.
     angle = np.degrees(np.linalg.norm(Rotation.from_matrix(stood.rotation).as_rotvec()))
     assert angle == pytest.approx(degrees_between(proper(stood), np.array([0, 0, 1.0])), abs=1e-6)
-    again = stand_up(viewmats, xyz)
+    again = compute_upright(viewmats, xyz)
     assert all(np.array_equal(getattr(stood, name), getattr(again, name)) for name in ("rotation", "translation"))
 
 
@@ -90,7 +90,7 @@ def test_a_room_turned_at_random_stands_on_its_floor(seed):
 def test_what_is_upright_already_is_left_alone(tilt, lift):
     viewmats, xyz, _ = room(np.random.default_rng(0))
     viewmats, xyz = moved(viewmats, xyz, Rotation.from_euler("x", tilt, degrees=True).as_matrix(), 1, (5, -3, lift))
-    stood = stand_up(viewmats, xyz)
+    stood = compute_upright(viewmats, xyz)
     proper(stood)
     assert (stood.rotation == np.eye(3)).all() == (tilt < 2)
     assert (stood.translation == 0).all() == (tilt < 2 and lift < 1)
@@ -103,7 +103,7 @@ def test_photos_turned_on_their_side_do_not_tilt_it():
     rng = np.random.default_rng(0)
     viewmats, xyz, _ = room(rng, floor=0, ceiling=0, roll=np.where(np.arange(40) % 5 == 0, 90.0, 1.0))
     turn = Rotation.random(random_state=5).as_matrix()
-    stood = stand_up(*moved(viewmats, xyz, turn))
+    stood = compute_upright(*moved(viewmats, xyz, turn))
     assert degrees_between(proper(stood), turn[:, 2]) < 4
 
 
@@ -114,7 +114,7 @@ def test_pictures_straight_down_have_up_behind_them():
     viewmats = looking(eyes, eyes + np.array([0, 0.02, -1]) + rng.normal(0, 0.01, (40, 3)), flown)
     ground = rng.uniform(-6, 6, (2000, 3)) * [1, 1, 0] + rng.normal(0, 0.02, (2000, 3))
     turn = Rotation.random(random_state=1).as_matrix()
-    assert degrees_between(proper(stand_up(*moved(viewmats, ground, turn))), turn[:, 2]) < 1
+    assert degrees_between(proper(compute_upright(*moved(viewmats, ground, turn))), turn[:, 2]) < 1
 
 
 def test_without_a_level_plane_the_cameras_say_and_the_lowest_points_lie_near_the_ground():
@@ -123,7 +123,7 @@ def test_without_a_level_plane_the_cameras_say_and_the_lowest_points_lie_near_th
     cloud = rng.normal([0, 0, 5], 0.3, (3000, 3))
     turn = Rotation.random(random_state=2).as_matrix()
     viewmats, cloud = moved(viewmats, cloud, turn)
-    stood = stand_up(viewmats, cloud)
+    stood = compute_upright(viewmats, cloud)
     assert degrees_between(proper(stood), turn[:, 2]) < 3
     heights = (cloud @ stood.rotation.T + stood.translation)[:, 2]
     assert 0 < (heights < 0).mean() < 0.05 and np.median(heights) == pytest.approx(0.6, abs=0.1)
@@ -133,7 +133,7 @@ def test_a_wall_is_no_ground():
     rng = np.random.default_rng(0)
     viewmats, _, _ = room(rng, arc=60, pitch=10)
     wall = rng.uniform(-2, 2, (3000, 3)) * [0, 1, 1] + [-3, 0, 2]
-    assert degrees_between(proper(stand_up(viewmats, wall)), np.array([0, 0, 1.0])) < 3
+    assert degrees_between(proper(compute_upright(viewmats, wall)), np.array([0, 0, 1.0])) < 3
 
 
 @pytest.mark.parametrize("views", [1, 2, 40])
@@ -149,7 +149,7 @@ def test_captures_that_say_little_are_still_stood_up(views, points):
         "stray": np.concatenate([xyz, [[1e9, 0, 0], [np.nan, 0, 0]]]),
     }[points]
     turn = Rotation.random(random_state=3).as_matrix()
-    stood = stand_up(*moved(viewmats[:views], xyz, turn))
+    stood = compute_upright(*moved(viewmats[:views], xyz, turn))
     assert degrees_between(proper(stood), turn[:, 2]) < (30 if views < 40 else 3)
 
 
@@ -157,14 +157,14 @@ def test_captures_that_say_little_are_still_stood_up(views, points):
 def test_upside_down_is_turned_over(upside_down):
     viewmats, xyz, _ = room(np.random.default_rng(0), roll=0)
     turn = np.diag([1.0, -1, -1]) if upside_down else np.eye(3)
-    assert degrees_between(proper(stand_up(*moved(viewmats, xyz, turn))), turn[:, 2]) < 0.5
+    assert degrees_between(proper(compute_upright(*moved(viewmats, xyz, turn))), turn[:, 2]) < 0.5
 
 
 def test_far_away_coordinates_get_a_round_origin_that_float32_can_follow():
     viewmats, xyz, stray = room(np.random.default_rng(0))
     turn = Rotation.random(random_state=4).as_matrix()
     viewmats, xyz = moved(viewmats, np.concatenate([xyz, stray]), turn, 1, (500_000, 4_500_000, 120))
-    stood = stand_up(viewmats, xyz)
+    stood = compute_upright(viewmats, xyz)
     assert degrees_between(proper(stood), turn[:, 2]) < 0.5
     assert np.abs(stood.origin - [500_000, 4_500_000, 120]).max() < 10
     assert (stood.origin == np.round(stood.origin)).all()
@@ -178,7 +178,7 @@ def test_real_captures_stand_on_their_table(tmp_path, name, held):
         pytest.skip(f"{name} is absent")
     capture = load_capture(DATA / name, tmp_path)
     viewmats, xyz = np.array([view.viewmat for view in capture.views]), capture.points.xyz
-    stood = stand_up(viewmats, xyz)
+    stood = compute_upright(viewmats, xyz)
     up = proper(stood)
     heights = (xyz @ stood.rotation.T + stood.translation)[:, 2]
     eyes = -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3]) @ stood.rotation.T + stood.translation

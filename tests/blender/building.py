@@ -8,8 +8,8 @@ import zlib
 from pathlib import Path
 
 import numpy as np
-from objectgs.backend.mesh_file import Mesh, write_mesh
-from objectgs.backend.ply import write_vertices
+from objectgs.backend.shared.formats.mesh_ply import Mesh, write_mesh
+from objectgs.backend.shared.formats.ply import write_vertices
 
 HUGE = 0xFFFFFFF0
 OBJECTS = {1: "mug", 2: "can", HUGE: "box"}
@@ -32,20 +32,48 @@ def look_at(eye, target=(0.0, 0.0, 0.0)) -> np.ndarray:
 def write_cameras(folder: Path, views, intrinsics=K, size=(640, 480), origin=(0.0, 0.0, 0.0), upright=None) -> None:
     upright = np.eye(4) if upright is None else upright
     cameras = [
-        {"name": f"{i:03}.png", "image": f"images/{i:03}.png", "mask": None, "width": size[0], "height": size[1],
-         "K": np.asarray(intrinsics).tolist(), "viewmat": view.tolist(), "held_out": i % 8 == 0}
-        for i, view in enumerate(views)]
+        {
+            "name": f"{i:03}.png",
+            "image": f"images/{i:03}.png",
+            "mask": None,
+            "width": size[0],
+            "height": size[1],
+            "K": np.asarray(intrinsics).tolist(),
+            "viewmat": view.tolist(),
+            "held_out": i % 8 == 0,
+        }
+        for i, view in enumerate(views)
+    ]
     (folder / "images").mkdir(exist_ok=True)
     for camera in cameras:
         (folder / camera["image"]).write_bytes(b"not read until it is drawn")
-    (folder / "cameras.json").write_text(json.dumps({
-        "capture": str(folder), "origin": list(origin), "cameras": cameras,
-        "upright": {"rotation": upright[:3, :3].tolist(), "translation": upright[:3, 3].tolist()}}))
+    (folder / "cameras.json").write_text(
+        json.dumps(
+            {
+                "capture": str(folder),
+                "origin": list(origin),
+                "cameras": cameras,
+                "upright": {"rotation": upright[:3, :3].tolist(), "translation": upright[:3, 3].tolist()},
+            }
+        )
+    )
 
 
 def write_points(folder: Path, xyz, ids) -> None:
-    table = np.zeros(len(xyz), [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("red", "u1"), ("green", "u1"),
-                                ("blue", "u1"), ("object_id", "<u4"), ("margin", "<f4"), ("votes", "<u4")])
+    table = np.zeros(
+        len(xyz),
+        [
+            ("x", "<f8"),
+            ("y", "<f8"),
+            ("z", "<f8"),
+            ("red", "u1"),
+            ("green", "u1"),
+            ("blue", "u1"),
+            ("object_id", "<u4"),
+            ("margin", "<f4"),
+            ("votes", "<u4"),
+        ],
+    )
     for axis, name in enumerate("xyz"):
         table[name] = np.asarray(xyz)[:, axis]
     table["red"], table["object_id"], table["margin"] = 200, ids, 0.5
@@ -53,15 +81,30 @@ def write_points(folder: Path, xyz, ids) -> None:
 
 
 def write_objects(folder: Path, objects=OBJECTS) -> None:
-    entries = [{"id": object_id, "name": name, "colour": [10, 20, 30 + i], "points": 1}
-               for i, (object_id, name) in enumerate(objects.items())]
+    entries = [
+        {"id": object_id, "name": name, "color": [10, 20, 30 + i], "points": 1}
+        for i, (object_id, name) in enumerate(objects.items())
+    ]
     (folder / "objects.json").write_text(json.dumps({"objects": entries, "edits": {}}))
 
 
 def splat_table(ids, degree: int = 1, seed: int = 0) -> np.ndarray:
     rest = 3 * ((degree + 1) ** 2 - 1)
-    names = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(rest)), "opacity",
-             "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    names = [
+        *"xyz",
+        "f_dc_0",
+        "f_dc_1",
+        "f_dc_2",
+        *(f"f_rest_{i}" for i in range(rest)),
+        "opacity",
+        "scale_0",
+        "scale_1",
+        "scale_2",
+        "rot_0",
+        "rot_1",
+        "rot_2",
+        "rot_3",
+    ]
     table = np.zeros(len(ids), [*((name, "<f4") for name in names), ("object_id", "<u4")])
     rng = np.random.default_rng(seed)
     for name in names:
@@ -71,8 +114,20 @@ def splat_table(ids, degree: int = 1, seed: int = 0) -> np.ndarray:
 
 
 def write_anchors(folder: Path, ids) -> None:
-    table = np.zeros(len(ids), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("object_id", "<u4"), ("scale_0", "<f4"),
-                                ("scale_1", "<f4"), ("scale_2", "<f4"), ("opacity", "<f4"), ("splats", "<u4")])
+    table = np.zeros(
+        len(ids),
+        [
+            ("x", "<f4"),
+            ("y", "<f4"),
+            ("z", "<f4"),
+            ("object_id", "<u4"),
+            ("scale_0", "<f4"),
+            ("scale_1", "<f4"),
+            ("scale_2", "<f4"),
+            ("opacity", "<f4"),
+            ("splats", "<u4"),
+        ],
+    )
     table["object_id"], table["opacity"], table["splats"], table["x"] = ids, 0.25, 7, 3.0
     write_vertices(folder / "anchors.ply", table)
 
@@ -90,27 +145,35 @@ def write_folder(place: Path) -> Path:
     return place
 
 
-def tetrahedron(centre=(0.0, 0.0, 0.0), size: float = 1.0, texture: str = "") -> Mesh:
-    """A closed mesh of 4 vertices and 4 faces, its last face invented; every number differs from its neighbours."""
+def tetrahedron(center=(0.0, 0.0, 0.0), size: float = 1.0, texture: str = "") -> Mesh:
+    """A closed mesh of 4 vertices and 4 faces, its last face unobserved; every number differs from its neighbors."""
     corners = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], float)
     faces = np.array([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)], np.int32)
     normals = corners - 0.25
     return Mesh(
-        vertices=np.asarray(centre) + size * corners,
+        vertices=np.asarray(center) + size * corners,
         normals=(normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32),
-        colors=(10 + 20 * np.arange(12)).reshape(4, 3).astype(np.uint8), faces=faces,
+        colors=(10 + 20 * np.arange(12)).reshape(4, 3).astype(np.uint8),
+        faces=faces,
         uvs=(np.arange(24) / 24.0).reshape(4, 3, 2).astype(np.float32),
-        invented=np.array([False, False, False, True]), texture=texture)
+        unobserved=np.array([False, False, False, True]),
+        texture=texture,
+    )
 
 
 def write_png(path: Path, rgb, size: int = 4) -> None:
-    """A PNG of one colour."""
+    """A PNG of one color."""
+
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
     row = b"\0" + bytes(rgb) * size
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", size, size, 8, 2, 0, 0, 0))
-                     + chunk(b"IDAT", zlib.compress(row * size)) + chunk(b"IEND", b""))
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", struct.pack(">IIBBBBB", size, size, 8, 2, 0, 0, 0))
+        + chunk(b"IDAT", zlib.compress(row * size))
+        + chunk(b"IEND", b"")
+    )
 
 
 def write_meshes(folder: Path, meshes: dict, ids: dict | None = None, rgb=(200, 100, 50)) -> None:
@@ -127,6 +190,14 @@ def write_meshes(folder: Path, meshes: dict, ids: dict | None = None, rgb=(200, 
         mesh.texture = f"{key}.png"
         write_mesh(place / f"{key}.ply", mesh)
         write_png(place / f"{key}.png", rgb)
-        entries[key] = {**entry, "file": f"{key}.ply", "texture": f"{key}.png", "vertices": len(mesh.vertices),
-                        "faces": len(mesh.faces), "watertight": True, "invented": 0.25, "seconds": 0.1}
+        entries[key] = {
+            **entry,
+            "file": f"{key}.ply",
+            "texture": f"{key}.png",
+            "vertices": len(mesh.vertices),
+            "faces": len(mesh.faces),
+            "watertight": True,
+            "unobserved": 0.25,
+            "seconds": 0.1,
+        }
     (place / "meshes.json").write_text(json.dumps({"trained_steps": 7, "meshes": entries}))

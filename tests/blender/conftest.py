@@ -10,11 +10,11 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
-import headless  # noqa: E402
+import headless
 
 headless.extension()
 
-from objectgs.objectgs_addon import demo_capture  # noqa: E402
+from objectgs.objectgs_addon.demo import capture as demo_capture
 
 _status = pytest.ExitCode.OK
 

@@ -13,9 +13,9 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
-from objectgs.backend.protocol import Cancelled  # noqa: E402
-from objectgs.objectgs_addon import demo_capture  # noqa: E402
-from objectgs.objectgs_addon.demo import mask_noise  # noqa: E402
+from objectgs.backend.shared.errors import Cancelled
+from objectgs.objectgs_addon.demo import capture as demo_capture
+from objectgs.objectgs_addon.demo import mask_noise
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = demo_capture.Settings(objects=7, views=4, width=64, height=48, samples=2)
@@ -35,16 +35,16 @@ def small(tmp_path_factory):
 
 
 def read_png(path):
-    """Pixels of the PNGs that the capture holds: grey 8/16 bits and RGB, filters "none" and "up"."""
+    """Pixels of the PNGs that the capture holds: gray 8/16 bits and RGB, filters "none" and "up"."""
     data = path.read_bytes()
     assert data[:8] == b"\x89PNG\r\n\x1a\n"
-    at, body, width, height, depth, colour = 8, b"", 0, 0, 0, 0
+    at, body, width, height, depth, color = 8, b"", 0, 0, 0, 0
     while at < len(data):
         size, kind = struct.unpack_from(">I4s", data, at)
-        chunk = data[at + 8:at + 8 + size]
+        chunk = data[at + 8 : at + 8 + size]
         assert zlib.crc32(kind + chunk) == struct.unpack_from(">I", data, at + 8 + size)[0]
         if kind == b"IHDR":
-            width, height, depth, colour = struct.unpack_from(">IIBB", chunk)
+            width, height, depth, color = struct.unpack_from(">IIBB", chunk)
         elif kind == b"IDAT":
             body += chunk
         at += 12 + size
@@ -53,7 +53,7 @@ def read_png(path):
     for i in range(1, height):
         if lines[i, 0] == 2:
             rows[i] += rows[i - 1]
-    if colour == 2:
+    if color == 2:
         return rows.reshape(height, width, 3)
     return rows if depth == 8 else rows.view(">u2").astype(np.uint16)
 
@@ -77,10 +77,13 @@ def read_model(folder):
         (n,) = struct.unpack_from("<Q", data, at)
         table = np.frombuffer(data, np.dtype([("xy", "<f8", 2), ("id", "<i8")]), n, at + 8)
         at += 8 + 24 * n
-        rotation = np.array([
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])
+        rotation = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
         images[number] = (name, rotation, np.array(t), table["xy"], table["id"])
     assert at == len(data)
 
@@ -125,7 +128,7 @@ def test_files_and_ids(tiny):
         picture = read_png(tiny / "images" / name)
         ids, depth = truth(tiny, name)
         assert picture.shape == (48, 64, 3) and 40 < picture.mean() < 200
-        assert ids.min() >= 1 and depth.dtype == np.float32 and depth.min() > .3 and depth.max() < 6
+        assert ids.min() >= 1 and depth.dtype == np.float32 and depth.min() > 0.3 and depth.max() < 6
         assert np.array_equal(ids, read_png(tiny / "masks" / name))
         found |= set(np.unique(ids).tolist())
     assert found == {int(key) for key in labels}
@@ -147,11 +150,11 @@ def test_masks_and_depth_agree_with_meshes(small):
             pixel, z = look(spots, image, camera)
             inside = (pixel > 0).all(1) & (pixel < [width, height]).all(1) & (z > 0)
             col, row = pixel[inside].astype(int).T
-            visible = np.abs(depth[row, col] - z[inside]) < .004
+            visible = np.abs(depth[row, col] - z[inside]) < 0.004
             front += visible.sum()
             same += (ids[row, col][visible] == entry["id"]).sum()
         assert front > 30, entry["name"]
-        assert same > .93 * front, entry["name"]
+        assert same > 0.93 * front, entry["name"]
 
 
 def test_points_agree_with_depth_and_tracks(small):
@@ -159,7 +162,7 @@ def test_points_agree_with_depth_and_tracks(small):
     hidden = np.load(small / "truth/points.npz")
     outlier, label = hidden["outlier"], hidden["object_id"]
     assert len(points) == len(outlier) > 300
-    assert .005 < outlier.mean() < .07
+    assert 0.005 < outlier.mean() < 0.07
     errors, away, ids_agree = [], [], []
     for number, (xyz, _, error, track) in points.items():
         assert len(track) >= 3 and len(set(track[:, 0])) == len(track)
@@ -180,9 +183,9 @@ def test_points_agree_with_depth_and_tracks(small):
         col, row = np.clip(pixel, 0, [159, 119]).astype(int).T
         away += np.abs(depth[row, col] - z)[label[mine - 1] <= SMALL.objects + 1].tolist()
         ids_agree += (ids[row, col] == label[mine - 1]).tolist()
-    assert .3 < np.mean(errors) < .75  # 0.5 pixels on both axes, less what the fit takes away
-    assert np.median(away) < .01
-    assert np.mean(ids_agree) > .9
+    assert 0.3 < np.mean(errors) < 0.75  # 0.5 pixels on both axes, less what the fit takes away
+    assert np.median(away) < 0.01
+    assert np.mean(ids_agree) > 0.9
 
 
 def test_same_seed_same_bytes(tiny, tmp_path):
@@ -199,8 +202,9 @@ def test_mask_noise():
     ids[30:50, 50:70] = 3
     assert np.array_equal(mask_noise.disturb(ids, 0, np.random.default_rng(0)), ids)
     low, middle, high = (
-        np.mean([mask_noise.disturb(ids, x, np.random.default_rng(i)) != ids for i in range(20)]) for x in (.1, .5, 1))
-    assert 0 < low < middle < high < .5
+        np.mean([mask_noise.disturb(ids, x, np.random.default_rng(i)) != ids for i in range(20)]) for x in (0.1, 0.5, 1)
+    )
+    assert 0 < low < middle < high < 0.5
 
 
 def run(*arguments):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Edits of objects in Blender: removal, colours, places, duplicates; in objects.json, after undo, and shown again."""
+"""Edits of objects in Blender: removal, colors, places, duplicates; in objects.json, after undo, and shown again."""
 
 import itertools
 import json
@@ -14,22 +14,38 @@ import bpy
 import numpy as np
 import pytest
 from mathutils import Matrix, Vector
-from objectgs.backend.mesh_file import read_mesh
-from objectgs.backend.objects import edit_objects, read_objects
-from objectgs.backend.ply import read_vertices, write_vertices
-from objectgs.backend.recolour import Recolour
-from objectgs.objectgs_addon import drawing, object_edits, selection, visibility
+from objectgs.backend.shared.color.recolor import Recolor
+from objectgs.backend.shared.formats.mesh_ply import read_mesh
+from objectgs.backend.shared.formats.ply import read_vertices, write_vertices
+from objectgs.backend.shared.reconstruction.objects import edit_objects, read_objects
+from objectgs.backend.shared.splats.spherical_harmonics import C0
+from objectgs.objectgs_addon import drawing
 from objectgs.objectgs_addon import scene as blender_scene
-from objectgs.objectgs_addon.scene import carrier, fills, floaters, kinds, places, preview
-from objectgs.objectgs_addon.splat_arrays import arrays_of
+from objectgs.objectgs_addon.blender import older_files
+from objectgs.objectgs_addon.drawing.splat_arrays import arrays_of
+from objectgs.objectgs_addon.picking import selection
+from objectgs.objectgs_addon.scene import carrier, kinds
+from objectgs.objectgs_addon.scene.edits import fills, floaters, placement
+from objectgs.objectgs_addon.scene.shading import modifiers, node_groups
+from objectgs.objectgs_addon.scene.shading.graph import VERSION, Graph
+from objectgs.objectgs_addon.scene.shading.materials import COLOR
+from objectgs.objectgs_addon.state import object_edits, visibility
 
 import headless
 
 from .building import HUGE, OBJECTS, look_at, splat_table, tetrahedron, write_cameras, write_folder, write_meshes
 
 ORIGIN = np.array([100.0, -200.0, 30.0])
-RECOLOUR = Recolour(replace=(0.9, 0.2, 0.1), amount=0.6, hue=0.2, saturation=1.4, contrast=1.2, value=0.9,
-                    tint=(1.0, 0.8, 0.6), middle=0.4)
+RECOLOR = Recolor(
+    replace=(0.9, 0.2, 0.1),
+    amount=0.6,
+    hue=0.2,
+    saturation=1.4,
+    contrast=1.2,
+    value=0.9,
+    tint=(1.0, 0.8, 0.6),
+    middle=0.4,
+)
 
 
 @pytest.fixture(scope="module")
@@ -90,9 +106,9 @@ def activate(root, object_id) -> None:
     root.objectgs.active_object = rows.index(object_id)
 
 
-def set_sliders(root, recolour=RECOLOUR, object_id=1) -> None:
-    for name in (*object_edits.SLIDERS, *object_edits.COLOURS):
-        setattr(item(root, object_id), name, getattr(recolour, name))
+def set_sliders(root, recolor=RECOLOR, object_id=1) -> None:
+    for name in (*object_edits.SLIDERS, *object_edits.COLORS):
+        setattr(item(root, object_id), name, getattr(recolor, name))
 
 
 def show_again(root) -> None:
@@ -104,79 +120,79 @@ def encoded(linear) -> np.ndarray:
     return np.where(linear > 0.0031308, 1.055 * linear ** (1 / 2.4) - 0.055, 12.92 * linear)
 
 
-def evaluated_colours(thing) -> np.ndarray:
+def evaluated_colors(obj) -> np.ndarray:
     """(n, 4) of the points that geometry nodes make of a carrier in the viewport."""
-    if "vertices" not in thing.modifiers:
+    if "vertices" not in obj.modifiers:
         # What meshes hold can be read in every Blender.
         tree = bpy.data.node_groups.new("vertices", "GeometryNodeTree")
         for way in ("OUTPUT", "INPUT"):
             tree.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
-        graph = preview.Graph(tree)
-        vertices = graph.node("GeometryNodePointsToVertices", {0: graph.node("NodeGroupInput").outputs[0]})
-        graph.node("NodeGroupOutput", {0: vertices.outputs[0]})
-        thing.modifiers.new("vertices", "NODES").node_group = tree
-    return seen_colours(thing)
+        nodes = Graph(tree)
+        vertices = nodes.node("GeometryNodePointsToVertices", {0: nodes.node("NodeGroupInput").outputs[0]})
+        nodes.node("NodeGroupOutput", {0: vertices.outputs[0]})
+        obj.modifiers.new("vertices", "NODES").node_group = tree
+    return seen_colors(obj)
 
 
-def seen_colours(thing) -> np.ndarray:
-    """(n, 4) the colours of the evaluated mesh's vertices."""
-    evaluated = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
+def seen_colors(obj) -> np.ndarray:
+    """(n, 4) the colors of the evaluated mesh's vertices."""
+    evaluated = obj.evaluated_get(bpy.context.evaluated_depsgraph_get())
     mesh = evaluated.to_mesh()
     values = np.empty(4 * len(mesh.vertices), np.float32)
-    mesh.attributes["colour"].data.foreach_get("color", values)
+    mesh.attributes[COLOR].data.foreach_get("color", values)
     evaluated.to_mesh_clear()
     return values.reshape(-1, 4)
 
 
-def show_faint(thing) -> None:
-    preview.set_input(preview.modifier_of(thing, preview.SPLATS_GROUP), "Minimum Opacity", 0.0)
-    thing.update_tag()
+def show_faint(obj) -> None:
+    modifiers.set_input(modifiers.modifier_of(obj, node_groups.SPLATS_GROUP), "Minimum Opacity", 0.0)
+    obj.update_tag()
 
 
-def rendered_quads(thing) -> np.ndarray:
-    """(n, 3) linear colours of the discs that a render would show, one each."""
-    for modifier in thing.modifiers:
-        modifier.show_viewport = kinds.kind_of(modifier.node_group) == preview.RENDER_GROUP
-    return seen_colours(thing).reshape(-1, 4, 4)[:, 0, :3]
+def rendered_quads(obj) -> np.ndarray:
+    """(n, 3) linear colors of the discs that a render would show, one each."""
+    for modifier in obj.modifiers:
+        modifier.show_viewport = kinds.kind_of(modifier.node_group) == node_groups.RENDER_GROUP
+    return seen_colors(obj).reshape(-1, 4, 4)[:, 0, :3]
 
 
-def expected(colours, recolour=None) -> np.ndarray:
-    """Encoded colours as they are to be seen."""
-    if recolour is not None:
-        matrix, offset = recolour.affine()
-        colours = colours @ matrix.T + offset
-    return np.maximum(colours, 0.0)
+def expected(colors, recolor=None) -> np.ndarray:
+    """Encoded colors as they are to be seen."""
+    if recolor is not None:
+        matrix, offset = recolor.affine()
+        colors = colors @ matrix.T + offset
+    return np.maximum(colors, 0.0)
 
 
-# Colours.
+# Colors.
 
 
-def test_points_show_exactly_the_map_of_the_encoded_colours(root):
+def test_points_show_exactly_the_map_of_the_encoded_colors(root):
     splats = part(root, "splats")
     blender_scene.show_kinds(root, "splats")
     show_faint(splats)
-    raw = 0.5 + preview.SH_C0 * carrier.read(splats.data, "radiance:base")[:, :3].astype(float)
+    raw = 0.5 + C0 * carrier.read(splats.data, "radiance:base")[:, :3].astype(float)
     before = carrier.read(splats.data, "radiance:base").copy()
-    assert encoded(evaluated_colours(splats)[:, :3]) == pytest.approx(expected(raw), abs=2e-5)
+    assert encoded(evaluated_colors(splats)[:, :3]) == pytest.approx(expected(raw), abs=2e-5)
     set_sliders(root)
-    wanted = object_edits.recolour_of(item(root))
+    wanted = object_edits.recolor_of(item(root))
     assert wanted.middle == pytest.approx(blender_scene.luma_of(collection_of(root)), abs=1e-5)
-    assert encoded(evaluated_colours(splats)[:, :3]) == pytest.approx(expected(raw, wanted), abs=5e-5)
+    assert encoded(evaluated_colors(splats)[:, :3]) == pytest.approx(expected(raw, wanted), abs=5e-5)
     assert np.array_equal(carrier.read(splats.data, "radiance:base"), before), "attributes stay as they are"
     assert bpy.ops.objectgs.reset_object(what="COLORS") == {"FINISHED"}
-    assert blender_scene.recolour_of(collection_of(root)) is None
-    assert encoded(evaluated_colours(splats)[:, :3]) == pytest.approx(expected(raw), abs=2e-5)
+    assert blender_scene.recolor_of(collection_of(root)) is None
+    assert encoded(evaluated_colors(splats)[:, :3]) == pytest.approx(expected(raw), abs=2e-5)
 
 
 def test_renders_show_the_map_of_all_bands(root):
-    camera = next(thing for thing in root.all_objects if blender_scene.kind_of(thing) == "camera")
+    camera = next(obj for obj in root.all_objects if blender_scene.kind_of(obj) == "camera")
     bpy.context.scene.camera = camera
     blender_scene.show_kinds(root, "splats")
     splats = part(root, "splats")
     plain = encoded(rendered_quads(splats))
     assert len(plain) > 10
-    # Colours below 0 are cut in what is compared with, so only maps of the others can be told.
-    hue = Recolour(hue=0.25, value=0.5, middle=blender_scene.luma_of(collection_of(root)))
+    # Colors below 0 are cut in what is compared with, so only maps of the others can be told.
+    hue = Recolor(hue=0.25, value=0.5, middle=blender_scene.luma_of(collection_of(root)))
     item(root).hue, item(root).value = hue.hue, hue.value
     seen = encoded(rendered_quads(splats))
     positive = (plain > 1e-4).all(1)
@@ -189,7 +205,7 @@ def test_textures_are_mapped_by_the_same_control_and_left_as_they_were(root):
     tree = mesh.data.materials[0].node_tree
     before = sorted((link.from_socket.name, link.to_socket.name) for link in tree.links)
     set_sliders(root)
-    matrix, offset = object_edits.recolour_of(item(root)).affine()
+    matrix, offset = object_edits.recolor_of(item(root)).affine()
     (group,) = [node for node in tree.nodes if node.type == "GROUP"]
     for row, channel in zip(matrix, ("Red", "Green", "Blue")):
         assert np.array(group.inputs[f"Recolor {channel}"].default_value) == pytest.approx(row, abs=1e-6)
@@ -202,8 +218,8 @@ def test_textures_are_mapped_by_the_same_control_and_left_as_they_were(root):
     assert not [node for node in tree.nodes if node.type == "GROUP"]
 
 
-def test_a_rendered_texture_has_the_mapped_colour(root):
-    """Cycles bakes nothing here: the shader's own nodes give a plane's colour, compared with the map of the texel."""
+def test_a_rendered_texture_has_the_mapped_color(root):
+    """Cycles bakes nothing here: the shader's own nodes give a plane's color, compared with the map of the texel."""
     mesh = part(root, "mesh")
     set_sliders(root)
     material = mesh.data.materials[0]
@@ -220,8 +236,8 @@ def test_a_rendered_texture_has_the_mapped_colour(root):
     plane.data.materials.append(material)
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     camera.location, camera.data.type, camera.data.ortho_scale = (0, 0, 2), "ORTHO", 1.0
-    for thing in (plane, camera):
-        stage.collection.objects.link(thing)
+    for obj in (plane, camera):
+        stage.collection.objects.link(obj)
     stage.camera = camera
     blender_scene.prepare_render(stage)
     stage.render.engine, stage.cycles.samples, stage.cycles.use_denoising = "CYCLES", 1, False
@@ -232,40 +248,40 @@ def test_a_rendered_texture_has_the_mapped_colour(root):
     bpy.ops.render.render(write_still=True, scene=stage.name)
     image = bpy.data.images.load(str(picture))
     pixels = np.array(image.pixels[:]).reshape(-1, 4)[:, :3]
-    wanted = expected(np.array([[200, 100, 50]]) / 255, object_edits.recolour_of(item(root)))
+    wanted = expected(np.array([[200, 100, 50]]) / 255, object_edits.recolor_of(item(root)))
     assert pixels == pytest.approx(np.repeat(np.clip(wanted, 0, 1), len(pixels), 0), abs=0.6 / 255)
 
 
-def test_colours_are_stored_and_shown_again_from_the_folder(root, folder):
+def test_colors_are_stored_and_shown_again_from_the_folder(root, folder):
     set_sliders(root)
-    stored = entry(root).recolour
+    stored = entry(root).recolor
     assert stored.hue == 0.2 and stored.tint == (1.0, 0.8, 0.6) and stored.amount == 0.6
-    assert blender_scene.recolour_of(collection_of(root)) == stored
-    edit_objects(folder / "objects.json", {1: {"recolour": None}, 2: {"recolour": RECOLOUR.stored()}})
+    assert blender_scene.recolor_of(collection_of(root)) == stored
+    edit_objects(folder / "objects.json", {1: {"recolor": None}, 2: {"recolor": RECOLOR.stored()}})
     show_again(root)
-    assert blender_scene.recolour_of(collection_of(root)) is None and not object_edits.recolour_of(item(root)).changes
-    assert blender_scene.recolour_of(collection_of(root, 2)) == RECOLOUR
-    assert object_edits.recolour_of(item(root, 2)) == RECOLOUR
+    assert blender_scene.recolor_of(collection_of(root)) is None and not object_edits.recolor_of(item(root)).changes
+    assert blender_scene.recolor_of(collection_of(root, 2)) == RECOLOR
+    assert object_edits.recolor_of(item(root, 2)) == RECOLOR
 
 
-def test_older_groups_are_exchanged_when_they_are_to_recolour(root):
+def test_older_groups_are_exchanged_when_they_are_to_recolor(root):
     splats = part(root, "splats")
-    modifier = preview.modifier_of(splats, preview.SPLATS_GROUP)
-    preview.set_input(modifier, "Point Size", 0.25)
+    modifier = modifiers.modifier_of(splats, node_groups.SPLATS_GROUP)
+    modifiers.set_input(modifier, "Point Size", 0.25)
     newest = modifier.node_group
     older = newest.copy()
-    older[preview.VERSION] = 1
+    older[VERSION] = 1
     for socket in list(older.interface.items_tree):
         if socket.name.startswith("Recolor "):
             older.interface.remove(socket)
     modifier.node_group = older
-    preview.set_input(modifier, "Point Size", 0.25)
+    modifiers.set_input(modifier, "Point Size", 0.25)
     show_again(root)
     assert modifier.node_group == older, "nothing is asked of it that it cannot do"
     item(root).hue = 0.5
     assert modifier.node_group == newest
-    assert preview._inputs_of(modifier)["Point Size"] == 0.25
-    assert preview._inputs_of(modifier)["Material"] == splats.data.materials[0]
+    assert modifiers.inputs_of(modifier)["Point Size"] == 0.25
+    assert modifiers.inputs_of(modifier)["Material"] == splats.data.materials[0]
 
 
 # Removal.
@@ -294,29 +310,32 @@ def test_removed_and_restored(root, folder):
 def test_floaters_go_by_the_backends_rule_and_come_back(root, folder, backend_python):
     activate(root, 1)
     bpy.ops.objectgs.remove_object(floaters=True)
-    unlabelled = part(root, "splats", 0)
-    hidden = blender_scene.hidden_splats(unlabelled.data)
+    unlabeled = part(root, "splats", 0)
+    hidden = blender_scene.hidden_splats(unlabeled.data)
     table = read_vertices(folder / "splats.ply")
-    script = ("import sys, json; from pathlib import Path; from backend.export import read_splats;"
-              "from backend.editing import apply_edits; from backend.objects import read_objects;"
-              "folder = Path(sys.argv[1]); splats = read_splats(folder / 'splats.ply')[0];"
-              "kept = apply_edits(splats, read_objects(folder / 'objects.json'));"
-              "print(json.dumps(kept.means[kept.object_ids == 0].astype(float).tolist()))")
-    ran = subprocess.run([backend_python, "-c", script, folder], cwd=headless.ROOT, capture_output=True, text=True,
-                         check=True)
+    script = (
+        "import sys, json; from pathlib import Path; from backend.export import read_splats;"
+        "from backend.editing import apply_edits; from backend.shared.reconstruction.objects import read_objects;"
+        "folder = Path(sys.argv[1]); splats = read_splats(folder / 'splats.ply')[0];"
+        "kept = apply_edits(splats, read_objects(folder / 'objects.json'));"
+        "print(json.dumps(kept.means[kept.object_ids == 0].astype(float).tolist()))"
+    )
+    ran = subprocess.run(
+        [backend_python, "-c", script, folder], cwd=headless.ROOT, capture_output=True, text=True, check=True
+    )
     kept = {tuple(row) for row in json.loads(ran.stdout)}
     rows = table[table["object_id"] == 0]
     wanted = [tuple(float(row[axis]) for axis in "xyz") not in kept for row in rows]
     assert 0 < hidden.sum() < len(hidden) and hidden.tolist() == wanted
     blender_scene.show_kinds(root, "splats")
-    show_faint(unlabelled)
-    assert len(evaluated_colours(unlabelled)) == (~hidden).sum()
-    assert len(arrays_of(unlabelled.data).means) == (~hidden).sum(), "nor drawn and picked"
+    show_faint(unlabeled)
+    assert len(evaluated_colors(unlabeled)) == (~hidden).sum()
+    assert len(arrays_of(unlabeled.data).means) == (~hidden).sum(), "nor drawn and picked"
     show_again(root)
     assert np.array_equal(blender_scene.hidden_splats(part(root, "splats", 0).data), hidden)
     bpy.ops.objectgs.restore_object(object="1")
-    assert blender_scene.hidden_splats(unlabelled.data) is None
-    assert len(evaluated_colours(unlabelled)) == len(rows)
+    assert blender_scene.hidden_splats(unlabeled.data) is None
+    assert len(evaluated_colors(unlabeled)) == len(rows)
 
 
 def test_the_hull_is_right_where_it_can_be_computed_by_hand():
@@ -336,7 +355,7 @@ def test_the_hull_is_right_where_it_can_be_computed_by_hand():
 def independent(root, local) -> np.ndarray:
     """(n, 3) capture coordinates of parts' vertices, worked out from Blender's own world."""
     bpy.context.view_layer.update()
-    parent = next(thing for thing in root.objects if blender_scene.kind_of(thing) == "parent")
+    parent = next(obj for obj in root.objects if blender_scene.kind_of(obj) == "parent")
     world = np.array(local.matrix_world, float)
     back = np.linalg.inv(np.array(parent.matrix_world, float))
     positions = np.empty(3 * len(local.data.vertices), np.float32)
@@ -347,7 +366,7 @@ def independent(root, local) -> np.ndarray:
 
 
 def test_a_moved_object_is_stored_in_the_captures_coordinates(root, folder, backend_python, tmp_path):
-    parent = next(thing for thing in root.objects if blender_scene.kind_of(thing) == "parent")
+    parent = next(obj for obj in root.objects if blender_scene.kind_of(obj) == "parent")
     parent.matrix_world = Matrix.Scale(2.5, 4) @ parent.matrix_world  # The user set a distance.
     pivot = part(root, "object_parent")
     pivot.rotation_euler = (0.3, -0.4, 1.2)
@@ -358,8 +377,12 @@ def test_a_moved_object_is_stored_in_the_captures_coordinates(root, folder, back
     assert entry(root).transform is not None and entry(root, 2).transform is None
     splats = part(root, "splats")
     blender_scene.show_kinds(root, "splats")
-    ran = subprocess.run([backend_python, "-m", "backend", "export", folder, "--out", tmp_path / "one.ply",
-                          "--objects", "1"], cwd=headless.ROOT, capture_output=True, text=True)
+    ran = subprocess.run(
+        [backend_python, "-m", "backend", "export", folder, "--out", tmp_path / "one.ply", "--objects", "1"],
+        cwd=headless.ROOT,
+        capture_output=True,
+        text=True,
+    )
     assert ran.returncode == 0, ran.stderr
     table = read_vertices(tmp_path / "one.ply")
     assert np.stack([table[axis] for axis in "xyz"], 1) == pytest.approx(independent(root, splats), abs=2e-4)
@@ -368,14 +391,20 @@ def test_a_moved_object_is_stored_in_the_captures_coordinates(root, folder, back
 def test_what_nobody_moved_is_exactly_where_it_was(root, folder):
     before = (folder / "objects.json").read_bytes()
     for collection in blender_scene.object_collections(root).values():
-        assert np.array_equal(blender_scene.place_of(root, collection), np.eye(4))
-    blender_scene.store_places(root)
+        assert np.array_equal(blender_scene.placement_of(root, collection), np.eye(4))
+    blender_scene.store_placements(root)
     assert (folder / "objects.json").read_bytes() == before
 
 
-@pytest.mark.parametrize("linear", [
-    1.3 * np.array(Matrix.Rotation(1.0, 3, (1, 2, 3))), np.diag([1.0, 2.0, 0.5]),
-    np.array([[1.0, 0.6, 0.0], [0.0, 1.0, 0.0], [0.2, 0.0, 1.0]]), np.diag([-1.0, 1.0, 1.0])])
+@pytest.mark.parametrize(
+    "linear",
+    [
+        1.3 * np.array(Matrix.Rotation(1.0, 3, (1, 2, 3))),
+        np.diag([1.0, 2.0, 0.5]),
+        np.array([[1.0, 0.6, 0.0], [0.0, 1.0, 0.0], [0.2, 0.0, 1.0]]),
+        np.diag([-1.0, 1.0, 1.0]),
+    ],
+)
 def test_places_from_the_folder_are_shown_and_stay_as_they_are(root, folder, linear):
     place = np.eye(4)
     place[:3, :3] = linear
@@ -386,17 +415,17 @@ def test_places_from_the_folder_are_shown_and_stay_as_they_are(root, folder, lin
     show_again(root)
     after = independent(root, part(root, "splats"))
     assert after == pytest.approx(before @ place[:3, :3].T + place[:3, 3], abs=2e-4)
-    assert blender_scene.place_of(root, collection_of(root)) == pytest.approx(place, abs=1e-3)
-    blender_scene.store_places(root)
+    assert blender_scene.placement_of(root, collection_of(root)) == pytest.approx(place, abs=1e-3)
+    blender_scene.store_placements(root)
     show_again(root)
     assert (folder / "objects.json").read_bytes() == stored
     part(root, "object_parent").location.x += 1.0
     show_again(root)
     moved = independent(root, part(root, "splats"))
     assert not np.allclose(moved, after, atol=0.1), "what the user moved since stays"
-    blender_scene.store_places(root)
+    blender_scene.store_placements(root)
     assert np.abs(np.array(entry(root).transform) - place).max() > 0.1
-    assert bpy.ops.objectgs.reset_object(what="PLACE") == {"FINISHED"}
+    assert bpy.ops.objectgs.reset_object(what="TRANSFORM") == {"FINISHED"}
     assert independent(root, part(root, "splats")) == pytest.approx(before, abs=2e-4)
     assert entry(root).transform is None
 
@@ -411,11 +440,11 @@ def test_a_part_that_is_moved_alone_and_pivots_elsewhere_count(root):
     bpy.context.view_layer.update()
     pivot.parent = holder
     after = independent(root, splats)
-    place = blender_scene.place_of(root, collection_of(root))
+    place = blender_scene.placement_of(root, collection_of(root))
     assert after == pytest.approx(before @ place[:3, :3].T + place[:3, 3], abs=2e-4)
     wanted = np.eye(4)
     wanted[:3, 3] = 1.0, 0.0, 0.0
-    places.put(root, collection_of(root), wanted)
+    placement.set_placement(root, collection_of(root), wanted)
     assert independent(root, splats) == pytest.approx(before + np.array([1, 0, 0]), abs=2e-4)
 
 
@@ -426,7 +455,7 @@ def test_a_duplicate_shares_its_data_and_is_kept(root, folder):
     activate(root, 1)
     item(root).hue = 0.25
     assert bpy.ops.objectgs.duplicate_object() == {"FINISHED"}
-    (copy,) = blender_scene.copies_of(root)[1]
+    (copy,) = blender_scene.duplicates_of(root)[1]
     assert entry(root).copies == (tuple(tuple(row) for row in np.eye(4).tolist()),)
     for kind in ("splats", "mesh", "anchors"):
         assert kinds.part_of(copy, kind).data == part(root, kind).data
@@ -434,7 +463,7 @@ def test_a_duplicate_shares_its_data_and_is_kept(root, folder):
     assert selection.selected_collections(bpy.context, root) == [copy]
     kinds.part_of(copy, "object_parent").location.x += 4.0
     part(root, "object_parent").location.y += 1.0
-    blender_scene.store_places(root)
+    blender_scene.store_placements(root)
     ((*_, row),) = (np.array(place).T.tolist() for place in entry(root).copies)
     assert row[:3] == pytest.approx([4.0, 0.0, 0.0], abs=1e-4)
     assert entry(root).transform is not None
@@ -442,7 +471,7 @@ def test_a_duplicate_shares_its_data_and_is_kept(root, folder):
     splats = read_vertices(folder / "splats.ply")
     write_vertices(folder / "splats.ply", splats[: len(splats) // 2])
     show_again(root)
-    (again,) = blender_scene.copies_of(root)[1]
+    (again,) = blender_scene.duplicates_of(root)[1]
     assert again == copy and len(kinds.part_of(copy, "splats").data.vertices) == 25
     assert independent(root, kinds.part_of(copy, "splats")) == pytest.approx(place[:25], abs=1e-4)
     visibility.toggle_solo(bpy.context.view_layer, root, 2)
@@ -450,17 +479,17 @@ def test_a_duplicate_shares_its_data_and_is_kept(root, folder):
     visibility.toggle_solo(bpy.context.view_layer, root, 2)
     assert kinds.part_of(copy, "object_parent").visible_get()
     item(root).hue = -0.25
-    assert drawing.owners()[kinds.part_of(copy, "splats")] == copy
+    assert drawing.collections_by_part()[kinds.part_of(copy, "splats")] == copy
     for collection in (copy, collection_of(root)):
-        modifier = preview.modifier_of(kinds.part_of(collection, "splats"), preview.SPLATS_GROUP)
-        row = Recolour(hue=-0.25, middle=item(root).middle).affine()[0][0]
-        assert list(preview._inputs_of(modifier)["Recolor Red"]) == pytest.approx(row, abs=1e-5)
+        modifier = modifiers.modifier_of(kinds.part_of(collection, "splats"), node_groups.SPLATS_GROUP)
+        row = Recolor(hue=-0.25, middle=item(root).middle).affine()[0][0]
+        assert list(modifiers.inputs_of(modifier)["Recolor Red"]) == pytest.approx(row, abs=1e-5)
     blender_scene.show_kinds(root, "splats")
     assert kinds.part_of(copy, "mesh").hide_viewport and not kinds.part_of(copy, "splats").hide_viewport
     activate(root, 2)
     selection.select_collections(bpy.context, [copy])
     assert bpy.ops.objectgs.remove_object() == {"FINISHED"}
-    assert entry(root).copies == () and not entry(root).removed and not blender_scene.copies_of(root)
+    assert entry(root).copies == () and not entry(root).removed and not blender_scene.duplicates_of(root)
 
 
 def test_duplicates_from_the_folder_come_and_go(root, folder):
@@ -468,15 +497,15 @@ def test_duplicates_from_the_folder_come_and_go(root, folder):
     first[0, 3], second[1, 3] = 2.0, 3.0
     edit_objects(folder / "objects.json", {1: {"copies": [first.tolist(), second.tolist()], "removed": True}})
     show_again(root)
-    one, two = blender_scene.copies_of(root)[1]
+    one, two = blender_scene.duplicates_of(root)[1]
     assert one.hide_render and two.hide_viewport, "removed with what they are duplicates of"
     edit_objects(folder / "objects.json", {1: {"copies": [second.tolist()], "removed": None}})
     show_again(root)
-    assert blender_scene.copies_of(root)[1] == [two] and not two.hide_render
-    for thing in list(two.objects):
-        bpy.data.objects.remove(thing)
-    blender_scene.store_places(root)
-    assert entry(root).copies == () and not blender_scene.copies_of(root)
+    assert blender_scene.duplicates_of(root)[1] == [two] and not two.hide_render
+    for obj in list(two.objects):
+        bpy.data.objects.remove(obj)
+    blender_scene.store_placements(root)
+    assert entry(root).copies == () and not blender_scene.duplicates_of(root)
 
 
 def test_blenders_own_duplicates_become_ours(root):
@@ -484,23 +513,23 @@ def test_blenders_own_duplicates_become_ours(root):
     selection.select_object(bpy.context, root, 1)
     chosen = set(bpy.context.selected_objects)
     bpy.ops.object.duplicate()
-    twin = next(thing for thing in bpy.context.selected_objects if blender_scene.kind_of(thing) == "object_parent")
+    twin = next(obj for obj in bpy.context.selected_objects if blender_scene.kind_of(obj) == "object_parent")
     assert twin not in chosen
     twin.location.x += 2.0
-    blender_scene.store_places(root)
-    (copy,) = blender_scene.copies_of(root)[1]
+    blender_scene.store_placements(root)
+    (copy,) = blender_scene.duplicates_of(root)[1]
     assert kinds.part_of(copy, "object_parent") == twin
     assert kinds.part_of(copy, "splats").data == part(root, "splats").data, "its splats are trained with the others"
-    assert len([thing for thing in collection_of(root).objects if blender_scene.kind_of(thing) == "splats"]) == 1
+    assert len([obj for obj in collection_of(root).objects if blender_scene.kind_of(obj) == "splats"]) == 1
     assert np.array(entry(root).copies[0])[:3, 3] == pytest.approx([2, 0, 0], abs=1e-4)
     selection.select_object(bpy.context, root, 2)
     bpy.ops.object.select_all(action="DESELECT")
     part(root, "splats", 2).select_set(True)
     bpy.ops.object.duplicate()
     bpy.context.selected_objects[0].location.y += 1.0
-    blender_scene.store_places(root)
+    blender_scene.store_placements(root)
     assert np.array(entry(root, 2).copies[0])[:3, 3] == pytest.approx([0, 1, 0], abs=1e-4)
-    place = independent(root, kinds.part_of(blender_scene.copies_of(root)[2][0], "splats"))
+    place = independent(root, kinds.part_of(blender_scene.duplicates_of(root)[2][0], "splats"))
     assert place == pytest.approx(independent(root, part(root, "splats", 2)) + np.array([0, 1, 0]), abs=1e-4)
 
 
@@ -512,21 +541,26 @@ def state(root) -> dict:
     splats = part(root, "splats")
     hidden = blender_scene.hidden_splats(part(root, "splats", 0).data)
     return {
-        "inputs": {m.name: {name: list(value) for name, value in preview._inputs_of(m).items()
-                            if name.startswith("Recolor")} for m in splats.modifiers},
+        "inputs": {
+            m.name: {name: list(value) for name, value in modifiers.inputs_of(m).items() if name.startswith("Recolor")}
+            for m in splats.modifiers
+        },
         "nodes": sorted(node.type for node in part(root, "mesh").data.materials[0].node_tree.nodes),
         "places": [list(map(list, part(root, "object_parent", i).matrix_basis)) for i in (1, 2)],
         "flags": [(collection_of(root, i).hide_viewport, collection_of(root, i).hide_render) for i in (1, 2)],
         "hidden": None if hidden is None else hidden.tolist(),
-        "copies": [len(copies) for copies in blender_scene.copies_of(root).values()],
-        "sliders": object_edits.recolour_of(item(root)).stored(), "removed": item(root).removed,
-        "file": {e.id: (e.removed, e.floaters, e.fill, e.recolour, e.transform, e.copies) for e in read_objects(
-            blender_scene.folder_of(root) / "objects.json")},
+        "copies": [len(copies) for copies in blender_scene.duplicates_of(root).values()],
+        "sliders": object_edits.recolor_of(item(root)).stored(),
+        "removed": item(root).removed,
+        "file": {
+            e.id: (e.removed, e.floaters, e.fill, e.recolor, e.transform, e.copies)
+            for e in read_objects(blender_scene.folder_of(root) / "objects.json")
+        },
     }
 
 
 def test_undo_and_redo_restore_everything(root, tmp_path):
-    def recolour():
+    def recolor():
         set_sliders(active())
 
     def move():
@@ -543,7 +577,7 @@ def test_undo_and_redo_restore_everything(root, tmp_path):
 
     bpy.ops.ed.undo_push(message="begin")
     states = [state(active())]
-    for step in (recolour, move, remove, copy):
+    for step in (recolor, move, remove, copy):
         step()
         bpy.ops.ed.undo_push(message=step.__name__)
         states.append(state(active()))
@@ -567,16 +601,16 @@ def test_edits_survive_merging_and_splitting(root):
     object_edits.merge(root, [1], 2)
     assert 1 not in blender_scene.object_collections(root)
     assert object_edits.split(root, 2) == 1
-    assert blender_scene.place_of(root, collection_of(root))[0, 3] == pytest.approx(1.0, abs=1e-4)
-    assert blender_scene.recolour_of(collection_of(root)).hue == 0.1
+    assert blender_scene.placement_of(root, collection_of(root))[0, 3] == pytest.approx(1.0, abs=1e-4)
+    assert blender_scene.recolor_of(collection_of(root)).hue == 0.1
 
 
-def test_a_folder_that_cannot_be_written_takes_the_colour_back(root, folder):
+def test_a_folder_that_cannot_be_written_takes_the_color_back(root, folder):
     item(root).hue = 0.1
     (folder / "objects.json").write_text("{")
     item(root).hue = 0.3
     assert item(root).hue == pytest.approx(0.1)
-    assert blender_scene.recolour_of(collection_of(root)).hue == pytest.approx(0.1)
+    assert blender_scene.recolor_of(collection_of(root)).hue == pytest.approx(0.1)
 
 
 # Files.
@@ -585,19 +619,25 @@ def test_a_folder_that_cannot_be_written_takes_the_colour_back(root, folder):
 def test_a_blend_built_without_a_window_shows_the_edits(fresh, folder):
     place = np.eye(4)
     place[0, 3] = 2.0
-    edit_objects(folder / "objects.json", {
-        1: {"removed": True, "floaters": True}, 2: {"recolour": RECOLOUR.stored(), "copies": [place.tolist()]},
-        HUGE: {"transform": place.tolist()}})
-    ran = subprocess.run([sys.executable, "headless.py", "build", folder], cwd=headless.ROOT, capture_output=True,
-                         text=True)
+    edit_objects(
+        folder / "objects.json",
+        {
+            1: {"removed": True, "floaters": True},
+            2: {"recolor": RECOLOR.stored(), "copies": [place.tolist()]},
+            HUGE: {"transform": place.tolist()},
+        },
+    )
+    ran = subprocess.run(
+        [sys.executable, "headless.py", "build", folder], cwd=headless.ROOT, capture_output=True, text=True
+    )
     assert ran.returncode == 0, ran.stderr
     bpy.ops.wm.open_mainfile(filepath=str(folder / "objectgs.blend"))
     root = next(c for c in bpy.data.collections if blender_scene.kind_of(c) == "reconstruction")
     assert blender_scene.is_removed(collection_of(root)) and collection_of(root).hide_render
     assert blender_scene.hidden_splats(part(root, "splats", 0).data) is not None
-    assert blender_scene.recolour_of(collection_of(root, 2)) == RECOLOUR
-    assert len(blender_scene.copies_of(root)[2]) == 1
-    assert blender_scene.place_of(root, collection_of(root, HUGE)) == pytest.approx(place, abs=1e-4)
+    assert blender_scene.recolor_of(collection_of(root, 2)) == RECOLOR
+    assert len(blender_scene.duplicates_of(root)[2]) == 1
+    assert blender_scene.placement_of(root, collection_of(root, HUGE)) == pytest.approx(place, abs=1e-4)
 
 
 def test_splats_are_exported_with_the_edits_and_imported_again(root, folder, backend_python, tmp_path):
@@ -608,8 +648,9 @@ def test_splats_are_exported_with_the_edits_and_imported_again(root, folder, bac
     table = read_vertices(tmp_path / "all.ply")
     assert set(table["object_id"].tolist()) == {0, 2, HUGE}
     assert np.array(entry(root, 2).transform)[0, 3] == pytest.approx(1.0, abs=1e-4)
-    assert bpy.ops.objectgs.import_splats(
-        filepath=str(tmp_path / "all.ply"), folder=str(tmp_path / "again")) == {"FINISHED"}
+    assert bpy.ops.objectgs.import_splats(filepath=str(tmp_path / "all.ply"), folder=str(tmp_path / "again")) == {
+        "FINISHED"
+    }
     other = active()
     assert other != root and set(blender_scene.object_collections(other)) == {0, 2, HUGE}
 
@@ -621,8 +662,9 @@ def test_meshes_are_exported_as_they_are_seen(root, tmp_path, suffix):
     activate(root, 1)
     bpy.ops.objectgs.duplicate_object()
     before = {name: len(getattr(bpy.data, name)) for name in ("objects", "meshes", "materials", "images", "scenes")}
-    assert bpy.ops.objectgs.export_meshes(filepath=str(tmp_path / "all"), format=suffix,
-                                          coordinates="capture") == {"FINISHED"}
+    assert bpy.ops.objectgs.export_meshes(filepath=str(tmp_path / "all"), format=suffix, coordinates="capture") == {
+        "FINISHED"
+    }
     assert (tmp_path / f"all.{suffix}").stat().st_size > 100
     assert {name: len(getattr(bpy.data, name)) for name in before} == before
     if suffix == "obj":
@@ -634,11 +676,12 @@ def test_meshes_are_exported_as_they_are_seen(root, tmp_path, suffix):
         texture = next(tmp_path.glob("*recolored*.png"))
         image = bpy.data.images.load(str(texture))
         wanted = expected_texel = np.array([200, 100, 50]) / 255
-        matrix, offset = object_edits.recolour_of(item(root)).affine()
+        matrix, offset = object_edits.recolor_of(item(root)).affine()
         wanted = np.clip(matrix @ expected_texel + offset, 0, 1)
         assert image.pixels[:3] == pytest.approx(wanted, abs=0.6 / 255)
-    assert bpy.ops.objectgs.export_meshes(filepath=str(tmp_path / "each"), format=suffix,
-                                          per_object=True) == {"FINISHED"}
+    assert bpy.ops.objectgs.export_meshes(filepath=str(tmp_path / "each"), format=suffix, per_object=True) == {
+        "FINISHED"
+    }
     assert {path.name for path in (tmp_path / "each").glob(f"*.{suffix}")} == {f"mug.{suffix}", f"can.{suffix}"}
 
 
@@ -646,29 +689,30 @@ def test_turned_by_a_right_angle(root):
     """A turn about the middle that can be told by hand."""
     pivot = part(root, "object_parent")
     pivot.rotation_euler.z = math.pi / 2
-    place = blender_scene.place_of(root, collection_of(root))
+    place = blender_scene.placement_of(root, collection_of(root))
     assert place[:3, :3] == pytest.approx(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]), abs=1e-6)
-    middle = np.array(pivot["objectgs_centre"]) + ORIGIN
+    middle = np.array(pivot["objectgs_center"]) + ORIGIN
     assert place[:3, :3] @ middle + place[:3, 3] == pytest.approx(middle, abs=1e-4)
 
 
-# What closes the places of removed objects.
+# Filled holes of removed objects.
 
 
 CLOSING = """
 import json, sys
-from backend.commands.filling import close_places
+from backend.commands.objects.fill import fill_holes
 from backend.editing import apply_edits
 from backend.export import read_splats
-from backend.objects import edit_objects, read_objects
-from backend.protocol import Reconstruction, Reporter
-from backend.stopping import StoppingReporter, StopRequest
+from backend.shared.reconstruction.objects import edit_objects, read_objects
+from backend.shared.events import Reporter
+from backend.shared.reconstruction.folder import Reconstruction
+from backend.shared.stopping import StoppingReporter, StopRequest
 folder = Reconstruction(sys.argv[1])
 splats = read_splats(folder.splats)[0]
 shown = []
 for ids in ([1], [1, int(sys.argv[2])]):
     edit_objects(folder.objects, {i: {"removed": True, "fill": True} for i in ids})
-    close_places(folder, StoppingReporter(Reporter(), StopRequest()))
+    fill_holes(folder, StoppingReporter(Reporter(), StopRequest()))
     kept = apply_edits(splats, read_objects(folder.objects))
     shown.append(kept.means[kept.object_ids == 2].astype(float).tolist())
     edit_objects(folder.objects, {i: {"removed": None, "fill": None} for i in ids})
@@ -678,8 +722,8 @@ print(json.dumps(shown))
 
 @pytest.fixture(scope="module")
 def closed(made, tmp_path_factory, backend_python) -> tuple[Path, list[np.ndarray]]:
-    """The folder with a flat ground, object 2, around a box, object 1, and around one more, object 3. The backend has
-    found already what closes it without the first and without both; and where splats of the ground are then."""
+    """The folder with a flat ground, object 2, around a box, object 1, and another box. The backend has already filled
+    the ground without the first and without both; and the positions of the ground's splats in both cases."""
     folder = Path(shutil.copytree(made, tmp_path_factory.mktemp("closed") / "table top"))
     rng = np.random.default_rng(0)
     flat = np.column_stack([rng.uniform(-1, 1, (4000, 2)), np.zeros(4000)])
@@ -692,8 +736,13 @@ def closed(made, tmp_path_factory, backend_python) -> tuple[Path, list[np.ndarra
     for name, value in (("rot_1", 0), ("rot_2", 0), ("rot_3", 0), ("scale_0", -3), ("scale_1", -3), ("scale_2", -7)):
         splats[name] = value
     write_vertices(folder / "splats.ply", splats)
-    ran = subprocess.run([backend_python, "-c", CLOSING, folder, str(HUGE)], cwd=headless.ROOT, capture_output=True,
-                         text=True, check=True)
+    ran = subprocess.run(
+        [backend_python, "-c", CLOSING, folder, str(HUGE)],
+        cwd=headless.ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     return folder, [np.array(means) for means in json.loads(ran.stdout)]
 
 
@@ -707,7 +756,8 @@ def surface(root) -> dict:
     """Everything that a carrier of splats holds."""
     mesh = part(root, "splats", 2).data
     return {name: (kind, values.tobytes()) for name, (kind, values) in fills._attributes(mesh).items()} | {
-        "position": carrier.read(mesh, "position").tobytes()}
+        "position": carrier.read(mesh, "position").tobytes()
+    }
 
 
 def test_the_place_of_a_removed_object_is_closed_and_opened_again(ground, closed, root):
@@ -718,12 +768,12 @@ def test_the_place_of_a_removed_object_is_closed_and_opened_again(ground, closed
     assert bpy.ops.objectgs.remove_object(fill=True) == {"FINISHED"}
     one = surface(root)
     mesh = part(root, "splats", 2).data
-    assert blender_scene.invented_splats(mesh).sum() == collection_of(root)[blender_scene.INVENTED_COUNT] > 20
+    assert blender_scene.unobserved_splats(mesh).sum() == collection_of(root)[blender_scene.UNOBSERVED_COUNT] > 20
     assert item(root, 2).splats == count and blender_scene.luma_of(collection_of(root, 2)) == luma
     activate(root, HUGE)
     bpy.ops.objectgs.remove_object(fill=True)
-    assert set(fills.closed_places(mesh).tolist()) == {0, 1, HUGE}
-    there = blender_scene.into_capture(root, part(root, "splats", 2))
+    assert set(fills.filled_objects(mesh).tolist()) == {0, 1, HUGE}
+    there = blender_scene.matrix_to_capture(root, part(root, "splats", 2))
     drawn = [arrays_of(mesh).means @ there[:3, :3].T + there[:3, 3]]
     bpy.ops.objectgs.restore_object(object=str(HUGE))
     drawn.insert(0, arrays_of(mesh).means @ there[:3, :3].T + there[:3, 3])
@@ -732,14 +782,14 @@ def test_the_place_of_a_removed_object_is_closed_and_opened_again(ground, closed
     assert surface(root) == one, "the file of before"
     show_again(root)
     assert surface(root) == one
-    assert not bpy.ops.objectgs.close_place.poll(), "the active one is not removed"
+    assert not bpy.ops.objectgs.fill_hole.poll(), "the active one is not removed"
     activate(root, 1)
-    bpy.ops.objectgs.close_place(closed=False)
+    bpy.ops.objectgs.fill_hole(filled=False)
     assert surface(root) == captured and blender_scene.is_removed(collection_of(root))
-    bpy.ops.objectgs.close_place()
+    bpy.ops.objectgs.fill_hole()
     assert surface(root) == one
     bpy.ops.objectgs.restore_object(object="1")
-    assert surface(root) == captured and blender_scene.INVENTED_COUNT not in collection_of(root)
+    assert surface(root) == captured and blender_scene.UNOBSERVED_COUNT not in collection_of(root)
 
 
 def test_until_the_backend_has_found_it_nothing_wrong_is_shown(ground, root, monkeypatch):
@@ -749,7 +799,7 @@ def test_until_the_backend_has_found_it_nothing_wrong_is_shown(ground, root, mon
     python = os.environ["OBJECTGS_PYTHON"]
     monkeypatch.setenv("OBJECTGS_PYTHON", str(ground / "no-python"))
     object_edits.restore(root, [1])
-    assert set(fills.closed_places(part(root, "splats", 2).data).tolist()) == {0, HUGE}
+    assert set(fills.filled_objects(part(root, "splats", 2).data).tolist()) == {0, HUGE}
     assert blender_scene.missing_fill(root, blender_scene.Objects.read(ground)) is not None
     stale = surface(root)
     monkeypatch.setenv("OBJECTGS_PYTHON", python)
@@ -760,18 +810,16 @@ def test_until_the_backend_has_found_it_nothing_wrong_is_shown(ground, root, mon
     assert surface(root) == captured
 
 
-def test_closed_places_come_and_go_with_undo(ground, root):
-    def now():
-        return surface(active()), item(active()).removed
-
-    bpy.ops.ed.undo_push(message="begin")
-    before = now()
-    activate(active(), 1)
-    bpy.ops.objectgs.remove_object(fill=True)
-    bpy.ops.ed.undo_push(message="remove")
-    after = now()
-    part(active(), "object_parent", 2).location.x += 1.0
-    bpy.ops.ed.undo_push(message="move")
-    for step, wanted in ((bpy.ops.ed.undo, after), (bpy.ops.ed.undo, before), (bpy.ops.ed.redo, after)):
-        step()
-        assert now() == wanted
+def test_holes_that_an_earlier_version_filled_are_filled_again_and_restored(ground, root):
+    captured = surface(root)
+    object_edits.remove(root, [1], False, True)
+    mesh, filled = part(root, "splats", 2).data, surface(root)
+    mesh.attributes["unobserved"].name, mesh.attributes["fills"].name = "invented", "closes"
+    mesh["objectgs_fill"] = "fill-of-an-earlier-version.ply"
+    collection_of(root)["objectgs_invented"] = collection_of(root).pop(blender_scene.UNOBSERVED_COUNT)
+    older_files.rename_all()
+    assert set(fills.filled_objects(mesh).tolist()) == {0, 1} and fills.unobserved_splats(mesh).any()
+    show_again(root)
+    assert surface(root) == filled
+    object_edits.restore(root, [1])
+    assert surface(root) == captured

@@ -8,12 +8,12 @@ import subprocess
 import sys
 import time
 import zipfile
-from pathlib import Path
 
 import pytest
-from objectgs.objectgs_addon import backend_process, environment
-from objectgs.objectgs_addon import environment_worker as worker
-from objectgs.objectgs_addon.jobs import JobQueue, State
+from objectgs.objectgs_addon.environment import environment
+from objectgs.objectgs_addon.environment.worker import checks, events, layout, pip, setup
+from objectgs.objectgs_addon.process import backend_process
+from objectgs.objectgs_addon.process.jobs import JobQueue, State
 
 WAIT = 60.0
 
@@ -97,7 +97,7 @@ def test_set_up_after_one_that_was_killed(root):
     assert environment.inspect(folder).python is None
 
     job = environment.set_up_job(sys.executable, folder, "cpu")
-    run(job, worker.environment_python(folder).exists, job.kill)
+    run(job, layout.environment_python(folder).exists, job.kill)
     assert job.state is State.STOPPED
     assert environment.inspect(folder).state == "incomplete" and environment.inspect(folder).python is None
 
@@ -109,8 +109,12 @@ def test_set_up_after_one_that_was_killed(root):
     state = environment.inspect(folder)
     assert state.state == "ready" and "PyTorch 2.13.0" in state.sentence
     assert not (folder / "venv" / "leftover").exists() and not (folder / "tmp").exists()
-    found = subprocess.run([state.python, "-c", "import smallnumba, torch; print(torch.__version__)"],
-                           capture_output=True, text=True, check=True)
+    found = subprocess.run(
+        [state.python, "-c", "import smallnumba, torch; print(torch.__version__)"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert found.stdout == "2.13.0\n"
 
     ready = json.loads((folder / "ready.json").read_text())
@@ -149,7 +153,7 @@ def test_failed_set_ups_leave_nothing(root):
 
     job = environment.set_up_job(sys.executable, folder, "cpu")
     run(job, lambda: job.message == "Making an environment", job.stop)
-    assert job.state is State.STOPPED and job.message == "Stopped; nothing of the environment stays."
+    assert job.state is State.STOPPED and job.message == "Stopped; nothing of the environment is kept."
     assert not folder.exists()
 
 
@@ -167,31 +171,37 @@ def test_other_peoples_files_are_left_alone(root):
     (folder / "holiday.jpg").write_text("")
     job = environment.set_up_job(sys.executable, folder, "cpu")
     run(job)
-    assert job.state is State.FAILED and "left alone" in job.error
+    assert job.state is State.FAILED and "not used" in job.error
     assert environment.inspect(folder).state == "broken" and "holiday" not in environment.inspect(folder).sentence
     with pytest.raises(OSError, match="not ObjectGS's"):
         environment.remove(folder)
-    (folder / worker.STAMP).write_text("")
+    (folder / layout.STAMP).write_text("")
     with pytest.raises(OSError, match="not ObjectGS's"):
         environment.remove(folder)
-    worker.remove_own(folder)
+    layout.remove_own(folder)
     assert [path.name for path in folder.iterdir()] == ["holiday.jpg"]
     (root / "link").symlink_to(folder)
-    assert not worker.is_ours(root / "link") and worker.is_ours(root / "new")
+    assert not layout.is_ours(root / "link") and layout.is_ours(root / "new")
 
 
 def test_states_of_a_broken_environment(root):
     folder = root / "environment"
-    python = worker.environment_python(folder)
+    python = layout.environment_python(folder)
     python.parent.mkdir(parents=True)
     python.write_text("")
-    (folder / worker.STAMP).write_text("")
+    (folder / layout.STAMP).write_text("")
     marker = {"python": "3.11.7", "base": str(python), "packages": {}, "requirements": "old", "device": "cpu"}
-    for at, (text, state) in enumerate([
-            ("{", "broken"), ("[]", "broken"), ('{"python": "3.11.7"}', "broken"),
-            (json.dumps({**marker, "base": str(root / "gone")}), "broken"), (json.dumps(marker), "outdated")]):
-        (folder / worker.MARKER).write_text(text)
-        os.utime(folder / worker.MARKER, (at, at))
+    for at, (text, state) in enumerate(
+        [
+            ("{", "broken"),
+            ("[]", "broken"),
+            ('{"python": "3.11.7"}', "broken"),
+            (json.dumps({**marker, "base": str(root / "gone")}), "broken"),
+            (json.dumps(marker), "outdated"),
+        ]
+    ):
+        (folder / layout.MARKER).write_text(text)
+        os.utime(folder / layout.MARKER, (at, at))
         assert environment.inspect(folder).state == state, text
     python.unlink()
     state = environment.inspect(folder)
@@ -200,12 +210,17 @@ def test_states_of_a_broken_environment(root):
 
 def test_inspect_is_cheap(root):
     folder = root / "environment"
-    worker.environment_python(folder).parent.mkdir(parents=True)
-    worker.environment_python(folder).write_text("")
-    (folder / worker.STAMP).write_text("")
-    marker = {"python": "3.11.7", "base": sys.executable, "packages": {}, "device": "cpu",
-              "requirements": environment._wanted("cpu")}
-    (folder / worker.MARKER).write_text(json.dumps(marker))
+    layout.environment_python(folder).parent.mkdir(parents=True)
+    layout.environment_python(folder).write_text("")
+    (folder / layout.STAMP).write_text("")
+    marker = {
+        "python": "3.11.7",
+        "base": sys.executable,
+        "packages": {},
+        "device": "cpu",
+        "requirements": environment._wanted("cpu"),
+    }
+    (folder / layout.MARKER).write_text(json.dumps(marker))
     assert environment.inspect(folder).state == "ready"
     started = time.perf_counter()
     for _ in range(100):
@@ -215,17 +230,17 @@ def test_inspect_is_cheap(root):
 
 def test_two_at_once(root):
     folder = root / "environment"
-    with worker.claimed(folder):
-        with pytest.raises(worker.Refused, match="Another Blender"), worker.claimed(folder):
+    with setup.claimed(folder):
+        with pytest.raises(events.Refused, match="Another Blender"), setup.claimed(folder):
             pass
-        assert (folder / worker.STAMP).is_file()
+        assert (folder / layout.STAMP).is_file()
 
 
 def test_what_a_removal_left_goes_with_the_next_set_up(root):
     old = root / "environment.removed-7-0"
     (old / "venv").mkdir(parents=True)
-    (old / worker.STAMP).write_text("")
-    with worker.claimed(root / "environment"):
+    (old / layout.STAMP).write_text("")
+    with setup.claimed(root / "environment"):
         assert not old.exists()
 
 
@@ -233,21 +248,21 @@ def test_pythons_that_will_not_do(root, monkeypatch):
     options = argparse.Namespace(folder=root / "environment", requirements=root / "requirements", device="cpu")
 
     def refusal():
-        with pytest.raises(worker.Refused) as caught:
-            worker.set_up(options, lambda: False)
+        with pytest.raises(events.Refused) as caught:
+            setup.set_up(options, lambda: False)
         assert not options.folder.exists()
         return str(caught.value)
 
     with monkeypatch.context() as patch:
-        patch.setattr(worker, "OLDEST", (3, 99))
+        patch.setattr(layout, "OLDEST", (3, 99))
         assert "needs 3.11, 3.12 or 3.13" in refusal()
     with monkeypatch.context() as patch:
-        patch.setattr(worker.struct, "calcsize", lambda _: 4)
+        patch.setattr(checks.struct, "calcsize", lambda _: 4)
         assert "32-bit" in refusal()
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "ensurepip", None)
         assert "ensurepip is missing" in refusal()
-    monkeypatch.setitem(worker.GIGABYTES, "cpu", 1e9)
+    monkeypatch.setitem(checks.GIGABYTES, "cpu", 1e9)
     assert "free; make room" in refusal()
 
 
@@ -273,8 +288,10 @@ def test_probe(root, monkeypatch):
     job = environment.probe_job(sys.executable, folder)
     job.environment["PYTHONPATH"] = str(packages)
     run(job)
-    assert job.error == ("The packages are there, but the backend does not work with them (exit code 1): "
-                         "OSError: libsomething.so is missing.")
+    assert job.error == (
+        "The packages are installed, but the backend does not work with them (exit code 1): "
+        "OSError: libsomething.so is missing."
+    )
 
 
 @pytest.mark.skipif(os.name != "posix", reason="POSIX programs")
@@ -282,25 +299,32 @@ def test_probe(root, monkeypatch):
 def test_probe_of_what_is_no_python(root, program):
     job = environment.probe_job(program, root / "environment")
     run(job)
-    assert job.error == f"{program} is no Python, or one older than 3.11; choose a Python 3.11, 3.12 or 3.13."
+    assert job.error == f"{program} is not a Python, or it is older than 3.11; choose a Python 3.11, 3.12 or 3.13."
 
 
-@pytest.mark.parametrize(("lines", "sentence"), [
-    (["WARNING: Retrying (Retry(total=4)) after connection broken by 'NewConnectionError'",
-      "ERROR: Could not find a version that satisfies the requirement numpy==2.4.6 (from versions: none)",
-      "ERROR: No matching distribution found for numpy==2.4.6"], "could not be reached"),
-    (["ERROR: No matching distribution found for numpy==2.4.6"], "no ready-made package numpy==2.4.6 for this"),
-    (["ERROR: Could not install packages due to an OSError: [Errno 28] No space left on device"], "disk is full"),
-    (["ERROR: THESE PACKAGES DO NOT MATCH THE HASHES FROM THE REQUIREMENTS FILE."], "damaged"),
-    (["Collecting x", "ERROR: Some new trouble."], "could not be installed: Some new trouble."),
-    ([], "it said nothing"),
-])
+@pytest.mark.parametrize(
+    ("lines", "sentence"),
+    [
+        (
+            [
+                "WARNING: Retrying (Retry(total=4)) after connection broken by 'NewConnectionError'",
+                "ERROR: Could not find a version that satisfies the requirement numpy==2.4.6 (from versions: none)",
+                "ERROR: No matching distribution found for numpy==2.4.6",
+            ],
+            "could not be reached",
+        ),
+        (["ERROR: No matching distribution found for numpy==2.4.6"], "no ready-made package numpy==2.4.6 for this"),
+        (["ERROR: Could not install packages due to an OSError: [Errno 28] No space left on device"], "disk is full"),
+        (["ERROR: THESE PACKAGES DO NOT MATCH THE HASHES FROM THE REQUIREMENTS FILE."], "damaged"),
+        (["Collecting x", "ERROR: Some new trouble."], "could not be installed: Some new trouble."),
+        ([], "it said nothing"),
+    ],
+)
 def test_why_pip_failed(lines, sentence):
-    assert sentence in worker.why_pip_failed(lines)
+    assert sentence in pip.why_pip_failed(lines)
 
 
 def test_requirements_of_this_extension():
-    root = Path(worker.__file__).resolve().parents[1]
-    for path in worker.requirement_files(root / "requirements", "cuda"):
-        for line in worker.requirement_lines(path):
+    for path in layout.requirement_files(environment.REQUIREMENTS, "cuda"):
+        for line in layout.requirement_lines(path):
             assert line.count("==") == 1 and line == line.replace(" ", ""), line

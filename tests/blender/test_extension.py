@@ -40,27 +40,49 @@ def test_zip_is_valid(package):
 def test_zip_holds_what_is_needed_and_nothing_else(package):
     with zipfile.ZipFile(package) as archive:
         names = {name for name in archive.namelist() if not name.endswith("/")}
-    assert {"__init__.py", "blender_manifest.toml", "headless.py", "LICENSE", "README.md", "backend/__main__.py",
-            "objectgs_addon/headless/commands.py", "operators/__init__.py", "requirements/backend.txt",
-            "requirements/torch.txt"} <= names
-    tracked = subprocess.run(["git", "ls-files", "--cached", "--others", "--exclude-standard"], cwd=ROOT,
-                             capture_output=True, text=True)
+    assert {
+        "__init__.py",
+        "blender_manifest.toml",
+        "headless.py",
+        "LICENSE",
+        "README.md",
+        "backend/__main__.py",
+        "objectgs_addon/headless/commands.py",
+        "operators/__init__.py",
+        "requirements/backend.txt",
+        "requirements/torch.txt",
+    } <= names
+    tracked = subprocess.run(
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True
+    )
     if tracked.returncode == 0:
         assert names <= set(tracked.stdout.splitlines())
     tops = {PurePosixPath(name).parts[0] for name in names}
-    assert tops == {"__init__.py", "blender_manifest.toml", "headless.py", "LICENSE", "README.md", "backend",
-                    "objectgs_addon", "operators", "requirements"}
+    assert tops == {
+        "__init__.py",
+        "blender_manifest.toml",
+        "headless.py",
+        "LICENSE",
+        "README.md",
+        "backend",
+        "objectgs_addon",
+        "operators",
+        "requirements",
+    }
     assert {name for name in names if name.startswith("requirements/")} == {
-        "requirements/backend.txt", "requirements/cuda.txt", "requirements/torch.txt"}
+        "requirements/backend.txt",
+        "requirements/cuda.txt",
+        "requirements/torch.txt",
+    }
     assert {PurePosixPath(name).suffix for name in names} <= {".py", ".toml", ".txt", ".md", ".json", ""}
 
 
 def test_versions_agree():
     manifest = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    from objectgs import backend
+    from objectgs.backend.shared.version import __version__
 
-    assert manifest["version"] == project["project"]["version"] == backend.__version__
+    assert manifest["version"] == project["project"]["version"] == __version__
 
 
 def in_blender(script, *arguments):
@@ -69,8 +91,9 @@ def in_blender(script, *arguments):
     It leaves at once: where a property ever had a callback, Blender 4.2's module crashes while Python ends.
     """
     script += "\nimport os\nsys.stdout.flush()\nos._exit(0)\n"
-    ran = subprocess.run([sys.executable, "-c", script, *map(str, arguments)], cwd=ROOT, capture_output=True,
-                         text=True, timeout=300)
+    ran = subprocess.run(
+        [sys.executable, "-c", script, *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, timeout=300
+    )
     assert ran.returncode == 0, ran.stdout[-3000:] + ran.stderr[-3000:]
     return json.loads(ran.stdout.splitlines()[-1])
 
@@ -149,7 +172,7 @@ try:
     from objectgs.objectgs_addon import scene
     folder = Path(sys.argv[1])
     shown = scene.show_capture(bpy.context.scene, folder)
-    result = scene.show_result(shown, folder, bpy.context.scene)
+    result = scene.show_result(shown, folder)
     assert result.splats > 0
 finally:
     root.unregister()

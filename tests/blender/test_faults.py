@@ -17,10 +17,15 @@ import headless
 
 bpy = pytest.importorskip("bpy")
 
-from objectgs.backend.objects import read_objects  # noqa: E402
-from objectgs.backend.protocol import Reconstruction  # noqa: E402
-from objectgs.objectgs_addon import environment_worker, locations, messages, object_edits, running, scene  # noqa: E402
-from objectgs.objectgs_addon.jobs import Job, State  # noqa: E402
+from objectgs.backend.shared.reconstruction.folder import Reconstruction
+from objectgs.backend.shared.reconstruction.objects import read_objects
+from objectgs.objectgs_addon import scene
+from objectgs.objectgs_addon.blender import messages
+from objectgs.objectgs_addon.environment import locations
+from objectgs.objectgs_addon.environment.worker import layout
+from objectgs.objectgs_addon.process.jobs import Job, State
+from objectgs.objectgs_addon.running import running
+from objectgs.objectgs_addon.state import object_edits
 
 FIXTURES = headless.ROOT.parent / "shared" / "data" / "fixtures"
 WAIT = 60.0
@@ -30,13 +35,16 @@ import json, sys, time
 print(json.dumps({"type": "status", "message": "Working"}), flush=True)
 """
 ENDS = WORKS + 'print(json.dumps({"type": "done"}), flush=True)\n'
-UNTIL_STOPPED = WORKS + """
+UNTIL_STOPPED = (
+    WORKS
+    + """
 for line in sys.stdin:
     if line.strip() == "stop":
         break
 print(json.dumps({"type": "done", "stopped": True, "message": "Saved"}), flush=True)
 sys.exit(130)
 """
+)
 
 
 @pytest.fixture
@@ -49,7 +57,7 @@ def extension(fresh, tmp_path, monkeypatch):
     root.register()
     yield root
     root.unregister()
-    running.queue.clear_finished()
+    running.queue.remove_finished()
 
 
 @pytest.fixture
@@ -93,7 +101,7 @@ def job(tmp_path, code=ENDS, kind="train", folder=None, title="Fake") -> Job:
 
 def start(job: Job, owner) -> Job:
     """What `running.submit` does in a window."""
-    running._wanted_in[job] = owner.session_uid
+    running._submitted_in[job] = owner.session_uid
     running.queue.add(job)
     return job
 
@@ -119,15 +127,17 @@ def snapshot(folder: Path) -> dict[str, bytes]:
 
 
 def blocks() -> dict[str, list[str]]:
-    return {kind: sorted(block.name for block in getattr(bpy.data, kind))
-            for kind in ("collections", "objects", "meshes", "cameras", "images", "materials")}
+    return {
+        kind: sorted(block.name for block in getattr(bpy.data, kind))
+        for kind in ("collections", "objects", "meshes", "cameras", "images", "materials")
+    }
 
 
 # The backend
 
 
 def test_no_backend(extension, shown, capture):
-    for operator in (bpy.ops.objectgs.vote, bpy.ops.objectgs.train, bpy.ops.objectgs.check_backend):
+    for operator in (bpy.ops.objectgs.assign_objects, bpy.ops.objectgs.train, bpy.ops.objectgs.check_backend):
         assert not operator.poll()
     assert "is not set up; press Set Up Backend" in refusal(bpy.ops.objectgs.train)
     assert "is not set up" in refusal(bpy.ops.objectgs.import_capture, directory=str(capture))
@@ -135,15 +145,20 @@ def test_no_backend(extension, shown, capture):
 
 def test_backend_of_another_version(extension, shown):
     place = locations.environment_folder()
-    python = environment_worker.environment_python(place)
+    python = layout.environment_python(place)
     python.parent.mkdir(parents=True)
     python.symlink_to(sys.executable)
-    (place / environment_worker.STAMP).write_text("")
-    marker = {"python": "3.11", "base": sys.executable, "requirements": "of another version", "packages": {},
-              "device": "cpu"}
-    (place / environment_worker.MARKER).write_text(json.dumps(marker))
+    (place / layout.STAMP).write_text("")
+    marker = {
+        "python": "3.11",
+        "base": sys.executable,
+        "requirements": "of another version",
+        "packages": {},
+        "device": "cpu",
+    }
+    (place / layout.MARKER).write_text(json.dumps(marker))
     assert "was set up for another version of ObjectGS" in refusal(bpy.ops.objectgs.train)
-    (place / environment_worker.MARKER).write_text("{")
+    (place / layout.MARKER).write_text("{")
     assert "ready.json cannot be read" in refusal(bpy.ops.objectgs.train)
 
 
@@ -152,11 +167,14 @@ def test_python_that_is_not_there(extension, shown, monkeypatch, tmp_path):
     assert f"{tmp_path / 'gone'} does not exist" in refusal(bpy.ops.objectgs.train)
 
 
-@pytest.mark.parametrize("name, program, sentence", [
-    ("no program", None, "could not be started (Permission denied); choose another Python"),
-    ("no Python", "#!/bin/sh\nexit 0\n", "cannot run the backend; choose a Python 3.11"),
-    ("too old", "#!/bin/sh\necho 'SyntaxError: invalid syntax' >&2\nexit 1\n", "cannot run the backend; choose a"),
-])
+@pytest.mark.parametrize(
+    ("name", "program", "sentence"),
+    [
+        ("no program", None, "could not be started (Permission denied); choose another Python"),
+        ("no Python", "#!/bin/sh\nexit 0\n", "cannot run the backend; choose a Python 3.11"),
+        ("too old", "#!/bin/sh\necho 'SyntaxError: invalid syntax' >&2\nexit 1\n", "cannot run the backend; choose a"),
+    ],
+)
 def test_wrong_python(extension, monkeypatch, capture, tmp_path, name, program, sentence):
     python = tmp_path / "python"
     python.write_text(program or "text")
@@ -178,8 +196,9 @@ def test_python_without_the_packages(extension, monkeypatch, capture, tmp_path):
 # Importing
 
 
-@pytest.mark.parametrize("name", ["cameras_only", "truncated", "degenerate_two_images",
-                                  "missing_cameras_subfolders_txt"])
+@pytest.mark.parametrize(
+    "name", ["cameras_only", "truncated", "degenerate_two_images", "missing_cameras_subfolders_txt"]
+)
 def test_broken_model_is_refused(extension, backend_python, monkeypatch, tmp_path, name):
     if not (FIXTURES / name).is_dir():
         pytest.skip(f"{FIXTURES / name} is not here")
@@ -190,9 +209,14 @@ def test_broken_model_is_refused(extension, backend_python, monkeypatch, tmp_pat
     assert blocks() == before and not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("make, sentence", [
-    (lambda place: None, "does not exist"), (lambda place: place.mkdir(), "cannot be read|does not|no COLMAP|missing"),
-    (lambda place: place.write_text("a file"), "does not exist")])
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda place: None, "does not exist"),
+        (lambda place: place.mkdir(), "cannot be read|does not|no COLMAP|missing"),
+        (lambda place: place.write_text("a file"), "does not exist"),
+    ],
+)
 def test_folder_that_is_no_capture(extension, backend_python, monkeypatch, tmp_path, make, sentence):
     monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
     make(tmp_path / "capture")
@@ -202,12 +226,14 @@ def test_folder_that_is_no_capture(extension, backend_python, monkeypatch, tmp_p
 
 
 def test_two_captures_of_one_name_get_folders_of_their_own(extension, tmp_path):
-    from objectgs.operators.import_capture import _folder_for
+    from objectgs.operators.capture.import_capture import _folder_for
 
     first, second = tmp_path / "a" / "mug", tmp_path / "b" / "mug"
     taken = _folder_for(first)
     taken.mkdir(parents=True)
-    (taken / "cameras.json").write_text(json.dumps({"capture": str(first)}))
+    upright = {"rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}
+    cameras = {"capture": str(first), "origin": [0.0, 0.0, 0.0], "upright": upright, "cameras": []}
+    (taken / "cameras.json").write_text(json.dumps(cameras))
     assert _folder_for(first) == taken and _folder_for(second) == taken.with_name("mug-2")
 
 
@@ -215,17 +241,25 @@ def test_import_where_another_works(extension, shown, folder, capture, tmp_path,
     monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
     held = start(job(tmp_path, UNTIL_STOPPED, folder=folder), bpy.context.scene)
     before = snapshot(folder)
-    assert f"A job works in {folder}" in refusal(bpy.ops.objectgs.import_capture, directory=str(capture),
-                                                 folder=str(folder))
-    assert f"A job works in {folder}" in refusal(bpy.ops.objectgs.train)
+    assert f"A job is using {folder}" in refusal(
+        bpy.ops.objectgs.import_capture, directory=str(capture), folder=str(folder)
+    )
+    assert f"A job is using {folder}" in refusal(bpy.ops.objectgs.train)
     held.stop()
     tick_until(lambda: held.is_finished)
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
-        (folder / ".lock").write_text(f"{other.pid}\n")
+    holds = f"""
+from pathlib import Path
+from backend.shared.reconstruction.lock import locked
+with locked(Path({str(folder)!r})):
+    print("locked", flush=True)
+    input()
+"""
+    command, pipes = [sys.executable, "-c", holds], {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen(command, cwd=Path(headless.__file__).parent, **pipes) as other:
+        assert other.stdout.readline().strip() == b"locked"
         told = refusal(bpy.ops.objectgs.import_capture, directory=str(capture), folder=str(folder))
-        assert f"Another program (process {other.pid}) works in {folder}" in told
+        assert f"Another program (process {other.pid}) is using {folder}" in told
         other.communicate(b"\n")
-    (folder / ".lock").unlink()
     assert snapshot(folder) == before
 
 
@@ -238,8 +272,9 @@ def test_capture_deleted(extension, backend_python, capture, tmp_path, monkeypat
     place = Path(shutil.copytree(capture, tmp_path / "capture"))
     bpy.ops.objectgs.import_capture(directory=str(place), folder=str(tmp_path / "out"))
     root = bpy.context.scene.objectgs.active
-    training = locations.backend_job("Train", "train", tmp_path / "out", "train", str(place), "--out",
-                                     str(tmp_path / "out"), "--steps", "40")
+    training = locations.backend_job(
+        "Train", "train", tmp_path / "out", "train", str(place), "--out", str(tmp_path / "out"), "--steps", "40"
+    )
     start(training, bpy.context.scene)
     tick_until(lambda: training.step or training.is_finished)
     shutil.rmtree(place)
@@ -247,9 +282,9 @@ def test_capture_deleted(extension, backend_python, capture, tmp_path, monkeypat
     assert training.state is State.DONE or plain(training.error)
     assert not (tmp_path / "out" / ".lock").exists() and not list((tmp_path / "out").rglob("*.part"))
     assert scene.kind_of(root) == "reconstruction"
-    assert f"The capture {place} is gone" in refusal(bpy.ops.objectgs.train)
+    assert f"The capture {place} is missing" in refusal(bpy.ops.objectgs.train)
     (tmp_path / "out" / "cameras.json").write_text("{}")
-    assert "does not say where the capture is" in refusal(bpy.ops.objectgs.train)
+    assert "does not name the capture" in refusal(bpy.ops.objectgs.train)
 
 
 @pytest.fixture
@@ -277,13 +312,14 @@ def test_full_disk_while_editing(shown, folder, said, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     before, row = snapshot(folder), shown.objectgs.objects[1]
-    name, colour = row.name, tuple(row.colour)
+    name, color = row.name, tuple(row.color)
     monkeypatch.setattr(os, "fsync", full)
-    row.name, row.colour, row.chosen = "cup", (0.1, 0.2, 0.3), False
-    assert (row.name, tuple(row.colour), row.chosen) == (name, colour, True)
+    row.name, row.color, row.chosen = "cup", (0.1, 0.2, 0.3), False
+    assert (row.name, tuple(row.color), row.chosen) == (name, color, True)
     assert len(said) == 3 and all("objects.json" in text and "free some space" in text for text in said)
-    assert "free some space" in refusal(bpy.ops.objectgs.merge_objects, into=str(object_edits.from_stored(
-        shown.objectgs.objects[2].object_id)))
+    assert "free some space" in refusal(
+        bpy.ops.objectgs.merge_objects, into=str(object_edits.from_stored(shown.objectgs.objects[2].object_id))
+    )
     assert snapshot(folder) == before
 
 
@@ -295,23 +331,40 @@ def test_old_file_without_its_folder(shown, folder, said, tmp_path, monkeypatch)
     root = bpy.context.scene.objectgs.active
     before = blocks()
     operators = bpy.ops.objectgs
-    for operator in (operators.vote, operators.train, operators.show_result, operators.show_preview,
-                     operators.merge_objects, operators.split_objects, operators.choose_objects,
-                     operators.set_ground, operators.set_distance, operators.solo_object, operators.select_object):
-        assert f"The folder {folder} of this reconstruction is gone" in refusal(operator)
+    for operator in (
+        operators.vote,
+        operators.train,
+        operators.show_result,
+        operators.show_preview,
+        operators.merge_objects,
+        operators.split_objects,
+        operators.choose_objects,
+        operators.set_ground,
+        operators.set_distance,
+        operators.solo_object,
+        operators.select_object,
+    ):
+        assert f"The folder {folder} of this reconstruction is missing" in refusal(operator)
     row = root.objectgs.objects[1]
-    name, colour = row.name, tuple(row.colour)
-    row.name, row.colour, row.chosen = "cup", (0.1, 0.2, 0.3), False
+    name, color = row.name, tuple(row.color)
+    row.name, row.color, row.chosen = "cup", (0.1, 0.2, 0.3), False
     row.name = "  "
-    assert (row.name, tuple(row.colour), row.chosen) == (name, colour, True)
+    assert (row.name, tuple(row.color), row.chosen) == (name, color, True)
     assert len(said) == 3 and all(plain(text) and "objects.json does not exist" in text for text in said)
     assert "has no cameras.json" in refusal(operators.open_reconstruction, directory=str(folder))
     assert blocks() == before and not folder.exists()
 
 
-@pytest.mark.parametrize("content", ["{", "[]", '{"objects": null}', '{"objects": [{"id": 5e12, "name": "a", '
-                                     '"colour": [1, 2, 3], "points": 1}]}', '{"objects": [{"id": 1, "name": "a", '
-                                     '"colour": [1, 2, Infinity], "points": 1}]}'])
+@pytest.mark.parametrize(
+    "content",
+    [
+        "{",
+        "[]",
+        '{"objects": null}',
+        '{"objects": [{"id": 5e12, "name": "a", "color": [1, 2, 3], "points": 1}]}',
+        '{"objects": [{"id": 1, "name": "a", "color": [1, 2, Infinity], "points": 1}]}',
+    ],
+)
 def test_broken_objects_file(shown, folder, said, tmp_path, content):
     (folder / "objects.json").write_text(content)
     before, there = snapshot(folder), blocks()
@@ -327,9 +380,15 @@ def test_broken_objects_file(shown, folder, said, tmp_path, content):
     assert snapshot(folder) == before and blocks() == there
 
 
-@pytest.mark.parametrize("name, content", [
-    ("cameras.json", b"{"), ("cameras.json", b'{"cameras": [{"name": "\\ud800"}]}'), ("points.ply", b"ply\n"),
-    ("objects.json", b"[]")])
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("cameras.json", b"{"),
+        ("cameras.json", b'{"cameras": [{"name": "\\ud800"}]}'),
+        ("points.ply", b"ply\n"),
+        ("objects.json", b"[]"),
+    ],
+)
 def test_broken_folder_leaves_no_half_made_collection(extension, folder, name, content):
     (folder / name).write_bytes(content)
     before = blocks()
@@ -352,10 +411,12 @@ def test_each_result_lands_in_its_own_scene(extension, folder, trained, tmp_path
     first = bpy.context.scene
     second, third = bpy.data.scenes.new("second"), bpy.data.scenes.new("third")
     other = Path(shutil.copytree(trained, tmp_path / "other"))
-    jobs = [start(job(tmp_path, kind="import", folder=folder, title="a"), first),
-            start(job(tmp_path, kind="import", folder=other, title="b"), second),
-            start(job(tmp_path, kind="import", folder=folder, title="c"), third),
-            start(job(tmp_path, kind="train", folder=other, title="d"), second)]
+    jobs = [
+        start(job(tmp_path, kind="import", folder=folder, title="a"), first),
+        start(job(tmp_path, kind="import", folder=other, title="b"), second),
+        start(job(tmp_path, kind="import", folder=folder, title="c"), third),
+        start(job(tmp_path, kind="train", folder=other, title="d"), second),
+    ]
     running._tick()
     assert [entry.state for entry in jobs[1:]] == [State.WAITING] * 3
     first.name, second.name = "second", "renamed"
@@ -393,9 +454,17 @@ def test_collection_renamed_or_taken_out_meanwhile(shown, folder, said, tmp_path
 def positions(root) -> dict[str, list[float]]:
     """Where things are, rounded: world positions of the first vertex of each mesh, and of each camera."""
     bpy.context.view_layer.update()
-    return {part.name: [round(value, 4) for value in (
-        part.matrix_world @ part.data.vertices[0].co if part.type == "MESH" and part.data.vertices
-        else part.matrix_world.translation)] for part in root.all_objects}
+    return {
+        part.name: [
+            round(value, 4)
+            for value in (
+                part.matrix_world @ part.data.vertices[0].co
+                if part.type == "MESH" and part.data.vertices
+                else part.matrix_world.translation
+            )
+        ]
+        for part in root.all_objects
+    }
 
 
 def test_parents_deleted(shown, folder, tmp_path):
@@ -440,7 +509,7 @@ def test_result_waits_for_object_mode(shown, folder, said, tmp_path, mode):
     tick_until(lambda: work.is_finished)
     for _ in range(5):
         assert running._tick() is not None
-    assert said == [f"Fake has ended; its result is shown when {name} is in Object Mode again."]
+    assert said == [f"Fake has finished; the result will be shown when {name} is in Object Mode again."]
     assert running._results == [work]
     bpy.ops.object.mode_set(mode="OBJECT")
     running._tick()
@@ -478,7 +547,7 @@ def test_a_failure_of_one_result_stops_no_other_job(extension, folder, said, tmp
     def fails(_job, _owner):
         raise ZeroDivisionError("on purpose")
 
-    monkeypatch.setitem(running._AFTER, "vote", fails)
+    monkeypatch.setitem(running._SHOWS, "vote", fails)
     broken = start(job(tmp_path, kind="vote", folder=folder, title="Vote"), bpy.context.scene)
     works = start(job(tmp_path, kind="import", folder=folder), bpy.context.scene)
     tick_until(lambda: works.is_finished and not running._results)
@@ -493,7 +562,7 @@ def test_registered_ten_times_while_a_job_runs(extension, folder, said, tmp_path
         extension.unregister()
         assert work.state is State.STOPPED and work.exit_code == 130
         extension.register()
-        assert not running.busy(folder) and not running._wanted_in
+        assert not running.busy(folder) and not running._submitted_in
     assert not said
 
 
@@ -511,7 +580,7 @@ def rename(folder, names: dict[int, str]) -> None:
 
 def test_odd_names(shown, folder):
     ids = [object_edits.from_stored(row.object_id) for row in shown.objectgs.objects if row.object_id][:5]
-    odd = ["", "Tasse\n☕\t/ \\ % \"q\"", "x" * 5000, "\ud800\0", "same", "same"]
+    odd = ["", 'Tasse\n☕\t/ \\ % "q"', "x" * 5000, "\ud800\0", "same", "same"]
     for names in (dict(zip(ids, odd)), dict(zip(ids, odd[2:])), dict.fromkeys(ids, "same")):
         rename(folder, names)
         assert bpy.ops.objectgs.show_result() == {"FINISHED"}
@@ -529,8 +598,10 @@ def test_many_objects_and_large_ids(shown, folder):
     content = json.loads(path.read_text())
     small = [entry["id"] for entry in content["objects"]]
     large = [2**31 - 1, 2**31, 2**32 - 1]
-    content["objects"] += [{"id": object_id, "name": f"thing {object_id}", "colour": [1, 2, 3], "points": 0}
-                           for object_id in [*range(1000, 1300), *large]]
+    content["objects"] += [
+        {"id": object_id, "name": f"thing {object_id}", "color": [1, 2, 3], "points": 0}
+        for object_id in [*range(1000, 1300), *large]
+    ]
     path.write_text(json.dumps(content))
     (folder / "splats.ply").write_bytes(with_large_ids(folder / "splats.ply", dict(zip(small[1:], large[1:]))))
     assert bpy.ops.objectgs.show_result() == {"FINISHED"}
@@ -558,7 +629,7 @@ def test_many_objects_and_large_ids(shown, folder):
 
 def with_large_ids(path: Path, ids: dict[int, int]) -> bytes:
     """splats.ply with some IDs replaced; object_id becomes an unsigned integer."""
-    from objectgs.backend.ply import read_vertices, vertex_header
+    from objectgs.backend.shared.formats.ply import read_vertices, vertex_header
 
     table = read_vertices(path)
     dtype = np.dtype([(name, "<u4" if name == "object_id" else table.dtype[name]) for name in table.dtype.names])

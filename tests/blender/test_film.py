@@ -2,7 +2,6 @@
 """Film from Blender: cameras and objects as the shot has them, against Blender's own projection; the compositor, and
 how Blender reads the frames."""
 
-import json
 import math
 import os
 import subprocess
@@ -13,14 +12,16 @@ import numpy as np
 import pytest
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Euler, Matrix
-from objectgs.backend.film.shot import read_shot
-from objectgs.backend.objects import edit_objects
-from objectgs.backend.ply import write_vertices
-from objectgs.backend.protocol import InputError
+from objectgs.backend.shared.errors import InputError
+from objectgs.backend.shared.formats.ply import write_vertices
+from objectgs.backend.shared.reconstruction.folder import Reconstruction
+from objectgs.backend.shared.reconstruction.objects import edit_objects
+from objectgs.backend.shared.reconstruction.record import TrainingRecord, VotesRecord, update_record
+from objectgs.backend.shared.reconstruction.shot import read_shot
 from objectgs.objectgs_addon import film
 from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.scene import kinds
-from objectgs.objectgs_addon.scene.object_collection import centre_of
+from objectgs.objectgs_addon.scene.object_collection import center_of
 
 import headless
 
@@ -43,7 +44,7 @@ def root(fresh, tmp_path):
     write_vertices(place / "splats.ply", splats)
     scene = bpy.context.scene
     root = blender_scene.show_capture(scene, place)
-    blender_scene.show_result(root, place, scene)
+    blender_scene.show_result(root, place)
     parent = kinds.parent_of(root)
     parent.matrix_world = Matrix.Scale(2.5, 4) @ parent.matrix_world
     camera = bpy.data.objects.new("Film", bpy.data.cameras.new("Film"))
@@ -59,7 +60,7 @@ def shoot(root, frames=(1,), samples=1):
     return film.shot_of(bpy.context.scene, bpy.context.view_layer, root, list(frames), samples)
 
 
-def pivot_of(root, object_id):
+def ensure_pivot(root, object_id):
     return kinds.part_of(blender_scene.object_collections(root)[object_id], "object_parent")
 
 
@@ -70,7 +71,7 @@ def splats_of(root, object_id):
 def captured(splats) -> np.ndarray:
     """(n, 3) where the object's splats were captured."""
     vertices = np.array([vertex.co for vertex in splats.data.vertices], np.float64)
-    return vertices + centre_of(splats.parent) + ORIGIN
+    return vertices + center_of(splats.parent) + ORIGIN
 
 
 def seen(shot, sample, points) -> np.ndarray:
@@ -85,8 +86,9 @@ def seen_by_blender(splats) -> np.ndarray:
     scene = bpy.context.scene
     percent = scene.render.resolution_percentage
     size = scene.render.resolution_x * percent // 100, scene.render.resolution_y * percent // 100
-    found = [world_to_camera_view(scene, scene.camera, splats.matrix_world @ vertex.co)
-             for vertex in splats.data.vertices]
+    found = [
+        world_to_camera_view(scene, scene.camera, splats.matrix_world @ vertex.co) for vertex in splats.data.vertices
+    ]
     return np.array([(x * size[0], (1 - y) * size[1], z) for x, y, z in found])
 
 
@@ -102,8 +104,9 @@ def assert_placed(root, shot, sample, object_id, splats, place=0) -> None:
 
 
 @pytest.mark.parametrize("fit", ["AUTO", "HORIZONTAL", "VERTICAL"])
-@pytest.mark.parametrize(("size", "aspect"), [
-    ((640, 360), (1.0, 1.0)), ((300, 500), (1.0, 2.0)), ((330, 220), (1.5, 1.0))])
+@pytest.mark.parametrize(
+    ("size", "aspect"), [((640, 360), (1.0, 1.0)), ((300, 500), (1.0, 2.0)), ((330, 220), (1.5, 1.0))]
+)
 def test_lenses_are_blenders_own(root, fit, size, aspect):
     scene = bpy.context.scene
     scene.render.resolution_x, scene.render.resolution_y = size
@@ -127,7 +130,7 @@ def test_lenses_are_blenders_own(root, fit, size, aspect):
 
 def test_cameras_of_the_capture_come_back_as_they_were(root):
     scene = bpy.context.scene
-    camera = next(thing for thing in root.all_objects if kinds.kind_of(thing) == "camera")
+    camera = next(obj for obj in root.all_objects if kinds.kind_of(obj) == "camera")
     blender_scene.use_camera(scene, camera)
     bpy.context.view_layer.update()
     shot = shoot(root)
@@ -139,7 +142,7 @@ def test_cameras_of_the_capture_come_back_as_they_were(root):
 def test_moving_things_move_in_every_frame(root):
     """Camera, lens, an object and the whole reconstruction, each with keyframes; the scene is where it was after."""
     scene = bpy.context.scene
-    pivot, parent = pivot_of(root, 1), kinds.parent_of(root)
+    pivot, parent = ensure_pivot(root, 1), kinds.parent_of(root)
     for frame, amount in ((1, 0.0), (11, 1.0)):
         scene.camera.location.x = 2.0 + amount
         scene.camera.keyframe_insert("location", frame=frame)
@@ -165,14 +168,15 @@ def test_moving_things_move_in_every_frame(root):
 
 def test_what_viewports_hide_moves_nevertheless(root):
     scene = bpy.context.scene
-    pivot = pivot_of(root, 1)
+    pivot = ensure_pivot(root, 1)
     before = splats_of(root, 1).matrix_world.copy()
     for frame, place in ((1, 0.0), (5, 2.0)):
         pivot.location.x = place
         pivot.keyframe_insert("location", frame=frame)
     scene.frame_set(1)
     layer = bpy.context.view_layer.layer_collection.children[root.name].children[
-        blender_scene.object_collections(root)[1].name]
+        blender_scene.object_collections(root)[1].name
+    ]
     layer.hide_viewport = True
     shot = shoot(root, (1, 5))
     assert layer.hide_viewport and before
@@ -198,10 +202,10 @@ def test_what_is_not_rendered_is_not_in_the_shot(root):
     collections[1].hide_render = False
     splats_of(root, 1).hide_render = True
     assert shown() == ids - {1, 2}
-    pivot_of(root, 0).hide_render = True
+    ensure_pivot(root, 0).hide_render = True
     for frame, hidden in ((1, True), (3, False)):
-        pivot_of(root, 0).hide_render = hidden
-        pivot_of(root, 0).keyframe_insert("hide_render", frame=frame)
+        ensure_pivot(root, 0).hide_render = hidden
+        ensure_pivot(root, 0).keyframe_insert("hide_render", frame=frame)
     scene.frame_set(1)
     objects = [set(frame.samples[0].objects) for frame in shoot(root, (1, 2, 3)).frames]
     assert objects == [ids - {0, 1, 2}, ids - {0, 1, 2}, ids - {1, 2}]
@@ -211,12 +215,12 @@ def test_copies_are_drawn_too(root):
     """A duplicated object, and one more by an empty that shows its collection elsewhere."""
     scene = bpy.context.scene
     collection = blender_scene.object_collections(root)[2]
-    pivot, splats = pivot_of(root, 2), splats_of(root, 2)
+    pivot, splats = ensure_pivot(root, 2), splats_of(root, 2)
     other, copy = pivot.copy(), splats.copy()
     copy.parent = other
     other.location.x += 1.5
-    for thing in (other, copy):
-        collection.objects.link(thing)
+    for obj in (other, copy):
+        collection.objects.link(obj)
     empty = bpy.data.objects.new("elsewhere", None)
     empty.instance_type, empty.instance_collection = "COLLECTION", blender_scene.object_collections(root)[1]
     empty.location, empty.rotation_euler = (0.5, 0.25, 1.0), (0, 0, 0.4)
@@ -231,8 +235,9 @@ def test_copies_are_drawn_too(root):
     instanced = sample.objects[1].maps[1]
     points = captured(splats_of(root, 1)) @ instanced[:3, :3].T + instanced[:3, 3]
     world = empty.matrix_world @ splats_of(root, 1).matrix_world
-    expected = np.array([world_to_camera_view(scene, scene.camera, world @ vertex.co).z
-                         for vertex in splats_of(root, 1).data.vertices])
+    expected = np.array(
+        [world_to_camera_view(scene, scene.camera, world @ vertex.co).z for vertex in splats_of(root, 1).data.vertices]
+    )
     np.testing.assert_allclose(seen(shot, sample, points)[:, 2], expected, rtol=1e-3, atol=1e-3)
 
 
@@ -276,9 +281,18 @@ def wall_splats() -> np.ndarray:
     table = splat_table([1, 2], degree=0)
     rotation = Euler((0.0, math.radians(35), 0.0)).to_quaternion()
     for name, values in {
-        "x": (-3.0, 3.0), "y": (0, 0), "z": (0, 0), "opacity": (8, 8), "scale_0": (0.2, 0.2), "scale_1": (0.2, 0.2),
-        "scale_2": (-9, -9), "rot_0": (rotation.w, 1), "rot_1": (rotation.x, 0), "rot_2": (rotation.y, 0),
-        "rot_3": (rotation.z, 0), **{f"f_dc_{i}": (np.array([RED[i], GREEN[i]]) - 0.5) / 0.28209479 for i in range(3)},
+        "x": (-3.0, 3.0),
+        "y": (0, 0),
+        "z": (0, 0),
+        "opacity": (8, 8),
+        "scale_0": (0.2, 0.2),
+        "scale_1": (0.2, 0.2),
+        "scale_2": (-9, -9),
+        "rot_0": (rotation.w, 1),
+        "rot_1": (rotation.x, 0),
+        "rot_2": (rotation.y, 0),
+        "rot_3": (rotation.z, 0),
+        **{f"f_dc_{i}": (np.array([RED[i], GREEN[i]]) - 0.5) / 0.28209479 for i in range(3)},
     }.items():
         table[name] = values
     return np.repeat(table, 12)
@@ -294,11 +308,12 @@ def shot_blend(tmp_path_factory):
     write_points(place, np.random.default_rng(0).normal(size=(9, 3)), np.ones(9, int))
     write_objects(place, {1: "mug", 2: "can"})
     write_vertices(place / "splats.ply", wall_splats())
-    (place / "objectgs.json").write_text(json.dumps({"training": {"settings": {"primitive": "2d"}}}))
+    training = TrainingRecord({"primitive": "2d"}, VotesRecord("majority", None, 1600, "", None))
+    update_record(Reconstruction(place), training=training)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     root = blender_scene.show_capture(scene, place)
-    blender_scene.show_result(root, place, scene)
+    blender_scene.show_result(root, place)
     blender_scene.prepare_render(scene)
     camera = bpy.data.objects.new("Film", bpy.data.cameras.new("Film"))
     camera.location = 0, 0, 10
@@ -333,9 +348,24 @@ def filmed(shot_blend, backend_python):
     """The folder that headless.py has left: a film frame, a composite and a .blend with its compositor set up."""
     out = shot_blend.parent / "film"
     ran = subprocess.run(
-        [sys.executable, headless.__file__, "film", shot_blend, "--out", out, "--composite", "png", "--png", "--save",
-         out / "joined.blend"], capture_output=True, text=True, timeout=300,
-        env={**os.environ, "OBJECTGS_PYTHON": backend_python})
+        [
+            sys.executable,
+            headless.__file__,
+            "film",
+            shot_blend,
+            "--out",
+            out,
+            "--composite",
+            "png",
+            "--png",
+            "--save",
+            out / "joined.blend",
+        ],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={**os.environ, "OBJECTGS_PYTHON": backend_python},
+    )
     assert ran.returncode == 0, ran.stdout + ran.stderr
     return out
 
@@ -353,10 +383,12 @@ def pixels_of(path) -> np.ndarray:
 
 def planes_of(path, python) -> dict[str, np.ndarray]:
     """The channels of an EXR, read by OpenEXR itself."""
-    script = ("import sys, numpy, OpenEXR\n"
-              "parts = OpenEXR.File(sys.argv[1], separate_channels=True).parts\n"
-              "numpy.savez(sys.argv[2], **{name: channel.pixels for part in parts for name, channel in\n"
-              "                            part.channels.items()})\n")
+    script = (
+        "import sys, numpy, OpenEXR\n"
+        "parts = OpenEXR.File(sys.argv[1], separate_channels=True).parts\n"
+        "numpy.savez(sys.argv[2], **{name: channel.pixels for part in parts for name, channel in\n"
+        "                            part.channels.items()})\n"
+    )
     table = path.with_suffix(".npz")
     subprocess.run([python, "-c", script, path, table], check=True)
     return dict(np.load(table))
@@ -375,8 +407,8 @@ def test_the_composite_is_joined_by_depth(filmed):
     picture = pixels_of(filmed / "composite.0007.png")
     splats = pixels_of(filmed / "splats.0007.png")
     assert picture.shape[:2] == (SIZE, SIZE)
-    for place, colour in ((LEFT_BALL, RED), (LEFT_WALL, RED), (RIGHT_WALL, GREEN), (RIGHT_BALL, encoded(BLUE))):
-        np.testing.assert_allclose(picture[place][:3], colour, atol=0.015, err_msg=str(place))
+    for place, color in ((LEFT_BALL, RED), (LEFT_WALL, RED), (RIGHT_WALL, GREEN), (RIGHT_BALL, encoded(BLUE))):
+        np.testing.assert_allclose(picture[place][:3], color, atol=0.015, err_msg=str(place))
         if place != RIGHT_BALL:
             np.testing.assert_allclose(picture[place], splats[place], atol=0.006)
 
@@ -385,8 +417,8 @@ def test_depth_is_blenders_own(shot_blend, filmed, backend_python, tmp_path):
     """The depth of a disc against Blender's own of a plane in its place, and where there is nothing."""
     bpy.ops.wm.open_mainfile(filepath=str(shot_blend))
     scene = bpy.context.scene
-    for thing in scene.objects:
-        thing.hide_render = thing.name != "plane"
+    for obj in scene.objects:
+        obj.hide_render = obj.name != "plane"
     bpy.context.view_layer.use_pass_z = True
     settings = scene.render.image_settings
     if hasattr(settings, "media_type"):
@@ -477,8 +509,13 @@ def test_edits_reach_the_frames_and_refusals_are_one_sentence(shot_blend, backen
     out = shot_blend.parent / "edited"
 
     def run(*words):
-        return subprocess.run([sys.executable, headless.__file__, "film", *map(str, words)], capture_output=True,
-                              text=True, timeout=300, env={**os.environ, "OBJECTGS_PYTHON": backend_python})
+        return subprocess.run(
+            [sys.executable, headless.__file__, "film", *map(str, words)],
+            capture_output=True,
+            text=True,
+            timeout=300,
+            env={**os.environ, "OBJECTGS_PYTHON": backend_python},
+        )
 
     objects = shot_blend.parent / "wall" / "objects.json"
     edit_objects(objects, {1: {"removed": True}})

@@ -3,12 +3,15 @@
 
 import json
 import struct
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("bpy")
 
-from objectgs.objectgs_addon.folder_state import folder_state
+from objectgs.backend.shared.reconstruction.cameras import Cameras, CameraView, write_cameras
+from objectgs.objectgs_addon.state.folder_state import folder_state
 
 
 def write_checkpoint(folder, step, seconds):
@@ -29,8 +32,11 @@ def test_each_step_is_seen(tmp_path):
     folder.mkdir()
     assert folder_state(folder).exists and not folder_state(folder).imported
     (folder / "points.ply").write_bytes(b"ply")
-    (folder / "cameras.json").write_text(json.dumps({"capture": "/somewhere/else", "cameras": [
-        {"width": 40, "height": 30}, {"width": 20, "height": 10}]}))
+    views = [
+        CameraView(f"{width}.png", folder / "image.png", None, width, height, np.eye(3), np.eye(4), False)
+        for width, height in ((40, 30), (20, 10))
+    ]
+    write_cameras(folder, Cameras(Path("/somewhere/else"), np.zeros(3), np.eye(4), views))
     state = folder_state(folder)
     assert state.imported and str(state.capture) == "/somewhere/else" and not state.voted
     assert state.pixels == (1200 + 200) / 2
@@ -42,7 +48,7 @@ def test_each_step_is_seen(tmp_path):
     assert folder_state(folder).trained
 
 
-@pytest.mark.parametrize("content", [b"", b"\xff" * 8, b"\x05\0\0\0\0\0\0\0{\"a\":", struct.pack("<Q", 2) + b"{}"])
+@pytest.mark.parametrize("content", [b"", b"\xff" * 8, b'\x05\0\0\0\0\0\0\0{"a":', struct.pack("<Q", 2) + b"{}"])
 def test_broken_files_count_as_nothing(tmp_path, content):
     (tmp_path / "checkpoint").mkdir()
     (tmp_path / "checkpoint" / "model.safetensors").write_bytes(content)

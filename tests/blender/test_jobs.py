@@ -10,9 +10,11 @@ import time
 from pathlib import Path
 
 import pytest
-from objectgs.objectgs_addon import jobs
-from objectgs.objectgs_addon.backend_process import BackendProcess, backend_command, backend_environment
-from objectgs.objectgs_addon.jobs import Job, JobQueue, State, lock_holder, run_blocking
+from objectgs.backend.shared.events import Reporter
+from objectgs.objectgs_addon.process import jobs
+from objectgs.objectgs_addon.process.backend_process import BackendProcess, backend_command, backend_environment
+from objectgs.objectgs_addon.process.blocking import run_blocking
+from objectgs.objectgs_addon.process.jobs import Job, JobQueue, State
 
 posix = pytest.mark.skipif(os.name != "posix", reason="signals and niceness are POSIX's")
 WAIT = 30.0
@@ -87,7 +89,8 @@ def started(job, queue=None):
 
 
 def test_figures_of_a_whole_run(make, tmp_path):
-    job = run(make("""
+    job = run(
+        make("""
 say("status", message="Reading the capture")
 say("progress", done=5, total=10)
 say("status", message="Training")
@@ -97,7 +100,8 @@ say("progress", done=0.5, total=1.0, step=7, seconds_left=12.5, splats=100, anch
 say("preview", path="latest.png")
 say("quality", seconds=3.0, step=9, psnr=26.5, miou=0.75, mbiou=0.5)
 say("done", steps=12, splats="splats.ply", anchors=11, psnr=27.0)
-"""))
+""")
+    )
     assert job.state is State.DONE and job.exit_code == 0 and job.error is None
     assert job.progress == 1 and job.seconds_left is None
     assert job.warnings == ["3 images have no pose."]
@@ -120,7 +124,7 @@ def test_the_one_after_waits_and_all_changes_are_told(make):
     until(lambda: second.is_finished, look)
     assert [title for title, state in order if state is State.DONE] == ["first", "second"]
     assert not queue.poll() and queue.running is None
-    queue.clear_finished()
+    queue.remove_finished()
     assert queue.jobs == []
 
 
@@ -176,7 +180,7 @@ def test_stop_twice_ends_a_deaf_one_by_force(make, monkeypatch):
 
 
 def test_stop_all_waits_for_those_that_save_and_kills_the_deaf(make):
-    for code, how in (TRAINS, "Saved at step 10."), (DEAF, "Ended by force; what was saved last is kept"):
+    for code, how in (TRAINS, "Saved at step 10."), (DEAF, "Ended by force; the last checkpoint is kept"):
         job, waiting = make(code), make(code)
         queue = started(job)
         queue.add(waiting)
@@ -188,11 +192,13 @@ def test_stop_all_waits_for_those_that_save_and_kills_the_deaf(make):
 
 @posix
 def test_crash_shows_the_last_message(make):
-    job = run(make("""
+    job = run(
+        make("""
 print("reading", file=sys.stderr)
 print("terminate called: out of cheese", file=sys.stderr, flush=True)
 os.abort()
-"""))
+""")
+    )
     assert job.state is State.FAILED and job.exit_code == -signal.SIGABRT
     assert job.error == "The backend crashed (Aborted); its last message: terminate called: out of cheese"
     assert job.log == ["reading", "terminate called: out of cheese"]
@@ -222,7 +228,8 @@ def test_error_and_exit_codes(make):
 
 
 def test_garbage_between_events(make):
-    job = run(make(r"""
+    job = run(
+        make(r"""
 out = sys.stdout.buffer
 out.write(b"\xff\xfe not text\n{ broken\n[1]\n{\"no\": \"type\"}\n\n" + b"x" * 3_000_000 + b"\n")
 for i in range(100):
@@ -231,7 +238,8 @@ out.write('{"type": "status", "message": "Größe"}\r\n'.encode())
 out.write(b'{"type": "progress", "done": "much", "total": null}\n{"type": "progress", "done": 1, "total": 0}\n')
 out.write(b'{"type": "progress", "done": NaN, "total": 1, "step": true}\n{"type": "unheard-of"}\n')
 out.write(b'{"type": "done", "message": "without an end of line"}')
-"""))
+""")
+    )
     assert job.state is State.DONE and job.message == "without an end of line"
     assert len(job.log) == 40 and job.log[-1] == "line 99" and job.step is None
 
@@ -263,7 +271,7 @@ say("done")
 
 
 def test_a_grandchild_that_keeps_the_pipes_holds_nothing_up(make, monkeypatch):
-    monkeypatch.setattr("objectgs.objectgs_addon.backend_process._PIPES_STAY_OPEN", 0.2)
+    monkeypatch.setattr("objectgs.objectgs_addon.process.backend_process._PIPES_STAY_OPEN", 0.2)
     job = make("""
 import subprocess
 child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(20)"])
@@ -300,10 +308,15 @@ def test_own_group_lower_priority_clean_environment(make, monkeypatch, tmp_path)
     monkeypatch.setenv("PYTHONHOME", "/nowhere")
     monkeypatch.setenv("PYTHONPATH", "/nowhere")
     monkeypatch.setenv("OBJECTGS_TEST", "stays")
-    job = run(make("""
+    job = run(
+        make(
+            """
 way = os.sched_getscheduler(0) == os.SCHED_IDLE if hasattr(os, "SCHED_IDLE") else os.nice(0) > 0
 say("done", group=os.getpgid(0), pid=os.getpid(), gives_way=way, variables=dict(os.environ))
-""", environment=backend_environment(tmp_path / "cache")))
+""",
+            environment=backend_environment(tmp_path / "cache"),
+        )
+    )
     assert job.state is State.DONE
     found, variables = job.result, job.result["variables"]
     assert found["group"] == found["pid"] and found["gives_way"]
@@ -313,7 +326,7 @@ say("done", group=os.getpgid(0), pid=os.getpid(), gives_way=way, variables=dict(
 
 def test_without_a_window_nobody_has_to_give_way(make):
     job = make("""say("done", policy=os.sched_getscheduler(0) if hasattr(os, "SCHED_IDLE") else os.nice(0))""")
-    run_blocking(job, echo=lambda line: None)
+    run_blocking(job, Reporter())
     assert job.result["policy"] == (os.sched_getscheduler(0) if hasattr(os, "SCHED_IDLE") else os.nice(0))
 
 
@@ -333,7 +346,7 @@ def test_what_cannot_be_started(make, tmp_path):
     job = run(make("", command=[str(tmp_path / "no-python"), "-m", "backend"]))
     assert job.state is State.FAILED and "no-python could not be started" in job.error
     job = run(make("", cwd=tmp_path / "gone"))
-    assert job.state is State.FAILED and "gone is gone" in job.error
+    assert job.state is State.FAILED and "gone is missing" in job.error
     (tmp_path / "text").write_text("no program")
     job = run(make("", command=[str(tmp_path / "text")]))
     assert job.state is State.FAILED and "could not be started" in job.error
@@ -381,20 +394,35 @@ def test_folder_by_any_name(make, tmp_path):
     assert queue.of_folder(tmp_path / "b") is None
 
 
-def test_run_blocking_tells_and_returns_the_exit_code(make):
-    said = []
-    code = run_blocking(make("""
+class Recorder(Reporter):
+    """Keeps messages and warnings."""
+
+    def __init__(self):
+        self.messages, self.warnings = [], []
+
+    def status(self, message):
+        self.messages.append(message)
+
+    def warning(self, message):
+        self.warnings.append(message)
+
+
+def test_run_blocking_reports_and_returns_the_exit_code(make):
+    reporter = Recorder()
+    code = run_blocking(
+        make("""
 say("status", message="Voting")
 time.sleep(0.2)
 say("warning", message="One mask is empty.")
 say("done", message="Voted.")
-"""), said.append)
-    assert code == 0 and said == ["Voting", "warning: One mask is empty.", "Voted."]
-    said.clear()
-    assert run_blocking(make('say("error", message="No masks."); sys.exit(2)'), said.append) == 2
-    assert said == ["error: No masks."]
-    assert run_blocking(make("os._exit(9)"), said.append) == 1
-    assert run_blocking(make("", command=["/no/such/python"]), said.append) == 2
+"""),
+        reporter,
+    )
+    assert code == 0 and reporter.messages == ["Voting", "Voted."] and reporter.warnings == ["One mask is empty."]
+    refused = make('say("error", message="No masks."); sys.exit(2)')
+    assert run_blocking(refused, Reporter()) == 2 and refused.error == "No masks."
+    assert run_blocking(make("os._exit(9)"), Reporter()) == 1
+    assert run_blocking(make("", command=["/no/such/python"]), Reporter()) == 2
 
 
 @posix
@@ -402,31 +430,26 @@ say("done", message="Voted.")
 def test_run_blocking_saves_on_a_signal(make, number):
     before = signal.getsignal(number)
     threading.Timer(0.7, os.kill, (os.getpid(), number)).start()
-    said = []
-    assert run_blocking(make(TRAINS), said.append) == 130
-    assert said[-1] == "Saved at step 10." and signal.getsignal(number) is before
+    reporter = Recorder()
+    assert run_blocking(make(TRAINS), reporter) == 130
+    assert reporter.messages[-1] == "Saved at step 10." and signal.getsignal(number) is before
 
 
 @posix
 def test_run_blocking_a_second_signal_ends_it_by_force(make):
     for seconds in (0.7, 1.0):
         threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT)).start()
-    assert run_blocking(make(DEAF), lambda line: None) == 130
-
-
-def test_lock_holder(tmp_path):
-    lock = tmp_path / ".lock"
-    assert lock_holder(tmp_path) is None and lock_holder(tmp_path / "gone") is None
-    child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
-    lock.write_text(f"{child.pid}\n")
-    assert lock_holder(tmp_path) == child.pid
-    child.communicate(b"\n")
-    assert lock_holder(tmp_path) is None
-    for text in ("", "pid", "-1", "0", str(os.getpid()), "9" * 40):
-        lock.write_text(text)
-        assert lock_holder(tmp_path) is None, text
+    assert run_blocking(make(DEAF), Reporter()) == 130
 
 
 def test_command_line():
     assert backend_command("/py", "train", Path("a"), "--out", "b") == [
-        "/py", "-m", "backend", "train", str(Path("a")), "--out", "b", "--json"]
+        "/py",
+        "-m",
+        "backend",
+        "train",
+        str(Path("a")),
+        "--out",
+        "b",
+        "--json",
+    ]

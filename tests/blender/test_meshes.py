@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshes in Blender: exact place, UVs, colours, material; updates in place; what is shown; merges and faults."""
+"""Meshes in Blender: exact place, UVs, colors, material; updates in place; what is shown; merges and faults."""
 
 import json
 import os
@@ -9,13 +9,14 @@ import bpy
 import numpy as np
 import pytest
 from mathutils import Matrix
-from objectgs.backend.objects import edit_objects
-from objectgs.backend.ply import write_vertices
-from objectgs.backend.protocol import InputError
-from objectgs.objectgs_addon import locations, running
+from objectgs.backend.shared.errors import InputError
+from objectgs.backend.shared.formats.ply import write_vertices
+from objectgs.backend.shared.reconstruction.objects import edit_objects
 from objectgs.objectgs_addon import scene as blender_scene
-from objectgs.objectgs_addon.folder_state import folder_state
+from objectgs.objectgs_addon.environment import locations
+from objectgs.objectgs_addon.running import running
 from objectgs.objectgs_addon.scene import kinds
+from objectgs.objectgs_addon.state.folder_state import folder_state
 
 import headless
 
@@ -36,8 +37,14 @@ def folder(tmp_path) -> Path:
     for axis, name in enumerate("xyz"):
         splats[name] += ORIGIN[axis]
     write_vertices(place / "splats.ply", splats)
-    write_meshes(place, {"1": tetrahedron(ORIGIN + 0.5), "2": tetrahedron(ORIGIN - 0.5, 0.5),
-                         str(HUGE): "box was seen in one view only."})
+    write_meshes(
+        place,
+        {
+            "1": tetrahedron(ORIGIN + 0.5),
+            "2": tetrahedron(ORIGIN - 0.5, 0.5),
+            str(HUGE): "box was seen in one view only.",
+        },
+    )
     return place
 
 
@@ -45,18 +52,18 @@ def folder(tmp_path) -> Path:
 def root(fresh, folder):
     """The folder shown, with its result."""
     shown = blender_scene.show_capture(bpy.context.scene, folder)
-    assert blender_scene.show_result(shown, folder, bpy.context.scene).warnings == []
+    assert blender_scene.show_result(shown, folder).warnings == []
     return shown
 
 
 def parts(root, object_id, kind):
     collection = blender_scene.object_collections(root)[object_id]
-    return [thing for thing in collection.objects if blender_scene.kind_of(thing) == kind]
+    return [obj for obj in collection.objects if blender_scene.kind_of(obj) == kind]
 
 
 def mesh_of(root, object_id):
-    (thing,) = parts(root, object_id, "mesh")
-    return thing
+    (obj,) = parts(root, object_id, "mesh")
+    return obj
 
 
 def rewrite(folder, rgb=(0, 255, 0), **meshes):
@@ -68,11 +75,11 @@ def rewrite(folder, rgb=(0, 255, 0), **meshes):
         os.utime(path, ns=(later, later))
 
 
-def coordinates(thing) -> np.ndarray:
+def coordinates(obj) -> np.ndarray:
     """(V, 3) of a mesh in the world."""
-    local = np.empty(3 * len(thing.data.vertices), np.float32)
-    thing.data.vertices.foreach_get("co", local)
-    matrix = np.array(thing.matrix_world)
+    local = np.empty(3 * len(obj.data.vertices), np.float32)
+    obj.data.vertices.foreach_get("co", local)
+    matrix = np.array(obj.matrix_world)
     return local.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
 
 
@@ -94,14 +101,14 @@ def picture_of(material):
 def test_a_mesh_is_exactly_where_the_file_says(root, folder):
     bpy.context.view_layer.update()
     upright = np.array(kinds.parent_of(root).matrix_world)
-    for object_id, centre, size in ((1, 0.5, 1.0), (2, -0.5, 0.5)):
-        thing = mesh_of(root, object_id)
-        expected = tetrahedron(ORIGIN + centre, size).vertices - ORIGIN
-        assert coordinates(thing) == pytest.approx(expected @ upright[:3, :3].T + upright[:3, 3], abs=2e-6)
-        assert thing.parent == parts(root, object_id, "object_parent")[0]
-        assert tuple(thing.matrix_basis.translation) == (0, 0, 0), "its origin is the pivot's, as the splats' is"
-        assert blender_scene.object_id_of(thing) == object_id
-        assert blender_scene.root_of(thing, bpy.context.scene) == root
+    for object_id, center, size in ((1, 0.5, 1.0), (2, -0.5, 0.5)):
+        obj = mesh_of(root, object_id)
+        expected = tetrahedron(ORIGIN + center, size).vertices - ORIGIN
+        assert coordinates(obj) == pytest.approx(expected @ upright[:3, :3].T + upright[:3, 3], abs=2e-6)
+        assert obj.parent == parts(root, object_id, "object_parent")[0]
+        assert tuple(obj.matrix_basis.translation) == (0, 0, 0), "its origin is the pivot's, as the splats' is"
+        assert blender_scene.object_id_of(obj) == object_id
+        assert blender_scene.root_of(obj, bpy.context.scene) == root
     assert parts(root, HUGE, "mesh") == []
     blender_scene.show_kinds(root, "both")
     bpy.context.view_layer.update()
@@ -109,23 +116,23 @@ def test_a_mesh_is_exactly_where_the_file_says(root, folder):
 
 
 def test_a_mesh_carries_all_that_the_file_holds(root):
-    thing, given = mesh_of(root, 1), tetrahedron()
-    mesh = thing.data
+    obj, given = mesh_of(root, 1), tetrahedron()
+    mesh = obj.data
     assert [tuple(polygon.vertices) for polygon in mesh.polygons] == [tuple(face) for face in given.faces]
     assert [layer.name for layer in mesh.uv_layers] == ["UVMap"] and mesh.uv_layers.active.active_render
     assert np.array([entry.vector for entry in mesh.uv_layers["UVMap"].uv]) == pytest.approx(given.uvs.reshape(-1, 2))
-    colours = mesh.color_attributes["Col"]
-    assert (colours.data_type, colours.domain) == ("BYTE_COLOR", "POINT")
-    assert np.array([entry.color_srgb for entry in colours.data])[:, :3] * 255 == pytest.approx(given.colors, abs=1e-3)
-    assert mesh.color_attributes.active_color == colours
-    invented = mesh.attributes["invented"]
-    assert (invented.data_type, invented.domain) == ("BOOLEAN", "FACE")
-    assert [entry.value for entry in invented.data] == list(given.invented)
+    colors = mesh.color_attributes["Col"]
+    assert (colors.data_type, colors.domain) == ("BYTE_COLOR", "POINT")
+    assert np.array([entry.color_srgb for entry in colors.data])[:, :3] * 255 == pytest.approx(given.colors, abs=1e-3)
+    assert mesh.color_attributes.active_color == colors
+    unobserved = mesh.attributes["unobserved"]
+    assert (unobserved.data_type, unobserved.domain) == ("BOOLEAN", "FACE")
+    assert [entry.value for entry in unobserved.data] == list(given.unobserved)
     assert all(polygon.use_smooth for polygon in mesh.polygons)
     normals = np.array([entry.vector for entry in mesh.corner_normals])
     assert normals == pytest.approx(given.normals[given.faces.reshape(-1)], abs=0.01)
     assert not mesh.validate()
-    assert (thing.name, mesh.name) == ("mug mesh", "mug mesh")
+    assert (obj.name, mesh.name) == ("mug mesh", "mug mesh")
 
 
 def test_the_material_shows_the_texture(root, folder):
@@ -166,75 +173,83 @@ def test_a_mesh_can_be_used_in_another_file(root, folder, tmp_path):
     dropped.instance_type, dropped.instance_collection = "COLLECTION", wanted.collections[0]
     dropped.location = 10, 20, 30
     bpy.context.scene.collection.objects.link(dropped)
-    (instance,) = [np.array(entry.matrix_world) for entry in bpy.context.evaluated_depsgraph_get().object_instances
-                   if entry.is_instance and blender_scene.kind_of(entry.object.original) == "mesh"]
-    thing = next(thing for thing in bpy.data.objects if blender_scene.kind_of(thing) == "mesh")
-    local = np.array([vertex.co for vertex in thing.data.vertices])
+    (instance,) = [
+        np.array(entry.matrix_world)
+        for entry in bpy.context.evaluated_depsgraph_get().object_instances
+        if entry.is_instance and blender_scene.kind_of(entry.object.original) == "mesh"
+    ]
+    obj = next(obj for obj in bpy.data.objects if blender_scene.kind_of(obj) == "mesh")
+    local = np.array([vertex.co for vertex in obj.data.vertices])
     placed = local @ instance[:3, :3].T + instance[:3, 3]
     low, high = before.min(0), before.max(0)
     stand = np.array([*((low + high) / 2)[:2], low[2]])
     assert placed == pytest.approx(before - stand + (10, 20, 30), abs=1e-5), "upright, in size, on what is below"
-    assert tuple(picture_of(thing.data.materials[0]).size) == (4, 4)
+    assert tuple(picture_of(obj.data.materials[0]).size) == (4, 4)
 
 
 # Updates in place.
 
 
 def test_meshes_made_again_keep_what_the_user_did(root, folder):
-    thing = mesh_of(root, 1)
-    pivot = thing.parent
-    ours = thing.data.materials[0]
+    obj = mesh_of(root, 1)
+    pivot = obj.parent
+    ours = obj.data.materials[0]
     shader_of(ours).inputs["Roughness"].default_value = 0.1
     own = bpy.data.materials.new("own")
-    thing.data.materials.append(own)
-    thing.name, thing.data.name = "mine", "mine too"
-    thing.location, pivot.scale = (1, 2, 3), (2, 2, 2)
-    thing.modifiers.new("Decimate", "DECIMATE")
-    thing.shape_key_add(name="Basis")
-    thing.hide_render = True
-    thing.hide_set(True)
+    obj.data.materials.append(own)
+    obj.name, obj.data.name = "mine", "mine too"
+    obj.location, pivot.scale = (1, 2, 3), (2, 2, 2)
+    obj.modifiers.new("Decimate", "DECIMATE")
+    obj.shape_key_add(name="Basis")
+    obj.hide_render = True
+    obj.hide_set(True)
     before, image = counts(), picture_of(ours)
     rewrite(folder)
     shown = blender_scene.show_meshes(root, folder)
     assert (shown.meshes, shown.updated, shown.warnings) == (1, 1, [])
-    assert mesh_of(root, 1) == thing and thing.parent == pivot
-    assert thing.data.materials[:] == [ours, own]
+    assert mesh_of(root, 1) == obj and obj.parent == pivot
+    assert obj.data.materials[:] == [ours, own]
     assert shader_of(ours).inputs["Roughness"].default_value == pytest.approx(0.1)
-    assert (thing.name, thing.data.name) == ("mine", "mine too")
-    assert tuple(thing.location) == (1, 2, 3) and tuple(pivot.scale) == (2, 2, 2)
-    assert [modifier.type for modifier in thing.modifiers] == ["DECIMATE"]
-    assert thing.hide_render and thing.hide_get()
-    assert np.ptp([vertex.co for vertex in thing.data.vertices], axis=0) == pytest.approx([2, 2, 2])
-    assert [layer.name for layer in thing.data.uv_layers] == ["UVMap"]
+    assert (obj.name, obj.data.name) == ("mine", "mine too")
+    assert tuple(obj.location) == (1, 2, 3) and tuple(pivot.scale) == (2, 2, 2)
+    assert [modifier.type for modifier in obj.modifiers] == ["DECIMATE"]
+    assert obj.hide_render and obj.hide_get()
+    assert np.ptp([vertex.co for vertex in obj.data.vertices], axis=0) == pytest.approx([2, 2, 2])
+    assert [layer.name for layer in obj.data.uv_layers] == ["UVMap"]
     assert picture_of(ours) == image and tuple(image.pixels[:3]) == pytest.approx((0, 1, 0))
     after = counts()
-    assert after == {**before, "objects": before["objects"] - 1, "meshes": before["meshes"] - 1,
-                     "materials": before["materials"] - 1, "images": before["images"] - 1}, "the can has none any more"
+    assert after == {
+        **before,
+        "objects": before["objects"] - 1,
+        "meshes": before["meshes"] - 1,
+        "materials": before["materials"] - 1,
+        "images": before["images"] - 1,
+    }, "the can has none any more"
 
 
 def test_a_material_of_the_users_own_stays_and_our_texture_in_it_follows(root, folder):
-    thing = mesh_of(root, 1)
+    obj = mesh_of(root, 1)
     own = bpy.data.materials.new("own")
     if own.node_tree is None:
         own.use_nodes = True
-    image = picture_of(thing.data.materials[0])
+    image = picture_of(obj.data.materials[0])
     own.node_tree.nodes.new("ShaderNodeTexImage").image = image
-    thing.data.materials[0] = own
+    obj.data.materials[0] = own
     image.pack()
     rewrite(folder)
     blender_scene.show_meshes(root, folder)
-    assert thing.data.materials[:] == [own]
+    assert obj.data.materials[:] == [own]
     assert image.packed_file is not None and tuple(image.pixels[:3]) == pytest.approx((0, 1, 0))
 
 
 def test_a_mesh_whose_files_are_the_same_is_not_touched(root, folder):
-    thing = mesh_of(root, 1)
-    thing.data.vertices[0].co.x += 5
-    moved = coordinates(thing)
-    blender_scene.show_result(root, folder, bpy.context.scene)
+    obj = mesh_of(root, 1)
+    obj.data.vertices[0].co.x += 5
+    moved = coordinates(obj)
+    blender_scene.show_result(root, folder)
     assert blender_scene.show_meshes(root, folder).updated == 0
-    assert coordinates(thing) == pytest.approx(moved)
-    bpy.data.objects.remove(thing)
+    assert coordinates(obj) == pytest.approx(moved)
+    bpy.data.objects.remove(obj)
     assert blender_scene.show_meshes(root, folder).updated == 1, "and comes again where it was deleted"
 
 
@@ -244,18 +259,18 @@ def test_meshes_come_back_to_their_pivots(root, folder):
     bpy.data.objects.remove(parts(root, 1, "object_parent")[0])
     bpy.data.collections.remove(blender_scene.object_collections(root)[2])
     blender_scene.show_capture(bpy.context.scene, folder)
-    blender_scene.show_result(root, folder, bpy.context.scene)
+    blender_scene.show_result(root, folder)
     bpy.context.view_layer.update()
     assert coordinates(mesh_of(root, 1)) == pytest.approx(before, abs=2e-6)
     assert len(mesh_of(root, 2).data.polygons) == 4
 
 
-def test_names_and_colours_follow_the_list(root, folder):
-    edit_objects(folder / "objects.json", {1: dict(name="cup", colour=[255, 0, 0])})
-    blender_scene.show_objects(root, folder, bpy.context.scene)
-    thing = mesh_of(root, 1)
-    assert (thing.name, thing.data.materials[0].name) == ("cup mesh", "cup mesh")
-    assert tuple(thing.color) == tuple(thing.data.materials[0].diffuse_color) == pytest.approx((1, 0, 0, 1))
+def test_names_and_colors_follow_the_list(root, folder):
+    edit_objects(folder / "objects.json", {1: dict(name="cup", color=[255, 0, 0])})
+    blender_scene.show_objects(root, folder)
+    obj = mesh_of(root, 1)
+    assert (obj.name, obj.data.materials[0].name) == ("cup mesh", "cup mesh")
+    assert tuple(obj.color) == tuple(obj.data.materials[0].diffuse_color) == pytest.approx((1, 0, 0, 1))
 
 
 # Merged and left out.
@@ -265,7 +280,7 @@ def test_merged_objects_bring_their_meshes_along_until_they_have_one(root, folde
     bpy.context.view_layer.update()
     can, before = mesh_of(root, 2), coordinates(mesh_of(root, 2))
     edit_objects(folder / "objects.json", {2: dict(merged_into=1)})
-    blender_scene.show_objects(root, folder, bpy.context.scene)
+    blender_scene.show_objects(root, folder)
     bpy.context.view_layer.update()
     assert can in parts(root, 1, "mesh") and len(parts(root, 1, "mesh")) == 2
     assert can.parent == parts(root, 1, "object_parent")[0] and blender_scene.object_id_of(can) == 1
@@ -277,7 +292,7 @@ def test_merged_objects_bring_their_meshes_along_until_they_have_one(root, folde
     assert mesh_of(root, 1) != can
 
     edit_objects(folder / "objects.json", {2: dict(merged_into=None)})
-    warnings = blender_scene.show_result(root, folder, bpy.context.scene).warnings
+    warnings = blender_scene.show_result(root, folder).warnings
     assert len(warnings) == 1 and "mug" in warnings[0] and "extract it again" in warnings[0]
     assert parts(root, 1, "mesh") == [] and len(mesh_of(root, 2).data.polygons) == 4
     assert not parts(root, 1, "splats")[0].hide_render
@@ -288,7 +303,7 @@ def test_split_objects_get_their_meshes_back_with_their_materials(root, folder):
     material = can.data.materials[0]
     for into in (1, None):
         edit_objects(folder / "objects.json", {2: dict(merged_into=into)})
-        blender_scene.show_objects(root, folder, bpy.context.scene)
+        blender_scene.show_objects(root, folder)
     assert mesh_of(root, 2) == can and can.data.materials[:] == [material]
     assert len(parts(root, 1, "mesh")) == 1
 
@@ -296,7 +311,7 @@ def test_split_objects_get_their_meshes_back_with_their_materials(root, folder):
 def test_left_out_objects_have_no_mesh(root, folder):
     before = counts()
     edit_objects(folder / "objects.json", {2: dict(left_out=True)})
-    blender_scene.show_objects(root, folder, bpy.context.scene)
+    blender_scene.show_objects(root, folder)
     assert 2 not in blender_scene.object_collections(root)
     assert counts()["images"] == before["images"] - 1
 
@@ -304,14 +319,17 @@ def test_left_out_objects_have_no_mesh(root, folder):
 # What is shown.
 
 
-def hidden(things) -> set[bool]:
-    return {value for thing in things for value in (thing.hide_viewport, thing.hide_render)}
+def hidden(objs) -> set[bool]:
+    return {value for obj in objs for value in (obj.hide_viewport, obj.hide_render)}
 
 
 def test_meshes_take_the_place_of_splats(root):
     assert blender_scene.shown_kinds(root) == "meshes", "since there are meshes from the beginning"
-    expected = {"splats": ({True}, {False}, {False}, {False}), "both": ({False}, {False}, {False}, {False}),
-                "meshes": ({False}, {True}, {False}, {True})}
+    expected = {
+        "splats": ({True}, {False}, {False}, {False}),
+        "both": ({False}, {False}, {False}, {False}),
+        "meshes": ({False}, {True}, {False}, {True}),
+    }
     for which, (meshes, splats, without, rest) in expected.items():
         blender_scene.show_kinds(root, which)
         assert blender_scene.shown_kinds(root) == which
@@ -338,19 +356,19 @@ def test_what_comes_later_follows_the_choice(root, folder):
 
 def test_what_the_user_hid_stays_hidden(root, folder):
     blender_scene.show_kinds(root, "both")
-    things = [*parts(root, 0, "splats"), *parts(root, 1, "splats"), mesh_of(root, 1)]
-    for thing in things:
-        thing.hide_viewport = thing.hide_render = True
+    objs = [*parts(root, 0, "splats"), *parts(root, 1, "splats"), mesh_of(root, 1)]
+    for obj in objs:
+        obj.hide_viewport = obj.hide_render = True
     rewrite(folder, _1=tetrahedron(ORIGIN), _2=tetrahedron(ORIGIN), **{f"_{HUGE}": tetrahedron(ORIGIN)})
     blender_scene.show_meshes(root, folder)
-    blender_scene.show_result(root, folder, bpy.context.scene)
-    assert hidden(things) == {True}
+    blender_scene.show_result(root, folder)
+    assert hidden(objs) == {True}
 
 
 def test_splats_are_shown_until_there_are_meshes(fresh, folder):
     (folder / "meshes" / "meshes.json").rename(folder / "later.json")
     root = blender_scene.show_capture(bpy.context.scene, folder)
-    blender_scene.show_result(root, folder, bpy.context.scene)
+    blender_scene.show_result(root, folder)
     assert blender_scene.shown_kinds(root) == "splats" and not blender_scene.has_shown_meshes(root)
     assert hidden(parts(root, 1, "splats")) == {False}
     (folder / "later.json").rename(folder / "meshes" / "meshes.json")
@@ -359,11 +377,19 @@ def test_splats_are_shown_until_there_are_meshes(fresh, folder):
 
 
 def test_the_whole_scene_and_sets_are_hidden_beside_the_objects(root, folder):
-    write_meshes(folder, {"1": tetrahedron(ORIGIN), "scene": tetrahedron(ORIGIN + 1, 3.0),
-                          "pair": tetrahedron(ORIGIN), "77": tetrahedron(ORIGIN)}, ids={"pair": [1, 2], "77": [1, 2]})
+    write_meshes(
+        folder,
+        {
+            "1": tetrahedron(ORIGIN),
+            "scene": tetrahedron(ORIGIN + 1, 3.0),
+            "pair": tetrahedron(ORIGIN),
+            "77": tetrahedron(ORIGIN),
+        },
+        ids={"pair": [1, 2], "77": [1, 2]},
+    )
     shown = blender_scene.show_meshes(root, folder)
     assert (shown.meshes, shown.warnings) == (4, [])
-    whole = {thing.name: thing for thing in blender_scene.scene_meshes(root)}
+    whole = {obj.name: obj for obj in blender_scene.scene_meshes(root)}
     assert set(whole) == {"name of scene mesh", "name of pair mesh", "name of 77 mesh"}
     assert hidden(whole.values()) == {True}
     whole["name of scene mesh"].hide_viewport = False
@@ -383,7 +409,7 @@ def test_a_scene_without_objects_shows_its_one_mesh(fresh, folder):
     write_vertices(folder / "splats.ply", splat_table(np.zeros(20, int)))
     write_meshes(folder, {"scene": tetrahedron(ORIGIN)})
     root = blender_scene.show_capture(bpy.context.scene, folder)
-    blender_scene.show_result(root, folder, bpy.context.scene)
+    blender_scene.show_result(root, folder)
     assert hidden(blender_scene.scene_meshes(root)) == {False} and hidden(parts(root, 0, "splats")) == {True}
     blender_scene.show_kinds(root, "splats")
     assert hidden(blender_scene.scene_meshes(root)) == {True} and hidden(parts(root, 0, "splats")) == {False}
@@ -392,11 +418,14 @@ def test_a_scene_without_objects_shows_its_one_mesh(fresh, folder):
 # Faults.
 
 
-@pytest.mark.parametrize("spoil, sentence", [
-    (lambda path: path.unlink(), "2.ply cannot be read"),
-    (lambda path: path.write_bytes(path.read_bytes()[:-1]), "2.ply is cut short"),
-    (lambda path: path.write_bytes(b"ply\n"), "2.ply is not a mesh"),
-])
+@pytest.mark.parametrize(
+    ("spoil", "sentence"),
+    [
+        (lambda path: path.unlink(), "2.ply cannot be read"),
+        (lambda path: path.write_bytes(path.read_bytes()[:-1]), "2.ply is cut short"),
+        (lambda path: path.write_bytes(b"ply\n"), "2.ply is not a mesh"),
+    ],
+)
 def test_a_broken_mesh_is_told_and_the_others_come(root, folder, spoil, sentence):
     kept = mesh_of(root, 2)
     rewrite(folder, _1=tetrahedron(ORIGIN, 2.0), _2=tetrahedron(ORIGIN, 2.0))
@@ -407,13 +436,15 @@ def test_a_broken_mesh_is_told_and_the_others_come(root, folder, spoil, sentence
     assert mesh_of(root, 2) == kept and len(kept.data.polygons) == 4
 
 
-@pytest.mark.parametrize("change", [
-    lambda mesh: mesh.vertices.__setitem__((0, 0), np.nan), lambda mesh: setattr(mesh, "faces", mesh.faces[:0])])
+@pytest.mark.parametrize(
+    "change",
+    [lambda mesh: mesh.vertices.__setitem__((0, 0), np.nan), lambda mesh: setattr(mesh, "faces", mesh.faces[:0])],
+)
 def test_a_mesh_without_a_surface_is_told(root, folder, change):
     bad = tetrahedron(ORIGIN)
     change(bad)
     if not len(bad.faces):
-        bad.uvs, bad.invented = bad.uvs[:0], bad.invented[:0]
+        bad.uvs, bad.unobserved = bad.uvs[:0], bad.unobserved[:0]
     rewrite(folder, _1=bad)
     (sentence,) = blender_scene.show_meshes(root, folder).warnings
     assert "1.ply holds no surface" in sentence
@@ -429,22 +460,29 @@ def test_faces_that_are_none_do_no_harm(root, folder):
     assert len(mesh.polygons) == 3 and not mesh.validate()
 
 
-@pytest.mark.parametrize("content", [
-    "[]", "{", '{"meshes": {"1": 5}}', '{"meshes": {"1": {"file": "1.ply", "ids": 7}}}',
-    '{"meshes": {"1": {"file": "1.ply", "ids": ["x"]}}}'])
+@pytest.mark.parametrize(
+    "content",
+    [
+        "[]",
+        "{",
+        '{"meshes": {"1": 5}}',
+        '{"meshes": {"1": {"file": "1.ply", "ids": 7}}}',
+        '{"meshes": {"1": {"file": "1.ply", "ids": ["x"]}}}',
+    ],
+)
 def test_a_broken_list_of_meshes_changes_nothing(root, folder, content):
     (folder / "meshes" / "meshes.json").write_text(content)
     before = counts()
     with pytest.raises(InputError, match=r"meshes\.json"):
         blender_scene.show_meshes(root, folder)
-    (sentence,) = blender_scene.show_result(root, folder, bpy.context.scene).warnings
+    (sentence,) = blender_scene.show_result(root, folder).warnings
     assert "meshes.json" in sentence and counts() == before
 
 
 def test_a_missing_texture_is_told_and_comes_later(fresh, folder):
     (folder / "meshes" / "1.png").rename(folder / "away.png")
     root = blender_scene.show_capture(bpy.context.scene, folder)
-    (sentence,) = blender_scene.show_result(root, folder, bpy.context.scene).warnings
+    (sentence,) = blender_scene.show_result(root, folder).warnings
     assert "1.png is missing" in sentence
     (folder / "away.png").rename(folder / "meshes" / "1.png")
     assert blender_scene.show_meshes(root, folder).warnings == []
@@ -496,11 +534,11 @@ def asked(monkeypatch):
     jobs = []
 
     def submit(job, owner, report):
-        jobs.append([str(word) for word in job.command[job.command.index("backend") + 1:-1]])
+        jobs.append([str(word) for word in job.command[job.command.index("backend") + 1 : -1]])
         return {"FINISHED"}
 
     monkeypatch.setattr(running, "submit", submit)
-    monkeypatch.setattr("objectgs.operators.need.training", lambda *_: True)
+    monkeypatch.setattr("objectgs.operators.common.need.training", lambda *_: True)
     return jobs
 
 
@@ -514,11 +552,11 @@ def test_the_operator_asks_for_what_the_panel_says(active, asked, folder):
     mesh_of(active, 2).select_set(True)
     bpy.context.view_layer.objects.active = mesh_of(active, 2)
     extract()
-    for thing in bpy.context.selected_objects:
-        thing.select_set(False)
+    for obj in bpy.context.selected_objects:
+        obj.select_set(False)
     properties.active_object = 0
-    for thing in bpy.context.selected_objects:
-        thing.select_set(False)
+    for obj in bpy.context.selected_objects:
+        obj.select_set(False)
     extract()
     options = ["--faces", "5000", "--open", "--texture-size", "2048"]
     named = ["mesh", str(folder), "--faces", "5000"]
@@ -541,7 +579,7 @@ def test_a_job_that_ends_shows_its_meshes(active, folder, monkeypatch):
     assert hidden(parts(active, 1, "splats")) == {False} and blender_scene.shown_kinds(active) == "splats"
     rewrite(folder)
     job = locations.backend_job("Meshes", "mesh", blender_scene.folder_of(active), "mesh")
-    running._wanted_in[job] = bpy.context.scene.session_uid
+    running._submitted_in[job] = bpy.context.scene.session_uid
     running.finish(job)
     assert properties.shown == "meshes" and hidden(parts(active, 1, "mesh")) == {False}
     assert properties.objects[0].faces == 4 and properties.objects[1].faces == 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The list of objects and what its buttons do: names, colours, solo, choosing, merging, the selection."""
+"""The list of objects and what its buttons do: names, colors, solo, choosing, merging, the selection."""
 
 import shutil
 
@@ -9,9 +9,11 @@ import headless
 
 bpy = pytest.importorskip("bpy")
 
-from objectgs.backend.objects import read_objects  # noqa: E402
-from objectgs.objectgs_addon import object_edits, scene, selection, visibility  # noqa: E402
-from objectgs.objectgs_addon.object_list import describe  # noqa: E402
+from objectgs.backend.shared.reconstruction.objects import read_objects
+from objectgs.objectgs_addon import scene
+from objectgs.objectgs_addon.panels.objects import describe
+from objectgs.objectgs_addon.picking import selection
+from objectgs.objectgs_addon.state import object_edits, visibility
 
 
 @pytest.fixture
@@ -46,19 +48,21 @@ def test_rows_say_what_the_file_says(root):
     entries = read_objects(scene.folder_of(root) / "objects.json")
     items = root.objectgs.objects
     assert [(object_edits.from_stored(i.object_id), i.name, i.points) for i in items] == [
-        (e.id, e.name, e.points) for e in entries]
+        (e.id, e.name, e.points) for e in entries
+    ]
     counts = object_edits.splat_counts(root)
     assert sum(counts.values()) > 0 and all(
-        item.splats == counts.get(object_edits.from_stored(item.object_id), 0) for item in items)
+        item.splats == counts.get(object_edits.from_stored(item.object_id), 0) for item in items
+    )
     assert f"{items[0].points:,} points" in describe(items[0], root.objectgs)
 
 
-def test_a_new_name_and_colour_reach_the_file_and_the_collection(root):
+def test_a_new_name_and_color_reach_the_file_and_the_collection(root):
     object_id = first_ids(root)[0]
     item = next(i for i in root.objectgs.objects if object_edits.from_stored(i.object_id) == object_id)
     item.name = "  tall thing "
-    item.colour = (1.0, 0.5, 0.0)
-    assert entry(root, object_id).name == "tall thing" and entry(root, object_id).colour == (255, 128, 0)
+    item.color = (1.0, 0.5, 0.0)
+    assert entry(root, object_id).name == "tall thing" and entry(root, object_id).color == (255, 128, 0)
     collection = scene.object_collections(root)[object_id]
     assert collection.name == "tall thing"
     splats = next(part for part in scene.parts_of(collection) if scene.kind_of(part) == "splats")
@@ -71,7 +75,8 @@ def test_solo_hides_the_others_and_once_more_shows_all(root):
     bpy.ops.objectgs.solo_object()
     layers = visibility.object_layers(bpy.context.view_layer, root)
     assert len(layers) > 2 and {i: layer.hide_viewport for i, layer in layers.items()} == {
-        i: i != object_id for i in layers}
+        i: i != object_id for i in layers
+    }
     other = first_ids(root)[1]
     activate(root, other)
     bpy.ops.objectgs.solo_object()
@@ -131,11 +136,11 @@ def test_distance_and_ground_by_points(root):
         bpy.ops.objectgs.set_distance(points=(1, 1, 1, 1, 1, 1), distance=2.0)
 
 
-def test_points_take_the_colour_that_is_asked_for(root):
+def test_points_take_the_color_that_is_asked_for(root):
     points = next(part for part in root.all_objects if scene.kind_of(part) == "points")
-    root.objectgs.colour_by = "object"
+    root.objectgs.color_by = "object"
     assert points.data.color_attributes.active_color_name == "object"
-    root.objectgs.colour_by = "photo"
+    root.objectgs.color_by = "photo"
     assert points.data.color_attributes.active_color_name == "photo"
 
 

@@ -6,7 +6,7 @@ import pytest
 
 pytest.importorskip("bpy")
 
-from objectgs.objectgs_addon.picking import nearest
+from objectgs.objectgs_addon.picking.point_picker import nearest
 
 SIZE = (200, 100)
 
@@ -14,8 +14,14 @@ SIZE = (200, 100)
 def perspective(near=0.1, far=100.0):
     """A camera at the origin that looks along -Z, 90 degrees wide: world to clip space."""
     aspect = SIZE[0] / SIZE[1]
-    return np.array([[1, 0, 0, 0], [0, aspect, 0, 0],
-                     [0, 0, -(far + near) / (far - near), -2 * far * near / (far - near)], [0, 0, -1, 0]])
+    return np.array(
+        [
+            [1, 0, 0, 0],
+            [0, aspect, 0, 0],
+            [0, 0, -(far + near) / (far - near), -2 * far * near / (far - near)],
+            [0, 0, -1, 0],
+        ]
+    )
 
 
 def test_a_click_takes_the_point_under_it():

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The plan in Blender: what the panel shows, what the user wants otherwise, and what training is told of it."""
 
+import argparse
 import json
 import shutil
 
@@ -10,12 +11,17 @@ import headless
 
 bpy = pytest.importorskip("bpy")
 
-from objectgs.backend.objects import read_objects  # noqa: E402
-from objectgs.backend.planning.plan import Decision, Plan, write_plan  # noqa: E402
-from objectgs.backend.protocol import Reconstruction  # noqa: E402
-from objectgs.objectgs_addon import jobs, locations, planning, running, scene  # noqa: E402
-from objectgs.objectgs_addon.headless import commands  # noqa: E402
-from objectgs.objectgs_addon.headless.arguments import parse  # noqa: E402
+from objectgs.backend.shared.events import Reporter
+from objectgs.backend.shared.reconstruction.folder import Reconstruction
+from objectgs.backend.shared.reconstruction.objects import read_objects
+from objectgs.backend.shared.reconstruction.plan import Decision, Plan, write_plan
+from objectgs.objectgs_addon import scene
+from objectgs.objectgs_addon.environment import locations
+from objectgs.objectgs_addon.headless import commands
+from objectgs.objectgs_addon.headless.arguments import parse
+from objectgs.objectgs_addon.process import jobs
+from objectgs.objectgs_addon.running import running
+from objectgs.objectgs_addon.state import planning
 
 
 @pytest.fixture
@@ -24,12 +30,18 @@ def root(fresh, trained, tmp_path):
     extension = headless.extension()
     extension.register()
     folder = shutil.copytree(trained, tmp_path / "demo")
-    write_plan(folder / "plan.json", Plan((
-        Decision("votes", "votes", False, "the capture has no masks", can_override=False),
-        Decision("labels", "the label loss", None, "the votes will tell"),
-        Decision("exposure", "undoing of exposure", False, "it does not vary"),
-        Decision("pyramid", "reduced pictures", True, "they are large"),
-        Decision("blind-views", "training on 1 view", False, "it sees nothing", views=("a.png",), wanted=True))))
+    write_plan(
+        folder / "plan.json",
+        Plan(
+            (
+                Decision("votes", "votes", False, "the capture has no masks", can_override=False),
+                Decision("labels", "the label loss", None, "the votes will tell"),
+                Decision("exposure", "undoing of exposure", False, "it does not vary"),
+                Decision("pyramid", "reduced pictures", True, "they are large"),
+                Decision("blind-views", "training on 1 view", False, "it sees nothing", views=("a.png",), wanted=True),
+            )
+        ),
+    )
     bpy.ops.objectgs.open_reconstruction(directory=str(folder))
     yield bpy.context.scene.objectgs.active
     extension.unregister()
@@ -42,10 +54,10 @@ def test_training_did_leave_a_plan(trained):
 def test_what_is_overridden_is_told_to_training_and_undone(root):
     toggle = bpy.ops.objectgs.override_decision
     asked = planning.arguments(root)
-    assert asked[asked.index("--keep"):] == ["--keep", "blind-views"], "as the folder has it already"
+    assert asked[asked.index("--keep") :] == ["--keep", "blind-views"], "as the folder has it already"
     assert toggle(key="exposure") == {"FINISHED"} and toggle(key="pyramid") == {"FINISHED"}
     asked = planning.arguments(root)
-    assert asked[asked.index("--keep"):] == ["--keep", "exposure", "blind-views", "--leave-out", "pyramid"]
+    assert asked[asked.index("--keep") :] == ["--keep", "exposure", "blind-views", "--leave-out", "pyramid"]
     assert toggle(key="exposure") == {"FINISHED"} and toggle(key="blind-views") == {"FINISHED"}
     asked = planning.arguments(root)
     assert "--keep" not in asked and asked[-2:] == ["--leave-out", "pyramid"]
@@ -65,14 +77,19 @@ def test_a_broken_plan_is_none(root):
 def test_plan_and_train_ask_the_backend_for_the_same(root, monkeypatch):
     asked = []
     monkeypatch.setattr(locations, "backend_python", lambda: "python")
-    monkeypatch.setattr(locations, "backend_job", lambda title, kind, folder, *words: asked.append(words) or jobs.Job(
-        title=title, kind=kind, folder=folder, command=["true"], cwd=folder))
+    monkeypatch.setattr(
+        locations,
+        "backend_job",
+        lambda title, kind, folder, *words: (
+            asked.append(words) or jobs.Job(title=title, kind=kind, folder=folder, command=["true"], cwd=folder)
+        ),
+    )
     monkeypatch.setattr(running, "submit", lambda *_: {"FINISHED"})
     bpy.ops.objectgs.override_decision(key="exposure")
-    assert bpy.ops.objectgs.plan() == {"FINISHED"} and bpy.ops.objectgs.train() == {"FINISHED"}
+    assert bpy.ops.objectgs.analyze_capture() == {"FINISHED"} and bpy.ops.objectgs.train() == {"FINISHED"}
     wanted = tuple(planning.arguments(root))
     assert [words[0] for words in asked] == ["plan", "train"]
-    assert all(words[-len(wanted):] == wanted and "exposure" in words for words in asked)
+    assert all(words[-len(wanted) :] == wanted and "exposure" in words for words in asked)
 
 
 def test_a_labels_file_groups_objects(root, tmp_path):
@@ -92,11 +109,14 @@ def test_headless_hands_groups_on_from_where_it_was_called(monkeypatch, tmp_path
     asked = []
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(commands, "find_backend", lambda _python: None)
-    monkeypatch.setattr(commands, "run_backend", lambda *words: asked.append(words))
+    monkeypatch.setattr(commands, "run_backend", lambda _reporter, *words: asked.append(words))
+    monkeypatch.setattr(argparse.Namespace, "reporter", Reporter(), raising=False)
     commands.plan(parse(["plan", "garden", "--no-meshes"]))
     commands.plan(parse(["plan", "garden", "--out", "made", "--groups", "g.json", "--keep", "all"]))
     commands.backend(parse(["vote", "garden", "--out", "made", "--groups", "g.json"]))
     garden, made, groups = tmp_path / "garden", tmp_path / "made", ("--groups", tmp_path / "g.json")
-    assert asked == [("plan", None, garden, "--no-meshes"),
-                     ("plan", made, garden, "--out", made, *groups, "--keep", "all"),
-                     ("vote", made, garden, "--out", made, *groups)]
+    assert asked == [
+        ("plan", None, garden, "--no-meshes"),
+        ("plan", made, garden, "--out", made, *groups, "--keep", "all"),
+        ("vote", made, garden, "--out", made, *groups),
+    ]

@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Matrix, Vector
-from objectgs.backend.objects import edit_objects
-from objectgs.backend.palette import to_linear
-from objectgs.backend.ply import write_vertices
-from objectgs.backend.protocol import InputError
+from objectgs.backend.shared.color.palette import to_linear
+from objectgs.backend.shared.errors import InputError
+from objectgs.backend.shared.formats.ply import write_vertices
+from objectgs.backend.shared.reconstruction.objects import edit_objects
+from objectgs.backend.shared.splats.spherical_harmonics import C0
 from objectgs.objectgs_addon import scene as blender_scene
-from objectgs.objectgs_addon.scene import carrier, kinds, preview
+from objectgs.objectgs_addon.scene import carrier, kinds
+from objectgs.objectgs_addon.scene.shading import modifiers, node_groups
+from objectgs.objectgs_addon.scene.shading.materials import COLOR
 
 from .building import HUGE, OBJECTS, K, look_at, splat_table, write_cameras, write_folder, write_points
 
@@ -30,12 +33,12 @@ def root(fresh, folder):
     """The folder shown, with its result."""
     owner = bpy.context.scene
     shown = blender_scene.show_capture(owner, folder)
-    blender_scene.show_result(shown, folder, owner)
+    blender_scene.show_result(shown, folder)
     return shown
 
 
 def again(root, folder):
-    return blender_scene.show_result(root, folder, bpy.context.scene)
+    return blender_scene.show_result(root, folder)
 
 
 def part(root, object_id, kind):
@@ -43,13 +46,17 @@ def part(root, object_id, kind):
 
 
 def cameras_of(root):
-    return sorted((thing for thing in kinds.capture_of(root).objects if blender_scene.kind_of(thing) == "camera"),
-                  key=lambda thing: thing.name)
+    return sorted(
+        (obj for obj in kinds.capture_of(root).objects if blender_scene.kind_of(obj) == "camera"),
+        key=lambda obj: obj.name,
+    )
 
 
 def counts():
-    return {name: len(getattr(bpy.data, name)) for name in (
-        "objects", "meshes", "collections", "cameras", "materials", "node_groups", "images")}
+    return {
+        name: len(getattr(bpy.data, name))
+        for name in ("objects", "meshes", "collections", "cameras", "materials", "node_groups", "images")
+    }
 
 
 # Cameras.
@@ -134,7 +141,7 @@ def test_cameras_that_the_capture_has_lost_go(root, folder):
 # Points.
 
 
-def test_points_carry_both_colours_and_show_the_chosen_one(root, folder):
+def test_points_carry_both_colors_and_show_the_chosen_one(root, folder):
     points = kinds.points_of(root)
     mesh = points.data
     assert points.hide_render
@@ -145,27 +152,27 @@ def test_points_carry_both_colours_and_show_the_chosen_one(root, folder):
     assert carrier.read(mesh, "object")[place] == pytest.approx([*to_linear((10, 20, 31)), 1.0], abs=1e-6)
     assert carrier.read(mesh, "margin")[0] == 0.5
     for by in ("object", "photo"):
-        blender_scene.colour_points_by(root, by)
+        blender_scene.color_points_by(root, by)
         shown = points.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
         assert len(shown.polygons) == 8 * 30
         assert shown.attributes.active_color_name == by  # what Solid shows with its color set to Attribute
         first = carrier.read(mesh, by)[:1]
-        assert carrier.read(shown, "colour")[1:7] == pytest.approx(np.repeat(first, 6, 0), abs=1e-6)
+        assert carrier.read(shown, COLOR)[1:7] == pytest.approx(np.repeat(first, 6, 0), abs=1e-6)
         assert shown.materials[0].name == "ObjectGS Points"
 
 
-def test_a_vote_recolours_points_and_edits_rename(root, folder):
-    blender_scene.colour_points_by(root, "object")
-    edit_objects(folder / "objects.json", {1: dict(name="cup", colour=[255, 0, 0])})
+def test_a_vote_recolors_points_and_edits_rename(root, folder):
+    blender_scene.color_points_by(root, "object")
+    edit_objects(folder / "objects.json", {1: dict(name="cup", color=[255, 0, 0])})
     write_points(folder, np.zeros((5, 3)), [1, 1, 1, 1, 2])
-    blender_scene.show_objects(root, folder, bpy.context.scene)
+    blender_scene.show_objects(root, folder)
     mesh = kinds.points_of(root).data
     assert len(mesh.vertices) == 5
     assert carrier.read(mesh, "object")[0] == pytest.approx([1, 0, 0, 1])
     assert mesh.attributes.active_color_name == "object"
     collection = blender_scene.object_collections(root)[1]
     assert collection.name == "cup"
-    assert {thing.name for thing in collection.objects} == {"cup", "cup splats", "cup anchors"}
+    assert {obj.name for obj in collection.objects} == {"cup", "cup splats", "cup anchors"}
     splats = part(root, 1, "splats")
     assert tuple(splats.color) == pytest.approx((1, 0, 0, 1))
     assert tuple(splats.data.materials[0].diffuse_color) == pytest.approx((1, 0, 0, 1))
@@ -176,17 +183,19 @@ def test_a_vote_recolours_points_and_edits_rename(root, folder):
 
 def test_every_object_has_a_collection_with_its_splats_and_anchors(root, folder):
     collections = blender_scene.object_collections(root)
-    assert {object_id: collection.name for object_id, collection in collections.items()} == {
-        **OBJECTS, 0: "Unlabelled"}
+    assert {object_id: collection.name for object_id, collection in collections.items()} == {**OBJECTS, 0: "Unlabeled"}
     for object_id, collection in collections.items():
         assert collection.name in root.children
         assert blender_scene.kind_of(collection) == "object"
         assert blender_scene.object_id_of(collection) == object_id
-        assert [blender_scene.kind_of(thing) for thing in blender_scene.parts_of(collection)] == [
-            "object_parent", "splats", "anchors"]
-        for thing in blender_scene.parts_of(collection):
-            assert blender_scene.object_id_of(thing) == object_id
-            assert blender_scene.root_of(thing, bpy.context.scene) == root
+        assert [blender_scene.kind_of(obj) for obj in blender_scene.parts_of(collection)] == [
+            "object_parent",
+            "splats",
+            "anchors",
+        ]
+        for obj in blender_scene.parts_of(collection):
+            assert blender_scene.object_id_of(obj) == object_id
+            assert blender_scene.root_of(obj, bpy.context.scene) == root
         assert blender_scene.root_of(collection, bpy.context.scene) == root
         anchors = part(root, object_id, "anchors")
         assert anchors.hide_render and anchors.hide_viewport
@@ -203,7 +212,7 @@ def test_splats_have_the_attributes_of_blenders_own(fresh, folder, degree):
     write_vertices(folder / "splats.ply", table)
     owner = bpy.context.scene
     root = blender_scene.show_capture(owner, folder)
-    shown = blender_scene.show_result(root, folder, owner)
+    shown = blender_scene.show_result(root, folder)
     assert (shown.objects, shown.splats, shown.warnings) == (3, 20, [])
     bpy.context.view_layer.update()
     rows = table[table["object_id"] == 2]
@@ -217,12 +226,14 @@ def test_splats_have_the_attributes_of_blenders_own(fresh, folder, degree):
     assert carrier.read(mesh, "scale") == pytest.approx(np.exp(np.stack([rows[f"scale_{i}"] for i in range(3)], 1)))
     quaternion = np.stack([rows[f"rot_{i}"] for i in range(4)], 1)
     assert carrier.read(mesh, "rotation") == pytest.approx(
-        quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True), abs=1e-6)
+        quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True), abs=1e-6
+    )
     higher = (degree + 1) ** 2 - 1
     assert f"radiance:sh_{higher + 1}" not in mesh.attributes
     for k in range(higher):
         assert carrier.read(mesh, f"radiance:sh_{k + 1}") == pytest.approx(
-            np.stack([rows[f"f_rest_{channel * higher + k}"] for channel in range(3)], 1))
+            np.stack([rows[f"f_rest_{channel * higher + k}"] for channel in range(3)], 1)
+        )
     assert set(carrier.read(mesh, "object_id")) == {2}
     types = {a.name: a.data_type for a in mesh.attributes}
     assert (types["radiance:base"], types["rotation"], types["scale"]) == ("FLOAT_COLOR", "QUATERNION", "FLOAT_VECTOR")
@@ -230,14 +241,20 @@ def test_splats_have_the_attributes_of_blenders_own(fresh, folder, degree):
 
 def test_the_viewport_shows_points_or_ellipsoids(root):
     splats = part(root, 1, "splats")
-    modifier = preview.modifier_of(splats, preview.SPLATS_GROUP)
-    instances = [1 for instance in bpy.context.evaluated_depsgraph_get().object_instances
-                 if instance.is_instance and instance.parent and instance.parent.original == splats]
+    modifier = modifiers.modifier_of(splats, node_groups.SPLATS_GROUP)
+    instances = [
+        1
+        for instance in bpy.context.evaluated_depsgraph_get().object_instances
+        if instance.is_instance and instance.parent and instance.parent.original == splats
+    ]
     assert len(instances) <= 1  # the point cloud itself
-    preview.set_input(modifier, "Ellipsoids", True)
+    modifiers.set_input(modifier, "Ellipsoids", True)
     splats.update_tag()
-    instances = [1 for instance in bpy.context.evaluated_depsgraph_get().object_instances
-                 if instance.is_instance and instance.parent and instance.parent.original == splats]
+    instances = [
+        1
+        for instance in bpy.context.evaluated_depsgraph_get().object_instances
+        if instance.is_instance and instance.parent and instance.parent.original == splats
+    ]
     assert len(instances) == 10
 
 
@@ -249,7 +266,7 @@ def test_what_cannot_be_shown_is_left_out_and_told(fresh, folder):
     write_vertices(folder / "splats.ply", table)
     owner = bpy.context.scene
     root = blender_scene.show_capture(owner, folder)
-    shown = blender_scene.show_result(root, folder, owner)
+    shown = blender_scene.show_result(root, folder)
     assert shown.splats == 16
     assert shown.warnings == ["4 of 20 splats in splats.ply were left out: they hold NaN, infinity or no rotation."]
 
@@ -270,7 +287,7 @@ def test_showing_again_keeps_what_the_user_did(root, folder):
     splats.modifiers.new("own", "NODES")
     own = bpy.data.materials.new("own")
     splats.data.materials.append(own)
-    preview.set_input(splats.modifiers[0], "Point Size", 3.0)
+    modifiers.set_input(splats.modifiers[0], "Point Size", 3.0)
     splats.hide_render, anchors.hide_viewport = True, False
     parent = kinds.parent_of(root)
     parent.location = 5, 5, 5
@@ -282,7 +299,7 @@ def test_showing_again_keeps_what_the_user_did(root, folder):
     write_vertices(folder / "splats.ply", table)
     assert blender_scene.show_capture(owner, folder) == root
     again(root, folder)
-    blender_scene.show_objects(root, folder, owner)
+    blender_scene.show_objects(root, folder)
 
     assert counts() == before
     assert blender_scene.object_collections(root)[1] == mug
@@ -320,7 +337,7 @@ def test_objects_that_vanish_go_but_the_users_things_stay(root, folder):
     assert shown.objects == 1
     collections = blender_scene.object_collections(root)
     assert set(collections) == {1, 2}
-    assert {thing.name for thing in collections[2].objects} == {"can", "cube"}
+    assert {obj.name for obj in collections[2].objects} == {"can", "cube"}
     after = counts()
     assert before["meshes"] - after["meshes"] == 6  # splats and anchors of 0, 2 and the last
     assert before["materials"] - after["materials"] == 3
@@ -329,25 +346,27 @@ def test_objects_that_vanish_go_but_the_users_things_stay(root, folder):
 
 def test_merged_objects_come_into_one_collection_and_apart_again(root, folder):
     edit_objects(folder / "objects.json", {2: dict(merged_into=1)})
-    blender_scene.show_objects(root, folder, bpy.context.scene)
+    blender_scene.show_objects(root, folder)
     collections = blender_scene.object_collections(root)
     assert set(collections) == {0, 1, HUGE}
     splats = part(root, 1, "splats")
     assert len(splats.data.vertices) == 20
     assert sorted(carrier.read(splats.data, "object_id")) == [1] * 10 + [2] * 10
     edit_objects(folder / "objects.json", {2: dict(merged_into=None)})
-    blender_scene.show_objects(root, folder, bpy.context.scene)
-    assert {object_id: len(part(root, object_id, "splats").data.vertices)
-            for object_id in blender_scene.object_collections(root)} == {0: 10, 1: 10, 2: 10, HUGE: 10}
+    blender_scene.show_objects(root, folder)
+    assert {
+        object_id: len(part(root, object_id, "splats").data.vertices)
+        for object_id in blender_scene.object_collections(root)
+    } == {0: 10, 1: 10, 2: 10, HUGE: 10}
 
 
 def test_left_out_objects_go_nowhere(root, folder):
     edit_objects(folder / "objects.json", {2: dict(left_out=True)})
-    blender_scene.show_objects(root, folder, bpy.context.scene)
+    blender_scene.show_objects(root, folder)
     assert set(blender_scene.object_collections(root)) == {0, 1, HUGE}
     ids = carrier.read(kinds.points_of(root).data, "object_id")
-    colours = carrier.read(kinds.points_of(root).data, "object")
-    assert colours[ids == 2] == pytest.approx(np.repeat(colours[ids == 0][:1], np.count_nonzero(ids == 2), 0))
+    colors = carrier.read(kinds.points_of(root).data, "object")
+    assert colors[ids == 2] == pytest.approx(np.repeat(colors[ids == 0][:1], np.count_nonzero(ids == 2), 0))
 
 
 def test_what_the_user_deleted_comes_back_with_the_next_result(root, folder):
@@ -369,7 +388,7 @@ def test_two_reconstructions_in_one_file_stay_apart(root, folder, tmp_path):
     write_vertices(other_folder / "splats.ply", splat_table(np.resize([1], 4)))
     owner = bpy.context.scene
     other = blender_scene.show_capture(owner, other_folder, name="Second")
-    blender_scene.show_result(other, other_folder, owner)
+    blender_scene.show_result(other, other_folder)
     assert other != root and other.name == "Second"
     assert set(blender_scene.object_collections(other)) == {1}
     assert len(part(other, 1, "splats").data.vertices) == 4
@@ -381,14 +400,17 @@ def test_two_reconstructions_in_one_file_stay_apart(root, folder, tmp_path):
 # Faults.
 
 
-@pytest.mark.parametrize("name, spoil, sentence", [
-    ("cameras.json", None, "has no cameras.json; run Import again"),
-    ("cameras.json", b"{}", "does not list cameras as expected"),
-    ("cameras.json", b"{", "cannot be read as JSON"),
-    ("points.ply", None, "has no points.ply; run Import again"),
-    ("points.ply", b"ply\n", "no complete PLY header"),
-    ("objects.json", b"[]", "does not list objects"),
-])
+@pytest.mark.parametrize(
+    ("name", "spoil", "sentence"),
+    [
+        ("cameras.json", None, "has no cameras.json; run Import again"),
+        ("cameras.json", b"{}", "does not list cameras as expected"),
+        ("cameras.json", b"{", "cannot be read as JSON"),
+        ("points.ply", None, "has no points.ply; run Import again"),
+        ("points.ply", b"ply\n", "no complete PLY header"),
+        ("objects.json", b"[]", "does not list objects"),
+    ],
+)
 def test_bad_captures_change_nothing(fresh, folder, name, spoil, sentence):
     (folder / name).unlink() if spoil is None else (folder / name).write_bytes(spoil)
     before = counts()
@@ -397,12 +419,15 @@ def test_bad_captures_change_nothing(fresh, folder, name, spoil, sentence):
     assert counts() == before
 
 
-@pytest.mark.parametrize("name, spoil, sentence", [
-    ("splats.ply", None, "has no splats.ply; train first"),
-    ("splats.ply", "points.ply", "no file of Gaussian splats"),
-    ("anchors.ply", "points.ply", "has no property scale_0"),
-    ("splats.ply", "cut", "cut short"),
-])
+@pytest.mark.parametrize(
+    ("name", "spoil", "sentence"),
+    [
+        ("splats.ply", None, "has no splats.ply; train first"),
+        ("splats.ply", "points.ply", "no file of Gaussian splats"),
+        ("anchors.ply", "points.ply", "has no property scale_0"),
+        ("splats.ply", "cut", "cut short"),
+    ],
+)
 def test_bad_results_change_nothing(root, folder, name, spoil, sentence):
     path = folder / name
     if spoil is None:
@@ -435,7 +460,7 @@ def test_a_blend_file_without_its_folder_still_opens(root, folder, tmp_path):
     owner = bpy.context.scene
     shown = next(child for child in owner.collection.children if blender_scene.kind_of(child) == "reconstruction")
     assert set(blender_scene.object_collections(shown)) == {0, *OBJECTS}
-    blender_scene.colour_points_by(shown, "object")
+    blender_scene.color_points_by(shown, "object")
     with pytest.raises(InputError, match="run Import again"):
         blender_scene.show_capture(owner, blender_scene.folder_of(shown), shown)
     with pytest.raises(InputError, match="train first"):
@@ -459,8 +484,8 @@ def test_three_points_become_the_ground_below_the_cameras(root):
             assert (move @ corner).z == pytest.approx(0.0, abs=1e-5)
         bpy.context.view_layer.update()
         assert all(camera.matrix_world.translation.z > 0.5 for camera in cameras_of(root))
-        centre = sum(corners, Vector()) / 3
-        assert tuple((move @ centre).xy) == pytest.approx(tuple(centre.xy), abs=1e-5)
+        center = sum(corners, Vector()) / 3
+        assert tuple((move @ center).xy) == pytest.approx(tuple(center.xy), abs=1e-5)
     with pytest.raises(InputError, match="one line"):
         blender_scene.orient_to_ground(root, (0, 0, 0), (1, 1, 1), (3, 3, 3))
 
@@ -497,7 +522,7 @@ def rendered(tmp_path, size=(33, 33)) -> np.ndarray:
     return pixels
 
 
-def test_a_rendered_splat_is_the_gaussian_with_its_colour_from_here(fresh, tmp_path):
+def test_a_rendered_splat_is_the_gaussian_with_its_color_from_here(fresh, tmp_path):
     """One splat of degree 3 under a moved, turned parent: every pixel against the formula."""
     view = look_at((2.0, -3.0, 1.5))
     intrinsics = np.array([[60.0, 0.0, 16.5], [0.0, 60.0, 16.5], [0.0, 0.0, 1.0]])
@@ -517,7 +542,7 @@ def test_a_rendered_splat_is_the_gaussian_with_its_colour_from_here(fresh, tmp_p
     write_vertices(tmp_path / "splats.ply", table)
     owner = bpy.context.scene
     root = blender_scene.show_capture(owner, tmp_path)
-    blender_scene.show_result(root, tmp_path, owner)
+    blender_scene.show_result(root, tmp_path)
     kinds.parent_of(root).matrix_world = Matrix.Translation((3, 4, 5)) @ Matrix.Rotation(1.0, 4, "Y")
     image = rendered(tmp_path)
 
@@ -531,37 +556,48 @@ def test_a_rendered_splat_is_the_gaussian_with_its_colour_from_here(fresh, tmp_p
     squared = start @ start - (rays @ start) ** 2
     alpha = 0.8 * np.exp(-0.5 * squared)
     alpha[alpha < 1 / 255] = 0.0
-    colour = np.clip(0.5 + _harmonics(table, position - eye), 0.0, None)
-    linear = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
+    color = np.clip(0.5 + _harmonics(table, position - eye), 0.0, None)
+    linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
     assert np.abs(image - alpha[..., None] * linear).max() < 0.002 * linear.max()
     assert image.max() > 0.5 * linear.max()
 
 
 def _rotation(table):
     w, x, y, z = np.array([table[f"rot_{i}"][0] for i in range(4)], float) / np.linalg.norm(
-        [table[f"rot_{i}"][0] for i in range(4)])
-    return [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]
+        [table[f"rot_{i}"][0] for i in range(4)]
+    )
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
 
 
 def _harmonics(table, direction):
-    """Colour of the spherical harmonics of degree 0 to 3, by their textbook formulas."""
+    """Color of the spherical harmonics of degree 0 to 3, by their textbook formulas."""
     x, y, z = direction / np.linalg.norm(direction)
     pi = math.pi
     basis = [
         math.sqrt(1 / (4 * pi)),
-        -math.sqrt(3 / (4 * pi)) * y, math.sqrt(3 / (4 * pi)) * z, -math.sqrt(3 / (4 * pi)) * x,
-        math.sqrt(15 / (4 * pi)) * x * y, -math.sqrt(15 / (4 * pi)) * y * z,
-        math.sqrt(5 / (16 * pi)) * (3 * z * z - 1), -math.sqrt(15 / (4 * pi)) * x * z,
+        -math.sqrt(3 / (4 * pi)) * y,
+        math.sqrt(3 / (4 * pi)) * z,
+        -math.sqrt(3 / (4 * pi)) * x,
+        math.sqrt(15 / (4 * pi)) * x * y,
+        -math.sqrt(15 / (4 * pi)) * y * z,
+        math.sqrt(5 / (16 * pi)) * (3 * z * z - 1),
+        -math.sqrt(15 / (4 * pi)) * x * z,
         math.sqrt(15 / (16 * pi)) * (x * x - y * y),
-        -math.sqrt(35 / (32 * pi)) * y * (3 * x * x - y * y), math.sqrt(105 / (4 * pi)) * x * y * z,
-        -math.sqrt(21 / (32 * pi)) * y * (5 * z * z - 1), math.sqrt(7 / (16 * pi)) * z * (5 * z * z - 3),
-        -math.sqrt(21 / (32 * pi)) * x * (5 * z * z - 1), math.sqrt(105 / (16 * pi)) * z * (x * x - y * y),
+        -math.sqrt(35 / (32 * pi)) * y * (3 * x * x - y * y),
+        math.sqrt(105 / (4 * pi)) * x * y * z,
+        -math.sqrt(21 / (32 * pi)) * y * (5 * z * z - 1),
+        math.sqrt(7 / (16 * pi)) * z * (5 * z * z - 3),
+        -math.sqrt(21 / (32 * pi)) * x * (5 * z * z - 1),
+        math.sqrt(105 / (16 * pi)) * z * (x * x - y * y),
         -math.sqrt(35 / (32 * pi)) * x * (x * x - 3 * y * y),
     ]
-    coefficients = np.array([[table[f"f_dc_{c}"][0], *(table[f"f_rest_{15 * c + k}"][0] for k in range(15))]
-                             for c in range(3)])
+    coefficients = np.array(
+        [[table[f"f_dc_{c}"][0], *(table[f"f_rest_{15 * c + k}"][0] for k in range(15))] for c in range(3)]
+    )
     return coefficients @ basis
 
 
@@ -574,12 +610,12 @@ def test_nearer_splats_hide_farther_ones(fresh, tmp_path):
     table["y"] = 0.5, -0.5
     for i in range(3):
         table[f"scale_{i}"] = np.log(0.2)
-        table[f"f_dc_{i}"] = -0.5 / preview.SH_C0
-    table["f_dc_0"][0] = table["f_dc_1"][1] = 0.5 / preview.SH_C0
+        table[f"f_dc_{i}"] = -0.5 / C0
+    table["f_dc_0"][0] = table["f_dc_1"][1] = 0.5 / C0
     table["opacity"] = 6.0
     write_vertices(tmp_path / "splats.ply", table)
     owner = bpy.context.scene
     root = blender_scene.show_capture(owner, tmp_path)
-    blender_scene.show_result(root, tmp_path, owner)
+    blender_scene.show_result(root, tmp_path)
     red, green, _ = rendered(tmp_path)[16, 16]
     assert green > 0.98 and red < 0.02

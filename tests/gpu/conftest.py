@@ -2,7 +2,7 @@
 
 import pytest
 
-from backend.device import why_not_cuda
+from backend.raster.devices import why_not_cuda
 
 pytest.register_assert_rewrite("tests.backend.test_raster", "tests.backend.test_raster_stiff")
 

@@ -8,8 +8,11 @@ import pytest
 import torch
 
 from backend import raster
-from backend.raster import Camera, cuda_tiles
-from backend.raster import cuda as renderer
+from backend.raster import Camera
+from backend.raster.cuda import renderer
+from backend.raster.cuda.blending import blend_kernel
+from backend.raster.cuda.blending_backward import blend_backward_kernel
+from backend.raster.cuda.staging import Wanted
 from tests.backend import test_raster, test_raster_stiff
 from tests.backend.test_raster import *  # noqa: F403
 from tests.backend.test_raster import NAMES, as_float32, random_scene
@@ -113,7 +116,9 @@ def test_torch_waits_for_nothing(primitive):
         for mode in ("default", "error"):
             torch.cuda.set_sync_debug_mode(mode)
             picture = raster.rasterize(**scene, camera=cam, labels=labels, want_depth=True, primitive=primitive)
-            (picture.color.sum() + picture.alpha.sum() + picture.weight.sum() + picture.depth.sum()).backward()
+            (
+                picture.color.sum() + picture.alpha.sum() + picture.label_probability.sum() + picture.depth.sum()
+            ).backward()
     finally:
         torch.cuda.set_sync_debug_mode(before)
 
@@ -134,10 +139,10 @@ def test_another_stream():
 def test_pixel_kernels_stay_in_registers(primitive):
     step(as_float32(random_scene(3, count=100)), large_camera(64, 48), primitive, GPU)
     flat = primitive == "2d"
-    wanted = cuda_tiles.Wanted(flat, True, True, True, flat, flat)
+    wanted = Wanted(flat, True, True, True, flat, flat)
     for kernel in (
-        cuda_tiles.blend_kernel(wanted),
-        cuda_tiles.blend_backward_kernel(wanted._replace(median=False)),
+        blend_kernel(wanted),
+        blend_backward_kernel(wanted._replace(median=False)),
     ):
         assert kernel.overloads, "the test looks at another kernel than was run"
         assert max(kernel.get_local_mem_per_thread().values()) == 0

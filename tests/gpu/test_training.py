@@ -13,18 +13,17 @@ import numpy as np
 import pytest
 import torch
 
-from backend import device
 from backend.model.anchors import Layout
+from backend.model.draw import draw
 from backend.model.generate import generate
 from backend.model.heads import Heads
-from backend.protocol import Reporter
-from backend.raster import rasterize
-from backend.raster.draw import draw
-from backend.training import loop
+from backend.raster import devices, rasterize
+from backend.shared.events import Reporter
+from backend.training import step
 from backend.training.budget import Budget
-from backend.training.loop import Trainer
-from backend.training.losses import image_loss, normal_loss, volume_loss
+from backend.training.losses.on_cpu import image_loss, normal_loss, volume_loss
 from backend.training.settings import Settings
+from backend.training.trainer import Trainer
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no GPU")
 
@@ -93,8 +92,8 @@ class Spheres:
         rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
         nearest, mask = np.full(x.shape, np.inf), np.zeros(x.shape, np.int64)
         picture = np.full((*x.shape, 3), 0.5)
-        for object_id, centre, radius, color in SPHERES:
-            c = viewmat[:3, :3] @ centre + viewmat[:3, 3]
+        for object_id, center, radius, color in SPHERES:
+            c = viewmat[:3, :3] @ center + viewmat[:3, 3]
             a, b = (rays * rays).sum(-1), rays @ c
             root = b * b - a * (c @ c - radius * radius)
             t = (b - np.sqrt(np.maximum(root, 0))) / a
@@ -111,7 +110,7 @@ class Spheres:
     def mask(self, index: int, downscale: int = 1) -> np.ndarray:
         return self._masks[index][::downscale, ::downscale]
 
-    def K(self, index: int, downscale: int = 1) -> np.ndarray:
+    def K(self, index: int, downscale: int = 1) -> np.ndarray:  # noqa: N802 - as of Capture
         K = self.views[index].K.copy()
         K[:2] /= downscale
         return K
@@ -127,11 +126,11 @@ def spheres():
 
 @pytest.fixture
 def gpu():
-    return device.pick("cuda")
+    return devices.pick("cuda")
 
 
 def started(spheres, settings, place):
-    return Trainer.start(spheres, spheres.ids, settings, place=place)
+    return Trainer.start(spheres, spheres.ids, settings, device=place)
 
 
 def trained(spheres, settings, place, steps=300):
@@ -154,8 +153,8 @@ def quality(trainer):
 
 
 def test_auto_takes_the_gpu(gpu):
-    assert device.why_not_cuda() is None
-    assert gpu.type == "cuda" and device.pick("auto") == gpu and device.pick("cpu").type == "cpu"
+    assert devices.why_not_cuda() is None
+    assert gpu.type == "cuda" and devices.pick("auto") == gpu and devices.pick("cpu").type == "cpu"
 
 
 def close(got, want, relative, absolute):
@@ -189,7 +188,7 @@ def test_losses_and_gaussians_are_those_of_the_processor(gpu):
         sum(values).backward()
         return torch.stack(values), [leaf.grad for leaf in leaves] + [p.grad for p in heads.parameters()]
 
-    want, want_gradients = everything(device.CPU)
+    want, want_gradients = everything(devices.CPU)
     got, gradients = everything(gpu)
     close(got, want, 2e-4, 0)
     for a, b in zip(gradients, want_gradients, strict=True):
@@ -217,7 +216,7 @@ def test_a_step_waits_for_nothing(spheres, gpu, settings):
 @pytest.mark.parametrize("settings", [SETTINGS, FLAT, dataclasses.replace(SETTINGS, mode="view")],
                          ids=["3d", "2d", "view"])  # fmt: skip
 def test_training_is_as_good_as_on_the_processor(spheres, gpu, settings):
-    want, want_right = quality(trained(spheres, settings, device.CPU))
+    want, want_right = quality(trained(spheres, settings, devices.CPU))
     begun = time.monotonic()
     trainer = trained(spheres, settings, gpu)
     got, right = quality(trainer)
@@ -230,10 +229,10 @@ def test_training_is_as_good_as_on_the_processor(spheres, gpu, settings):
 
 @pytest.mark.parametrize("first", ["cpu", "cuda"])
 def test_a_checkpoint_goes_on_on_the_other_device(spheres, gpu, tmp_path, first):
-    places = [device.CPU, gpu] if first == "cpu" else [gpu, device.CPU]
+    places = [devices.CPU, gpu] if first == "cpu" else [gpu, devices.CPU]
     begun = started(spheres, SETTINGS, places[0])
     begun.run(Budget(steps=150), tmp_path, Reporter())
-    resumed, warning = Trainer.resume(spheres, tmp_path, SETTINGS, place=places[1])
+    resumed, warning = Trainer.resume(spheres, tmp_path, SETTINGS, device=places[1])
     assert warning is None and resumed.progress.step == 150
     assert resumed.model.device == places[1]
     close(resumed.model.anchors.rows, begun.model.anchors.rows, 0, 0)
@@ -248,7 +247,7 @@ def test_pictures_in_parts_teach_as_well(spheres, gpu, monkeypatch):
             raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
         return rasterize(*arguments, **options)
 
-    monkeypatch.setattr(loop, "rasterize", full)
+    monkeypatch.setattr(step, "rasterize", full)
     trainer = trained(spheres, SETTINGS, gpu)
     monkeypatch.undo()
     found, right = quality(trainer)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Runs inside a Blender with a window: executes the scripts that a test leaves in a folder, one after another.
+"""Runs inside a Blender with a window: executes the scripts that a test writes to a folder, one after another.
 
     blender --python driver.py -- FOLDER
 
-FOLDER/<n>.py is executed in the main thread, from a timer, as a user's own action would be: it may write even where
-Blender forbids that to timers. The value of its variable `result` comes back as FOLDER/<n>.json, or the traceback if
-it fails.
+FOLDER/<n>.py is executed in the main thread, from a timer, with the permissions of a user's action: it can write where
+Blender forbids that to timers. The value of its variable `result`, or the traceback of its failure, is written to
+FOLDER/<n>.json.
 """
 
 import json
@@ -39,9 +39,9 @@ def _execute(script: Path) -> dict:
         return {"error": traceback.format_exc()}
 
 
-def _look() -> float:
-    # What Blender calls to read a property may write.
-    return bpy.data.window_managers[0].driver_look
+def _poll() -> float:
+    # Unlike a timer, the getter of a property may write.
+    return bpy.data.window_managers[0].driver_poll
 
 
 def _execute_next(_manager) -> float:
@@ -56,5 +56,5 @@ def _execute_next(_manager) -> float:
     return 0.05
 
 
-bpy.types.WindowManager.driver_look = bpy.props.FloatProperty(get=_execute_next)
-bpy.app.timers.register(_look, first_interval=0.5, persistent=True)
+bpy.types.WindowManager.driver_poll = bpy.props.FloatProperty(get=_execute_next)
+bpy.app.timers.register(_poll, first_interval=0.5, persistent=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A real Blender in a window on a virtual screen, driven from outside by scripts, clicks and keys."""
+"""A real Blender in a window on a virtual screen, driven by scripts, clicks and keys."""
 
 import json
 import os
@@ -16,9 +16,9 @@ PACKAGE = "bl_ext.user_default.objectgs"
 
 
 def blenders() -> dict[str, tuple[list[str], dict[str, str]]]:
-    """Name -> (command that opens a window, extra variables) of each Blender that can be had here.
+    """Name -> (command that opens a window, additional variables) of each Blender on this machine.
 
-    OBJECTGS_BLENDER names one (a program); else those that ../shared/tools/real-blender has set up.
+    OBJECTGS_BLENDER is the path of one; else those that ../shared/tools/real-blender has set up.
     """
     chosen = os.environ.get("OBJECTGS_BLENDER")
     if chosen:
@@ -27,46 +27,75 @@ def blenders() -> dict[str, tuple[list[str], dict[str, str]]]:
     if not tool.is_file():
         return {}
     suites = {"4.3": "trixie", "5.2": "sid"}
-    return {version: ([str(tool), "gui"], {"REAL_BLENDER_SUITE": suite}) for version, suite in suites.items()
-            if Path(f"/var/tmp/real-blender-{suite}/usr/bin/blender").exists()}
+    return {
+        version: ([str(tool), "gui"], {"REAL_BLENDER_SUITE": suite})
+        for version, suite in suites.items()
+        if Path(f"/var/tmp/real-blender-{suite}/usr/bin/blender").exists()
+    }
 
 
 class Failed(Exception):
-    """A script failed inside Blender, or Blender is gone."""
+    """A script failed inside Blender, or Blender has ended."""
 
 
 class Blender:
-    """One running Blender of `size` pixels. `shots` is where screenshots go, `place` a scratch folder of its own."""
+    """One running Blender of `size` pixels, with a scratch folder and a folder for screenshots (`shots`)."""
 
-    def __init__(self, command, variables, place: Path, shots: Path, size=SIZE) -> None:
-        self.place, self.shots, self.display = place, shots, _free_display()
-        self.scripts = place / "scripts"
+    def __init__(self, command, variables, folder: Path, shots: Path, size=SIZE) -> None:
+        self.folder, self.shots, self.display = folder, shots, _free_display()
+        self.scripts = folder / "scripts"
         self.scripts.mkdir(parents=True)
         shots.mkdir(parents=True, exist_ok=True)
         self._count = 0
-        self._screen = subprocess.Popen(["Xvfb", self.display, "-screen", "0", f"{size[0]}x{size[1]}x24"],
-                                        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        self._screen = subprocess.Popen(
+            ["Xvfb", self.display, "-screen", "0", f"{size[0]}x{size[1]}x24"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
         _wait(lambda: Path(f"/tmp/.X11-unix/X{self.display[1:]}").exists(), 10, "the virtual screen does not start")
-        environment = {**os.environ, **variables, "DISPLAY": self.display, "LIBGL_ALWAYS_SOFTWARE": "1",
-                       "BLENDER_USER_RESOURCES": str(place / "user")}
-        (place / "user").mkdir()
-        self._log = open(place / "blender.log", "wb")
+        environment = {
+            **os.environ,
+            **variables,
+            "DISPLAY": self.display,
+            "LIBGL_ALWAYS_SOFTWARE": "1",
+            "BLENDER_USER_RESOURCES": str(folder / "user"),
+        }
+        (folder / "user").mkdir()
+        self._log = (folder / "blender.log").open("wb")
         self._process = subprocess.Popen(
-            [*command, "--window-geometry", "0", "0", str(size[0]), str(size[1]), "--python",
-             str(Path(__file__).with_name("driver.py")), "--", str(self.scripts)],
-            cwd=ROOT, env=environment, stdout=self._log, stderr=subprocess.STDOUT, start_new_session=True)
+            [
+                *command,
+                "--window-geometry",
+                "0",
+                "0",
+                str(size[0]),
+                str(size[1]),
+                "--python",
+                str(Path(__file__).with_name("driver.py")),
+                "--",
+                str(self.scripts),
+            ],
+            cwd=ROOT,
+            env=environment,
+            stdout=self._log,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
 
     def install(self, archive: Path, backend_python: Path) -> None:
-        """Install the extension's zip, say which Python has the backend, and begin with an empty scene."""
+        """Install the extension's zip, set the Python of the backend, and remove all objects of the scene."""
         self.key("Escape")  # The splash screen.
-        self.run(f"""
+        self.run(
+            f"""
             bpy.ops.extensions.package_install_files(
                 filepath={str(archive)!r}, repo="user_default", enable_on_install=True)
             preferences = bpy.context.preferences.addons["{PACKAGE}"].preferences
             preferences.backend_python = {str(backend_python)!r}
-            for thing in list(bpy.data.objects):
-                bpy.data.objects.remove(thing)
-        """, timeout=120)
+            for obj in list(bpy.data.objects):
+                bpy.data.objects.remove(obj)
+        """,
+            timeout=120,
+        )
 
     def run(self, script: str, timeout: float = 60.0):
         """Execute a script inside Blender and return its variable `result`."""
@@ -75,8 +104,9 @@ class Blender:
         part.write_text(textwrap.dedent(script), encoding="utf-8")
         part.rename(self.scripts / f"{self._count}.py")
         answer = self.scripts / f"{self._count}.json"
-        _wait(lambda: answer.exists() or self._process.poll() is not None, timeout,
-              f"Blender does not answer:\n{script}")
+        _wait(
+            lambda: answer.exists() or self._process.poll() is not None, timeout, f"Blender does not answer:\n{script}"
+        )
         if not answer.exists():
             raise Failed(f"Blender has ended with code {self._process.returncode}; see {self._log.name}")
         content = json.loads(answer.read_text(encoding="utf-8"))
@@ -85,7 +115,7 @@ class Blender:
         return content["result"]
 
     def wait_for(self, expression: str, timeout: float = 60.0):
-        """Ask until the expression is true; returns its value."""
+        """Wait until the expression is true; returns its value."""
         found = []
 
         def true() -> bool:
@@ -96,13 +126,13 @@ class Blender:
         return found[0]
 
     def shot(self, name: str) -> Path:
-        """A picture of the whole screen."""
+        """Save a screenshot; returns its path."""
         path = self.shots / f"{name}.png"
         self._tool("import", "-window", "root", str(path))
         return path
 
     def click(self, x: float, y: float, button: int = 1, key: str | None = None) -> None:
-        """Move the mouse to a place (pixels from the upper left) and click there, with `key` held."""
+        """Move the mouse to a position (pixels from the upper left) and click there, with `key` held."""
         self._tool("xdotool", "mousemove", str(round(x)), str(round(y)))
         time.sleep(0.4)
         held = ["keydown", key] if key else []
@@ -115,11 +145,11 @@ class Blender:
         time.sleep(0.4)
 
     def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
-        """Press the left button at a place (pixels from the upper left) and let it go at another."""
+        """Press the left button at a position (pixels from the upper left) and release it at another."""
         self.move(*start)
         self._tool("xdotool", "mousedown", "1")
-        for share in (0.2, 0.6, 1.0):
-            self.move(*(a + share * (b - a) for a, b in zip(start, end)))
+        for fraction in (0.2, 0.6, 1.0):
+            self.move(*(a + fraction * (b - a) for a, b in zip(start, end)))
         self._tool("xdotool", "mouseup", "1")
         time.sleep(0.6)
 
@@ -129,7 +159,7 @@ class Blender:
         time.sleep(0.3)
 
     def release(self, key: str) -> None:
-        """Let a key go that is held."""
+        """Release a held key."""
         self._tool("xdotool", "keyup", key)
         time.sleep(0.3)
 
@@ -154,24 +184,25 @@ class Blender:
         self._log.close()
 
     def quit(self, timeout: float = 30.0) -> int:
-        """Let Blender quit as a user would; returns its exit code."""
+        """Quit Blender as a user would; returns its exit code."""
         part = self.scripts / "next.part"
         part.write_text("bpy.ops.wm.quit_blender()", encoding="utf-8")
         part.rename(self.scripts / f"{self._count + 1}.py")
         return self._process.wait(timeout)
 
     def _tool(self, *command: str) -> None:
-        subprocess.run(command, env={**os.environ, "DISPLAY": self.display}, check=True, timeout=30,
-                       stdout=subprocess.DEVNULL)
+        subprocess.run(
+            command, env={**os.environ, "DISPLAY": self.display}, check=True, timeout=30, stdout=subprocess.DEVNULL
+        )
 
 
 def missing_tools() -> list[str]:
-    """Programs that the harness needs and that are not here."""
+    """Programs that the harness needs and that are missing."""
     return [tool for tool in ("Xvfb", "xdotool", "import") if shutil.which(tool) is None]
 
 
 def _free_display() -> str:
-    """A screen that nobody uses: other tests may run beside these."""
+    """A free display, since other tests may run at the same time."""
     return next(f":{number}" for number in range(97, 1000) if not Path(f"/tmp/.X11-unix/X{number}").exists())
 
 

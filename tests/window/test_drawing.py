@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from backend.editing.apply import recoloured, transformed
+from backend.editing.apply import recolored, transformed
 from backend.export import write_splats
 from backend.model.splats import Splats
-from backend.ply import write_vertices
 from backend.raster import Camera, rasterize
-from backend.recolour import Recolour
+from backend.shared.color.recolor import Recolor
+from backend.shared.formats.ply import write_vertices
 
 from .harness import PACKAGE
 
@@ -30,7 +30,7 @@ import numpy as np
 from pathlib import Path
 scene = importlib.import_module("{PACKAGE}.objectgs_addon.scene")
 drawing = importlib.import_module("{PACKAGE}.objectgs_addon.drawing")
-picking = importlib.import_module("{PACKAGE}.backend.picking")
+picking = importlib.import_module("{PACKAGE}.backend.shared.splats.picking")
 owner = bpy.context.scene
 root = owner.objectgs.active
 selected = lambda: sorted({{thing.users_collection[0].name for thing in bpy.context.view_layer.objects
@@ -54,9 +54,14 @@ def splats() -> Splats:
     scales[600:] = 0.15
     sh = rng.normal(size=(count, 16, 3)) * 0.12
     sh[:, 0] *= 8.0
-    return Splats(means, quats / np.linalg.norm(quats, axis=1, keepdims=True), scales,
-                  np.concatenate([rng.uniform(0.2, 0.99, 600), np.full(400, 0.95)]), sh,
-                  np.repeat([1, 2, 3], [300, 300, 400]))
+    return Splats(
+        means,
+        quats / np.linalg.norm(quats, axis=1, keepdims=True),
+        scales,
+        np.concatenate([rng.uniform(0.2, 0.99, 600), np.full(400, 0.95)]),
+        sh,
+        np.repeat([1, 2, 3], [300, 300, 400]),
+    )
 
 
 def viewmat(eye=(0.3, -3.0, 0.8)) -> np.ndarray:
@@ -77,28 +82,64 @@ def folder(blender, tmp_path_factory):
     place = tmp_path_factory.mktemp("drawing") / "balls"
     (place / "images").mkdir(parents=True)
     write_splats(place / "splats.ply", splats())
-    points = np.zeros(3, [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("red", "u1"), ("green", "u1"), ("blue", "u1"),
-                          ("object_id", "<u4"), ("margin", "<f4"), ("votes", "<u4")])
+    points = np.zeros(
+        3,
+        [
+            ("x", "<f8"),
+            ("y", "<f8"),
+            ("z", "<f8"),
+            ("red", "u1"),
+            ("green", "u1"),
+            ("blue", "u1"),
+            ("object_id", "<u4"),
+            ("margin", "<f4"),
+            ("votes", "<u4"),
+        ],
+    )
     write_vertices(place / "points.ply", points)
-    camera = {"name": "0.png", "image": "images/0.png", "mask": None, "width": SIZE[0], "height": SIZE[1], "K": K,
-              "viewmat": viewmat().tolist(), "held_out": True}
-    (place / "cameras.json").write_text(json.dumps({
-        "capture": str(place), "origin": [0.1, 0.2, 0.3], "cameras": [camera],
-        "upright": {"rotation": np.eye(3).tolist(), "translation": [0.1, 0.2, 0.3]}}))
-    (place / "objects.json").write_text(json.dumps({"edits": {}, "objects": [
-        {"id": i, "name": name, "colour": [200, 40 * i, 10], "points": 1}
-        for i, name in ((1, "left"), (2, "right"), (3, "wall"))]}))
+    camera = {
+        "name": "0.png",
+        "image": "images/0.png",
+        "mask": None,
+        "width": SIZE[0],
+        "height": SIZE[1],
+        "K": K,
+        "viewmat": viewmat().tolist(),
+        "held_out": True,
+    }
+    (place / "cameras.json").write_text(
+        json.dumps(
+            {
+                "capture": str(place),
+                "origin": [0.1, 0.2, 0.3],
+                "cameras": [camera],
+                "upright": {"rotation": np.eye(3).tolist(), "translation": [0.1, 0.2, 0.3]},
+            }
+        )
+    )
+    (place / "objects.json").write_text(
+        json.dumps(
+            {
+                "edits": {},
+                "objects": [
+                    {"id": i, "name": name, "color": [200, 40 * i, 10], "points": 1}
+                    for i, name in ((1, "left"), (2, "right"), (3, "wall"))
+                ],
+            }
+        )
+    )
     return place
 
 
 @pytest.fixture(scope="module")
 def window(blender, folder):
     """Blender that shows the reconstruction through its camera, with Draw Splats on and object 2 moved."""
-    blender.run(script(f"""
+    blender.run(
+        script(f"""
         root = scene.show_capture(owner, Path({str(folder)!r}))
-        scene.show_result(root, Path({str(folder)!r}), owner)
+        scene.show_result(root, Path({str(folder)!r}))
         owner.objectgs.active = root
-        importlib.import_module("{PACKAGE}.objectgs_addon.object_edits").fill(root)
+        importlib.import_module("{PACKAGE}.objectgs_addon.state.object_edits").fill(root)
         for thing in bpy.data.objects:
             if scene.kind_of(thing) in ("points", "camera"):
                 thing.hide_set(True)
@@ -113,15 +154,17 @@ def window(blender, folder):
         bpy.context.view_layer.update()
         owner.objectgs.draw_splats = True
         bpy.ops.ed.undo_push(message="shown")
-    """))
+    """)
+    )
     return blender
 
 
 def drawn(window, matrix=None, focal: float = 200.0, orthographic: bool = False) -> np.ndarray:
     """(H, W, 4) what the drawing makes of the camera's view, or of another."""
-    path = window.place / "drawn.npy"
+    path = window.folder / "drawn.npy"
     matrix = viewmat() if matrix is None else matrix
-    window.run(script(f"""
+    window.run(
+        script(f"""
         view = picking.View(np.array({matrix.tolist()}), {focal}, {focal}, 118.0, 92.0, {SIZE[0]}, {SIZE[1]},
                             orthographic={orthographic})
         near, far = 0.01, 2000.0
@@ -130,28 +173,32 @@ def drawn(window, matrix=None, focal: float = 200.0, orthographic: bool = False)
         if {orthographic}:
             projection[2, 2:] = -2.0 / (far - near), -(far + near) / (far - near)
         np.save({str(path)!r}, drawing.picture(owner, bpy.context.view_layer, view, projection))
-    """))
+    """)
+    )
     return np.load(path)
 
 
-def backend_draws(without: int = 0, recolour: Recolour | None = None, camera: Camera | None = None) -> np.ndarray:
+def backend_draws(without: int = 0, recolor: Recolor | None = None, camera: Camera | None = None) -> np.ndarray:
     """(H, W, 4) what the backend makes of it, with object 2 where it was moved to."""
     camera = camera or Camera(viewmat(), np.array(K), *SIZE)
     given = splats()
     parts = [subset(given, given.object_ids == i) for i in (1, 2, 3) if i != without]
     parts = [transformed(part, MOVED) if part.object_ids[0] == 2 else part for part in parts]
-    if recolour is not None:
-        parts = [recoloured(part, recolour) if part.object_ids[0] == 3 else part for part in parts]
-    arrays = [np.concatenate([getattr(part, name) for part in parts]).astype(np.float32)
-              for name in ("means", "quats", "scales", "opacities", "sh")]
+    if recolor is not None:
+        parts = [recolored(part, recolor) if part.object_ids[0] == 3 else part for part in parts]
+    arrays = [
+        np.concatenate([getattr(part, name) for part in parts]).astype(np.float32)
+        for name in ("means", "quats", "scales", "opacities", "sh")
+    ]
     ids = torch.zeros(len(arrays[0]), dtype=torch.int32)
     picture = rasterize(*map(torch.from_numpy, arrays), ids, camera)
     return np.concatenate([picture.color.numpy(), picture.alpha.numpy()[None]]).transpose(1, 2, 0)
 
 
 def subset(splats: Splats, which) -> Splats:
-    return Splats(*(getattr(splats, name)[which]
-                    for name in ("means", "quats", "scales", "opacities", "sh", "object_ids")))
+    return Splats(
+        *(getattr(splats, name)[which] for name in ("means", "quats", "scales", "opacities", "sh", "object_ids"))
+    )
 
 
 def psnr(first: np.ndarray, second: np.ndarray) -> float:
@@ -163,16 +210,20 @@ def test_the_drawing_is_the_backends_picture(window):
     picture = drawn(window)
     assert 0.3 < picture[..., 3].mean() < 1.0
     assert psnr(picture, backend_draws()) > 40.0
-    window.run(script("""
+    window.run(
+        script("""
         for part in scene.object_collections(root)[1].objects:
             part.hide_set(True)
-    """))
+    """)
+    )
     without = drawn(window)
     assert psnr(without, backend_draws(without=1)) > 40.0 > psnr(without, picture)
-    window.run(script("""
+    window.run(
+        script("""
         for part in scene.object_collections(root)[1].objects:
             part.hide_set(False)
-    """))
+    """)
+    )
 
 
 def test_parallel_projection(window):
@@ -184,75 +235,89 @@ def test_parallel_projection(window):
     assert psnr(picture, backend_draws(camera=Camera(viewmat(eye), lens, *SIZE))) > 35.0
 
 
-def test_recolouring_is_seen(window):
-    """The affine map of an object's colours, in every direction."""
-    window.run(script("""
+def test_recoloring_is_seen(window):
+    """The affine map of an object's colors, in every direction."""
+    window.run(
+        script("""
         item = next(item for item in root.objectgs.objects if item.object_id == 3)
         item.hue, item.value = 0.3, 0.8
-    """))
+    """)
+    )
     picture = drawn(window)
-    stored = window.run(script("result = scene.recolour_of(scene.object_collections(root)[3]).stored()"))
+    stored = window.run(script("result = scene.recolor_of(scene.object_collections(root)[3]).stored()"))
     assert (stored["hue"], stored["value"]) == pytest.approx((0.3, 0.8))
-    window.run(script("""
+    window.run(
+        script("""
         item = next(item for item in root.objectgs.objects if item.object_id == 3)
         item.hue, item.value = 0.0, 1.0
-    """))
-    assert psnr(picture, backend_draws(recolour=Recolour.of(stored))) > 40.0
+    """)
+    )
+    assert psnr(picture, backend_draws(recolor=Recolor.of(stored))) > 40.0
     assert psnr(picture, drawn(window)) < 30.0
 
 
-def place_of(window, point) -> tuple[float, float]:
+def placement_of(window, point) -> tuple[float, float]:
     """Where on the screen a point of the world is shown, from the upper left."""
-    return tuple(window.run(script(f"""
+    return tuple(
+        window.run(
+            script(f"""
         from bpy_extras.view3d_utils import location_3d_to_region_2d
         context = window_context()
         region = context["region"]
         at = location_3d_to_region_2d(region, context["area"].spaces.active.region_3d, {point!r})
         result = [region.x + at.x, context["window"].height - region.y - at.y]
-    """)))
+    """)
+        )
+    )
 
 
-def colour_at(window, place, name: str) -> np.ndarray:
-    """(3,) mean colour of a few pixels of a screenshot."""
+def color_at(window, place, name: str) -> np.ndarray:
+    """(3,) mean color of a few pixels of a screenshot."""
     from PIL import Image
 
     time.sleep(1.5)
     shot = np.asarray(Image.open(window.shot(name)).convert("RGB"), float)
     x, y = (round(value) for value in place)
-    return shot[y - 1:y + 2, x - 1:x + 2].mean((0, 1))
+    return shot[y - 1 : y + 2, x - 1 : x + 2].mean((0, 1))
 
 
 def test_the_viewport_shows_it_behind_what_is_in_front(window):
-    """The colour on the screen is that of the photos; a cube hides what is behind it, and not what is in front."""
-    wall = place_of(window, (0.0, 1.5, 0.2))
-    seen = colour_at(window, wall, "11-drawn")
-    off = window.run(script("""
+    """The color on the screen is that of the photos; a cube hides what is behind it, and not what is in front."""
+    wall = placement_of(window, (0.0, 1.5, 0.2))
+    seen = color_at(window, wall, "11-drawn")
+    off = window.run(
+        script("""
         owner.objectgs.draw_splats = False
         result = [modifier.show_viewport for modifier in bpy.data.objects["left splats"].modifiers]
-    """))
+    """)
+    )
     assert off == [True, False]
     window.run(script("owner.objectgs.draw_splats = True"))
-    window.run(script("""
+    window.run(
+        script("""
         bpy.ops.mesh.primitive_cube_add(size=0.2, location=(0, 1.0, 0.2))
         bpy.context.active_object.name = "cube"
-    """))
-    hidden = colour_at(window, wall, "12-cube-in-front")
+    """)
+    )
+    hidden = color_at(window, wall, "12-cube-in-front")
     window.run(script("bpy.data.objects['cube'].location.y = 3.0"))
-    again = colour_at(window, wall, "13-cube-behind")
+    again = color_at(window, wall, "13-cube-behind")
     window.run(script("bpy.data.objects.remove(bpy.data.objects['cube'])"))
     assert np.abs(seen - again).max() < 6.0 < np.abs(seen - hidden).max()
 
 
 def test_clicks_pick_what_is_seen(window):
     """Click, Shift, a box, undo and Esc, with the tool of the toolbar."""
-    window.run(script("""
+    window.run(
+        script("""
         with bpy.context.temp_override(**window_context()):
             bpy.ops.wm.tool_set_by_id(name="objectgs.pick")
         for thing in bpy.context.view_layer.objects:
             thing.select_set(False)
-    """))
-    left = place_of(window, (-0.5, 0.0, 0.2))
-    wall = place_of(window, (0.0, 1.5, 1.2))
+    """)
+    )
+    left = placement_of(window, (-0.5, 0.0, 0.2))
+    wall = placement_of(window, (0.0, 1.5, 1.2))
     window.move(*left)
     time.sleep(1.0)
     window.click(*left)
@@ -283,15 +348,18 @@ def wait(window, expression: str) -> None:
 
 def test_a_mesh_in_front_is_picked(window):
     """And not one behind; where there is nothing, nothing is selected."""
-    x, y = window.run(script("""
+    x, y = window.run(
+        script("""
         from bpy_extras.view3d_utils import location_3d_to_region_2d
         context = window_context()
         result = list(location_3d_to_region_2d(
             context["region"], context["area"].spaces.active.region_3d, (-0.5, 0.0, 0.2)))
-    """))
+    """)
+    )
     picks = []
     for at in (-1.0, 3.0):
-        window.run(script(f"""
+        window.run(
+            script(f"""
             import mathutils
             bpy.ops.mesh.primitive_cube_add(size=0.1)
             cube = bpy.context.active_object
@@ -299,13 +367,18 @@ def test_a_mesh_in_front_is_picked(window):
             eye, ball = mathutils.Vector((0.3, -3.0, 0.8)), mathutils.Vector((-0.5, 0.0, 0.2))
             cube.location = ball + (eye - ball).normalized() * -({at})
             bpy.context.view_layer.update()
-        """))
-        picks.append(window.run(script(f"""
+        """)
+        )
+        picks.append(
+            window.run(
+                script(f"""
             with bpy.context.temp_override(**window_context()):
                 bpy.ops.objectgs.pick_object("EXEC_DEFAULT", x={round(x)}, y={round(y)})
             result = bpy.context.active_object.name
             bpy.data.objects.remove(bpy.data.objects["cube"])
-        """)))
+        """)
+            )
+        )
     assert picks == ["cube", "left"]
     window.run("""
         with bpy.context.temp_override(**window_context()):
@@ -315,10 +388,12 @@ def test_a_mesh_in_front_is_picked(window):
 
 
 def test_words_find_objects(window):
-    window.run(script("""
+    window.run(
+        script("""
         with bpy.context.temp_override(**window_context()):
-            bpy.ops.objectgs.find_objects("EXEC_DEFAULT", query="RIG, wall")
-    """))
+            bpy.ops.objectgs.select_by_name("EXEC_DEFAULT", query="RIG, wall")
+    """)
+    )
     assert window.run(script("result = [selected(), bpy.context.active_object.name]")) == [["right", "wall"], "wall"]
 
 
@@ -326,24 +401,28 @@ def test_another_file_undo_and_the_end(window):
     """Drawing goes on after undo and in a file that is opened again, and everything is given back at the end."""
     before = drawn(window)
     window.run(script("bpy.ops.ed.undo_push(message='before')"))
-    window.run(script("""
+    window.run(
+        script("""
         bpy.data.objects["left"].location.x += 1.0
         bpy.context.view_layer.update()
         bpy.ops.ed.undo_push(message="moved")
-    """))
+    """)
+    )
     assert psnr(drawn(window), before) < 30.0
     window.run("with bpy.context.temp_override(**window_context()): bpy.ops.ed.undo()")
     assert psnr(drawn(window), before) > 60.0
-    path = window.place / "drawn.blend"
+    path = window.folder / "drawn.blend"
     window.run(f"bpy.ops.wm.save_as_mainfile(filepath={str(path)!r})")
     window.run("bpy.ops.wm.read_homefile(use_empty=True)")
     window.run(f"bpy.ops.wm.open_mainfile(filepath={str(path)!r})")
     time.sleep(1.0)
     assert psnr(drawn(window), before) > 60.0
-    states = window.run(script(f"""
+    states = window.run(
+        script(f"""
         result = [[m.show_viewport for m in bpy.data.objects["left splats"].modifiers]]
         bpy.ops.preferences.addon_disable(module="{PACKAGE}")
         result.append([m.show_viewport for m in bpy.data.objects["left splats"].modifiers])
-    """))
+    """)
+    )
     assert states == [[False, False, True], [True, False]]
     assert window.quit() == 0

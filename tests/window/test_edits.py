@@ -45,27 +45,31 @@ def test_a_dragged_slider_and_a_removed_object_are_undone_and_redone(window, fol
     drag(window, MOUSE[0], MOUSE[1] + HUE, 60)
     dragged = hue(window)
     assert dragged > 0.05, "shown while the button is still held"
-    assert window.run(script(f"""
-        recolour = scene.recolour_of(scene.object_collections(root)[{first}])
-        result = abs(recolour.hue - {dragged}) < 1e-5
-    """))
+    assert window.run(
+        script(f"""
+        recolor = scene.recolor_of(scene.object_collections(root)[{first}])
+        result = abs(recolor.hue - {dragged}) < 1e-5
+    """)
+    )
     window.shot("edits-dragged")
     window._tool("xdotool", "mouseup", "1")
     window.move(200, 700)
     window.key("Escape")
     time.sleep(1)
-    assert abs(edits(folder)[first]["recolour"]["hue"] - dragged) < 1e-5
-    window.run(script("""
+    assert abs(edits(folder)[first]["recolor"]["hue"] - dragged) < 1e-5
+    window.run(
+        script("""
         with bpy.context.temp_override(**window_context()):
             bpy.ops.objectgs.remove_object("INVOKE_DEFAULT", True)
-    """))
+    """)
+    )
     assert edits(folder)[first]["removed"]
     draws(window)
     window.shot("edits-removed")
     window.move(400, 500)
     window.key("ctrl+z")
     soon(window, "not root.objectgs.objects[0].removed")
-    assert "removed" not in edits(folder)[first] and edits(folder)[first]["recolour"]
+    assert "removed" not in edits(folder)[first] and edits(folder)[first]["recolor"]
     assert window.run(script(f"result = not scene.object_collections(root)[{first}].hide_viewport"))
     window.key("ctrl+z")
     soon(window, "root.objectgs.objects[0].hue == 0")
@@ -73,5 +77,5 @@ def test_a_dragged_slider_and_a_removed_object_are_undone_and_redone(window, fol
     window.key("ctrl+shift+z")
     window.key("ctrl+shift+z")
     soon(window, "root.objectgs.objects[0].removed")
-    assert edits(folder)[first]["removed"] and edits(folder)[first]["recolour"]
+    assert edits(folder)[first]["removed"] and edits(folder)[first]["recolor"]
     draws(window)

@@ -29,10 +29,34 @@ def trained(tmp_path_factory) -> Path:
     """A small reconstruction, a few steps old."""
     place = tmp_path_factory.mktemp("trained")
     python = harness.ROOT / ".venv-bpy" / "bin" / "python"
-    subprocess.run([python, "headless.py", "demo", place / "capture", "--objects", "3", "--views", "12", "--width",
-                    "96", "--height", "72", "--samples", "2"], cwd=harness.ROOT, check=True, stdout=subprocess.DEVNULL)
-    subprocess.run([sys.executable, "-m", "backend", "train", place / "capture", "--out", place / "demo", "--steps",
-                    "30"], cwd=harness.ROOT, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    subprocess.run(
+        [
+            python,
+            "headless.py",
+            "demo",
+            place / "capture",
+            "--objects",
+            "3",
+            "--views",
+            "12",
+            "--width",
+            "96",
+            "--height",
+            "72",
+            "--samples",
+            "2",
+        ],
+        cwd=harness.ROOT,
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
+    subprocess.run(
+        [sys.executable, "-m", "backend", "train", place / "capture", "--out", place / "demo", "--steps", "30"],
+        cwd=harness.ROOT,
+        check=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
     return place / "demo"
 
 
@@ -57,12 +81,14 @@ def window(blender):
 @pytest.fixture
 def folder(window, trained, request) -> Path:
     """The reconstruction as the test's own folder, shown in the file."""
-    place = Path(shutil.copytree(trained, window.place / request.node.originalname))
-    window.run(script(f"""
+    place = Path(shutil.copytree(trained, window.folder / request.node.originalname))
+    window.run(
+        script(f"""
         with bpy.context.temp_override(**window_context()):
             bpy.ops.objectgs.open_reconstruction("EXEC_DEFAULT", directory={str(place)!r})
             bpy.ops.ed.undo_push(message="opened")
-    """))
+    """)
+    )
     yield place
     shutil.rmtree(place, ignore_errors=True)
 
@@ -73,20 +99,22 @@ def soon(window, expression: str) -> None:
 
 
 def log(window) -> str:
-    return (window.place / "blender.log").read_text(errors="replace")
+    return (window.folder / "blender.log").read_text(errors="replace")
 
 
 def start_fake(window, folder: Path, kind: str = "train", owner: str = "owner") -> Path:
     """A job in the background that ends when the file that is returned is there."""
-    program, go = window.place / "fake.py", window.place / f"go-{time.monotonic()}"
+    program, go = window.folder / "fake.py", window.folder / f"go-{time.monotonic()}"
     program.write_text(FAKE)
-    window.run(script(f"""
+    window.run(
+        script(f"""
         from pathlib import Path
-        from {PACKAGE}.objectgs_addon.jobs import Job
-        job = Job(title="Fake", kind={kind!r}, folder=Path({str(folder)!r}), cwd=Path({str(window.place)!r}),
+        from {PACKAGE}.objectgs_addon.process.jobs import Job
+        job = Job(title="Fake", kind={kind!r}, folder=Path({str(folder)!r}), cwd=Path({str(window.folder)!r}),
                   command=[{sys.executable!r}, {str(program)!r}, {str(go)!r}])
         running.submit(job, {owner}, print)
-    """))
+    """)
+    )
     return go
 
 
@@ -103,9 +131,9 @@ def draws(window) -> None:
 
 
 def test_panels_of_a_file_whose_folder_is_gone(window, folder):
-    window.run(f"bpy.ops.wm.save_as_mainfile(filepath={str(window.place / 'old.blend')!r})")
+    window.run(f"bpy.ops.wm.save_as_mainfile(filepath={str(window.folder / 'old.blend')!r})")
     shutil.rmtree(folder)
-    window.run(f"bpy.ops.wm.open_mainfile(filepath={str(window.place / 'old.blend')!r})")
+    window.run(f"bpy.ops.wm.open_mainfile(filepath={str(window.folder / 'old.blend')!r})")
     draws(window)
     name = window.run(script("result = root.objectgs.objects[1].name"))
     assert window.run(script("root.objectgs.objects[1].name = 'cup'; result = root.objectgs.objects[1].name")) == name
@@ -118,16 +146,18 @@ def test_panels_of_a_file_whose_folder_is_gone(window, folder):
 def test_panels_of_a_folder_with_broken_objects(window, folder):
     (folder / "objects.json").write_text("{")
     window.run(script("root.objectgs.objects.clear()"))
-    window.run(f"bpy.ops.wm.save_as_mainfile(filepath={str(window.place / 'broken.blend')!r})")
-    window.run(f"bpy.ops.wm.open_mainfile(filepath={str(window.place / 'broken.blend')!r})")
+    window.run(f"bpy.ops.wm.save_as_mainfile(filepath={str(window.folder / 'broken.blend')!r})")
+    window.run(f"bpy.ops.wm.open_mainfile(filepath={str(window.folder / 'broken.blend')!r})")
     draws(window)
-    window.run(script("""
+    window.run(
+        script("""
         with bpy.context.temp_override(**window_context()):
             try:
                 bpy.ops.objectgs.show_result("EXEC_DEFAULT")
             except RuntimeError as error:
                 result = str(error)
-    """))
+    """)
+    )
     draws(window)
     assert (folder / "objects.json").read_text() == "{"
 
@@ -135,31 +165,36 @@ def test_panels_of_a_folder_with_broken_objects(window, folder):
 def test_result_waits_for_edit_mode(window, folder):
     """The user edits splats when a training ends: their edit stays, the result comes when Edit Mode is left."""
     go = start_fake(window, folder)
-    window.run(script("""
+    window.run(
+        script("""
         part = next(part for part in root.all_objects if scene.kind_of(part) == "splats" and part.visible_get())
         with bpy.context.temp_override(**window_context()):
             bpy.context.view_layer.objects.active = part
             bpy.ops.object.mode_set(mode="EDIT")
             bpy.ops.mesh.select_all(action="SELECT")
-    """))
+    """)
+    )
     go.touch()
     soon(window, f"{IDLE} and len(running._results)")
-    assert "its result is shown when" in log(window)
+    assert "the result will be shown when" in log(window)
     window.shot("faults-edit-mode")
     window.key("Escape")
     assert window.run("result = bpy.context.mode") == "EDIT_MESH"
-    window.run(script("""
+    window.run(
+        script("""
         with bpy.context.temp_override(**window_context()):
             bpy.ops.object.mode_set(mode="OBJECT")
-    """))
+    """)
+    )
     soon(window, "not running._results")
     draws(window)
 
 
 def test_result_waits_for_the_end_of_a_render(window, folder):
     """The render is an engine's that ends when the test says so, or when it is left."""
-    end = window.place / "end-of-render"
-    window.run(script(f"""
+    end = window.folder / "end-of-render"
+    window.run(
+        script(f"""
         import os, time
 
         class Engine(bpy.types.RenderEngine):
@@ -170,7 +205,8 @@ def test_result_waits_for_the_end_of_a_render(window, folder):
 
         bpy.utils.register_class(Engine)
         owner.render.engine = Engine.bl_idname
-    """))
+    """)
+    )
     try:
         go = start_fake(window, folder)
         window.run(script("call(bpy.ops.render.render)"))
@@ -187,7 +223,8 @@ def test_result_waits_for_the_end_of_a_render(window, folder):
 
 def test_result_comes_where_blender_forgot_to_allow_writing(window, folder):
     """As after a render that began in the middle of a drawing: Blender 4 lets timers write no more."""
-    window.run(script("""
+    window.run(
+        script("""
         import sys, time
         names = bpy.app.driver_namespace
         names.update(began=False, draws=False)
@@ -227,7 +264,8 @@ def test_result_comes_where_blender_forgot_to_allow_writing(window, folder):
                 names["refused"] = str(error)
 
         names["write"] = write
-    """))
+    """)
+    )
     soon(window, "not bpy.app.is_job_running('RENDER')")
     window.run("bpy.app.timers.register(bpy.app.driver_namespace['write'])")
     soon(window, "'refused' in bpy.app.driver_namespace")
@@ -245,14 +283,18 @@ def test_result_comes_where_blender_forgot_to_allow_writing(window, folder):
 def test_undo_while_a_job_runs(window, folder):
     """Undo to before the reconstruction came, and redo, harm neither the job nor what it brings."""
     go = start_fake(window, folder)
-    middle = window.run("context = window_context(); r = context['region']; w = context['window']; "
-                        "result = [r.x + r.width / 3, w.height - r.y - r.height / 3]")
+    middle = window.run(
+        "context = window_context(); r = context['region']; w = context['window']; "
+        "result = [r.x + r.width / 3, w.height - r.y - r.height / 3]"
+    )
     window.move(*middle)
-    window.run(script("""
+    window.run(
+        script("""
         root.objectgs.objects[1].name = "cup"
         with bpy.context.temp_override(**window_context()):
             bpy.ops.ed.undo_push(message="renamed")
-    """))
+    """)
+    )
     window.key("ctrl+z")
     names = [entry["name"] for entry in json.loads((folder / "objects.json").read_text())["objects"]]
     assert window.run(script("result = root.objectgs.objects[1].name")) in names
@@ -270,7 +312,7 @@ def test_undo_while_a_job_runs(window, folder):
 
 def test_two_scenes_with_two_jobs(window, folder):
     """The user looks at one scene while results come in for both."""
-    other = Path(shutil.copytree(folder, window.place / "other"))
+    other = Path(shutil.copytree(folder, window.folder / "other"))
     window.run("bpy.data.scenes.new('Second')")
     first = start_fake(window, folder, "train")
     second = start_fake(window, other, "import", "bpy.data.scenes['Second']")
@@ -279,21 +321,25 @@ def test_two_scenes_with_two_jobs(window, folder):
     time.sleep(0.5)
     first.touch()
     soon(window, f"{IDLE} and not running._results")
-    assert window.run(script("""
+    assert window.run(
+        script("""
         result = [str(scene.folder_of(each.objectgs.active)) for each in (owner, bpy.data.scenes["Renamed"])]
-    """)) == [str(folder), str(other)]
+    """)
+    ) == [str(folder), str(other)]
     draws(window)
 
 
 def test_collection_deleted_while_its_job_runs(window, folder):
     go = start_fake(window, folder)
-    window.run(script("""
+    window.run(
+        script("""
         for collection in [*root.children_recursive, root]:
             bpy.data.collections.remove(collection)
-    """))
+    """)
+    )
     go.touch()
     soon(window, f"{IDLE} and not running._results")
-    assert "Open Reconstruction shows" in log(window)
+    assert "with Open Reconstruction" in log(window)
     draws(window)
 
 

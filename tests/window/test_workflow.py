@@ -34,20 +34,26 @@ def capture(tmp_path_factory):
     """A small demo capture, rendered by the bpy wheel."""
     out = tmp_path_factory.mktemp("capture") / "demo"
     python = harness.ROOT / ".venv-bpy" / "bin" / "python"
-    subprocess.run([python, "headless.py", "demo", out, "--views", "12", "--width", "160", "--height", "120",
-                    "--samples", "4"], cwd=harness.ROOT, check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [python, "headless.py", "demo", out, "--views", "12", "--width", "160", "--height", "120", "--samples", "4"],
+        cwd=harness.ROOT,
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
     return out
 
 
 @pytest.fixture(scope="module")
 def window(blender, capture):
     """Blender with the backend set and the capture imported."""
-    folder = blender.place / "reconstruction"
-    blender.run(script(f"""
+    folder = blender.folder / "reconstruction"
+    blender.run(
+        script(f"""
         with bpy.context.temp_override(**window_context()):
             result = list(bpy.ops.objectgs.import_capture(
                 "EXEC_DEFAULT", directory={str(capture)!r}, folder={str(folder)!r}))
-    """))
+    """)
+    )
     blender.run("window_context()['area'].spaces.active.show_region_ui = True")
     wait(blender, "owner.objectgs.active is not None")
     blender.run("""
@@ -66,24 +72,32 @@ def wait(blender, expression: str, timeout: float = 120.0):
         if value:
             return value
         time.sleep(0.3)
-    raise harness.Failed(f"it never became true: {expression}; jobs: " + json.dumps(blender.run(script(
-        "result = [(job.title, job.state.value, job.message, job.error) for job in running.queue.jobs]"))))
+    raise harness.Failed(
+        f"it never became true: {expression}; jobs: "
+        + json.dumps(
+            blender.run(
+                script("result = [(job.title, job.state.value, job.message, job.error) for job in running.queue.jobs]")
+            )
+        )
+    )
 
 
 def test_import_shows_cameras_photos_and_points(window):
-    kinds = window.run(script("""
+    kinds = window.run(
+        script("""
         parts = [part for collection in root.children_recursive for part in collection.objects]
         cameras = [part for part in parts if scene.kind_of(part) == "camera"]
         points = [part for part in parts if scene.kind_of(part) == "points"]
         result = [len(cameras), sum(bool(camera.data.background_images) for camera in cameras),
                   len(points[0].data.vertices)]
-    """))
+    """)
+    )
     assert kinds[:2] == [12, 12] and kinds[2] > 100
     window.shot("1-imported")
 
 
 def test_vote_fills_the_list(window):
-    window.run(script("call(bpy.ops.objectgs.vote)"))
+    window.run(script("call(bpy.ops.objectgs.assign_objects)"))
     wait(window, f"len(root.objectgs.objects) and {IDLE}")
     names = window.run(script("result = [item.name for item in root.objectgs.objects]"))
     assert {"mug", "table"} <= set(names) or len(names) >= 8
@@ -91,10 +105,12 @@ def test_vote_fills_the_list(window):
 
 
 def test_training_shows_objects(window):
-    window.run(script("""
+    window.run(
+        script("""
         root.objectgs.minutes = 0.3
         call(bpy.ops.objectgs.train)
-    """))
+    """)
+    )
     wait(window, "running.queue.running is not None and running.queue.running.progress > 0.2")
     window.shot("3-training")
     wait(window, f"{IDLE} and len(scene.object_collections(root)) > 1", 400)
@@ -109,7 +125,8 @@ def test_nothing_heavy_is_loaded(window):
 
 def test_click_selects_the_whole_object(window):
     """A real click in the viewport on the middle of an object."""
-    place = window.run(script("""
+    place = window.run(
+        script("""
         from bpy_extras.view3d_utils import location_3d_to_region_2d
         import mathutils, numpy as np
         context = window_context()
@@ -142,15 +159,18 @@ def test_click_selects_the_whole_object(window):
         spot = location_3d_to_region_2d(context["region"], region3d, middle)
         height = bpy.context.window_manager.windows[0].height
         result = [item.name, context["region"].x + spot.x, height - (context["region"].y + spot.y)]
-    """))
+    """)
+    )
     window.shot("5-before-click")
     window.click(place[1], place[2])
     selected = []
     for _ in range(20):
         # Blender tells of the click when it next has time.
-        selected = window.run(script("""
+        selected = window.run(
+            script("""
             result = sorted(scene.kind_of(part) for part in bpy.context.selected_objects)
-        """))
+        """)
+        )
         if len(selected) > 1:
             break
         time.sleep(0.5)
@@ -158,47 +178,57 @@ def test_click_selects_the_whole_object(window):
     assert "splats" in selected and "object_parent" in selected
     assert window.run(script("result = object_edits.active_item(root).name")) == place[0]
 
+
 def test_merge_is_undone_and_split(window):
     """Objects.json follows the list through merge, undo, redo and split."""
-    first = window.run(script("""
+    first = window.run(
+        script("""
         from pathlib import Path
-        from bl_ext.user_default.objectgs.backend.objects import read_objects
+        from bl_ext.user_default.objectgs.backend.shared.reconstruction.objects import read_objects
         ids = [object_edits.from_stored(item.object_id) for item in root.objectgs.objects]
         result = [ids[0], ids[1], object_edits.splat_counts(root)[ids[0]], object_edits.splat_counts(root)[ids[1]]]
-    """))
+    """)
+    )
     state = """
-        from bl_ext.user_default.objectgs.backend.objects import read_objects
+        from bl_ext.user_default.objectgs.backend.shared.reconstruction.objects import read_objects
         entry = next(entry for entry in read_objects(scene.folder_of(root) / "objects.json") if entry.id == {0})
         counts = object_edits.splat_counts(root)
         result = [entry.merged_into, counts.get({0}, 0), counts[{1}]]
     """.format(*first)
     apart, together = [None, first[2], first[3]], [first[1], 0, first[2] + first[3]]
-    window.run(script(f"""
+    window.run(
+        script(f"""
         root.objectgs.active_object = 0
         for selected in bpy.context.selected_objects:
             selected.select_set(False)
         with bpy.context.temp_override(**window_context()):
             bpy.ops.ed.undo_push(message="before")
             bpy.ops.objectgs.merge_objects("EXEC_DEFAULT", True, into="{first[1]}")
-    """))
+    """)
+    )
     assert window.run(script(state)) == together
-    middle = window.run("context = window_context(); r = context['region']; w = context['window']; "
-                        "result = [r.x + r.width / 3, w.height - r.y - r.height / 3]")
+    middle = window.run(
+        "context = window_context(); r = context['region']; w = context['window']; "
+        "result = [r.x + r.width / 3, w.height - r.y - r.height / 3]"
+    )
     window.move(*middle)
     window.key("ctrl+z")
     assert window.run(script(state)) == apart
     window.key("ctrl+shift+z")
     assert window.run(script(state)) == together
-    window.run(script("""
+    window.run(
+        script("""
         with bpy.context.temp_override(**window_context()):
             bpy.ops.objectgs.split_objects("EXEC_DEFAULT", True)
-    """))
+    """)
+    )
     assert window.run(script(state)) == apart
 
 
 def test_extracted_meshes_take_the_place_of_splats(window):
     """Two objects become meshes in the background; the others show their splats still."""
-    chosen = window.run(script("""
+    chosen = window.run(
+        script("""
         properties = root.objectgs
         small = sorted((i for i in properties.objects if i.name not in ("table", "backdrop")), key=lambda i: -i.splats)
         chosen = [object_edits.from_stored(item.object_id) for item in small[:2]]
@@ -211,15 +241,18 @@ def test_extracted_meshes_take_the_place_of_splats(window):
         properties.mesh_objects, properties.mesh_faces, properties.texture_size = "selected", 3000, "1024"
         call(bpy.ops.objectgs.extract_meshes)
         result = chosen
-    """))
+    """)
+    )
     wait(window, "running.queue.running is not None and running.queue.running.progress > 0.1", 240)
     window.shot("7-extracting")
     wait(window, f"{IDLE} and bool(scene.object_meshes(root))", 300)
-    shown = window.run(script("""
+    shown = window.run(
+        script("""
         result = {object_id: [[scene.kind_of(part), part.visible_get(), len(part.data.polygons)]
                               for part in collection.objects if scene.kind_of(part) in ("splats", "mesh")]
                   for object_id, collection in scene.object_collections(root).items() if object_id}
-    """))
+    """)
+    )
     for object_id, parts in shown.items():
         found = {kind: (visible, faces) for kind, visible, faces in parts}
         assert ("mesh" in found) == (int(object_id) in chosen)
@@ -255,20 +288,24 @@ def test_pause_resume_and_stop(window):
     window.run(script("call(bpy.ops.objectgs.stop_job)"))
     wait(window, IDLE)
     assert window.run(script("result = running.queue.jobs[-1].state.value")) == "stopped"
-    assert window.run(script(f"""
-        from bl_ext.user_default.objectgs.objectgs_addon.folder_state import folder_state
+    assert window.run(
+        script(f"""
+        from bl_ext.user_default.objectgs.objectgs_addon.state.folder_state import folder_state
         result = folder_state(scene.folder_of(root)).steps >= {first}
-    """))
+    """)
+    )
 
 
 def test_another_file_in_between_finds_the_job_again(window):
     """Saving, opening an empty file and opening the first one again while training runs."""
-    path = window.place / "scene.blend"
-    window.run(script(f"""
+    path = window.folder / "scene.blend"
+    window.run(
+        script(f"""
         root.objectgs.minutes = 30
         call(bpy.ops.objectgs.train)
         bpy.ops.wm.save_as_mainfile(filepath={str(path)!r})
-    """))
+    """)
+    )
     wait(window, "running.queue.running is not None and running.queue.running.step")
     window.run("bpy.ops.wm.read_homefile(use_empty=False)")
     time.sleep(1)

@@ -1,0 +1,109 @@
+"""The parts of a COLMAP model, as its files hold them and as they are used after validation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ...shared.errors import InputError
+
+CAMERA_MODELS: dict[int, tuple[str, int]] = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4),
+    13: ("DIVISION", 5),
+    14: ("SIMPLE_FISHEYE", 3),
+    15: ("FISHEYE", 4),
+    16: ("EUCM", 6),
+    17: ("EQUIRECTANGULAR", 2),
+}
+"""Camera models by COLMAP's number: name and number of parameters."""
+
+FILE_STEMS = ("cameras", "images", "points3D")
+"""The files of a model, without suffix."""
+
+EXPORT_AGAIN = "copy the model again, or export it again from COLMAP"
+"""The advice that ends the message about a damaged file."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One camera as COLMAP wrote it: size in pixels, parameters in COLMAP's order for `model`."""
+
+    id: int
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Image:
+    """One posed image: viewmat (4, 4) world to camera; xy (n, 2) pixels and point_index (n,) of the observed points."""
+
+    name: str
+    camera_id: int
+    viewmat: np.ndarray
+    xy: np.ndarray
+    point_index: np.ndarray
+
+
+@dataclass(frozen=True)
+class Model:
+    """A whole model: images in the file's order, points as arrays of length M."""
+
+    folder: Path
+    suffix: str
+    cameras: dict[int, Camera]
+    images: list[Image]
+    xyz: np.ndarray
+    rgb: np.ndarray
+    error: np.ndarray
+    ids: np.ndarray
+    warnings: list[str] = field(default_factory=list)
+
+    def file(self, stem: str) -> Path:
+        """The path of cameras, images or points3D, with the model's suffix."""
+        return self.folder / f"{stem}{self.suffix}"
+
+
+@dataclass
+class RawImage:
+    """One image as the file holds it, before validation: quaternion (w, x, y, z) and translation, world to camera."""
+
+    name: str
+    camera_id: int
+    quaternion: tuple[float, ...]
+    translation: tuple[float, ...]
+    xy: np.ndarray
+    point_ids: np.ndarray
+
+
+@dataclass
+class RawPoints:
+    """All points as the file holds them, before validation."""
+
+    ids: np.ndarray
+    xyz: np.ndarray
+    rgb: np.ndarray
+    error: np.ndarray
+
+
+def decode_name(raw: bytes, path: Path) -> str:
+    """Decode an image name; raises InputError that names the file where it is not UTF-8."""
+    try:
+        return raw.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} names an image {raw!r}, which is not UTF-8; rename it and {EXPORT_AGAIN}.") from error

@@ -1,0 +1,185 @@
+"""Loads a capture: undistorts and reduces its images once, into a cache."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from ..shared.defaults import MAX_SIZE
+from ..shared.errors import InputError
+from ..shared.events import Reporter
+from ..shared.formats.atomic import write_atomic
+from ..shared.formats.json_file import write_json
+from .capture import Capture, Points, View, needs_no_resampling
+from .files import encode_mask, image_size, read_image, write_image
+from .survey import Source, Survey, check_mask, check_size, distinct_ids, refuse, run_in_parallel, survey_capture
+from .undistort import resample_image, resample_mask
+
+_CACHE_VERSION = 1
+
+
+def load_capture(
+    folder: str | Path,
+    cache: str | Path | None,
+    memory_mb: float = 2000,
+    max_size: int = MAX_SIZE,
+    reporter: Reporter | None = None,
+) -> Capture:
+    """Load a capture: images/, a COLMAP model (sparse/0, sparse/ or beside images/), and optionally masks/ and
+    labels.json or labels.txt.
+
+    Images that are distorted or too large are resampled into the cache, once as long as their sources do not change.
+    A killed run leaves no incomplete file.
+
+    Args:
+        folder: The capture.
+        cache: Folder for resampled files; None to resample and write nothing, so that the capture is only `prepared`
+            if no image needs resampling.
+        memory_mb: Limit of the memory for decoded images, in megabytes.
+        max_size: Longer side of the views, in pixels; 0 for any size.
+        reporter: Receives status, progress and warnings.
+
+    Returns:
+        The capture; its images and masks are decoded on demand.
+
+    Raises:
+        InputError: The capture cannot be used; the message names the file.
+    """
+    reporter = reporter or Reporter()
+    folder, cache = Path(folder), None if cache is None else Path(cache) / "views"
+    survey = survey_capture(folder, max_size, refuse, reporter)
+    if cache is None:
+        reporter.status("Reading the masks")
+    else:
+        try:
+            cache.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            what = f"The folder {cache.parent} cannot be written to ({error.strerror}); choose another."
+            raise InputError(what) from error
+        reporter.status("Preparing the images")
+    views, ids_of_views = [], []
+    found = run_in_parallel(
+        lambda source: _read_view(source, survey) if cache is None else _prepare_view(source, survey, cache),
+        survey.sources,
+    )
+    for done, (view, ids) in enumerate(found, 1):
+        views.append(view)
+        ids_of_views.append(ids)
+        reporter.progress(done, len(survey.sources), what="images")
+    model = survey.model
+    for sentence in survey.warnings:
+        reporter.warning(sentence)
+    return Capture(
+        folder,
+        tuple(views),
+        Points(model.xyz, model.rgb, model.error, model.ids),
+        survey.names,
+        survey.warnings,
+        survey.counts,
+        ids_of_views,
+        [(source.camera, source.image) for source in survey.sources],
+        survey.color_masks,
+        memory_mb,
+        prepared=cache is not None
+        or all(
+            needs_no_resampling(source.camera, source.target.width, source.target.height) for source in survey.sources
+        ),
+    )
+
+
+def _read_view(source: Source, survey: Survey) -> tuple[View, tuple[int, ...]]:
+    """Check one view, without resampling, and return it and the IDs in its mask."""
+    check_size(source, image_size(source.image_path), survey.model.file("cameras"))
+    ids = () if source.mask_path is None else tuple(distinct_ids(check_mask(source, survey.color_masks)))
+    return _view_of(source, source.image_path, source.mask_path), ids
+
+
+def _view_of(source: Source, image_file: Path, mask_file: Path | None) -> View:
+    target, image = source.target, source.image
+    return View(
+        image.name, image_file, mask_file, target.K.copy(), image.viewmat, target.width, target.height,
+        source.camera.id,
+    )  # fmt: skip
+
+
+def _prepare_view(source: Source, survey: Survey, cache: Path) -> tuple[View, tuple[int, ...]]:
+    """Check one view, resample it into the cache if necessary, and return it and the IDs in its mask.
+
+    The stamp beside the cached files records their sources and is written last.
+    """
+    name = source.image.name
+    camera, target = source.camera, source.target
+    # The name includes the size, so that loading a capture at another size does not replace files in use.
+    digest = hashlib.sha256(f"{name}\0{target.width}x{target.height}".encode()).hexdigest()[:12]
+    stem = re.sub(r"[^A-Za-z0-9_-]+", "_", name)[-40:].strip("_") + "-" + digest
+    stamp_path = cache / f"{stem}.json"
+    made_from = {
+        "version": _CACHE_VERSION,
+        "image": _identify(source.image_path),
+        "mask": _identify(source.mask_path) if source.mask_path else None,
+        "color_masks": survey.color_masks,
+        "camera": [camera.model, camera.width, camera.height, list(camera.params)],
+        "target": [target.width, target.height, target.K.tolist()],
+    }
+    stamp = _read_stamp(stamp_path, made_from, cache)
+    if stamp is None:
+        try:
+            stamp = _resample(source, survey, cache, stem, made_from)
+            write_json(stamp_path, stamp)
+        except OSError as error:
+            raise InputError(
+                f"{error.filename or cache} cannot be written ({error.strerror}); free some space or choose "
+                "another folder."
+            ) from error
+    image_file = cache / stamp["image_file"] if stamp["image_file"] else source.image_path
+    mask_file = cache / stamp["mask_file"] if stamp["mask_file"] else source.mask_path
+    return _view_of(source, image_file, mask_file), tuple(stamp["ids"])
+
+
+def _identify(path: Path) -> list[Any]:
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}); check the file.") from error
+    return [str(path.resolve()), status.st_size, status.st_mtime_ns]
+
+
+def _read_stamp(path: Path, made_from: dict[str, Any], cache: Path) -> dict[str, Any] | None:
+    """Read the stamp of valid cached files; None if they have to be made again. A damaged cache is not an error."""
+    try:
+        stamp = json.loads(path.read_text(encoding="utf-8"))
+        if stamp["made_from"] != made_from:
+            return None
+        for key in ("image_file", "mask_file"):
+            if stamp[key] and (cache / stamp[key]).stat().st_size != stamp[f"{key}_bytes"]:
+                return None
+        return stamp
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _resample(source: Source, survey: Survey, cache: Path, stem: str, made_from: dict[str, Any]) -> dict[str, Any]:
+    camera, target = source.camera, source.target
+    stamp: dict[str, Any] = {"made_from": made_from, "ids": []}
+    files: dict[str, str | None] = {"image_file": None, "mask_file": None}
+    pixels = read_image(source.image_path)
+    check_size(source, pixels.size, survey.model.file("cameras"))
+    in_place = needs_no_resampling(camera, target.width, target.height)
+    if not in_place:
+        files["image_file"] = f"{stem}.png"
+        write_image(cache / f"{stem}.png", resample_image(pixels, camera, target))
+    if source.mask_path is not None:
+        ids = check_mask(source, survey.color_masks)
+        if not in_place or ids.shape != (target.height, target.width):
+            ids = resample_mask(ids, camera, target)
+            suffix, data = encode_mask(ids)
+            files["mask_file"] = f"{stem}.mask{suffix}"
+            write_atomic(cache / f"{stem}.mask{suffix}", data)
+        stamp["ids"] = distinct_ids(ids)
+    for key, name in files.items():
+        stamp[key] = name
+        stamp[f"{key}_bytes"] = (cache / name).stat().st_size if name else None
+    return stamp

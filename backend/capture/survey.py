@@ -1,0 +1,320 @@
+"""Checks a capture and lists its contents before any image is prepared."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
+
+import numpy as np
+from PIL import Image as PilImage
+
+from ..shared.defaults import MAX_SIZE
+from ..shared.errors import InputError
+from ..shared.events import Reporter
+from ..shared.reconstruction.objects import default_name
+from .capture import MIN_VIEWS_TO_HOLD_OUT
+from .colmap import Camera, Image, Model, find_model, read_model
+from .files import (
+    IMAGE_SUFFIXES,
+    Files,
+    image_size,
+    is_color_mask,
+    is_three_channel,
+    mask_names,
+    read_image,
+    read_mask,
+    read_names,
+)
+from .undistort import Pinhole, is_pinhole, pinhole_for
+
+Problem = Callable[[str], None]
+"""Takes a sentence that describes a problem; either raises it or collects it."""
+
+_ASPECT_TOLERANCE = 0.01
+_T = TypeVar("_T")
+_R = TypeVar("_R")
+
+
+@dataclass
+class Source:
+    """One image of the model that exists on disk, with its mask, camera and the pinhole camera that replaces it."""
+
+    image: Image
+    camera: Camera
+    target: Pinhole
+    image_path: Path
+    mask_path: Path | None
+
+
+@dataclass
+class Survey:
+    """The contents of a capture, before its images are read."""
+
+    folder: Path
+    model: Model
+    sources: list[Source]
+    names: dict[int, str]
+    warnings: list[str]
+    counts: dict[str, Any]
+    color_masks: bool
+
+
+def refuse(sentence: str) -> NoReturn:
+    """Raise a problem as InputError."""
+    raise InputError(sentence)
+
+
+def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Reporter) -> Survey:
+    """List the contents of a capture.
+
+    Args:
+        folder: The capture.
+        max_size: Longer side of the views, in pixels; 0 for any size.
+        problem: Called with each problem that makes the capture unusable; may raise it or collect it.
+        reporter: Receives the status.
+
+    Returns:
+        The survey; if `problem` collects, of what can be used.
+
+    Raises:
+        InputError: A problem that prevents further checks, whatever `problem` does.
+    """
+    if not folder.is_dir():
+        what = "is a file, not a folder" if folder.exists() else "does not exist"
+        raise InputError(f"The capture {folder} {what}; expected a folder with images/ and sparse/0/.")
+    reporter.status("Reading the COLMAP model")
+    try:
+        model_folder, warnings = find_model(folder)
+    except OSError as error:
+        raise InputError(f"{error.filename or folder} cannot be read ({error.strerror}); check it.") from error
+    model = read_model(model_folder)
+    warnings += model.warnings
+    no_names: dict[int, str] = {}
+    names = _tolerate(problem, lambda: read_names(folder), no_names)
+
+    targets: dict[int, Pinhole | None] = {}
+    for camera_id in sorted({image.camera_id for image in model.images}):
+        targets[camera_id] = _tolerate(
+            problem, partial(pinhole_for, model.cameras[camera_id], model.file("cameras"), max_size), None
+        )
+    if not any(targets.values()):
+        raise InputError(f"{model.file('cameras')} holds no usable camera; run COLMAP again.")
+
+    images_folder, masks_folder = folder / "images", folder / "masks"
+    if not images_folder.is_dir():
+        raise InputError(f"{images_folder} does not exist; put the images that the COLMAP model names there.")
+    files = Files(images_folder)
+    masks = Files(masks_folder) if masks_folder.is_dir() else None
+    sources, absent, unmasked = [], [], []
+    for image in sorted(model.images, key=lambda image: image.name):
+        if re.match(r"[/\\]|[A-Za-z]:", image.name) or ".." in re.split(r"[/\\]", image.name):
+            problem(
+                f"{model.file('images')} names an image {image.name}, which lies outside {images_folder}; rename it."
+            )
+            continue
+        path = files.find(image.name)
+        if path is None:
+            absent.append(image.name)
+            continue
+        mask_path = None
+        if masks is not None:
+            accepted, lossy = mask_names(image.name)
+            mask_path = masks.first(accepted)
+            if mask_path is None and (jpeg := masks.first(lossy)) is not None:
+                problem(f"{jpeg} is a JPEG, whose compression changes IDs; save the mask as PNG.")
+            if mask_path is None:
+                unmasked.append(image.name)
+        target = targets[image.camera_id]
+        if target is not None:
+            sources.append(Source(image, model.cameras[image.camera_id], target, path, mask_path))
+    present = len(model.images) - len(absent)
+    if absent and not present:
+        raise InputError(
+            f"{images_folder} holds none of the {len(absent)} images that {model.file('images')} names, for instance "
+            f"{absent[0]}; put them there."
+        )
+    if absent:
+        warnings.append(
+            f"{len(absent)} of {len(model.images)} images in the model are not in {images_folder} and are left out, "
+            f"for instance {absent[0]}."
+        )
+    registered = {source.image_path for source in sources}
+    on_disk = [path for path in files.paths if Path(path).suffix.lower() in IMAGE_SUFFIXES]
+    unregistered = [path for path in on_disk if images_folder / path not in registered]
+    if unregistered and len(registered) == present:
+        warnings.append(
+            f"{len(unregistered)} of {len(on_disk)} images in {images_folder} are not in the model, for instance "
+            f"{unregistered[0]}; COLMAP could not register them, and they are not used."
+        )
+    if unmasked:
+        first = masks_folder / Path(unmasked[0]).with_suffix(".png")
+        if 2 * len(unmasked) > present:
+            problem(
+                f"The mask {first} is missing, as are those of {len(unmasked)} of {present} images: add them, or "
+                f"remove {masks_folder} to work without objects."
+            )
+        else:
+            warnings.append(f"{len(unmasked)} of {present} images have no mask, for instance {first} is missing.")
+    if present < MIN_VIEWS_TO_HOLD_OUT:
+        warnings.append(f"Only {present} images can be used, so none is held out and quality cannot be measured.")
+    centers = np.array([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in model.images])
+    extent = float(np.abs(model.xyz - np.median(model.xyz, 0)).max())
+    if len(centers) > 1 and float(np.ptp(centers, 0).max()) <= 1e-9 * max(extent, 1e-30):
+        warnings.append(f"All cameras in {model.file('images')} have the same position, so depth cannot be determined.")
+
+    counts = {
+        "registered": len(model.images),
+        "used": present,
+        "missing": len(absent),
+        "unregistered": len(unregistered),
+        "masks": present - len(unmasked) if masks is not None else 0,
+        "points": len(model.xyz),
+        "cameras": dict(Counter(model.cameras[i].model for i in sorted(targets))),
+    }
+    return Survey(folder, model, sources, names, warnings, counts, _is_color_coded(sources, problem))
+
+
+def _tolerate(problem: Problem, make: Callable[[], _T], otherwise: _T) -> _T:
+    try:
+        return make()
+    except InputError as error:
+        problem(str(error))
+        return otherwise
+
+
+def _is_color_coded(sources: list[Source], problem: Problem) -> bool:
+    """Whether three-channel masks encode IDs as colors; decided for the whole capture, since ID 65,793 is gray."""
+    for source in sources:
+        if source.mask_path is not None:
+            if not _tolerate(problem, partial(is_three_channel, source.mask_path), True):
+                return False
+            if _tolerate(problem, partial(is_color_mask, source.mask_path), False):
+                return True
+    return False
+
+
+def check_size(source: Source, size: tuple[int, int], cameras_file: Path) -> None:
+    """Raise InputError if an image's size (width, height) is not its camera's."""
+    camera = source.camera
+    if size != (camera.width, camera.height):
+        raise InputError(
+            f"{source.image_path} is {size[0]}x{size[1]} pixels, but {cameras_file} gives its camera {camera.id} "
+            f"{camera.width}x{camera.height}; use the images that COLMAP was run on."
+        )
+
+
+def check_mask(source: Source, color: bool) -> np.ndarray:
+    """Read a mask as it is on disk; raises InputError if its aspect ratio is not the image's."""
+    assert source.mask_path is not None
+    ids = read_mask(source.mask_path, color)
+    height, width = ids.shape
+    camera = source.camera
+    # A difference of one pixel is due to rounding.
+    expected = height * camera.width / camera.height
+    if abs(width - expected) > max(1.0, _ASPECT_TOLERANCE * expected):
+        raise InputError(
+            f"{source.mask_path} is {width}x{height} pixels, but its image {source.image_path.name} is "
+            f"{camera.width}x{camera.height}; make the mask the image's size."
+        )
+    return ids
+
+
+def run_in_parallel(work: Callable[[_T], _R], items: Iterable[_T]) -> Iterator[_R]:
+    """Yield the results in order; the first error cancels the items that have not started."""
+    pool = ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1)))
+    try:
+        yield from pool.map(work, items)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def check_capture(folder: str | Path, max_size: int = MAX_SIZE, reporter: Reporter | None = None) -> dict[str, Any]:
+    """Check a capture; reads every image and mask once and writes nothing.
+
+    Args:
+        folder: The capture.
+        max_size: Longer side of the views, in pixels; 0 for any size.
+        reporter: Receives status and progress.
+
+    Returns:
+        A JSON-compatible dict. "problems" holds a sentence for each reason why `load_capture` would refuse the
+        capture, "warnings" other sentences for the user. If the model cannot be read, the only other key is "folder".
+    """
+    reporter = reporter or Reporter()
+    folder = Path(folder)
+    problems: list[str] = []
+    try:
+        survey = survey_capture(folder, max_size, problems.append, reporter)
+    except InputError as error:
+        return {"folder": str(folder), "problems": [*problems, str(error)], "warnings": []}
+    model = survey.model
+    reporter.status("Reading the images and masks")
+
+    def check(source: Source) -> tuple[list[str], list[int]]:
+        wrong: list[str] = []
+        _tolerate(wrong.append, lambda: _check_image(source, model.file("cameras")), None)
+        if source.mask_path is None:
+            return wrong, []
+        ids = _tolerate(wrong.append, lambda: check_mask(source, survey.color_masks), None)
+        return wrong, [] if ids is None else distinct_ids(ids)
+
+    views_of: Counter[int] = Counter()
+    for done, (wrong, ids) in enumerate(run_in_parallel(check, survey.sources), 1):
+        problems += [sentence for sentence in wrong if sentence not in problems]
+        views_of.update(ids)
+        reporter.progress(done, len(survey.sources), what="images")
+    known = model.error[model.error >= 0]
+    sizes = Counter(f"{source.target.width}x{source.target.height}" for source in survey.sources)
+    unnamed = sorted(set(survey.names) - set(views_of))
+    warnings = list(survey.warnings)
+    if views_of and unnamed:
+        warnings.append(
+            f"The labels name {len(unnamed)} objects that no mask shows, for instance {unnamed[0]} "
+            f"({survey.names[unnamed[0]]})."
+        )
+    observations = sum(len(image.point_index) for image in model.images)
+    return {
+        "folder": str(folder),
+        "model": str(model.folder),
+        "problems": problems,
+        "warnings": warnings,
+        "counts": survey.counts,
+        "cameras": [
+            {
+                "id": camera.id,
+                "model": camera.model,
+                "width": camera.width,
+                "height": camera.height,
+                "images": sum(image.camera_id == camera.id for image in model.images),
+                "undistort": not is_pinhole(camera),
+            }
+            for camera in (model.cameras[i] for i in sorted({image.camera_id for image in model.images}))
+        ],
+        "view_sizes": dict(sizes),
+        "points": len(model.xyz),
+        "observations": observations,
+        "mean_reprojection_error": round(float(known.mean()), 4) if len(known) else None,
+        "objects": [
+            {"id": i, "name": survey.names.get(i, default_name(i)), "views": views_of[i]} for i in sorted(views_of) if i
+        ],
+        "unlabeled_views": views_of[0],
+    }
+
+
+def _check_image(source: Source, cameras_file: Path) -> PilImage.Image:
+    check_size(source, image_size(source.image_path), cameras_file)
+    return read_image(source.image_path)
+
+
+def distinct_ids(ids: np.ndarray) -> list[int]:
+    """The IDs of a mask, ascending. Small IDs are counted, which is faster than sorting all pixels."""
+    if ids.size and ids.min() >= 0 and ids.max() < 1 << 16:
+        return np.flatnonzero(np.bincount(ids.ravel())).tolist()
+    return np.unique(ids).tolist()

@@ -1,0 +1,109 @@
+"""Help texts of the commands."""
+
+INTRODUCTION = """\
+Turn photos into labeled splats and meshes. A capture is a folder with images/, the
+COLMAP model of their cameras in sparse/0 and, for objects, an object ID mask of each
+image in masks/. The result is written to a reconstruction folder.
+
+  python -m backend check    garden                      check the capture
+  python -m backend plan     garden                      show what training would do
+  python -m backend train    garden --out garden-splats  train the splats (5 minutes)
+  python -m backend mesh     garden-splats               extract a mesh of each object
+  python -m backend evaluate garden-splats               measure their quality
+  python -m backend report   garden-splats               write garden-splats/report.md
+  python -m backend edit     garden-splats --remove mug  edit objects
+  python -m backend export   garden-splats --out all.ply export for other programs
+"""
+
+ENDING = """\
+`python -m backend COMMAND --help` lists the options of a command. Ctrl+C stops at any
+time; run the same command again to resume. Exit codes: 0 done, 2 the input cannot be
+used (the message says why), 130 stopped, 1 any other error.
+"""
+
+CHECK = """\
+Check a capture and list its contents and problems: cameras, images without a pose,
+masks, objects. Nothing is written.
+"""
+
+IMPORT = """\
+Prepare a capture for display: undistort its images once, and write its cameras to
+cameras.json and its points to points.ply. `vote` and `train` do this themselves.
+"""
+
+PLAN = """\
+Show what training would do with a capture, what it would omit, and why. Nothing is
+trained and no image is changed. `plan` takes the options of `train`; --keep and
+--leave-out override its decisions. With --out, the votes and omitted objects in DIR
+are taken into account, and the plan is written to DIR/plan.json.
+"""
+
+VOTE = """\
+Assign each 3D point of the capture the object that most masks show at the point.
+Writes points.ply, with an object_id per point, and objects.json to the reconstruction
+folder. `train` votes itself if no current votes exist.
+"""
+
+TRAIN = """\
+Train the splats. Writes splats.ply, which splat viewers and Blender read, checkpoints
+to resume from, and previews/, which show the progress. If training is stopped, it
+keeps the mean of its latest steps. To train longer, run the command again with more
+--minutes or --steps.
+"""
+
+RENDER = """\
+Render the splats from the capture's cameras to DIR/renders, with the images' names.
+"""
+
+EVALUATE = """\
+Compare renderings with the photos held out of training (every 8th). PSNR and SSIM
+measure the images; mIoU, mBIoU, Dice and accuracy measure how well the objects agree
+with the masks. Meshes are measured too: whether they are closed, how their textures
+look in those photos and, if CAPTURE/truth contains the true surfaces, how far they are
+from these. `report` shows the figures.
+"""
+
+MESH = """\
+Extract a textured mesh of each object: closed, in the capture's coordinates, as PLY
+with a PNG texture in DIR/meshes. After a stop, run the same command again for the
+remaining meshes. `evaluate` then measures the meshes too.
+"""
+
+FILM = """\
+Render film frames of the splats, with the edits in DIR/objects.json, from a shot file:
+multilayer EXR with color (linear, premultiplied), depth, object IDs and Cryptomatte.
+Blender's Film panel writes shot files; their format is described in
+backend/shared/reconstruction/shot.py. Existing frames are skipped, so several machines
+can share a folder, each with its own --frames.
+"""
+
+REPORT = """\
+Write report.md, with images, plots and a list of what was omitted, and report.json,
+the same for programs. Run `evaluate` first, so that the report includes quality.
+"""
+
+EDIT = """\
+Remove, recolor, move or duplicate objects; `export`, `film` and Blender show the
+result. Edits are stored in objects.json, and the trained splats stay unchanged, so
+that every edit can be undone. Without options, list the edits. OBJECT is a name, part
+of a name, or an ID; separate several KEY=VALUE with commas. Lengths are in the
+capture's units. x, y and z are Blender's axes, Z up; the rotations rx, ry and rz, in
+degrees, and the scale are about the object's center. A new color or transform replaces
+the earlier one.
+"""
+
+EXPORT = """\
+Export the splats, with all edits, for other programs: as PLY (exact, with object_id),
+SPZ (a fifth of the size) or .splat (one color per splat).
+"""
+
+IMPORT_SPLATS = """\
+Make a reconstruction from splats that another program trained. Their objects are taken
+from object_id in the file or, with --capture, from a vote by that capture's masks; the
+splats must be in its coordinates.
+"""
+
+DOCTOR = """\
+Show versions and devices, and test everything on a tiny scene. The first run compiles
+the kernels, which takes about a minute, so that later commands start at once.
+"""

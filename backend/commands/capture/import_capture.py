@@ -1,0 +1,39 @@
+"""`import`: prepares a capture's cameras and points for display, before the vote and training."""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+
+from ...labels import Votes
+from ...labels.points import write_points
+from ...shared.reconstruction.objects import write_objects
+from ...shared.reconstruction.record import read_record, update_record
+from ...shared.stopping import StoppingReporter
+from ..folder import capture_record, open_reconstruction
+from .plan import write_default_plan
+from .votes import votes_are_current
+
+
+def import_capture(options: argparse.Namespace, reporter: StoppingReporter) -> None:
+    """Undistort the images; leave cameras.json, points.ply, plan.json and the capture's entry in objectgs.json.
+
+    Points keep the objects of an earlier vote on this capture; without a vote they belong to no object.
+    """
+    with open_reconstruction(options, reporter) as (folder, capture):
+        update_record(folder, capture=capture_record(capture, options.max_size))
+        voted = read_record(folder).votes
+        cast = voted and (options.max_size, voted.strategy, voted.seed or 0)
+        if not cast or not votes_are_current(folder, capture, *cast):
+            count = len(capture.points.xyz)
+            none = Votes(np.zeros(count, np.int64), np.zeros(count, np.float32), {}, np.zeros(count, np.int32))
+            # The record is cleared first, so that points without a vote never count as voted on.
+            update_record(folder, votes=None)
+            write_points(folder.points, capture.points, none)
+            if folder.objects.exists():
+                write_objects(folder.objects, [])
+        write_default_plan(folder, capture, options.max_size)
+    reporter.done(
+        cameras=str(folder.cameras), points=str(folder.points), views=len(capture.views), masks=capture.has_masks
+    )

@@ -1,0 +1,90 @@
+"""`import-splats`: makes a reconstruction from splats of another program, for display and editing."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import ExitStack
+
+import numpy as np
+
+from ...capture import Capture, Points
+from ...export import read_splats, write_splats
+from ...labels import Votes
+from ...labels import vote as vote_points
+from ...labels.points import write_points
+from ...model.splats import Splats
+from ...shared.color.palette import object_colors
+from ...shared.errors import InputError
+from ...shared.events import Reporter
+from ...shared.reconstruction.folder import Reconstruction
+from ...shared.reconstruction.lock import locked
+from ...shared.reconstruction.objects import default_name, write_objects
+from ...shared.reconstruction.record import ImportRecord, update_record
+from ...shared.stopping import StoppingReporter
+from ..cameras import write_splat_cameras
+from ..folder import capture_record, open_reconstruction, removed_if_refused
+from .votes import object_name
+
+_LEAST_VISIBLE = 0.5
+"""Least fraction of the splats inside a view; with fewer, they are probably not in the capture's coordinates."""
+
+
+def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> None:
+    """Write splats.ply, objects.json, cameras.json and points.ply from the PLY."""
+    folder = Reconstruction(options.out)
+    if folder.checkpoint.exists():
+        raise InputError(f"{folder.folder} already contains a training; choose another --out.")
+    reporter.status(f"Reading {options.ply.name}")
+    splats, warnings = read_splats(options.ply)
+    if len(splats) == 0:
+        raise InputError(f"{options.ply} holds no splats.")
+    for sentence in warnings:
+        reporter.warning(sentence)
+    names: dict[int, str] = {}
+    with removed_if_refused(folder), ExitStack() as opened:
+        if options.capture is None:
+            folder.create()
+            opened.enter_context(locked(folder.folder))
+            write_splat_cameras(folder, splats.means)
+            write_points(folder.points, _no_points(), _no_votes(0))
+        else:
+            _, capture = opened.enter_context(open_reconstruction(options, reporter))
+            names = {i: object_name(capture, i) for i in capture.object_ids.tolist()}
+            votes = _no_votes(len(capture.points.xyz))
+            if capture.has_masks:
+                splats.object_ids = _vote_on_splats(capture, splats, reporter)
+                votes = vote_points(capture)
+            else:
+                reporter.warning(f"{capture.folder / 'masks'} does not exist, so splats keep the objects of the file.")
+            write_points(folder.points, capture.points, votes)
+            update_record(folder, capture=capture_record(capture, options.max_size))
+        for sentence in write_splats(folder.splats, splats):
+            reporter.warning(sentence)
+        found, counts = np.unique(splats.object_ids[splats.object_ids > 0], return_counts=True)
+        colors = object_colors(found)
+        objects = [
+            {"id": i, "name": names.get(i, default_name(i)), "color": list(colors[i]), "points": n}
+            for i, n in zip(found.tolist(), counts.tolist())
+        ]
+        write_objects(folder.objects, objects)
+        update_record(folder, imported=ImportRecord(str(options.ply.resolve()), len(splats)))
+    reporter.done(splats=len(splats), objects=len(objects), reconstruction=str(folder.folder))
+
+
+def _vote_on_splats(capture: Capture, splats: Splats, reporter: Reporter) -> np.ndarray:
+    """Vote on the object of each splat (N,); raises InputError if the splats are not inside the capture's views."""
+    votes = vote_points(capture, reporter=reporter, positions=splats.means)
+    seen = float((votes.visible > 0).mean())
+    if seen < _LEAST_VISIBLE:
+        raise InputError(
+            f"Only {seen:.0%} of the splats lie in the views of {capture.folder}; they must be in its coordinates."
+        )
+    return votes.ids
+
+
+def _no_points() -> Points:
+    return Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), np.zeros(0, np.int64))
+
+
+def _no_votes(count: int) -> Votes:
+    return Votes(np.zeros(count, np.int64), np.zeros(count, np.float32), {}, np.zeros(count, np.int32))

@@ -1,0 +1,68 @@
+"""The votes on the objects of points, in points.ply and objects.json, and whether they are current."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+
+from ...capture import Capture
+from ...labels import vote as vote_points
+from ...labels.points import read_points, write_points
+from ...shared.color.palette import object_colors
+from ...shared.errors import InputError
+from ...shared.events import Reporter
+from ...shared.reconstruction.folder import Reconstruction
+from ...shared.reconstruction.objects import default_name, write_objects
+from ...shared.reconstruction.record import VotesRecord, read_record, update_record
+from ..folder import digest
+from ..stages import stage
+
+
+def cast_votes(folder: Reconstruction, capture: Capture, options: argparse.Namespace, reporter: Reporter) -> None:
+    """Vote on the objects of the capture's points; writes points.ply and objects.json."""
+    with stage(folder, "vote"):
+        votes = vote_points(capture, options.strategy, options.seed, reporter=reporter)
+        colors = object_colors(votes.counts)
+        objects = [
+            {"id": i, "name": object_name(capture, i), "color": list(colors[i]), "points": n}
+            for i, n in sorted(votes.counts.items())
+            if i
+        ]
+        write_points(folder.points, capture.points, votes)
+        write_objects(folder.objects, objects)
+    update_record(folder, votes=votes_key(capture, options.max_size, options.strategy, options.seed))
+    for entry in objects:
+        reporter.status(f"object {entry['id']} {entry['name']}: {entry['points']:,} points")
+
+
+def votes_are_current(folder: Reconstruction, capture: Capture, max_size: int, strategy: str, seed: int) -> bool:
+    """Whether points.ply is complete and holds the result of the same vote."""
+    if not folder.points.exists() or not folder.objects.exists():
+        return False
+    if read_record(folder).votes != votes_key(capture, max_size, strategy, seed):
+        return False
+    try:
+        return len(read_points(folder.points).ids) == len(capture.points.xyz)
+    except InputError:
+        return False
+
+
+def votes_key(capture: Capture, max_size: int, strategy: str, seed: int) -> VotesRecord:
+    """Everything that votes depend on, as objectgs.json stores it; a mask file that was modified changes it."""
+    masks = hashlib.sha256()
+    for view in capture.views:
+        if view.mask_file is not None:
+            status = view.mask_file.stat()
+            masks.update(f"{view.name}\0{status.st_size}\0{status.st_mtime_ns}\0".encode())
+    return VotesRecord(
+        strategy,
+        seed if strategy == "probability" else None,
+        max_size,
+        digest(capture),
+        masks.hexdigest()[:16] if capture.has_masks else None,
+    )
+
+
+def object_name(capture: Capture, object_id: int) -> str:
+    """What an object is called: as in the capture, or by its number."""
+    return capture.names.get(object_id, default_name(object_id))

@@ -1,0 +1,1 @@
+"""Commands on the objects of a reconstruction: mesh, edit, export, film."""

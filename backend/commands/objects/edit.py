@@ -1,0 +1,118 @@
+"""`edit`: store the user's edits of objects in objects.json; splats.ply does not change."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ...editing.placement import Placement, luma_of, middle_of
+from ...export import read_splats
+from ...model.splats import Splats
+from ...shared.errors import InputError
+from ...shared.reconstruction.folder import Reconstruction
+from ...shared.reconstruction.objects import Matrix, SceneObject, edit_objects, find_object, merged, read_objects
+from ...shared.stopping import StoppingReporter
+from ..cameras import read_upright
+from .fill import fill_holes
+
+_NONE: dict[str, Any] = dict.fromkeys(("removed", "floaters", "fill", "recolor", "transform", "copies"))
+"""Resets every edit of an object that this command makes."""
+
+
+def edit(options: argparse.Namespace, reporter: StoppingReporter) -> None:
+    """Store the edits of the options, fill the holes of removed objects, and report all edits."""
+    folder = Reconstruction(options.folder)
+    for name in ("floaters", "fill"):
+        if getattr(options, name) and not options.remove:
+            raise InputError(f"--{name} requires --remove, which selects the objects to remove.")
+    wanted = _Edits(folder)
+    everything = [word for word in options.reset if word.casefold() == "all"]
+    for entry in wanted.objects if everything else wanted.find(options.reset):
+        wanted.change(entry, **_NONE)
+    for entry in wanted.find(options.restore):
+        wanted.change(entry, removed=None, floaters=None, fill=None)
+    for entry in wanted.find(options.remove):
+        wanted.change(entry, removed=True, floaters=options.floaters or None, fill=options.fill or None)
+    for word, recolor in options.recolor:
+        (entry,) = wanted.find([word])
+        wanted.change(entry, recolor=replace(recolor, middle=luma_of(wanted.splats_of(entry))).stored())
+    for word, values in options.move:
+        (entry,) = wanted.find([word])
+        wanted.change(entry, transform=wanted.transform(entry, Placement(**values)))
+    for word, values in options.duplicate:
+        (entry,) = wanted.find([word])
+        wanted.change(entry, copies=[*wanted.copies(entry), wanted.transform(entry, Placement(**values))])
+    if wanted.changes:
+        edit_objects(folder.objects, wanted.changes)
+    new_splats = fill_holes(folder, reporter)
+    # As one message, since a status display shows only the latest one.
+    lines = [
+        f"{e.id} {e.name}: {', '.join(_described(e, new_splats.get(e.id))) or 'as captured'}"
+        for e in read_objects(folder.objects)
+    ]
+    reporter.status("\n".join(lines) or "There are no objects.")
+    reporter.done(objects=str(folder.objects), edited=len(wanted.changes), new_splats=sum(new_splats.values()))
+
+
+class _Edits:
+    """The changes of one command to the objects of a folder."""
+
+    def __init__(self, folder: Reconstruction) -> None:
+        self.folder = folder
+        self.objects = read_objects(folder.objects)
+        self.changes: dict[int, dict[str, Any]] = {}
+
+    def find(self, words: Iterable[str]) -> Sequence[SceneObject]:
+        return [find_object(self.objects, word, self.folder.objects) for word in words]
+
+    def change(self, entry: SceneObject, **values: Any) -> None:
+        self.changes.setdefault(entry.id, {}).update(values)
+
+    def copies(self, entry: SceneObject) -> Sequence[Matrix]:
+        """Return the duplicates of an object, including the changes so far."""
+        return self.changes.get(entry.id, {}).get("copies", entry.copies) or ()
+
+    def splats_of(self, entry: SceneObject) -> Splats:
+        """Return the captured splats of an object, including those merged into it; InputError if there are none."""
+        ids = [i for i, target in merged(self.objects).items() if target == entry.id]
+        own = self._splats.select(np.isin(self._splats.object_ids, ids))
+        if len(own) == 0:
+            raise InputError(f"{self.folder.splats} has no splats of {entry.name}, so it cannot be edited.")
+        return own
+
+    def transform(self, entry: SceneObject, placement: Placement) -> Matrix:
+        return placement.matrix(middle_of(self.splats_of(entry)), read_upright(self.folder).rotation)
+
+    @cached_property
+    def _splats(self) -> Splats:
+        return read_splats(self.folder.splats)[0]
+
+
+def _described(entry: SceneObject, new_splats: int | None) -> list[str]:
+    """The edits of an object in words; new_splats: that fill the hole it leaves, None where that was not asked for."""
+    words = [f"merged into {entry.merged_into}"] if entry.merged_into is not None else []
+    words += ["left out"] if entry.left_out else []
+    if entry.removed:
+        words.append("removed" + " with floaters" * entry.floaters)
+        if entry.fill and new_splats == 0:
+            words.append("nothing flat around it to fill its hole with")
+        elif entry.fill:
+            words.append("its hole filled" + f" with {new_splats:,} new splats" * bool(new_splats))
+    if entry.recolor:
+        stored = entry.recolor.stored() or {}
+        words.append("recolored " + " ".join(f"{key}={_short(value)}" for key, value in stored.items()))
+    if entry.transform:
+        scale = abs(np.linalg.det(np.array(entry.transform)[:3, :3])) ** (1 / 3)
+        words.append("moved" if abs(scale - 1) < 1e-6 else f"moved, scaled by {scale:.4g}")
+    if entry.copies:
+        words.append(f"{len(entry.copies)} cop{'y' if len(entry.copies) == 1 else 'ies'}")
+    return words
+
+
+def _short(value: Any) -> str:
+    return "/".join(map(_short, value)) if isinstance(value, list) else f"{value:.4g}"

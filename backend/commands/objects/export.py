@@ -1,0 +1,112 @@
+"""`export`: write the splats with all edits for other programs."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ...capture import Upright
+from ...editing import apply_edits, transformed
+from ...export import read_splats, write_splat, write_splats, write_spz
+from ...model.splats import Splats
+from ...shared.errors import InputError
+from ...shared.reconstruction.folder import Reconstruction
+from ...shared.reconstruction.objects import SceneObject, default_name, find_object, read_objects
+from ...shared.reconstruction.record import read_record
+from ...shared.stopping import StoppingReporter
+from ..cameras import read_upright
+
+_DOWN_TO_UP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From the axes of COLMAP (x right, y down, z forward) to those of SPZ (x right, y up, z back)."""
+_Z_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+
+def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
+    """Write one file, or one for each object."""
+    folder = Reconstruction(options.folder)
+    kind, write = _format(options)
+    objects = read_objects(folder.objects) if folder.objects.exists() else []
+    chosen = [find_object(objects, word, folder.objects).id for word in options.objects or ()]
+    reporter.status(f"Reading {folder.splats.name}")
+    captured, warnings = read_splats(folder.splats)
+    for sentence in warnings:
+        reporter.warning(sentence)
+    _warn_about_fit(folder, reporter)
+    splats = apply_edits(captured, objects)
+    if chosen:
+        splats = splats.select(np.isin(splats.object_ids, chosen))
+    if len(splats) == 0:
+        raise InputError(
+            f"No splats of {folder.splats} are left to export, since removed and left-out objects are skipped."
+        )
+    if splats.unobserved.any():
+        reporter.status(f"{splats.unobserved.sum():,} splats fill the holes of removed objects")
+    if options.sh_degree is not None:
+        splats = splats.with_degree(options.sh_degree)
+    splats = _in_coordinates(splats, options.coordinates, read_upright(folder), y_up=kind == "spz")
+    files = _files(options, splats, objects, kind)
+    for done, (path, ids) in enumerate(files.items(), 1):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = splats if ids is None else splats.select(np.isin(splats.object_ids, ids))
+        for sentence in write(path, part):
+            reporter.warning(sentence)
+        reporter.progress(done, len(files), what="files")
+    reporter.done(exported=str(options.out), files=len(files), splats=len(splats))
+
+
+def _format(options: argparse.Namespace) -> tuple[str, Callable[[Path, Splats], list[str]]]:
+    """Return the name of the format, which is also the suffix of its files, and its writer."""
+    writers: dict[str, Callable[[Path, Splats], list[str]]] = {
+        "ply": lambda path, splats: write_splats(path, splats, with_ids=not options.no_ids),
+        "spz": write_spz,
+        "splat": write_splat,
+    }
+    suffix = options.out.suffix[1:].lower()
+    kind = options.format or (suffix if suffix in writers and not options.per_object else "ply")
+    return kind, writers[kind]
+
+
+def _warn_about_fit(folder: Reconstruction, reporter: StoppingReporter) -> None:
+    """Warn if the splats are only a fit of the trained model, with its PSNR."""
+    record = read_record(folder)
+    psnr = record.export.psnr_of_export if record.export else None
+    if psnr is not None and record.training and record.training.settings.get("mode") == "view":
+        reporter.warning(
+            f"{folder.splats.name} is a fit of a model whose splats change with the camera; its PSNR to renders of "
+            f"that model is {psnr:.1f} dB."
+        )
+
+
+def _in_coordinates(splats: Splats, coordinates: str, upright: Upright, y_up: bool) -> Splats:
+    """Return the splats in the capture's coordinates, or upright as in Blender; SPZ has its own axes for both."""
+    if coordinates == "blender":
+        splats = replace(splats, means=splats.means.astype(np.float64) - upright.origin)
+        stand = np.eye(4)
+        stand[:3, :3], stand[:3, 3] = upright.rotation, upright.translation
+        return transformed(splats, (_Z_TO_Y_UP if y_up else np.eye(4)) @ stand)
+    return transformed(splats, _DOWN_TO_UP) if y_up else splats
+
+
+def _files(
+    options: argparse.Namespace, splats: Splats, objects: list[SceneObject], kind: str
+) -> dict[Path, list[int] | None]:
+    """Return path -> IDs of the splats in this file, None: all."""
+    if not options.per_object:
+        if options.out.is_dir():
+            raise InputError(f"{options.out} is a folder; name a file, such as {options.out / f'splats.{kind}'}.")
+        return {options.out: None}
+    if options.out.exists() and not options.out.is_dir():
+        raise InputError(f"{options.out} is a file; with --per-object, name a folder.")
+    names = {entry.id: entry.name for entry in objects}
+    files: dict[Path, list[int] | None] = {}
+    for object_id in np.unique(splats.object_ids).tolist():
+        stem = re.sub(r"[^\w.-]+", "_", names.get(object_id, default_name(object_id))).strip("._") or "object"
+        taken = {path.stem.casefold() for path in files}
+        stem = f"{stem}_{object_id}" if stem.casefold() in taken else stem
+        files[options.out / f"{stem}.{kind}"] = [object_id]
+    return files

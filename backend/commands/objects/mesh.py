@@ -1,0 +1,216 @@
+"""`mesh`: make a textured mesh of each object, of sets of objects or of the whole scene, in DIR/meshes."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import re
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from ...mesh.field.extract import extract, is_watertight
+from ...mesh.field.fusion import fuse
+from ...mesh.refine import refine
+from ...mesh.surface import NoSurface, Surface
+from ...mesh.texture.bake import bake_texture, texture_size
+from ...mesh.texture.unwrap import unwrap
+from ...mesh.views import Views
+from ...model.object_model import ObjectModel
+from ...shared.errors import InputError
+from ...shared.events import Reporter
+from ...shared.formats.atomic import write_atomic
+from ...shared.formats.mesh_ply import Mesh, write_mesh
+from ...shared.reconstruction.folder import Reconstruction
+from ...shared.reconstruction.lock import locked
+from ...shared.reconstruction.meshes import MeshEntry, read_meshes, write_meshes
+from ...shared.reconstruction.objects import find_object, merged, read_objects
+from ...shared.stopping import StoppingReporter
+from ..folder import Trained, open_trained
+from ..setup.kernels import ensure_kernels
+from ..stages import finish_stage
+
+SCENE = "scene"
+SCENE_BUDGET = 5
+"""Factor by which the whole scene may have more faces than an object."""
+
+_SHARES = {"fuse": 0.4, "extract": 0.1, "refine": 0.2, "unwrap": 0.1, "bake": 0.2}
+"""Fractions of the time of one mesh, for the progress."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A mesh to make: its key in meshes.json, its name for messages, and the IDs of its objects (None: everything)."""
+
+    key: str
+    name: str
+    ids: tuple[int, ...] | None
+
+
+def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
+    """Make the meshes of the options that do not exist yet; each is written as soon as it is complete."""
+    trained = open_trained(options, reporter)
+    folder = trained.folder
+    ensure_kernels(reporter, trained.model.device)
+    with locked(folder.folder):
+        targets = _targets(options, folder)
+        folder.meshes.mkdir(exist_ok=True)
+        known = {} if options.restart else _known_meshes(folder)
+        wanted = [target for target in targets if not _is_current(known.get(target.key), target, options, trained)]
+        if len(wanted) < len(targets):
+            reporter.status(f"{len(targets) - len(wanted)} of {len(targets)} meshes exist already")
+        started = time.monotonic()
+        views = Views(trained.model, trained.scene, trained.capture.train_indices)
+        for done, target in enumerate(wanted):
+            reporter.status(f"Making the mesh of {target.name} ({done + 1} of {len(wanted)})")
+            entry = _make(target, options, trained, views, _Part(reporter, done, len(wanted), started))
+            if entry.why:
+                reporter.warning(entry.why)
+            known = {**_known_meshes(folder), target.key: entry}
+            write_meshes(folder.meshes, known, trained.progress.step)
+        if wanted:
+            finish_stage(folder, "mesh", time.monotonic() - started)
+    made = [target.key for target in targets if target.key in known and known[target.key].file]
+    if not made:
+        raise InputError(f"No mesh could be made: {known[targets[0].key].why}")
+    reporter.done(meshes=str(folder.meshes), made=len(made), without=len(targets) - len(made))
+
+
+class _Part(Reporter):
+    """Converts the progress of a step of a mesh to that of the whole command, with the remaining time."""
+
+    def __init__(self, reporter: StoppingReporter, done: int, total: int, started: float) -> None:
+        self._reporter, self._done, self._total, self._started = reporter, done, total, started
+        self._before, self._share, self._shown = 0.0, 0.0, float(done)
+
+    def begin(self, step: str) -> _Part:
+        """Begin a step of the mesh; returns itself."""
+        self._before += self._share
+        self._share = _SHARES[step]
+        self.progress(0, 1)
+        return self
+
+    def warning(self, message: str) -> None:
+        self._reporter.warning(message)
+
+    def progress(self, done: float, total: float, **_: Any) -> None:
+        fraction = self._before + self._share * min(done / max(total, 1e-9), 1.0)
+        # A step may pass over the views several times, each with a progress from 0.
+        self._shown = max(self._shown, self._done + fraction)
+        behind = self._shown / self._total
+        spent = time.monotonic() - self._started
+        left = {"seconds_left": round(spent / behind - spent, 1)} if behind > 0 else {}
+        self._reporter.progress(round(self._shown, 4), self._total, what="meshes", **left)
+
+
+def _make(target: Target, options: argparse.Namespace, trained: Trained, views: Views, part: _Part) -> MeshEntry:
+    """Make and write one mesh, and return its entry in meshes.json."""
+    started = time.monotonic()
+    model, folder = trained.model, trained.folder.meshes
+    entry = _entry_of(target, options, trained)
+    classes = np.arange(len(model.classes))
+    if target.ids is not None:
+        classes = model.classes.classes_among(target.ids)
+    budget = options.faces * (SCENE_BUDGET if target.key == SCENE else 1)
+    try:
+        if not np.isin(model.anchors.ids, classes).any():
+            raise NoSurface(f"{target.name} has no splats, so it has no mesh; was it left out of the training?")
+        field = fuse(views, classes.tolist(), reporter=part.begin("fuse"))
+        surface = extract(field, closed=not options.open, faces=budget, reporter=part.begin("extract"))
+    except NoSurface as reason:
+        for suffix in (".ply", ".png"):
+            (folder / f"{_stem(target.key)}{suffix}").unlink(missing_ok=True)
+        return replace(entry, why=str(reason))
+    surface = refine(surface, views, classes.tolist(), part.begin("refine"))
+    part.begin("unwrap")
+    size = options.texture_size or texture_size(surface, views)
+    uvs = unwrap(surface, size)
+    texture, colors = bake_texture(surface, uvs, size, views, classes.tolist(), reporter=part.begin("bake"))
+    stem = _stem(target.key)
+    _write_image(folder / f"{stem}.png", texture)
+    write_mesh(folder / f"{stem}.ply", _in_world(surface, colors, uvs, f"{stem}.png", model))
+    figures = {
+        "texture_size": size,
+        "vertices": len(surface.vertices),
+        "faces": len(surface.faces),
+        "watertight": is_watertight(surface.faces),
+        "unobserved": round(float(surface.unobserved.mean()), 4),
+        "seconds": round(time.monotonic() - started, 2),
+    }
+    return replace(entry, file=f"{stem}.ply", texture=f"{stem}.png", figures=figures)
+
+
+def _in_world(surface: Surface, colors: np.ndarray, uvs: np.ndarray, texture: str, model: ObjectModel) -> Mesh:
+    vertices, normals = model.normalization.to_world(surface.vertices), surface.normals().astype(np.float32)
+    return Mesh(vertices, normals, colors, surface.faces, uvs, surface.unobserved, texture)
+
+
+def _write_image(path: Path, pixels: np.ndarray) -> None:
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG", compress_level=4)
+    write_atomic(path, buffer.getvalue())
+
+
+def _targets(options: argparse.Namespace, folder: Reconstruction) -> list[Target]:
+    """Return the meshes that the options select; without a selection, those of all objects, merged ones as one."""
+    objects = [entry for entry in read_objects(folder.objects) if entry.id] if folder.objects.exists() else []
+    into = merged(objects)
+    groups = {entry.id: Target(str(entry.id), entry.name, _with_merged(entry.id, into)) for entry in objects}
+    shown = [entry.id for entry in objects if into[entry.id] == entry.id and not entry.left_out]
+
+    def find(word: str) -> int:
+        return find_object(objects, word, folder.objects).id
+
+    targets: list[Target] = []
+    if options.objects:
+        targets += [groups[i] for i in dict.fromkeys(find(word) for word in options.objects)]
+    for name, words in options.set or ():
+        ids = {i for word in words for i in (groups[find(word)].ids or ())}
+        if name == SCENE or name in {str(i) for i in groups}:
+            raise InputError(f"--set {name}=... would replace another mesh; choose another name.")
+        targets.append(Target(name, name, tuple(sorted(ids))))
+    if options.scene:
+        targets.append(Target(SCENE, "the whole scene", None))
+    if not targets:
+        targets = [groups[i] for i in shown] or [Target(SCENE, "the whole scene", None)]
+    return targets
+
+
+def _with_merged(object_id: int, into: dict[int, int]) -> tuple[int, ...]:
+    return tuple(sorted(i for i, shown_as in into.items() if shown_as == object_id))
+
+
+def _stem(key: str) -> str:
+    """Return a file name for a key: names of sets may contain characters that are not allowed there."""
+    return re.sub(r"[^\w.-]+", "_", key).strip("._") or "set"
+
+
+def _known_meshes(folder: Reconstruction) -> dict[str, MeshEntry]:
+    """The entries of meshes.json; none where it cannot be used, so that it is made anew."""
+    try:
+        return read_meshes(folder.meshes)
+    except InputError:
+        return {}
+
+
+def _entry_of(target: Target, options: argparse.Namespace, trained: Trained) -> MeshEntry:
+    """The entry of a mesh with what decides how it comes out, and no files yet."""
+    settings = {"faces": options.faces, "closed": not options.open, "texture_size": options.texture_size}
+    return MeshEntry(target.key, target.name, target.ids, trained.progress.step, settings)
+
+
+def _is_current(entry: MeshEntry | None, target: Target, options: argparse.Namespace, trained: Trained) -> bool:
+    """Whether the mesh of `target` is there and would come out the same."""
+    wanted = _entry_of(target, options, trained)
+    if entry is None or (entry.ids, entry.trained_steps, entry.settings) != (
+        wanted.ids, wanted.trained_steps, wanted.settings,
+    ):  # fmt: skip
+        return False
+    files = [name for name in (entry.file, entry.texture) if name]
+    return entry.why is not None or (
+        len(files) == 2 and all((trained.folder.meshes / name).is_file() for name in files)
+    )

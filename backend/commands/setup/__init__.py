@@ -1,0 +1,1 @@
+"""The machine: the command doctor, compilation of kernels, threads and memory."""

@@ -1,0 +1,28 @@
+"""`doctor`: reports versions and devices, and tests everything on a tiny scene."""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+from ...raster import devices
+from ...shared.stopping import StoppingReporter
+from .kernels import try_kernels
+from .machine import machine_facts
+
+
+def doctor(options: argparse.Namespace, reporter: StoppingReporter) -> None:
+    """Report versions and devices, compile the kernels and run a short training."""
+    device = devices.pick(options.device)
+    found = machine_facts(device)
+    for key, value in found.items():
+        reporter.status(f"{key}: {value}")
+    why_not = devices.why_not_cuda()
+    if why_not is not None:
+        reporter.status(f"CUDA is not used: {why_not}")
+    elif options.device == "cpu":
+        reporter.status("CUDA works, but --device cpu was given")
+    started = time.monotonic()
+    try_kernels(reporter, device)
+    seconds = time.monotonic() - started
+    reporter.done(message=f"The backend works; the kernels were ready in {seconds:.1f} s.", machine=found)

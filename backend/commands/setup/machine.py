@@ -1,0 +1,61 @@
+"""The machine that a command runs on: versions, cores, threads and memory."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import sys
+from typing import Any
+
+import numba
+import psutil
+import torch
+
+from ...raster import devices
+from ...shared.version import __version__
+
+_PACKAGES = ("torch", "numpy", "numba", "pycolmap", "scikit-image", "manifold3d", "xatlas")
+
+
+def set_threads(threads: int | None) -> None:
+    """Set the number of threads of kernels and of torch; None for every core that this process may use."""
+    count = max(min(threads or cores(), numba.config.NUMBA_NUM_THREADS), 1)
+    numba.set_num_threads(count)
+    torch.set_num_threads(count)
+
+
+def cores() -> int:
+    """The number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def machine_facts(device: torch.device) -> dict[str, Any]:
+    """Versions and hardware, to be stored with measurements; `device` trains and draws the splats."""
+    gpu = {}
+    if device.type == "cuda":
+        gpu = {
+            "gpu_memory_gb": round(torch.cuda.get_device_properties(device).total_memory / 1e9, 1),
+            "cuda": torch.version.cuda, "numba-cuda": importlib.metadata.version("numba-cuda"),
+        }  # fmt: skip
+    return {
+        "objectgs": __version__,
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "cores": cores(),
+        "threads": numba.get_num_threads(),
+        "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
+        "device": devices.name_of(device),
+        **gpu,
+        **{name: importlib.metadata.version(name) for name in _PACKAGES},
+    }
+
+
+def peak_mb() -> float:
+    """Peak memory of this process so far, in MB."""
+    if sys.platform == "win32":
+        return round(psutil.Process().memory_info().peak_wset / 1e6, 1)
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / 1e6 if sys.platform == "darwin" else peak / 1e3, 1)

@@ -1,0 +1,1 @@
+"""Commands around a training: train, render, evaluate, report."""

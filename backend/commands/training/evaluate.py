@@ -1,0 +1,55 @@
+"""`evaluate`: measure splats and meshes on the held-out views, into evaluation.json."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import numpy as np
+
+from ...evaluation import evaluate as evaluate_views
+from ...evaluation.meshes import evaluate_mesh, mesh_entries
+from ...evaluation.truth import load_truth
+from ...model.draw import draw
+from ...shared.errors import InputError
+from ...shared.reconstruction.report import Evaluation, write_evaluation
+from ...shared.stopping import StoppingReporter
+from ..folder import Trained, open_trained
+from ..stages import stage
+
+
+def evaluate(options: argparse.Namespace, reporter: StoppingReporter) -> None:
+    """Measure splats and meshes on the held-out views, and write evaluation.json, which `report` reads."""
+    trained = open_trained(options, reporter)
+    folder, capture = trained.folder, trained.capture
+    if not capture.test_indices:
+        raise InputError(f"{capture.folder} has too few views for held-out ones, so that nothing can be measured.")
+    reporter.status(f"Measuring on the {len(capture.test_indices)} held-out views")
+
+    def drawn(index: int) -> tuple[np.ndarray, np.ndarray]:
+        picture = draw(trained.model, trained.scene.camera(index))
+        assert picture.ids is not None
+        return picture.image, picture.ids
+
+    with stage(folder, "evaluate"):
+        found = evaluate_views(capture, drawn, capture.test_indices, reporter, trained.scene.zero_is_object)
+        meshes = _meshes(trained, reporter)
+    write_evaluation(folder.folder, Evaluation(trained.progress.step, **found, meshes=meshes))
+    quality = {name: value for name, value in found["quality"].items() if value is not None}
+    reporter.done(**{name: round(float(value), 4) for name, value in quality.items()})
+
+
+def _meshes(trained: Trained, reporter: StoppingReporter) -> dict[str, dict[str, Any]]:
+    """Measure every mesh in the folder that was made from this state of the model."""
+    capture, folder = trained.capture, trained.folder.meshes
+    entries = mesh_entries(folder, trained.progress.step, reporter)
+    if not entries:
+        return {}
+    reporter.status(f"Measuring {len(entries)} meshes")
+    truth = load_truth(capture, capture.train_indices)
+    found = {}
+    for done, (key, entry) in enumerate(entries.items()):
+        reporter.progress(done, len(entries), what="meshes")
+        found[key] = evaluate_mesh(folder, entry, trained.scene, truth, capture.test_indices, reporter)
+    reporter.progress(len(entries), len(entries), what="meshes")
+    return found

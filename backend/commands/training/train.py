@@ -1,0 +1,254 @@
+"""`train`: begin, resume or extend a training, and write a checkpoint, previews, splats.ply and anchors.ply."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from typing import Any
+
+import numpy as np
+import torch
+
+from ...capture import Capture
+from ...evaluation import IdScores, comparison, curve_image, psnr, save_image, thumbnail
+from ...export import agreement, fit_splats, write_anchors, write_splats
+from ...labels.points import read_points
+from ...model.checkpoint import has_checkpoint
+from ...model.draw import draw
+from ...model.object_model import ObjectModel
+from ...planning.coverage import unseen_points
+from ...planning.decisions import OF_TRAINING, decide, planned_capture, planned_settings
+from ...raster import devices
+from ...shared.errors import Cancelled, InputError
+from ...shared.events import Reporter
+from ...shared.formats.json_file import plain
+from ...shared.reconstruction.folder import Reconstruction
+from ...shared.reconstruction.plan import Plan, write_plan
+from ...shared.reconstruction.record import ExportRecord, TrainingRecord, read_record, update_record
+from ...shared.stopping import StoppingReporter
+from ...training.budget import Budget, TrainingProgress
+from ...training.scene import Scene
+from ...training.trainer import Evaluate, Trainer
+from ..capture.plan import build_context, change_objects, choices, find_requested_objects, report_plan, settings
+from ..capture.votes import cast_votes, votes_are_current, votes_key
+from ..folder import capture_record, digest, memory_for_planes, open_reconstruction, plan_of
+from ..setup.kernels import ensure_kernels
+from ..stages import finish_stage, stage
+from .length import budget_of, expected_of
+
+CURVE_VIEWS = 20
+"""Largest number of held-out views that are measured during training; `evaluate` measures all."""
+
+_COMPARED_VIEWS = 20
+"""Largest number of views on which the exported splats are compared with the model."""
+
+
+def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
+    """Begin, resume or extend a training, and write a checkpoint, previews, splats.ply and anchors.ply."""
+    device = devices.pick(options.device)
+    budget = budget_of(options)
+    with open_reconstruction(options, reporter) as (folder, capture):
+        trainer, plan = _begin(folder, capture, options, reporter, device)
+        progress = trainer.progress
+        if progress.step and budget.progress(progress) >= 1:
+            reporter.status(
+                f"Already trained for {progress.step} steps in {progress.seconds:.0f} s; ask for more --minutes or "
+                "--steps to extend it, or --restart to begin anew."
+            )
+        else:
+            update_record(
+                folder,
+                capture=capture_record(capture, options.max_size),
+                training=TrainingRecord(
+                    settings=trainer.settings.as_dict(),
+                    minutes=None if budget.seconds is None else budget.seconds / 60,
+                    steps=budget.steps,
+                    preset=options.preset,
+                    device=devices.name_of(device),
+                    left_out=trainer.scene.capture.left_out.tolist(),
+                    votes=votes_key(trainer.scene.capture, options.max_size, options.strategy, options.seed),
+                    plan=plan.as_list(),
+                ),
+            )
+            if expected := expected_of(budget, trainer.scene.capture, device, progress):
+                reporter.status(expected)
+            try:
+                _run(trainer, budget, folder, options.checkpoint_seconds, reporter)
+            except Cancelled:
+                # The result of a stopped training is exported, too, if that takes no time.
+                if trainer.model.explicit and progress.step:
+                    _export(trainer.shown, trainer.scene, folder, reporter)
+                raise
+        export = _export(trainer.shown, trainer.scene, folder, reporter)
+    latest = progress.curve[-1] if progress.curve else {}
+    reporter.done(
+        steps=progress.step, seconds=round(progress.seconds, 1), anchors=len(trainer.model.anchors),
+        splats=str(folder.splats), psnr=latest.get("psnr"), miou=latest.get("miou"),
+        psnr_of_export=export.psnr_of_export,
+    )  # fmt: skip
+
+
+def _begin(
+    folder: Reconstruction,
+    capture: Capture,
+    options: argparse.Namespace,
+    reporter: StoppingReporter,
+    device: torch.device,
+) -> tuple[Trainer, Plan]:
+    """Resume the training of the folder or start a new one, with new votes if the present ones differ; and its plan."""
+    resuming = not options.restart and has_checkpoint(folder.checkpoint)
+    voters = capture.without_masks() if "votes" in options.leave_out else capture
+    current = votes_are_current(folder, voters, options.max_size, options.strategy, options.seed)
+    if not (current or resuming):
+        cast_votes(folder, voters, options, reporter)
+    point_ids = read_points(folder.points).ids if current or not resuming else None
+    objects, _ = find_requested_objects(folder, capture, options)
+    context = build_context(capture, choices(options), objects, point_ids, thorough=True)
+    plan = decide(context)
+    if resuming:
+        plan = plan.settled_by(_plan_before(folder))
+    gains = context.gains if plan.does("exposure") else np.ones_like(context.gains)
+    planned, wanted = planned_capture(context.capture, plan), planned_settings(settings(options), plan)
+    memory = memory_for_planes(options)
+    if resuming:
+        resumed = Trainer.resume(planned, folder.checkpoint, wanted, memory, device, gains)
+        assert resumed is not None
+        trainer, warning = resumed
+        if warning:
+            reporter.warning(warning)
+        _check_same_training(folder, planned, plan, options)
+    else:
+        assert context.point_ids is not None
+        seeds = None if plan.does("unseen-points") else ~unseen_points(planned)
+        trainer = Trainer.start(
+            planned, context.point_ids, wanted, memory, device,
+            seeds=seeds, supervise_background=planned.has_masks and plan.does("rest"), gains=gains,
+        )  # fmt: skip
+    if options.restart:
+        shutil.rmtree(folder.checkpoint, ignore_errors=True)
+    change_objects(folder, voters, options)
+    write_plan(folder.plan, plan)
+    report_plan(plan, reporter)
+    return trainer, plan
+
+
+def _plan_before(folder: Reconstruction) -> Plan:
+    """Return the plan of the training in the folder."""
+    return plan_of(read_record(folder).training)
+
+
+def _check_same_training(folder: Reconstruction, capture: Capture, plan: Plan, options: argparse.Namespace) -> None:
+    """Raise InputError if the folder has a training of another capture or with other settings."""
+    training = read_record(folder).training
+    otherwise = "use the same, another --out, or --restart to train anew."
+    if training is None:
+        raise InputError(f"{folder.settings} does not say what {folder.checkpoint} was trained from; {otherwise}")
+    votes = training.votes
+    if votes.capture != digest(capture):
+        raise InputError(f"{folder.checkpoint} was trained on another capture than {capture.folder}; {otherwise}")
+    if votes.max_size != options.max_size:
+        raise InputError(f"{folder.checkpoint} was trained with --max-size {votes.max_size}; {otherwise}")
+    if votes.strategy != options.strategy:
+        raise InputError(f"{folder.checkpoint} was trained with --strategy {votes.strategy}; {otherwise}")
+    before, left_out = training.left_out, capture.left_out.tolist()
+    if before != left_out:
+        without = f"without {', '.join(map(str, before))}" if before else "with all objects"
+        raise InputError(
+            f"{folder.checkpoint} was trained {without}, and {folder.objects} leaves out "
+            f"{', '.join(map(str, left_out)) or 'none'}; leave out the same, or use --restart to train anew."
+        )
+    if training.plan is not None and (otherwise_now := plan.difference(plan_of(training), OF_TRAINING)):
+        raise InputError(
+            f"{folder.checkpoint} was trained by another plan ({', '.join(otherwise_now)}); --keep and --leave-out the "
+            f"same, or use --restart to train anew."
+        )
+
+
+def _run(
+    trainer: Trainer, budget: Budget, folder: Reconstruction, checkpoint_seconds: float, reporter: StoppingReporter
+) -> None:
+    """Run the training, which handles a stop itself, since it writes a checkpoint first."""
+    ensure_kernels(reporter, trainer.model.device)
+    folder.previews.mkdir(exist_ok=True)
+    step = trainer.progress.step
+    begun = f"Resuming after step {step} with" if step else "Training"
+    where = "" if trainer.model.device.type == "cpu" else f", on {devices.name_of(trainer.model.device)}"
+    reporter.status(f"{begun} {len(trainer.model.anchors):,} anchors{where}")
+    measure = _measure_held_out(folder, reporter)
+    try:
+        trainer.run(budget, folder.checkpoint, reporter.reporter, measure, reporter.stop, checkpoint_seconds)
+    except Cancelled:
+        finish_stage(folder, "train", trainer.progress.seconds)
+        raise
+    finish_stage(folder, "train", trainer.progress.seconds)
+
+
+def _measure_held_out(folder: Reconstruction, reporter: StoppingReporter) -> Evaluate:
+    """Return a function that measures held-out views, and writes previews of the first one and of the curve."""
+
+    def measure(model: ObjectModel, scene: Scene, progress: TrainingProgress) -> dict[str, Any]:
+        # Without SSIM, which would take most of the time, while the clock of the training runs.
+        found, ids = [], IdScores(scene.zero_is_object)
+        capture = scene.capture
+        every = max(len(capture.test_indices) // CURVE_VIEWS, 1)
+        for number, index in enumerate(capture.test_indices[::every][:CURVE_VIEWS] or (0,)):
+            photo, truth = capture.image(index), capture.mask(index)
+            picture = draw(model, scene.camera(index), want_ids=truth is not None or number == 0)
+            if number == 0:
+                assert picture.ids is not None
+                preview = comparison(photo, picture.image, truth, picture.ids, None, capture.names)
+                render = save_image(thumbnail(picture.image), folder.previews / "render.png", quick=True)
+                latest = save_image(preview, folder.previews / "latest.png", quick=True)
+                reporter.preview(latest, render=render)
+            if capture.test_indices:
+                found.append(psnr(picture.image, photo))
+                if truth is not None and picture.ids is not None:
+                    ids.add(picture.ids, truth)
+        scores = ids.result()
+        figures = {
+            "psnr": float(np.mean(found)) if found else None, "miou": scores["miou"], "mbiou": scores["mbiou"],
+        }  # fmt: skip
+        curve = curve_image([*progress.curve, {"seconds": progress.seconds, **figures}])
+        if curve is not None:
+            save_image(curve, folder.previews / "curve.png", quick=True)
+        return figures
+
+    return measure
+
+
+def _export(model: ObjectModel, scene: Scene, folder: Reconstruction, reporter: Reporter) -> ExportRecord:
+    """Write splats.ply and anchors.ply; return and record their sizes and, if the splats are only a fit, their PSNR to
+    the model."""
+    with stage(folder, "export"):
+        export = _write_export(model, scene, folder, reporter)
+    update_record(folder, export=export)
+    return export
+
+
+def _write_export(model: ObjectModel, scene: Scene, folder: Reconstruction, reporter: Reporter) -> ExportRecord:
+    reporter.status(f"Writing {folder.splats.name}")
+    psnr = None
+    capture = scene.capture
+    if model.explicit:
+        splats, source = model.splats()
+    else:
+        splats, source = fit_splats(model, [scene.camera(i) for i in capture.train_indices], reporter)
+    if not model.explicit or model.primitive == "2d":
+        views = (capture.test_indices or capture.train_indices)[:_COMPARED_VIEWS]
+        psnr = plain(agreement(model, splats, [scene.camera(i) for i in views]))
+        where = "held-out" if capture.test_indices else "training"
+        how_well = "cannot be measured" if psnr is None else f"is {psnr:.1f} dB"
+        what, has = (
+            ("A view-dependent model has no exact splats", "a fit")
+            if not model.explicit
+            else ("Most programs do not support flat splats", "thin Gaussians instead")
+        )
+        report = reporter.status if model.explicit else reporter.warning
+        report(
+            f"{what}: {folder.splats.name} holds {has}, whose PSNR to renders of the model in the {where} views "
+            f"{how_well}."
+        )
+    for sentence in write_splats(folder.splats, splats):
+        reporter.warning(sentence)
+    write_anchors(folder.anchors, model, splats, source)
+    return ExportRecord(len(splats), len(model.anchors), None if psnr is None else round(psnr, 2))

@@ -1,0 +1,234 @@
+"""The sections of report.md as Markdown text."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+OBJECTS_SHOWN = 40
+QUALITY = ("psnr", "ssim", "lpips", "miou", "mbiou", "dice", "accuracy")
+
+_MEANINGS = {
+    "psnr": (
+        "PSNR",
+        "dB",
+        "difference of the rendered pixels from the photos; 30 dB is good, 6 dB more halve the error",
+    ),
+    "ssim": ("SSIM", "", "similarity of local structure; 1 is identical"),
+    "lpips": ("LPIPS", "", "perceptual difference; 0 is identical"),
+    "miou": ("mIoU", "", "overlap of rendered and true masks, mean over the objects; 1 is perfect"),
+    "mbiou": ("mBIoU", "", "the same overlap, but only along the outlines of the objects"),
+    "dice": ("Dice", "", "overlap as the Dice score, mean over the objects"),
+    "accuracy": ("Pixel accuracy", "", "fraction of the labeled pixels that show the right object"),
+}
+
+
+def summarize(report: dict[str, Any]) -> str:
+    """Return one sentence with the numbers of objects and splats, the quality and the computing time."""
+    quality, model = report["quality"], report["model"]
+    seconds = sum(stage["seconds"] or 0 for stage in report["stages"])
+    facts = []
+    if report["objects"]:
+        facts.append(f"{len(report['objects']):,} object{'s' if len(report['objects']) != 1 else ''}")
+    if model["gaussians"] is not None:
+        facts.append(f"{model['gaussians']:,.0f} splats")
+    if quality["psnr"] is not None:
+        facts.append(f"PSNR {quality['psnr']:.2f} dB")
+    if quality["miou"] is not None:
+        facts.append(f"mIoU {quality['miou']:.3f}")
+    if seconds:
+        facts.append(f"{duration(seconds)} of computing time")
+    return (", ".join(facts) or "Nothing has been measured yet") + "."
+
+
+def quality_section(report: dict[str, Any]) -> list[str]:
+    rows = []
+    for key in QUALITY:
+        label, unit, meaning = _MEANINGS[key]
+        value = report["quality"][key]
+        text = "—" if value is None else f"{value:.2f} {unit}" if unit else f"{value:.4f}"
+        rows.append((label, f"**{text}**" if value is not None else text, meaning))
+    intro = (
+        "Measured on the held-out views (every 8th image by file name), which were not used for training. "
+        "Pixels without a label in the masks do not count in the object scores."
+    )
+    return ["## Quality", intro, table(("", "Value", "Meaning"), rows, right=(1,))]
+
+
+def choose_objects(objects: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], str]:
+    """Return all objects by ID, or if there are many, those with the lowest IoU and a sentence about the selection."""
+    by_id = sorted(objects, key=lambda entry: entry["id"])
+    if len(objects) <= OBJECTS_SHOWN:
+        return by_id, ""
+    worst = sorted(by_id, key=lambda entry: math.inf if entry["iou"] is None else entry["iou"])
+    return worst[:OBJECTS_SHOWN], (
+        f"These are the {OBJECTS_SHOWN} objects with the lowest IoU; "
+        f"the other {len(objects) - OBJECTS_SHOWN:,} are in `report.json`."
+    )
+
+
+def objects_table(objects: list[dict[str, Any]], swatches: Mapping[int, str]) -> str:
+    rows = [
+        (
+            f"![]({swatches[entry['id']]})",
+            str(entry["id"]),
+            escape(entry["name"]),
+            _number(entry["iou"], "{:.3f}"),
+            _number(entry["anchors"], "{:,.0f}"),
+        )
+        for entry in objects
+    ]
+    return table(("", "ID", "Name", "IoU", "Anchors"), rows, right=(1, 3, 4))
+
+
+_MESH_COLUMNS = (
+    ("Faces", "faces", "{:,.0f}"),
+    ("Watertight", "watertight", ""),
+    ("Manifold", "manifold", ""),
+    ("Parts", "components", "{:,.0f}"),
+    ("Cut faces", "self_intersections", "{:,.0f}"),
+    ("Unobserved", "unobserved", "{:.1%}"),
+    ("Chamfer", "chamfer", "{:.3g}"),
+    ("Precision", "precision", "{:.3f}"),
+    ("Recall", "recall", "{:.3f}"),
+    ("F1", "f1", "{:.3f}"),
+    ("F1 at 0.005", "f1_005", "{:.3f}"),
+    ("F1 of all", "f1_all", "{:.3f}"),
+    ("Texture", "texture_psnr", "{:.1f} dB"),
+    ("Covered", "texture_coverage", "{:.1%}"),
+)
+_MESH_INTRO = """\
+*Faces*: number of triangles; *watertight*: the mesh has no open edges; *manifold*: it is also nowhere pinched; \
+*parts*: number of connected components; *cut faces*: faces that intersect other faces of the mesh; \
+*unobserved*: fraction of the faces that close the mesh where no camera saw the object."""
+_TRUTH_INTRO = """\
+*Chamfer*, *precision*, *recall* and *F1* compare the mesh with the true surface in the capture. *Chamfer* is the mean \
+distance in both directions, in the capture's units. *Precision* is the fraction of the mesh that lies within 0.02 of \
+the true surface, *recall* the fraction of the true surface that lies within 0.02 of the mesh, and *F1* their harmonic \
+mean. Only parts that at least two training views see are counted; *F1 of all* also counts hidden parts."""
+_TEXTURE_INTRO = """\
+*Texture*: PSNR of the textured mesh against the held-out photos, within the object's mask; *covered*: fraction of the \
+mask that the mesh covers."""
+
+
+def meshes_section(report: dict[str, Any], sheet: str | None) -> list[str]:
+    """Return the section about the meshes; empty if there are none. `sheet` links to the image of all meshes."""
+    objects = [(entry["name"], entry["mesh"]) for entry in report["objects"]]
+    named = [*objects, *((entry["name"], entry) for entry in report.get("meshes") or [])]
+    made = [(name, mesh) for name, mesh in named if mesh.get("faces") is not None]
+    without = [(name, mesh["why"]) for name, mesh in named if mesh.get("faces") is None and mesh.get("why")]
+    if not made and not without:
+        return []
+    columns = [column for column in _MESH_COLUMNS if any(mesh.get(column[1]) is not None for _, mesh in made)]
+    keys = {key for _, key, _ in columns}
+    intros = ((_MESH_INTRO, "faces"), (_TRUTH_INTRO, "f1_all"), (_TEXTURE_INTRO, "texture_psnr"))
+    parts = ["## Meshes", _mesh_summary(objects)]
+    if sheet:
+        parts.append(f"![Each mesh: surface, wireframe and texture]({sheet})")
+    if made:
+        rows = [[escape(name), *(_mesh_cell(mesh.get(key), how) for _, key, how in columns)] for name, mesh in made]
+        parts.append(table(["", *(head for head, _, _ in columns)], rows, right=range(1, 1 + len(columns))))
+        parts.append(" ".join(intro for intro, key in intros if key in keys))
+    if without:
+        parts.append(table(("No mesh of", "Why"), [(escape(name), escape(why)) for name, why in without]))
+    return parts
+
+
+def _mesh_cell(value: Any, how: str) -> str:
+    if value is None:
+        return "—"
+    return how.format(value) if how else {True: "yes", False: "**no**"}[bool(value)]
+
+
+def _mesh_summary(objects: Sequence[tuple[str, dict[str, Any]]]) -> str:
+    """Return one sentence: how many objects have a mesh, and how good these meshes are."""
+    made = [(name, mesh) for name, mesh in objects if mesh.get("faces") is not None]
+    facts = [f"{len(made)} of {len(objects)} objects have a mesh"]
+    for key in ("watertight", "manifold"):
+        known = [mesh[key] for _, mesh in made if mesh.get(key) is not None]
+        if known:
+            facts.append(f"{'all' if all(known) else sum(known)} {key}")
+    for key, label, how in (
+        ("f1", "median F1 at 0.02", "{:.3f}"),
+        ("texture_psnr", "median texture PSNR", "{:.1f} dB"),
+    ):
+        values = sorted((mesh[key], name) for name, mesh in made if mesh.get(key) is not None)
+        if values:
+            middle = statistics.median(value for value, _ in values)
+            facts.append(
+                f"{label} **{how.format(middle)}**, lowest {how.format(values[0][0])} ({escape(values[0][1])})"
+            )
+    return "; ".join(facts) + "."
+
+
+def stages_section(report: dict[str, Any]) -> list[str]:
+    if not report["stages"]:
+        return []
+    rows = [
+        (
+            escape(stage["name"]),
+            "—" if stage["seconds"] is None else duration(stage["seconds"]),
+            _number(stage["peak_rss_mb"], "{:,.0f} MB"),
+        )
+        for stage in report["stages"]
+    ]
+    return ["## Stages", table(("Stage", "Time", "Peak memory"), rows, right=(1, 2))]
+
+
+def left_out_section(report: dict[str, Any]) -> list[str]:
+    if not report["left_out"]:
+        return ["## Left out", "Nothing was left out."]
+    rows = [(escape(entry["what"]), escape(entry["why"])) for entry in report["left_out"]]
+    return ["## Left out", table(("What", "Why"), rows)]
+
+
+def duration(seconds: float) -> str:
+    """Return `seconds` as text, such as 4.2 s, 35 s, 2 min 30 s or 1 h 05 min."""
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def _number(value: float | None, how: str) -> str:
+    return "—" if value is None else how.format(value)
+
+
+def value_text(key: str, value: Any) -> str:
+    """Return one value of capture, settings, machine or model as text."""
+    if value is None:
+        return "—"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if key == "bytes" and isinstance(value, int | float):
+        return f"{value / 1e6:,.1f} MB"
+    if isinstance(value, int) and abs(value) >= 10_000 and key != "seed":
+        return f"{value:,}"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list | dict):
+        text = json.dumps(value, ensure_ascii=False)
+        return escape(text if len(text) <= 200 else text[:200] + " ...")
+    return escape(value)
+
+
+def escape(value: Any) -> str:
+    """Return `value` as text that cannot break out of a cell of a Markdown table."""
+    text = " ".join(str(value).split())
+    return re.sub(r"([\\|<>\[\]*_`])", r"\\\1", text)
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
+    """Return a Markdown table; `right` are the indices of the right-aligned columns."""
+    lines = ["| " + " | ".join(head) + " |"]
+    lines.append("|" + "|".join("---:" if i in right else "---" for i in range(len(head))) + "|")
+    lines += ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join(lines)

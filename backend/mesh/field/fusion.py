@@ -1,0 +1,312 @@
+"""Fusion of the views of an object into its signed distance field, in blocks around the surface.
+
+For each view, a point in front of the visible surface is outside of the object, a point near the visible surface of the
+object has a signed distance from it, and a point behind the visible surface, of the object or another one, is unknown.
+A point that is unknown in all views is inside if the observed surface surrounds it (winding number).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ...raster import Camera
+from ...shared.events import Reporter
+from ..surface import NoSurface
+from ..views import ObjectView, SceneMap
+from .blocks import AROUND, SAMPLES, SIDE, Blocks, distinct
+from .holes import Patches
+from .integrate import Sight, add, own_depth, prepare_sight
+from .marching import compact, march, parts
+from .winding import Winding
+
+RESOLUTION = 256
+"""Largest number of voxels along the object's longest side."""
+SMALLEST_PART = 0.03
+"""Components of the surface smaller than this fraction of the largest one are floaters."""
+
+_VOXEL_PER_PIXEL = 0.7
+_REACH_VOXELS, _REACH_PIXELS = 5.0, 3.5
+_BACK_VOXELS, _BACK_PIXELS = 3.0, 2.0
+_BYTES_PER_BLOCK = 8 * SAMPLES * 4
+"""Largest memory of a block: sums, values, flags and the triangles in it."""
+_COARSEST, _FEW = 16, 1000
+"""Smallest number of voxels along the longest side, whatever the memory; and blocks that are enough for so few."""
+_FILLING = 8
+"""Time that filling the holes of the surface takes, in times of one view, for the progress."""
+_SURE = 1.0
+"""Weight from which on the distance depends only on the views."""
+_SEEN = 0.1
+"""Smallest weight of a seen sample."""
+_SKIN = 1.75
+"""Depth in voxels below the surface to which samples count as seen; no cell across the surface reaches deeper."""
+
+
+class SeesObjects(Protocol):
+    """The part of `Views` that `fuse` needs."""
+
+    indices: tuple[int, ...]
+
+    def scene_map(self, index: int) -> SceneMap: ...
+
+    def object_view(self, index: int, classes: Sequence[int]) -> ObjectView | None: ...
+
+
+@dataclass
+class Field:
+    """A signed distance field in voxels, negative inside.
+
+    values (B, 512) float32 at the samples of `blocks`; seen (B, 512) bool: samples that a view saw. Sample (i, j, k) of
+    block c lies at origin + voxel * (8 c + (i, j, k)) in scene units. The zero level lies within the blocks.
+    """
+
+    origin: np.ndarray
+    voxel: float
+    blocks: Blocks
+    values: np.ndarray
+    seen: np.ndarray
+
+
+@dataclass
+class _Extent:
+    """The extent of an object: observed points (n, 3), low and high corner without outliers, pixel size on it, and the
+    nearest depth."""
+
+    points: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    pixel: float
+    nearest: float
+
+
+def fuse(
+    views: SeesObjects,
+    classes: Sequence[int],
+    resolution: int = RESOLUTION,
+    memory_mb: float = 1500,
+    reporter: Reporter | None = None,
+) -> Field:
+    """Fuse the views of objects into one signed distance field.
+
+    The voxel is 0.7 times the size of a pixel on the object, or its longest side / `resolution` if that is larger.
+
+    Args:
+        views: The renders of the model.
+        classes: The class indices of the objects, which are treated as one.
+        resolution: The largest number of voxels along the longest side.
+        memory_mb: The memory to use. If it is not enough, the voxel is enlarged, with a warning.
+        reporter: Receives the progress and the warning.
+
+    Returns:
+        The field around the surface.
+
+    Raises:
+        NoSurface: If too little of the objects was seen.
+    """
+    reporter = reporter or Reporter()
+    extent = _extent(views, classes, reporter)
+    size = float((extent.high - extent.low).max())
+    voxel = max(_VOXEL_PER_PIXEL * extent.pixel, size / resolution)
+    room = max(int(memory_mb * 1e6 / _BYTES_PER_BLOCK), 64)
+    asked = voxel
+    while True:
+        try:
+            field = _Fusion(views, classes, extent, voxel, room, reporter).run()
+            break
+        except _TooMany as error:
+            voxel *= max(1.1, (error.blocks / room) ** 0.5)
+            if voxel > size / _COARSEST:
+                # So few blocks that their memory does not matter.
+                voxel, room = max(asked, size / _COARSEST), error.blocks + _FEW
+    if voxel > asked:
+        reporter.warning(
+            f"The memory is enough for {size / voxel:.0f} voxels along the longest side, not for the "
+            f"{size / asked:.0f} that the photos allow; the mesh is coarser."
+        )
+    return field
+
+
+def _extent(views: SeesObjects, classes: Sequence[int], reporter: Reporter) -> _Extent:
+    """Compute the extent of the object from all pixels that show it."""
+    points, pixels, nearest = [np.zeros((0, 3))], [np.zeros(0)], np.inf
+    for done, index in enumerate(views.indices):
+        reporter.progress(done, 2 * len(views.indices) + _FILLING)
+        view = views.object_view(index, classes)
+        if view is None:
+            continue
+        depth = own_depth(view)
+        v, u = np.nonzero(depth)
+        d = depth[v, u].astype(np.float64)
+        points.append(_lifted(view.camera, u + 0.5, v + 0.5, d))
+        pixels.append(d / view.camera.K[0, 0])
+        nearest = min(nearest, d.min(initial=np.inf))
+    every = np.concatenate(points)
+    if len(every) < 8:
+        raise NoSurface("No view shows enough of it: it is hidden, out of view or too small to be seen.")
+    low, high = np.quantile(every, (0.01, 0.99), axis=0)
+    return _Extent(every, low, high, float(np.median(np.concatenate(pixels))), float(nearest))
+
+
+def _lifted(camera: Camera, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Unproject the pixels (u, v) to points (n, 3) at `depth`."""
+    K = camera.K
+    local = np.stack([(u - K[0, 2]) / K[0, 0] * depth, (v - K[1, 2]) / K[1, 1] * depth, depth], 1)
+    return (local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+
+
+class _TooMany(Exception):
+    def __init__(self, blocks: int) -> None:
+        self.blocks = blocks
+
+
+class _Fusion:
+    def __init__(
+        self, views: SeesObjects, classes: Sequence[int], extent: _Extent, voxel: float, room: int, reporter: Reporter
+    ) -> None:  # fmt: skip
+        self.views = views
+        self.classes = classes
+        self.extent = extent
+        self.voxel = voxel
+        self.room = room
+        self.reporter = reporter
+        self.reach = max(_REACH_VOXELS * voxel, _REACH_PIXELS * extent.pixel)
+        self.back = max(_BACK_VOXELS * voxel, _BACK_PIXELS * extent.pixel)
+        self.origin = (extent.low + extent.high) / 2
+        self.sights: dict[int, Sight] = {}
+        # The object ends within this box: no blocks are added beyond it.
+        pad = (extent.high - extent.low).max() * 0.5 + 4 * self.reach
+        self.box = np.stack([extent.low - pad - self.origin, extent.high + pad - self.origin]) / (SIDE * voxel)
+        self.rounds = 0
+
+    def run(self) -> Field:
+        blocks = Blocks(self._touched())
+        self._check(len(blocks))
+        total, weights = self._integrated(blocks.coords)
+        winding = self._seen_surface(blocks, total, weights)
+        values = self._finished(blocks.coords, total, weights, winding)
+        seen = self._seen(total, weights)
+        fresh = np.arange(len(blocks))
+        while True:
+            coords = self._missing(blocks, values, fresh)
+            if not len(coords):
+                break
+            self._check(len(blocks) + len(coords))
+            total, weights = self._integrated(coords)
+            fresh = np.arange(len(blocks), len(blocks) + len(coords))
+            blocks = blocks.joined(coords)
+            values = np.concatenate([values, self._finished(coords, total, weights, winding)])
+            seen = np.concatenate([seen, self._seen(total, weights)])
+            self.rounds += 1
+        return Field(self.origin, self.voxel, blocks, values, seen)
+
+    def _check(self, blocks: int) -> None:
+        if blocks > self.room:
+            raise _TooMany(blocks)
+
+    def _touched(self) -> np.ndarray:
+        """Find the blocks within reach of an observed point."""
+        points = (self.extent.points - self.origin) / self.voxel
+        coarse = distinct(np.floor(points).astype(np.int64))
+        offset = self.reach / self.voxel
+        corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * offset
+        found = [distinct(np.floor((coarse + 0.5 + corner) / SIDE).astype(np.int64)) for corner in corners]
+        return self._in_box(distinct(np.concatenate(found)))
+
+    def _in_box(self, coords: np.ndarray) -> np.ndarray:
+        return coords[((coords >= np.floor(self.box[0])) & (coords <= self.box[1])).all(1)]
+
+    def _sight(self, index: int) -> Sight:
+        if index not in self.sights:
+            scene = self.views.scene_map(index)
+            view = self.views.object_view(index, self.classes)
+            margin = 0
+            if view is not None:
+                margin = int(np.ceil(self.reach * scene.camera.K[0, 0] / max(self.extent.nearest, 1e-9))) + 1
+            self.sights[index] = prepare_sight(scene, view, min(margin, 64), 2 * self.reach)
+        return self.sights[index]
+
+    def _integrated(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        total = np.zeros((len(coords), SAMPLES), np.float32)
+        weights = np.zeros((len(coords), SAMPLES), np.float32)
+        for done, index in enumerate(self.views.indices):
+            add(self._sight(index), self.origin, self.voxel, coords, self.reach, self.back, total, weights)
+            self._progress(done + 1)
+        return total, weights
+
+    def _seen_surface(self, blocks: Blocks, total: np.ndarray, weights: np.ndarray) -> Winding:
+        values = _nudged(total / np.maximum(weights, 1e-9) / self.voxel)
+        vertices, faces, _ = march(blocks, values, self._seen(total, weights), closed=False)
+        vertices, faces = largest_parts(vertices, faces)
+        if not len(faces):
+            raise NoSurface("The views see too little of it, or do not agree on where it is.")
+        self.patches = Patches(vertices, faces)
+        return Winding(
+            np.concatenate([vertices, self.patches.points]),
+            np.concatenate([faces, self.patches.faces + len(vertices)]),
+        )
+
+    def _seen(self, total: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Return the samples that were seen, in front of the surface or just below it."""
+        return (weights >= _SEEN) & (total > -_SKIN * self.voxel * weights)
+
+    def _progress(self, views: float) -> None:
+        """Report how many views are integrated in the first round; later rounds have few samples."""
+        count = len(self.views.indices)
+        self.reporter.progress(2 * count if self.rounds else count + views, 2 * count + _FILLING)
+
+    def _finished(self, coords: np.ndarray, total: np.ndarray, weights: np.ndarray, winding: Winding) -> np.ndarray:
+        """Return the distances in voxels; where they were not seen, from the winding number."""
+        values = total / np.maximum(weights, 1e-9) / self.voxel
+        unsure = weights < _SURE
+        reach = self.reach / self.voxel
+        size = (self.extent.high - self.extent.low).mean() / self.voxel
+        closing = np.clip((0.5 - winding.at(coords, unsure)) * size, -reach, reach)
+        self.patches.thicken(coords, unsure, 0.8 * self.back / self.voxel, closing)
+        share = np.minimum(weights / _SURE, 1)
+        return _nudged(share * values + (1 - share) * closing).astype(np.float32)
+
+    def _missing(self, blocks: Blocks, values: np.ndarray, fresh: np.ndarray) -> np.ndarray:
+        """Find the missing neighbors (n, 3) of blocks that the surface crosses."""
+        inside = (values < 0).reshape(-1, SIDE, SIDE, SIDE)
+        near = fresh if not self.rounds else np.unique(
+            np.concatenate([fresh, *(blocks.find(blocks.coords[fresh] + step) for step in _FACES)])
+        )  # fmt: skip
+        near = near[near >= 0]
+        flat = inside[near].reshape(len(near), -1)
+        crossed = flat.any(1) & ~flat.all(1)
+        for step in _FACES:
+            beside = blocks.find(blocks.coords[near] + step)
+            known = beside >= 0
+            axis = int(np.abs(step).argmax())
+            mine, theirs = (-1, 0) if step[axis] > 0 else (0, -1)
+            differs = inside[near[known]].take(mine, axis + 1) != inside[beside[known]].take(theirs, axis + 1)
+            crossed[known] |= differs.any((1, 2))
+        around = self._in_box(distinct((blocks.coords[near[crossed]][:, None] + AROUND).reshape(-1, 3)))
+        return around[blocks.find(around) < 0]
+
+
+_FACES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+
+
+def _nudged(values: np.ndarray) -> np.ndarray:
+    """Keep values off 0, so that no two vertices coincide."""
+    return np.where(values < 0, np.minimum(values, -1e-3), np.maximum(values, 1e-3)).astype(np.float32)
+
+
+def largest_parts(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Remove the floaters among the connected components of a surface."""
+    keep = faces[of_size(vertices, faces)]
+    return compact(vertices, keep)
+
+
+def of_size(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Find the faces of components with at least SMALLEST_PART of the area of the largest one, (F,) bool."""
+    count, part = parts(faces, len(vertices))
+    if not count:
+        return np.zeros(0, bool)
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    area = np.bincount(part, np.linalg.norm(np.cross(b - a, c - a), axis=1), count)
+    return (area >= SMALLEST_PART * area.max())[part]

@@ -1,0 +1,251 @@
+"""Integration of one view into the samples of a sparse signed distance field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import prange
+from scipy.ndimage import distance_transform_edt
+
+from ...raster import Camera
+from ...raster.kernel import kernel
+from ..views import ALPHA_SEEN, ObjectView, SceneMap
+from .blocks import SAMPLES, SIDE
+
+_UNCERTAINTY_HALF = 3.0
+"""Uncertainty of a pixel's depth, in pixels, at which its weight is one half."""
+
+_MIN_SLOPE = 0.15
+"""Lower limit of the cosine between ray and normal."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """One view as evidence about one object.
+
+    front (H, W) float32: depth of the visible surface along z, infinite where there is none; trust (H, W): its weight,
+    0 .. 1. In a rectangle (h, w) with the upper left corner (x, y): own, the object's depth where the object is
+    visible, else 0; depth_uncertainty, the expected error of it; slope, the change of the distance from the surface for
+    a step along z; weight of the pixel; beside, distance from the object's outline in pixels.
+    """
+
+    camera: Camera
+    front: np.ndarray
+    trust: np.ndarray
+    x: int
+    y: int
+    own: np.ndarray
+    depth_uncertainty: np.ndarray
+    slope: np.ndarray
+    weight: np.ndarray
+    beside: np.ndarray
+
+
+def own_depth(view: ObjectView) -> np.ndarray:
+    """Return the object's depth (h, w) where the object is visible, elsewhere 0."""
+    return np.where(view.visible * view.alpha >= ALPHA_SEEN, view.depth, np.float32(0))
+
+
+def prepare_sight(scene: SceneMap, view: ObjectView | None, margin: int, jump: float) -> Sight:
+    """Prepare a view for `add`.
+
+    Args:
+        scene: The render of the whole scene.
+        view: The render of the object alone; None if it is out of view.
+        margin: The width in pixels around the object where distances from its outline are needed.
+        jump: The difference of depth, in scene units, from which on neighboring pixels show different surfaces.
+    """
+    front = np.where(scene.depth > 0, scene.depth, np.float32(np.inf))
+    trust = _trust(scene.depth_uncertainty, scene.depth, scene.camera)
+    if view is None:
+        nothing = np.zeros((0, 0), np.float32)
+        return Sight(scene.camera, front, trust, 0, 0, nothing, nothing, nothing, nothing, nothing)
+    height, width = view.alpha.shape
+    x0, y0 = max(view.x - margin, 0), max(view.y - margin, 0)
+    x1, y1 = min(view.x + width + margin, front.shape[1]), min(view.y + height + margin, front.shape[0])
+    own = np.zeros((y1 - y0, x1 - x0), np.float32)
+    depth_uncertainty = np.zeros_like(own)
+    inside = slice(view.y - y0, view.y - y0 + height), slice(view.x - x0, view.x - x0 + width)
+    own[inside], depth_uncertainty[inside] = own_depth(view), view.depth_uncertainty
+    seen = own > 0
+    if seen.any():
+        beside = _beside(seen, own, front[y0:y1, x0:x1], jump)
+    else:
+        beside = np.full(own.shape, max(margin, 1), np.float32)
+    K = scene.camera.K
+    slope = np.zeros_like(own)
+    weight = np.zeros_like(own)
+    _slopes(own, K[0, 0], K[1, 1], K[0, 2] - x0, K[1, 2] - y0, jump, slope, weight)
+    weight *= _trust(depth_uncertainty, own, scene.camera)
+    return Sight(scene.camera, front, trust, x0, y0, own, depth_uncertainty, slope, weight, beside)
+
+
+def _trust(depth_uncertainty: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the weight of a depth by its uncertainty, 0 .. 1; 1 where there is no depth."""
+    pixels = depth_uncertainty / np.where(depth > 0, depth, 1) * np.float32(camera.K[0, 0])
+    return (1 / (1 + (pixels / np.float32(_UNCERTAINTY_HALF)) ** 2)).astype(np.float32)
+
+
+def _beside(seen: np.ndarray, own: np.ndarray, front: np.ndarray, jump: float) -> np.ndarray:
+    """Return the distance (h, w) in pixels from the object's outline, negative inside and where the object may be
+    occluded."""
+    nearest = distance_transform_edt(~seen, return_distances=False, return_indices=True)
+    filled = seen | (front < own[tuple(nearest)] + jump)
+    # Pixel centers are at least half a pixel from the outline, on either side.
+    outside, inside = distance_transform_edt(~filled), distance_transform_edt(np.pad(filled, 1, mode="edge"))
+    return np.where(filled, 0.5 - inside[1:-1, 1:-1], outside - 0.5).astype(np.float32)
+
+
+@kernel(parallel=True)
+def _slopes(own, fx, fy, cx, cy, jump, slope, weight):
+    """slope: the cosine between ray and normal times the ray's length for a step of 1 along z."""
+    height, width = own.shape
+    for v in prange(height):
+        for u in range(width):
+            d = own[v, u]
+            if d == 0.0:
+                continue
+            # Differences of the depth over one pixel, from the sides that lie on the same surface.
+            du = 0.0
+            dv = 0.0
+            sides_u = 0
+            sides_v = 0
+            for s in (-1, 1):
+                if 0 <= u + s < width and own[v, u + s] > 0 and abs(own[v, u + s] - d) < jump:
+                    du += s * (own[v, u + s] - d)
+                    sides_u += 1
+                if 0 <= v + s < height and own[v + s, u] > 0 and abs(own[v + s, u] - d) < jump:
+                    dv += s * (own[v + s, u] - d)
+                    sides_v += 1
+            x = (u + 0.5 - cx) / fx
+            y = (v + 0.5 - cy) / fy
+            if sides_u:
+                du /= sides_u
+            if sides_v:
+                dv /= sides_v
+            # Point (x d, y d, d): derivatives by u and v, and their cross product, the normal.
+            ux, uy, uz = d / fx + x * du, y * du, du
+            vx, vy, vz = x * dv, d / fy + y * dv, dv
+            nx = uy * vz - uz * vy
+            ny = uz * vx - ux * vz
+            nz = ux * vy - uy * vx
+            length = np.sqrt(nx * nx + ny * ny + nz * nz)
+            ray = np.sqrt(x * x + y * y + 1.0)
+            along = abs(nx * x + ny * y + nz) / max(length, 1e-30)
+            slope[v, u] = max(along, _MIN_SLOPE * ray)
+            weight[v, u] = max(along / ray, _MIN_SLOPE)
+            if sides_u < 2 or sides_v < 2:
+                weight[v, u] *= 0.5
+
+
+def add(
+    sight: Sight, origin: np.ndarray, voxel: float, coords: np.ndarray, reach: float, back: float,
+    total: np.ndarray, weights: np.ndarray,
+) -> None:  # fmt: skip
+    """Add a view to the samples of blocks.
+
+    Args:
+        sight: The view.
+        origin: (3,) position of grid point 0 in scene units.
+        voxel: The distance of the samples in scene units.
+        coords: (B, 3) the blocks.
+        reach: The largest distance in front of the surface in scene units; larger ones are clamped.
+        back: The distance behind the surface from which on samples stay unchanged. So do those that another object
+            occludes.
+        total: (B, 512) float32 sums of weighted distances in scene units, changed in place.
+        weights: (B, 512) float32 sums of weights, changed in place.
+    """
+    viewmat, intrinsics = sight.camera.arrays()
+    _add(
+        viewmat, intrinsics, float(sight.camera.near), sight.front, sight.trust, sight.x, sight.y, sight.own,
+        sight.depth_uncertainty, sight.slope, sight.weight, sight.beside, np.asarray(origin, np.float64), float(voxel),
+        coords,
+        float(reach), float(back), total, weights,
+    )  # fmt: skip
+
+
+@kernel(parallel=True)
+def _add(
+    viewmat, intrinsics, near, front, trust, x0, y0, own, depth_uncertainty, slope, weight, beside, origin, voxel,
+    coords, reach,
+    back, total, weights,
+):  # fmt: skip
+    fx, fy, cx, cy = intrinsics
+    height, width = front.shape
+    h, w = own.shape
+    half = 0.5 * (SIDE - 1) * voxel
+    radius = half * np.sqrt(3.0)
+    for b in prange(coords.shape[0]):
+        corner = np.empty(3)
+        center = np.empty(3)
+        for i in range(3):
+            corner[i] = origin[i] + coords[b, i] * SIDE * voxel
+            center[i] = corner[i] + half
+        z = viewmat[2, 0] * center[0] + viewmat[2, 1] * center[1] + viewmat[2, 2] * center[2] + viewmat[2, 3]
+        if z + radius <= near:
+            continue
+        if z > 2 * radius:
+            x = viewmat[0, 0] * center[0] + viewmat[0, 1] * center[1] + viewmat[0, 2] * center[2] + viewmat[0, 3]
+            y = viewmat[1, 0] * center[0] + viewmat[1, 1] * center[1] + viewmat[1, 2] * center[2] + viewmat[1, 3]
+            u, v = fx * x / z + cx, fy * y / z + cy
+            # No point of the sphere around the block projects farther from its center than this.
+            spread = 2 * radius / z * (1 + max(abs(x), abs(y)) / z)
+            if u + fx * spread < 0 or u - fx * spread > width or v + fy * spread < 0 or v - fy * spread > height:
+                continue
+        for n in range(SAMPLES):
+            px = corner[0] + (n // (SIDE * SIDE)) * voxel
+            py = corner[1] + (n // SIDE % SIDE) * voxel
+            pz = corner[2] + (n % SIDE) * voxel
+            z = viewmat[2, 0] * px + viewmat[2, 1] * py + viewmat[2, 2] * pz + viewmat[2, 3]
+            if z <= near:
+                continue
+            u = fx * (viewmat[0, 0] * px + viewmat[0, 1] * py + viewmat[0, 2] * pz + viewmat[0, 3]) / z + cx
+            v = fy * (viewmat[1, 0] * px + viewmat[1, 1] * py + viewmat[1, 2] * pz + viewmat[1, 3]) / z + cy
+            if not (0 <= u < width and 0 <= v < height):
+                continue
+            iu, iv = int(u), int(v)
+            ru, rv = iu - x0, iv - y0
+            inside = 0 <= ru < w and 0 <= rv < h
+            su, sv = u - 0.5 - x0, v - 0.5 - y0
+            au, av = int(np.floor(su)), int(np.floor(sv))
+            tu, tv = su - au, sv - av
+            between = 0 <= au < w - 1 and 0 <= av < h - 1
+            aside = reach
+            if between:
+                above = beside[av, au] * (1 - tu) + beside[av, au + 1] * tu
+                below = beside[av + 1, au] * (1 - tu) + beside[av + 1, au + 1] * tu
+                aside = (above * (1 - tv) + below * tv) * z / fx
+            elif inside:
+                aside = beside[rv, ru] * z / fx
+            if inside and own[rv, ru] > 0:
+                d = own[rv, ru]
+                # Between four pixels of one surface the depth is interpolated.
+                if between:
+                    d00, d01, d10, d11 = own[av, au], own[av, au + 1], own[av + 1, au], own[av + 1, au + 1]
+                    low = min(min(d00, d01), min(d10, d11))
+                    high = max(max(d00, d01), max(d10, d11))
+                    if low > 0 and (high - low) * slope[rv, ru] < reach:
+                        d = (d00 * (1 - tu) + d01 * tu) * (1 - tv) + (d10 * (1 - tu) + d11 * tu) * tv
+                distance = (d - z) * slope[rv, ru]
+                # What may be off is that much thicker, and as much less sharp, or what one view sees too near another
+                # one that sees it too far would wipe out.
+                off = depth_uncertainty[rv, ru] * slope[rv, ru]
+                if distance <= -back - off:
+                    continue
+                gain = weight[rv, ru]
+                if distance < 0:
+                    gain *= 1 + distance / (back + off)
+                distance *= reach / (reach + off)
+                distance = max(distance, aside) if aside > 0 else distance
+                total[b, n] += gain * min(distance, reach)
+                weights[b, n] += gain
+            else:
+                ahead = front[iv, iu] - z
+                if ahead <= 0:
+                    continue
+                # Where the object may go on behind what is seen here, no outline bounds the distance.
+                hides = inside and beside[rv, ru] < 0
+                gain = trust[iv, iu]
+                total[b, n] += gain * (min(reach, ahead) if hides else min(min(reach, ahead), aside))
+                weights[b, n] += gain

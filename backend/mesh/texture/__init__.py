@@ -1,0 +1,1 @@
+"""Texturing of a surface: UVs, texels, and their colors from the photos."""

@@ -1,0 +1,248 @@
+"""Baking of the photos into a texture and vertex colors of a surface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.sparse import diags
+from scipy.sparse.linalg import cg
+
+from ...raster.camera import Camera
+from ...raster.kernel import kernel
+from ...shared.events import Reporter
+from ..surface import Surface, neighbors, vertex_normals
+from ..views import Views
+from .atlas import Texels, fill, find_texels, interpolate
+from .leveling import level
+from .photos import Photo, Photos, Samples, add_photo, blend
+
+SIZES = (512, 1024, 2048, 4096)
+
+_USED = 0.5
+"""Approximate fraction of a texture that charts cover."""
+
+_AT_ONCE = 4_000_000
+"""Largest number of texels that are processed together, to limit the memory."""
+
+_EMPTY, _SEEN, _UNSEEN = 0, 1, 2
+"""State of a texel: it shows no surface; photos show it; it shows a surface, but no photo shows it."""
+
+
+def texture_size(surface: Surface, views: Views) -> int:
+    """Choose the size of a texture.
+
+    Args:
+        surface: The surface in scene units.
+        views: The training views.
+
+    Returns:
+        The smallest of SIZES in which texels are not larger than the pixels that show them best, on nearly all of the
+        surface.
+    """
+    vertices, faces = _arrays(surface)
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    normal = np.cross(b - a, c - a)
+    area = np.linalg.norm(normal, axis=1) / 2
+    normal /= np.maximum(2 * area, 1e-30)[:, None]
+    center = (a + b + c) / 3
+    finest = np.zeros(len(faces))  # pixels on a unit of area
+    for index in views.indices:
+        camera = views.scene.camera(index)
+        pixels, depth = _project(center, camera)
+        shown = (depth > camera.near) & ((pixels > 0) & (pixels < [camera.width, camera.height])).all(1)
+        way = camera.center - center
+        facing = (way * normal).sum(1) / np.maximum(np.linalg.norm(way, axis=1), 1e-30)
+        density = camera.K[0, 0] * camera.K[1, 1] / np.maximum(depth, camera.near) ** 2 * np.maximum(facing, 0)
+        finest = np.maximum(finest, np.where(shown, density, 0))
+    seen = finest > 0
+    if not seen.any():
+        return SIZES[0]
+    # The density that is enough for 80% of the seen area, on the whole surface.
+    order = np.argsort(finest[seen])
+    reached = np.cumsum(area[seen][order]) / max(float(area[seen].sum()), 1e-30)
+    density = finest[seen][order][min(int(np.searchsorted(reached, 0.8)), len(order) - 1)]
+    needed = np.sqrt(density * area.sum() / _USED)
+    return next((size for size in SIZES if size >= needed), SIZES[-1])
+
+
+def bake_texture(
+    surface: Surface,
+    uvs: np.ndarray,
+    size: int,
+    views: Views,
+    classes: Sequence[int],
+    reporter: Reporter | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bake the photos into a texture.
+
+    Each texel is blended from the photos that show it best; texels that no photo shows continue their surroundings.
+
+    Args:
+        surface: The surface in scene units.
+        uvs: (F, 3, 2) from `unwrap`.
+        size: The width and height of the texture.
+        views: The training views with their photos.
+        classes: The class indices of the surface's objects.
+        reporter: Receives the progress.
+
+    Returns:
+        The texture (size, size, 3) uint8 sRGB, top row first, and the vertices' colors (V, 3) uint8 sRGB, which are
+        those of the splats.
+    """
+    reporter = reporter or Reporter()
+    pictures = Photos(views, surface.vertices, surface.faces, classes)
+    vertices, faces = pictures.vertices, pictures.faces
+    normals = vertex_normals(vertices, faces)
+    texture = np.zeros((size, size, 3), np.uint8)
+    state = np.zeros((size, size), np.uint8)
+    splats = _Mean(len(vertices))
+    photos = _Mean(len(vertices))
+    rows = max(1, _AT_ONCE // size)
+    steps = [(first, min(rows, size - first)) for first in range(0, size, rows)]
+    passes = (1 + len(steps)) * len(views.indices)
+    no_offsets = np.zeros((len(vertices), 3), np.float32)
+    offsets = level(pictures, normals, lambda done: reporter.progress(done, passes))
+    for step, (first, count) in enumerate(steps):
+        texels = find_texels(uvs, size, first, count)
+        positions = _on_faces(vertices, faces, texels)
+        facing = _on_faces(normals, faces, texels)
+        samples = Samples.none(len(texels.face))
+        corners = faces[texels.face]
+        for done, index in enumerate(views.indices):
+            reporter.progress((step + 1) * len(views.indices) + done, passes)
+            photo = pictures[index]
+            if photo is None:
+                continue
+            add_photo(photo, positions, facing, corners, texels.weights, offsets.get(index, no_offsets), samples)
+            if step == 0:
+                _add_splats(splats, photo, vertices, normals, views, index, classes)
+        color, seen = blend(samples)
+        texture.reshape(-1, 3)[texels.place] = np.rint(color * 255)
+        state.ravel()[texels.place] = np.where(seen, _SEEN, _UNSEEN)
+        _add_texels(faces, texels.face, texels.weights, color, seen, photos.total, photos.weight)
+    vertex_colors = _extrapolate(splats, vertices, faces, np.full(3, 0.5, np.float32))
+    base = _extrapolate(photos, vertices, faces, vertex_colors)
+    _complete(texture, state, base, faces, uvs, steps)
+    return texture, np.rint(np.clip(vertex_colors, 0, 1) * 255).astype(np.uint8)
+
+
+class _Mean:
+    """Weighted sums of colors at vertices."""
+
+    def __init__(self, count: int) -> None:
+        self.total = np.zeros((count, 3))
+        self.weight = np.zeros(count)
+
+
+def _arrays(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    return np.ascontiguousarray(surface.vertices, np.float64), np.ascontiguousarray(surface.faces, np.int32)
+
+
+def _project(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Project points (N, 3) to pixels (N, 2) and depth (N,); pixels are valid only where the depth is positive."""
+    seen = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    depth = np.where(seen[:, 2] > 0, seen[:, 2], -1.0)
+    return seen[:, :2] / depth[:, None] * [camera.K[0, 0], camera.K[1, 1]] + camera.K[:2, 2], depth
+
+
+def _on_faces(values: np.ndarray, faces: np.ndarray, texels: Texels) -> np.ndarray:
+    out = np.empty((len(texels.face), 3), np.float32)
+    interpolate(values, faces, texels.face, texels.weights, out)
+    return out
+
+
+def _add_splats(
+    mean: _Mean,
+    photo: Photo,
+    vertices: np.ndarray,
+    normals: np.ndarray,
+    views: Views,
+    index: int,
+    classes: Sequence[int],
+) -> None:
+    """Add the colors of the objects' own splats in view `index` to the vertices that are visible in it."""
+    view = views.object_view(index, classes)
+    if view is None:
+        return
+    way = photo.camera.center - vertices
+    facing = (way * normals).sum(1) / np.maximum(np.linalg.norm(way, axis=1), 1e-30)
+    pixels, depth = _project(vertices, photo.camera)
+    column, row = np.floor(pixels).astype(np.int64).T
+    seen = (facing > 0) & (depth > 0) & (column >= 0) & (row >= 0)
+    seen &= (column < photo.depth.shape[1]) & (row < photo.depth.shape[0])
+    at = np.flatnonzero(seen)
+    nearest = photo.depth[row[at], column[at]]
+    at = at[depth[at] <= nearest * 1.01]
+    # The view of the objects may be downscaled, and has a rectangle of its own.
+    column = (column[at] + photo.x) // views.downscale - view.x
+    row = (row[at] + photo.y) // views.downscale - view.y
+    inside = (column >= 0) & (row >= 0) & (column < view.alpha.shape[1]) & (row < view.alpha.shape[0])
+    at, column, row = at[inside], column[inside], row[inside]
+    weight = facing[at] ** 2 * view.alpha[row, column] * (view.visible[row, column] + 1e-3)
+    mean.total[at] += view.color[row, column] * weight[:, None]
+    mean.weight[at] += weight
+
+
+@kernel()
+def _add_texels(faces, face, weights, color, seen, total, weight):
+    for n in range(face.size):
+        if seen[n]:
+            for i in range(3):
+                v = faces[face[n], i]
+                w = max(weights[n, i], np.float32(0.0))
+                weight[v] += w
+                for c in range(3):
+                    total[v, c] += w * color[n, c]
+
+
+def _extrapolate(mean: _Mean, vertices: np.ndarray, faces: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    """Return colors (V, 3) float32: the means, extrapolated smoothly along the surface to vertices without one.
+
+    otherwise: (3,) or (V, 3), the colors if no vertex has a mean.
+    """
+    known = mean.weight > 1e-6
+    out = np.empty((len(vertices), 3), np.float32)
+    out[:] = otherwise
+    if not known.any():
+        return out
+    out[known] = mean.total[known] / mean.weight[known, None]
+    out[~known] = out[known].mean(0)
+    if known.all():
+        return out
+    near = neighbors(vertices, faces)
+    mine = np.asarray(near.sum(1)).ravel()[~known]
+    unknown = np.flatnonzero(~known)
+    system = diags(np.maximum(mine, 1e-30)) - near[unknown][:, unknown]
+    given = near[unknown][:, known] @ out[known]
+    for c in range(3):
+        solved, _ = cg(
+            system, given[:, c], x0=out[unknown, c], rtol=1e-4, maxiter=300, M=diags(1 / np.maximum(mine, 1e-30))
+        )
+        out[unknown, c] = np.clip(solved, out[known, c].min(), out[known, c].max())
+    return out
+
+
+def _complete(
+    texture: np.ndarray, state: np.ndarray, base: np.ndarray, faces: np.ndarray, uvs: np.ndarray, steps: list
+) -> None:
+    """Color the texels that no photo shows, and those between the charts, in place.
+
+    An unseen texel gets the color `base`, interpolated between the vertices, plus the smoothly extrapolated difference
+    of the seen texels from it, so that there is no visible border.
+    """
+    size = len(state)
+    if (state == _UNSEEN).any():
+        smooth = np.zeros((size, size, 3), np.float32)
+        for first, count in steps:
+            texels = find_texels(uvs, size, first, count)
+            smooth.reshape(-1, 3)[texels.place] = _on_faces(base, faces, texels)
+        difference = texture.astype(np.float32) / 255 - smooth
+        fill(difference, state == _SEEN)
+        unseen = state == _UNSEEN
+        texture[unseen] = np.rint(np.clip(smooth[unseen] + difference[unseen], 0, 1) * 255)
+        del smooth, difference
+    values = texture.astype(np.float32)
+    fill(values, state != _EMPTY)
+    np.rint(values, out=values)
+    texture[:] = np.where((state == _EMPTY)[..., None], values, texture)

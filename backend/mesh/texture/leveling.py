@@ -1,0 +1,87 @@
+"""Leveling of the colors of photos of one surface.
+
+Highlights and shading move with the camera, so that photos of the same point differ, with a seam wherever one photo
+follows another. Therefore the difference of each photo from the median of all photos, smoothed along the surface, is
+subtracted. Finer detail stays (cf. Waechter et al. 2014, who level photos against each other at the seams).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numba import prange
+from scipy.sparse import diags, eye
+
+from ...raster.kernel import kernel
+from ..surface import neighbors
+from .photos import Photo, Photos, between, look
+
+_ASKED = 64
+"""Largest number of photos that the median is computed from."""
+_STEPS = 40
+"""Rounds of smoothing the differences; their radius in edges is the square root of it."""
+
+
+def level(photos: Photos, normals: np.ndarray, progress: Callable[[int], None]) -> dict[int, np.ndarray]:
+    """Compute the offsets (V, 3) float32 to each photo's colors at the vertices, by the photo's index.
+
+    normals (V, 3): the vertices' unit normals; progress: called with the number of photos done. Photos that show no
+    vertex are left out.
+    """
+    asked = photos.indices[:: max(1, -(-len(photos.indices) // _ASKED))]
+    seen: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    for done, index in enumerate(photos.indices):
+        progress(done)
+        photo = photos[index]
+        if photo is not None:
+            weight, color = _at_vertices(photo, photos.vertices, normals)
+            if weight.any():
+                seen[index] = weight, color
+    if not seen:
+        return {}
+    samples = [seen[index] for index in asked if index in seen] or list(seen.values())[:_ASKED]
+    medians, known = _medians(np.stack([color for _, color in samples]), np.stack([weight for weight, _ in samples]))
+    near = neighbors(photos.vertices, photos.faces)
+    mean = diags(1 / np.maximum(np.asarray(near.sum(1)).ravel(), 1e-30)) @ near
+    smooth = ((eye(len(normals)) + mean) / 2).astype(np.float32).tocsr()
+    offsets = {}
+    for index, (weight, color) in seen.items():
+        sure = np.where(known, weight, 0)[:, None]
+        sums = np.concatenate([(medians - color) * sure, sure], 1).astype(np.float32)
+        for _ in range(_STEPS):
+            sums = smooth @ sums
+        offsets[index] = sums[:, :3] / np.maximum(sums[:, 3:], 1e-9)
+    return offsets
+
+
+def _at_vertices(photo: Photo, vertices: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the photo's weight at each vertex, (V,) float32, 0: not visible, and its colors there, (V, 3) float32."""
+    viewmat, intrinsics = photo.camera.arrays()
+    weight = np.zeros(len(vertices), np.float32)
+    color = np.zeros((len(vertices), 3), np.float32)
+    _look(
+        vertices, normals, photo.planes, photo.depth, photo.clearance, viewmat, intrinsics, photo.camera.center,
+        (photo.x, photo.y), photo.safe, weight, color,
+    )  # fmt: skip
+    return weight, color
+
+
+@kernel(parallel=True)
+def _look(vertices, normals, planes, depth, clearance, viewmat, intrinsics, eye, corner, safe, weight, color):
+    for n in prange(vertices.shape[0]):
+        score, u, v, _clear = look(vertices, normals, n, 0.0, eye, viewmat, intrinsics, depth, clearance, safe)
+        if score <= 0.0:
+            continue
+        # As many pixels as a side of the place has.
+        weight[n] = np.sqrt(score)
+        for c in range(3):
+            color[n, c] = between(planes[c], u + corner[0], v + corner[1])
+
+
+def _medians(colors: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weighted median (V, 3) of P photos' colors (P, V, 3), weights (P, V), and where there is one, (V,)."""
+    order = np.argsort(colors, 0)
+    behind = np.cumsum(np.take_along_axis(np.broadcast_to(weights[..., None], colors.shape), order, 0), 0)
+    middle = (behind >= behind[-1] / 2).argmax(0)[None]
+    return np.take_along_axis(np.take_along_axis(colors, order, 0), middle, 0)[0], behind[-1, :, 0] > 0

@@ -1,0 +1,58 @@
+"""Rendering a model to an image, for evaluation, previews and the render command."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from ..raster import devices, object_map, rasterize
+from ..raster.camera import Camera
+from .object_model import ObjectModel, anchors_in_view
+
+
+class RenderedView(NamedTuple):
+    """A rendered view of a model.
+
+    image (H, W, 3): float32 in [0, 1]. ids (H, W) int64: object IDs; probability (H, W) float32: their probabilities
+    (both None if not requested). alpha (H, W). depth (H, W): expected depth in world units, 0 where nothing is drawn
+    (None if not requested).
+    """
+
+    image: np.ndarray
+    ids: np.ndarray | None
+    probability: np.ndarray | None
+    alpha: np.ndarray
+    depth: np.ndarray | None
+
+
+def draw(model: ObjectModel, camera: Camera, want_ids: bool = True, want_depth: bool = False) -> RenderedView:
+    """Render a model over its background.
+
+    Args:
+        model: the model.
+        camera: the view, in scene units.
+        want_ids: requests the most probable object of every pixel.
+        want_depth: requests the expected depth.
+
+    Returns:
+        The rendered view, as NumPy arrays.
+    """
+    viewmat, intrinsics = camera.arrays()
+    seen = anchors_in_view(model.anchors, viewmat, intrinsics, camera.width, camera.height, camera.near)
+    g = model.generate(seen, camera.center)
+    with torch.no_grad():
+        drawn = rasterize(*g[:6], camera, want_depth=want_depth, primitive=model.primitive)
+        image = drawn.color + (1 - drawn.alpha) * model.background.detach()[:, None, None]
+        image = image * torch.tensor(camera.gain).to(image.device)[:, None, None]
+        pixels = devices.host(image.clamp(0, 1).permute(1, 2, 0).contiguous())
+    alpha = devices.host(drawn.alpha)
+    depth = None
+    if drawn.depth is not None:
+        depth = devices.host(drawn.depth) / np.maximum(alpha, 1e-6) / np.float32(model.normalization.scale)
+    ids = probability = None
+    if want_ids:
+        classes, probability = (devices.host(plane) for plane in object_map(drawn))
+        ids = model.classes.ids_of(classes)
+    return RenderedView(pixels, ids, probability, alpha, depth)

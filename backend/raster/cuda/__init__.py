@@ -1,0 +1,1 @@
+"""The CUDA renderer, in numba-cuda."""

@@ -1,0 +1,198 @@
+"""Choosing the device to compute on, the CPU or an NVIDIA GPU through CUDA, and why CUDA is not available.
+
+Functions with a version for each device ask `on_gpu` about one of their tensors. In numba's simulator
+(NUMBA_ENABLE_CUDASIM=1), tensors stay in host memory and everything else takes the GPU's path.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+from typing import Any
+
+import numpy as np
+import torch
+from numba import config
+
+from ..shared.errors import InputError
+
+CHOICES = ("auto", "cpu", "cuda")
+
+MIN_FREE_MEMORY = 1e9
+"""Bytes of GPU memory that must be free; CUDA itself and torch's libraries take about half of them."""
+
+_OUT_OF_MEMORY_TEXTS = ("CUDA_ERROR_OUT_OF_MEMORY", "CUDA error: out of memory", "CUBLAS_STATUS_ALLOC_FAILED")
+"""Of numba's driver, of the CUDA runtime and of cuBLAS."""
+
+CPU = torch.device("cpu")
+
+
+def pick(asked: str) -> torch.device:
+    """Select the device to compute on.
+
+    Args:
+        asked: "cpu", "cuda", or "auto": CUDA where it works, else the CPU.
+
+    Returns:
+        The torch device; in numba's simulator always the CPU.
+
+    Raises:
+        InputError: if `asked` is "cuda" and CUDA is not available.
+        ValueError: if `asked` is none of CHOICES.
+    """
+    if asked not in CHOICES:
+        raise ValueError(f"the device is {asked!r}, expected one of {CHOICES}")
+    why_not = None if asked == "cpu" else why_not_cuda()
+    if asked == "cuda" and why_not is not None:
+        raise InputError(why_not)
+    if asked == "cpu" or why_not is not None or simulated():
+        return CPU
+    return torch.device("cuda", torch.cuda.current_device())
+
+
+def simulated() -> bool:
+    """Return whether numba runs CUDA kernels in its simulator."""
+    return bool(config.ENABLE_CUDASIM)
+
+
+def on_gpu(tensor: torch.Tensor) -> bool:
+    """Return whether a tensor takes the GPU's path: torch and CUDA kernels instead of numba's kernels on arrays."""
+    return tensor.is_cuda or simulated()
+
+
+def name_of(device: torch.device) -> str:
+    """Return the display name of a device: "cpu", or "cuda" with the GPU's name."""
+    return f"cuda ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else "cpu"
+
+
+def host(values: torch.Tensor | np.ndarray) -> np.ndarray:
+    """Copy a tensor to a NumPy array.
+
+    Args:
+        values: a tensor on any device, or an array.
+
+    Returns:
+        The array; of a tensor in host memory, it shares the memory.
+    """
+    return values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else values
+
+
+def upload(values: np.ndarray, like: torch.Tensor | torch.device) -> torch.Tensor:
+    """Copy an array to a device without waiting for the device to finish other work.
+
+    Args:
+        values: the array.
+        like: the device, or a tensor on it.
+
+    Returns:
+        The tensor on the device.
+    """
+    device = like.device if isinstance(like, torch.Tensor) else like
+    return torch.from_numpy(values).to(device, non_blocking=True)
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Return whether an error, of torch or numba, means that the GPU's memory is full."""
+    return isinstance(error, torch.cuda.OutOfMemoryError) or any(words in str(error) for words in _OUT_OF_MEMORY_TEXTS)
+
+
+@functools.cache
+def why_not_cuda() -> str | None:
+    """Explain why CUDA cannot be used on this computer.
+
+    Returns:
+        One sentence with the reason and what helps; None where CUDA works.
+    """
+    if simulated():
+        return None
+    return _problem_with_build() or _problem_with_driver() or _problem_with_gpu() or _problem_with_kernels()
+
+
+def _problem_with_build() -> str | None:
+    if getattr(torch.version, "hip", None):
+        return "This PyTorch is built for AMD GPUs, which ObjectGS cannot use; install a build for CUDA."
+    if torch.version.cuda is None:
+        return (
+            f"This PyTorch ({torch.__version__}) is built without CUDA; set the backend up again for an NVIDIA GPU, or "
+            "install a build of PyTorch for CUDA."
+        )
+    if importlib.util.find_spec("numba_cuda") is None:
+        return "The package numba-cuda is missing; install it with pip install -r requirements/cuda.txt."
+    return None
+
+
+def _problem_with_driver() -> str | None:
+    try:
+        torch.cuda.init()
+    except (RuntimeError, AssertionError) as error:
+        return explain_cuda_error(str(error), torch.version.cuda)
+    return None if torch.cuda.device_count() else explain_cuda_error("No CUDA GPUs are available", torch.version.cuda)
+
+
+def explain_cuda_error(error: str, toolkit: str | None) -> str:
+    """Explain torch's error when CUDA does not start; toolkit: the CUDA version that torch is built for."""
+    text = error.lower()
+    if "driver on your system is too old" in text or "driver version is insufficient" in text:
+        return (
+            f"The NVIDIA driver is too old for CUDA {toolkit}, which this PyTorch is built for; install a newer driver "
+            "from nvidia.com, or a PyTorch for an older CUDA."
+        )
+    if "no nvidia driver" in text:
+        return "There is no NVIDIA driver on this computer; install the one for your GPU from nvidia.com."
+    if "no cuda gpus" in text or "no cuda-capable device" in text:
+        return "The NVIDIA driver shows no GPU that may be used; check nvidia-smi and CUDA_VISIBLE_DEVICES."
+    first = error.strip().partition("\n")[0].rstrip(".") or "no reason was given"
+    return f"CUDA does not start on this computer ({first}); restarting it, or a newer NVIDIA driver, may help."
+
+
+def _problem_with_gpu() -> str | None:
+    name = torch.cuda.get_device_name()
+    try:
+        if float(torch.ones(1, device="cuda").sum()) != 1.0:
+            return f"The GPU {name} computes wrong results; restart the computer."
+        free, total = torch.cuda.mem_get_info()
+    except RuntimeError as error:
+        if "no kernel image" in str(error):
+            major, minor = torch.cuda.get_device_capability()
+            return (
+                f"This PyTorch has no code for the GPU {name} (compute capability {major}.{minor}); install a build of "
+                "PyTorch that has."
+            )
+        free, total = (0, 0) if is_out_of_memory(error) else (-1, -1)
+        if free < 0:
+            return explain_cuda_error(str(error), torch.version.cuda)
+    return explain_low_memory(name, free, total)
+
+
+def explain_low_memory(name: str, free: float, total: float) -> str | None:
+    """Explain that the GPU has fewer than MIN_FREE_MEMORY of its `total` bytes free; None if it has more."""
+    if free >= MIN_FREE_MEMORY:
+        return None
+    if 0 < total < MIN_FREE_MEMORY:
+        return f"The GPU {name} has {total / 1e9:.1f} GB of memory, and {MIN_FREE_MEMORY / 1e9:.0f} GB are needed."
+    return (
+        f"The GPU {name} has {free / 1e9:.1f} GB of memory free, and {MIN_FREE_MEMORY / 1e9:.0f} GB are needed; close "
+        "programs that use it."
+    )
+
+
+def _problem_with_kernels() -> str | None:
+    """Compile and run a minimal kernel: numba-cuda has a toolkit of its own, which the driver must support, too."""
+    try:
+        from numba import cuda
+
+        @cuda.jit
+        def mark(out: Any) -> None:
+            out[0] = 1
+
+        out = torch.zeros(1, dtype=torch.int32, device="cuda")
+        mark[1, 1](cuda.as_cuda_array(out))
+        cuda.synchronize()
+        if int(out[0]) != 1:
+            return "A CUDA kernel ran without effect; restart the computer."
+    except Exception as error:  # Whatever it is, the CPU still works.
+        first = f"{type(error).__name__}: {str(error).strip()}".partition("\n")[0].rstrip(".: ")
+        if "PTX" in str(error) and "version" in str(error).lower():
+            return "The NVIDIA driver is too old for the installed numba-cuda; install a newer driver from nvidia.com."
+        return f"numba-cuda cannot run a kernel here ({first}); install it with pip install -r requirements/cuda.txt."
+    return None

@@ -1,0 +1,1 @@
+"""What the compute process and Blender's process share. Standard library and NumPy only."""

@@ -1,0 +1,142 @@
+"""Events of a command as a person in a terminal wants to see them."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from pathlib import Path
+from typing import Any, TextIO
+
+from .durations import clock
+from .events import Reporter
+
+SECONDS_BETWEEN_LINES = 5.0
+SECONDS_BETWEEN_REDRAWS = 0.1
+BAR_COLUMNS = 30
+
+
+def _figures(fields: dict[str, Any]) -> list[str]:
+    """Format the known figures among an event's fields, with units, in a fixed order."""
+    formats = {
+        "loss": "loss {:.4f}",
+        "splats": "{:,.0f} splats",
+        "psnr": "PSNR {:.1f} dB",
+        "ssim": "SSIM {:.3f}",
+        "miou": "mIoU {:.3f}",
+        "mbiou": "mBIoU {:.3f}",
+    }
+    return [text.format(fields[name]) for name, text in formats.items() if isinstance(fields.get(name), int | float)]
+
+
+def _block(stream: TextIO) -> str:
+    """The character that fills the bar, as far as the stream can write it."""
+    try:
+        "█".encode(stream.encoding or "utf-8")
+    except (UnicodeEncodeError, LookupError):
+        return "#"
+    return "█"
+
+
+class ConsoleReporter(Reporter):
+    """Prints a progress bar with the time left on a terminal; elsewhere plain lines, at most one every 5 seconds.
+
+    Progress, status and results go to `stream` (stdout), warnings and errors to `errors` (stderr).
+    """
+
+    def __init__(self, stream: TextIO | None = None, errors: TextIO | None = None) -> None:
+        self.stream = stream or sys.stdout
+        self.errors = errors or sys.stderr
+        self.on_terminal = self.stream.isatty()
+        self._bar = ""
+        """The line of the progress bar on screen; empty without one."""
+        self._started = time.monotonic()
+        self._last_line = -SECONDS_BETWEEN_LINES
+        self._kept: dict[str, Any] = {}
+        self._preview_folder: Path | None = None
+
+    def status(self, message: str) -> None:
+        """Print what is being done now; progress that follows belongs to it."""
+        self.close()
+        self._print(message, self.stream)
+
+    def progress(self, done: float, total: float, **fields: Any) -> None:
+        """Move the bar; figures that come only now and then (psnr, miou) stay on show until they change."""
+        self._kept.update({name: value for name, value in fields.items() if value is not None})
+        now, finished = time.monotonic(), done >= total
+        interval = SECONDS_BETWEEN_REDRAWS if self.on_terminal else SECONDS_BETWEEN_LINES
+        if now - self._last_line < interval and not finished:
+            return
+        self._last_line = now
+        seconds_left = fields.get("seconds_left")
+        if seconds_left is None and 0 < done <= total:
+            seconds_left = (now - self._started) * (total - done) / done
+        left = [] if seconds_left is None or finished else [f"{clock(seconds_left)} left"]
+        text = ", ".join(left + _figures(self._kept))
+        if self.on_terminal:
+            self._draw_bar(done / total if total else 1.0, text)
+            if finished:
+                self._end_bar()
+        else:
+            percentage = f"{100 * done / total:3.0f}%" if total else "    "
+            self._print(f"  {percentage}  {text}".rstrip(), self.stream)
+
+    def preview(self, path: Path, **_fields: Any) -> None:
+        """Name the folder of the preview images once; they come too often to name each."""
+        folder = Path(path).parent
+        if folder != self._preview_folder:
+            self._preview_folder = folder
+            self._print(f"  previews in {folder}", self.stream)
+
+    def warning(self, message: str) -> None:
+        self._print(f"warning: {message}", self.errors)
+
+    def error(self, message: str) -> None:
+        self.close()
+        self._print(f"error: {message}", self.errors)
+
+    def stopped(self, message: str) -> None:
+        """Print that the command was stopped, and what becomes of its result."""
+        self.status(message)
+
+    def done(self, **fields: Any) -> None:
+        """Close with the figures, and with every other field on its own line."""
+        self.close()
+        figures = _figures(fields)
+        self._print("Done" + (f": {', '.join(figures)}" if figures else "."), self.stream)
+        for name, value in fields.items():
+            if isinstance(value, str | Path):
+                self._print(f"  {name}: {value}", self.stream)
+
+    def close(self) -> None:
+        """End the bar, so that other text can follow; progress after this starts a new one."""
+        self._end_bar()
+        self._started = time.monotonic()
+        self._last_line = -SECONDS_BETWEEN_LINES
+        self._kept = {}
+
+    def _draw_bar(self, progress: float, text: str) -> None:
+        columns = shutil.get_terminal_size().columns - 1
+        width = min(BAR_COLUMNS, max(5, columns - 11 - len(text)))
+        filled = round(width * min(max(progress, 0.0), 1.0))
+        line = f"  {100 * progress:3.0f}% |{(_block(self.stream) * filled).ljust(width)}| {text}"[:columns]
+        # Spaces overwrite what a longer line before has left.
+        self.stream.write("\r" + line.ljust(len(self._bar)))
+        self.stream.flush()
+        self._bar = line
+
+    def _end_bar(self) -> None:
+        """Leave the bar as it is and go on to the next line."""
+        if self._bar:
+            print(file=self.stream, flush=True)
+            self._bar = ""
+
+    def _print(self, text: str, stream: TextIO) -> None:
+        """Print a line; a bar on screen makes room for it and is drawn again below."""
+        if self._bar:
+            self.stream.write("\r" + " " * len(self._bar) + "\r")
+            self.stream.flush()
+        print(text, file=stream, flush=True)
+        if self._bar:
+            self.stream.write(self._bar)
+            self.stream.flush()

@@ -1,0 +1,26 @@
+"""Errors that end a command, and its exit codes."""
+
+from __future__ import annotations
+
+import sys
+
+EXIT_DONE = 0
+EXIT_FAILED = 1
+EXIT_BAD_INPUT = 2
+EXIT_CANCELLED = 130
+
+
+class InputError(Exception):
+    """What the user gave cannot be used; the message is one plain sentence that names the file."""
+
+
+class Cancelled(Exception):
+    """The user asked to stop; everything worth keeping is on disk."""
+
+
+def describe_missing_package(error: ModuleNotFoundError) -> str:
+    """The sentence for a Python that does not have the backend's packages."""
+    return (
+        f"The Python {sys.executable} lacks the package {error.name}, which the compute backend needs; "
+        "set up the backend, or choose a Python that has its packages."
+    )

@@ -1,0 +1,1 @@
+"""Files in general: atomic writes, JSON, PLY tables and mesh PLY."""

@@ -1,0 +1,48 @@
+"""JSON files and the values they hold."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from .atomic import write_atomic
+
+
+def plain(value: Any, where: str = "value") -> Any:
+    """NumPy numbers, paths and tuples as what JSON knows; NaN and infinity as None. Raises ValueError for the rest."""
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, np.generic | np.ndarray):
+        return plain(value.tolist(), where)
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(key): plain(entry, f"{where}.{key}") for key, entry in value.items()}
+    if isinstance(value, Sequence):
+        return [plain(entry, f"{where}[{i}]") for i, entry in enumerate(value)]
+    raise ValueError(f"{where} is a {type(value).__name__}, which JSON cannot hold")
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write `value` as JSON, atomically; NaN is refused, since readers of JSON cannot take it."""
+    write_atomic(path, (json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
+
+
+def read_json(path: Path) -> Any:
+    """Read JSON; raises InputError that names the file when it is missing or broken."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(f"{path} does not exist; run the step that makes it first.") from error
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path} cannot be read as JSON ({error}); repair it, or delete it and run the step that makes it."
+        ) from error

@@ -1,0 +1,112 @@
+"""Vertices of binary PLY files as NumPy tables, one field a property.
+
+Standard library and NumPy only, so that Blender's own Python can import it.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from ..errors import InputError
+from .atomic import atomic_file
+
+LONGEST_HEADER = 1 << 20
+
+_WORDS = {
+    "i1": ("char", "int8"),
+    "u1": ("uchar", "uint8"),
+    "i2": ("short", "int16"),
+    "u2": ("ushort", "uint16"),
+    "i4": ("int", "int32"),
+    "u4": ("uint", "uint32"),
+    "f4": ("float", "float32"),
+    "f8": ("double", "float64"),
+}
+_KINDS = {word: kind for kind, words in _WORDS.items() for word in words}
+
+
+def vertex_header(dtype: np.dtype, count: int) -> bytes:
+    """The header of a little-endian file of `count` vertices; `dtype` has one number a field, of a PLY type."""
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    for name in dtype.names or ():
+        field = dtype[name]
+        if f"{field.kind}{field.itemsize}" not in _WORDS:
+            raise ValueError(f"PLY has no type for the property {name} ({field})")
+        lines.append(f"property {_WORDS[f'{field.kind}{field.itemsize}'][0]} {name}")
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
+
+
+def write_vertices(path: Path, table: np.ndarray) -> None:
+    """Write a structured array (N,) of plain numbers as binary little-endian PLY, atomically."""
+    packed = np.dtype([(name, table.dtype[name].newbyteorder("<")) for name in table.dtype.names or ()])
+    with atomic_file(path) as file:
+        file.write(vertex_header(packed, len(table)))
+        file.write(np.ascontiguousarray(table.astype(packed, copy=False)).data)
+
+
+def read_vertices(path: Path) -> np.ndarray:
+    """The vertices of a binary PLY file: (N,) structured, with the file's own property names, order and types.
+
+    Elements after the vertices are left alone. Raises InputError that names the file when it is missing, cut short,
+    ASCII, or holds no vertices of plain numbers.
+    """
+    try:
+        with path.open("rb") as file:
+            return _read(file, path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror or error}).") from error
+
+
+def _read(file: BinaryIO, path: Path) -> np.ndarray:
+    head = file.read(LONGEST_HEADER)
+    if not head.startswith(b"ply"):
+        raise InputError(f"{path} is not a PLY file.")
+    end = head.find(b"end_header")
+    newline = head.find(b"\n", end)
+    if end < 0 or newline < 0:
+        raise InputError(f"{path} has no complete PLY header; it may be cut short.")
+    order = ""
+    count = -1
+    fields: list[tuple[str, str]] = []
+    element = ""
+    for line in head[:end].decode("ascii", "replace").splitlines():
+        words = line.split()
+        if not words or words[0] in ("ply", "comment", "obj_info"):
+            continue
+        if words[0] == "format" and len(words) >= 2:
+            if words[1] == "ascii":
+                raise InputError(f"{path} is an ASCII PLY file; only binary ones are read. Save it as binary PLY.")
+            order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(words[1], "")
+        elif words[0] == "element" and len(words) == 3 and words[2].isdigit():
+            if count >= 0:
+                break
+            element = words[1]
+            size = int(words[2])
+            if element == "vertex":
+                count = size
+            elif size:
+                raise InputError(f"{path} has an element {element} before its vertices, which is not supported.")
+        elif words[0] == "property" and element == "vertex":
+            if len(words) != 3 or words[1] not in _KINDS:
+                raise InputError(f"{path} has a vertex property that is not a plain number: {line.strip()!r}.")
+            fields.append((words[2], _KINDS[words[1]]))
+        elif words[0] != "property":
+            raise InputError(f"{path} has a PLY header line that makes no sense: {line.strip()!r}.")
+    if not order or count < 0 or not fields:
+        raise InputError(f"{path} has no format or no vertices in its PLY header.")
+    try:
+        dtype = np.dtype([(name, order + kind) for name, kind in fields])
+    except ValueError as error:
+        raise InputError(f"{path} names a vertex property twice.") from error
+    available = os.fstat(file.fileno()).st_size - newline - 1
+    if available < count * dtype.itemsize:
+        raise InputError(
+            f"{path} is cut short: its header promises {count} vertices, "
+            f"but only {available // dtype.itemsize} are there."
+        )
+    file.seek(newline + 1)
+    return np.fromfile(file, dtype, count)

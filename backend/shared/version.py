@@ -1,0 +1,3 @@
+"""The version of extension and backend."""
+
+__version__ = "0.1.0"

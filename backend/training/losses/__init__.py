@@ -1,0 +1,1 @@
+"""The loss of a view, on the CPU and on a GPU."""

@@ -1,0 +1,308 @@
+"""One view's step: render it, compute its loss and the gradients of the anchors that it shows.
+
+On a GPU the CPU does not wait for results. Where the GPU's memory is too small for an image, it is rendered in strips,
+whose gradients add up to the image's.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from ..model.anchors import Anchors
+from ..model.generate import Generated, generate
+from ..model.object_model import ObjectModel, anchors_in_view, first_anchors_in_view
+from ..raster import Camera, Rendered, devices, rasterize
+from ..shared.errors import InputError
+from . import check_finite
+from .adam import take_rows
+from .check_finite import FiniteCheck
+from .growth_strategy import GrowthStrategy, ViewStatistics
+from .losses.on_cpu import image_loss, normal_loss, volume_loss
+from .scene import Scene
+from .settings import SURFACE_FROM, Settings, downscale_at
+
+MOST_PARTS = 16
+"""The largest number of parts in which an image is rendered that does not fit into the GPU's memory."""
+
+_NO_ROOM = (
+    "The GPU's memory is too small, even for a sixteenth of an image at a time; close programs that use it, or try a "
+    "smaller --max-size or --max-anchors, or --device cpu."
+)
+
+_IMAGE = "the image loss"
+
+
+class _Part(NamedTuple):
+    """An image, or a strip of one: its camera, target (3, h, w), labels (h, w), its fraction of the image's pixels, and
+    the fraction of its pixels that are labeled, relative to that of the whole image."""
+
+    camera: Camera
+    image: torch.Tensor
+    labels: torch.Tensor | None
+    fraction: float
+    more_labels: float | torch.Tensor
+
+
+class ViewGradients(NamedTuple):
+    """One view's loss and gradients; those of the heads lie in the heads' parameters.
+
+    Attributes:
+        camera: of the view.
+        loss: ().
+        seen: (n,) int64, the anchors in view.
+        rows: (n, columns), copies of their rows, with the gradients.
+        finite: () bool, on the GPU: whether the loss is finite and the view shows any anchor.
+        usable: (n,) bool, on the GPU: the rows whose gradients may be used.
+        statistics: of the image or its parts, where growth asks for them.
+    """
+
+    camera: Camera
+    loss: torch.Tensor
+    seen: torch.Tensor
+    rows: torch.Tensor
+    finite: torch.Tensor | None
+    usable: torch.Tensor | None
+    statistics: list[ViewStatistics]
+
+
+class _Limits:
+    """Upper limits of the number of anchors in a view, so that the processor need not wait for their number: somewhat
+    more than were in view last time, which the GPU has reported since; all for a view that is new."""
+
+    _MARGIN, _STEP = 1.25, 4096
+
+    def __init__(self) -> None:
+        self._reports: dict[int, tuple[torch.Tensor, torch.cuda.Event | None, int]] = {}
+
+    def of(self, view: int, anchors: int) -> int:
+        """The limit for a view of a model with a number of `anchors`."""
+        if view not in self._reports:
+            return anchors
+        count, arrived, then = self._reports[view]
+        if arrived is not None and not arrived.query():
+            return anchors
+        expected = int(count) * anchors / max(then, 1)
+        return min(anchors, math.ceil(self._MARGIN * expected / self._STEP + 1) * self._STEP)
+
+    def note(self, view: int, count: torch.Tensor, anchors: int) -> None:
+        """Record that `count` () of all `anchors` were in view."""
+        if not count.is_cuda:
+            self._reports[view] = (count, None, anchors)
+            return
+        report = torch.empty((), dtype=count.dtype, pin_memory=True).copy_(count, non_blocking=True)
+        arrived = torch.cuda.Event()
+        arrived.record()
+        self._reports[view] = (report, arrived, anchors)
+
+
+def strips(
+    camera: Camera, image: torch.Tensor, labels: torch.Tensor | None, count: int
+) -> list[tuple[Camera, torch.Tensor, torch.Tensor | None]]:
+    """Cut an image (3, H, W), its labels (H, W) and its camera into `count` strips across its longer side."""
+    wide = camera.width >= camera.height
+    length = camera.width if wide else camera.height
+    edges = [round(i * length / count) for i in range(count + 1)]
+    found = []
+    for first, last in itertools.pairwise(sorted(set(edges))):
+        part = (slice(None), slice(first, last)) if wide else (slice(first, last), slice(None))
+        size = last - first
+        crop = camera.crop(first, 0, size, camera.height) if wide else camera.crop(0, first, camera.width, size)
+        found.append((crop, image[:, *part].contiguous(), None if labels is None else labels[part].contiguous()))
+    return found
+
+
+class ViewStep:
+    """Computes the loss of a view and its gradients, in as many parts as the GPU's memory asks for."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        settings: Settings,
+        model: ObjectModel,
+        head_optimizer: torch.optim.Optimizer,
+        growth: GrowthStrategy,
+        check: FiniteCheck,
+    ) -> None:
+        self.scene = scene
+        self.settings = settings
+        self.model = model
+        self.parts = 1
+        self._head_optimizer = head_optimizer
+        self._growth = growth
+        self._check = check
+        self._limits = _Limits()
+        self._splats: int | torch.Tensor = 0
+
+    @property
+    def splats(self) -> int:
+        """Splats drawn in the latest step. Waits for the GPU."""
+        return int(self._splats)
+
+    def compute(self, index: int, progress: float) -> ViewGradients | None:
+        """The loss and gradients of a view.
+
+        Args:
+            index: of the view in the capture.
+            progress: of the training, 0 .. 1.
+
+        Returns:
+            None where the view shows nothing or its loss is not finite.
+
+        Raises:
+            InputError: the GPU's memory does not suffice for the smallest parts, or the view's image cannot be read.
+        """
+        gradients, full = self._compute_if_it_fits(index, progress)
+        while full:
+            self._make_room()
+            gradients, full = self._compute_if_it_fits(index, progress)
+        return gradients
+
+    def _compute_if_it_fits(self, index: int, progress: float) -> tuple[ViewGradients | None, bool]:
+        """The result of `_compute`, and whether the GPU's memory was full instead."""
+        try:
+            return self._compute(index, progress), False
+        except Exception as error:
+            if not devices.is_out_of_memory(error):
+                raise
+            return None, True
+
+    def _make_room(self) -> None:
+        """Halve the parts and release memory, for another attempt at the same view."""
+        if self.parts >= MOST_PARTS:
+            raise InputError(_NO_ROOM)
+        self.parts *= 2
+        self._head_optimizer.zero_grad(set_to_none=True)
+        self.scene.forget(shrink=0.5)
+        if self.model.device.type == "cuda":
+            torch.cuda.empty_cache()
+
+    def _compute(self, index: int, progress: float) -> ViewGradients | None:
+        """`compute`, in the present number of parts."""
+        anchors, on_gpu = self.model.anchors, devices.on_gpu(self.model.anchors.rows)
+        view = self.scene.capture.views[index]
+        downscale = downscale_at(progress, max(view.width, view.height), self.settings.pyramid)
+        image, labels = self.scene.target(index, downscale)
+        camera = self.scene.camera(index, downscale)
+        present = None
+        if on_gpu and self.parts == 1:
+            limit = self._limits.of(index, len(anchors))
+            seen, present, count = first_anchors_in_view(anchors, *frustum(camera), limit)
+            self._limits.note(index, count, len(anchors))
+        else:
+            seen = anchors_in_view(anchors, *frustum(camera))
+        if len(seen) == 0:
+            return None
+        self._head_optimizer.zero_grad(set_to_none=True)
+        rows = take_rows(anchors.rows, seen).requires_grad_()
+        loss = torch.zeros((), device=rows.device)
+        self._splats = 0
+        statistics = []
+        for part in self._parts_of(camera, image, labels):
+            chosen = self._anchors_of(part, seen, rows)
+            terms, g, drawn = self._terms(part, *chosen, present, progress)
+            of_part = self._total(terms, part)
+            if self._check.at_once and not math.isfinite(float(of_part.detach())):
+                self._check.skipped += 1
+                named = self._split_image_loss(terms, part, drawn)
+                self._check.fault = check_finite.find_fault_of_loss(named, g, chosen[0], anchors.layout.offsets)
+                return None
+            of_part.backward()
+            loss = loss + of_part.detach()
+            self._splats = self._splats + (len(g.source) if g.made is None else g.made.sum())
+            if self._growth.observes(progress) and drawn.frame.screen_gradient is not None:
+                statistics.append(
+                    ViewStatistics(
+                        chosen[0], g.source, g.opacities.detach(), drawn.frame.seen, drawn.frame.screen_gradient
+                    )
+                )
+        finite = usable = None
+        if on_gpu:
+            finite = loss.isfinite() if present is None else loss.isfinite() & present.any()
+            usable = finite.expand(len(seen)) if present is None else finite & present
+        return ViewGradients(camera, loss, seen, rows, finite, usable, statistics)
+
+    def _parts_of(self, camera: Camera, image: torch.Tensor, labels: torch.Tensor | None) -> Iterator[_Part]:
+        """The parts to render, one at a time. Their losses add up to the image's, except for SSIM beside the cuts."""
+        if self.parts == 1:
+            yield _Part(camera, image, labels, 1.0, 1.0)
+            return
+        for crop, cut, cut_labels in strips(camera, image, labels, self.parts):
+            fraction = crop.width * crop.height / (camera.width * camera.height)
+            more: float | torch.Tensor = 1.0
+            if labels is not None and cut_labels is not None:
+                more = (cut_labels >= 0).sum() / ((labels >= 0).sum().clamp(min=1) * fraction)
+            yield _Part(crop, cut, cut_labels, fraction, more)
+
+    def _anchors_of(self, part: _Part, seen: torch.Tensor, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The anchors and rows of a part, among those of the whole image."""
+        if self.parts == 1:
+            return seen, rows
+        a = self.model.anchors
+        here = anchors_in_view(
+            Anchors(a.layout, a.voxel, a.positions[seen], rows.detach(), a.ids[seen]), *frustum(part.camera)
+        )
+        return seen[here], rows.index_select(0, here)
+
+    def _terms(
+        self, part: _Part, seen: torch.Tensor, rows: torch.Tensor, present: torch.Tensor | None, progress: float
+    ) -> tuple[dict[str, torch.Tensor], Generated, Rendered]:
+        """Render a part from the anchors' rows; returns the weighted terms () of its loss and the rendering."""
+        anchors, settings = self.model.anchors, self.settings
+        g = generate(
+            anchors.layout, anchors.positions[seen], rows, anchors.ids[seen], self.model.heads, part.camera.center,
+            present,
+        )  # fmt: skip
+        flat = settings.primitive == "2d"
+        normal_weight, distortion_weight = (
+            weight if flat and progress >= SURFACE_FROM else 0.0
+            for weight in (settings.normal_weight, settings.distortion_weight)
+        )
+        drawn = rasterize(
+            *g[:6], part.camera, labels=part.labels if settings.semantic_weight else None,
+            primitive=settings.primitive, want_depth=normal_weight > 0, want_normals=normal_weight > 0,
+            want_distortion=distortion_weight > 0,
+        )  # fmt: skip
+        terms = {_IMAGE: self._image_loss(part, drawn, drawn.label_probability)}
+        if settings.volume_weight and len(g.scales):
+            terms["the volume loss"] = (
+                settings.volume_weight * (0.5 if flat else 1.0) * volume_loss(g.scales, flat, g.made)
+            )
+        if drawn.normals is not None and drawn.depth is not None:
+            intrinsics = part.camera.arrays()[1]
+            terms["the normal loss"] = normal_weight * normal_loss(drawn.normals, drawn.depth, drawn.alpha, intrinsics)
+        if drawn.distortion is not None:
+            terms["the distortion loss"] = distortion_weight * drawn.distortion.mean()
+        return terms, g, drawn
+
+    def _image_loss(self, part: _Part, drawn: Rendered, label_probability: torch.Tensor | None) -> torch.Tensor:
+        """The loss () of the image, and of the labels if their probability (h, w) is given."""
+        return image_loss(
+            drawn.color, drawn.alpha, label_probability, self.model.background, part.image, part.labels,
+            self.settings.ssim_weight, self.settings.semantic_weight * part.more_labels,
+        )  # fmt: skip
+
+    def _total(self, terms: dict[str, torch.Tensor], part: _Part) -> torch.Tensor:
+        """The loss of a part, weighted by its size."""
+        first, *others = terms.values()
+        loss = sum(others, start=first)
+        return part.fraction * loss if self.parts > 1 else loss
+
+    def _split_image_loss(
+        self, terms: dict[str, torch.Tensor], part: _Part, drawn: Rendered
+    ) -> dict[str, torch.Tensor]:
+        """The same terms with the image loss and the label loss apart."""
+        with torch.no_grad():
+            image = self._image_loss(part, drawn, None)
+        labels = torch.where(image.isfinite(), terms[_IMAGE].detach(), 0.0)
+        return {**terms, _IMAGE: image, "the label loss": labels}
+
+
+def frustum(camera: Camera) -> tuple[np.ndarray, np.ndarray, int, int, float]:
+    """The arguments of `anchors_in_view` for a camera."""
+    return (*camera.arrays(), camera.width, camera.height, camera.near)

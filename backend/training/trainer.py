@@ -1,0 +1,433 @@
+"""The training loop: one view per step, growth at intervals, checkpoints, and a curve of held-out quality.
+
+The model, its Adam moments and the images lie on one device, the CPU or a GPU. On a GPU no step waits for its results;
+they are read when the training reports or saves.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from ..model.anchors import median_spacing, seed_anchors
+from ..model.checkpoint import save_checkpoint
+from ..model.heads import Heads
+from ..model.object_model import Normalization, ObjectModel
+from ..raster import devices
+from ..shared.class_table import ClassTable
+from ..shared.errors import Cancelled, InputError
+from ..shared.events import Reporter
+from ..shared.reconstruction.objects import default_name
+from ..shared.stopping import StopRequest
+from . import check_finite
+from .adam import BETA1, BETA2, step_rows
+from .average import Average
+from .budget import Budget, TrainingProgress
+from .check_finite import FiniteCheck
+from .growth_strategy import GrowthStrategy
+from .scene import Scene
+from .settings import HEAD_RATES, Settings, background_is_masked, rate, row_rates
+from .state import (
+    model_from_checkpoint,
+    read_checkpoint,
+    restore_head_optimizer,
+    restore_statistics,
+    restore_tensor,
+    training_tensors,
+)
+from .step import ViewGradients, ViewStep
+
+if TYPE_CHECKING:
+    from ..capture import Capture
+
+CHECKPOINT_SECONDS = 30.0
+_REPORT_SECONDS = 0.5
+
+_IN_PARTS = (
+    "The GPU's memory is full, so each image is rendered in {parts} parts from here on, and fewer images are kept "
+    "there; a smaller --max-size or --max-anchors would be faster."
+)
+_CONVERGED = "The training has converged; its learning rates fall from step {steps:,} on"
+
+Evaluate = Callable[[ObjectModel, Scene, TrainingProgress], dict[str, Any]]
+
+
+class Trainer:
+    """A model in training, on the device where it lies. Create one with `start` or `resume`, then call `run`."""
+
+    def __init__(self, scene: Scene, settings: Settings, model: ObjectModel, rng: np.random.Generator) -> None:
+        self.scene = scene
+        self.settings = settings
+        self.model = model
+        self.rng = rng
+        self.progress = TrainingProgress()
+        self._exp_avg = torch.zeros_like(model.anchors.rows)
+        self._exp_avg_sq = torch.zeros_like(model.anchors.rows)
+        self._warnings: list[str] = []
+        self._average = Average(model)
+        model.background.requires_grad_(settings.background == "learned")
+        groups: list[dict[str, Any]] = [
+            {"params": list(getattr(model.heads, name).parameters()), "name": name, "lr": ends[0]}
+            for name, ends in HEAD_RATES.items()
+            if name != "background"
+        ]
+        groups.append({"params": [model.background], "name": "background", "lr": HEAD_RATES["background"][0]})
+        self._head_optimizer = torch.optim.Adam(groups, betas=(BETA1, BETA2), eps=1e-15, fused=True)
+        self._check = FiniteCheck(model.device)
+        self._growth = GrowthStrategy(settings, model)
+        self._view_step = ViewStep(scene, settings, model, self._head_optimizer, self._growth, self._check)
+
+    @classmethod
+    def start(
+        cls,
+        capture: Capture,
+        point_ids: np.ndarray,
+        settings: Settings,
+        memory_mb: float = 2000,
+        device: torch.device = devices.CPU,
+        *,
+        seeds: np.ndarray | None = None,
+        supervise_background: bool | None = None,
+        gains: np.ndarray | None = None,
+    ) -> Trainer:
+        """Begin a training with anchors on the capture's points.
+
+        Args:
+            capture: the views and points.
+            point_ids: (M,) int64 object ID of each point, 0 where it belongs to none.
+            settings: of the training.
+            memory_mb: limit for the targets that are kept in memory.
+            device: where to train.
+            seeds: (M,) bool, the points that anchors start from, and that the scene's extent and density are measured
+                from; None: all.
+            supervise_background: as in `Scene`; None: as `background_is_masked` decides.
+            gains: as in `Scene`.
+
+        Raises:
+            InputError: an image cannot be read.
+        """
+        rng = np.random.default_rng(settings.seed)
+        seeds = np.ones(len(capture.points.xyz), np.bool_) if seeds is None else seeds
+        xyz, rgb = capture.points.xyz[seeds], capture.points.rgb[seeds]
+        eyes = np.array([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in capture.views])
+        normalization = Normalization.of(eyes, xyz)
+        classes = ClassTable(np.concatenate([[0], point_ids]))
+        scene_xyz = normalization.to_scene(xyz)
+        voxel = settings.voxel * normalization.scale if settings.voxel else median_spacing(scene_xyz)
+        point_classes = classes.classes_of(point_ids[seeds])
+        anchors = seed_anchors(scene_xyz, rgb / 255.0, point_classes, voxel, settings.layout, rng)
+        generator = torch.Generator().manual_seed(settings.seed)
+        heads = Heads(settings.layout, settings.mode, settings.sh_degree, generator)
+        shade = {"learned": rgb.mean(axis=0) / 255.0, "black": np.zeros(3), "white": np.ones(3)}
+        background = torch.from_numpy(shade[settings.background].astype(np.float32))
+        model = ObjectModel(anchors, heads, background, classes, normalization, settings.primitive)
+        if supervise_background is None:
+            supervise_background = capture.has_masks and background_is_masked(point_ids[seeds])
+        scene = Scene(
+            capture, classes, normalization, settings.zero_is_object, memory_mb, supervise_background, device, gains
+        )
+        return cls(scene, settings, model.to(device), rng)
+
+    @property
+    def shown(self) -> ObjectModel:
+        """The model to display, evaluate and export: the mean over the latest steps."""
+        return self._average.of(self.model)
+
+    def save(self, folder: Path) -> None:
+        """Write a checkpoint: everything that the next step depends on.
+
+        Raises:
+            InputError: the checkpoint cannot be written; the previous one is kept.
+        """
+        model = self.model
+        self.progress.skipped += self._check.take_skipped()
+        save_checkpoint(
+            folder,
+            training_tensors(
+                model, self._exp_avg, self._exp_avg_sq, self._growth.statistics, self._average, self._head_optimizer
+            ),
+            {
+                "settings": self.settings.as_dict(),
+                "voxel": model.anchors.voxel,
+                "supervise_background": self.scene.supervise_background,
+                "normalization": {"center": model.normalization.center, "scale": model.normalization.scale},
+                "rng": self.rng.bit_generator.state,
+                "progress": {**self.progress.__dict__},
+            },
+        )
+
+    @classmethod
+    def resume(
+        cls,
+        capture: Capture,
+        folder: Path,
+        settings: Settings | None = None,
+        memory_mb: float = 2000,
+        device: torch.device = devices.CPU,
+        gains: np.ndarray | None = None,
+    ) -> tuple[Trainer, str | None] | None:
+        """Continue the training of the newest whole checkpoint.
+
+        Args:
+            capture: the one that the checkpoint was trained on.
+            folder: of the checkpoints.
+            settings: those asked for now; None: those of the checkpoint.
+            memory_mb, gains: as in `start`.
+            device: where to train, whichever device the checkpoint was saved on.
+
+        Returns:
+            The trainer and a warning or None; None if there is no checkpoint.
+
+        Raises:
+            InputError: the checkpoint was trained with other settings, or cannot be read.
+        """
+        found = read_checkpoint(folder)
+        if found is None:
+            return None
+        tensors, state, warning = found
+        stored = Settings(**state["settings"])
+        if settings is not None and settings.in_effect() != stored.in_effect():
+            changed = [k for k, v in settings.as_dict().items() if stored.as_dict()[k] != v]
+            raise InputError(
+                f"The checkpoint in {folder} was trained with other settings ({', '.join(changed)}); use the same, "
+                "another --out, or --restart to train anew."
+            )
+        model = model_from_checkpoint(tensors, state)
+        scene = Scene(
+            capture, model.classes, model.normalization, stored.zero_is_object, memory_mb,
+            state["supervise_background"], device, gains,
+        )  # fmt: skip
+        rng = np.random.default_rng()
+        rng.bit_generator.state = state["rng"]
+        trainer = cls(scene, stored, model.to(device), rng)
+        device = trainer.model.device
+        trainer._exp_avg = restore_tensor(tensors, "adam.exp_avg", device)
+        trainer._exp_avg_sq = restore_tensor(tensors, "adam.exp_avg_sq", device)
+        trainer._growth.statistics = restore_statistics(tensors, device)
+        restore_head_optimizer(trainer._head_optimizer, tensors, device)
+        trainer._average = Average.from_checkpoint(tensors, trainer.model)
+        trainer.progress = TrainingProgress(**state["progress"])
+        return trainer, warning
+
+    def run(
+        self,
+        budget: Budget,
+        checkpoints: Path,
+        reporter: Reporter,
+        evaluate: Evaluate | None = None,
+        stop: StopRequest | None = None,
+        checkpoint_seconds: float = CHECKPOINT_SECONDS,
+    ) -> None:
+        """Train until the budget is spent.
+
+        Pauses do not count as time of the training.
+
+        Args:
+            budget: how long to train in all.
+            checkpoints: folder for checkpoints: one at the end, before a pause, and at intervals.
+            reporter: receives progress, quality and warnings.
+            evaluate: measures the model on held-out views.
+            stop: asked before each step.
+            checkpoint_seconds: the interval between checkpoints.
+
+        Raises:
+            Cancelled: `stop` asked for it; the training is saved.
+            InputError, OSError: an image cannot be read or a file cannot be written; the steps so far are saved where
+                that is possible.
+        """
+        first_step = self.progress.step
+        try:
+            self._train(budget, checkpoints, reporter, evaluate, stop or StopRequest(), checkpoint_seconds)
+        except (InputError, OSError):
+            if self.progress.step > first_step:
+                with suppress(InputError, OSError):
+                    self.save(checkpoints)
+            raise
+
+    def _train(
+        self,
+        budget: Budget,
+        checkpoints: Path,
+        reporter: Reporter,
+        evaluate: Evaluate | None,
+        stop: StopRequest,
+        checkpoint_seconds: float,
+    ) -> None:
+        p = self.progress
+        started = last_saved = last_report = time.monotonic()
+        before = p.seconds
+        first_step = p.step
+        budget.begin(p)
+        smooth = torch.full((), math.nan, device=self.model.device)
+        parts = self.parts
+        while True:
+            p.seconds = before + time.monotonic() - started
+            if evaluate is not None and budget.evaluation_is_due(p):
+                self._evaluate(evaluate, reporter, float(smooth))
+                if budget.check_convergence(p):
+                    reporter.status(_CONVERGED.format(steps=p.step))
+            progress = budget.progress(p)
+            if progress >= 1.0:
+                break
+            if stop.paused:
+                self.save(checkpoints)
+                last_saved = time.monotonic()
+            asked = time.monotonic()
+            stopped = stop()
+            waited = time.monotonic() - asked
+            started, last_saved, last_report = started + waited, last_saved + waited, last_report + waited
+            if stopped:
+                self.save(checkpoints)
+                raise Cancelled(f"Stopped after {p.step} steps; run the same command again to go on.")
+            loss = self.step(progress)
+            while self._warnings:
+                reporter.warning(self._warnings.pop(0))
+            smooth = torch.where(smooth.isnan(), loss, smooth.lerp(loss, 0.05))
+            if parts == 1 < self.parts:
+                reporter.warning(_IN_PARTS.format(parts=self.parts))
+                parts = self.parts
+            now = time.monotonic()
+            if now - last_report >= _REPORT_SECONDS:
+                last_report = now
+                p.seconds = before + now - started
+                self._report(budget, reporter, float(smooth), (now - started) / (p.step - first_step))
+                self._check.watch()
+            if now - last_saved >= checkpoint_seconds:
+                self.save(checkpoints)
+                last_saved = time.monotonic()
+        self.save(checkpoints)
+        if p.skipped:
+            because = f": {p.causes}" if p.faults else ""
+            reporter.warning(f"{p.skipped} updates were not finite and were skipped{because}.")
+
+    def _evaluate(self, evaluate: Evaluate, reporter: Reporter, loss: float) -> None:
+        p = self.progress
+        quality = evaluate(self.shown, self.scene, p)
+        loss_db = round(-20 * math.log10(loss), 3) if 0 < loss < math.inf else None
+        reached = {"seconds": round(p.seconds, 2), "step": p.step, "anchors": len(self.model.anchors)}
+        p.curve.append({**reached, "loss_db": loss_db, **quality})
+        reporter.quality(**p.curve[-1])
+
+    def _report(self, budget: Budget, reporter: Reporter, loss: float, pace: float) -> None:
+        p = self.progress
+        left = budget.remaining(p, pace)
+        latest = p.curve[-1] if p.curve else {}
+        reporter.progress(
+            round(budget.displayed_progress(p), 5),
+            1.0,
+            step=p.step,
+            seconds=round(p.seconds, 1),
+            seconds_left=None if left is None else round(left, 1),
+            loss=round(loss, 5) if math.isfinite(loss) else None,
+            anchors=len(self.model.anchors),
+            splats=self.splats,
+            psnr=latest.get("psnr"),
+            miou=latest.get("miou"),
+        )
+
+    @property
+    def parts(self) -> int:
+        """The number of parts in which an image is rendered."""
+        return self._view_step.parts
+
+    @property
+    def splats(self) -> int:
+        """Splats drawn in the latest step. Waits for the GPU."""
+        return self._view_step.splats
+
+    def step(self, progress: float) -> torch.Tensor:
+        """Train on one view: forward, backward and update.
+
+        Args:
+            progress: of the training, 0 .. 1, which learning rates, growth and resolution follow.
+
+        Returns:
+            The loss () float32; NaN where the view shows nothing or its loss is not finite.
+        """
+        p = self.progress
+        if not p.queue:
+            p.queue = self.rng.permutation(self.scene.capture.train_indices).tolist()
+        gradients = self._view_step.compute(p.queue[-1], progress)
+        # Only now, so that an image that cannot be read stays the next one.
+        index = p.queue.pop()
+        p.step += 1
+        loss = torch.full((), math.nan, device=self.model.device)
+        if gradients is not None:
+            self._update(gradients, progress)
+            self._average.follow(self.model, p.step)
+            loss = gradients.loss if gradients.finite is None else torch.where(gradients.finite, gradients.loss, loss)
+        before = len(self.model.anchors)
+        if (fault := self._check.take_fault()) is not None:
+            self._handle(fault, index)
+        if gradients is not None and self._growth.observes(progress) and len(self.model.anchors) == before:
+            self._grow(gradients, progress)
+        return loss
+
+    def _handle(self, fault: check_finite.Fault, index: int) -> None:
+        """Count a fault of the step on view `index`, warn if it is the first of its kind, and remove anchors that
+        cannot recover."""
+        p, model, capture = self.progress, self.model, self.scene.capture
+        if fault.what not in p.faults:
+            owner = None
+            if len(fault.anchors):
+                object_id = int(model.classes.ids_of(int(model.anchors.ids[fault.anchors[0]])))
+                owner = capture.names.get(object_id, default_name(object_id) if object_id else "no object")
+            self._warnings.append(fault.sentence(p.step, capture.views[index].name, owner))
+        p.faults[fault.what] = p.faults.get(fault.what, 0) + 1
+        if not len(fault.unrecoverable):
+            return
+        a = model.anchors
+        kept = torch.ones(len(a), dtype=torch.bool, device=model.device)
+        kept[fault.unrecoverable] = False
+        a.positions, a.rows, a.ids = a.positions[kept], a.rows[kept], a.ids[kept]
+        self._exp_avg, self._exp_avg_sq = self._exp_avg[kept], self._exp_avg_sq[kept]
+        self._average.take(kept, a.rows[:0])
+        self._growth.clear(model)
+
+    def _update(self, gradients: ViewGradients, progress: float) -> None:
+        step, optimizer = self.progress.step, self._head_optimizer
+        for group in optimizer.param_groups:
+            group["lr"] = rate(HEAD_RATES[group["name"]], progress)
+        of_heads = {
+            group["name"]: [parameter.grad.flatten() for parameter in group["params"] if parameter.grad is not None]
+            for group in optimizer.param_groups
+        }
+        finite = torch.cat([part for parts in of_heads.values() for part in parts]).isfinite().all()
+        if gradients.finite is not None:
+            finite = finite & gradients.finite
+        # As torch's gradient scaler does it: if set, the optimizer skips the update without telling the CPU.
+        optimizer.found_inf = (~finite).float()  # type: ignore[attr-defined]
+        optimizer.step()
+        assert gradients.rows.grad is not None
+        skipped = ~finite + step_rows(
+            self.model.anchors.rows, self._exp_avg, self._exp_avg_sq, gradients.seen, gradients.rows.grad,
+            row_rates(self.settings.layout, progress), 1 - BETA1**step, 1 - BETA2**step, gradients.usable,
+        )  # fmt: skip
+        self._check.skipped += skipped
+        if self._check.at_once and skipped:
+            self._check.fault = check_finite.find_fault_of_rows(
+                gradients.rows.grad, gradients.rows.detach(), gradients.seen, self.settings.layout
+            ) or check_finite.find_fault_of_heads(of_heads)
+
+    def _grow(self, gradients: ViewGradients, progress: float) -> None:
+        p, anchors, camera = self.progress, self.model.anchors, gradients.camera
+        self._growth.observe(
+            gradients.statistics, anchors.layout.offsets, camera.width, camera.height, gradients.usable
+        )
+        if not self._growth.is_due(progress, p.step, p.last_growth):
+            return
+        p.last_growth = p.step
+        growth = self._growth.grow(self.model, self.rng)
+
+        def follow(moments: torch.Tensor) -> torch.Tensor:
+            return torch.cat([moments[growth.kept], moments.new_zeros((growth.added, moments.shape[1]))])
+
+        self._exp_avg, self._exp_avg_sq = follow(self._exp_avg), follow(self._exp_avg_sq)
+        self._average.take(growth.kept, anchors.rows[len(anchors) - growth.added :])

@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The demo capture: a table-top in meters, rendered by Cycles, as a folder that a real capture would be.
+
+    images/0000.png ...                    8-bit sRGB pictures
+    sparse/0/{cameras,images,points3D}.bin COLMAP model, one PINHOLE camera
+    masks/0000.png ...                     16-bit object IDs, with mistakes where asked for
+    labels.json                            ID -> name
+    truth/masks, truth/depth (float32 .npy, meters along the camera's axis), truth/meshes/<id>_<name>.ply,
+    truth/objects.json, truth/points.npz (object_id and outlier for each point of the model), truth/settings.json
+
+Everything is in meters, Z up, in one frame.  Equal settings give an equal capture.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ...backend.shared.errors import Cancelled, InputError
+from ...backend.shared.events import Reporter
+from . import files, mask_noise, points, scene
+from .render import Renderer
+
+VERSION = 1  # counts up when equal settings give another capture
+
+__all__ = ["Settings", "make"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the capture depends on: counts, picture size in pixels, seed, mask noise 0..1, samples a pixel."""
+
+    objects: int = 8
+    views: int = 48
+    width: int = 320
+    height: int = 240
+    seed: int = 0
+    mask_noise: float = 0.0
+    samples: int = 20
+
+    def check(self) -> None:
+        """Raise `InputError` for a value out of range."""
+        ranges = {
+            "objects": (1, 60),
+            "views": (4, 1000),
+            "width": (32, 4096),
+            "height": (32, 4096),
+            "seed": (0, 2**31 - 1),
+            "mask_noise": (0, 1),
+            "samples": (1, 4096),
+        }
+        for name, (low, high) in ranges.items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                what = name.replace("_", " ").capitalize()
+                raise InputError(f"{what} must be between {low} and {high}, not {value}.")
+
+
+def make(
+    out: Any,
+    settings: Settings | None = None,
+    overwrite: bool = False,
+    reporter: Reporter | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Path:
+    """Make the capture in the folder `out` and return its path.
+
+    An equal capture that is there already is kept.  Raises `InputError` for bad input and `Cancelled` when `stopped()`
+    says so between two views; nothing half-made stays behind.
+    """
+    settings, reporter = settings or Settings(), reporter or Reporter()
+    settings.check()
+    out = Path(out).expanduser().absolute()
+    if _is_there(out, settings, overwrite):
+        reporter.status(f"The same demo capture is already in {out}; nothing to do.")
+        return out
+    part = out.with_name(out.name + ".part")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        if part.exists():
+            shutil.rmtree(part)
+        part.mkdir()
+    except OSError as error:
+        raise InputError(f"The folder {out} cannot be written: {error.strerror or error}.") from error
+    try:
+        _fill(part, settings, reporter, stopped)
+        _swap(part, out)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+    return out
+
+
+def _is_there(out: Path, settings: Settings, overwrite: bool) -> bool:
+    """Whether `out` holds this capture; raises `InputError` if it holds something that must stay."""
+    if not out.exists():
+        return False
+    if not out.is_dir():
+        raise InputError(f"{out} is a file; the demo capture needs a folder.")
+    if not any(out.iterdir()):
+        return False
+    if not (out / "truth" / "objects.json").is_file():
+        raise InputError(f"The folder {out} is not empty and holds no demo capture; choose another one.")
+    if _recorded(out) == _record(settings):
+        return True
+    if not overwrite:
+        raise InputError(f"The folder {out} holds a demo capture with other settings; --overwrite replaces it.")
+    return False
+
+
+def _record(settings: Settings) -> dict:
+    return {"version": VERSION, **asdict(settings)}
+
+
+def _recorded(out: Path) -> Any:
+    try:
+        return json.loads((out / "truth" / "settings.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+
+
+def _swap(part: Path, out: Path) -> None:
+    """Put the finished folder in place; the one before goes only when the new one stands."""
+    old = out.with_name(out.name + ".old")
+    if out.exists():
+        if old.exists():
+            shutil.rmtree(old)
+        out.rename(old)
+    try:
+        part.rename(out)
+    except OSError:
+        if old.exists():
+            old.rename(out)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _json(path: Path, value: Any) -> None:
+    path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
+
+
+def _fill(part: Path, settings: Settings, reporter: Any, stopped: Any) -> None:
+    start = time.monotonic()
+    for name in ("images", "masks", "sparse/0", "truth/masks", "truth/depth", "truth/meshes"):
+        (part / name).mkdir(parents=True)
+    built, objs = scene.build(settings.objects, settings.seed)
+    try:
+        views = scene.cameras(settings.views, settings.seed)
+        pictures, depths, ids = _render(built, views, settings, part, reporter, stopped)
+        _write_truth(part, objs)
+    finally:
+        scene.remove(built)
+    for view, picture, depth, labels, i in zip(views, pictures, depths, ids, range(len(views))):
+        files.write_png(part / "images" / view.name, picture)
+        files.write_png(part / "truth" / "masks" / view.name, labels)
+        noisy = mask_noise.disturb(labels, settings.mask_noise, scene.rng_for(settings.seed, 6, i))
+        files.write_png(part / "masks" / view.name, noisy)
+        np.save(part / "truth" / "depth" / (view.name[:-4] + ".npy"), depth)
+    intrinsics = scene.intrinsics(settings.width, settings.height)
+    cloud = points.make(views, intrinsics, pictures, depths, ids, scene.rng_for(settings.seed, 5))
+    files.write_colmap(
+        part / "sparse" / "0",
+        intrinsics,
+        (settings.width, settings.height),
+        [v.name for v in views],
+        [v.rotation for v in views],
+        [v.translation for v in views],
+        cloud.observations,
+        cloud.points,
+    )
+    np.savez(part / "truth" / "points.npz", object_id=cloud.object_id.astype(np.int32), outlier=cloud.outlier)
+    _json(part / "labels.json", {str(obj.id): obj.name for obj in objs})
+    _json(part / "truth" / "settings.json", _record(settings))
+    reporter.status(
+        f"{len(views)} views, {len(objs)} objects, {len(cloud.points['xyz'])} points "
+        f"in {time.monotonic() - start:.0f} s."
+    )
+
+
+def _render(built: Any, views: Any, settings: Settings, part: Path, reporter: Any, stopped: Any) -> Any:
+    """Pictures, depths and ID maps of all views; all pictures first, because changing over costs time."""
+    renderer = Renderer(built, settings.width, settings.height, settings.samples, settings.seed, part)
+    pictures, truth = [], []
+    total = 2 * len(views)
+    try:
+        reporter.status("Rendering IDs and depth")
+        renderer.for_truth()
+        for i, view in enumerate(views, 1):
+            if stopped():
+                raise Cancelled
+            truth.append(renderer.truth(view))
+            reporter.progress(i, total)
+        reporter.status("Rendering pictures")
+        renderer.for_pictures()
+        begin = time.monotonic()
+        for i, view in enumerate(views, 1):
+            if stopped():
+                raise Cancelled
+            pictures.append(renderer.picture(view))
+            left = (time.monotonic() - begin) / i * (len(views) - i)
+            reporter.progress(len(views) + i, total, seconds_left=round(left, 1))
+    finally:
+        renderer.close()
+    return pictures, [depth for _, depth in truth], [labels for labels, _ in truth]
+
+
+def _write_truth(part: Path, objs: Iterable[bpy.types.Object]) -> None:
+    rows = []
+    for obj in objs:
+        vertices, triangles = scene.triangles(obj)
+        name = f"meshes/{obj.id}_{obj.name}.ply"
+        files.write_ply(part / "truth" / name, vertices, triangles)
+        box = {"min": vertices.min(0).round(6).tolist(), "max": vertices.max(0).round(6).tolist()}
+        rows.append({"id": obj.id, "name": obj.name, "mesh": name, "bounding_box": box})
+    _json(part / "truth" / "objects.json", {"unit": "meter", "objects": rows})

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The splats of mesh carriers as arrays, for drawing and picking.
+
+They are cached by the session UID of the mesh, never by the mesh itself, until the mesh changes, after undo and redo,
+and when another file is opened.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ...backend.shared.splats.picking import Cloud
+from .. import scene
+from ..scene import carrier
+
+
+@dataclass(frozen=True)
+class SplatArrays:
+    """The splats of a carrier that are not hidden, float32, in the object's coordinates.
+
+    means (N, 3); quats (N, 4) wxyz; scales (N, 3); opacities (N,); harmonics (N, K, 3): coefficients of spherical
+    harmonics for red, green and blue.
+    """
+
+    means: np.ndarray
+    quats: np.ndarray
+    scales: np.ndarray
+    opacities: np.ndarray
+    harmonics: np.ndarray
+
+    @cached_property
+    def cloud(self) -> Cloud:
+        """The splats in the form that picking needs."""
+        return Cloud(self.means, self.quats, self.scales, self.opacities)
+
+
+_held: dict[int, SplatArrays] = {}
+
+
+def arrays_of(mesh: bpy.types.Mesh) -> SplatArrays | None:
+    """The splats of a carrier's mesh; None if attributes are missing."""
+    found = _held.get(mesh.session_uid)
+    if found is None and all(name in mesh.attributes for name in ("radiance:base", "scale", "rotation")):
+        found = _held[mesh.session_uid] = _read(mesh)
+    return found
+
+
+def _read(mesh: bpy.types.Mesh) -> SplatArrays:
+    base = carrier.read(mesh, "radiance:base")
+    coefficients = [base[:, :3]]
+    while (name := f"radiance:sh_{len(coefficients)}") in mesh.attributes:
+        coefficients.append(carrier.read(mesh, name))
+    arrays = (
+        carrier.read(mesh, "position"),
+        carrier.read(mesh, "rotation"),
+        carrier.read(mesh, "scale"),
+        np.ascontiguousarray(base[:, 3]),
+        np.stack(coefficients, axis=1),
+    )
+    hidden = scene.hidden_splats(mesh)
+    return SplatArrays(*arrays) if hidden is None else SplatArrays(*(values[~hidden] for values in arrays))
+
+
+def _forget(*_: Any) -> None:
+    _held.clear()
+
+
+def _changed(_scene: Any, depsgraph: Any) -> None:
+    # Objects are updated when they are moved, too, since their modifiers may depend on their placement.
+    for update in depsgraph.updates:
+        if update.is_updated_geometry and isinstance(update.id, bpy.types.Mesh):
+            _held.pop(update.id.original.session_uid, None)
+
+
+_forget, _changed = bpy.app.handlers.persistent(_forget), bpy.app.handlers.persistent(_changed)
+_HANDLERS = (("depsgraph_update_post", _changed), ("undo_post", _forget), ("redo_post", _forget), ("load_pre", _forget))
+
+
+def register() -> None:
+    for name, handler in _HANDLERS:
+        getattr(bpy.app.handlers, name).append(handler)
+
+
+def unregister() -> None:
+    for name, handler in reversed(_HANDLERS):
+        getattr(bpy.app.handlers, name).remove(handler)
+    _forget()

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The backend's environment: its state, and the jobs that make it or check another Python. No bpy."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import functools
+import itertools
+import json
+import os
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..process.backend_process import backend_environment
+from ..process.jobs import Job
+from .extension import ROOT
+from .worker import layout
+
+REQUIREMENTS = ROOT / "requirements"
+WORKER = Path(layout.__file__).resolve().parent
+"""The program that makes environments: a folder with `__main__.py`."""
+
+_AGAIN = "press Set Up Backend"
+_removed = itertools.count()
+
+
+@dataclass(frozen=True)
+class EnvironmentState:
+    """state: absent, incomplete, outdated, ready or broken. python: of a ready environment. sentence: for the user."""
+
+    state: str
+    python: Path | None
+    sentence: str
+
+
+def inspect(folder: str | Path) -> EnvironmentState:
+    """The state of the environment in `folder`, from a few files; cheap enough for every redraw."""
+    folder = Path(folder)
+    python = layout.environment_python(folder)
+    try:
+        ours = layout.is_ours(folder)
+    except OSError as error:
+        return EnvironmentState("broken", None, f"{folder} cannot be read ({error.strerror}); check its permissions.")
+    if not ours:
+        return EnvironmentState("broken", None, f"{folder} contains files that are not ObjectGS's; move them away.")
+    if not (folder / layout.STAMP).is_file():
+        return EnvironmentState("absent", None, f"The compute backend is not set up; {_AGAIN}.")
+    try:
+        ready = _ready(folder / layout.MARKER, (folder / layout.MARKER).stat().st_mtime_ns)
+    except OSError:
+        return EnvironmentState("incomplete", None, f"The set-up of the compute backend is not complete; {_AGAIN}.")
+    if ready is None:
+        return EnvironmentState("broken", None, f"{folder / layout.MARKER} cannot be read; {_AGAIN} again.")
+    # The environment's Python is a link to its base or, on Windows, a small program that starts it.
+    if not python.exists() or not Path(ready["base"]).exists():
+        gone = ready["base"] if python.is_symlink() or python.exists() else python
+        return EnvironmentState("broken", None, f"The backend's Python {gone} is missing; {_AGAIN} again.")
+    if ready["requirements"] != _wanted(ready["device"]):
+        return EnvironmentState(
+            "outdated", None, f"The compute backend was set up for another version of ObjectGS; {_AGAIN} again."
+        )
+    found = f"Python {ready['python']}, PyTorch {ready['packages'].get('torch', '?')}"
+    return EnvironmentState("ready", python, f"The compute backend is ready: {found}.")
+
+
+@functools.lru_cache(4)
+def _ready(path: Path, _changed: int) -> dict[str, Any] | None:
+    """The content of the marker, cached until its file changes; None if it is not valid."""
+    try:
+        ready = json.loads(path.read_text(encoding="utf-8"))
+        shape = {"python": str, "base": str, "requirements": str, "packages": dict, "device": str}
+        return ready if all(isinstance(ready[name], kind) for name, kind in shape.items()) else None
+    except (ValueError, KeyError, TypeError):
+        return None
+
+
+@functools.lru_cache(2)
+def _wanted(device: str) -> str:
+    """The digest of this extension's requirements for a device."""
+    return layout.requirements_digest(REQUIREMENTS, device)
+
+
+def cache_folder(folder: str | Path) -> Path:
+    """The folder of compiled kernels, next to the environment's folder, so that it outlives the environment."""
+    return Path(folder).parent / "cache"
+
+
+def set_up_job(base_python: str | Path, folder: str | Path, device: str) -> Job:
+    """A job that makes the environment in `folder` for `device` (cpu or cuda), replacing an earlier one."""
+    return _job("Set up backend", "setup", base_python, folder, "setup", "--folder", str(folder), "--device", device)
+
+
+def probe_job(python: str | Path, folder: str | Path) -> Job:
+    """A job that checks whether a Python has the packages of the backend, and runs the backend with it.
+
+    folder: that of the environment, which identifies the job and need not exist.
+    """
+    return _job("Check backend", "doctor", python, folder, "probe")
+
+
+def _job(title: str, kind: str, python: str | Path, folder: str | Path, *arguments: str) -> Job:
+    silent = (
+        f"{python} is not a Python, or it is older than {layout.OLDEST[0]}.{layout.OLDEST[1]}; choose a Python "
+        f"{layout.VERSIONS}."
+    )
+    return Job(
+        title=title,
+        kind=kind,
+        folder=Path(folder),
+        cwd=ROOT,
+        if_silent=silent,
+        command=[str(python), str(WORKER), *arguments, "--requirements", str(REQUIREMENTS)],
+        environment=backend_environment(cache_folder(folder)),
+    )
+
+
+def remove(folder: str | Path) -> None:
+    """Remove the environment: the folder at once, its many files in the background.
+
+    Raises:
+        OSError: it is in use, or contains files that the set-up did not make.
+    """
+    folder = Path(folder)
+    if not os.path.lexists(folder):
+        return
+    own = {layout.STAMP, layout.MARKER, layout.MARKER + ".part", layout.VENV, layout.TEMPORARY}
+    if not layout.is_ours(folder) or not own.issuperset(path.name for path in folder.iterdir()):
+        raise OSError(errno.ENOTEMPTY, "it contains files that are not ObjectGS's", str(folder))
+    away = folder.with_name(f"{folder.name}{layout.REMOVED}{os.getpid()}-{next(_removed)}")
+    folder.rename(away)
+    threading.Thread(target=_finish_removing, args=(away,), daemon=True).start()
+
+
+def _finish_removing(folder: Path) -> None:
+    # The stamp stays with what cannot be removed, and the next set-up removes both.
+    with contextlib.suppress(OSError):
+        layout.remove_own(folder)

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Locations of the user's folders and of the backend's Python."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..process.backend_process import backend_command, backend_environment
+from ..process.jobs import Job
+from . import environment
+from .extension import PACKAGE, ROOT
+from .worker.layout import VERSIONS
+
+
+def preferences() -> Any:
+    """The preferences of the extension, or None without a window, where it is not enabled."""
+    addon = bpy.context.preferences.addons.get(PACKAGE)
+    return addon.preferences if addon else None
+
+
+def user_folder() -> Path:
+    """The folder for files that outlive updates of the extension, created if needed."""
+    if PACKAGE.startswith("bl_ext."):
+        return Path(bpy.utils.extension_path_user(PACKAGE, create=True))
+    return Path(bpy.utils.user_resource("DATAFILES", path="objectgs", create=True))
+
+
+def environment_folder() -> Path:
+    """The folder of the backend's environment."""
+    return user_folder() / "environment"
+
+
+def reconstructions_folder() -> Path:
+    """The default folder of new reconstructions."""
+    chosen = preferences().reconstructions if preferences() else ""
+    return Path(bpy.path.abspath(chosen)) if chosen else user_folder() / "reconstructions"
+
+
+def new_reconstruction(name: str, is_free: Callable[[Path], bool]) -> Path:
+    """A folder for a reconstruction of this name, numbered until `is_free` is true."""
+    name = re.sub(r"[^\w.-]+", "_", name) or "capture"
+    numbered = (name if number == 1 else f"{name}-{number}" for number in itertools.count(1))
+    return next(folder for each in numbered if is_free(folder := reconstructions_folder() / each))
+
+
+def backend_python() -> Path | None:
+    """The Python of the backend: the user's choice, or that of the environment; None without either."""
+    chosen = _chosen_python()
+    if chosen is not None:
+        return chosen if chosen.is_file() else None
+    state = environment.inspect(environment_folder())
+    return state.python if state.state == "ready" else None
+
+
+def backend_sentence() -> str:
+    """A sentence about the backend: its location, or why it cannot be run and what to do."""
+    chosen = _chosen_python()
+    if chosen is None:
+        return environment.inspect(environment_folder()).sentence
+    if chosen.is_file():
+        return f"The backend is at {chosen}."
+    return f"The backend's Python {chosen} does not exist; choose another, or clear the field."
+
+
+def _chosen_python() -> Path | None:
+    """The Python that the user has chosen, whether it exists or not."""
+    chosen = os.environ.get("OBJECTGS_PYTHON") or (preferences().backend_python if preferences() else "")
+    return Path(bpy.path.abspath(chosen)) if chosen else None
+
+
+def base_python() -> Path:
+    """The Python for new environments: the user's choice, or Blender's own."""
+    chosen = preferences().base_python if preferences() else ""
+    return Path(bpy.path.abspath(chosen)) if chosen else Path(sys.executable)
+
+
+def backend_job(title: str, kind: str, folder: Path | None, *arguments: str) -> Job:
+    """A job that runs `python -m backend ARGUMENTS --json`; `backend_python` must not be None.
+
+    Args:
+        title: name for the user.
+        kind: as of `Job`.
+        folder: the reconstruction folder, or None.
+        arguments: command and options of the backend.
+    """
+    python = backend_python()
+    assert python is not None
+    silent = f"{python} cannot run the backend; choose a Python {VERSIONS} that has its packages, or set it up again."
+    cache = os.environ.get("NUMBA_CACHE_DIR") or user_folder() / "cache"
+    return Job(
+        title=title,
+        kind=kind,
+        folder=folder,
+        command=backend_command(python, *arguments),
+        cwd=ROOT,
+        environment=backend_environment(cache),
+        if_silent=silent,
+    )
+
+
+def demo_folder() -> Path:
+    """The folder of the demo capture."""
+    return user_folder() / "demo-capture"
+
+
+def demo_job() -> Job:
+    """A job that renders the demo capture in another Blender without a window."""
+    script = [str(ROOT / "headless.py"), "--", "demo", str(demo_folder()), "--json"]
+    return Job(
+        title="Make demo capture",
+        kind="demo",
+        folder=demo_folder(),
+        command=[bpy.app.binary_path, "--background", "--factory-startup", "--python", *script],
+        cwd=ROOT,
+        environment={},
+    )

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Checks of a Python, of the free disk space, and of the backend itself."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import json
+import platform
+import shutil
+import struct
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from . import layout
+from .events import Progress, Refused, emit, print_error
+from .programs import run
+
+GIGABYTES = {"cpu": 2.5, "cuda": 9.0}
+"""Free disk space that the set-up needs for the packages and their wheels."""
+
+
+def check_python() -> None:
+    """Refuse a Python that the packages of the backend do not support."""
+    if not layout.OLDEST <= sys.version_info[:2] <= layout.NEWEST:
+        raise Refused(
+            f"{sys.executable} is Python {platform.python_version()}, and the backend needs {layout.VERSIONS}; "
+            "choose such a Python, from python.org or your system's packages."
+        )
+    if struct.calcsize("P") != 8:
+        raise Refused(f"{sys.executable} is a 32-bit Python, and the backend needs a 64-bit one; choose another.")
+
+
+def check_can_make_environments() -> None:
+    """Refuse a Python that cannot make environments, as some systems package it."""
+    try:
+        import ensurepip  # noqa: F401
+        import venv  # noqa: F401
+    except ImportError as error:
+        package = f"python{sys.version_info[0]}.{sys.version_info[1]}-venv"
+        raise Refused(
+            f"{sys.executable} cannot make environments, since its module {error.name} is missing; install "
+            f"it (on Debian and Ubuntu the package {package}) or choose another Python."
+        ) from error
+
+
+def check_space(folder: Path, device: str) -> None:
+    """Refuse a folder on a disk with too little free space."""
+    existing = next(parent for parent in (folder, *folder.parents) if parent.is_dir())
+    free, needed = shutil.disk_usage(existing).free / 1e9, GIGABYTES[device]
+    if free < needed:
+        raise Refused(
+            f"The backend needs about {needed:g} GB and the disk of {existing} has {free:.1f} GB free; make "
+            "room and try again."
+        )
+
+
+def check_backend(python: Path, progress: Progress, stop: Callable[[], bool]) -> dict[str, Any]:
+    """Run the backend on a tiny scene (`doctor`), which also compiles its kernels; returns its last event."""
+    output = _DoctorOutput(progress)
+    code = run([str(python), "-m", "backend", "doctor", "--json"], stop, output.take, first=b"attached\n")
+    if code != 0:
+        how = f"signal {-code}" if code < 0 else f"exit code {code}"
+        raise Refused(
+            f"The packages are installed, but the backend does not work with them ({how}): "
+            f"{output.last_message.rstrip('.')}."
+        )
+    return output.result
+
+
+class _DoctorOutput:
+    """Turns the events of `doctor` into the worker's own."""
+
+    def __init__(self, progress: Progress) -> None:
+        self.progress = progress
+        self.result: dict[str, Any] = {}
+        self.last_message = "it said nothing"
+        self._is_compiled = False
+        self._fraction = 0.0
+
+    def take(self, line: str) -> None:
+        """Take a line of output."""
+        try:
+            event = json.loads(line)
+        except ValueError:
+            event = None
+        if not isinstance(event, dict):
+            print_error(line)
+            self.last_message = line
+            return
+        kind, message = event.get("type"), str(event.get("message", ""))
+        if kind == "status":
+            self.progress.status(message)
+        elif kind == "progress" and event.get("total"):
+            fraction = event["done"] / event["total"]
+            # It compiles, which takes most of the time, and then trains with a progress from 0 again.
+            self._is_compiled = self._is_compiled or fraction < self._fraction
+            self._fraction = fraction
+            self.progress.at(0.8 + 0.2 * fraction if self._is_compiled else 0.8 * fraction)
+        elif kind == "warning":
+            emit("warning", message=message)
+        elif kind == "error":
+            self.last_message = message
+        elif kind == "done":
+            self.result = event
+
+
+def probe(options: argparse.Namespace, stop: Callable[[], bool]) -> None:
+    """Check whether this Python has the packages of the backend, then run the backend with it."""
+    check_python()
+    missing, warnings = [], []
+    for name in layout.REQUIREMENTS:
+        for line in layout.requirement_lines(options.requirements / name):
+            package, _, wanted = line.partition("==")
+            try:
+                found = importlib.metadata.version(package)
+            except importlib.metadata.PackageNotFoundError:
+                missing.append(package)
+                continue
+            if found.partition("+")[0] != wanted:
+                warnings.append(f"{package} is version {found}; ObjectGS was tested with {wanted}.")
+    if missing:
+        files = " ".join(f'-r "{options.requirements / name}"' for name in layout.REQUIREMENTS)
+        raise Refused(
+            f"{sys.executable} lacks {' and '.join(filter(None, [', '.join(missing[:-1]), missing[-1]]))}; "
+            f"install them (pip install {files}) or choose another Python."
+        )
+    for warning in warnings:
+        emit("warning", message=warning)
+    progress = Progress({"check": 60})
+    progress.begin("check", "Checking the backend")
+    checked = check_backend(Path(sys.executable), progress, stop)
+    emit("done", message=checked.get("message", "The backend works."), machine=checked.get("machine", {}))

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The command line of the worker."""
+
+from __future__ import annotations
+
+import argparse
+import traceback
+from pathlib import Path
+
+from .checks import probe
+from .events import Refused, Stopped, StopRequest, emit
+from .setup import set_up
+
+
+def main() -> int:
+    """Run the command line; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="worker", description="Make or check the environment of ObjectGS's backend.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    setup = commands.add_parser("setup", help="make an environment")
+    setup.add_argument("--folder", type=Path, required=True, help="its folder: new, empty or an earlier environment")
+    setup.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    check = commands.add_parser("probe", help="check this Python")
+    for command in (setup, check):
+        command.add_argument("--requirements", type=Path, required=True, help="folder of torch.txt and backend.txt")
+    options = parser.parse_args()
+    try:
+        {"setup": set_up, "probe": probe}[options.command](options, StopRequest())
+        return 0
+    except Refused as refusal:
+        emit("error", message=str(refusal))
+        return 2
+    except Stopped:
+        what = "nothing of the environment is kept" if options.command == "setup" else "nothing was changed"
+        emit("done", stopped=True, message=f"Stopped; {what}.")
+        return 130
+    except OSError as error:
+        emit(
+            "error",
+            message=f"{error.filename or 'A file'} cannot be used ({error.strerror or error}); free it, or "
+            "make room, and try again.",
+        )
+        return 2
+    except Exception as error:
+        traceback.print_exc()
+        emit("error", message=f"An unexpected failure: {type(error).__name__}: {' '.join(str(error).split())}")
+        return 1

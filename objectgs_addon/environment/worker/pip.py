@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Installation of packages with pip, with progress and plain error messages."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from .events import Progress, Refused, emit, print_error
+from .layout import TEMPORARY, VENV, environment_python
+from .programs import guarded, run
+
+WHEELS = "https://download.pytorch.org/whl/"
+PROBE_SECONDS = 8
+
+
+class Pip:
+    """pip of the environment in `folder`."""
+
+    def __init__(self, folder: Path, progress: Progress, stop: Callable[[], bool]) -> None:
+        self.folder, self.progress, self.stop = folder, progress, stop
+        self.temporary = folder / TEMPORARY
+        self.temporary.mkdir()
+        self.lines: list[str] = []
+
+    @property
+    def packages(self) -> dict[str, str]:
+        """Names and versions of the installed packages."""
+        return {
+            found.metadata["Name"].lower(): found.version
+            for found in importlib.metadata.distributions(path=[str(self.site)])
+        }
+
+    @property
+    def site(self) -> Path:
+        """The folder of installed packages."""
+        version = f"python{sys.version_info[0]}.{sys.version_info[1]}"
+        return self.folder / VENV / ("Lib" if os.name == "nt" else f"lib/{version}") / "site-packages"
+
+    def install(self, arguments: list[str], megabytes: float) -> None:
+        """`pip install`, wheels only, with the user's own settings of pip.
+
+        Args:
+            arguments: of `pip install`.
+            megabytes: expected size of the downloads, for the progress.
+
+        Raises:
+            Refused: pip failed.
+        """
+        self._downloaded, self._file, self._file_size = 0.0, "", 0.0
+        self._installing: list[str] = []
+        self._before = len(self._installed())
+        command = ["install", "--no-input", "--progress-bar", "off", "--only-binary", ":all:", *arguments]
+        if self._run(command, lambda: self._tick(megabytes)) != 0:
+            raise Refused(why_pip_failed(self.lines))
+
+    def offers(self, requirement: str, build: str, index: str | None = None) -> bool:
+        """Whether the user's indexes, or `index`, have this build; an unreachable index costs a few seconds."""
+        name, _, version = requirement.partition("==")
+        where = ["--index-url", index] if index else []
+        self._run(["index", "versions", name, *where, "--retries", "0", "--timeout", str(PROBE_SECONDS)])
+        return any(re.search(rf"\b{re.escape(version)}\+{build}", line) for line in self.lines)
+
+    def _run(self, arguments: list[str], on_tick: Callable[[], None] = lambda: None) -> int:
+        self.lines = []
+        # Temporary files can be larger than /tmp; and `user = true` in pip's settings excludes environments.
+        folder = str(self.temporary)
+        environment = {
+            "TMPDIR": folder,
+            "TEMP": folder,
+            "TMP": folder,
+            "PIP_USER": "0",
+            "PIP_DISABLE_PIP_VERSION_CHECK": "1",
+        }
+        return run(
+            guarded(environment_python(self.folder), "pip", *arguments), self.stop, self._line, on_tick, environment
+        )
+
+    def _line(self, line: str) -> None:
+        print_error(line)
+        self.lines.append(line)
+        words = line.split()
+        size = re.search(r"\(([\d.]+) ([kMG])B\)$", line)
+        if words[0] == "Collecting":
+            self.progress.status(f"Resolving {re.split('[^A-Za-z0-9._-]', words[1])[0]}")
+        elif line.lstrip().startswith(("Downloading ", "Using cached ")) and size and ".metadata" not in line:
+            self._downloaded += self._file_size
+            self._file = next(word for word in words if word.endswith(".whl")).rsplit("/", 1)[-1]
+            self._file_size = float(size[1]) * {"k": 1e-3, "M": 1, "G": 1e3}[size[2]]
+            if words[0] == "Downloading":
+                self.progress.status(f"Downloading {self._file.split('-')[0]} ({size[1]} {size[2]}B)")
+        elif line.startswith("Installing collected packages: "):
+            self._installing = line.partition(": ")[2].split(", ")
+            self.progress.status(f"Installing {len(self._installing)} packages")
+
+    def _tick(self, megabytes: float) -> None:
+        """Update the progress from files, since pip does not report it: two thirds download, one third unpacking."""
+        if self._installing:
+            fraction = (len(self._installed()) - self._before) / len(self._installing)
+            self.progress.at((2 + fraction) / 3)
+        elif self._file:
+            received = max((path.stat().st_size for path in self._partial()), default=0) / 1e6
+            self.progress.at(min((self._downloaded + min(received, self._file_size)) / megabytes, 1.0) * 2 / 3)
+
+    def _partial(self) -> list[Path]:
+        return [path for path in self.temporary.rglob(self._file) if path.is_file()]
+
+    def _installed(self) -> list[Path]:
+        return [path for path in self.site.iterdir() if path.name.endswith(".dist-info")]
+
+
+def why_pip_failed(lines: list[str]) -> str:
+    """The failure of pip in one sentence."""
+    text = "\n".join(lines)
+    lacking = re.search(r"No matching distribution found for (\S+)", text)
+    unreached = re.search(r"Retrying \(|Could not fetch URL|connection error|Connection to \S+ timed out", text)
+    if "No space left on device" in text or "not enough space on the disk" in text:
+        return "The disk is full; make room and set the backend up again."
+    if (lacking and unreached) or "ReadTimeoutError" in text or "ConnectionResetError" in text:
+        return (
+            "Python's package index could not be reached; check the network connection (or pip's proxy or "
+            "mirror settings) and set the backend up again."
+        )
+    if lacking:
+        system = f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"
+        return f"There is no ready-made package {lacking[1]} for this computer ({system})."
+    if "Windows Long Path" in text:
+        return (
+            "Windows refuses paths as long as the packages need; allow long paths in Windows "
+            "(LongPathsEnabled) and set the backend up again."
+        )
+    if "DO NOT MATCH THE HASHES" in text:
+        return "A package was damaged in the download; set the backend up again."
+    errors = [line for line in lines if line.startswith("ERROR: ")] or lines or ["it said nothing"]
+    return f"The packages could not be installed: {errors[-1].replace('ERROR: ', '', 1).rstrip('.')}."
+
+
+def torch_options(pip: Pip, torch: str, device: str) -> list[str]:
+    """pip's options for the matching build of PyTorch; the usual index has CUDA's on Linux and the CPU's on Windows."""
+    build = {("Linux", "cpu"): "cpu", ("Windows", "cuda"): "cu130"}.get((platform.system(), device))
+    if build is None or pip.offers(torch, build):
+        return []
+    if pip.offers(torch, build, WHEELS + build):
+        return ["--extra-index-url", WHEELS + build]
+    if device == "cuda":
+        emit(
+            "warning",
+            message="PyTorch's builds for NVIDIA GPUs could not be reached, so the one for processors is "
+            "installed; set the backend up again when they can be reached.",
+        )
+    return []
+
+
+def brings_cuda(pip: Pip) -> bool:
+    """Whether the installed PyTorch needs the packages of CUDA on this system."""
+    wanted = next(iter(importlib.metadata.distributions(name="torch", path=[str(pip.site)]))).requires or []
+    return platform.system() == "Linux" and any(line.startswith("nvidia-") for line in wanted)

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Programs that the worker runs."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import signal
+import subprocess
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from .events import Stopped
+
+# The end of the input means that the parent is gone; then the program ends as well.
+_GUARDED = """\
+import os, runpy, sys, threading
+def watch():
+    while os.read(0, 1024):
+        pass
+    os._exit(1)
+threading.Thread(target=watch, daemon=True).start()
+del sys.argv[0]
+runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
+"""
+
+
+def guarded(python: Path, module: str, *arguments: str) -> list[str]:
+    """The command line of a module that ends with this process and ignores environment variables and user folders."""
+    return [str(python), "-I", "-u", "-X", "utf8", "-c", _GUARDED, module, *arguments]
+
+
+def run(
+    command: list[str],
+    stop: Callable[[], bool],
+    on_line: Callable[[str], None],
+    on_tick: Callable[[], None] = lambda: None,
+    environment: dict[str, str] | None = None,
+    first: bytes = b"",
+) -> int:
+    """Run a program to its end.
+
+    Args:
+        command: program and arguments.
+        stop: whether to stop.
+        on_line: takes each line of its output and errors.
+        on_tick: called several times a second.
+        environment: additional environment variables.
+        first: first input of the program.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        Stopped: `stop` was true; the program was ended.
+    """
+    # A group, so that a stop reaches its children as well; Windows ends those with their parent.
+    options: dict[str, Any] = {} if os.name == "nt" else {"process_group": 0}
+    child = subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        env={**os.environ, **(environment or {})},
+        **options,
+    )
+    assert child.stdin is not None and child.stdout is not None
+    lines: queue.Queue[str | None] = queue.Queue()
+    threading.Thread(target=_read_lines, args=(child.stdout, lines), daemon=True).start()
+    try:
+        child.stdin.write(first)
+        child.stdin.flush()
+        while True:
+            if stop():
+                raise Stopped
+            try:
+                line = lines.get(timeout=0.2)
+            except queue.Empty:
+                line = ""
+            if line is None:
+                return child.wait()
+            if line:
+                on_line(line)
+            on_tick()
+    finally:
+        if child.poll() is None:
+            child.kill() if os.name == "nt" else os.killpg(child.pid, signal.SIGKILL)
+            child.wait()
+        with contextlib.suppress(OSError):
+            child.stdin.close()
+
+
+def _read_lines(stream: Any, lines: queue.Queue[str | None]) -> None:
+    """Put the lines of a pipe into a queue, and None at its end."""
+    with stream:
+        for line in stream:
+            lines.put(line.decode("utf-8", errors="replace").rstrip())
+    lines.put(None)

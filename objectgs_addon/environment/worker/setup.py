@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Set-up of an environment."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import errno
+import json
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+from . import layout
+from .checks import GIGABYTES, check_backend, check_can_make_environments, check_python, check_space
+from .events import Progress, Refused, Stopped, emit, print_error
+from .pip import Pip, brings_cuda, torch_options
+from .programs import guarded, run
+
+MEGABYTES = {"cpu": 180, "cuda": 2500}
+"""Size of the downloads besides torch, for the progress."""
+
+_STAMP_TEXT = "ObjectGS for Blender keeps the Python packages of its backend here; its preferences remove them.\n"
+
+
+def set_up(options: argparse.Namespace, stop: Callable[[], bool]) -> None:
+    """Make the environment in `options.folder`, or leave nothing of it on failure."""
+    folder, device = options.folder.absolute(), options.device
+    check_python()
+    check_can_make_environments()
+    check_space(folder, device)
+    torch = layout.requirement_lines(options.requirements / "torch.txt")[0]
+    digest = layout.requirements_digest(options.requirements, device)
+    progress = Progress({"venv": 5, "torch": 60, "packages": 60 if device == "cpu" else 300, "check": 60})
+    with claimed(folder), layout.short_path(folder) as short:
+        progress.begin("venv", "Making an environment")
+        if run(guarded(Path(sys.executable), "venv", str(short / layout.VENV)), stop, print_error) != 0:
+            raise Refused(f"{sys.executable} could not make an environment in {folder}; choose another Python.")
+        pip = Pip(short, progress, stop)
+        progress.begin("torch", "Resolving PyTorch")
+        pip.install(["--no-deps", *torch_options(pip, torch, device), torch], megabytes=500)
+        installed = device
+        if device == "cpu" and brings_cuda(pip):
+            installed = "cuda"
+            emit(
+                "warning",
+                message="PyTorch's builds for processors could not be reached, so its build for NVIDIA GPUs "
+                f"is installed, which also works without one but takes about {GIGABYTES['cuda']:g} GB.",
+            )
+            check_space(folder, "cuda")
+        progress.begin("packages", "Resolving the other packages")
+        files = layout.requirement_files(options.requirements, device)
+        pip.install([argument for path in files for argument in ("-r", str(path))], MEGABYTES[installed])
+        progress.begin("check", "Checking the backend")
+        checked = check_backend(layout.environment_python(folder), progress, stop)
+        shutil.rmtree(pip.temporary)
+        ready = {
+            "python": platform.python_version(),
+            "base": getattr(sys, "_base_executable", None) or sys.executable,
+            "device": device,
+            "requirements": digest,
+            "packages": pip.packages,
+            "machine": checked.get("machine", {}),
+        }
+        _write_marker(folder, ready, stop)
+    emit("done", message=checked.get("message", "The backend works."), machine=ready["machine"], folder=str(folder))
+
+
+def _write_marker(folder: Path, ready: dict[str, Any], stop: Callable[[], bool]) -> None:
+    part = folder / (layout.MARKER + ".part")
+    with part.open("w", encoding="utf-8") as file:
+        json.dump(ready, file, indent=1)
+        file.flush()
+        os.fsync(file.fileno())
+    if stop():
+        raise Stopped
+    part.replace(folder / layout.MARKER)
+
+
+@contextlib.contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Lock `folder` for this process, with nothing but the stamp in it; on any exception it is removed.
+
+    Raises:
+        Refused: the folder is not ours, or another process uses it.
+    """
+    if not layout.is_ours(folder):
+        raise Refused(f"{folder} is not empty and was not made by ObjectGS, so it is not used; move it away.")
+    for old in folder.parent.glob(folder.name + layout.REMOVED + "*"):
+        if layout.is_ours(old):
+            layout.remove_own(old)
+    folder.mkdir(parents=True, exist_ok=True)
+    with contextlib.ExitStack() as opened:
+        stamp = opened.enter_context((folder / layout.STAMP).open("a+", encoding="utf-8"))
+        if not _lock(stamp):
+            raise Refused(f"Another Blender is setting up the backend in {folder}; wait for it.")
+        (folder / layout.MARKER).unlink(missing_ok=True)
+        try:
+            for name in (layout.VENV, layout.TEMPORARY):
+                if (folder / name).is_dir():
+                    emit("status", message="Removing the previous environment")
+                    shutil.rmtree(layout.long_path(folder / name))
+            stamp.truncate(0)
+            stamp.write(_STAMP_TEXT)
+            stamp.flush()
+            yield
+        except BaseException:
+            # Windows does not remove open files.
+            opened.close()
+            layout.remove_own(folder)
+            raise
+
+
+def _lock(file: IO[str]) -> bool:
+    """Lock an open file until it is closed or this process ends; returns False if another process has it."""
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        # Some network folders have no locks; there, two set-ups at once are not detected.
+        return error.errno not in (errno.EACCES, errno.EAGAIN, errno.EDEADLK)
+    return True

@@ -1,0 +1,339 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A scene's camera and the objects of a reconstruction over time, as a shot in the capture's coordinates.
+
+A shot contains what Blender would render: the splats of every object whose collections, pivot and parts are not hidden
+in renders. The reconstruction's own collection may be hidden, since the compositor combines film frames with Blender's
+rendering without it. An object that is not moved in Blender keeps its transform from objects.json.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ...backend.shared.errors import InputError
+from ...backend.shared.reconstruction.shot import Frame, Placed, Sample, Shot
+from ..scene.capture import origin_of
+from ..scene.kinds import MESH, OBJECT_PARENT, SPLATS, kind_of, object_id_of, parent_of, part_of
+from ..scene.object_collection import center_of
+
+TOLERANCE = 2e-6
+"""Tolerance, relative to the size of the scene, below which an object counts as not moved; Blender stores float32."""
+
+_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
+_UNSUPPORTED = {"ORTHO": "orthographic", "PANO": "panoramic"}
+
+
+def shot_of(
+    scene: bpy.types.Scene,
+    view_layer: bpy.types.ViewLayer,
+    root: bpy.types.Collection,
+    frames: Sequence[int],
+    samples: int = 1,
+    progress: Callable[[int, int], object] = lambda *_: None,
+) -> Shot:
+    """Sample the scene's frames as a shot of a reconstruction; the scene's current frame is restored.
+
+    Args:
+        scene: its camera, resolution and motion blur are used.
+        view_layer: its visibility of collections is used.
+        root: the reconstruction's collection.
+        frames: frame numbers, ascending.
+        samples: sub-frames per frame while the shutter is open; 1: the frame's own time.
+        progress: called with (done, total) after every frame.
+
+    Raises:
+        InputError: the scene has no camera, or one through which splats cannot be drawn.
+    """
+    if parent_of(root) is None:
+        raise InputError(f"{root.name} has lost the empty that moves it; run Import again.")
+    if not frames or frames[0] < 0:
+        raise InputError(
+            "The first frame is below 0, but files in a sequence cannot have negative numbers; move the shot."
+        )
+    instances = _instances_of(scene, view_layer, root)
+    before = scene.frame_current, scene.frame_subframe
+    made, scale = [], None
+    try:
+        with _evaluated_pivots(view_layer, instances):
+            for done, number in enumerate(frames, 1):
+                taken = []
+                for time in _times(scene, number, samples):
+                    whole = math.floor(time)
+                    scene.frame_set(whole, subframe=time - whole)
+                    frame = _RootTransform.of(root, scale)
+                    scale = frame.scale
+                    taken.append(_sample(scene, view_layer, instances, frame, time))
+                made.append(Frame(number, _shutter(scene, number, samples), taken))
+                progress(done, len(frames))
+    finally:
+        scene.frame_set(before[0], subframe=before[1])
+    _reset_unmoved([sample for frame in made for sample in frame.samples])
+    width, height = _size(scene)
+    aspect = scene.render.pixel_aspect_x / scene.render.pixel_aspect_y
+    return Shot(width, height, made, pixel_aspect=aspect, depth_scale=scale, only_named=True)
+
+
+@dataclass(frozen=True)
+class _RootTransform:
+    """The similarity transform of a reconstruction, without stretching or shearing by its parent:
+
+    world = scale * rotation @ (capture - origin) + shift.
+    """
+
+    origin: np.ndarray
+    rotation: np.ndarray
+    scale: float
+    shift: np.ndarray
+
+    @classmethod
+    def of(cls, root: bpy.types.Collection, scale: float | None) -> _RootTransform:
+        """The transform now; scale: of the whole shot, since depth is in its unit, or None: the parent's."""
+        world = np.array(_world_of(parent_of(root)), np.float64)
+        left, stretches, right = np.linalg.svd(world[:3, :3])
+        if stretches[2] <= 1e-12 * stretches[0]:
+            raise InputError(f"{root.name} is scaled to nothing by its parent; give it a size again.")
+        left[:, 2] *= np.sign(np.linalg.det(left @ right))
+        return cls(origin_of(root), left @ right, scale or float(np.cbrt(stretches.prod())), world[:3, 3])
+
+    def map_from(self, world: np.ndarray, center: np.ndarray) -> np.ndarray:
+        """The transform of an object, in the capture's coordinates, that its world matrix amounts to.
+
+        Args:
+            world: (4, 4) matrix of the object in the world.
+            center: (3,) origin of its vertices, in the reconstruction's coordinates.
+
+        Returns:
+            (4, 4), exactly the identity if the object is not moved.
+        """
+        linear = self.rotation.T @ world[:3, :3] / self.scale
+        shift = self.rotation.T @ (world[:3, 3] - self.shift) / self.scale - linear @ center
+        size = np.abs([*center, *self.shift / self.scale]).max() + 1e-30
+        rotated = np.abs(linear - np.eye(3)).max() > TOLERANCE
+        moved = np.abs(linear @ center + shift - center).max() > TOLERANCE * size
+        found = np.eye(4)
+        if rotated or moved:
+            found[:3, :3], found[:3, 3] = linear, shift + self.origin - linear @ self.origin
+        return found
+
+    def viewmat(self, camera: np.ndarray) -> np.ndarray:
+        """(4, 4) from the capture's coordinates to OpenCV camera coordinates; camera: its unscaled world matrix."""
+        to_camera = _TO_OPENCV @ camera[:3, :3].T
+        found = np.eye(4)
+        found[:3, :3] = to_camera @ self.rotation
+        found[:3, 3] = to_camera @ ((self.shift - camera[:3, 3]) / self.scale) - found[:3, :3] @ self.origin
+        return found
+
+
+@dataclass(frozen=True)
+class _SplatsInstance:
+    """A carrier of splats in the scene, or an instance of it.
+
+    object_id: of its object; splats: the carrier; pivot: the empty that is the origin of its vertices; parts: the
+    carrier and the meshes of the same object, one of which must be shown; paths: layer collections from the top of the
+    view layer, one path of which must be shown; instancer: the empty that instances the carrier's collection, or None.
+    """
+
+    object_id: int
+    splats: bpy.types.Object
+    pivot: bpy.types.Object
+    parts: tuple
+    paths: tuple
+    instancer: bpy.types.Object | None = None
+
+    def is_seen(self) -> bool:
+        """Whether Blender renders it at the current frame, apart from the reconstruction's own collection."""
+        top = self.instancer or self.pivot
+        shown = any(not part.hide_render for part in self.parts)
+        return (
+            shown
+            and not top.hide_render
+            and any(
+                all(not layer.exclude and not layer.collection.hide_render for layer in path) for path in self.paths
+            )
+        )
+
+    def world(self) -> np.ndarray:
+        """(4, 4) float64: object to world at the current frame."""
+        world = _world_of(self.splats)
+        if self.instancer is not None:
+            offset = Matrix.Translation(-self.instancer.instance_collection.instance_offset)
+            world = _world_of(self.instancer) @ offset @ world
+        return np.array(world, np.float64)
+
+
+def _reset_unmoved(samples: Sequence[Sample]) -> None:
+    """Drop the transforms of objects that are not moved in any sample."""
+    here = np.eye(4)[None]
+    moving = {
+        object_id
+        for sample in samples
+        for object_id, placed in sample.objects.items()
+        if not np.array_equal(placed.maps, here)
+    }
+    for sample in samples:
+        for object_id in sample.objects.keys() - moving:
+            sample.objects[object_id] = Placed()
+
+
+def _instances_of(
+    scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, root: bpy.types.Collection
+) -> list[_SplatsInstance]:
+    paths = _paths(view_layer, root)
+    parent = parent_of(root)
+    ours = [obj for obj in scene.objects if kind_of(obj) == SPLATS and _is_below(obj, parent)]
+    found = [instance for obj in ours if (instance := _instance_of(obj, paths)) is not None]
+    for instancer in scene.objects:
+        if instancer.instance_type == "COLLECTION" and instancer.instance_collection is not None:
+            for obj in instancer.instance_collection.all_objects:
+                if kind_of(obj) == SPLATS and _is_below(obj, parent):
+                    found.append(_instance_of(obj, paths, instancer))
+    return [instance for instance in found if instance is not None]
+
+
+def _instance_of(obj: bpy.types.Object, paths: Any, instancer: Any = None) -> _SplatsInstance | None:
+    collections = list(obj.users_collection)
+    pivot = (
+        obj.parent
+        if kind_of(obj.parent) == OBJECT_PARENT
+        else next(
+            (pivot for collection in collections if (pivot := part_of(collection, OBJECT_PARENT)) is not None), None
+        )
+    )
+    object_id = object_id_of(obj)
+    if pivot is None or object_id is None:
+        return None
+    meshes = [part for part in pivot.children if kind_of(part) == MESH]
+    top = instancer or obj
+    of_top = [path for collection in top.users_collection for path in paths.get(collection, ())]
+    return _SplatsInstance(object_id, obj, pivot, (obj, *meshes), tuple(of_top), instancer)
+
+
+def _paths(view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -> dict:
+    """Collection -> its paths in a view layer: lists of layer collections from the top, without the root's."""
+    found: dict = {}
+
+    def walk(layer: Any, path: list) -> None:
+        if layer.collection != root:
+            path = [*path, layer]
+        found.setdefault(layer.collection, []).append(path)
+        for child in layer.children:
+            walk(child, path)
+
+    walk(view_layer.layer_collection, [])
+    return found
+
+
+def _is_below(obj: bpy.types.Object, parent: bpy.types.Object) -> bool:
+    while obj is not None and obj != parent:
+        obj = obj.parent
+    return obj is not None
+
+
+def _world_of(obj: bpy.types.Object) -> Matrix:
+    """An object's world matrix; if it is hidden, from its parent's, since Blender does not update hidden objects."""
+    if obj.visible_get() or obj.parent is None or obj.parent_type != "OBJECT":
+        return obj.matrix_world
+    return _world_of(obj.parent) @ obj.matrix_parent_inverse @ obj.matrix_basis
+
+
+@contextmanager
+def _evaluated_pivots(view_layer: bpy.types.ViewLayer, instances: Any) -> Iterator[None]:
+    """Temporarily show animated pivots in viewports, since Blender does not animate what is hidden there."""
+    inactive = {
+        instance.pivot: instance
+        for instance in instances
+        if (instance.pivot.animation_data or instance.pivot.constraints) and not instance.pivot.visible_get()
+    }
+    changed = []
+
+    def show(obj: bpy.types.Object) -> None:
+        changed.append((obj, obj.hide_viewport))
+        obj.hide_viewport = False
+
+    hidden = []
+    for pivot, instance in inactive.items():
+        for path in instance.paths:
+            for layer in path:
+                show(layer)
+                show(layer.collection)
+        show(pivot)
+        if pivot.hide_get(view_layer=view_layer):
+            hidden.append(pivot)
+            pivot.hide_set(False, view_layer=view_layer)
+    try:
+        yield
+    finally:
+        for pivot in hidden:
+            pivot.hide_set(True, view_layer=view_layer)
+        for obj, before in reversed(changed):
+            obj.hide_viewport = before
+
+
+def _sample(
+    scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, instances: Any, transform: _RootTransform, time: float
+) -> Sample:
+    objects: dict[int, list[np.ndarray]] = {}
+    for instance in instances:
+        if instance.is_seen():
+            objects.setdefault(instance.object_id, []).append(
+                transform.map_from(instance.world(), center_of(instance.pivot))
+            )
+    camera = scene.camera
+    if camera is None or camera.type != "CAMERA":
+        raise InputError(f"The scene {scene.name} has no camera at frame {time:g}; choose one.")
+    if camera.data.type != "PERSP":
+        kind = _UNSUPPORTED.get(camera.data.type, "special")
+        raise InputError(
+            f"{camera.name} is {kind}, but splats can be drawn only through perspective cameras; choose one."
+        )
+    matrix = np.array(_world_of(camera).normalized(), np.float64)
+    clip = camera.data.clip_start / transform.scale, camera.data.clip_end / transform.scale
+    placed = {object_id: Placed(maps=np.array(maps)) for object_id, maps in objects.items()}
+    return Sample(time, transform.viewmat(matrix), _intrinsics(scene, view_layer, camera), clip, placed)
+
+
+def _intrinsics(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, camera: bpy.types.Object) -> np.ndarray:
+    """K (3, 3) of the camera at the current frame, from Blender's own projection."""
+    width, height = _size(scene)
+    projection = camera.calc_matrix_camera(
+        view_layer.depsgraph,
+        x=width,
+        y=height,
+        scale_x=scene.render.pixel_aspect_x,
+        scale_y=scene.render.pixel_aspect_y,
+    )
+    found = np.eye(3)
+    found[0, 0], found[0, 2] = projection[0][0] * width / 2, (1 - projection[0][2]) * width / 2
+    found[1, 1], found[1, 2] = projection[1][1] * height / 2, (1 + projection[1][2]) * height / 2
+    return found
+
+
+def _size(scene: bpy.types.Scene) -> tuple[int, int]:
+    """Width and height of a render in pixels, rounded as Blender does."""
+    render = scene.render
+    return (
+        max(render.resolution_x * render.resolution_percentage // 100, 1),
+        max(render.resolution_y * render.resolution_percentage // 100, 1),
+    )
+
+
+def _shutter(scene: bpy.types.Scene, number: int, samples: int) -> tuple[float, float]:
+    """The times at which the shutter opens and closes, in frames."""
+    if samples == 1:
+        return float(number), float(number)
+    length = scene.render.motion_blur_shutter
+    opens = number - {"START": 0.0, "CENTER": 0.5, "END": 1.0}[scene.render.motion_blur_position] * length
+    return opens, opens + length
+
+
+def _times(scene: bpy.types.Scene, number: int, samples: int) -> list[float]:
+    opens, closes = _shutter(scene, number, samples)
+    return [opens + (closes - opens) * (index + 0.5) / samples for index in range(samples)]

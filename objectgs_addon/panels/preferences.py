@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The preferences of the extension: the compute backend, and the folder of reconstructions."""
+
+import bpy
+from bpy.props import EnumProperty, StringProperty
+
+from ..environment import locations
+from ..running import job_display, running
+
+
+class Preferences(bpy.types.AddonPreferences):
+    """Settings of the backend and of folders."""
+
+    bl_idname = locations.PACKAGE
+
+    device: EnumProperty(
+        name="Device",
+        default="cpu",
+        items=[
+            ("cpu", "CPU", "Works on every computer; 1.6 GB on disk"),
+            ("cuda", "NVIDIA GPU", "Also install the packages for NVIDIA graphics cards; several GB"),
+        ],
+    )
+    backend_python: StringProperty(
+        name="Backend Python",
+        subtype="FILE_PATH",
+        description="Python that has the packages of the backend. If empty, that of Set Up Backend is used",
+    )
+    base_python: StringProperty(
+        name="Base Python",
+        subtype="FILE_PATH",
+        description="Python 3.11 to 3.13 for new environments. If empty, Blender's own is used",
+    )
+    reconstructions: StringProperty(
+        name="Reconstructions",
+        subtype="DIR_PATH",
+        description="Default folder of reconstructions. If empty, they are saved in the user folder of the extension",
+    )
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        layout = self.layout
+        box = layout.box()
+        box.label(text="Compute Backend", icon="SYSTEM")
+        _draw_state(box)
+        row = box.row()
+        row.prop(self, "device", expand=True)
+        if not bpy.app.online_access:
+            box.label(text="Downloads need Preferences > System > Network > Allow Online Access", icon="INFO")
+        row = box.row()
+        row.operator("objectgs.set_up_backend", icon="IMPORT")
+        row.operator("objectgs.check_backend", icon="CHECKMARK")
+        row.operator("objectgs.remove_backend", icon="TRASH")
+        column = box.column()
+        column.use_property_split = True
+        column.prop(self, "backend_python")
+        column.prop(self, "base_python")
+        column = layout.column()
+        column.use_property_split = True
+        column.prop(self, "reconstructions")
+
+
+def _draw_state(layout: bpy.types.UILayout) -> None:
+    """Draw the state of the backend and of its set-up."""
+    job = running.queue.of_folder(locations.environment_folder())
+    if job is not None and not job.is_finished:
+        job_display.draw_running(layout, job, running.queue.jobs.index(job))
+        return
+    sentence, icon = backend_state()
+    job_display.write(layout, sentence, icon)
+    if job is not None:
+        job_display.draw_over(layout, job)
+
+
+def backend_state() -> tuple[str, str]:
+    """The state of the backend as a sentence and an icon."""
+    return locations.backend_sentence(), "CHECKMARK" if locations.backend_python() is not None else "ERROR"
+
+
+def register() -> None:
+    bpy.utils.register_class(Preferences)
+
+
+def unregister() -> None:
+    bpy.utils.unregister_class(Preferences)

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Which objects, shown as splats or meshes, are visible at a pixel or in a rectangle of a 3D viewport."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import bpy
+import numpy as np
+from bpy_extras.view3d_utils import region_2d_to_origin_3d, region_2d_to_vector_3d
+
+from ...backend.shared.splats.picking import PickObject, View, ids_in, pick
+from .. import drawing, scene
+from ..drawing.splat_arrays import arrays_of
+
+MIN_PROBABILITY = 0.1
+"""Minimum contribution of an object's splats to a pixel for the object to count as visible there."""
+
+_SEE_THROUGH = ("splats", "points", "anchors")
+_GRID = 12
+"""Number of sample points across and down a rectangle at which meshes are tested."""
+
+
+@dataclass(frozen=True)
+class Hit:
+    """What is visible: an object's collection, or a Blender object that belongs to none."""
+
+    collection: bpy.types.Collection | None
+    obj: bpy.types.Object | None
+
+    @property
+    def name(self) -> str:
+        return (self.collection or self.obj).name
+
+
+def object_at(context: bpy.types.Context, x: float, y: float) -> Hit | None:
+    """Find what the viewport of the context shows at a pixel.
+
+    Args:
+        context: of a 3D viewport.
+        x, y: pixels of its region from the lower left.
+
+    Returns:
+        The nearest splats or mesh, or None.
+    """
+    view = view_of(context)
+    collections, placed = _splats(context)
+    seen = pick(placed, view, x + 0.5, view.height - y - 0.5)
+    if seen is not None and seen.probability < MIN_PROBABILITY:
+        seen = None
+    obj, depth = _mesh_at(context, _meshes(context), view, x, y)
+    if obj is not None and (seen is None or depth < seen.depth):
+        collection = drawing.collections_by_part().get(obj)
+        return Hit(collection, None if collection else obj)
+    return None if seen is None else Hit(collections[seen.object_id], None)
+
+
+def objects_in(
+    context: bpy.types.Context, left: float, bottom: float, right: float, top: float
+) -> list[bpy.types.Collection]:
+    """The collections of the objects that are visible in a rectangle, in pixels of the region from the lower left."""
+    view = view_of(context)
+    collections, placed = _splats(context)
+    found = [collections[key] for key in ids_in(placed, view, (left, view.height - top, right, view.height - bottom))]
+    collections_by_part = drawing.collections_by_part()
+    meshes = _meshes(context)
+    if any(obj in collections_by_part for obj in meshes):
+        for x in np.linspace(left, right, _GRID):
+            for y in np.linspace(bottom, top, _GRID):
+                obj, _ = _mesh_at(context, meshes, view, x, y)
+                if obj in collections_by_part:
+                    found.append(collections_by_part[obj])
+    return list(dict.fromkeys(found))
+
+
+def view_of(context: bpy.types.Context) -> View:
+    """The view of the context's viewport."""
+    region, region_3d = context.region, context.region_data
+    return View.of_matrices(
+        np.array(region_3d.view_matrix), np.array(region_3d.window_matrix), region.width, region.height
+    )
+
+
+def _splats(context: bpy.types.Context) -> tuple[dict[int, bpy.types.Collection], list[PickObject]]:
+    """The collections of objects whose splats are shown, by session UID, and these splats."""
+    collections, placed = {}, []
+    collections_by_part = drawing.collections_by_part()
+    for part in drawing.splat_parts(context.view_layer, context.space_data):
+        collection, arrays = collections_by_part.get(part), arrays_of(part.data)
+        if collection is not None and arrays is not None and not part.hide_select:
+            collections[collection.session_uid] = collection
+            placed.append(PickObject(collection.session_uid, arrays.cloud, np.array(part.matrix_world)))
+    return collections, placed
+
+
+def _meshes(context: bpy.types.Context) -> list[bpy.types.Object]:
+    """The mesh objects that the viewport shows, without splats and points."""
+    return [
+        obj
+        for obj in context.view_layer.objects
+        if obj.type == "MESH"
+        and scene.kind_of(obj) not in _SEE_THROUGH
+        and not obj.hide_select
+        and drawing.shown(obj, context.view_layer, context.space_data)
+    ]
+
+
+def _mesh_at(
+    context: bpy.types.Context, meshes: Any, view: View, x: float, y: float
+) -> tuple[bpy.types.Object | None, float]:
+    """The nearest of the meshes at a pixel of the region, and its depth."""
+    region, region_3d = context.region, context.region_data
+    origin = region_2d_to_origin_3d(region, region_3d, (x, y))
+    along = region_2d_to_vector_3d(region, region_3d, (x, y))
+    depsgraph = context.evaluated_depsgraph_get()
+    best, nearest = None, np.inf
+    for obj in meshes:
+        shape = obj.evaluated_get(depsgraph)
+        inverse = shape.matrix_world.inverted_safe()
+        hit, place, _normal, _face = shape.ray_cast(inverse @ origin, (inverse.to_3x3() @ along).normalized())
+        if hit:
+            depth = float(view.viewmat[2] @ [*(shape.matrix_world @ place), 1.0])
+            if view.near < depth < nearest:
+                best, nearest = obj, depth
+    return best, nearest

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Picking points of a reconstruction with the mouse."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+import gpu
+import numpy as np
+from bpy_extras.view3d_utils import location_3d_to_region_2d
+from gpu_extras.batch import batch_for_shader
+
+from .. import scene
+
+REACH = 12.0
+"""Distance from the cursor, in pixels, within which a point can be picked."""
+
+
+class PointPicker:
+    """World positions of all visible vertices of a reconstruction, and the points picked so far."""
+
+    def __init__(self, root: bpy.types.Collection) -> None:
+        positions = [
+            _world_positions(part)
+            for collection in (root, *root.children_recursive)
+            for part in collection.objects
+            if scene.kind_of(part) in ("points", "splats", "mesh") and part.visible_get()
+        ]
+        self.positions = np.concatenate(positions) if positions else np.zeros((0, 3))
+        self.picked = []
+        self._handler = None
+
+    @property
+    def has_points(self) -> bool:
+        return len(self.positions) > 0
+
+    def begin(self, context: bpy.types.Context, text: str) -> None:
+        """Show a crosshair, the picked points and `text` in the status bar, until `end`."""
+        self._handler = bpy.types.SpaceView3D.draw_handler_add(self._draw, (), "WINDOW", "POST_PIXEL")
+        context.window.cursor_modal_set("CROSSHAIR")
+        self.show_status(context, text)
+
+    def show_status(self, context: bpy.types.Context, text: str) -> None:
+        """Show `text` in the status bar."""
+        context.workspace.status_text_set(text)
+        context.area.tag_redraw()
+
+    def end(self, context: bpy.types.Context) -> None:
+        """Restore the cursor and the status bar."""
+        bpy.types.SpaceView3D.draw_handler_remove(self._handler, "WINDOW")
+        context.window.cursor_modal_restore()
+        self.show_status(context, None)
+
+    def pick(self, context: bpy.types.Context, event: bpy.types.Event) -> bool:
+        """Add the point under the mouse; return False if there is none."""
+        region = next(region for region in context.area.regions if region.type == "WINDOW")
+        mouse = np.array([event.mouse_x - region.x, event.mouse_y - region.y], float)
+        place = nearest(
+            self.positions,
+            np.array(context.space_data.region_3d.perspective_matrix),
+            (region.width, region.height),
+            mouse,
+            REACH,
+        )
+        if place is None:
+            return False
+        self.picked.append(tuple(float(value) for value in self.positions[place]))
+        return True
+
+    def _draw(self) -> None:
+        context = bpy.context
+        places = [location_3d_to_region_2d(context.region, context.region_data, point) for point in self.picked]
+        shader = gpu.shader.from_builtin("UNIFORM_COLOR")
+        shader.uniform_float("color", (1.0, 0.6, 0.0, 1.0))
+        for place in places:
+            if place is not None:
+                x, y = place
+                diamond = [(x - 6, y, 0), (x, y + 6, 0), (x + 6, y, 0), (x, y - 6, 0), (x - 6, y, 0)]
+                batch_for_shader(shader, "LINE_STRIP", {"pos": diamond}).draw(shader)
+
+
+def nearest(positions: Any, perspective: Any, size: Any, mouse: Any, reach: float) -> int | None:
+    """Choose the point to pick.
+
+    Of the points within `reach` pixels of the mouse and up to a tenth deeper than the nearest of them, the one nearest
+    on the screen is chosen.
+
+    Args:
+        positions: (N, 3) in world coordinates.
+        perspective: (4, 4) world to clip space.
+        size: (width, height) of the region, in pixels.
+        mouse: (2,) in pixels from the lower left.
+        reach: in pixels.
+
+    Returns:
+        Index of the point, or None.
+    """
+    clip = positions @ perspective[:3, :3].T + perspective[:3, 3]
+    w = positions @ perspective[3, :3] + perspective[3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        screen = (clip[:, :2] / w[:, None] * 0.5 + 0.5) * np.asarray(size, float)
+        depth = clip[:, 2] / w
+        distance = np.hypot(*(screen - mouse).T)
+    close = np.flatnonzero((distance <= reach) & (w > 0) & (np.abs(depth) <= 1.0))
+    if len(close) == 0:
+        return None
+    deep = w[close]
+    front = close[deep <= deep.min() + 0.1 * abs(deep.min())]
+    return int(front[np.argmin(distance[front])])
+
+
+def _world_positions(part: bpy.types.Object) -> Any:
+    """(N, 3) float64 vertices of an object's mesh in world coordinates."""
+    local = np.empty(3 * len(part.data.vertices), np.float32)
+    part.data.vertices.foreach_get("co", local)
+    matrix = np.array(part.matrix_world)
+    return local.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Selecting the objects of a reconstruction in the viewport."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from .. import scene
+
+
+def select_object(context: bpy.types.Context, root: bpy.types.Collection, object_id: int, extend: bool = False) -> bool:
+    """Select all visible parts of an object; return False if there are none."""
+    collection = scene.object_collections(root).get(object_id)
+    return collection is not None and select_collections(context, [collection], extend)
+
+
+def select_collections(context: bpy.types.Context, collections: Any, extend: bool = False) -> bool:
+    """Select all visible parts of objects, and make the last object active.
+
+    Args:
+        context: its view layer is used.
+        collections: of the objects.
+        extend: keep the current selection.
+
+    Returns:
+        False if there is nothing to select; the selection is unchanged then.
+    """
+    parts = [parts_to_select(collection) for collection in collections]
+    if not any(parts):
+        return False
+    if not extend:
+        select_nothing(context)
+    for part in (part for own in parts for part in own):
+        part.select_set(True)
+    last = next(own for own in reversed(parts) if own)
+    context.view_layer.objects.active = next((part for part in last if scene.kind_of(part) == "object_parent"), last[0])
+    return True
+
+
+def parts_to_select(collection: bpy.types.Collection) -> list:
+    """The parts of an object's collection that can be selected."""
+    return [part for part in scene.parts_of(collection) if selectable(part)]
+
+
+def select_nothing(context: bpy.types.Context) -> None:
+    for selected in context.selected_objects:
+        selected.select_set(False)
+
+
+def selected_ids(context: bpy.types.Context, root: bpy.types.Collection) -> list[int]:
+    """IDs of the selected objects, the active one last."""
+    ids = []
+    parts = list(context.selected_objects)
+    if context.active_object in parts:
+        parts.remove(context.active_object)
+        parts.append(context.active_object)
+    for part in parts:
+        if scene.root_of(part, context.scene) == root and (object_id := scene.object_id_of(part)) is not None:
+            if object_id in ids:
+                ids.remove(object_id)
+            ids.append(object_id)
+    return ids
+
+
+def selected_collections(context: bpy.types.Context, root: bpy.types.Collection) -> list:
+    """The collections of the selected objects and duplicates."""
+    found = (
+        scene.collection_of(part) for part in context.selected_objects if scene.root_of(part, context.scene) == root
+    )
+    return list(dict.fromkeys(collection for collection in found if collection is not None))
+
+
+def selectable(part: bpy.types.Object) -> bool:
+    return part.visible_get() and not part.hide_select

@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A command of the backend as a child process: JSON lines come out, single words go in, and no call waits."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+LOG_LINES = 40
+"""Number of the last lines that are no events, kept to describe a crash."""
+
+_LINE_BYTES = 1 << 20
+_LOG_CHARACTERS = 500
+_WAITING_EVENTS = 1000
+_EVENTS_A_POLL = 200
+_PIPES_STAY_OPEN = 2.0
+"""Seconds that the pipes may stay open after the process ended, since its children may have inherited them."""
+_NICENESS = 10
+
+
+def backend_command(python: str | Path, *arguments: str | Path) -> list[str]:
+    """The command line of a backend command with JSON events; it must run in the folder that contains backend/."""
+    return [str(python), "-m", "backend", *map(str, arguments), "--json"]
+
+
+def backend_environment(cache_folder: str | Path) -> dict[str, str]:
+    """Additional variables for the backend; `cache_folder` for compiled kernels should outlive updates."""
+    return {"NUMBA_CACHE_DIR": str(cache_folder), "PYTHONUTF8": "1", "PYTHONFAULTHANDLER": "1"}
+
+
+def child_environment(extra: Mapping[str, str]) -> dict[str, str]:
+    """The variables of this process without those of its own Python (home, paths, options), and `extra`."""
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.upper().startswith("PYTHON") and name != "__PYVENV_LAUNCHER__"
+    }
+    return {**kept, **extra}
+
+
+class BackendProcess:
+    """One child process in its own process group.
+
+    Its first input line is `attached`: from then on the end of its input means that its parent is gone.
+
+    Args:
+        command: program and arguments.
+        cwd: working directory.
+        environment: additional environment variables.
+        in_background: run with lower priority, so that a window stays responsive.
+
+    Raises:
+        OSError: it cannot be started.
+    """
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        cwd: str | Path,
+        environment: Mapping[str, str] | None = None,
+        in_background: bool = True,
+    ) -> None:
+        _ignore_broken_pipes()
+        self._events: queue.Queue[dict[str, Any]] = queue.Queue(_WAITING_EVENTS)
+        self._log: deque[str] = deque(maxlen=LOG_LINES)
+        self._ended_at: float | None = None
+        # A process group, so that Ctrl-C in Blender's terminal reaches Blender alone. Not a session: Linux would
+        # divide the processor equally between the two sessions and ignore the lower priority.
+        options: dict[str, Any]
+        if sys.platform == "win32":
+            options = {
+                "creationflags": subprocess.CREATE_NO_WINDOW
+                | subprocess.CREATE_NEW_PROCESS_GROUP
+                | (subprocess.BELOW_NORMAL_PRIORITY_CLASS if in_background else 0)
+            }
+        else:
+            options = {"process_group": 0}
+        self._process: subprocess.Popen[bytes] = subprocess.Popen(
+            list(command),
+            cwd=cwd,
+            env=child_environment(environment or {}),
+            bufsize=0,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            **options,
+        )
+        self._input = cast(BinaryIO, self._process.stdin)
+        if in_background:
+            self._lower_priority()
+        self._readers = [
+            threading.Thread(target=self._read, args=(stream,), daemon=True)
+            for stream in (self._process.stdout, self._process.stderr)
+        ]
+        for reader in self._readers:
+            reader.start()
+        self.send("attached")
+
+    def _lower_priority(self) -> None:
+        """Give the child the lowest priority that the system supports."""
+        try:
+            if hasattr(os, "SCHED_IDLE"):
+                os.sched_setscheduler(self.pid, os.SCHED_IDLE, os.sched_param(0))
+            elif sys.platform != "win32":
+                os.setpriority(os.PRIO_PROCESS, self.pid, _NICENESS)
+        except OSError:
+            pass  # It has ended, or the system forbids it.
+
+    @property
+    def pid(self) -> int:
+        """The child's process ID."""
+        return self._process.pid
+
+    @property
+    def log(self) -> list[str]:
+        """The last lines from either pipe that are no events, oldest first."""
+        return list(self._log)
+
+    def send(self, line: str) -> bool:
+        """Write a line to the child; returns False if it no longer reads."""
+        try:
+            self._input.write(line.encode() + b"\n")
+        except (OSError, ValueError):
+            return False
+        return True
+
+    def stop(self) -> bool:
+        """Ask the child to save and end; returns False if it no longer reads."""
+        return self.send("stop")
+
+    def kill(self) -> None:
+        """End the child and its children at once; does nothing if it has ended."""
+        if self._process.poll() is not None:
+            return
+        try:
+            if sys.platform == "win32":
+                # Windows has no process groups; end the process tree or, if that fails, the process alone.
+                subprocess.run(
+                    ["taskkill", "/F", "/T", "/PID", str(self.pid)],
+                    capture_output=True,
+                    timeout=5,
+                    creationflags=subprocess.CREATE_NO_WINDOW,
+                    check=False,
+                )
+                self._process.kill()
+            else:
+                os.killpg(self.pid, signal.SIGKILL)
+        except (OSError, subprocess.SubprocessError):
+            self._process.kill()
+
+    def poll(self) -> list[dict[str, Any]]:
+        """The events since the last call, oldest first, without waiting; at most some hundreds."""
+        events: list[dict[str, Any]] = []
+        while len(events) < _EVENTS_A_POLL:
+            try:
+                events.append(self._events.get_nowait())
+            except queue.Empty:
+                break
+        return events
+
+    @property
+    def exit_code(self) -> int | None:
+        """The child's exit code once `poll` has returned all its events, or None; negative for a signal."""
+        code = self._process.poll()
+        if code is None:
+            return None
+        if self._ended_at is None:
+            self._ended_at = time.monotonic()
+        reading = any(reader.is_alive() for reader in self._readers)
+        if reading and time.monotonic() - self._ended_at < _PIPES_STAY_OPEN:
+            return None
+        if not self._events.empty():
+            return None
+        self._input.close()
+        return code
+
+    def _read(self, stream: Any) -> None:
+        """Sort the lines of a pipe into events and log; a full queue blocks the child, which bounds the memory."""
+        with io.BufferedReader(stream) as lines:
+            while line := lines.readline(_LINE_BYTES):
+                event = _event(line) if stream is self._process.stdout else None
+                if event is not None:
+                    self._events.put(event)
+                elif text := line.decode("utf-8", errors="replace").rstrip():
+                    self._log.append(text[:_LOG_CHARACTERS])
+
+
+def _ignore_broken_pipes() -> None:
+    """Blender leaves SIGPIPE at its default, so that writing to a child that has just ended would end Blender too."""
+    is_main = threading.current_thread() is threading.main_thread()
+    if hasattr(signal, "SIGPIPE") and is_main and signal.getsignal(signal.SIGPIPE) == signal.SIG_DFL:
+        signal.signal(signal.SIGPIPE, signal.SIG_IGN)
+
+
+def _event(line: bytes) -> dict[str, Any] | None:
+    """Parse a line as an event; None if it is something else."""
+    if not line.startswith(b"{"):
+        return None
+    try:
+        event = json.loads(line)
+    except ValueError:
+        return None
+    return event if isinstance(event, dict) and isinstance(event.get("type"), str) else None

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Runs a job to its end, where no timer can poll it."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from types import FrameType
+
+from ...backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, EXIT_FAILED
+from ...backend.shared.events import Reporter
+from .jobs import Job, State
+
+
+def run_blocking(job: Job, reporter: Reporter) -> int:
+    """Run a job to its end.
+
+    Ctrl-C or a termination signal asks the job to stop and save; a second one ends it by force.
+
+    Args:
+        job: a waiting job.
+        reporter: takes messages, warnings and progress. An error is left in `job.error`, for the caller to report.
+
+    Returns:
+        The exit code: 0, 1, 2 or 130.
+    """
+    try:
+        with _counted_signals() as signals:
+            job.start(in_background=False)
+            _watch(job, reporter, signals)
+    finally:
+        job.kill()
+    if job.state is State.DONE:
+        return EXIT_DONE
+    if job.state is State.STOPPED:
+        return EXIT_CANCELLED
+    return EXIT_BAD_INPUT if job.exit_code in (EXIT_BAD_INPUT, None) else EXIT_FAILED
+
+
+@contextlib.contextmanager
+def _counted_signals() -> Iterator[list[int]]:
+    """The numbers of the signals that have arrived; in the main thread alone, where Python handles signals."""
+    arrived: list[int] = []
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        arrived.append(number)
+
+    is_main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM) if is_main}
+    try:
+        yield arrived
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+
+def _watch(job: Job, reporter: Reporter, signals: list[int]) -> None:
+    """Poll the job until its end, and report what changes."""
+    handled, message, warned, progress = 0, "", 0, 0.0
+    while not job.is_finished:
+        if len(signals) > handled:
+            handled += 1
+            job.stop() if handled == 1 else job.kill()
+        job.poll()
+        if job.message != message and not job.is_finished:
+            message = job.message
+            reporter.status(message)
+        for warning in job.warnings[warned:]:
+            reporter.warning(warning)
+        warned = len(job.warnings)
+        if job.progress != progress:
+            progress = job.progress
+            reporter.progress(
+                progress, 1.0, seconds_left=job.seconds_left, splats=job.splats, psnr=job.psnr, miou=job.miou
+            )
+        time.sleep(0.02)
+    if job.state is not State.FAILED:
+        reporter.status(job.message)

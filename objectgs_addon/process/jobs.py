@@ -1,0 +1,357 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Jobs of the backend, run one after another, with their progress, results and errors.
+
+In a window a timer calls `JobQueue.poll`; without one, `blocking.run_blocking` polls a single job.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from ...backend.shared.errors import EXIT_CANCELLED, EXIT_DONE
+from .backend_process import BackendProcess
+
+GRACE_SECONDS = 10.0
+"""Time that a job has for saving after the first request to stop; a second request then ends it by force."""
+
+_WARNINGS = 50
+_ESTIMATE_FROM = 0.02
+_ESTIMATE_AFTER = 1.0
+_ENDING_SECONDS = 3.0
+
+
+class State(StrEnum):
+    """State of a job; DONE, STOPPED and FAILED are final."""
+
+    WAITING = "waiting"
+    RUNNING = "running"
+    PAUSED = "paused"
+    STOPPING = "stopping"
+    DONE = "done"
+    STOPPED = "stopped"
+    FAILED = "failed"
+
+
+FINISHED = (State.DONE, State.STOPPED, State.FAILED)
+
+
+@dataclass(eq=False)
+class Job:
+    """One command of the backend, or another program with the same events.
+
+    Attributes:
+        title: name for the user.
+        kind: import, import-splats, plan, vote, train, mesh, export, film, fill, demo, setup or doctor.
+        folder: the reconstruction folder, or None.
+        environment: additional environment variables.
+        if_silent: error message if the program ends without any event, since it is not the expected program.
+
+    The other attributes change while the job runs: progress from 0 to 1, seconds_left (reported or estimated), message
+    (the current step), warnings and error (sentences), figures of the training, preview (path of the newest image),
+    curve (quality events: seconds, step, psnr, miou, mbiou), result (fields of the last event), exit_code and log (last
+    lines that were no events).
+    """
+
+    title: str
+    kind: str
+    folder: Path | None
+    command: list[str]
+    cwd: Path
+    environment: dict[str, str] = field(default_factory=dict)
+    if_silent: str | None = None
+
+    state: State = State.WAITING
+    progress: float = 0.0
+    seconds_left: float | None = None
+    message: str = ""
+    warnings: list[str] = field(default_factory=list)
+    error: str | None = None
+    step: int | None = None
+    splats: int | None = None
+    anchors: int | None = None
+    psnr: float | None = None
+    miou: float | None = None
+    preview: Path | None = None
+    curve: list[dict[str, Any]] = field(default_factory=list)
+    result: dict[str, Any] = field(default_factory=dict)
+    exit_code: int | None = None
+    log: list[str] = field(default_factory=list)
+
+    _process: BackendProcess | None = field(default=None, repr=False)
+    _changed: bool = field(default=False, repr=False)
+    _new_preview: bool = field(default=False, repr=False)
+    _answered: bool = field(default=False, repr=False)
+    _done: bool = field(default=False, repr=False)
+    _killed: bool = field(default=False, repr=False)
+    _phase_began: float = field(default=0.0, repr=False)
+    _paused_at: float | None = field(default=None, repr=False)
+    _stop_asked: float | None = field(default=None, repr=False)
+    _kill_at: float | None = field(default=None, repr=False)
+
+    @property
+    def _child(self) -> BackendProcess:
+        """The process of a started job."""
+        assert self._process is not None
+        return self._process
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the job has ended."""
+        return self.state in FINISHED
+
+    @property
+    def can_pause(self) -> bool:
+        """Whether the job can be paused, which only a running training can."""
+        return self.kind == "train" and self.state is State.RUNNING
+
+    def pause(self) -> None:
+        """Pause a running training."""
+        if self.can_pause and self._child.send("pause"):
+            self._paused_at = time.monotonic()
+            self._set(State.PAUSED)
+
+    def resume(self) -> None:
+        """Resume a paused training."""
+        if self.state is State.PAUSED and self._child.send("resume"):
+            self._shift_clock()
+            self._set(State.RUNNING)
+
+    def stop(self) -> None:
+        """Ask the job to save and end; a waiting job ends at once.
+
+        A second call ends it by force after a grace period.
+        """
+        if self.state is State.WAITING:
+            self._set(State.STOPPED, "Stopped before it began")
+        elif self.state is State.STOPPING:
+            self._kill_at = (self._stop_asked or time.monotonic()) + GRACE_SECONDS
+        elif not self.is_finished:
+            self._child.stop()
+            self._stop_asked = time.monotonic()
+            self._shift_clock()
+            self._set(State.STOPPING, "Stopping")
+
+    def kill(self) -> None:
+        """End the job at once; its last checkpoint is kept."""
+        if self.state is State.WAITING:
+            self.stop()
+        elif not self.is_finished:
+            self._killed = True
+            self._child.kill()
+
+    def start(self, in_background: bool = True) -> None:
+        """Start the process of a waiting job. If that fails, the job is FAILED, with an error.
+
+        in_background: as for `BackendProcess`.
+        """
+        self._changed = True
+        try:
+            self._process = BackendProcess(self.command, self.cwd, self.environment, in_background)
+        except (OSError, ValueError) as error:
+            why = getattr(error, "strerror", None) or error
+            self.error = f"{self.command[0]} could not be started ({why}); choose another Python for the backend."
+            if not self.cwd.is_dir():
+                self.error = f"The folder {self.cwd} is missing; install the extension again."
+            self._set(State.FAILED, self.error)
+            return
+        self._phase_began = time.monotonic()
+        self._set(State.RUNNING)
+
+    def poll(self) -> bool:
+        """Process the events since the last call, without waiting; returns whether anything changed."""
+        if self._process is not None and not self.is_finished:
+            for event in self._process.poll():
+                self._take(event)
+            code = self._process.exit_code
+            if code is not None:
+                self._finish(code)
+            elif self._kill_at is not None and time.monotonic() >= self._kill_at and not self._killed:
+                self.kill()
+        changed, self._changed = self._changed, False
+        return changed
+
+    def take_preview(self) -> bool:
+        """Whether a preview was written since the last call."""
+        new, self._new_preview = self._new_preview, False
+        return new
+
+    def _set(self, state: State, message: str | None = None) -> None:
+        self.state = state
+        self._changed = True
+        if message is not None:
+            self.message = message
+
+    def _shift_clock(self) -> None:
+        """Exclude the pause from the time that the estimate is based on."""
+        if self._paused_at is not None:
+            self._phase_began += time.monotonic() - self._paused_at
+            self._paused_at = None
+
+    def _take(self, event: dict[str, Any]) -> None:
+        """Apply an event; unexpected fields are ignored."""
+        self._answered = self._changed = True
+        kind, message = event["type"], str(event.get("message", ""))
+        if kind == "status":
+            if self.state is State.RUNNING:
+                self._phase_began = time.monotonic()
+                self.seconds_left = None
+                if self.progress == 1.0:  # The previous phase is complete, not the job.
+                    self.progress = 0.0
+            if self.state is not State.STOPPING:
+                self.message = message
+        elif kind == "progress":
+            self._take_progress(event)
+        elif kind == "quality":
+            self.curve.append({name: value for name, value in event.items() if name not in ("type", "time")})
+            self._take_figures(event)
+        elif kind == "preview":
+            self.preview = Path(str(event.get("path", "")))
+            self._new_preview = True
+        elif kind == "warning":
+            if message not in self.warnings and len(self.warnings) < _WARNINGS:
+                self.warnings.append(message)
+        elif kind == "error":
+            self.error = message
+        elif kind == "done":
+            self._done = True
+            self.result = {name: value for name, value in event.items() if name not in ("type", "time")}
+            self._take_figures(event)
+
+    def _take_progress(self, event: dict[str, Any]) -> None:
+        done, total = _number(event.get("done")), _number(event.get("total"))
+        self._take_figures(event)
+        if done is None or not total or total < 0:
+            return
+        now = time.monotonic()
+        progress = min(max(done / total, 0.0), 1.0)
+        if progress < self.progress:
+            self._phase_began = now
+        self.progress = progress
+        self.seconds_left = _number(event.get("seconds_left"))
+        elapsed = now - self._phase_began
+        if self.seconds_left is None and progress >= _ESTIMATE_FROM and elapsed >= _ESTIMATE_AFTER:
+            self.seconds_left = elapsed * (1 - progress) / progress
+
+    def _take_figures(self, event: dict[str, Any]) -> None:
+        for name in ("step", "splats", "anchors", "psnr", "miou"):
+            value = _number(event.get(name))
+            if value is not None:
+                setattr(self, name, value)
+
+    def _finish(self, code: int) -> None:
+        """Set the final state from the exit code and the last event."""
+        self.exit_code = code
+        self.log = self._child.log
+        self.seconds_left = None
+        if self._done and not self.result.get("stopped"):
+            if code != EXIT_DONE and not self._killed:
+                self.warnings.append(f"The backend {_how_it_ended(code)} after it was done.")
+            self.progress = 1.0
+            self._set(State.DONE, str(self.result.get("message", "Done")))
+        elif self._killed:
+            self._set(State.STOPPED, "Ended by force; the last checkpoint is kept")
+        elif code == EXIT_CANCELLED or self.result.get("stopped"):
+            self._set(State.STOPPED, str(self.result.get("message", "Stopped")))
+        else:
+            if self.error is None:
+                self.error = self._crash(code)
+            self._set(State.FAILED, self.error)
+
+    def _crash(self, code: int) -> str:
+        """Describe an unexplained end in one sentence, with the last message of the program."""
+        if self.if_silent is not None and not self._answered and code >= 0:
+            return self.if_silent
+        text = _last_message(self.log)
+        how = "ended without a result" if code == EXIT_DONE else _how_it_ended(code)
+        return f"The backend {how}" + (f"; its last message: {text}" if text else ".")
+
+
+def _number(value: Any) -> float | int | None:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return value if is_number and abs(value) < float("inf") else None
+
+
+def _how_it_ended(code: int) -> str:
+    """Describe an exit code: signals by name on POSIX, exceptions by number on Windows."""
+    if code < 0:
+        if -code == getattr(signal, "SIGKILL", None):
+            return "was ended by the system, as happens when memory runs out"
+        try:
+            return f"crashed ({signal.strsignal(-code) or signal.Signals(-code).name})"
+        except ValueError:
+            return f"crashed (signal {-code})"
+    if sys.platform == "win32" and code >= 0xC0000000:
+        return f"crashed (Windows error 0x{code:08X})"
+    return f"ended unexpectedly (exit code {code})"
+
+
+def _last_message(log: list[str]) -> str:
+    """The most informative line about a crash: the interpreter's fatal error, or else the last line."""
+    named = [line for line in log if line.startswith("Fatal Python error")]
+    return (named or log or [""])[-1].strip()
+
+
+class JobQueue:
+    """Jobs in the order of addition; one runs while the others wait."""
+
+    def __init__(self) -> None:
+        self.jobs: list[Job] = []
+
+    @property
+    def running(self) -> Job | None:
+        """The job that is running, paused or stopping, or None."""
+        return next((job for job in self.jobs if job.state is not State.WAITING and not job.is_finished), None)
+
+    def add(self, job: Job) -> None:
+        """Append a job; `poll` starts it when its turn comes."""
+        job._changed = True
+        self.jobs.append(job)
+
+    def poll(self) -> list[Job]:
+        """Start the next job if none is running; returns the jobs that changed since the last call, without waiting."""
+        if self.running is None:
+            waiting = next((job for job in self.jobs if job.state is State.WAITING), None)
+            if waiting is not None:
+                waiting.start()
+        changed = [job for job in self.jobs if job.poll()]
+        # A job that was stopped before it began is not kept.
+        self.jobs = [job for job in self.jobs if job._process or job.state is not State.STOPPED]
+        return changed
+
+    def of_folder(self, folder: str | Path) -> Job | None:
+        """The latest job of a reconstruction folder, or None."""
+        wanted = _resolved(folder)
+        return next((job for job in reversed(self.jobs) if job.folder and _resolved(job.folder) == wanted), None)
+
+    def remove_finished(self) -> None:
+        """Remove the jobs that have ended."""
+        self.jobs = [job for job in self.jobs if not job.is_finished]
+
+    def stop_all(self, timeout: float) -> None:
+        """Stop all jobs; the running one has `timeout` seconds to save, then it is ended by force."""
+        for job in self.jobs:
+            job.stop()
+        deadline = time.monotonic() + timeout
+        running = self.running
+        while running is not None and not running.is_finished:
+            running.poll()
+            if time.monotonic() >= deadline:
+                if running._killed:
+                    break
+                running.kill()
+                deadline = time.monotonic() + _ENDING_SECONDS
+            time.sleep(0.02)
+        for job in self.jobs:
+            job._changed = True
+        self.poll()
+
+
+def _resolved(folder: str | Path) -> str:
+    return os.path.normcase(os.path.realpath(folder))

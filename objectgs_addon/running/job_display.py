@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Display of jobs in panels, preferences and the status bar."""
+
+from __future__ import annotations
+
+import textwrap
+
+import bpy
+
+from ...backend.shared.durations import clock
+from ..process.jobs import Job, State
+
+CHARACTER = 6.6
+"""Average width of a character in pixels at a UI scale of 1."""
+AROUND = 60.0
+"""Width of borders and icon in pixels."""
+
+
+def summary(job: Job) -> str:
+    """The state of a job in a few words."""
+    if job.state is State.WAITING:
+        return f"{job.title}: waiting"
+    if job.state is State.PAUSED:
+        return f"{job.title}: paused at {100 * job.progress:.0f} %"
+    if job.state is State.STOPPING:
+        return f"{job.title}: saving and stopping"
+    left = f", {clock(job.seconds_left)} left" if job.seconds_left is not None else ""
+    return f"{job.title}: {100 * job.progress:.0f} %{left}"
+
+
+def draw_running(layout: bpy.types.UILayout, job: Job, index: int) -> None:
+    """Draw progress, buttons and figures of a job that has not ended."""
+    row = layout.row(align=True)
+    if job.state is State.WAITING:
+        row.label(text=summary(job), icon="TIME")
+    else:
+        left = f"{clock(job.seconds_left)} left" if job.seconds_left is not None else ""
+        text = {State.PAUSED: "Paused", State.STOPPING: "Saving and stopping"}.get(job.state, left)
+        row.progress(factor=job.progress, text=f"{100 * job.progress:.0f} %   {text}")
+    if job.can_pause:
+        row.operator("objectgs.pause_job", text="", icon="PAUSE")
+    if job.state is State.PAUSED:
+        row.operator("objectgs.resume_job", text="", icon="PLAY")
+    if job.state is not State.STOPPING:
+        row.operator("objectgs.stop_job", text="", icon="X").index = index
+    if job.message and job.state is not State.WAITING:
+        write(layout, f"{job.title}: {job.message}")
+    draw_figures(layout, job)
+
+
+def draw_figures(layout: bpy.types.UILayout, job: Job) -> None:
+    """Draw the quality on held-out photos and the number of splats."""
+    figures = []
+    if job.psnr is not None:
+        figures.append(f"PSNR {job.psnr:.1f} dB")
+    if job.miou is not None:
+        figures.append(f"mIoU {job.miou:.3f}")
+    if job.splats:
+        figures.append(f"{job.splats:,} splats")
+    if figures:
+        write(layout, "   ".join(figures))
+
+
+def draw_over(layout: bpy.types.UILayout, job: Job) -> None:
+    """Draw how a job ended."""
+    if job.state is State.FAILED:
+        write(layout, f"{job.title} failed. {job.error}", "ERROR")
+    elif job.state is State.STOPPED:
+        write(layout, f"{job.title}: stopped. {job.message}", "INFO")
+    else:
+        write(layout, f"{job.title}: done", "CHECKMARK")
+        draw_figures(layout, job)
+    for sentence in job.warnings[:3]:
+        write(layout, sentence, "ERROR")
+
+
+def write(layout: bpy.types.UILayout, text: str, icon: str = "NONE") -> None:
+    """Draw `text`, wrapped to the width of the current region."""
+    scale = bpy.context.preferences.system.ui_scale
+    width = max(20, int((bpy.context.region.width / scale - AROUND) / CHARACTER))
+    column = layout.column(align=True)
+    for line in textwrap.wrap(text, width):
+        column.label(text=line, icon=icon)
+        icon = icon if icon == "NONE" else "BLANK1"

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Edits of objects in the scene: removal, fill, colors, placement, duplicates."""

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Duplicates of objects: a collection each, whose parts share the data of the object's own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from ..kinds import (
+    ANCHORS,
+    DUPLICATE,
+    MESH,
+    MESH_KEY,
+    OBJECT,
+    OBJECT_PARENT,
+    SPLATS,
+    duplicates_of,
+    kind_of,
+    mark,
+    object_collections,
+    object_id_of,
+    part_of,
+    parts_of,
+)
+from ..object_collection import NAME
+from .placement import PLACEMENT, placement_of, set_placement
+
+DUPLICATES = "objectgs_copies"
+"""On an object's collection: where objects.json has its duplicates, as of when Blender agreed with it, as JSON."""
+
+_CARRIERS = (SPLATS, ANCHORS)
+
+
+def duplicate(root: bpy.types.Collection, source: bpy.types.Collection) -> bpy.types.Collection:
+    """A duplicate of an object, or of a duplicate of it, in the same place; all that lies in its collection comes
+    along. The original's sliders work on it, too."""
+    copy = _new_collection(root, source)
+    twins = {obj: obj.copy() for obj in source.objects}
+    for obj, twin in twins.items():
+        if obj.parent in twins:
+            inverse = twin.matrix_parent_inverse.copy()
+            twin.parent = twins[obj.parent]
+            twin.matrix_parent_inverse = inverse
+        copy.objects.link(twin)
+    return copy
+
+
+def remove_duplicate(copy: bpy.types.Collection) -> None:
+    """Remove a duplicate with all that lies only in it; the data stays with the original."""
+    for obj in list(copy.objects):
+        if len(obj.users_collection) == 1:
+            bpy.data.objects.remove(obj)
+    bpy.data.collections.remove(copy)
+
+
+def adopt_blender_duplicates(root: bpy.types.Collection) -> None:
+    """Make what the user duplicated with Blender's own means duplicates of ours, each in its own collection.
+
+    That is: a whole collection; an object's pivot with the parts that hang on it; its splats alone. A mesh alone, which
+    may be on its way to becoming something else, stays the user's.
+    """
+    originals = object_collections(root)
+    for collection in root.children_recursive:
+        if kind_of(collection) == OBJECT and collection not in originals.values():
+            mark(collection, DUPLICATE, object_id_of(collection))
+            for name in (PLACEMENT, DUPLICATES):
+                if name in collection:
+                    del collection[name]
+    for collection in root.children_recursive:
+        if kind_of(collection) not in (OBJECT, DUPLICATE):
+            continue
+        pivots = [obj for obj in collection.objects if kind_of(obj) == OBJECT_PARENT]
+        for pivot in pivots[1:]:
+            copy = _new_collection(root, collection)
+            for obj in [pivot, *(child for child in pivot.children if child in collection.objects[:])]:
+                copy.objects.link(obj)
+                collection.objects.unlink(obj)
+        splats = [obj for obj in collection.objects if kind_of(obj) == SPLATS]
+        for obj in splats[1:] if pivots else ():
+            copy = _new_collection(root, collection)
+            copy.objects.link(obj)
+            collection.objects.unlink(obj)
+            pivot = pivots[0].copy()
+            copy.objects.link(pivot)
+            obj.parent = pivot
+            place = placement_of(root, copy)
+            obj.matrix_parent_inverse.identity()
+            obj.matrix_basis.identity()
+            set_placement(root, copy, place)
+
+
+def bring_up_to_date(root: bpy.types.Collection) -> None:
+    """Give duplicates the parts that their originals have now; those of objects that are gone go."""
+    originals = object_collections(root)
+    for object_id, copies in duplicates_of(root).items():
+        for copy in copies:
+            if object_id in originals:
+                _follow(originals[object_id], copy)
+            else:
+                remove_duplicate(copy)
+
+
+def _follow(source: Any, copy: Any) -> None:
+    pivot = part_of(copy, OBJECT_PARENT)
+    there = {_key(obj): obj for obj in parts_of(copy) if kind_of(obj) in (*_CARRIERS, MESH)}
+    for obj in [obj for obj in parts_of(source) if kind_of(obj) in (*_CARRIERS, MESH)]:
+        twin = there.pop(_key(obj), None)
+        if twin is None:
+            twin = obj.copy()
+            twin.parent = pivot
+            copy.objects.link(twin)
+        elif kind_of(obj) in _CARRIERS and twin.data != obj.data:
+            old, twin.data = twin.data, obj.data
+            if old.users == 0:
+                bpy.data.meshes.remove(old)
+        twin.hide_viewport, twin.hide_render = obj.hide_viewport, obj.hide_render
+    for gone in there.values():
+        bpy.data.objects.remove(gone)
+
+
+def _key(obj: bpy.types.Object) -> tuple:
+    return kind_of(obj), str(obj.get(MESH_KEY, ""))
+
+
+def _new_collection(root: bpy.types.Collection, source: Any) -> bpy.types.Collection:
+    copy = bpy.data.collections.new(source[NAME])
+    for name, value in source.items():
+        if name.startswith("objectgs_") and name not in (PLACEMENT, DUPLICATES):
+            copy[name] = value
+    mark(copy, DUPLICATE, object_id_of(source))
+    copy.hide_viewport, copy.hide_render = source.hide_viewport, source.hide_render
+    copy.color_tag = source.color_tag
+    above = next((each for each in (root, *root.children_recursive) if source in each.children[:]), root)
+    above.children.link(copy)
+    return copy

@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Filled holes of removed objects: unobserved splats at the end of the carriers whose surface they continue, and hidden
+splats that give way to them. The backend computes both; each has the ID of the removed object."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ....backend.shared.formats.ply import read_vertices
+from ....backend.shared.reconstruction.fill import FILLS, UNOBSERVED, fill_path
+from ....backend.shared.reconstruction.folder import Reconstruction
+from .. import carrier
+from ..capture import origin_of
+from ..kinds import OBJECT_PARENT, SPLATS, folder_of, object_collections, part_of
+from ..object_collection import center_of
+from ..objects_file import Objects
+from ..points import positions_of
+from ..shading.modifiers import update_groups
+from ..shading.node_groups import HIDDEN
+from ..splats import ids_of, splat_attributes
+
+SHOWN_FILL = "objectgs_fill"
+"""Custom property of a carrier's mesh that has the attribute `FILLS`: the name of the file that it shows."""
+UNOBSERVED_COUNT = "objectgs_unobserved"
+"""Custom property of a removed object's collection: the number of splats that fill its hole, where that is known."""
+
+
+def missing_fill(root: bpy.types.Collection, objects: Objects) -> Path | None:
+    """The file that the edits ask for if it does not exist yet, else None."""
+    path = _path(root, objects)
+    return None if path is None or path.is_file() else path
+
+
+def show_fills(root: bpy.types.Collection, objects: Objects) -> None:
+    """Fill the holes of removed objects as the edits ask for.
+
+    While the file for these edits is missing, the splats shown so far stay for the objects that are still to be filled.
+
+    Raises:
+        InputError: If a file cannot be read or a carrier is in Edit Mode; nothing is changed then.
+    """
+    path = _path(root, objects)
+    rows = read_vertices(path) if path is not None and path.is_file() else None
+    filled = [entry.id for entry in objects.entries.values() if entry.removed and entry.fill]
+    changes = []
+    for object_id, collection in object_collections(root).items():
+        obj = part_of(collection, SPLATS)
+        if obj is None or obj.data.library is not None or "radiance:base" not in obj.data.attributes:
+            continue
+        fills = filled_objects(obj.data)
+        if rows is None:
+            if not np.isin(fills, [0, *filled]).all():
+                changes.append((collection, obj, np.where(np.isin(fills, filled), fills, 0), None, ""))
+            continue
+        own = rows[ids_of(rows) == object_id]
+        shows = path.name if len(own) else ""
+        if shows != (obj.data.get(SHOWN_FILL, "") if fills.any() else ""):
+            changes.append((collection, obj, np.zeros_like(fills), own, shows))
+    carrier.require_object_mode(obj for _, obj, *_ in changes)
+    for collection, obj, fills, own, shows in changes:
+        _keep(obj, fills)
+        if shows:
+            pivot = part_of(collection, OBJECT_PARENT)
+            _put(obj, own, origin_of(root), np.zeros(3) if pivot is None else center_of(pivot))
+        obj.data[SHOWN_FILL] = shows
+    for object_id, collection in object_collections(root).items():
+        if rows is not None and object_id in filled:
+            collection[UNOBSERVED_COUNT] = int(((rows[FILLS] == object_id) & (rows[UNOBSERVED] != 0)).sum())
+        elif UNOBSERVED_COUNT in collection:
+            del collection[UNOBSERVED_COUNT]
+
+
+def filled_objects(mesh: bpy.types.Mesh) -> np.ndarray:
+    """(n,) int64: for each splat of a carrier that fills the hole of a removed object, or gives way to one that does,
+    the ID of that object; 0 for all others."""
+    if FILLS not in mesh.attributes:
+        return np.zeros(len(mesh.vertices), np.int64)
+    return carrier.read(mesh, FILLS).astype(np.int64) & 0xFFFFFFFF
+
+
+def unobserved_splats(mesh: bpy.types.Mesh) -> np.ndarray:
+    """(n,) bool: which splats of a carrier are in no photo, because they fill a hole."""
+    if UNOBSERVED not in mesh.attributes:
+        return np.zeros(len(mesh.vertices), bool)
+    return carrier.read(mesh, UNOBSERVED)
+
+
+def given_way(mesh: bpy.types.Mesh) -> np.ndarray:
+    """(n,) bool: which splats of a carrier are hidden because unobserved ones replace them."""
+    return (filled_objects(mesh) != 0) & ~unobserved_splats(mesh)
+
+
+def _path(root: bpy.types.Collection, objects: Objects) -> Path | None:
+    return fill_path(Reconstruction(folder_of(root)), sorted(objects.entries.values(), key=lambda entry: entry.id))
+
+
+def _keep(obj: bpy.types.Object, fills: np.ndarray) -> None:
+    """Keep the filling splats of a carrier where `fills` (n,) is not 0, and show again what gave way to the others."""
+    mesh = obj.data
+    if FILLS not in mesh.attributes:
+        return
+    stay = ~unobserved_splats(mesh) | (fills != 0)
+    attributes = _attributes(mesh)
+    attributes[FILLS] = "INT", carrier.stored_ids(fills)
+    attributes[HIDDEN] = "BOOLEAN", _hidden_otherwise(mesh)
+    _fill(
+        obj,
+        carrier.read(mesh, "position")[stay],
+        {name: (kind, values[stay]) for name, (kind, values) in attributes.items()},
+    )
+
+
+def _put(obj: bpy.types.Object, rows: np.ndarray, origin: np.ndarray, center: np.ndarray) -> None:
+    """Hide the splats of a carrier that are among rows, and append the unobserved ones. center (3,): the origin of the
+    carrier's coordinates in the reconstruction's, whose own is `origin` in the capture's."""
+    mesh = obj.data
+    is_put = rows[UNOBSERVED] != 0
+    positions, new = positions_of(rows, origin) - center, splat_attributes(rows)
+    before = _attributes(mesh)
+    before[HIDDEN] = "BOOLEAN", _hidden_otherwise(mesh)
+    there = carrier.read(mesh, "position")
+    taken = _among(
+        _keys(there, before["radiance:base"][1]),
+        _keys(positions[~is_put], new["radiance:base"][1][~is_put]),
+        rows[FILLS][~is_put],
+    )
+    count = int(is_put.sum())
+    attributes = {}
+    for name, (kind, values) in before.items():
+        added = new[name][1][is_put] if name in new else np.zeros((count, *values.shape[1:]), values.dtype)
+        attributes[name] = kind, np.concatenate([values, added])
+    attributes[UNOBSERVED] = "BOOLEAN", np.arange(len(there) + count) >= len(there)
+    attributes[FILLS] = "INT", carrier.stored_ids(np.concatenate([taken, rows[FILLS][is_put]]))
+    _fill(obj, np.concatenate([there, positions[is_put]]), attributes)
+
+
+def _fill(obj: bpy.types.Object, positions: np.ndarray, attributes: dict[str, tuple[str, np.ndarray]]) -> None:
+    """Replace a carrier's splats. Those that give way are hidden; if none does, the carrier is as captured."""
+    fills, hidden = attributes[FILLS][1] != 0, attributes[HIDDEN][1]
+    if fills.any():
+        hidden = hidden | (fills & ~attributes[UNOBSERVED][1])
+        update_groups(obj)
+    else:
+        del attributes[FILLS], attributes[UNOBSERVED]
+    attributes[HIDDEN] = "BOOLEAN", hidden
+    if not hidden.any():
+        del attributes[HIDDEN]
+    carrier.fill(obj.data, positions, attributes)
+
+
+def _hidden_otherwise(mesh: bpy.types.Mesh) -> np.ndarray:
+    """(n,) bool: which splats are hidden for another reason than that unobserved ones replace them."""
+    hidden = carrier.read(mesh, HIDDEN) if HIDDEN in mesh.attributes else np.zeros(len(mesh.vertices), bool)
+    return hidden & ~given_way(mesh)
+
+
+def _attributes(mesh: bpy.types.Mesh) -> dict[str, tuple[str, np.ndarray]]:
+    """All attributes of a carrier's splats but their positions and Blender's own flags."""
+    return {
+        attribute.name: (attribute.data_type, carrier.read(mesh, attribute.name))
+        for attribute in mesh.attributes
+        if attribute.domain == "POINT"
+        and attribute.data_type in carrier.KINDS
+        and attribute.name != "position"
+        and not attribute.name.startswith(".")
+    }
+
+
+def _keys(positions: np.ndarray, base: np.ndarray) -> np.ndarray:
+    """(n,) keys that identify splats bit for bit: position, and color without the opacity."""
+    values = np.ascontiguousarray(np.hstack([positions.astype(np.float32), base[:, :3].astype(np.float32)]))
+    return values.view(f"V{values.itemsize * 6}").reshape(-1)
+
+
+def _among(keys: np.ndarray, wanted: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """(n,) int64: for each key the value of the equal key in `wanted`, or 0."""
+    known = dict(zip(wanted.tolist(), values.tolist()))
+    return np.array([known.get(key, 0) for key in keys.tolist()], np.int64)

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""An object's other colors, on its splats and its textures alike: inputs of node groups, nothing is rewritten."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ....backend.shared.color.recolor import Recolor, average_luma
+from ....backend.shared.splats.spherical_harmonics import C0
+from .. import carrier
+from ..kinds import MESH, SPLATS, TEXTURE, kind_of, part_of, parts_of
+from ..object_collection import our_materials
+from ..shading.color_nodes import CHANNELS, OFFSET, encoded_channel, linear_channel, recolor_inputs, recolored
+from ..shading.graph import Graph, find_or_make
+from ..shading.modifiers import recolor_splats
+from .fills import unobserved_splats
+
+RECOLOR = "objectgs_recolor"
+"""On an object's collection: what objects.json says of its colors, as JSON."""
+
+TEXTURE_GROUP = "texture_recolor"
+
+
+def recolor_of(collection: bpy.types.Collection) -> Recolor | None:
+    """What the user asks of the colors of an object, or of the object that this is a duplicate of."""
+    stored = collection.get(RECOLOR)
+    return Recolor.of(json.loads(stored)) if stored else None
+
+
+def set_recolor(collection: bpy.types.Collection, recolor: Recolor | None) -> None:
+    """Show splats and meshes of a collection in other colors; None takes that back, and the nodes with it."""
+    stored = recolor.stored() if recolor is not None else None
+    if stored is not None:
+        collection[RECOLOR] = json.dumps(stored)
+    elif RECOLOR in collection:
+        del collection[RECOLOR]
+    affine = None if recolor is None else recolor.affine()
+    for obj in parts_of(collection):
+        if kind_of(obj) == SPLATS:
+            recolor_splats(obj, affine)
+        elif kind_of(obj) == MESH:
+            for material in our_materials(obj):
+                _recolor_textures(material, affine)
+
+
+def luma_of(collection: bpy.types.Collection) -> float:
+    """How bright the object's splats are on average, 0 .. 1, by which recoloring keeps their shading."""
+    obj = part_of(collection, SPLATS)
+    if obj is None or "radiance:base" not in obj.data.attributes:
+        return average_luma(np.zeros((0, 3)), np.zeros(0))
+    base = carrier.read(obj.data, "radiance:base")[~unobserved_splats(obj.data)].astype(np.float64)
+    return average_luma(0.5 + C0 * base[:, :3], base[:, 3])
+
+
+def _recolor_textures(material: bpy.types.Material, affine: Any) -> None:
+    """Put the map between our textures and what they go into, or take it away (None)."""
+    tree = material.node_tree
+    for picture in [node for node in tree.nodes if node.type == "TEX_IMAGE" and kind_of(node.image) == TEXTURE]:
+        color = picture.outputs["Color"]
+        between = [link.to_node for link in color.links if _is_ours(link.to_node)]
+        if affine is None:
+            for node in between:
+                for link in list(node.outputs[0].links):
+                    tree.links.new(color, link.to_socket)
+                tree.nodes.remove(node)
+            continue
+        if not between:
+            between = [_insert(tree, picture)]
+        matrix, offset = affine
+        for node in between:
+            for channel, row in zip(CHANNELS, matrix):
+                node.inputs[f"Recolor {channel}"].default_value = row.tolist()
+            node.inputs[OFFSET].default_value = offset.tolist()
+
+
+def with_own_textures(
+    material: bpy.types.Material, recolor: Recolor, folder: Path
+) -> tuple[bpy.types.Material, list[bpy.types.Image]]:
+    """A copy of a material whose textures are pictures in other colors, in `folder`, and these pictures."""
+    matrix, offset = recolor.affine()
+    copy, images = material.copy(), []
+    _recolor_textures(copy, None)
+    for node in [node for node in copy.node_tree.nodes if node.type == "TEX_IMAGE" and kind_of(node.image) == TEXTURE]:
+        source = node.image
+        pixels = np.empty(4 * source.size[0] * source.size[1], np.float32)
+        source.pixels.foreach_get(pixels)
+        colors = pixels.reshape(-1, 4)
+        colors[:, :3] = np.clip(colors[:, :3] @ matrix.T + offset, 0.0, 1.0)
+        image = bpy.data.images.new(f"{source.name} recolored", *source.size)
+        image.pixels.foreach_set(pixels)
+        image.filepath_raw = str(folder / f"{bpy.path.clean_name(image.name)}.png")
+        image.file_format = "PNG"
+        image.save()
+        image.source = "FILE"
+        node.image = image
+        images.append(image)
+    return copy, images
+
+
+def _is_ours(node: bpy.types.Node) -> bool:
+    return node.type == "GROUP" and kind_of(node.node_tree) == TEXTURE_GROUP
+
+
+def _insert(tree: bpy.types.NodeTree, picture: Any) -> bpy.types.Node:
+    color = picture.outputs["Color"]
+    targets = [link.to_socket for link in color.links]
+    node = tree.nodes.new("ShaderNodeGroup")
+    node.node_tree = find_or_make(bpy.data.node_groups, TEXTURE_GROUP, 1, "ObjectGS Recolor", _make_group)
+    node.label = "Recolor"
+    node.location = picture.location[0] + 20.0, picture.location[1] - 280.0
+    for target in targets:
+        tree.links.new(node.outputs[0], target)
+    tree.links.new(color, node.inputs["Color"])
+    return node
+
+
+def _make_group(name: str) -> bpy.types.NodeTree:
+    """A texture's linear colors encoded, mapped, and linear again."""
+    tree = bpy.data.node_groups.new(name, "ShaderNodeTree")
+    tree.interface.new_socket("Color", in_out="OUTPUT", socket_type="NodeSocketColor")
+    tree.interface.new_socket("Color", in_out="INPUT", socket_type="NodeSocketColor")
+    for label, kind, default, _, description in recolor_inputs():
+        socket = tree.interface.new_socket(label, in_out="INPUT", socket_type=kind)
+        socket.default_value, socket.description = default, description
+    graph = Graph(tree)
+    given = graph.node("NodeGroupInput")
+    encoded = [encoded_channel(graph, channel) for channel in graph.separated(given.outputs["Color"])]
+    color = graph.node("ShaderNodeCombineXYZ", dict(enumerate(encoded))).outputs[0]
+    mapped = graph.separated(recolored(graph, color, given))
+    linear = [linear_channel(graph, channel) for channel in mapped]
+    graph.node("NodeGroupOutput", {0: graph.node("ShaderNodeCombineXYZ", dict(enumerate(linear))).outputs[0]})
+    graph.arrange()
+    return tree

@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Removal, color, place and duplicates of objects: shown as objects.json says, and stored there as Blender has them.
+
+Places and duplicates are the user's to change in Blender at any moment, so both sides may be newer. Each collection
+remembers what objects.json said when they agreed, and where its parts were then.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ....backend.shared.color.recolor import Recolor
+from ....backend.shared.reconstruction.folder import Reconstruction
+from ....backend.shared.reconstruction.objects import SceneObject, edit_objects, read_objects
+from .. import carrier
+from ..kinds import OBJECT_PARENT, SPLATS, duplicates_of, folder_of, object_collections, part_of
+from ..objects_file import Objects
+from .duplicates import DUPLICATES, adopt_blender_duplicates, bring_up_to_date, duplicate, remove_duplicate
+from .fills import show_fills
+from .floaters import hide_floaters
+from .placement import PLACEMENT, local_placement, placement_of, rest_placement, set_placement
+from .recolor import recolor_of, set_recolor
+
+REMOVED = "objectgs_removed"
+"""On the collection of a removed object: whether it was hidden before in viewports and in renders."""
+
+
+def show_edits(root: bpy.types.Collection, objects: Objects) -> None:
+    """Remove, recolor, place and duplicate objects as objects.json says. What the user moved since stays there, unless
+    objects.json has another place than it had before. Raises InputError where splats that are to change are in Edit
+    Mode."""
+    collections = object_collections(root)
+    hulls = [entry.id for entry in objects.entries.values() if entry.removed and entry.floaters]
+    if hulls and 0 in collections:
+        carrier.require_object_mode([part_of(collections[0], SPLATS)])
+    show_fills(root, objects)
+    adopt_blender_duplicates(root)
+    bring_up_to_date(root)
+    copies = duplicates_of(root)
+    for object_id, collection in collections.items():
+        entry = objects.entries.get(object_id)
+        if entry is None:
+            continue
+        _show_place(root, collection, entry.transform)
+        all_of_it = [collection, *_show_copies(root, collection, copies.get(object_id, []), entry)]
+        for each in all_of_it:
+            _set_removed(each, entry.removed)
+            if entry.recolor is not None or recolor_of(each) is not None:
+                set_recolor(each, entry.recolor)
+    hide_floaters(root, hulls)
+
+
+def recolor(root: bpy.types.Collection, object_id: int, wanted: Recolor | None) -> bool:
+    """Show an object and its duplicates in other colors, nothing is stored yet; False where it has no collection."""
+    collection = object_collections(root).get(object_id)
+    if collection is None:
+        return False
+    for each in (collection, *duplicates_of(root).get(object_id, ())):
+        set_recolor(each, wanted)
+    return True
+
+
+def reset_placement(root: bpy.types.Collection, collection: bpy.types.Collection) -> None:
+    """Move an object back to where it was captured; parts that were moved by themselves, too."""
+    pivot = part_of(collection, OBJECT_PARENT)
+    for obj in pivot.children if pivot is not None else ():
+        obj.matrix_parent_inverse.identity()
+        obj.matrix_basis.identity()
+    set_placement(root, collection, None)
+
+
+def store_placements(root: bpy.types.Collection, everything: bool = False) -> None:
+    """Write to objects.json where objects and their duplicates are now, as far as the user changed it.
+
+    What Blender's own means have duplicated becomes a duplicate of ours. everything: also what agreed with the file
+    once, for after an undo. Raises InputError or OSError.
+    """
+    path = Reconstruction(folder_of(root)).objects
+    if not path.exists():
+        return
+    adopt_blender_duplicates(root)
+    for twins in duplicates_of(root).values():
+        for copy in [copy for copy in twins if part_of(copy, OBJECT_PARENT) is None]:
+            remove_duplicate(copy)  # The user deleted what was in it.
+    bring_up_to_date(root)
+    copies, collections = duplicates_of(root), object_collections(root)
+    now = {
+        object_id: (_place(root, collection), [_place(root, copy) or _IDENTITY for copy in copies.get(object_id, ())])
+        for object_id, collection in collections.items()
+        if local_placement(root, collection) is not None
+    }
+    changed = {
+        object_id
+        for object_id, (place, copied) in now.items()
+        if place != _agreed_place(collections[object_id]) or copied != _agreed_copies(collections[object_id])
+    }
+    if not changed and not everything:
+        return
+    entries = {entry.id: entry for entry in read_objects(path)}
+    changes: dict[int, dict] = {}
+    for object_id in (now if everything else changed) & entries.keys():
+        entry, (place, copied) = entries[object_id], now[object_id]
+        change = {}
+        if not _same([entry.transform], [place]):
+            change["transform"] = place
+        if not _same(entry.copies, copied):
+            change["copies"] = copied or None
+        if change:
+            changes[object_id] = change
+    if changes:
+        edit_objects(path, changes)
+    for object_id in now.keys() & entries.keys():
+        place, copied = now[object_id]
+        change = changes.get(object_id, {})
+        entry = entries[object_id]
+        _agree(root, collections[object_id], change["transform"] if "transform" in change else _rows(entry.transform))
+        stored = change["copies"] or [] if "copies" in change else [_rows(copy) for copy in entry.copies]
+        for copy, matrix in zip(copies.get(object_id, ()), stored):
+            _agree(root, copy, matrix)
+        _agree_copies(collections[object_id], stored)
+
+
+_IDENTITY = np.eye(4).tolist()
+
+
+def _show_place(root: bpy.types.Collection, collection: bpy.types.Collection, transform: Any) -> None:
+    wanted = _rows(transform)
+    if wanted != _agreed_place(collection):
+        set_placement(root, collection, wanted)
+        _agree(root, collection, wanted)
+
+
+def _show_copies(
+    root: bpy.types.Collection, collection: bpy.types.Collection, there: list, entry: SceneObject
+) -> list[bpy.types.Collection]:
+    """Bring an object's duplicates into agreement with the file; returns them."""
+    wanted = [_rows(copy) for copy in entry.copies]
+    if wanted == _agreed_copies(collection):
+        return there
+    missing, kept = list(wanted), []
+    for copy in there:
+        agreed = _agreed_place(copy)
+        if agreed in missing:
+            missing.remove(agreed)
+            kept.append(copy)
+        else:
+            remove_duplicate(copy)
+    for place in missing:
+        copy = duplicate(root, collection)
+        set_placement(root, copy, place)
+        _agree(root, copy, place)
+        kept.append(copy)
+    _agree_copies(collection, wanted)
+    return kept
+
+
+def _set_removed(collection: bpy.types.Collection, removed: bool) -> None:
+    if removed:
+        if REMOVED not in collection:
+            collection[REMOVED] = [int(collection.hide_viewport), int(collection.hide_render)]
+        if not collection.hide_viewport or not collection.hide_render:
+            collection.hide_viewport = collection.hide_render = True
+    elif REMOVED in collection:
+        collection.hide_viewport, collection.hide_render = (bool(before) for before in collection[REMOVED])
+        del collection[REMOVED]
+
+
+def is_removed(collection: bpy.types.Collection) -> bool:
+    """Whether the object that a collection shows has been removed."""
+    return REMOVED in collection
+
+
+def _place(root: bpy.types.Collection, collection: bpy.types.Collection) -> list | None:
+    """Where an object is, as objects.json holds it: exactly what that says where nothing moved since."""
+    local = local_placement(root, collection)
+    if local is None:
+        return None
+    agreed = json.loads(collection[PLACEMENT]) if PLACEMENT in collection else None
+    if agreed is not None and agreed["local"] == local.tolist():
+        return agreed["stored"]
+    place = placement_of(root, collection)
+    return None if np.array_equal(place, np.eye(4)) else place.tolist()
+
+
+def _agreed_place(collection: bpy.types.Collection) -> list | None:
+    return json.loads(collection[PLACEMENT])["stored"] if PLACEMENT in collection else None
+
+
+def _agree(root: bpy.types.Collection, collection: bpy.types.Collection, stored: list | None) -> None:
+    local = local_placement(root, collection)
+    if stored is None and (local is None or np.array_equal(local, rest_placement(collection))):
+        if PLACEMENT in collection:
+            del collection[PLACEMENT]
+        return
+    if local is not None:
+        collection[PLACEMENT] = json.dumps({"stored": stored, "local": local.tolist()})
+
+
+def _agreed_copies(collection: bpy.types.Collection) -> list:
+    return json.loads(collection.get(DUPLICATES, "[]"))
+
+
+def _agree_copies(collection: bpy.types.Collection, stored: list) -> None:
+    if stored:
+        collection[DUPLICATES] = json.dumps(stored)
+    elif DUPLICATES in collection:
+        del collection[DUPLICATES]
+
+
+def _rows(matrix: Any) -> list | None:
+    return None if matrix is None else [list(row) for row in matrix]
+
+
+def _same(first: Any, second: Any) -> bool:
+    """Whether two lists hold the same maps, None being no move, as far as Blender's single numbers can tell."""
+    if len(first) != len(second):
+        return False
+    for one, other in zip(first, second):
+        if one is other:
+            continue  # None, as nearly always.
+        one, other = (np.array(_IDENTITY if matrix is None else matrix, float) for matrix in (one, other))
+        if not np.allclose(one, other, rtol=1e-6, atol=1e-6):
+            return False
+    return True

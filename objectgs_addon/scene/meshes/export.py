@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Meshes of objects as files of other programs, by Blender's own exporters, with the objects' edits."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import bpy
+from mathutils import Matrix
+
+from ....backend.shared.errors import InputError
+from ... import scene
+from ...blender.quiet import quiet
+
+
+def export(
+    root: bpy.types.Collection, out: Path, suffix: str, ids: list[int] | None, per_object: bool, in_capture: bool
+) -> list[Path]:
+    """Write the meshes of objects (None: all that have one and are not removed) and of their duplicates.
+
+    out: the file, or with `per_object` the folder. in_capture: in COLMAP's coordinates and axes instead of Blender's.
+    Returns the files. Raises InputError where there is nothing to write, OSError or RuntimeError as exporters do.
+    """
+    collections, copies = scene.object_collections(root), scene.duplicates_of(root)
+    chosen = [
+        object_id
+        for object_id in sorted(scene.object_meshes(root))
+        if (ids is None or object_id in ids) and not scene.is_removed(collections[object_id])
+    ]
+    if not chosen:
+        raise InputError("None of the objects has a mesh that is not removed; extract meshes, or choose others.")
+    if per_object and out.is_file():
+        raise InputError(f"{out} is a file; choose another name for the folder.")
+    files: dict[Path, list[int]] = {out: chosen}
+    if per_object:
+        files = {}
+        for object_id in chosen:
+            stem = re.sub(r"[^\w.-]+", "_", collections[object_id].name).strip("._") or f"object_{object_id}"
+            stem = f"{stem}_{object_id}" if out / f"{stem}.{suffix}" in files else stem
+            files[out / f"{stem}.{suffix}"] = [object_id]
+    for path, those in files.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        parts = [
+            (collection, mesh)
+            for object_id in those
+            for collection in (collections[object_id], *copies.get(object_id, ()))
+            for mesh in scene.parts_of(collection)
+            if scene.kind_of(mesh) == "mesh"
+        ]
+        with _stage(root, parts, in_capture):
+            _write(path, suffix, in_capture)
+    return list(files)
+
+
+def _write(path: Path, suffix: str, in_capture: bool) -> None:
+    with quiet():
+        if suffix == "glb":
+            bpy.ops.export_scene.gltf(
+                filepath=str(path),
+                export_format="GLB",
+                export_yup=not in_capture,
+                export_apply=True,
+                use_active_scene=True,
+            )
+        elif suffix == "usdc":
+            bpy.ops.wm.usd_export(filepath=str(path), export_materials=True)
+        else:
+            axes = {"forward_axis": "Y", "up_axis": "Z"} if in_capture else {}
+            bpy.ops.wm.obj_export(filepath=str(path), path_mode="COPY", export_materials=True, **axes)
+
+
+@contextmanager
+def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool) -> Any:
+    """A scene of its own in the window with the meshes alone, whatever is hidden in the user's, and with textures as
+    other programs know them: recolored ones are pictures of their own, since node groups do not travel."""
+    window = bpy.context.window or bpy.context.window_manager.windows[0]
+    before = window.scene
+    stage = bpy.data.scenes.new("ObjectGS export")
+    made, pictures = [], {}
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            for collection, mesh in parts:
+                obj = mesh.copy()
+                made.append(obj)
+                place = scene.matrix_to_capture(root, mesh) if in_capture else scene.matrix_to_world(mesh)
+                obj.parent = None
+                obj.constraints.clear()
+                obj.matrix_basis = Matrix(place.tolist())
+                obj.hide_viewport = obj.hide_render = False
+                stage.collection.objects.link(obj)
+                for slot, own in zip(obj.material_slots, mesh.material_slots):
+                    material = own.material
+                    if scene.recolor_of(collection) is not None and material is not None:
+                        if material not in pictures:
+                            pictures[material] = scene.with_own_textures(
+                                material, scene.recolor_of(collection), Path(folder)
+                            )
+                        material = pictures[material][0]
+                    slot.link, slot.material = "OBJECT", material
+            window.scene = stage
+            stage.view_layers[0].update()
+            yield
+    finally:
+        window.scene = before
+        for obj in made:
+            bpy.data.objects.remove(obj)
+        for material, images in pictures.values():
+            bpy.data.materials.remove(material)
+            for image in images:
+                bpy.data.images.remove(image)
+        bpy.data.scenes.remove(stage)

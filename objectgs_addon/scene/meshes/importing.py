@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Mesh files as Blender objects, made or updated in the collections of their objects."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+from ....backend.shared.color.palette import to_linear
+from ....backend.shared.errors import InputError
+from ....backend.shared.formats.mesh_ply import Mesh, read_mesh
+from .. import carrier
+from ..capture import origin_of
+from ..kinds import ANCHORS, MESH, MESH_KEY, OBJECT_PARENT, SPLATS, adopt, mark, parent_of
+from ..object_collection import NAME, center_of, ensure_pivot, new_collection, textures_of
+from ..objects_file import Objects
+from ..shading.materials import mesh_material
+from .listed import ListedMesh
+from .textures import load_texture, reload_texture
+
+WRITTEN = "objectgs_written"
+"""Custom property of a mesh object: when the files that it shows were written."""
+
+UV_MAP, COLORS, UNOBSERVED = "UVMap", "Col", "unobserved"
+
+
+class MeshImporter:
+    """Puts meshes into the collections of a reconstruction.
+
+    Attributes:
+        changed: IDs of the objects whose collections have received or lost a mesh; None: the reconstruction's own.
+        new: IDs of the objects whose collections were made; these are not linked yet.
+        warnings: sentences about missing textures.
+    """
+
+    def __init__(
+        self, root: bpy.types.Collection, objects: Objects, collections: dict[int, bpy.types.Collection]
+    ) -> None:
+        self.root, self.objects, self.collections = root, objects, collections
+        self.origin = origin_of(root)
+        self.parent = parent_of(root)
+        self.changed: set[int | None] = set()
+        self.new: list[int] = []
+        self.warnings: list[str] = []
+        self._material: bpy.types.Material | None = None
+
+    def show(self, listed: ListedMesh, target: int | None, obj: bpy.types.Object | None) -> bool:
+        """Make or update one mesh.
+
+        Args:
+            listed: the mesh and its files.
+            target: ID of the object in whose collection it lies, None: the reconstruction's own.
+            obj: the Blender object that shows it already, or None.
+
+        Returns:
+            Whether its files were read.
+
+        Raises:
+            InputError: the mesh's file cannot be shown; nothing is changed then.
+        """
+        collection = self.root if target is None else self.collections.get(target)
+        in_place = obj is not None and collection is not None and _contains(collection, obj)
+        written = listed.written()
+        if obj is not None and in_place and obj.parent is not None and obj.get(WRITTEN) == written:
+            return False
+        loaded = _read(listed)
+        positions = loaded.vertices - self.origin
+        if target is not None and collection is None:
+            collection = self.collections[target] = new_collection(target, self.objects)
+            adopt(collection, self.root, (OBJECT_PARENT, SPLATS, ANCHORS, MESH), target)
+            in_place = obj is not None and _contains(collection, obj)
+            self.new.append(target)
+        pivot, center = self.parent, np.zeros(3)
+        if target is not None:
+            pivot = ensure_pivot(collection, self.parent, target, positions)
+            center = center_of(pivot)
+        if obj is None:
+            obj = self._new(listed, target, collection)
+        elif not in_place:
+            self.unlink(obj)
+            collection.objects.link(obj)
+            mark(obj, MESH, target)
+            self.changed.add(target)
+        if obj.parent is None or not in_place:
+            obj.parent = pivot
+        fill_mesh(obj.data, positions - center, loaded)
+        self._update_material(obj, listed)
+        obj[WRITTEN] = written
+        if not listed.texture.is_file():
+            self.warnings.append(f"{listed.texture} is missing, so {obj.name} has no texture; make the mesh again.")
+        return True
+
+    def unlink(self, obj: bpy.types.Object) -> None:
+        """Take a mesh out of its collection, because its objects were merged or split, or because it is removed."""
+        for object_id, collection in ((None, self.root), *self.collections.items()):
+            if _contains(collection, obj):
+                collection.objects.unlink(obj)
+                self.changed.add(object_id)
+
+    def _new(self, listed: ListedMesh, target: int | None, collection: bpy.types.Collection) -> bpy.types.Object:
+        name = listed.name
+        if target is not None:
+            name = collection[NAME] if str(target) == listed.key else self.objects.name(int(listed.key))
+        obj = bpy.data.objects.new(f"{name} {MESH}", bpy.data.meshes.new(f"{name} {MESH}"))
+        mark(obj, MESH, target)
+        obj[MESH_KEY] = listed.key
+        if target is None:
+            obj.hide_viewport = obj.hide_render = True
+        else:
+            obj.color = (*to_linear(self.objects.rgb(target)), 1.0)
+        collection.objects.link(obj)
+        self.changed.add(target)
+        return obj
+
+    def _update_material(self, obj: bpy.types.Object, listed: ListedMesh) -> None:
+        """Give the mesh our material if it has none; if it has one, only reload our textures."""
+        slots = [slot.material for slot in obj.material_slots]
+        if not slots:
+            image = load_texture(listed.texture, obj.name, listed.key)
+            self._material = material = mesh_material(obj.name, image, self._material)
+            material.diffuse_color = obj.color
+            obj.data.materials.append(material)
+            return
+        for image in dict.fromkeys(image for material in slots for image in textures_of(material)):
+            if image.get(MESH_KEY) == obj.get(MESH_KEY):
+                reload_texture(image, listed.texture)
+
+
+def fill_mesh(mesh: bpy.types.Mesh, positions: np.ndarray, loaded: Mesh) -> None:
+    """Replace the geometry of a mesh; its materials stay.
+
+    Args:
+        mesh: Blender's mesh.
+        positions: of its new vertices, (V, 3), in its own coordinates.
+        loaded: its new faces, UV map, vertex colors, normals, and which faces are unobserved.
+    """
+    if mesh.shape_keys is not None:
+        for user in [obj for obj in bpy.data.objects if obj.data == mesh]:
+            user.shape_key_clear()  # They belong to the old vertices.
+    mesh.clear_geometry()
+    count = len(loaded.faces)
+    mesh.vertices.add(len(positions))
+    mesh.loops.add(3 * count)
+    mesh.polygons.add(count)
+    carrier.write(mesh, "position", "FLOAT_VECTOR", positions)
+    mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * count, 3, dtype=np.int32))
+    mesh.loops.foreach_set("vertex_index", np.ascontiguousarray(loaded.faces, np.int32).reshape(-1))
+    uvs = mesh.uv_layers.new(name=UV_MAP, do_init=False)
+    uvs.uv.foreach_set("vector", np.nan_to_num(loaded.uvs).astype(np.float32).reshape(-1))
+    colors = mesh.color_attributes.new(COLORS, "BYTE_COLOR", "POINT")
+    rgba = np.ones((len(positions), 4), np.float32)
+    rgba[:, :3] = loaded.colors / np.float32(255.0)
+    colors.data.foreach_set("color_srgb", rgba.reshape(-1))
+    mesh.color_attributes.active_color = colors
+    unobserved = mesh.attributes.new(UNOBSERVED, "BOOLEAN", "FACE")
+    unobserved.data.foreach_set("value", np.ascontiguousarray(loaded.unobserved, bool))
+    mesh.update(calc_edges=True)
+    # Removes faces that use a vertex twice, which would crash Blender's tools.
+    mesh.validate(clean_customdata=False)
+    mesh.normals_split_custom_set_from_vertices(np.nan_to_num(loaded.normals))
+    mesh.update()
+
+
+def _read(listed: ListedMesh) -> Mesh:
+    loaded = read_mesh(listed.mesh)
+    if not len(loaded.faces) or not np.isfinite(loaded.vertices).all():
+        raise InputError(f"{listed.mesh} holds no surface; make the meshes again.")
+    return loaded
+
+
+def _contains(collection: bpy.types.Collection, obj: bpy.types.Object) -> bool:
+    return collection.objects.get(obj.name) == obj

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""State saved in the .blend and the preferences, and its exchange with the reconstruction folder."""

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A click in the viewport or the outliner on one part of an object selects all of it, and the list follows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from .. import scene
+from ..blender import writing
+from ..picking.selection import selectable
+from . import object_edits
+
+_owner = object()
+
+
+@writing.allowed
+def _active_changed() -> None:
+    """Called by Blender when another object becomes active."""
+    context = bpy.context
+    part = getattr(context, "active_object", None)
+    if part is None or part.mode != "OBJECT" or not part.select_get():
+        return
+    object_id = scene.object_id_of(part)
+    root = scene.root_of(part, context.scene) if object_id is not None else None
+    if root is None:
+        return
+    context.scene.objectgs.active = root
+    for index, item in enumerate(root.objectgs.objects):
+        if object_edits.from_stored(item.object_id) == object_id:
+            with object_edits.without_callbacks():
+                root.objectgs.active_object = index
+            break
+    if context.scene.objectgs.select_whole:
+        whole = scene.collection_of(part)
+        for other in scene.parts_of(whole) if whole is not None else ():
+            if selectable(other):
+                other.select_set(True)
+
+
+def _subscribe() -> None:
+    bpy.msgbus.subscribe_rna(key=(bpy.types.LayerObjects, "active"), owner=_owner, args=(), notify=_active_changed)
+
+
+@bpy.app.handlers.persistent
+def _file_loaded(*_: Any) -> None:
+    bpy.msgbus.clear_by_owner(_owner)
+    _subscribe()
+
+
+@bpy.app.handlers.persistent
+def _undone(*_: Any) -> None:
+    """Blender kept the selection as the click itself left it."""
+    _active_changed()
+
+
+def register() -> None:
+    _subscribe()
+    bpy.app.handlers.undo_post.append(_undone)
+    bpy.app.handlers.redo_post.append(_undone)
+    bpy.app.handlers.load_post.append(_file_loaded)
+
+
+def unregister() -> None:
+    bpy.app.handlers.redo_post.remove(_undone)
+    bpy.app.handlers.undo_post.remove(_undone)
+    bpy.app.handlers.load_post.remove(_file_loaded)
+    bpy.msgbus.clear_by_owner(_owner)

@@ -1,0 +1,450 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The list of objects, filled from objects.json, and the user's edits written back to that file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...backend.shared.color.recolor import Recolor
+from ...backend.shared.errors import InputError
+from ...backend.shared.grouping import grouped, read_groups
+from ...backend.shared.reconstruction.folder import Reconstruction
+from ...backend.shared.reconstruction.objects import SceneObject, edit_objects, merged, read_objects
+from .. import scene
+from ..blender import messages, writing
+from ..picking import selection
+from ..scene import from_stored, to_stored
+
+WRITE_AFTER = 0.4
+"""Seconds after the last change until new colors are written, since a dragged slider changes all the time."""
+
+SLIDERS = ("amount", "hue", "saturation", "value", "contrast")
+COLORS = ("replace", "tint")
+DIGITS = 6
+"""Decimals of a slider's value, about the precision of Blender's floats."""
+
+after_edits: list[Callable[[bpy.types.Collection], None]] = []
+"""Called with a reconstruction's collection after an edit that the backend may have to complete."""
+
+_filling = False
+_unwritten: set[tuple[int, int]] = set()
+"""(session UID of the collection, object ID) of new colors that are not in objects.json yet."""
+
+
+@contextmanager
+def without_callbacks() -> Iterator[None]:
+    """Set properties of rows without calling their update callbacks."""
+    global _filling
+    before, _filling = _filling, True
+    try:
+        yield
+    finally:
+        _filling = before
+
+
+def fill(root: bpy.types.Collection) -> None:
+    """Fill the list from objects.json and the shown splats; it is empty before objects are assigned."""
+    flush()
+    properties = root.objectgs
+    path = Reconstruction(scene.folder_of(root)).objects
+    entries = read_objects(path) if path.exists() else []
+    shown, faces = splat_counts(root), face_counts(root)
+    active = active_item(root)
+    active_id = active.object_id if active else None
+    with without_callbacks():
+        properties.objects.clear()
+        for entry in entries:
+            item = properties.objects.add()
+            item.name = entry.name
+            item.object_id = to_stored(entry.id)
+            item.color = [channel / 255.0 for channel in entry.color]
+            item.chosen = not entry.left_out
+            item.points = entry.points
+            item.splats = shown.get(entry.id, 0)
+            item.faces = faces.get(entry.id, 0)
+            item.is_merged = entry.merged_into is not None
+            item.merged_into = to_stored(entry.merged_into or 0)
+            item.removed, item.floaters, item.fill = entry.removed, entry.floaters, entry.fill
+            _set_sliders(item, entry.recolor)
+            _remember(item)
+            if item.object_id == active_id:
+                properties.active_object = len(properties.objects) - 1
+        properties.active_object = max(0, min(properties.active_object, len(entries) - 1))
+
+
+def splat_counts(root: bpy.types.Collection) -> dict[int, int]:
+    """Object ID -> number of splats in its collection, including those of merged objects."""
+    return {
+        object_id: sum(
+            len(part.data.vertices) - int(scene.unobserved_splats(part.data).sum())
+            for part in scene.parts_of(collection)
+            if scene.kind_of(part) == "splats"
+        )
+        for object_id, collection in scene.object_collections(root).items()
+    }
+
+
+def face_counts(root: bpy.types.Collection) -> dict[int, int]:
+    """Object ID -> number of faces of its meshes, for objects that have any."""
+    return {
+        object_id: sum(len(mesh.data.polygons) for mesh in meshes)
+        for object_id, meshes in scene.object_meshes(root).items()
+    }
+
+
+def store(root: bpy.types.Collection) -> None:
+    """Write the list and the transforms to objects.json after undo or redo changed them."""
+    _unwritten.difference_update([mark for mark in _unwritten if mark[0] == root.session_uid])
+    path = Reconstruction(scene.folder_of(root)).objects
+    if not path.exists():
+        return
+    entries = {entry.id: entry for entry in read_objects(path)}
+    items = {from_stored(item.object_id): item for item in root.objectgs.objects}
+    if set(items) != set(entries):
+        return
+    changes = {}
+    for object_id, item in items.items():
+        entry = entries[object_id]
+        wanted = {
+            "name": item.name,
+            "color": _rgb(item),
+            "left_out": None if item.chosen else True,
+            "merged_into": from_stored(item.merged_into) if item.is_merged else None,
+            "removed": item.removed or None,
+            "floaters": item.floaters or None,
+            "fill": item.fill or None,
+            "recolor": recolor_of(item).stored(),
+        }
+        there = {
+            "name": entry.name,
+            "color": list(entry.color),
+            "left_out": entry.left_out or None,
+            "merged_into": entry.merged_into,
+            "removed": entry.removed or None,
+            "floaters": entry.floaters or None,
+            "fill": entry.fill or None,
+            "recolor": _rounded(entry.recolor).stored(),
+        }
+        changed = {key: value for key, value in wanted.items() if value != there[key]}
+        if changed:
+            changes[object_id] = changed
+    if changes:
+        edit_objects(path, changes)
+    scene.store_placements(root, everything=True)
+
+
+def store_edits(root: bpy.types.Collection) -> None:
+    """Write pending edits to objects.json, before something else reads it."""
+    flush()
+    scene.store_placements(root)
+
+
+def merge(root: bpy.types.Collection, object_ids: Iterable[int], into: int) -> None:
+    """Make objects parts of the object `into`."""
+    _edit(root, {object_id: {"merged_into": into} for object_id in object_ids if object_id != into})
+
+
+def split(root: bpy.types.Collection, object_id: int) -> int:
+    """Undo every merge into `object_id` and its own; returns their number."""
+    items = root.objectgs.objects
+    apart = [
+        from_stored(item.object_id)
+        for item in items
+        if item.is_merged and (from_stored(item.merged_into) == object_id or from_stored(item.object_id) == object_id)
+    ]
+    _edit(root, {part: {"merged_into": None} for part in apart})
+    return len(apart)
+
+
+def group(root: bpy.types.Collection, labels: Path) -> None:
+    """Merge the IDs that a labels file gives the same name. Raises InputError if it is no labels file."""
+    objects = read_objects(Reconstruction(scene.folder_of(root)).objects)
+    _edit(root, grouped(objects, read_groups(labels), labels))
+
+
+def choose(root: bpy.types.Collection, chosen: dict[int, bool]) -> None:
+    """Set for each ID whether training makes it an object."""
+    _edit(root, {object_id: {"left_out": None if wanted else True} for object_id, wanted in chosen.items()})
+
+
+def _edit(root: bpy.types.Collection, changes: dict[int, dict]) -> None:
+    """Write edits to objects.json and show them."""
+    if not changes:
+        return
+    _require_object_mode(root)
+    store_edits(root)
+    edit_objects(Reconstruction(scene.folder_of(root)).objects, changes)
+    try:
+        if scenes_of(root):
+            show(root)
+    finally:
+        fill(root)
+    _notify(root)
+
+
+def show(root: bpy.types.Collection) -> None:
+    """Update the collections from the folder."""
+    folder = scene.folder_of(root)
+    if Reconstruction(folder).splats.exists():
+        scene.show_result(root, folder)
+    else:
+        scene.show_objects(root, folder)
+
+
+def remove(root: bpy.types.Collection, object_ids: Iterable[int], floaters: bool, fill: bool = False) -> None:
+    """Hide objects until they are restored.
+
+    floaters: also hide the unlabeled splats inside them. fill: fill the holes in the ground or walls behind them.
+    """
+    change = {"removed": True, "floaters": floaters or None, "fill": fill or None}
+    _show_edit(root, dict.fromkeys(object_ids, change))
+
+
+def restore(root: bpy.types.Collection, object_ids: Iterable[int]) -> None:
+    """Show removed objects again, unchanged."""
+    _show_edit(root, {object_id: {"removed": None, "floaters": None, "fill": None} for object_id in object_ids})
+
+
+def fill_hole(root: bpy.types.Collection, object_id: int, is_filled: bool) -> None:
+    """Fill the hole behind a removed object, or leave it as it was trained."""
+    _show_edit(root, {object_id: {"fill": is_filled or None}})
+
+
+def reset_colors(root: bpy.types.Collection, object_ids: Iterable[int]) -> None:
+    """Reset objects to their captured colors."""
+    _show_edit(root, {object_id: {"recolor": None} for object_id in object_ids})
+
+
+def _show_edit(root: bpy.types.Collection, changes: dict[int, dict]) -> None:
+    """Write edits to objects.json and show them, for edits that need no splats from the folder."""
+    _require_object_mode(root)
+    flush()
+    folder = scene.folder_of(root)
+    edit_objects(Reconstruction(folder).objects, changes)
+    try:
+        scene.show_edits(root, scene.Objects.read(folder))
+    finally:
+        fill(root)
+    _notify(root)
+
+
+def _notify(root: bpy.types.Collection) -> None:
+    for call in after_edits:
+        call(root)
+
+
+def flush() -> None:
+    """Write pending colors."""
+    waiting = set(_unwritten)
+    if not waiting:
+        return
+    _unwritten.clear()
+    for root in [root for root in bpy.data.collections if scene.kind_of(root) == "reconstruction"]:
+        items = [item for item in root.objectgs.objects if (root.session_uid, from_stored(item.object_id)) in waiting]
+        if items:
+            _write_colors(root, items)
+
+
+def _write_colors(root: bpy.types.Collection, items: list[Any]) -> None:
+    changes = {from_stored(item.object_id): {"recolor": recolor_of(item).stored()} for item in items}
+    try:
+        edit_objects(Reconstruction(scene.folder_of(root)).objects, changes)
+    except (InputError, OSError) as error:
+        for item in items:
+            _restore(item)
+            scene.recolor(root, from_stored(item.object_id), recolor_of(item))
+        messages.show(f"Colors were not changed: {messages.sentence(error)}", "ERROR")
+        return
+    for item in items:
+        _remember(item)
+
+
+def recolor_of(item: Any) -> Recolor:
+    """The color edit that a row's sliders describe."""
+    values = {name: round(getattr(item, name), DIGITS) for name in SLIDERS}
+    values |= {name: tuple(round(channel, DIGITS) for channel in getattr(item, name)) for name in COLORS}
+    return Recolor(**values, middle=round(item.middle, DIGITS)) if item.middle else Recolor(**values)
+
+
+def _rounded(recolor: Recolor | None) -> Recolor:
+    """A stored color edit with the sliders' precision."""
+    if recolor is None:
+        return Recolor()
+    values = {name: round(getattr(recolor, name), DIGITS) for name in (*SLIDERS, "middle")}
+    return Recolor(
+        **values, **{name: tuple(round(channel, DIGITS) for channel in getattr(recolor, name)) for name in COLORS}
+    )
+
+
+def _set_sliders(item: Any, recolor: Recolor | None) -> None:
+    wanted = recolor or Recolor()
+    for name in (*SLIDERS, *COLORS):
+        setattr(item, name, getattr(wanted, name))
+    item.middle = wanted.middle if recolor is not None else 0.0
+
+
+def chosen_ids(context: bpy.types.Context, root: bpy.types.Collection) -> list[int]:
+    """IDs of the objects selected in the viewport, or of the active row; of merged objects, the one they belong to."""
+    ids = selection.selected_ids(context, root)
+    item = active_item(root)
+    if not ids and item is not None:
+        ids = [from_stored(item.object_id)]
+    return list(dict.fromkeys(shown_as(root, object_id) for object_id in ids if object_id))
+
+
+def require_chosen_ids(context: bpy.types.Context, root: bpy.types.Collection) -> list[int]:
+    """As `chosen_ids`. Raises InputError if there are none."""
+    ids = chosen_ids(context, root)
+    if not ids:
+        raise InputError("No object is selected; select one in the viewport or in the list")
+    return ids
+
+
+def item_of(root: bpy.types.Collection, object_id: int) -> Any:
+    """The row of an object ID, or None."""
+    return next((item for item in root.objectgs.objects if from_stored(item.object_id) == object_id), None)
+
+
+def shown_item(root: bpy.types.Collection) -> Any:
+    """The active row, or the row it is merged into; None if the list is empty."""
+    item = active_item(root)
+    return item and item_of(root, shown_as(root, from_stored(item.object_id)))
+
+
+def shown_as(root: bpy.types.Collection, object_id: int) -> int:
+    """The ID of the object that shows `object_id`: itself, or the one it is merged into."""
+    rows = [
+        SceneObject(
+            from_stored(item.object_id),
+            item.name,
+            (0, 0, 0),
+            0,
+            from_stored(item.merged_into) if item.is_merged else None,
+        )
+        for item in root.objectgs.objects
+    ]
+    return merged(rows).get(object_id, object_id)
+
+
+def scenes_of(root: bpy.types.Collection) -> list[bpy.types.Scene]:
+    """The scenes that contain the reconstruction."""
+    return [owner for owner in bpy.data.scenes if root in owner.collection.children_recursive]
+
+
+def active_item(root: bpy.types.Collection) -> Any:
+    """The active row, or None if the list is empty."""
+    properties = root.objectgs
+    count = len(properties.objects)
+    return properties.objects[min(max(properties.active_object, 0), count - 1)] if count else None
+
+
+def _rgb(item: Any) -> list[int]:
+    return [round(255 * channel) for channel in item.color]
+
+
+# Update callbacks of the rows' properties.
+
+
+def name_changed(item: Any, _context: bpy.types.Context) -> None:
+    if _filling:
+        return
+    name = " ".join(item.name.split())
+    if not name:
+        _restore(item)
+        return
+    with without_callbacks():
+        item.name = name
+    _row_changed(item, name=name)
+
+
+def color_changed(item: Any, _context: bpy.types.Context) -> None:
+    _row_changed(item, color=_rgb(item))
+
+
+def chosen_changed(item: Any, _context: bpy.types.Context) -> None:
+    _row_changed(item, left_out=None if item.chosen else True)
+
+
+def recolor_changed(item: Any, _context: bpy.types.Context) -> None:
+    """Show a moved slider's color at once, and write it a little later."""
+    if _filling:
+        return
+    root, object_id = item.id_data, from_stored(item.object_id)
+    collection = scene.object_collections(root).get(object_id)
+    if collection is None:
+        _restore(item)
+        return
+    if not item.middle:
+        with without_callbacks():
+            item.middle = scene.luma_of(collection)
+    scene.recolor(root, object_id, recolor_of(item))
+    _unwritten.add((root.session_uid, object_id))
+    if bpy.app.background:
+        flush()
+        return
+    if bpy.app.timers.is_registered(_flush_later):
+        bpy.app.timers.unregister(_flush_later)
+    bpy.app.timers.register(_flush_later, first_interval=WRITE_AFTER)
+
+
+@writing.allowed
+def _flush_later() -> None:
+    flush()
+
+
+def _row_changed(item: Any, **changes: Any) -> None:
+    """Store an edit of a row, or revert it if that fails, since a callback must not raise."""
+    if _filling:
+        return
+    root = item.id_data
+    folder = scene.folder_of(root)
+    try:
+        _require_object_mode(root)
+        flush()
+        edit_objects(Reconstruction(folder).objects, {from_stored(item.object_id): changes})
+    except (InputError, OSError) as error:
+        _restore(item)
+        messages.show(f"{item.name} was not changed: {messages.sentence(error)}", "ERROR")
+        return
+    _remember(item)
+    try:
+        if scenes_of(root):
+            scene.show_objects(root, folder)
+        _notify(root)
+    except (InputError, OSError) as error:
+        messages.show(messages.sentence(error), "ERROR")
+
+
+def _require_object_mode(root: bpy.types.Collection) -> None:
+    """Raise InputError if a part is in Edit Mode, where an edit could not be shown."""
+    scene.require_object_mode(part for part in root.all_objects if scene.kind_of(part) is not None)
+
+
+def _remember(item: Any) -> None:
+    """Store the state that a failed edit reverts to."""
+    item.stored = json.dumps([item.name, list(item.color), item.chosen, recolor_of(item).stored()])
+
+
+def _restore(item: Any) -> None:
+    """Revert a failed edit."""
+    if item.stored:
+        with without_callbacks():
+            item.name, item.color, item.chosen, *recolor = json.loads(item.stored)
+            if recolor:  # Files of older versions have none.
+                _set_sliders(item, Recolor.of(recolor[0]) if recolor[0] else None)
+
+
+def active_changed(properties: Any, context: bpy.types.Context) -> None:
+    """Select the clicked object of the list in the viewport."""
+    if _filling:
+        return
+    root = properties.id_data
+    item = active_item(root)
+    if item is not None:
+        selection.select_object(context, root, shown_as(root, from_stored(item.object_id)))

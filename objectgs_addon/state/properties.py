@@ -1,0 +1,278 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The state saved in the .blend: the active reconstruction, its list of objects and its training settings.
+
+`Collection.objectgs` holds a reconstruction's state, `Scene.objectgs` the active one. Everything here is undone and
+saved with the .blend; background jobs are not (see `running`).
+"""
+
+from typing import Any
+
+import bpy
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    FloatVectorProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
+
+from ...backend.shared.defaults import MAX_SIZE
+from ...backend.shared.expectation import PRESET_STEPS
+from ...backend.shared.reconstruction.fill import UNOBSERVED
+from .. import drawing
+from ..scene import SHOWS, color_points_by, kind_of, show_kinds, shown_kinds
+from . import object_edits
+
+
+def _slider(name: str, default: float, least: float, most: float, description: str) -> Any:
+    return FloatProperty(
+        name=name,
+        default=default,
+        min=least,
+        soft_max=most,
+        max=most if most <= 1.0 else 10.0,
+        subtype="FACTOR",
+        options=set(),
+        description=description,
+        update=object_edits.recolor_changed,
+    )
+
+
+def _color_edit(name: str, default: float, description: str) -> Any:
+    return FloatVectorProperty(
+        name=name,
+        subtype="COLOR_GAMMA",
+        size=3,
+        min=0.0,
+        soft_max=1.0,
+        max=10.0,
+        default=(default,) * 3,
+        options=set(),
+        description=description,
+        update=object_edits.recolor_changed,
+    )
+
+
+class ObjectItem(bpy.types.PropertyGroup):
+    """A row of the objects list. IDs above 2^31 - 1 are stored as the int32 of the same bits."""
+
+    name: StringProperty(
+        name="Name", description="Name of the object, kept in the reconstruction", update=object_edits.name_changed
+    )
+    color: FloatVectorProperty(
+        name="Color",
+        description="Color that represents the object",
+        subtype="COLOR_GAMMA",
+        size=3,
+        min=0.0,
+        max=1.0,
+        update=object_edits.color_changed,
+    )
+    chosen: BoolProperty(
+        name="Reconstruct",
+        default=True,
+        update=object_edits.chosen_changed,
+        description="Train this object; otherwise it stays part of the unlabeled rest",
+    )
+    object_id: IntProperty(name="ID", description="Pixel value of the object in the masks")
+    points: IntProperty(name="Points", description="Points of the capture that are assigned to this object")
+    splats: IntProperty(name="Splats", description="Number of Gaussian splats of this object")
+    faces: IntProperty(name="Faces", description="Number of faces of this object's mesh; 0 without a mesh")
+    is_merged: BoolProperty(name="Merged", description="Part of another object")
+    merged_into: IntProperty(name="Merged Into", description="ID of the object that this one is a part of")
+    removed: BoolProperty(name="Removed", description="Hidden until it is restored")
+    floaters: BoolProperty(name="With Floaters", description="Removed with the unlabeled splats inside it")
+    fill: BoolProperty(
+        name="Fill Hole", description="The hole in the ground or wall behind it is filled from its surroundings"
+    )
+    replace: _color_edit("New Color", 0.5, "Replaces the object's color and keeps its shading")
+    amount: _slider("Amount", 0.0, 0.0, 1.0, "Amount of the new color")
+    hue: _slider("Hue", 0.0, -0.5, 0.5, "Rotation of the hue in turns of the color wheel; brightness is kept")
+    saturation: _slider("Saturation", 1.0, 0.0, 2.0, "0 is gray, 1 is unchanged")
+    value: _slider("Brightness", 1.0, 0.0, 2.0, "Factor of the brightness")
+    contrast: _slider("Contrast", 1.0, 0.0, 2.0, "Contrast around the object's average brightness; 1 is unchanged")
+    tint: _color_edit("Tint", 1.0, "Factor of each channel; white is unchanged")
+    middle: FloatProperty(
+        name="Average Brightness", description="Average brightness of the object's splats; 0 if it is not known yet"
+    )
+    stored: StringProperty(name="Stored", description="State in objects.json, which a failed edit reverts to")
+
+
+class PlanChoice(bpy.types.PropertyGroup):
+    """The user's choice for a decision of the plan; `name` is its key."""
+
+    done: BoolProperty(name="Done", description="Whether training does it")
+
+
+class ReconstructionProperties(bpy.types.PropertyGroup):
+    """State of one reconstruction, on its collection."""
+
+    objects: CollectionProperty(type=ObjectItem)
+    plan_choices: CollectionProperty(type=PlanChoice)
+    active_object: IntProperty(name="Active Object", default=0, update=object_edits.active_changed, options=set())
+    length: EnumProperty(
+        name="Length",
+        default="minutes",
+        description="Total length of the training",
+        items=[
+            ("preview", "Preview", f"{PRESET_STEPS['preview']:,} steps, for a quick check"),
+            ("standard", "Standard", f"{PRESET_STEPS['standard']:,} steps"),
+            ("final", "Until Converged", "Until the error on held-out photos stops decreasing"),
+            ("minutes", "Minutes", "A time limit; a finished training can be extended"),
+        ],
+    )
+    minutes: FloatProperty(
+        name="Minutes",
+        default=5.0,
+        min=0.1,
+        soft_max=120.0,
+        precision=1,
+        step=50,
+        description="Total time of the training. More time gives a sharper result; a finished training can be extended",
+    )
+    mode: EnumProperty(
+        name="Model",
+        default="explicit",
+        items=[
+            ("explicit", "Plain Splats", "The trained model is exactly what Blender shows and the PLY file contains"),
+            ("view", "View-Dependent", "As in the paper, splats depend on the view; the PLY file is an approximation"),
+        ],
+    )
+    sh_degree: IntProperty(
+        name="SH Degree",
+        default=1,
+        min=0,
+        max=3,
+        description="Degree of the spherical harmonics: how much colors can depend on the view direction",
+    )
+    primitive: EnumProperty(
+        name="Splats",
+        default="3d",
+        items=[
+            ("3d", "Ellipsoids", "3D Gaussians, for the best images"),
+            ("2d", "Discs", "2D Gaussians, for the best meshes, since discs align with surfaces"),
+        ],
+    )
+    strategy: EnumProperty(
+        name="Assignment",
+        description="How the masks vote on the object of a point",
+        default="majority",
+        items=[
+            ("majority", "Majority", "The object that most masks show at the point"),
+            ("probability", "Probability", "Random choice in proportion to the votes"),
+            ("correspondence", "Correspondence", "Only photos in which COLMAP matched the point"),
+        ],
+    )
+    max_size: IntProperty(
+        name="Image Size",
+        default=MAX_SIZE,
+        min=64,
+        soft_max=8192,
+        description="Longest side in pixels; larger photos are scaled down",
+    )
+    color_by: EnumProperty(
+        name="Color Points By",
+        default="photo",
+        items=[("photo", "Photo", "Colors of the photos"), ("object", "Object", "Color of the assigned object")],
+        update=lambda self, _context: color_points_by(self.id_data, self.color_by),
+    )
+    # Stored outside of this property group, as in files made without the extension.
+    shown: EnumProperty(
+        name="Show",
+        items=[
+            ("splats", "Splats", "The Gaussian splats", 0),
+            ("meshes", "Meshes", "The textured meshes; objects without a mesh show their splats", 1),
+            ("both", "Both", "Splats and meshes together", 2),
+        ],
+        get=lambda self: SHOWS.index(shown_kinds(self.id_data)),
+        set=lambda self, value: show_kinds(self.id_data, SHOWS[value]),
+    )
+    mesh_objects: EnumProperty(
+        name="Objects",
+        default="all",
+        items=[
+            ("all", "All", "Every object that is not left out; merged objects become one mesh"),
+            ("selected", "Selected", "The objects selected in the viewport, or the active one of the list"),
+        ],
+    )
+    mesh_scene: BoolProperty(name="Whole Scene", description="Also make one mesh of the whole scene, hidden")
+    mesh_faces: IntProperty(
+        name="Faces",
+        default=20_000,
+        min=100,
+        soft_max=200_000,
+        step=1000,
+        description="Maximum triangles of an object's mesh; the mesh of the whole scene may have five times as many",
+    )
+    mesh_closed: BoolProperty(
+        name="Closed",
+        default=True,
+        description=(
+            "Close each mesh where no camera saw the object, such as its underside. The attribute "
+            f'"{UNOBSERVED}" marks these faces'
+        ),
+    )
+    texture_size: EnumProperty(
+        name="Texture",
+        default="auto",
+        items=[
+            ("auto", "Automatic", "Size that matches the resolution of the photos"),
+            ("512", "512 px", ""),
+            ("1024", "1024 px", ""),
+            ("2048", "2048 px", ""),
+            ("4096", "4096 px", ""),
+        ],
+        description="Width and height of each mesh's texture",
+    )
+
+
+def _is_reconstruction(_scene: Any, collection: bpy.types.Collection) -> bool:
+    return kind_of(collection) == "reconstruction"
+
+
+class SceneProperties(bpy.types.PropertyGroup):
+    """The active reconstruction of a scene, and how it is shown."""
+
+    active: PointerProperty(
+        type=bpy.types.Collection,
+        name="Reconstruction",
+        poll=_is_reconstruction,
+        description="Active reconstruction of the scene",
+    )
+    select_whole: BoolProperty(
+        name="Select Whole Objects",
+        default=True,
+        description="Clicking a part of an object selects all its parts, so that they move together",
+    )
+    draw_splats: BoolProperty(
+        name="Draw Splats",
+        default=False,
+        update=drawing.show,
+        description="Draw splats in the 3D viewports as in the final image, instead of a preview by points",
+    )
+    splat_colors: EnumProperty(
+        name="Splat Colors",
+        default="photo",
+        items=[("photo", "Photo", "Colors of the photos"), ("object", "Object", "Colors that represent the objects")],
+        update=drawing.redraw,
+    )
+
+
+CLASSES = (ObjectItem, PlanChoice, ReconstructionProperties, SceneProperties)
+
+
+def register() -> None:
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+    bpy.types.Collection.objectgs = PointerProperty(type=ReconstructionProperties)
+    bpy.types.Scene.objectgs = PointerProperty(type=SceneProperties)
+
+
+def unregister() -> None:
+    del bpy.types.Scene.objectgs
+    del bpy.types.Collection.objectgs
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)

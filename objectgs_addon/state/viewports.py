@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the 3D viewports look at and show."""
+
+from __future__ import annotations
+
+import contextlib
+
+import bpy
+
+from .. import scene
+from . import object_edits
+
+
+def show(root: bpy.types.Collection) -> None:
+    """Let every 3D viewport of a reconstruction's scene look at its cameras, and show colors in Solid mode."""
+    for window in bpy.context.window_manager.windows:
+        if root not in window.scene.collection.children_recursive:
+            continue
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                area.spaces.active.shading.color_type = "VERTEX"
+                region = next(region for region in area.regions if region.type == "WINDOW")
+                with bpy.context.temp_override(window=window, area=area, region=region):
+                    _frame(root)
+
+
+def hide_points(root: bpy.types.Collection) -> None:
+    """Take the point cloud out of sight, since splats or meshes come into its place."""
+    points = [part for part in root.all_objects if scene.kind_of(part) == "points"]
+    for layer in (layer for owner in object_edits.scenes_of(root) for layer in owner.view_layers):
+        for part in points:
+            # Not looked for in the layer, which does not list yet what was just linked.
+            with contextlib.suppress(RuntimeError):  # It was taken out of this layer.
+                part.hide_set(True, view_layer=layer)
+
+
+def _frame(root: bpy.types.Collection) -> None:
+    """Look at the cameras in the viewport of the context; the selection stays."""
+    context = bpy.context
+    selected = list(context.selected_objects)
+    for obj in selected:
+        obj.select_set(False)
+    wanted = [part for part in root.all_objects if scene.kind_of(part) == "camera" and part.visible_get()]
+    for part in wanted:
+        part.select_set(True)
+    if wanted:
+        bpy.ops.view3d.view_selected()
+    for part in wanted:
+        part.select_set(False)
+    for obj in selected:
+        obj.select_set(True)

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Visibility of a reconstruction's objects in a view layer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import bpy
+
+from .. import scene
+
+
+def _layers(layer: bpy.types.LayerCollection) -> Iterator[bpy.types.LayerCollection]:
+    """A layer collection and all below it."""
+    yield layer
+    for child in layer.children:
+        yield from _layers(child)
+
+
+def object_layers(view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -> dict[int, bpy.types.LayerCollection]:
+    """Object ID -> layer collection, for objects that have one."""
+    top = next((layer for layer in _layers(view_layer.layer_collection) if layer.collection == root), None)
+    return {
+        object_id: layer
+        for layer in (_layers(top) if top is not None else ())
+        if scene.kind_of(layer.collection) == "object"
+        and (object_id := scene.object_id_of(layer.collection)) is not None
+    }
+
+
+def _duplicate_layers(view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -> list[bpy.types.LayerCollection]:
+    """The layer collections of the objects' duplicates."""
+    copies = [copy for copies in scene.duplicates_of(root).values() for copy in copies]
+    return [layer for layer in _layers(view_layer.layer_collection) if layer.collection in copies] if copies else []
+
+
+def toggle_solo(view_layer: bpy.types.ViewLayer, root: bpy.types.Collection, object_id: int) -> bool:
+    """Hide every object but one, or show all if it is the only one shown; False if it has no collection.
+
+    Duplicates follow their originals.
+    """
+    layers = object_layers(view_layer, root)
+    if object_id not in layers:
+        return False
+    alone = all(layer.hide_viewport != (other == object_id) for other, layer in layers.items())
+    for other, layer in layers.items():
+        layer.hide_viewport = not alone and other != object_id
+    for layer in _duplicate_layers(view_layer, root):
+        layer.hide_viewport = not alone and scene.object_id_of(layer.collection) != object_id
+    return True

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Import the cameras, photos and points of a capture."""
+
+from pathlib import Path
+
+import bpy
+from bpy.props import BoolProperty, IntProperty, StringProperty
+
+from ...backend.shared.defaults import MAX_SIZE
+from ...backend.shared.errors import InputError
+from ...objectgs_addon.environment import locations
+from ...objectgs_addon.running import running
+from ...objectgs_addon.state.folder_state import folder_state
+from ..common import need
+from ..common.reporting import reports_errors
+
+
+class ImportCapture(bpy.types.Operator):
+    bl_idname = "objectgs.import_capture"
+    bl_label = "Import Capture"
+    bl_description = (
+        "Import the cameras, photos and points of a folder with images/, a COLMAP model in sparse/0, and masks/"
+    )
+    bl_options = {"REGISTER"}
+
+    directory: StringProperty(name="Capture", subtype="DIR_PATH", description="Folder with images/ and sparse/0")
+    filter_folder: BoolProperty(default=True, options={"HIDDEN"})
+    # A plain string: the button of a DIR_PATH cannot open a second file browser.
+    folder: StringProperty(
+        name="Save To",
+        description="Path of the reconstruction folder, which may grow to gigabytes. If empty, it is named after the "
+        "capture, in the folder set in the preferences",
+    )
+    max_size: IntProperty(
+        name="Image Size",
+        default=MAX_SIZE,
+        min=64,
+        soft_max=8192,
+        description="Longest side in pixels; larger photos are scaled down",
+    )
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        return need.backend(cls)
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        self.layout.use_property_split = True
+        self.layout.prop(self, "folder", placeholder="Automatic")
+        self.layout.prop(self, "max_size")
+
+    @reports_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        capture = Path(bpy.path.abspath(self.directory)).resolve() if self.directory else None
+        if capture is None or not capture.is_dir():
+            raise InputError(f"The folder {capture or 'of the capture'} does not exist; choose another")
+        folder = Path(bpy.path.abspath(self.folder)).resolve() if self.folder else _folder_for(capture)
+        need.require_unused(folder)
+        job = locations.backend_job(
+            f"Import {capture.name}",
+            "import",
+            folder,
+            "import",
+            str(capture),
+            "--out",
+            str(folder),
+            "--max-size",
+            str(self.max_size),
+        )
+        return running.submit(job, context.scene, self.report)
+
+
+def _folder_for(capture: Path) -> Path:
+    """A reconstruction folder named after the capture, or after its parent where the capture has a generic name.
+
+    It is numbered where that name belongs to another capture.
+    """
+    name = capture.name if capture.name.lower() not in ("capture", "colmap", "data") else capture.parent.name
+    return locations.new_reconstruction(name, lambda folder: folder_state(folder).capture in (None, capture))
+
+
+CLASSES = (ImportCapture,)

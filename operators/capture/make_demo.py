@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Make the demo capture, for a first try without own photos."""
+
+import bpy
+
+from ...objectgs_addon.environment import locations
+from ...objectgs_addon.running import running
+
+
+class MakeDemo(bpy.types.Operator):
+    bl_idname = "objectgs.make_demo"
+    bl_label = "Make Demo Capture"
+    bl_description = (
+        "Render objects on a table as a capture, in the background, and import it. This takes a minute or two"
+    )
+    bl_options = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        if running.busy(locations.demo_folder()):
+            cls.poll_message_set("The demo capture is being made")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        return running.submit(locations.demo_job(), context.scene, self.report)
+
+
+CLASSES = (MakeDemo,)

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Conditions of operators; each that does not hold says why in the tooltip of the grayed-out button."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...backend.shared.errors import InputError
+from ...backend.shared.reconstruction.folder import Reconstruction
+from ...backend.shared.reconstruction.lock import lock_holder
+from ...objectgs_addon import scene
+from ...objectgs_addon.environment import locations
+from ...objectgs_addon.picking import selection
+from ...objectgs_addon.running import running
+from ...objectgs_addon.state import object_edits
+from ...objectgs_addon.state.folder_state import folder_state
+
+
+def active_root(context: bpy.types.Context) -> Any:
+    """The active reconstruction's collection, or None."""
+    return context.scene.objectgs.active
+
+
+def backend(cls: Any) -> bool:
+    """Whether the compute backend can be run."""
+    if locations.backend_python() is not None:
+        return True
+    cls.poll_message_set(f"{locations.backend_sentence()} See the preferences of ObjectGS")
+    return False
+
+
+def reconstruction(cls: Any, context: bpy.types.Context) -> bool:
+    """Whether there is an active reconstruction whose folder exists."""
+    root = active_root(context)
+    if root is None:
+        cls.poll_message_set("There is no reconstruction in this scene; import a capture first")
+        return False
+    folder = scene.folder_of(root)
+    if not folder_state(folder).exists:
+        cls.poll_message_set(f"The folder {folder} of this reconstruction is missing; put it back or import again")
+        return False
+    return True
+
+
+def idle(cls: Any, context: bpy.types.Context) -> bool:
+    """Whether no job uses the active reconstruction's folder, in this or another program."""
+    sentence = _use_of(scene.folder_of(active_root(context)))
+    if sentence is not None:
+        cls.poll_message_set(sentence)
+    return sentence is None
+
+
+def require_unused(folder: Path) -> None:
+    """Raise InputError where a job uses a reconstruction folder, in this or another program."""
+    sentence = _use_of(folder)
+    if sentence is not None:
+        raise InputError(sentence)
+
+
+def _use_of(folder: Path) -> str | None:
+    """Who uses a reconstruction folder, as a sentence; None where nobody does."""
+    if running.busy(folder):
+        return f"A job is using {folder}; wait for it or stop it"
+    holder = lock_holder(folder)
+    if holder is not None:
+        process = f" (process {holder})" if holder else ""
+        return f"Another program{process} is using {folder}; wait for it or stop it"
+    return None
+
+
+def capture(cls: Any, context: bpy.types.Context) -> bool:
+    """Whether the active reconstruction's capture is where it was."""
+    folder = scene.folder_of(active_root(context))
+    location = folder_state(folder).capture
+    if location is None:
+        cls.poll_message_set(f"{Reconstruction(folder).cameras} does not name the capture; import it again")
+        return False
+    if location.is_dir():
+        return True
+    cls.poll_message_set(f"The capture {location} is missing; put it back, or import it again from where it is now")
+    return False
+
+
+def training(cls: Any, context: bpy.types.Context) -> bool:
+    """Whether the active reconstruction has a trained model, which imported splats lack."""
+    if folder_state(scene.folder_of(active_root(context))).steps:
+        return True
+    cls.poll_message_set("Meshes need a trained model; train first")
+    return False
+
+
+def work_on_capture(cls: Any, context: bpy.types.Context) -> bool:
+    """Whether a job on the active reconstruction's capture could start."""
+    return backend(cls) and reconstruction(cls, context) and idle(cls, context) and capture(cls, context)
+
+
+def objects(cls: Any, context: bpy.types.Context) -> bool:
+    """Whether the active reconstruction has a list of objects."""
+    if not reconstruction(cls, context):
+        return False
+    if active_root(context).objectgs.objects:
+        return True
+    cls.poll_message_set("There are no objects yet; use Assign Objects first")
+    return False
+
+
+def edited(cls: Any, context: bpy.types.Context) -> bool:
+    """Whether the active object, or the one it is merged into, has splats or a mesh that can be edited."""
+    if not objects(cls, context):
+        return False
+    root = active_root(context)
+    item = object_edits.shown_item(root)
+    if object_edits.from_stored(item.object_id) in scene.object_collections(root):
+        return True
+    cls.poll_message_set(f"{item.name} has no splats and no mesh yet; train first, or choose another in the list")
+    return False
+
+
+def not_removed(cls: Any, context: bpy.types.Context, addition: str) -> bool:
+    """Whether the active object can be edited and is not removed, unless objects are selected in the viewport.
+
+    addition: what follows "... is removed" in the message.
+    """
+    if not edited(cls, context):
+        return False
+    root = active_root(context)
+    item = object_edits.shown_item(root)
+    if not item.removed or selection.selected_collections(context, root):
+        return True
+    cls.poll_message_set(f"{item.name} is removed{addition}")
+    return False

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Render film frames: the splats through the scene's camera, frame by frame, in the background."""
+
+import bpy
+
+from ...backend.shared.reconstruction.folder import Reconstruction
+from ...backend.shared.reconstruction.shot import NAME, write_shot
+from ...objectgs_addon import film, scene
+from ...objectgs_addon.environment import locations
+from ...objectgs_addon.film.properties import folder_of, samples_of
+from ...objectgs_addon.running import running
+from ...objectgs_addon.state import object_edits
+from ..common import need
+from ..common.reporting import reports_errors
+
+
+class FilmFrames(bpy.types.Operator):
+    bl_idname = "objectgs.film_frames"
+    bl_label = "Render Film Frames"
+    bl_description = (
+        "Render the splats with all edits through the scene's camera over its frame range, in the "
+        "background: color, depth and object mattes as EXR. Existing frames are skipped"
+    )
+    bl_options = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not (need.backend(cls) and need.reconstruction(cls, context) and need.idle(cls, context)):
+            return False
+        if not Reconstruction(scene.folder_of(need.active_root(context))).splats.is_file():
+            cls.poll_message_set("There are no splats yet; train first")
+            return False
+        if context.scene.camera is None:
+            cls.poll_message_set("The scene has no camera; choose one")
+            return False
+        return True
+
+    @reports_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        root, owner = need.active_root(context), context.scene
+        reconstruction = scene.folder_of(root)
+        folder = folder_of(owner, reconstruction)
+        settings = owner.objectgs_film
+        frames = range(owner.frame_start, owner.frame_end + 1, owner.frame_step)
+        manager = context.window_manager
+        manager.progress_begin(0, max(len(frames), 1))
+        try:
+            object_edits.store_edits(root)
+            shot = film.shot_of(
+                owner,
+                context.view_layer,
+                root,
+                frames,
+                samples_of(owner, settings.subframes),
+                lambda done, _total: manager.progress_update(done),
+            )
+            folder.mkdir(parents=True, exist_ok=True)
+            write_shot(folder / NAME, shot)
+        finally:
+            manager.progress_end()
+        options = ["--png"] if settings.png else []
+        job = locations.backend_job(
+            f"Film of {root.name}",
+            "film",
+            reconstruction,
+            "film",
+            str(reconstruction),
+            "--shot",
+            str(folder / NAME),
+            "--out",
+            str(folder),
+            *options,
+        )
+        return running.submit(job, owner, self.report)
+
+
+CLASSES = (FilmFrames,)

@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Set up the compositor to combine film frames with Blender's own rendering."""
+
+import bpy
+
+from ...objectgs_addon import film, scene
+from ...objectgs_addon.film.properties import folder_of
+from ...objectgs_addon.state import object_edits
+from ..common import need
+from ..common.reporting import reports_errors
+
+
+class SetUpCompositor(bpy.types.Operator):
+    bl_idname = "objectgs.set_up_compositor"
+    bl_label = "Set Up Compositor"
+    bl_description = (
+        "Combine the film frames with Blender's rendering by depth, with mattes of objects. The "
+        "reconstruction itself is hidden in renders, so that it does not appear twice"
+    )
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return need.reconstruction(cls, context)
+
+    @reports_errors
+    def execute(self, context: bpy.types.Context) -> None:
+        root, owner = need.active_root(context), context.scene
+        item = object_edits.active_item(root)
+        film.set_up_compositor(
+            owner,
+            context.view_layer,
+            root,
+            folder_of(owner, scene.folder_of(root)),
+            item.name if item is not None else "",
+        )
+        self.report(
+            {"INFO"},
+            f"Renders show the film frames of {root.name}; its splats and meshes in Blender are hidden in renders",
+        )
+
+
+CLASSES = (SetUpCompositor,)

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Choose which objects to reconstruct; the others stay part of the unlabeled rest."""
+
+import bpy
+from bpy.props import EnumProperty
+
+from ...backend.shared.errors import InputError
+from ...objectgs_addon.picking import selection
+from ...objectgs_addon.state import object_edits
+from ..common import need
+from ..common.reporting import reports_errors
+
+
+class ChooseObjects(bpy.types.Operator):
+    bl_idname = "objectgs.choose_objects"
+    bl_label = "Choose Objects"
+    bl_description = "Choose which objects to train; the others are left out"
+    bl_options = {"REGISTER", "UNDO"}
+
+    which: EnumProperty(
+        name="Which",
+        items=[
+            ("ALL", "All", "Train every object"),
+            ("ACTIVE", "Only Active", "Train only the active object of the list"),
+            ("SELECTED", "Only Selected", "Train only the objects selected in the viewport"),
+            ("INVERT", "Invert", "Train the objects that are left out now, and leave out the others"),
+        ],
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return need.objects(cls, context) and need.idle(cls, context)
+
+    @reports_errors
+    def execute(self, context: bpy.types.Context) -> None:
+        root = need.active_root(context)
+        rows = {object_edits.from_stored(item.object_id): item.chosen for item in root.objectgs.objects}
+        active = object_edits.from_stored(object_edits.active_item(root).object_id)
+        kept = {
+            "ALL": set(rows),
+            "ACTIVE": {active},
+            "SELECTED": set(selection.selected_ids(context, root)),
+            "INVERT": {object_id for object_id, chosen in rows.items() if not chosen},
+        }[self.which] & set(rows)
+        if not kept:
+            raise InputError("No object would be left to train")
+        object_edits.choose(root, {object_id: object_id in kept for object_id in rows})
+
+
+CLASSES = (ChooseObjects,)

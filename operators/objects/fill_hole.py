@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Fill the hole behind a removed object, or leave it as it was trained."""
+
+import bpy
+from bpy.props import BoolProperty
+
+from ...backend.shared.reconstruction.fill import UNOBSERVED
+from ...objectgs_addon.state import object_edits
+from ..common import need
+from ..common.reporting import reports_errors
+
+
+class FillHole(bpy.types.Operator):
+    bl_idname = "objectgs.fill_hole"
+    bl_label = "Fill Hole"
+    bl_description = (
+        "Fill the hole in the ground or wall behind the removed object from its surroundings. The attribute "
+        f'"{UNOBSERVED}" marks these splats'
+    )
+    bl_options = {"REGISTER", "UNDO"}
+
+    filled: BoolProperty(name="Filled", default=True, options={"SKIP_SAVE"})
+
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        return cls.bl_description if properties.filled else "Leave what is behind the object as it was trained"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not need.edited(cls, context):
+            return False
+        item = object_edits.shown_item(need.active_root(context))
+        if item.removed:
+            return True
+        cls.poll_message_set(f"{item.name} is not removed, so it leaves no hole")
+        return False
+
+    @reports_errors
+    def execute(self, context: bpy.types.Context) -> None:
+        root = need.active_root(context)
+        object_id = object_edits.from_stored(object_edits.shown_item(root).object_id)
+        object_edits.fill_hole(root, object_id, self.filled)
+
+
+CLASSES = (FillHole,)

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Mark the objects' collections as assets."""
+
+import bpy
+
+from ...objectgs_addon import scene
+from ...objectgs_addon.picking import selection
+from ..common import need
+
+
+class MarkAssets(bpy.types.Operator):
+    bl_idname = "objectgs.mark_assets"
+    bl_label = "Mark as Assets"
+    bl_description = (
+        "Mark the selected objects that have a mesh, or all, as assets. They keep their size and up axis, and "
+        "stand on the surface they are dropped on"
+    )
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not need.objects(cls, context):
+            return False
+        if scene.object_meshes(need.active_root(context)):
+            return True
+        cls.poll_message_set("There are no meshes yet; extract them first")
+        return False
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        root = need.active_root(context)
+        meshes = scene.object_meshes(root)
+        selected = set(selection.selected_ids(context, root)) & set(meshes)
+        collections = scene.object_collections(root)
+        context.view_layer.update()
+        for object_id in sorted(selected or meshes):
+            scene.mark_asset(collections[object_id], meshes[object_id])
+        self.report({"INFO"}, f"{len(selected or meshes)} objects marked as assets")
+        return {"FINISHED"}
+
+
+CLASSES = (MarkAssets,)

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Select visible objects in a viewport by a click or a box, and highlight the one under the mouse."""
+
+import time
+from typing import Any
+
+import bpy
+import gpu
+from bpy.props import BoolProperty, EnumProperty, IntProperty
+from gpu_extras.batch import batch_for_shader
+
+from ...objectgs_addon.picking import hit_test, selection
+from ...objectgs_addon.picking import tool as pick_tool
+
+_HIDDEN = {"HIDDEN", "SKIP_SAVE"}
+_PAUSE = 1.0
+"""Pause after a lookup under the mouse, relative to its duration, so that redraws keep up."""
+
+
+class _InViewport:
+    poll_message_set: Any
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if context.region_data is None:
+            cls.poll_message_set("This needs a 3D viewport")
+            return False
+        if context.mode != "OBJECT":
+            cls.poll_message_set("Switch to Object Mode first")
+            return False
+        return True
+
+
+class PickObject(_InViewport, bpy.types.Operator):
+    bl_idname = "objectgs.pick_object"
+    bl_label = "Pick Object"
+    bl_description = "Select the object under the mouse, whether it shows splats or a mesh"
+    bl_options = {"REGISTER", "UNDO"}
+
+    toggle: BoolProperty(
+        name="Toggle", description="Add the object to the selection, or remove it", options={"SKIP_SAVE"}
+    )
+    x: IntProperty(name="X", description="Pixels from the left of the viewport", options=_HIDDEN)
+    y: IntProperty(name="Y", description="Pixels from the bottom of the viewport", options=_HIDDEN)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        self.x, self.y = event.mouse_region_x, event.mouse_region_y
+        return self.execute(context)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        hit = hit_test.object_at(context, self.x, self.y)
+        if hit is None:
+            if not self.toggle:
+                selection.select_nothing(context)
+            return {"FINISHED"}
+        parts = [hit.obj] if hit.collection is None else selection.parts_to_select(hit.collection)
+        if self.toggle and parts and all(part.select_get() for part in parts):
+            for part in parts:
+                part.select_set(False)
+        elif hit.collection is not None:
+            selection.select_collections(context, [hit.collection], self.toggle)
+        else:
+            if not self.toggle:
+                selection.select_nothing(context)
+            hit.obj.select_set(True)
+            context.view_layer.objects.active = hit.obj
+        return {"FINISHED"}
+
+
+class PickBox(_InViewport, bpy.types.Operator):
+    bl_idname = "objectgs.pick_box"
+    bl_label = "Pick Objects in Box"
+    bl_description = "Select the objects that are visible in a box"
+    bl_options = {"REGISTER", "UNDO"}
+
+    mode: EnumProperty(
+        name="Mode",
+        options={"SKIP_SAVE"},
+        items=[
+            ("SET", "Set", "Set a new selection"),
+            ("ADD", "Add", "Extend the existing selection"),
+            ("SUBTRACT", "Subtract", "Subtract from the existing selection"),
+        ],
+    )
+    left: IntProperty(options=_HIDDEN)
+    bottom: IntProperty(options=_HIDDEN)
+    right: IntProperty(options=_HIDDEN)
+    top: IntProperty(options=_HIDDEN)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        region = context.region
+        self._from = event.mouse_prev_press_x - region.x, event.mouse_prev_press_y - region.y
+        self._to = event.mouse_region_x, event.mouse_region_y
+        self._handler = bpy.types.SpaceView3D.draw_handler_add(self._draw, (), "WINDOW", "POST_PIXEL")
+        context.window_manager.modal_handler_add(self)
+        pick_tool.point_at(None)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if event.type in {"ESC", "RIGHTMOUSE"}:
+            self._end(context)
+            return {"CANCELLED"}
+        if event.type == "MOUSEMOVE":
+            self._to = event.mouse_region_x, event.mouse_region_y
+            context.area.tag_redraw()
+        if event.type == "LEFTMOUSE" and event.value == "RELEASE":
+            self._to = event.mouse_region_x, event.mouse_region_y
+            self._end(context)
+            (self.left, self.right), (self.bottom, self.top) = (sorted(ends) for ends in zip(self._from, self._to))
+            return self.execute(context)
+        return {"RUNNING_MODAL"}
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        self._end(context)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        collections = hit_test.objects_in(context, self.left, self.bottom, self.right + 1, self.top + 1)
+        if self.mode == "SUBTRACT":
+            for part in (part for collection in collections for part in selection.parts_to_select(collection)):
+                part.select_set(False)
+        elif not selection.select_collections(context, collections, self.mode == "ADD") and self.mode == "SET":
+            selection.select_nothing(context)
+        return {"FINISHED"}
+
+    def _end(self, context: bpy.types.Context) -> None:
+        bpy.types.SpaceView3D.draw_handler_remove(self._handler, "WINDOW")
+        context.area.tag_redraw()
+
+    def _draw(self) -> None:
+        (left, bottom), (right, top) = self._from, self._to
+        corners = [(left, bottom, 0), (right, bottom, 0), (right, top, 0), (left, top, 0), (left, bottom, 0)]
+        shader = gpu.shader.from_builtin("UNIFORM_COLOR")
+        shader.uniform_float("color", (1.0, 1.0, 1.0, 1.0))
+        batch_for_shader(shader, "LINE_STRIP", {"pos": corners}).draw(shader)
+
+
+class PointAt(_InViewport, bpy.types.Operator):
+    bl_idname = "objectgs.point_at"
+    bl_label = "Point at Object"
+    bl_description = "Show the name of the object under the mouse and highlight it"
+    bl_options = {"INTERNAL"}
+
+    _next = 0.0
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        began = time.monotonic()
+        if began >= PointAt._next:
+            pick_tool.point_at(hit_test.object_at(context, event.mouse_region_x, event.mouse_region_y))
+            now = time.monotonic()
+            PointAt._next = now + _PAUSE * (now - began)
+        context.area.tag_redraw()
+        return {"PASS_THROUGH"}
+
+
+CLASSES = (PickObject, PickBox, PointAt)

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Set up the compute backend in its own environment, check it, and remove it."""
+
+from typing import Any
+
+import bpy
+
+from ...backend.shared.errors import InputError
+from ...objectgs_addon.environment import environment, locations
+from ...objectgs_addon.running import running
+from ..common.reporting import reports_errors
+
+
+def _idle(cls: Any) -> bool:
+    if running.busy(locations.environment_folder()):
+        cls.poll_message_set("The backend is being set up or checked")
+        return False
+    return True
+
+
+class SetUpBackend(bpy.types.Operator):
+    bl_idname = "objectgs.set_up_backend"
+    bl_label = "Set Up Backend"
+    bl_description = (
+        "Download the packages of the compute backend (PyTorch and others, 1.6 GB or more) to a separate folder. "
+        "Nothing else on this computer is changed"
+    )
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        if not bpy.app.online_access:
+            cls.poll_message_set(
+                "Enable Preferences > System > Network > Allow Online Access first; packages are downloaded"
+            )
+            return False
+        return _idle(cls)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        preferences = locations.preferences()
+        device = preferences.device if preferences else "cpu"
+        job = environment.set_up_job(locations.base_python(), locations.environment_folder(), device)
+        return running.submit(job, context.scene, self.report)
+
+
+class CheckBackend(bpy.types.Operator):
+    bl_idname = "objectgs.check_backend"
+    bl_label = "Check Backend"
+    bl_description = "Run the backend on a tiny scene, and report what works and how fast this computer is"
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        if locations.backend_python() is None:
+            cls.poll_message_set("There is no backend to check; set it up, or choose a Python that has it")
+            return False
+        return _idle(cls)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        job = environment.probe_job(locations.backend_python(), locations.environment_folder())
+        return running.submit(job, context.scene, self.report)
+
+
+class RemoveBackend(bpy.types.Operator):
+    bl_idname = "objectgs.remove_backend"
+    bl_label = "Remove Backend"
+    bl_description = "Delete the packages that Set Up Backend has downloaded. Reconstructions are kept"
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        if environment.inspect(locations.environment_folder()).state == "absent":
+            cls.poll_message_set("The backend is not set up")
+            return False
+        return _idle(cls)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        return context.window_manager.invoke_confirm(self, event)
+
+    @reports_errors
+    def execute(self, _context: bpy.types.Context) -> None:
+        try:
+            environment.remove(locations.environment_folder())
+        except OSError as error:
+            raise InputError(
+                f"{error.filename or locations.environment_folder()} cannot be removed "
+                f"({error.strerror}); close the programs that use it and try again"
+            ) from error
+
+
+CLASSES = (SetUpBackend, CheckBackend, RemoveBackend)

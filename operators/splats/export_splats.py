@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Export the splats with all edits, in the background."""
+
+import bpy
+from bpy.props import EnumProperty, StringProperty
+
+from ...objectgs_addon import scene
+from ...objectgs_addon.environment import locations
+from ...objectgs_addon.running import running
+from ...objectgs_addon.state import object_edits
+from ...objectgs_addon.state.folder_state import folder_state
+from ..common import need
+from ..common.export_dialog import ExportDialog
+from ..common.reporting import reports_errors
+
+
+class ExportSplats(ExportDialog, bpy.types.Operator):
+    bl_idname = "objectgs.export_splats"
+    bl_label = "Export Splats"
+    bl_description = "Export the splats with all edits: without removed objects, recolored, moved, and with duplicates"
+    bl_options = {"REGISTER"}
+
+    filter_glob: StringProperty(default="*.ply;*.spz;*.splat", options={"HIDDEN"})
+    format: EnumProperty(
+        name="Format",
+        items=[
+            ("ply", "PLY", "The format of 3D Gaussian splatting programs: exact, with object IDs"),
+            ("spz", "SPZ", "About a fifth of the size, slightly rounded"),
+            ("splat", "Splat", "For web viewers: one color per splat, independent of the view direction"),
+        ],
+    )
+    objects: EnumProperty(
+        name="Objects",
+        items=[
+            ("ALL", "All", "Everything except objects that are removed or left out"),
+            ("SELECTED", "Selected", "The objects selected in the viewport, or the active one of the list"),
+        ],
+    )
+    coordinates: EnumProperty(
+        name="Coordinates",
+        items=[
+            ("capture", "Capture", "Coordinates of the COLMAP model"),
+            ("blender", "Upright", "Z up, as oriented on import"),
+        ],
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not need.backend(cls) or not need.reconstruction(cls, context) or not need.idle(cls, context):
+            return False
+        if folder_state(scene.folder_of(need.active_root(context))).trained:
+            return True
+        cls.poll_message_set("There are no splats yet; train first")
+        return False
+
+    @reports_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        root = need.active_root(context)
+        folder = scene.folder_of(root)
+        out, ids = self.choices(context)
+        arguments = [
+            "export",
+            str(folder),
+            "--out",
+            str(out),
+            "--format",
+            self.format,
+            "--coordinates",
+            self.coordinates,
+        ]
+        if ids is not None:
+            arguments += ["--objects", *map(str, ids)]
+        if self.per_object:
+            arguments.append("--per-object")
+        object_edits.store_edits(root)
+        job = locations.backend_job(f"Export {out.name}", "export", folder, *arguments)
+        return running.submit(job, context.scene, self.report)
+
+
+CLASSES = (ExportSplats,)

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Import splats of other programs as a reconstruction whose objects can be edited."""
+
+from pathlib import Path
+
+import bpy
+from bpy.props import StringProperty
+
+from ...backend.shared.errors import InputError
+from ...objectgs_addon.environment import locations
+from ...objectgs_addon.running import running
+from ..common import need
+from ..common.reporting import reports_errors
+
+
+class ImportSplats(bpy.types.Operator):
+    bl_idname = "objectgs.import_splats"
+    bl_label = "Import Splats"
+    bl_description = (
+        "Import Gaussian splats that were trained by another program. Their objects come from the file or, with the "
+        "capture that they were trained on, from its masks"
+    )
+    bl_options = {"REGISTER"}
+
+    filepath: StringProperty(name="File", subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
+    # Plain strings: the button of a DIR_PATH cannot open a second file browser.
+    capture: StringProperty(
+        name="Capture",
+        description=(
+            "Path of the folder with images/, sparse/0 and masks/ that the splats were trained on. If empty, the "
+            "objects of the file are used"
+        ),
+    )
+    folder: StringProperty(
+        name="Save To",
+        description=(
+            "Path of the new reconstruction folder. If empty, it is named after the file, in the folder set in the "
+            "preferences"
+        ),
+    )
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        return need.backend(cls)
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        self.layout.use_property_split = True
+        self.layout.prop(self, "capture", placeholder="Path, for objects")
+        self.layout.prop(self, "folder", placeholder="Automatic")
+
+    @reports_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        ply = Path(bpy.path.abspath(self.filepath)).resolve()
+        if not self.filepath or not ply.is_file():
+            raise InputError(f"The file {self.filepath} does not exist; choose another")
+        folder = Path(bpy.path.abspath(self.folder)).resolve() if self.folder else _folder_for(ply)
+        need.require_unused(folder)
+        arguments = ["import-splats", str(ply), "--out", str(folder)]
+        if self.capture:
+            arguments += ["--capture", str(Path(bpy.path.abspath(self.capture)).resolve())]
+        job = locations.backend_job(f"Import {ply.name}", "import-splats", folder, *arguments)
+        return running.submit(job, context.scene, self.report)
+
+
+def _folder_for(ply: Path) -> Path:
+    """A new reconstruction folder, named after the file, or after its parent where the file has a generic name."""
+    name = ply.parent.name if ply.stem.lower() in ("point_cloud", "splats", "splat") else ply.stem
+    return locations.new_reconstruction(name, lambda folder: not folder.exists())
+
+
+CLASSES = (ImportSplats,)

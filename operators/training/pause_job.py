@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Pause and resume the running job."""
+
+import bpy
+
+from ...objectgs_addon.process.jobs import State
+from ...objectgs_addon.running import running
+
+
+class PauseJob(bpy.types.Operator):
+    bl_idname = "objectgs.pause_job"
+    bl_label = "Pause"
+    bl_description = "Save and pause the running job"
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        job = running.queue.running
+        if job is not None and job.can_pause:
+            return True
+        cls.poll_message_set("No training is running; only training can be paused")
+        return False
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        running.queue.running.pause()
+        running.redraw()
+        return {"FINISHED"}
+
+
+class ResumeJob(bpy.types.Operator):
+    bl_idname = "objectgs.resume_job"
+    bl_label = "Resume"
+    bl_description = "Resume the paused job"
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        job = running.queue.running
+        if job is not None and job.state is State.PAUSED:
+            return True
+        cls.poll_message_set("No job is paused")
+        return False
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        running.queue.running.resume()
+        running.redraw()
+        return {"FINISHED"}
+
+
+CLASSES = (PauseJob, ResumeJob)

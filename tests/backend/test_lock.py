@@ -1,0 +1,95 @@
+"""One process at a time has a reconstruction folder."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from backend.shared.reconstruction import lock
+from backend.shared.reconstruction.lock import FolderInUse, lock_holder, locked
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from backend.shared.reconstruction.lock import locked
+with locked(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+COUNT = """
+import sys, time
+from pathlib import Path
+from backend.shared.reconstruction.lock import FolderInUse, locked
+folder = Path(sys.argv[1])
+for _ in range(100):
+    try:
+        with locked(folder):
+            inside = folder / "inside"
+            inside.touch(exist_ok=False)  # Fails where another one is in here.
+            inside.unlink()
+    except FolderInUse:
+        pass
+"""
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """Another process that holds the lock of tmp_path."""
+    process = subprocess.Popen([sys.executable, "-c", HOLD, tmp_path], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "held\n"
+    yield process
+    process.kill()
+    process.wait()
+
+
+def test_a_second_process_is_refused_by_the_first_ones_id(tmp_path, holder):
+    assert lock_holder(tmp_path) == holder.pid
+    with (
+        pytest.raises(FolderInUse, match=rf"another process \(pid {holder.pid}\); wait for it or stop it"),
+        locked(tmp_path),
+    ):
+        pass
+    assert lock_holder(tmp_path) == holder.pid
+
+
+def test_a_killed_process_holds_nothing(tmp_path, holder):
+    os.kill(holder.pid, signal.SIGKILL if hasattr(signal, "SIGKILL") else signal.SIGTERM)
+    holder.wait()
+    assert lock_holder(tmp_path) is None
+    with locked(tmp_path):
+        assert (tmp_path / ".lock").read_text() == f"{os.getpid()}\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_is_not_stale_whatever_its_file_says(tmp_path):
+    (tmp_path / ".lock").write_text("1\n")
+    assert lock_holder(tmp_path) is None
+    with locked(tmp_path):
+        pass
+
+
+def test_one_process_does_not_lock_twice(tmp_path, monkeypatch):
+    monkeypatch.setattr(lock, "_PATIENCE", 0.05)
+    with locked(tmp_path), pytest.raises(FolderInUse), locked(tmp_path):
+        pass
+
+
+def test_looking_for_the_holder_refuses_nobody(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-c", COUNT.replace("100", "50"), tmp_path], stderr=subprocess.PIPE, text=True
+    )
+    while process.poll() is None:
+        lock_holder(tmp_path)
+        time.sleep(0.001)
+    assert process.returncode == 0, process.stderr.read()
+
+
+def test_processes_that_race_are_never_inside_together(tmp_path):
+    racers = [
+        subprocess.Popen([sys.executable, "-c", COUNT, tmp_path], stderr=subprocess.PIPE, text=True) for _ in range(4)
+    ]
+    assert [(racer.wait(), racer.stderr.read()) for racer in racers] == [(0, "")] * 4
+    assert list(tmp_path.iterdir()) == []

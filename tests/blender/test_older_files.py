@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Files with the names that older versions wrote open with the names of now."""
+
+import bpy
+import numpy as np
+import pytest
+from objectgs.backend.shared.color.recolor import Recolor
+from objectgs.objectgs_addon import scene as blender_scene
+from objectgs.objectgs_addon.blender import older_files
+from objectgs.objectgs_addon.scene import carrier, kinds, object_collection
+from objectgs.objectgs_addon.scene.edits import fills, recolor
+from objectgs.objectgs_addon.scene.shading import modifiers, node_groups
+from objectgs.objectgs_addon.scene.shading.materials import COLOR
+from objectgs.objectgs_addon.state import object_edits
+
+import headless
+
+from .building import tetrahedron, write_folder, write_meshes
+
+RED = (1.0, 0.0, 0.0)
+
+
+@pytest.fixture
+def extension(fresh):
+    registered = headless.extension()
+    registered.register()
+    yield registered
+    registered.unregister()
+
+
+@pytest.fixture
+def older_file(extension, tmp_path):
+    """A file with all names that ever changed, under their former names."""
+    folder = write_folder(tmp_path / "table top")
+    write_meshes(folder, {"1": tetrahedron(np.zeros(3))})
+    scene = bpy.context.scene
+    root = blender_scene.show_capture(scene, folder)
+    blender_scene.show_result(root, folder)
+    scene.objectgs.active = root
+    object_edits.fill(root)
+    with object_edits.without_callbacks():
+        root.objectgs.objects[1].color = RED
+    root.objectgs.color_by = "object"
+    scene.objectgs.splat_colors = "object"
+    blender_scene.recolor(root, 1, Recolor(hue=0.3))
+    mesh = splats_of(root).data
+    carrier.write(mesh, fills.FILLS, "INT", np.arange(len(mesh.vertices)))
+    carrier.write(mesh, fills.UNOBSERVED, "BOOLEAN", np.ones(len(mesh.vertices), bool))
+    blender_scene.object_collections(root)[1][fills.UNOBSERVED_COUNT] = 7
+    give_former_names()
+    assert set(former_names()) >= {*older_files.CUSTOM_PROPERTIES, "colour_by", "splat_colours"}
+    assert color_attributes() == {"colour"}
+    path = tmp_path / "older.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    return path
+
+
+def give_former_names() -> None:
+    tables = ("CUSTOM_PROPERTIES", "KINDS", "GROUPS", "ATTRIBUTES", "NODE_ATTRIBUTES")
+    with pytest.MonkeyPatch.context() as patch:
+        for table in tables:
+            names = getattr(older_files, table)
+            patch.setattr(older_files, table, {name: former for former, name in names.items()})
+        older_files.rename_all()
+
+
+def splats_of(root, object_id=1):
+    return kinds.part_of(blender_scene.object_collections(root)[object_id], "splats")
+
+
+def color_attributes() -> set[str]:
+    """The names under which colors are stored by node groups and read by materials."""
+    found = set()
+    for tree in (*bpy.data.node_groups, *(material.node_tree for material in bpy.data.materials)):
+        for node in tree.nodes:
+            if node.bl_idname == "ShaderNodeAttribute":
+                found.add(node.attribute_name)
+            elif node.bl_idname == "GeometryNodeStoreNamedAttribute" and node.data_type == "FLOAT_COLOR":
+                found.add(node.inputs["Name"].default_value)
+    return found - {"disc"}
+
+
+def check(root) -> None:
+    collection = blender_scene.object_collections(root)[1]
+    assert recolor.recolor_of(collection) == Recolor(hue=0.3)
+    assert collection[fills.UNOBSERVED_COUNT] == 7
+    pivot = kinds.part_of(collection, "object_parent")
+    assert object_collection.CENTER in pivot and object_collection.center_of(pivot).any()
+    mesh = splats_of(root).data
+    assert fills.unobserved_splats(mesh).all() and fills.filled_objects(mesh).tolist() == list(
+        range(len(mesh.vertices))
+    )
+    (shape,) = blender_scene.object_meshes(root)[1]
+    assert "unobserved" in shape.data.attributes
+    assert recolor.TEXTURE_GROUP in [kinds.kind_of(tree) for tree in bpy.data.node_groups]
+    assert color_attributes() == {COLOR}
+
+
+def test_an_older_file_opens_with_all_its_values(older_file):
+    bpy.ops.wm.open_mainfile(filepath=str(older_file))
+    scene = bpy.context.scene
+    root = scene.objectgs.active
+    check(root)
+    assert tuple(root.objectgs.objects[1].color) == RED and len(root.objectgs.objects) == 3
+    assert root.objectgs.color_by == "object" and scene.objectgs.splat_colors == "object"
+    older_files.rename_all()
+    check(root)
+    assert not former_names()
+
+
+def former_names() -> list[str]:
+    return [
+        name
+        for block in older_files._blocks()
+        for name in (*block.keys(), *(older_files._stored_group(block) or {}))
+        if name in older_files.CUSTOM_PROPERTIES or name in older_files.GROUPS
+    ]
+
+
+def test_an_older_file_can_be_recolored_and_updated(older_file):
+    """Also where groups of before and of now are shown with the same material."""
+    bpy.ops.wm.open_mainfile(filepath=str(older_file))
+    root = bpy.context.scene.objectgs.active
+    for tree in bpy.data.node_groups:
+        if "objectgs_version" in tree:
+            tree["objectgs_version"] -= 1
+    splats = splats_of(root)
+    modifiers.update_groups(splats)
+    assert len([tree for tree in bpy.data.node_groups if kinds.kind_of(tree) == node_groups.SPLATS_GROUP]) == 2
+    assert color_attributes() == {COLOR}
+    assert blender_scene.recolor(root, 1, None)
+    (texture,) = [
+        n
+        for m in blender_scene.object_meshes(root)[1]
+        for n in m.data.materials[0].node_tree.nodes
+        if n.type == "TEX_IMAGE"
+    ]
+    assert [link.to_node.type for link in texture.outputs["Color"].links] == ["BSDF_PRINCIPLED"], "the group is gone"
+
+
+@pytest.mark.skipif(bpy.app.version < (4, 3, 0), reason="has no handler for what is appended")
+@pytest.mark.parametrize("link", [False, True])
+def test_an_object_of_an_older_file_can_be_appended_and_linked(older_file, link):
+    with bpy.data.libraries.load(str(older_file), link=link) as (there, here):
+        here.collections = list(there.collections)
+    root = next(collection for collection in bpy.data.collections if kinds.kind_of(collection) == "reconstruction")
+    check(root)
+
+
+def test_a_file_of_now_stays_as_it_is(older_file):
+    bpy.ops.wm.open_mainfile(filepath=str(older_file))
+    before = {block: list(block.keys()) for block in older_files._blocks()}
+    assert bpy.context.scene.objectgs.active is not None
+    older_files.rename_all()
+    assert {block: list(block.keys()) for block in older_files._blocks()} == before
