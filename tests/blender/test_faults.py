@@ -332,7 +332,7 @@ def test_old_file_without_its_folder(shown, folder, said, tmp_path, monkeypatch)
     before = blocks()
     operators = bpy.ops.objectgs
     for operator in (
-        operators.vote,
+        operators.assign_objects,
         operators.train,
         operators.show_result,
         operators.show_preview,
@@ -540,7 +540,7 @@ def test_result_waits_for_the_end_of_rendering(shown, folder, said, tmp_path, mo
     assert running._tick() is not None and not calls
     monkeypatch.setattr(running, "bpy", bpy)
     running._tick()
-    assert calls == [work] and said == ["Fake has ended; its result is shown when rendering has ended."]
+    assert calls == [work] and said == ["Fake has finished; the result will be shown when rendering ends."]
 
 
 def test_a_failure_of_one_result_stops_no_other_job(extension, folder, said, tmp_path, monkeypatch):

@@ -290,7 +290,7 @@ def test_splats_without_meshes_are_a_result_still(capture, trained, backend_pyth
     )
     ran = run("run", capture, "--out", folder, "--steps", "30", *SIZE, "--backend-python", python)
     assert ran.returncode == 0, ran.output + ran.errors
-    assert "Warning: There is no mesh to be had." in ran.output
+    assert "warning: There is no mesh to be had." in ran.errors
     assert (folder / "render.png").is_file() and not (folder / "pulled-apart.png").exists()
     assert "no mesh to be had" in refusal("mesh", folder, "--backend-python", python)
 
@@ -430,7 +430,7 @@ def test_batch_goes_on_with_what_is_not_done(batch, capture, backend_python):
     again = run(*arguments, OBJECTGS_PYTHON=backend_python)
     assert again.returncode == 0, again.output + again.errors
     second = summary(out)
-    assert second["good"] == first["good"] and "good (2 of 2): done before" in again.output
+    assert second["good"] == first["good"] and "good (2 of 2): already done" in again.output
     assert second["bad"]["state"] == "done" and second["bad"]["error"] is None
 
 
