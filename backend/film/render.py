@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..raster import Camera, Rendered, devices, object_ranks, rasterize
 from ..raster.ranked_ids import add_ranked
+from ..shared.color.srgb import decode, encode
 from ..shared.reconstruction.shot import Frame, Sample, Shot
 from .cryptomatte import RANKS
 from .stage import Stage
@@ -74,24 +75,10 @@ def _first(ranked: NDArray) -> NDArray:
     return np.ascontiguousarray(np.moveaxis(ranked[..., :RANKS], -1, 0))
 
 
-def decoded(encoded: NDArray) -> NDArray[np.float32]:
-    """Decode sRGB values to linear light; values above 1 continue on the same curve."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0.0) + 0.055) / 1.055) ** 2.4).astype(
-        np.float32
-    )
-
-
-def encoded(linear: NDArray) -> NDArray[np.float32]:
-    """Encode linear light as sRGB values, the inverse of `decoded`."""
-    return np.where(
-        linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
-    ).astype(np.float32)
-
-
 def to_srgb_8bit(rgba: NDArray) -> NDArray[np.uint8]:
     """Return a frame (H, W, 4) as 8-bit sRGB with straight alpha."""
     alpha = rgba[..., 3:]
-    straight = encoded(rgba[..., :3] / np.maximum(alpha, _FAINTEST))
+    straight = encode(rgba[..., :3] / np.maximum(alpha, _FAINTEST))
     return np.rint(255.0 * np.clip(np.concatenate([straight, alpha], -1), 0.0, 1.0)).astype(np.uint8)
 
 
@@ -109,7 +96,7 @@ def _light(drawn: Rendered) -> NDArray[np.float32]:
     """Return linear light (H, W, 4): unpremultiplied, decoded, and premultiplied again."""
     alpha = devices.host(drawn.alpha)[..., None]
     blended = np.moveaxis(devices.host(drawn.color), 0, -1)
-    return np.concatenate([decoded(blended / np.maximum(alpha, _FAINTEST)) * alpha, alpha], -1)
+    return np.concatenate([decode(blended / np.maximum(alpha, _FAINTEST)) * alpha, alpha], -1)
 
 
 def _depth(drawn: Rendered, scale: float) -> NDArray[np.float32]:

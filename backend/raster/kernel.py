@@ -15,6 +15,8 @@ from numba import njit
 
 _LAYERS = ("raster", "model", "training", "mesh")
 """The packages that contain kernels; each may use itself and those before it."""
+_SHARED = ("blending.py", "spherical_harmonics.py")
+"""The files of `backend.shared.splats` whose constants are compiled into kernels."""
 _BACKEND = Path(__file__).resolve().parents[1]
 
 
@@ -49,7 +51,9 @@ def _digest_of_file(path: Path) -> bytes:
 @functools.cache
 def digest_up_to(layer: str) -> str:
     """Hash the code that kernels of `layer` (one of `_LAYERS`) may depend on."""
-    digest = hashlib.sha256(_digest_of_file(_BACKEND / "shared" / "splats" / "blending.py"))
+    digest = hashlib.sha256()
+    for name in _SHARED:
+        digest.update(_digest_of_file(_BACKEND / "shared" / "splats" / name))
     for folder in _LAYERS[: _LAYERS.index(layer) + 1]:
         for path in sorted((_BACKEND / folder).rglob("*.py")):
             digest.update(_digest_of_file(path))
@@ -80,7 +84,7 @@ def kernel(
 
     numba renews a function's cache when the function's own file changes, although the compiled code contains constants
     and functions of other files, too. Here the cache is valid as long as the code of the function's layer, of the
-    layers below it, and of `backend.shared.splats.blending` is unchanged; comments and docstrings do not count.
+    layers below it, and of `_SHARED` is unchanged; comments and docstrings do not count.
 
     Args:
         parallel: whether `prange` loops run in parallel.

@@ -2,30 +2,21 @@
 
 from __future__ import annotations
 
+from ..shared.splats.spherical_harmonics import C0, C1, C2, C20, C30, C31, C32, C33
 from .kernel import kernel
 
-_C0 = 0.28209479177387814
-_C1 = 0.4886025119029199
-_C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
-_C3 = (
-    -0.5900435899266435,
-    2.890611442640554,
-    -0.4570457994644658,
-    0.3731763325901154,
-    -0.4570457994644658,
-    1.445305721320277,
-    -0.5900435899266435,
-)
+_C2 = (C2, -C2, C20, -C2, C2 / 2)
+_C3 = (-C33, C32, -C31, C30, -C31, C32 / 2, -C33)
 
 
 @kernel()
 def sh_basis(x, y, z, count, out):
     """Write the `count` (1, 4, 9 or 16) real spherical harmonics at the unit direction (x, y, z) to `out`."""
-    out[0] = _C0
+    out[0] = C0
     if count > 1:
-        out[1] = -_C1 * y
-        out[2] = _C1 * z
-        out[3] = -_C1 * x
+        out[1] = -C1 * y
+        out[2] = C1 * z
+        out[3] = -C1 * x
     if count > 4:
         xx, yy, zz = x * x, y * y, z * z
         out[4] = _C2[0] * x * y
@@ -48,9 +39,9 @@ def sh_gradient(x, y, z, count, g):
     """Gradient of sum_k g[k] Y_k(x, y, z) with respect to the direction, before its normalization."""
     gx = gy = gz = 0.0
     if count > 1:
-        gy -= _C1 * g[1]
-        gz += _C1 * g[2]
-        gx -= _C1 * g[3]
+        gy -= C1 * g[1]
+        gz += C1 * g[2]
+        gx -= C1 * g[3]
     if count > 4:
         gx += _C2[0] * y * g[4] + _C2[2] * -2.0 * x * g[6] + _C2[3] * z * g[7] + _C2[4] * 2.0 * x * g[8]
         gy += _C2[0] * x * g[4] + _C2[1] * z * g[5] + _C2[2] * -2.0 * y * g[6] - _C2[4] * 2.0 * y * g[8]

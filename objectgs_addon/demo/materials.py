@@ -9,6 +9,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import bpy
+import numpy as np
+
+from ...backend.shared.color.srgb import decode
 
 
 class _Nodes:
@@ -110,7 +113,7 @@ def _linear(code: str, turn: float = 0.0) -> Any:
     rgb = [int(code[i : i + 2], 16) / 255 for i in (0, 2, 4)]
     hue, light, color = colorsys.rgb_to_hls(*rgb)
     rgb = colorsys.hls_to_rgb((hue + turn) % 1.0, light, color)
-    return (*[((c + 0.055) / 1.055) ** 2.4 if c > 0.04045 else c / 12.92 for c in rgb], 1.0)
+    return (*decode(np.array(rgb)).tolist(), 1.0)
 
 
 def _checker(n: Any, raw: Any, place: Any, c: Any, size: Any, around: Any) -> Any:

@@ -10,6 +10,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from ...backend.shared.color.srgb import encode
 from ...backend.shared.errors import Cancelled
 from ..blender.quiet import quiet
 from .scene import FOCAL, View
@@ -86,8 +87,7 @@ class Renderer:
     def picture(self, view: View) -> np.ndarray:
         """(H, W, 3) uint8 sRGB, as the view transform "Standard" without dithering gives."""
         linear = np.clip(self._render(view), 0, 1)
-        encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1 / 2.4) - 0.055)
-        return np.round(encoded * 255).astype(np.uint8)
+        return np.round(encode(linear) * 255).astype(np.uint8)
 
     def truth(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """(H, W) uint16 IDs and (H, W) float32 depth along the camera's axis in meters."""

@@ -6,6 +6,8 @@ They are described by GPUShaderCreateInfo, so that they work with OpenGL, Metal 
 
 import gpu
 
+from ...backend.shared.color import srgb
+from ...backend.shared.splats import spherical_harmonics as sh
 from ...backend.shared.splats.blending import ALPHA_MAX, ALPHA_MIN, EPS_2D, MAX_EXTENT
 
 TABLE_WIDTH = 4096
@@ -26,6 +28,14 @@ _CONSTANTS = f"""
 #define ALPHA_MIN {ALPHA_MIN!r}
 #define EPS_2D {EPS_2D!r}
 #define MAX_EXTENT {MAX_EXTENT!r}
+#define SH_C0 {sh.C0!r}
+#define SH_C1 {sh.C1!r}
+#define SH_C2 {sh.C2!r}
+#define SH_C20 {sh.C20!r}
+#define SH_C30 {sh.C30!r}
+#define SH_C31 {sh.C31!r}
+#define SH_C32 {sh.C32!r}
+#define SH_C33 {sh.C33!r}
 """
 
 _SPLAT_VERTEX = (
@@ -37,26 +47,26 @@ vec4 at(sampler2D table, int index) {
 
 vec3 radiance(int splat, vec3 d) {
     int first = splat * bands;
-    vec3 c = 0.28209479177387814 * at(harmonics, first).rgb;
+    vec3 c = SH_C0 * at(harmonics, first).rgb;
     if (bands > 1) {
-        c += 0.4886025119029199 * (d.z * at(harmonics, first + 2).rgb - d.y * at(harmonics, first + 1).rgb
-                                   - d.x * at(harmonics, first + 3).rgb);
+        c += SH_C1 * (d.z * at(harmonics, first + 2).rgb - d.y * at(harmonics, first + 1).rgb
+                      - d.x * at(harmonics, first + 3).rgb);
     }
     vec3 s = d * d;
     if (bands > 4) {
-        c += 1.0925484305920792 * (d.x * d.y * at(harmonics, first + 4).rgb - d.y * d.z * at(harmonics, first + 5).rgb
-                                   - d.x * d.z * at(harmonics, first + 7).rgb);
-        c += 0.31539156525252005 * (2.0 * s.z - s.x - s.y) * at(harmonics, first + 6).rgb;
-        c += 0.5462742152960396 * (s.x - s.y) * at(harmonics, first + 8).rgb;
+        c += SH_C2 * (d.x * d.y * at(harmonics, first + 4).rgb - d.y * d.z * at(harmonics, first + 5).rgb
+                      - d.x * d.z * at(harmonics, first + 7).rgb);
+        c += SH_C20 * (2.0 * s.z - s.x - s.y) * at(harmonics, first + 6).rgb;
+        c += 0.5 * SH_C2 * (s.x - s.y) * at(harmonics, first + 8).rgb;
     }
     if (bands > 9) {
-        c -= 0.5900435899266435 * d.y * (3.0 * s.x - s.y) * at(harmonics, first + 9).rgb;
-        c += 2.890611442640554 * d.x * d.y * d.z * at(harmonics, first + 10).rgb;
-        c -= 0.4570457994644658 * d.y * (4.0 * s.z - s.x - s.y) * at(harmonics, first + 11).rgb;
-        c += 0.3731763325901154 * d.z * (2.0 * s.z - 3.0 * s.x - 3.0 * s.y) * at(harmonics, first + 12).rgb;
-        c -= 0.4570457994644658 * d.x * (4.0 * s.z - s.x - s.y) * at(harmonics, first + 13).rgb;
-        c += 1.445305721320277 * d.z * (s.x - s.y) * at(harmonics, first + 14).rgb;
-        c -= 0.5900435899266435 * d.x * (s.x - 3.0 * s.y) * at(harmonics, first + 15).rgb;
+        c -= SH_C33 * d.y * (3.0 * s.x - s.y) * at(harmonics, first + 9).rgb;
+        c += SH_C32 * d.x * d.y * d.z * at(harmonics, first + 10).rgb;
+        c -= SH_C31 * d.y * (4.0 * s.z - s.x - s.y) * at(harmonics, first + 11).rgb;
+        c += SH_C30 * d.z * (2.0 * s.z - 3.0 * s.x - 3.0 * s.y) * at(harmonics, first + 12).rgb;
+        c -= SH_C31 * d.x * (4.0 * s.z - s.x - s.y) * at(harmonics, first + 13).rgb;
+        c += 0.5 * SH_C32 * d.z * (s.x - s.y) * at(harmonics, first + 14).rgb;
+        c -= SH_C33 * d.x * (s.x - 3.0 * s.y) * at(harmonics, first + 15).rgb;
     }
     return 0.5 + c;
 }
@@ -160,13 +170,15 @@ void main() {
 """
 
 # The viewport blends linear colors.
-_OVER_FRAGMENT = """
-void main() {
+_OVER_FRAGMENT = f"""
+void main() {{
     vec4 drawn = texture(picture, uv);
     vec3 color = drawn.rgb / max(drawn.a, 1e-6);
-    vec3 high = pow((color + 0.055) / 1.055, vec3(2.4));
-    result = vec4(mix(high, color / 12.92, vec3(lessThanEqual(color, vec3(0.04045)))) * drawn.a, drawn.a);
-}
+    vec3 curve = pow((color + {srgb.OFFSET}) / {1.0 + srgb.OFFSET}, vec3({srgb.GAMMA}));
+    vec3 line = color / {srgb.LINEAR_SLOPE};
+    vec3 on_line = vec3(lessThanEqual(color, vec3({srgb.ENCODED_CUTOFF})));
+    result = vec4(mix(curve, line, on_line) * drawn.a, drawn.a);
+}}
 """
 
 

@@ -14,12 +14,13 @@ from backend.commands.objects.film import frame_path
 from backend.editing.apply import recolored, transformed
 from backend.export.ply import read_splats, write_splats
 from backend.film import cryptomatte, exr
-from backend.film.render import FAR, decoded, encoded
+from backend.film.render import FAR
 from backend.model.splats import Splats, concatenate
 from backend.raster import Camera
 from backend.raster.ranked_ids import add_ranked
 from backend.raster.reference import rasterize_reference
 from backend.shared.color.recolor import Recolor
+from backend.shared.color.srgb import decode, encode
 from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE, InputError
 from backend.shared.reconstruction.folder import Reconstruction
 from backend.shared.reconstruction.objects import edit_objects, write_objects
@@ -157,7 +158,7 @@ def test_a_frame_is_what_the_reference_draws(folder, film, primitive):
     assert_same(picture, splats, sample(), primitive)
     rgba = rgba_of(picture)
     photo = np.asarray(Image.open(frame_path(folder.folder.parent / "film", 1).with_suffix(".png")))
-    straight = encoded(rgba[..., :3] / np.maximum(rgba[..., 3:], 1e-6))
+    straight = encode(rgba[..., :3] / np.maximum(rgba[..., 3:], 1e-6))
     solid = rgba[..., 3] > 0.1
     assert np.abs(photo[..., :3] - 255 * np.clip(straight, 0, 1))[solid].max() < 1.5
     assert np.abs(photo[..., 3] - 255 * rgba[..., 3]).max() < 0.7
@@ -269,8 +270,8 @@ def test_cryptomatte_is_as_published(folder, film):
 
 def test_colors_go_there_and_back():
     values = np.linspace(0, 1.5, 200, dtype=np.float32)
-    np.testing.assert_allclose(encoded(decoded(values)), values, atol=1e-6)
-    np.testing.assert_allclose(decoded(np.float32([0.0, 0.5, 1.0])), [0.0, 0.2140411, 1.0], atol=1e-6)
+    np.testing.assert_allclose(encode(decode(values)), values, atol=1e-6)
+    np.testing.assert_allclose(decode(np.float32([0.0, 0.5, 1.0])), [0.0, 0.2140411, 1.0], atol=1e-6)
 
 
 # --- resuming and stopping --------------------------------------------------------------------------------------------

@@ -154,9 +154,9 @@ print(sum(_head_output.stats.cache_hits.values()))
             False,
         ),
         ("if count > 9:", "if count > 8:", True),
-        ("_C0 = 0.282", "_C0 = 0.283", True),
-        ("out[1] = -_C1 * y", "out[1] = -_C1 / y", True),
-        ("out[2] = _C1 * z", "out[2] = _C1 * x", True),
+        ("_C2 = (C2, -C2", "_C2 = (C2, C2", True),
+        ("out[1] = -C1 * y", "out[1] = -C1 / y", True),
+        ("out[2] = C1 * z", "out[2] = C1 * x", True),
     ],
 )
 def test_only_code_changes_a_kernels_digest(old, new, changes):

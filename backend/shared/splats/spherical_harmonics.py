@@ -8,13 +8,15 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-C0 = 0.28209479177387814
+C0 = math.sqrt(1 / 4 / math.pi)
 """The constant harmonic: a splat's mean color is 0.5 + C0 * f_dc."""
 
 HIGHEST_DEGREE = 3
 
-_C1, _C2, _C20 = (math.sqrt(value / math.pi) for value in (3 / 4, 15 / 4, 5 / 16))
-_C30, _C31, _C32, _C33 = (math.sqrt(value / math.pi) for value in (7 / 16, 21 / 32, 105 / 4, 35 / 32))
+C1 = math.sqrt(3 / 4 / math.pi)
+C2, C20 = math.sqrt(15 / 4 / math.pi), math.sqrt(5 / 16 / math.pi)
+C30, C31, C32, C33 = (math.sqrt(value / math.pi) for value in (7 / 16, 21 / 32, 105 / 4, 35 / 32))
+"""Factors of the harmonics of degree 1, 2 and 3 in `basis`."""
 
 
 def basis(directions: NDArray, degree: int) -> NDArray:
@@ -34,12 +36,12 @@ def basis(directions: NDArray, degree: int) -> NDArray:
     xx, yy, zz = x * x, y * y, z * z
     bands = [
         [np.full_like(x, C0)],
-        [-_C1 * y, _C1 * z, -_C1 * x],
-        [_C2 * x * y, -_C2 * y * z, _C20 * (2 * zz - xx - yy), -_C2 * x * z, _C2 / 2 * (xx - yy)],
+        [-C1 * y, C1 * z, -C1 * x],
+        [C2 * x * y, -C2 * y * z, C20 * (2 * zz - xx - yy), -C2 * x * z, C2 / 2 * (xx - yy)],
         [
-            -_C33 * y * (3 * xx - yy), _C32 * x * y * z, -_C31 * y * (4 * zz - xx - yy),
-            _C30 * z * (2 * zz - 3 * xx - 3 * yy),
-            -_C31 * x * (4 * zz - xx - yy), _C32 / 2 * z * (xx - yy), -_C33 * x * (xx - 3 * yy),
+            -C33 * y * (3 * xx - yy), C32 * x * y * z, -C31 * y * (4 * zz - xx - yy),
+            C30 * z * (2 * zz - 3 * xx - 3 * yy),
+            -C31 * x * (4 * zz - xx - yy), C32 / 2 * z * (xx - yy), -C33 * x * (xx - 3 * yy),
         ],
     ]  # fmt: skip
     if not 0 <= degree <= HIGHEST_DEGREE:

@@ -7,6 +7,7 @@ from typing import Any
 
 import bpy
 
+from ....backend.shared.color import srgb
 from .graph import Graph
 
 CHANNELS = ("Red", "Green", "Blue")
@@ -46,15 +47,19 @@ def recolored(graph: Graph, color: bpy.types.NodeSocket, group_input: bpy.types.
 def linear_channel(graph: Graph, value: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
     """sRGB-encoded to linear; negative values count as 0."""
     value = graph.math("MAXIMUM", value, 0.0)
-    high = graph.math("POWER", graph.math("DIVIDE", graph.math("ADD", value, 0.055), 1.055), 2.4)
-    return _select(graph, graph.math("GREATER_THAN", value, 0.04045), high, graph.math("DIVIDE", value, 12.92))
+    scaled = graph.math("DIVIDE", graph.math("ADD", value, srgb.OFFSET), 1.0 + srgb.OFFSET)
+    curve = graph.math("POWER", scaled, srgb.GAMMA)
+    line = graph.math("DIVIDE", value, srgb.LINEAR_SLOPE)
+    return _select(graph, graph.math("GREATER_THAN", value, srgb.ENCODED_CUTOFF), curve, line)
 
 
 def encoded_channel(graph: Graph, value: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
     """Linear to sRGB-encoded; negative values count as 0."""
     value = graph.math("MAXIMUM", value, 0.0)
-    high = graph.math("MULTIPLY_ADD", graph.math("POWER", value, 1.0 / 2.4), 1.055, -0.055)
-    return _select(graph, graph.math("GREATER_THAN", value, 0.0031308), high, graph.math("MULTIPLY", value, 12.92))
+    power = graph.math("POWER", value, 1.0 / srgb.GAMMA)
+    curve = graph.math("MULTIPLY_ADD", power, 1.0 + srgb.OFFSET, -srgb.OFFSET)
+    line = graph.math("MULTIPLY", value, srgb.LINEAR_SLOPE)
+    return _select(graph, graph.math("GREATER_THAN", value, srgb.LINEAR_CUTOFF), curve, line)
 
 
 def _select(graph: Graph, condition: bpy.types.NodeSocket, yes: Any, no: Any) -> bpy.types.NodeSocket:
