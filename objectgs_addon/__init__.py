@@ -15,7 +15,7 @@ def _modules() -> tuple[ModuleType, ...]:
     from .drawing import splat_arrays
     from .film import properties as film
     from .panels import preferences
-    from .running import running
+    from .running import handlers
     from .state import click_selection, properties
 
     return (
@@ -24,7 +24,7 @@ def _modules() -> tuple[ModuleType, ...]:
         properties,
         film,
         preferences,
-        running,
+        handlers,
         click_selection,
         splat_arrays,
         drawing,

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators, one module for each verb: they read the context, call objectgs_addon and report to the user."""
+"""Operators by theme: they read the context, call objectgs_addon and report to the user.
+
+Small operators that belong together share a module.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ def _classes() -> list[type]:
         group_objects,
         import_capture,
         make_demo,
+        open_reconstruction,
         orient,
         override_decision,
     )
@@ -47,6 +51,7 @@ def _classes() -> list[type]:
         remove_finished_jobs,
         show_result,
         show_preview,
+        open_reconstruction,
         select_object,
         pick_object,
         select_by_name,

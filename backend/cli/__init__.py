@@ -1,1 +1,1 @@
-"""The command line of `python -m backend`: options, help texts, exit codes and terminal output."""
+"""The command line of `python -m backend`: options, help texts and exit codes."""

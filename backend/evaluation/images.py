@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ..shared.color.palette import colors_of, object_colors
 from ..shared.formats.atomic import write_atomic
+from ..shared.reconstruction.objects import default_name
 
 Colors = Mapping[int, Sequence[int]]
 
@@ -186,7 +187,7 @@ def _legend_entries(ids: NDArray, colors: Colors | None, names: Mapping[int, str
     entries: _Legend = []
     for i in shown[:LEGEND_ENTRIES]:
         r, g, b = id_image(np.array([[i]]), colors)[0, 0].tolist()
-        entries.append(((r, g, b), (names or {}).get(i) or f"object {i}"))
+        entries.append(((r, g, b), (names or {}).get(i) or default_name(i)))
     if len(shown) > LEGEND_ENTRIES:
         entries.append((None, f"and {len(shown) - LEGEND_ENTRIES} more"))
     if len(shown) < len(found):

@@ -19,7 +19,7 @@ from ..raster import devices
 from ..shared.class_table import ClassTable
 from ..shared.events import Reporter
 from ..shared.reconstruction.folder import Reconstruction
-from ..shared.reconstruction.objects import SceneObject, read_objects
+from ..shared.reconstruction.objects import SceneObject, default_name, read_objects
 from ..shared.reconstruction.shot import Frame, Placed, Sample, Shot
 
 _FORMAT = 2
@@ -135,5 +135,5 @@ def _digest_of(path: Path, objects: list[SceneObject], primitive: str) -> str:
 
 def _names(ids: list[int], entries: dict[int, SceneObject]) -> list[str]:
     """Return a name for each object; equal names get their ID, since mattes are selected by name."""
-    names = [entries[i].name if i in entries else "Unlabeled" if i == 0 else f"object {i}" for i in ids]
+    names = [entries[i].name if i in entries else default_name(i) for i in ids]
     return [f"{name} ({i})" if names.count(name) > 1 else name for name, i in zip(names, ids)]

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..capture import Capture
 from ..shared.defaults import MAX_SIZE
-from ..shared.reconstruction.objects import SceneObject, merged
+from ..shared.reconstruction.objects import SceneObject, default_name, merged
 from ..shared.reconstruction.plan import KEYS, Decision, Plan
 from ..training.exposure import VARIES_FROM, differences, measure_gains
 from ..training.settings import Settings, background_is_masked, downscale_at
@@ -124,7 +124,7 @@ def _objects(context: PlanningContext) -> Decision | None:
     if not (context.labeled and left_out):
         return None
     names = {entry.id: entry.name for entry in context.objects}
-    what = f"splats of {_listed([names.get(i, f'object {i}') for i in left_out])}"
+    what = f"splats of {_listed([names.get(i, default_name(i)) for i in left_out])}"
     why = f"only {len(context.capture.object_ids)} objects are selected; the others count as unlabeled"
     return Decision("objects", what, False, why, can_override=False)
 

@@ -8,7 +8,7 @@ import bpy
 from .. import scene
 from ..environment import locations
 from ..process import jobs
-from ..running import running
+from ..running import background
 from ..running.job_display import write
 from ..state.folder_state import folder_state
 from .tab import Tab, draw_job
@@ -29,7 +29,7 @@ class CapturePanel(Tab, bpy.types.Panel):
         column.operator("objectgs.import_capture", icon="IMPORT")
         column.operator("objectgs.open_reconstruction", icon="FILE_FOLDER")
         column.operator("objectgs.make_demo", icon="MESH_MONKEY")
-        for index, job in enumerate(running.queue.jobs):
+        for index, job in enumerate(background.queue.jobs):
             if job.kind in ("import", "demo") and (not job.is_finished or job.state is jobs.State.FAILED):
                 draw_job(layout, job, index)
         active = context.scene.objectgs.active

@@ -11,9 +11,9 @@ import numpy as np
 from mathutils import Matrix
 
 from .. import scene
-from ..running import running
+from ..running import background
 from ..running.job_display import write
-from ..state import object_edits
+from ..state import object_list
 from .tab import WithReconstruction, draw_job_of
 
 
@@ -24,11 +24,11 @@ class EditPanel(WithReconstruction, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         root = context.scene.objectgs.active
-        item = object_edits.shown_item(root)
+        item = object_list.shown_item(root)
         if item is None:
             write(layout, "Use Assign Objects to find the objects.", "INFO")
             return
-        collection = scene.object_collections(root).get(object_edits.from_stored(item.object_id))
+        collection = scene.object_collections(root).get(scene.from_stored(item.object_id))
         row = layout.row()
         row.label(text=item.name, icon="TRASH" if item.removed else "OUTLINER_COLLECTION")
         if item.removed:
@@ -58,7 +58,7 @@ class EditPanel(WithReconstruction, bpy.types.Panel):
         self, layout: bpy.types.UILayout, root: bpy.types.Collection, collection: bpy.types.Collection | None
     ) -> None:
         count = None if collection is None else collection.get(scene.UNOBSERVED_COUNT)
-        job = running.job_of(root)
+        job = background.job_of(root)
         if count:
             write(layout, f"{count:,} splats fill the hole", "CHECKMARK")
         elif count == 0:
@@ -75,7 +75,7 @@ class EditPanel(WithReconstruction, bpy.types.Panel):
             column.prop(item, name)
         column.row(align=True).prop(item, "tint")
         row = column.row()
-        row.enabled = object_edits.recolor_of(item).changes
+        row.enabled = object_list.recolor_of(item).changes
         row.operator("objectgs.reset_object", text="Reset Colors", icon="LOOP_BACK").what = "COLORS"
 
     def _draw_transform(

@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 
 from .. import scene
-from ..running import running
+from ..running import background
 from ..running.job_display import write
 from .tab import WithReconstruction, draw_job_of
 
@@ -20,9 +20,9 @@ class FilmPanel(WithReconstruction, bpy.types.Panel):
         layout = self.layout
         owner = context.scene
         root, settings, render = owner.objectgs.active, owner.objectgs_film, owner.render
-        job = running.job_of(root)
+        job = background.job_of(root)
         column = layout.column()
-        column.enabled = not running.busy(scene.folder_of(root))
+        column.enabled = not background.busy(scene.folder_of(root))
         column.operator("objectgs.film_frames", icon="RENDER_ANIMATION")
         column.use_property_split = True
         column.use_property_decorate = False

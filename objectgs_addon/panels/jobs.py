@@ -7,7 +7,7 @@ from typing import Any
 
 import bpy
 
-from ..running import running
+from ..running import background
 from ..running.job_display import summary
 from .tab import Tab, draw_job
 
@@ -19,18 +19,18 @@ class JobsPanel(Tab, bpy.types.Panel):
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        return bool(running.queue.jobs)
+        return bool(background.queue.jobs)
 
     def draw(self, _context: bpy.types.Context) -> None:
         layout = self.layout
-        for index, job in enumerate(running.queue.jobs):
+        for index, job in enumerate(background.queue.jobs):
             draw_job(layout, job, index)
         layout.operator("objectgs.remove_finished_jobs", icon="X")
 
 
 def status_bar(bar: Any, _context: bpy.types.Context) -> None:
     """Draw the running job with its time left and a button to stop it."""
-    job = running.queue.running
+    job = background.queue.running
     if job is not None:
         row = bar.layout.row(align=True)
         row.label(text=f"ObjectGS  {summary(job)}", icon="TIME")

@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 
 from .. import scene
-from ..running import running
+from ..running import background
 from ..running.job_display import write
 from ..state.folder_state import folder_state
 from .tab import WithReconstruction, draw_job_of
@@ -22,9 +22,9 @@ class MeshesPanel(WithReconstruction, bpy.types.Panel):
         properties = root.objectgs
         folder = scene.folder_of(root)
         state = folder_state(folder)
-        job = running.job_of(root)
+        job = background.job_of(root)
         column = layout.column()
-        column.enabled = not running.busy(folder)
+        column.enabled = not background.busy(folder)
         column.operator("objectgs.extract_meshes", icon="MESH_DATA")
         column.row().prop(properties, "mesh_objects", expand=True)
         column.use_property_split = True
@@ -34,7 +34,7 @@ class MeshesPanel(WithReconstruction, bpy.types.Panel):
         column.prop(properties, "mesh_scene")
         if job is not None and job.kind == "mesh":
             draw_job_of(layout, job)
-        if state.stale_meshes and not running.busy(folder):
+        if state.stale_meshes and not background.busy(folder):
             write(
                 layout,
                 f"{state.stale_meshes} of {state.meshes} meshes were made at another step of the training. "

@@ -7,8 +7,9 @@ from typing import Any
 
 import bpy
 
+from .. import scene
 from ..running.job_display import write
-from ..state import object_edits, visibility
+from ..state import visibility
 from .tab import WithReconstruction
 
 
@@ -43,7 +44,7 @@ class ObjectList(bpy.types.UIList):
         numbers.active = False
         numbers.label(text=_count(item))
         row.prop(item, "chosen", text="", icon="CHECKBOX_HLT" if item.chosen else "CHECKBOX_DEHLT", emboss=False)
-        object_id = object_edits.from_stored(item.object_id)
+        object_id = scene.from_stored(item.object_id)
         layer = ObjectList.layers.get(object_id)
         if item.removed:
             row.operator("objectgs.restore_object", text="", icon="TRASH", emboss=False).object = str(object_id)
@@ -98,7 +99,7 @@ class ObjectsPanel(WithReconstruction, bpy.types.Panel):
 
 def describe(item: Any, properties: Any) -> str:
     """The ID, counts and state of a row in words."""
-    words = [f"ID {object_edits.from_stored(item.object_id)}", f"{item.points:,} points"]
+    words = [f"ID {scene.from_stored(item.object_id)}", f"{item.points:,} points"]
     if item.splats:
         words.append(f"{item.splats:,} splats")
     if item.faces:

@@ -9,7 +9,7 @@ import bpy
 
 from ...backend.shared.reconstruction.plan import Decision
 from .. import scene
-from ..running import running
+from ..running import background
 from ..running.job_display import write
 from ..state import planning
 from ..state.planning import sentence_case
@@ -31,7 +31,7 @@ class PlanPanel(WithReconstruction, bpy.types.Panel):
         layout = self.layout
         root = context.scene.objectgs.active
         folder = scene.folder_of(root)
-        layout.enabled = not running.busy(folder)
+        layout.enabled = not background.busy(folder)
         for decision in planning.plan_of(folder).decisions:
             _draw_decision(layout, root.objectgs, decision)
         row = layout.row(align=True)

@@ -5,7 +5,7 @@ import bpy
 from bpy.props import EnumProperty, StringProperty
 
 from ..environment import locations
-from ..running import job_display, running
+from ..running import background, job_display
 
 
 class Preferences(bpy.types.AddonPreferences):
@@ -61,9 +61,9 @@ class Preferences(bpy.types.AddonPreferences):
 
 def _draw_state(layout: bpy.types.UILayout) -> None:
     """Draw the state of the backend and of its set-up."""
-    job = running.queue.of_folder(locations.environment_folder())
+    job = background.queue.of_folder(locations.environment_folder())
     if job is not None and not job.is_finished:
-        job_display.draw_running(layout, job, running.queue.jobs.index(job))
+        job_display.draw_running(layout, job, background.queue.jobs.index(job))
         return
     sentence, icon = backend_state()
     job_display.write(layout, sentence, icon)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 
 from ..process.jobs import Job
-from ..running import running
+from ..running import background
 from ..running.job_display import draw_over, draw_running
 
 
@@ -27,7 +27,7 @@ def draw_job_of(layout: bpy.types.UILayout, job: Job) -> None:
     if job.is_finished:
         draw_over(layout, job)
     else:
-        draw_job(layout, job, running.queue.jobs.index(job))
+        draw_job(layout, job, background.queue.jobs.index(job))
 
 
 def draw_job(layout: bpy.types.UILayout, job: Job, index: int) -> None:

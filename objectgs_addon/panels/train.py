@@ -14,7 +14,7 @@ from ...backend.shared.expectation import PRESET_STEPS, expectation
 from ...backend.shared.reconstruction.lock import lock_holder
 from .. import scene
 from ..process.jobs import Job
-from ..running import previews, running
+from ..running import background, previews
 from ..running.job_display import write
 from ..state.folder_state import FolderState, folder_state
 from .tab import WithReconstruction, draw_job_of
@@ -29,10 +29,10 @@ class TrainPanel(WithReconstruction, bpy.types.Panel):
         root = context.scene.objectgs.active
         properties = root.objectgs
         folder = scene.folder_of(root)
-        job = running.job_of(root)
+        job = background.job_of(root)
         if job is not None and job.kind in ("mesh", "film", "fill"):
             job = None  # Other panels show these.
-        active = running.busy(folder)
+        active = background.busy(folder)
         column = layout.column()
         column.enabled = not active
         column.operator("objectgs.assign_objects", icon="GROUP_VERTEX")

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...backend.shared.color.palette import UNLABELED, colors_of, to_linear
 from ...backend.shared.reconstruction.folder import Reconstruction
-from ...backend.shared.reconstruction.objects import SceneObject, merged, read_objects
+from ...backend.shared.reconstruction.objects import SceneObject, default_name, merged, read_objects
 
 _LINEAR = np.array([to_linear((value,))[0] for value in range(256)], np.float32)
 
@@ -43,9 +43,7 @@ class Objects:
 
     def name(self, object_id: int) -> str:
         """The object's name; IDs that objects.json does not know get one, too."""
-        if object_id in self.entries:
-            return self.entries[object_id].name
-        return "Unlabeled" if object_id == 0 else f"object {object_id}"
+        return self.entries[object_id].name if object_id in self.entries else default_name(object_id)
 
     def rgb(self, object_id: int) -> tuple[int, int, int]:
         """The object's color, sRGB 0 .. 255."""

@@ -28,7 +28,7 @@ def _active_changed() -> None:
         return
     context.scene.objectgs.active = root
     for index, item in enumerate(root.objectgs.objects):
-        if object_edits.from_stored(item.object_id) == object_id:
+        if scene.from_stored(item.object_id) == object_id:
             with object_edits.without_callbacks():
                 root.objectgs.active_object = index
             break

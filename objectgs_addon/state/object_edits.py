@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The list of objects, filled from objects.json, and the user's edits written back to that file."""
+"""Edits by the user: the list of objects is filled from objects.json, and changes are written back to it."""
 
 from __future__ import annotations
 
@@ -15,19 +15,15 @@ from ...backend.shared.color.recolor import Recolor
 from ...backend.shared.errors import InputError
 from ...backend.shared.grouping import grouped, read_groups
 from ...backend.shared.reconstruction.folder import Reconstruction
-from ...backend.shared.reconstruction.objects import SceneObject, edit_objects, merged, read_objects
+from ...backend.shared.reconstruction.objects import edit_objects, read_objects
 from .. import scene
 from ..blender import messages, writing
 from ..picking import selection
 from ..scene import from_stored, to_stored
+from . import object_list
 
 WRITE_AFTER = 0.4
 """Seconds after the last change until new colors are written, since a dragged slider changes all the time."""
-
-SLIDERS = ("amount", "hue", "saturation", "value", "contrast")
-COLORS = ("replace", "tint")
-DIGITS = 6
-"""Decimals of a slider's value, about the precision of Blender's floats."""
 
 after_edits: list[Callable[[bpy.types.Collection], None]] = []
 """Called with a reconstruction's collection after an edit that the backend may have to complete."""
@@ -54,8 +50,8 @@ def fill(root: bpy.types.Collection) -> None:
     properties = root.objectgs
     path = Reconstruction(scene.folder_of(root)).objects
     entries = read_objects(path) if path.exists() else []
-    shown, faces = splat_counts(root), face_counts(root)
-    active = active_item(root)
+    shown, faces = object_list.splat_counts(root), object_list.face_counts(root)
+    active = object_list.active_item(root)
     active_id = active.object_id if active else None
     with without_callbacks():
         properties.objects.clear()
@@ -76,26 +72,6 @@ def fill(root: bpy.types.Collection) -> None:
             if item.object_id == active_id:
                 properties.active_object = len(properties.objects) - 1
         properties.active_object = max(0, min(properties.active_object, len(entries) - 1))
-
-
-def splat_counts(root: bpy.types.Collection) -> dict[int, int]:
-    """Object ID -> number of splats in its collection, including those of merged objects."""
-    return {
-        object_id: sum(
-            len(part.data.vertices) - int(scene.unobserved_splats(part.data).sum())
-            for part in scene.parts_of(collection)
-            if scene.kind_of(part) == "splats"
-        )
-        for object_id, collection in scene.object_collections(root).items()
-    }
-
-
-def face_counts(root: bpy.types.Collection) -> dict[int, int]:
-    """Object ID -> number of faces of its meshes, for objects that have any."""
-    return {
-        object_id: sum(len(mesh.data.polygons) for mesh in meshes)
-        for object_id, meshes in scene.object_meshes(root).items()
-    }
 
 
 def store(root: bpy.types.Collection) -> None:
@@ -119,7 +95,7 @@ def store(root: bpy.types.Collection) -> None:
             "removed": item.removed or None,
             "floaters": item.floaters or None,
             "fill": item.fill or None,
-            "recolor": recolor_of(item).stored(),
+            "recolor": object_list.recolor_of(item).stored(),
         }
         there = {
             "name": entry.name,
@@ -129,7 +105,7 @@ def store(root: bpy.types.Collection) -> None:
             "removed": entry.removed or None,
             "floaters": entry.floaters or None,
             "fill": entry.fill or None,
-            "recolor": _rounded(entry.recolor).stored(),
+            "recolor": object_list.rounded(entry.recolor).stored(),
         }
         changed = {key: value for key, value in wanted.items() if value != there[key]}
         if changed:
@@ -181,7 +157,7 @@ def _edit(root: bpy.types.Collection, changes: dict[int, dict]) -> None:
     store_edits(root)
     edit_objects(Reconstruction(scene.folder_of(root)).objects, changes)
     try:
-        if scenes_of(root):
+        if object_list.scenes_of(root):
             show(root)
     finally:
         fill(root)
@@ -252,96 +228,24 @@ def flush() -> None:
 
 
 def _write_colors(root: bpy.types.Collection, items: list[Any]) -> None:
-    changes = {from_stored(item.object_id): {"recolor": recolor_of(item).stored()} for item in items}
+    changes = {from_stored(item.object_id): {"recolor": object_list.recolor_of(item).stored()} for item in items}
     try:
         edit_objects(Reconstruction(scene.folder_of(root)).objects, changes)
     except (InputError, OSError) as error:
         for item in items:
             _restore(item)
-            scene.recolor(root, from_stored(item.object_id), recolor_of(item))
+            scene.recolor(root, from_stored(item.object_id), object_list.recolor_of(item))
         messages.show(f"Colors were not changed: {messages.sentence(error)}", "ERROR")
         return
     for item in items:
         _remember(item)
 
 
-def recolor_of(item: Any) -> Recolor:
-    """The color edit that a row's sliders describe."""
-    values = {name: round(getattr(item, name), DIGITS) for name in SLIDERS}
-    values |= {name: tuple(round(channel, DIGITS) for channel in getattr(item, name)) for name in COLORS}
-    return Recolor(**values, middle=round(item.middle, DIGITS)) if item.middle else Recolor(**values)
-
-
-def _rounded(recolor: Recolor | None) -> Recolor:
-    """A stored color edit with the sliders' precision."""
-    if recolor is None:
-        return Recolor()
-    values = {name: round(getattr(recolor, name), DIGITS) for name in (*SLIDERS, "middle")}
-    return Recolor(
-        **values, **{name: tuple(round(channel, DIGITS) for channel in getattr(recolor, name)) for name in COLORS}
-    )
-
-
 def _set_sliders(item: Any, recolor: Recolor | None) -> None:
     wanted = recolor or Recolor()
-    for name in (*SLIDERS, *COLORS):
+    for name in (*object_list.SLIDERS, *object_list.COLORS):
         setattr(item, name, getattr(wanted, name))
     item.middle = wanted.middle if recolor is not None else 0.0
-
-
-def chosen_ids(context: bpy.types.Context, root: bpy.types.Collection) -> list[int]:
-    """IDs of the objects selected in the viewport, or of the active row; of merged objects, the one they belong to."""
-    ids = selection.selected_ids(context, root)
-    item = active_item(root)
-    if not ids and item is not None:
-        ids = [from_stored(item.object_id)]
-    return list(dict.fromkeys(shown_as(root, object_id) for object_id in ids if object_id))
-
-
-def require_chosen_ids(context: bpy.types.Context, root: bpy.types.Collection) -> list[int]:
-    """As `chosen_ids`. Raises InputError if there are none."""
-    ids = chosen_ids(context, root)
-    if not ids:
-        raise InputError("No object is selected; select one in the viewport or in the list")
-    return ids
-
-
-def item_of(root: bpy.types.Collection, object_id: int) -> Any:
-    """The row of an object ID, or None."""
-    return next((item for item in root.objectgs.objects if from_stored(item.object_id) == object_id), None)
-
-
-def shown_item(root: bpy.types.Collection) -> Any:
-    """The active row, or the row it is merged into; None if the list is empty."""
-    item = active_item(root)
-    return item and item_of(root, shown_as(root, from_stored(item.object_id)))
-
-
-def shown_as(root: bpy.types.Collection, object_id: int) -> int:
-    """The ID of the object that shows `object_id`: itself, or the one it is merged into."""
-    rows = [
-        SceneObject(
-            from_stored(item.object_id),
-            item.name,
-            (0, 0, 0),
-            0,
-            from_stored(item.merged_into) if item.is_merged else None,
-        )
-        for item in root.objectgs.objects
-    ]
-    return merged(rows).get(object_id, object_id)
-
-
-def scenes_of(root: bpy.types.Collection) -> list[bpy.types.Scene]:
-    """The scenes that contain the reconstruction."""
-    return [owner for owner in bpy.data.scenes if root in owner.collection.children_recursive]
-
-
-def active_item(root: bpy.types.Collection) -> Any:
-    """The active row, or None if the list is empty."""
-    properties = root.objectgs
-    count = len(properties.objects)
-    return properties.objects[min(max(properties.active_object, 0), count - 1)] if count else None
 
 
 def _rgb(item: Any) -> list[int]:
@@ -383,7 +287,7 @@ def recolor_changed(item: Any, _context: bpy.types.Context) -> None:
     if not item.middle:
         with without_callbacks():
             item.middle = scene.luma_of(collection)
-    scene.recolor(root, object_id, recolor_of(item))
+    scene.recolor(root, object_id, object_list.recolor_of(item))
     _unwritten.add((root.session_uid, object_id))
     if bpy.app.background:
         flush()
@@ -414,7 +318,7 @@ def _row_changed(item: Any, **changes: Any) -> None:
         return
     _remember(item)
     try:
-        if scenes_of(root):
+        if object_list.scenes_of(root):
             scene.show_objects(root, folder)
         _notify(root)
     except (InputError, OSError) as error:
@@ -428,7 +332,7 @@ def _require_object_mode(root: bpy.types.Collection) -> None:
 
 def _remember(item: Any) -> None:
     """Store the state that a failed edit reverts to."""
-    item.stored = json.dumps([item.name, list(item.color), item.chosen, recolor_of(item).stored()])
+    item.stored = json.dumps([item.name, list(item.color), item.chosen, object_list.recolor_of(item).stored()])
 
 
 def _restore(item: Any) -> None:
@@ -445,6 +349,6 @@ def active_changed(properties: Any, context: bpy.types.Context) -> None:
     if _filling:
         return
     root = properties.id_data
-    item = active_item(root)
+    item = object_list.active_item(root)
     if item is not None:
-        selection.select_object(context, root, shown_as(root, from_stored(item.object_id)))
+        selection.select_object(context, root, object_list.shown_as(root, from_stored(item.object_id)))

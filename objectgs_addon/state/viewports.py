@@ -8,7 +8,7 @@ import contextlib
 import bpy
 
 from .. import scene
-from . import object_edits
+from . import object_list
 
 
 def show(root: bpy.types.Collection) -> None:
@@ -27,7 +27,7 @@ def show(root: bpy.types.Collection) -> None:
 def hide_points(root: bpy.types.Collection) -> None:
     """Take the point cloud out of sight, since splats or meshes come into its place."""
     points = [part for part in root.all_objects if scene.kind_of(part) == "points"]
-    for layer in (layer for owner in object_edits.scenes_of(root) for layer in owner.view_layers):
+    for layer in (layer for owner in object_list.scenes_of(root) for layer in owner.view_layers):
         for part in points:
             # Not looked for in the layer, which does not list yet what was just linked.
             with contextlib.suppress(RuntimeError):  # It was taken out of this layer.

@@ -5,7 +5,7 @@ import bpy
 
 from ...objectgs_addon import scene
 from ...objectgs_addon.environment import locations
-from ...objectgs_addon.running import running
+from ...objectgs_addon.running import background
 from ...objectgs_addon.state import planning
 from ...objectgs_addon.state.folder_state import folder_state
 from ..common import need
@@ -34,7 +34,7 @@ class AnalyzeCapture(bpy.types.Operator):
             str(folder),
             *planning.arguments(root),
         )
-        return running.submit(job, context.scene, self.report)
+        return background.submit(job, context.scene, self.report)
 
 
 CLASSES = (AnalyzeCapture,)

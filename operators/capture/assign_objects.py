@@ -5,7 +5,7 @@ import bpy
 
 from ...objectgs_addon import scene
 from ...objectgs_addon.environment import locations
-from ...objectgs_addon.running import running
+from ...objectgs_addon.running import background
 from ...objectgs_addon.state.folder_state import folder_state
 from ..common import need
 
@@ -36,7 +36,7 @@ class AssignObjects(bpy.types.Operator):
             "--max-size",
             str(root.objectgs.max_size),
         )
-        return running.submit(job, context.scene, self.report)
+        return background.submit(job, context.scene, self.report)
 
 
 CLASSES = (AssignObjects,)

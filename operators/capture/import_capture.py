@@ -9,7 +9,7 @@ from bpy.props import BoolProperty, IntProperty, StringProperty
 from ...backend.shared.defaults import MAX_SIZE
 from ...backend.shared.errors import InputError
 from ...objectgs_addon.environment import locations
-from ...objectgs_addon.running import running
+from ...objectgs_addon.running import background
 from ...objectgs_addon.state.folder_state import folder_state
 from ..common import need
 from ..common.reporting import reports_errors
@@ -70,7 +70,7 @@ class ImportCapture(bpy.types.Operator):
             "--max-size",
             str(self.max_size),
         )
-        return running.submit(job, context.scene, self.report)
+        return background.submit(job, context.scene, self.report)
 
 
 def _folder_for(capture: Path) -> Path:

@@ -4,7 +4,7 @@
 import bpy
 
 from ...objectgs_addon.environment import locations
-from ...objectgs_addon.running import running
+from ...objectgs_addon.running import background
 
 
 class MakeDemo(bpy.types.Operator):
@@ -17,13 +17,13 @@ class MakeDemo(bpy.types.Operator):
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        if running.busy(locations.demo_folder()):
+        if background.busy(locations.demo_folder()):
             cls.poll_message_set("The demo capture is being made")
             return False
         return True
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        return running.submit(locations.demo_job(), context.scene, self.report)
+        return background.submit(locations.demo_job(), context.scene, self.report)
 
 
 CLASSES = (MakeDemo,)

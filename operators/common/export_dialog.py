@@ -8,7 +8,7 @@ import bpy
 from bpy.props import BoolProperty, StringProperty
 
 from ...backend.shared.errors import InputError
-from ...objectgs_addon.state import object_edits
+from ...objectgs_addon.state import object_list
 from . import need
 
 
@@ -54,7 +54,7 @@ class ExportDialog:
             raise InputError("Choose a file to write")
         ids = None
         if self.objects == "SELECTED":
-            ids = object_edits.require_chosen_ids(context, need.active_root(context))
+            ids = object_list.require_chosen_ids(context, need.active_root(context))
         return self._named(Path(bpy.path.abspath(self.filepath)).resolve()), ids
 
     def _named(self, path: Path) -> Path:

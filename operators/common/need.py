@@ -14,8 +14,8 @@ from ...backend.shared.reconstruction.lock import lock_holder
 from ...objectgs_addon import scene
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.picking import selection
-from ...objectgs_addon.running import running
-from ...objectgs_addon.state import object_edits
+from ...objectgs_addon.running import background
+from ...objectgs_addon.state import object_list
 from ...objectgs_addon.state.folder_state import folder_state
 
 
@@ -62,7 +62,7 @@ def require_unused(folder: Path) -> None:
 
 def _use_of(folder: Path) -> str | None:
     """Who uses a reconstruction folder, as a sentence; None where nobody does."""
-    if running.busy(folder):
+    if background.busy(folder):
         return f"A job is using {folder}; wait for it or stop it"
     holder = lock_holder(folder)
     if holder is not None:
@@ -81,6 +81,14 @@ def capture(cls: Any, context: bpy.types.Context) -> bool:
     if location.is_dir():
         return True
     cls.poll_message_set(f"The capture {location} is missing; put it back, or import it again from where it is now")
+    return False
+
+
+def splats(cls: Any, context: bpy.types.Context) -> bool:
+    """Whether the active reconstruction has splats."""
+    if folder_state(scene.folder_of(active_root(context))).trained:
+        return True
+    cls.poll_message_set("There are no splats yet; train first")
     return False
 
 
@@ -112,8 +120,8 @@ def edited(cls: Any, context: bpy.types.Context) -> bool:
     if not objects(cls, context):
         return False
     root = active_root(context)
-    item = object_edits.shown_item(root)
-    if object_edits.from_stored(item.object_id) in scene.object_collections(root):
+    item = object_list.shown_item(root)
+    if scene.from_stored(item.object_id) in scene.object_collections(root):
         return True
     cls.poll_message_set(f"{item.name} has no splats and no mesh yet; train first, or choose another in the list")
     return False
@@ -127,7 +135,7 @@ def not_removed(cls: Any, context: bpy.types.Context, addition: str) -> bool:
     if not edited(cls, context):
         return False
     root = active_root(context)
-    item = object_edits.shown_item(root)
+    item = object_list.shown_item(root)
     if not item.removed or selection.selected_collections(context, root):
         return True
     cls.poll_message_set(f"{item.name} is removed{addition}")

@@ -3,12 +3,11 @@
 
 import bpy
 
-from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.shot import NAME, write_shot
 from ...objectgs_addon import film, scene
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.film.properties import folder_of, samples_of
-from ...objectgs_addon.running import running
+from ...objectgs_addon.running import background
 from ...objectgs_addon.state import object_edits
 from ..common import need
 from ..common.reporting import reports_errors
@@ -27,8 +26,7 @@ class FilmFrames(bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         if not (need.backend(cls) and need.reconstruction(cls, context) and need.idle(cls, context)):
             return False
-        if not Reconstruction(scene.folder_of(need.active_root(context))).splats.is_file():
-            cls.poll_message_set("There are no splats yet; train first")
+        if not need.splats(cls, context):
             return False
         if context.scene.camera is None:
             cls.poll_message_set("The scene has no camera; choose one")
@@ -71,7 +69,7 @@ class FilmFrames(bpy.types.Operator):
             str(folder),
             *options,
         )
-        return running.submit(job, owner, self.report)
+        return background.submit(job, owner, self.report)
 
 
 CLASSES = (FilmFrames,)

@@ -5,7 +5,7 @@ import bpy
 
 from ...objectgs_addon import film, scene
 from ...objectgs_addon.film.properties import folder_of
-from ...objectgs_addon.state import object_edits
+from ...objectgs_addon.state import object_list
 from ..common import need
 from ..common.reporting import reports_errors
 
@@ -26,7 +26,7 @@ class SetUpCompositor(bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:
         root, owner = need.active_root(context), context.scene
-        item = object_edits.active_item(root)
+        item = object_list.active_item(root)
         film.set_up_compositor(
             owner,
             context.view_layer,

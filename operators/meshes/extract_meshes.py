@@ -5,8 +5,8 @@ import bpy
 
 from ...objectgs_addon import scene
 from ...objectgs_addon.environment import locations
-from ...objectgs_addon.running import running
-from ...objectgs_addon.state import object_edits
+from ...objectgs_addon.running import background
+from ...objectgs_addon.state import object_list
 from ..common import need
 from ..common.reporting import reports_errors
 
@@ -31,13 +31,11 @@ class ExtractMeshes(bpy.types.Operator):
         folder = scene.folder_of(root)
         arguments = ["mesh", str(folder), "--faces", str(properties.mesh_faces)]
         if properties.mesh_objects == "selected":
-            arguments += ["--objects", *map(str, object_edits.require_chosen_ids(context, root))]
+            arguments += ["--objects", *map(str, object_list.require_chosen_ids(context, root))]
         elif properties.mesh_scene:
             # --scene without --objects would make the mesh of the whole scene alone.
             ids = [
-                object_edits.from_stored(item.object_id)
-                for item in properties.objects
-                if item.chosen and not item.is_merged
+                scene.from_stored(item.object_id) for item in properties.objects if item.chosen and not item.is_merged
             ]
             arguments += ["--objects", *map(str, ids)] if ids else []
         if properties.mesh_scene:
@@ -47,7 +45,7 @@ class ExtractMeshes(bpy.types.Operator):
         if properties.texture_size != "auto":
             arguments += ["--texture-size", properties.texture_size]
         job = locations.backend_job(f"Meshes of {root.name}", "mesh", folder, *arguments)
-        return running.submit(job, context.scene, self.report)
+        return background.submit(job, context.scene, self.report)
 
 
 CLASSES = (ExtractMeshes,)

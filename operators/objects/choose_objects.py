@@ -5,8 +5,9 @@ import bpy
 from bpy.props import EnumProperty
 
 from ...backend.shared.errors import InputError
+from ...objectgs_addon import scene
 from ...objectgs_addon.picking import selection
-from ...objectgs_addon.state import object_edits
+from ...objectgs_addon.state import object_edits, object_list
 from ..common import need
 from ..common.reporting import reports_errors
 
@@ -34,8 +35,8 @@ class ChooseObjects(bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:
         root = need.active_root(context)
-        rows = {object_edits.from_stored(item.object_id): item.chosen for item in root.objectgs.objects}
-        active = object_edits.from_stored(object_edits.active_item(root).object_id)
+        rows = {scene.from_stored(item.object_id): item.chosen for item in root.objectgs.objects}
+        active = scene.from_stored(object_list.active_item(root).object_id)
         kept = {
             "ALL": set(rows),
             "ACTIVE": {active},

@@ -6,7 +6,7 @@ import bpy
 from ...backend.shared.errors import InputError
 from ...objectgs_addon import scene
 from ...objectgs_addon.picking import selection
-from ...objectgs_addon.state import object_edits
+from ...objectgs_addon.state import object_edits, object_list
 from ..common import need
 from ..common.reporting import reports_errors
 
@@ -27,9 +27,9 @@ class DuplicateObject(bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:
         root = need.active_root(context)
-        known = {object_edits.from_stored(item.object_id) for item in root.objectgs.objects}
+        known = {scene.from_stored(item.object_id) for item in root.objectgs.objects}
         wanted = selection.selected_collections(context, root) or [
-            scene.object_collections(root)[object_id] for object_id in object_edits.chosen_ids(context, root)
+            scene.object_collections(root)[object_id] for object_id in object_list.chosen_ids(context, root)
         ]
         wanted = [collection for collection in wanted if scene.object_id_of(collection) in known]
         if not wanted:

@@ -5,7 +5,8 @@ import bpy
 from bpy.props import BoolProperty
 
 from ...backend.shared.reconstruction.fill import UNOBSERVED
-from ...objectgs_addon.state import object_edits
+from ...objectgs_addon import scene
+from ...objectgs_addon.state import object_edits, object_list
 from ..common import need
 from ..common.reporting import reports_errors
 
@@ -29,7 +30,7 @@ class FillHole(bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         if not need.edited(cls, context):
             return False
-        item = object_edits.shown_item(need.active_root(context))
+        item = object_list.shown_item(need.active_root(context))
         if item.removed:
             return True
         cls.poll_message_set(f"{item.name} is not removed, so it leaves no hole")
@@ -38,7 +39,7 @@ class FillHole(bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:
         root = need.active_root(context)
-        object_id = object_edits.from_stored(object_edits.shown_item(root).object_id)
+        object_id = scene.from_stored(object_list.shown_item(root).object_id)
         object_edits.fill_hole(root, object_id, self.filled)
 
 

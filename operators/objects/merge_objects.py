@@ -7,8 +7,9 @@ import bpy
 from bpy.props import EnumProperty
 
 from ...backend.shared.errors import InputError
+from ...objectgs_addon import scene
 from ...objectgs_addon.picking import selection
-from ...objectgs_addon.state import object_edits
+from ...objectgs_addon.state import object_edits, object_list
 from ..common import need
 from ..common.reporting import reports_errors
 
@@ -20,7 +21,7 @@ def _targets(_operator: Any, context: bpy.types.Context) -> list[tuple[str, str,
     global _choices
     root = need.active_root(context)
     items = root.objectgs.objects if root else ()
-    _choices = [(str(object_edits.from_stored(item.object_id)), item.name, "") for item in items if not item.is_merged]
+    _choices = [(str(scene.from_stored(item.object_id)), item.name, "") for item in items if not item.is_merged]
     return _choices
 
 
@@ -28,7 +29,7 @@ def _sources(context: bpy.types.Context) -> list[int]:
     """IDs to merge: the objects selected in the viewport if there are several, else the active one of the list."""
     root = need.active_root(context)
     ids = [object_id for object_id in selection.selected_ids(context, root) if object_id]
-    return ids if len(ids) > 1 else [object_edits.from_stored(object_edits.active_item(root).object_id)]
+    return ids if len(ids) > 1 else [scene.from_stored(object_list.active_item(root).object_id)]
 
 
 class MergeObjects(bpy.types.Operator):
@@ -60,9 +61,7 @@ class MergeObjects(bpy.types.Operator):
         return context.window_manager.invoke_props_dialog(self)
 
     def draw(self, context: bpy.types.Context) -> None:
-        items = {
-            object_edits.from_stored(item.object_id): item.name for item in need.active_root(context).objectgs.objects
-        }
+        items = {scene.from_stored(item.object_id): item.name for item in need.active_root(context).objectgs.objects}
         names = [items.get(object_id, "?") for object_id in _sources(context) if str(object_id) != self.into]
         self.layout.label(text=f"Merge {', '.join(names) or 'nothing'}")
         self.layout.prop(self, "into")
@@ -86,7 +85,7 @@ class SplitObjects(bpy.types.Operator):
         if not need.objects(cls, context) or not need.idle(cls, context):
             return False
         root = need.active_root(context)
-        item = object_edits.active_item(root)
+        item = object_list.active_item(root)
         if item is not None and (
             item.is_merged
             or any(other.is_merged and other.merged_into == item.object_id for other in root.objectgs.objects)
@@ -98,7 +97,7 @@ class SplitObjects(bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:
         root = need.active_root(context)
-        object_edits.split(root, object_edits.from_stored(object_edits.active_item(root).object_id))
+        object_edits.split(root, scene.from_stored(object_list.active_item(root).object_id))
 
 
 CLASSES = (MergeObjects, SplitObjects)

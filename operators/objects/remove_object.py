@@ -8,7 +8,7 @@ from ...backend.shared.errors import InputError
 from ...objectgs_addon import scene
 from ...objectgs_addon.blender import messages
 from ...objectgs_addon.picking import selection
-from ...objectgs_addon.state import object_edits
+from ...objectgs_addon.state import object_edits, object_list
 from ..common import need
 
 
@@ -35,8 +35,8 @@ class RemoveObject(bpy.types.Operator):
         selected = selection.selected_collections(context, root)
         duplicates = [collection for collection in selected if scene.kind_of(collection) == "object_copy"]
         ids = [scene.object_id_of(collection) for collection in selected if collection not in duplicates]
-        ids = ids if selected else object_edits.chosen_ids(context, root)
-        ids = [object_id for object_id in ids if object_edits.item_of(root, object_id)]
+        ids = ids if selected else object_list.chosen_ids(context, root)
+        ids = [object_id for object_id in ids if object_list.item_of(root, object_id)]
         if not ids and not duplicates:
             self.report({"ERROR"}, "The unlabeled rest cannot be removed; hide it, or choose an object")
             return {"CANCELLED"}

@@ -5,7 +5,7 @@ import bpy
 from bpy.props import EnumProperty
 
 from ...objectgs_addon import scene
-from ...objectgs_addon.state import object_edits
+from ...objectgs_addon.state import object_edits, object_list
 from ..common import need
 from ..common.reporting import reports_errors
 
@@ -38,7 +38,7 @@ class ResetObject(bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:
         root = need.active_root(context)
-        object_id = object_edits.from_stored(object_edits.shown_item(root).object_id)
+        object_id = scene.from_stored(object_list.shown_item(root).object_id)
         if self.what == "COLORS":
             object_edits.reset_colors(root, [object_id])
         else:

@@ -5,7 +5,8 @@ import bpy
 from bpy.props import StringProperty
 
 from ...backend.shared.errors import InputError
-from ...objectgs_addon.state import object_edits
+from ...objectgs_addon import scene
+from ...objectgs_addon.state import object_edits, object_list
 from ..common import need
 from ..common.reporting import reports_errors
 
@@ -34,10 +35,10 @@ class RestoreObject(bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:
         root = need.active_root(context)
-        item = object_edits.item_of(root, int(self.object)) if self.object else object_edits.shown_item(root)
+        item = object_list.item_of(root, int(self.object)) if self.object else object_list.shown_item(root)
         if item is None or not item.removed:
             raise InputError(f"{item.name if item else self.object} is not removed; choose one that is")
-        object_edits.restore(root, [object_edits.from_stored(item.object_id)])
+        object_edits.restore(root, [scene.from_stored(item.object_id)])
 
 
 CLASSES = (RestoreObject,)

@@ -7,7 +7,7 @@ from bpy.props import BoolProperty, StringProperty
 from ...objectgs_addon import scene
 from ...objectgs_addon.picking import selection
 from ...objectgs_addon.picking.name_search import find_by_name
-from ...objectgs_addon.state import object_edits
+from ...objectgs_addon.state import object_list
 from ..common import need
 
 
@@ -32,9 +32,9 @@ class SelectByName(bpy.types.Operator):
         if not self.query.strip():
             self.report({"WARNING"}, "Enter a name")
             return {"CANCELLED"}
-        names = {object_edits.from_stored(item.object_id): item.name for item in root.objectgs.objects}
+        names = {scene.from_stored(item.object_id): item.name for item in root.objectgs.objects}
         found = list(
-            dict.fromkeys(object_edits.shown_as(root, object_id) for object_id in find_by_name(self.query, names))
+            dict.fromkeys(object_list.shown_as(root, object_id) for object_id in find_by_name(self.query, names))
         )
         if not found:
             self.report({"WARNING"}, f"No object is called {self.query}")

@@ -4,8 +4,9 @@
 import bpy
 from bpy.props import BoolProperty
 
+from ...objectgs_addon import scene
 from ...objectgs_addon.picking import selection
-from ...objectgs_addon.state import object_edits
+from ...objectgs_addon.state import object_list
 from ..common import need
 
 
@@ -23,8 +24,8 @@ class SelectObject(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         root = need.active_root(context)
-        item = object_edits.active_item(root)
-        object_id = object_edits.shown_as(root, object_edits.from_stored(item.object_id))
+        item = object_list.active_item(root)
+        object_id = object_list.shown_as(root, scene.from_stored(item.object_id))
         if not selection.select_object(context, root, object_id, self.extend):
             self.report({"WARNING"}, f"{item.name} is hidden or has no splats and no mesh yet")
             return {"CANCELLED"}

@@ -4,7 +4,7 @@
 import bpy
 
 from ...objectgs_addon import scene
-from ...objectgs_addon.state import object_edits, visibility
+from ...objectgs_addon.state import object_list, visibility
 from ..common import need
 
 
@@ -20,13 +20,13 @@ class SoloObject(bpy.types.Operator):
             return False
         if scene.object_collections(need.active_root(context)):
             return True
-        cls.poll_message_set("There are no splats yet; train first")
+        cls.poll_message_set("No object is shown yet; train first")
         return False
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         root = need.active_root(context)
-        item = object_edits.active_item(root)
-        object_id = object_edits.shown_as(root, object_edits.from_stored(item.object_id))
+        item = object_list.active_item(root)
+        object_id = object_list.shown_as(root, scene.from_stored(item.object_id))
         if not visibility.toggle_solo(context.view_layer, root, object_id):
             self.report({"WARNING"}, f"{item.name} has no splats to show")
             return {"CANCELLED"}

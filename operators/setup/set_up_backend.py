@@ -7,12 +7,12 @@ import bpy
 
 from ...backend.shared.errors import InputError
 from ...objectgs_addon.environment import environment, locations
-from ...objectgs_addon.running import running
+from ...objectgs_addon.running import background
 from ..common.reporting import reports_errors
 
 
 def _idle(cls: Any) -> bool:
-    if running.busy(locations.environment_folder()):
+    if background.busy(locations.environment_folder()):
         cls.poll_message_set("The backend is being set up or checked")
         return False
     return True
@@ -39,7 +39,7 @@ class SetUpBackend(bpy.types.Operator):
         preferences = locations.preferences()
         device = preferences.device if preferences else "cpu"
         job = environment.set_up_job(locations.base_python(), locations.environment_folder(), device)
-        return running.submit(job, context.scene, self.report)
+        return background.submit(job, context.scene, self.report)
 
 
 class CheckBackend(bpy.types.Operator):
@@ -56,7 +56,7 @@ class CheckBackend(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         job = environment.probe_job(locations.backend_python(), locations.environment_folder())
-        return running.submit(job, context.scene, self.report)
+        return background.submit(job, context.scene, self.report)
 
 
 class RemoveBackend(bpy.types.Operator):

@@ -6,9 +6,8 @@ from bpy.props import EnumProperty, StringProperty
 
 from ...objectgs_addon import scene
 from ...objectgs_addon.environment import locations
-from ...objectgs_addon.running import running
+from ...objectgs_addon.running import background
 from ...objectgs_addon.state import object_edits
-from ...objectgs_addon.state.folder_state import folder_state
 from ..common import need
 from ..common.export_dialog import ExportDialog
 from ..common.reporting import reports_errors
@@ -46,12 +45,12 @@ class ExportSplats(ExportDialog, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not need.backend(cls) or not need.reconstruction(cls, context) or not need.idle(cls, context):
-            return False
-        if folder_state(scene.folder_of(need.active_root(context))).trained:
-            return True
-        cls.poll_message_set("There are no splats yet; train first")
-        return False
+        return (
+            need.backend(cls)
+            and need.reconstruction(cls, context)
+            and need.idle(cls, context)
+            and need.splats(cls, context)
+        )
 
     @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
@@ -74,7 +73,7 @@ class ExportSplats(ExportDialog, bpy.types.Operator):
             arguments.append("--per-object")
         object_edits.store_edits(root)
         job = locations.backend_job(f"Export {out.name}", "export", folder, *arguments)
-        return running.submit(job, context.scene, self.report)
+        return background.submit(job, context.scene, self.report)
 
 
 CLASSES = (ExportSplats,)

@@ -8,7 +8,7 @@ from bpy.props import StringProperty
 
 from ...backend.shared.errors import InputError
 from ...objectgs_addon.environment import locations
-from ...objectgs_addon.running import running
+from ...objectgs_addon.running import background
 from ..common import need
 from ..common.reporting import reports_errors
 
@@ -64,7 +64,7 @@ class ImportSplats(bpy.types.Operator):
         if self.capture:
             arguments += ["--capture", str(Path(bpy.path.abspath(self.capture)).resolve())]
         job = locations.backend_job(f"Import {ply.name}", "import-splats", folder, *arguments)
-        return running.submit(job, context.scene, self.report)
+        return background.submit(job, context.scene, self.report)
 
 
 def _folder_for(ply: Path) -> Path:

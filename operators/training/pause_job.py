@@ -4,7 +4,7 @@
 import bpy
 
 from ...objectgs_addon.process.jobs import State
-from ...objectgs_addon.running import running
+from ...objectgs_addon.running import background
 
 
 class PauseJob(bpy.types.Operator):
@@ -14,15 +14,15 @@ class PauseJob(bpy.types.Operator):
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        job = running.queue.running
+        job = background.queue.running
         if job is not None and job.can_pause:
             return True
         cls.poll_message_set("No training is running; only training can be paused")
         return False
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        running.queue.running.pause()
-        running.redraw()
+        background.queue.running.pause()
+        background.redraw()
         return {"FINISHED"}
 
 
@@ -33,15 +33,15 @@ class ResumeJob(bpy.types.Operator):
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        job = running.queue.running
+        job = background.queue.running
         if job is not None and job.state is State.PAUSED:
             return True
         cls.poll_message_set("No job is paused")
         return False
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        running.queue.running.resume()
-        running.redraw()
+        background.queue.running.resume()
+        background.redraw()
         return {"FINISHED"}
 
 

@@ -3,7 +3,7 @@
 
 import bpy
 
-from ...objectgs_addon.running import running
+from ...objectgs_addon.running import background
 
 
 class RemoveFinishedJobs(bpy.types.Operator):
@@ -12,8 +12,8 @@ class RemoveFinishedJobs(bpy.types.Operator):
     bl_description = "Remove the jobs that have ended from the list"
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        running.queue.remove_finished()
-        running.redraw()
+        background.queue.remove_finished()
+        background.redraw()
         return {"FINISHED"}
 
 

@@ -4,7 +4,7 @@
 import bpy
 from bpy.props import IntProperty
 
-from ...objectgs_addon.running import running
+from ...objectgs_addon.running import background
 
 
 class StopJob(bpy.types.Operator):
@@ -18,19 +18,19 @@ class StopJob(bpy.types.Operator):
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        if any(not job.is_finished for job in running.queue.jobs):
+        if any(not job.is_finished for job in background.queue.jobs):
             return True
         cls.poll_message_set("No job is running")
         return False
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        jobs = running.queue.jobs
-        job = jobs[self.index] if 0 <= self.index < len(jobs) else running.queue.running
+        jobs = background.queue.jobs
+        job = jobs[self.index] if 0 <= self.index < len(jobs) else background.queue.running
         if job is None or job.is_finished:
             self.report({"WARNING"}, "This job has already ended")
             return {"CANCELLED"}
         job.stop()
-        running.redraw()
+        background.redraw()
         return {"FINISHED"}
 
 

@@ -7,7 +7,7 @@ from bpy.props import BoolProperty
 from ...backend.shared.errors import InputError
 from ...objectgs_addon import scene
 from ...objectgs_addon.environment import locations
-from ...objectgs_addon.running import running
+from ...objectgs_addon.running import background
 from ...objectgs_addon.state import planning
 from ...objectgs_addon.state.folder_state import folder_state
 from ..common import need
@@ -54,7 +54,7 @@ class Train(bpy.types.Operator):
         if self.restart:
             arguments.append("--restart")
         job = locations.backend_job(f"Train {root.name}", "train", folder, *arguments)
-        return running.submit(job, context.scene, self.report)
+        return background.submit(job, context.scene, self.report)
 
 
 CLASSES = (Train,)

@@ -29,7 +29,7 @@ from objectgs.objectgs_addon.scene.edits import fills, floaters, placement
 from objectgs.objectgs_addon.scene.shading import modifiers, node_groups
 from objectgs.objectgs_addon.scene.shading.graph import VERSION, Graph
 from objectgs.objectgs_addon.scene.shading.materials import COLOR
-from objectgs.objectgs_addon.state import object_edits, visibility
+from objectgs.objectgs_addon.state import object_edits, object_list, visibility
 
 import headless
 
@@ -98,16 +98,16 @@ def part(root, kind, object_id=1):
 
 
 def item(root, object_id=1):
-    return object_edits.item_of(root, object_id)
+    return object_list.item_of(root, object_id)
 
 
 def activate(root, object_id) -> None:
-    rows = [object_edits.from_stored(row.object_id) for row in root.objectgs.objects]
+    rows = [blender_scene.from_stored(row.object_id) for row in root.objectgs.objects]
     root.objectgs.active_object = rows.index(object_id)
 
 
 def set_sliders(root, recolor=RECOLOR, object_id=1) -> None:
-    for name in (*object_edits.SLIDERS, *object_edits.COLORS):
+    for name in (*object_list.SLIDERS, *object_list.COLORS):
         setattr(item(root, object_id), name, getattr(recolor, name))
 
 
@@ -175,7 +175,7 @@ def test_points_show_exactly_the_map_of_the_encoded_colors(root):
     before = carrier.read(splats.data, "radiance:base").copy()
     assert encoded(evaluated_colors(splats)[:, :3]) == pytest.approx(expected(raw), abs=2e-5)
     set_sliders(root)
-    wanted = object_edits.recolor_of(item(root))
+    wanted = object_list.recolor_of(item(root))
     assert wanted.middle == pytest.approx(blender_scene.luma_of(collection_of(root)), abs=1e-5)
     assert encoded(evaluated_colors(splats)[:, :3]) == pytest.approx(expected(raw, wanted), abs=5e-5)
     assert np.array_equal(carrier.read(splats.data, "radiance:base"), before), "attributes stay as they are"
@@ -205,7 +205,7 @@ def test_textures_are_mapped_by_the_same_control_and_left_as_they_were(root):
     tree = mesh.data.materials[0].node_tree
     before = sorted((link.from_socket.name, link.to_socket.name) for link in tree.links)
     set_sliders(root)
-    matrix, offset = object_edits.recolor_of(item(root)).affine()
+    matrix, offset = object_list.recolor_of(item(root)).affine()
     (group,) = [node for node in tree.nodes if node.type == "GROUP"]
     for row, channel in zip(matrix, ("Red", "Green", "Blue")):
         assert np.array(group.inputs[f"Recolor {channel}"].default_value) == pytest.approx(row, abs=1e-6)
@@ -248,7 +248,7 @@ def test_a_rendered_texture_has_the_mapped_color(root):
     bpy.ops.render.render(write_still=True, scene=stage.name)
     image = bpy.data.images.load(str(picture))
     pixels = np.array(image.pixels[:]).reshape(-1, 4)[:, :3]
-    wanted = expected(np.array([[200, 100, 50]]) / 255, object_edits.recolor_of(item(root)))
+    wanted = expected(np.array([[200, 100, 50]]) / 255, object_list.recolor_of(item(root)))
     assert pixels == pytest.approx(np.repeat(np.clip(wanted, 0, 1), len(pixels), 0), abs=0.6 / 255)
 
 
@@ -259,9 +259,9 @@ def test_colors_are_stored_and_shown_again_from_the_folder(root, folder):
     assert blender_scene.recolor_of(collection_of(root)) == stored
     edit_objects(folder / "objects.json", {1: {"recolor": None}, 2: {"recolor": RECOLOR.stored()}})
     show_again(root)
-    assert blender_scene.recolor_of(collection_of(root)) is None and not object_edits.recolor_of(item(root)).changes
+    assert blender_scene.recolor_of(collection_of(root)) is None and not object_list.recolor_of(item(root)).changes
     assert blender_scene.recolor_of(collection_of(root, 2)) == RECOLOR
-    assert object_edits.recolor_of(item(root, 2)) == RECOLOR
+    assert object_list.recolor_of(item(root, 2)) == RECOLOR
 
 
 def test_older_groups_are_exchanged_when_they_are_to_recolor(root):
@@ -550,7 +550,7 @@ def state(root) -> dict:
         "flags": [(collection_of(root, i).hide_viewport, collection_of(root, i).hide_render) for i in (1, 2)],
         "hidden": None if hidden is None else hidden.tolist(),
         "copies": [len(copies) for copies in blender_scene.duplicates_of(root).values()],
-        "sliders": object_edits.recolor_of(item(root)).stored(),
+        "sliders": object_list.recolor_of(item(root)).stored(),
         "removed": item(root).removed,
         "file": {
             e.id: (e.removed, e.floaters, e.fill, e.recolor, e.transform, e.copies)
@@ -676,7 +676,7 @@ def test_meshes_are_exported_as_they_are_seen(root, tmp_path, suffix):
         texture = next(tmp_path.glob("*recolored*.png"))
         image = bpy.data.images.load(str(texture))
         wanted = expected_texel = np.array([200, 100, 50]) / 255
-        matrix, offset = object_edits.recolor_of(item(root)).affine()
+        matrix, offset = object_list.recolor_of(item(root)).affine()
         wanted = np.clip(matrix @ expected_texel + offset, 0, 1)
         assert image.pixels[:3] == pytest.approx(wanted, abs=0.6 / 255)
     assert bpy.ops.objectgs.export_meshes(filepath=str(tmp_path / "each"), format=suffix, per_object=True) == {

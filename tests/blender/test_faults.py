@@ -24,8 +24,8 @@ from objectgs.objectgs_addon.blender import messages
 from objectgs.objectgs_addon.environment import locations
 from objectgs.objectgs_addon.environment.worker import layout
 from objectgs.objectgs_addon.process.jobs import Job, State
-from objectgs.objectgs_addon.running import running
-from objectgs.objectgs_addon.state import object_edits
+from objectgs.objectgs_addon.running import background, handlers, results
+from objectgs.objectgs_addon.state import object_list
 
 FIXTURES = headless.ROOT.parent / "shared" / "data" / "fixtures"
 WAIT = 60.0
@@ -57,7 +57,7 @@ def extension(fresh, tmp_path, monkeypatch):
     root.register()
     yield root
     root.unregister()
-    running.queue.remove_finished()
+    background.queue.remove_finished()
 
 
 @pytest.fixture
@@ -100,9 +100,9 @@ def job(tmp_path, code=ENDS, kind="train", folder=None, title="Fake") -> Job:
 
 
 def start(job: Job, owner) -> Job:
-    """What `running.submit` does in a window."""
-    running._submitted_in[job] = owner.session_uid
-    running.queue.add(job)
+    """What `background.submit` does in a window."""
+    background._submitted_in[job] = owner.session_uid
+    background.queue.add(job)
     return job
 
 
@@ -111,14 +111,14 @@ def tick_until(condition) -> None:
     deadline = time.monotonic() + WAIT
     while not condition():
         assert time.monotonic() < deadline, "it never came"
-        running._tick()
+        background._tick()
         time.sleep(0.01)
 
 
 def run(job: Job, owner) -> Job:
     """A job to its end, its result included."""
     start(job, owner)
-    tick_until(lambda: job.is_finished and not running._results)
+    tick_until(lambda: job.is_finished and not background._results)
     return job
 
 
@@ -278,7 +278,7 @@ def test_capture_deleted(extension, backend_python, capture, tmp_path, monkeypat
     start(training, bpy.context.scene)
     tick_until(lambda: training.step or training.is_finished)
     shutil.rmtree(place)
-    tick_until(lambda: training.is_finished and not running._results)
+    tick_until(lambda: training.is_finished and not background._results)
     assert training.state is State.DONE or plain(training.error)
     assert not (tmp_path / "out" / ".lock").exists() and not list((tmp_path / "out").rglob("*.part"))
     assert scene.kind_of(root) == "reconstruction"
@@ -318,7 +318,7 @@ def test_full_disk_while_editing(shown, folder, said, monkeypatch):
     assert (row.name, tuple(row.color), row.chosen) == (name, color, True)
     assert len(said) == 3 and all("objects.json" in text and "free some space" in text for text in said)
     assert "free some space" in refusal(
-        bpy.ops.objectgs.merge_objects, into=str(object_edits.from_stored(shown.objectgs.objects[2].object_id))
+        bpy.ops.objectgs.merge_objects, into=str(scene.from_stored(shown.objectgs.objects[2].object_id))
     )
     assert snapshot(folder) == before
 
@@ -376,7 +376,7 @@ def test_broken_objects_file(shown, folder, said, tmp_path, content):
     assert "objects.json" in told and "delete it" in told and plain(told)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "broken.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "broken.blend"))
-    running._undone()
+    handlers._undone()
     assert snapshot(folder) == before and blocks() == there
 
 
@@ -417,10 +417,10 @@ def test_each_result_lands_in_its_own_scene(extension, folder, trained, tmp_path
         start(job(tmp_path, kind="import", folder=folder, title="c"), third),
         start(job(tmp_path, kind="train", folder=other, title="d"), second),
     ]
-    running._tick()
+    background._tick()
     assert [entry.state for entry in jobs[1:]] == [State.WAITING] * 3
     first.name, second.name = "second", "renamed"
-    tick_until(lambda: all(entry.is_finished for entry in jobs) and not running._results)
+    tick_until(lambda: all(entry.is_finished for entry in jobs) and not background._results)
     for owner, place in ((first, folder), (second, other), (third, folder)):
         roots = [child for child in owner.collection.children_recursive if scene.kind_of(child) == "reconstruction"]
         assert roots == [owner.objectgs.active] and scene.folder_of(roots[0]) == place
@@ -435,7 +435,7 @@ def test_scene_and_collection_deleted_meanwhile(extension, folder, said, tmp_pat
     bpy.data.collections.remove(root)
     bpy.data.scenes.remove(owner)
     before = blocks()
-    tick_until(lambda: work.is_finished and not running._results)
+    tick_until(lambda: work.is_finished and not background._results)
     assert len(said) == 1 and "Open Reconstruction" in said[0] and str(folder) in said[0]
     assert blocks() == before
     said.clear()
@@ -447,7 +447,7 @@ def test_collection_renamed_or_taken_out_meanwhile(shown, folder, said, tmp_path
     work = start(job(tmp_path, folder=folder), bpy.context.scene)
     shown.name = "mine"
     bpy.context.scene.collection.children.unlink(shown)
-    tick_until(lambda: work.is_finished and not running._results)
+    tick_until(lambda: work.is_finished and not background._results)
     assert shown.name == "mine" and shown in list(bpy.context.scene.collection.children) and not said
 
 
@@ -508,12 +508,12 @@ def test_result_waits_for_object_mode(shown, folder, said, tmp_path, mode):
     work = start(job(tmp_path, folder=folder), bpy.context.scene)
     tick_until(lambda: work.is_finished)
     for _ in range(5):
-        assert running._tick() is not None
+        assert background._tick() is not None
     assert said == [f"Fake has finished; the result will be shown when {name} is in Object Mode again."]
-    assert running._results == [work]
+    assert background._results == [work]
     bpy.ops.object.mode_set(mode="OBJECT")
-    running._tick()
-    assert not running._results and len(said) == 1
+    background._tick()
+    assert not background._results and len(said) == 1
 
 
 def test_result_waits_for_the_end_of_rendering(shown, folder, said, tmp_path, monkeypatch):
@@ -532,14 +532,14 @@ def test_result_waits_for_the_end_of_rendering(shown, folder, said, tmp_path, mo
         def __getattr__(self, name):
             return getattr(bpy, name)
 
-    monkeypatch.setattr(running, "bpy", Blender())
+    monkeypatch.setattr(background, "bpy", Blender())
     calls = []
-    monkeypatch.setattr(running, "finish", calls.append)
+    monkeypatch.setattr(background, "finish", calls.append)
     work = start(job(tmp_path, folder=folder), bpy.context.scene)
     tick_until(lambda: work.is_finished)
-    assert running._tick() is not None and not calls
-    monkeypatch.setattr(running, "bpy", bpy)
-    running._tick()
+    assert background._tick() is not None and not calls
+    monkeypatch.setattr(background, "bpy", bpy)
+    background._tick()
     assert calls == [work] and said == ["Fake has finished; the result will be shown when rendering ends."]
 
 
@@ -547,10 +547,10 @@ def test_a_failure_of_one_result_stops_no_other_job(extension, folder, said, tmp
     def fails(_job, _owner):
         raise ZeroDivisionError("on purpose")
 
-    monkeypatch.setitem(running._SHOWS, "vote", fails)
+    monkeypatch.setitem(results.SHOW_BY_KIND, "vote", fails)
     broken = start(job(tmp_path, kind="vote", folder=folder, title="Vote"), bpy.context.scene)
     works = start(job(tmp_path, kind="import", folder=folder), bpy.context.scene)
-    tick_until(lambda: works.is_finished and not running._results)
+    tick_until(lambda: works.is_finished and not background._results)
     assert broken.state is State.DONE and bpy.context.scene.objectgs.active is not None
     assert said == ["Vote: the result could not be shown (ZeroDivisionError: on purpose)"]
 
@@ -562,7 +562,7 @@ def test_registered_ten_times_while_a_job_runs(extension, folder, said, tmp_path
         extension.unregister()
         assert work.state is State.STOPPED and work.exit_code == 130
         extension.register()
-        assert not running.busy(folder) and not running._submitted_in
+        assert not background.busy(folder) and not background._submitted_in
     assert not said
 
 
@@ -579,7 +579,7 @@ def rename(folder, names: dict[int, str]) -> None:
 
 
 def test_odd_names(shown, folder):
-    ids = [object_edits.from_stored(row.object_id) for row in shown.objectgs.objects if row.object_id][:5]
+    ids = [scene.from_stored(row.object_id) for row in shown.objectgs.objects if row.object_id][:5]
     odd = ["", 'Tasse\n☕\t/ \\ % "q"', "x" * 5000, "\ud800\0", "same", "same"]
     for names in (dict(zip(ids, odd)), dict(zip(ids, odd[2:])), dict.fromkeys(ids, "same")):
         rename(folder, names)
@@ -606,11 +606,11 @@ def test_many_objects_and_large_ids(shown, folder):
     (folder / "splats.ply").write_bytes(with_large_ids(folder / "splats.ply", dict(zip(small[1:], large[1:]))))
     assert bpy.ops.objectgs.show_result() == {"FINISHED"}
     rows = shown.objectgs.objects
-    listed = [object_edits.from_stored(row.object_id) for row in rows]
+    listed = [scene.from_stored(row.object_id) for row in rows]
     assert len(rows) == len(small) + 303 and listed[-3:] == large
     assert set(large[1:]) <= set(scene.object_collections(shown))
     shown.objectgs.active_object = 9999
-    assert object_edits.active_item(shown) == rows[-1]
+    assert object_list.active_item(shown) == rows[-1]
     shown.objectgs.active_object = len(rows) - 2
     assert bpy.ops.objectgs.select_object() == {"FINISHED"}
     assert {scene.object_id_of(part) for part in bpy.context.selected_objects} == {2**31}

@@ -14,7 +14,7 @@ from objectgs.backend.shared.formats.ply import write_vertices
 from objectgs.backend.shared.reconstruction.objects import edit_objects
 from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.environment import locations
-from objectgs.objectgs_addon.running import running
+from objectgs.objectgs_addon.running import background
 from objectgs.objectgs_addon.scene import kinds
 from objectgs.objectgs_addon.state.folder_state import folder_state
 
@@ -537,7 +537,7 @@ def asked(monkeypatch):
         jobs.append([str(word) for word in job.command[job.command.index("backend") + 1 : -1]])
         return {"FINISHED"}
 
-    monkeypatch.setattr(running, "submit", submit)
+    monkeypatch.setattr(background, "submit", submit)
     monkeypatch.setattr("objectgs.operators.common.need.training", lambda *_: True)
     return jobs
 
@@ -579,12 +579,12 @@ def test_a_job_that_ends_shows_its_meshes(active, folder, monkeypatch):
     assert hidden(parts(active, 1, "splats")) == {False} and blender_scene.shown_kinds(active) == "splats"
     rewrite(folder)
     job = locations.backend_job("Meshes", "mesh", blender_scene.folder_of(active), "mesh")
-    running._submitted_in[job] = bpy.context.scene.session_uid
-    running.finish(job)
+    background._submitted_in[job] = bpy.context.scene.session_uid
+    background.finish(job)
     assert properties.shown == "meshes" and hidden(parts(active, 1, "mesh")) == {False}
     assert properties.objects[0].faces == 4 and properties.objects[1].faces == 0
     properties.shown = "both"
-    running.finish(job)
+    background.finish(job)
     assert properties.shown == "both", "the user's choice stays where meshes are shown already"
 
 

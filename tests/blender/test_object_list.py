@@ -13,7 +13,7 @@ from objectgs.backend.shared.reconstruction.objects import read_objects
 from objectgs.objectgs_addon import scene
 from objectgs.objectgs_addon.panels.objects import describe
 from objectgs.objectgs_addon.picking import selection
-from objectgs.objectgs_addon.state import object_edits, visibility
+from objectgs.objectgs_addon.state import object_list, visibility
 
 
 @pytest.fixture
@@ -35,31 +35,31 @@ def entry(root, object_id):
 
 def first_ids(root) -> list[int]:
     """IDs of the rows that have splats."""
-    return [object_edits.from_stored(item.object_id) for item in root.objectgs.objects if item.splats]
+    return [scene.from_stored(item.object_id) for item in root.objectgs.objects if item.splats]
 
 
 def activate(root, object_id: int) -> None:
     """Make an object's row the active one, as a click in the list does."""
-    rows = [object_edits.from_stored(item.object_id) for item in root.objectgs.objects]
+    rows = [scene.from_stored(item.object_id) for item in root.objectgs.objects]
     root.objectgs.active_object = rows.index(object_id)
 
 
 def test_rows_say_what_the_file_says(root):
     entries = read_objects(scene.folder_of(root) / "objects.json")
     items = root.objectgs.objects
-    assert [(object_edits.from_stored(i.object_id), i.name, i.points) for i in items] == [
+    assert [(scene.from_stored(i.object_id), i.name, i.points) for i in items] == [
         (e.id, e.name, e.points) for e in entries
     ]
-    counts = object_edits.splat_counts(root)
+    counts = object_list.splat_counts(root)
     assert sum(counts.values()) > 0 and all(
-        item.splats == counts.get(object_edits.from_stored(item.object_id), 0) for item in items
+        item.splats == counts.get(scene.from_stored(item.object_id), 0) for item in items
     )
     assert f"{items[0].points:,} points" in describe(items[0], root.objectgs)
 
 
 def test_a_new_name_and_color_reach_the_file_and_the_collection(root):
     object_id = first_ids(root)[0]
-    item = next(i for i in root.objectgs.objects if object_edits.from_stored(i.object_id) == object_id)
+    item = next(i for i in root.objectgs.objects if scene.from_stored(i.object_id) == object_id)
     item.name = "  tall thing "
     item.color = (1.0, 0.5, 0.0)
     assert entry(root, object_id).name == "tall thing" and entry(root, object_id).color == (255, 128, 0)
@@ -99,21 +99,21 @@ def test_a_row_selects_its_object_and_the_selection_is_read_back(root):
 
 def test_selected_objects_are_merged_into_the_active_one_and_split(root):
     first, second = first_ids(root)[:2]
-    before = object_edits.splat_counts(root)
+    before = object_list.splat_counts(root)
     selection.select_object(bpy.context, root, first)
     selection.select_object(bpy.context, root, second, extend=True)
     bpy.ops.objectgs.merge_objects(into=str(second))
     assert entry(root, first).merged_into == second and entry(root, second).merged_into is None
-    after = object_edits.splat_counts(root)
+    after = object_list.splat_counts(root)
     assert after[second] == before[first] + before[second] and first not in after
-    assert object_edits.shown_as(root, first) == second
+    assert object_list.shown_as(root, first) == second
     activate(root, second)
     bpy.ops.objectgs.split_objects()
-    assert object_edits.splat_counts(root) == before and entry(root, first).merged_into is None
+    assert object_list.splat_counts(root) == before and entry(root, first).merged_into is None
 
 
 def test_leaving_out_the_rest(root):
-    first, *others = [object_edits.from_stored(item.object_id) for item in root.objectgs.objects]
+    first, *others = [scene.from_stored(item.object_id) for item in root.objectgs.objects]
     activate(root, first)
     bpy.ops.objectgs.choose_objects(which="ACTIVE")
     assert not entry(root, first).left_out and all(entry(root, i).left_out for i in others)

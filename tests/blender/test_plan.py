@@ -20,7 +20,7 @@ from objectgs.objectgs_addon.environment import locations
 from objectgs.objectgs_addon.headless import commands
 from objectgs.objectgs_addon.headless.arguments import parse
 from objectgs.objectgs_addon.process import jobs
-from objectgs.objectgs_addon.running import running
+from objectgs.objectgs_addon.running import background
 from objectgs.objectgs_addon.state import planning
 
 
@@ -84,7 +84,7 @@ def test_plan_and_train_ask_the_backend_for_the_same(root, monkeypatch):
             asked.append(words) or jobs.Job(title=title, kind=kind, folder=folder, command=["true"], cwd=folder)
         ),
     )
-    monkeypatch.setattr(running, "submit", lambda *_: {"FINISHED"})
+    monkeypatch.setattr(background, "submit", lambda *_: {"FINISHED"})
     bpy.ops.objectgs.override_decision(key="exposure")
     assert bpy.ops.objectgs.analyze_capture() == {"FINISHED"} and bpy.ops.objectgs.train() == {"FINISHED"}
     wanted = tuple(planning.arguments(root))

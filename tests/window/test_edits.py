@@ -35,7 +35,7 @@ def drag(window, x: int, y: int, by: int) -> None:  # noqa: F811
 
 def test_a_dragged_slider_and_a_removed_object_are_undone_and_redone(window, folder):  # noqa: F811
     window.run(script("root.objectgs.active_object = 0"))
-    first = window.run(script("result = str(object_edits.from_stored(root.objectgs.objects[0].object_id))"))
+    first = window.run(script("result = str(scene.from_stored(root.objectgs.objects[0].object_id))"))
     window.move(*MOUSE)
     window.run("""
         with bpy.context.temp_override(**window_context()):

@@ -112,7 +112,7 @@ def start_fake(window, folder: Path, kind: str = "train", owner: str = "owner") 
         from {PACKAGE}.objectgs_addon.process.jobs import Job
         job = Job(title="Fake", kind={kind!r}, folder=Path({str(folder)!r}), cwd=Path({str(window.folder)!r}),
                   command=[{sys.executable!r}, {str(program)!r}, {str(go)!r}])
-        running.submit(job, {owner}, print)
+        background.submit(job, {owner}, print)
     """)
     )
     return go
@@ -175,7 +175,7 @@ def test_result_waits_for_edit_mode(window, folder):
     """)
     )
     go.touch()
-    soon(window, f"{IDLE} and len(running._results)")
+    soon(window, f"{IDLE} and len(background._results)")
     assert "the result will be shown when" in log(window)
     window.shot("faults-edit-mode")
     window.key("Escape")
@@ -186,7 +186,7 @@ def test_result_waits_for_edit_mode(window, folder):
             bpy.ops.object.mode_set(mode="OBJECT")
     """)
     )
-    soon(window, "not running._results")
+    soon(window, "not background._results")
     draws(window)
 
 
@@ -212,12 +212,12 @@ def test_result_waits_for_the_end_of_a_render(window, folder):
         window.run(script("call(bpy.ops.render.render)"))
         soon(window, "bpy.app.is_job_running('RENDER')")
         go.touch()
-        soon(window, f"{IDLE} and len(running._results)")
+        soon(window, f"{IDLE} and len(background._results)")
         assert window.run("result = bpy.app.is_job_running('RENDER')")
         window.shot("faults-rendering")
     finally:
         end.touch()
-    soon(window, "not bpy.app.is_job_running('RENDER') and not running._results")
+    soon(window, "not bpy.app.is_job_running('RENDER') and not background._results")
     draws(window)
 
 
@@ -275,7 +275,7 @@ def test_result_comes_where_blender_forgot_to_allow_writing(window, folder):
         pytest.skip("Blender 5 does not forget it")
     go = start_fake(window, folder)
     go.touch()
-    soon(window, f"{IDLE} and not running._results")
+    soon(window, f"{IDLE} and not background._results")
     draws(window)
     window.shot("faults-writing-forgotten")
 
@@ -301,12 +301,12 @@ def test_undo_while_a_job_runs(window, folder):
     window.key("ctrl+shift+z")
     assert window.run(script("result = root.objectgs.objects[1].name")) == "cup"
     go.touch()
-    soon(window, f"{IDLE} and not running._results")
+    soon(window, f"{IDLE} and not background._results")
     window.key("ctrl+z")
     window.key("ctrl+z")
     window.key("ctrl+shift+z")
     window.key("ctrl+shift+z")
-    assert window.run(script("result = sum(object_edits.splat_counts(root).values())")) > 100
+    assert window.run(script("result = sum(object_list.splat_counts(root).values())")) > 100
     draws(window)
 
 
@@ -320,7 +320,7 @@ def test_two_scenes_with_two_jobs(window, folder):
     second.touch()
     time.sleep(0.5)
     first.touch()
-    soon(window, f"{IDLE} and not running._results")
+    soon(window, f"{IDLE} and not background._results")
     assert window.run(
         script("""
         result = [str(scene.folder_of(each.objectgs.active)) for each in (owner, bpy.data.scenes["Renamed"])]
@@ -338,7 +338,7 @@ def test_collection_deleted_while_its_job_runs(window, folder):
     """)
     )
     go.touch()
-    soon(window, f"{IDLE} and not running._results")
+    soon(window, f"{IDLE} and not background._results")
     assert "with Open Reconstruction" in log(window)
     draws(window)
 
@@ -346,7 +346,7 @@ def test_collection_deleted_while_its_job_runs(window, folder):
 def test_disabled_while_a_job_runs(window, folder):
     """The extension is switched off and on again: its job has ended, and everything can be used again."""
     go = start_fake(window, folder)
-    soon(window, "running.queue.running is not None and running.queue.running.message")
+    soon(window, "background.queue.running is not None and background.queue.running.message")
     window.run(f"""
         import addon_utils
         addon_utils.disable("{PACKAGE}")

@@ -15,14 +15,16 @@ from .harness import PACKAGE
 PRELUDE = f"""
 import sys
 addon = sys.modules["{PACKAGE}.objectgs_addon"]
-from {PACKAGE}.objectgs_addon import running, scene, object_edits
+from {PACKAGE}.objectgs_addon import scene
+from {PACKAGE}.objectgs_addon.running import background
+from {PACKAGE}.objectgs_addon.state import object_list
 owner = bpy.context.scene
 root = owner.objectgs.active
 def call(operator, **options):
     with bpy.context.temp_override(**window_context()):
         return list(operator("INVOKE_DEFAULT", **options))
 """
-IDLE = "all(job.is_finished for job in running.queue.jobs)"
+IDLE = "all(job.is_finished for job in background.queue.jobs)"
 
 
 def script(body: str) -> str:
@@ -76,7 +78,9 @@ def wait(blender, expression: str, timeout: float = 120.0):
         f"it never became true: {expression}; jobs: "
         + json.dumps(
             blender.run(
-                script("result = [(job.title, job.state.value, job.message, job.error) for job in running.queue.jobs]")
+                script(
+                    "result = [(job.title, job.state.value, job.message, job.error) for job in background.queue.jobs]"
+                )
             )
         )
     )
@@ -111,10 +115,10 @@ def test_training_shows_objects(window):
         call(bpy.ops.objectgs.train)
     """)
     )
-    wait(window, "running.queue.running is not None and running.queue.running.progress > 0.2")
+    wait(window, "background.queue.running is not None and background.queue.running.progress > 0.2")
     window.shot("3-training")
     wait(window, f"{IDLE} and len(scene.object_collections(root)) > 1", 400)
-    counts = window.run(script("result = object_edits.splat_counts(root)"))
+    counts = window.run(script("result = object_list.splat_counts(root)"))
     assert sum(counts.values()) > 500
     window.shot("4-trained")
 
@@ -134,7 +138,7 @@ def test_click_selects_the_whole_object(window):
         space.overlay.show_overlays = True
         small = [i for i in root.objectgs.objects if i.name not in ("table", "backdrop")]
         item = max(small, key=lambda i: i.splats)
-        collection = scene.object_collections(root)[object_edits.from_stored(item.object_id)]
+        collection = scene.object_collections(root)[scene.from_stored(item.object_id)]
         splats = next(part for part in scene.parts_of(collection) if scene.kind_of(part) == "splats")
         for selected in bpy.context.selected_objects:
             selected.select_set(False)
@@ -176,7 +180,7 @@ def test_click_selects_the_whole_object(window):
         time.sleep(0.5)
     window.shot("6-clicked")
     assert "splats" in selected and "object_parent" in selected
-    assert window.run(script("result = object_edits.active_item(root).name")) == place[0]
+    assert window.run(script("result = object_list.active_item(root).name")) == place[0]
 
 
 def test_merge_is_undone_and_split(window):
@@ -185,14 +189,14 @@ def test_merge_is_undone_and_split(window):
         script("""
         from pathlib import Path
         from bl_ext.user_default.objectgs.backend.shared.reconstruction.objects import read_objects
-        ids = [object_edits.from_stored(item.object_id) for item in root.objectgs.objects]
-        result = [ids[0], ids[1], object_edits.splat_counts(root)[ids[0]], object_edits.splat_counts(root)[ids[1]]]
+        ids = [scene.from_stored(item.object_id) for item in root.objectgs.objects]
+        result = [ids[0], ids[1], object_list.splat_counts(root)[ids[0]], object_list.splat_counts(root)[ids[1]]]
     """)
     )
     state = """
         from bl_ext.user_default.objectgs.backend.shared.reconstruction.objects import read_objects
         entry = next(entry for entry in read_objects(scene.folder_of(root) / "objects.json") if entry.id == {0})
-        counts = object_edits.splat_counts(root)
+        counts = object_list.splat_counts(root)
         result = [entry.merged_into, counts.get({0}, 0), counts[{1}]]
     """.format(*first)
     apart, together = [None, first[2], first[3]], [first[1], 0, first[2] + first[3]]
@@ -231,7 +235,7 @@ def test_extracted_meshes_take_the_place_of_splats(window):
         script("""
         properties = root.objectgs
         small = sorted((i for i in properties.objects if i.name not in ("table", "backdrop")), key=lambda i: -i.splats)
-        chosen = [object_edits.from_stored(item.object_id) for item in small[:2]]
+        chosen = [scene.from_stored(item.object_id) for item in small[:2]]
         for selected in bpy.context.selected_objects:
             selected.select_set(False)
         for object_id, collection in scene.object_collections(root).items():
@@ -243,7 +247,7 @@ def test_extracted_meshes_take_the_place_of_splats(window):
         result = chosen
     """)
     )
-    wait(window, "running.queue.running is not None and running.queue.running.progress > 0.1", 240)
+    wait(window, "background.queue.running is not None and background.queue.running.progress > 0.1", 240)
     window.shot("7-extracting")
     wait(window, f"{IDLE} and bool(scene.object_meshes(root))", 300)
     shown = window.run(
@@ -260,7 +264,7 @@ def test_extracted_meshes_take_the_place_of_splats(window):
         if "mesh" in found:
             visible, faces = found["mesh"]
             assert visible and 100 < faces <= 3000
-    assert window.run(script("result = [root.objectgs.shown, running.queue.jobs[-1].error]")) == ["meshes", None]
+    assert window.run(script("result = [root.objectgs.shown, background.queue.jobs[-1].error]")) == ["meshes", None]
     window.run("""
         context = window_context()
         context["area"].spaces.active.shading.type = "MATERIAL"
@@ -275,19 +279,19 @@ def test_extracted_meshes_take_the_place_of_splats(window):
 def test_pause_resume_and_stop(window):
     """A paused training stands still; a stopped one has saved; undo in between harms nothing."""
     window.run(script("root.objectgs.minutes = 5; call(bpy.ops.objectgs.train)"))
-    wait(window, "running.queue.running is not None and running.queue.running.step")
+    wait(window, "background.queue.running is not None and background.queue.running.step")
     window.run(script("call(bpy.ops.objectgs.pause_job)"))
-    wait(window, "running.queue.running.state.value == 'paused' and running.queue.running.message == 'Paused'")
-    first = window.run(script("result = running.queue.running.step"))
+    wait(window, "background.queue.running.state.value == 'paused' and background.queue.running.message == 'Paused'")
+    first = window.run(script("result = background.queue.running.step"))
     window.shot("9-paused")
     window.key("ctrl+z")
     time.sleep(1.5)
-    assert window.run(script("result = running.queue.running.step")) == first
+    assert window.run(script("result = background.queue.running.step")) == first
     window.run(script("call(bpy.ops.objectgs.resume_job)"))
-    wait(window, f"running.queue.running.step > {first}")
+    wait(window, f"background.queue.running.step > {first}")
     window.run(script("call(bpy.ops.objectgs.stop_job)"))
     wait(window, IDLE)
-    assert window.run(script("result = running.queue.jobs[-1].state.value")) == "stopped"
+    assert window.run(script("result = background.queue.jobs[-1].state.value")) == "stopped"
     assert window.run(
         script(f"""
         from bl_ext.user_default.objectgs.objectgs_addon.state.folder_state import folder_state
@@ -306,25 +310,25 @@ def test_another_file_in_between_finds_the_job_again(window):
         bpy.ops.wm.save_as_mainfile(filepath={str(path)!r})
     """)
     )
-    wait(window, "running.queue.running is not None and running.queue.running.step")
+    wait(window, "background.queue.running is not None and background.queue.running.step")
     window.run("bpy.ops.wm.read_homefile(use_empty=False)")
     time.sleep(1)
-    before = window.run(script("result = running.queue.running.step"))
+    before = window.run(script("result = background.queue.running.step"))
     window.run(f"bpy.ops.wm.open_mainfile(filepath={str(path)!r})")
-    wait(window, f"running.job_of(root) is running.queue.running and running.queue.running.step > {before}")
+    wait(window, f"background.job_of(root) is background.queue.running and background.queue.running.step > {before}")
     window.shot("10-reopened")
     # Timers and drawing go on in the moment when a file has just been opened and nothing is in the context yet.
     for pause in (0.0, 0.2, 0.5, 0.8):
         window.run("bpy.ops.wm.read_homefile(use_empty=False)")
         time.sleep(pause)
         window.run(f"bpy.ops.wm.open_mainfile(filepath={str(path)!r})")
-    wait(window, "running.job_of(root) is running.queue.running")
+    wait(window, "background.job_of(root) is background.queue.running")
 
 
 def test_quitting_saves_and_the_file_explains(window):
     """Blender quits while it trains: the training has saved, and nothing runs on."""
     folder = Path(window.run(script("result = str(scene.folder_of(root))")))
-    pid = window.run(script("result = running.queue.running._process.pid"))
+    pid = window.run(script("result = background.queue.running._process.pid"))
     window.run("bpy.ops.wm.save_mainfile()")
     assert window.quit() == 0
     deadline = time.monotonic() + 20

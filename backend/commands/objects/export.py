@@ -105,7 +105,7 @@ def _files(
     names = {entry.id: entry.name for entry in objects}
     files: dict[Path, list[int] | None] = {}
     for object_id in np.unique(splats.object_ids).tolist():
-        stem = re.sub(r"[^\w.-]+", "_", names.get(object_id, default_name(object_id))).strip("._") or "object"
+        stem = re.sub(r"[^\w.-]+", "_", names.get(object_id, default_name(object_id).lower())).strip("._") or "object"
         taken = {path.stem.casefold() for path in files}
         stem = f"{stem}_{object_id}" if stem.casefold() in taken else stem
         files[options.out / f"{stem}.{kind}"] = [object_id]

@@ -129,7 +129,7 @@ def find_object(objects: Sequence[SceneObject], word: str, path: Path) -> SceneO
 
 def default_name(object_id: int) -> str:
     """What an object is called that nobody has named; ID 0 is what belongs to no object."""
-    return f"object {object_id}" if object_id else "unlabeled"
+    return f"object {object_id}" if object_id else "Unlabeled"
 
 
 def _object(entry: Mapping[str, Any]) -> SceneObject:

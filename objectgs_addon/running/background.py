@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Background jobs in Blender: a timer polls the queue, redraws panels and shows results.
+"""Background jobs: a timer polls the queue, redraws panels and shows results.
 
 The queue belongs to Blender and not to the .blend: it survives undo and opening another file. A reconstruction finds
 its job by the folder.
@@ -7,11 +7,9 @@ its job by the folder.
 
 from __future__ import annotations
 
-import contextlib
 import time
 import traceback
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +17,13 @@ import bpy
 
 from ...backend.shared.console import ConsoleReporter
 from ...backend.shared.errors import InputError
-from ...backend.shared.reconstruction.folder import Reconstruction
-from .. import film, scene
+from .. import scene
 from ..blender import messages, writing
 from ..environment import locations
 from ..process.blocking import run_blocking
 from ..process.jobs import Job, JobQueue, State
-from ..state import object_edits
-from ..state import viewports as view
-from . import previews
+from ..state import object_edits, object_list
+from . import previews, results
 
 INTERVAL = 0.1
 """Seconds between two polls of the queue."""
@@ -84,7 +80,7 @@ def fill_holes(root: bpy.types.Collection, again: bool = True) -> None:
     folder = scene.folder_of(root)
     missing = scene.missing_fill(root, scene.Objects.read(folder))
     is_asked = any(job.kind == "fill" and job.folder == folder and not job.is_finished for job in queue.jobs)
-    owner = next(iter(object_edits.scenes_of(root)), None)
+    owner = next(iter(object_list.scenes_of(root)), None)
     if missing is None or is_asked or owner is None or (not again and _requested_fills.get(folder) == missing):
         return
     _requested_fills[folder] = missing
@@ -176,7 +172,7 @@ def _obstacle(job: Job) -> str | None:
     for window in bpy.context.window_manager.windows:
         if any(operator.bl_idname.startswith("TRANSFORM_OT_") for operator in window.modal_operators):
             return "the transform is confirmed"
-    for root in _roots_of(job.folder):
+    for root in results.roots_of(job.folder):
         for part in root.all_objects:
             if scene.kind_of(part) is not None and part.mode != "OBJECT":
                 return f"{part.name} is in Object Mode again"
@@ -199,112 +195,11 @@ def finish(job: Job) -> None:
     object_edits.flush()
     submitted_in = _submitted_in.pop(job, None)
     owner = next((owner for owner in bpy.data.scenes if owner.session_uid == submitted_in), None)
-    show = _SHOWS.get(job.kind)
+    show = _import_demo if job.kind == "demo" else results.SHOW_BY_KIND.get(job.kind)
     if show is not None and show(job, owner):
         _push_undo(job.title)
-    for root in _roots_of(job.folder):
+    for root in results.roots_of(job.folder):
         fill_holes(root, again=False)
-
-
-def _folder_of(job: Job) -> Path:
-    """The folder of a job whose result can be shown."""
-    assert job.folder is not None
-    return job.folder
-
-
-def _roots_of(folder: Path | None) -> list[bpy.types.Collection]:
-    return [
-        collection
-        for collection in bpy.data.collections
-        if scene.kind_of(collection) == "reconstruction"
-        and scene.folder_of(collection) == folder
-        and collection.library is None
-    ]
-
-
-def _shown_roots(job: Job, owner: bpy.types.Scene | None) -> list[bpy.types.Collection]:
-    """The reconstruction's collections in scenes; one that the user unlinked from `owner` is linked again."""
-    roots = _roots_of(job.folder)
-    for root in roots:
-        if owner is not None and owner.objectgs.active == root and not object_edits.scenes_of(root):
-            owner.collection.children.link(root)
-    return [root for root in roots if object_edits.scenes_of(root)]
-
-
-def _show_capture(job: Job, owner: bpy.types.Scene | None) -> bool:
-    roots = _shown_roots(job, owner)
-    for root in roots:
-        scene.show_capture(object_edits.scenes_of(root)[0], _folder_of(job), root)
-        object_edits.fill(root)
-    if owner is not None:
-        root = next((root for root in roots if owner in object_edits.scenes_of(root)), None)
-        if root is None:
-            root = scene.show_capture(owner, _folder_of(job))
-            object_edits.fill(root)
-            roots.append(root)
-        owner.objectgs.active = root
-        view.show(root)
-    if roots:
-        job.warnings.extend(scene.warnings_of(roots[0]))
-    return bool(roots) or _announce_hidden(job)
-
-
-def _show_imported(job: Job, owner: bpy.types.Scene | None) -> bool:
-    """Splats of another program may come without cameras and points."""
-    return _show_capture(job, owner) and _show_result(job, owner)
-
-
-def _show_votes(job: Job, owner: bpy.types.Scene | None) -> bool:
-    roots = _shown_roots(job, owner)
-    for root in roots:
-        scene.show_objects(root, _folder_of(job))
-        object_edits.fill(root)
-        root.objectgs.color_by = "object"
-    return bool(roots) or _announce_hidden(job)
-
-
-def _show_result(job: Job, owner: bpy.types.Scene | None) -> bool:
-    if not Reconstruction(_folder_of(job)).splats.exists():
-        return False
-    roots = _shown_roots(job, owner)
-    for root in roots:
-        if not scene.object_collections(root):
-            view.hide_points(root)
-        shown = scene.show_result(root, _folder_of(job))
-        job.warnings.extend(shown.warnings)
-        object_edits.fill(root)
-    return bool(roots) or _announce_hidden(job)
-
-
-def _show_meshes(job: Job, owner: bpy.types.Scene | None) -> bool:
-    """Also shows the meshes of a stopped job."""
-    roots = _shown_roots(job, owner)
-    for root in roots:
-        shown = scene.show_meshes(root, _folder_of(job))
-        job.warnings.extend(shown.warnings)
-        if shown.meshes and scene.shown_kinds(root) == "splats":
-            scene.show_kinds(root, "meshes")
-        object_edits.fill(root)
-    return bool(roots) or _announce_hidden(job)
-
-
-def _show_fill(job: Job, _owner: bpy.types.Scene | None) -> bool:
-    """Makes no undo step, since the fill follows from the edits and is undone with them."""
-    for root in _shown_roots(job, None):
-        _show_fill_of(root)
-    return False
-
-
-def _show_fill_of(root: bpy.types.Collection) -> None:
-    scene.show_fills(root, scene.Objects.read(scene.folder_of(root)))
-
-
-def _announce_hidden(job: Job) -> bool:
-    """Tell the user where a result is that no scene shows; returns False, since nothing has changed."""
-    messages.show(
-        f"{job.title} has finished, but its scene or collection is gone; open {job.folder} with Open Reconstruction."
-    )
-    return False
 
 
 def _import_demo(job: Job, owner: bpy.types.Scene | None) -> bool:
@@ -321,25 +216,6 @@ def _import_demo(job: Job, owner: bpy.types.Scene | None) -> bool:
     return False
 
 
-def _show_film(job: Job, _owner: bpy.types.Scene | None) -> bool:
-    """Show new frames in the compositors that use their folder."""
-    for other in bpy.data.scenes:
-        film.show_frames(other, Path(job.result.get("film", "")))
-    return False
-
-
-_SHOWS = {
-    "demo": _import_demo,
-    "import": _show_capture,
-    "vote": _show_votes,
-    "train": _show_result,
-    "mesh": _show_meshes,
-    "film": _show_film,
-    "import-splats": _show_imported,
-    "fill": _show_fill,
-}
-
-
 def _push_undo(title: str) -> None:
     windows = bpy.context.window_manager.windows
     if windows and not bpy.app.background:
@@ -347,60 +223,8 @@ def _push_undo(title: str) -> None:
             bpy.ops.ed.undo_push(message=f"ObjectGS: {title}")
 
 
-@bpy.app.handlers.persistent
-@writing.allowed
-def _undone(*_: Any) -> None:
-    """Update objects.json and the fills after an undo or redo."""
-    for root in [root for root in bpy.data.collections if scene.kind_of(root) == "reconstruction"]:
-        for action in (object_edits.store, _show_fill_of, partial(fill_holes, again=False)):
-            _try(action, root)
-
-
-@bpy.app.handlers.persistent
-@writing.allowed
-def _saving(*_: Any) -> None:
-    """Write pending colors and transforms to objects.json when the .blend is saved."""
-    for root in bpy.data.collections:
-        if scene.kind_of(root) == "reconstruction" and root.library is None:
-            _try(object_edits.store_edits, root)
-
-
-def _try(action: Callable[[bpy.types.Collection], None], root: bpy.types.Collection) -> None:
-    try:
-        action(root)
-    except (InputError, OSError) as error:
-        messages.show(messages.sentence(error), "ERROR")
-
-
-@bpy.app.handlers.persistent
-@writing.allowed
-def _file_loaded(*_: Any) -> None:
-    """Fill the lists of objects and choose the active reconstruction, which files made without a window lack."""
-    for owner in bpy.data.scenes:
-        roots = [root for root in owner.collection.children_recursive if scene.kind_of(root) == "reconstruction"]
-        for root in roots:
-            if not root.objectgs.objects:
-                # The panel reports a missing or broken folder.
-                with contextlib.suppress(InputError, OSError):
-                    object_edits.fill(root)
-        if roots and owner.objectgs.active is None:
-            owner.objectgs.active = roots[0]
-
-
-def register() -> None:
-    object_edits.after_edits.append(fill_holes)
-    bpy.app.handlers.load_post.append(_file_loaded)
-    bpy.app.handlers.save_pre.append(_saving)
-    bpy.app.handlers.undo_post.append(_undone)
-    bpy.app.handlers.redo_post.append(_undone)
-
-
-def unregister() -> None:
-    bpy.app.handlers.redo_post.remove(_undone)
-    bpy.app.handlers.undo_post.remove(_undone)
-    bpy.app.handlers.save_pre.remove(_saving)
-    bpy.app.handlers.load_post.remove(_file_loaded)
-    object_edits.after_edits.remove(fill_holes)
+def stop() -> None:
+    """Stop all jobs and forget what waits to be shown, as when the extension is disabled."""
     object_edits.flush()
     if bpy.app.timers.is_registered(_tick):
         bpy.app.timers.unregister(_tick)

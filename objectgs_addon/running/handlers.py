@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What follows when a .blend is opened or saved, and on undo and redo."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import bpy
+
+from ...backend.shared.errors import InputError
+from .. import scene
+from ..blender import messages, writing
+from ..state import object_edits
+from . import background, results
+
+
+@bpy.app.handlers.persistent
+@writing.allowed
+def _undone(*_: Any) -> None:
+    """Update objects.json and the fills after an undo or redo."""
+    for root in [root for root in bpy.data.collections if scene.kind_of(root) == "reconstruction"]:
+        for action in (object_edits.store, results.show_fill, partial(background.fill_holes, again=False)):
+            _try(action, root)
+
+
+@bpy.app.handlers.persistent
+@writing.allowed
+def _saving(*_: Any) -> None:
+    """Write pending colors and transforms to objects.json when the .blend is saved."""
+    for root in bpy.data.collections:
+        if scene.kind_of(root) == "reconstruction" and root.library is None:
+            _try(object_edits.store_edits, root)
+
+
+def _try(action: Callable[[bpy.types.Collection], None], root: bpy.types.Collection) -> None:
+    try:
+        action(root)
+    except (InputError, OSError) as error:
+        messages.show(messages.sentence(error), "ERROR")
+
+
+@bpy.app.handlers.persistent
+@writing.allowed
+def _file_loaded(*_: Any) -> None:
+    """Fill the lists of objects and choose the active reconstruction, which files made without a window lack."""
+    for owner in bpy.data.scenes:
+        roots = [root for root in owner.collection.children_recursive if scene.kind_of(root) == "reconstruction"]
+        for root in roots:
+            if not root.objectgs.objects:
+                # The panel reports a missing or broken folder.
+                with contextlib.suppress(InputError, OSError):
+                    object_edits.fill(root)
+        if roots and owner.objectgs.active is None:
+            owner.objectgs.active = roots[0]
+
+
+def register() -> None:
+    object_edits.after_edits.append(background.fill_holes)
+    bpy.app.handlers.load_post.append(_file_loaded)
+    bpy.app.handlers.save_pre.append(_saving)
+    bpy.app.handlers.undo_post.append(_undone)
+    bpy.app.handlers.redo_post.append(_undone)
+
+
+def unregister() -> None:
+    bpy.app.handlers.redo_post.remove(_undone)
+    bpy.app.handlers.undo_post.remove(_undone)
+    bpy.app.handlers.save_pre.remove(_saving)
+    bpy.app.handlers.load_post.remove(_file_loaded)
+    object_edits.after_edits.remove(background.fill_holes)
+    background.stop()

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a finished job brings is shown in Blender: a function for each kind of job."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from ...backend.shared.reconstruction.folder import Reconstruction
+from .. import film, scene
+from ..blender import messages
+from ..process.jobs import Job
+from ..state import object_edits, object_list
+from ..state import viewports as view
+
+
+def _folder_of(job: Job) -> Path:
+    """The folder of a job whose result can be shown."""
+    assert job.folder is not None
+    return job.folder
+
+
+def roots_of(folder: Path | None) -> list[bpy.types.Collection]:
+    return [
+        collection
+        for collection in bpy.data.collections
+        if scene.kind_of(collection) == "reconstruction"
+        and scene.folder_of(collection) == folder
+        and collection.library is None
+    ]
+
+
+def _shown_roots(job: Job, owner: bpy.types.Scene | None) -> list[bpy.types.Collection]:
+    """The reconstruction's collections in scenes; one that the user unlinked from `owner` is linked again."""
+    roots = roots_of(job.folder)
+    for root in roots:
+        if owner is not None and owner.objectgs.active == root and not object_list.scenes_of(root):
+            owner.collection.children.link(root)
+    return [root for root in roots if object_list.scenes_of(root)]
+
+
+def _show_capture(job: Job, owner: bpy.types.Scene | None) -> bool:
+    roots = _shown_roots(job, owner)
+    for root in roots:
+        scene.show_capture(object_list.scenes_of(root)[0], _folder_of(job), root)
+        object_edits.fill(root)
+    if owner is not None:
+        root = next((root for root in roots if owner in object_list.scenes_of(root)), None)
+        if root is None:
+            root = scene.show_capture(owner, _folder_of(job))
+            object_edits.fill(root)
+            roots.append(root)
+        owner.objectgs.active = root
+        view.show(root)
+    if roots:
+        job.warnings.extend(scene.warnings_of(roots[0]))
+    return bool(roots) or _announce_hidden(job)
+
+
+def _show_imported(job: Job, owner: bpy.types.Scene | None) -> bool:
+    """Splats of another program may come without cameras and points."""
+    return _show_capture(job, owner) and _show_result(job, owner)
+
+
+def _show_votes(job: Job, owner: bpy.types.Scene | None) -> bool:
+    roots = _shown_roots(job, owner)
+    for root in roots:
+        scene.show_objects(root, _folder_of(job))
+        object_edits.fill(root)
+        root.objectgs.color_by = "object"
+    return bool(roots) or _announce_hidden(job)
+
+
+def _show_result(job: Job, owner: bpy.types.Scene | None) -> bool:
+    if not Reconstruction(_folder_of(job)).splats.exists():
+        return False
+    roots = _shown_roots(job, owner)
+    for root in roots:
+        if not scene.object_collections(root):
+            view.hide_points(root)
+        shown = scene.show_result(root, _folder_of(job))
+        job.warnings.extend(shown.warnings)
+        object_edits.fill(root)
+    return bool(roots) or _announce_hidden(job)
+
+
+def _show_meshes(job: Job, owner: bpy.types.Scene | None) -> bool:
+    """Also shows the meshes of a stopped job."""
+    roots = _shown_roots(job, owner)
+    for root in roots:
+        shown = scene.show_meshes(root, _folder_of(job))
+        job.warnings.extend(shown.warnings)
+        if shown.meshes and scene.shown_kinds(root) == "splats":
+            scene.show_kinds(root, "meshes")
+        object_edits.fill(root)
+    return bool(roots) or _announce_hidden(job)
+
+
+def _show_fill_job(job: Job, _owner: bpy.types.Scene | None) -> bool:
+    """Makes no undo step, since the fill follows from the edits and is undone with them."""
+    for root in _shown_roots(job, None):
+        show_fill(root)
+    return False
+
+
+def show_fill(root: bpy.types.Collection) -> None:
+    scene.show_fills(root, scene.Objects.read(scene.folder_of(root)))
+
+
+def _announce_hidden(job: Job) -> bool:
+    """Tell the user where a result is that no scene shows; returns False, since nothing has changed."""
+    messages.show(
+        f"{job.title} has finished, but its scene or collection is gone; open {job.folder} with Open Reconstruction."
+    )
+    return False
+
+
+def _show_film(job: Job, _owner: bpy.types.Scene | None) -> bool:
+    """Show new frames in the compositors that use their folder."""
+    for other in bpy.data.scenes:
+        film.show_frames(other, Path(job.result.get("film", "")))
+    return False
+
+
+SHOW_BY_KIND = {
+    "import": _show_capture,
+    "vote": _show_votes,
+    "train": _show_result,
+    "mesh": _show_meshes,
+    "film": _show_film,
+    "import-splats": _show_imported,
+    "fill": _show_fill_job,
+}

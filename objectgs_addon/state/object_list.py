@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the list of objects says: its rows, which are chosen, and what the objects consist of."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from ...backend.shared.color.recolor import Recolor
+from ...backend.shared.errors import InputError
+from ...backend.shared.reconstruction.objects import SceneObject, merged
+from .. import scene
+from ..picking import selection
+from ..scene import from_stored
+
+SLIDERS = ("amount", "hue", "saturation", "value", "contrast")
+COLORS = ("replace", "tint")
+DIGITS = 6
+"""Decimals of a slider's value, about the precision of Blender's floats."""
+
+
+def active_item(root: bpy.types.Collection) -> Any:
+    """The active row, or None if the list is empty."""
+    properties = root.objectgs
+    count = len(properties.objects)
+    return properties.objects[min(max(properties.active_object, 0), count - 1)] if count else None
+
+
+def item_of(root: bpy.types.Collection, object_id: int) -> Any:
+    """The row of an object ID, or None."""
+    return next((item for item in root.objectgs.objects if from_stored(item.object_id) == object_id), None)
+
+
+def shown_item(root: bpy.types.Collection) -> Any:
+    """The active row, or the row it is merged into; None if the list is empty."""
+    item = active_item(root)
+    return item and item_of(root, shown_as(root, from_stored(item.object_id)))
+
+
+def shown_as(root: bpy.types.Collection, object_id: int) -> int:
+    """The ID of the object that shows `object_id`: itself, or the one it is merged into."""
+    rows = [
+        SceneObject(
+            from_stored(item.object_id),
+            item.name,
+            (0, 0, 0),
+            0,
+            from_stored(item.merged_into) if item.is_merged else None,
+        )
+        for item in root.objectgs.objects
+    ]
+    return merged(rows).get(object_id, object_id)
+
+
+def chosen_ids(context: bpy.types.Context, root: bpy.types.Collection) -> list[int]:
+    """IDs of the objects selected in the viewport, or of the active row; of merged objects, the one they belong to."""
+    ids = selection.selected_ids(context, root)
+    item = active_item(root)
+    if not ids and item is not None:
+        ids = [from_stored(item.object_id)]
+    return list(dict.fromkeys(shown_as(root, object_id) for object_id in ids if object_id))
+
+
+def require_chosen_ids(context: bpy.types.Context, root: bpy.types.Collection) -> list[int]:
+    """As `chosen_ids`. Raises InputError if there are none."""
+    ids = chosen_ids(context, root)
+    if not ids:
+        raise InputError("No object is selected; select one in the viewport or in the list")
+    return ids
+
+
+def scenes_of(root: bpy.types.Collection) -> list[bpy.types.Scene]:
+    """The scenes that contain the reconstruction."""
+    return [owner for owner in bpy.data.scenes if root in owner.collection.children_recursive]
+
+
+def splat_counts(root: bpy.types.Collection) -> dict[int, int]:
+    """Object ID -> number of splats in its collection, including those of merged objects."""
+    return {
+        object_id: sum(
+            len(part.data.vertices) - int(scene.unobserved_splats(part.data).sum())
+            for part in scene.parts_of(collection)
+            if scene.kind_of(part) == "splats"
+        )
+        for object_id, collection in scene.object_collections(root).items()
+    }
+
+
+def face_counts(root: bpy.types.Collection) -> dict[int, int]:
+    """Object ID -> number of faces of its meshes, for objects that have any."""
+    return {
+        object_id: sum(len(mesh.data.polygons) for mesh in meshes)
+        for object_id, meshes in scene.object_meshes(root).items()
+    }
+
+
+def recolor_of(item: Any) -> Recolor:
+    """The color edit that a row's sliders describe."""
+    values = {name: round(getattr(item, name), DIGITS) for name in SLIDERS}
+    values |= {name: tuple(round(channel, DIGITS) for channel in getattr(item, name)) for name in COLORS}
+    return Recolor(**values, middle=round(item.middle, DIGITS)) if item.middle else Recolor(**values)
+
+
+def rounded(recolor: Recolor | None) -> Recolor:
+    """A stored color edit with the sliders' precision."""
+    if recolor is None:
+        return Recolor()
+    values = {name: round(getattr(recolor, name), DIGITS) for name in (*SLIDERS, "middle")}
+    return Recolor(
+        **values, **{name: tuple(round(channel, DIGITS) for channel in getattr(recolor, name)) for name in COLORS}
+    )

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Show the contents of a reconstruction folder in the scene."""
+
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...backend.shared.errors import InputError
+from ...backend.shared.reconstruction.folder import Reconstruction
+from ...objectgs_addon import scene
+from ...objectgs_addon.blender import messages
+from ...objectgs_addon.running import background
+from ...objectgs_addon.state import object_edits
+from ...objectgs_addon.state import viewports as view
+
+
+def show_folder(operator: bpy.types.Operator, context: bpy.types.Context, folder: Path, root: Any) -> None:
+    """Show what a folder contains, and report it through `operator`.
+
+    root: the collection that shows the folder, or None to add one.
+
+    Raises InputError for unusable cameras; what is wrong with splats and meshes is reported.
+    """
+    root = scene.show_capture(context.scene, folder, root)
+    object_edits.fill(root)
+    context.scene.objectgs.active = root
+    try:
+        if Reconstruction(folder).splats.exists():
+            if not scene.object_collections(root):
+                view.hide_points(root)
+            shown = scene.show_result(root, folder)
+            for sentence in shown.warnings:
+                operator.report({"WARNING"}, sentence)
+            operator.report({"INFO"}, f"{shown.splats:,} splats of {shown.objects} objects")
+            object_edits.fill(root)
+            background.fill_holes(root)
+    except (InputError, OSError) as error:
+        operator.report({"ERROR"}, messages.sentence(error))  # Cameras and points are shown; they need an undo step.
