@@ -30,20 +30,6 @@ APART_PICTURE = "pulled-apart.png"
 SAMPLES = 16
 """Samples per pixel of a built .blend."""
 
-_TITLES = {
-    "import": "Import",
-    "plan": "Plan",
-    "vote": "Vote",
-    "train": "Train",
-    "mesh": "Mesh",
-    "edit": "Edit",
-    "export": "Export",
-    "import-splats": "Import splats",
-    "film": "Film",
-    "evaluate": "Evaluate",
-    "report": "Report",
-}
-
 
 class StepFailed(Exception):
     """A step failed for a reason other than its input; the message is one sentence."""
@@ -300,7 +286,7 @@ def run_backend(reporter: Reporter, command: str, folder: Path | None, *argument
         Cancelled: the user cancelled.
         StepFailed: it failed for another reason.
     """
-    job = locations.backend_job(_TITLES[command], command, folder, command, *map(str, arguments))
+    job = locations.backend_job(command.replace("-", " ").capitalize(), command, folder, command, *map(str, arguments))
     code = run_blocking(job, reporter)
     if code == EXIT_DONE:
         return

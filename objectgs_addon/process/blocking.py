@@ -59,15 +59,15 @@ def _counted_signals() -> Iterator[list[int]]:
 
 def _watch(job: Job, reporter: Reporter, signals: list[int]) -> None:
     """Poll the job until its end, and report what changes."""
-    handled, message, warned, progress = 0, "", 0, 0.0
+    handled, told, warned, progress = 0, 0, 0, 0.0
     while not job.is_finished:
         if len(signals) > handled:
             handled += 1
             job.stop() if handled == 1 else job.kill()
         job.poll()
-        if job.message != message and not job.is_finished:
-            message = job.message
+        for message in job.statuses[told:]:
             reporter.status(message)
+        told = len(job.statuses)
         for warning in job.warnings[warned:]:
             reporter.warning(warning)
         warned = len(job.warnings)

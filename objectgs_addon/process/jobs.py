@@ -54,9 +54,9 @@ class Job:
         if_silent: error message if the program ends without any event, since it is not the expected program.
 
     The other attributes change while the job runs: progress from 0 to 1, seconds_left (reported or estimated), message
-    (the current step), warnings and error (sentences), figures of the training, preview (path of the newest image),
-    curve (quality events: seconds, step, psnr, miou, mbiou), result (fields of the last event), exit_code and log (last
-    lines that were no events).
+    (the current step), statuses (all messages so far), warnings and error (sentences), figures of the training, preview
+    (path of the newest image), curve (quality events: seconds, step, psnr, miou, mbiou), result (fields of the last
+    event), exit_code and log (last lines that were no events).
     """
 
     title: str
@@ -71,6 +71,7 @@ class Job:
     progress: float = 0.0
     seconds_left: float | None = None
     message: str = ""
+    statuses: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     error: str | None = None
     step: int | None = None
@@ -137,6 +138,7 @@ class Job:
             self._stop_asked = time.monotonic()
             self._shift_clock()
             self._set(State.STOPPING, "Stopping")
+            self.statuses.append(self.message)
 
     def kill(self) -> None:
         """End the job at once; its last checkpoint is kept."""
@@ -206,6 +208,7 @@ class Job:
                     self.progress = 0.0
             if self.state is not State.STOPPING:
                 self.message = message
+                self.statuses.append(message)
         elif kind == "progress":
             self._take_progress(event)
         elif kind == "quality":

@@ -16,6 +16,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 from objectgs.backend.shared.formats.ply import read_vertices
+from objectgs.objectgs_addon.headless import COMMANDS
 from objectgs.objectgs_addon.headless.batch import fingerprint
 
 import headless
@@ -71,20 +72,7 @@ def blend(trained, tmp_path_factory):
 def test_help(capsys):
     ran = run("--help")
     assert ran.returncode == 0
-    for command in (
-        "demo",
-        "import",
-        "vote",
-        "train",
-        "mesh",
-        "edit",
-        "export",
-        "import-splats",
-        "build",
-        "render",
-        "run",
-        "batch",
-    ):
+    for command in COMMANDS:
         assert f"\n    {command}" in ran.output
         with pytest.raises(SystemExit) as ended:
             headless.main([command, "--help"])

@@ -407,6 +407,13 @@ class Recorder(Reporter):
         self.warnings.append(message)
 
 
+def test_run_blocking_reports_every_message(make):
+    reporter = Recorder()
+    job = make("for n in range(100): say('status', message=f'object {n}')\nsay('done', message='Voted.')")
+    assert run_blocking(job, reporter) == 0
+    assert reporter.messages == [*(f"object {n}" for n in range(100)), "Voted."]
+
+
 def test_run_blocking_reports_and_returns_the_exit_code(make):
     reporter = Recorder()
     code = run_blocking(
