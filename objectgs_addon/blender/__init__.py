@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Helpers around Blender itself: messages, writing from timers, its console output, .blend files of older versions."""
+"""Blender helpers: messages, writing from timers and handlers, console output, and .blend files of older versions."""

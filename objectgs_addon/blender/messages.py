@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Messages to the user from timers, handlers and properties, where no operator can report them."""
+"""User messages from timers, handlers and properties, which cannot report through an operator."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import bpy
 
 
 def sentence(error: Exception) -> str:
-    """Format an error as a sentence; for errors of the operating system, with the file's name and what to do."""
+    """Format an error as a sentence; for an OSError, include the file's name and a suggested remedy."""
     if not isinstance(error, OSError):
         return str(error)
     what = error.filename or "A file"
@@ -21,7 +21,7 @@ def sentence(error: Exception) -> str:
 
 
 def show(text: str, kind: str = "INFO") -> None:
-    """Show a message as a pop-up, or in background mode on the console; kind: INFO or ERROR."""
+    """Print a message to the console and, unless in background mode, show a pop-up; kind: INFO or ERROR."""
     print(f"ObjectGS: {text}", flush=True)
     manager = bpy.context.window_manager
     if bpy.app.background or manager is None or not manager.windows:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Names that older versions of the extension wrote to .blend files, renamed when a file is opened.
+"""Migration of names that older versions of the extension wrote to .blend files, when a file is opened.
 
-Opening changes nothing but names, and a file whose names are those of now is left as it is.
+Only names are changed, and files with current names are not modified.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ KINDS = {"texture_recolour": "texture_recolor"}
 """Values of the custom property KIND."""
 
 GROUPS = {"colour": "color", "colour_by": "color_by", "splat_colours": "splat_colors"}
-"""Properties of the groups at `Collection.objectgs` and `Scene.objectgs`, and of the items of their lists."""
+"""Properties of the property groups `Collection.objectgs` and `Scene.objectgs`, and of the items of their lists."""
 
 ATTRIBUTES = {"closes": "fills", "invented": "unobserved"}
-"""Attributes of the meshes of splats and of objects."""
+"""Attributes of splat carriers and object meshes."""
 
 NODE_ATTRIBUTES = {"colour": "display_color"}
-"""Attributes that our node groups store and the materials of points and splats read."""
+"""Attributes that the add-on's node groups store and the materials of points and splats read."""
 
 _CARRIERS = ("points", "splats")
 _MESHES = ("splats", "mesh")
@@ -41,7 +41,7 @@ _MATERIALS_WITH_COLOR = ("points_material", "splats_material", "ellipsoids_mater
 
 
 def rename_all() -> None:
-    """Give everything in the open file that has a former name the name of now."""
+    """Replace all former names in the open file with the current ones."""
     for block in _blocks():
         _rename_keys(block, CUSTOM_PROPERTIES)
         kind = block.get(KIND)
@@ -66,7 +66,7 @@ def _blocks() -> Iterator[bpy.types.ID]:
 
 
 def _stored_group(block: bpy.types.ID) -> Any:
-    """What the file holds of the property group `objectgs` of a collection or scene, or None."""
+    """Return the stored data of the property group `objectgs` of a collection or scene, or None."""
     if hasattr(block, "bl_system_properties_get"):  # from Blender 5.0 on
         properties = block.bl_system_properties_get()
         return None if properties is None else properties.get("objectgs")
@@ -99,7 +99,7 @@ def _rename_attributes(mesh: bpy.types.Mesh) -> None:
 
 
 def _trees_with_color() -> set[bpy.types.NodeTree]:
-    """The node trees that use our attribute of colors: our groups, and the materials of carriers."""
+    """Return the node trees that use the display color attribute: the add-on's groups and materials of carriers."""
     materials = {material for material in bpy.data.materials if material.get(KIND) in _MATERIALS_WITH_COLOR}
     for obj in bpy.data.objects:
         if obj.get(KIND) in _CARRIERS and isinstance(obj.data, bpy.types.Mesh):
@@ -125,21 +125,21 @@ def _file_loaded(*_: Any) -> None:
     rename_all()
 
 
-# Blender before 4.3 has no handler for what is linked or appended.
+# Blender before 4.3 has no handler for linked or appended data.
 _HANDLERS = [name for name in ("load_post", "blend_import_post") if hasattr(bpy.app.handlers, name)]
 
 
 def register() -> None:
-    """Rename whenever a file is opened, linked or appended; called before those whose handlers read the names."""
+    """Add the handlers for opened, linked and appended files; call this before adding handlers that read the names."""
     for name in _HANDLERS:
         getattr(bpy.app.handlers, name).append(_file_loaded)
     if not bpy.app.background:
-        # The extension may be installed while a file is open, which cannot be changed while it registers.
+        # The extension may be installed while a file is open, and the file cannot be changed during registration.
         bpy.app.timers.register(_file_loaded, first_interval=0.0)
 
 
 def unregister() -> None:
-    """Take the handlers back."""
+    """Remove the handlers."""
     if bpy.app.timers.is_registered(_file_loaded):
         bpy.app.timers.unregister(_file_loaded)
     for name in _HANDLERS:

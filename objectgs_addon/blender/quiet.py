@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Silencing Blender's own output, which would disturb the progress shown in a terminal."""
+"""Suppression of Blender's console output, which would disturb the progress shown in a terminal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import bpy
 
 @contextlib.contextmanager
 def quiet() -> Any:
-    """Discard what Blender prints in background mode; with a window, change nothing."""
+    """Discard Blender's standard output in background mode; with a window, do nothing."""
     if not bpy.app.background:
         yield
         return

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Writing to Blender's data from timers and handlers, also where Blender wrongly forbids it.
+"""Write access to Blender's data from timers and handlers, including cases where Blender wrongly denies it.
 
-Blender forbids Python to write to its data while it draws; Blender 4 does so with one flag for all threads. When a
-render by Cycles, or by another engine in Python, starts while Blender draws, the flag is restored to "forbidden" at the
-end of the render. From then on, all writing by timers and handlers fails ("Writing to ID classes in this context is not
-allowed") until Blender is closed. The getter of a property may always write, so functions are called by such a getter.
+Blender denies Python write access to its data while it draws; Blender 4 uses one flag for all threads. If a render by
+Cycles, or by another Python render engine, starts while Blender draws, the end of the render restores the flag to
+"denied". From then on, all writes by timers and handlers fail ("Writing to ID classes in this context is not allowed")
+until Blender is closed. Property getters can always write, so such a getter calls the functions.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from bpy.props import BoolProperty
 
 
 class _Waiting(local):
-    """The pending calls of one thread; renders update the scene in a thread of their own."""
+    """Pending calls of one thread; renders update the scene in a separate thread."""
 
     def __init__(self) -> None:
         self.calls: list[Callable[[], None]] = []
@@ -29,7 +29,7 @@ _waiting = _Waiting()
 
 
 def allowed(function: Callable) -> Callable:
-    """Decorate a timer or handler, so that it may write to Blender's data."""
+    """Decorate a timer or handler so that it can write to Blender's data."""
 
     @wraps(function)
     def wrapper(*arguments: Any) -> Any:

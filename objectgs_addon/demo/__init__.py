@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The parts of the demo capture: shapes, materials, scene, rendering, sparse points, files.
+"""The demo capture: shapes, materials, scene, rendering, sparse points and files.
 
-`objectgs_addon.demo.capture` puts them together.  Only `bpy`, `numpy` and the standard library are used.
-Everything is in meters with Z up; cameras follow OpenCV (x right, y down, z forward), pixel centers at +0.5.
+`objectgs_addon.demo.capture` combines these parts. All coordinates are in meters with Z up. Cameras follow the OpenCV
+convention (x right, y down, z forward) with pixel centers at +0.5.
 """

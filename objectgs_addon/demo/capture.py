@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The demo capture: a table-top in meters, rendered by Cycles, as a folder that a real capture would be.
+"""The demo capture: a tabletop scene rendered by Cycles, in a folder with the layout of a real capture.
 
-    images/0000.png ...                    8-bit sRGB pictures
+    images/0000.png ...                    8-bit sRGB images
     sparse/0/{cameras,images,points3D}.bin COLMAP model, one PINHOLE camera
-    masks/0000.png ...                     16-bit object IDs, with mistakes where asked for
+    masks/0000.png ...                     16-bit object IDs, with simulated errors if requested
     labels.json                            ID -> name
-    truth/masks, truth/depth (float32 .npy, meters along the camera's axis), truth/meshes/<id>_<name>.ply,
+    truth/masks, truth/depth (float32 .npy, meters along the camera axis), truth/meshes/<id>_<name>.ply,
     truth/objects.json, truth/points.npz (object_id and outlier for each point of the model), truth/settings.json
 
-Everything is in meters, Z up, in one frame.  Equal settings give an equal capture.
+All coordinates are in meters with Z up, in one frame. Equal settings produce an equal capture.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from ...backend.shared.events import Reporter
 from . import files, mask_noise, points, scene
 from .render import Renderer
 
-VERSION = 1  # counts up when equal settings give another capture
+VERSION = 1  # Incremented when equal settings produce a different capture.
 
 __all__ = ["Settings", "make"]
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What the capture depends on: counts, picture size in pixels, seed, mask noise 0..1, samples a pixel."""
+    """Settings of the capture: counts, image size in pixels, seed, mask noise 0..1, samples per pixel."""
 
     objects: int = 8
     views: int = 48
@@ -47,7 +47,7 @@ class Settings:
     samples: int = 20
 
     def check(self) -> None:
-        """Raise `InputError` for a value out of range."""
+        """Raise InputError if a value is out of range."""
         ranges = {
             "objects": (1, 60),
             "views": (4, 1000),
@@ -71,10 +71,23 @@ def make(
     reporter: Reporter | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Path:
-    """Make the capture in the folder `out` and return its path.
+    """Create the capture, or keep an existing equal one.
 
-    An equal capture that is there already is kept.  Raises `InputError` for bad input and `Cancelled` when `stopped()`
-    says so between two views; nothing half-made stays behind.
+    After an error, no incomplete files are left.
+
+    Args:
+        out: output folder.
+        settings: settings of the capture, or None for the defaults.
+        overwrite: replace a demo capture with other settings.
+        reporter: receives status and progress.
+        stopped: called before each view; True cancels.
+
+    Returns:
+        The absolute path of the folder.
+
+    Raises:
+        InputError: A setting is out of range, or the folder cannot be used.
+        Cancelled: `stopped()` returned True, or the render was cancelled.
     """
     settings, reporter = settings or Settings(), reporter or Reporter()
     settings.check()
@@ -100,7 +113,7 @@ def make(
 
 
 def _is_there(out: Path, settings: Settings, overwrite: bool) -> bool:
-    """Whether `out` holds this capture; raises `InputError` if it holds something that must stay."""
+    """Return whether `out` holds this capture; raise InputError if it holds something that must not be replaced."""
     if not out.exists():
         return False
     if not out.is_dir():
@@ -128,7 +141,7 @@ def _recorded(out: Path) -> Any:
 
 
 def _swap(part: Path, out: Path) -> None:
-    """Put the finished folder in place; the one before goes only when the new one stands."""
+    """Move the finished folder into place; the old one is deleted only after that succeeds."""
     old = out.with_name(out.name + ".old")
     if out.exists():
         if old.exists():
@@ -186,7 +199,7 @@ def _fill(part: Path, settings: Settings, reporter: Any, stopped: Any) -> None:
 
 
 def _render(built: Any, views: Any, settings: Settings, part: Path, reporter: Any, stopped: Any) -> Any:
-    """Pictures, depths and ID maps of all views; all pictures first, because changing over costs time."""
+    """Return images, depths and ID maps of all views; each kind is rendered in one pass, since switching is slow."""
     renderer = Renderer(built, settings.width, settings.height, settings.samples, settings.seed, part)
     pictures, truth = [], []
     total = 2 * len(views)

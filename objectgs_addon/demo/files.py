@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Writers for the files of a capture: PNG, PLY and COLMAP's binary model.  No bpy here."""
+"""Writers for the files of a capture: PNG, PLY and COLMAP's binary model."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-PINHOLE = 1  # COLMAP's number for the camera model
+PINHOLE = 1  # COLMAP's ID of the camera model.
 
 
 def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Write `pixels` as PNG: (H, W) uint8 or uint16 grayscale, or (H, W, 3) uint8 RGB; equal bytes for equal pixels."""
+    """Write (H, W) uint8 or uint16 grayscale or (H, W, 3) uint8 RGB pixels as PNG; the output is deterministic."""
     height, width = pixels.shape[:2]
     color = 2 if pixels.ndim == 3 else 0
     if color == 2 and (pixels.shape[2] != 3 or pixels.dtype != np.uint8):
@@ -23,7 +23,7 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
     big_endian = np.ascontiguousarray(pixels.astype(pixels.dtype.newbyteorder(">")))
     rows = big_endian.view(np.uint8).reshape(height, -1)
     lines = np.zeros((height, rows.shape[1] + 1), np.uint8)
-    if color == 2:  # filter 2 ("up") halves the size of pictures; ID maps compress better without
+    if color == 2:  # Filter 2 ("up") halves the size of images; ID maps compress better unfiltered.
         lines[:, 0] = 2
         lines[0, 1:] = rows[0]
         lines[1:, 1:] = rows[1:] - rows[:-1]
@@ -42,7 +42,7 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
 
 
 def write_ply(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
-    """Write a triangle mesh as binary PLY: `vertices` (V, 3) meters, `triangles` (F, 3) indices."""
+    """Write a triangle mesh as binary PLY: `vertices` (V, 3) in meters, `triangles` (F, 3) indices."""
     header = (
         "ply\nformat binary_little_endian 1.0\n"
         f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
@@ -55,7 +55,7 @@ def write_ply(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternion (w, x, y, z), w >= 0, of a 3x3 rotation matrix."""
+    """Return the unit quaternion (w, x, y, z), w >= 0, of a (3, 3) rotation matrix."""
     m = rotation
     k = np.array(
         [
@@ -83,10 +83,18 @@ def write_colmap(
 ) -> None:
     """Write cameras.bin, images.bin and points3D.bin for one PINHOLE camera.
 
-    intrinsics: (fx, fy, cx, cy) pixels; size: (width, height); rotations (V, 3, 3) and translations (V, 3): world to
-    camera.  observations: for each view (xy (K, 2) pixels, point ids (K,), -1 = none).  points: dict of arrays `xyz`
-    (P, 3), `rgb` (P, 3) uint8, `error` (P,) pixels, and `track`, a list of (L, 2) arrays of (image id, index in image).
-    Ids count from 1 in the order given.
+    IDs count from 1 in the given order.
+
+    Args:
+        folder: output folder, created if missing.
+        intrinsics: (fx, fy, cx, cy) in pixels.
+        size: (width, height) in pixels.
+        names: image names of the V views.
+        rotations: (V, 3, 3) world to camera.
+        translations: (V, 3) world to camera.
+        observations: for each view (xy (K, 2) in pixels, point IDs (K,) with -1 for unmatched).
+        points: dict of arrays `xyz` (P, 3), `rgb` (P, 3) uint8, `error` (P,) in pixels, and `track`, a list of (L, 2)
+            arrays of (image ID, index in image).
     """
     folder.mkdir(parents=True, exist_ok=True)
     camera = struct.pack("<QiiQQ4d", 1, 1, PINHOLE, size[0], size[1], *intrinsics)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Mistakes of a segmentation network, made on true ID maps.  No bpy here."""
+"""Simulated segmentation errors, applied to ground-truth ID maps."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 
 def _smooth(shape: Any, cell: int, rng: Any) -> np.ndarray:
-    """Random field in about -1..1 that varies over `cell` pixels."""
+    """Return a smooth random field in about -1..1 that varies over `cell` pixels."""
     rows, cols = shape[0] // cell + 3, shape[1] // cell + 3
     coarse = rng.uniform(-1, 1, (rows, cols))
     y, x = np.arange(shape[0]) / cell, np.arange(shape[1]) / cell
@@ -32,12 +32,17 @@ def _grow(region: np.ndarray, pixels: int) -> np.ndarray:
 
 
 def disturb(ids: np.ndarray, amount: float, rng: Any) -> np.ndarray:
-    """Copy of an ID map (H, W) with mistakes; `amount` from 0 (none) to 1 (poor).
+    """Return a copy of an ID map with simulated segmentation errors.
 
-    All borders wander by up to 4 * amount pixels in smooth waves.  Then each object of the view, by chance and apart
-    from the others: with probability amount it is 1 to 3 pixels too large or too small (what it leaves is 0,
-    unlabeled); with probability 0.15 * amount it carries another object's ID; with 0.10 * amount it is missing (0).
-    These two happen only to what covers less than a fifth of the picture: networks seldom lose a wall.
+    All borders are displaced smoothly by up to 4 * amount pixels. Then each object is changed independently: with
+    probability amount, it grows or shrinks by 1 to 3 pixels (uncovered pixels become 0, unlabeled); with probability
+    0.15 * amount, it gets the ID of a random object in the view; with probability 0.10 * amount, it is missing (0). The
+    last two apply only to objects that cover at most a fifth of the image, since networks rarely miss a wall.
+
+    Args:
+        ids: (H, W) ID map.
+        amount: from 0 (no errors) to 1 (poor masks).
+        rng: random generator.
     """
     if amount <= 0:
         return ids.copy()

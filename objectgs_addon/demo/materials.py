@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Procedural textures.  Details are at least 1.5 cm, so about 3 pixels or more in a 320x240 view from 1.4 m."""
+"""Procedural textures with details of at least 1.5 cm, about 3 pixels in a 320x240 view from 1.4 m."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ...backend.shared.color.srgb import decode
 
 
 class _Nodes:
-    """A material's node tree with short words for what the patterns need."""
+    """A material's node tree with shorthand methods for the patterns."""
 
     def __init__(self, name: str) -> None:
         self.material = bpy.data.materials.new(name)
@@ -25,7 +25,7 @@ class _Nodes:
         self.tree.nodes.clear()
 
     def add(self, kind: str, inputs: Any = None, **settings: Any) -> Any:
-        """New node; `inputs` maps socket name or index to a value or to another node's output."""
+        """Add a node; `inputs` maps socket names or indices to values or other nodes' outputs."""
         node = self.tree.nodes.new("ShaderNode" + kind)
         for key, value in settings.items():
             setattr(node, key, value)
@@ -44,7 +44,7 @@ class _Nodes:
         return node.outputs[2]
 
     def ramp(self, value: Any, colors: Any, soft: bool = False, stops: Any = None) -> Any:
-        """Colors over 0..1, in steps or (`soft`) blended."""
+        """Map a value in 0..1 to colors, in steps or blended (`soft`)."""
         node = self.add("ValToRGB", {0: value})
         ramp = node.color_ramp
         ramp.interpolation = "EASE" if soft else "CONSTANT"
@@ -57,17 +57,17 @@ class _Nodes:
         return node.outputs[0]
 
     def step(self, value: Any, edge: float, width: float) -> Any:
-        """0 below, 1 above `edge`, blended over `width`."""
+        """Return 0 below and 1 above `edge`, blended over `width`."""
         node = self.add("MapRange", {0: value, 1: edge - width / 2, 2: edge + width / 2, 3: 0.0, 4: 1.0})
         return node.outputs[0]
 
     def place(self, offset: Any) -> Any:
-        """Object coordinates in meters, moved by a seeded offset."""
+        """Return object coordinates in meters, and the same moved by an offset."""
         coordinates = self.add("TexCoord").outputs["Object"]
         return coordinates, self.add("VectorMath", {0: coordinates, 1: offset}, operation="ADD").outputs[0]
 
     def wrap(self, coordinates: Any, around: int) -> Any:
-        """(turns x `around`, height in meters) around the z axis."""
+        """Return cylindrical coordinates around the z axis: (turns * `around`, height in meters)."""
         x, y, z = self.add("SeparateXYZ", {0: coordinates}).outputs
         turn = self.math("DIVIDE", self.math("ARCTAN2", y, x), 2 * math.pi)
         return self.math("MULTIPLY", turn, float(around)), z
@@ -83,13 +83,13 @@ class _Nodes:
         return node.outputs
 
     def vary(self, color: Sequence[float], place: Any, amount: float = 0.35, scale: float = 14.0) -> Any:
-        """Lighter and darker patches, so that repeats of a pattern can be told apart."""
+        """Multiply a color by lighter and darker patches, which make repeats of a pattern distinguishable."""
         grays = [_gray(1 - amount), _gray(1.0), _gray(1 - amount / 2), _gray(1.0)]
         patches = self.ramp(self.noise(place, scale, 1.5), grays, soft=True, stops=[0.3, 0.45, 0.58, 0.72])
         return self.mix(1.0, color, patches, "MULTIPLY")
 
     def glow(self, color: Sequence[float]) -> Any:
-        """Color that needs no light: none is traced for the room, half of the pixels, and none of it is noisy."""
+        """Finish as an emission shader; the room, half of the pixels, then requires no lighting and has no noise."""
         shader = self.add("Emission", {0: color, 1: 0.9})
         self.tree.links.new(shader.outputs[0], self.add("OutputMaterial").inputs[0])
         self.material.cycles.emission_sampling = "NONE"
@@ -109,7 +109,7 @@ def _gray(value: float) -> Any:
 
 
 def _linear(code: str, turn: float = 0.0) -> Any:
-    """Scene-linear RGBA of an sRGB "rrggbb", its hue turned by `turn` (1 = full circle)."""
+    """Return scene-linear RGBA of an sRGB "rrggbb" code, its hue rotated by `turn` (1 is a full circle)."""
     rgb = [int(code[i : i + 2], 16) / 255 for i in (0, 2, 4)]
     hue, light, color = colorsys.rgb_to_hls(*rgb)
     rgb = colorsys.hls_to_rgb((hue + turn) % 1.0, light, color)
@@ -163,7 +163,7 @@ def _clouds(n: Any, raw: Any, place: Any, c: Any, size: Any, around: Any) -> Any
     return n.ramp(n.noise(place, 0.42 / size, 1.5), c, stops=stops)
 
 
-# kind: pattern, size of a detail (m), details around, sRGB colors, roughness, specular level
+# Kind: pattern, detail size (m), details around, sRGB colors, roughness, specular level.
 LOOKS = {
     "mug": (_checker, 0.025, 14, ("e8e0cf", "c0392b", "e9a23b"), 0.8, 0.1),
     "bottle": (_zigzag, 0.022, 12, ("1f6f5c", "e6dcae", "2f9a76", "d98e32"), 0.8, 0.1),
@@ -183,7 +183,7 @@ LOOKS = {
 
 
 def material(kind: str, rng: Any) -> bpy.types.Material:
-    """The material of one kind of object; hue and place of the pattern vary with the random generator `rng`."""
+    """Create the material of a kind of object; `rng` varies the hue and the position of the pattern."""
     pattern, size, around, codes, roughness, specular = LOOKS[kind]
     turn = float(rng.uniform(-0.03, 0.03))
     n = _Nodes(kind)
@@ -193,7 +193,7 @@ def material(kind: str, rng: Any) -> bpy.types.Material:
 
 
 def table(rng: Any) -> bpy.types.Material:
-    """Planks of warm wood with knots."""
+    """Create the table's material: planks of warm wood with grain."""
     n = _Nodes("table")
     raw, place = n.place(tuple(map(float, rng.uniform(-5, 5, 3))))
     planks = n.add(
@@ -222,7 +222,7 @@ def table(rng: Any) -> bpy.types.Material:
 
 
 def floor(rng: Any) -> bpy.types.Material:
-    """Tiles, darker under the table."""
+    """Create the floor's material: tiles, darker under the table."""
     n = _Nodes("floor")
     raw, place = n.place(tuple(map(float, rng.uniform(-5, 5, 3))))
     color = n.add(
@@ -235,7 +235,7 @@ def floor(rng: Any) -> bpy.types.Material:
 
 
 def wall(rng: Any) -> bpy.types.Material:
-    """Large cells with light joints; details of 6 cm and more, as the wall is farther away."""
+    """Create the wall's material: large cells with light joints; details are at least 6 cm for the larger distance."""
     n = _Nodes("wall")
     _, place = n.place(tuple(map(float, rng.uniform(-5, 5, 3))))
     choice = n.add("SeparateColor", {0: n.cells(place, 3.2)["Color"]}).outputs[0]

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Sparse points with tracks as structure-from-motion finds them, from pictures and true depth.  No bpy here.
+"""Simulated structure-from-motion: sparse points with tracks, from images and ground-truth depth.
 
-Detections are drawn at pixels with texture, and a track goes to the other views that see the same spot unhidden
-(tested against their depth), from a similar direction, and by chance.  Observations get Gaussian noise, and the
-points are triangulated from them, so that their noise in space is what the noise in the pictures makes of it.
+Detections are sampled at textured pixels. A track continues at random in other views that see the same spot unoccluded
+(tested against their depth) from a similar direction. Observations get Gaussian noise, and the points are triangulated
+from them, so that the noise in space results from the noise in the images.
 """
 
 from __future__ import annotations
@@ -13,17 +13,22 @@ from typing import Any
 
 import numpy as np
 
-NOISE = 0.5  # pixels, standard deviation of an observation
-TOLERANCE = 0.008  # meters of depth within which a spot counts as seen
-ANGLE = 38.0  # degrees between two views of one spot up to which it is recognized
-OUTLIERS = 0.03  # fraction of points that are wrong matches
+NOISE = 0.5  # Standard deviation of an observation in pixels.
+TOLERANCE = 0.008  # Largest depth difference in meters at which a spot counts as visible.
+ANGLE = 38.0  # Largest angle in degrees between two views of a spot at which it is matched.
+OUTLIERS = 0.03  # Fraction of points that are wrong matches.
 
 
 @dataclass
 class Cloud:
-    """`observations`: for each view (xy (K, 2), point ids (K,)); `points` as `files.write_colmap` takes them.
+    """Sparse points with observations.
 
-    For checks: `outlier` (P,) bool and `object_id` (P,) of the surface that each point was drawn from."""
+    Attributes:
+        observations: for each view (xy (K, 2), point IDs (K,)).
+        points: as for `files.write_colmap`.
+        outlier: (P,) bool ground truth of wrong matches.
+        object_id: (P,) ground-truth ID of the surface from which each point was sampled.
+    """
 
     observations: list
     points: dict
@@ -32,7 +37,7 @@ class Cloud:
 
 
 def project(points: np.ndarray, view: Any, intrinsics: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel positions (N, 2) and depth (N,) in meters of world points (N, 3) in a view."""
+    """Return pixel positions (N, 2) and depths (N,) in meters of world points (N, 3) in a view."""
     local = points @ view.rotation.T + view.translation
     fx, fy, cx, cy = intrinsics
     depth = local[:, 2]
@@ -47,7 +52,7 @@ def _lift(xy: Any, depth: Any, view: Any, intrinsics: Any) -> np.ndarray:
 
 
 def _seeds(picture: Any, depth: Any, count: Any, rng: Any) -> np.ndarray:
-    """(count, 2) pixel rows and columns, drawn where there is texture and away from steps in depth."""
+    """Sample (count, 2) pixel rows and columns in textured areas away from depth discontinuities."""
     gray = picture.astype(np.float32).mean(2)
     gy, gx = np.gradient(gray)
     weight = np.hypot(gx, gy) + 1.0
@@ -55,7 +60,7 @@ def _seeds(picture: Any, depth: Any, count: Any, rng: Any) -> np.ndarray:
     weight[step > 0.03] = 0
     weight[:2], weight[-2:], weight[:, :2], weight[:, -2:] = 0, 0, 0, 0
     weight = np.minimum(weight, 40.0).ravel()
-    # Gumbel's trick draws without replacement, weighted
+    # The Gumbel trick: weighted sampling without replacement.
     with np.errstate(divide="ignore"):
         keys = np.log(weight) + rng.gumbel(size=weight.size)
     keep = np.argpartition(-keys, count)[:count]
@@ -64,7 +69,17 @@ def _seeds(picture: Any, depth: Any, count: Any, rng: Any) -> np.ndarray:
 
 
 def make(views: Any, intrinsics: Any, pictures: Any, depths: Any, ids: Any, rng: Any, target: int = 13_500) -> Cloud:
-    """About `target` points (fewer from few or small views) of `views` with pictures, depths (meters) and ID maps."""
+    """Return about `target` points, fewer for few or small views.
+
+    Args:
+        views: the cameras.
+        intrinsics: (fx, fy, cx, cy) in pixels.
+        pictures: image of each view.
+        depths: depth of each view in meters.
+        ids: ID map of each view.
+        rng: random generator.
+        target: wanted number of points.
+    """
     height, width = depths[0].shape
     target = min(target, len(views) * height * width // 40)
     per_view = max(1, int(np.ceil(target * 1.8 / len(views))))
@@ -77,7 +92,7 @@ def make(views: Any, intrinsics: Any, pictures: Any, depths: Any, ids: Any, rng:
         label.append(ids[v][at[:, 0], at[:, 1]])
     spots, source, label = np.concatenate(spots), np.concatenate(source), np.concatenate(label)
     seen = _seen(spots, source, label, views, intrinsics, depths, ids)
-    luck = rng.random(len(spots))[:, None] * 0.5 + 0.35  # some spots are found again easily, others not
+    luck = rng.random(len(spots))[:, None] * 0.5 + 0.35  # Some spots are matched more easily than others.
     seen &= rng.random(seen.shape) < luck
     seen[np.arange(len(spots)), source] = True
     cap = max(8, int(3.2 * target * 2.2 / len(views)))
@@ -106,14 +121,14 @@ def make(views: Any, intrinsics: Any, pictures: Any, depths: Any, ids: Any, rng:
     xy += rng.normal(size=xy.shape) * noise
     keep = inside & (np.bincount(point[inside], minlength=len(spots))[point] >= 3)
     xyz, error = _triangulate(wrong, point[keep], view_of[keep], xy[keep], views, intrinsics)
-    # what a real reconstruction filters too: points that the observations do not fix
+    # A real reconstruction also filters points that the observations do not constrain.
     bad = ~np.isfinite(error) | (error > 4.0) | (np.linalg.norm(xyz - wrong, axis=1) > 0.05)
     kept = np.flatnonzero(~bad & (np.bincount(point[keep], minlength=len(spots)) >= 3))
     return _pack(kept, point[keep], view_of[keep], xy[keep], xyz, error, outlier, label, views, pictures, rng)
 
 
 def _seen(spots: Any, source: Any, label: Any, views: Any, intrinsics: Any, depths: Any, ids: Any) -> Any:
-    """(N, V) bool: which views see which spots."""
+    """Return an (N, V) bool mask of the spots that each view sees."""
     height, width = depths[0].shape
     centers = np.array([v.center for v in views])
     rays = spots[:, None, :] - centers[None]
@@ -129,7 +144,7 @@ def _seen(spots: Any, source: Any, label: Any, views: Any, intrinsics: Any, dept
 
 
 def _triangulate(start: Any, point: Any, view_of: Any, xy: Any, views: Any, intrinsics: Any, rounds: int = 4) -> Any:
-    """Least-squares points (P, 3) from observations, and their mean reprojection error in pixels."""
+    """Return least-squares points (P, 3) from observations, and their mean reprojection errors in pixels."""
     fx, fy, cx, cy = intrinsics
     rotation = np.stack([v.rotation for v in views])[view_of]
     translation = np.stack([v.translation for v in views])[view_of]
@@ -177,7 +192,7 @@ def _pack(
     observations = []
     for v in range(len(views)):
         here = np.flatnonzero(view_of == v)
-        loose = len(here) // 4  # detections that were never matched
+        loose = len(here) // 4  # Number of unmatched detections.
         places = np.concatenate([xy[here], rng.uniform([2, 2], [width - 2, height - 2], (loose, 2))])
         ids = np.concatenate([point[here] + 1, np.full(loose, -1)])
         order = rng.permutation(len(ids))

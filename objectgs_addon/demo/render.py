@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rendering with Cycles on the CPU: pictures, and exact IDs and depth at pixel centers."""
+"""Rendering with Cycles on the CPU: images, and exact object IDs and depth at pixel centers."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from ..blender.quiet import quiet
 from .scene import FOCAL, View
 
 UNDENOISED = 8
-"""How many times the rays a pixel gets where Blender cannot denoise."""
+"""Factor on the samples per pixel if Blender has no denoiser."""
 
 
 class Renderer:
-    """Renders views of a scene through files in `folder`, which must exist."""
+    """Renderer for the views of a scene; it writes temporary files to `folder`, which must exist."""
 
     def __init__(self, scene: bpy.types.Scene, width: int, height: int, samples: int, seed: int, folder: Path) -> None:
         self.scene, self.folder, self.samples, self.seed = scene, folder, samples, seed
@@ -51,33 +51,33 @@ class Renderer:
         self.looks = {mesh: list(mesh.materials) for mesh in meshes}
 
     def _assign_materials(self, looks: Any) -> None:
-        """Set the meshes' materials."""
+        """Assign the materials in `looks` to the meshes."""
         for mesh, materials in looks.items():
             for slot, material in enumerate(materials):
                 mesh.materials[slot] = material
 
     def close(self) -> None:
-        """Free what was made for rendering beside the scene's own objects."""
+        """Restore the materials and remove the override material."""
         self._assign_materials(self.looks)
         bpy.data.materials.remove(self.override)
 
     def for_pictures(self) -> None:
-        """Settings for `picture`."""
+        """Set up the scene for `picture`."""
         self._assign_materials(self.looks)
         cycles = self.scene.cycles
         cycles.samples, cycles.seed = self.samples, self.seed
-        # Measured at 42 dB between two seeds: half the noise is that of edges in the textures, so the rays go there
+        # Texture edges cause half of the noise (42 dB between two seeds), so adaptive sampling concentrates there.
         cycles.use_adaptive_sampling, cycles.adaptive_threshold, cycles.adaptive_min_samples = True, 0.03, 4
         cycles.pixel_filter_type = "BOX"
         cycles.denoising_input_passes, cycles.denoising_prefilter = "RGB_ALBEDO_NORMAL", "NONE"
         cycles.use_denoising = True
         try:
             cycles.denoiser = "OPENIMAGEDENOISE"
-        except TypeError:  # some builds of Blender come without it
+        except TypeError:  # Some builds of Blender lack OpenImageDenoise.
             cycles.use_denoising, cycles.samples = False, UNDENOISED * self.samples
 
     def for_truth(self) -> None:
-        """Settings for `truth`: one ray through each pixel's center (Cycles ignores the width of its box filter)."""
+        """Set up the scene for `truth`: one ray per pixel center (Cycles ignores the width of the box filter)."""
         self._assign_materials({mesh: [self.override] * len(looks) for mesh, looks in self.looks.items()})
         cycles = self.scene.cycles
         cycles.samples, cycles.seed, cycles.use_adaptive_sampling = 1, 0, False
@@ -85,18 +85,18 @@ class Renderer:
         cycles.use_denoising = False
 
     def picture(self, view: View) -> np.ndarray:
-        """(H, W, 3) uint8 sRGB, as the view transform "Standard" without dithering gives."""
+        """Render (H, W, 3) uint8 sRGB, equal to the view transform "Standard" without dithering."""
         linear = np.clip(self._render(view), 0, 1)
         return np.round(encode(linear) * 255).astype(np.uint8)
 
     def truth(self, view: View) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W) uint16 IDs and (H, W) float32 depth along the camera's axis in meters."""
+        """Render (H, W) uint16 object IDs and (H, W) float32 depth along the camera axis in meters."""
         values = self._render(view)
         return np.round(values[..., 0]).astype(np.uint16), np.ascontiguousarray(values[..., 1])
 
     def _render(self, view: View) -> np.ndarray:
         pose = np.eye(4)
-        pose[:3, :3] = view.rotation.T * [1, -1, -1]  # OpenCV's axes to Blender's
+        pose[:3, :3] = view.rotation.T * [1, -1, -1]  # OpenCV camera axes to Blender's.
         pose[:3, 3] = view.center
         self.camera.matrix_world = Matrix(pose.tolist())
         path = self.folder / "view.exr"
@@ -121,7 +121,7 @@ class Renderer:
 
 
 def _id_and_depth() -> bpy.types.Material:
-    """A material that glows with (object index, depth along the camera's axis, 0)."""
+    """Create a material that emits (object index, depth along the camera axis, 0)."""
     material = bpy.data.materials.new("demo id and depth")
     if material.node_tree is None:
         material.use_nodes = True
@@ -135,5 +135,5 @@ def _id_and_depth() -> bpy.types.Material:
     tree.links.new(depth, color.inputs[1])
     tree.links.new(color.outputs[0], glow.inputs["Color"])
     tree.links.new(glow.outputs[0], output.inputs["Surface"])
-    material.cycles.emission_sampling = "NONE"  # or every triangle becomes a lamp, 0.5 s more a view
+    material.cycles.emission_sampling = "NONE"  # Otherwise every triangle is sampled as a light: 0.5 s more per view.
     return material

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The demo's scene: objects on a round table in a room, soft light, and cameras on two rings."""
+"""The demo scene: objects on a round table in a room, soft light, and cameras on two rings."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from mathutils import Matrix, Vector
 
 from . import materials, shapes
 
-FOCAL = 1.08  # focal length / picture width
+FOCAL = 1.08  # Focal length / image width.
 LOOK_AT = np.array([0.0, 0.0, 0.07])
-RINGS = ((1.40, 0.47), (1.16, 0.98))  # radius, height in meters
+RINGS = ((1.40, 0.47), (1.16, 0.98))  # Radius and height in meters.
 
 
 @dataclass
 class Thing:
-    """An object with an ID of its own."""
+    """An object of the scene with its ID."""
 
     id: int
     name: str
@@ -29,7 +29,7 @@ class Thing:
 
 @dataclass
 class View:
-    """One camera: picture name, `rotation` (3, 3) and `translation` (3,) from world to camera (OpenCV axes, meters)."""
+    """A camera: image name, and world-to-camera `rotation` (3, 3) and `translation` (3,) (OpenCV axes, meters)."""
 
     name: str
     rotation: np.ndarray
@@ -37,17 +37,17 @@ class View:
 
     @property
     def center(self) -> np.ndarray:
-        """Camera position in the world, meters."""
+        """Camera position in world coordinates, in meters."""
         return -self.rotation.T @ self.translation
 
 
 def rng_for(seed: int, *key: int) -> np.random.Generator:
-    """A random generator of its own for each purpose, so that one choice does not shift the others."""
+    """Return a separate random generator per key, so that random choices do not affect each other."""
     return np.random.default_rng([seed, *key])
 
 
 def build(objects: int, seed: int) -> tuple[bpy.types.Scene, list[Thing]]:
-    """A new scene with `objects` things on a table in a backdrop; IDs 1..N, then table and backdrop."""
+    """Create a scene with `objects` objects on a table in a backdrop; IDs are 1..N, then table and backdrop."""
     scene = bpy.data.scenes.new("ObjectGS demo")
     kinds = list(shapes.MAKERS)
     objs, sizes = [], []
@@ -78,14 +78,14 @@ def build(objects: int, seed: int) -> tuple[bpy.types.Scene, list[Thing]]:
         objs.append(obj)
     for obj in objs:
         obj.object.pass_index = obj.id
-    room = objs[-1].object  # the world's light comes through it
+    room = objs[-1].object  # World lighting passes through the room.
     room.visible_diffuse = room.visible_glossy = room.visible_shadow = False
     _light(scene)
     return scene, objs
 
 
 def _size(mesh: bpy.types.Mesh) -> tuple[float, float]:
-    """Radius around the z axis and height, meters."""
+    """Return a mesh's radius around the z axis and its height, in meters."""
     points = np.empty(len(mesh.vertices) * 3, np.float32)
     mesh.vertices.foreach_get("co", points)
     points = points.reshape(-1, 3)
@@ -93,7 +93,7 @@ def _size(mesh: bpy.types.Mesh) -> tuple[float, float]:
 
 
 def _arrange(sizes: np.ndarray, seed: int) -> Any:
-    """Places (x, y, turn) without overlap, dense, high things inside; the radius used; and a common scale."""
+    """Return dense placements (x, y, angle) without overlap and with tall objects inside, their radius, and a scale."""
     rng = rng_for(seed, 3)
     scale, limit = 1.0, 0.44
     while True:
@@ -103,7 +103,7 @@ def _arrange(sizes: np.ndarray, seed: int) -> Any:
             placed = _scatter(radius, height, limit, rng)
             if placed is None:
                 continue
-            # dense around the middle, and the high things inside
+            # Prefer dense arrangements with tall objects near the center.
             cost = float((np.hypot(*placed.T) * (height + 0.05)).sum())
             if best is None or cost < best[0]:
                 best = (cost, placed)
@@ -145,7 +145,7 @@ def _light(scene: bpy.types.Scene) -> None:
     background.inputs[1].default_value = 0.62
     output = tree.nodes.new("ShaderNodeOutputWorld")
     tree.links.new(background.outputs[0], output.inputs[0])
-    world.cycles.sampling_method = "NONE"  # an even sky is met best by the rays that bounce off
+    world.cycles.sampling_method = "NONE"  # A uniform sky is sampled best by bounced rays.
     scene.world = world
     for place, power, size, color in (((1.5, -1.2, 2.6), 85.0, 1.5, (1.0, 0.93, 0.82)),):
         lamp = bpy.data.lights.new("demo", "AREA")
@@ -157,7 +157,7 @@ def _light(scene: bpy.types.Scene) -> None:
 
 
 def cameras(views: int, seed: int) -> list[View]:
-    """Cameras on two rings all around the table, the low ring first; a little seeded disorder, as from a hand."""
+    """Return cameras on two rings around the table, the low ring first, with small handheld-like random deviations."""
     rng = rng_for(seed, 4)
     low = (views + 1) // 2
     result = []
@@ -182,12 +182,12 @@ def cameras(views: int, seed: int) -> list[View]:
 
 
 def intrinsics(width: int, height: int) -> tuple[float, float, float, float]:
-    """(fx, fy, cx, cy) in pixels."""
+    """Return (fx, fy, cx, cy) in pixels."""
     return FOCAL * width, FOCAL * width, width / 2, height / 2
 
 
 def triangles(obj: Thing) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) in world meters and triangles (F, 3) of a thing."""
+    """Return an object's vertices (V, 3) in world coordinates (meters) and its triangles (F, 3)."""
     mesh = obj.object.data
     mesh.calc_loop_triangles()
     points = np.empty(len(mesh.vertices) * 3, np.float32)
@@ -199,7 +199,7 @@ def triangles(obj: Thing) -> tuple[np.ndarray, np.ndarray]:
 
 
 def remove(scene: bpy.types.Scene) -> None:
-    """Take the scene and all that was made for it out of the open file."""
+    """Remove the scene and all its data from the open file."""
     objects = list(scene.collection.all_objects)
     data = {o.data for o in objects if o.data is not None}
     looks = {m for d in data if isinstance(d, bpy.types.Mesh) for m in d.materials if m is not None}

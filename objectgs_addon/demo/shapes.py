@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshes of the demo's objects.  Every maker returns a new mesh in meters that stands on z = 0 around the z axis."""
+"""Meshes of the demo's objects; each maker returns a new mesh in meters that stands on z = 0 around the z axis."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mathutils import Matrix, Vector
 
 
 def _rounded(points: Any, times: int = 3) -> np.ndarray:
-    """Cut the corners of an open polyline (Chaikin); both ends stay."""
+    """Round the corners of an open polyline by Chaikin's algorithm; both ends stay fixed."""
     line = np.asarray(points, float)
     for _ in range(times):
         a = 0.75 * line[:-1] + 0.25 * line[1:]
@@ -30,7 +30,7 @@ def _mesh(name: str, vertices: Any, faces: Any) -> bpy.types.Mesh:
 
 
 def _finish(mesh: bpy.types.Mesh, sharp_degrees: float = 40.0) -> bpy.types.Mesh:
-    """Smooth shading with sharp edges above an angle, normals outwards."""
+    """Set smooth shading with sharp edges above an angle, and outward normals."""
     bm = bmesh.new()
     bm.from_mesh(mesh)
     bmesh.ops.recalc_face_normals(bm, faces=bm.faces)
@@ -43,7 +43,16 @@ def _finish(mesh: bpy.types.Mesh, sharp_degrees: float = 40.0) -> bpy.types.Mesh
 
 
 def lathe(name: str, profile: Any, segments: int = 64, lobes: int = 0, depth: float = 0.0, twist: float = 0.0) -> Any:
-    """Turn a profile of (radius, height) meters, both ends on the axis, around z; `lobes` waves of relative `depth`."""
+    """Create a surface of revolution around the z axis.
+
+    Args:
+        name: name of the mesh.
+        profile: (P, 2) radii and heights in meters, with both ends on the axis.
+        segments: number of segments around the axis.
+        lobes: number of waves around the axis.
+        depth: amplitude of the waves relative to the radius.
+        twist: phase shift of the waves in radians per meter of height.
+    """
     profile = np.asarray(profile, float)
     inner = profile[1:-1]
     angle = np.arange(segments) * (2 * math.pi / segments)
@@ -66,7 +75,7 @@ def lathe(name: str, profile: Any, segments: int = 64, lobes: int = 0, depth: fl
 
 
 def tube(name: str, path: Any, radii: Any, segments: int = 20) -> Any:
-    """A closed tube along a path (P, 3) that lies in the xz plane, with a radius for each of its points."""
+    """Create a closed tube along a path (P, 3) in the xz plane, with a radius for each point."""
     path = np.asarray(path, float)
     radii = np.broadcast_to(np.asarray(radii, float), len(path))
     tangent = np.gradient(path, axis=0)
@@ -92,7 +101,7 @@ def tube(name: str, path: Any, radii: Any, segments: int = 20) -> Any:
 
 
 def _union(meshes: Any, scene: bpy.types.Scene) -> bpy.types.Mesh:
-    """One closed surface from overlapping closed meshes (exact boolean)."""
+    """Join overlapping closed meshes into one closed surface (exact boolean)."""
     objects = [bpy.data.objects.new("part", _finish(m)) for m in meshes]
     layer = scene.view_layers[0]
     for part in objects:
@@ -136,7 +145,7 @@ def _arc(center: Any, radius_x: Any, radius_z: Any, start: Any, stop: Any, steps
 
 
 def mug(scene: bpy.types.Scene) -> bpy.types.Object:
-    """Mug with a handle, 15 cm high."""
+    """Create a mug with a handle, 15 cm high."""
     body = lathe(
         "mug",
         _rounded(
@@ -160,7 +169,7 @@ def mug(scene: bpy.types.Scene) -> bpy.types.Object:
 
 
 def bottle(scene: bpy.types.Scene) -> bpy.types.Object:
-    """Bottle with a long neck, 36 cm high."""
+    """Create a bottle with a long neck, 36 cm high."""
     return lathe(
         "bottle",
         _rounded(
@@ -184,7 +193,7 @@ def bottle(scene: bpy.types.Scene) -> bpy.types.Object:
 
 
 def ring(scene: bpy.types.Scene) -> bpy.types.Object:
-    """Ring (torus) that stands on its edge, 24 cm high."""
+    """Create a ring (torus) standing on its edge, 24 cm high."""
     angle = np.arange(64) * (2 * math.pi / 64)
     small = np.arange(28) * (2 * math.pi / 28)
     big = 0.085 + 0.035 * np.cos(small)[None, :]
@@ -205,7 +214,7 @@ def ring(scene: bpy.types.Scene) -> bpy.types.Object:
 
 
 def bowl(scene: bpy.types.Scene) -> bpy.types.Object:
-    """Bowl, 26 cm wide."""
+    """Create a bowl, 26 cm wide."""
     return lathe(
         "bowl",
         _rounded(
@@ -226,7 +235,7 @@ def bowl(scene: bpy.types.Scene) -> bpy.types.Object:
 
 
 def books(scene: bpy.types.Scene) -> bpy.types.Object:
-    """Stack of three books, 24 cm wide and 13 cm high."""
+    """Create a stack of three books, 24 cm wide and 13 cm high."""
     stack, z = [], 0.0
     for size, turn in (((0.24, 0.17, 0.05), 0.0), ((0.22, 0.155, 0.04), 0.22), ((0.19, 0.14, 0.045), -0.30)):
         matrix = Matrix.Translation((0, 0, z + size[2] / 2)) @ Matrix.Rotation(turn, 4, "Z")
@@ -236,7 +245,7 @@ def books(scene: bpy.types.Scene) -> bpy.types.Object:
 
 
 def monkey(scene: bpy.types.Scene) -> bpy.types.Object:
-    """Blender's monkey, 24 cm high, smoothed."""
+    """Create Blender's monkey, smoothed, 24 cm high."""
     base = _from_bmesh("monkey", lambda bm: bmesh.ops.create_monkey(bm))
     part = bpy.data.objects.new("part", base)
     scene.collection.objects.link(part)
@@ -251,7 +260,7 @@ def monkey(scene: bpy.types.Scene) -> bpy.types.Object:
 
 
 def teapot(scene: bpy.types.Scene) -> bpy.types.Object:
-    """Teapot with spout, handle and lid, 18 cm high."""
+    """Create a teapot with spout, handle and lid, 18 cm high."""
     body = lathe(
         "teapot",
         _rounded(
@@ -279,7 +288,7 @@ def teapot(scene: bpy.types.Scene) -> bpy.types.Object:
 
 
 def vase(scene: bpy.types.Scene) -> bpy.types.Object:
-    """Vase with twisted lobes, 38 cm high."""
+    """Create a vase with twisted lobes, 38 cm high."""
     profile = _rounded(
         [
             (0, 0),
@@ -301,25 +310,25 @@ def vase(scene: bpy.types.Scene) -> bpy.types.Object:
 
 
 def cone(scene: bpy.types.Scene) -> bpy.types.Object:
-    """Blunt cone, 26 cm high."""
+    """Create a blunt cone, 26 cm high."""
     return lathe(
         "cone", _rounded([(0, 0), (0.095, 0), (0.10, 0.004), (0.098, 0.012), (0.015, 0.25), (0.008, 0.26), (0, 0.261)])
     )
 
 
 def ball(scene: bpy.types.Scene) -> bpy.types.Object:
-    """Ball of 18 cm, flattened a little where it stands."""
+    """Create a ball with a diameter of 18 cm."""
     mesh = _from_bmesh("ball", lambda bm: bmesh.ops.create_icosphere(bm, subdivisions=5, radius=0.09))
     return _stand(mesh, 0.18)
 
 
 def die(scene: bpy.types.Scene) -> bpy.types.Object:
-    """Cube with round corners, 15 cm."""
+    """Create a cube with rounded corners, 15 cm."""
     return _bevelled_box((0.15, 0.15, 0.15), 0.018, Matrix.Translation((0, 0, 0.075)))
 
 
 def pumpkin(scene: bpy.types.Scene) -> bpy.types.Object:
-    """Ribbed pumpkin, 16 cm high."""
+    """Create a ribbed pumpkin, 16 cm high."""
     profile = _rounded(
         [
             (0, 0.012),
@@ -338,7 +347,7 @@ def pumpkin(scene: bpy.types.Scene) -> bpy.types.Object:
 
 
 def mushroom(scene: bpy.types.Scene) -> bpy.types.Object:
-    """Mushroom, 20 cm high."""
+    """Create a mushroom, 20 cm high."""
     return lathe(
         "mushroom",
         _rounded(
@@ -360,7 +369,7 @@ def mushroom(scene: bpy.types.Scene) -> bpy.types.Object:
 
 
 def gear(scene: bpy.types.Scene) -> bpy.types.Object:
-    """Thick gear that lies flat, 24 cm wide."""
+    """Create a thick gear lying flat, 24 cm wide."""
     return lathe(
         "gear",
         [
@@ -387,12 +396,12 @@ MAKERS = {
 
 
 def make(kind: str, scene: bpy.types.Scene) -> bpy.types.Mesh:
-    """The mesh of one kind of object (a key of `MAKERS`); `scene` is used as a workbench for booleans."""
+    """Create the mesh of a kind of object (a key of `MAKERS`); `scene` temporarily holds parts for modifiers."""
     return _finish(MAKERS[kind](scene))
 
 
 def table(radius: float) -> bpy.types.Mesh:
-    """Round table on one foot whose top, of `radius` meters, lies at z = 0."""
+    """Create a round table on one foot, with its top of `radius` meters at z = 0."""
     top = _rounded(
         [(0.16, -0.045), (radius - 0.02, -0.045), (radius, -0.038), (radius, -0.006), (radius - 0.006, 0)], 2
     )
@@ -402,9 +411,10 @@ def table(radius: float) -> bpy.types.Mesh:
 
 
 def backdrop(radius: float) -> bpy.types.Mesh:
-    """Closed room of `radius` meters without corners: floor at z = -0.7 (material 0), wall and dome (1).
+    """Create a closed room of `radius` meters without corners and with inward normals.
 
-    Normals point inwards."""
+    The floor at z = -0.7 has material 0; the wall and dome have material 1.
+    """
     z, top = -0.70, 2.4
     line = _rounded(
         [
@@ -427,7 +437,7 @@ def backdrop(radius: float) -> bpy.types.Mesh:
 
 
 def _stand(mesh: bpy.types.Mesh, height: float) -> bpy.types.Mesh:
-    """Scale to a height in meters and put the lowest point on z = 0, the middle on the axis."""
+    """Scale a mesh to a height in meters, and move its lowest point to z = 0 and its center to the axis."""
     points = np.empty(len(mesh.vertices) * 3, np.float32)
     mesh.vertices.foreach_get("co", points)
     low, high = points.reshape(-1, 3).min(0), points.reshape(-1, 3).max(0)

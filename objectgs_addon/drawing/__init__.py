@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Gaussian splats in the 3D viewports: sorted, alpha-blended, with view-dependent colors.
+"""Drawing of Gaussian splats in the 3D viewports: sorted, alpha-blended, with view-dependent colors.
 
-`gather` lists the objects to draw, `splat_arrays` holds their splats as arrays, `order` sorts them, `renderer` draws
-them with the programs in `shaders`, and `viewport` adds the result to the viewports.
+`gather` lists the objects to draw, `splat_arrays` caches their splats as arrays, `order` sorts them, `renderer` draws
+them with the shaders in `shaders`, and `viewport` composites the result over the viewports.
 """
 
 from .gather import collections_by_part, shown, splat_parts

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which splats of a scene a viewport shows, and how."""
+"""Selection of the splats that a viewport shows, with their transforms and colors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _HIDES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "VOLUME", "POINTCLOUD", "C
 
 
 def splat_parts(view_layer: bpy.types.ViewLayer, space: bpy.types.SpaceView3D | None = None) -> list[bpy.types.Object]:
-    """The mesh carriers of splats that a view layer, or one of its viewports, shows."""
+    """Return the splat carriers that are visible in a view layer or in one of its viewports."""
     return [part for part in view_layer.objects if scenes.kind_of(part) == "splats" and shown(part, view_layer, space)]
 
 
@@ -33,7 +33,10 @@ def shown(part: bpy.types.Object, view_layer: bpy.types.ViewLayer, space: bpy.ty
 
 
 def collections_by_part() -> dict[bpy.types.Object, bpy.types.Collection]:
-    """Part -> collection of its object or duplicate; one pass, since Blender searches all collections for each part."""
+    """Map parts to the collections of their objects or duplicates.
+
+    This is one pass over all collections; Blender would search all of them for each part.
+    """
     return {
         part: collection
         for collection in bpy.data.collections
@@ -43,7 +46,7 @@ def collections_by_part() -> dict[bpy.types.Object, bpy.types.Collection]:
 
 
 def gather(parts: Any, colors: str = "photo", pointed_at: int | None = None, marks: bool = True) -> list[DrawnObject]:
-    """Convert carriers to what the renderer draws; those whose attributes are missing are left out.
+    """Convert carriers to objects for the renderer; carriers without the required attributes are left out.
 
     Args:
         parts: mesh carriers of splats.
@@ -69,7 +72,7 @@ def gather(parts: Any, colors: str = "photo", pointed_at: int | None = None, mar
 
 
 def color_map(collection: bpy.types.Collection) -> np.ndarray:
-    """(3, 4): matrix and offset by which the object of a collection is recolored; None: not recolored."""
+    """Return the (3, 4) affine recoloring of a collection's object; the identity for None or no recoloring."""
     recolor = scenes.recolor_of(collection) if collection is not None else None
     if recolor is None:
         return NO_RECOLOR
@@ -78,7 +81,7 @@ def color_map(collection: bpy.types.Collection) -> np.ndarray:
 
 
 def may_hide_splats(view_layer: bpy.types.ViewLayer, space: bpy.types.SpaceView3D) -> bool:
-    """Whether a viewport shows anything that may occlude splats."""
+    """Return whether a viewport shows anything that may occlude splats."""
     return space.overlay.show_overlays or any(
         obj.type in _HIDES and scenes.kind_of(obj) != "splats" and shown(obj, view_layer, space)
         for obj in view_layer.objects

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Back-to-front order of splats, by a radix sort of 16-bit keys."""
+"""Back-to-front sorting of splats with a radix sort of 16-bit keys."""
 
 import numpy as np
 
@@ -7,11 +7,11 @@ import numpy as np
 def back_to_front(depths: np.ndarray, near: float, orthographic: bool) -> np.ndarray:
     """Sort splats by depth.
 
-    In perspective, splats whose depths differ by less than about 1e-4 of the depth may keep their given order.
+    In perspective, splats whose relative depths differ by less than about 1e-4 may keep their input order.
 
     Args:
         depths: (N,) float32.
-        near: splats that are not deeper are left out.
+        near: splats at or in front of this depth are left out.
         orthographic: quantize depths linearly instead of logarithmically.
 
     Returns:
@@ -26,7 +26,7 @@ def back_to_front(depths: np.ndarray, near: float, orthographic: bool) -> np.nda
         least, most = float(kept.min()), float(kept.max())
         keys = ((most - kept) * (65535.0 / max(most - least, 1e-30))).astype(np.uint16)
     else:
-        # The bits of positive floats have the floats' order, and are nearly proportional to their logarithms.
+        # The bits of positive floats sort like the floats and are nearly linear in their logarithms.
         bits = np.ascontiguousarray(kept, np.float32).view(np.uint32)
         least, most = int(bits.min()), int(bits.max())
         keys = ((most - bits) >> max(0, (most - least).bit_length() - 16)).astype(np.uint16)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rendering of splats on the GPU, with the same blending as the backend's rasterizers."""
+"""GPU rendering of splats with the same blending as the backend's rasterizers."""
 
 from __future__ import annotations
 
@@ -22,8 +22,12 @@ from .splat_arrays import SplatArrays
 class DrawnObject:
     """An object to draw.
 
-    matrix: (4, 4) object to world; recolor: (3, 4) affine map of colors; color, highlight: sRGB-encoded RGB that covers
-    the splats' colors, and its opacity.
+    Attributes:
+        splats: splats in local coordinates.
+        matrix: (4, 4) local to world.
+        recolor: (3, 4) affine map of colors.
+        color: sRGB-encoded RGB that replaces the splats' colors but keeps their brightness, and its opacity.
+        highlight: sRGB-encoded RGB blended over the splats' colors, and its opacity.
     """
 
     splats: SplatArrays
@@ -34,7 +38,7 @@ class DrawnObject:
 
 
 class Renderer:
-    """GPU programs, and the textures of the objects drawn last. Needs an active GPU context."""
+    """Splat renderer with shaders and the textures of the objects drawn last; requires an active GPU context."""
 
     def __init__(self) -> None:
         self._splat = shaders.splat_shader()
@@ -47,14 +51,14 @@ class Renderer:
         self._sorted: _Sorted | None = None
 
     def draw(self, objs: Sequence[DrawnObject], view: View, projection: np.ndarray, depth: np.ndarray | None) -> bool:
-        """Draw into the renderer's own image.
+        """Draw into the renderer's offscreen image.
 
         Args:
             objs: the objects to draw.
             view: camera and image size.
             projection: (4, 4) OpenGL projection matrix of the view.
-            depth: (height, width) depth buffer under this projection, 0 at the near plane and 1 at the far plane, which
-                hides splats behind it; or None.
+            depth: (height, width) depth buffer for this projection, 0 at the near plane and 1 at the far plane, that
+                occludes splats; or None.
 
         Returns:
             False if there is nothing to draw.
@@ -85,7 +89,7 @@ class Renderer:
             self._quads[self._over].draw(self._over)
 
     def pixels(self) -> np.ndarray:
-        """The image as (height, width, 4) float32, premultiplied, the top row first."""
+        """Return the image as (height, width, 4) float32, premultiplied, top row first."""
         width, height = self._target.width, self._target.height
         with self._target.bind():
             read = gpu.state.active_framebuffer_get().read_color(0, 0, width, height, 4, 0, "FLOAT")
@@ -132,7 +136,7 @@ class Renderer:
 
 
 class _Pool:
-    """The splats of several meshes, concatenated in textures."""
+    """Splats of several meshes, concatenated in textures."""
 
     def __init__(self, objs: Sequence[DrawnObject]) -> None:
         self._arrays = list({id(obj.splats): obj.splats for obj in objs}.values())
@@ -155,7 +159,7 @@ class _Pool:
         self.harmonics = _table(harmonics, "RGBA16F")
 
     def holds(self, objs: Sequence[DrawnObject]) -> bool:
-        """Whether it contains the splats of all of these objects, and not many others."""
+        """Return whether the textures contain the splats of all these objects and not many others."""
         wanted = {id(obj.splats): obj.splats for obj in objs}
         if not all(key in self.starts for key in wanted):
             return False
@@ -164,7 +168,7 @@ class _Pool:
 
 
 class _Sorted:
-    """The drawing order of splats, for one view and placement of objects."""
+    """Drawing order of splats for one view and one set of object transforms."""
 
     def __init__(self, pool: _Pool, objs: Sequence[DrawnObject]) -> None:
         self._splats = [obj.splats for obj in objs]
@@ -184,7 +188,7 @@ class _Sorted:
         self.texture: gpu.types.GPUTexture | None = None
 
     def holds(self, objs: Sequence[DrawnObject]) -> bool:
-        """Whether these are the objects that it sorts."""
+        """Return whether this order is for these objects."""
         return len(objs) == len(self._splats) and all(obj.splats is splats for obj, splats in zip(objs, self._splats))
 
     def sort(self, objs: Sequence[DrawnObject], view: View) -> None:
@@ -202,12 +206,12 @@ class _Sorted:
 
 
 def _objects(objs: Sequence[DrawnObject], view: View) -> np.ndarray:
-    """(n, OBJECT_TEXELS, 4) float32: the shader's data of each object in this view."""
+    """Return the shader's data for each object in this view, (n, OBJECT_TEXELS, 4) float32."""
     table = np.zeros((len(objs), shaders.OBJECT_TEXELS, 4), np.float32)
     matrices = np.array([obj.matrix for obj in objs])
     eye = np.linalg.inv(view.viewmat)[:3]
     table[:, 0:3] = (view.viewmat @ matrices)[:, :3]
-    # Harmonics rotate with the object, but are not scaled with it.
+    # Harmonics rotate with the object but ignore its scale.
     left, _, right = np.linalg.svd(matrices[:, :3, :3])
     back = np.swapaxes(left @ right, 1, 2)
     if view.orthographic:
@@ -221,7 +225,7 @@ def _objects(objs: Sequence[DrawnObject], view: View) -> np.ndarray:
 
 
 def _table(values: np.ndarray, kind: str) -> gpu.types.GPUTexture:
-    """Texels (..., channels) as a texture of rows of TABLE_WIDTH."""
+    """Store texels (..., channels) in a texture with rows of TABLE_WIDTH."""
     channels = values.shape[-1]
     texels = values.size // channels
     rows = max(1, -(-texels // shaders.TABLE_WIDTH))
@@ -237,7 +241,7 @@ def _buffer(values: np.ndarray) -> gpu.types.Buffer:
 
 
 class _KeptState:
-    """Restores the state of blending and depth tests."""
+    """Context manager that restores the GPU state of blending and depth tests."""
 
     def __enter__(self) -> None:
         self._before = gpu.state.blend_get(), gpu.state.depth_test_get(), gpu.state.depth_mask_get()

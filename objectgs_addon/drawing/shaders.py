@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""GPU programs: a splat as a quad with its Gaussian, and the finished image over the viewport.
+"""Shaders that draw each splat as a quad with a Gaussian falloff and composite the image over the viewport.
 
-They are described by GPUShaderCreateInfo, so that they work with OpenGL, Metal and Vulkan.
+They use GPUShaderCreateInfo, which works with OpenGL, Metal and Vulkan.
 """
 
 import gpu
@@ -11,14 +11,14 @@ from ...backend.shared.splats import spherical_harmonics as sh
 from ...backend.shared.splats.blending import ALPHA_MAX, ALPHA_MIN, EPS_2D, MAX_EXTENT
 
 TABLE_WIDTH = 4096
-"""Texels per row of textures that hold tables."""
+"""Texels per row of data textures."""
 
 SPLAT_TEXELS = 3
-"""Texels per splat: mean and opacity, quaternion, scales."""
+"""Texels per splat: mean and opacity, quat, scales."""
 
 OBJECT_TEXELS = 12
-"""Texels per object: three rows each of the map to camera space, of the map to view directions and of the affine map of
-colors; the color and the highlight, each with its opacity; one is unused."""
+"""Texels per object: three rows each of the map to camera space, the map to view directions and the affine map of
+colors; the color and the highlight, each with its opacity; one unused texel."""
 
 _CONSTANTS = f"""
 #define TABLE_WIDTH {TABLE_WIDTH}
@@ -183,7 +183,7 @@ void main() {{
 
 
 def splat_shader() -> gpu.types.GPUShader:
-    """Draws a quad for each entry of `order`; the output is premultiplied and sRGB-encoded."""
+    """Create the shader that draws a quad for each entry of `order`; the output is premultiplied and sRGB-encoded."""
     between = gpu.types.GPUStageInterfaceInfo("objectgs_splat")
     between.smooth("VEC2", "beside")
     between.flat("VEC4", "shape")
@@ -206,7 +206,7 @@ def splat_shader() -> gpu.types.GPUShader:
 
 
 def over_shader() -> gpu.types.GPUShader:
-    """Blends a premultiplied, sRGB-encoded image over the framebuffer."""
+    """Create the shader that blends a premultiplied, sRGB-encoded image over the framebuffer."""
     between = gpu.types.GPUStageInterfaceInfo("objectgs_over")
     between.smooth("VEC2", "uv")
     info = gpu.types.GPUShaderCreateInfo()

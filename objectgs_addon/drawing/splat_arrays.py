@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The splats of mesh carriers as arrays, for drawing and picking.
+"""Splats of mesh carriers as arrays, for drawing and picking.
 
-They are cached by the session UID of the mesh, never by the mesh itself, until the mesh changes, after undo and redo,
-and when another file is opened.
+The arrays are cached by the session UID of the mesh, never by the mesh itself. They are dropped when the mesh changes,
+on undo and redo, and when another file is opened.
 """
 
 from __future__ import annotations
@@ -21,10 +21,14 @@ from ..scene import carrier
 
 @dataclass(frozen=True)
 class SplatArrays:
-    """The splats of a carrier that are not hidden, float32, in the object's coordinates.
+    """Visible splats of a carrier as float32 arrays in the object's local coordinates.
 
-    means (N, 3); quats (N, 4) wxyz; scales (N, 3); opacities (N,); harmonics (N, K, 3): coefficients of spherical
-    harmonics for red, green and blue.
+    Attributes:
+        means: (N, 3).
+        quats: (N, 4) wxyz.
+        scales: (N, 3).
+        opacities: (N,).
+        harmonics: (N, K, 3) spherical harmonics coefficients for red, green and blue.
     """
 
     means: np.ndarray
@@ -35,7 +39,7 @@ class SplatArrays:
 
     @cached_property
     def cloud(self) -> Cloud:
-        """The splats in the form that picking needs."""
+        """The splats in the form required for picking."""
         return Cloud(self.means, self.quats, self.scales, self.opacities)
 
 
@@ -43,7 +47,7 @@ _held: dict[int, SplatArrays] = {}
 
 
 def arrays_of(mesh: bpy.types.Mesh) -> SplatArrays | None:
-    """The splats of a carrier's mesh; None if attributes are missing."""
+    """Return the splats of a carrier's mesh, or None if attributes are missing."""
     found = _held.get(mesh.session_uid)
     if found is None and all(name in mesh.attributes for name in ("radiance:base", "scale", "rotation")):
         found = _held[mesh.session_uid] = _read(mesh)
@@ -71,7 +75,7 @@ def _forget(*_: Any) -> None:
 
 
 def _changed(_scene: Any, depsgraph: Any) -> None:
-    # Objects are updated when they are moved, too, since their modifiers may depend on their placement.
+    # Only mesh updates count: objects also get geometry updates when moved, since modifiers may depend on transforms.
     for update in depsgraph.updates:
         if update.is_updated_geometry and isinstance(update.id, bpy.types.Mesh):
             _held.pop(update.id.original.session_uid, None)

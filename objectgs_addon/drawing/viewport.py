@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Splats drawn over the 3D viewports, and hidden behind what is in front of them."""
+"""Splats drawn over the 3D viewports, occluded by geometry in front of them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _pointed_at: int | None = None
 
 
 def renderer() -> Renderer:
-    """The only renderer of this Blender, made when it is first needed."""
+    """Return the shared renderer, created on first use."""
     global _renderer
     if _renderer is None:
         _renderer = Renderer()
@@ -32,16 +32,16 @@ def renderer() -> Renderer:
 
 
 def failure() -> str | None:
-    """The reason why splats cannot be drawn on this computer, or None."""
+    """Return why splats cannot be drawn on this computer, or None."""
     return _failure
 
 
 def picture(context_scene: Any, view_layer: bpy.types.ViewLayer, view: View, projection: np.ndarray) -> np.ndarray:
-    """Render the splats of a scene alone; needs a Blender with a window.
+    """Render only the splats of a scene; requires Blender with a window.
 
     Args:
-        context_scene: chooses the colors.
-        view_layer: its visible splats are drawn.
+        context_scene: scene whose setting selects the colors.
+        view_layer: view layer whose visible splats are drawn.
         view: camera and image size.
         projection: (4, 4) OpenGL projection matrix of the view.
 
@@ -64,7 +64,7 @@ def _draw() -> None:
         return
     try:
         renderer()
-    except Exception as error:  # Drivers fail in different ways, and Blender has no exception of its own for it.
+    except Exception as error:  # Driver failures raise various exceptions.
         _failure = f"The graphics driver cannot draw splats: {error}"
         print(f"ObjectGS: {_failure}", flush=True)
         return
@@ -86,7 +86,7 @@ def _draw() -> None:
 
 
 def point_at(collection: bpy.types.Collection) -> None:
-    """Highlight the object of a collection in all viewports; None: no object."""
+    """Highlight the object of a collection in all viewports; None removes the highlight."""
     global _pointed_at
     uid = None if collection is None else collection.session_uid
     if uid != _pointed_at:
@@ -95,7 +95,7 @@ def point_at(collection: bpy.types.Collection) -> None:
 
 
 def show(properties: Any, _context: bpy.types.Context = None) -> None:
-    """Switch a scene's splats between the preview by geometry nodes and this drawing."""
+    """Switch a scene's splats between the geometry nodes preview and this drawing."""
     for part in properties.id_data.objects:
         if kind_of(part) == "splats":
             show_preview(part, not properties.draw_splats)

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Film frames of a reconstruction: Blender's camera and objects as a shot, and the compositor nodes that combine the
-frames with Blender's own rendering."""
+"""Film frames of a reconstruction: shots from Blender's camera and objects, and compositor nodes for the frames."""
 
 from .compositing import has_frames, set_up_compositor, show_frames
 from .shot import shot_of

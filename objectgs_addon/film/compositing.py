@@ -5,7 +5,8 @@
                            `-- Combined -> behind -> Blender's rendering over it -> in front -> output
     Cryptomatte of the same files, for mattes of single objects
 
-Splats are behind Blender's rendering where that is nearer, and in front of it elsewhere; both are blended by alpha.
+Splats are behind Blender's rendering where the rendering is nearer, and in front of it elsewhere; both are blended by
+alpha.
 Blender 4.2 to 4.5 store the compositor nodes in the scene, 5.0 and newer in a node group.
 """
 
@@ -21,31 +22,31 @@ from ..scene.kinds import KIND, kind_of, mark
 from ..scene.shading.graph import Graph
 
 FILM = "film"
-"""The kind of our nodes and of their image."""
+"""Kind of the add-on's compositor nodes and of their image."""
 
 PATTERN = "splats.{:04d}.exr"
 NEAREST_IN = 1
-"""Radius in pixels of the minimum filter on the depth of Blender's rendering, so that antialiased edges have the depth
-of the object in front."""
+"""Radius in pixels of the minimum filter on the depth of Blender's rendering; it gives antialiased edges the depth of
+the object in front."""
 
 
 def set_up_compositor(
     scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, root: bpy.types.Collection, folder: Path, matte: str = ""
 ) -> None:
-    """Make the scene's compositor combine film frames with its rendering, which no longer shows the reconstruction.
+    """Set up the scene's compositor to combine film frames with Blender's rendering.
 
-    The present input of the compositor's output is taken as Blender's rendering. If the nodes exist already, they only
-    get the frames of `folder`.
+    The current input of the compositor's output is used as Blender's rendering. If the nodes already exist, only their
+    frames are updated. The reconstruction is hidden in renders.
 
     Args:
-        scene: its compositor is changed.
-        view_layer: its depth is used.
-        root: the reconstruction's collection, which is hidden in renders.
-        folder: of the film frames.
+        scene: scene whose compositor is changed.
+        view_layer: view layer whose depth is used.
+        root: the reconstruction's collection.
+        folder: folder of the film frames.
         matte: name of the object that the Cryptomatte node shows first.
 
     Raises:
-        InputError: `folder` has no film frames.
+        InputError: `folder` contains no film frames.
     """
     frames = _frames_in(folder)
     if not frames:
@@ -61,13 +62,13 @@ def set_up_compositor(
 
 
 def has_frames(scene: bpy.types.Scene) -> bool:
-    """Whether the scene's compositor shows film frames."""
+    """Return whether the scene's compositor shows film frames."""
     tree = _tree_if_any(scene)
     return tree is not None and _image_node(tree) is not None
 
 
 def show_frames(scene: bpy.types.Scene, folder: Path) -> None:
-    """Update the compositor to the present frames of `folder`, if it shows frames of this folder."""
+    """Update the compositor to the current frames of `folder` if it shows frames of this folder."""
     tree = _tree_if_any(scene)
     node = _image_node(tree) if tree is not None else None
     frames = _frames_in(folder)
@@ -76,7 +77,7 @@ def show_frames(scene: bpy.types.Scene, folder: Path) -> None:
 
 
 def _frames_in(folder: Path) -> list[int]:
-    """The numbers of the frames in a folder, ascending."""
+    """Return the frame numbers in a folder, ascending."""
     words = [path.name.split(".") for path in folder.glob("splats.*.exr")]
     return sorted(int(word[1]) for word in words if len(word) == 3 and word[1].isdecimal())
 
@@ -86,7 +87,7 @@ def _tree_if_any(scene: bpy.types.Scene) -> Any:
 
 
 def _tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
-    """The scene's compositor nodes; if there are none, with Blender's initial ones."""
+    """Return the scene's compositor node tree, created if missing."""
     if not hasattr(scene, "compositing_node_group"):  # 4.2 to 4.5
         scene.use_nodes = True
         return scene.node_tree
@@ -103,7 +104,7 @@ def _image_node(tree: bpy.types.NodeTree) -> Any:
 
 def _load(folder: Path, frames: list[int]) -> bpy.types.Image:
     path = str(folder / PATTERN.format(frames[0]))
-    # An image of its own, since other images in the file must not change with it.
+    # Load a separate image, so that other images in the file do not change.
     image = bpy.data.images.load(path)
     image.source = "SEQUENCE"
     image.name = "Splats"
@@ -116,7 +117,7 @@ def _path(image: bpy.types.Image) -> Path:
 
 
 def _use(tree: bpy.types.NodeTree, folder: Path, frames: list[int]) -> None:
-    """Let our nodes read the frames of a folder, each at the frame of its number."""
+    """Set the add-on's nodes to read the frames of a folder, each at its own frame number."""
     first, last = frames[0], frames[-1]
     for node in tree.nodes:
         if node.get(KIND) != FILM or node.type not in ("IMAGE", "CRYPTOMATTE_V2"):
@@ -169,7 +170,7 @@ def _join(
 
 
 def _output(scene: bpy.types.Scene, tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:
-    """The input socket of the compositor's output."""
+    """Return the input socket of the compositor's output node, created if missing."""
     is_group = hasattr(scene, "compositing_node_group")
     node = next((node for node in tree.nodes if node.type == ("GROUP_OUTPUT" if is_group else "COMPOSITE")), None)
     if node is None:
@@ -181,7 +182,7 @@ def _output(scene: bpy.types.Scene, tree: bpy.types.NodeTree) -> bpy.types.NodeS
 def _rendering(
     scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, graph: Graph, tree: bpy.types.NodeTree, output: Any
 ) -> Any:
-    """The present input of the output, or else the rendering of the view layer; and the depth of this rendering."""
+    """Return the current input of the output, or else the view layer's rendering, and the view layer's depth."""
     view_layer.use_pass_z = True
     layers = next((node for node in tree.nodes if node.type == "R_LAYERS" and node.layer == view_layer.name), None)
     if layers is None:
@@ -192,12 +193,12 @@ def _rendering(
 
 
 def _math(graph: Graph, operation: str, *values: Any) -> bpy.types.NodeSocket:
-    """Output of a Math node; from Blender 5.0 on, the compositor uses the shaders' nodes."""
+    """Add a Math node and return its output; since Blender 5.0, the compositor uses shader nodes."""
     kind = "ShaderNodeMath" if bpy.app.version >= (5, 0) else "CompositorNodeMath"
     return graph.node(kind, dict(enumerate(values)), operation=operation).outputs[0]
 
 
 def _over(graph: Graph, factor: Any, background: Any, foreground: Any) -> bpy.types.NodeSocket:
-    """Output of an Alpha Over node, whose sockets have had unique names since Blender 5.0."""
+    """Add an Alpha Over node and return its output; its sockets have unique names since Blender 5.0."""
     keys = ("Factor", "Background", "Foreground") if bpy.app.version >= (5, 0) else (0, 1, 2)
     return graph.node("CompositorNodeAlphaOver", dict(zip(keys, (factor, background, foreground)))).outputs[0]

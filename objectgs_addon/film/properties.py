@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Settings of film frames beside the scene's own: camera, resolution, frame range and motion blur."""
+"""Settings of film frames in addition to the scene's own camera, resolution, frame range and motion blur."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import bpy
 from bpy.props import BoolProperty, IntProperty, PointerProperty, StringProperty
 
 SUBFRAMES = 9
-"""Odd, so that one of them is in the middle of the exposure."""
+"""Default number of sub-frames, odd so that one is at the middle of the exposure."""
 
 
 class FilmProperties(bpy.types.PropertyGroup):
@@ -29,13 +29,13 @@ class FilmProperties(bpy.types.PropertyGroup):
 
 
 def folder_of(scene: bpy.types.Scene, reconstruction: Path) -> Path:
-    """The output folder of the scene's film frames; by default `film` in the reconstruction folder."""
+    """Return the output folder of the scene's film frames, by default `film` in the reconstruction folder."""
     chosen = scene.objectgs_film.folder
     return Path(bpy.path.abspath(chosen)) if chosen else reconstruction / "film"
 
 
 def samples_of(scene: bpy.types.Scene, subframes: int = SUBFRAMES) -> int:
-    """Number of sub-frames per frame: 1 without motion blur."""
+    """Return the number of sub-frames per frame, which is 1 without motion blur."""
     return subframes if scene.render.use_motion_blur else 1
 
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A scene's camera and the objects of a reconstruction over time, as a shot in the capture's coordinates.
+"""Sampling of a scene's camera and a reconstruction's objects over time as a shot in capture coordinates.
 
-A shot contains what Blender would render: the splats of every object whose collections, pivot and parts are not hidden
-in renders. The reconstruction's own collection may be hidden, since the compositor combines film frames with Blender's
-rendering without it. An object that is not moved in Blender keeps its transform from objects.json.
+A shot contains the splats that Blender would render: those of every object whose collections, pivot and parts are not
+hidden in renders. The reconstruction's own collection may be hidden, since the compositor combines film frames with
+Blender's rendering without the reconstruction. An object not moved in Blender keeps its transform from objects.json.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ..scene.kinds import MESH, OBJECT_PARENT, SPLATS, kind_of, object_id_of, pa
 from ..scene.object_collection import center_of
 
 TOLERANCE = 2e-6
-"""Tolerance, relative to the size of the scene, below which an object counts as not moved; Blender stores float32."""
+"""Tolerance, relative to the scene size, up to which an object counts as not moved, since Blender stores float32."""
 
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 _UNSUPPORTED = {"ORTHO": "orthographic", "PANO": "panoramic"}
@@ -42,15 +42,19 @@ def shot_of(
     """Sample the scene's frames as a shot of a reconstruction; the scene's current frame is restored.
 
     Args:
-        scene: its camera, resolution and motion blur are used.
-        view_layer: its visibility of collections is used.
+        scene: scene with the camera, resolution and motion blur.
+        view_layer: view layer with the visibility of collections.
         root: the reconstruction's collection.
         frames: frame numbers, ascending.
-        samples: sub-frames per frame while the shutter is open; 1: the frame's own time.
+        samples: sub-frames per frame while the shutter is open; 1 samples the frame itself.
         progress: called with (done, total) after every frame.
 
+    Returns:
+        The shot.
+
     Raises:
-        InputError: the scene has no camera, or one through which splats cannot be drawn.
+        InputError: The parent empty or the camera is missing, the camera is not perspective, the frames are empty or
+            start below 0, or the reconstruction is scaled to zero.
     """
     if parent_of(root) is None:
         raise InputError(f"{root.name} has lost the empty that moves it; run Import again.")
@@ -83,7 +87,7 @@ def shot_of(
 
 @dataclass(frozen=True)
 class _RootTransform:
-    """The similarity transform of a reconstruction, without stretching or shearing by its parent:
+    """Similarity transform of a reconstruction, without nonuniform scale or shear of its parent empty.
 
     world = scale * rotation @ (capture - origin) + shift.
     """
@@ -95,7 +99,7 @@ class _RootTransform:
 
     @classmethod
     def of(cls, root: bpy.types.Collection, scale: float | None) -> _RootTransform:
-        """The transform now; scale: of the whole shot, since depth is in its unit, or None: the parent's."""
+        """Return the transform at the current frame; `scale` is fixed per shot for depth, None uses the parent's."""
         world = np.array(_world_of(parent_of(root)), np.float64)
         left, stretches, right = np.linalg.svd(world[:3, :3])
         if stretches[2] <= 1e-12 * stretches[0]:
@@ -104,11 +108,11 @@ class _RootTransform:
         return cls(origin_of(root), left @ right, scale or float(np.cbrt(stretches.prod())), world[:3, 3])
 
     def map_from(self, world: np.ndarray, center: np.ndarray) -> np.ndarray:
-        """The transform of an object, in the capture's coordinates, that its world matrix amounts to.
+        """Convert an object's world matrix to its transform in capture coordinates.
 
         Args:
-            world: (4, 4) matrix of the object in the world.
-            center: (3,) origin of its vertices, in the reconstruction's coordinates.
+            world: (4, 4) local to world.
+            center: (3,) origin of its vertices in reconstruction coordinates.
 
         Returns:
             (4, 4), exactly the identity if the object is not moved.
@@ -124,7 +128,7 @@ class _RootTransform:
         return found
 
     def viewmat(self, camera: np.ndarray) -> np.ndarray:
-        """(4, 4) from the capture's coordinates to OpenCV camera coordinates; camera: its unscaled world matrix."""
+        """Return the (4, 4) map from capture to OpenCV camera coordinates; `camera`: world matrix without scale."""
         to_camera = _TO_OPENCV @ camera[:3, :3].T
         found = np.eye(4)
         found[:3, :3] = to_camera @ self.rotation
@@ -134,11 +138,15 @@ class _RootTransform:
 
 @dataclass(frozen=True)
 class _SplatsInstance:
-    """A carrier of splats in the scene, or an instance of it.
+    """A splat carrier in the scene, or an instance of it.
 
-    object_id: of its object; splats: the carrier; pivot: the empty that is the origin of its vertices; parts: the
-    carrier and the meshes of the same object, one of which must be shown; paths: layer collections from the top of the
-    view layer, one path of which must be shown; instancer: the empty that instances the carrier's collection, or None.
+    Attributes:
+        object_id: ID of its object.
+        splats: the carrier.
+        pivot: empty at the origin of its vertices.
+        parts: the carrier and the meshes of the same object; at least one must be shown.
+        paths: paths of layer collections from the top of the view layer; at least one path must be shown.
+        instancer: empty that instances the carrier's collection, or None.
     """
 
     object_id: int
@@ -149,7 +157,7 @@ class _SplatsInstance:
     instancer: bpy.types.Object | None = None
 
     def is_seen(self) -> bool:
-        """Whether Blender renders it at the current frame, apart from the reconstruction's own collection."""
+        """Return whether Blender renders it at the current frame, ignoring the reconstruction's own collection."""
         top = self.instancer or self.pivot
         shown = any(not part.hide_render for part in self.parts)
         return (
@@ -161,7 +169,7 @@ class _SplatsInstance:
         )
 
     def world(self) -> np.ndarray:
-        """(4, 4) float64: object to world at the current frame."""
+        """Return the map from local to world coordinates at the current frame, (4, 4) float64."""
         world = _world_of(self.splats)
         if self.instancer is not None:
             offset = Matrix.Translation(-self.instancer.instance_collection.instance_offset)
@@ -170,7 +178,7 @@ class _SplatsInstance:
 
 
 def _reset_unmoved(samples: Sequence[Sample]) -> None:
-    """Drop the transforms of objects that are not moved in any sample."""
+    """Remove the transforms of objects that are not moved in any sample."""
     here = np.eye(4)[None]
     moving = {
         object_id
@@ -217,7 +225,7 @@ def _instance_of(obj: bpy.types.Object, paths: Any, instancer: Any = None) -> _S
 
 
 def _paths(view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -> dict:
-    """Collection -> its paths in a view layer: lists of layer collections from the top, without the root's."""
+    """Map collections to their paths in a view layer: lists of layer collections from the top, without the root's."""
     found: dict = {}
 
     def walk(layer: Any, path: list) -> None:
@@ -238,7 +246,7 @@ def _is_below(obj: bpy.types.Object, parent: bpy.types.Object) -> bool:
 
 
 def _world_of(obj: bpy.types.Object) -> Matrix:
-    """An object's world matrix; if it is hidden, from its parent's, since Blender does not update hidden objects."""
+    """Return an object's world matrix, computed from its parent's if hidden, since Blender skips hidden objects."""
     if obj.visible_get() or obj.parent is None or obj.parent_type != "OBJECT":
         return obj.matrix_world
     return _world_of(obj.parent) @ obj.matrix_parent_inverse @ obj.matrix_basis
@@ -246,7 +254,7 @@ def _world_of(obj: bpy.types.Object) -> Matrix:
 
 @contextmanager
 def _evaluated_pivots(view_layer: bpy.types.ViewLayer, instances: Any) -> Iterator[None]:
-    """Temporarily show animated pivots in viewports, since Blender does not animate what is hidden there."""
+    """Temporarily show animated pivots in viewports, since Blender does not animate hidden objects."""
     inactive = {
         instance.pivot: instance
         for instance in instances
@@ -301,7 +309,7 @@ def _sample(
 
 
 def _intrinsics(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, camera: bpy.types.Object) -> np.ndarray:
-    """K (3, 3) of the camera at the current frame, from Blender's own projection."""
+    """Return K (3, 3) of the camera at the current frame, from Blender's projection matrix."""
     width, height = _size(scene)
     projection = camera.calc_matrix_camera(
         view_layer.depsgraph,
@@ -317,7 +325,7 @@ def _intrinsics(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, camera:
 
 
 def _size(scene: bpy.types.Scene) -> tuple[int, int]:
-    """Width and height of a render in pixels, rounded as Blender does."""
+    """Return the width and height of a render in pixels, rounded as in Blender."""
     render = scene.render
     return (
         max(render.resolution_x * render.resolution_percentage // 100, 1),
@@ -326,7 +334,7 @@ def _size(scene: bpy.types.Scene) -> tuple[int, int]:
 
 
 def _shutter(scene: bpy.types.Scene, number: int, samples: int) -> tuple[float, float]:
-    """The times at which the shutter opens and closes, in frames."""
+    """Return the times at which the shutter opens and closes, in frames."""
     if samples == 1:
         return float(number), float(number)
     length = scene.render.motion_blur_shutter

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which objects, shown as splats or meshes, are visible at a pixel or in a rectangle of a 3D viewport."""
+"""Hit tests for objects, shown as splats or meshes, at a pixel or in a rectangle of a 3D viewport."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ MIN_PROBABILITY = 0.1
 
 _SEE_THROUGH = ("splats", "points", "anchors")
 _GRID = 12
-"""Number of sample points across and down a rectangle at which meshes are tested."""
+"""Number of mesh sample points per side of a rectangle."""
 
 
 @dataclass(frozen=True)
 class Hit:
-    """What is visible: an object's collection, or a Blender object that belongs to none."""
+    """A visible object: its collection, or a Blender object outside such collections."""
 
     collection: bpy.types.Collection | None
     obj: bpy.types.Object | None
@@ -35,11 +35,12 @@ class Hit:
 
 
 def object_at(context: bpy.types.Context, x: float, y: float) -> Hit | None:
-    """Find what the viewport of the context shows at a pixel.
+    """Return the object that the context's viewport shows at a pixel.
 
     Args:
-        context: of a 3D viewport.
-        x, y: pixels of its region from the lower left.
+        context: context of a 3D viewport.
+        x: pixel in the region from the left.
+        y: pixel in the region from the bottom.
 
     Returns:
         The nearest splats or mesh, or None.
@@ -59,7 +60,7 @@ def object_at(context: bpy.types.Context, x: float, y: float) -> Hit | None:
 def objects_in(
     context: bpy.types.Context, left: float, bottom: float, right: float, top: float
 ) -> list[bpy.types.Collection]:
-    """The collections of the objects that are visible in a rectangle, in pixels of the region from the lower left."""
+    """Return the collections of objects visible in a rectangle, given in region pixels from the lower left."""
     view = view_of(context)
     collections, placed = _splats(context)
     found = [collections[key] for key in ids_in(placed, view, (left, view.height - top, right, view.height - bottom))]
@@ -75,7 +76,7 @@ def objects_in(
 
 
 def view_of(context: bpy.types.Context) -> View:
-    """The view of the context's viewport."""
+    """Return the view of the context's viewport."""
     region, region_3d = context.region, context.region_data
     return View.of_matrices(
         np.array(region_3d.view_matrix), np.array(region_3d.window_matrix), region.width, region.height
@@ -83,7 +84,7 @@ def view_of(context: bpy.types.Context) -> View:
 
 
 def _splats(context: bpy.types.Context) -> tuple[dict[int, bpy.types.Collection], list[PickObject]]:
-    """The collections of objects whose splats are shown, by session UID, and these splats."""
+    """Return the collections of objects with visible splats by session UID, and these splats."""
     collections, placed = {}, []
     collections_by_part = drawing.collections_by_part()
     for part in drawing.splat_parts(context.view_layer, context.space_data):
@@ -95,7 +96,7 @@ def _splats(context: bpy.types.Context) -> tuple[dict[int, bpy.types.Collection]
 
 
 def _meshes(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """The mesh objects that the viewport shows, without splats and points."""
+    """Return the visible mesh objects except splats, points and anchors."""
     return [
         obj
         for obj in context.view_layer.objects
@@ -109,7 +110,7 @@ def _meshes(context: bpy.types.Context) -> list[bpy.types.Object]:
 def _mesh_at(
     context: bpy.types.Context, meshes: Any, view: View, x: float, y: float
 ) -> tuple[bpy.types.Object | None, float]:
-    """The nearest of the meshes at a pixel of the region, and its depth."""
+    """Return the nearest of the meshes at a pixel of the region, and its depth."""
     region, region_3d = context.region, context.region_data
     origin = region_2d_to_origin_3d(region, region_3d, (x, y))
     along = region_2d_to_vector_3d(region, region_3d, (x, y))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Searching objects by words of their names."""
+"""Search for objects by words of their names."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def find_by_name(query: str, names: Mapping[int, str]) -> list[int]:
 
 
 def _score(words: Sequence[str], name: str) -> int:
-    """3: the name equals the words, 2: it contains them as words, 1: as parts of words, 0: not at all."""
+    """Return 3 if the name equals the words, 2 if it contains them as words, 1 as parts of words, 0 not at all."""
     if not all(word in name for word in words):
         return 0
     own = name.replace("_", " ").replace("-", " ").replace(".", " ").split()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Picking points of a reconstruction with the mouse."""
+"""Mouse picking of points of a reconstruction."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ REACH = 12.0
 
 
 class PointPicker:
-    """World positions of all visible vertices of a reconstruction, and the points picked so far."""
+    """Picker with the world positions of all visible vertices of a reconstruction, and the points picked so far."""
 
     def __init__(self, root: bpy.types.Collection) -> None:
         positions = [
@@ -81,17 +81,17 @@ class PointPicker:
 
 
 def nearest(positions: Any, perspective: Any, size: Any, mouse: Any, reach: float) -> int | None:
-    """Choose the point to pick.
+    """Return the point to pick.
 
-    Of the points within `reach` pixels of the mouse and up to a tenth deeper than the nearest of them, the one nearest
-    on the screen is chosen.
+    Candidates are within `reach` pixels of the mouse and at most a tenth deeper than the frontmost of these points. The
+    candidate nearest to the mouse on the screen is picked.
 
     Args:
         positions: (N, 3) in world coordinates.
         perspective: (4, 4) world to clip space.
-        size: (width, height) of the region, in pixels.
-        mouse: (2,) in pixels from the lower left.
-        reach: in pixels.
+        size: (width, height) of the region in pixels.
+        mouse: (2,) pixels from the lower left.
+        reach: largest distance from the mouse in pixels.
 
     Returns:
         Index of the point, or None.
@@ -111,7 +111,7 @@ def nearest(positions: Any, perspective: Any, size: Any, mouse: Any, reach: floa
 
 
 def _world_positions(part: bpy.types.Object) -> Any:
-    """(N, 3) float64 vertices of an object's mesh in world coordinates."""
+    """Return the vertices of an object's mesh in world coordinates, (N, 3) float64."""
     local = np.empty(3 * len(part.data.vertices), np.float32)
     part.data.vertices.foreach_get("co", local)
     matrix = np.array(part.matrix_world)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Selecting the objects of a reconstruction in the viewport."""
+"""Selection of a reconstruction's objects in the viewport."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ def select_collections(context: bpy.types.Context, collections: Any, extend: boo
     """Select all visible parts of objects, and make the last object active.
 
     Args:
-        context: its view layer is used.
-        collections: of the objects.
+        context: context with the view layer.
+        collections: collections of the objects.
         extend: keep the current selection.
 
     Returns:
-        False if there is nothing to select; the selection is unchanged then.
+        False if there is nothing to select; the selection is then unchanged.
     """
     parts = [parts_to_select(collection) for collection in collections]
     if not any(parts):
@@ -40,7 +40,7 @@ def select_collections(context: bpy.types.Context, collections: Any, extend: boo
 
 
 def parts_to_select(collection: bpy.types.Collection) -> list:
-    """The parts of an object's collection that can be selected."""
+    """Return the selectable parts of an object's collection."""
     return [part for part in scene.parts_of(collection) if selectable(part)]
 
 
@@ -50,7 +50,7 @@ def select_nothing(context: bpy.types.Context) -> None:
 
 
 def selected_ids(context: bpy.types.Context, root: bpy.types.Collection) -> list[int]:
-    """IDs of the selected objects, the active one last."""
+    """Return the IDs of the selected objects, the active one last."""
     ids = []
     parts = list(context.selected_objects)
     if context.active_object in parts:
@@ -65,7 +65,7 @@ def selected_ids(context: bpy.types.Context, root: bpy.types.Collection) -> list
 
 
 def selected_collections(context: bpy.types.Context, root: bpy.types.Collection) -> list:
-    """The collections of the selected objects and duplicates."""
+    """Return the collections of the selected objects and duplicates."""
     found = (
         scene.collection_of(part) for part in context.selected_objects if scene.root_of(part, context.scene) == root
     )

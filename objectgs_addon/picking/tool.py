@@ -19,7 +19,7 @@ _EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4)
 _handler = None
 _name = ""
 _pointed_at: int | None = None
-"""The name of the object under the mouse, and the session UID of its collection."""
+"""Session UID of the collection under the mouse; `_name` is the label of the object."""
 
 
 class PickTool(bpy.types.WorkSpaceTool):
@@ -54,7 +54,7 @@ class PickTool(bpy.types.WorkSpaceTool):
         ("wm.tool_set_by_id", {"type": "ESC", "value": "PRESS"}, {"properties": [("name", "builtin.select_box")]}),
     )
 
-    def draw_cursor(context: bpy.types.Context, _tool: Any, place: Any) -> None:  # noqa: N805 - Blender calls it without self
+    def draw_cursor(context: bpy.types.Context, _tool: Any, place: Any) -> None:  # noqa: N805 - no self
         """Draw the label; Blender calls this with the mouse's position in the window."""
         if not _name:
             return
@@ -69,13 +69,13 @@ class PickTool(bpy.types.WorkSpaceTool):
 
 
 def is_active(context: bpy.types.Context) -> bool:
-    """Whether the tool is active in the context's workspace."""
+    """Return whether the tool is active in the context's workspace."""
     tool = context.workspace.tools.from_space_view3d_mode("OBJECT", create=False)
     return tool is not None and tool.idname == TOOL
 
 
 def point_at(hit: Any) -> None:
-    """Label and highlight what is under the mouse; None: nothing."""
+    """Label and highlight the hit under the mouse; None removes label and highlight."""
     global _name, _pointed_at
     collection = None if hit is None else hit.collection
     _name = "" if hit is None else hit.name

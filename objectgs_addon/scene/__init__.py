@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A reconstruction folder as collections, cameras, points and splats in Blender. bpy and NumPy only, no operators."""
+"""A reconstruction folder shown as collections, cameras, points and splats in Blender; contains no operators."""
 
 from .cameras import use_camera
 from .capture import show_capture, warnings_of

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""cameras.json as Blender cameras that see exactly what the capture's pinhole cameras saw."""
+"""Blender cameras that exactly match the pinhole cameras in cameras.json."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,13 +14,13 @@ from .kinds import CAMERA, KIND, kind_of, mark
 SENSOR_WIDTH = 36.0
 LARGEST_ASPECT_ERROR = 0.01
 DISPLAY_SIZE = 0.4
-"""Size of a camera's frame relative to the median distance from a camera to its nearest."""
+"""Display size of a camera relative to the median distance between nearest cameras."""
 
 
 def show_cameras(capture: bpy.types.Collection, parent: bpy.types.Object, cameras: Cameras) -> list[str]:
-    """Make or update the cameras in `capture`, children of `parent`; returns warnings.
+    """Create or update the cameras in the collection `capture` as children of `parent`, and return warnings.
 
-    A camera is known again by the image's name; one that is not in `cameras` any more is removed.
+    Existing cameras are matched by image name; those no longer in `cameras` are removed.
     """
     there = {obj["objectgs_image"]: obj for obj in capture.objects if kind_of(obj) == CAMERA}
     poses = [_pose(view, cameras.origin) for view in cameras.views]
@@ -50,7 +50,7 @@ def show_cameras(capture: bpy.types.Collection, parent: bpy.types.Object, camera
 
 
 def use_camera(scene: bpy.types.Scene, camera: bpy.types.Object) -> None:
-    """Make `camera` the scene's camera, and where it is one of a capture give the render its size and pixel aspect."""
+    """Make `camera` the scene's camera; for a capture camera, also set the render size and pixel aspect."""
     scene.camera = camera
     if kind_of(camera) != CAMERA:
         return
@@ -61,7 +61,7 @@ def use_camera(scene: bpy.types.Scene, camera: bpy.types.Object) -> None:
 
 
 def _pose(view: CameraView, origin: np.ndarray) -> np.ndarray:
-    """(4, 4) from Blender's camera axes (x right, y up, looking along -z) to the reconstruction's coordinates."""
+    """Return the (4, 4) map from Blender camera space (x right, y up, looking along -z) to reconstruction space."""
     pose = np.linalg.inv(view.viewmat)
     pose[:3, 3] -= origin
     pose[:3, 1:3] *= -1.0
@@ -77,7 +77,7 @@ def _place(obj: bpy.types.Object, pose: np.ndarray) -> None:
 
 
 def _set_lens(camera: bpy.types.Camera, view: CameraView) -> None:
-    """The exact K: Blender's shifts are in widths of the picture, its lens in units of the sensor's width."""
+    """Set the lens from K; Blender's shifts are relative to the image width, its focal length is in sensor units."""
     camera.type = "PERSP"
     camera.sensor_fit = "HORIZONTAL"
     camera.sensor_width = SENSOR_WIDTH
@@ -88,7 +88,7 @@ def _set_lens(camera: bpy.types.Camera, view: CameraView) -> None:
 
 
 def _set_background(camera: bpy.types.Camera, view: CameraView) -> None:
-    """The photo behind the view; Blender reads the file when it first draws it."""
+    """Set the photo as background image; Blender reads the file when it first draws it."""
     ours = next(
         (entry for entry in camera.background_images if entry.image is not None and entry.image.get(KIND) == "photo"),
         None,
@@ -108,7 +108,7 @@ def _set_background(camera: bpy.types.Camera, view: CameraView) -> None:
 
 
 def _spacing(centers: np.ndarray) -> float:
-    """Median distance from a camera to its nearest; of one camera, or of many in one place, 1."""
+    """Return the median distance from a camera to its nearest neighbor; 1 for a single camera or position."""
     if len(centers) < 2:
         return 1.0
     some = centers[:: max(1, len(centers) // 500)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A reconstruction's collection with its capture: the parent that stands it up, cameras and points."""
+"""The collection of a reconstruction with its capture: parent empty, cameras and points."""
 
 from __future__ import annotations
 
@@ -43,11 +43,19 @@ WARNINGS = "objectgs_warnings"
 def show_capture(
     scene: bpy.types.Scene, folder: Path, root: bpy.types.Collection | None = None, name: str | None = None
 ) -> bpy.types.Collection:
-    """Show the cameras and points of a reconstruction folder in `scene`; returns the reconstruction's collection.
+    """Show the cameras and points of a reconstruction folder.
 
-    `root` is updated where it is given, or else the scene's collection of the same folder; without either a new one
-    called `name` (default: the folder's name) is made. Raises InputError, before anything is changed, where the
-    folder's files cannot be used.
+    Args:
+        scene: the scene that receives a new collection.
+        folder: the reconstruction folder.
+        root: collection to update; by default the scene's collection of the same folder, or else a new one.
+        name: name of a new collection; by default the folder's name.
+
+    Returns:
+        The reconstruction's collection.
+
+    Raises:
+        InputError: The folder's files cannot be used, or the points are in Edit Mode; nothing is changed.
     """
     folder = Path(folder).absolute()
     if any("\ud800" <= character <= "\udfff" for character in str(folder)):
@@ -83,7 +91,7 @@ def show_capture(
     root[WARNINGS] = "\n".join(show_cameras(capture, parent, cameras))
     show_points(capture, parent, f"{root.name} points", table, cameras.origin, objects)
 
-    # Linked last: Blender brings all view layers up to date for each link below a scene.
+    # Linked last, since Blender updates all view layers for each link below a scene.
     if new_capture:
         root.children.link(capture)
     if is_new or not any(root in other.collection.children_recursive for other in bpy.data.scenes):
@@ -95,18 +103,18 @@ def show_capture(
 
 
 def warnings_of(root: bpy.types.Collection) -> list[str]:
-    """What the last `show_capture` has to say about the cameras."""
+    """Return the camera warnings of the last `show_capture`."""
     text = root.get(WARNINGS, "")
     return text.split("\n") if text else []
 
 
 def origin_of(root: bpy.types.Collection) -> np.ndarray:
-    """(3,) what is subtracted from the capture's coordinates."""
+    """Return the (3,) origin that is subtracted from the capture's coordinates."""
     return np.array(root.get(ORIGIN, (0.0, 0.0, 0.0)), np.float64)
 
 
 def _stand_up(root: bpy.types.Collection, upright: np.ndarray, views: Any) -> bpy.types.Object:
-    """The parent empty, made where there is none; one that the user has moved stays where it is."""
+    """Return the parent empty, created if missing and set to `upright` unless the user has moved it."""
     parent = parent_of(root)
     wanted = Matrix(upright.tolist())
     if parent is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshes of loose vertices that carry a value of each kind for each vertex, filled without loops."""
+"""Mesh carriers: meshes of loose vertices with point attributes, read and written as NumPy arrays."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from ...backend.shared.errors import InputError
 
-# Attribute type -> its field in foreach_set, NumPy type and numbers for each vertex.
+# Attribute type -> field name for foreach_set, NumPy type and number of components per vertex.
 _FIELDS = {
     "FLOAT": ("value", np.float32, 1),
     "INT": ("value", np.int32, 1),
@@ -20,13 +20,13 @@ _FIELDS = {
     "BOOLEAN": ("value", bool, 1),
 }
 KINDS = frozenset(_FIELDS)
-"""The types of attributes that can be read and written."""
+"""Attribute types that can be read and written."""
 
 
 def require_object_mode(objs: Iterable[bpy.types.Object]) -> None:
-    """Raise InputError where one of the objects is in Edit Mode or another mode that works on its mesh.
+    """Raise InputError if any of the objects is in Edit Mode or another mode that edits its mesh.
 
-    Edit Mode would overwrite what is written to the mesh when it is left.
+    Leaving Edit Mode would overwrite data written to the mesh.
     """
     for obj in objs:
         if obj is not None and (obj.mode != "OBJECT" or getattr(obj.data, "is_editmode", False)):
@@ -35,9 +35,12 @@ def require_object_mode(objs: Iterable[bpy.types.Object]) -> None:
 
 
 def fill(mesh: bpy.types.Mesh, positions: np.ndarray, attributes: dict[str, tuple[str, np.ndarray]]) -> None:
-    """Replace all vertices of `mesh`; its materials stay.
+    """Replace all vertices of `mesh` and keep its materials.
 
-    positions (n, 3); attributes: name -> (Blender's attribute type, array of n rows).
+    Args:
+        mesh: the mesh carrier.
+        positions: (n, 3) vertex positions.
+        attributes: name -> (Blender attribute type, array of n rows).
     """
     count = len(positions)
     mesh.clear_geometry()
@@ -49,7 +52,7 @@ def fill(mesh: bpy.types.Mesh, positions: np.ndarray, attributes: dict[str, tupl
 
 
 def write(mesh: bpy.types.Mesh, name: str, kind: str, values: np.ndarray) -> None:
-    """Set one attribute of all vertices, made where it is missing or of another type."""
+    """Set a point attribute for all vertices; create it if it is missing or has another type or domain."""
     field, dtype, width = _FIELDS[kind]
     attribute = mesh.attributes.get(name)
     if attribute is not None and (attribute.data_type != kind or attribute.domain != "POINT"):
@@ -65,7 +68,7 @@ def write(mesh: bpy.types.Mesh, name: str, kind: str, values: np.ndarray) -> Non
 
 
 def read(mesh: bpy.types.Mesh, name: str) -> np.ndarray:
-    """One attribute of all vertices: (n,) or (n, width)."""
+    """Return an attribute of all vertices, (n,) or (n, width)."""
     attribute = mesh.attributes[name]
     field, dtype, width = _FIELDS[attribute.data_type]
     values = np.empty(width * len(mesh.vertices), dtype)
@@ -74,5 +77,5 @@ def read(mesh: bpy.types.Mesh, name: str) -> np.ndarray:
 
 
 def stored_ids(ids: np.ndarray) -> np.ndarray:
-    """IDs 0 .. 2^32 - 1 as the int32 of the same bits, which is what attributes can hold."""
+    """Reinterpret the bits of IDs 0 .. 2^32 - 1 as int32, the integer type of attributes."""
     return np.asarray(ids, np.int64).astype(np.uint32).view(np.int32)

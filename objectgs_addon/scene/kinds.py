@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Who is what: custom properties on collections and objects, and finding things by them.
+"""Custom properties that identify the add-on's data-blocks, and lookups by them.
 
-Nothing is ever found by its name, since users rename things and Blender numbers names that are taken.
+Lookups never use names, since users rename data-blocks and Blender appends numbers to names already in use.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from typing import Any
 
 import bpy
 
-KIND = "objectgs_kind"  # Not "objectgs": before Blender 5.0 a property group of that name would take its place.
+KIND = "objectgs_kind"  # Not "objectgs": before Blender 5.0, it would collide with the property group of that name.
 OBJECT_ID = "object_id"
 FOLDER = "objectgs_folder"
-MESH_KEY = "objectgs_mesh"  # On a mesh: its key in meshes.json.
+MESH_KEY = "objectgs_mesh"  # Key of a mesh in meshes.json.
 
 RECONSTRUCTION = "reconstruction"
 PARENT = "parent"
@@ -34,58 +34,61 @@ TEXTURE = "mesh_texture"
 
 
 def kind_of(block: bpy.types.ID) -> str | None:
-    """What a collection, object, mesh, material or node group is to this extension; None where it is not ours."""
+    """Return the kind of a data-block (collection, object, mesh, material, node group); None if it has none."""
     kind = block.get(KIND) if block is not None else None
     return kind if isinstance(kind, str) else None
 
 
 def object_id_of(block: bpy.types.ID) -> int | None:
-    """ID 0 .. 2^32 - 1 of the object that a collection or an object belongs to, or None."""
+    """Return the object ID (0 .. 2^32 - 1) of a collection or Blender object, or None."""
     value = block.get(OBJECT_ID) if kind_of(block) is not None else None
     return from_stored(value) if isinstance(value, int) else None
 
 
 def mark(block: bpy.types.ID, kind: str, object_id: int | None = None) -> None:
-    """Say what `block` is."""
+    """Store the kind and, if given, the object ID of `block` as custom properties."""
     block[KIND] = kind
     if object_id is not None:
         block[OBJECT_ID] = to_stored(object_id)
 
 
 def to_stored(object_id: int) -> int:
-    """A mask's ID (0 .. 2^32 - 1) as Blender's signed 32-bit integers hold it: the int32 of the same bits."""
+    """Convert an object ID (0 .. 2^32 - 1) to the signed 32-bit integer with the same bits, as Blender stores it."""
     return object_id - (1 << 32) if object_id >= 1 << 31 else object_id
 
 
 def from_stored(value: int) -> int:
-    """The mask's ID again."""
+    """Convert the result of `to_stored` back to an object ID."""
     return value & 0xFFFFFFFF
 
 
 def folder_of(root: bpy.types.Collection) -> Path:
-    """The reconstruction folder, absolute; it need not exist any more."""
+    """Return the absolute path of the reconstruction folder, which may no longer exist."""
     return Path(root.get(FOLDER, ""))
 
 
 def parts_of(collection: bpy.types.Collection) -> list[bpy.types.Object]:
-    """Our objects that lie directly in `collection`."""
+    """Return the add-on's Blender objects directly in `collection`."""
     return [obj for obj in collection.objects if kind_of(obj) is not None]
 
 
 def part_of(collection: bpy.types.Collection, kind: str) -> bpy.types.Object | None:
-    """The first object of a kind that lies directly in `collection`, or None."""
+    """Return the first Blender object of a kind directly in `collection`, or None."""
     return next((obj for obj in collection.objects if kind_of(obj) == kind), None)
 
 
 def parent_of(root: bpy.types.Collection) -> bpy.types.Object | None:
-    """The empty that everything of a reconstruction hangs on, or None where the user deleted it."""
+    """Return the reconstruction's parent empty, or None if the user deleted it."""
     return part_of(root, PARENT)
 
 
 def adopt(
     collection: bpy.types.Collection, root: bpy.types.Collection, kinds: Any, object_id: int | None = None
 ) -> None:
-    """Move parts that lie about in `root` itself into `collection`: those of a collection that the user dissolved."""
+    """Move parts of these kinds (and this object ID, if given) from `root` itself into `collection`.
+
+    Parts end up directly in `root` when the user deletes their collection.
+    """
     for obj in list(root.objects):
         if kind_of(obj) in kinds and (object_id is None or object_id_of(obj) == object_id):
             collection.objects.link(obj)
@@ -93,20 +96,20 @@ def adopt(
 
 
 def capture_of(root: bpy.types.Collection) -> bpy.types.Collection | None:
-    """The collection of the cameras and points, or None."""
+    """Return the collection of the cameras and points, or None."""
     return next((child for child in root.children_recursive if kind_of(child) == CAPTURE), None)
 
 
 def points_of(root: bpy.types.Collection) -> bpy.types.Object | None:
-    """The point cloud's object, or None."""
+    """Return the Blender object of the point cloud, or None."""
     capture = capture_of(root)
     return part_of(capture, POINTS) if capture is not None else None
 
 
 def object_collections(root: bpy.types.Collection) -> dict[int, bpy.types.Collection]:
-    """Object ID -> its collection; also those that the user moved out of the reconstruction's.
+    """Map object IDs to their collections, including those the user moved out of the reconstruction's collection.
 
-    Where the user duplicated one, the first counts.
+    If the user duplicated a collection, the first one is returned.
     """
     found: dict[int, bpy.types.Collection] = {}
     for collection in root.children_recursive:
@@ -124,7 +127,7 @@ def object_collections(root: bpy.types.Collection) -> dict[int, bpy.types.Collec
 
 
 def duplicates_of(root: bpy.types.Collection) -> dict[int, list[bpy.types.Collection]]:
-    """Object ID -> the collections of its duplicates, in Blender's order; of the objects that have any."""
+    """Map the IDs of objects with duplicates to the duplicates' collections, in Blender's order."""
     found: dict[int, list[bpy.types.Collection]] = {}
     for collection in root.children_recursive:
         if kind_of(collection) == DUPLICATE:
@@ -133,14 +136,14 @@ def duplicates_of(root: bpy.types.Collection) -> dict[int, list[bpy.types.Collec
 
 
 def collection_of(part: bpy.types.Object) -> bpy.types.Collection | None:
-    """The collection of the object, or of the duplicate of one, that a part lies in directly; None in neither."""
+    """Return the collection of the object or duplicate that directly contains a part, or None."""
     return next(
         (collection for collection in part.users_collection if kind_of(collection) in (OBJECT, DUPLICATE)), None
     )
 
 
 def root_of(block: bpy.types.ID, scene: bpy.types.Scene) -> bpy.types.Collection | None:
-    """The reconstruction's collection in `scene` that an object or a collection belongs to, or None."""
+    """Return the reconstruction collection in `scene` that a Blender object or collection belongs to, or None."""
     roots = [child for child in scene.collection.children_recursive if kind_of(child) == RECONSTRUCTION]
     if isinstance(block, bpy.types.Collection):
         for root in roots:

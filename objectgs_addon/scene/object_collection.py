@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The collection of one object: made with its pivot, renamed, painted and taken apart as a whole."""
+"""The collection of one object: creation with its pivot, renaming, coloring and removal."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _MATERIALS = {SPLATS: SPLATS_MATERIAL, MESH: MESH_MATERIAL}
 
 
 def new_collection(object_id: int, objects: Objects) -> bpy.types.Collection:
-    """An object's collection, not linked anywhere yet: Blender brings all view layers up to date for each link."""
+    """Return a new collection for an object, unlinked since Blender updates all view layers for each link."""
     collection = bpy.data.collections.new(objects.name(object_id))
     mark(collection, OBJECT, object_id)
     collection[NAME] = objects.name(object_id)
@@ -39,8 +39,7 @@ def new_collection(object_id: int, objects: Objects) -> bpy.types.Collection:
 def ensure_pivot(
     collection: bpy.types.Collection, parent: bpy.types.Object, object_id: int, positions: np.ndarray
 ) -> bpy.types.Object:
-    """The object's own parent empty, made at the middle of `positions` (n, 3) where there is none; the user may move
-    it."""
+    """Return the object's pivot (its own parent empty), created at the median of `positions` (n, 3) if missing."""
     pivot = part_of(collection, OBJECT_PARENT)
     if pivot is None:
         pivot = bpy.data.objects.new(collection[NAME], None)
@@ -61,12 +60,12 @@ def ensure_pivot(
 
 
 def center_of(pivot: bpy.types.Object) -> np.ndarray:
-    """Where the pivot was made, in the reconstruction's coordinates: the origin of its children's."""
+    """Return the pivot's initial position in reconstruction coordinates, the origin of its children's coordinates."""
     return np.array(pivot.get(CENTER, (0.0, 0.0, 0.0)), np.float64)
 
 
 def rename(collection: bpy.types.Collection, name: str) -> None:
-    """Give collection and parts a new name from objects.json; names that the user gave in Blender stay else."""
+    """Rename a collection and its parts if the name in objects.json changed; otherwise keep the user's names."""
     if collection.get(NAME) == name:
         return
     collection[NAME] = collection.name = name
@@ -80,8 +79,7 @@ def rename(collection: bpy.types.Collection, name: str) -> None:
 
 
 def paint(collection: bpy.types.Collection, rgb: tuple[int, int, int]) -> None:
-    """Give the parts the color that stands for the object, sRGB 0 .. 255, where Blender shows objects or materials
-    by a color."""
+    """Set the viewport colors of the parts and their materials to the object's color, sRGB 0 .. 255."""
     color = (*to_linear(rgb), 1.0)
     for obj in parts_of(collection):
         obj.color = color
@@ -90,7 +88,7 @@ def paint(collection: bpy.types.Collection, rgb: tuple[int, int, int]) -> None:
 
 
 def our_materials(obj: bpy.types.Object) -> list[bpy.types.Material]:
-    """The materials that we made for a splats object or a mesh."""
+    """Return the materials that the add-on created for a splats carrier or a mesh."""
     wanted = _MATERIALS.get(kind_of(obj))
     if wanted is None or obj.data is None:
         return []
@@ -98,7 +96,7 @@ def our_materials(obj: bpy.types.Object) -> list[bpy.types.Material]:
 
 
 def remove_if_empty(collection: bpy.types.Collection) -> None:
-    """Remove a collection where only its own pivot is left in it."""
+    """Remove a collection that contains at most its own pivot."""
     pivot = part_of(collection, OBJECT_PARENT)
     others = [obj for obj in collection.objects if obj != pivot]
     if others or collection.children or (pivot is not None and pivot.children):
@@ -108,7 +106,7 @@ def remove_if_empty(collection: bpy.types.Collection) -> None:
 
 
 def remove(obj: bpy.types.Object) -> None:
-    """Remove an object with its mesh, our materials and their textures, where nothing else uses them."""
+    """Remove a Blender object with its mesh, add-on materials and their textures, unless they have other users."""
     if obj is None:
         return
     mesh, materials = obj.data, our_materials(obj)
@@ -125,7 +123,7 @@ def remove(obj: bpy.types.Object) -> None:
 
 
 def textures_of(material: bpy.types.Material | None) -> list[bpy.types.Image]:
-    """The textures of ours that a material uses, whoever made the material."""
+    """Return the add-on's textures that a material, including a user's own, references."""
     tree = material.node_tree if material is not None else None
     return (
         []

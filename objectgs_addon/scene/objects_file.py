@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What objects.json says about showing objects: names, colors, which are merged and which are left out."""
+"""Display data of objects from objects.json: names, colors, merges and left-out objects."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ _LINEAR = np.array([to_linear((value,))[0] for value in range(256)], np.float32)
 
 
 def linear_colors(rgb: np.ndarray) -> np.ndarray:
-    """(n, 3) uint8 sRGB -> (n, 4) float32 linear, opaque."""
+    """Convert (n, 3) uint8 sRGB to (n, 4) float32 opaque linear RGBA."""
     colors = np.ones((len(rgb), 4), np.float32)
     colors[:, :3] = _LINEAR[rgb]
     return colors
@@ -22,31 +22,40 @@ def linear_colors(rgb: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Objects:
-    """entries: ID -> object with the user's edits; target: ID -> the ID that it is shown as."""
+    """Objects of a reconstruction.
+
+    Attributes:
+        entries: ID -> object with the user's edits.
+        target: ID -> ID of the object it is merged into, or its own.
+    """
 
     entries: dict[int, SceneObject]
     target: dict[int, int]
 
     @classmethod
     def read(cls, folder: Path) -> "Objects":
-        """objects.json of a folder; no objects where there was no vote yet, InputError where it is broken."""
+        """Read objects.json of a folder; without the file (before the first vote) there are no objects.
+
+        Raises:
+            InputError: objects.json is invalid.
+        """
         path = Reconstruction(folder).objects
         entries = read_objects(path) if path.exists() else []
         return cls({entry.id: entry for entry in entries}, merged(entries))
 
     def shown_as(self, object_id: int) -> int | None:
-        """The ID whose collection shows `object_id`, or None where it is left out."""
+        """Return the ID of the object whose collection shows `object_id`, or None if the object is left out."""
         target = self.target.get(object_id, object_id)
         if any(at in self.entries and self.entries[at].left_out for at in (object_id, target)):
             return None
         return target
 
     def name(self, object_id: int) -> str:
-        """The object's name; IDs that objects.json does not know get one, too."""
+        """Return the object's name, or a default name if the ID is not in objects.json."""
         return self.entries[object_id].name if object_id in self.entries else default_name(object_id)
 
     def rgb(self, object_id: int) -> tuple[int, int, int]:
-        """The object's color, sRGB 0 .. 255."""
+        """Return the object's color, sRGB 0 .. 255."""
         if object_id in self.entries:
             red, green, blue = self.entries[object_id].color
             return red, green, blue
@@ -54,7 +63,7 @@ class Objects:
         return red, green, blue
 
     def colors(self, ids: np.ndarray) -> np.ndarray:
-        """(n,) IDs -> (n, 4) float32 linear: an object's color is that of what it is shown as, gray if left out."""
+        """Return (n, 4) float32 linear RGBA for (n,) IDs; merged objects share a color, left-out objects are gray."""
         if len(ids) == 0:
             return np.zeros((0, 4), np.float32)
         known, inverse = np.unique(ids, return_inverse=True)
@@ -63,6 +72,6 @@ class Objects:
         return linear_colors(rgb)[inverse.reshape(-1)]
 
     def grouping(self) -> dict[str, int | None]:
-        """ID (as text) -> what it is shown as, of those that are not shown as themselves."""
+        """Map the IDs (as strings) of merged and left-out objects to the result of `shown_as`."""
         shown = {object_id: self.shown_as(object_id) for object_id in self.entries}
         return {str(object_id): target for object_id, target in shown.items() if target != object_id}

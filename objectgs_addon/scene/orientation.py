@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Standing a reconstruction on the ground and giving it its true size, by its parent empty alone."""
+"""Orientation to the ground and metric scale of a reconstruction, applied to its parent empty."""
 
 from __future__ import annotations
 
@@ -12,14 +12,23 @@ from ...backend.shared.errors import InputError
 from .kinds import CAMERA, capture_of, kind_of, parent_of
 
 SMALLEST_SINE = 1e-3
-"""Three points count as one line below this sine of the angle between them."""
+"""Three points are collinear if the sine of the angle between them is at most this."""
 
 
 def orient_to_ground(root: bpy.types.Collection, p1: Any, p2: Any, p3: Any) -> None:
-    """Turn and lift the reconstruction so that three points, in world coordinates, lie on Z = 0.
+    """Rotate and translate the reconstruction so that three points lie on the plane Z = 0.
 
-    Up is the side of the cameras, or without cameras the side that is up now. The points' center keeps its X and Y.
-    Raises InputError where the points lie on one line.
+    The side of the cameras, or without cameras the side that is currently up, faces up. The center of the points keeps
+    its X and Y.
+
+    Args:
+        root: the reconstruction's collection.
+        p1: first point in world coordinates.
+        p2: second point in world coordinates.
+        p3: third point in world coordinates.
+
+    Raises:
+        InputError: The points are collinear, or the parent empty is missing.
     """
     parent = _parent(root)
     p1, p2, p3 = Vector(p1), Vector(p2), Vector(p3)
@@ -39,10 +48,18 @@ def orient_to_ground(root: bpy.types.Collection, p1: Any, p2: Any, p3: Any) -> N
 
 
 def scale_to_distance(root: bpy.types.Collection, p1: Any, p2: Any, distance: float) -> None:
-    """Scale the reconstruction about the world's origin so that two points, in world coordinates, are that far apart.
+    """Scale the reconstruction about the world origin so that two points have the given distance.
 
-    About the origin, so that what stands on the ground stays there. Raises InputError where the points are one, or
-    the distance is not above 0.
+    Scaling about the origin keeps the ground at Z = 0.
+
+    Args:
+        root: the reconstruction's collection.
+        p1: first point in world coordinates.
+        p2: second point in world coordinates.
+        distance: wanted distance between the points.
+
+    Raises:
+        InputError: The points coincide, the distance is not positive and finite, or the parent empty is missing.
     """
     parent = _parent(root)
     apart = (Vector(p2) - Vector(p1)).length

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The capture's point cloud: a mesh carrier whose vertices are shown as points in one of two colors."""
+"""The capture's point cloud: a mesh carrier whose vertices are shown as points in one of two colorings."""
 
 from pathlib import Path
 
@@ -17,13 +17,17 @@ from .shading.modifiers import modifier_of, set_input
 from .shading.node_groups import POINTS_GROUP, points_group
 
 SIZE = 0.004
-"""Radius of a point relative to the diagonal of the box that holds the middle 90 percent of the points."""
+"""Radius of a point relative to the diagonal of the box around the 5th to 95th percentiles of the points."""
 
 COLORINGS = ("photo", "object")
 
 
 def read_points(folder: Path) -> np.ndarray:
-    """points.ply as a structured array; InputError where it is missing or holds something else."""
+    """Return points.ply as a structured array.
+
+    Raises:
+        InputError: points.ply is missing or lacks required properties.
+    """
     path = Reconstruction(folder).points
     if not path.is_file():
         raise InputError(f"{folder} has no points.ply; run Import again.")
@@ -35,7 +39,7 @@ def read_points(folder: Path) -> np.ndarray:
 
 
 def positions_of(table: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """(n, 3) float64 in the reconstruction's coordinates."""
+    """Return the (n, 3) float64 positions of a table in reconstruction coordinates."""
     return np.stack([table[axis].astype(np.float64) - origin[i] for i, axis in enumerate("xyz")], axis=1)
 
 
@@ -47,7 +51,7 @@ def show_points(
     origin: np.ndarray,
     objects: Objects,
 ) -> None:
-    """Make or update the point cloud's object in `capture`."""
+    """Create or update the Blender object of the point cloud in `capture`."""
     positions = positions_of(table, origin)
     obj = part_of(capture, POINTS)
     if obj is None:
@@ -80,7 +84,7 @@ def show_points(
 
 
 def color_points_by(root: bpy.types.Collection, by: str) -> None:
-    """Show the point cloud in its colors of the photos ("photo") or of its objects ("object")."""
+    """Color the point cloud by its photos ("photo") or its objects ("object")."""
     if by not in COLORINGS:
         raise ValueError(f"points cannot be colored by {by}")
     obj = points_of(root)
@@ -95,7 +99,7 @@ def color_points_by(root: bpy.types.Collection, by: str) -> None:
 
 
 def _activate(obj: bpy.types.Object, by: str) -> None:
-    """The active color is what Solid shows with its color set to Attribute."""
+    """Set the active color attribute, which Solid mode shows when its color type is Attribute."""
     obj.data.attributes.active_color_name = by
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The objects of a reconstruction: a collection for each, with its splats and anchors, new or updated in place."""
+"""Collections of the objects of a reconstruction, created or updated in place from splats.ply and anchors.ply."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ from .splats import anchor_attributes, ids_of, median_scale, read_anchors, read_
 
 GROUPING = "objectgs_grouping"
 SHOWN = "objectgs_shown"
-"""On the root: when the splats.ply that it shows was written."""
+"""Custom property of the root collection: the modification time of the shown splats.ply."""
 
 LARGEST_POINT = 3.0
-"""Largest radius of a point in the viewport relative to the size of the splats in the middle."""
+"""Largest radius of a point in the viewport relative to the median scale of the splats."""
 
 
 @dataclass
 class Shown:
-    """What `show_result` put into Blender: how many objects (the unlabeled rest is none), splats and anchors."""
+    """Result of `show_result`: the numbers of objects (without the unlabeled rest), splats and anchors; warnings."""
 
     objects: int = 0
     splats: int = 0
@@ -61,12 +61,20 @@ class Shown:
 
 
 def show_result(root: bpy.types.Collection, folder: Path) -> Shown:
-    """Show splats.ply, anchors.ply and the meshes: each object in its collection, merged ones in that of the other.
+    """Show splats.ply, anchors.ply and the meshes, with one collection per object after merges.
 
-    What is there is updated in place: transforms, modifiers, materials, visibility and the place of collections stay
-    as the user left them. Objects that have no splats any more lose theirs, and their collection where nothing else
-    is in it. Raises InputError, before anything is changed, where the folder's files cannot be used; meshes that cannot
-    be are a warning.
+    Existing data is updated in place: transforms, modifiers, materials, visibility and the positions of collections in
+    the hierarchy are kept. For objects that no longer have splats, carriers and empty collections are removed.
+
+    Args:
+        root: the reconstruction's collection.
+        folder: the reconstruction folder.
+
+    Returns:
+        The counts of what is shown, and warnings, also about meshes that cannot be used.
+
+    Raises:
+        InputError: The folder's files cannot be used, or a part is in Edit Mode; nothing is changed.
     """
     folder = Path(folder)
     splats, warnings = read_splats(folder)
@@ -130,13 +138,13 @@ def show_result(root: bpy.types.Collection, folder: Path) -> Shown:
 
 
 def result_is_newer(root: bpy.types.Collection) -> bool:
-    """Whether the folder holds another splats.ply than the one that is shown."""
+    """Return whether the folder's splats.ply differs in modification time from the one shown."""
     written = _written(folder_of(root))
     return bool(written) and root.get(SHOWN) != written
 
 
 def _written(folder: Path) -> str:
-    """When splats.ply was written, in nanoseconds; Blender's integers are too short for that. Empty without one."""
+    """Return the modification time of splats.ply in ns, as a string since Blender's integers have 32 bits, or ""."""
     try:
         return str(Reconstruction(folder).splats.stat().st_mtime_ns)
     except OSError:
@@ -144,10 +152,9 @@ def _written(folder: Path) -> str:
 
 
 def show_objects(root: bpy.types.Collection, folder: Path) -> None:
-    """Bring points and object collections into agreement with points.ply and objects.json, after a vote or an edit.
+    """Update points and object collections from points.ply and objects.json after a vote or an edit.
 
-    Names, colors and edits are shown; where merges or left-out objects changed, splats are shown again as
-    `show_result` does.
+    This updates names, colors and edits. If merges or left-out objects changed, it calls `show_result`.
     """
     folder = Path(folder)
     objects = Objects.read(folder)
@@ -171,7 +178,7 @@ def show_objects(root: bpy.types.Collection, folder: Path) -> None:
 
 
 def _groups(table: np.ndarray, objects: Objects) -> dict[int, np.ndarray]:
-    """ID of a collection -> its rows of the table, in the file's order; rows of left-out objects are in none."""
+    """Map the IDs of collections to their rows of the table, in file order, without rows of left-out objects."""
     ids, inverse = unique_ids(ids_of(table))
     shown = [objects.shown_as(int(object_id)) for object_id in ids]
     targets = sorted({target for target in shown if target is not None})
@@ -179,7 +186,7 @@ def _groups(table: np.ndarray, objects: Objects) -> dict[int, np.ndarray]:
     # Small integers sort much faster.
     kind = np.uint16 if len(targets) < 1 << 16 else np.int64
     group = np.array([len(targets) if target is None else place[target] for target in shown], kind)[inverse]
-    # As bytes, since rows of named fields are copied field by field.
+    # Sort as bytes, since NumPy copies structured rows field by field.
     as_bytes = table.view(np.uint8).reshape(len(table), table.dtype.itemsize)
     rows = as_bytes[np.argsort(group, kind="stable")].reshape(-1).view(table.dtype)
     ends = np.cumsum(np.bincount(group, minlength=len(targets)))
@@ -187,23 +194,23 @@ def _groups(table: np.ndarray, objects: Objects) -> dict[int, np.ndarray]:
 
 
 class _Makers:
-    """Makes mesh carriers; the second of a kind is a copy of the first, which is several times faster."""
+    """Factory for mesh carriers; later carriers of a kind are copies of the first, which is several times faster."""
 
     def __init__(self, objects: Objects, largest_point: float) -> None:
         self.objects = objects
         self.largest_point = largest_point
         self.changed: set[int] = set()
-        """IDs of the objects whose splats are new."""
+        """IDs of the objects whose splats carrier was created."""
         self._made: dict[str, bpy.types.Object] = {}
 
     def part(
         self, collection: bpy.types.Collection, kind: str, object_id: int, pivot: bpy.types.Object
     ) -> bpy.types.Object:
-        """The carrier of a kind in `collection`, made where there is none."""
+        """Return the carrier of a kind in `collection`, created if missing."""
         obj = part_of(collection, kind)
         if obj is not None:
             if obj.parent is None:
-                obj.parent = pivot  # The user deleted the one before.
+                obj.parent = pivot  # The user deleted the previous pivot.
             return obj
         name = f"{collection[NAME]} {kind}"
         mesh = bpy.data.meshes.new(name)
@@ -218,7 +225,7 @@ class _Makers:
             self._update_appearance(obj, first, collection[NAME], to_linear(self.objects.rgb(object_id)))
             self.changed.add(object_id)
         elif first is None:
-            # Blender visits every object of the file for each of these settings; copies have them.
+            # Setting these makes Blender visit every object in the file; copies inherit them.
             obj.hide_render = obj.hide_viewport = True
         obj.parent = pivot
         collection.objects.link(obj)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""splats.ply and anchors.ply as the attributes of mesh carriers."""
+"""Readers for splats.ply and anchors.ply, and their conversion to attributes of mesh carriers."""
 
 from __future__ import annotations
 
@@ -32,14 +32,18 @@ _NEEDED = (
 )
 LARGEST_LOG_SCALE = 80.0
 ROWS_AT_ONCE = 1 << 14
-"""Few enough to stay in the processor's cache while their columns are looked at."""
+"""Number of rows checked at a time, small enough to stay in the CPU cache."""
 
 LARGEST_TABLE = 1 << 22
-"""IDs below this are told apart by counting, without a sort."""
+"""IDs below this limit are grouped by counting instead of sorting."""
 
 
 def read_splats(folder: Path) -> tuple[np.ndarray, list[str]]:
-    """splats.ply as a structured array without splats that cannot be shown, and warnings about those."""
+    """Return splats.ply as a structured array, and warnings; splats that cannot be shown are left out.
+
+    Raises:
+        InputError: splats.ply is missing or lacks required properties.
+    """
     path = Reconstruction(folder).splats
     if not path.is_file():
         raise InputError(f"{folder} has no splats.ply; train first.")
@@ -53,7 +57,11 @@ def read_splats(folder: Path) -> tuple[np.ndarray, list[str]]:
 
 
 def read_anchors(folder: Path) -> tuple[np.ndarray | None, list[str]]:
-    """anchors.ply as a structured array, None where there is none, and warnings."""
+    """Return anchors.ply as a structured array (None if there is no such file), and warnings.
+
+    Raises:
+        InputError: anchors.ply lacks required properties.
+    """
     path = Reconstruction(folder).anchors
     if not path.is_file():
         return None, []
@@ -66,7 +74,7 @@ def read_anchors(folder: Path) -> tuple[np.ndarray | None, list[str]]:
 
 
 def ids_of(table: np.ndarray) -> np.ndarray:
-    """(n,) int64 object IDs; 0 where the file names none."""
+    """Return the (n,) int64 object IDs of a table, 0 if it stores none."""
     if "object_id" not in (table.dtype.names or ()):
         return np.zeros(len(table), np.int64)
     ids = table["object_id"]
@@ -76,7 +84,10 @@ def ids_of(table: np.ndarray) -> np.ndarray:
 
 
 def unique_ids(ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The different IDs, ascending, and the place of each of (n,) `ids` among them; without a sort for small ones."""
+    """Return the unique IDs in ascending order and the index of each of the (n,) `ids` among them.
+
+    IDs below LARGEST_TABLE need no sort.
+    """
     if len(ids) == 0 or ids.max() >= LARGEST_TABLE:
         unique, inverse = np.unique(ids, return_inverse=True)
         return unique, inverse.reshape(-1)
@@ -85,7 +96,7 @@ def unique_ids(ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def median_scale(table: np.ndarray) -> float:
-    """Of a sample of splats: the median of their middle scales; 1 without splats."""
+    """Return the median, over a sample of splats, of each splat's middle scale; 1 if there are no splats."""
     if len(table) == 0:
         return 1.0
     some = table[:: max(1, len(table) // 10_000)]
@@ -93,9 +104,10 @@ def median_scale(table: np.ndarray) -> float:
 
 
 def splat_attributes(table: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
-    """The attributes of Blender's own Gaussian splats: linear scale and opacity, unit quaternions, and the ID.
+    """Return carrier attributes in the layout of Blender's own Gaussian splats, plus the object ID.
 
-    `radiance:base` holds the raw constant coefficients and the opacity, `radiance:sh_1` .. the higher ones, RGB each.
+    Scales and opacities are linear, quats are unit length. `radiance:base` holds the raw degree 0 SH coefficients and
+    the opacity; `radiance:sh_1` and following hold the higher coefficients, one RGB vector each.
     """
     rest = _rest_count(table.dtype.names) // 3
     base = _columns(table, "f_dc_0", "f_dc_1", "f_dc_2", "opacity")
@@ -115,7 +127,7 @@ def splat_attributes(table: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
 
 
 def anchor_attributes(table: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
-    """What an anchor says of the splats that it makes: scaling of their offsets, mean opacity, how many."""
+    """Return the carrier attributes of anchors: object ID, scale of the offsets, mean opacity and number of splats."""
     return {
         "object_id": ("INT", stored_ids(ids_of(table))),
         "scale": ("FLOAT_VECTOR", _columns(table, "scale_0", "scale_1", "scale_2")),
@@ -125,7 +137,7 @@ def anchor_attributes(table: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
 
 
 def _columns(table: np.ndarray, *names: str) -> np.ndarray:
-    """(n, len(names)) float32."""
+    """Return the named columns as (n, len(names)) float32."""
     values = np.empty((len(table), len(names)), np.float32)
     for i, name in enumerate(names):
         values[:, i] = table[name]
@@ -133,7 +145,7 @@ def _columns(table: np.ndarray, *names: str) -> np.ndarray:
 
 
 def _rest_count(names: Any, path: Path | None = None) -> int:
-    """How many properties f_rest_* there are."""
+    """Count the properties f_rest_*; if `path` is given, raise InputError unless they form whole SH degrees."""
     count = sum(name.startswith("f_rest_") for name in names)
     if path is not None and (
         count % 3

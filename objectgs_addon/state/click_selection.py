@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A click in the viewport or the outliner on one part of an object selects all of it, and the list follows."""
+"""Selection of whole objects and their list rows when one part is clicked in the viewport or the outliner."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _owner = object()
 
 @writing.allowed
 def _active_changed() -> None:
-    """Called by Blender when another object becomes active."""
+    """Select the object of the new active part; Blender calls this when the active object changes."""
     context = bpy.context
     part = getattr(context, "active_object", None)
     if part is None or part.mode != "OBJECT" or not part.select_get():
@@ -51,7 +51,7 @@ def _file_loaded(*_: Any) -> None:
 
 @bpy.app.handlers.persistent
 def _undone(*_: Any) -> None:
-    """Blender kept the selection as the click itself left it."""
+    """Extend the selection again, since undo and redo restore only the click itself."""
     _active_changed()
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How far a reconstruction folder is, read from its files alone (no torch, no backend)."""
+"""Progress of a reconstruction folder, read from its files."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +14,20 @@ from ...backend.shared.reconstruction.meshes import read_meshes
 
 @dataclass(frozen=True)
 class FolderState:
-    """exists: the folder is there; imported: cameras and points are; voted: objects are; steps, seconds: of the
-    checkpoint's training (0: none); trained: splats are there; capture: where the photos are, or None; pixels: of a
-    view, on average; meshes: how many there are; stale_meshes: those of another state of the training."""
+    """Contents of a reconstruction folder.
+
+    Attributes:
+        exists: the folder exists.
+        imported: cameras and points exist.
+        voted: objects.json exists.
+        steps: training steps of the checkpoint; 0 without one.
+        seconds: training time of the checkpoint; 0 without one.
+        trained: splats exist.
+        capture: folder of the capture with the photos, or None.
+        pixels: average number of pixels per view.
+        meshes: number of meshes.
+        stale_meshes: number of meshes made at another training step than the checkpoint's.
+    """
 
     exists: bool
     imported: bool
@@ -34,7 +45,7 @@ _known: dict[Path, tuple[tuple, FolderState]] = {}
 
 
 def folder_state(folder: Path) -> FolderState:
-    """What is in `folder`; cheap enough to be asked while a panel is drawn."""
+    """Return the state of `folder`; the result is cached, so panels can call this while drawing."""
     paths = Reconstruction(folder)
     checkpoint = paths.checkpoint / CURRENT
     listed = paths.meshes / MESHES
@@ -71,7 +82,7 @@ def _modified(path: Path) -> int | None:
 
 
 def _views(folder: Path) -> tuple[Path | None, float]:
-    """The capture's folder, and how many pixels its views have on average."""
+    """Return the capture's folder and the average number of pixels per view."""
     try:
         cameras = read_cameras(folder)
     except InputError:
@@ -81,7 +92,7 @@ def _views(folder: Path) -> tuple[Path | None, float]:
 
 
 def _mesh_steps(folder: Path) -> list[int | None]:
-    """The steps of the training that each mesh was made at."""
+    """Return the training step at which each mesh was made."""
     try:
         return [entry.trained_steps for entry in read_meshes(folder).values() if entry.file]
     except InputError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Edits by the user: the list of objects is filled from objects.json, and changes are written back to it."""
+"""User edits: the list of objects is filled from objects.json, and changes are written back to it."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from ..scene import from_stored, to_stored
 from . import object_list
 
 WRITE_AFTER = 0.4
-"""Seconds after the last change until new colors are written, since a dragged slider changes all the time."""
+"""Delay in seconds between the last change and writing new colors, since a dragged slider changes continuously."""
 
 after_edits: list[Callable[[bpy.types.Collection], None]] = []
-"""Called with a reconstruction's collection after an edit that the backend may have to complete."""
+"""Callbacks that receive a reconstruction's collection after an edit that the backend may have to complete."""
 
 _filling = False
 _unwritten: set[tuple[int, int]] = set()
-"""(session UID of the collection, object ID) of new colors that are not in objects.json yet."""
+"""(session UID of the collection, object ID) of new colors not yet in objects.json."""
 
 
 @contextmanager
@@ -45,7 +45,7 @@ def without_callbacks() -> Iterator[None]:
 
 
 def fill(root: bpy.types.Collection) -> None:
-    """Fill the list from objects.json and the shown splats; it is empty before objects are assigned."""
+    """Fill the list from objects.json and the shown splats and meshes; it is empty before the first vote."""
     flush()
     properties = root.objectgs
     path = Reconstruction(scene.folder_of(root)).objects
@@ -75,7 +75,7 @@ def fill(root: bpy.types.Collection) -> None:
 
 
 def store(root: bpy.types.Collection) -> None:
-    """Write the list and the transforms to objects.json after undo or redo changed them."""
+    """Write the list and the transforms to objects.json after an undo or redo."""
     _unwritten.difference_update([mark for mark in _unwritten if mark[0] == root.session_uid])
     path = Reconstruction(scene.folder_of(root)).objects
     if not path.exists():
@@ -116,18 +116,18 @@ def store(root: bpy.types.Collection) -> None:
 
 
 def store_edits(root: bpy.types.Collection) -> None:
-    """Write pending edits to objects.json, before something else reads it."""
+    """Write pending edits to objects.json before it is read elsewhere."""
     flush()
     scene.store_placements(root)
 
 
 def merge(root: bpy.types.Collection, object_ids: Iterable[int], into: int) -> None:
-    """Make objects parts of the object `into`."""
+    """Merge objects into the object `into`."""
     _edit(root, {object_id: {"merged_into": into} for object_id in object_ids if object_id != into})
 
 
 def split(root: bpy.types.Collection, object_id: int) -> int:
-    """Undo every merge into `object_id` and its own; returns their number."""
+    """Undo every merge into `object_id` and its own merge, and return their number."""
     items = root.objectgs.objects
     apart = [
         from_stored(item.object_id)
@@ -139,13 +139,13 @@ def split(root: bpy.types.Collection, object_id: int) -> int:
 
 
 def group(root: bpy.types.Collection, labels: Path) -> None:
-    """Merge the IDs that a labels file gives the same name. Raises InputError if it is no labels file."""
+    """Merge IDs that have the same name in a labels file; raise InputError if the file is not a labels file."""
     objects = read_objects(Reconstruction(scene.folder_of(root)).objects)
     _edit(root, grouped(objects, read_groups(labels), labels))
 
 
 def choose(root: bpy.types.Collection, chosen: dict[int, bool]) -> None:
-    """Set for each ID whether training makes it an object."""
+    """Set for each ID whether it is trained as an object."""
     _edit(root, {object_id: {"left_out": None if wanted else True} for object_id, wanted in chosen.items()})
 
 
@@ -176,7 +176,11 @@ def show(root: bpy.types.Collection) -> None:
 def remove(root: bpy.types.Collection, object_ids: Iterable[int], floaters: bool, fill: bool = False) -> None:
     """Hide objects until they are restored.
 
-    floaters: also hide the unlabeled splats inside them. fill: fill the holes in the ground or walls behind them.
+    Args:
+        root: the reconstruction's collection.
+        object_ids: IDs of the objects.
+        floaters: also hide the unlabeled splats inside the objects.
+        fill: fill the holes in the ground or walls behind the objects.
     """
     change = {"removed": True, "floaters": floaters or None, "fill": fill or None}
     _show_edit(root, dict.fromkeys(object_ids, change))
@@ -188,7 +192,7 @@ def restore(root: bpy.types.Collection, object_ids: Iterable[int]) -> None:
 
 
 def fill_hole(root: bpy.types.Collection, object_id: int, is_filled: bool) -> None:
-    """Fill the hole behind a removed object, or leave it as it was trained."""
+    """Fill the hole behind a removed object, or remove the fill."""
     _show_edit(root, {object_id: {"fill": is_filled or None}})
 
 
@@ -198,7 +202,7 @@ def reset_colors(root: bpy.types.Collection, object_ids: Iterable[int]) -> None:
 
 
 def _show_edit(root: bpy.types.Collection, changes: dict[int, dict]) -> None:
-    """Write edits to objects.json and show them, for edits that need no splats from the folder."""
+    """Write edits to objects.json and show them, for edits that require no splats from the folder."""
     _require_object_mode(root)
     flush()
     folder = scene.folder_of(root)
@@ -276,7 +280,7 @@ def chosen_changed(item: Any, _context: bpy.types.Context) -> None:
 
 
 def recolor_changed(item: Any, _context: bpy.types.Context) -> None:
-    """Show a moved slider's color at once, and write it a little later."""
+    """Show the color of a moved slider immediately and schedule writing it."""
     if _filling:
         return
     root, object_id = item.id_data, from_stored(item.object_id)
@@ -303,7 +307,7 @@ def _flush_later() -> None:
 
 
 def _row_changed(item: Any, **changes: Any) -> None:
-    """Store an edit of a row, or revert it if that fails, since a callback must not raise."""
+    """Store an edit of a row, or revert it on failure, since update callbacks must not raise."""
     if _filling:
         return
     root = item.id_data
@@ -340,7 +344,7 @@ def _restore(item: Any) -> None:
     if item.stored:
         with without_callbacks():
             item.name, item.color, item.chosen, *recolor = json.loads(item.stored)
-            if recolor:  # Files of older versions have none.
+            if recolor:  # Missing in files of older versions.
                 _set_sliders(item, Recolor.of(recolor[0]) if recolor[0] else None)
 
 

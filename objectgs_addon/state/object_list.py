@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the list of objects says: its rows, which are chosen, and what the objects consist of."""
+"""Queries on the list of objects: rows, chosen objects, counts of splats and faces, and color edits."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ DIGITS = 6
 
 
 def active_item(root: bpy.types.Collection) -> Any:
-    """The active row, or None if the list is empty."""
+    """Return the active row, or None if the list is empty."""
     properties = root.objectgs
     count = len(properties.objects)
     return properties.objects[min(max(properties.active_object, 0), count - 1)] if count else None
 
 
 def item_of(root: bpy.types.Collection, object_id: int) -> Any:
-    """The row of an object ID, or None."""
+    """Return the row of an object ID, or None."""
     return next((item for item in root.objectgs.objects if from_stored(item.object_id) == object_id), None)
 
 
 def shown_item(root: bpy.types.Collection) -> Any:
-    """The active row, or the row it is merged into; None if the list is empty."""
+    """Return the active row or the row it is merged into; None if the list is empty."""
     item = active_item(root)
     return item and item_of(root, shown_as(root, from_stored(item.object_id)))
 
 
 def shown_as(root: bpy.types.Collection, object_id: int) -> int:
-    """The ID of the object that shows `object_id`: itself, or the one it is merged into."""
+    """Return the ID of the object into which `object_id` is merged, or `object_id` itself."""
     rows = [
         SceneObject(
             from_stored(item.object_id),
@@ -54,7 +54,7 @@ def shown_as(root: bpy.types.Collection, object_id: int) -> int:
 
 
 def chosen_ids(context: bpy.types.Context, root: bpy.types.Collection) -> list[int]:
-    """IDs of the objects selected in the viewport, or of the active row; of merged objects, the one they belong to."""
+    """Return the IDs of the objects selected in the viewport, or else of the active row, with merges resolved."""
     ids = selection.selected_ids(context, root)
     item = active_item(root)
     if not ids and item is not None:
@@ -63,7 +63,7 @@ def chosen_ids(context: bpy.types.Context, root: bpy.types.Collection) -> list[i
 
 
 def require_chosen_ids(context: bpy.types.Context, root: bpy.types.Collection) -> list[int]:
-    """As `chosen_ids`. Raises InputError if there are none."""
+    """Return `chosen_ids`; raise InputError if there are none."""
     ids = chosen_ids(context, root)
     if not ids:
         raise InputError("No object is selected; select one in the viewport or in the list")
@@ -71,12 +71,12 @@ def require_chosen_ids(context: bpy.types.Context, root: bpy.types.Collection) -
 
 
 def scenes_of(root: bpy.types.Collection) -> list[bpy.types.Scene]:
-    """The scenes that contain the reconstruction."""
+    """Return the scenes that contain the reconstruction."""
     return [owner for owner in bpy.data.scenes if root in owner.collection.children_recursive]
 
 
 def splat_counts(root: bpy.types.Collection) -> dict[int, int]:
-    """Object ID -> number of splats in its collection, including those of merged objects."""
+    """Map object IDs to the numbers of observed splats in their collections, including those of merged objects."""
     return {
         object_id: sum(
             len(part.data.vertices) - int(scene.unobserved_splats(part.data).sum())
@@ -88,7 +88,7 @@ def splat_counts(root: bpy.types.Collection) -> dict[int, int]:
 
 
 def face_counts(root: bpy.types.Collection) -> dict[int, int]:
-    """Object ID -> number of faces of its meshes, for objects that have any."""
+    """Map the IDs of objects with meshes to the numbers of their faces."""
     return {
         object_id: sum(len(mesh.data.polygons) for mesh in meshes)
         for object_id, meshes in scene.object_meshes(root).items()
@@ -96,14 +96,14 @@ def face_counts(root: bpy.types.Collection) -> dict[int, int]:
 
 
 def recolor_of(item: Any) -> Recolor:
-    """The color edit that a row's sliders describe."""
+    """Return the color edit set by a row's sliders."""
     values = {name: round(getattr(item, name), DIGITS) for name in SLIDERS}
     values |= {name: tuple(round(channel, DIGITS) for channel in getattr(item, name)) for name in COLORS}
     return Recolor(**values, middle=round(item.middle, DIGITS)) if item.middle else Recolor(**values)
 
 
 def rounded(recolor: Recolor | None) -> Recolor:
-    """A stored color edit with the sliders' precision."""
+    """Round a stored color edit to the precision of the sliders."""
     if recolor is None:
         return Recolor()
     values = {name: round(getattr(recolor, name), DIGITS) for name in (*SLIDERS, "middle")}

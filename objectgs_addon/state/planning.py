@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The plan of a training and the decisions that the user overrides."""
+"""The training plan and the user's overrides of its decisions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _known: dict[Path, tuple[int, Plan]] = {}
 
 
 def plan_of(folder: Path) -> Plan:
-    """The plan in a reconstruction folder; one without decisions if it is missing or broken."""
+    """Return the plan in a reconstruction folder, or an empty plan if the file is missing or invalid."""
     path = Reconstruction(folder).plan
     try:
         written = path.stat().st_mtime_ns
@@ -30,24 +30,24 @@ def plan_of(folder: Path) -> Plan:
 
 
 def is_wanted(properties: Any, decision: Decision) -> bool | None:
-    """Whether training does it: the user's choice, or else the planned one (None: not known yet)."""
+    """Return whether a decision applies: the user's choice, or else the plan's (None if not known yet)."""
     choice = properties.plan_choices.get(decision.key)
     return decision.done if choice is None else choice.done
 
 
 def want(properties: Any, key: str, done: bool) -> None:
-    """Store the user's choice."""
+    """Store the user's choice for a decision."""
     choice = properties.plan_choices.get(key) or properties.plan_choices.add()
     choice.name, choice.done = key, done
 
 
 def sentence_case(text: str) -> str:
-    """`text` with a capital first letter."""
+    """Return `text` with a capital first letter."""
     return text[:1].upper() + text[1:]
 
 
 def arguments(root: bpy.types.Collection) -> list[str]:
-    """The settings of the training as options of the backend's commands `plan` and `train`."""
+    """Return the training settings as options of the backend's commands `plan` and `train`."""
     properties = root.objectgs
     wanted = {
         decision.key: is_wanted(properties, decision)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The state saved in the .blend: the active reconstruction, its list of objects and its training settings.
+"""Properties saved in the .blend: the active reconstruction, its list of objects and its training settings.
 
-`Collection.objectgs` holds a reconstruction's state, `Scene.objectgs` the active one. Everything here is undone and
-saved with the .blend; background jobs are not (see `running`).
+`Collection.objectgs` stores the state of a reconstruction and `Scene.objectgs` the active reconstruction. These
+properties support undo and are saved with the .blend, unlike background jobs (see `running`).
 """
 
 from typing import Any
@@ -57,7 +57,7 @@ def _color_edit(name: str, default: float, description: str) -> Any:
 
 
 class ObjectItem(bpy.types.PropertyGroup):
-    """A row of the objects list. IDs above 2^31 - 1 are stored as the int32 of the same bits."""
+    """A row of the objects list; IDs above 2^31 - 1 are stored as the int32 with the same bits."""
 
     name: StringProperty(
         name="Name", description="Name of the object, kept in the reconstruction", update=object_edits.name_changed
@@ -108,7 +108,7 @@ class PlanChoice(bpy.types.PropertyGroup):
 
 
 class ReconstructionProperties(bpy.types.PropertyGroup):
-    """State of one reconstruction, on its collection."""
+    """State of one reconstruction, stored on its collection."""
 
     objects: CollectionProperty(type=ObjectItem)
     plan_choices: CollectionProperty(type=PlanChoice)
@@ -179,7 +179,7 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
         items=[("photo", "Photo", "Colors of the photos"), ("object", "Object", "Color of the assigned object")],
         update=lambda self, _context: color_points_by(self.id_data, self.color_by),
     )
-    # Stored outside of this property group, as in files made without the extension.
+    # Stored in a custom property outside this property group, as in files made without the extension.
     shown: EnumProperty(
         name="Show",
         items=[
@@ -234,7 +234,7 @@ def _is_reconstruction(_scene: Any, collection: bpy.types.Collection) -> bool:
 
 
 class SceneProperties(bpy.types.PropertyGroup):
-    """The active reconstruction of a scene, and how it is shown."""
+    """The active reconstruction of a scene and its display settings."""
 
     active: PointerProperty(
         type=bpy.types.Collection,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the 3D viewports look at and show."""
+"""View and shading of the 3D viewports."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from . import object_list
 
 
 def show(root: bpy.types.Collection) -> None:
-    """Let every 3D viewport of a reconstruction's scene look at its cameras, and show colors in Solid mode."""
+    """Frame the cameras in every 3D viewport of a reconstruction's scene, and show color attributes in Solid mode."""
     for window in bpy.context.window_manager.windows:
         if root not in window.scene.collection.children_recursive:
             continue
@@ -25,17 +25,17 @@ def show(root: bpy.types.Collection) -> None:
 
 
 def hide_points(root: bpy.types.Collection) -> None:
-    """Take the point cloud out of sight, since splats or meshes come into its place."""
+    """Hide the point cloud when splats or meshes replace it."""
     points = [part for part in root.all_objects if scene.kind_of(part) == "points"]
     for layer in (layer for owner in object_list.scenes_of(root) for layer in owner.view_layers):
         for part in points:
-            # Not looked for in the layer, which does not list yet what was just linked.
-            with contextlib.suppress(RuntimeError):  # It was taken out of this layer.
+            # No lookup in the layer, which does not list newly linked objects yet.
+            with contextlib.suppress(RuntimeError):  # The layer does not contain the points.
                 part.hide_set(True, view_layer=layer)
 
 
 def _frame(root: bpy.types.Collection) -> None:
-    """Look at the cameras in the viewport of the context; the selection stays."""
+    """Frame the cameras in the context's viewport and keep the selection."""
     context = bpy.context
     selected = list(context.selected_objects)
     for obj in selected:

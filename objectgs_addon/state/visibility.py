@@ -11,14 +11,14 @@ from .. import scene
 
 
 def _layers(layer: bpy.types.LayerCollection) -> Iterator[bpy.types.LayerCollection]:
-    """A layer collection and all below it."""
+    """Yield a layer collection and all its descendants."""
     yield layer
     for child in layer.children:
         yield from _layers(child)
 
 
 def object_layers(view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -> dict[int, bpy.types.LayerCollection]:
-    """Object ID -> layer collection, for objects that have one."""
+    """Map object IDs to layer collections, for objects that have one."""
     top = next((layer for layer in _layers(view_layer.layer_collection) if layer.collection == root), None)
     return {
         object_id: layer
@@ -29,15 +29,21 @@ def object_layers(view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -
 
 
 def _duplicate_layers(view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -> list[bpy.types.LayerCollection]:
-    """The layer collections of the objects' duplicates."""
+    """Return the layer collections of the objects' duplicates."""
     copies = [copy for copies in scene.duplicates_of(root).values() for copy in copies]
     return [layer for layer in _layers(view_layer.layer_collection) if layer.collection in copies] if copies else []
 
 
 def toggle_solo(view_layer: bpy.types.ViewLayer, root: bpy.types.Collection, object_id: int) -> bool:
-    """Hide every object but one, or show all if it is the only one shown; False if it has no collection.
+    """Hide all objects except one and its duplicates, or show all if it is the only one shown.
 
-    Duplicates follow their originals.
+    Args:
+        view_layer: the view layer.
+        root: the reconstruction's collection.
+        object_id: ID of the object to isolate.
+
+    Returns:
+        False if the object has no collection.
     """
     layers = object_layers(view_layer, root)
     if object_id not in layers:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Edits of objects in the scene: removal, fill, colors, placement, duplicates."""
+"""Edits of objects in the scene: removal, fill, recoloring, placement and duplicates."""

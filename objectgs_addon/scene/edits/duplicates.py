@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Duplicates of objects: a collection each, whose parts share the data of the object's own."""
+"""Duplicates of objects: collections whose parts share the data of the original's parts."""
 
 from __future__ import annotations
 
@@ -27,14 +27,23 @@ from ..object_collection import NAME
 from .placement import PLACEMENT, placement_of, set_placement
 
 DUPLICATES = "objectgs_copies"
-"""On an object's collection: where objects.json has its duplicates, as of when Blender agreed with it, as JSON."""
+"""Custom property of an object's collection: placements of its duplicates at the last sync with objects.json (JSON)."""
 
 _CARRIERS = (SPLATS, ANCHORS)
 
 
 def duplicate(root: bpy.types.Collection, source: bpy.types.Collection) -> bpy.types.Collection:
-    """A duplicate of an object, or of a duplicate of it, in the same place; all that lies in its collection comes
-    along. The original's sliders work on it, too."""
+    """Duplicate an object or one of its duplicates in place, with all Blender objects in its collection.
+
+    The original's sliders also control the duplicate.
+
+    Args:
+        root: the reconstruction's collection.
+        source: the collection of the object or duplicate.
+
+    Returns:
+        The collection of the new duplicate.
+    """
     copy = _new_collection(root, source)
     twins = {obj: obj.copy() for obj in source.objects}
     for obj, twin in twins.items():
@@ -47,7 +56,7 @@ def duplicate(root: bpy.types.Collection, source: bpy.types.Collection) -> bpy.t
 
 
 def remove_duplicate(copy: bpy.types.Collection) -> None:
-    """Remove a duplicate with all that lies only in it; the data stays with the original."""
+    """Remove a duplicate and the Blender objects that are only in its collection; the data stays with the original."""
     for obj in list(copy.objects):
         if len(obj.users_collection) == 1:
             bpy.data.objects.remove(obj)
@@ -55,10 +64,10 @@ def remove_duplicate(copy: bpy.types.Collection) -> None:
 
 
 def adopt_blender_duplicates(root: bpy.types.Collection) -> None:
-    """Make what the user duplicated with Blender's own means duplicates of ours, each in its own collection.
+    """Convert what the user duplicated with Blender's own operators to duplicates, each in its own collection.
 
-    That is: a whole collection; an object's pivot with the parts that hang on it; its splats alone. A mesh alone, which
-    may be on its way to becoming something else, stays the user's.
+    This applies to whole collections, to pivots with their children, and to splats alone. A mesh duplicated alone is
+    left to the user, who may have another use for it.
     """
     originals = object_collections(root)
     for collection in root.children_recursive:
@@ -91,7 +100,7 @@ def adopt_blender_duplicates(root: bpy.types.Collection) -> None:
 
 
 def bring_up_to_date(root: bpy.types.Collection) -> None:
-    """Give duplicates the parts that their originals have now; those of objects that are gone go."""
+    """Sync the parts of duplicates with their originals; remove duplicates whose original no longer exists."""
     originals = object_collections(root)
     for object_id, copies in duplicates_of(root).items():
         for copy in copies:

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Filled holes of removed objects: unobserved splats at the end of the carriers whose surface they continue, and hidden
-splats that give way to them. The backend computes both; each has the ID of the removed object."""
+"""Fills of holes left by removed objects.
+
+The backend computes unobserved splats, appended to the carriers whose surface they continue, and the splats that they
+replace, which are hidden. Both store the ID of the removed object.
+"""
 
 from __future__ import annotations
 
@@ -23,24 +26,24 @@ from ..shading.node_groups import HIDDEN
 from ..splats import ids_of, splat_attributes
 
 SHOWN_FILL = "objectgs_fill"
-"""Custom property of a carrier's mesh that has the attribute `FILLS`: the name of the file that it shows."""
+"""Custom property of a carrier's mesh: the name of the fill file that it shows."""
 UNOBSERVED_COUNT = "objectgs_unobserved"
-"""Custom property of a removed object's collection: the number of splats that fill its hole, where that is known."""
+"""Custom property of a removed object's collection: the number of splats that fill its hole, if known."""
 
 
 def missing_fill(root: bpy.types.Collection, objects: Objects) -> Path | None:
-    """The file that the edits ask for if it does not exist yet, else None."""
+    """Return the fill file that the edits require if it does not exist yet, else None."""
     path = _path(root, objects)
     return None if path is None or path.is_file() else path
 
 
 def show_fills(root: bpy.types.Collection, objects: Objects) -> None:
-    """Fill the holes of removed objects as the edits ask for.
+    """Show the fills of removed objects that the edits require.
 
-    While the file for these edits is missing, the splats shown so far stay for the objects that are still to be filled.
+    While the file for these edits is missing, objects that still require a fill keep the splats shown so far.
 
     Raises:
-        InputError: If a file cannot be read or a carrier is in Edit Mode; nothing is changed then.
+        InputError: A file cannot be read, or a carrier is in Edit Mode; nothing is changed.
     """
     path = _path(root, objects)
     rows = read_vertices(path) if path is not None and path.is_file() else None
@@ -74,22 +77,21 @@ def show_fills(root: bpy.types.Collection, objects: Objects) -> None:
 
 
 def filled_objects(mesh: bpy.types.Mesh) -> np.ndarray:
-    """(n,) int64: for each splat of a carrier that fills the hole of a removed object, or gives way to one that does,
-    the ID of that object; 0 for all others."""
+    """Return the (n,) int64 IDs of the removed objects whose fill adds or replaces each splat of a carrier; else 0."""
     if FILLS not in mesh.attributes:
         return np.zeros(len(mesh.vertices), np.int64)
     return carrier.read(mesh, FILLS).astype(np.int64) & 0xFFFFFFFF
 
 
 def unobserved_splats(mesh: bpy.types.Mesh) -> np.ndarray:
-    """(n,) bool: which splats of a carrier are in no photo, because they fill a hole."""
+    """Return an (n,) bool mask of a carrier's unobserved splats, which fill a hole and are in none of the photos."""
     if UNOBSERVED not in mesh.attributes:
         return np.zeros(len(mesh.vertices), bool)
     return carrier.read(mesh, UNOBSERVED)
 
 
 def given_way(mesh: bpy.types.Mesh) -> np.ndarray:
-    """(n,) bool: which splats of a carrier are hidden because unobserved ones replace them."""
+    """Return an (n,) bool mask of a carrier's splats that are hidden because unobserved splats replace them."""
     return (filled_objects(mesh) != 0) & ~unobserved_splats(mesh)
 
 
@@ -98,7 +100,7 @@ def _path(root: bpy.types.Collection, objects: Objects) -> Path | None:
 
 
 def _keep(obj: bpy.types.Object, fills: np.ndarray) -> None:
-    """Keep the filling splats of a carrier where `fills` (n,) is not 0, and show again what gave way to the others."""
+    """Keep only fill splats where `fills` (n,) is not 0, and show the splats replaced by the other fills again."""
     mesh = obj.data
     if FILLS not in mesh.attributes:
         return
@@ -114,8 +116,14 @@ def _keep(obj: bpy.types.Object, fills: np.ndarray) -> None:
 
 
 def _put(obj: bpy.types.Object, rows: np.ndarray, origin: np.ndarray, center: np.ndarray) -> None:
-    """Hide the splats of a carrier that are among rows, and append the unobserved ones. center (3,): the origin of the
-    carrier's coordinates in the reconstruction's, whose own is `origin` in the capture's."""
+    """Append the unobserved splats in `rows` to a carrier, and hide its splats that match the other rows.
+
+    Args:
+        obj: the carrier.
+        rows: rows of the fill file for this carrier.
+        origin: (3,) origin of the reconstruction in capture coordinates.
+        center: (3,) origin of the carrier in reconstruction coordinates.
+    """
     mesh = obj.data
     is_put = rows[UNOBSERVED] != 0
     positions, new = positions_of(rows, origin) - center, splat_attributes(rows)
@@ -138,7 +146,7 @@ def _put(obj: bpy.types.Object, rows: np.ndarray, origin: np.ndarray, center: np
 
 
 def _fill(obj: bpy.types.Object, positions: np.ndarray, attributes: dict[str, tuple[str, np.ndarray]]) -> None:
-    """Replace a carrier's splats. Those that give way are hidden; if none does, the carrier is as captured."""
+    """Replace a carrier's splats and hide the replaced ones; without fills, drop the fill attributes."""
     fills, hidden = attributes[FILLS][1] != 0, attributes[HIDDEN][1]
     if fills.any():
         hidden = hidden | (fills & ~attributes[UNOBSERVED][1])
@@ -152,13 +160,13 @@ def _fill(obj: bpy.types.Object, positions: np.ndarray, attributes: dict[str, tu
 
 
 def _hidden_otherwise(mesh: bpy.types.Mesh) -> np.ndarray:
-    """(n,) bool: which splats are hidden for another reason than that unobserved ones replace them."""
+    """Return an (n,) bool mask of the splats that are hidden for reasons other than a fill."""
     hidden = carrier.read(mesh, HIDDEN) if HIDDEN in mesh.attributes else np.zeros(len(mesh.vertices), bool)
     return hidden & ~given_way(mesh)
 
 
 def _attributes(mesh: bpy.types.Mesh) -> dict[str, tuple[str, np.ndarray]]:
-    """All attributes of a carrier's splats but their positions and Blender's own flags."""
+    """Return all point attributes of a carrier except positions and Blender's internal attributes."""
     return {
         attribute.name: (attribute.data_type, carrier.read(mesh, attribute.name))
         for attribute in mesh.attributes
@@ -170,12 +178,12 @@ def _attributes(mesh: bpy.types.Mesh) -> dict[str, tuple[str, np.ndarray]]:
 
 
 def _keys(positions: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """(n,) keys that identify splats bit for bit: position, and color without the opacity."""
+    """Return (n,) keys from the exact bits of the splats' positions and colors, without opacities."""
     values = np.ascontiguousarray(np.hstack([positions.astype(np.float32), base[:, :3].astype(np.float32)]))
     return values.view(f"V{values.itemsize * 6}").reshape(-1)
 
 
 def _among(keys: np.ndarray, wanted: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """(n,) int64: for each key the value of the equal key in `wanted`, or 0."""
+    """Return, for each key, the value of the equal key in `wanted`, or 0, as (n,) int64."""
     known = dict(zip(wanted.tolist(), values.tolist()))
     return np.array([known.get(key, 0) for key in keys.tolist()], np.int64)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What floats unlabeled around removed objects: hidden with them by an attribute of the carrier, by the rule that the
-backend exports by."""
+"""Floaters: unlabeled splats inside removed objects, hidden by a carrier attribute.
+
+The rule is the same as in the backend's export.
+"""
 
 import bmesh
 import bpy
@@ -15,13 +17,13 @@ from ..shading.node_groups import HIDDEN
 from .fills import given_way, unobserved_splats
 
 FLATTEST = 1e-5
-"""A hull thinner than this, relative to its length, has no inside."""
+"""A hull that is thinner than this, relative to its length, counts as flat and has no interior."""
 TOLERANCE = 1e-5
-"""How far a hull's corner may lie beyond one of its faces, relative to the hull's size."""
+"""Largest distance of a hull's corner outside one of its faces, relative to the hull's size."""
 
 
 def hide_floaters(root: bpy.types.Collection, removed: list[int]) -> None:
-    """Hide the unlabeled splats inside the objects of these IDs, which have been removed, and show all others."""
+    """Hide the unlabeled splats inside the removed objects with these IDs, and show all other unlabeled splats."""
     collections = object_collections(root)
     carriers = {object_id: part_of(collection, SPLATS) for object_id, collection in collections.items()}
     unlabeled = carriers.pop(0, None)
@@ -36,7 +38,7 @@ def hide_floaters(root: bpy.types.Collection, removed: list[int]) -> None:
         obj = carriers.get(object_id)
         if obj is not None and "radiance:base" in obj.data.attributes:
             hidden |= inside_hull(places, _places(obj), carrier.read(obj.data, "radiance:base")[:, 3])
-    # What was merged with the unlabeled rest is not unlabeled.
+    # Objects merged into the unlabeled rest keep their own IDs and are not floaters.
     hidden &= (carrier.read(unlabeled.data, OBJECT_ID) == 0) & ~unobserved_splats(unlabeled.data)
     hidden |= given_way(unlabeled.data)
     if np.array_equal(hidden, np.zeros(len(places), bool) if before is None else before):
@@ -48,7 +50,7 @@ def hide_floaters(root: bpy.types.Collection, removed: list[int]) -> None:
 
 
 def hidden_splats(mesh: bpy.types.Mesh) -> np.ndarray | None:
-    """(n,) which splats of a carrier are hidden one by one; None where none is."""
+    """Return an (n,) bool mask of a carrier's individually hidden splats, or None if there are none."""
     if HIDDEN not in mesh.attributes:
         return None
     hidden = carrier.read(mesh, HIDDEN)
@@ -56,9 +58,15 @@ def hidden_splats(mesh: bpy.types.Mesh) -> np.ndarray | None:
 
 
 def inside_hull(points: np.ndarray, means: np.ndarray, opacities: np.ndarray) -> np.ndarray:
-    """Which of points (n, 3) lie inside the convex hull of an object's splats, as the backend finds them: (n,).
+    """Return which points lie inside the convex hull of an object's reliable splats, as in the backend.
 
-    means (m, 3), opacities (m,).
+    Args:
+        points: (n, 3) points to test.
+        means: (m, 3) means of the object's splats.
+        opacities: (m,) opacities of the object's splats.
+
+    Returns:
+        (n,) bool mask.
     """
     means = reliable_centers(means, opacities)
     if len(means) < 4:
@@ -69,10 +77,10 @@ def inside_hull(points: np.ndarray, means: np.ndarray, opacities: np.ndarray) ->
 
 
 def _planes(corners: np.ndarray) -> np.ndarray:
-    """(p, 4) the planes of the convex hull of four corners or more (k, 3): normals to the outside and offsets; none for
-    a flat one.
+    """Return the planes (p, 4) of the convex hull of `corners` (k, 3), k >= 4; empty for a flat hull.
 
-    From the corners' own coordinates, since Blender's are single; faces too thin to have a plane have none.
+    Each plane has an outward normal and an offset. Planes are computed from `corners`, since Blender's coordinates are
+    single precision; degenerate faces are skipped.
     """
     spread = np.sqrt(np.clip(np.linalg.eigvalsh(np.cov(corners.T)), 0.0, None))
     if spread[0] <= FLATTEST * spread[2]:
@@ -101,7 +109,7 @@ def _planes(corners: np.ndarray) -> np.ndarray:
     normals, first = normals[good] / lengths[good, None], first[good]
     hull = corners[np.unique(triangles)]
     beyond = normals @ hull.T - np.sum(normals * first, axis=1)[:, None]
-    # Towards the side that no corner is on.
+    # Orient the normals to the side without corners.
     flipped = beyond.max(1) > -beyond.min(1)
     normals[flipped] *= -1.0
     outermost = np.where(flipped, -beyond.min(1), beyond.max(1))
@@ -111,6 +119,6 @@ def _planes(corners: np.ndarray) -> np.ndarray:
 
 
 def _places(obj: bpy.types.Object) -> np.ndarray:
-    """(n, 3) float64 where a carrier's splats were captured, in the reconstruction's coordinates."""
+    """Return the captured positions of a carrier's splats in reconstruction coordinates, (n, 3) float64."""
     center = center_of(obj.parent) if obj.parent is not None else np.zeros(3)
     return carrier.read(obj.data, "position").astype(np.float64) + center

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where an object is, as an affine map of the capture's coordinates from where it was captured."""
+"""Placement of objects: an affine map in capture coordinates from the captured pose to the current one."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from ..kinds import MESH, OBJECT_PARENT, SPLATS, parent_of, part_of
 from ..object_collection import center_of
 
 PLACEMENT = "objectgs_place"
-"""On a collection: the place that objects.json had for it when Blender agreed, and `local_placement` then, as JSON."""
+"""Custom property of a collection: its placement in objects.json and its `local_placement` at the last sync (JSON)."""
 
 EXACT = 1e-5
-"""Location, rotation and scale hold a map that they come this close to; the rest of others is put below them."""
+"""Largest relative error of a map as location, rotation and scale; beyond it, the parent inverse stores the rest."""
 
 
 def local_placement(root: bpy.types.Collection, collection: bpy.types.Collection) -> np.ndarray | None:
-    """(4, 4) float64 the map from the coordinates of an object's parts into the reconstruction's; None where the user
-    deleted the empty that it hangs on, or that of the whole.
+    """Return the map from an object's local coordinates to reconstruction coordinates, (4, 4) float64.
 
-    The pivot's; where splats or mesh were moved without it, theirs.
+    It is the map of the pivot, or that of the splats or mesh if they were moved relative to the pivot. The result is
+    None if the user deleted the pivot or the reconstruction's parent empty.
     """
     pivot, parent = part_of(collection, OBJECT_PARENT), parent_of(root)
     if pivot is None or parent is None:
@@ -31,9 +31,9 @@ def local_placement(root: bpy.types.Collection, collection: bpy.types.Collection
 
 
 def placement_of(root: bpy.types.Collection, collection: bpy.types.Collection) -> np.ndarray | None:
-    """(4, 4) float64 the map from where an object was captured to where it is, in the capture's coordinates.
+    """Return the map from an object's captured pose to its current one in capture coordinates, (4, 4) float64.
 
-    Exactly the identity where nobody moved it; None where `local_placement` is.
+    It is exactly the identity if the object was not moved, and None if `local_placement` is None.
     """
     local = local_placement(root, collection)
     if local is None:
@@ -43,7 +43,7 @@ def placement_of(root: bpy.types.Collection, collection: bpy.types.Collection) -
 
 
 def set_placement(root: bpy.types.Collection, collection: bpy.types.Collection, place: np.ndarray | None) -> None:
-    """Move an object's pivot so that `placement_of` becomes `place` (None: where it was captured)."""
+    """Move an object's pivot so that `placement_of` returns `place`; None restores the captured pose."""
     pivot, parent = part_of(collection, OBJECT_PARENT), parent_of(root)
     if pivot is None or parent is None:
         return
@@ -60,22 +60,22 @@ def set_placement(root: bpy.types.Collection, collection: bpy.types.Collection, 
     pivot.matrix_parent_inverse.identity()
     pivot.matrix_basis = simple
     if np.abs(np.array(simple) - wanted)[:3, :3].max() > EXACT * size and pivot.parent is not None:
-        # Sheared, as what is stretched after a turn.
+        # The map contains shear, such as a nonuniform scale after a rotation.
         pivot.matrix_parent_inverse = needed @ simple.inverted()
 
 
 def matrix_to_world(obj: bpy.types.Object) -> np.ndarray:
-    """(4, 4) float64 the map from a thing's coordinates into the world's, also of what is hidden."""
+    """Return the map from local to world coordinates of a Blender object, also if it is hidden, (4, 4) float64."""
     return _map(obj, None)
 
 
 def matrix_to_capture(root: bpy.types.Collection, obj: bpy.types.Object) -> np.ndarray:
-    """(4, 4) float64 the map from a thing's coordinates into the capture's."""
+    """Return the map from local to capture coordinates of a Blender object, (4, 4) float64."""
     return _shift(origin_of(root)) @ _map(obj, parent_of(root))
 
 
 def distance_moved(root: bpy.types.Collection, collection: bpy.types.Collection) -> float:
-    """How far an object is from where it was captured, in the world's lengths."""
+    """Return the distance of an object from its captured position in world units."""
     local, parent = local_placement(root, collection), parent_of(root)
     if local is None:
         return 0.0
@@ -83,12 +83,12 @@ def distance_moved(root: bpy.types.Collection, collection: bpy.types.Collection)
 
 
 def rest_placement(collection: bpy.types.Collection) -> np.ndarray:
-    """`local_placement` where nobody moved the object."""
+    """Return the `local_placement` of an object that was not moved."""
     return _shift(_rest(part_of(collection, OBJECT_PARENT)))
 
 
 def _own(collection: bpy.types.Collection, pivot: bpy.types.Object) -> np.ndarray:
-    """Where the splats, or else the mesh, were moved to beside the pivot that they hang on."""
+    """Return the transform of the splats, or else of the mesh, relative to the pivot; identity if not moved."""
     for kind in (SPLATS, MESH):
         part = part_of(collection, kind)
         if part is not None and part.parent == pivot:
@@ -99,10 +99,10 @@ def _own(collection: bpy.types.Collection, pivot: bpy.types.Object) -> np.ndarra
 
 
 def _map(obj: bpy.types.Object, above: bpy.types.Object | None) -> np.ndarray:
-    """(4, 4) float64 from a thing's coordinates into those of `above`, or of the world.
+    """Return the map from local coordinates of `obj` to those of `above` or, if None, the world, (4, 4) float64.
 
-    From what the user set, since Blender does not know the place of what is hidden; only where constraints or special
-    parents have a say, from what Blender has worked out.
+    It is computed from the local transforms, since Blender does not evaluate hidden objects. Only constraints and
+    parent types other than Object require Blender's evaluated matrix.
     """
     matrix, at = np.eye(4), obj
     while at is not None and at != above:
@@ -119,7 +119,7 @@ def _map(obj: bpy.types.Object, above: bpy.types.Object | None) -> np.ndarray:
 
 
 def _rest(pivot: bpy.types.Object) -> np.ndarray:
-    """(3,) where the pivot was made, as Blender's single numbers hold it."""
+    """Return the pivot's (3,) initial position, rounded to Blender's single precision."""
     return center_of(pivot).astype(np.float32).astype(np.float64)
 
 
@@ -130,7 +130,7 @@ def _shift(by: np.ndarray) -> np.ndarray:
 
 
 def _about(matrix: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """The map in coordinates whose origin lies at -`origin` of those it is in."""
+    """Return the map `matrix` expressed in coordinates that are shifted by `origin`."""
     moved = matrix.copy()
     moved[:3, 3] += origin - matrix[:3, :3] @ origin
     return moved

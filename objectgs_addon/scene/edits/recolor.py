@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""An object's other colors, on its splats and its textures alike: inputs of node groups, nothing is rewritten."""
+"""Nondestructive recoloring of an object's splats and textures through inputs of node groups."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from ..shading.modifiers import recolor_splats
 from .fills import unobserved_splats
 
 RECOLOR = "objectgs_recolor"
-"""On an object's collection: what objects.json says of its colors, as JSON."""
+"""Custom property of an object's collection: its recoloring from objects.json, as JSON."""
 
 TEXTURE_GROUP = "texture_recolor"
 
 
 def recolor_of(collection: bpy.types.Collection) -> Recolor | None:
-    """What the user asks of the colors of an object, or of the object that this is a duplicate of."""
+    """Return the recoloring of an object or duplicate, or None."""
     stored = collection.get(RECOLOR)
     return Recolor.of(json.loads(stored)) if stored else None
 
 
 def set_recolor(collection: bpy.types.Collection, recolor: Recolor | None) -> None:
-    """Show splats and meshes of a collection in other colors; None takes that back, and the nodes with it."""
+    """Recolor the splats and meshes of a collection; None restores the captured colors and removes texture nodes."""
     stored = recolor.stored() if recolor is not None else None
     if stored is not None:
         collection[RECOLOR] = json.dumps(stored)
@@ -49,7 +49,7 @@ def set_recolor(collection: bpy.types.Collection, recolor: Recolor | None) -> No
 
 
 def luma_of(collection: bpy.types.Collection) -> float:
-    """How bright the object's splats are on average, 0 .. 1, by which recoloring keeps their shading."""
+    """Return the average luma of the object's splats, 0 .. 1, from which recoloring preserves shading."""
     obj = part_of(collection, SPLATS)
     if obj is None or "radiance:base" not in obj.data.attributes:
         return average_luma(np.zeros((0, 3)), np.zeros(0))
@@ -58,7 +58,7 @@ def luma_of(collection: bpy.types.Collection) -> float:
 
 
 def _recolor_textures(material: bpy.types.Material, affine: Any) -> None:
-    """Put the map between our textures and what they go into, or take it away (None)."""
+    """Insert or update the recolor node after each of the add-on's textures; None removes it."""
     tree = material.node_tree
     for picture in [node for node in tree.nodes if node.type == "TEX_IMAGE" and kind_of(node.image) == TEXTURE]:
         color = picture.outputs["Color"]
@@ -81,7 +81,16 @@ def _recolor_textures(material: bpy.types.Material, affine: Any) -> None:
 def with_own_textures(
     material: bpy.types.Material, recolor: Recolor, folder: Path
 ) -> tuple[bpy.types.Material, list[bpy.types.Image]]:
-    """A copy of a material whose textures are pictures in other colors, in `folder`, and these pictures."""
+    """Copy a material with recolored texture images.
+
+    Args:
+        material: the material to copy.
+        recolor: the recoloring.
+        folder: where to save the images as PNG.
+
+    Returns:
+        The copy and its new images.
+    """
     matrix, offset = recolor.affine()
     copy, images = material.copy(), []
     _recolor_textures(copy, None)
@@ -120,7 +129,7 @@ def _insert(tree: bpy.types.NodeTree, picture: Any) -> bpy.types.Node:
 
 
 def _make_group(name: str) -> bpy.types.NodeTree:
-    """A texture's linear colors encoded, mapped, and linear again."""
+    """Create the shader group that applies the affine map to a texture's linear colors in sRGB encoding."""
     tree = bpy.data.node_groups.new(name, "ShaderNodeTree")
     tree.interface.new_socket("Color", in_out="OUTPUT", socket_type="NodeSocketColor")
     tree.interface.new_socket("Color", in_out="INPUT", socket_type="NodeSocketColor")

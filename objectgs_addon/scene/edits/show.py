@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Removal, color, place and duplicates of objects: shown as objects.json says, and stored there as Blender has them.
+"""Two-way sync of removal, recoloring, placement and duplicates of objects between Blender and objects.json.
 
-Places and duplicates are the user's to change in Blender at any moment, so both sides may be newer. Each collection
-remembers what objects.json said when they agreed, and where its parts were then.
+Users can change placements and duplicates in Blender at any time, so either side may be newer. Each collection
+therefore stores the values of objects.json and the placement of its parts at the last sync.
 """
 
 from __future__ import annotations
@@ -26,13 +26,21 @@ from .placement import PLACEMENT, local_placement, placement_of, rest_placement,
 from .recolor import recolor_of, set_recolor
 
 REMOVED = "objectgs_removed"
-"""On the collection of a removed object: whether it was hidden before in viewports and in renders."""
+"""Custom property of a removed object's collection: its previous visibility flags for viewports and renders."""
 
 
 def show_edits(root: bpy.types.Collection, objects: Objects) -> None:
-    """Remove, recolor, place and duplicate objects as objects.json says. What the user moved since stays there, unless
-    objects.json has another place than it had before. Raises InputError where splats that are to change are in Edit
-    Mode."""
+    """Apply removals, recoloring, placements and duplicates from objects.json.
+
+    Objects that the user has moved since keep their placement, unless the placement in objects.json has changed.
+
+    Args:
+        root: the reconstruction's collection.
+        objects: the objects with the user's edits.
+
+    Raises:
+        InputError: Splats that would change are in Edit Mode.
+    """
     collections = object_collections(root)
     hulls = [entry.id for entry in objects.entries.values() if entry.removed and entry.floaters]
     if hulls and 0 in collections:
@@ -55,7 +63,7 @@ def show_edits(root: bpy.types.Collection, objects: Objects) -> None:
 
 
 def recolor(root: bpy.types.Collection, object_id: int, wanted: Recolor | None) -> bool:
-    """Show an object and its duplicates in other colors, nothing is stored yet; False where it has no collection."""
+    """Recolor an object and its duplicates without writing objects.json; return False if it has no collection."""
     collection = object_collections(root).get(object_id)
     if collection is None:
         return False
@@ -65,7 +73,7 @@ def recolor(root: bpy.types.Collection, object_id: int, wanted: Recolor | None) 
 
 
 def reset_placement(root: bpy.types.Collection, collection: bpy.types.Collection) -> None:
-    """Move an object back to where it was captured; parts that were moved by themselves, too."""
+    """Move an object and its individually moved parts back to the captured pose."""
     pivot = part_of(collection, OBJECT_PARENT)
     for obj in pivot.children if pivot is not None else ():
         obj.matrix_parent_inverse.identity()
@@ -74,10 +82,17 @@ def reset_placement(root: bpy.types.Collection, collection: bpy.types.Collection
 
 
 def store_placements(root: bpy.types.Collection, everything: bool = False) -> None:
-    """Write to objects.json where objects and their duplicates are now, as far as the user changed it.
+    """Write placements and duplicates that the user changed to objects.json.
 
-    What Blender's own means have duplicated becomes a duplicate of ours. everything: also what agreed with the file
-    once, for after an undo. Raises InputError or OSError.
+    Copies made with Blender's own operators are converted to duplicates.
+
+    Args:
+        root: the reconstruction's collection.
+        everything: also compare objects unchanged since the last sync with the file, as required after an undo.
+
+    Raises:
+        InputError: objects.json cannot be used.
+        OSError: objects.json cannot be written.
     """
     path = Reconstruction(folder_of(root)).objects
     if not path.exists():
@@ -85,7 +100,7 @@ def store_placements(root: bpy.types.Collection, everything: bool = False) -> No
     adopt_blender_duplicates(root)
     for twins in duplicates_of(root).values():
         for copy in [copy for copy in twins if part_of(copy, OBJECT_PARENT) is None]:
-            remove_duplicate(copy)  # The user deleted what was in it.
+            remove_duplicate(copy)  # The user deleted its pivot.
     bring_up_to_date(root)
     copies, collections = duplicates_of(root), object_collections(root)
     now = {
@@ -137,7 +152,7 @@ def _show_place(root: bpy.types.Collection, collection: bpy.types.Collection, tr
 def _show_copies(
     root: bpy.types.Collection, collection: bpy.types.Collection, there: list, entry: SceneObject
 ) -> list[bpy.types.Collection]:
-    """Bring an object's duplicates into agreement with the file; returns them."""
+    """Update an object's duplicates from the file and return their collections."""
     wanted = [_rows(copy) for copy in entry.copies]
     if wanted == _agreed_copies(collection):
         return there
@@ -170,12 +185,12 @@ def _set_removed(collection: bpy.types.Collection, removed: bool) -> None:
 
 
 def is_removed(collection: bpy.types.Collection) -> bool:
-    """Whether the object that a collection shows has been removed."""
+    """Return whether the object of a collection has been removed."""
     return REMOVED in collection
 
 
 def _place(root: bpy.types.Collection, collection: bpy.types.Collection) -> list | None:
-    """Where an object is, as objects.json holds it: exactly what that says where nothing moved since."""
+    """Return an object's placement for objects.json; the stored value is kept exactly if the object has not moved."""
     local = local_placement(root, collection)
     if local is None:
         return None
@@ -216,12 +231,12 @@ def _rows(matrix: Any) -> list | None:
 
 
 def _same(first: Any, second: Any) -> bool:
-    """Whether two lists hold the same maps, None being no move, as far as Blender's single numbers can tell."""
+    """Return whether two lists hold equal maps within single precision; None is the identity."""
     if len(first) != len(second):
         return False
     for one, other in zip(first, second):
         if one is other:
-            continue  # None, as nearly always.
+            continue  # Usually both are None.
         one, other = (np.array(_IDENTITY if matrix is None else matrix, float) for matrix in (one, other))
         if not np.allclose(one, other, rtol=1e-6, atol=1e-6):
             return False

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Textured meshes: shown in the scene, and exported by Blender's own exporters."""
+"""Textured meshes: display in the scene, and export with Blender's own exporters."""

@@ -10,12 +10,12 @@ from ..edits.placement import matrix_to_world
 
 
 def mark_asset(collection: bpy.types.Collection, meshes: list[bpy.types.Object]) -> None:
-    """Offer an object's collection in the asset browser; dropped, it stands upright, in size, at the mouse.
+    """Mark an object's collection as an asset whose instances stand upright, at true size, at the drop position.
 
-    The collection is marked, not the mesh, since the mesh alone has another rotation than its parents give it.
+    This marks the collection instead of the mesh, since the mesh alone lacks the rotation of its parents.
 
     Args:
-        collection: the object's.
+        collection: the object's collection.
         meshes: the object's meshes, at least one.
     """
     low, high = bounds(meshes)
@@ -28,7 +28,7 @@ def mark_asset(collection: bpy.types.Collection, meshes: list[bpy.types.Object])
 
 
 def bounds(meshes: list[bpy.types.Object]) -> np.ndarray:
-    """(2, 3) float64: minimum and maximum world coordinates of mesh objects."""
+    """Return the minimum and maximum world coordinates of mesh objects, (2, 3) float64."""
     ends = []
     for obj in meshes:
         local = np.empty(3 * len(obj.data.vertices), np.float32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshes of objects as files of other programs, by Blender's own exporters, with the objects' edits."""
+"""Export of object meshes, including edits, with Blender's own exporters."""
 
 from __future__ import annotations
 
@@ -20,10 +20,23 @@ from ...blender.quiet import quiet
 def export(
     root: bpy.types.Collection, out: Path, suffix: str, ids: list[int] | None, per_object: bool, in_capture: bool
 ) -> list[Path]:
-    """Write the meshes of objects (None: all that have one and are not removed) and of their duplicates.
+    """Write the meshes of objects and of their duplicates; removed objects and objects without a mesh are skipped.
 
-    out: the file, or with `per_object` the folder. in_capture: in COLMAP's coordinates and axes instead of Blender's.
-    Returns the files. Raises InputError where there is nothing to write, OSError or RuntimeError as exporters do.
+    Args:
+        root: the reconstruction's collection.
+        out: the file, or with `per_object` the folder.
+        suffix: file suffix, which selects the format: "glb", "usdc", or another for OBJ.
+        ids: object IDs, or None for all.
+        per_object: write one file per object.
+        in_capture: use COLMAP's coordinates and axes instead of Blender's.
+
+    Returns:
+        The written files.
+
+    Raises:
+        InputError: There is nothing to write, or `out` is a file where a folder is needed.
+        OSError: A file cannot be written.
+        RuntimeError: The exporter failed.
     """
     collections, copies = scene.object_collections(root), scene.duplicates_of(root)
     chosen = [
@@ -75,8 +88,10 @@ def _write(path: Path, suffix: str, in_capture: bool) -> None:
 
 @contextmanager
 def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool) -> Any:
-    """A scene of its own in the window with the meshes alone, whatever is hidden in the user's, and with textures as
-    other programs know them: recolored ones are pictures of their own, since node groups do not travel."""
+    """Show a temporary scene with visible copies of the meshes in the window.
+
+    Recolored textures are replaced by recolored images, since exporters do not support the recolor node group.
+    """
     window = bpy.context.window or bpy.context.window_manager.windows[0]
     before = window.scene
     stage = bpy.data.scenes.new("ObjectGS export")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Mesh files as Blender objects, made or updated in the collections of their objects."""
+"""Import of mesh files as Blender objects, created or updated in the collections of their objects."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from .listed import ListedMesh
 from .textures import load_texture, reload_texture
 
 WRITTEN = "objectgs_written"
-"""Custom property of a mesh object: when the files that it shows were written."""
+"""Custom property of a mesh object: the modification times of the files it shows."""
 
 UV_MAP, COLORS, UNOBSERVED = "UVMap", "Col", "unobserved"
 
 
 class MeshImporter:
-    """Puts meshes into the collections of a reconstruction.
+    """Importer of meshes into the collections of a reconstruction.
 
     Attributes:
-        changed: IDs of the objects whose collections have received or lost a mesh; None: the reconstruction's own.
-        new: IDs of the objects whose collections were made; these are not linked yet.
-        warnings: sentences about missing textures.
+        changed: IDs of the objects whose collections gained or lost a mesh; None for the reconstruction's own.
+        new: IDs of the objects whose collections were created; these are not linked yet.
+        warnings: warnings about missing textures.
     """
 
     def __init__(
@@ -45,18 +45,18 @@ class MeshImporter:
         self._material: bpy.types.Material | None = None
 
     def show(self, listed: ListedMesh, target: int | None, obj: bpy.types.Object | None) -> bool:
-        """Make or update one mesh.
+        """Create or update one mesh.
 
         Args:
             listed: the mesh and its files.
-            target: ID of the object in whose collection it lies, None: the reconstruction's own.
-            obj: the Blender object that shows it already, or None.
+            target: ID of the object whose collection receives the mesh; None for the reconstruction's own.
+            obj: the Blender object that already shows the mesh, or None.
 
         Returns:
             Whether its files were read.
 
         Raises:
-            InputError: the mesh's file cannot be shown; nothing is changed then.
+            InputError: The mesh's file cannot be shown; nothing is changed.
         """
         collection = self.root if target is None else self.collections.get(target)
         in_place = obj is not None and collection is not None and _contains(collection, obj)
@@ -91,7 +91,7 @@ class MeshImporter:
         return True
 
     def unlink(self, obj: bpy.types.Object) -> None:
-        """Take a mesh out of its collection, because its objects were merged or split, or because it is removed."""
+        """Unlink a mesh from its collection after a merge, a split or a removal."""
         for object_id, collection in ((None, self.root), *self.collections.items()):
             if _contains(collection, obj):
                 collection.objects.unlink(obj)
@@ -113,7 +113,7 @@ class MeshImporter:
         return obj
 
     def _update_material(self, obj: bpy.types.Object, listed: ListedMesh) -> None:
-        """Give the mesh our material if it has none; if it has one, only reload our textures."""
+        """Add the add-on's material to a mesh without materials; otherwise only reload the add-on's textures."""
         slots = [slot.material for slot in obj.material_slots]
         if not slots:
             image = load_texture(listed.texture, obj.name, listed.key)
@@ -127,16 +127,16 @@ class MeshImporter:
 
 
 def fill_mesh(mesh: bpy.types.Mesh, positions: np.ndarray, loaded: Mesh) -> None:
-    """Replace the geometry of a mesh; its materials stay.
+    """Replace the geometry of a mesh and keep its materials.
 
     Args:
-        mesh: Blender's mesh.
-        positions: of its new vertices, (V, 3), in its own coordinates.
-        loaded: its new faces, UV map, vertex colors, normals, and which faces are unobserved.
+        mesh: the Blender mesh.
+        positions: (V, 3) positions of the new vertices in the mesh's local coordinates.
+        loaded: the new faces, UV map, vertex colors, normals and flags of unobserved faces.
     """
     if mesh.shape_keys is not None:
         for user in [obj for obj in bpy.data.objects if obj.data == mesh]:
-            user.shape_key_clear()  # They belong to the old vertices.
+            user.shape_key_clear()  # Shape keys belong to the old vertices.
     mesh.clear_geometry()
     count = len(loaded.faces)
     mesh.vertices.add(len(positions))

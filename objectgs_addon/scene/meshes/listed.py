@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The meshes that meshes.json lists: their files, and the collection in which each is shown."""
+"""Meshes listed in meshes.json: their files and the collections that show them."""
 
 from __future__ import annotations
 
@@ -15,8 +15,13 @@ from ..objects_file import Objects
 class ListedMesh:
     """A mesh of a reconstruction folder.
 
-    key: in meshes.json; ids: the objects it was made of, None: the whole scene; object_id: the object whose own mesh it
-    is, None for a set or the whole scene; mesh, texture: its files; name: as shown.
+    Attributes:
+        key: key in meshes.json.
+        ids: IDs of the objects it was made from; None for the whole scene.
+        object_id: ID of the object whose own mesh it is; None for a set of objects or the whole scene.
+        mesh: mesh file.
+        texture: texture file.
+        name: displayed name.
     """
 
     key: str
@@ -27,18 +32,18 @@ class ListedMesh:
     name: str
 
     def written(self) -> str:
-        """Modification times of its files, as text, since Blender's integers are too short for nanoseconds."""
+        """Return the modification times of its files in ns as a string, since Blender's integers have 32 bits."""
         return " ".join(_modified(path) for path in (self.mesh, self.texture))
 
 
 def read_listed(folder: Path) -> list[ListedMesh]:
-    """Read which meshes a reconstruction folder holds.
+    """Read the list of meshes in a reconstruction folder.
 
     Args:
         folder: the reconstruction folder.
 
     Returns:
-        The meshes that were made, in the order of meshes.json; none where there is no such file.
+        The meshes that have a file, in the order of meshes.json; empty if meshes.json is missing.
 
     Raises:
         InputError: meshes.json cannot be used.
@@ -65,11 +70,11 @@ def assign_to_collections(
 
     Args:
         listed: the meshes of the folder.
-        objects: says which objects are merged and which are left out.
+        objects: the merges and left-out objects.
 
     Returns:
-        The meshes to show, each with the ID of the object in whose collection it lies (None: the reconstruction's), and
-        warnings about the others.
+        The meshes to show, each with the ID of the object whose collection holds it (None for the reconstruction's
+        own), and warnings about meshes made before objects were split.
     """
     assigned: list[tuple[ListedMesh, int | None]] = []
     warnings = []
@@ -90,7 +95,7 @@ def assign_to_collections(
     for mesh, target in assigned:
         if target is not None:
             of_target.setdefault(target, []).append(set(mesh.ids or ()))
-    # The mesh of an object that was merged before this mesh was made is a part of this one.
+    # Skip meshes that are part of a mesh made later from the merged object.
     return [
         (mesh, target)
         for mesh, target in assigned

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The textured meshes of a reconstruction: updated from its folder, and shown instead of splats or beside them.
+"""Display of a reconstruction's textured meshes, updated from its folder, in place of splats or together with them.
 
-An object's mesh lies in the object's collection; those of the whole scene and of sets of objects lie in the
-reconstruction's own.
+An object's mesh is in the object's collection; meshes of the whole scene and of sets of objects are in the
+reconstruction's own collection.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from .importing import MeshImporter
 from .listed import assign_to_collections, read_listed
 
 SHOW = "objectgs_show"
-"""Custom property of the root collection: which of SHOWS it shows."""
+"""Custom property of the root collection: the chosen entry of SHOWS."""
 
 SHOWS = ("splats", "meshes", "both")
 
 
 @dataclass
 class ShownMeshes:
-    """Result of `show_meshes`: how many meshes are in Blender, how many of them were read, and warnings."""
+    """Result of `show_meshes`: the number of meshes in Blender, the number of meshes read from files, and warnings."""
 
     meshes: int = 0
     updated: int = 0
@@ -39,28 +39,28 @@ class ShownMeshes:
 
 
 def show_meshes(root: bpy.types.Collection, folder: Path) -> ShownMeshes:
-    """Update the meshes as `update_meshes` does, then show all edits of the objects."""
+    """Call `update_meshes`, then show all edits of the objects."""
     shown = update_meshes(root, folder)
     show_edits(root, Objects.read(folder))
     return shown
 
 
 def update_meshes(root: bpy.types.Collection, folder: Path) -> ShownMeshes:
-    """Show the meshes that meshes.json lists, each exactly where its splats are.
+    """Show the meshes listed in meshes.json, each aligned with its splats.
 
-    Meshes that are shown already are updated in place if their files are newer: transforms, names, modifiers, materials
-    and their slots stay as the user left them. A mesh whose files have not changed is not touched. A mesh that was made
-    of other objects than its collection shows now is removed.
+    Existing meshes are updated in place if their files changed: transforms, names, modifiers, materials and material
+    slots are kept. A mesh whose files have not changed is not modified. A mesh made from other objects than those its
+    collection shows is removed.
 
     Args:
         root: the reconstruction's collection.
         folder: the reconstruction folder.
 
     Returns:
-        What was shown. A mesh that cannot be read stays as it is, with a warning.
+        The counts of meshes, and warnings. A mesh that cannot be read is kept unchanged, with a warning.
 
     Raises:
-        InputError: meshes.json or objects.json cannot be used; nothing is changed then.
+        InputError: meshes.json or objects.json cannot be used, or a mesh is in Edit Mode; nothing is changed.
     """
     folder = Path(folder)
     listed = read_listed(folder)
@@ -89,7 +89,7 @@ def update_meshes(root: bpy.types.Collection, folder: Path) -> ShownMeshes:
     if SHOW not in root and shown.meshes:
         show_kinds(root, "meshes")
     elif importer.changed:
-        # The unlabeled rest, which never has a mesh, follows the first mesh that appears and the last that is removed.
+        # The first mesh added and the last mesh removed change whether the splats of the unlabeled rest are shown.
         apply_shown(root, {*importer.changed, 0} if had_meshes != bool(shown.meshes) else importer.changed)
     for object_id in importer.changed:
         if object_id is not None and object_id not in importer.new:
@@ -100,24 +100,24 @@ def update_meshes(root: bpy.types.Collection, folder: Path) -> ShownMeshes:
 
 
 def has_shown_meshes(root: bpy.types.Collection) -> bool:
-    """Whether the reconstruction ever showed meshes, so that the user can choose."""
+    """Return whether the reconstruction has ever shown meshes, which makes the choice of SHOWS available."""
     return SHOW in root
 
 
 def shown_kinds(root: bpy.types.Collection) -> str:
-    """Which of SHOWS a reconstruction shows."""
+    """Return the entry of SHOWS that a reconstruction shows."""
     chosen = root.get(SHOW)
     return chosen if chosen in SHOWS else SHOWS[0]
 
 
 def show_kinds(root: bpy.types.Collection, which: str) -> None:
-    """Show splats, meshes or both, in viewports and renders; an object without a mesh always shows its splats.
+    """Show splats, meshes or both in viewports and renders; an object without a mesh always shows its splats.
 
-    The user can hide single objects in addition, by their collection or their eye.
+    In addition, users can hide single objects by their collection or with the eye icon.
 
     Args:
         root: the reconstruction's collection.
-        which: one of SHOWS.
+        which: an entry of SHOWS.
     """
     if which not in SHOWS:
         raise ValueError(f"{which} cannot be shown")
@@ -126,7 +126,7 @@ def show_kinds(root: bpy.types.Collection, which: str) -> None:
 
 
 def apply_shown(root: bpy.types.Collection, changed: Iterable[int | None]) -> None:
-    """Apply the choice of `show_kinds` to the collections of these object IDs, whose parts were added or removed."""
+    """Apply the choice of `show_kinds` to the collections of object IDs whose parts were added or removed."""
     wanted = set(changed)
     which, collections, copies = shown_kinds(root), object_collections(root), duplicates_of(root)
     meshes, whole = object_meshes(root), scene_meshes(root)
@@ -146,12 +146,12 @@ def apply_shown(root: bpy.types.Collection, changed: Iterable[int | None]) -> No
 
 
 def scene_meshes(root: bpy.types.Collection) -> list[bpy.types.Object]:
-    """The meshes of the whole scene and of sets of objects, which lie in the reconstruction's own collection."""
+    """Return the meshes of the whole scene and of sets of objects, from the reconstruction's own collection."""
     return [obj for obj in root.objects if kind_of(obj) == MESH and object_id_of(obj) is None]
 
 
 def object_meshes(root: bpy.types.Collection) -> dict[int, list[bpy.types.Object]]:
-    """Object ID -> the meshes in its collection, of the objects that have one."""
+    """Map the IDs of objects with meshes to the meshes in their collections."""
     found = {
         object_id: [obj for obj in parts_of(collection) if kind_of(obj) == MESH]
         for object_id, collection in object_collections(root).items()
@@ -160,9 +160,9 @@ def object_meshes(root: bpy.types.Collection) -> dict[int, list[bpy.types.Object
 
 
 def _hide(hidden: dict[bpy.types.Object, bool]) -> None:
-    """Hide or show objects, in viewports and renders.
+    """Hide or show objects in viewports and renders.
 
-    All but one are set together and without notifying Blender, which visits every object of the file each time.
+    All but the last are set in bulk without notifying Blender, which visits every object in the file each time.
     """
     objs = bpy.data.objects
     index = {obj: i for i, obj in enumerate(objs)}
@@ -183,7 +183,7 @@ def _hide(hidden: dict[bpy.types.Object, bool]) -> None:
 def _meshes_by_key(
     root: bpy.types.Collection, collections: Collection[bpy.types.Collection]
 ) -> dict[str, bpy.types.Object]:
-    """Key in meshes.json -> mesh; if the user duplicated one, the first counts."""
+    """Map keys in meshes.json to mesh objects; if the user duplicated a mesh, the first one is returned."""
     found: dict[str, bpy.types.Object] = {}
     for collection in (root, *collections):
         for obj in parts_of(collection):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Textures of meshes as images in Blender."""
+"""Loading of mesh textures as Blender images."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from ..kinds import MESH_KEY, TEXTURE, mark
 
 
 def load_texture(path: Path, name: str, key: str) -> bpy.types.Image:
-    """Load a mesh's texture; a file that does not exist yet is shown as soon as it does.
+    """Load a mesh's texture; if the file does not exist yet, return an image that refers to it.
 
     Args:
-        path: the texture.
+        path: the texture file.
         name: the image's name in Blender.
-        key: of the mesh, in meshes.json.
+        key: the mesh's key in meshes.json.
     """
     if path.is_file():
         image = bpy.data.images.load(str(path), check_existing=False)
@@ -24,7 +24,7 @@ def load_texture(path: Path, name: str, key: str) -> bpy.types.Image:
         image = bpy.data.images.new(name, 1, 1)
         image.source = "FILE"
     image.name = name
-    # Raw, since Blender visits every node of the file otherwise.
+    # Setting `filepath` instead would make Blender visit every node in the file.
     image.filepath_raw = _stored_path(path)
     mark(image, TEXTURE)
     image[MESH_KEY] = key
@@ -32,7 +32,7 @@ def load_texture(path: Path, name: str, key: str) -> bpy.types.Image:
 
 
 def reload_texture(image: bpy.types.Image, path: Path) -> None:
-    """Show the present content of a texture's file; an image that the user packed into the .blend is packed again."""
+    """Reload a texture from its file; an image that the user packed into the .blend is packed again."""
     packed = image.packed_file is not None
     if packed:
         image.unpack(method="REMOVE")
@@ -43,7 +43,7 @@ def reload_texture(image: bpy.types.Image, path: Path) -> None:
 
 
 def _stored_path(path: Path) -> str:
-    """A path as the .blend stores it: relative to the .blend if the user prefers that and the .blend is saved."""
+    """Return a path relative to the .blend if the preferences ask for that and the .blend is saved; else unchanged."""
     if not bpy.data.filepath or not bpy.context.preferences.filepaths.use_relative_paths:
         return str(path)
     try:

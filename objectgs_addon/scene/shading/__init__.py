@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How points and splats look in the viewport and in renders."""
+"""Materials, node groups and modifiers for the viewport and for renders."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Nodes that convert and recolor colors, in geometry nodes and in shaders."""
+"""Nodes for color conversion and recoloring in geometry and shader node trees."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from .graph import Graph
 
 CHANNELS = ("Red", "Green", "Blue")
 OFFSET = "Recolor Offset"
-"""Input of a group: what is added to red, green and blue."""
+"""Name of the group input that is added to red, green and blue."""
 
 
 def recolor_inputs() -> list[tuple[str, str, Any, None, str]]:
-    """Group inputs of an affine map of sRGB-encoded colors, by default the identity.
+    """Return the group inputs of an affine map on sRGB-encoded colors, by default the identity.
 
     Returns:
-        (name, socket type, default, minimum, description) of the matrix's three rows and of the offset.
+        (name, socket type, default, minimum, description) of the three matrix rows and of the offset.
     """
     rows = [
         (
@@ -35,7 +35,7 @@ def recolor_inputs() -> list[tuple[str, str, Any, None, str]]:
 
 
 def recolored(graph: Graph, color: bpy.types.NodeSocket, group_input: bpy.types.Node) -> bpy.types.NodeSocket:
-    """An sRGB-encoded color under the affine map of the `recolor_inputs`."""
+    """Apply the affine map from the `recolor_inputs` to an sRGB-encoded color."""
     rows = [
         graph.vector("DOT_PRODUCT", color, group_input.outputs[f"Recolor {channel}"], output="Value")
         for channel in CHANNELS
@@ -45,7 +45,7 @@ def recolored(graph: Graph, color: bpy.types.NodeSocket, group_input: bpy.types.
 
 
 def linear_channel(graph: Graph, value: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-    """sRGB-encoded to linear; negative values count as 0."""
+    """Convert an sRGB-encoded value to linear; negative values are clamped to 0."""
     value = graph.math("MAXIMUM", value, 0.0)
     scaled = graph.math("DIVIDE", graph.math("ADD", value, srgb.OFFSET), 1.0 + srgb.OFFSET)
     curve = graph.math("POWER", scaled, srgb.GAMMA)
@@ -54,7 +54,7 @@ def linear_channel(graph: Graph, value: bpy.types.NodeSocket) -> bpy.types.NodeS
 
 
 def encoded_channel(graph: Graph, value: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-    """Linear to sRGB-encoded; negative values count as 0."""
+    """Convert a linear value to sRGB-encoded; negative values are clamped to 0."""
     value = graph.math("MAXIMUM", value, 0.0)
     power = graph.math("POWER", value, 1.0 / srgb.GAMMA)
     curve = graph.math("MULTIPLY_ADD", power, 1.0 + srgb.OFFSET, -srgb.OFFSET)
@@ -63,7 +63,7 @@ def encoded_channel(graph: Graph, value: bpy.types.NodeSocket) -> bpy.types.Node
 
 
 def _select(graph: Graph, condition: bpy.types.NodeSocket, yes: Any, no: Any) -> bpy.types.NodeSocket:
-    """`yes` where the condition is 1, `no` where it is 0."""
+    """Return `yes` where the condition is 1 and `no` where it is 0."""
     return graph.math(
         "MULTIPLY_ADD", condition, yes, graph.math("MULTIPLY", graph.math("SUBTRACT", 1.0, condition), no)
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Node trees built by Python, and node groups and materials that are shared and found again by kind and version."""
+"""Construction of node trees, and lookup of shared node groups and materials by kind and version."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import bpy
 from ..kinds import kind_of, mark
 
 VERSION = "objectgs_version"
-"""Custom property of a node group or material: the version of its nodes. A block of an older version stays with what
-uses it, until that has to show something that only the newer version can."""
+"""Custom property of a node group or material: the version of its nodes. Users of an older version keep it until they
+require a feature of the newer version."""
 
 
 class Graph:
-    """A node tree under construction: nodes by type, links from outputs to inputs."""
+    """Builder for a node tree; its methods add nodes and link sockets."""
 
     def __init__(self, tree: bpy.types.NodeTree) -> None:
         self.tree = tree
@@ -41,29 +41,29 @@ class Graph:
         return node
 
     def math(self, operation: str, *values: Any) -> bpy.types.NodeSocket:
-        """Output of a Math node on numbers or outputs."""
+        """Add a Math node with numbers or sockets as inputs and return its output."""
         return self.node("ShaderNodeMath", dict(enumerate(values)), operation=operation).outputs[0]
 
     def vector(self, operation: str, *values: Any, output: str = "Vector") -> bpy.types.NodeSocket:
-        """Output of a Vector Math node on vectors or outputs; the second value of SCALE is the factor."""
+        """Add a Vector Math node and return its output; the second value of SCALE is the factor."""
         keys: Iterable[Any] = ("Vector", "Scale") if operation == "SCALE" else range(len(values))
         return self.node("ShaderNodeVectorMath", dict(zip(keys, values)), operation=operation).outputs[output]
 
     def attribute(self, name: str, kind: str) -> bpy.types.NodeSocket:
-        """A named attribute of the geometry (geometry nodes)."""
+        """Return a named attribute of the geometry (geometry nodes)."""
         node = self.node("GeometryNodeInputNamedAttribute", {"Name": name}, data_type=kind)
         return next(socket for socket in node.outputs if socket.enabled and socket.name == "Attribute")
 
     def separated(self, vector: Any) -> list[bpy.types.NodeSocket]:
-        """The three components of a vector."""
+        """Return the three components of a vector."""
         return list(self.node("ShaderNodeSeparateXYZ", {0: vector}).outputs)
 
     def rotated(self, vector: Any, rotation: Any) -> bpy.types.NodeSocket:
-        """A vector after a rotation (geometry nodes)."""
+        """Rotate a vector (geometry nodes)."""
         return self.node("FunctionNodeRotateVector", {"Vector": vector, "Rotation": rotation}).outputs[0]
 
     def store(self, geometry: Any, name: str, kind: str, value: Any) -> bpy.types.NodeSocket:
-        """The geometry with a named attribute on its points (geometry nodes)."""
+        """Store a named point attribute and return the new geometry (geometry nodes)."""
         return self.node(
             "GeometryNodeStoreNamedAttribute",
             {"Geometry": geometry, "Name": name, "Value": value},
@@ -72,7 +72,7 @@ class Graph:
         ).outputs[0]
 
     def removed(self, geometry: Any, pattern: str) -> bpy.types.NodeSocket:
-        """The geometry without the attributes whose names match; `*` is a wildcard (geometry nodes)."""
+        """Remove attributes whose names match `pattern`, with `*` as wildcard (geometry nodes)."""
         node = self.node("GeometryNodeRemoveAttribute", {"Geometry": geometry, "Name": pattern})
         if hasattr(node, "pattern_mode"):
             node.pattern_mode = "WILDCARD"
@@ -81,13 +81,13 @@ class Graph:
         return node.outputs[0]
 
     def arrange(self) -> None:
-        """Place nodes in columns from left to right, by their distance from an input."""
+        """Arrange the nodes in columns from left to right by their longest distance from an input."""
         into: dict[str, list[str]] = {node.name: [] for node in self.tree.nodes}
         for link in self.tree.links:
             into[link.to_node.name].append(link.from_node.name)
         columns: dict[str, int] = {}
         rows: dict[int, int] = {}
-        for node in self.tree.nodes:  # A node is added after those that are linked to its inputs.
+        for node in self.tree.nodes:  # Nodes come after those linked to their inputs.
             column = max((columns.get(name, -1) + 1 for name in into[node.name]), default=0)
             columns[node.name] = column
             node.location = (220.0 * column, -180.0 * rows.get(column, 0))
@@ -95,7 +95,7 @@ class Graph:
 
 
 def find_or_make(collection: Iterable[Any], kind: str, version: int, name: str, make: Callable[[str], Any]) -> Any:
-    """Return the local data-block of this kind and version; where there is none, make(name) makes it."""
+    """Return the local data-block of this kind and version, created by make(name) if missing."""
     for block in collection:
         if kind_of(block) == kind and block.get(VERSION) == version and block.library is None:
             return block

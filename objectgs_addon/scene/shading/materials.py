@@ -9,10 +9,10 @@ from ..kinds import MESH_MATERIAL, SPLATS_MATERIAL, mark
 from .graph import Graph, find_or_make
 
 SMALLEST_ALPHA = 1.0 / 255.0
-"""Alpha at which a splat ends."""
+"""Alpha at which a splat is cut off."""
 
 COLOR = "display_color"
-"""Attribute of shown points and splats: linear RGBA. Not "color", which Cycles takes for the color of a volume."""
+"""Linear RGBA attribute of shown points and splats. Cycles uses the name "color" for the color of volumes."""
 
 SPLAT_SHADER = "splat_shader"
 POINTS_MATERIAL = "points_material"
@@ -20,11 +20,11 @@ ELLIPSOIDS_MATERIAL = "ellipsoids_material"
 
 MESH_ROUGHNESS = 0.8
 MESH_SPECULAR = 0.2
-"""Low, since the texture already contains the photos' highlights."""
+"""Low specular level, since the texture already contains the highlights of the photos."""
 
 
 def points_material() -> bpy.types.Material:
-    """The shared material of point clouds, which emits their color."""
+    """Return the shared emission material of point clouds."""
     return find_or_make(bpy.data.materials, POINTS_MATERIAL, 2, "ObjectGS Points", _make_points_material)
 
 
@@ -38,7 +38,7 @@ def _make_points_material(name: str) -> bpy.types.Material:
 
 
 def splats_material(name: str, color: tuple[float, ...]) -> bpy.types.Material:
-    """Make a material for one object's splats; color: linear RGB, shown by Solid mode."""
+    """Create a material for the splats of one object; `color` is the linear RGB viewport color of Solid mode."""
     material, graph = _empty_material(name)
     mark(material, SPLATS_MATERIAL)
     shader = find_or_make(bpy.data.node_groups, SPLAT_SHADER, 2, "ObjectGS Splat", _make_splat_shader)
@@ -50,9 +50,9 @@ def splats_material(name: str, color: tuple[float, ...]) -> bpy.types.Material:
 
 
 def _make_splat_shader(name: str) -> bpy.types.NodeTree:
-    """The shader of discs, whose attribute `disc` holds the position on the disc and the nearness of the camera.
+    """Create the shader of discs, whose attribute `disc` stores the position on the disc and the camera's nearness.
 
-    Points have no such attribute, and alpha 1.
+    Points have no such attribute and alpha 1.
     """
     tree = bpy.data.node_groups.new(name, "ShaderNodeTree")
     tree.interface.new_socket("Shader", in_out="OUTPUT", socket_type="NodeSocketShader")
@@ -67,7 +67,7 @@ def _make_splat_shader(name: str) -> bpy.types.NodeTree:
 
 
 def ellipsoids_material() -> bpy.types.Material:
-    """The shared material of ellipsoids, whose color is an attribute of the instance."""
+    """Return the shared material of ellipsoids, which reads the color from an instance attribute."""
     return find_or_make(bpy.data.materials, ELLIPSOIDS_MATERIAL, 2, "ObjectGS Ellipsoids", _make_ellipsoids_material)
 
 
@@ -100,10 +100,16 @@ def _falloff(
     squared_distance: bpy.types.NodeSocket,
     hidden: bpy.types.NodeSocket | None,
 ) -> None:
-    """Make the Gaussian's emission and alpha the output of the tree.
+    """Add the output of the tree: the emission of a Gaussian, mixed by its alpha.
 
-    alpha = opacity * exp(-sigmas^2 / 2) with sigmas^2 = 2 ln(255 opacity) * squared_distance, where squared_distance,
-    of the ray from the splat's center, is 1 at the end of the splat. hidden: 1 where alpha is 0, or None.
+    alpha = opacity * exp(-sigmas^2 / 2) with sigmas^2 = 2 ln(255 opacity) * squared_distance.
+
+    Args:
+        graph: the tree under construction.
+        color: emitted color.
+        opacity: opacity of the splat.
+        squared_distance: from the splat's center to the ray; 1 where the splat is cut off.
+        hidden: 1 where alpha is forced to 0, or None.
     """
     falloff = graph.math(
         "POWER", graph.math("MULTIPLY", opacity, 1.0 / SMALLEST_ALPHA), graph.math("MULTIPLY", squared_distance, -1.0)
@@ -122,7 +128,7 @@ def _falloff(
 
 
 def mesh_material(name: str, image: bpy.types.Image, like: bpy.types.Material | None) -> bpy.types.Material:
-    """Make a material with a mesh's texture, as a copy of `like` if given, which is faster."""
+    """Create a material with a mesh's texture; copying the material `like`, if given, is faster."""
     if like is not None:
         material = like.copy()
         material.name = name
@@ -145,13 +151,13 @@ def _empty_material(name: str) -> tuple[bpy.types.Material, Graph]:
     material = _material_without_nodes(name)
     material.surface_render_method = "DITHERED"
     if hasattr(material, "cycles"):
-        material.cycles.emission_sampling = "NONE"  # A million small lamps would be slow.
+        material.cycles.emission_sampling = "NONE"  # Sampling each splat as a light would be slow.
     return material, Graph(material.node_tree)
 
 
 def _material_without_nodes(name: str) -> bpy.types.Material:
     material = bpy.data.materials.new(name)
     if material.node_tree is None:
-        material.use_nodes = True  # From Blender 5.0 on always so, and deprecated.
+        material.use_nodes = True  # Always true, and deprecated, since Blender 5.0.
     material.node_tree.nodes.clear()
     return material

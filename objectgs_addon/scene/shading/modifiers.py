@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The geometry-nodes modifiers of mesh carriers: added, set, updated to newer groups, switched off in viewports."""
+"""Geometry nodes modifiers of mesh carriers: creation, inputs, updates of node groups, and viewport display."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .node_groups import HIDE_GROUP, RENDER_GROUP, SPLATS_GROUP, hide_group, spl
 
 
 def add_splats_modifiers(obj: bpy.types.Object, largest_point: float) -> None:
-    """Show a mesh carrier's splats with one modifier in viewports and one in renders.
+    """Add the modifiers that show a mesh carrier's splats, one for viewports and one for renders.
 
     Args:
         obj: the mesh carrier.
@@ -40,7 +40,7 @@ def recolor_splats(obj: bpy.types.Object, affine: tuple[np.ndarray, np.ndarray] 
 
     Args:
         obj: the mesh carrier.
-        affine: matrix (3, 3) and offset (3,) of sRGB-encoded colors; None: the colors of the photos.
+        affine: matrix (3, 3) and offset (3,) on sRGB-encoded colors; None restores the captured colors.
     """
     matrix, offset = affine or (np.eye(3), np.zeros(3))
     changed = False
@@ -48,7 +48,7 @@ def recolor_splats(obj: bpy.types.Object, affine: tuple[np.ndarray, np.ndarray] 
         newest = splats_group(kind_of(modifier.node_group))
         if modifier.node_group != newest:
             if affine is None:
-                continue  # An older group may lack the inputs, and then never recolors.
+                continue  # An older group may lack the recolor inputs, so there is nothing to reset.
             _replace_group(modifier, newest)
         for name, row in ((OFFSET, offset), *((f"Recolor {channel}", row) for channel, row in zip(CHANNELS, matrix))):
             set_input(modifier, name, [float(value) for value in row])
@@ -58,7 +58,7 @@ def recolor_splats(obj: bpy.types.Object, affine: tuple[np.ndarray, np.ndarray] 
 
 
 def update_groups(obj: bpy.types.Object) -> None:
-    """Show a carrier's splats with the newest node groups; inputs that the user set keep their values."""
+    """Replace a carrier's node groups with the newest versions; inputs keep their values."""
     for modifier in _splats_modifiers(obj):
         newest = splats_group(kind_of(modifier.node_group))
         if modifier.node_group != newest:
@@ -66,9 +66,9 @@ def update_groups(obj: bpy.types.Object) -> None:
 
 
 def show_preview(part: bpy.types.Object, is_on: bool) -> None:
-    """Switch the preview of a carrier's splats in viewports; renders keep theirs.
+    """Switch the viewport preview of a carrier's splats on or off; renders are not affected.
 
-    Without the preview, a group without output hides the vertices, which Blender would draw as dots.
+    While the preview is off, a modifier with empty output hides the vertices, which Blender would draw as dots.
     """
     preview, hiding = modifier_of(part, SPLATS_GROUP), modifier_of(part, HIDE_GROUP)
     if preview is None or part.library is not None:
@@ -84,7 +84,7 @@ def show_preview(part: bpy.types.Object, is_on: bool) -> None:
 
 
 def set_input(modifier: bpy.types.NodesModifier, name: str, value: Any) -> None:
-    """Set an input of a geometry-nodes modifier by its label; KeyError where there is none."""
+    """Set an input of a geometry nodes modifier by its label; raise KeyError if there is no such input."""
     for item in modifier.node_group.interface.items_tree:
         if item.item_type == "SOCKET" and item.in_out == "INPUT" and item.name == name:
             if hasattr(modifier, "properties"):  # from Blender 5.2 on
@@ -96,7 +96,7 @@ def set_input(modifier: bpy.types.NodesModifier, name: str, value: Any) -> None:
 
 
 def inputs_of(modifier: bpy.types.NodesModifier) -> dict[str, Any]:
-    """Label -> value of a geometry-nodes modifier's inputs, without its geometry."""
+    """Map the labels of a geometry nodes modifier's inputs, except its geometry, to their values."""
     values = {}
     for item in modifier.node_group.interface.items_tree:
         if item.item_type == "SOCKET" and item.in_out == "INPUT" and item.socket_type != "NodeSocketGeometry":
@@ -108,7 +108,7 @@ def inputs_of(modifier: bpy.types.NodesModifier) -> dict[str, Any]:
 
 
 def modifier_of(obj: bpy.types.Object, kind: str) -> bpy.types.NodesModifier | None:
-    """The object's modifier whose node group is of this kind."""
+    """Return the first modifier of an object whose node group is of this kind, or None."""
     for modifier in obj.modifiers:
         if modifier.type == "NODES" and modifier.node_group is not None and kind_of(modifier.node_group) == kind:
             return modifier
@@ -116,7 +116,7 @@ def modifier_of(obj: bpy.types.Object, kind: str) -> bpy.types.NodesModifier | N
 
 
 def _splats_modifiers(obj: bpy.types.Object) -> list[bpy.types.NodesModifier]:
-    """The modifiers for viewports and renders, without those that the user removed."""
+    """Return the existing splat modifiers for viewports and renders."""
     found = (modifier_of(obj, kind) for kind in (SPLATS_GROUP, RENDER_GROUP))
     return [modifier for modifier in found if modifier is not None]
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Geometry-node groups that show mesh carriers: points, the viewport's preview of splats, and splats in renders.
+"""Geometry node groups that show mesh carriers: point clouds, the viewport preview of splats, and splats in renders.
 
 Viewports show splats as points, or as ellipsoids, which are correct from every side. Renders show them as discs that
-face the camera: one hit per splat and ray instead of two, in the order of the splats' centers, and colors that depend
-on the direction.
+face the camera: each ray hits a splat once instead of twice, hits are sorted by the splats' centers, and colors depend
+on the view direction.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ RENDER_GROUP = "splats_render"
 HIDE_GROUP = "splats_drawn"
 
 HIDDEN = "objectgs_hidden"
-"""Boolean attribute of a carrier's vertices: splats that are not shown, whatever object they belong to."""
+"""Boolean attribute of a carrier's vertices: splats that are hidden individually."""
 
 MINIMUM_FLATNESS = 1e-3
-"""Lower limit of a splat's smallest scale relative to its largest, since a ray cannot hit a flatter ellipsoid."""
+"""Lower limit of a splat's smallest scale relative to its largest, since rays miss flatter ellipsoids."""
 
 MAXIMUM_NEARNESS = 0.9
-"""Upper limit of (radius / distance from the camera)^2 of a splat, both in sigmas; nearer splats are not rendered."""
+"""Upper limit of a splat's (radius / camera distance)^2, both in sigmas; closer splats are not rendered."""
 
 ICOSPHERE_INRADIUS = 0.9341
-"""Distance from the center of an icosphere of 80 faces and radius 1 to its faces."""
+"""Distance from the center to the faces of an icosphere with 80 faces and radius 1."""
 
 
 def points_group() -> bpy.types.NodeTree:
-    """The group that shows a carrier's vertices as small octahedra in one of two colors."""
+    """Return the group that shows a carrier's vertices as small octahedra in one of two colorings."""
     return find_or_make(bpy.data.node_groups, POINTS_GROUP, 2, "ObjectGS Points", _make_points_group)
 
 
@@ -68,7 +68,7 @@ def _make_points_group(name: str) -> bpy.types.NodeTree:
     ).outputs["Mesh"]
     placed = graph.node("GeometryNodeInstanceOnPoints", {"Points": colored, "Instance": shape}).outputs[0]
     real = graph.node("GeometryNodeRealizeInstances", {"Geometry": placed}).outputs[0]
-    # Joined after the carrier, since the result takes over its active color, which Solid mode shows.
+    # A vertex of the carrier comes first, so that the result has its active color attribute, which Solid mode shows.
     index = graph.node("GeometryNodeInputIndex").outputs[0]
     first = graph.node("GeometryNodeDeleteGeometry", {"Geometry": colored, "Selection": index}).outputs[0]
     joined = graph.node("GeometryNodeJoinGeometry")
@@ -83,14 +83,14 @@ def _make_points_group(name: str) -> bpy.types.NodeTree:
 
 
 def splats_group(kind: str) -> bpy.types.NodeTree:
-    """The newest group that shows splats in viewports (kind: SPLATS_GROUP) or renders (RENDER_GROUP)."""
+    """Return the newest group that shows splats in viewports (kind: SPLATS_GROUP) or renders (RENDER_GROUP)."""
     if kind == SPLATS_GROUP:
         return find_or_make(bpy.data.node_groups, kind, 3, "ObjectGS Splats", _make_splats_group)
     return find_or_make(bpy.data.node_groups, kind, 3, "ObjectGS Render", _make_render_group)
 
 
 def hide_group() -> bpy.types.NodeTree:
-    """The group that shows nothing; without it, Blender marks the vertices of a mesh that has only those."""
+    """Return a group with empty output; without it, Blender draws dots for the loose vertices of a mesh."""
     for tree in bpy.data.node_groups:
         if kind_of(tree) == HIDE_GROUP and tree.library is None:
             return tree
@@ -104,7 +104,7 @@ def hide_group() -> bpy.types.NodeTree:
 
 
 def _geometry_group(name: str, inputs: list[tuple[str, str, Any, float | None, str]]) -> bpy.types.NodeTree:
-    """A geometry-node group for a modifier; inputs: (name, socket type, default, minimum, description)."""
+    """Create a geometry node group for a modifier; `inputs`: (name, socket type, default, minimum, description)."""
     tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
     tree.is_modifier = True
     tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
@@ -116,7 +116,7 @@ def _geometry_group(name: str, inputs: list[tuple[str, str, Any, float | None, s
             socket.default_value = default
         if minimum is not None:
             socket.min_value = minimum
-        socket.hide_in_modifier = label.startswith("Recolor ")  # The panel has sliders for them.
+        socket.hide_in_modifier = label.startswith("Recolor ")  # The add-on's panel has sliders for these.
     return tree
 
 
@@ -198,14 +198,14 @@ def _make_render_group(name: str) -> bpy.types.NodeTree:
     eye = graph.node("GeometryNodeObjectInfo", {"Object": camera}, transform_space="RELATIVE").outputs["Location"]
     towards = graph.vector("SUBTRACT", eye, position)
 
-    # In the space where the splat is a unit ball: direction to the eye, and two directions across it.
+    # In the space where the splat is a unit sphere: the direction to the camera and two directions orthogonal to it.
     sigmas = graph.vector("MAXIMUM", splat.scale, splat.thinnest)
     back = graph.node("FunctionNodeInvertRotation", {0: splat.rotation}).outputs[0]
     local = graph.vector("DIVIDE", graph.rotated(towards, back), sigmas)
     distance = graph.vector("LENGTH", local, output="Value")
     axis = graph.vector("NORMALIZE", local)
     x = graph.separated(axis)[0]
-    # Any vector that is not parallel to the axis.
+    # Any vector not parallel to the axis.
     aside = graph.node(
         "ShaderNodeCombineXYZ",
         {
@@ -216,7 +216,7 @@ def _make_render_group(name: str) -> bpy.types.NodeTree:
     across = graph.vector("NORMALIZE", graph.vector("CROSS_PRODUCT", axis, aside))
     along = graph.vector("CROSS_PRODUCT", axis, across)
 
-    # Seen from nearby, a ball covers more of the plane through its center than its own disc.
+    # Seen from nearby, the silhouette of a sphere on the plane through its center is larger than its great circle.
     ratio = graph.math("DIVIDE", splat.reach, graph.math("MAXIMUM", distance, 1e-20))
     nearness = graph.math("MULTIPLY", ratio, ratio)
     outside = graph.math("LESS_THAN", nearness, MAXIMUM_NEARNESS)
@@ -280,7 +280,7 @@ def _make_render_group(name: str) -> bpy.types.NodeTree:
 
 
 class _Splat:
-    """The attributes of a splat as sockets, and values derived from them."""
+    """Sockets of a splat's attributes and of values derived from them."""
 
     def __init__(self, graph: Graph) -> None:
         base = graph.attribute("radiance:base", "FLOAT_COLOR")
@@ -291,7 +291,7 @@ class _Splat:
         self.sides = graph.separated(self.scale)
         longest = graph.math("MAXIMUM", graph.math("MAXIMUM", *self.sides[:2]), self.sides[2])
         self.thinnest = graph.math("MULTIPLY", longest, MINIMUM_FLATNESS)
-        # Alpha falls to 1/255 this many sigmas from the center.
+        # Distance from the center in sigmas at which alpha falls to 1/255.
         ratio = graph.math("MAXIMUM", graph.math("MULTIPLY", self.opacity, 1.0 / SMALLEST_ALPHA), 1.0)
         self.reach = graph.math("SQRT", graph.math("MULTIPLY", graph.math("LOGARITHM", ratio, math.e), 2.0))
         self.hidden = graph.attribute(HIDDEN, "BOOLEAN")
@@ -304,19 +304,19 @@ class _Splat:
 
 
 def _linear_color(graph: Graph, raw: bpy.types.NodeSocket, alpha: Any) -> bpy.types.NodeSocket:
-    """A splat's color, which is sRGB-encoded and may be negative, as Blender's linear RGBA."""
+    """Convert a splat's sRGB-encoded color, which may be negative, to linear RGBA."""
     channels = {index: linear_channel(graph, channel) for index, channel in enumerate(graph.separated(raw))}
     return graph.node("FunctionNodeCombineColor", {**channels, "Alpha": alpha}).outputs[0]
 
 
 def _add_harmonics(graph: Graph, color: bpy.types.NodeSocket, direction: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-    """`color` plus the spherical harmonics of degree 1 to 3 in a direction; missing coefficients count as 0."""
+    """Add the spherical harmonics of degrees 1 to 3 in a direction to `color`; missing coefficients count as 0."""
     x, y, z = graph.separated(direction)
     xx, yy, zz = (graph.math("MULTIPLY", side, side) for side in (x, y, z))
     xy, yz, xz = graph.math("MULTIPLY", x, y), graph.math("MULTIPLY", y, z), graph.math("MULTIPLY", x, z)
 
     def combined(*terms: tuple[float, Any]) -> bpy.types.NodeSocket:
-        """Sum of factor * output."""
+        """Return the sum of factor * value."""
         total: Any = 0.0
         for factor, value in terms:
             total = graph.math("MULTIPLY_ADD", value, factor, total)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Settings of a scene for faithful renders of splats."""
+"""Scene settings for accurate renders of splats."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import bpy
 
 
 def prepare_render(scene: bpy.types.Scene) -> None:
-    """Render colors as they were captured, and let rays pass many splats.
+    """Set up a scene to render the captured colors and let rays pass through many splats.
 
-    Changes the scene's view transform and Cycles' bounces, so it is never called for a user's own scene.
+    Do not call it for a user's own scene, since it changes the view transform and the Cycles bounces.
     """
     scene.view_settings.view_transform = "Standard"
     scene.view_settings.look = "None"
