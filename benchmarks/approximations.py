@@ -1,13 +1,13 @@
-"""Error against run time for every approximation, and whether the defaults lie on the Pareto front.
+"""Error against run time of all approximations, and whether the defaults lie on the Pareto front.
 
     python benchmarks/approximations.py [--demo build/demo] [--steps 750] [--restart] [--json]
 
---demo is a reconstruction of the demo capture, as `make demo` leaves it; nothing is written there. The rasterizer's
-choices are compared on its splats in one held-out view, against the exact picture (see raster_variants.py); the
-training's by trainings of --steps beside the default's, and what the default comes to in the same time (see
-training_variants.py); those of meshes and textures on three objects of the reconstruction, against their true
-surfaces. Leaves docs/error-against-time.md and plots beside it. What is done is kept in build/approximations: a run
-that was stopped goes on where it was.
+--demo is a reconstruction of the demo capture from `make demo`; it is not modified. The rasterizer's choices are
+compared on its splats in one held-out view, against the exact image (see raster_variants.py). Those of the training
+are compared by trainings of --steps beside the default, with the default's quality in the same time (see
+training_variants.py). Those of meshes and textures are compared on three objects of the reconstruction, against their
+true surfaces. Writes docs/error-against-time.md and its plots. Results are kept in build/approximations, so a stopped
+run continues where it ended.
 """
 
 from __future__ import annotations
@@ -35,33 +35,36 @@ from benchmarks import raster_variants, shared, training_variants
 
 WORK = ROOT / "build" / "approximations"
 TURNS, SETS = 40, 5
-"""How often each variant of the rasterizer is timed, and in how many sets of processes: where a process has its memory
-makes some of them slower than others by as much as variants differ."""
+"""Number of timings of each variant of the rasterizer, and number of sets of processes among which they are divided.
+The memory layout of a process can change its speed by as much as variants differ."""
 MORE_SETS = 10
-"""A choice of which a variant seems better is timed in so many more sets, and all of them count: of some thirty
-variants one or two seem so by chance."""
+"""Number of additional sets for a choice in which a variant seems better than the default; all sets count. Among about
+thirty variants, one or two seem better by chance."""
 SEEDS = 3
-"""A variant that seems better by half of what counts as noise is trained so many times, and its means count."""
+"""Number of trainings, of which the means count, for a variant that seems better by at least half of the noise."""
 MESHED = 3
-"""How often the meshes of each variant are made, all of them in turns; the median time counts."""
+"""Number of times that the meshes of each variant are made; all variants take turns, and the median time counts."""
 CURVE = (0.5, 0.7, 1.0, 1.4)
-"""The default is trained for so many times as long, too: what it comes to in a variant's time lies between these."""
+"""Lengths at which the default is trained, relative to --steps; its quality in a variant's time is interpolated."""
 OBJECTS = ("mug", "teapot", "vase")
 AGAIN = "the default again"
-"""In a process of its own, it says what is noise in the rasterizer's times."""
+"""Name of a second process with the default, which measures the noise of the rasterizer's times."""
 
 TIME_NOISE, ERROR_NOISE = 0.03, 0.02
-"""Times and errors of the rasterizer that differ by less than these parts count as equal, and times by less than those
-of the default do in two processes."""
+"""Relative differences up to which the rasterizer's times and errors count as equal. The noise of the times is at least
+the difference of the default's times in two processes."""
 MESH_TIME_NOISE, PSNR_NOISE, SHARE_NOISE = 0.05, 0.1, 0.002
-"""At least so much of a mesh's time, in dB, and in mIoU and F1 counts as noise."""
+"""Minimum noise of a mesh's time (relative), of PSNR (dB), and of mIoU and F1."""
 _LEAST_NOISE = (PSNR_NOISE, SHARE_NOISE)
 
 
 @dataclass(frozen=True)
 class Choice:
-    """One approximation: its name, the variants by name, as the processes take them, and which is the default; why it
-    is that even where another is better."""
+    """One approximation.
+
+    title: its name. default: name of the default variant. variants: changes by name, in the form that the processes
+    take. why: reason to keep the default even if another variant is better.
+    """
 
     title: str
     default: str
@@ -72,8 +75,9 @@ class Choice:
 
 @dataclass
 class Verdict:
-    """Whether the default of a choice lies on the front, and which variants are better in something and worse in
-    nothing."""
+    """Variants that are better than a choice's default in some figure and worse in none; if there are none, the default
+    lies on the front."""
+
 
     choice: Choice
     better: list[str] = field(default_factory=list)
@@ -83,7 +87,7 @@ class Verdict:
 
 
 def raster_choices() -> list[Choice]:
-    """Of the CPU rasterizer. The variant {} is the product as it is."""
+    """Return the choices of the CPU rasterizer; the variant {} changes nothing."""
     from backend.raster import simd
     from backend.raster.cpu import binning as cpu_bin
     from backend.shared.splats.blending import ALPHA_MIN, TRANSMITTANCE_THRESHOLD
@@ -151,7 +155,7 @@ def raster_choices() -> list[Choice]:
 
 
 def training_choices() -> list[Choice]:
-    """Of the training; each variant is judged against the default in the same time."""
+    """Return the choices of the training; each variant is compared with the default in the same time."""
     from backend.training.settings import GROW_FROM, GROW_UNTIL, Settings, growth_interval
 
     settings = Settings()
@@ -199,7 +203,7 @@ def training_choices() -> list[Choice]:
 
 
 def mesh_choices() -> list[Choice]:
-    """Of meshes and textures."""
+    """Return the choices of meshes and textures."""
     from backend.mesh.field.extract import FACES
     from backend.mesh.field.fusion import _VOXEL_PER_PIXEL
 
@@ -227,8 +231,11 @@ def mesh_choices() -> list[Choice]:
 
 
 def write_scene(folder: Path, path: Path) -> None:
-    """The splats that a reconstruction shows in a held-out view, its labels, and gradients to go backward from: those
-    of half the squared error of the picture and of the mean -log of the label's probability."""
+    """Save the splats of a reconstruction in a held-out view, the view's labels, and gradients for the backward pass.
+
+    The gradients are those of half the mean squared error of the image and of a weighted mean -log of the label's
+    probability.
+    """
     import numpy as np
     import torch
 
@@ -260,7 +267,7 @@ def write_scene(folder: Path, path: Path) -> None:
 
 
 def opened(folder: Path) -> Any:
-    """A reconstruction, as the product's own commands open it."""
+    """Open a reconstruction as the user's commands do."""
     from backend.cli.parser import build_parser
     from backend.commands.folder import open_trained
     from backend.shared.events import Reporter
@@ -271,7 +278,7 @@ def opened(folder: Path) -> Any:
 
 
 def write_exact(scene_file: Path, path: Path) -> None:
-    """The exact picture of a scene, in as many processes as there are cores."""
+    """Render and save the exact image of a scene, in as many processes as there are cores."""
     import numpy as np
 
     scene = np.load(scene_file)
@@ -290,7 +297,7 @@ def write_exact(scene_file: Path, path: Path) -> None:
 
 
 class Worker:
-    """A variant of the rasterizer in a process of its own."""
+    """A variant of the rasterizer in a separate process."""
 
     def __init__(self, changes: Mapping[str, Any], kernels: Path, scene: Path, exact: Path) -> None:
         words = [sys.executable, "-m", "benchmarks.raster_variants", json.dumps(changes), str(scene), str(exact)]
@@ -301,7 +308,7 @@ class Worker:
         )  # fmt: skip
 
     def answer(self) -> dict[str, Any]:
-        """The next line of the process; RuntimeError where there is none."""
+        """Read the next line of the process; raise RuntimeError if the process has ended."""
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:
@@ -310,7 +317,7 @@ class Worker:
         return json.loads(line)
 
     def turn(self) -> dict[str, Any]:
-        """The times of one forward and backward."""
+        """Run one forward and backward pass and return the times."""
         assert self._process.stdin is not None
         self._process.stdin.write("\n")
         self._process.stdin.flush()
@@ -323,13 +330,15 @@ class Worker:
 
 
 def measure_choice(choice: Choice, scene: Path, exact: Path, kernels: Path, sets: int) -> dict[str, Any]:
-    """Errors and times of all variants of a choice, and of AGAIN, in some sets of processes."""
+    """Measure errors and times of all variants of a choice, and of AGAIN, in `sets` sets of processes."""
     return joined([measure_set(choice, scene, exact, kernels) for _ in range(sets)])
 
 
 def joined(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What several sets of processes, or several lots of sets, say of a choice: medians over the sets of the ratios to
-    the default, and over the parts of the milliseconds."""
+    """Merge results of a choice, from single sets or merged before.
+
+    The ratios to the default are medians over all sets, the milliseconds medians over `parts`.
+    """
 
     def of_sets(row: Mapping[str, Any]) -> list[float]:
         return row.get("times_default_of_sets", [row["times_default"]])
@@ -347,8 +356,10 @@ def joined(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def measure_set(choice: Choice, scene: Path, exact: Path, kernels: Path) -> dict[str, Any]:
-    """Errors and times of all variants of a choice, and of AGAIN, a process each. They take turns, so that what else
-    the machine does meets all."""
+    """Measure errors and times of all variants of a choice, and of AGAIN, in one process each.
+
+    They take turns, so that other load on the machine affects them equally.
+    """
     workers: dict[str, Worker] = {}
     found: dict[str, Any] = {}
     try:
@@ -356,7 +367,7 @@ def measure_set(choice: Choice, scene: Path, exact: Path, kernels: Path) -> dict
             place = kernels / shared.digest([], sorted(changes.items()))
             place.mkdir(parents=True, exist_ok=True)
             workers[name] = Worker(changes, place, scene, exact)
-            # Each one compiles on a core of its own, so no more of them at a time.
+            # Each process compiles on one core, so at most one per core starts at a time.
             waiting = [other for other in workers if other not in found]
             if len(waiting) == os.cpu_count():
                 found[waiting[0]] = workers[waiting[0]].answer()
@@ -372,7 +383,7 @@ def measure_set(choice: Choice, scene: Path, exact: Path, kernels: Path) -> dict
             worker.close()
     for name, rows in times.items():
         sums = [row["forward_ms"] + row["backward_ms"] for row in rows]
-        # Against the default in the same round, since rounds differ more than variants.
+        # Relative to the default in the same turn, since turns differ more than variants.
         ratios = [a / b for a, b in zip(sums, [r["forward_ms"] + r["backward_ms"] for r in times[choice.default]])]
         found[name] |= {
             "forward_ms": statistics.median(row["forward_ms"] for row in rows),
@@ -387,7 +398,7 @@ def measure_set(choice: Choice, scene: Path, exact: Path, kernels: Path) -> dict
 
 
 def meshed(spec: dict[str, Any], folder: str) -> dict[str, Any]:
-    """Make meshes of OBJECTS in a copy of a reconstruction, and measure them; in a process of its own."""
+    """Make meshes of OBJECTS in a copy of a reconstruction, and measure them; must run in a separate process."""
     from backend.cli import main as arguments
     from backend.evaluation.meshes import evaluate_mesh, mesh_entries
     from backend.evaluation.truth import load_truth
@@ -423,8 +434,10 @@ def meshed(spec: dict[str, Any], folder: str) -> dict[str, Any]:
 
 
 def better_than(default: Sequence[float], others: Mapping[str, Sequence[float]], noise: Sequence[float]) -> list[str]:
-    """The variants that are better than the default in something and worse in nothing. All figures are costs; those
-    that differ by no more than `noise` are equal."""
+    """Return the variants that are better than the default in some figure and worse in none.
+
+    All figures are costs; differences up to `noise` count as equal.
+    """
 
     def beats(costs: Sequence[float]) -> bool:
         gains = [(mine - cost, n) for mine, cost, n in zip(default, costs, noise, strict=True)]
@@ -434,14 +447,14 @@ def better_than(default: Sequence[float], others: Mapping[str, Sequence[float]],
 
 
 def raster_verdict(choice: Choice, found: Mapping[str, Any], time_noise: float) -> Verdict:
-    """Costs: time and the errors of picture and gradient."""
+    """Compare the variants of a rasterizer choice; the costs are time and the errors of image and gradient."""
     costs = {n: (row["times_default"], row["picture"], row["gradient"]) for n, row in found.items()}
     mine = costs.pop(choice.default)
     return Verdict(choice, better_than(mine, costs, [time_noise, *(ERROR_NOISE * cost for cost in mine[1:])]))
 
 
 def training_row(pairs: Sequence[Mapping[str, Any]], curve: Mapping[int, Any], steps: int) -> dict[str, float]:
-    """A variant's figures, means over its seeds, and those of the default in the same time."""
+    """Return a variant's figures as means over its seeds, and the default's figures in the same time."""
     time = statistics.fmean(pair["times_default"] for pair in pairs)
     return {
         "time": time,
@@ -460,18 +473,21 @@ def _in_default_time(curve: Mapping[int, Any], steps: float) -> dict[str, float]
 
 
 def training_gains(row: Mapping[str, float]) -> list[float]:
-    """By how much a variant's figures are better than the default's in the same time."""
+    """Return the gains of a variant's figures over the default's in the same time."""
     return [row[name] - row[f"{name}_default"] for name in training_variants.FIGURES]
 
 
 def training_noise(rows: Sequence[Mapping[str, float]]) -> list[float]:
-    """Twice the standard deviation of the default's figures over seeds."""
+    """Return twice the standard deviation of the default's figures over seeds."""
     return [2 * statistics.stdev(row[name] for row in rows) for name in training_variants.FIGURES]
 
 
 def training_verdict(choice: Choice, found: Mapping[str, Any], noise: Sequence[float]) -> Verdict:
-    """Costs: by how much PSNR and mIoU fall short of the default's in the same time. `noise`: of a single training;
-    means over n seeds have the square root of n less, but no less than what counts as noise anyway."""
+    """Compare the variants of a training choice; the costs are the losses of PSNR and mIoU against the default.
+
+    `noise` is that of a single training; for means over n seeds it is divided by the square root of n, but it is at
+    least _LEAST_NOISE.
+    """
     verdict = Verdict(choice)
     for name, row in found.items():
         if name != choice.default:
@@ -482,7 +498,7 @@ def training_verdict(choice: Choice, found: Mapping[str, Any], noise: Sequence[f
 
 
 def mesh_verdict(choice: Choice, found: Mapping[str, Any]) -> Verdict:
-    """Costs: time, F1 at 5 mm and the texture's PSNR."""
+    """Compare the variants of a mesh choice; the costs are time, negative F1 at 5 mm and negative texture PSNR."""
     costs = {name: (row["seconds"], -row["f1_005"], -row["texture_psnr"]) for name, row in found.items()}
     mine = costs.pop(choice.default)
     return Verdict(choice, better_than(mine, costs, (MESH_TIME_NOISE * mine[0], SHARE_NOISE, PSNR_NOISE)))
@@ -493,8 +509,11 @@ def mesh_verdict(choice: Choice, found: Mapping[str, Any]) -> Verdict:
 
 @dataclass
 class Found:
-    """Results by choice and variant; `time_noise` of the rasterizer, a part; `noise` of the trainings' PSNR and mIoU;
-    `curve`: the default's figures by number of steps, and `seeds` how many of it were trained for `steps`."""
+    """Results by choice and variant.
+
+    time_noise: relative noise of the rasterizer's times. noise: that of the trainings' PSNR and mIoU. curve: the
+    default's figures by number of steps. seeds: number of trainings of the default with `steps` steps.
+    """
 
     raster: dict[str, dict[str, Any]]
     training: dict[str, dict[str, Any]]
@@ -508,7 +527,7 @@ class Found:
 
 
 def raster_plot(choices: Sequence[Choice], found: Mapping[str, Any]) -> Any:
-    """Time against the error of the picture, a panel each."""
+    """Plot time against the error of the image, one panel per choice."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import NullFormatter
 
@@ -540,7 +559,7 @@ def raster_plot(choices: Sequence[Choice], found: Mapping[str, Any]) -> Any:
 
 
 def _front_panel(ax: Any, points: Mapping[str, tuple[float, float]], default: str) -> None:
-    """Points of (time, cost), each with a look of its own, the default marked, and the front through the best."""
+    """Plot points (time, cost) with distinct markers, the default highlighted, and the Pareto front."""
     best, steps = float("inf"), []
     for x, y in sorted(points.values()):
         if y < best:
@@ -558,7 +577,7 @@ def _front_panel(ax: Any, points: Mapping[str, tuple[float, float]], default: st
 
 
 def training_plot(choices: Sequence[Choice], found: Found) -> Any:
-    """Time against PSNR and mIoU, a column for each choice: the variants, and the default's curve with its noise."""
+    """Plot time against PSNR and mIoU, one column per choice: the variants, and the default's curve with its noise."""
     from matplotlib.figure import Figure
 
     panels = [choice for choice in choices if found.training.get(choice.title)]
@@ -592,7 +611,7 @@ def training_plot(choices: Sequence[Choice], found: Found) -> Any:
 
 
 def mesh_plot(choices: Sequence[Choice], found: Mapping[str, Any]) -> Any:
-    """Time against F1 at 5 mm and against the texture's PSNR, a column for each choice."""
+    """Plot time against 1 - F1 at 5 mm and against the texture's RMSE, one column per choice."""
     from matplotlib.figure import Figure
 
     panels = [choice for choice in choices if found.get(choice.title)]
@@ -615,7 +634,7 @@ def mesh_plot(choices: Sequence[Choice], found: Mapping[str, Any]) -> Any:
 
 
 def document(found: Found, choices: Mapping[str, Sequence[Choice]], scene: Mapping[str, Any]) -> str:
-    """docs/error-against-time.md."""
+    """Return the text of docs/error-against-time.md."""
     off = [verdict for verdict in found.verdicts if verdict.better]
     on = len(found.verdicts) - len(off)
     lines = [
@@ -741,7 +760,11 @@ def _mesh_row(row: Mapping[str, Any]) -> list[str]:
 
 
 def run(demo: Path, steps: int) -> tuple[Found, dict[str, Sequence[Choice]], dict[str, Any], dict[str, str]]:
-    """Measure everything that is not there yet. Returns the results, the choices, what the scene is, and failures."""
+    """Measure everything that has no stored result.
+
+    Returns:
+        The results; the choices by kind; the number of splats and the image size of the scene; the failures by name.
+    """
     import numpy as np
 
     shared.compile_everything()
@@ -857,7 +880,7 @@ def run(demo: Path, steps: int) -> tuple[Found, dict[str, Sequence[Choice]], dic
 
 
 def main() -> None:
-    """Measure, write the document and the plots, and say which defaults lie off the front."""
+    """Measure, write the document and the plots, and print which defaults lie off the front."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--demo", type=Path, default=ROOT / "build/demo", help="a reconstruction of the demo capture")
     parser.add_argument("--steps", type=int, default=750, help="how long a variant is trained")

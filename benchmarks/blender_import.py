@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How long Blender is busy while a result comes in: many splats in few objects, many objects, and their meshes.
+"""Time that Blender is blocked while it shows a result: many splats in few objects, many objects, and their meshes.
 
-Runs inside Blender or in a Python that has the bpy wheel. Times are medians of fresh files; `show` is what
-`show_result` takes, from the files to the collections, `update` the first evaluation for the viewport that follows,
-`again` bringing the same result in once more. `meshes` is a small mesh for each object that is shown already, `switch`
-showing splats instead of meshes.
+Runs inside Blender or in a Python with the bpy wheel. Times are medians over repeats, each in a new file. `show` is
+`show_result`, from the files to the collections; `update` is the first depsgraph evaluation after it; `again` shows the
+same result once more. `meshes` adds a small mesh to each object that is already shown; `switch` shows splats instead of
+meshes.
 
     blender -b -P benchmarks/blender_import.py -- [--json] [--splats 1000000] [--objects 1000] [--repeats 3]
 """
@@ -26,7 +26,7 @@ DEGREE_1 = 9
 
 
 def extension():
-    """The checkout's root as package `objectgs`, loaded by its place."""
+    """Load the repository root as package `objectgs` and return the modules that this benchmark uses."""
     if "objectgs" not in sys.modules:
         spec = importlib.util.spec_from_file_location(
             "objectgs", ROOT / "__init__.py", submodule_search_locations=[str(ROOT)]
@@ -39,7 +39,7 @@ def extension():
 
 
 def write_result(folder: Path, splats: int, objects: int, write_vertices) -> None:
-    """A reconstruction folder with random splats of degree 1, one anchor for ten, and a few points and cameras."""
+    """Write a reconstruction: random splats of SH degree 1, one anchor per ten splats, 1,000 points and a camera."""
     rng = np.random.default_rng(0)
     names = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(DEGREE_1))]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
@@ -76,7 +76,7 @@ def write_result(folder: Path, splats: int, objects: int, write_vertices) -> Non
 
 
 def write_meshes(folder: Path, objects: int, mesh_file) -> None:
-    """meshes/ with a closed grid of 16 x 16 vertices, 512 faces, for each object, and one small texture."""
+    """Write meshes/ with a closed grid of 16 x 16 vertices (512 faces) and a small texture for each object."""
     place = folder / "meshes"
     place.mkdir()
     image = bpy.data.images.new("texture", 64, 64)
@@ -102,7 +102,7 @@ def write_meshes(folder: Path, objects: int, mesh_file) -> None:
 
 
 def measure(splats: int, objects: int, repeats: int) -> dict:
-    """Seconds of `show`, `update` and `again`."""
+    """Measure the median seconds of each operation."""
     scene, ply, mesh_file = extension()
     times: dict[str, list[float]] = {name: [] for name in ("show", "update", "again", "meshes", "switch")}
     with tempfile.TemporaryDirectory() as place:

@@ -1,17 +1,18 @@
-"""How fast the CUDA renderer is, in ms and in ns for each (pixel, splat) pair, and what of the GPU it makes use of.
+"""Speed of the CUDA renderer, in ms and in ns per (pixel, splat) pair, and its utilization of the GPU.
 
-Pairs are counted as in benchmarks/raster.py: pixels inside a splat's bounding box, clipped to the picture. Forward is
-projection, binning and blending of color, alpha and label probability; backward is all gradients. Scenes are random and
-about 45 deep at every pixel, whatever the number of splats and pixels.
+Pairs are counted as in benchmarks/raster.py: pixels inside a splat's bounding box, clipped to the image. Forward is
+projection, binning and blending of color, alpha and label probability; backward is all gradients. Scenes are random,
+with about 45 splats per pixel for any number of splats and pixels.
 
-The limits are measured in the same run: a copy within the GPU's memory, and a float32 matrix product without tensor
-cores. A blending kernel's share of arithmetic counts what it computes for every pixel of a tile and every splat that
-the tile goes through (FORWARD_FLOPS, BACKWARD_FLOPS), its share of memory what must be read and written once.
+The GPU's limits are measured in the same run: a copy within GPU memory, and a float32 matrix product without tensor
+cores. A blending kernel's share of arithmetic counts the operations for every pixel of a tile and every splat that the
+tile processes (FORWARD_FLOPS, BACKWARD_FLOPS); its share of memory counts the data that must be read and written once.
 
     python benchmarks/gpu.py [--json] [--repeats 10] [--demo build/demo/capture]
 
---demo names a capture to train on; without it, the demo's where `make demo` has left it. With gsplat installed, its
-renderer draws the same splats in the same run. Without a GPU, or what training needs, this says so and ends well.
+--demo names a capture to train on; the default is the demo capture, if `make demo` has created it. If gsplat is
+installed, it renders the same splats in the same run. If there is no GPU, or packages for training are missing, the
+benchmark reports this and exits normally.
 """
 
 from __future__ import annotations
@@ -47,12 +48,12 @@ OBJECTS = (1, 7, 24, 63, 90, 1_000, 10_000)
 DEMO = ROOT / "build" / "demo" / "capture"
 DEMO_SECONDS = (15, 30, 60)
 FORWARD_FLOPS, BACKWARD_FLOPS = 14, 40
-"""Operations for a pixel of a tile and a splat, a fused multiply-add as two: what is done whether it is drawn or not
-and, for about a third of them, what is drawn."""
+"""Operations per (tile pixel, splat) pair; a fused multiply-add counts as two. Includes the operations on every pair
+and, for about a third of the pairs, those of blending."""
 
 
 class Scene:
-    """Random splats on the GPU that fill a picture, spread evenly over it and over depths 1 to 4."""
+    """Random splats on the GPU, spread evenly over the image and over depths 1 to 4."""
 
     def __init__(self, count: int, width: int, height: int, objects: int = 8) -> None:
         from backend.raster.cuda import renderer
@@ -69,7 +70,7 @@ class Scene:
         across = int(np.ceil(np.sqrt(objects)))
 
         def field(x: np.ndarray, y: np.ndarray) -> torch.Tensor:
-            """Objects lie side by side like fields of a board."""
+            """Return object IDs on a regular grid over the image."""
             row, column = (y * across / height).astype(np.int32), (x * across / width).astype(np.int32)
             return torch.from_numpy(np.minimum(row * across + column, objects - 1)).cuda()
 
@@ -91,17 +92,17 @@ class Scene:
         self.renderer.backward(self.frame, self.g_color, self.g_alpha, self.g_label_probability)
 
     def step(self) -> None:
-        """What the rasterizer does in a training step."""
+        """Run the rasterizer's part of a training step."""
         self.renderer.backward(self.forward(), self.g_color, self.g_alpha, self.g_label_probability)
 
     def step_discs(self, surface: bool = False) -> None:
-        """The same for the same splats as discs; surface: with depth, normals and distortion."""
+        """Run the same step with the splats as discs; surface: with depth, normals and distortion."""
         frame = self.forward(flat=True, want_depth=surface, want_normals=surface, want_moments=surface)
         more = (self.g_alpha, self.g_color, self.g_color[:2].contiguous()) if surface else ()
         self.renderer.backward(frame, self.g_color, self.g_alpha, self.g_label_probability, *more)
 
     def id_render(self) -> None:
-        """Color, and the most probable object of every pixel."""
+        """Render color, and find the most probable object of every pixel."""
         self.renderer.object_ranks(self.renderer.forward(self.gaussians, self.camera), 1)
 
     @property
@@ -112,8 +113,8 @@ class Scene:
         return float((across * down).sum())
 
     def work(self) -> dict[str, float]:
-        """The least work of a step: intersections of tiles and splats, those blended, operations and bytes of the two
-        blending kernels."""
+        """Return the minimum work of a step: (tile, splat) intersections, those that are blended, and the operations
+        and bytes of the two blending kernels."""
         intersections, blended = float(self.frame.intersections.isect_offsets[-1]), float(self.frame.isect_counts.sum())
         pixels = self.frame.transmittance.numel()
         staged = blended * (4 * SPLAT_COLUMNS + 8)
@@ -128,7 +129,7 @@ class Scene:
 
 
 def timed(jobs: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
-    """Median in ms by the GPU's clock; jobs take turns, and the first two turns are not counted."""
+    """Return the median GPU time of each job in ms; jobs take turns, and the first two turns are not counted."""
     times: dict[str, list[float]] = {name: [] for name in jobs}
     for turn in range(repeats + 2):
         for name, job in jobs.items():
@@ -143,7 +144,7 @@ def timed(jobs: dict[str, Callable[[], object]], repeats: int) -> dict[str, floa
 
 
 def peak_mb(job: Callable[[], object]) -> float:
-    """By how many MB a job raises the GPU's memory at most."""
+    """Return the peak GPU memory that a job adds, in MB."""
     torch.cuda.synchronize()
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats()
@@ -154,7 +155,7 @@ def peak_mb(job: Callable[[], object]) -> float:
 
 
 def limits(repeats: int) -> dict[str, float]:
-    """What the GPU can do: GB/s, read and written, of a copy; and float32 TFLOP/s of a matrix product."""
+    """Measure the GPU's limits: GB/s of a copy (reads plus writes), and float32 TFLOP/s of a matrix product."""
     numbers = torch.empty(2**28, device="cuda")
     copy = torch.empty_like(numbers)
     a, b = torch.randn(2, 8192, 8192, device="cuda").unbind()
@@ -168,7 +169,7 @@ def limits(repeats: int) -> dict[str, float]:
 
 
 def kernels_alone(scene: Scene, repeats: int) -> dict[str, float]:
-    """ms of the two blending kernels, by torch's profiler."""
+    """Measure the two blending kernels with torch's profiler, in ms."""
     from torch.profiler import ProfilerActivity, profile
 
     scene.step()
@@ -186,7 +187,10 @@ def kernels_alone(scene: Scene, repeats: int) -> dict[str, float]:
 
 
 def gsplat_step(scene: Scene) -> tuple[Callable[[], object], Callable[[], object]] | None:
-    """gsplat's picture of the scene's splats (color and alpha only), and that with all gradients; None without it."""
+    """Return gsplat's forward pass, and its forward and backward pass, on the scene's splats (color and alpha only).
+
+    None if gsplat is not installed.
+    """
     try:
         from gsplat import rasterization
     except ImportError:
@@ -212,8 +216,8 @@ def gsplat_step(scene: Scene) -> tuple[Callable[[], object], Callable[[], object
 
 
 def demo_quality(capture: Path) -> list[dict[str, float]]:
-    """Trainings on the GPU by the command itself, each from the beginning: quality on the held-out views after so many
-    seconds of training."""
+    """Train on the GPU with the command, from the beginning for each of DEMO_SECONDS, and return the quality on the
+    held-out views."""
     curve = []
     with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as place:
         for seconds in DEMO_SECONDS:
@@ -230,7 +234,7 @@ def demo_quality(capture: Path) -> list[dict[str, float]]:
 
 
 def lacking_for_training() -> list[str]:
-    """Packages that the training command needs and this Python does not have."""
+    """Return the names of missing packages that the training command requires."""
     packages = ("pycolmap", "scipy", "PIL", "safetensors", "skimage", "xatlas", "manifold3d", "fast_simplification")
     return [name for name in packages if importlib.util.find_spec(name) is None]
 

@@ -1,12 +1,11 @@
-"""How good a training of each length is: a row for each length and preset, and the curve of error against run time.
+"""Quality of trainings of different lengths: a row for each length and preset, and the curve of error against run time.
 
     python benchmarks/length.py [--json] [--capture build/demo/capture] [--write]
     python benchmarks/length.py --expect CAPTURE ...
 
-Each length is a training of its own, from the beginning, by the commands that a user runs. --write leaves the table in
-docs/length.md and the plot in docs/error-over-time.png. --expect measures what
-backend/shared/expectation.py says: by how much so many steps fall short of a training that goes on until it converges,
-on each of these captures.
+Each length is a separate training from the beginning, through the user's commands. --write saves the table to
+docs/length.md and the plot to docs/error-over-time.png. --expect measures the values in backend/shared/expectation.py:
+the loss of PSNR after each number of steps, compared with a training until it converges, on each of these captures.
 """
 
 from __future__ import annotations
@@ -28,10 +27,10 @@ SECONDS = (15, 30, 60, 120, 300)
 PRESETS = ("preview", "standard", "final")
 STEPS = (150, 300, 600, 1000, 1500)
 OPEN_END = "final"
-"""Its meshes are measured, too."""
+"""The preset that trains until it stops improving, and the only preset whose meshes are measured."""
 SEEDS = 2
-"""It and the longest are compared by their means over so many seeds: trainings that differ in nothing else are 0.1 dB
-and more apart."""
+"""Number of seeds over which OPEN_END and the longest training are averaged for their comparison, since trainings that
+differ only in the seed are 0.1 dB and more apart."""
 
 _COLUMNS = (
     ("train_seconds", "seconds", "{:.0f}"), ("steps", "steps", "{:,}"), ("psnr", "PSNR", "{:.2f} dB"),
@@ -66,7 +65,7 @@ def main() -> None:
         )  # fmt: skip
 
     presets = {preset: get(preset, "--preset", preset, meshes=preset == OPEN_END) for preset in PRESETS}
-    # The longest follows the open end, with which it is compared: a machine's pace may differ from hour to hour.
+    # The longest training directly follows OPEN_END, since they are compared and a machine's speed varies over hours.
     lengths = {f"{seconds} s": get(f"{seconds} s", "--minutes", seconds / 60, meshes=True) for seconds in SECONDS[::-1]}
     found = dict(reversed(lengths.items())) | presets
     longest = f"{SECONDS[-1]} s", "--minutes", SECONDS[-1] / 60
@@ -84,7 +83,7 @@ def main() -> None:
 
 
 def shortfalls(captures: list[Path]) -> dict[str, dict[str, float]]:
-    """Capture -> steps -> dB that they fall short of a training until it stops improving."""
+    """Return capture -> steps -> dB below a training that stops when it no longer improves."""
     total = len(captures) * (len(STEPS) + 1)
     found = {}
     for capture in captures:
@@ -104,7 +103,7 @@ def shortfalls(captures: list[Path]) -> dict[str, dict[str, float]]:
 
 
 def table(found: dict[str, dict[str, Any]]) -> list[str]:
-    """The Markdown table."""
+    """Return the lines of the Markdown table."""
 
     def cells(row: dict[str, Any]) -> list[str]:
         return ["" if row[key] is None else form.format(row[key]) for key, _, form in _COLUMNS]
@@ -114,7 +113,7 @@ def table(found: dict[str, dict[str, Any]]) -> list[str]:
 
 
 def comparison(longest: list[dict[str, Any]], ends: list[dict[str, Any]]) -> str:
-    """How trainings with an open end compare with the longest ones, each of several seeds."""
+    """Compare trainings with an open end with the longest ones, each over several seeds; returns text."""
 
     def mean(rows: list[dict[str, Any]], key: str) -> float:
         return statistics.fmean(row[key] for row in rows)
@@ -128,7 +127,7 @@ def comparison(longest: list[dict[str, Any]], ends: list[dict[str, Any]]) -> str
 
 
 def plot(found: dict[str, dict[str, Any]]) -> Any:
-    """PSNR, mIoU and F1 over the seconds of training."""
+    """Plot PSNR, mIoU and F1 over the seconds of training."""
     from matplotlib.figure import Figure
 
     with shared.plot_style():
@@ -141,7 +140,7 @@ def plot(found: dict[str, dict[str, Any]]) -> Any:
                 row = found[name]
                 if row[key] is not None:
                     axes.plot(row["train_seconds"], row[key], "D", color=shared.MARKED, markersize=5)
-                    below = -11 if name != OPEN_END else 5  # it is near the one before
+                    below = -11 if name != OPEN_END else 5  # its point is near the previous one
                     axes.annotate(
                         name,
                         (row["train_seconds"], row[key]),

@@ -1,4 +1,4 @@
-"""Measures the effect of errors in masks: compares the given masks and the rendered IDs with the exact masks.
+"""Effect of errors in masks: compare the given masks and the rendered IDs with the exact masks.
 
     python benchmarks/mask_noise.py [--capture build/demo/capture] [--steps 200] [--restart] [--json]
 
@@ -35,14 +35,14 @@ from benchmarks import shared
 WORK = ROOT / "build" / "mask-noise"
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5)
 SPECK = 3
-"""Smaller holes, in pixels, count as rough edges, in masks and renders alike."""
+"""Minimum size of a hole in pixels; smaller ones count as rough edges, in masks and renders alike."""
 
 
 # --- errors --------------------------------------------------------------------------------------------------------
 
 
 def segmenter(ids: np.ndarray, level: float, rng: np.random.Generator) -> np.ndarray:
-    """The errors of the demo's `--mask-noise`; level 0.5 is its maximum."""
+    """Apply the errors of the demo's `--mask-noise`; level 0.5 is its maximum."""
     path = ROOT / "objectgs_addon" / "demo" / "mask_noise.py"
     # Loaded as a file, since its package requires Blender.
     spec = importlib.util.spec_from_file_location("objectgs_mask_noise", path)
@@ -53,7 +53,7 @@ def segmenter(ids: np.ndarray, level: float, rng: np.random.Generator) -> np.nda
 
 
 def wrong_ids(ids: np.ndarray, level: float, rng: np.random.Generator) -> np.ndarray:
-    """Each object of a view has another object's ID, with probability `level`."""
+    """Replace each object's ID in a view by another object's ID, with probability `level`."""
     present = np.unique(ids[ids > 0])
     result = ids.copy()
     for value in present:
@@ -63,12 +63,12 @@ def wrong_ids(ids: np.ndarray, level: float, rng: np.random.Generator) -> np.nda
 
 
 def missing(ids: np.ndarray, level: float, rng: np.random.Generator) -> np.ndarray | None:
-    """A view has no mask, with probability `level`."""
+    """Drop the mask of a view, with probability `level`."""
     return None if rng.random() < level else ids
 
 
 def holes(ids: np.ndarray, level: float, rng: np.random.Generator) -> np.ndarray:
-    """Unlabeled discs with a radius of 2 to 7 pixels, until they cover the fraction `level` of the image."""
+    """Cover the fraction `level` of the image with unlabeled discs of radius 2 to 7 pixels."""
     rows, columns = np.mgrid[: ids.shape[0], : ids.shape[1]]
     gone = np.zeros(ids.shape, bool)
     while gone.mean() < level:
@@ -109,7 +109,7 @@ def disturbed_capture(source: Path, kind: str, level: float, folder: Path) -> No
 
 
 def holes_of(found: np.ndarray, true: np.ndarray) -> tuple[int, int]:
-    """The number of holes of at least SPECK pixels in the objects of an ID map (H, W), and their pixels.
+    """Count the holes of at least SPECK pixels in the objects of an ID map (H, W), and their pixels.
 
     A hole is enclosed by an object's region on all sides and belongs to the object in the exact masks.
     """
@@ -125,7 +125,7 @@ def holes_of(found: np.ndarray, true: np.ndarray) -> tuple[int, int]:
 
 
 class Tally:
-    """Compares ID maps of several views with the exact masks."""
+    """Comparison of ID maps of several views with the exact masks."""
 
     def __init__(self) -> None:
         from backend.evaluation import IdScores
@@ -134,7 +134,7 @@ class Tally:
         self._views = self._holes = self._hole_pixels = self._labeled = self._unlabeled = 0
 
     def add(self, found: np.ndarray | None, true: np.ndarray) -> None:
-        """Add a view; None if it has no ID map, so that all of it is unlabeled."""
+        """Add a view; `found` None: all pixels are unlabeled."""
         found = np.zeros_like(true) if found is None else found
         self._scores.add(found, true)
         count, pixels = holes_of(found, true)
@@ -145,8 +145,8 @@ class Tally:
         self._unlabeled += int(((found <= 0) & (true > 0)).sum())
 
     def result(self) -> dict[str, float]:
-        """miou and error (part of the labeled pixels with another ID or none), holes for each view and the part of the
-        labeled pixels in them, and the part without a label."""
+        """Return miou, mbiou, error (fraction of the labeled pixels with another ID or none), holes per view,
+        hole_share (fraction of the labeled pixels in holes), and unlabeled (fraction without a label)."""
         scores = self._scores.result()
         return {
             "miou": scores["miou"],
@@ -159,7 +159,7 @@ class Tally:
 
 
 def measured(capture: str, kind: str, level: float, steps: int) -> dict[str, Any]:
-    """Train with erroneous masks; call it in a separate process.
+    """Train with erroneous masks; must run in a separate process.
 
     Returns the scores of the masks and of the rendered IDs on the training views, and of the rendered IDs on the
     held-out views.
@@ -228,7 +228,7 @@ def plot(found: dict[str, dict[float, dict[str, Any]]]) -> Any:
 
 
 def document(found: dict[str, dict[float, dict[str, Any]]], steps: int, views: tuple[int, int]) -> str:
-    """docs/mask-noise.md."""
+    """Return the text of docs/mask-noise.md."""
     entries = [(kind, level, entry) for kind, levels in found.items() for level, entry in levels.items() if level]
     closer = [e for e in entries if e[2]["rendered"]["miou"] > e[2]["masks"]["miou"]]
     with_holes = [e for e in entries if e[2]["masks"]["holes"] > 0]
@@ -268,7 +268,7 @@ def document(found: dict[str, dict[float, dict[str, Any]]], steps: int, views: t
 
 
 def _named(all_of: Sequence[tuple[str, float, Any]], good: Sequence[tuple[str, float, Any]]) -> str:
-    """The exceptions, in words."""
+    """Return the exceptions as text."""
     bad = [f"{kind} {level:.0%}" for kind, level, entry in all_of if (kind, level, entry) not in good]
     return f"; exceptions: {', '.join(bad)}" if bad else ""
 

@@ -1,9 +1,9 @@
-"""Anchors against plain splats, and both modes of the heads, on one capture with equal time or equal steps.
+"""Compare plain splats with both modes of the heads on one capture, in equal time or equal steps.
 
     python benchmarks/modes.py [--json] [--capture build/demo/capture] [--seconds 150 | --steps 600]
 
-`plain` is the same pipeline with the heads silenced: every splat has its own color, opacity, scale and rotation and
-nothing is shared, as in 3D Gaussian splatting. Quality is on the held-out views.
+`plain` is the same pipeline with the heads disabled: every splat has its own color, opacity, scale and rotation, as in
+3D Gaussian splatting. Quality is measured on the held-out views.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def train(capture, ids: np.ndarray, variant: str, budget: Budget) -> dict:
 
 
 def silence(trainer: Trainer) -> None:
-    """Make the heads say nothing, for ever; splats start with rotations of their own instead."""
+    """Zero and freeze the heads, and initialize the splats with random rotations instead."""
     heads, anchors = trainer.model.heads, trainer.model.anchors
     with torch.no_grad():
         for layer in (heads.opacity, heads.shape, heads.color):

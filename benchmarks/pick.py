@@ -1,10 +1,10 @@
-"""How well and how fast `backend.shared.splats.picking` finds the object under a click, against exact IDs, the renderer
-and the clock.
+"""Accuracy and speed of `backend.shared.splats.picking`, compared with the exact IDs and the renderer.
 
-The splats of a reconstruction of a capture that brings its truth (`make demo`). `agrees_with_truth` is the share of
-random pixels of held-out views whose picked ID is the true one, those left aside at whose neighbors truth differs;
-`agrees_with_renderer` the share of all of them that show what `raster.object_map` says. Times are of single picks at
-`splats` splats, which are the reconstruction's, repeated side by side with all copies in the picture.
+The splats are those of a reconstruction whose capture has exact masks (`make demo`). `agrees_with_truth` is the
+fraction of random pixels whose picked ID is the true one, excluding pixels whose neighbors have another ID;
+`agrees_with_renderer` is the fraction of all random pixels whose picked ID equals that of `raster.object_map`. Held-out
+views are used first. Times are of single picks among about `splats` splats: randomly moved copies of the
+reconstruction.
 
     python benchmarks/pick.py [RECONSTRUCTION] [--json]
 """
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def measure(folder: Path, wanted: int) -> dict:
-    """What `main` prints."""
+    """Return the figures that `main` prints."""
     splats, _warnings = read_splats(Reconstruction(folder).splats)
     cameras = read_json(Reconstruction(folder).cameras)
     truth = Path(cameras["capture"]) / "truth" / "masks"
@@ -86,7 +86,7 @@ def measure(folder: Path, wanted: int) -> dict:
 
 
 def placed(splats, matrix: np.ndarray | None = None) -> list[PickObject]:
-    """Each object's splats in the world."""
+    """Return each object's splats with the object-to-world matrix."""
     matrix = np.eye(4) if matrix is None else matrix
     found = []
     for object_id in np.unique(splats.object_ids):
@@ -97,7 +97,7 @@ def placed(splats, matrix: np.ndarray | None = None) -> list[PickObject]:
 
 
 def view_of(camera: dict) -> View:
-    """A camera of cameras.json."""
+    """Convert a camera of cameras.json."""
     K = np.array(camera["K"])
     return View(
         np.array(camera["viewmat"]), K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera["width"], camera["height"], near=1e-3
@@ -105,7 +105,7 @@ def view_of(camera: dict) -> View:
 
 
 def rendered_ids(splats, view: View) -> np.ndarray:
-    """(H, W) what the renderer says; -1 where nothing is drawn."""
+    """Return the renderer's object IDs (H, W); -1 where nothing is drawn."""
     known, index = np.unique(splats.object_ids, return_inverse=True)
     K = np.array([[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1]])
     camera = Camera(view.viewmat, K, view.width, view.height, view.near)
@@ -117,7 +117,7 @@ def rendered_ids(splats, view: View) -> np.ndarray:
 
 
 def windows_agree(ids: np.ndarray) -> np.ndarray:
-    """(H, W) whether a pixel's neighbors all have its ID; not so at the border."""
+    """Return (H, W) bool: whether all neighbors of a pixel have its ID; False at the border."""
     windows = np.lib.stride_tricks.sliding_window_view(ids, (3, 3))
     agree = np.zeros(ids.shape, bool)
     agree[1:-1, 1:-1] = (windows == ids[1:-1, 1:-1, None, None]).all((2, 3))
@@ -125,7 +125,7 @@ def windows_agree(ids: np.ndarray) -> np.ndarray:
 
 
 def clock(splats, view: View, wanted: int) -> tuple[list[float], float, float]:
-    """Milliseconds of picks at `wanted` splats, of the first one with its preparation, and of a large rectangle."""
+    """Measure picks among at least `wanted` splats, the first pick with its setup, and a box select of the view; ms."""
     copies = -(-wanted // len(splats.means))
     side = 1.2 * np.linalg.norm(np.percentile(splats.means, 95, 0) - np.percentile(splats.means, 5, 0))
     rng = np.random.default_rng(1)

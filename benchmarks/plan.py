@@ -1,4 +1,4 @@
-"""Measures what the plan saves: trainings with all of its omissions, with none, and with parts of the result only.
+"""Savings of the plan: trainings with all of its omissions, with none, and with parts of the result only.
 
     python benchmarks/plan.py [CAPTURE ...] [--json] [--steps 800] [--needed] [--write] [-- TRAIN OPTIONS]
 
@@ -6,9 +6,9 @@ Each training is measured on the held-out views; if the plan omits something, th
 Several omissions are also undone one at a time. If the omissions change the quality, the training as planned is
 repeated with fewer or more steps until its quality is the same. A capture without masks is also trained with empty
 masks, so that nothing is omitted, and with masks that show one object everywhere. `--needed` also omits, one at a time,
-what the plan does. Further trainings lead to meshes: of everything, of one object, in groups, and without meshes. At
-last, redundant data is added to the captures that `--surplus` names, and pinhole images are undistorted. `--write`
-writes the tables to docs/plan.md.
+the operations that the plan includes. Further trainings extract meshes: of everything, of one object, in groups, and
+none. Finally, redundant data is added to the captures that `--surplus` names, and pinhole images are undistorted.
+`--write` writes the tables to docs/plan.md.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ SAME_PSNR = 0.1
 SEEDS = 3
 
 DB_AN_OCTAVE, TRIES, MOST_TIMES = 1.5, 4, 2
-"""Assumed gain of twice the steps, in dB, until it is measured; largest number of trainings with other steps; largest
+"""Assumed gain in dB of doubling the steps, until it is measured; maximum number of trainings with other steps; maximum
 factor of the steps."""
 
 FLAT = ("--primitive", "2d")
 AS_GOOD, EVERYWHERE = "as planned, as good", "with an object everywhere"
 
 SURPLUS = ("duplicate-views", "blind-views", "unseen-points")
-"""The plan's keys of the data that `plan_captures.with_surplus` adds."""
+"""Plan keys of the redundant data that `plan_captures.with_surplus` adds."""
 
 GROUPS = 3
 """Number of groups, to which objects are assigned in turn."""
@@ -64,7 +64,7 @@ _ASKED_COLUMNS = (
 
 
 def backend(*words: object) -> tuple[list[dict[str, Any]], float, float]:
-    """Run a command; returns its events, the seconds of wall time and the seconds of processor time."""
+    """Run a command and return its events, its wall time and its processor time in seconds."""
     before, started = os.times(), time.monotonic()
     done = subprocess.run(
         [sys.executable, "-m", "backend", *map(str, words), "--json"], cwd=ROOT, capture_output=True, text=True
@@ -77,8 +77,10 @@ def backend(*words: object) -> tuple[list[dict[str, Any]], float, float]:
 
 
 def measured(capture: Path, options: Sequence[str], meshes: bool = False) -> dict[str, Any]:
-    """Train, optionally extract meshes, and return the figures; iou: by ID, left_out: the plan's keys, objects: of
-    objects.json."""
+    """Train, optionally extract meshes, and return the figures.
+
+    iou is by object ID, left_out the keys that the plan omits, objects the list in objects.json.
+    """
     with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as scratch:
         out = Path(scratch) / "out"
         events, seconds, busy = backend("train", capture, "--out", out, *options)
@@ -107,7 +109,10 @@ def measured(capture: Path, options: Sequence[str], meshes: bool = False) -> dic
 
 
 class Capture:
-    """A capture and its results. folder: its folder; options: of every training; name: of its results."""
+    """A capture and its results.
+
+    folder: the capture's folder. options: options of every training. name: name of its results.
+    """
 
     def __init__(self, folder: Path, options: Sequence[str], name: str = "") -> None:
         self.folder, self.options = folder, tuple(options)
@@ -124,11 +129,11 @@ class Capture:
         return Capture(make(self.folder, folder, *arguments), self.options, name)
 
     def plan(self) -> list[dict[str, Any]]:
-        """The decisions, as plan.json has them."""
+        """Return the decisions as in plan.json."""
         return backend("plan", self.folder, *self.options)[0][-1]["plan"]
 
     def train(self, steps: int, *more: str, meshes: bool = False) -> dict[str, Any]:
-        """The figures of a training, measured once."""
+        """Return the figures of a training, measured once."""
         words = ["--steps", str(steps), *self.options, *more]
         name = f"{self.name} {' '.join(words)}" + (" and meshes" if meshes else "")
         return self._once(
@@ -138,7 +143,7 @@ class Capture:
         )
 
     def prepare(self) -> dict[str, Any]:
-        """The seconds of an import, and its memory and disk space; measured once."""
+        """Return the seconds, memory and disk space of an import, measured once."""
         return self._once(
             f"{self.name} imported", functools.partial(imported, self.folder), lambda row: f"{row['seconds']:.1f} s"
         )
@@ -146,7 +151,7 @@ class Capture:
     def _once(
         self, name: str, make: Callable[[], dict[str, Any]], line: Callable[[dict[str, Any]], str]
     ) -> dict[str, Any]:
-        """Return a result; raises SystemExit if it fails."""
+        """Return a result; raise SystemExit if it fails."""
         self.results.total += 1
         found = self.results.get(name, make, line)
         if self.results.failures:
@@ -154,7 +159,7 @@ class Capture:
         return found
 
     def train_often(self, seeds: int, steps: int, *more: str, **words: Any) -> dict[str, Any]:
-        """Means of the figures over seeds, and the standard error of the PSNR."""
+        """Return means of the figures over seeds, and the standard error of the PSNR."""
         rows = [self.train(steps, *more, *(("--seed", str(seed)) if seed else ()), **words) for seed in range(seeds)]
         known = {key for key, _, _ in _COLUMNS if rows[0][key] is not None}
         spread = statistics.stdev(row["psnr"] for row in rows) if seeds > 1 else 0.0
@@ -178,7 +183,7 @@ def omissions(capture: Capture, steps: int, needed: bool) -> tuple[list[str], di
         whole = train(steps, "--keep", "all")
     else:
         left_out = ["votes", "labels", *left_out]
-        # Without supervision of unlabeled pixels, which would be a label too, as when masks are missing.
+        # Supervision of unlabeled pixels is disabled, as when masks are missing, since it acts as a label.
         empty = capture.made("with empty masks", plan_captures.with_masks, 0)
         whole = empty.train_often(SEEDS, steps, "--keep", "all", "--leave-out", "rest")
         labeled = capture.made("with an object everywhere", plan_captures.with_masks, 1)
@@ -197,7 +202,8 @@ def omissions(capture: Capture, steps: int, needed: bool) -> tuple[list[str], di
 def surplus_of(capture: Capture, steps: int) -> dict[str, dict[str, Any]]:
     """Train on a capture with redundant data: without all of it, with all of it, and with one kind at a time.
 
-    Raises RuntimeError if the plan does not omit the redundant data.
+    Raises:
+        RuntimeError: the plan does not omit the redundant data.
     """
     more = capture.made("with more than it needs", plan_captures.with_surplus)
     if missing := set(SURPLUS) - set(more.train(steps)["left_out"]):
@@ -212,7 +218,7 @@ def surplus_of(capture: Capture, steps: int) -> dict[str, dict[str, Any]]:
 
 
 def as_good(train: Callable[[int], dict[str, Any]], planned: dict[str, Any], psnr: float) -> dict[str, Any]:
-    """Repeat the training as planned with other steps until it has this PSNR; the nearest of `TRIES` otherwise."""
+    """Repeat the training as planned with other steps until it reaches this PSNR; else return the nearest of TRIES."""
     tried = {planned["steps"]: planned}
     steps = min(2 ** ((psnr - planned["psnr"]) / DB_AN_OCTAVE), MOST_TIMES) * planned["steps"]
     for _ in range(TRIES):
@@ -230,7 +236,7 @@ def as_good(train: Callable[[int], dict[str, Any]], planned: dict[str, Any], psn
 
 
 def imported(folder: Path) -> dict[str, Any]:
-    """Import a capture; returns the seconds, and memory and disk space in MB."""
+    """Import a capture and return the seconds, and memory and disk space in MB."""
     with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as scratch:
         out = Path(scratch) / "out"
         _, seconds, _ = backend("import", folder, "--out", out)
@@ -242,7 +248,7 @@ def imported(folder: Path) -> dict[str, Any]:
 def asked_for(capture: Capture, steps: int) -> dict[str, dict[str, Any]]:
     """Train and extract meshes of everything and of parts.
 
-    `iou` is that of the object which is extracted alone, the one with the median number of points.
+    `iou` is that of the object which is also extracted alone: the one with the median number of points.
     """
     everything = capture.train(steps, meshes=True)
     found = {"everything": everything}
@@ -263,7 +269,7 @@ def asked_for(capture: Capture, steps: int) -> dict[str, dict[str, Any]]:
 
 
 def change(new: dict[str, Any], old: dict[str, Any], names: Mapping[str, str]) -> str:
-    """The relative differences of figures, in words."""
+    """Return the relative differences of figures as text."""
     return ", ".join(
         f"{abs(1 - new[key] / old[key]):.0%} {'less' if new[key] <= old[key] else 'more'} {name}"
         for key, name in names.items()
@@ -274,7 +280,7 @@ _COSTS = {"seconds": "time", "cpu_seconds": "time of the processors", "peak_mb":
 
 
 def verdict(found: dict[str, dict[str, Any]]) -> str:
-    """The effect of the omissions on cost and quality, in words."""
+    """Return the effect of the omissions on cost and quality as text."""
     planned, whole = found["as planned"], found["nothing left out"]
     text = f"As planned, as many steps take {change(planned, whole, _COSTS)}; {gain_of(planned, whole)}, "
     text += f"{judged(planned, whole)}."
@@ -288,18 +294,18 @@ def verdict(found: dict[str, dict[str, Any]]) -> str:
 
 
 def error_of(new: dict[str, Any], old: dict[str, Any]) -> float:
-    """The standard error of the difference of two PSNR, dB."""
+    """Return the standard error of the difference of two PSNR values, in dB."""
     return math.hypot(new["error"], old["error"])
 
 
 def gain_of(new: dict[str, Any], old: dict[str, Any]) -> str:
-    """The difference of two PSNR and its standard error, in words."""
+    """Return the difference of two PSNR values and its standard error as text."""
     error = error_of(new, old)
     return f"{new['psnr'] - old['psnr']:+.2f}{f' ± {error:.2f}' if error else ''} dB"
 
 
 def judged(new: dict[str, Any], old: dict[str, Any]) -> str:
-    """Whether a training is better than another, equal or worse."""
+    """Return `better`, `equal` or `worse`, comparing the PSNR of two trainings."""
     gain = new["psnr"] - old["psnr"]
     if abs(gain) <= max(SAME_PSNR, 2 * error_of(new, old)):
         return "equal"
@@ -307,7 +313,7 @@ def judged(new: dict[str, Any], old: dict[str, Any]) -> str:
 
 
 def asked_verdict(found: dict[str, dict[str, Any]]) -> str:
-    """The savings of extracting less, in words."""
+    """Return the savings of extracting less as text."""
     everything = found["everything"]
     lines = []
     for name, row in found.items():
@@ -319,7 +325,7 @@ def asked_verdict(found: dict[str, dict[str, Any]]) -> str:
 
 
 def rows_of(columns: Sequence[tuple[str, str, str]], found: dict[str, dict[str, Any]]) -> list[str]:
-    """A table, in Markdown."""
+    """Return a Markdown table."""
 
     def cells(row: dict[str, Any]) -> list[str]:
         return ["" if row.get(key) is None else form.format(row[key]) for key, _, form in columns]
@@ -328,12 +334,12 @@ def rows_of(columns: Sequence[tuple[str, str, str]], found: dict[str, dict[str, 
 
 
 def heading(level: int, text: str) -> str:
-    """A heading, in Markdown."""
+    """Return a Markdown heading."""
     return f"{'#' * level} {text[0].upper()}{text[1:]}"
 
 
 def section_of_omissions(capture: Capture, steps: int, needed: bool) -> tuple[dict[str, Any], list[str]]:
-    """What the plan omits: the figures, and lines of Markdown."""
+    """Measure the plan's omissions; returns the figures and lines of Markdown."""
     left_out, trainings = omissions(capture, steps, needed)
     found = verdict(trainings) if left_out else f"{verdict(trainings)} Both did the same: what they differ by is noise."
     lines = [f"Left out: {', '.join(left_out) or 'nothing'}.", "", *rows_of(_COLUMNS, trainings), "",
@@ -342,7 +348,7 @@ def section_of_omissions(capture: Capture, steps: int, needed: bool) -> tuple[di
 
 
 def section_of_what_is_asked_for(capture: Capture, steps: int) -> tuple[dict[str, Any], list[str]]:
-    """What the user omits: the figures, and lines of Markdown."""
+    """Measure the user's choices of results; returns the figures and lines of Markdown."""
     asked = asked_for(capture, steps)
     lines = ["With meshes, and with parts of the result only:", "", *rows_of(_ASKED_COLUMNS, asked), "",
              asked_verdict(asked), ""]  # fmt: skip
@@ -350,7 +356,7 @@ def section_of_what_is_asked_for(capture: Capture, steps: int) -> tuple[dict[str
 
 
 def section_of_pinholes(capture: Capture) -> tuple[dict[str, Any], list[str]]:
-    """The savings if images need no undistortion: the figures, and lines of Markdown; empty if they need it."""
+    """Measure the savings without undistortion; returns the figures and lines of Markdown, empty if images need it."""
     if any(own["key"] == "undistortion" and own["done"] for own in capture.plan()):
         return {}, []
     plain, bent = capture.prepare(), capture.made("through a lens", plan_captures.through_a_lens).prepare()
@@ -363,7 +369,7 @@ def section_of_pinholes(capture: Capture) -> tuple[dict[str, Any], list[str]]:
 
 
 def section_of_surplus(capture: Capture, steps: int) -> tuple[dict[str, Any], list[str]]:
-    """The savings for a capture with redundant data: the figures, and lines of Markdown."""
+    """Measure the savings for a capture with redundant data; returns the figures and lines of Markdown."""
     trainings = surplus_of(capture, steps)
     lines = [
         heading(3, f"{capture.name}, with more than it needs"), "",

@@ -1,4 +1,4 @@
-"""Makes captures from others, so that a plan has something to omit, for `benchmarks/plan.py`."""
+"""Derived captures for `benchmarks/plan.py`, with data that a plan can omit."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ UNSEEN = 0.3
 """Number of added points outside all views, as a fraction of the points."""
 
 LENS = 1e-5
-"""A radial distortion that moves no pixel of an image of 1,000 pixels by a hundredth of a pixel."""
+"""A radial distortion that moves each pixel of a 1,000-pixel image by less than a hundredth of a pixel."""
 
 
 def with_masks(capture: Path, folder: Path, value: int) -> Path:
-    """Copy a capture without masks to `folder`, with masks that have this ID in every pixel; 0 is no object."""
+    """Copy a capture without masks to `folder` and add masks with the ID `value` in every pixel; 0 is no object."""
     for part in capture.iterdir():
         (folder / part.name).symlink_to(part)
     images = capture / "images"
@@ -38,7 +38,7 @@ def with_masks(capture: Path, folder: Path, value: int) -> Path:
 
 
 def through_a_lens(capture: Path, folder: Path) -> Path:
-    """Copy a capture of pinhole images to `folder`, with cameras that have a negligible distortion."""
+    """Copy a capture of pinhole images to `folder` and give its cameras a negligible distortion."""
     model = _model(capture)
     for camera in model.cameras.values():
         fx, fy, cx, cy = camera.calibration_matrix()[[0, 1, 0, 1], [0, 1, 2, 2]]
@@ -52,17 +52,18 @@ def through_a_lens(capture: Path, folder: Path) -> Path:
 
 
 def with_surplus(capture: Path, folder: Path, seed: int = 0) -> Path:
-    """Copy a capture to `folder` with redundant data: about as many photos again, half of them the same photos as
-    JPEG, the others of nothing that was reconstructed, and points outside every photo (`UNSEEN`).
+    """Copy a capture to `folder` and add redundant data.
 
-    The same photos are held out, each of them twice, and the same photos are trained on.
+    The number of photos about doubles: half of the added photos are JPEG copies, the others show nothing reconstructed.
+    Points outside every photo are added, too (`UNSEEN`). The same photos are held out, each of them twice, and the same
+    photos are trained on.
     """
     rng = np.random.default_rng(seed)
     model = _model(capture)
     images = sorted(model.images.values(), key=lambda image: image.name)
     held_out = images[::HOLDOUT_EVERY]
     trained = [image for i, image in enumerate(images) if i % HOLDOUT_EVERY]
-    # Every 8th photo of the new capture is held out: exactly these, when each of them occurs twice.
+    # Every 8th photo of the new capture is held out; these are exactly the old held-out photos, twice each.
     room = 2 * len(held_out) * (HOLDOUT_EVERY - 1) - len(trained)
     jpegs = trained[: room // 2]
     blind = [trained[i % len(trained)] for i in range(room - len(jpegs))]
@@ -129,7 +130,7 @@ def _as_jpeg(capture: Path, old: str, folder: Path, new: str, rng: np.random.Gen
 
 
 def _as_wall(capture: Path, old: str, folder: Path, new: str, rng: np.random.Generator) -> None:
-    """A photo of a wall: one shade and noise."""
+    """Write an image of a uniform color with noise, as of a wall."""
     target = folder / "images" / new
     target.parent.mkdir(parents=True, exist_ok=True)
     width, height = Image.open(capture / "images" / old).size
@@ -149,7 +150,7 @@ def _place(source: Path, target: Path) -> None:
 
 
 def _away_from(xyz: np.ndarray, rotation: np.ndarray, shift: np.ndarray, camera: Any, rng: np.random.Generator) -> Any:
-    """A rotation (3, 3) of the camera after which none of the points is in or near its image."""
+    """Return a rotation (3, 3) that turns the camera so that all points are well outside its image."""
     seen = xyz @ rotation.T + shift
     for _ in range(1000):
         turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
@@ -162,7 +163,7 @@ def _away_from(xyz: np.ndarray, rotation: np.ndarray, shift: np.ndarray, camera:
 def _unseen(
     xyz: np.ndarray, poses: list[tuple[np.ndarray, np.ndarray, Any]], count: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Points (count, 3) around the scene, outside all images and their surroundings; poses: rotation, shift, camera."""
+    """Return points (count, 3) around the scene, well outside all images; poses: (rotation, translation, camera)."""
     middle = np.median(xyz, axis=0)
     size = np.quantile(np.linalg.norm(xyz - middle, axis=1), 0.9)
     found = np.zeros((0, 3))
@@ -179,7 +180,7 @@ def _unseen(
 
 
 def _in_image(points: np.ndarray, camera: Any) -> np.ndarray:
-    """Which of the points (n, 3) in camera space are in the image or within a quarter of its size: (n,) bool."""
+    """Return (n,) bool: whether camera-space points (n, 3) are in the image or within a quarter of its size of it."""
     K = camera.calibration_matrix()
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         pixels = (points @ K.T)[:, :2] / points[:, 2:]
@@ -188,7 +189,7 @@ def _in_image(points: np.ndarray, camera: Any) -> np.ndarray:
 
 
 def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """(w, x, y, z) of a rotation (3, 3)."""
+    """Convert a rotation matrix (3, 3) to a quaternion (w, x, y, z)."""
     import pycolmap
 
     x, y, z, w = pycolmap.Rotation3d(rotation).quat

@@ -1,9 +1,10 @@
-"""3D Gaussians against 2D ones on one capture with a known truth: pictures, objects and meshes, in equal time.
+"""Compare 3D Gaussians with 2D Gaussians on one capture with exact truth: images, objects and meshes, in equal time.
 
     python benchmarks/primitives.py [--json] [--capture build/demo/capture] [--seconds 144]
 
-Everything is made by the commands that a user runs. Quality is on the held-out views, F1 over the true surface that
-training views see; of F1 and the texture's PSNR the median over the objects is shown, of F1 also the least.
+Training, meshing and evaluation run through the user's commands. Quality is measured on the held-out views, and F1 on
+the part of the true surface that training views see. F1 and the texture's PSNR are medians over the objects; the lowest
+F1 is printed, too.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""How fast the rasterizer is, in ns for each (pixel, splat) pair.
+"""Speed of the rasterizer, in ns per (pixel, splat) pair.
 
-A pair is a pixel inside a splat's bounding box, clipped to the picture: what a renderer without exact spans or early
-stops would compute. Forward is projection, binning and blending of color, alpha and label probability; backward is all
-gradients. Scenes are random: splats of a few pixels, 40 to 50 deep at every pixel, opacities 0.05 to 0.95.
-The reference is the float64 torch renderer of the tests, which blends every splat into every pixel; it is timed
-on a small picture, beside the kernels on that very picture, so the factor grows with the scene.
+A pair is a pixel inside a splat's bounding box, clipped to the image: the work of a renderer without exact spans or
+early termination. Forward is projection, binning and blending of color, alpha and label probability; backward is all
+gradients. Scenes are random: splats of a few pixels, 40 to 50 splats per pixel, opacities 0.05 to 0.95.
+The reference is the float64 torch renderer of the tests, which blends every splat into every pixel. It is compared with
+the kernels on a small image; for larger scenes, the factor is larger.
 
     python -m benchmarks.raster [--json] [--repeats 15]
 """
@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
-import backend  # noqa: F401, I001 - says how threads wait, before torch is loaded
+import backend  # noqa: F401, I001 - sets the thread wait policy, before torch is loaded
 
 import numba
 import numpy as np
@@ -44,7 +44,7 @@ OBJECTS = (1, 10, 100, 1_000, 10_000)
 
 
 class Scene:
-    """Random splats that fill a picture: `size` pixels across, spread evenly over it and over depths 1 to 4."""
+    """Random splats, `size` pixels across, spread evenly over the image and over depths 1 to 4."""
 
     def __init__(
         self, count: int, width: int, height: int, size: float, objects: int = 8, scattered: bool = False
@@ -57,7 +57,7 @@ class Scene:
         quats, opacities = rng.normal(size=(count, 4)), rng.uniform(0.05, 0.95, count)
         sh = rng.normal(0, 0.3, (count, 4, 3))
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        # Objects lie side by side like fields of a board; scattered, any splat may be of any object.
+        # Objects form a regular grid over the image; with `scattered`, each splat has a random object.
         across = int(np.ceil(np.sqrt(objects)))
 
         def field(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -82,12 +82,11 @@ class Scene:
         cpu.backward(self.frame, self.g_color, self.g_alpha, self.g_label_probability)
 
     def step(self) -> None:
-        """What the rasterizer does in a training step."""
+        """Run the rasterizer's part of a training step."""
         cpu.backward(self.forward(), self.g_color, self.g_alpha, self.g_label_probability)
 
     def step_discs(self, surface: bool = False) -> None:
-        """The same step for the same splats as discs; surface: with depth, normals and distortion and their gradients
-        as well."""
+        """Run the same step with the splats as discs; surface: with depth, normals, distortion and their gradients."""
         frame = cpu.forward(
             self.gaussians, self.camera, self.labels, surface, False, surface, surface, flat=True
         )  # fmt: skip
@@ -95,7 +94,7 @@ class Scene:
         cpu.backward(frame, self.g_color, self.g_alpha, self.g_label_probability, *three)
 
     def id_render(self) -> None:
-        """Color, and the most probable object of every pixel."""
+        """Render color, and find the most probable object of every pixel."""
         cpu.object_ranks(cpu.forward(self.gaussians, self.camera), 1)
 
     @property
@@ -107,7 +106,7 @@ class Scene:
 
 
 def timed(jobs: dict[str, Callable[[], object]], repeats: int) -> dict[str, tuple[float, float]]:
-    """Median and spread (half the distance between the quartiles) in ms; jobs take turns, the first is not counted."""
+    """Return median and spread (half the interquartile range) in ms; jobs take turns, the first turn is not counted."""
     times: dict[str, list[float]] = {name: [] for name in jobs}
     for turn in range(repeats + 1):
         for name, job in jobs.items():
@@ -123,7 +122,7 @@ def timed(jobs: dict[str, Callable[[], object]], repeats: int) -> dict[str, tupl
 
 
 def against_reference(repeats: int) -> dict[str, float]:
-    """Forward + backward of the same small scene by both; and ns for each useful pair."""
+    """Time forward + backward of a small scene with the reference and the kernels."""
     scene = Scene(*SMALL)
     g = scene.gaussians
     names = ("means", "quats", "scales", "opacities", "sh")
@@ -148,14 +147,14 @@ def against_reference(repeats: int) -> dict[str, float]:
 
 
 def peak_mb(objects: int) -> float:
-    """Peak memory that a step and an ID render take in a process of their own, beyond the scene, in MB."""
+    """Return the peak memory that a step and an ID render add to the scene's, in MB; measured in a separate process."""
     script = f"from benchmarks.raster import memory; memory({objects})"
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
     return float(done.stdout.split()[-1])
 
 
 def memory(objects: int) -> None:
-    """Print by how many MB a step and an ID render raise this process's memory at most."""
+    """Print the peak memory that a step and an ID render add to this process, in MB."""
     compile_kernels()
     scene = Scene(*MIDDLE, objects=objects)
     del scene.frame
@@ -168,7 +167,7 @@ def memory(objects: int) -> None:
 
 
 def _peak_bytes() -> int:
-    """The largest resident memory so far."""
+    """Return the peak resident memory of this process."""
     if Path("/proc/self/status").exists():
         lines = Path("/proc/self/status").read_text().splitlines()
         return next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM"))

@@ -1,14 +1,14 @@
-"""The CPU rasterizer with one of its choices made otherwise, in a process of its own, and the exact picture to compare.
+"""Variants of the CPU rasterizer, each in a separate process, and the exact image to compare them with.
 
-A kernel's constants are frozen when it is compiled, so a variant is a process that changes the modules' constants or
-functions first, with a folder for compiled kernels of its own. `benchmarks/approximations.py` starts these processes
-and lets them take turns:
+A kernel's constants are frozen when it is compiled, so a variant is a process that changes constants or functions of
+the modules first, and that has its own folder for compiled kernels. `benchmarks/approximations.py` starts these
+processes and lets them take turns:
 
     python -m benchmarks.raster_variants '{"alpha_min": 0.01}' SCENE.npz EXACT.npz
 
-The exact picture is that of the float64 reference, which draws every splat in exact order: without the cut-off at
-ALPHA_MIN (splats are left out only where they add less than 1e-12 to each pixel) and without TRANSMITTANCE_THRESHOLD.
-The constants that define the image, ALPHA_MAX and EPS_2D, are the same everywhere.
+The exact image is that of the float64 reference, which draws every splat in exact order, without the cut-off at
+ALPHA_MIN (only splats that add less than 1e-12 to each pixel are omitted) and without TRANSMITTANCE_THRESHOLD. The
+constants that define the image, ALPHA_MAX and EPS_2D, are the same in all variants.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from benchmarks import shared
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 NOTHING = 1e-12
-"""What adds less than this to every pixel of a part is left out of the exact picture."""
+"""Splats that add less than this to every pixel of a part are omitted from the exact image."""
 _PART = 48
-"""Pixels, at most, along the sides of the parts that the exact picture is drawn in."""
+"""Maximum side, in pixels, of the parts in which the exact image is drawn."""
 
 
-# --- the exact picture -----------------------------------------------------------------------------------------------
+# --- the exact image -------------------------------------------------------------------------------------------------
 
 
 def parts_of(width: int, height: int) -> list[tuple[int, int, int, int]]:
-    """(x, y, width, height) of the parts of a picture."""
+    """Return (x, y, width, height) of each part of an image."""
     return [
         (x, y, min(_PART, width - x), min(_PART, height - y))
         for y in range(0, height, _PART)
@@ -47,8 +47,12 @@ def parts_of(width: int, height: int) -> list[tuple[int, int, int, int]]:
 
 
 def exact_part(scene_file: str, part: tuple[int, int, int, int]) -> dict[str, np.ndarray]:
-    """The exact color (3, h, w) and label probability (h, w) of a part of the picture; the splats drawn there, and the
-    gradients of those in the order of PARAMETERS."""
+    """Render a part of the exact image.
+
+    Returns:
+        `color` (3, h, w) and `label_probability` (h, w); `drawn`, the indices of the splats drawn there; and
+        `g_` + name, their gradients for each of PARAMETERS.
+    """
     import torch
 
     from backend.raster import reference
@@ -83,7 +87,7 @@ def exact_part(scene_file: str, part: tuple[int, int, int, int]) -> dict[str, np
 
 
 def _reaches(scene: Any, camera: Any) -> np.ndarray:
-    """(N,) bool: which splats add NOTHING or more to some pixel of the camera's picture."""
+    """Return (N,) bool: whether a splat adds NOTHING or more to some pixel of the camera's image."""
     import torch
 
     from backend.raster.reference import _footprints, rotation_matrices
@@ -105,7 +109,7 @@ def _reaches(scene: Any, camera: Any) -> np.ndarray:
 
 
 def join(scene: Any, parts: Iterator[tuple[tuple[int, int, int, int], dict[str, np.ndarray]]]) -> dict[str, np.ndarray]:
-    """The whole exact picture and gradients of its parts."""
+    """Assemble the exact image and its gradients from its parts."""
     height, width = scene["labels"].shape
     whole = {"color": np.zeros((3, height, width)), "label_probability": np.zeros((height, width))}
     whole |= {f"g_{name}": np.zeros(scene[name].shape) for name in PARAMETERS}
@@ -118,7 +122,7 @@ def join(scene: Any, parts: Iterator[tuple[tuple[int, int, int, int], dict[str, 
 
 
 def camera_of(scene: Any) -> Any:
-    """The camera that a scene file holds."""
+    """Return the camera of a scene file."""
     from backend.raster import Camera
 
     height, width = scene["labels"].shape
@@ -129,8 +133,11 @@ def camera_of(scene: Any) -> Any:
 
 
 def exp2_coefficients(degree: int) -> tuple[float, ...]:
-    """Of the polynomial of `degree` for 2^f on [-1/2, 1/2], highest first: that of the product's kernels at their own
-    degree, otherwise a fit of the relative error at Chebyshev's points, nearly the best there is."""
+    """Return the coefficients, highest degree first, of a polynomial of `degree` for 2^f on [-1/2, 1/2].
+
+    For the kernels' own degree, these are the kernels' coefficients; otherwise, a least-squares fit of the relative
+    error at Chebyshev nodes, which is nearly optimal.
+    """
     from backend.raster import simd
 
     if degree == len(simd._EXP2) - 1:
@@ -141,7 +148,7 @@ def exp2_coefficients(degree: int) -> tuple[float, ...]:
 
 
 def _set_everywhere(**values: float) -> None:
-    """Give a constant another value, of the type it has, in every module of the rasterizer that knows it."""
+    """Change a constant, keeping its type, in every module of the rasterizer that has it."""
     for name, value in values.items():
         owners = [m for key, m in list(sys.modules.items()) if key.startswith("backend.raster") and hasattr(m, name)]
         if not owners:
@@ -172,8 +179,11 @@ def _tile(size: tuple[int, int]) -> None:
 
 
 def _bounds(kind: str) -> None:
-    """`box`: tiles and pixels of the ellipse's box; `tiles`, `box tiles` and `square`: every pixel of the tiles of
-    16 x 16 that the ellipse, its box or a square of 3 sigma (of the longer axis) meets."""
+    """Change the pixels in which a splat is evaluated.
+
+    `box`: tiles and pixels of the ellipse's bounding box. `tiles`, `box tiles` and `square`: every pixel of the 16 x 16
+    tiles that intersect the ellipse, its bounding box or a square of 3 sigma (of the longer axis).
+    """
     from numba import njit, prange
 
     from backend.raster import simd
@@ -241,8 +251,11 @@ def _bounds(kind: str) -> None:
 
 
 def _sort(kind: str) -> None:
-    """`argsort`: NumPy's; `16 bits` or `8 bits` of the depths' range, ties as they come; `none`: in the order of the
-    model; `tiles`: each tile's intersections alone; `keys`: one sort of all intersections by tile and depth."""
+    """Change the sort of the splats by depth.
+
+    `argsort`: NumPy's sort. `16 bits` and `8 bits`: quantized depths, with ties in model order. `none`: in model order.
+    `tiles`: each tile's intersections separately. `keys`: one sort of all intersections by tile and depth.
+    """
     from numba import njit, prange
 
     from backend.raster.cpu import renderer as cpu
@@ -295,7 +308,7 @@ def _sort(kind: str) -> None:
 
 
 class _Doubled(importlib.machinery.SourceFileLoader):
-    """Loads a module of the rasterizer with every float32 as float64."""
+    """Loader for a module of the rasterizer that replaces float32 by float64."""
 
     _EXP2 = (
         ("_INTS", "ir.VectorType(ir.IntType(64), LANES)"),
@@ -348,8 +361,7 @@ _CHANGES: dict[str, Callable[[Any], None]] = {
 
 
 def main() -> None:
-    """Say how far the variant is from the exact picture, then time one forward and backward for each line that comes:
-    a JSON object each."""
+    """Print the variant's errors, then the times of one forward and backward pass per input line, as JSON objects."""
     changes, scene_file, exact_file = json.loads(sys.argv[1]), sys.argv[2], sys.argv[3]
     kind = np.float64 if changes.pop("float64", False) else np.float32
     if kind is np.float64:
@@ -378,8 +390,13 @@ def main() -> None:
 
 
 def errors(frame: Any, gradients: Any, exact: Any) -> dict[str, float]:
-    """picture: root of the mean squared error of the colors, in steps of 8 bits; largest: the largest one; gradient:
-    length of the difference as a part of the exact gradient's, the root mean square over PARAMETERS."""
+    """Compare a variant with the exact image and gradients.
+
+    Returns:
+        `picture`: RMSE of the colors in 8-bit steps. `largest`: the largest error. `gradient`: norm of the difference
+        relative to the exact gradient's norm, as root mean square over PARAMETERS.
+    """
+
     picture = 255 * (frame.color - exact["color"])
     parts = []
     for name in PARAMETERS:

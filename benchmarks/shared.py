@@ -1,5 +1,4 @@
-"""Functions of several benchmarks: results that are kept when a run is stopped, work in separate processes, the
-quality of a training, and plots for docs/."""
+"""Shared helpers of the benchmarks: results that survive a stopped run, child processes, training quality and plots."""
 
 from __future__ import annotations
 
@@ -21,12 +20,12 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
-import backend  # noqa: F401 - sets how threads wait, before torch is loaded
+import backend  # noqa: F401 - sets the thread wait policy, before torch is loaded
 
 GRAY = "#8a8a92"
 COLORS = ("#3b7dd8", "#d9731a", "#2a9d6f", "#b0479e", "#7a6a2f", "#5b5bd6")
 MARKED = "#c8322b"
-"""The color of the default in every plot."""
+"""Color of the default in every plot."""
 
 _STYLE: dict[str, Any] = {
     "font.size": 9,
@@ -47,7 +46,7 @@ _STYLE: dict[str, Any] = {
 
 
 def digest(paths: Iterable[Path], *words: object) -> str:
-    """A digest of the content of files and of anything else that a result depends on."""
+    """Return a digest of the content of files and of all other values that a result depends on."""
     sha = hashlib.sha256(repr(words).encode())
     for path in sorted(paths):
         sha.update(path.name.encode() + b"\0" + path.read_bytes())
@@ -55,14 +54,15 @@ def digest(paths: Iterable[Path], *words: object) -> str:
 
 
 def sources() -> list[Path]:
-    """The files that determine the backend's results: all except the module that states earlier measurements."""
+    """Return the files that determine the backend's results: all except the module with earlier measurements."""
     return sorted(path for path in (ROOT / "backend").rglob("*.py") if path.name != "expectation.py")
 
 
 class Results:
-    """Results by name in a folder; each is computed once for the same code and input, and printed as one line.
+    """Named results in a folder; each is computed once for the same code and input, and printed as one line.
 
-    made_from: `digest` of everything that the results depend on. total: expected number of results, to be printed.
+    made_from: `digest` of everything that the results depend on. total: expected number of results, for the printed
+    lines.
     """
 
     def __init__(self, folder: Path, made_from: str, total: int) -> None:
@@ -103,9 +103,15 @@ def forget(folder: Path) -> None:
 
 
 def in_child(call: str, environment: Mapping[str, str] | None = None, **words: Any) -> dict[str, Any]:
-    """Call `module:function` with the keywords `words`, as JSON, in a separate process and return its result.
+    """Call `module:function` in a separate process and return its result.
 
-    Raises RuntimeError with the end of its error output if it fails.
+    Args:
+        call: `module:function`.
+        environment: additional environment variables.
+        words: keyword arguments, passed as JSON.
+
+    Raises:
+        RuntimeError: the process failed; the message is the end of its error output.
     """
     module, function = call.split(":")
     script = (
@@ -122,9 +128,10 @@ def in_child(call: str, environment: Mapping[str, str] | None = None, **words: A
 
 
 def replace(owner: Any, name: str, value: Any) -> Any:
-    """Replace the value of a module's name in this process; returns the old value.
+    """Replace a module's attribute in this process and return the old value.
 
-    Raises RuntimeError if the module has no such name, since nothing would change.
+    Raises:
+        RuntimeError: the module has no such attribute, so nothing would change.
     """
     if not hasattr(owner, name):
         raise RuntimeError(f"{owner.__name__} no longer has {name}, which this benchmark changes")
@@ -171,10 +178,10 @@ def train_and_measure(trainer: Any, capture: Any, budget: Any) -> dict[str, Any]
 
 
 def from_photos_to_report(capture: Path, *options: object, meshes: bool = True) -> dict[str, Any]:
-    """Train, mesh and evaluate with the commands that a user runs; returns figures of the report.
+    """Train, mesh and evaluate with the user's commands and return figures of the report.
 
-    F1 is measured on the true surface that training views see. F1 and the texture's PSNR are medians over the objects;
-    `f1_least` is the least F1.
+    F1 is measured on the part of the true surface that training views see. F1 and the texture's PSNR are medians over
+    the objects; `f1_least` is the lowest F1.
     """
     with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as scratch:
         out = Path(scratch) / "out"
@@ -210,7 +217,7 @@ def from_photos_to_report(capture: Path, *options: object, meshes: bool = True) 
 
 
 def plot_style() -> AbstractContextManager[None]:
-    """A context in which figures have the style of docs/."""
+    """Return a context in which figures have the style of docs/."""
     from matplotlib import rc_context
 
     return rc_context(_STYLE)
@@ -231,7 +238,7 @@ def save_figure(figure: Any, path: Path) -> None:
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
-    """Lines of a Markdown table; the first column is left-aligned, the others right-aligned."""
+    """Return the lines of a Markdown table; the first column is left-aligned, the others right-aligned."""
     head = list(head)
     lines = ["| " + " | ".join(head) + " |", "|" + "|".join(["---"] + ["---:"] * (len(head) - 1)) + "|"]
     return [*lines, *("| " + " | ".join(row) + " |" for row in rows)]

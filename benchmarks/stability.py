@@ -1,10 +1,10 @@
-"""Whole trainings on captures that go wrong: what each is expected to come to, and whether it did.
+"""Train on difficult captures and compare each result with its expectation.
 
     python benchmarks/stability.py [--json] [--write] [--only CASE ...]
 
-Captures of colored spheres are made for each case, and trained for a fixed number of steps, so that the machine's load
-changes nothing but the seconds. No step may lose its numbers, in any case; what else is expected stands in the table.
-With --write the table goes to docs/stability.md. Exit code 1 if an expectation did not hold.
+Each case trains on synthetic captures of colored spheres for a fixed number of steps, so the machine's load affects
+only the seconds. All values must stay finite in every case; the table lists the other expectations. --write saves the
+table to docs/stability.md. The exit code is 1 if an expectation does not hold.
 """
 
 from __future__ import annotations
@@ -46,9 +46,12 @@ SETTINGS = {"3d": Settings(offsets=5), "2d": Settings(offsets=5, primitive="2d")
 
 
 class Trained(NamedTuple):
-    """psnr: mean of the held-out views, or of all where none is held out; miou: of the rendered IDs of the training
-    views against the exact truth, and given_miou of their masks; lost: losses, numbers of the model and updates that
-    were not finite."""
+    """Quality of a training.
+
+    psnr: mean over the held-out views, or over all views if none is held out. miou: of the rendered IDs in the training
+    views against the exact masks; given_miou: of their given masks. lost: number of losses, model values and updates
+    that are not finite.
+    """
 
     psnr: float
     miou: float | None
@@ -71,7 +74,7 @@ Change = Callable[[Scene], None]
 
 
 def each_image(change: Callable[[int, np.ndarray], np.ndarray]) -> Change:
-    """A change of the pixels (h, w, 3) uint8 of every view."""
+    """Return a change that maps the pixels (h, w, 3) uint8 of every view."""
 
     def apply(scene: Scene) -> None:
         for view, name in enumerate(scene.names):
@@ -82,7 +85,7 @@ def each_image(change: Callable[[int, np.ndarray], np.ndarray]) -> Change:
 
 
 def each_mask(change: Callable[[int, np.ndarray], np.ndarray | None]) -> Change:
-    """A change of the IDs (h, w) of every view; None: no mask."""
+    """Return a change that maps the IDs (h, w) of every view; None removes the mask."""
 
     def apply(scene: Scene) -> None:
         for view, name in enumerate(scene.names):
@@ -97,7 +100,7 @@ def each_mask(change: Callable[[int, np.ndarray], np.ndarray | None]) -> Change:
 
 
 def elsewhere(scale: float, offset: float) -> Change:
-    """The same world, scaled and then moved along all axes."""
+    """Return a change that scales the world and then translates it by `offset` along each axis."""
 
     def apply(scene: Scene) -> None:
         scene.xyz = scene.xyz * scale + offset
@@ -108,7 +111,7 @@ def elsewhere(scale: float, offset: float) -> Change:
 
 
 def enlarged(times: int) -> Change:
-    """Every picture so many times as wide and high."""
+    """Return a change that multiplies the width and height of all images and masks by `times`."""
 
     def apply(scene: Scene) -> None:
         model, width, height, params = scene.camera
@@ -125,7 +128,7 @@ def enlarged(times: int) -> Change:
 
 
 def paint(scene: Scene) -> None:
-    """Give the spheres a pattern that looks the same from everywhere, and what is behind them one color."""
+    """Paint a view-independent pattern on the spheres, and the background in one color."""
     rays = rays_of(scene.lens())
 
     def painted(view: int, _: np.ndarray) -> np.ndarray:
@@ -139,7 +142,7 @@ def paint(scene: Scene) -> None:
 
 
 def take_colors(scene: Scene) -> None:
-    """Give each point the color of a photo that shows it, as COLMAP would, and write the model."""
+    """Set each point's color from an image that shows it, as COLMAP does, and write the model."""
     for name, seen, pixels in zip(scene.names, scene.seen, scene.pixels, strict=True):
         x, y = pixels.astype(np.int64).T
         scene.rgb[seen] = np.asarray(Image.open(scene.folder / "images" / name))[y, x]
@@ -154,7 +157,12 @@ def train(
     scored: bool = True,
     **options,
 ) -> Trained:
-    """Make a capture, change it, train and measure; `options` as for `write_scene`, `scored`: with IDs."""
+    """Make a capture, change it, train and measure.
+
+    Args:
+        scored: also compute mIoU.
+        options: passed to `write_scene`.
+    """
     with tempfile.TemporaryDirectory(prefix="objectgs-stability-") as folder:
         scene = write_scene(Path(folder) / "capture", **{"views": VIEWS, "size": SIZE, "points": 200, **options})
         paint(scene)
@@ -197,13 +205,13 @@ def train(
 
 
 def row(case: str, expected: str, found: str, held: bool, *trained: Trained) -> Row:
-    """A line about these trainings, none of which may have lost a number; the clock adds its seconds."""
+    """Return a table row that holds only if all values of these trainings are finite; `main` sets its seconds."""
     lost = sum(t.lost for t in trained)
     return Row(case, expected, found + (f"; {lost} numbers not finite" if lost else ""), held and not lost, 0.0)
 
 
 def seeds() -> list[Row]:
-    """Twenty seeds, of the capture and of the training, both primitives in turn."""
+    """Train with 20 seeds for capture and training, alternating between the primitives."""
     found = []
     for seed in range(20):
         settings = dataclasses.replace(SETTINGS["2d" if seed % 2 else "3d"], seed=seed)
@@ -214,10 +222,10 @@ def seeds() -> list[Row]:
 
 
 def places() -> list[Row]:
-    """The same world in other units and elsewhere: means over the seeds of the training.
+    """Train on the same world scaled or translated, and compare means over seeds.
 
-    A coordinate with 1e6 added keeps ten decimals. That is no more than a change of the last bit of some float32
-    numbers, but 300 steps make of it what they make of another seed: one training can end 0.1 dB higher or lower.
+    A coordinate with 1e6 added keeps ten decimals. This changes at most the last bit of some float32 values, but over
+    300 steps the effect grows to that of another seed: a single training can end 0.1 dB higher or lower.
     """
     rows = []
     for primitive, settings in SETTINGS.items():
@@ -241,7 +249,7 @@ def places() -> list[Row]:
 
 
 def exposure() -> list[Row]:
-    """Photos brighter and darker, each channel of its own: compared at the common exposure, which is known."""
+    """Train with a random known gain per image and channel, and compare at the common exposure."""
     rng = np.random.default_rng(0)
     logs = rng.uniform(-0.3, 0.3, (VIEWS, 1)) + rng.uniform(-0.1, 0.1, (VIEWS, 3))
     size = (240, 180)  # a gain is measured on 3 x 3 pixels at each point
@@ -270,7 +278,7 @@ def exposure() -> list[Row]:
 
 
 def masks() -> list[Row]:
-    """Wrong, missing and shifted masks."""
+    """Train with wrong, missing and shifted masks."""
     rng = np.random.default_rng(0)
     known = (1, 2, 5)
 
@@ -309,7 +317,7 @@ def masks() -> list[Row]:
 
 
 def images() -> list[Row]:
-    """Too few images, and images that show nothing."""
+    """Train with too few images, and with images that show nothing."""
     rows = []
 
     def at_least(case: str, decibel: float, found: Trained) -> None:
@@ -335,7 +343,8 @@ def images() -> list[Row]:
 
 
 def large() -> list[Row]:
-    """More pixels, cameras and objects than usual."""
+    """Train with more pixels, cameras and objects than usual."""
+
     found = train(enlarged(16), max_size=0, views=3, size=(344, 228), steps=6, scored=False)
     view = found.trainer.scene.capture.views[0]
     rows = [
@@ -372,7 +381,7 @@ CASES = {f.__name__: f for f in (seeds, places, exposure, masks, images, large)}
 
 
 def table(rows: list[Row]) -> str:
-    """As Markdown."""
+    """Return the rows as a Markdown table."""
     lines = ["| Case | Expected | Found | Held | Seconds |", "| --- | --- | --- | --- | ---: |"]
     for r in rows:
         held = "yes" if r.held else "**no**"

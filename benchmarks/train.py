@@ -1,8 +1,8 @@
-"""Where the time of a training step goes, on the demo capture with 40,000 splats at its own resolution.
+"""Time of a training step by part, on the demo capture with 40,000 splats at its own resolution.
 
     python benchmarks/train.py [--json] [--capture build/demo/capture] [--splats 40000] [--steps 60]
 
-The model is trained for a moment first, so that splats have the sizes they have in earnest.
+The model is trained briefly first, so that splats have realistic sizes.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ PARTS = ("raster", "heads", "loss", "optimizer")
 
 
 class Stopwatch:
-    """Adds up the seconds spent inside wrapped functions, by part."""
+    """Timer that sums up the seconds spent in wrapped functions, by part."""
 
     def __init__(self) -> None:
         self.seconds = dict.fromkeys(PARTS, 0.0)
 
     def wrap(self, owner: object, name: str, part: str) -> None:
-        """Replace owner.name by a version that is timed as `part`."""
+        """Replace `owner.name` with a version that is timed as `part`."""
         inner = getattr(owner, name)
 
         def timed(*arguments, **options):
@@ -51,7 +51,7 @@ class Stopwatch:
 
 
 def trainer_of(folder: Path, splats: int) -> Trainer:
-    """A trainer on the capture, warmed up, with about `splats` splats: from finer cells where there are too few."""
+    """Return a warmed-up trainer with about `splats` splats; smaller anchor cells are used if there are too few."""
     capture = load_capture(folder, Path(tempfile.mkdtemp(prefix="objectgs-benchmark-")))
     ids = vote(capture).ids if capture.has_masks else np.zeros(len(capture.points.xyz), np.int64)
     for fineness in (1.0, 0.6, 0.3):
@@ -72,7 +72,7 @@ def trainer_of(folder: Path, splats: int) -> Trainer:
 
 
 def measure(trainer: Trainer, steps: int) -> dict:
-    """Step time (median, ms) and the share of each part."""
+    """Measure the median time of a step in ms, and the share of each part."""
     from backend.model.generate_on_cpu import Generate
     from backend.raster import _Rasterize
     from backend.training.losses.on_cpu import _ImageLoss
@@ -85,7 +85,7 @@ def measure(trainer: Trainer, steps: int) -> dict:
     watch.wrap(step, "generate", "heads")
     watch.wrap(Generate, "backward", "heads")
     watch.wrap(Trainer, "_update", "optimizer")
-    # What the heads' own layers spend in the backward pass is what autograd spends beyond the functions above.
+    # The backward pass of the heads' layers is the time of autograd outside the functions above.
     whole = {"seconds": 0.0}
     inner = torch.Tensor.backward
 

@@ -1,8 +1,8 @@
-"""Variants of the training, each in a process of its own beside the default's, so that both meet the same machine.
+"""Variants of the training, each in a process beside the default's, so that both run under the same load.
 
-A host's speed may change by a third within minutes; the ratio of two trainings that run at once, each on a core of its
-own, is not touched by that. What they come to doesn't depend on the clock at all: a training of so many steps gives the
-same, bit for bit, however fast it runs.
+A host's speed can change by a third within minutes, but the ratio of two trainings that run at the same time, each on
+its own core, stays the same. The results do not depend on the clock: a training with a fixed number of steps is
+bit-identical at any speed.
 """
 
 from __future__ import annotations
@@ -18,12 +18,23 @@ from typing import Any
 from benchmarks import shared
 
 FIGURES = ("psnr", "miou")
-"""What trainings are compared by: the higher the better."""
+"""Figures by which trainings are compared; higher is better."""
 
 
 def side_by_side(spec: Mapping[str, Any], capture: str, cache: str, steps: int, seeds: Sequence[int]) -> dict[str, Any]:
-    """Train a variant, with the first seed, beside the default, with the second. Returns the figures of both, as
-    `variant` and `default`, and `times_default`: how many times as long the variant took."""
+    """Train a variant beside the default, each on its own core.
+
+    Args:
+        spec: the variant, see `change`.
+        seeds: (seed of the variant, seed of the default).
+
+    Returns:
+        The figures of both as `variant` and `default`, and `times_default`: the variant's time relative to the
+        default's.
+
+    Raises:
+        RuntimeError: a training ended without a result.
+    """
     context = multiprocessing.get_context("spawn")
     children: list[tuple[Any, Connection]] = []
     try:
@@ -35,7 +46,7 @@ def side_by_side(spec: Mapping[str, Any], capture: str, cache: str, steps: int, 
             child.start()
             its.close()
             children.append((child, mine))
-            _received(mine)  # ready, so that the next one finds the capture prepared
+            _received(mine)  # wait until it is ready, so that the next process finds the capture in the cache
         for _, pipe in children:
             pipe.send("go")
         variant, default = (_received(pipe) for _, pipe in children)
@@ -55,8 +66,8 @@ def _received(pipe: Connection) -> Any:
 
 
 def _train(pipe: Connection, core: int, spec: dict[str, Any], capture: str, cache: str, steps: int, seed: int) -> None:
-    """In a process of its own: train when told, send the figures, and keep the core busy until killed, so that the
-    other one has no more of the machine at its end than it had before."""
+    """Train in a child process when told, send the figures, and keep the core busy until killed, so that the other
+    training does not speed up at its end."""
     if hasattr(os, "sched_setaffinity"):
         cores = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, {cores[core % len(cores)]})
@@ -84,7 +95,7 @@ def _train(pipe: Connection, core: int, spec: dict[str, Any], capture: str, cach
 
 
 def change(spec: Mapping[str, Any]) -> None:
-    """Change the training of this process as a variant has it, but for what `Settings` says."""
+    """Apply a variant to this process, except its `settings`, which are passed to `Settings`."""
     import torch
 
     from backend.training import growth_strategy, step, trainer
@@ -105,7 +116,7 @@ def change(spec: Mapping[str, Any]) -> None:
 
 
 def curve_of(rows: Iterable[Mapping[str, Any]]) -> dict[int, dict[str, float]]:
-    """The default's figures by number of steps, means over seeds, shortest first."""
+    """Return the default's figures by number of steps in ascending order, as means over seeds."""
     by_steps: dict[int, list[Mapping[str, Any]]] = {}
     for row in rows:
         by_steps.setdefault(row["steps"], []).append(row)
@@ -116,8 +127,11 @@ def curve_of(rows: Iterable[Mapping[str, Any]]) -> dict[int, dict[str, float]]:
 
 
 def in_time(curve: Mapping[int, Mapping[str, float]], steps: float) -> dict[str, float]:
-    """The default's figures after so many of its steps, between those measured in the logarithm of the steps;
-    ValueError where the curve doesn't reach so far, or begins later."""
+    """Interpolate the default's figures at a number of steps, linearly in the logarithm of the steps.
+
+    Raises:
+        ValueError: the curve does not cover this number of steps.
+    """
     known = sorted(curve)
     if not known[0] <= steps <= known[-1]:
         raise ValueError(f"{steps:.0f} steps of the default lie outside of its curve of {known[0]} to {known[-1]}.")

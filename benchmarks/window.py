@@ -1,10 +1,10 @@
-"""How long Blender's main thread is blocked while training runs, and while a million splats come in.
+"""Time that Blender's main thread is blocked during training and while a result is shown.
 
-A timer inside a Blender with a window should tick every 10 ms; its longest gap is what the user feels. Needs a Blender
-that tests/window can drive, the extension's zip (make zip) and a capture. "Undrawn" is with the same training but
-without the panels being drawn, which on a machine without a graphics card takes most of the time. "Blender's own" is
-what is left without this extension: its sidebar is drawn as often, with Blender's own tab in it, while nothing else
-runs and while the same training runs outside of Blender, at the same low priority:
+A timer inside a Blender with a window should tick every 10 ms; its longest gap is the delay that the user notices.
+Requires a Blender that tests/window can drive, the extension's zip (make zip) and a capture. "Undrawn" is the same
+training without drawing the panels, which takes most of the time on a machine without a graphics card. "Blender's own"
+is the delay without this extension: the sidebar is redrawn as often, with Blender's own tab, first idle and then while
+the same training runs outside Blender at the same low priority.
 
     .venv/bin/python benchmarks/window.py build/demo/capture [--json]
 """
@@ -66,7 +66,7 @@ result = {"ticks": len(gaps), "median_ms": 1000 * gaps[len(gaps) // 2], "p99_ms"
 def measure(
     name: str, command, variables, capture: Path, archive: Path, seconds: float, size
 ) -> dict[str, dict[str, float]]:
-    """Gaps of the timer in one Blender: at rest, while training runs, and how long the result takes to come in."""
+    """Measure the timer's gaps in one Blender: at rest, during training, and for Blender on its own."""
     place = Path(tempfile.mkdtemp(prefix="objectgs-window-"))
     blender = harness.Blender(command, variables, place, place / "shots", size)
     found: dict[str, dict[str, float]] = {}
@@ -103,12 +103,12 @@ def measure(
         wait(blender, "background.queue.running is None")
         blender.run(NAMES + "background.redraw = background.shown")
         blender.run(NAMES + DRAW_OWN)
-        time.sleep(10)  # The result of the training before comes in.
+        time.sleep(10)  # wait until the result of the previous training is shown
         blender.run(START)
         time.sleep(10)
         found["Blender's own, no training"] = blender.run(STOP)
         outside = train_outside(capture, place / "outside", seconds)
-        time.sleep(10)  # Reading the capture.
+        time.sleep(10)  # wait until the training has read the capture
         blender.run(START)
         while outside.poll() is None:
             time.sleep(1)
@@ -119,7 +119,7 @@ def measure(
 
 
 def train_outside(capture: Path, folder: Path, seconds: float) -> subprocess.Popen:
-    """The same training as the extension starts, beside Blender."""
+    """Start the same training as the extension does, outside Blender."""
     command = [sys.executable, "-m", "backend", "train", str(capture), "--out", str(folder), "--minutes"]
     return subprocess.Popen(
         [*command, str(seconds / 60)], cwd=harness.ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
@@ -128,7 +128,7 @@ def train_outside(capture: Path, folder: Path, seconds: float) -> subprocess.Pop
 
 
 def wait(blender: harness.Blender, expression: str, interval: float = 0.5) -> None:
-    """Until an expression is true inside Blender."""
+    """Wait until an expression is true inside Blender."""
     for _ in range(1000):
         if blender.run(NAMES + f"result = bool({expression})"):
             return
@@ -137,7 +137,8 @@ def wait(blender: harness.Blender, expression: str, interval: float = 0.5) -> No
 
 
 def main() -> None:
-    """Measure in every Blender that is here."""
+    """Measure in every installed Blender."""
+
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("capture", type=Path)
     parser.add_argument("--seconds", type=float, default=60.0, help="length of the training")

@@ -1,4 +1,4 @@
-"""What a command answered, taken apart."""
+"""Exit code and output of a command, with checks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TYPES = {"status", "progress", "preview", "quality", "warning", "error", "done"}
 
 @dataclass
 class Answer:
-    """What one command said."""
+    """Exit code and output of a command."""
 
     code: int
     out: str
@@ -20,7 +20,7 @@ class Answer:
 
     @property
     def events(self) -> list[dict]:
-        """The lines of stdout, each a JSON object of a known type; the last one closes."""
+        """Lines of stdout as JSON objects of known types; the last one is `done` or `error`."""
         events = [json.loads(line) for line in self.out.splitlines()]
         assert events and {event["type"] for event in events} <= TYPES
         assert events[-1]["type"] in ("done", "error")
@@ -32,7 +32,7 @@ class Answer:
 
 
 def refused(answer: Answer, *words: str) -> str:
-    """The command was refused with one plain sentence that holds `words`; returns it."""
+    """Check that the command was refused with a single sentence that contains `words`, and return the sentence."""
     assert answer.code == EXIT_BAD_INPUT, answer
     sentences = [line for line in answer.err.splitlines() if line.startswith("error: ")]
     assert len(sentences) == 1 and "Traceback" not in answer.err, answer.err

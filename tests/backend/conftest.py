@@ -1,4 +1,4 @@
-"""Tiny synthetic captures (colored spheres seen by a ring of cameras, with exact masks and tracks), and commands."""
+"""Fixtures: tiny synthetic captures (colored spheres, a ring of cameras, exact masks and tracks), and commands."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SPHERES = [(1, (-0.7, 0.0, 0.0), 0.5), (2, (0.7, 0.1, 0.0), 0.45), (5, (0.0, -0.
 
 
 class Scene:
-    """What `write_capture` wrote, and the truth behind it."""
+    """A capture written by `write_scene`, and its exact data."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -50,14 +50,14 @@ class Scene:
 
 
 def rays_of(lens: pycolmap.Camera) -> np.ndarray:
-    """The viewing direction of each pixel's center, (h, w, 3), z = 1."""
+    """Return the viewing direction of each pixel's center, (h, w, 3) with z = 1."""
     x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     xy = np.asarray(lens.cam_from_img(np.stack([x.ravel(), y.ravel()], 1)))
     return np.column_stack([xy, np.ones(len(xy))]).reshape(lens.height, lens.width, 3)
 
 
 def sphere_ids(rays: np.ndarray, viewmat: np.ndarray, spheres: list) -> tuple[np.ndarray, np.ndarray]:
-    """The ID that each ray (..., 3) meets first (0: none), and how far along the ray (infinite: none)."""
+    """Return the object ID that each ray (..., 3) hits first (0: none), and the distance along the ray (inf: none)."""
     best, ids = np.full(rays.shape[:-1], np.inf), np.zeros(rays.shape[:-1], np.int64)
     for object_id, center, radius in spheres:
         c = viewmat[:3, :3] @ center + viewmat[:3, 3]
@@ -71,7 +71,7 @@ def sphere_ids(rays: np.ndarray, viewmat: np.ndarray, spheres: list) -> tuple[np
 
 
 def look_at(eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The quaternion (w, x, y, z) and the world-to-camera matrix of a camera at `eye` that looks at the origin."""
+    """Return the quaternion (w, x, y, z) and world-to-camera matrix of a camera at `eye` that looks at the origin."""
     forward = -eye / np.linalg.norm(eye)
     right = np.cross(forward, [0.0, -1.0, 0.0])
     right /= np.linalg.norm(right)
@@ -83,7 +83,7 @@ def look_at(eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_model(scene: Scene, folder: Path, suffix: str) -> None:
-    """The scene as COLMAP writes it, binary or text."""
+    """Write the scene's COLMAP model, binary or text."""
     folder.mkdir(parents=True, exist_ok=True)
     model, width, height, params = scene.camera
     tracks: dict[int, list[tuple[int, int]]] = {i: [] for i in range(len(scene.xyz))}
@@ -131,10 +131,16 @@ def write_scene(
     folder, views=6, size=(96, 72), model="PINHOLE", params=None, masks=True, suffix=".bin", names=None,
     spheres=SPHERES, points=60, seed=0,
 ) -> Scene:  # fmt: skip
-    """Write a capture into a folder.
+    """Write a capture to a folder.
 
-    views; size (width, height); camera model and params (default PINHOLE with a focal length of the width); masks
-    (False: none); suffix (".bin" or ".txt"); names (one a view); spheres [(id, center, radius)]; points (each).
+    Args:
+        size: (width, height) of the images.
+        model, params: COLMAP camera; by default PINHOLE with the image width as focal length.
+        masks: whether masks are written.
+        suffix: ".bin" or ".txt", the format of the COLMAP model.
+        names: image names, one per view.
+        spheres: (ID, center, radius) of each sphere.
+        points: number of points on each sphere.
     """
     rng = np.random.default_rng(seed)
     scene = Scene(folder)
@@ -182,19 +188,19 @@ def write_scene(
 
 @pytest.fixture
 def write_capture(tmp_path):
-    """`write_scene` into a folder of the test's own, `name` inside it."""
+    """Function that runs `write_scene` in the test's own folder `name`."""
 
     def write(name="capture", **options) -> Scene:
         return write_scene(tmp_path / name, **options)
 
-    # Reached through the fixture, since test folders are no packages to import from.
+    # Offered as attributes, since test folders are not packages.
     write.sphere_ids, write.write_model, write.rays_of = sphere_ids, write_model, rays_of
     return write
 
 
 @pytest.fixture
 def ask(capsys):
-    """Runs a command in this process; `--json` in the arguments for events."""
+    """Function that runs a command in this process; with `--json`, the answer has events."""
     threads = numba.get_num_threads(), torch.get_num_threads()
 
     def run(*words) -> Answer:
@@ -210,7 +216,7 @@ def ask(capsys):
 
 @pytest.fixture
 def tiny(write_capture, tmp_path):
-    """A function that writes a capture of nine small views; it returns the capture and its points' objects."""
+    """Function that writes a capture of nine small views and returns it with the object IDs of its points."""
 
     def make(**options):
         scene = write_capture(views=9, size=(64, 48), **options)

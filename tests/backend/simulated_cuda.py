@@ -1,4 +1,4 @@
-"""The CUDA renderer beyond what every renderer is tested for; run in numba's simulator by test_cuda.py."""
+"""Tests of the CUDA renderer alone; test_cuda.py runs them in numba's simulator."""
 
 import itertools
 
@@ -68,7 +68,7 @@ def test_a_thread_for_each(count):
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
 def test_too_little_capacity_for_the_intersections(primitive, monkeypatch):
-    """The intersections and the image are computed again, with the same result."""
+    """The intersections and the image are recomputed, with the same result."""
     made = []
     tile_intersections = cuda_bin.tile_intersections
     monkeypatch.setattr(
@@ -120,7 +120,7 @@ def test_each_plane_alone_is_as_among_the_others(wanted, primitive):
 
 @pytest.mark.parametrize("flat", [False, True])
 def test_meets_the_same_tiles_as_the_cpu_renderer(flat):
-    """Tight bounds: in an image as large as one tile of the CPU's, that tile has the splats of the 8 small tiles."""
+    """In an image of one CPU tile, that tile has the same splats as the 8 small CUDA tiles together."""
     cam = camera(64, 32)
     scene = as_float32(random_scene(4, count=50))
     cpu_frame = cpu.forward(cpu.Gaussians(*(scene[n].numpy() for n in (*NAMES, "ids"))), cam, flat=flat)
@@ -131,7 +131,7 @@ def test_meets_the_same_tiles_as_the_cpu_renderer(flat):
     assert set(used) == set(cpu_frame.isect_ids.tolist())
     boxes = np.ceil(2 * cpu_frame.splats[cpu_frame.seen][:, 10:12] / 16 + 1).prod(1).sum()
     assert used.size < boxes
-    # In every tile front to back as on the CPU.
+    # Each tile has the CPU's order from front to back.
     rank = np.argsort(np.argsort(cpu_frame.isect_ids))
     place = dict(zip(cpu_frame.isect_ids.tolist(), range(len(rank)), strict=True))
     starts = frame.intersections.isect_offsets.tolist()
@@ -142,7 +142,7 @@ def test_meets_the_same_tiles_as_the_cpu_renderer(flat):
 
 @pytest.fixture
 def uninitialized_memory_filled():
-    """torch fills uninitialized memory with NaN, or the largest integer."""
+    """Make torch fill uninitialized memory with NaN or the largest integer."""
     torch.use_deterministic_algorithms(True)
     yield
     torch.use_deterministic_algorithms(False)
@@ -166,7 +166,7 @@ def test_splats_below_the_transmittance_threshold_have_no_gradient(primitive, un
 
 
 def test_more_splats_in_a_tile_than_fit_in_shared_memory():
-    """Faint ones, so that all of them are drawn."""
+    """The splats are faint, so that all of them are drawn."""
     scene = as_float32(random_scene(0, count=STAGED + 150, size=0.3))
     scene["opacities"] *= 0.02
     scene["opacities"] += 0.005

@@ -1,4 +1,4 @@
-"""How long a training takes: steps, minutes, or until it has converged."""
+"""Length of a training: steps, minutes, or until convergence."""
 
 import math
 
@@ -24,7 +24,8 @@ def curve_of(steps, psnr, **more):
 
 
 def walk(budget, psnr, longest=100_000, seconds_a_step=0.05, anchors=lambda step: step):
-    """The progress at the end of a training under a budget, with the `psnr` and number of `anchors` of each step."""
+    """Return the progress at the end of a simulated training, given `psnr` and number of `anchors` as functions of the
+    step."""
     p = TrainingProgress()
     budget.begin(p)
     progress, displayed = [], []
@@ -44,14 +45,14 @@ def walk(budget, psnr, longest=100_000, seconds_a_step=0.05, anchors=lambda step
 
 
 def converged_after(octave):
-    """The step from which on more are not worthwhile where an octave of steps gains `octave` dB."""
+    """Return the step from which more steps are not worthwhile, if doubling the steps gains `octave` dB."""
     return LOOKAHEAD / (2 ** (WORTHWHILE_DB / octave) - 1)
 
 
 def test_convergence_follows_the_logarithm_of_the_steps():
     steps = range(WARM_UP, 4100, 100)
     assert convergence_step(curve_of(steps, lambda s: 20 + 0.7 * math.log2(s))) == pytest.approx(converged_after(0.7))
-    # What came before the latest octaves does not matter, nor what came before it is judged.
+    # Values before the latest octaves, and before convergence is first checked, have no effect.
     late = curve_of(steps, lambda s: 30.0 if s >= steps[-1] / 2**OCTAVES else 0.0)
     assert convergence_step(late) == 0.0
     early = curve_of(range(100, 3 * WARM_UP + 1, 100), lambda s: 30.0 if s >= WARM_UP else 0.0)
@@ -118,7 +119,7 @@ def test_no_training_converges_before_the_warm_up():
 
 def test_growth_goes_on_as_long_as_anchors_become_more():
     def until(anchors):
-        """The step of the first measurement after which nothing grows, None: anchors grow to the end."""
+        """Return the step of the measurement that ends growth; None: anchors grow to the end."""
         budget, p = PRESETS["final"], TrainingProgress()
         while p.step < 20_000:
             p.step += 1
@@ -131,9 +132,9 @@ def test_growth_goes_on_as_long_as_anchors_become_more():
 
     assert until(lambda step: 1000 * step**0.1) is None
     assert until(lambda step: min(step, 5000)) == pytest.approx(5000 * math.sqrt(2), rel=0.1)
-    # They become fewer at first, where many start in the wrong place; before the warm-up is over, this ends nothing.
+    # The number of anchors falls at first if many start in the wrong place; this ends growth only after the warm-up.
     assert WARM_UP < until(lambda step: 1e6 / step) < 1.6 * WARM_UP
-    # What does not grow any more does not begin again.
+    # Growth that has ended does not restart.
     assert walk(PRESETS["final"], math.log1p, 5000, anchors=lambda step: 1000 + 500 * (step > 2500)).grown
 
 

@@ -1,4 +1,4 @@
-"""Captures: every camera model, mask format and kind of bad input; real COLMAP files where ../shared/data is there."""
+"""Captures: all camera models, mask formats and kinds of bad input; real COLMAP files if ../shared/data exists."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ def fixture(name: str) -> Path:
 
 
 def refused(folder: Path, tmp_path: Path, *words: str, **options) -> str:
-    """Loading is refused with one sentence that holds `words`, writes nothing half, and checking says the same."""
+    """Check that loading fails with a sentence that contains `words`, leaves no partial files, and that `check_capture`
+    reports the same problem."""
     cache = tmp_path / "cache-of-refused"
     with pytest.raises(InputError) as caught:
         load_capture(folder, cache, **options)
@@ -211,7 +212,7 @@ def lens_of(name: str, width: int = 640, height: int = 480) -> Camera:
 @pytest.mark.parametrize("name", LENSES)
 @pytest.mark.parametrize("max_size", [0, 400])
 def test_known_points_land_where_the_pinhole_says(write_capture, tmp_path, name, max_size):
-    """Spots painted where pycolmap's distorted camera sees 3D points are found where the undistorted K puts them."""
+    """Spots painted at the projections of pycolmap's distorted camera appear at those of the undistorted K."""
     camera = lens_of(name)
     scene = write_capture(
         views=3, size=(640, 480), model=camera.model, params=list(camera.params), masks=False, points=2
@@ -226,7 +227,7 @@ def test_known_points_land_where_the_pinhole_says(write_capture, tmp_path, name,
     xyz = np.column_stack([(spots - target.K[:2, 2]) / [target.K[0, 0], target.K[1, 1]], np.ones(30)]) * depth[:, None]
     seen = np.asarray(lens.img_from_cam(xyz))
     assert (seen > 0).all() and (seen < [640, 480]).all()
-    # A spot is round in the pinhole view, so in the distorted image it has the shape that the inverse model gives it.
+    # Spots are round in the pinhole view; the inverse camera model gives their shape in the distorted image.
     canvas = np.zeros((480, 640))
     rays = write_capture.rays_of(lens)[..., :2] * [target.K[0, 0], target.K[1, 1]] + target.K[:2, 2]
     for (u, v), (a, b) in zip(spots, seen.astype(int)):
@@ -253,7 +254,7 @@ def test_undistorted_images_have_no_blank_pixels(name):
     target = pinhole_for(camera, Path("cameras.bin"), 0)
     at = source_pixels(camera, target)
     assert (at >= -0.01).all() and (at[0] <= 480.01).all() and (at[1] <= 640.01).all()
-    # The view is not needlessly small: a ray at its border lies at the image's border, or at the limit.
+    # The view is as large as possible: its border reaches the image's border or the limit.
     reach = [-target.K[0, 2] / target.K[0, 0], (target.width - target.K[0, 2]) / target.K[0, 0]]
     touches = min(at.min(), (480 - at[0]).min(), (640 - at[1]).min()) < 2
     assert touches or max(map(abs, reach)) > 1.72
@@ -296,7 +297,7 @@ def test_undistorted_masks_are_the_pinholes(write_capture, tmp_path, name):
 
 
 def test_fold_over_is_culled():
-    """Beyond the fold a ray lands in the image a second time; the view must end before it."""
+    """The view must end before the fold, beyond which rays project into the image a second time."""
     camera = Camera(1, "SIMPLE_RADIAL", 200, 150, (100.0, 100.0, 75.0, -0.5))
     target = pinhole_for(camera, Path("cameras.bin"), 0)
     corner = np.hypot(target.K[0, 2] / target.K[0, 0], target.K[1, 2] / target.K[1, 1])
@@ -494,7 +495,7 @@ def test_every_mask_format(write_capture, tmp_path, kind):
 
 
 def low_bit_png(ids: np.ndarray, bits: int) -> bytes:
-    """A gray PNG of fewer than 8 bits, which Pillow cannot write."""
+    """Encode a gray PNG with fewer than 8 bits, which Pillow does not support."""
     import zlib
 
     def chunk(kind: bytes, data: bytes) -> bytes:
@@ -513,7 +514,7 @@ def low_bit_png(ids: np.ndarray, bits: int) -> bytes:
 
 
 def test_gray_or_color_is_decided_for_the_capture(write_capture, tmp_path):
-    """A color-coded ID may be gray in a view that shows no other: 65,793 is (1, 1, 1)."""
+    """A color-coded ID can be gray, and a view may show no other ID: 65,793 is (1, 1, 1)."""
     scene = write_capture(views=3)
     for index, name in enumerate(scene.names):
         ids = np.full((72, 96), 65_793)
@@ -618,7 +619,7 @@ def test_the_largest_of_several_models_is_used(write_capture, tmp_path):
 
 
 def spoil(scene, what: str) -> tuple[str, ...]:
-    """Break the capture; what the sentence must name."""
+    """Break the capture and return the words that the error must contain."""
     model, images, masks = scene.folder / "sparse/0", scene.folder / "images", scene.folder / "masks"
     first = scene.names[0]
     if what.endswith("is missing"):
@@ -856,7 +857,7 @@ NAMES = [
 
 
 def with_images(model_folder: Path, folder: Path) -> Path:
-    """A capture around a model of real COLMAP: an image of the right size for each name."""
+    """Create a capture from a real COLMAP model, with a uniform image of the right size for each name."""
     model = read_model(model_folder)
     folder.mkdir()
     (folder / "sparse").symlink_to(model_folder)
@@ -880,7 +881,7 @@ def test_all_camera_models(tmp_path, suffix):
         assert len(keypoints.xy) == (0 if view.name == "UPPER.PNG" else 50)
         if len(keypoints.xy):
             p = (capture.points.xyz[keypoints.point_index] @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]) @ view.K.T
-            # The fixture's observations are exact projections with noise of a pixel at most.
+            # The fixture's observations are projections with noise of at most a pixel.
             assert np.median(np.linalg.norm(keypoints.xy - p[:, :2] / p[:, 2:], axis=1)) < 1
 
 

@@ -1,4 +1,4 @@
-"""Numbers that are not finite in training: named, skipped, counted, and kept from spreading."""
+"""Non-finite values in training: reported, skipped, counted, and kept from spreading."""
 
 import math
 
@@ -42,7 +42,7 @@ def numbers(trainer):
 
 
 def poisoned(wrapped, gradient, value):
-    """A function whose result, or whose gradient, is not a number."""
+    """Wrap a function so that its result or its gradient is multiplied by `value`."""
     if not gradient:
         return lambda *a, **k: wrapped(*a, **k) * value
 
@@ -92,7 +92,7 @@ def test_the_label_loss_is_told_from_the_pictures(trainer, monkeypatch):
 
 @pytest.mark.parametrize("value", [1e30, math.nan])
 def test_a_splat_that_cannot_recover_is_named_and_taken_out(trainer, monkeypatch, value):
-    """The color of its third splat overflows in SSIM; the size of its anchor is not a number."""
+    """1e30: the color of an anchor's third splat overflows in SSIM. NaN: the size of the anchor is NaN."""
     trained = trainer()
     anchors, layout = trained.model.anchors, SMALL.layout
     index = trained.scene.capture.train_indices
@@ -122,7 +122,7 @@ def test_a_splat_that_cannot_recover_is_named_and_taken_out(trainer, monkeypatch
 
 
 def spoiled(rasterize, splat, value):
-    """As `rasterize`, whose gradient of one splat's place, along y, is `value`."""
+    """Wrap `rasterize` so that the gradient of one splat's mean along y is `value`."""
 
     def call(means, *others, **options):
         def spoil(g):
@@ -140,7 +140,7 @@ def spoiled(rasterize, splat, value):
 
 @pytest.mark.parametrize("value", [math.nan, -math.inf, 1e25])
 def test_a_gradient_that_is_not_finite_stays_with_its_anchor(trainer, monkeypatch, value):
-    """All other anchors, and the heads, learn what they would if that anchor had no gradient at all."""
+    """All other anchors and the heads get the same update as if that anchor had no gradient."""
     results = []
     for given in (0.0, value):
         trained = trainer()
@@ -152,7 +152,7 @@ def test_a_gradient_that_is_not_finite_stays_with_its_anchor(trainer, monkeypatc
         trained._update(learned, 0.6)
         results.append((trained, before))
     (clean, _), (hurt, before) = results
-    if value == 1e25:  # finite, so only Adam stumbles over it
+    if value == 1e25:  # finite, so only Adam's step overflows
         assert all(t.isfinite().all() for t in numbers(hurt))
     fault = hurt._check.fault
     assert clean._check.fault is None and int(hurt._check.skipped) >= 1
@@ -169,7 +169,7 @@ def test_a_gradient_that_is_not_finite_stays_with_its_anchor(trainer, monkeypatc
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_the_heads_learn_from_the_other_anchors(trainer, monkeypatch, value):
-    """A splat's rotation goes through the heads; its gradient of no number stops nobody else's."""
+    """A rotation's gradient passes through the heads; if it is not finite, the other anchors still train the heads."""
     trained = trainer()
     trained.step(0.6)  # at first, features are zero, and the hidden layer's weights have no gradient
     index = trained.scene.capture.train_indices[0]

@@ -1,4 +1,4 @@
-"""Object IDs to class indices and back."""
+"""Conversion between object IDs and class indices."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What the command line prints before a command begins."""
+"""Output of the command line before a command starts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: the whole chain, exit codes, events, and what happens when things go wrong."""
+"""The command line: the whole chain, exit codes, events and errors."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _kept: dict[str, Path] = {}
 
 @pytest.fixture
 def trained(write_capture, tmp_path, tmp_path_factory, ask):
-    """A capture, and a copy of a reconstruction of it in 20 steps; both made once."""
+    """A capture and a copy of its reconstruction after 20 steps; both are made once."""
     if not _kept:
         place = tmp_path_factory.mktemp("trained")
         shutil.copytree(write_capture(name="first", views=9, size=(64, 48)).folder, place / "capture")
@@ -59,7 +59,7 @@ def trained(write_capture, tmp_path, tmp_path_factory, ask):
 
 
 def no_halves(folder: Path) -> None:
-    """Nothing is left that was meant to be there only while a command ran."""
+    """Check that no temporary file of a command is left."""
     hidden = [path for path in folder.rglob(".*") if path.name == LOCK or path.name.startswith(".write-test")]
     assert not [*folder.rglob("*.part"), *hidden]
 
@@ -409,7 +409,7 @@ def test_too_few_views_to_hold_any_out(write_capture, tmp_path, ask):
 
 
 def spoil(scene, what: str) -> tuple[str, ...]:
-    """Break the capture; what the sentence must name."""
+    """Break the capture and return the words that the error must contain."""
     model, images, masks = scene.folder / "sparse/0", scene.folder / "images", scene.folder / "masks"
     first = scene.names[0]
     if what == "no folder":
@@ -534,7 +534,7 @@ def test_a_command_line_that_makes_no_sense(capsys, words):
 
 @pytest.fixture
 def full_disk_for(monkeypatch):
-    """Makes the disk full for files whose name ends so."""
+    """Function that makes the disk full for files in a folder whose name has this ending."""
     original = os.fsync
 
     def start(folder: Path, ending: str) -> None:
@@ -608,7 +608,7 @@ def test_a_checkpoint_cut_short_falls_back_and_says_so(trained, ask):
 
 
 def signal_at(monkeypatch, owner, name: str, call: int, number=signal.SIGINT) -> None:
-    """Raise a signal in a call of `owner.name`."""
+    """Raise a signal in the given call of `owner.name`."""
     original = getattr(owner, name)
     calls = []
 
@@ -749,7 +749,7 @@ def test_a_folder_is_trained_by_one_process_until_it_ends_or_is_killed(write_cap
             assert process.poll() is None and (out / "points.ply").exists()
         finally:
             process.kill()
-        # Dead, though nobody has asked yet how it ended.
+        # The process has ended, but its exit status has not been collected.
         os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
         assert (out / LOCK).read_text() == f"{process.pid}\n"
         assert ask(*train, "--steps", 5).code == EXIT_DONE
@@ -789,7 +789,7 @@ def test_a_lock_that_cannot_be_written_leaves_nothing(tmp_path, monkeypatch):
     assert failure.value.filename == str(tmp_path / LOCK) and not list(tmp_path.iterdir())
 
 
-# --- what else a program may meet ------------------------------------------------------------------------------------
+# --- other errors ----------------------------------------------------------------------------------------------------
 
 
 def test_an_unexpected_failure_is_exit_code_1(write_capture, ask, monkeypatch):

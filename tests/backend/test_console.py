@@ -1,4 +1,4 @@
-"""What a person sees in a terminal, and what a log file gets."""
+"""Output to a terminal and to a log file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Terminal(io.StringIO):
 
 @pytest.fixture
 def now(monkeypatch):
-    """A clock that the test turns."""
+    """A clock that the test sets."""
     time = [100.0]
     monkeypatch.setattr(console.time, "monotonic", lambda: time[0])
     return time

@@ -1,5 +1,7 @@
-"""The CUDA kernels in numba's simulator, which a process chooses before it imports numba: each test runs other test
-files in a process of its own and shows what that says."""
+"""The CUDA kernels in numba's simulator.
+
+The simulator must be enabled before numba is imported, so each test runs other test files in a separate process.
+"""
 
 import os
 import subprocess
@@ -31,7 +33,7 @@ def test_simulated(words):
 
 
 def test_the_cpu_renderer_needs_nothing_of_cuda():
-    """numba-cuda may be missing, or of a kind that fails when it is imported."""
+    """numba-cuda may be missing or fail on import."""
     script = """
 import sys
 sys.modules["numba.cuda"] = None

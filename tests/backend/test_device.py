@@ -1,6 +1,6 @@
-"""What runs on a GPU against what runs on the processor, on the same numbers; and choosing between them.
+"""GPU code paths against CPU code paths on the same data, and the choice of the device.
 
-Without a GPU the torch versions run on tensors in the processor's memory, with the processor's renderer.
+Without a GPU, the torch versions run on CPU tensors with the CPU renderer.
 """
 
 import dataclasses
@@ -41,7 +41,7 @@ FLAT = dataclasses.replace(SMALL, primitive="2d", distortion_weight=0.1)
 
 @pytest.fixture
 def both(monkeypatch):
-    """A function that calls another on the processor and then as on a GPU, and returns both results."""
+    """Function that calls another one with the CPU path and then with the GPU path, and returns both results."""
 
     def call(function):
         found = []
@@ -55,12 +55,12 @@ def both(monkeypatch):
 
 @pytest.fixture
 def as_on_gpu(monkeypatch):
-    """Switches between the two versions: as_on_gpu(True) and as_on_gpu(False)."""
+    """Function that selects the GPU path (True) or the CPU path (False)."""
     return lambda answer: monkeypatch.setattr(devices, "on_gpu", lambda tensor: answer)
 
 
 def close(got, want, relative=2e-4, absolute=2e-5):
-    """Equal to within float32: `absolute` is of the largest number."""
+    """Check that values are equal within float32 accuracy; `absolute` is relative to the largest value."""
     got, want = torch.as_tensor(got).detach(), torch.as_tensor(want).detach()
     assert got.shape == want.shape
     largest = float(want.abs().max()) if want.numel() else 0.0
@@ -283,7 +283,7 @@ def trained(capture, ids, settings, steps=150):
 
 
 def quality(trainer):
-    """PSNR of the taught views, and how much of the objects' pixels shows the right one."""
+    """Return PSNR in the training views, and the fraction of object pixels with the right ID."""
     capture = trainer.scene.capture
     found, right = [], []
     for index in capture.train_indices:
@@ -329,7 +329,7 @@ def test_a_checkpoint_goes_on_on_the_other_device(tiny, tmp_path, as_on_gpu, fir
 
 
 class Numbers(TorchDispatchMode):
-    """Counts the operations that make the processor wait for a number from the device."""
+    """Recorder of operations that make the CPU wait for a value from the device."""
 
     def __init__(self):
         super().__init__()
@@ -413,7 +413,7 @@ for primitive in ("3d", "2d"):
 
 
 def test_the_whole_loop_runs_in_numbas_simulator(write_capture, tmp_path):
-    """With the CUDA kernels: steps and pictures are those of the processor."""
+    """With the CUDA kernels, losses and images equal those of the CPU."""
     folder = write_capture(views=3, size=(24, 18), points=20).folder
     found = []
     for simulate in ("0", "1"):
@@ -450,7 +450,7 @@ def test_strips_are_the_picture(tiny):
 
 
 def test_parts_teach_the_same_as_the_whole(tiny, as_on_gpu):
-    """But for SSIM beside the cuts, and the volume (a mean over each part's splats)."""
+    """Except SSIM beside the cuts, and the volume loss (a mean over each part's splats)."""
     as_on_gpu(True)
     capture, ids = tiny()
     settings = dataclasses.replace(SMALL, ssim_weight=0.0, volume_weight=0.0)
@@ -602,7 +602,7 @@ def test_make_gpu_without_a_gpu_says_so_and_passes_nothing():
 
 
 def test_training_needs_nothing_that_reads_captures():
-    """So that a machine which has torch and numba alone can measure it."""
+    """A machine that has only torch and numba can benchmark the training."""
     absent = ("pycolmap", "xatlas", "manifold3d", "fast_simplification", "skimage", "matplotlib")
     code = (
         f"import sys; sys.modules.update(dict.fromkeys({absent})); import backend.training.trainer, backend.model.draw"

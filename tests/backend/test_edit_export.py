@@ -1,4 +1,4 @@
-"""The commands that change objects, write splats for other programs and take theirs."""
+"""The commands `edit`, `export` and `import-splats`."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def some_splats(n=60, degree=2, seed=0):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A reconstruction with splats of four objects, that stands askew."""
+    """A reconstruction with splats of four objects, whose capture space is not upright."""
     made = Reconstruction(tmp_path / "made").create()
     write_splats(made.splats, some_splats())
     write_objects(made.objects, [{"id": i, "name": name, "color": [1, 2, 3], "points": 9} for i, name in NAMES.items()])
@@ -77,7 +77,7 @@ def test_objects_are_removed_and_restored_by_name_part_or_id(ask, folder):
 
 
 def test_fills_of_holes_are_cached_for_those_who_show_them(ask, folder):
-    """Anew for each state of edits and splats; taking an edit back finds the file of before, and old ones go."""
+    """One file per state of edits and splats; undoing an edit reuses the earlier file, and old files are removed."""
     rng = np.random.default_rng(0)
     ground = np.column_stack([rng.uniform(-1, 1, (9000, 2)), np.zeros(9000)])
     ground = ground[np.abs(ground).max(1) > 0.15]
@@ -139,7 +139,7 @@ def test_moves_are_along_blenders_axes_and_about_the_objects_middle(ask, folder)
     ask("edit", folder.folder, "--move", "can:x=0.5,z=-1,rz=90,scale=2", "--duplicate", "can:y=1", "can:y=2")
     can = edited(folder, 7)
     matrix = np.array(can.transform)
-    # What Blender shows: capture -> upright.
+    # Blender shows upright coordinates.
     shift = UPRIGHT @ ((matrix @ [*middle, 1])[:3] - middle)
     np.testing.assert_allclose(shift, (0.5, 0, -1), atol=1e-9)
     np.testing.assert_allclose(UPRIGHT @ matrix[:3, :3] @ UPRIGHT.T, [[0, -2, 0], [2, 0, 0], [0, 0, 2]], atol=1e-9)
@@ -257,7 +257,7 @@ def test_exports_that_make_no_sense_are_refused(ask, folder, tmp_path):
 
 
 def read_spz(path):
-    """Splats of an SPZ file, taken apart splat by splat as its specification says."""
+    """Decode an SPZ file splat by splat as specified."""
     data = gzip.decompress(path.read_bytes())
     magic, version, count, degree, bits, flags, reserved = struct.unpack_from("<IIIBBBB", data)
     assert (magic, version, flags, reserved) == (0x5053474E, 3, 0, 0)

@@ -1,4 +1,4 @@
-"""Edits of objects on plain splats, against what the reference renderer shows."""
+"""Edits of objects on plain splats, checked with the reference renderer."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def some_splats(n=30, degree=3, seed=0, ids=(0, 1, 2), dtype=np.float64):
 
 
 def camera(moved=None):
-    """A camera at z = -4, or where a rigid map (4, 4) of the scene takes it."""
+    """Return a camera at z = -4, optionally moved by a rigid map (4, 4) of the scene."""
     viewmat = np.eye(4)
     viewmat[2, 3] = 4.0
     if moved is not None:
@@ -42,7 +42,7 @@ def camera(moved=None):
 
 
 def picture(splats, view):
-    """(30, 40, 4) float64: color and alpha."""
+    """Render color and alpha, (30, 40, 4) float64."""
     arrays = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
     tensors = (torch.from_numpy(np.asarray(array, np.float64)) for array in arrays)
     drawn = rasterize_reference(*tensors, torch.zeros(len(splats), dtype=torch.int64), view)
@@ -197,7 +197,8 @@ def test_floaters_inside_the_hull_go_where_that_is_asked_for():
 
 
 def surface(rng, n, axes, at, colors, object_id, thin=0.002):
-    """Flat splats in a square of side 2, spanned by two rows of axes (3, 3), around `at`; colors by place in it."""
+    """Return flat splats in a square of side 2 around `at`, spanned by the first two rows of `axes` (3, 3); `colors`
+    maps positions in the square to colors."""
     flat = rng.uniform(-1, 1, (n, 2))
     quats = Rotation.from_matrix(axes.T).as_quat(scalar_first=True)
     return Splats(
@@ -208,13 +209,13 @@ def surface(rng, n, axes, at, colors, object_id, thin=0.002):
 
 
 def stripes(flat):
-    """Dark and light stripes along x, and red that grows along x."""
+    """Return colors with dark and light stripes along x, and red increasing along x."""
     light = np.where(np.floor(flat[:, 1] / 0.08) % 2 == 0, 0.35, 0.65)
     return np.stack([light + 0.2 * flat[:, 0], light, light], 1)
 
 
 def box(rng, low, high, object_id, n=3000):
-    """Splats all over the sides of a box."""
+    """Return splats on the sides of a box."""
     low, high = np.array(low), np.array(high)
     points = rng.uniform(low, high, (n, 3))
     side = rng.integers(3, size=n)
@@ -228,7 +229,7 @@ HERE = np.eye(4)
 
 
 def with_box_on_ground(place=HERE):
-    """A striped ground with a hole, a box over the hole, and something else; and where the hole is (n,) among them."""
+    """Return a striped ground with a hole, a box over the hole and another box; and the ground's splats in the hole."""
     rng = np.random.default_rng(0)
     ground = surface(rng, 12000, np.eye(3), np.zeros(3), stripes, 5)
     hidden = (np.abs(ground.means[:, :2]) < 0.15).all(1)
@@ -246,11 +247,11 @@ def test_the_ground_under_a_removed_object_is_closed_by_what_is_around(place):
     assert len(unobserved) > 0.7 * len(hidden) and set(unobserved.object_ids.tolist()) == {5}
     back = transformed(unobserved, np.linalg.inv(place))
     assert np.abs(back.means[:, :2]).max() < 0.2 and np.abs(back.means[:, 2]).max() < 0.005
-    # Each is colored like what was there: the stripes go on, and so does the red.
+    # The new splats continue the stripes and the red gradient.
     truth = stripes(back.means[:, :2].astype(np.float64))
     found = 0.5 + C0 * back.sh[:, 0]
     assert np.median(np.abs(found - truth)) < 0.04 and (np.abs(found - truth).max(1) < 0.1).mean() > 0.75
-    # Above the hole, straight down, one sees no less than beside it.
+    # Seen straight from above, the hole is as opaque as its surroundings.
     down = np.diag([1.0, -1, -1, 1])
     down[2, 3] = 2.0
     view = Camera(down, np.array([[100.0, 0, 12], [0, 100, 12], [0, 0, 1]]), 24, 24)
@@ -259,7 +260,7 @@ def test_the_ground_under_a_removed_object_is_closed_by_what_is_around(place):
         shown = transformed(shown, np.linalg.inv(place))
         alphas.append(picture(shown.select((np.abs(shown.means[:, :2]) < 0.3).all(1)), view)[..., 3])
     assert alphas[0][8:16, 8:16].max() < 0.1 and alphas[1].min() > 0.9
-    # What is not at the rim stays as it was, in its order.
+    # Splats away from the rim stay the same, in the same order.
     kept = edited.select(~edited.unobserved)
     others = splats.select(splats.object_ids != 1)
     there = np.isin(others.means, kept.means).all(1)
@@ -293,7 +294,7 @@ def test_sheets_that_meet_under_an_object_are_each_continued_to_their_edge():
 
 
 def test_rumpled_ground_is_closed_with_its_relief():
-    """A dome higher than what counts as flat; what is put lies on it, not in the plane."""
+    """On a dome that is too high to count as flat, the new splats lie on the dome, not in a plane."""
 
     def height(flat):
         return -0.06 * (flat[:, :2] ** 2).sum(1)

@@ -1,4 +1,4 @@
-"""What the benchmarks of error against time and of mask noise conclude, and what they change in the kernels."""
+"""Verdicts of the benchmarks, and their changes of the kernels."""
 
 from pathlib import Path
 
@@ -178,7 +178,7 @@ def test_the_parts_of_a_picture_cover_it_once():
 
 def test_holes_are_what_an_object_encloses_of_itself():
     true = np.ones((30, 40), int)
-    true[10:16, 10:16] = 2  # stands in front of 1, which has no hole there
+    true[10:16, 10:16] = 2  # in front of 1, so it is not a hole
     found = true.copy()
     found[2:4, 2:6] = 0
     found[20:22, 20:22] = 2

@@ -1,4 +1,4 @@
-"""What is expected of a training before it begins."""
+"""Expected duration and quality of a training."""
 
 import pytest
 
@@ -32,7 +32,7 @@ def test_steps_say_how_long_and_how_good():
 
 
 def test_minutes_say_how_many_steps():
-    # 0.05 to 0.2 s a step: the fewest steps decide on the most that is lost.
+    # 0.05 to 0.2 s per step: the lowest number of steps determines the largest loss of quality.
     assert expected(None, 80.0, 100_000) == (
         "Expected of 400 to 1,600 steps on a CPU: up to 2.0 dB below a training until it stops improving"
     )

@@ -1,4 +1,4 @@
-"""Gains of photos that set their own exposure, against known ones."""
+"""Estimated gains of photos with varying exposure, against known gains."""
 
 from types import SimpleNamespace
 
@@ -8,8 +8,8 @@ from backend.training.exposure import measure_gains, varies
 
 
 def photos(gains, cameras, held_out=(), points=200, noise=0.0, hidden=0.0):
-    """A stand-in for a capture: every view shows every point on a 3 x 3 patch of its color times the view's gain, but
-    for a share `hidden` of them, where something bright is in front."""
+    """Return a stand-in for a capture: each view shows each point as a 3 x 3 patch of its color times the view's gain,
+    except a fraction `hidden` of the points, which are covered by something bright."""
     rng = np.random.default_rng(0)
     colors = rng.uniform(0.1, 0.6, (points, 3))
     columns = int(np.ceil(np.sqrt(points)))

@@ -1,4 +1,4 @@
-"""Film frames: what is in the files, against the reference renderer; resuming, stopping and bad shots."""
+"""Film frames: content of the files against the reference renderer; resuming, stopping and bad shots."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def some_splats(count=90, seed=0) -> Splats:
 
 @pytest.fixture
 def folder(tmp_path) -> Reconstruction:
-    """A reconstruction folder of some splats, without a capture."""
+    """A reconstruction folder with splats but no capture."""
     place = Reconstruction(tmp_path / "made").create()
     write_splats(place.splats, some_splats())
     write_objects(
@@ -65,7 +65,7 @@ def folder(tmp_path) -> Reconstruction:
 
 
 def view(x=0.0) -> np.ndarray:
-    """A camera a little beside the origin, turned a little."""
+    """Return the viewmat of a slightly rotated camera near the origin."""
     turn = np.array([[np.cos(0.1), 0, np.sin(0.1)], [0, 1, 0], [-np.sin(0.1), 0, np.cos(0.1)]])
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = turn, -turn @ [x, 0.05, -0.2]
@@ -83,13 +83,13 @@ def sample(x=0.0, objects=None, clip=(0.05, 100.0), time=1.0) -> Sample:
 
 
 def shot_of(*frames, **settings) -> Shot:
-    """A shot of frames 1, 2, ..., each a list of samples."""
+    """Return a shot of frames 1, 2, ..., each given as a list of samples."""
     return Shot(WIDTH, HEIGHT, [Frame(i, (i - 0.25, i + 0.25), entry) for i, entry in enumerate(frames, 1)], **settings)
 
 
 @pytest.fixture
 def film(folder, tmp_path, ask):
-    """A function that draws a shot and returns the channels of each frame."""
+    """Function that renders a shot and returns the channels of each frame."""
 
     def draw(shot, *options):
         write_shot(tmp_path / "shot.json", shot)
@@ -107,7 +107,7 @@ def channels(path) -> dict[str, np.ndarray]:
 
 
 def reference(splats: Splats, at: Sample, primitive="3d") -> tuple[np.ndarray, ...]:
-    """RGBA in linear light, depth and coverages (H, W, IDS) by the float64 reference."""
+    """Render linear RGBA, depth and coverages (H, W, IDS) with the float64 reference."""
     slots = np.searchsorted(IDS, splats.object_ids)
     arrays = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
     tensors = [torch.tensor(np.asarray(values, np.float64)) for values in arrays]
@@ -125,7 +125,7 @@ def rgba_of(picture) -> np.ndarray:
 
 
 def coverage_of(picture) -> np.ndarray:
-    """(H, W, IDS), from the Cryptomatte channels."""
+    """Return coverages (H, W, IDS) from the Cryptomatte channels."""
     hashes = [np.uint32(cryptomatte.name_bits(name)).view(np.float32) for name in SHOWN_NAMES]
     found = np.zeros((*picture["A"].shape, len(IDS)))
     for layer in range(3):
@@ -137,12 +137,12 @@ def coverage_of(picture) -> np.ndarray:
 
 
 def assert_same(picture, splats, at, primitive="3d") -> None:
-    """A frame of one sample is what the reference draws."""
+    """Check that a frame of one sample equals the reference."""
     rgba, depth, coverage = reference(splats, at, primitive)
     np.testing.assert_allclose(rgba_of(picture), rgba, atol=2e-3, rtol=2e-3)
     np.testing.assert_allclose(coverage_of(picture), coverage, atol=1e-5)
     np.testing.assert_allclose(coverage_of(picture).sum(-1), picture["A"], atol=6e-4)
-    # Where the median is a matter of rounding the two may choose neighbors.
+    # Where rounding decides the median, the two may choose neighboring splats.
     assert (np.abs(picture["Z"] - depth) <= 1e-4 * depth).mean() > 0.995
     winner = np.array(IDS, np.uint32)[coverage.argmax(-1)]
     clear = np.sort(coverage, -1)[..., -1] - np.sort(coverage, -1)[..., -2] > 1e-4
@@ -165,7 +165,7 @@ def test_a_frame_is_what_the_reference_draws(folder, film, primitive):
 
 
 def test_edits_and_places(folder, film):
-    """Static edits of objects.json; maps of the shot, copies and visibility, which take the place of its transforms."""
+    """Edits in objects.json apply, except that the shot's maps, copies and visibility replace its transforms."""
     recolor = Recolor(hue=0.3, value=0.8)
     place = moved(0.3, -0.1, 0.2)
     edit_objects(folder.objects, {
@@ -249,13 +249,13 @@ def header(out, number=1) -> dict:
 
 
 def test_cryptomatte_is_as_published(folder, film):
-    """The hashes of the specification's own examples and of others' test vectors; names and keys in the header."""
+    """Hashes match the specification's examples and known test vectors; the header has the names and keys."""
     for name, expected in (
         ("bunny", 0x13851A76), ("default", 0x42C9679F), ("test", 0xBA6BD213), ("Hello, world!", 0xC0363E43),
         ("The quick brown fox jumps over the lazy dog", 0x2E4FF723), ("", 0),
     ):  # fmt: skip
         assert cryptomatte.murmur3(name.encode()) == expected, name
-    # Hashes whose bits would be those of a number that is not normal; found by trying.
+    # No hash may have the bits of a float32 that is not normal; for some of these names, the plain hash would.
     for bits in (cryptomatte.name_bits(f"object {i}") for i in range(3000)):
         assert 1 <= bits >> 23 & 255 <= 254
     film(shot_of([sample()], pixel_aspect=1.5))
@@ -279,7 +279,7 @@ def test_colors_go_there_and_back():
 
 @pytest.fixture
 def shoot(folder, tmp_path, ask):
-    """A function that runs the command on a shot of three frames, or another one."""
+    """Function that runs the command on a shot of three frames, or on another shot."""
 
     def run(*options, shot=None):
         write_shot(tmp_path / "shot.json", shot or shot_of([sample()], [sample(0.1)], [sample(0.2), sample(0.21)]))

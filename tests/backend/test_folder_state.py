@@ -1,4 +1,4 @@
-"""What Blender reads of a checkpoint is what the backend writes there."""
+"""Checkpoints that the backend writes, as Blender reads them."""
 
 import importlib
 

@@ -1,4 +1,4 @@
-"""Who may import whom, how large files and folders may be, and that each file of a reconstruction has one owner."""
+"""Import rules, size limits of files and folders, and the single owner of each file of a reconstruction."""
 
 import ast
 import re
@@ -22,7 +22,8 @@ def module_of(path: Path) -> tuple[str, ...]:
 
 
 def imports_of(path: Path) -> list[tuple[tuple[str, ...], int]]:
-    """Absolute names of the modules that a file imports, and the lines; from a package, those of its submodules."""
+    """Return the absolute names and lines of the modules that a file imports; `from package import module` counts as
+    the module."""
     package = path.relative_to(ROOT).parent.parts
     found = []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -39,13 +40,13 @@ def imports_of(path: Path) -> list[tuple[tuple[str, ...], int]]:
 
 
 def room_of(module: tuple[str, ...]) -> str:
-    """The folder that the rules speak of: the top two levels, or the root package alone."""
+    """Return the folder to which the rules apply: the top two levels, or the root package alone."""
     folder = ROOT.joinpath(*module[:2])
     return "/".join(module[:2]) if folder.is_dir() and len(module) > 1 else module[0]
 
 
 def documented_rules() -> dict[str, set[str]]:
-    """The table of docs/architecture.md: folder -> the folders that it may import from."""
+    """Return the table in docs/architecture.md: folder -> folders that it may import from."""
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     block = re.search(r"```imports\n(.*?)```", text, re.S)
     assert block, "docs/architecture.md has lost its table of imports"
@@ -91,9 +92,10 @@ def test_documented_rules_have_no_circle():
 
 
 def outside_imports(folder: str) -> dict[str, str]:
-    """Top-level names of other packages that a folder imports -> one place of each."""
+    """Return external top-level packages that a folder imports -> one place where each is imported."""
     found = {}
-    # Run by other Pythons as a program, which finds its modules beside it under this name.
+    # Other Pythons run this file as a script, so it imports its own package under a top-level name.
+
     program = ROOT / "objectgs_addon" / "environment" / "worker" / "__main__.py"
     for path in (path for path in SOURCES if path.is_relative_to(ROOT / folder) and path != program):
         for module, line in imports_of(path):
@@ -166,7 +168,7 @@ OWNERS = {
     "previous.safetensors": "checkpoint",
     ".lock": "lock",
 }
-"""File of a reconstruction folder -> the module of backend/shared/reconstruction that alone says its name."""
+"""File of a reconstruction folder -> the only module of backend/shared/reconstruction that contains its name."""
 
 
 def test_each_file_of_a_reconstruction_has_one_owner():
@@ -175,6 +177,6 @@ def test_each_file_of_a_reconstruction_has_one_owner():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Constant) and node.value in OWNERS:
                 places[node.value].add(str(path.relative_to(ROOT)))
-    # Captures have a truth/objects.json of their own.
+    # Captures have a separate truth/objects.json.
     places["objects.json"] -= {"objectgs_addon/demo/capture.py", "backend/evaluation/truth.py"}
     assert places == {name: {f"backend/shared/reconstruction/{owner}.py"} for name, owner in OWNERS.items()}

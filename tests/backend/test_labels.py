@@ -1,4 +1,4 @@
-"""Votes: known answers on synthetic scenes, what the strategies promise, and the labeled PLY."""
+"""Votes: known results on synthetic scenes, guarantees of the strategies, and the labeled PLY."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STRATEGIES = ["majority", "probability", "correspondence"]
 
 @dataclass
 class Given:
-    """A capture made of arrays: each view's mask is given, points lie where `place` puts them."""
+    """A capture made of arrays."""
 
     points: Points
     views: list[View]
@@ -51,7 +51,8 @@ class Given:
 
 
 def given(masks, xyz, seen=None, viewmats=None, names=None) -> Given:
-    """Views of 8 x 8 pixels, K = 8 and the principal point in the middle, all at the origin unless told."""
+    """Return a capture with one view per mask, a focal length of 8, a centered principal point, and cameras at the
+    origin unless `viewmats` is given."""
     xyz = np.asarray(xyz, float)
     height, width = masks[0].shape
     K = np.array([[8.0, 0, width / 2], [0, 8.0, height / 2], [0, 0, 1]])
@@ -121,7 +122,7 @@ def test_occlusion_drops_hidden_views_but_not_observed_ones():
     wall = np.stack([(x.ravel() - 20) / 8, (y.ravel() - 20) / 8, np.ones(1600)], 1)
     behind = np.array([[0.0, 0.0, 4.0]])
     away = np.eye(4)
-    away[2, 3] = -2.0  # this view stands between the wall and the point
+    away[2, 3] = -2.0  # this camera is between the wall and the point
     masks = [np.full((40, 40), 1), np.full((40, 40), 1), np.full((40, 40), 2)]
     xyz, viewmats = np.concatenate([wall, behind]), [np.eye(4), np.eye(4), away]
     assert vote(given(masks, xyz, viewmats=viewmats), occlusion=False).ids[-1] == 1
@@ -289,7 +290,7 @@ def test_damaged_point_clouds_are_refused(tmp_path):
 
 
 def test_the_file_opens_elsewhere(tmp_path):
-    """Read by the header alone, as any other PLY reader would."""
+    """The header alone is sufficient to read the file."""
     points = Points(np.array([[1.0, 2, 3]]), np.array([[4, 5, 6]], np.uint8), np.zeros(1, np.float32), np.zeros(1, int))
     write_points(tmp_path / "points.ply", points, vote(given(plain(7), [[0.0, 0.0, 1.0]])))
     data = (tmp_path / "points.ply").read_bytes()

@@ -1,4 +1,4 @@
-"""One process at a time has a reconstruction folder."""
+"""Lock of a reconstruction folder, which one process at a time can hold."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""The mesh command: what it leaves, what it refuses, how it stops and goes on."""
+"""The mesh command: output, errors, stopping and resuming."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ TRAINING = ("--offsets", 4, "--background", "black")
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory):
-    """A folder for what is trained once."""
+    """Folder for the training that the tests share."""
     return tmp_path_factory.mktemp("spheres")
 
 
 @pytest.fixture
 def trained(kept, tmp_path, write_capture, ask):
-    """Three spheres, trained long enough to have a shape; a copy."""
+    """A copy of a reconstruction of three spheres, trained until the spheres have a shape."""
     if not (kept / "out").exists():
         scene = write_capture(views=24, size=(96, 72))
         for name, ids in zip(scene.names, scene.ids):
-            # Nothing stands behind the spheres, so nothing else must have to explain what is seen there.
+            # The background is black, so that no splats are needed to explain it.
             pixels = np.asarray(Image.open(scene.folder / "images" / name))
             Image.fromarray(pixels * (ids != 0).astype(np.uint8)[..., None]).save(scene.folder / "images" / name)
         shutil.copytree(scene.folder, kept / "capture")
@@ -99,7 +99,7 @@ def test_what_cannot_be_asked_for(trained, ask, words, said):
 
 
 class Stub:
-    """Stands in for the slow part: counts what is made, and may stop the command or find no surface."""
+    """Replacement for meshing: records the targets, and can stop the command or find no surface."""
 
     def __init__(self, monkeypatch, stop_at: int | None = None, without=()) -> None:
         self.made: list[str] = []

@@ -1,4 +1,4 @@
-"""Figures of meshes against shapes whose answers are known, and pictures that show what the files hold."""
+"""Quality figures of meshes, on shapes with known results, and images of meshes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from backend.shared.reconstruction.meshes import MeshEntry
 
 
 def box(low=(0, 0, 0), high=(1, 1, 1)):
-    """Vertices (8, 3) and faces (12, 3) of a box, outward."""
+    """Return vertices (8, 3) and outward faces (12, 3) of a box."""
     vertices = np.array(list(itertools.product(*zip(low, high))), float)
     faces = [
         (0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
@@ -111,7 +111,7 @@ def test_a_sphere_of_many_faces_is_sound():
 
 def test_crossing_boxes_cut_each_other_and_near_ones_do_not():
     cut = self_intersecting(*joined(box(), box((0.3, 0.3, 0.5), (0.6, 0.6, 2))))
-    # The pillar's walls go through the lid, or through its other half only.
+    # All 8 wall faces of the pillar cross the lid, but perhaps only one of the lid's two faces.
     assert cut[12:].sum() == 8 and 1 <= cut[:12].sum() <= 2
     assert not self_intersecting(*joined(box(), box((0.3, 0.3, 1.001), (0.6, 0.6, 2)))).any()
     assert not self_intersecting(*joined(box(), box((0.3, 0.3, 0.2), (0.6, 0.6, 0.8)))).any(), "one inside the other"
@@ -132,7 +132,7 @@ def test_neighbors_cut_where_they_are_folded_flat(last, cuts):
 
 
 def exactly_meet(p, q):
-    """Whether two triangles of integer corners meet beyond the corners that they share, by exact arithmetic."""
+    """Return whether two triangles with integer corners intersect beyond shared corners, by exact arithmetic."""
 
     def minus(a, b):
         return [a[i] - b[i] for i in range(3)]
@@ -174,7 +174,7 @@ def test_cuts_agree_with_exact_arithmetic_where_everything_touches():
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     corners = corners[(across != 0).any(1)]
     pairs = [(i, j) for i, j in itertools.combinations(range(len(corners)), 2) if exactly_meet(corners[i], corners[j])]
-    # Two at a time, so that every pair is told from every other.
+    # Each pair is tested alone, so that the result belongs to that pair.
     for i, j in itertools.combinations(range(0, len(corners), 2), 2):
         found = self_intersecting(corners[[i, j]].reshape(-1, 3).astype(float), np.arange(6).reshape(2, 3))
         assert found.tolist() == [(i, j) in pairs] * 2, corners[[i, j]].tolist()
@@ -233,7 +233,7 @@ def test_nothing_to_compare_is_none():
 
 
 def write_truth(scene, write_capture, spheres):
-    """The spheres of a capture as its truth/ has them."""
+    """Write the spheres of a capture to its truth/."""
     truth = scene.folder / "truth"
     for name in ("meshes", "depth", "masks"):
         (truth / name).mkdir(parents=True)
@@ -264,7 +264,7 @@ SPHERES = [(1, (0.0, 0.0, 0.0), 0.5), (5, (0.0, 0.0, 1.2), 0.3)]
 
 @pytest.fixture
 def true_capture(write_capture, tmp_path):
-    """A capture of two spheres with its truth: (the capture, its `Scene` as written)."""
+    """A capture of two spheres with exact truth, and its `Scene`."""
     scene = write_capture(views=9, size=(96, 72), spheres=SPHERES)
     write_truth(scene, write_capture, SPHERES)
     return load_capture(scene.folder, tmp_path / "cache"), scene
@@ -277,7 +277,7 @@ def test_a_point_is_seen_where_two_views_show_it(true_capture):
     every = load_truth(capture, range(9)).seen(points, normals, [1])
     assert every[np.abs(points[:, 1] + 0.2) < 0.2].all(), "cameras stand at y = -0.8, all around"
     assert not every[points[:, 1] > 0.48].any(), "nobody looks from below"
-    # Two cameras: only what both look at, and not behind the other sphere.
+    # With two cameras, only points that both see count, and not those behind the other sphere.
     nine = load_truth(capture, [1, 2])
     two = nine.seen(points, normals, [1])
     centers = [-viewmat[:3, :3].T @ viewmat[:3, 3] for viewmat in (scene.viewmats[1], scene.viewmats[2])]
@@ -306,18 +306,18 @@ def test_hidden_parts_count_only_where_all_counts(true_capture, tmp_path):
     assert found["f1"] > 0.999 and found["f1_005"] > 0.99 and not found["watertight"]
     assert found["recall_all"] < 0.97 and found["precision_all"] > 0.999 and 0.6 < found["seen"] < 0.95
     assert found["texture_psnr"] is None and found["texture_coverage"] is None
-    # A bulge where nobody looks is forgiven over the seen part alone.
+    # A bulge that no camera sees counts only over the whole surface.
     bulged = vertices.copy()
     bulged[vertices[:, 1] > 0.47] *= 1.2
     write_mesh(tmp_path / "2.ply", textured(bulged, faces))
     found = measured("2.ply")
     assert found["precision"] > 0.995 and found["precision_all"] < 0.97
-    # Where everybody looks it is not.
+    # A bulge that cameras see counts.
     bulged = vertices.copy()
     bulged[vertices[:, 1] < -0.3] *= 1.2
     write_mesh(tmp_path / "3.ply", textured(bulged, faces))
     assert measured("3.ply")["precision"] < 0.9
-    # A wall inside that nobody can see is wrong over all of the surface alone; one outside is seen.
+    # An inner wall, which no camera sees, counts only over the whole surface; an outer wall is seen.
     inner = joined((vertices, faces), sphere(0.4))
     write_mesh(tmp_path / "4.ply", textured(*inner))
     found = measured("4.ply")
@@ -353,7 +353,7 @@ def test_a_capture_without_truth_has_none_and_a_broken_one_is_named(true_capture
 
 
 class FakeScene:
-    """Cameras along +z from the origin, a photo and labels each."""
+    """Cameras at the origin that look along +z, each with a photo and labels."""
 
     classes = ClassTable([0, 4, 9])
     normalization = Normalization((10.0, 0.0, 0.0), 0.5)
@@ -371,7 +371,7 @@ class FakeScene:
 
 
 def poster(share=1.0):
-    """A sheet at depth 2 of the scene that fills `share` of a 40 x 30 picture from the left, uvs along the picture."""
+    """Return a sheet at depth 2 that fills the left `share` of a 40 x 30 image, with UVs along the image."""
     right = -1 + 2 * share
     seen = np.array([(-1, -0.75, 2), (right, -0.75, 2), (right, 0.75, 2), (-1, 0.75, 2)])
     faces = np.array([(0, 1, 2), (0, 2, 3)], np.int32)
@@ -604,7 +604,7 @@ def test_evaluate_and_report_say_how_good_the_meshes_are(write_capture, tmp_path
     assert "(pictures/meshes.png)" in text and "| the whole scene |" in text
     assert (out / "pictures" / "meshes.png").stat().st_size < 300_000
 
-    # The record speaks of another state of the model: nothing of it is told.
+    # meshes.json belongs to another state of the model, so it is not used.
     for entry in record["meshes"].values():
         entry["trained_steps"] = 11
     (folder / "meshes.json").write_text(json.dumps(record))

@@ -1,4 +1,4 @@
-"""From splats to surfaces: what views see of an object, signed distance, and the closed mesh around it."""
+"""Surfaces from splats: views of an object, signed distance, and the closed mesh."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from backend.shared.events import Reporter
 
 
 def camera_at(eye, width=64, height=48, focal=60.0):
-    """A camera at `eye` that looks at the origin, z up."""
+    """Return a camera at `eye` that looks at the origin, with z up."""
     eye = np.asarray(eye, float)
     forward = -eye / np.linalg.norm(eye)
     right = np.cross(forward, [0.0, 0.0, 1.0] if abs(forward[2]) < 0.99 else [0.0, 1.0, 0.0])
@@ -40,7 +40,7 @@ def camera_at(eye, width=64, height=48, focal=60.0):
 
 
 def sheet(x, class_index, half=0.5, step=0.05, color=0.5):
-    """Opaque splats on the plane at `x`, facing along x."""
+    """Return opaque splats on the plane at `x`, facing along x."""
     grid = np.arange(-half, half + 1e-6, step)
     y, z = (a.ravel() for a in np.meshgrid(grid, grid))
     n = len(y)
@@ -56,12 +56,12 @@ def sheet(x, class_index, half=0.5, step=0.05, color=0.5):
 
 
 def together(*parts):
-    """The splats of all parts."""
+    """Concatenate the splats of all parts."""
     return Generated(*(torch.cat(tensors) for tensors in zip(*(part[:7] for part in parts))))
 
 
 def views_of(splats, cameras, explicit=True, mask=None, primitive="3d", **options):
-    """`Views` of plain splats; the objects' IDs are ten times their classes."""
+    """Return `Views` of plain splats; object IDs are ten times the class index."""
 
     def generate(seen=None, eye=None):
         assert explicit or eye is not None
@@ -117,7 +117,7 @@ def test_a_depth_is_sure_where_the_light_comes_from_one_place():
         assert found.depth_uncertainty[y, x] > 0.2, primitive
         assert found.depth_uncertainty[y, x - 6] < 0.02 and found.depth[y, x - 6] == pytest.approx(4.0, abs=0.01)
         assert found.depth_uncertainty[found.alpha < 0.5].max() == 0
-    # The median of discs is on one of two that share a surface, their mean is between them.
+    # Where two discs share a surface, the mean depth lies between them; the median would lie on one of them.
     first, second = sheet(0.03, 2), sheet(0.0, 2)
     pair = together(first, second)
     pair = pair._replace(
@@ -200,7 +200,7 @@ def ring(radius=0.4, thickness=0.15):
 
 
 def bowl(radius=0.5, thickness=0.06):
-    """The lower half of a hollow ball."""
+    """Return the signed distance of the lower half of a hollow ball."""
     return lambda p: np.maximum(np.abs(np.linalg.norm(p, axis=-1) - radius) - thickness, p[..., 2])
 
 
@@ -215,7 +215,7 @@ def rod(a, b, radius):
 
 
 class Exact:
-    """What `fuse` needs of Views, of shapes given by their signed distance: exact depths, sharp edges."""
+    """Replacement for `Views` with exact depths and sharp edges, for shapes given by signed distance."""
 
     def __init__(self, shapes, cameras):
         self.shapes, self.cameras = list(shapes), list(cameras)
@@ -223,7 +223,7 @@ class Exact:
         self._alone = {}
 
     def depths(self, index):
-        """The depth of each shape, (shapes, H, W), infinite where it is not."""
+        """Return the depth of each shape, (shapes, H, W), infinite where there is none."""
         if index not in self._alone:
             camera = self.cameras[index]
             u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
@@ -271,7 +271,7 @@ class Exact:
 
 
 def around(count=10, distance=2.5, heights=(-0.9, 0.2, 1.2), **options):
-    """Cameras around the origin at several heights."""
+    """Return cameras around the origin at several heights."""
     cameras = []
     for i in range(count):
         height = heights[i % len(heights)]
@@ -286,14 +286,14 @@ def volume(surface):
 
 
 def holes(surface):
-    """How many handles the surface has, counted over its parts together: genus."""
+    """Return the genus: the number of handles, summed over the surface's parts."""
     count, _ = parts(surface.faces, len(surface.vertices))
     euler = len(surface.vertices) - len(surface.faces) // 2
     return count - euler / 2
 
 
 def assert_sound(surface):
-    """Closed, two-manifold, turned outside, finite, without loose vertices."""
+    """Check that a surface is closed, two-manifold, oriented outward and finite, without loose vertices."""
     assert len(surface.faces) and np.isfinite(surface.vertices).all()
     assert len(surface.unobserved) == len(surface.faces)
     assert len(np.unique(surface.faces)) == len(surface.vertices)
@@ -304,7 +304,7 @@ def assert_sound(surface):
 
 
 def errors(surface, shape, seen_only=True):
-    """Distances of the vertices from the true surface."""
+    """Return the distances of the vertices from the true surface."""
     keep = np.unique(surface.faces[~surface.unobserved]) if seen_only else slice(None)
     return np.abs(shape(surface.vertices[keep]))
 
@@ -400,7 +400,7 @@ def test_behind_another_object_is_unknown_not_free():
     assert hidden >= 4
     surface = extract(fuse(views, [0]))
     assert_sound(surface)
-    # The half that the others see fixes the ball; what is hidden is closed smoothly and never eaten away.
+    # The other views fix the visible half of the ball; the hidden part is closed smoothly and not removed.
     assert volume(surface) == pytest.approx(4 / 3 * np.pi * 0.4**3, rel=0.12)
 
 
@@ -433,7 +433,7 @@ def test_a_poster_becomes_a_thin_flat_slab():
 
 def test_views_that_know_how_far_off_they_may_be_do_not_pierce_a_sheet():
     class Unsure(Exact):
-        """Off by up to `most`, each view elsewhere, and by how much is said or not."""
+        """Views with independent depth errors up to `most`, which are reported as uncertainty if `said`."""
 
         def __init__(self, *scene, most, said):
             super().__init__(*scene)
@@ -617,7 +617,7 @@ def test_torn_surfaces_are_found_out():
 
 
 def test_a_surface_in_the_border_of_two_cubes_is_there_once():
-    # So near below sample 64 that float32 puts it there: the cubes of the marching end at it.
+    # The surface is so close below sample 64, a border of the marching cubes, that float32 rounds it to the sample.
     grid = np.stack(np.meshgrid([0, 1], [0, 1], [7, 8], indexing="ij"), -1).reshape(-1, 3)
     blocks = Blocks(grid)
     places = 8 * grid[:, None] + np.stack(np.unravel_index(np.arange(SAMPLES), (8, 8, 8)), 1)

@@ -1,4 +1,4 @@
-"""Meshes drawn, unwrapped and dressed: against geometry worked out by hand and scenes of known colors."""
+"""Drawing, unwrapping and texturing of meshes, on geometry with known results and scenes of known colors."""
 
 from __future__ import annotations
 
@@ -102,11 +102,11 @@ def test_layout_is_free_of_overlaps_and_proportional_to_area(size):
     assert uvs.shape == (len(mesh.faces), 3, 2) and uvs.dtype == np.float32
     assert uvs.min() >= 0 and uvs.max() <= 1
     flat = areas(uvs.astype(np.float64))
-    assert (flat > 0).all()  # none mirrored
+    assert (flat > 0).all()  # no mirrored faces
     assert flat.sum() > 0.35
     ratio = flat / mesh.area_faces
     assert ratio.std() / ratio.mean() < 0.35
-    # A texel whose center lies in two faces would be an overlap: then the areas add up to more than what is covered.
+    # If faces overlapped, their areas would add up to more than the covered texels.
     texels = find_texels(uvs, 512, 0, 512)
     covered = (texels.weights >= 0).all(1).sum() / 512**2
     np.testing.assert_allclose(covered, flat.sum(), rtol=0.02)
@@ -157,7 +157,7 @@ def test_filling_continues_what_is_known():
 
 
 def colors_at(points: np.ndarray) -> np.ndarray:
-    """What the surface looks like: stripes on a gradient, (N, 3) in 0..1."""
+    """Return the colors of the surface, (N, 3) in 0..1: stripes on a gradient."""
     waves = 0.15 * np.sin(points @ np.array([[5, 1, 0], [0, 4, 2], [2, 0, 5]]).T)
     return np.clip(0.5 + 0.15 * points + waves, 0, 1).astype(np.float32)
 
@@ -166,7 +166,7 @@ LOUD = np.array([1.0, 0.0, 1.0], np.float32)
 
 
 class StubViews:
-    """Photos of a mesh of known colors, behind another of one loud color; class 1 is the first, class 2 the other."""
+    """Photos of a mesh of known colors (class 1), partly hidden by another mesh of one loud color (class 2)."""
 
     def __init__(self, mesh, other=None, eyes=24, size=160, masks=True, below=False):
         self.downscale = 1
@@ -193,7 +193,7 @@ class StubViews:
 
     @staticmethod
     def _photo(mesh, other, camera):
-        # Four samples a pixel, so that pixels at a border show both sides, as a photo's do.
+        # Four samples per pixel, so that border pixels mix both sides as in a photo.
         fine = Camera(camera.viewmat, camera.K * [[2], [2], [1]], camera.width * 2, camera.height * 2)
         depth, face, weights = draw_mesh(mesh.vertices, mesh.faces, fine)
         image = np.full((fine.height, fine.width, 3), [0.0, 1.0, 0.0], np.float32)
@@ -230,7 +230,7 @@ class StubViews:
 
 
 def looked_up(texture, uvs, mesh, camera):
-    """The dressed mesh through a camera: (H, W, 3) float32 and where it is, (H, W)."""
+    """Draw the textured mesh; return its colors (H, W, 3) float32 and its mask (H, W)."""
     _, face, weights = draw_mesh(mesh.vertices, mesh.faces, camera)
     image = np.zeros((*face.shape, 3), np.float32)
     uv = np.einsum("nij,ni->nj", uvs[face[face >= 0]], weights[face >= 0])
@@ -256,7 +256,7 @@ def test_photos_give_the_surface_its_colors_back():
         whole = shown & (views.labels[index] == 1)
         inner = whole & (views.pictures[index][..., 1] < 0.99)
         assert psnr(image[inner], views.pictures[index][inner]) > 30
-    # Looked up between texels at the charts' edges, nothing else comes in.
+    # No foreign color bleeds in at the charts' edges.
     texels = find_texels(uvs, 512, 0, 512)
     points = np.einsum("nij,ni->nj", mesh.vertices[mesh.faces[texels.face]], texels.weights)
     assert np.abs(texture.reshape(-1, 3)[texels.place] / 255 - colors_at(points)).max() < 0.2
@@ -278,7 +278,7 @@ def test_gloss_that_moves_with_the_camera_stays_off_the_texture():
     texels = find_texels(uvs, 512, 0, 512)
     points = np.einsum("nij,ni->nj", mesh.vertices[mesh.faces[texels.face]], texels.weights)
     wrong = np.abs(texture.reshape(-1, 3)[texels.place] / 255 - colors_at(points))
-    # Just blended, the photos give 0.046 and 0.29.
+    # Plain blending of the photos gives 0.046 and 0.29.
     assert wrong.mean() < 0.022 and np.quantile(wrong, 0.99) < 0.14
 
 
@@ -297,7 +297,7 @@ def test_nothing_of_an_object_in_front_comes_in(masks):
     seen = points[:, 2] > -0.7  # no camera looks from below
     truth = colors_at(points)
     assert np.abs(color - truth)[seen].mean() < 0.03
-    # Loud is bright in red and blue and dark in green; nothing tends towards it, nor towards the green behind.
+    # The loud color is bright in red and blue and dark in green; no color tends toward it or the green background.
     towards = ((color - truth) * (LOUD - 0.5) * 2).min(1)
     assert towards.max() < 0.1 and (-towards)[seen].max() < 0.35
     # The bottom continues the sides.

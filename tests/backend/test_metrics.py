@@ -1,4 +1,4 @@
-"""Metrics against their definitions, written out slowly, and against values worked out by hand."""
+"""Metrics against slow implementations of their definitions, and against values computed by hand."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from backend.shared.events import Reporter
 
 
 def slow_ssim(a, b):
-    """SSIM with the 11 x 11 window summed at each pixel, zeros beyond the border."""
+    """Compute SSIM with an explicit sum over the 11 x 11 window at each pixel and zero padding."""
     h, w, channels = a.shape
     window = np.array([[math.exp(-(i * i + j * j) / (2 * 1.5**2)) for j in range(-5, 6)] for i in range(-5, 6)])
     window /= window.sum()
@@ -32,7 +32,7 @@ def slow_ssim(a, b):
 
 
 def slow_band(mask, distance):
-    """A mask without what erosion by 3 x 3, repeated `distance` times, leaves of it; zeros beyond the border."""
+    """Return a mask minus its erosion by 3 x 3, repeated `distance` times, with zero padding."""
     eroded = np.pad(mask, 1)
     for _ in range(distance):
         before = np.pad(eroded, 1)
@@ -44,7 +44,7 @@ def slow_band(mask, distance):
 
 
 def slow_scores(views, zero_is_class=False):
-    """The scores by a loop over every ID and every view with full-size masks."""
+    """Compute the scores with a loop over all IDs and views on full-size masks."""
     ids = sorted({int(i) for _, truth in views for i in np.unique(truth)} - (set() if zero_is_class else {0}))
     iou, biou, dice = {}, {}, {}
     right = labeled = 0
@@ -82,7 +82,7 @@ def scores(*views, **options):
 
 
 def blobs(rng, height, width, ids):
-    """A label image of a few patches, so that masks have an inside."""
+    """Return a label image of a few patches, so that masks have an interior."""
     centers = rng.random((len(ids), 2)) * (height, width)
     y, x = np.mgrid[:height, :width]
     nearest = ((y[..., None] - centers[:, 0]) ** 2 + (x[..., None] - centers[:, 1]) ** 2).argmin(-1)
@@ -177,7 +177,7 @@ def test_boundary_iou_of_a_shifted_square_by_hand():
     result = IdScores(zero_is_class=True)
     result.add(predicted, truth)
     row = next(row for row in result.table() if row["id"] == 2)
-    # Two frames of 36 pixels: top and bottom rows share 2 x 8; columns 7 and 14 are inside of the other square.
+    # Two frames of 36 pixels: their top and bottom rows share 2 x 8; columns 7 and 14 are inside the other square.
     assert row["biou"] == pytest.approx(16 / (36 + 36 - 16))
 
 

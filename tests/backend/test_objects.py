@@ -1,4 +1,4 @@
-"""objects.json: what the votes found, the user's edits over it, and merges of merges."""
+"""objects.json: the objects from the votes, the user's edits, and nested merges."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BOX = {"id": 2**32 - 1, "name": "box", "color": [40, 50, 60], "points": 7}
 
 @pytest.fixture
 def path(tmp_path):
-    """objects.json with the box before the mug."""
+    """Path of an objects.json that lists the box before the mug."""
     write_objects(tmp_path / "objects.json", [BOX, MUG])
     return tmp_path / "objects.json"
 

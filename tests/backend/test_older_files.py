@@ -1,7 +1,7 @@
-"""A reconstruction as an earlier version left it (colour, centre, teach_unlabelled...) is read, measured and resumed.
+"""Reading, measuring and resuming a reconstruction of an earlier version (colour, centre, teach_unlabelled...).
 
-tests/data/earlier-reconstruction.zip: the capture (a small demo of three objects), and the folder that training,
-`mesh`, `edit` and the headless command `build` left.
+tests/data/earlier-reconstruction.zip contains the capture (a small demo of three objects), and the folder after
+training, `mesh`, `edit` and the headless command `build`.
 """
 
 import zipfile
@@ -21,7 +21,7 @@ ARCHIVE = Path(__file__).resolve().parents[1] / "data" / "earlier-reconstruction
 
 @pytest.fixture
 def earlier(tmp_path):
-    """The folder with `rec` and `capture`, unpacked."""
+    """The unpacked folder with `rec` and `capture`."""
     zipfile.ZipFile(ARCHIVE).extractall(tmp_path)
     return tmp_path
 

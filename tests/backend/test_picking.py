@@ -1,4 +1,4 @@
-"""What is seen at a pixel: against the renderer's own map of objects, and where no renderer can follow."""
+"""The object at a pixel: against the renderer's object map, and in cases that the renderer does not support."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SIZE = (64, 48)
 
 
 def splats(count: int, seed: int = 0) -> tuple[np.ndarray, ...]:
-    """means, quats, scales, opacities, ids of six objects in a ball of radius 1, of all sizes."""
+    """Return means, quats, scales, opacities and IDs of six objects around the origin, with splats of all sizes."""
     rng = np.random.default_rng(seed)
     means = rng.normal(size=(count, 3)) * 0.5
     scales = np.exp(rng.uniform(np.log(0.002), np.log(0.3), (count, 3)))
@@ -33,13 +33,13 @@ def objects_of(means, quats, scales, opacities, ids, matrix=None) -> list[PickOb
 
 
 def view(distance: float = 3.0, **options) -> View:
-    """From `distance` along z, looking at the middle, turned a little, with the principal point off the center."""
+    """Return a view from `distance` along z, slightly rolled, with an off-center principal point."""
     turned = np.array([[0.96, 0.28, 0, 0], [-0.28, 0.96, 0, 0], [0, 0, 1, distance], [0, 0, 0, 1]])
     return View(turned, 55.0, 60.0, 30.0, 26.0, *SIZE, **options)
 
 
 def drawn(view: View, means, quats, scales, opacities, ids) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What the renderer says: IDs (-1: nothing), their probability, depth."""
+    """Return the renderer's IDs (-1: nothing), their probability, and alpha."""
     K = np.array([[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1.0]])
     tensors = [torch.from_numpy(np.asarray(a, np.float32)) for a in (means, quats, scales, opacities)]
     sh = torch.zeros(len(means), 1, 3)
@@ -51,7 +51,7 @@ def drawn(view: View, means, quats, scales, opacities, ids) -> tuple[np.ndarray,
 
 
 def assert_agrees(objects: list[PickObject], view: View, ids: np.ndarray, probability: np.ndarray) -> None:
-    """Every third pixel's pick is what is drawn, and weighs as much."""
+    """Check on every third pixel that the pick has the rendered ID and its probability."""
     asked = 0
     for y in range(1, SIZE[1], 3):
         for x in range(1, SIZE[0], 3):
@@ -67,7 +67,7 @@ def assert_agrees(objects: list[PickObject], view: View, ids: np.ndarray, probab
 
 @pytest.mark.parametrize("distance", [3.0, 0.4])
 def test_it_is_what_the_renderer_draws(distance):
-    """From outside, and from among the splats, where many are behind and huge."""
+    """From outside, and from among the splats, where many are behind the camera or huge."""
     given = splats(600)
     seen = view(distance)
     ids, probability, _ = drawn(seen, *given)
@@ -76,7 +76,7 @@ def test_it_is_what_the_renderer_draws(distance):
 
 
 def test_an_object_moved_turned_and_stretched_is_picked_where_it_is():
-    """The same picture whether an affine map is the object's or the camera's."""
+    """An affine map has the same effect on the object as on the camera."""
     given = splats(200, seed=1)
     outer = np.array([[0.9, -0.3, 0, 0.4], [0.3, 0.9, 0.1, 0], [0, -0.1, 1.4, 0.2], [0, 0, 0, 1]])
     moved = view()
@@ -94,7 +94,7 @@ def test_a_splat_in_front_hides_what_it_covers_and_hidden_ones_are_not_there():
     seen = pick([behind, front], middle, 32, 24)
     assert seen.object_id == 7 and seen.depth == pytest.approx(2.0) and seen.probability == pytest.approx(0.99)
     assert pick([behind, PickObject(7, front.cloud, np.eye(4), hidden=True)], middle, 32, 24).object_id == 9
-    # Two see-through splats of one object together outweigh the one between them.
+    # Two transparent splats of one object together outweigh the splat between them.
     parts = [PickObject(1, one_splat((0, 0, z), 0.5, 0.4), np.eye(4)) for z in (0, 1)]
     between = PickObject(2, one_splat((0, 0, 0.5), 0.5, 0.5), np.eye(4))
     assert pick([*parts, between], middle, 32, 24).object_id == 1
@@ -110,7 +110,7 @@ def one_splat(place, size: float, opacity: float) -> Cloud:
 
 
 def test_parallel_projection():
-    """A splat's size is the same at every depth, and what is nearer hides what is behind."""
+    """A splat's size is the same at every depth, and nearer splats hide farther ones."""
     flat = View(np.eye(4), 20.0, 20.0, 32.0, 24.0, *SIZE, near=-50.0, orthographic=True)
     far = PickObject(1, one_splat((0.5, 0, 30.0), 0.25, 0.9), np.eye(4))
     reach = np.sqrt(2 * np.log(0.9 * 255) * ((0.25 * 20) ** 2 + 0.3))
@@ -121,7 +121,7 @@ def test_parallel_projection():
 
 
 def test_rectangles():
-    """Small objects in large rectangles are found, hidden ones are not."""
+    """Small objects in large rectangles are found; hidden objects are not."""
     camera = View(np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1.0]]), 600, 600, 320, 240, 640, 480)
     wall = PickObject(5, one_splat((0, 0, 1), 5.0, 0.999), np.eye(4))
     speck = PickObject(6, one_splat((0.41, 0.2, 0), 0.002, 0.999), np.eye(4))
@@ -134,7 +134,7 @@ def test_rectangles():
 
 
 def test_matrices_of_a_viewport():
-    """OpenGL's matrices give the pixels that they give."""
+    """A `View` from OpenGL matrices projects to the same pixels as the matrices."""
     near, far = 0.1, 50.0
     perspective = np.array(
         [

@@ -1,4 +1,4 @@
-"""The plan: what each decision rests on, how it is overridden, and that training, evaluation and report follow it."""
+"""The plan: basis and override of each decision, and its effect on training, evaluation and report."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_what_is_known_later_is_done_until_then_and_settled_by_what_was_known():
     assert Plan((later,)).settled_by(Plan())["labels"] == later
 
 
-# --- what decisions rest on ------------------------------------------------------------------------------------------
+# --- basis of decisions ----------------------------------------------------------------------------------------------
 
 
 def test_a_capture_with_objects_needs_nearly_everything(write_capture, tmp_path):
@@ -127,7 +127,7 @@ def test_views_that_repeat_others_are_found(write_capture, tmp_path):
 
     for at, of, shift in ((3, 1, 0.0), (4, 1, 1e-4), (6, 5, 0.5)):
         repeat(at, of, shift)
-    repeat(2, 0)  # A held-out view is there to be measured on, so what repeats it stays.
+    repeat(2, 0)  # View 0 is held out and not trained on, so view 2 is kept.
     write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
     assert duplicate_views(loaded(scene, tmp_path)) == [3, 4], "6 stands elsewhere"
     plan = planned(loaded(scene, tmp_path))

@@ -1,4 +1,4 @@
-"""Splat PLY files: the exact bytes, an independent reading of them, and files of other programs."""
+"""Splat PLY files: exact bytes, an independent reader, and files of other programs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def some_splats(n=5, degree=1, seed=0, dtype=np.float32):
 
 
 def parse(data):
-    """PLY bytes -> (property names, rows of values), by struct and nothing else."""
+    """Parse PLY bytes with struct alone; return (property names, rows of values)."""
     head, body = data.split(b"end_header\n", 1)
     lines = head.decode().splitlines()
     count = next(int(line.split()[2]) for line in lines if line.startswith("element vertex"))
@@ -40,7 +40,7 @@ def parse(data):
 
 
 def foreign(path, names, rows, kinds=None, order="<"):
-    """Write a PLY as another program might: any names in any order."""
+    """Write a PLY with any property names in any order, as another program might."""
     kinds = kinds or {}
     word = {"f": "float", "d": "double", "I": "uint", "B": "uchar"}
     row = struct.Struct(order + "".join(kinds.get(name, "f") for name in names))

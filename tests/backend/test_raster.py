@@ -1,5 +1,4 @@
-"""The kernels against the float64 reference: those of the CPU; in numba's simulator (test_cuda.py) and on a GPU
-(tests/gpu) those for CUDA."""
+"""The kernels against the float64 reference: CPU kernels here, CUDA kernels in test_cuda.py and tests/gpu."""
 
 import numpy as np
 import pytest
@@ -13,17 +12,17 @@ from backend.raster.reference import rasterize_reference
 NAMES = ("means", "quats", "scales", "opacities", "sh")
 DEVICE = torch.device("cpu")
 SIMULATED = bool(config.ENABLE_CUDASIM)
-"""A simulated GPU draws some hundred pixels a second: its pictures are smaller, seen with a shorter focal length."""
+"""A simulated GPU draws a few hundred pixels per second, so its images are smaller, with a shorter focal length."""
 WIDTH, HEIGHT, FOCAL = (19, 13, 18.0) if SIMULATED else (45, 33, 40.0)
 
 
 def fewer(values, simulated):
-    """All of a test's parameters, or the places in `simulated` of them."""
+    """Return all parameters of a test; in the simulator, only those at the indices `simulated`."""
     return [values[i] for i in simulated] if SIMULATED else values
 
 
 def rasterize(**asked):
-    """`backend.raster.rasterize` on DEVICE, for tensors of the CPU."""
+    """Run `backend.raster.rasterize` on DEVICE with CPU tensors as input and output."""
     moved = {k: v.to(DEVICE) if isinstance(v, torch.Tensor) else v for k, v in asked.items()}
     *planes, frame = raster.rasterize(**moved)
     return raster.Rendered(*(p if p is None else p.cpu() for p in planes), frame)
@@ -51,22 +50,22 @@ def random_scene(seed, count=60, coefficients=4, objects=5, size=0.12):
 
 
 def as_float32(scene):
-    """What both renderers get: the float32 numbers, so that no difference comes from rounding the input."""
+    """Convert to float32, so that both renderers get the same rounded input."""
     return {k: v if k == "ids" else v.float() for k, v in scene.items()}
 
 
 def mapped(picture):
-    """The object map as NumPy arrays, whichever renderer drew."""
+    """Return the object map as NumPy arrays, for any renderer."""
     return tuple(torch.as_tensor(a).cpu().numpy() for a in object_map(picture))
 
 
 def ranked(picture, ranks):
-    """The object ranks as NumPy arrays, whichever renderer drew."""
+    """Return the object ranks as NumPy arrays, for any renderer."""
     return tuple(torch.as_tensor(a).cpu().numpy() for a in object_ranks(picture, ranks))
 
 
 def compare_ranks(ids, probabilities, dense, **tolerance):
-    """What `object_ranks` says against all probabilities, `dense` (H, W, n), of IDs 0 .. n - 1."""
+    """Compare the result of `object_ranks` with all probabilities `dense` (H, W, n) of the IDs 0 .. n - 1."""
     ranks, objects = len(ids), dense.shape[-1]
     largest = np.zeros((ranks, *dense.shape[:2]))
     largest[:objects] = -np.sort(-np.moveaxis(dense, -1, 0), axis=0)[:ranks]
@@ -80,7 +79,7 @@ def compare_ranks(ids, probabilities, dense, **tolerance):
 
 
 def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolerance=1e-5, primitive="3d"):
-    """Picture and gradients of a random loss by both renderers; `primitive` "2d": with everything that discs have."""
+    """Compare image and gradients of a random loss between both renderers; "2d" includes normals and distortion."""
     scene = as_float32(scene)
     flat = primitive == "2d"
     rng = np.random.default_rng(seed)
@@ -109,7 +108,7 @@ def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolera
     for a, b in pairs:
         assert torch.isfinite(a).all()
         np.testing.assert_allclose(a.detach().numpy(), b.detach().numpy(), rtol=1e-4, atol=value_tolerance)
-    # Where half of the light is taken almost exactly, rounding decides which of two splats is the one.
+    # Where the transmittance is almost exactly one half, rounding decides which of two splats is the median.
     differs = np.abs(got.median.numpy() - want.median.numpy()) > 1e-4 * want.median.numpy() + value_tolerance
     assert differs.mean() < 2e-3 and not got.median.requires_grad
     loss = sum((a * v.float()).sum() for (a, _), v in zip(pairs, g, strict=True))
@@ -126,7 +125,7 @@ def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolera
             np.testing.assert_allclose(
                 a.numpy(), b.numpy(), rtol=relative, atol=gradient_tolerance * largest, err_msg=name
             )
-            # Splat by splat, so that a gradient that was lost cannot hide below the largest one.
+            # Per splat, so that a lost gradient is not hidden by the tolerance of the largest one.
             norms = [v.reshape(len(v), -1).norm(dim=1) for v in (a, b)]
             counted = norms[1] > 1e-3 * largest
             ratio = (norms[0] / norms[1])[counted].numpy()
@@ -168,7 +167,7 @@ def test_median_depth_is_that_of_the_splat_at_half_of_the_light():
 
 @PRIMITIVES
 def test_a_part_of_a_picture_is_drawn_as_in_the_whole(primitive):
-    """Splats far beside a narrow part are seen under the same perspective."""
+    """Splats far outside a narrow crop are projected as in the whole image."""
     scene, whole = as_float32(random_scene(3, size=0.4)), camera()
     want = rasterize(**scene, camera=whole, primitive=primitive).color
     x, y, width, height = whole.width // 2, 3, 4, whole.height - 5

@@ -1,5 +1,5 @@
-"""What holds for any scene, on scenes that hypothesis looks for among extreme ones: kernels against the float64
-reference, and against themselves where the scene is told in another way."""
+"""Invariants of the kernels on extreme scenes from hypothesis: equality with the float64 reference, and with themselves
+for equivalent scenes."""
 
 import dataclasses
 import itertools
@@ -27,7 +27,7 @@ cpu_only = pytest.mark.skipif(SIMULATED, reason="the two renderers share what th
 
 
 def powers(low, high):
-    """Log-uniform numbers between 10^low and 10^high."""
+    """Return a strategy of log-uniform numbers between 10^low and 10^high."""
     return st.floats(low, high).map(lambda exponent: 10.0**exponent)
 
 
@@ -45,7 +45,7 @@ colors = st.tuples(*3 * [st.floats(0, 2)])
 
 @st.composite
 def splats(draw):
-    """One, as a dictionary of lists; some lie where another one would be looked for too."""
+    """Draw one splat as a dictionary of lists."""
     z = draw(depths)
     turn, length = np.array(draw(directions)), draw(lengths)
     return {
@@ -60,7 +60,7 @@ def splats(draw):
 
 @st.composite
 def scenes(draw):
-    """Up to eight splats, some of them where the one before is."""
+    """Draw up to eight splats, some of them at the position of the previous one."""
     found = draw(st.lists(splats(), min_size=1, max_size=8))
     for before, here in itertools.pairwise(found):
         if draw(st.booleans()):
@@ -72,7 +72,7 @@ def scenes(draw):
 
 
 def drawn(scene, cam=CAMERA, primitive="3d", gradient=True, labels=LABELS):
-    """The planes by name, and the gradients of a fixed loss of theirs, as float64 NumPy arrays."""
+    """Return the planes by name, and the gradients of a fixed loss on them, as NumPy arrays."""
     flat = primitive == "2d"
     leaves = {k: v.clone().requires_grad_(gradient and k != "ids") for k, v in scene.items()}
     picture = rasterize(
@@ -112,13 +112,13 @@ def by_reference(scene, cam, primitive):
 
 
 def with_distinct_depths(scene):
-    """Without those as deep as one before: which of them is in front is the kernels' own choice."""
+    """Remove splats of the same depth as an earlier one, since their order is not defined."""
     first = np.sort(np.unique(scene["means"][:, 2].numpy(), return_index=True)[1])
     return {name: values[first] for name, values in scene.items()}
 
 
 def assert_close(a, b, tolerance, names=None):
-    """Every array of `b` within so much of its largest number, or 1."""
+    """Check that arrays agree within `tolerance` times the larger of 1 and the largest value in `b`."""
     for name in names or b:
         assert np.isfinite(a[name]).all(), name
         room = tolerance * max(1.0, float(np.abs(b[name]).max(initial=0)))
@@ -129,7 +129,7 @@ def assert_close(a, b, tolerance, names=None):
 @anything
 @given(scene=scenes())
 def test_kernels_are_finite_and_equal_the_reference(primitive, scene):
-    """A pixel at the very cut-off of 1/255 may be drawn by one and not by the other; then gradients are only finite."""
+    """If only one of them draws a pixel at the cut-off of 1/255, gradients need only be finite."""
     scene = with_distinct_depths(scene)
     got, want = drawn(scene, primitive=primitive), by_reference(scene, CAMERA, primitive)
     assert all(np.isfinite(array).all() for found in (got, want) for array in found.values())
@@ -138,7 +138,7 @@ def test_kernels_are_finite_and_equal_the_reference(primitive, scene):
     assert cut.mean() < 0.02
     if not cut.any():
         assert_close(got, want, 1e-4, [name for name in want if name in PLANES])
-        # How needles turn is known less well: off by 0.204 % where this was met.
+        # Rotation gradients of needles are less accurate; an error of 0.204 % has occurred.
         turn = "gradient of quats"
         longest, width = (getattr(scene["scales"], of)(1).values for of in ("max", "median"))
         assert_close(got, want, 2e-3, [name for name in want if name != turn])
@@ -163,7 +163,7 @@ def test_the_order_of_the_input_does_not_matter(primitive, scene, seed):
 @anything
 @given(scene=scenes(), power=st.integers(-20, 20))
 def test_the_unit_of_length_does_not_matter(primitive, scene, power):
-    """By powers of two, so that nothing is rounded: bit for bit the same."""
+    """Scaling by powers of two involves no rounding, so results are identical bit for bit."""
     unit = 2.0**power
     here = drawn(scene, primitive=primitive)
     larger = {**scene, "means": scene["means"] * unit, "scales": scene["scales"] * unit}
@@ -179,7 +179,7 @@ def test_the_unit_of_length_does_not_matter(primitive, scene, power):
 @given(scene=scenes(), place=st.tuples(*3 * [st.floats(-1e6, 1e6)]))
 def test_the_place_in_the_world_does_not_matter(primitive, scene, place):
     offset = torch.tensor(place, dtype=torch.float64)
-    # Quarters of a thousandth, so that float64 holds the sum to the last bit.
+    # Multiples of 1/4096 and 1/64, so that the float64 sum is exact.
     means = torch.round(scene["means"].double() * 4096) / 4096
     offset = torch.round(offset * 64) / 64
     viewmat = CAMERA.viewmat.copy()
@@ -195,7 +195,7 @@ def test_the_place_in_the_world_does_not_matter(primitive, scene, place):
 @anything
 @given(scene=scenes(), data=st.data())
 def test_pictures_are_linear_in_the_colors(primitive, scene, data):
-    """Splats at one depth are ordered by their look, so each has a depth of its own."""
+    """Splats of equal depth are ordered by their other values, so each gets a distinct depth."""
     scene = with_distinct_depths(scene)
     count = len(scene["ids"])
     one, other = (torch.tensor([data.draw(colors) for _ in range(count)]) for _ in range(2))
@@ -224,7 +224,7 @@ def test_the_weights_and_what_passes_are_all_of_the_light(primitive, scene):
 @anything
 @given(scene=scenes(), left=st.integers(0, 20), top=st.integers(0, 14), data=st.data())
 def test_a_part_is_that_part_of_the_whole(primitive, scene, left, top, data):
-    """Splats at one depth are ordered by their look, so each has a depth of its own."""
+    """Splats of equal depth are ordered by their other values, so each gets a distinct depth."""
     scene = with_distinct_depths(scene)
     width = data.draw(st.integers(1, CAMERA.width - left))
     height = data.draw(st.integers(1, CAMERA.height - top))

@@ -1,4 +1,4 @@
-"""Stiff and extreme scenes: pictures finite and equal to the float64 reference, gradients finite and equal too."""
+"""Stiff and extreme scenes: images and gradients are finite and equal to the float64 reference."""
 
 import dataclasses
 
@@ -29,7 +29,7 @@ from tests.backend.test_raster import (
 
 
 def straight(width=WIDTH, height=HEIGHT, focal=FOCAL, **kwargs):
-    """Looks along +z; the point (0, 0, z) falls on the center of the picture's middle pixel."""
+    """Return a camera along +z that projects (0, 0, z) to the center of the middle pixel."""
     K = np.array([[focal, 0, width // 2 + 0.5], [0, focal, height // 2 + 0.5], [0, 0, 1]])
     return Camera(np.eye(4), K, width, height, **kwargs)
 
@@ -59,7 +59,7 @@ OTHERS = 10 if SIMULATED else 25
 
 
 def among_others(scene, seed=0):
-    """The stiff splats with ordinary ones around them, whose gradients must not suffer."""
+    """Add ordinary splats, whose gradients must not suffer from the stiff ones."""
     return join(scene, random_scene(seed, count=OTHERS))
 
 
@@ -69,7 +69,7 @@ def primitive(request):
 
 
 def draw(scene, cam, labels=None, seed=0, primitive="3d"):
-    """Picture and gradients of a random loss, all as NumPy arrays."""
+    """Return the image and the gradients of a random loss as NumPy arrays."""
     leaves = {k: v.clone() if k == "ids" else v.clone().requires_grad_() for k, v in scene.items()}
     flat = primitive == "2d"
     picture = rasterize(
@@ -91,7 +91,7 @@ def assert_same_bits(a, b):
 
 
 def assert_unharmed(bad, seed=1, primitive="3d"):
-    """A dropped splat leaves the others' picture and gradients bit for bit as they are without it."""
+    """Check that a dropped splat has no gradient and changes no bit of the others' image and gradients."""
     others = as_float32(random_scene(seed, count=OTHERS))
     bad = as_float32(bad)
     alone, together = (
@@ -115,7 +115,7 @@ def test_zero_quaternion_is_dropped(primitive):
 
 
 BEHIND_OPAQUE = 2e-4
-"""What lies behind nearly opaque splats gets the small difference of two float32 sums, divided by 1 - alpha."""
+"""Tolerance of gradients behind nearly opaque splats: small differences of two float32 sums, divided by 1 - alpha."""
 
 
 @pytest.mark.parametrize("length", [1e-3, 1e3, 1e9])
@@ -150,7 +150,7 @@ def test_scales_whose_determinant_underflows_float32(primitive):
 @pytest.mark.parametrize("thin", [1e-6, 1e-3])
 def test_needle(ratio, angle, thin, primitive):
     if primitive == "2d" and thin > 1e-6:
-        thin *= 10  # broad enough for its plane to be drawn
+        thin *= 10  # wide enough for its plane to be drawn
     half = np.deg2rad(angle) / 2
     needle = one(quat=(np.cos(half), 0, 0, np.sin(half)), scale=(thin * ratio, thin, thin), mean=(0.013, -0.021, 2.0))
     if not SIMULATED:
@@ -189,7 +189,7 @@ def test_splat_that_misses_the_picture_has_no_gradient(primitive):
 
 @pytest.mark.parametrize("scale", fewer([np.inf, 3e38, 1e20, 1e9], [0, 2]))
 def test_overflowing_scale(scale, primitive):
-    """exp() of a log-scale that ran away."""
+    """The exponential of a diverged log scale."""
     for scales in ((scale, 0.1, 0.1), (0.1, scale, 0.1), (scale, scale, scale)):
         compare(among_others(one(scale=scales, quat=(0.9, 0.3, -0.2, 0.1))), camera(), primitive=primitive)
 
@@ -320,7 +320,7 @@ def test_no_labeled_pixel(primitive):
 
 
 def test_one_class(primitive):
-    """With one object the label's probability is the picture's alpha."""
+    """With one object, the label probability equals alpha."""
     cam = camera()
     scene = as_float32(random_scene(0, objects=1))
     labels = torch.zeros(cam.height, cam.width, dtype=torch.int32)
@@ -353,7 +353,7 @@ def test_probability_zero_under_the_logarithm(primitive):
 
 
 def dense_probabilities(scene, cam, values, primitive="3d"):
-    """P (H, W, n) for the n IDs in `values`, from the label probabilities of the same kernels, one ID at a time."""
+    """Return the probabilities (H, W, n) of the n IDs in `values`, from the kernels' label probability of each ID."""
     planes = []
     for value in values:
         labels = torch.full((cam.height, cam.width), int(value), dtype=torch.int32)
@@ -378,13 +378,13 @@ def test_object_map_equals_the_dense_computation(seed, primitive):
 
 
 def test_object_map_gives_ties_to_the_smallest_id():
-    """Two objects of equal probability, one at either side of the same row of pixels, in both orders of input."""
+    """Two objects with equal probability, in both orders of input."""
     cam = straight() if SIMULATED else straight(65, 33)
     left, right = (one(mean=(x, 0, 2.0), scale=(0.5, 0.5, 0.1), opacity=0.2) for x in (-0.1, 0.1))
     for a, b in ((70_000, 9), (9, 70_000)):
         left["ids"][0], right["ids"][0] = a, b
         right["means"] = left["means"].clone()
-        # Behind, so that the one in front does not win: (1 - 0.2) * 0.25 = 0.2.
+        # The splat behind gets the same weight as the one in front: (1 - 0.2) * 0.25 = 0.2.
         right["opacities"][0] = 0.25
         ids, probability = mapped(rasterize(**as_float32(join(left, right)), camera=cam))
         dense = dense_probabilities(as_float32(join(left, right)), cam, [9, 70_000])
@@ -400,7 +400,7 @@ def test_object_map_gives_ties_to_the_smallest_id():
 
 
 def test_ten_thousand_objects_and_large_ids(primitive):
-    """Simulated, 200: more at any pixel than a GPU adds up at once."""
+    """In the simulator, 200 objects: more per pixel than the GPU sums up at once."""
     rng = np.random.default_rng(0)
     objects, count, size, cam = (200, 240, 0.2, camera()) if SIMULATED else (10_000, 12_000, 0.02, camera(97, 71))
     scene = as_float32(random_scene(0, count=count, size=size))
@@ -416,7 +416,7 @@ def test_ten_thousand_objects_and_large_ids(primitive):
     again = rasterize(**scene, camera=cam, labels=labels, primitive=primitive)
     np.testing.assert_allclose(again.label_probability, probability, rtol=1e-5, atol=1e-6)
     assert np.isin(ids[ids >= 0], names).all()
-    # Renaming the objects, in the same order, renames the map and changes nothing else.
+    # Renumbering the objects in the same order renumbers the map and changes nothing else.
     small = {**scene, "ids": torch.tensor(np.argsort(np.argsort(names)).astype(np.int32)[which])}
     ids_small, probability_small = mapped(rasterize(**small, camera=cam, primitive=primitive))
     assert np.array_equal(ids, np.where(ids_small >= 0, np.sort(names)[ids_small], -1))
@@ -435,7 +435,7 @@ def test_odd_sizes(size, primitive):
 
 
 def test_scene_far_from_the_origin(primitive):
-    """Georeferenced: float64 means are taken relative to the camera before they become float32."""
+    """Georeferenced float64 means are made relative to the camera before conversion to float32."""
     offset = torch.tensor([4.6e6, -1.2e6, 3.1e6], dtype=torch.float64)
     scene = {k: v if k in ("ids", "means") else v.float() for k, v in random_scene(0).items()}
     cam = camera()
@@ -447,7 +447,7 @@ def test_scene_far_from_the_origin(primitive):
     there = draw({**scene, "means": scene["means"] + offset}, far, labels, primitive=primitive)
     assert there["means"].dtype == np.float64
     for name in here:
-        # 1e-9 is what float64 itself loses at this offset.
+        # At this offset, float64 itself is accurate to 1e-9.
         np.testing.assert_allclose(
             there[name], here[name], rtol=1e-4, atol=1e-4 * np.abs(here[name]).max(), err_msg=name
         )
@@ -495,12 +495,12 @@ def test_one_and_two_threads_give_the_same_bits(primitive):
 
 
 def tilted(angle, scale=(0.5, 0.3, 1.0), **kwargs):
-    """A disc turned about the x axis: 0 faces the camera of `straight`, pi / 2 is seen from its edge."""
+    """Return a disc rotated about the x axis: 0 faces the camera of `straight`, pi / 2 is edge-on."""
     return one(quat=(np.cos(angle / 2), np.sin(angle / 2), 0, 0), scale=scale, **kwargs)
 
 
 def facts(scene, cam):
-    """Kernels' picture of discs with all that it can hold."""
+    """Render discs with all planes."""
     return rasterize(
         **as_float32(scene), camera=cam, want_depth=True, want_median=True, want_normals=True, want_distortion=True,
         primitive="2d",
@@ -509,18 +509,18 @@ def facts(scene, cam):
 
 @pytest.mark.parametrize("turn", fewer([1e-6, 1e-4, 1e-3, 1e-2, 0.1], [0, 2, 4]))
 def test_disc_seen_almost_from_its_edge(turn):
-    # Not in the middle of a pixel, where plane and spot are equal and only one of them is seen by the gradients.
+    # Not at a pixel center, where plane and spot are equal and gradients depend on only one of them.
     for mean in ((0.003, 0.002, 2.0), (0.011, -0.023, 2.0), (0.403, 0.001, 2.0)):
         scene = tilted(np.pi / 2 - turn, mean=mean)
         got, _ = compare(scene, straight(), primitive="2d")
-        # However thin, it is not smaller than its spot.
+        # Its footprint is never smaller than its spot.
         u, v = int(FOCAL / 2 * mean[0] + WIDTH / 2), int(FOCAL / 2 * mean[1] + HEIGHT / 2)
         assert got.alpha[v, u] > 0.2
         compare(among_others(scene), straight(), primitive="2d")
 
 
 def test_disc_seen_from_its_very_edge():
-    """Which side of it is seen is not defined, but it is there and harmless."""
+    """Its visible side is undefined, but it is drawn and everything is finite."""
     arrays = draw(as_float32(among_others(tilted(np.pi / 2))), straight(), primitive="2d")
     assert all(np.isfinite(array).all() for array in arrays.values())
     assert draw(as_float32(tilted(np.pi / 2)), straight(), primitive="2d")["plane 1"].max() > 0.5
@@ -528,7 +528,7 @@ def test_disc_seen_from_its_very_edge():
 
 @pytest.mark.parametrize("turn", fewer([0.0, 1e-6, 1e-3, 0.1], [0, 2]))
 def test_plane_through_the_camera(turn):
-    """The distance along the ray to the plane is 0, or nearly, in every pixel or in some."""
+    """The distance along the ray to the plane is zero or nearly zero in some or all pixels."""
     lying = (np.cos(np.pi / 4 + turn), np.sin(np.pi / 4 + turn), 0, 0)
     for mean in ((0.001, 0.003, 0.5), (0.001, 1e-4, 0.5), (0.1, 0.01, 0.02), (0.001, 0.02, 2.0)):
         for scale in ((0.2, 0.3, 1), (5.0, 8.0, 1)):
@@ -537,7 +537,7 @@ def test_plane_through_the_camera(turn):
 
 
 def test_disc_that_reaches_behind_the_camera():
-    """A floor under the camera: drawn up to its end, not drawn above the horizon where its plane lies behind."""
+    """A floor below the camera is drawn up to its end, but not above the horizon, where its plane is behind."""
     floor = one(mean=(0.003, 0.302, 1.0), quat=(np.sqrt(0.5), np.sqrt(0.5), 0, 0), scale=(4, 4, 1), opacity=0.9)
     got, _ = compare(floor, straight(), primitive="2d")
     assert (got.alpha[-1] > 0.5).all() and not got.alpha[: HEIGHT // 2].any()
@@ -591,7 +591,7 @@ def test_what_3d_gaussians_do_not_have():
 
 
 def test_screen_gradient_is_that_of_a_moving_footprint():
-    """Growth follows it: the plane's part must be in it, not the spot's alone."""
+    """Growth uses this gradient, so it must include the plane's part, not only the spot's."""
     scene = as_float32(tilted(0.7, scale=(6 / FOCAL, 8 / FOCAL, 1)))
     leaves = {k: v.requires_grad_(k != "ids") for k, v in scene.items()}
     picture = rasterize(**leaves, camera=straight(), primitive="2d")

@@ -1,4 +1,4 @@
-"""Recoloring as one affine map of colors: each control does what it says and nothing else."""
+"""Recoloring as one affine map of colors, and the effect of each control."""
 
 from __future__ import annotations
 

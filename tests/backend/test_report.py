@@ -1,4 +1,4 @@
-"""The report: names that other programs read, null for what was not measured, and pictures that show what they say."""
+"""The report: names that other programs read, null for missing measurements, and images."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def reconstruction(tmp_path):
 
 
 def strictly(text):
-    """JSON as the standard has it, without NaN or Infinity."""
+    """Parse standard JSON, without NaN or Infinity."""
 
     def refuse(word):
         raise AssertionError(f"{word} in JSON")
@@ -273,7 +273,7 @@ def test_id_pictures_use_given_colors_and_the_palette_elsewhere():
 
 
 def panels(sheet):
-    """Which pure colors the sheet holds, and how many pixels of each."""
+    """Return the colors of a sheet and their numbers of pixels."""
     colors, counts = np.unique(np.asarray(sheet).reshape(-1, 3), axis=0, return_counts=True)
     return {tuple(color): int(count) for color, count in zip(colors.tolist(), counts)}
 

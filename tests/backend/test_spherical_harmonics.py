@@ -1,4 +1,4 @@
-"""Spherical harmonics in NumPy: the rasterizer's, and turned exactly."""
+"""Spherical harmonics in NumPy: agreement with the rasterizer, and exact rotation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Short trainings on captures that go wrong; benchmarks/stability.py has them at length."""
+"""Short trainings on difficult captures; benchmarks/stability.py runs longer ones."""
 
 import numpy as np
 import pytest
@@ -66,7 +66,7 @@ def test_wrong_masks_are_outvoted():
                 out[ids == i] = rng.choice([j for j in (1, 2, 5) if j != i])
         return out
 
-    # Of 9 views, a few that are wrong in the same way decide.
+    # With only 9 views, a few that are wrong in the same way would win the vote.
     found = train(each_mask(wrong), **{**SHORT, "views": 18, "steps": 120, "scored": True})
     assert not found.lost and found.given_miou < 0.7 and found.miou > found.given_miou + 0.2
 

@@ -1,4 +1,4 @@
-"""Stopping and pausing a command from the program that drives it, with real processes where that matters."""
+"""Stopping and pausing a command from the program that drives it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 class Driven:
-    """A command in a process of its own, driven over its standard input and output."""
+    """A command in a child process, driven through its standard input and output."""
 
     def __init__(self, *words: object) -> None:
         self.process = subprocess.Popen(
@@ -39,7 +39,7 @@ class Driven:
         self.process.stdin.flush()
 
     def until(self, kind: str, message: str = "") -> dict:
-        """Read events up to one of this kind, whose message holds `message`."""
+        """Read events up to one of this kind whose message contains `message`."""
         for line in self.process.stdout:
             self.events.append(json.loads(line))
             if self.events[-1]["type"] == kind and message in self.events[-1].get("message", ""):
@@ -47,13 +47,13 @@ class Driven:
         raise AssertionError(f"it ended without {kind} {message}: {self.events[-3:]} {self.process.stderr.read()}")
 
     def until_it_trains(self) -> dict:
-        """Read events up to the first of the training's own progress."""
+        """Read events up to the first progress of the training."""
         while "step" not in (event := self.until("progress")):
             pass
         return event
 
     def end(self) -> int:
-        """Wait for its end; nothing may have gone wrong. Returns the exit code."""
+        """Wait for the end, check that there is no error output, and return the exit code."""
         out, err = self.process.communicate(timeout=60)
         self.events += [json.loads(line) for line in out.splitlines()]
         assert err == ""
@@ -62,11 +62,11 @@ class Driven:
 
 @pytest.fixture
 def drive(request):
-    """Starts a `Driven`, which is killed should the test fail."""
+    """Function that starts a `Driven`; it is killed at the end of the test."""
 
     def start(*words):
         driven = Driven(*words)
-        # Reading its events would wait for ever, should it neither say what is waited for nor end.
+        # Reading events would block forever if the expected event never came and the process did not end.
         timer = threading.Timer(120, driven.process.kill)
         timer.start()
         request.addfinalizer(timer.cancel)
@@ -78,7 +78,7 @@ def drive(request):
 
 @pytest.fixture
 def endless(write_capture, tmp_path):
-    """A training that would not end, and saves nothing unless it is stopped; and its folder."""
+    """Command of a training that does not end and saves only when it is stopped; and its folder."""
     scene, out = write_capture(views=9, size=(160, 120)), tmp_path / "out"
     train = ("train", scene.folder, "--out", out, "--offsets", 4, "--minutes", 1000, "--checkpoint-seconds", 1000)
     return train, out
@@ -198,7 +198,7 @@ def test_stopping_while_paused(drive, endless, how):
 
 
 def test_other_commands_wait_as_well(monkeypatch):
-    """A pause before a command's first progress, taken back while it waits, and a stop while it waits."""
+    """Pause before the first progress, resume, pause again, and stop while paused."""
     ask, asked = threading.Event(), threading.Event()
     said: list[str] = []
 

@@ -126,7 +126,7 @@ def test_normal_loss_and_gradients_equal_autograd():
 
 
 def test_normal_loss_of_a_plane_is_nothing():
-    """Rendered discs of one plane have its normal and its depth."""
+    """Rendered discs of one plane have the plane's normal and depth."""
     camera = Camera(np.eye(4), np.array([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]]), 32, 24)
     spread = torch.linspace(-1, 1, 12)
     x, y = (v.reshape(-1) for v in torch.meshgrid(spread, spread, indexing="xy"))
@@ -199,7 +199,7 @@ def test_one_anchor_a_voxel_with_the_majority_id():
     ids = np.array([2, 2, 1, 3, 1])
     anchors = seed_anchors(xyz, np.zeros((5, 3)), ids, 1.0, Layout(4, 8), np.random.default_rng(0))
     assert len(anchors) == 2
-    assert anchors.ids.tolist() == [2, 3]  # majority; then the tie goes to the point nearest to the center
+    assert anchors.ids.tolist() == [2, 3]  # majority; in a tie, the point nearest to the cell center
     assert len(np.unique(cell_keys(anchors.positions, 1.0), axis=0)) == 2
 
 
@@ -271,7 +271,7 @@ def test_a_gradient_that_is_not_finite_stays_with_its_anchor():
     layout, n = Layout(4, 8), 40
     rng = np.random.default_rng(2)
     rows = torch.tensor(rng.normal(0, 0.5, (n, layout.columns)), dtype=torch.float32, requires_grad=True)
-    rows.data[7, layout.feature_columns] = math.nan  # makes no splat, so nothing may come of it
+    rows.data[7, layout.feature_columns] = math.nan  # generates no splat, so it must have no effect
     positions, ids = torch.zeros(n, 3), torch.zeros(n, dtype=torch.int32)
     heads = Heads(layout, "explicit", 1, torch.Generator().manual_seed(0))
     g = generate(layout, positions, rows, ids, heads)
@@ -316,7 +316,7 @@ def grown(gradient, ids=(1, 2), positions=((0.0, 0, 0), (8.0, 0, 0)), offset=(0.
 
 
 def statistics_of(gradient, opacity=1.0):
-    """Ten steps of it."""
+    """Return growth statistics of ten steps with this gradient and opacity."""
     visits = torch.full((2,), 10, dtype=torch.int32)
     return GrowthStatistics(torch.tensor(gradient) * 10, visits, torch.full((2,), opacity * 10), visits)
 
@@ -362,7 +362,7 @@ def test_what_was_seen_too_seldom_to_be_judged_is_judged_later():
         rows[:, layout.offset_columns] = 2.2
         return Anchors(layout, 1.0, positions, rows, ids)
 
-    # The first anchor is transparent and goes; of the others, one splat of four was seen often enough.
+    # The first anchor is transparent and pruned; of the four splats of the others, one was seen often enough.
     often, seldom = MIN_VISITS, MIN_VISITS - 1
     visits = torch.tensor([0, 0, often, seldom, seldom, 0], dtype=torch.int32)
     views = torch.tensor([often, often, seldom], dtype=torch.int32)
@@ -429,7 +429,7 @@ def test_training_lowers_the_loss_and_draws_the_right_objects(tiny, settings):
     for i in range(150):
         trainer.step(i / 150)
     assert mean_loss(trainer, 8, 1.0) < 0.5 * before
-    # The ring's 40 degree gaps leave nothing to learn a held-out view from; a taught one must come out.
+    # The cameras are 40 degrees apart, too far for held-out views, so a training view is checked.
     index = capture.train_indices[0]
     picture = draw(trainer.shown, trainer.scene.camera(index))
     truth = capture.mask(index)
@@ -663,7 +663,7 @@ def test_normalization_makes_scale_and_place_irrelevant(scale, offset):
 
 
 def test_kill_9_and_resume_loses_nothing_but_time(write_capture, tmp_path):
-    """The command is killed between two checkpoints; resumed, it ends at the very model of an undisturbed run."""
+    """A run that is killed between two checkpoints and resumed gives the same model as an uninterrupted run."""
     scene = write_capture(views=9, size=(64, 48))
     common = ["--steps", "260", "--offsets", "4", "--threads", "1"]
 

@@ -1,4 +1,4 @@
-"""Standing captures up: synthetic rooms turned at random, captures that say little, and real ones."""
+"""Upright orientation of captures: randomly rotated synthetic rooms, captures with little data, and real ones."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
 def looking(eyes, targets, roll_degrees=0.0):
-    """World-to-camera matrices (V, 4, 4) of cameras at `eyes` that look at `targets`, Z up, rolled a little."""
+    """Return viewmats (V, 4, 4) of cameras at `eyes` that look at `targets`, with Z up and some roll."""
     viewmats = []
     for eye, target, roll in zip(eyes, targets, np.broadcast_to(roll_degrees, len(eyes))):
         forward = (target - eye) / np.linalg.norm(target - eye)
@@ -28,7 +28,7 @@ def looking(eyes, targets, roll_degrees=0.0):
 
 
 def room(rng, arc=360.0, pitch=25.0, roll=2.0, views=40, floor=3000, ceiling=2500):
-    """Cameras around the middle of a room, on part of a circle, and the room's points; the floor is z = 0."""
+    """Return cameras on an arc around the middle of a room, the room's points with the floor at z = 0, and outliers."""
     angles = np.radians(np.linspace(0, arc, views, endpoint=False) + rng.normal(0, 2, views))
     down = np.tan(np.radians(pitch))
     eyes = np.stack([2 * np.cos(angles), 2 * np.sin(angles), 0.4 + 2 * down + rng.normal(0, 0.05, views)], 1)
@@ -49,7 +49,7 @@ def room(rng, arc=360.0, pitch=25.0, roll=2.0, views=40, floor=3000, ceiling=250
 
 
 def moved(viewmats, xyz, turn, scale=1.0, shift=(0, 0, 0)):
-    """The capture in another frame: x' = scale * turn x + shift."""
+    """Transform the capture to another frame: x' = scale * turn x + shift."""
     out = viewmats.copy()
     out[:, :3, :3] = viewmats[:, :3, :3] @ turn.T
     out[:, :3, 3] = scale * viewmats[:, :3, 3] - out[:, :3, :3] @ np.asarray(shift, float)
@@ -61,7 +61,7 @@ def degrees_between(a, b):
 
 
 def proper(stood):
-    """A rotation and two offsets, all finite; returns the direction that becomes Z."""
+    """Check that rotation and offsets are valid and finite; return the direction that becomes Z."""
     np.testing.assert_allclose(stood.rotation @ stood.rotation.T, np.eye(3), atol=1e-9)
     assert np.linalg.det(stood.rotation) == pytest.approx(1)
     assert np.isfinite(stood.origin).all() and np.isfinite(stood.translation).all()
@@ -79,7 +79,8 @@ def test_a_room_turned_at_random_stands_on_its_floor(seed):
     assert degrees_between(proper(stood), turn[:, 2]) < 0.5
     floor = xyz[:3000] @ stood.rotation.T + stood.translation
     assert (stood.origin == 0).all() and np.abs(np.median(floor[:, 2])) < 0.02 * scale
-    # The smallest rotation that does it: its axis is square to Z and to what becomes Z.
+    # It is the smallest such rotation: its axis is perpendicular to Z and to the direction that becomes Z.
+
     angle = np.degrees(np.linalg.norm(Rotation.from_matrix(stood.rotation).as_rotvec()))
     assert angle == pytest.approx(degrees_between(proper(stood), np.array([0, 0, 1.0])), abs=1e-6)
     again = compute_upright(viewmats, xyz)

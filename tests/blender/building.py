@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reconstruction folders written by hand: cameras, points, splats and meshes of which every number is known."""
+"""Hand-made reconstruction folders, in which all values of cameras, points, splats and meshes are known."""
 
 import json
 import math
@@ -17,7 +17,7 @@ K = np.array([[500.0, 0.0, 310.0], [0.0, 500.0, 250.5], [0.0, 0.0, 1.0]])
 
 
 def look_at(eye, target=(0.0, 0.0, 0.0)) -> np.ndarray:
-    """(4, 4) world to OpenCV camera."""
+    """Return the world-to-camera matrix (4, 4) of an OpenCV camera at `eye` that looks at `target`."""
     eye = np.asarray(eye, float)
     forward = np.asarray(target, float) - eye
     forward /= np.linalg.norm(forward)
@@ -133,7 +133,7 @@ def write_anchors(folder: Path, ids) -> None:
 
 
 def write_folder(place: Path) -> Path:
-    """8 cameras around the origin, 30 points, 3 objects and 0 in 40 splats."""
+    """Write 8 cameras around the origin, 30 points, and 40 splats of 3 objects and of no object."""
     place.mkdir()
     views = [look_at((3 * math.cos(a), 3 * math.sin(a), 1.0)) for a in np.linspace(0, 2 * math.pi, 8, endpoint=False)]
     write_cameras(place, views)
@@ -146,7 +146,7 @@ def write_folder(place: Path) -> Path:
 
 
 def tetrahedron(center=(0.0, 0.0, 0.0), size: float = 1.0, texture: str = "") -> Mesh:
-    """A closed mesh of 4 vertices and 4 faces, its last face unobserved; every number differs from its neighbors."""
+    """Return a closed mesh of 4 vertices and 4 faces with distinct values; the last face is unobserved."""
     corners = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], float)
     faces = np.array([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)], np.int32)
     normals = corners - 0.25
@@ -162,7 +162,7 @@ def tetrahedron(center=(0.0, 0.0, 0.0), size: float = 1.0, texture: str = "") ->
 
 
 def write_png(path: Path, rgb, size: int = 4) -> None:
-    """A PNG of one color."""
+    """Write a PNG of one color."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -177,7 +177,7 @@ def write_png(path: Path, rgb, size: int = 4) -> None:
 
 
 def write_meshes(folder: Path, meshes: dict, ids: dict | None = None, rgb=(200, 100, 50)) -> None:
-    """meshes/ as the backend leaves it. meshes: key -> Mesh, or a sentence why there is none; ids: key -> IDs."""
+    """Write meshes/ like the backend. meshes: key -> Mesh, or the reason why there is none; ids: key -> object IDs."""
     place = folder / "meshes"
     place.mkdir(exist_ok=True)
     entries = {}

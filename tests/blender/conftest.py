@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The checkout's root as package `objectgs`, as headless.py loads it, and what the tests of the Blender side share."""
+"""Shared fixtures of the Blender tests; loads the repository root as package `objectgs`, like headless.py."""
 
 import os
 import shutil
@@ -26,7 +26,7 @@ def pytest_sessionfinish(exitstatus):
 
 @pytest.hookimpl(trylast=True)
 def pytest_unconfigure(config):
-    """Where a property ever had a callback, Blender 4.2's module crashes while Python ends: leave before that."""
+    """Exit early: after a property had a callback, Blender 4.2's module crashes when Python shuts down."""
     if bpy.app.version < (5, 0):
         config.get_terminal_writer().flush()
         os._exit(_status)
@@ -34,7 +34,7 @@ def pytest_unconfigure(config):
 
 @pytest.fixture
 def fresh():
-    """An empty file for the test, and another one after it."""
+    """An empty file before and after the test."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     yield
     bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -42,14 +42,14 @@ def fresh():
 
 @pytest.fixture(scope="session")
 def capture(tmp_path_factory) -> Path:
-    """A demo capture: 3 objects and 12 views of 96x72. To be read only."""
+    """A demo capture of 3 objects and 12 views of 96x72; read-only."""
     settings = demo_capture.Settings(objects=3, views=12, width=96, height=72, samples=2)
     return demo_capture.make(tmp_path_factory.mktemp("capture") / "demo", settings)
 
 
 @pytest.fixture(scope="session")
 def backend_python() -> str:
-    """The Python that has the compute backend."""
+    """Path of the Python that has the compute backend."""
     python = os.environ.get("OBJECTGS_PYTHON") or shutil.which(headless.ROOT / ".venv" / "bin" / "python")
     if not python:
         pytest.skip("no compute backend: set OBJECTGS_PYTHON, or run make venv")
@@ -58,7 +58,7 @@ def backend_python() -> str:
 
 @pytest.fixture(scope="session")
 def trained(capture, backend_python, tmp_path_factory) -> Path:
-    """A reconstruction of `capture` after a few steps. To be read only."""
+    """A reconstruction of `capture` after a few steps; read-only."""
     folder = tmp_path_factory.mktemp("reconstruction") / "demo"
     command = [backend_python, "-m", "backend", "train", capture, "--out", folder, "--steps", "30"]
     subprocess.run(command, cwd=headless.ROOT, check=True, timeout=300)

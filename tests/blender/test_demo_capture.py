@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The demo capture: its files agree with each other, and equal settings give equal bytes."""
+"""The demo capture: consistent files, and equal bytes for equal settings."""
 
 import json
 import struct
@@ -35,7 +35,7 @@ def small(tmp_path_factory):
 
 
 def read_png(path):
-    """Pixels of the PNGs that the capture holds: gray 8/16 bits and RGB, filters "none" and "up"."""
+    """Decode the capture's PNGs: 8-bit or 16-bit gray and RGB, with the filters "none" and "up"."""
     data = path.read_bytes()
     assert data[:8] == b"\x89PNG\r\n\x1a\n"
     at, body, width, height, depth, color = 8, b"", 0, 0, 0, 0
@@ -59,7 +59,11 @@ def read_png(path):
 
 
 def read_model(folder):
-    """((w, h), (fx, fy, cx, cy)), images {id: (name, R, t, xy, point ids)}, points {id: (xyz, rgb, error, track)}."""
+    """Read a binary COLMAP model.
+
+    Returns:
+        ((w, h), (fx, fy, cx, cy)), images {id: (name, R, t, xy, point ids)}, points {id: (xyz, rgb, error, track)}.
+    """
     data = (folder / "cameras.bin").read_bytes()
     count, _, model, width, height = struct.unpack_from("<QiiQQ", data)
     assert (count, model) == (1, 1)
@@ -108,7 +112,7 @@ def read_ply(path):
 
 
 def look(points, image, camera):
-    """Pixels (N, 2) and depth (N,) of world points in an image."""
+    """Project world points to pixels (N, 2) and depths (N,) of an image."""
     _, rotation, translation, _, _ = image
     fx, fy, cx, cy = camera[1]
     x, y, z = (points @ rotation.T + translation).T
@@ -183,7 +187,7 @@ def test_points_agree_with_depth_and_tracks(small):
         col, row = np.clip(pixel, 0, [159, 119]).astype(int).T
         away += np.abs(depth[row, col] - z)[label[mine - 1] <= SMALL.objects + 1].tolist()
         ids_agree += (ids[row, col] == label[mine - 1]).tolist()
-    assert 0.3 < np.mean(errors) < 0.75  # 0.5 pixels on both axes, less what the fit takes away
+    assert 0.3 < np.mean(errors) < 0.75  # noise of 0.5 pixels on both axes, reduced by the fit of the points
     assert np.median(away) < 0.01
     assert np.mean(ids_agree) > 0.9
 

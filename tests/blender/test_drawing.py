@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the viewport's drawing is given: splats as arrays, their order, their places, and carriers without a preview."""
+"""Input of the viewport drawing: splat arrays, their order and placement, and objects with a hidden preview."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from .building import HUGE, write_folder
 
 @pytest.fixture
 def root(tmp_path, fresh):
-    """Three objects and what belongs to none, in Blender."""
+    """A reconstruction with three objects and splats of no object."""
     folder = write_folder(tmp_path / "folder")
     root = scene.show_capture(bpy.context.scene, folder)
     scene.show_result(root, folder)
@@ -33,9 +33,9 @@ def part(root, object_id: int):
 
 
 def evaluated_size(obj) -> int:
-    """How many vertices or points a viewport gets of an object."""
+    """Return the number of vertices or points of an object that the viewport shows."""
     shape = obj.evaluated_get(bpy.context.evaluated_depsgraph_get())
-    if hasattr(shape, "evaluated_geometry"):  # Not in 4.2, whose scripts see no point clouds.
+    if hasattr(shape, "evaluated_geometry"):  # absent in 4.2, where scripts cannot access evaluated point clouds
         geometry = shape.evaluated_geometry()
         return sum(
             0 if block is None else len(block.attributes["position"].data) if "position" in block.attributes else 0
@@ -71,7 +71,7 @@ def test_what_is_hidden_is_not_drawn(root):
 
 
 def test_places_marks_and_colors_are_those_of_now(root, monkeypatch):
-    """Moving, selecting and recoloring need no new arrays."""
+    """Moving, selecting and recoloring reuse the arrays."""
     obj = part(root, 1)
     before = gather.gather([obj])[0]
     obj.parent.location.x += 2.0
@@ -90,7 +90,7 @@ def test_places_marks_and_colors_are_those_of_now(root, monkeypatch):
 
 
 def test_a_drawn_carrier_shows_nothing_itself(root):
-    """And its preview comes back as the user left it; renders keep theirs."""
+    """Its preview is restored with the user's settings; renders are unaffected."""
     obj = part(root, 1)
     kept = [(modifier.name, modifier.show_viewport, modifier.show_render) for modifier in obj.modifiers]
     seen = evaluated_size(obj)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Edits of objects in Blender: removal, colors, places, duplicates; in objects.json, after undo, and shown again."""
+"""Edits of objects in Blender: removal, colors, transforms and duplicates, in objects.json, after undo and reload."""
 
 import itertools
 import json
@@ -50,7 +50,7 @@ RECOLOR = Recolor(
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
-    """A folder far from the origin and turned, whose objects 1 and 2 have meshes. To be read only."""
+    """A rotated folder far from the origin, with meshes of objects 1 and 2; read-only."""
     place = write_folder(tmp_path_factory.mktemp("made") / "table top")
     upright = np.eye(4)
     upright[:3, :3] = np.array(Matrix.Rotation(0.7, 3, "X")) @ np.array(Matrix.Rotation(0.3, 3, "Z"))
@@ -71,7 +71,7 @@ def folder(made, tmp_path) -> Path:
 
 @pytest.fixture
 def root(fresh, folder, backend_python, monkeypatch):
-    """The folder shown in a registered extension."""
+    """Root collection of the folder in a registered extension."""
     monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
     extension = headless.extension()
     extension.register()
@@ -81,7 +81,7 @@ def root(fresh, folder, backend_python, monkeypatch):
 
 
 def active():
-    """The reconstruction's collection, which undo replaces."""
+    """Return the reconstruction's collection, which undo replaces."""
     return bpy.context.scene.objectgs.active
 
 
@@ -121,9 +121,9 @@ def encoded(linear) -> np.ndarray:
 
 
 def evaluated_colors(obj) -> np.ndarray:
-    """(n, 4) of the points that geometry nodes make of a carrier in the viewport."""
+    """Return the colors (n, 4) of the points that geometry nodes generate from a splat object in the viewport."""
     if "vertices" not in obj.modifiers:
-        # What meshes hold can be read in every Blender.
+        # Mesh attributes can be read in all Blender versions.
         tree = bpy.data.node_groups.new("vertices", "GeometryNodeTree")
         for way in ("OUTPUT", "INPUT"):
             tree.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
@@ -135,7 +135,7 @@ def evaluated_colors(obj) -> np.ndarray:
 
 
 def seen_colors(obj) -> np.ndarray:
-    """(n, 4) the colors of the evaluated mesh's vertices."""
+    """Return the vertex colors (n, 4) of the evaluated mesh."""
     evaluated = obj.evaluated_get(bpy.context.evaluated_depsgraph_get())
     mesh = evaluated.to_mesh()
     values = np.empty(4 * len(mesh.vertices), np.float32)
@@ -150,14 +150,14 @@ def show_faint(obj) -> None:
 
 
 def rendered_quads(obj) -> np.ndarray:
-    """(n, 3) linear colors of the discs that a render would show, one each."""
+    """Return the linear colors (n, 3) of the discs that a render shows."""
     for modifier in obj.modifiers:
         modifier.show_viewport = kinds.kind_of(modifier.node_group) == node_groups.RENDER_GROUP
     return seen_colors(obj).reshape(-1, 4, 4)[:, 0, :3]
 
 
 def expected(colors, recolor=None) -> np.ndarray:
-    """Encoded colors as they are to be seen."""
+    """Return the expected encoded colors after recoloring."""
     if recolor is not None:
         matrix, offset = recolor.affine()
         colors = colors @ matrix.T + offset
@@ -191,7 +191,7 @@ def test_renders_show_the_map_of_all_bands(root):
     splats = part(root, "splats")
     plain = encoded(rendered_quads(splats))
     assert len(plain) > 10
-    # Colors below 0 are cut in what is compared with, so only maps of the others can be told.
+    # Negative colors are clamped in `plain`, so only the others can be compared.
     hue = Recolor(hue=0.25, value=0.5, middle=blender_scene.luma_of(collection_of(root)))
     item(root).hue, item(root).value = hue.hue, hue.value
     seen = encoded(rendered_quads(splats))
@@ -219,7 +219,7 @@ def test_textures_are_mapped_by_the_same_control_and_left_as_they_were(root):
 
 
 def test_a_rendered_texture_has_the_mapped_color(root):
-    """Cycles bakes nothing here: the shader's own nodes give a plane's color, compared with the map of the texel."""
+    """A plane with the shader's nodes as emission is rendered and compared with the mapped texel color."""
     mesh = part(root, "mesh")
     set_sliders(root)
     material = mesh.data.materials[0]
@@ -349,11 +349,11 @@ def test_the_hull_is_right_where_it_can_be_computed_by_hand():
     assert not floaters.inside_hull(points, corners[:3], np.ones(3)).any()
 
 
-# Places.
+# Transforms.
 
 
 def independent(root, local) -> np.ndarray:
-    """(n, 3) capture coordinates of parts' vertices, worked out from Blender's own world."""
+    """Compute capture coordinates (n, 3) of an object's vertices from its world matrix."""
     bpy.context.view_layer.update()
     parent = next(obj for obj in root.objects if blender_scene.kind_of(obj) == "parent")
     world = np.array(local.matrix_world, float)
@@ -367,7 +367,7 @@ def independent(root, local) -> np.ndarray:
 
 def test_a_moved_object_is_stored_in_the_captures_coordinates(root, folder, backend_python, tmp_path):
     parent = next(obj for obj in root.objects if blender_scene.kind_of(obj) == "parent")
-    parent.matrix_world = Matrix.Scale(2.5, 4) @ parent.matrix_world  # The user set a distance.
+    parent.matrix_world = Matrix.Scale(2.5, 4) @ parent.matrix_world  # as after setting a distance
     pivot = part(root, "object_parent")
     pivot.rotation_euler = (0.3, -0.4, 1.2)
     pivot.location += Vector((0.5, 1.0, -2.0))
@@ -537,7 +537,7 @@ def test_blenders_own_duplicates_become_ours(root):
 
 
 def state(root) -> dict:
-    """Everything that edits change."""
+    """Return everything that edits change."""
     splats = part(root, "splats")
     hidden = blender_scene.hidden_splats(part(root, "splats", 0).data)
     return {
@@ -565,7 +565,7 @@ def test_undo_and_redo_restore_everything(root, tmp_path):
 
     def move():
         part(active(), "object_parent", 2).location.x += 1.0
-        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "some.blend"))  # Stores the place.
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "some.blend"))  # saving stores the transform
 
     def remove():
         activate(active(), 1)
@@ -686,7 +686,7 @@ def test_meshes_are_exported_as_they_are_seen(root, tmp_path, suffix):
 
 
 def test_turned_by_a_right_angle(root):
-    """A turn about the middle that can be told by hand."""
+    """A rotation about the center has a known result."""
     pivot = part(root, "object_parent")
     pivot.rotation_euler.z = math.pi / 2
     place = blender_scene.placement_of(root, collection_of(root))
@@ -722,8 +722,8 @@ print(json.dumps(shown))
 
 @pytest.fixture(scope="module")
 def closed(made, tmp_path_factory, backend_python) -> tuple[Path, list[np.ndarray]]:
-    """The folder with a flat ground, object 2, around a box, object 1, and another box. The backend has already filled
-    the ground without the first and without both; and the positions of the ground's splats in both cases."""
+    """A folder with a flat ground (object 2) around a box (object 1), and another box, with cached fills for removal of
+    the first box and of both; and the positions of the ground's splats in both cases."""
     folder = Path(shutil.copytree(made, tmp_path_factory.mktemp("closed") / "table top"))
     rng = np.random.default_rng(0)
     flat = np.column_stack([rng.uniform(-1, 1, (4000, 2)), np.zeros(4000)])
@@ -748,12 +748,12 @@ def closed(made, tmp_path_factory, backend_python) -> tuple[Path, list[np.ndarra
 
 @pytest.fixture
 def ground(closed, folder) -> Path:
-    """That folder as the test's own."""
+    """A copy of the `closed` folder."""
     return Path(shutil.copytree(closed[0], folder, dirs_exist_ok=True))
 
 
 def surface(root) -> dict:
-    """Everything that a carrier of splats holds."""
+    """Return all attributes of the ground's splat object."""
     mesh = part(root, "splats", 2).data
     return {name: (kind, values.tobytes()) for name, (kind, values) in fills._attributes(mesh).items()} | {
         "position": carrier.read(mesh, "position").tobytes()
@@ -761,7 +761,7 @@ def surface(root) -> dict:
 
 
 def test_the_place_of_a_removed_object_is_closed_and_opened_again(ground, closed, root):
-    """By exactly what the backend exports, in what is drawn and picked; also when splats are read again."""
+    """Drawing and picking show exactly what the backend exports, also after the splats are reloaded."""
     captured, count = surface(root), item(root, 2).splats
     luma = blender_scene.luma_of(collection_of(root, 2))
     activate(root, 1)
@@ -793,7 +793,7 @@ def test_the_place_of_a_removed_object_is_closed_and_opened_again(ground, closed
 
 
 def test_until_the_backend_has_found_it_nothing_wrong_is_shown(ground, root, monkeypatch):
-    """What was found for an object goes with its edit at once; the others' stays until there is something newer."""
+    """An object's fill disappears with its edit at once; other fills stay until newer ones exist."""
     captured = surface(root)
     object_edits.remove(root, [1, HUGE], False, True)
     python = os.environ["OBJECTGS_PYTHON"]

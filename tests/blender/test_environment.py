@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The backend's environment, made of two tiny packages from a folder and a backend that only pretends; no network."""
+"""Setup of the backend's environment, with two tiny local packages and a fake backend, without network."""
 
 import argparse
 import json
@@ -35,7 +35,7 @@ say("done", message="It works.", machine={"torch": "2.13.0"})
 
 
 def wheel(folder, name, version):
-    """The smallest package that pip installs."""
+    """Write a minimal package that pip can install."""
     info = f"{name}-{version}.dist-info"
     files = {
         f"{name}.py": f"__version__ = '{version}'\n",
@@ -50,7 +50,7 @@ def wheel(folder, name, version):
 
 @pytest.fixture
 def root(tmp_path, monkeypatch):
-    """A folder with requirements/ and a backend/, as an extension's; packages come from its wheels/ alone."""
+    """An extension folder with requirements/ and backend/; packages come only from its wheels/."""
     for name in ("wheels", "requirements", "backend"):
         (tmp_path / name).mkdir()
     for name, version in ("torch", "2.13.0"), ("smallnumba", "0.68"):
@@ -76,7 +76,7 @@ def root(tmp_path, monkeypatch):
 
 
 def run(job, until=lambda: False, after=None):
-    """Run a job to its end; once `until()` holds, `after` is done to it. Returns the shares of progress seen."""
+    """Run a job to its end, call `after` once `until()` holds, and return all progress values."""
     queue, shares = JobQueue(), []
     queue.add(job)
     deadline = time.monotonic() + WAIT
@@ -158,7 +158,7 @@ def test_failed_set_ups_leave_nothing(root):
 
 
 def test_what_goes_wrong_while_the_driver_is_gone(root):
-    """The set-up notices the end of its input, ends what it runs, and cleans up."""
+    """When its input ends, the setup stops its child processes and cleans up."""
     folder = root / "environment"
     job = environment.set_up_job(sys.executable, folder, "cpu")
     run(job, lambda: (folder / "venv").exists(), lambda: job._process._process.stdin.close())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The extension as a package: what its zip holds, what it leaves behind in Blender, and what it never imports."""
+"""The extension as a package: content of its zip, unregistering, and packages that it must not import."""
 
 import json
 import subprocess
@@ -22,7 +22,7 @@ def tool(*arguments):
 
 @pytest.fixture(scope="module")
 def package(tmp_path_factory):
-    """The zip that Blender's own tool builds of this checkout, environments and caches and all."""
+    """The zip that Blender's tool builds from this checkout, including its environments and caches."""
     folder = tmp_path_factory.mktemp("zip")
     built = tool("build", "--source-dir", ROOT, "--output-dir", folder)
     assert built.returncode == 0, built.stdout + built.stderr
@@ -86,9 +86,9 @@ def test_versions_agree():
 
 
 def in_blender(script, *arguments):
-    """Run a script under the bpy module, in a process of its own; the object that it prints last.
+    """Run a script with the bpy module in a child process, and return the JSON object that it prints last.
 
-    It leaves at once: where a property ever had a callback, Blender 4.2's module crashes while Python ends.
+    The script exits early: after a property had a callback, Blender 4.2's module crashes when Python shuts down.
     """
     script += "\nimport os\nsys.stdout.flush()\nos._exit(0)\n"
     ran = subprocess.run(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bad input and faults as a user meets them: one plain sentence, and Blender's data and the folder stay whole."""
+"""Bad input and faults: one plain sentence for the user, and no damage to Blender's data or the folder."""
 
 import errno
 import json
@@ -52,7 +52,7 @@ def extension(fresh, tmp_path, monkeypatch):
     """The extension, registered in an empty file, with its folders in tmp_path."""
     root = headless.extension()
     monkeypatch.setattr(locations, "user_folder", lambda: tmp_path / "user")
-    monkeypatch.setattr(locations, "backend_environment", lambda _cache: {})  # Kernels that are compiled already.
+    monkeypatch.setattr(locations, "backend_environment", lambda _cache: {})  # reuse compiled kernels
     monkeypatch.delenv("OBJECTGS_PYTHON", raising=False)
     root.register()
     yield root
@@ -62,7 +62,7 @@ def extension(fresh, tmp_path, monkeypatch):
 
 @pytest.fixture
 def said(monkeypatch):
-    """What pop-ups say."""
+    """Messages of pop-ups."""
     sentences = []
     monkeypatch.setattr(messages, "show", lambda text, kind="INFO": sentences.append(text))
     return sentences
@@ -70,19 +70,19 @@ def said(monkeypatch):
 
 @pytest.fixture
 def folder(trained, tmp_path) -> Path:
-    """A trained reconstruction folder of the test's own."""
+    """A copy of the trained reconstruction folder."""
     return Path(shutil.copytree(trained, tmp_path / "demo"))
 
 
 @pytest.fixture
 def shown(extension, folder):
-    """`folder` in the scene; its root."""
+    """Root collection of `folder` in the scene."""
     bpy.ops.objectgs.open_reconstruction(directory=str(folder))
     return bpy.context.scene.objectgs.active
 
 
 def refusal(operator, **options) -> str:
-    """The sentence with which an operator, called as a script does, fails."""
+    """Return the error message of an operator that fails."""
     with pytest.raises(RuntimeError) as failed:
         operator(**options)
     return str(failed.value)
@@ -93,21 +93,21 @@ def plain(sentence: str) -> bool:
 
 
 def job(tmp_path, code=ENDS, kind="train", folder=None, title="Fake") -> Job:
-    """A job that runs the Python `code`."""
+    """Return a job that runs the Python `code`."""
     script = tmp_path / f"fake-{len(list(tmp_path.glob('fake-*')))}.py"
     script.write_text(code, encoding="utf-8")
     return Job(title=title, kind=kind, folder=folder, command=[sys.executable, str(script)], cwd=tmp_path)
 
 
 def start(job: Job, owner) -> Job:
-    """What `background.submit` does in a window."""
+    """Submit a job as `background.submit` does in a window."""
     background._submitted_in[job] = owner.session_uid
     background.queue.add(job)
     return job
 
 
 def tick_until(condition) -> None:
-    """Blender's timer, until `condition()` holds."""
+    """Run the background timer until `condition()` holds."""
     deadline = time.monotonic() + WAIT
     while not condition():
         assert time.monotonic() < deadline, "it never came"
@@ -116,7 +116,7 @@ def tick_until(condition) -> None:
 
 
 def run(job: Job, owner) -> Job:
-    """A job to its end, its result included."""
+    """Run a job until its result has been shown."""
     start(job, owner)
     tick_until(lambda: job.is_finished and not background._results)
     return job
@@ -187,7 +187,7 @@ def test_wrong_python(extension, monkeypatch, capture, tmp_path, name, program, 
 
 
 def test_python_without_the_packages(extension, monkeypatch, capture, tmp_path):
-    """The Python of these tests has bpy and NumPy alone."""
+    """The Python of these tests has only bpy and NumPy."""
     monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
     told = refusal(bpy.ops.objectgs.import_capture, directory=str(capture), folder=str(tmp_path / "out"))
     assert "lacks the package" in told and sys.executable in told and not (tmp_path / "out").exists()
@@ -263,11 +263,11 @@ with locked(Path({str(folder)!r})):
     assert snapshot(folder) == before
 
 
-# Files that go or break while they are in use
+# Files that disappear or break while in use
 
 
 def test_capture_deleted(extension, backend_python, capture, tmp_path, monkeypatch):
-    """Before training the button says so; in the middle of it what was trained is kept, or a sentence says why not."""
+    """A running training keeps its result or reports an error; the Train operator then reports the missing capture."""
     monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
     place = Path(shutil.copytree(capture, tmp_path / "capture"))
     bpy.ops.objectgs.import_capture(directory=str(place), folder=str(tmp_path / "out"))
@@ -289,7 +289,7 @@ def test_capture_deleted(extension, backend_python, capture, tmp_path, monkeypat
 
 @pytest.fixture
 def tiny_disk(tmp_path):
-    """A file system of 96 KiB."""
+    """A mounted file system of 96 KiB."""
     place = tmp_path / "disk"
     place.mkdir()
     mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=96k", "tmpfs", place], capture_output=True)
@@ -404,7 +404,7 @@ def test_broken_splats_leave_cameras_and_points(extension, folder):
     assert not scene.object_collections(root) and len(root.objectgs.objects)
 
 
-# Jobs and what becomes of their scene meanwhile
+# Jobs whose scene changes while they run
 
 
 def test_each_result_lands_in_its_own_scene(extension, folder, trained, tmp_path):
@@ -452,7 +452,7 @@ def test_collection_renamed_or_taken_out_meanwhile(shown, folder, said, tmp_path
 
 
 def positions(root) -> dict[str, list[float]]:
-    """Where things are, rounded: world positions of the first vertex of each mesh, and of each camera."""
+    """Return rounded world positions: the first vertex of each mesh, and the origin of other objects."""
     bpy.context.view_layer.update()
     return {
         part.name: [
@@ -479,7 +479,7 @@ def test_parents_deleted(shown, folder, tmp_path):
 
 @pytest.mark.parametrize("with_objects", [True, False])
 def test_collections_dissolved(shown, folder, tmp_path, with_objects):
-    """As the outliner's Delete does, which gives the objects to the collection above, and as Delete Hierarchy."""
+    """As with Delete in the Outliner, which moves objects to the parent collection, and with Delete Hierarchy."""
     before = positions(shown)
     for collection in list(shown.children_recursive):
         for part in list(collection.objects):
@@ -518,7 +518,7 @@ def test_result_waits_for_object_mode(shown, folder, said, tmp_path, mode):
 
 def test_result_waits_for_the_end_of_rendering(shown, folder, said, tmp_path, monkeypatch):
     class Rendering:
-        """bpy.app, while a picture is rendered."""
+        """bpy.app during a render."""
 
         def __getattr__(self, name):
             return getattr(bpy.app, name)
@@ -570,7 +570,7 @@ def test_registered_ten_times_while_a_job_runs(extension, folder, said, tmp_path
 
 
 def rename(folder, names: dict[int, str]) -> None:
-    """Change what the vote said, as other labels would."""
+    """Change the names from the vote, as other labels would."""
     path = Reconstruction(folder).objects
     content = json.loads(path.read_text())
     for entry in content["objects"]:
@@ -593,7 +593,7 @@ def test_odd_names(shown, folder):
 
 
 def test_many_objects_and_large_ids(shown, folder):
-    """300 rows with IDs up to 2^32 - 1: listed, chosen, merged, split and selected."""
+    """300 rows with IDs up to 2^32 - 1 can be listed, chosen, merged, split and selected."""
     path = Reconstruction(folder).objects
     content = json.loads(path.read_text())
     small = [entry["id"] for entry in content["objects"]]
@@ -628,7 +628,7 @@ def test_many_objects_and_large_ids(shown, folder):
 
 
 def with_large_ids(path: Path, ids: dict[int, int]) -> bytes:
-    """splats.ply with some IDs replaced; object_id becomes an unsigned integer."""
+    """Return the bytes of splats.ply with some IDs replaced and object_id as an unsigned integer."""
     from objectgs.backend.shared.formats.ply import read_vertices, vertex_header
 
     table = read_vertices(path)

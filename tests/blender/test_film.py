@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Film from Blender: cameras and objects as the shot has them, against Blender's own projection; the compositor, and
-how Blender reads the frames."""
+"""Film from Blender: cameras and objects in the shot against Blender's projection, the compositor, and the frames."""
 
 import math
 import os
@@ -32,7 +31,7 @@ ORIGIN = np.array([100.0, -200.0, 30.0])
 
 @pytest.fixture
 def root(fresh, tmp_path):
-    """A reconstruction far from the origin, on its side, and a camera of the scene's own that sees some of it."""
+    """A tilted reconstruction far from the origin, and a separate scene camera that sees part of it."""
     place = write_folder(tmp_path / "table top")
     upright = np.eye(4)
     upright[:3, :3] = np.array(Matrix.Rotation(0.7, 3, "X")) @ np.array(Matrix.Rotation(0.3, 3, "Z"))
@@ -69,20 +68,20 @@ def splats_of(root, object_id):
 
 
 def captured(splats) -> np.ndarray:
-    """(n, 3) where the object's splats were captured."""
+    """Return the capture coordinates (n, 3) of the object's splats."""
     vertices = np.array([vertex.co for vertex in splats.data.vertices], np.float64)
     return vertices + center_of(splats.parent) + ORIGIN
 
 
 def seen(shot, sample, points) -> np.ndarray:
-    """(n, 3): pixels and depth of points of the capture."""
+    """Project capture points to pixels and depth, (n, 3), with the shot's camera."""
     at = points @ sample.viewmat[:3, :3].T + sample.viewmat[:3, 3]
     pixels = at @ sample.K.T
     return np.column_stack([pixels[:, :2] / pixels[:, 2:], shot.depth_scale * at[:, 2]])
 
 
 def seen_by_blender(splats) -> np.ndarray:
-    """The same of an object's splats where they are now, by Blender."""
+    """Project an object's splats at their current location to pixels and depth, (n, 3), with Blender."""
     scene = bpy.context.scene
     percent = scene.render.resolution_percentage
     size = scene.render.resolution_x * percent // 100, scene.render.resolution_y * percent // 100
@@ -93,7 +92,7 @@ def seen_by_blender(splats) -> np.ndarray:
 
 
 def assert_placed(root, shot, sample, object_id, splats, place=0) -> None:
-    """A map of an object brings its splats to where Blender sees them."""
+    """Check that an object's map in the shot moves its splats to where Blender sees them."""
     maps = sample.objects[object_id].maps
     at = np.eye(4) if maps is None else maps[place]
     points = captured(splats_of(root, object_id)) @ at[:3, :3].T + at[:3, 3]
@@ -140,7 +139,7 @@ def test_cameras_of_the_capture_come_back_as_they_were(root):
 
 
 def test_moving_things_move_in_every_frame(root):
-    """Camera, lens, an object and the whole reconstruction, each with keyframes; the scene is where it was after."""
+    """Camera, lens, an object and the whole reconstruction have keyframes; the scene's current frame is restored."""
     scene = bpy.context.scene
     pivot, parent = ensure_pivot(root, 1), kinds.parent_of(root)
     for frame, amount in ((1, 0.0), (11, 1.0)):
@@ -212,7 +211,7 @@ def test_what_is_not_rendered_is_not_in_the_shot(root):
 
 
 def test_copies_are_drawn_too(root):
-    """A duplicated object, and one more by an empty that shows its collection elsewhere."""
+    """A duplicated object, and an empty that instances a collection elsewhere."""
     scene = bpy.context.scene
     collection = blender_scene.object_collections(root)[2]
     pivot, splats = ensure_pivot(root, 2), splats_of(root, 2)
@@ -276,8 +275,8 @@ SIZE = 80
 
 
 def wall_splats() -> np.ndarray:
-    """Two discs, each of several in one place, which hide what is behind them: "mug" to the left, red, oblique, and
-    "can" to the right, green."""
+    """Return two opaque discs, each of several identical splats: "mug" on the left, red and oblique, and "can" on the
+    right, green."""
     table = splat_table([1, 2], degree=0)
     rotation = Euler((0.0, math.radians(35), 0.0)).to_quaternion()
     for name, values in {
@@ -300,8 +299,8 @@ def wall_splats() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def shot_blend(tmp_path_factory):
-    """A .blend that looks down at two discs, with a ball before the right one, one behind the left one, and a plane
-    exactly where the left disc is, which is not rendered."""
+    """A .blend with a camera above two discs, a ball in front of the right one, a ball behind the left one, and a plane
+    exactly at the left disc that is hidden in renders."""
     place = tmp_path_factory.mktemp("film") / "wall"
     place.mkdir()
     write_cameras(place, [look_at((0, -1, 10.0))])
@@ -345,7 +344,7 @@ def shot_blend(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def filmed(shot_blend, backend_python):
-    """The folder that headless.py has left: a film frame, a composite and a .blend with its compositor set up."""
+    """Output folder of headless.py: a film frame, a composite, and a .blend with its compositor set up."""
     out = shot_blend.parent / "film"
     ran = subprocess.run(
         [
@@ -371,7 +370,7 @@ def filmed(shot_blend, backend_python):
 
 
 def pixels_of(path) -> np.ndarray:
-    """(H, W, 4), as stored; the first row on top."""
+    """Return the stored pixels (H, W, 4), from the top row."""
     image = bpy.data.images.load(str(path))
     try:
         image.colorspace_settings.name = "Non-Color"
@@ -382,7 +381,7 @@ def pixels_of(path) -> np.ndarray:
 
 
 def planes_of(path, python) -> dict[str, np.ndarray]:
-    """The channels of an EXR, read by OpenEXR itself."""
+    """Read the channels of an EXR with OpenEXR."""
     script = (
         "import sys, numpy, OpenEXR\n"
         "parts = OpenEXR.File(sys.argv[1], separate_channels=True).parts\n"
@@ -400,7 +399,7 @@ def encoded(linear) -> np.ndarray:
 
 
 LEFT_BALL, RIGHT_BALL, LEFT_WALL, RIGHT_WALL = (40, 23), (40, 71), (30, 12), (30, 60)
-"""(row, column) of pixels in the middle of what they are called after."""
+"""(row, column) of a pixel in the middle of each of these."""
 
 
 def test_the_composite_is_joined_by_depth(filmed):
@@ -414,7 +413,7 @@ def test_the_composite_is_joined_by_depth(filmed):
 
 
 def test_depth_is_blenders_own(shot_blend, filmed, backend_python, tmp_path):
-    """The depth of a disc against Blender's own of a plane in its place, and where there is nothing."""
+    """The depth of a disc equals Blender's depth of a plane in its place, and so does the depth of the background."""
     bpy.ops.wm.open_mainfile(filepath=str(shot_blend))
     scene = bpy.context.scene
     for obj in scene.objects:
@@ -434,7 +433,7 @@ def test_depth_is_blenders_own(shot_blend, filmed, backend_python, tmp_path):
     inner = on_it.copy()
     inner[1:-1, 1:-1] &= on_it[:-2, 1:-1] & on_it[2:, 1:-1] & on_it[1:-1, :-2] & on_it[1:-1, 2:]
     assert inner.sum() > 200
-    # Blender's rays go through somewhere in the pixel, ours through its middle: a pixel is 0.1 deep here.
+    # Blender's rays pass through a random point in the pixel, ours through its center; depth varies by 0.1 in a pixel.
     assert np.abs(of_disc - of_plane)[inner].max() < 0.12
     assert abs((of_disc - of_plane)[inner].mean()) < 0.02
     assert np.ptp(of_plane[inner]) > 1.0
@@ -442,7 +441,7 @@ def test_depth_is_blenders_own(shot_blend, filmed, backend_python, tmp_path):
 
 
 def test_blender_reads_the_mattes(filmed, backend_python):
-    """Blender's Cryptomatte node finds the objects by name, by a hash of its own, and cuts them out."""
+    """Blender's Cryptomatte node finds the objects by the hash of their name, and extracts their mattes."""
     bpy.ops.wm.open_mainfile(filepath=str(filmed / "joined.blend"))
     scene = bpy.context.scene
     tree = scene.compositing_node_group if bpy.app.version >= (5, 0) else scene.node_tree
@@ -451,7 +450,7 @@ def test_blender_reads_the_mattes(filmed, backend_python):
     for name, object_id, place in (("mug", 1, LEFT_WALL), ("can", 2, RIGHT_WALL)):
         node.matte_id = name
         assert [entry.name for entry in node.entries] == [name]
-        # Kept as it was computed by Blender, from the name.
+        # Blender computed this hash from the name.
         assert node.entries[0].encoded_hash == planes["CryptoObject00.R"][place]
         assert planes["IndexOB.X"][place] == object_id
     node.matte_id = "can"
@@ -545,7 +544,7 @@ def registered():
 
 
 def test_the_buttons(shot_blend, backend_python, registered, monkeypatch, tmp_path):
-    """Film frames in the folder that the panel names, then the compositor; refusals that say why."""
+    """Operators for film frames and the compositor use the panel's folder, and report why they fail."""
     monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
     bpy.ops.wm.open_mainfile(filepath=str(shot_blend))
     scene = bpy.context.scene

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How far a reconstruction folder is, from its files alone."""
+"""State of a reconstruction folder, from its files alone."""
 
 import json
 import struct
@@ -15,7 +15,7 @@ from objectgs.objectgs_addon.state.folder_state import folder_state
 
 
 def write_checkpoint(folder, step, seconds):
-    """The header of a safetensors file, as the backend writes it; no tensors."""
+    """Write a safetensors file with the backend's header and no tensors."""
     state = json.dumps({"format": 1, "progress": {"step": step, "seconds": seconds}})
     header = json.dumps({"__metadata__": {"state": state}}).encode()
     (folder / "checkpoint").mkdir(exist_ok=True)

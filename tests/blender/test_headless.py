@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""headless.py: what its commands leave behind, its exit codes, and that it can be stopped at any moment."""
+"""headless.py: output of its commands, exit codes, and stopping at any time."""
 
 import json
 import math
@@ -45,7 +45,7 @@ def run(*arguments, **variables):
 
 
 def refusal(*arguments, **variables):
-    """The one sentence of a command that cannot be done; exit code 2."""
+    """Return the error of a command that must fail with one sentence and exit code 2."""
     ran = run(*arguments, **variables)
     assert ran.returncode == 2, ran.output + ran.errors
     assert ran.errors.count("\n") == 1 and "Traceback" not in ran.output, ran.errors
@@ -62,7 +62,7 @@ def size_of(picture):
 
 @pytest.fixture(scope="module")
 def blend(trained, tmp_path_factory):
-    """The .blend that build makes of the reconstruction."""
+    """The .blend that `build` creates from the reconstruction."""
     file = tmp_path_factory.mktemp("blend") / "made" / "scene.blend"
     ran = run("build", trained, "--blend", file)
     assert ran.returncode == 0, ran.output + ran.errors
@@ -171,7 +171,7 @@ def test_objects_are_edited_exported_and_imported_again(trained, backend_python,
 
 @pytest.fixture(scope="module")
 def meshed(trained, tmp_path_factory):
-    """A trained folder with a mesh of each object but the last, and its .blend; they stand in a ring, in a room."""
+    """A trained folder with its .blend and a mesh for each object but the last: a ring of meshes inside a room."""
     folder = shutil.copytree(trained, tmp_path_factory.mktemp("meshed") / "demo")
     ids = [entry["id"] for entry in json.loads((folder / "objects.json").read_text())["objects"]]
     meshes = {str(i): tetrahedron((math.cos(i), math.sin(i), 0.0), 0.8) for i in ids[:-1]}
@@ -188,7 +188,7 @@ def opened(blend):
 
 
 def pixels(picture):
-    """(H, W, 3), 0 .. 1."""
+    """Return the pixels (H, W, 3) of an image file, 0 .. 1."""
     image = bpy.data.images.load(str(picture))
     try:
         return np.array(image.pixels[:]).reshape(image.size[1], image.size[0], -1)[..., :3]
@@ -239,7 +239,7 @@ def test_nothing_to_pull_apart(blend, tmp_path):
 
 
 def stand_in(place, backend_python, meshes: str):
-    """A Python that does as the backend's does, but for the mesh command a line of shell; and the file of its calls."""
+    """Return a fake Python that runs `meshes` as shell code instead of the mesh command, and the file of its calls."""
     calls, python = place / "calls", place / "python"
     python.write_text(f"""#!/bin/sh
 echo "$3" >> '{calls}'
@@ -386,7 +386,7 @@ def test_stopped_rendering_ends_soon(blend, tmp_path):
 
 @pytest.fixture(scope="module")
 def batch(capture, backend_python, tmp_path_factory):
-    """(folder of captures, where they went, the arguments, the first run): a good capture and a bad one."""
+    """A batch of a good and a bad capture: (captures, output folder, arguments, first run)."""
     folder = tmp_path_factory.mktemp("batch")
     shutil.copytree(capture, folder / "captures" / "good")
     (folder / "captures" / "bad" / "images").mkdir(parents=True)

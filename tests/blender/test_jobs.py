@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Background jobs, with small programs that stand in for the backend: they report, wait, crash, hang and babble."""
+"""Background jobs, with small programs in place of the backend that report, wait, crash, hang and print garbage."""
 
 import os
 import signal
@@ -48,7 +48,7 @@ time.sleep(60)
 
 @pytest.fixture
 def make(tmp_path):
-    """make(code, **fields): a job that runs the Python `code`; what still runs at the end of the test is killed."""
+    """Function (code, **fields) that returns a job that runs the Python `code`; it is killed at the end of the test."""
     made = []
 
     def one(code, kind="train", **fields):
@@ -73,7 +73,7 @@ def until(condition, look=lambda: None):
 
 
 def run(job):
-    """The job at its end, by a queue of its own."""
+    """Run a job to its end in a new queue."""
     queue = JobQueue()
     queue.add(job)
     until(lambda: job.is_finished, queue.poll)
@@ -81,7 +81,7 @@ def run(job):
 
 
 def started(job, queue=None):
-    """The queue, once the job has said something."""
+    """Start a job and return the queue once the job has sent a message."""
     queue = queue or JobQueue()
     queue.add(job)
     until(lambda: job.message, queue.poll)
@@ -332,7 +332,7 @@ def test_without_a_window_nobody_has_to_give_way(make):
 
 @posix
 def test_a_word_to_a_process_that_has_ended_harms_nobody(tmp_path):
-    """As in Blender, which leaves SIGPIPE as the system has it."""
+    """With the system's default for SIGPIPE, as in Blender."""
     before = signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     try:
         process = BackendProcess([sys.executable, "-c", "pass"], tmp_path)
@@ -395,7 +395,7 @@ def test_folder_by_any_name(make, tmp_path):
 
 
 class Recorder(Reporter):
-    """Keeps messages and warnings."""
+    """Reporter that stores messages and warnings."""
 
     def __init__(self):
         self.messages, self.warnings = [], []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshes in Blender: exact place, UVs, colors, material; updates in place; what is shown; merges and faults."""
+"""Meshes in Blender: exact position, UVs, colors, material, updates in place, visibility, merges and faults."""
 
 import json
 import os
@@ -27,7 +27,7 @@ ORIGIN = np.array([1000.0, -2000.0, 30.0])
 
 @pytest.fixture
 def folder(tmp_path) -> Path:
-    """A folder whose objects 1 and 2 have meshes, far from the origin; HUGE has none, and says why."""
+    """A folder far from the origin with meshes of objects 1 and 2; HUGE has none, with a reason."""
     place = write_folder(tmp_path / "table top")
     upright = np.eye(4)
     upright[:3, :3] = np.array(Matrix.Rotation(0.7, 3, "X")) @ np.array(Matrix.Rotation(0.3, 3, "Z"))
@@ -50,7 +50,7 @@ def folder(tmp_path) -> Path:
 
 @pytest.fixture
 def root(fresh, folder):
-    """The folder shown, with its result."""
+    """Root collection of the folder, with its result shown."""
     shown = blender_scene.show_capture(bpy.context.scene, folder)
     assert blender_scene.show_result(shown, folder).warnings == []
     return shown
@@ -67,7 +67,7 @@ def mesh_of(root, object_id):
 
 
 def rewrite(folder, rgb=(0, 255, 0), **meshes):
-    """Meshes of object 1 and others, made anew: newer, larger, green."""
+    """Write newer meshes with a new texture; by default, a larger mesh of object 1."""
     meshes = {key.removeprefix("_"): mesh for key, mesh in meshes.items()} or {"1": tetrahedron(ORIGIN, 2.0)}
     write_meshes(folder, meshes, rgb=rgb)
     for path in (folder / "meshes").iterdir():
@@ -76,7 +76,7 @@ def rewrite(folder, rgb=(0, 255, 0), **meshes):
 
 
 def coordinates(obj) -> np.ndarray:
-    """(V, 3) of a mesh in the world."""
+    """Return the world coordinates (V, 3) of a mesh's vertices."""
     local = np.empty(3 * len(obj.data.vertices), np.float32)
     obj.data.vertices.foreach_get("co", local)
     matrix = np.array(obj.matrix_world)
@@ -158,7 +158,7 @@ def test_a_saved_file_finds_its_textures_wherever_it_goes(root, folder, tmp_path
 
 
 def test_a_mesh_can_be_used_in_another_file(root, folder, tmp_path):
-    """Dropped from the asset browser, which appends the collection and shows an instance of it."""
+    """As when dropped from the asset browser, which appends the collection and adds an instance of it."""
     bpy.context.view_layer.update()
     before = coordinates(mesh_of(root, 1))
     collection = blender_scene.object_collections(root)[1]
@@ -512,12 +512,12 @@ def test_a_mesh_in_edit_mode_is_not_overwritten(root, folder):
     bpy.ops.object.mode_set(mode="OBJECT")
 
 
-# The panel's side of it.
+# Operators and panels.
 
 
 @pytest.fixture
 def active(fresh, folder, monkeypatch, tmp_path):
-    """The folder opened in the registered extension; its root. It seems trained, and there seems to be a backend."""
+    """Root collection of the folder in the registered extension, with a fake backend Python."""
     extension = headless.extension()
     extension.register()
     python = tmp_path / "python"
@@ -530,7 +530,7 @@ def active(fresh, folder, monkeypatch, tmp_path):
 
 @pytest.fixture
 def asked(monkeypatch):
-    """The backend's arguments of each job that is submitted; none runs."""
+    """Backend arguments of each submitted job; jobs do not run."""
     jobs = []
 
     def submit(job, owner, report):

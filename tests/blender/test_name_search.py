@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Searching objects by words of their names."""
+"""Search for objects by words of their names."""
 
 import pytest
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The list of objects and what its buttons do: names, colors, solo, choosing, merging, the selection."""
+"""The list of objects and its operators: names, colors, solo, choosing, merging and selection."""
 
 import shutil
 
@@ -28,18 +28,18 @@ def root(fresh, trained, tmp_path):
 
 
 def entry(root, object_id):
-    """What objects.json says of an object."""
+    """Return an object's entry in objects.json."""
     path = scene.folder_of(root) / "objects.json"
     return next(found for found in read_objects(path) if found.id == object_id)
 
 
 def first_ids(root) -> list[int]:
-    """IDs of the rows that have splats."""
+    """Return the IDs of the rows that have splats."""
     return [scene.from_stored(item.object_id) for item in root.objectgs.objects if item.splats]
 
 
 def activate(root, object_id: int) -> None:
-    """Make an object's row the active one, as a click in the list does."""
+    """Make an object's row active, like a click in the list."""
     rows = [scene.from_stored(item.object_id) for item in root.objectgs.objects]
     root.objectgs.active_object = rows.index(object_id)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Files with the names that older versions wrote open with the names of now."""
+"""Files with names from older versions are opened with the current names."""
 
 import bpy
 import numpy as np
@@ -30,7 +30,7 @@ def extension(fresh):
 
 @pytest.fixture
 def older_file(extension, tmp_path):
-    """A file with all names that ever changed, under their former names."""
+    """A file that uses the former version of every renamed name."""
     folder = write_folder(tmp_path / "table top")
     write_meshes(folder, {"1": tetrahedron(np.zeros(3))})
     scene = bpy.context.scene
@@ -70,7 +70,7 @@ def splats_of(root, object_id=1):
 
 
 def color_attributes() -> set[str]:
-    """The names under which colors are stored by node groups and read by materials."""
+    """Return the attribute names under which node groups store colors and materials read them."""
     found = set()
     for tree in (*bpy.data.node_groups, *(material.node_tree for material in bpy.data.materials)):
         for node in tree.nodes:
@@ -119,7 +119,7 @@ def former_names() -> list[str]:
 
 
 def test_an_older_file_can_be_recolored_and_updated(older_file):
-    """Also where groups of before and of now are shown with the same material."""
+    """Also if older and current node groups are used with the same material."""
     bpy.ops.wm.open_mainfile(filepath=str(older_file))
     root = bpy.context.scene.objectgs.active
     for tree in bpy.data.node_groups:

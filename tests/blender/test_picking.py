@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which point a click takes."""
+"""Picking of points by a click."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ SIZE = (200, 100)
 
 
 def perspective(near=0.1, far=100.0):
-    """A camera at the origin that looks along -Z, 90 degrees wide: world to clip space."""
+    """Return the world-to-clip matrix of a camera at the origin that looks along -Z, 90 degrees wide."""
     aspect = SIZE[0] / SIZE[1]
     return np.array(
         [

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The plan in Blender: what the panel shows, what the user wants otherwise, and what training is told of it."""
+"""The plan in Blender: the panel, the user's overrides, and the arguments for training."""
 
 import argparse
 import json

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A reconstruction folder in Blender: exact cameras, points, splats in their objects' collections, updates in place."""
+"""A reconstruction folder in Blender: exact cameras, points, splats in object collections, and updates in place."""
 
 import json
 import math
@@ -30,7 +30,7 @@ def folder(tmp_path) -> Path:
 
 @pytest.fixture
 def root(fresh, folder):
-    """The folder shown, with its result."""
+    """Root collection of the folder, with its result shown."""
     owner = bpy.context.scene
     shown = blender_scene.show_capture(owner, folder)
     blender_scene.show_result(shown, folder)
@@ -155,7 +155,7 @@ def test_points_carry_both_colors_and_show_the_chosen_one(root, folder):
         blender_scene.color_points_by(root, by)
         shown = points.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
         assert len(shown.polygons) == 8 * 30
-        assert shown.attributes.active_color_name == by  # what Solid shows with its color set to Attribute
+        assert shown.attributes.active_color_name == by  # Solid shading shows it if its color is set to Attribute
         first = carrier.read(mesh, by)[:1]
         assert carrier.read(shown, COLOR)[1:7] == pytest.approx(np.repeat(first, 6, 0), abs=1e-6)
         assert shown.materials[0].name == "ObjectGS Points"
@@ -506,7 +506,7 @@ def test_two_points_become_a_distance_apart(root):
 
 
 def rendered(tmp_path, size=(33, 33)) -> np.ndarray:
-    """(H, W, 3) linear, from the top, by Cycles."""
+    """Render with Cycles; return linear colors (H, W, 3) from the top row."""
     owner = bpy.context.scene
     blender_scene.prepare_render(owner)
     owner.render.engine = "CYCLES"
@@ -523,7 +523,7 @@ def rendered(tmp_path, size=(33, 33)) -> np.ndarray:
 
 
 def test_a_rendered_splat_is_the_gaussian_with_its_color_from_here(fresh, tmp_path):
-    """One splat of degree 3 under a moved, turned parent: every pixel against the formula."""
+    """Every pixel of a degree-3 splat under a moved and rotated parent agrees with the formula."""
     view = look_at((2.0, -3.0, 1.5))
     intrinsics = np.array([[60.0, 0.0, 16.5], [0.0, 60.0, 16.5], [0.0, 0.0, 1.0]])
     write_cameras(tmp_path, [view], intrinsics, size=(33, 33))
@@ -574,7 +574,7 @@ def _rotation(table):
 
 
 def _harmonics(table, direction):
-    """Color of the spherical harmonics of degree 0 to 3, by their textbook formulas."""
+    """Evaluate spherical harmonics of degree 0 to 3 with the textbook formulas."""
     x, y, z = direction / np.linalg.norm(direction)
     pi = math.pi
     basis = [

@@ -1,4 +1,4 @@
-"""Tests that need an NVIDIA GPU. Where there is none they say so in one sentence, and nothing counts as passed."""
+"""Tests that require an NVIDIA GPU; without one, a message is printed and no test counts as passed."""
 
 import pytest
 

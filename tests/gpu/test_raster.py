@@ -1,5 +1,5 @@
-"""The CUDA renderer on a real GPU: all that every renderer is tested for, larger scenes beside the CPU renderer, and
-what only a GPU shows."""
+"""The CUDA renderer on a real GPU: the tests of all renderers, larger scenes against the CPU renderer, and tests that
+require a GPU."""
 
 import gc
 
@@ -18,7 +18,7 @@ from tests.backend.test_raster import *  # noqa: F403
 from tests.backend.test_raster import NAMES, as_float32, random_scene
 from tests.backend.test_raster_stiff import *  # noqa: F403
 
-# Of the reference alone; and of the CPU's threads.
+# These test only the reference, and CPU threads.
 del test_gradcheck_of_the_reference, test_one_and_two_threads_give_the_same_bits  # noqa: F821
 
 GPU = torch.device("cuda")
@@ -35,7 +35,7 @@ def large_camera(width=640, height=480):
 
 
 def step(scene, cam, primitive, device):
-    """Every plane and all gradients of a random loss, as NumPy arrays; and the frame."""
+    """Return all planes and the gradients of a random loss as NumPy arrays, and the frame."""
     flat = primitive == "2d"
     rng = np.random.default_rng(0)
     labels = torch.tensor(rng.integers(0, 5, (cam.height, cam.width)), dtype=torch.int32).to(device)
@@ -68,7 +68,7 @@ def test_agrees_with_the_cpu_renderer(count, size, primitive):
         got = here[name]
         assert np.isfinite(got).all(), name
         if name in ("ids", "median"):
-            # Where two objects or two splats are almost equal, rounding decides.
+            # Where two objects or splats are almost equal, rounding decides.
             assert (np.abs(got - expected) > 1e-4).mean() < 1e-3, name
         elif name in (*NAMES, "screen"):
             difference = np.linalg.norm(got - expected) / np.linalg.norm(expected)
@@ -78,7 +78,7 @@ def test_agrees_with_the_cpu_renderer(count, size, primitive):
             ratio = norms[0][counted] / norms[1][counted]
             assert counted.any() and (np.abs(ratio - 1) < 1e-2).mean() > 0.999, name
         else:
-            # A pixel whose light ends at a hair's breadth from STOP may take one splat more.
+            # A pixel whose transmittance is almost exactly at the threshold may blend one splat more.
             close = np.isclose(got, expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max())
             assert close.mean() > 0.9999, (name, close.mean())
 
@@ -107,7 +107,7 @@ def test_memory_is_given_back(primitive):
 
 @KINDS
 def test_torch_waits_for_nothing(primitive):
-    """A step but for the object map, whose pictures go to the host: no operation of torch's waits for the GPU."""
+    """No torch operation of a step waits for the GPU, except for the object map, which is copied to the host."""
     scene = {k: v.to(GPU).requires_grad_(k != "ids") for k, v in as_float32(random_scene(3, count=2_000)).items()}
     cam = large_camera()
     labels = torch.zeros((cam.height, cam.width), dtype=torch.int32, device=GPU)
@@ -124,7 +124,7 @@ def test_torch_waits_for_nothing(primitive):
 
 
 def test_another_stream():
-    """Kernels run in torch's current stream, also in one of its own."""
+    """Kernels run in torch's current stream, also if it is not the default one."""
     scene = {k: v.to(GPU) for k, v in as_float32(random_scene(3, count=5_000)).items()}
     expected = raster.rasterize(**scene, camera=large_camera()).color
     stream = torch.cuda.Stream()
@@ -150,7 +150,7 @@ def test_pixel_kernels_stay_in_registers(primitive):
 
 
 def test_a_thousand_objects_cost_what_one_costs():
-    """The number of objects is nowhere in the blending kernels: the same picture, whichever IDs it has."""
+    """The blending kernels do not depend on the number of objects, so the image is the same for any IDs."""
     scene = as_float32(random_scene(4, count=20_000, size=0.02, objects=1_000))
     many, _ = step(scene, large_camera(), "3d", GPU)
     scene["ids"][:] = 0

@@ -1,6 +1,6 @@
-"""Training on a real GPU: as good as on the processor, without waiting, and each goes on where the other stopped.
+"""Training on a real GPU: quality as on the CPU, no synchronization, and checkpoints that resume on either device.
 
-Imports torch, numba, numba-cuda, scipy, safetensors and Pillow's likes at most: what reads captures is not needed.
+Requires only packages such as torch, numba, numba-cuda, scipy, safetensors and Pillow, not those that read captures.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Keypoints:
 
 
 class Spheres:
-    """A capture of three shaded spheres by a ring of cameras, as training takes it, without any file."""
+    """A capture of three shaded spheres by a ring of cameras, in memory."""
 
     has_masks = True
 
@@ -141,7 +141,7 @@ def trained(spheres, settings, place, steps=300):
 
 
 def quality(trainer):
-    """PSNR of the held-out views in dB, and how much of the objects' pixels shows the right one."""
+    """Return PSNR in the held-out views in dB, and the fraction of object pixels with the right ID."""
     capture = trainer.scene.capture
     squares, right = [], []
     for index in capture.test_indices:
@@ -164,7 +164,7 @@ def close(got, want, relative, absolute):
 
 
 def test_losses_and_gaussians_are_those_of_the_processor(gpu):
-    """On the GPU's own arithmetic: no tensor cores' short floats in SSIM's variances or in the heads."""
+    """On the GPU, tensor cores must not reduce the precision of SSIM's variances or of the heads."""
     rng = np.random.default_rng(0)
     h, w = 120, 200
     planes = [torch.tensor(rng.uniform(0.3, 1, s), dtype=torch.float32) for s in ((3, h, w), (h, w), (h, w), (3,))]
@@ -200,7 +200,7 @@ def test_losses_and_gaussians_are_those_of_the_processor(gpu):
 def test_a_step_waits_for_nothing(spheres, gpu, settings):
     trainer = started(spheres, settings, gpu)
     for share in (0.3, 0.8):
-        for _ in spheres.train_indices:  # Targets are sent, kernels compiled.
+        for _ in spheres.train_indices:  # targets are uploaded and kernels compiled
             trainer.step(share)
     trainer.progress.last_growth = trainer.progress.step
     torch.cuda.synchronize()

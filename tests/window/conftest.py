@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which Blenders the window tests run in; skipped by name where there is none."""
+"""Blender versions for the window tests, which are skipped if there is none."""
 
 import subprocess
 import sys
@@ -43,7 +43,7 @@ def blender(request, tmp_path_factory, extension_zip):
         try:
             running.wait_for("True", timeout=120)
         except harness.Failed as failure:
-            # Nothing of the extension is in it yet.
+            # The extension is not installed yet, so this is no fault of the extension.
             pytest.skip(f"Blender {request.param} opens no window here: {failure}")
         running.install(extension_zip, Path(sys.executable))
         yield running

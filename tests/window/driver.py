@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Runs inside a Blender with a window: executes the scripts that a test writes to a folder, one after another.
+"""Driver inside a Blender with a window: executes the scripts that a test writes to a folder, one after another.
 
     blender --python driver.py -- FOLDER
 
-FOLDER/<n>.py is executed in the main thread, from a timer, with the permissions of a user's action: it can write where
-Blender forbids that to timers. The value of its variable `result`, or the traceback of its failure, is written to
+FOLDER/<n>.py is executed in the main thread, from a timer, but with the permissions of a user's action: it can write
+data that timers must not write. The value of its variable `result`, or the traceback of its failure, is written to
 FOLDER/<n>.json.
 """
 
@@ -20,7 +20,7 @@ _next = 1
 
 
 def window_context():
-    """The first window with its largest 3D viewport, for operators that need one."""
+    """Return the context of the first window and its largest 3D viewport, for operators that require one."""
     window = bpy.context.window_manager.windows[0]
     areas = [area for area in window.screen.areas if area.type == "VIEW_3D"]
     if not areas:

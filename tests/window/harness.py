@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A real Blender in a window on a virtual screen, driven by scripts, clicks and keys."""
+"""Control of a real Blender in a window on a virtual screen, with scripts, clicks and keys."""
 
 import json
 import os
@@ -16,9 +16,9 @@ PACKAGE = "bl_ext.user_default.objectgs"
 
 
 def blenders() -> dict[str, tuple[list[str], dict[str, str]]]:
-    """Name -> (command that opens a window, additional variables) of each Blender on this machine.
+    """Return name -> (command that opens a window, additional environment variables) of each Blender on this machine.
 
-    OBJECTGS_BLENDER is the path of one; else those that ../shared/tools/real-blender has set up.
+    This is the Blender at the path OBJECTGS_BLENDER, or else those that ../shared/tools/real-blender has set up.
     """
     chosen = os.environ.get("OBJECTGS_BLENDER")
     if chosen:
@@ -35,11 +35,11 @@ def blenders() -> dict[str, tuple[list[str], dict[str, str]]]:
 
 
 class Failed(Exception):
-    """A script failed inside Blender, or Blender has ended."""
+    """A script failed inside Blender, or Blender ended or did not respond."""
 
 
 class Blender:
-    """One running Blender of `size` pixels, with a scratch folder and a folder for screenshots (`shots`)."""
+    """A running Blender with a window of `size` pixels, a scratch folder, and a folder for screenshots (`shots`)."""
 
     def __init__(self, command, variables, folder: Path, shots: Path, size=SIZE) -> None:
         self.folder, self.shots, self.display = folder, shots, _free_display()
@@ -84,7 +84,7 @@ class Blender:
 
     def install(self, archive: Path, backend_python: Path) -> None:
         """Install the extension's zip, set the Python of the backend, and remove all objects of the scene."""
-        self.key("Escape")  # The splash screen.
+        self.key("Escape")  # close the splash screen
         self.run(
             f"""
             bpy.ops.extensions.package_install_files(
@@ -115,7 +115,7 @@ class Blender:
         return content["result"]
 
     def wait_for(self, expression: str, timeout: float = 60.0):
-        """Wait until the expression is true; returns its value."""
+        """Wait until the expression is true and return its value."""
         found = []
 
         def true() -> bool:
@@ -126,7 +126,7 @@ class Blender:
         return found[0]
 
     def shot(self, name: str) -> Path:
-        """Save a screenshot; returns its path."""
+        """Save a screenshot and return its path."""
         path = self.shots / f"{name}.png"
         self._tool("import", "-window", "root", str(path))
         return path
@@ -184,7 +184,7 @@ class Blender:
         self._log.close()
 
     def quit(self, timeout: float = 30.0) -> int:
-        """Quit Blender as a user would; returns its exit code."""
+        """Quit Blender as a user would and return its exit code."""
         part = self.scripts / "next.part"
         part.write_text("bpy.ops.wm.quit_blender()", encoding="utf-8")
         part.rename(self.scripts / f"{self._count + 1}.py")
@@ -197,12 +197,12 @@ class Blender:
 
 
 def missing_tools() -> list[str]:
-    """Programs that the harness needs and that are missing."""
+    """Return the names of missing programs that the harness requires."""
     return [tool for tool in ("Xvfb", "xdotool", "import") if shutil.which(tool) is None]
 
 
 def _free_display() -> str:
-    """A free display, since other tests may run at the same time."""
+    """Return a free display, since other tests may run at the same time."""
     return next(f":{number}" for number in range(97, 1000) if not Path(f"/tmp/.X11-unix/X{number}").exists())
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Take the screenshots of docs/ from the result of `make demo`, in the first Blender that `harness.blenders` finds:
+"""Take the screenshots in docs/ of the result of `make demo`, in the first Blender that `harness.blenders` finds.
 
-.venv/bin/python -m tests.window.screenshots
+    .venv/bin/python -m tests.window.screenshots
 """
 
 import shutil
@@ -21,10 +21,10 @@ DOCS = harness.ROOT / "docs"
 SIZE = (1280, 720)
 QUALITY = 85
 
-# Headers of panels that are open by default, in pixels of the window, as they are with the panels above them closed.
+# Header of a panel that is open by default, in window pixels, with the panels above it closed.
 TRAIN_HEADER = (1077, 256)
 AWAY = (300, 850)
-"""Where the mouse changes nothing."""
+"""A mouse position without effect on the image."""
 
 
 def view(blender, distance: float, height: float = 0.12, tilt: float = 68.0, turn: float = 30.0) -> None:
@@ -49,7 +49,7 @@ def save(blender, name: str) -> None:
 
 
 def show_sidebar(blender) -> None:
-    """Open the tab ObjectGS of the sidebar."""
+    """Open the ObjectGS tab of the sidebar."""
     blender.run("window_context()['area'].spaces.active.show_region_ui = True")
     time.sleep(0.5)
     blender.run("""
@@ -75,7 +75,7 @@ def open_demo(blender, folder: Path) -> None:
 
 
 def objects(blender) -> None:
-    """Meshes in the colors of their objects, one of them selected by a click."""
+    """Save a screenshot of meshes in object colors, one of them selected by a click."""
     view(blender, 1.5, turn=105.0)
     blender.click(*TRAIN_HEADER)
     spot = blender.run(
@@ -98,7 +98,7 @@ def objects(blender) -> None:
 
 
 def edited(blender) -> None:
-    """Meshes of recolored, removed and duplicated objects."""
+    """Save a screenshot of meshes with recolored, removed and duplicated objects."""
     blender.run(
         script("""
         from mathutils import Matrix
@@ -139,7 +139,7 @@ def edited(blender) -> None:
 
 
 def training(blender, folder: Path) -> None:
-    """A training that is three quarters done."""
+    """Save a screenshot of a training at more than 70 % of its length."""
     blender.run(
         script(f"""
         with bpy.context.temp_override(**window_context()):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Splats in a real viewport: the backend's picture, Blender's depth, picking what is seen, and what undo leaves."""
+"""Splats in a real viewport: agreement with the backend's image, Blender's depth, picking and undo."""
 
 import json
 import math
@@ -22,7 +22,7 @@ from .harness import PACKAGE
 SIZE = (240, 180)
 K = [[200.0, 0, 118.0], [0, 200.0, 92.0], [0, 0, 1]]
 MOVED = np.array([[0.0, -1.2, 0, 0.3], [1.2, 0, 0, -0.2], [0, 0, 1.2, 0.4], [0, 0, 0, 1]])
-"""A turn, a scale and a shift that object 2 gets in Blender."""
+"""Rotation, scale and translation of object 2 in Blender."""
 
 PRELUDE = f"""
 import importlib, sys
@@ -43,7 +43,7 @@ def script(body: str) -> str:
 
 
 def splats() -> Splats:
-    """Two balls of splats of degree 3 side by side, object 1 to the left, and object 3 as a wall behind."""
+    """Return two balls of degree-3 splats side by side, object 1 on the left, and object 3 as a wall behind them."""
     rng = np.random.default_rng(0)
     balls = rng.normal(size=(600, 3)) * 0.12 + np.where(np.arange(600)[:, None] < 300, (-0.5, 0, 0.2), (0.5, 0, 0.2))
     wall = np.stack([rng.uniform(-2, 2, 400), np.full(400, 1.5), rng.uniform(-1, 2, 400)], 1)
@@ -65,7 +65,7 @@ def splats() -> Splats:
 
 
 def viewmat(eye=(0.3, -3.0, 0.8)) -> np.ndarray:
-    """From `eye` towards the middle."""
+    """Return the viewmat of a camera at `eye` that looks at the center."""
     forward = np.array([0, 0, 0.2]) - eye
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, (0, 0, 1.0))
@@ -78,7 +78,7 @@ def viewmat(eye=(0.3, -3.0, 0.8)) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def folder(blender, tmp_path_factory):
-    """A reconstruction that holds the splats; one for each Blender, since edits are stored in it."""
+    """A reconstruction with the splats, one for each Blender, since edits are stored in it."""
     place = tmp_path_factory.mktemp("drawing") / "balls"
     (place / "images").mkdir(parents=True)
     write_splats(place / "splats.ply", splats())
@@ -160,7 +160,7 @@ def window(blender, folder):
 
 
 def drawn(window, matrix=None, focal: float = 200.0, orthographic: bool = False) -> np.ndarray:
-    """(H, W, 4) what the drawing makes of the camera's view, or of another."""
+    """Return the viewport drawing's image (H, W, 4) of the camera's view or of another view."""
     path = window.folder / "drawn.npy"
     matrix = viewmat() if matrix is None else matrix
     window.run(
@@ -179,7 +179,7 @@ def drawn(window, matrix=None, focal: float = 200.0, orthographic: bool = False)
 
 
 def backend_draws(without: int = 0, recolor: Recolor | None = None, camera: Camera | None = None) -> np.ndarray:
-    """(H, W, 4) what the backend makes of it, with object 2 where it was moved to."""
+    """Return the backend's image (H, W, 4), with object 2 moved."""
     camera = camera or Camera(viewmat(), np.array(K), *SIZE)
     given = splats()
     parts = [subset(given, given.object_ids == i) for i in (1, 2, 3) if i != without]
@@ -206,7 +206,7 @@ def psnr(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def test_the_drawing_is_the_backends_picture(window):
-    """Also of an object that was turned, with harmonics of degree 3, and of one that was hidden."""
+    """Includes a rotated object with harmonics of degree 3, and a hidden object."""
     picture = drawn(window)
     assert 0.3 < picture[..., 3].mean() < 1.0
     assert psnr(picture, backend_draws()) > 40.0
@@ -227,7 +227,7 @@ def test_the_drawing_is_the_backends_picture(window):
 
 
 def test_parallel_projection(window):
-    """It is what a camera sees from very far away."""
+    """It equals the image of a very distant camera."""
     eye = np.array([200.0, -900.0, 300.0])
     far = float(np.linalg.norm(eye - (0, 0, 0.2)))
     lens = np.array([[50.0 * far, 0, 118.0], [0, 50.0 * far, 92.0], [0, 0, 1]])
@@ -236,7 +236,7 @@ def test_parallel_projection(window):
 
 
 def test_recoloring_is_seen(window):
-    """The affine map of an object's colors, in every direction."""
+    """The affine map applies to an object's colors in all directions."""
     window.run(
         script("""
         item = next(item for item in root.objectgs.objects if item.object_id == 3)
@@ -257,7 +257,7 @@ def test_recoloring_is_seen(window):
 
 
 def placement_of(window, point) -> tuple[float, float]:
-    """Where on the screen a point of the world is shown, from the upper left."""
+    """Return the window position of a world point, in pixels from the upper left."""
     return tuple(
         window.run(
             script(f"""
@@ -272,7 +272,7 @@ def placement_of(window, point) -> tuple[float, float]:
 
 
 def color_at(window, place, name: str) -> np.ndarray:
-    """(3,) mean color of a few pixels of a screenshot."""
+    """Return the mean color (3,) of a few pixels of a screenshot."""
     from PIL import Image
 
     time.sleep(1.5)
@@ -282,7 +282,7 @@ def color_at(window, place, name: str) -> np.ndarray:
 
 
 def test_the_viewport_shows_it_behind_what_is_in_front(window):
-    """The color on the screen is that of the photos; a cube hides what is behind it, and not what is in front."""
+    """The screen has the color of the photos; a cube hides what is behind it, but not what is in front."""
     wall = placement_of(window, (0.0, 1.5, 0.2))
     seen = color_at(window, wall, "11-drawn")
     off = window.run(
@@ -307,7 +307,7 @@ def test_the_viewport_shows_it_behind_what_is_in_front(window):
 
 
 def test_clicks_pick_what_is_seen(window):
-    """Click, Shift, a box, undo and Esc, with the tool of the toolbar."""
+    """Click, Shift-click, box select, undo and Esc work with the tool of the toolbar."""
     window.run(
         script("""
         with bpy.context.temp_override(**window_context()):
@@ -339,7 +339,7 @@ def test_clicks_pick_what_is_seen(window):
 
 
 def wait(window, expression: str) -> None:
-    """Until an expression in the prelude's names is true."""
+    """Wait until an expression that can use the prelude's names is true."""
     deadline = time.monotonic() + 20
     while not window.run(script(f"result = {expression}")):
         assert time.monotonic() < deadline, window.run(script("result = selected()"))
@@ -347,7 +347,7 @@ def wait(window, expression: str) -> None:
 
 
 def test_a_mesh_in_front_is_picked(window):
-    """And not one behind; where there is nothing, nothing is selected."""
+    """A mesh behind is not picked; a click on the background deselects everything."""
     x, y = window.run(
         script("""
         from bpy_extras.view3d_utils import location_3d_to_region_2d
@@ -398,7 +398,7 @@ def test_words_find_objects(window):
 
 
 def test_another_file_undo_and_the_end(window):
-    """Drawing goes on after undo and in a file that is opened again, and everything is given back at the end."""
+    """Drawing continues after undo and in a reopened file; disabling the extension restores the modifiers."""
     before = drawn(window)
     window.run(script("bpy.ops.ed.undo_push(message='before')"))
     window.run(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Faults that need a window: panels of a broken file, results that come while Blender or the user is busy, undo."""
+"""Faults that require a window: panels of broken files, results that arrive while Blender or the user is busy, undo."""
 
 import json
 import shutil
@@ -26,7 +26,7 @@ print(json.dumps({"type": "done"}), flush=True)
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> Path:
-    """A small reconstruction, a few steps old."""
+    """A small reconstruction after a few steps."""
     place = tmp_path_factory.mktemp("trained")
     python = harness.ROOT / ".venv-bpy" / "bin" / "python"
     subprocess.run(
@@ -80,7 +80,7 @@ def window(blender):
 
 @pytest.fixture
 def folder(window, trained, request) -> Path:
-    """The reconstruction as the test's own folder, shown in the file."""
+    """A copy of the reconstruction, shown in the file."""
     place = Path(shutil.copytree(trained, window.folder / request.node.originalname))
     window.run(
         script(f"""
@@ -94,7 +94,7 @@ def folder(window, trained, request) -> Path:
 
 
 def soon(window, expression: str) -> None:
-    """As `wait`, for what takes no work."""
+    """Wait like `wait`, with a shorter timeout."""
     wait(window, expression, 40.0)
 
 
@@ -103,7 +103,7 @@ def log(window) -> str:
 
 
 def start_fake(window, folder: Path, kind: str = "train", owner: str = "owner") -> Path:
-    """A job in the background that ends when the file that is returned is there."""
+    """Start a background job that ends when the returned file exists."""
     program, go = window.folder / "fake.py", window.folder / f"go-{time.monotonic()}"
     program.write_text(FAKE)
     window.run(
@@ -119,7 +119,7 @@ def start_fake(window, folder: Path, kind: str = "train", owner: str = "owner") 
 
 
 def draws(window) -> None:
-    """Let everything be drawn anew; no panel and no callback may fail."""
+    """Redraw everything and check that no panel or callback fails."""
     window.run("""
         for window in bpy.context.window_manager.windows:
             for area in window.screen.areas:
@@ -163,7 +163,7 @@ def test_panels_of_a_folder_with_broken_objects(window, folder):
 
 
 def test_result_waits_for_edit_mode(window, folder):
-    """The user edits splats when a training ends: their edit stays, the result comes when Edit Mode is left."""
+    """If training ends while the user is in Edit Mode, the result is shown after Edit Mode ends."""
     go = start_fake(window, folder)
     window.run(
         script("""
@@ -191,7 +191,7 @@ def test_result_waits_for_edit_mode(window, folder):
 
 
 def test_result_waits_for_the_end_of_a_render(window, folder):
-    """The render is an engine's that ends when the test says so, or when it is left."""
+    """The render engine runs until the test ends it or the render is canceled."""
     end = window.folder / "end-of-render"
     window.run(
         script(f"""
@@ -222,7 +222,8 @@ def test_result_waits_for_the_end_of_a_render(window, folder):
 
 
 def test_result_comes_where_blender_forgot_to_allow_writing(window, folder):
-    """As after a render that began in the middle of a drawing: Blender 4 lets timers write no more."""
+    """Blender 4 forbids timers to write data after a render that started during drawing; the result is still shown."""
+
     window.run(
         script("""
         import sys, time
@@ -281,7 +282,7 @@ def test_result_comes_where_blender_forgot_to_allow_writing(window, folder):
 
 
 def test_undo_while_a_job_runs(window, folder):
-    """Undo to before the reconstruction came, and redo, harm neither the job nor what it brings."""
+    """Undo and redo harm neither the running job nor its result."""
     go = start_fake(window, folder)
     middle = window.run(
         "context = window_context(); r = context['region']; w = context['window']; "
@@ -311,7 +312,7 @@ def test_undo_while_a_job_runs(window, folder):
 
 
 def test_two_scenes_with_two_jobs(window, folder):
-    """The user looks at one scene while results come in for both."""
+    """Results arrive for both scenes while one of them is open."""
     other = Path(shutil.copytree(folder, window.folder / "other"))
     window.run("bpy.data.scenes.new('Second')")
     first = start_fake(window, folder, "train")
@@ -344,7 +345,7 @@ def test_collection_deleted_while_its_job_runs(window, folder):
 
 
 def test_disabled_while_a_job_runs(window, folder):
-    """The extension is switched off and on again: its job has ended, and everything can be used again."""
+    """After the extension is disabled and enabled, its job has ended and the operators work again."""
     go = start_fake(window, folder)
     soon(window, "background.queue.running is not None and background.queue.running.message")
     window.run(f"""

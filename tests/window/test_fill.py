@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The place of a removed object in a real viewport: closed in the background, seen, picked, undone and redone."""
+"""The hole of a removed object in a real viewport: filled in the background, drawn, picked, undone and redone."""
 
 import json
 import time
@@ -21,7 +21,7 @@ MIDDLE = (0.0, 0.0, 0.0)
 
 @pytest.fixture(scope="module")
 def folder(blender, tmp_path_factory):
-    """A reconstruction of a brown ground, object 2, with a hole under a blue box, object 1."""
+    """A reconstruction of a brown ground (object 2) with a hole under a blue box (object 1)."""
     place = tmp_path_factory.mktemp("fill") / "room"
     place.mkdir()
     rng = np.random.default_rng(0)
@@ -85,7 +85,7 @@ def folder(blender, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def window(blender, folder):
-    """Blender that looks down on it, with Draw Splats on."""
+    """Blender with a top view of the reconstruction and Draw Splats enabled."""
     blender.run(
         script(f"""
         with bpy.context.temp_override(**window_context()):
@@ -111,7 +111,7 @@ def window(blender, folder):
 
 
 def ground_splats(window) -> list[int]:
-    """How many splats of the ground there are, unobserved ones among them, and how many give way to those."""
+    """Return the number of the ground's splats, of unobserved splats among them, and of splats that they replace."""
     return window.run(
         script("""
         part = next(part for part in scene.object_collections(root)[2].objects if scene.kind_of(part) == "splats")

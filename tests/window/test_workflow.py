@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""From the installed zip to objects that can be clicked, in a real window: import, vote, train, select, merge, undo."""
+"""The whole workflow in a real window, from the installed zip: import, vote, train, select, merge and undo."""
 
 import json
 import subprocess
@@ -67,7 +67,7 @@ def window(blender, capture):
 
 
 def wait(blender, expression: str, timeout: float = 120.0):
-    """Until an expression in the prelude's names is true."""
+    """Wait until an expression that can use the prelude's names is true, and return its value."""
     deadline = time.monotonic() + timeout
     while time.monotonic() < deadline:
         value = blender.run(script(f"result = {expression}"))
@@ -128,7 +128,7 @@ def test_nothing_heavy_is_loaded(window):
 
 
 def test_click_selects_the_whole_object(window):
-    """A real click in the viewport on the middle of an object."""
+    """A real click in the viewport on the center of an object selects it."""
     place = window.run(
         script("""
         from bpy_extras.view3d_utils import location_3d_to_region_2d
@@ -169,7 +169,7 @@ def test_click_selects_the_whole_object(window):
     window.click(place[1], place[2])
     selected = []
     for _ in range(20):
-        # Blender tells of the click when it next has time.
+        # Blender handles the click asynchronously.
         selected = window.run(
             script("""
             result = sorted(scene.kind_of(part) for part in bpy.context.selected_objects)
@@ -184,7 +184,7 @@ def test_click_selects_the_whole_object(window):
 
 
 def test_merge_is_undone_and_split(window):
-    """Objects.json follows the list through merge, undo, redo and split."""
+    """objects.json follows the list through merge, undo, redo and split."""
     first = window.run(
         script("""
         from pathlib import Path
@@ -230,7 +230,7 @@ def test_merge_is_undone_and_split(window):
 
 
 def test_extracted_meshes_take_the_place_of_splats(window):
-    """Two objects become meshes in the background; the others show their splats still."""
+    """Two objects become meshes in the background; the others still show their splats."""
     chosen = window.run(
         script("""
         properties = root.objectgs
@@ -277,7 +277,7 @@ def test_extracted_meshes_take_the_place_of_splats(window):
 
 
 def test_pause_resume_and_stop(window):
-    """A paused training stands still; a stopped one has saved; undo in between harms nothing."""
+    """A paused training does not advance, a stopped one is saved, and undo in between does no harm."""
     window.run(script("root.objectgs.minutes = 5; call(bpy.ops.objectgs.train)"))
     wait(window, "background.queue.running is not None and background.queue.running.step")
     window.run(script("call(bpy.ops.objectgs.pause_job)"))
@@ -301,7 +301,7 @@ def test_pause_resume_and_stop(window):
 
 
 def test_another_file_in_between_finds_the_job_again(window):
-    """Saving, opening an empty file and opening the first one again while training runs."""
+    """The file is saved, replaced by an empty one, and reopened while training runs."""
     path = window.folder / "scene.blend"
     window.run(
         script(f"""
@@ -317,7 +317,7 @@ def test_another_file_in_between_finds_the_job_again(window):
     window.run(f"bpy.ops.wm.open_mainfile(filepath={str(path)!r})")
     wait(window, f"background.job_of(root) is background.queue.running and background.queue.running.step > {before}")
     window.shot("10-reopened")
-    # Timers and drawing go on in the moment when a file has just been opened and nothing is in the context yet.
+    # Timers and drawing also run right after a file is opened, while the context is still empty.
     for pause in (0.0, 0.2, 0.5, 0.8):
         window.run("bpy.ops.wm.read_homefile(use_empty=False)")
         time.sleep(pause)
@@ -326,7 +326,8 @@ def test_another_file_in_between_finds_the_job_again(window):
 
 
 def test_quitting_saves_and_the_file_explains(window):
-    """Blender quits while it trains: the training has saved, and nothing runs on."""
+    """If Blender quits during training, the training is saved and its process ends."""
+
     folder = Path(window.run(script("result = str(scene.folder_of(root))")))
     pid = window.run(script("result = background.queue.running._process.pid"))
     window.run("bpy.ops.wm.save_mainfile()")
