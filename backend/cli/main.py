@@ -80,7 +80,7 @@ def _reporter(as_json: bool) -> Reporter:
 
 
 def _describe_error(error: Exception) -> str | None:
-    """A sentence for errors due to missing memory, packages or files; None for every other error."""
+    """Return a sentence for errors due to missing memory, packages or files; None for all other errors."""
     from ..raster.devices import is_out_of_memory
 
     if is_out_of_memory(error):

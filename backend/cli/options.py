@@ -1,4 +1,4 @@
-"""Options that several commands have in common, and the groups of options of `train`."""
+"""Options that several commands share, and the option groups of `train`."""
 
 from __future__ import annotations
 

@@ -23,8 +23,8 @@ def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command line.
 
     Returns:
-        A parser whose result holds the command's name as `command` beside its options. It raises `UsageError` where
-        argparse would exit.
+        A parser whose result contains the command's name as `command` and its options. It raises `UsageError` instead
+        of exiting.
     """
     parser = _Parser(
         prog="python -m backend",

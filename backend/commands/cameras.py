@@ -1,4 +1,4 @@
-"""The cameras of a capture, and of imported splats, as cameras.json holds them."""
+"""Writing and reading of cameras.json for captures and for imported splats."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ..shared.reconstruction.folder import Reconstruction
 
 
 def write_capture_cameras(folder: Reconstruction, capture: Capture) -> None:
-    """Write cameras.json of a capture: its views, and how to stand it up."""
+    """Write cameras.json for a capture: its views and its upright transform."""
     held_out = set(capture.test_indices)
     views = [
         CameraView(
@@ -23,19 +23,19 @@ def write_capture_cameras(folder: Reconstruction, capture: Capture) -> None:
 
 
 def write_splat_cameras(folder: Reconstruction, centers: np.ndarray) -> None:
-    """Write cameras.json of splats without photos.
+    """Write cameras.json for splats with centers (N, 3), without photos.
 
-    Up is where it is for COLMAP's first camera, mostly, or square to the plane that most of the centers (N, 3) lie in.
+    The up direction is -Y, as usual for COLMAP's first camera, refined by the largest level plane of the centers.
     """
     upright = compute_upright(np.eye(4)[None], centers)
     write_cameras(folder.folder, Cameras(None, upright.origin, _matrix(upright), ()))
 
 
 def read_upright(folder: Reconstruction) -> Upright:
-    """How cameras.json stands the capture up; where there is none, as it is.
+    """Read the upright transform from cameras.json; return the identity if there is no such file.
 
     Raises:
-        InputError: the file cannot be used.
+        InputError: The file is invalid.
     """
     if not (folder.folder / NAME).exists():
         return Upright(np.zeros(3), np.eye(3), np.zeros(3))

@@ -1,4 +1,4 @@
-"""Opening a reconstruction folder: one to make splats in, or one with a model to draw and measure."""
+"""Opening of reconstruction folders, to create a reconstruction or to render and measure its trained model."""
 
 from __future__ import annotations
 
@@ -32,20 +32,23 @@ from .stages import stage
 
 
 def memory_for_files(options: argparse.Namespace) -> float:
-    """The part of --memory-mb, in megabytes, that decoded files may take; as bytes they need a quarter of the room."""
+    """Return the part of --memory-mb, in MB, for decoded uint8 images; their float32 planes take four times as much."""
     return options.memory_mb / 5
 
 
 def memory_for_planes(options: argparse.Namespace) -> float:
-    """The part of --memory-mb, in megabytes, for the same pictures as the float planes that training compares with."""
+    """Return the part of --memory-mb, in MB, for the float32 planes of the same images, which are training targets."""
     return options.memory_mb - memory_for_files(options)
 
 
 @contextmanager
 def open_reconstruction(options: argparse.Namespace, reporter: Reporter) -> Iterator[tuple[Reconstruction, Capture]]:
-    """The folder of --out, made where it is not there and locked meanwhile, and the capture to fill it from.
+    """Create and lock the folder of --out, load the capture and write cameras.json.
 
-    Leaves cameras.json. Bad input leaves nothing behind.
+    If the input is invalid, a new folder is removed again.
+
+    Yields:
+        The folder, locked for the duration of the context, and the capture.
     """
     folder = Reconstruction(options.out)
     with ExitStack() as held:
@@ -62,7 +65,7 @@ def open_reconstruction(options: argparse.Namespace, reporter: Reporter) -> Iter
 
 @contextmanager
 def removed_if_refused(folder: Reconstruction) -> Iterator[None]:
-    """Remove what bad input leaves of a folder that was not there before, unless another process makes use of it."""
+    """Remove newly created folders on InputError or OSError, unless the folder is in use by another process."""
     absent = [path for path in (folder.cache, folder.folder, *folder.folder.parents) if not path.exists()]
     try:
         yield
@@ -75,7 +78,7 @@ def removed_if_refused(folder: Reconstruction) -> Iterator[None]:
 
 
 class Trained(NamedTuple):
-    """A reconstruction folder with a model in it, opened."""
+    """An opened reconstruction with its trained model."""
 
     folder: Reconstruction
     capture: Capture
@@ -87,13 +90,23 @@ class Trained(NamedTuple):
 
     @property
     def trained_on(self) -> str:
-        """The device that the model was trained on, as `backend.raster.devices.name_of` calls it."""
+        """Name of the device that the model was trained on, as from `backend.raster.devices.name_of`."""
         return self.training.device
 
 
 def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
-    """What `train` left in DIR, on the device asked for, with the capture it was made from; InputError where one of
-    them is not there."""
+    """Open a trained reconstruction with its capture.
+
+    Args:
+        options: Options with the folder, and the device to load the model on; `capture` replaces a recorded folder.
+        reporter: Receives status and warnings.
+
+    Returns:
+        The reconstruction, with the capture edited and planned as for its training.
+
+    Raises:
+        InputError: The folder, its model or its capture is missing, or the capture is not that of the training.
+    """
     device = devices.pick(options.device)
     folder = Reconstruction(options.folder)
     if not folder.folder.is_dir():
@@ -116,7 +129,7 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
     source = Path(options.capture or (record.capture.folder if record.capture else ""))
     if not source.is_dir():
         raise InputError(f"The capture {source} of {folder.folder} is gone; say with --capture where it is now.")
-    # What it was trained from, not record.capture, which a later import of another capture replaces.
+    # The capture of the training; record.capture changes with a later import of another capture.
     max_size = training.votes.max_size
     capture = load_capture(source, folder.cache, memory_for_files(options), max_size, reporter)
     if digest(capture) != training.votes.capture:
@@ -127,7 +140,7 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
     if options.capture:
         update_record(folder, capture=capture_record(capture, max_size))
         write_capture_cameras(folder, capture)
-    # What it was trained without, whatever the user has since chosen.
+    # The objects left out of the training, regardless of later edits.
     plan = plan_of(training)
     capture = planned_capture(edited(capture, folder, training.left_out), plan)
     exposure = plan["exposure"]
@@ -141,18 +154,18 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
 
 
 def plan_of(training: TrainingRecord | None) -> Plan:
-    """The plan of a training; nothing for those of older versions."""
+    """Return the plan of a training; empty without a training or for those of older versions."""
     return Plan.of(training.plan or () if training else ())
 
 
 def edited(capture: Capture, folder: Reconstruction, left_out: Iterable[int]) -> Capture:
-    """The capture with the user's names of its objects, and without those that are left out."""
+    """Return the capture with the user's names of its objects, and without the objects in `left_out`."""
     known = read_objects(folder.objects) if folder.objects.exists() else []
     return capture.edited({entry.id: entry.name for entry in known}, left_out)
 
 
 def digest(capture: Capture) -> str:
-    """Tells one capture from another, wherever it lies: names, poses and points."""
+    """Return a hash of a capture's view names, poses and points; it does not depend on the capture's folder."""
     sha = hashlib.sha256()
     for view in capture.views:
         sha.update(view.name.encode() + b"\0" + np.ascontiguousarray(view.viewmat).tobytes())
@@ -161,5 +174,5 @@ def digest(capture: Capture) -> str:
 
 
 def capture_record(capture: Capture, max_size: int) -> CaptureRecord:
-    """A capture as objectgs.json holds it."""
+    """Return the entry of a capture for objectgs.json."""
     return CaptureRecord(str(capture.folder.resolve()), max_size, digest(capture))

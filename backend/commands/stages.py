@@ -1,4 +1,4 @@
-"""How long the stages of a command take, kept in objectgs.json."""
+"""Timing of the stages of a command, recorded in objectgs.json."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .setup.machine import peak_mb
 
 @contextmanager
 def stage(folder: Reconstruction, name: str) -> Iterator[None]:
-    """Measure a stage and record its figures once it is done."""
+    """Measure a stage and record its figures when it has completed."""
     started = time.monotonic()
     yield
     finish_stage(folder, name, time.monotonic() - started)

@@ -1,4 +1,4 @@
-"""The user's edits of objects, applied to splats."""
+"""Application of the user's edits of objects to splats."""
 
 from .apply import Fill, apply_edits, compute_fill, recolored, transformed
 

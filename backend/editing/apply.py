@@ -1,5 +1,7 @@
-"""Applying the edits in objects.json to splats for export and film. Splats without edits stay bitwise the same and in
-their order, so that pixels without an edited object stay the same."""
+"""Application of the edits in objects.json to splats, for export and film.
+
+Splats without edits stay bitwise identical and in order, so that pixels without an edited object do not change.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ def apply_edits(splats: Splats, objects: Sequence[SceneObject]) -> Splats:
 
     Args:
         splats: The captured splats.
-        objects: The objects with their edits; splats with other IDs stay as they are.
+        objects: The objects with their edits; splats with other IDs do not change.
 
     Returns:
         The edited splats. Splats of a merged object have the ID of the object that it is merged into, whose edits count
@@ -56,8 +58,10 @@ def apply_edits(splats: Splats, objects: Sequence[SceneObject]) -> Splats:
 class Fill:
     """The filling of the holes of removed objects, untransformed and in the captured colors.
 
-    splats: n splats; put (n,) bool: these are new, the others are captured ones that they replace; fills (n,): the IDs
-    of the removed objects.
+    Attributes:
+        splats: n splats.
+        put: (n,) bool; true for new splats, false for captured splats that they replace.
+        fills: (n,) IDs of the removed objects whose holes are filled.
     """
 
     splats: Splats
@@ -112,7 +116,7 @@ def recolored(splats: Splats, recolor: Recolor) -> Splats:
 
 
 def _remove_and_fill(splats: Splats, objects: Sequence[SceneObject]) -> tuple[Splats, Fill]:
-    """Return the visible splats, with the IDs that they are shown as and with filled holes, and the filling alone."""
+    """Return the visible splats, with the IDs that they are shown as and with filled holes, and the filling itself."""
     known, slots = np.unique(splats.object_ids, return_inverse=True)
     shown = _shown_as(known, objects)[slots]
     keep = shown != _DROPPED
@@ -168,7 +172,7 @@ def _rotations(quats: NDArray) -> Rotation:
 
 
 def _stretched(splats: Splats, linear: NDArray) -> tuple[NDArray, NDArray]:
-    """Unit quaternions (N, 4) and scales (N, 3), largest first, of Gaussians under a linear map (3, 3)."""
+    """Return unit quats (N, 4) and scales (N, 3), largest first, of Gaussians under a linear map (3, 3)."""
     axes, scales, _ = np.linalg.svd((linear @ _rotations(splats.quats).as_matrix()) * splats.scales[:, None, :])
     axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]
     return Rotation.from_matrix(axes).as_quat(scalar_first=True), scales

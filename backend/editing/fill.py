@@ -1,9 +1,9 @@
 """Filling the hole that a removed object leaves in the ground or a wall, with copies of the surroundings.
 
-The object stands on, or at, planes that the splats of its neighbors lie in, or near to, as in rumpled cloth. No photo
-shows the part of such a plane that the object hid. It is filled with a patch of the visible part, whose detail (grain,
-joints) fits the rim of the hole best, with the colors and the relief around the hole. Where several objects meet under
-the removed one, such as sheets of paper, each is continued with straight edges.
+The object stands on or against planes; the splats of its neighbors are in these planes or, as in rumpled cloth, near
+them. No photo shows the part of such a plane that the object hid. That part is filled with a patch of the visible part
+whose detail (grain, joints) best fits the rim of the hole, adjusted to the colors and the relief around the hole. Where
+several objects meet under the removed one, such as sheets of paper, each is continued with straight edges.
 
 A hole is filled only where the surface surrounds it, since the object may stand at the edge of the surface.
 """
@@ -32,29 +32,29 @@ from ..shared.splats.convex_hull import reliable_centers
 from ..shared.splats.spherical_harmonics import C0
 
 PLANES = 3
-"""Largest number of planes: an object may stand in a corner."""
+"""Largest number of planes, since an object may stand in a corner."""
 NEAR = 0.5
 """Distance from the object within which planes are searched, relative to its size."""
 FLAT_WITHIN = (0.02, 0.04, 0.08)
-"""Distance from a plane, relative to the object's size, within which splats lie in it. The larger ones, for surfaces
-that are not flat, are tried if the hole stays open with the smaller ones."""
+"""Largest distances of a plane's splats from it, relative to the object's size. The larger ones, for surfaces that are
+not flat, are tried if the smaller ones leave the hole open."""
 PART_OF_IT = 0.5
-"""Smallest fraction of another object's splats near the removed one in a plane; with less, it only stands on it."""
+"""Smallest fraction, in a plane, of another object's splats near the removed one; with less, it only stands on it."""
 LOWEST_PERCENT = 3.0
 TOUCHES_WITHIN = 0.1
-"""Largest distance of its lowest percent from a plane that the object stands on, relative to its size."""
+"""Largest height of the object's `LOWEST_PERCENT` percentile above a plane that it touches, relative to its size."""
 FEWEST = 60
-"""Smallest number of splats that make a plane."""
+"""Smallest number of splats in a plane."""
 ALIGNED = 0.7
 """Smallest cosine between a plane's normal and the thinnest axis of a splat in it."""
 COVERED = 0.3
-"""Smallest alpha, seen along its normal, where a plane has no hole: the splats that make it opaque may lie deeper."""
+"""Smallest alpha along a plane's normal where it has no hole; the splats that make it opaque may lie deeper."""
 WINDOW = 3.0
 """Width of the surroundings that a patch may come from, relative to the object's footprint."""
 CELLS = 128
 """Cells across the window."""
 SURROUNDS = 0.2
-"""Smallest fraction of the window that a plane covers; with less, it is the side of a small object."""
+"""Smallest fraction of the window that a plane covers; with less, it is a side of a small object."""
 ENCLOSED = 0.5
 """Smallest fraction of the touched cells that the surface surrounds; with less, the object stands at its edge."""
 RIM = 2
@@ -65,8 +65,8 @@ SMALLEST_PATCH = 4
 RELIEF_WITHIN = 0.03
 """Smallest height of a bump on the surface above or below its surroundings, relative to the object's size."""
 SHELL = 0.06
-"""Distance from the object's own splats, relative to its size, within which splats of the surface that stand above it
-are mislabeled ones of the object."""
+"""Distance from the object's own splats, relative to its size, within which splats that have the surface's IDs and are
+above its plane are taken for mislabeled splats of the object."""
 
 _TRIPLES = 600
 _SCORED = 3000
@@ -109,11 +109,15 @@ def fill_hole(splats: Splats, removed: Splats) -> tuple[NDArray[np.bool_], Splat
 
 
 class _Around:
-    """The splats around a removed object, whose own centers, relative to its `middle`, are solid (m, 3).
+    """The splats around a removed object.
 
-    centered (N, 3): the centers of all splats relative to `middle`; far (N,): their distances from the nearest of
-    `solid`, infinite beyond `NEAR`; near: indices of the splats that planes are found from; reach: indices of those
-    that planes may be continued from.
+    Attributes:
+        solid: (m, 3) centers of the object's own splats, relative to its center `middle`.
+        centered: (N, 3) centers of all splats, relative to `middle`.
+        far: (N,) their distances from the nearest of `solid`, infinite beyond `NEAR`.
+        near: indices of the splats in which planes are searched.
+        reach: indices of the splats from which planes may be continued.
+        thin: (N, 3) thinnest axes of the splats in `reach`, otherwise 0.
     """
 
     def __init__(self, splats: Splats, solid: NDArray, middle: NDArray, size: float) -> None:
@@ -148,7 +152,7 @@ class _Around:
         return found
 
     def shell(self, flat: NDArray[np.int64], planes: list[_Plane], within: float) -> NDArray[np.int64]:
-        """Find splats with the IDs of those in a plane, `flat`, that stand above all planes where the object was."""
+        """Find splats above all planes and near the removed object that have the IDs of a plane's splats `flat`."""
         close = np.flatnonzero(self.far < SHELL * self.size)
         standing = np.all([plane.height(self.centered[close]) > within for plane in planes], axis=0)
         return close[standing & np.isin(self.splats.object_ids[close], np.unique(self.splats.object_ids[flat]))]
@@ -179,9 +183,11 @@ def _thin_axes(splats: Splats) -> NDArray[np.float64]:
 def _plane(
     points: NDArray, thin: NDArray, solid: NDArray, size: float, within: float, before: list[_Plane]
 ) -> _Plane | None:
-    """Find the plane that the object's own centers, solid (m, 3), stand on or at, with most of points (n, 3) within the
-    distance `within` and their thin axes (n, 3) along its normal; None if there is none. It is not parallel to those
-    in `before`."""
+    """Find the plane that touches the object's centers, solid (m, 3), and contains the most of points (n, 3).
+
+    A plane contains points that are within the distance `within` and whose thin axes (n, 3) are along its normal.
+    Planes parallel to those in `before` are excluded. Returns None if there is no plane.
+    """
     if len(points) < FEWEST:
         return None
     rng = np.random.default_rng(0)
@@ -219,8 +225,11 @@ def _plane(
 class _Surface:
     """The splats that lie in a plane, seen along its normal on a grid of square cells around the object.
 
-    at (n, 2): their centers in cells; look (n, 4): base color, and height above the plane in cells; owners: their
-    object IDs; under, touched (CELLS, CELLS): the cells that the object hides, and those that it touches.
+    Attributes:
+        at: (n, 2) centers of the splats in cells.
+        appearance: (n, 4) base color, and height above the plane in cells.
+        owners: the distinct object IDs of the splats; `owner` (n,) has their indices.
+        under, touched: (CELLS, CELLS) bool, the cells that the object hides, and those that it touches.
     """
 
     def __init__(
@@ -240,7 +249,7 @@ class _Surface:
         self.owners, self.owner = np.unique(splats.object_ids, return_inverse=True)
         cells = ((footprint - corner) / self.cell).astype(int)
         self.under = _fill_footprint(cells)
-        # No camera has seen the plane where the object touches it, whatever splats lie there.
+        # No camera has seen the plane where the object touches it, even if splats exist there.
         self.touched = _fill_footprint(cells[plane.height(solid) < rough * TOUCHES_WITHIN * size])
 
     def _render_top(self) -> tuple[NDArray, NDArray, NDArray]:
@@ -367,15 +376,15 @@ def _smooth(values: NDArray, good: NDArray, width: float) -> NDArray:
 
 
 def _fill_footprint(cells: NDArray) -> NDArray[np.bool_]:
-    """Return the cells (CELLS, CELLS) between and within cells (n, 2)."""
+    """Return the cells (CELLS, CELLS) bool of cells (n, 2) with gaps and holes closed."""
     found = np.zeros((CELLS, CELLS), bool)
     found[tuple(cells.clip(0, CELLS - 1).T)] = True
     return binary_fill_holes(binary_closing(found, iterations=6))
 
 
 def _patches(target: NDArray, good: NDArray, detail: NDArray) -> list[tuple[NDArray, tuple[int, int]]]:
-    """Split the cells to fill, target (n, n), into parts, each with the shift to the part of `good` whose detail fits
-    its rim best; cells that no part fits are left out."""
+    """Split the cells to fill, target (n, n), into parts, each with the shift to the cells of `good` whose detail best
+    fits its rim; cells for which no shift is found are left out."""
     shift = _best_shift(target, good, detail)
     if shift is not None:
         return [(target, shift)]
@@ -412,7 +421,7 @@ def _best_shift(target: NDArray, good: NDArray, detail: NDArray) -> tuple[int, i
     fits = good[there[..., 0], there[..., 1]]
     changes = ((detail[there[..., 0], there[..., 1]] - detail[band[:, 0], band[:, 1]]) ** 2).sum(2)
     changes = np.where(fits, changes, 2.0 * float(energy[good].mean())).mean(1)
-    # With as much detail as the surroundings: neither plainer, nor with something on it.
+    # Prefer as much detail as in the surroundings: a patch that is neither plainer nor has an object on it.
     strength = _correlate(energy, shape, 0.0)[tuple((at + CELLS + (top, left)).T)] / shape.sum()
     best = at[(changes + np.abs(strength - energy[tuple(band.T)].mean())).argmin()]
     return int(best[0]), int(best[1])

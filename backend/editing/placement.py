@@ -1,4 +1,4 @@
-"""Transforms of objects from numbers that the user gives, and the brightness of an object."""
+"""Transforms of objects from user input, and the center and luma of an object."""
 
 from __future__ import annotations
 

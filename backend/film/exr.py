@@ -36,7 +36,7 @@ def write(path: Path, channels: Mapping[str, NDArray], header: Mapping[str, Any]
     entries = {**header, DIGEST: digest, "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     planes = {name: np.ascontiguousarray(plane) for name, plane in channels.items()}
     with atomic_path(path, part):
-        part.write_bytes(b"")  # OpenEXR's own error does not tell why a file cannot be written.
+        part.write_bytes(b"")  # Raises OSError with the reason, which OpenEXR's error lacks.
         try:
             OpenEXR.File(entries, planes).write(str(part))
         except RuntimeError as error:

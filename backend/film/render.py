@@ -29,9 +29,14 @@ _FAINTEST = 1e-6
 
 
 class FilmImage(NamedTuple):
-    """rgba (H, W, 4) float32: linear light of sRGB's primaries, premultiplied. depth (H, W) float32: along the camera's
-    axis, `FAR` in empty pixels. ids (RANKS, H, W) int32: indices in the stage's names, by descending coverage, -1:
-    none; coverage (RANKS, H, W) float32: of each object; the sum over all is alpha."""
+    """A rendered frame.
+
+    Attributes:
+        rgba: (H, W, 4) float32, linear light with sRGB primaries, premultiplied.
+        depth: (H, W) float32 along the camera's axis; `FAR` in empty pixels.
+        ids: (RANKS, H, W) int32 indices in the stage's names, by descending coverage; -1: none.
+        coverage: (RANKS, H, W) float32 of each object; the sum over all objects is alpha.
+    """
 
     rgba: NDArray[np.float32]
     depth: NDArray[np.float32]
@@ -100,9 +105,9 @@ def _light(drawn: Rendered) -> NDArray[np.float32]:
 
 
 def _depth(drawn: Rendered, scale: float) -> NDArray[np.float32]:
-    """Return the depth (H, W): the median, which unlike the mean lies on a surface at occlusion edges, too.
+    """Return the depth (H, W): the median, which is on a surface even at occlusion edges, unlike the mean.
 
-    Where alpha is too small for a median, it is the mean.
+    Where alpha is too small for a median, the mean is used.
     """
     assert drawn.depth is not None and drawn.median is not None
     alpha, mean, median = (devices.host(plane) for plane in (drawn.alpha, drawn.depth, drawn.median))

@@ -1,4 +1,4 @@
-"""The edited splats of a moment: colors and removals from objects.json, transforms from the shot."""
+"""The edited splats at a sample time: colors and removals from objects.json, transforms from the shot."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from ..shared.reconstruction.objects import SceneObject, default_name, read_obje
 from ..shared.reconstruction.shot import Frame, Placed, Sample, Shot
 
 _FORMAT = 2
-"""Version of the renders and files: another number renders all frames anew."""
+"""Version of the renders and files; a change causes all frames to be rendered again."""
 
 Tensors = dict[str, torch.Tensor]
 
 
 class Stage:
-    """The splats of a reconstruction with their edits, to be drawn under the transforms of a moment.
+    """The splats of a reconstruction with their edits, to be rendered with the transforms of a sample.
 
-    names: of the objects, by their class indices, which images contain.
+    names: names of the objects by class index; the rendered IDs are class indices.
     """
 
     def __init__(self, folder: Reconstruction, primitive: str, device: torch.device, reporter: Reporter) -> None:
@@ -67,10 +67,10 @@ class Stage:
         return hashlib.sha256((self._digest + json.dumps(facts)).encode()).hexdigest()
 
     def at(self, sample: Sample, only_named: bool) -> Tensors:
-        """Return the splats at a moment.
+        """Return the splats of a sample.
 
         Args:
-            sample: The moment with its camera, transforms and visibility.
+            sample: The sample with its camera, transforms and visibility.
             only_named: Leave out objects that the sample does not list.
 
         Returns:

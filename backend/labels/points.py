@@ -1,4 +1,4 @@
-"""Labeled points as PLY, with double coordinates, since captures may be georeferenced, and a 32-bit `object_id`."""
+"""Labeled points as PLY, with a 32-bit `object_id`, and double coordinates since captures may be georeferenced."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 Two differences from the published code: views in which a point is behind the camera or outside the image do not vote
 on it, and label 0 (unlabeled) counts only if no view voted for an object. Held-out views do not vote, so that their
-masks stay unseen until quality is measured.
+masks are used only to measure quality.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ def _project(
 
 
 def _find_unhidden(x: np.ndarray, y: np.ndarray, z: np.ndarray, width: int, height: int, focal: float) -> np.ndarray:
-    """Which points are not hidden by nearer points: (n,) bool.
+    """Find the points that are not hidden by nearer points: (n,) bool.
 
     The points are too sparse for a surface, so each covers the 3 x 3 cells around it; a cell is as wide as the mean
     distance between points. A point is hidden if it is farther than the nearest point of its cell by more than a
@@ -170,7 +170,7 @@ def _find_unhidden(x: np.ndarray, y: np.ndarray, z: np.ndarray, width: int, heig
 
 
 def _observed(capture: Capture, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The points that COLMAP observed inside a view, in the form of `_project`."""
+    """Return the points that COLMAP observed inside a view, in the form of `_project`."""
     view, keypoints = capture.views[index], capture.keypoints(index)
     x, y = keypoints.xy[:, 0], keypoints.xy[:, 1]
     inside = (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height)

@@ -1,1 +1,1 @@
-"""Decisions about what training needs for a capture, made before any work: `decisions` from the facts of `coverage`."""
+"""Decisions about which steps a capture needs, made before training: `decisions`, based on facts from `coverage`."""

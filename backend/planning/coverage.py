@@ -1,4 +1,4 @@
-"""Finds redundant views, and points outside all views."""
+"""Detection of redundant views, and of points outside all views."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def duplicate_views(capture: Capture) -> list[int]:
 
 
 def _compute_pose_vectors(capture: Capture, views: list[int]) -> np.ndarray:
-    """Positions and rotations of views as vectors (n, 12), scaled to pixels: a distance of 1 moves a view's points by
-    at most one pixel, and by about one pixel in the view with the nearest points."""
+    """Return positions and rotations of views as vectors (n, 12), scaled to pixels: a distance of 1 moves a view's
+    points by at most one pixel, and by about one pixel in the view with the nearest points."""
     rotations = np.array([capture.views[i].viewmat[:3, :3] for i in views])
     shifts = np.array([capture.views[i].viewmat[:3, 3] for i in views])
     focals = np.array([capture.views[i].K[0, 0] for i in views])
@@ -73,7 +73,7 @@ def _same_image(capture: Capture, a: int, b: int) -> bool:
 
 
 def blind_views(capture: Capture) -> list[int]:
-    """Find training views without any point inside or near their border.
+    """Find training views that contain no point, even with a margin around their border.
 
     Args:
         capture: The capture.
@@ -122,7 +122,7 @@ def unseen_points(capture: Capture) -> np.ndarray:
 
 
 def _inside(capture: Capture, index: int, xyz: np.ndarray) -> np.ndarray:
-    """Which of the points xyz (n, 3) are inside a view or near its border: (n,) bool."""
+    """Return which of the points xyz (n, 3) are inside a view or near its border: (n,) bool."""
     view = capture.views[index]
     x, y, z = (xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]).T
     across, down = MARGIN * view.width, MARGIN * view.height

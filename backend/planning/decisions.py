@@ -200,7 +200,7 @@ def _blind_views(context: PlanningContext) -> Decision | None:
 
 
 def _other_views(context: PlanningContext) -> Decision | None:
-    """These views are needed: they show the rest of the scene, and constrain where the objects are not."""
+    """Keep these views: they show the rest of the scene, and constrain where the objects are not."""
     if not (context.labeled and len(context.capture.left_out)):
         return None
     found = views_without_objects(context.capture)

@@ -1,1 +1,1 @@
-"""What the compute process and Blender's process share. Standard library and NumPy only."""
+"""Modules used by both the backend and the Blender add-on; they import only the standard library and NumPy."""

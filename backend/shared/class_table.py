@@ -1,4 +1,4 @@
-"""Object IDs and class indices: an object's ID may be any number, classes count from 0 without gaps."""
+"""Mapping between object IDs, which may be any numbers, and class indices, which are contiguous from 0."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class ClassTable:
         return len(self.ids)
 
     def classes_of(self, ids: ArrayLike) -> NDArray[np.int64]:
-        """The class of each object ID.
+        """Return the class index of each object ID.
 
         Args:
             ids: integers >= 0 of any shape.
@@ -36,7 +36,7 @@ class ClassTable:
         return np.where(known, classes, -1)
 
     def ids_of(self, classes: NDArray | Sequence[int] | int) -> NDArray[np.int64]:
-        """The object ID of each class.
+        """Return the object ID of each class.
 
         Args:
             classes: integers of any shape; -1 for "no class".
@@ -47,5 +47,5 @@ class ClassTable:
         return self._ids_and_none[classes]
 
     def classes_among(self, ids: ArrayLike) -> NDArray[np.int64]:
-        """The classes, ascending, whose object IDs are among `ids`."""
+        """Return the classes whose object IDs are in `ids`, ascending."""
         return np.flatnonzero(np.isin(self.ids, ids))

@@ -1,4 +1,4 @@
-"""Events of a command as a person in a terminal wants to see them."""
+"""Output of a command's events to a terminal."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _figures(fields: dict[str, Any]) -> list[str]:
 
 
 def _block(stream: TextIO) -> str:
-    """The character that fills the bar, as far as the stream can write it."""
+    """Return the character that fills the bar, or # if the stream's encoding does not have it."""
     try:
         "█".encode(stream.encoding or "utf-8")
     except (UnicodeEncodeError, LookupError):
@@ -39,7 +39,7 @@ def _block(stream: TextIO) -> str:
 
 
 class ConsoleReporter(Reporter):
-    """Prints a progress bar with the time left on a terminal; elsewhere plain lines, at most one every 5 seconds.
+    """Prints a progress bar with the remaining time on a terminal, otherwise plain lines, at most one every 5 seconds.
 
     Progress, status and results go to `stream` (stdout), warnings and errors to `errors` (stderr).
     """
@@ -49,19 +49,19 @@ class ConsoleReporter(Reporter):
         self.errors = errors or sys.stderr
         self.on_terminal = self.stream.isatty()
         self._bar = ""
-        """The line of the progress bar on screen; empty without one."""
+        """The progress bar on screen; empty if there is none."""
         self._started = time.monotonic()
         self._last_line = -SECONDS_BETWEEN_LINES
         self._kept: dict[str, Any] = {}
         self._preview_folder: Path | None = None
 
     def status(self, message: str) -> None:
-        """Print what is being done now; progress that follows belongs to it."""
+        """Print the current activity, to which the following progress belongs."""
         self.close()
         self._print(message, self.stream)
 
     def progress(self, done: float, total: float, **fields: Any) -> None:
-        """Move the bar; figures that come only now and then (psnr, miou) stay on show until they change."""
+        """Update the bar; figures that are not part of every event (psnr, miou) stay visible until they change."""
         self._kept.update({name: value for name, value in fields.items() if value is not None})
         now, finished = time.monotonic(), done >= total
         interval = SECONDS_BETWEEN_REDRAWS if self.on_terminal else SECONDS_BETWEEN_LINES
@@ -82,7 +82,7 @@ class ConsoleReporter(Reporter):
             self._print(f"  {percentage}  {text}".rstrip(), self.stream)
 
     def preview(self, path: Path, **_fields: Any) -> None:
-        """Name the folder of the preview images once; they come too often to name each."""
+        """Print the folder of the preview images once instead of each image."""
         folder = Path(path).parent
         if folder != self._preview_folder:
             self._preview_folder = folder
@@ -96,11 +96,11 @@ class ConsoleReporter(Reporter):
         self._print(f"error: {message}", self.errors)
 
     def stopped(self, message: str) -> None:
-        """Print that the command was stopped, and what becomes of its result."""
+        """Print the message of a stopped command."""
         self.status(message)
 
     def done(self, **fields: Any) -> None:
-        """Close with the figures, and with every other field on its own line."""
+        """Print the final figures, and text and path fields on lines of their own."""
         self.close()
         figures = _figures(fields)
         self._print("Done" + (f": {', '.join(figures)}" if figures else "."), self.stream)
@@ -109,7 +109,7 @@ class ConsoleReporter(Reporter):
                 self._print(f"  {name}: {value}", self.stream)
 
     def close(self) -> None:
-        """End the bar, so that other text can follow; progress after this starts a new one."""
+        """End the bar, so that other text can follow; later progress starts a new one."""
         self._end_bar()
         self._started = time.monotonic()
         self._last_line = -SECONDS_BETWEEN_LINES
@@ -120,19 +120,19 @@ class ConsoleReporter(Reporter):
         width = min(BAR_COLUMNS, max(5, columns - 11 - len(text)))
         filled = round(width * min(max(progress, 0.0), 1.0))
         line = f"  {100 * progress:3.0f}% |{(_block(self.stream) * filled).ljust(width)}| {text}"[:columns]
-        # Spaces overwrite what a longer line before has left.
+        # Spaces overwrite the rest of a longer previous line.
         self.stream.write("\r" + line.ljust(len(self._bar)))
         self.stream.flush()
         self._bar = line
 
     def _end_bar(self) -> None:
-        """Leave the bar as it is and go on to the next line."""
+        """Keep the bar on screen and move to the next line."""
         if self._bar:
             print(file=self.stream, flush=True)
             self._bar = ""
 
     def _print(self, text: str, stream: TextIO) -> None:
-        """Print a line; a bar on screen makes room for it and is drawn again below."""
+        """Print a line; a bar on screen is erased and redrawn below it."""
         if self._bar:
             self.stream.write("\r" + " " * len(self._bar) + "\r")
             self.stream.flush()

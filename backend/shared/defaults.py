@@ -1,4 +1,4 @@
-"""Defaults that the command line and Blender's panels have in common."""
+"""Defaults shared by the command line and Blender's panels."""
 
 MAX_SIZE = 1600
-"""Longer side, in pixels, that images are reduced to."""
+"""Length of the longer side, in pixels, to which larger images are reduced."""

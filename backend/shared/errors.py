@@ -1,4 +1,4 @@
-"""Errors that end a command, and its exit codes."""
+"""Exceptions that end a command, and exit codes."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ EXIT_CANCELLED = 130
 
 
 class InputError(Exception):
-    """What the user gave cannot be used; the message is one plain sentence that names the file."""
+    """Invalid user input; the message is one plain sentence that names the file."""
 
 
 class Cancelled(Exception):
-    """The user asked to stop; everything worth keeping is on disk."""
+    """The user stopped the command; all results worth keeping are on disk."""
 
 
 def describe_missing_package(error: ModuleNotFoundError) -> str:
-    """The sentence for a Python that does not have the backend's packages."""
+    """Return the message for a Python without the backend's packages."""
     return (
         f"The Python {sys.executable} lacks the package {error.name}, which the compute backend needs; "
         "set up the backend, or choose a Python that has its packages."

@@ -1,4 +1,4 @@
-"""Events that a command reports while it runs, and their form as JSON lines."""
+"""Events that a command reports while it runs, and their output as JSON lines."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from .formats.json_file import plain
 
 
 class Reporter:
-    """Takes a command's events; this base class drops them (for tests and library use).
+    """Receiver of a command's events; this base class discards them (for tests and library use).
 
-    status(message): what is being done now. progress(done, total, ...): any extra fields as keywords,
-    `seconds_left` among them. preview(path): a picture was written. quality(**figures): what was measured on held-out
-    views, and when: seconds and step of the training, psnr, miou, mbiou. warning(message). A command ends with one of
-    done(**fields), stopped(message) where the user asked for it, and error(message).
+    status(message): the current activity. progress(done, total, ...): extra fields such as `seconds_left` as keywords.
+    preview(path): an image was written. quality(**figures): metrics on held-out views (psnr, miou, mbiou), with the
+    seconds and the step of the training. warning(message). A command ends with one of done(**fields), stopped(message)
+    if the user stopped it, and error(message).
     """
 
     def status(self, message: str) -> None: ...
@@ -40,7 +40,7 @@ class Reporter:
 
 
 class JsonReporter(Reporter):
-    """Writes each event as one JSON object a line."""
+    """Writes each event as one JSON object per line."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self.stream = stream or sys.stdout

@@ -1,7 +1,4 @@
-"""How long a training takes and how good it is expected to become, to be said before it begins.
-
-Standard library only, so that Blender's own Python can import it.
-"""
+"""Estimates of a training's duration and quality, shown before it begins."""
 
 from __future__ import annotations
 
@@ -11,14 +8,14 @@ from bisect import bisect_left
 DEFAULT_SECONDS = 300.0
 
 PRESET_STEPS = {"preview": 600, "standard": 1500}
-"""Lengths by name; `benchmarks/length.py` measures their places on the curve of error against run time."""
+"""Training lengths of the presets; `benchmarks/length.py` measures their error and run time."""
 
 SHORT_OF_FINAL = {248: (3.6, 3.6), 488: (1.7, 1.7), 600: (1.2, 1.2), 1114: (0.5, 0.5), 1500: (0.2, 0.2)}
-"""Steps -> by how many dB, PSNR of held-out views, trainings of so many fell short of one with an open end: the least
-and the most of the captures that were measured, here those of the demo in docs/length.md."""
+"""Steps -> deficit of a training's PSNR on held-out views, in dB, relative to a training until convergence: minimum and
+maximum over the measured captures, which are those of the demo in docs/length.md."""
 
 NANOSECONDS_A_PIXEL = (300.0, 1200.0)
-"""What a step takes on a CPU for each pixel of a view, at least and at most, as long as nothing was measured here."""
+"""Minimum and maximum time of a step on a CPU per pixel of a view, used until a training has been measured."""
 
 _FINAL = "a training until it stops improving"
 
@@ -26,10 +23,17 @@ _FINAL = "a training until it stops improving"
 def expectation(
     steps: int | None, seconds: float | None, pixels: float | None, trained: tuple[int, float] = (0, 0.0)
 ) -> str | None:
-    """What to expect of a training of so many steps, or of so many seconds, in a sentence; None where nobody knows.
+    """Describe the expected duration and quality of a training.
 
-    trained: how many steps of the same training are done, and the seconds they took; before it begins the time is
-    guessed from the pixels of a view (None: it runs on something else than a CPU).
+    Args:
+        steps: Length in steps, or None.
+        seconds: Length in seconds, or None; ignored if `steps` is given.
+        pixels: Pixels of a view, from which the time on a CPU is estimated before the training begins; None on other
+            devices.
+        trained: Steps of the same training that are done, and the seconds that they took.
+
+    Returns:
+        A sentence, or None if there is no basis for an estimate.
     """
     where = ""
     if all(trained):
@@ -56,8 +60,10 @@ def expectation(
 
 
 def shortfall(steps: float) -> tuple[float, float]:
-    """By how many dB so many steps fall short of a training with an open end, the least and the most: between what
-    was measured, as the logarithm of the steps goes; outside, as at the nearest."""
+    """Return the minimum and maximum PSNR deficit in dB of a training of `steps` steps.
+
+    Interpolates `SHORT_OF_FINAL` linearly in log(steps); outside its range, the nearest value is used.
+    """
     known = sorted(SHORT_OF_FINAL)
     above = bisect_left(known, steps)
     if above in (0, len(known)):
@@ -76,7 +82,7 @@ def _range(least: str, most: str) -> str:
 
 
 def _rounded(count: float) -> int:
-    """To two digits, at least 1."""
+    """Round to two significant digits, at least 1."""
     return int(round(count, 1 - math.floor(math.log10(count)))) if count >= 1 else 1
 
 

@@ -1,6 +1,6 @@
-"""Which objects are made: those that are chosen (`--only`), and groups of IDs as one object each (`--groups`).
+"""Selection of the objects to reconstruct (`--only`), and grouping of IDs into one object (`--groups`).
 
-Both are edits as objects.json has them, so that they can be taken back in the list of objects.
+Both produce edits for objects.json, so they can be reverted in the list of objects.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from .formats.json_file import read_json
 from .reconstruction.objects import LARGEST_ID, SceneObject, find_object, merged
 
 Changes = dict[int, dict[str, Any]]
-"""Edits by ID, as `edit_objects` takes them."""
+"""Object ID -> edits, as for `edit_objects`."""
 
 
 def read_groups(path: Path) -> dict[int, str]:
-    """ID -> name of its group, from a labels file in which several IDs have one name: {"1": "chair", "2": "chair"}."""
+    """Read ID -> name of its group from a labels file that gives IDs the same name: {"1": "chair", "2": "chair"}."""
     content = read_json(path)
     if not isinstance(content, dict) or not content:
         raise InputError(f'{path} has no groups; expected IDs and the name of each one\'s group: {{"1": "chair"}}.')
@@ -36,7 +36,7 @@ def read_groups(path: Path) -> dict[int, str]:
 
 
 def grouped(objects: Sequence[SceneObject], groups: Mapping[int, str], path: Path) -> Changes:
-    """Make one object of the IDs that have one name in `groups`, read from `path`: the one with the smallest ID."""
+    """Return edits that merge the IDs with the same name in `groups`, read from `path`, into the smallest of them."""
     members: dict[str, list[int]] = defaultdict(list)
     for entry in sorted(objects, key=lambda entry: entry.id):
         if entry.id in groups:
@@ -52,13 +52,13 @@ def grouped(objects: Sequence[SceneObject], groups: Mapping[int, str], path: Pat
 
 
 def chosen(objects: Sequence[SceneObject], words: Sequence[str], path: Path) -> Changes:
-    """Choose the objects that `words` name, with all that is merged into them, and leave out the others of `path`."""
+    """Return edits that leave out all objects of `path` but those that `words` select and those merged into them."""
     wanted, into = {find_object(objects, word, path).id for word in words}, merged(objects)
     return {entry.id: {"left_out": None if into[entry.id] in wanted else True} for entry in objects}
 
 
 def changed(objects: Sequence[SceneObject], changes: Changes) -> list[SceneObject]:
-    """The objects as they are after these changes."""
+    """Return the objects with the changes applied."""
     found = []
     for entry in objects:
         change: dict[str, Any] = {**changes.get(entry.id, {})}

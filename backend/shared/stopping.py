@@ -1,4 +1,4 @@
-"""Asking a command to stop or to wait: by a signal, or by lines from the program that drives it."""
+"""Requests to stop or pause a command, by signals or by lines on standard input from a controlling program."""
 
 from __future__ import annotations
 
@@ -16,20 +16,22 @@ from .errors import Cancelled
 from .events import Reporter
 
 _ASKED_EVERY = 0.1
-"""Seconds between two looks, while paused, at whether to go on."""
+"""Polling interval in seconds while paused."""
 
 
 class StopRequest:
-    """Asked by calling it: whether to stop. While paused the call does not return.
+    """A callable that returns whether to stop, and blocks while paused.
 
-    Set by an interrupt, a termination signal, or lines on standard input: `stop`, `pause`, `resume`, and `attached`,
-    after which the end of standard input means that the driving program is gone, which stops too.
-    `announce` is told when a pause begins and ends.
+    It is set by an interrupt, by a termination signal, or by the lines `stop`, `pause` and `resume` on standard input.
+    After the line `attached`, the end of standard input means that the controlling program has exited, and also stops.
+
+    Args:
+        announce: Called with a message when a pause begins and ends.
     """
 
     def __init__(self, announce: Callable[[str], None] = lambda _: None) -> None:
         self._announce = announce
-        # Plain flags: a lock that the main thread holds could not be taken by a signal handler, which interrupts it.
+        # Plain flags, since a signal handler that interrupts the main thread would deadlock on a lock that it holds.
         self._stopped = False
         self._paused = False
 
@@ -49,9 +51,9 @@ class StopRequest:
 
     @contextmanager
     def listening(self, read_stdin: bool) -> Iterator[None]:
-        """Take over the signals, and standard input where another program drives this one.
+        """Handle SIGINT and SIGTERM and, if `read_stdin`, the lines on standard input; restore the handlers at the end.
 
-        A second signal interrupts at once, whatever is being done.
+        A second signal raises KeyboardInterrupt immediately.
         """
 
         def on_signal(_number: int, _frame: FrameType | None) -> None:
@@ -83,16 +85,16 @@ class StopRequest:
                 elif word == "attached":
                     attached = True
         except (OSError, ValueError):
-            pass  # Closed, or not to be read: then nothing can be asked there.
+            pass  # Standard input is closed or unreadable.
         if attached:
             self._stopped = True
 
 
 class StoppingReporter(Reporter):
-    """Hands events on; at each progress it waits while `stop` is paused, and raises Cancelled where it says so.
+    """Forwards events; each progress event waits while `stop` is paused, and raises Cancelled once a stop is requested.
 
-    For work that writes whole files alone and so may end between any two of its steps. Other work asks `stop` itself
-    and tells `reporter`, the one behind.
+    For work that only writes complete files and may therefore end between any two steps. Other work calls `stop` itself
+    and reports to `reporter`, the wrapped reporter.
     """
 
     def __init__(self, reporter: Reporter, stop: StopRequest) -> None:

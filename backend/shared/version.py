@@ -1,3 +1,3 @@
-"""The version of extension and backend."""
+"""Version of the extension and the backend."""
 
 __version__ = "0.1.0"

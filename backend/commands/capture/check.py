@@ -10,7 +10,7 @@ from ...shared.stopping import StoppingReporter
 
 
 def check(options: argparse.Namespace, reporter: StoppingReporter) -> None:
-    """Report a capture's contents; raises InputError with the first problem if it cannot be used."""
+    """Report a capture's contents; raise InputError with the first problem if it cannot be used."""
     found = check_capture(options.capture, options.max_size, reporter)
     for sentence in found["warnings"] + found["problems"][1:]:
         reporter.warning(sentence)

@@ -17,7 +17,7 @@ from .votes import votes_are_current
 
 
 def import_capture(options: argparse.Namespace, reporter: StoppingReporter) -> None:
-    """Undistort the images; leave cameras.json, points.ply, plan.json and the capture's entry in objectgs.json.
+    """Undistort the images; write cameras.json, points.ply, plan.json and the capture's entry in objectgs.json.
 
     Points keep the objects of an earlier vote on this capture; without a vote they belong to no object.
     """
@@ -28,7 +28,7 @@ def import_capture(options: argparse.Namespace, reporter: StoppingReporter) -> N
         if not cast or not votes_are_current(folder, capture, *cast):
             count = len(capture.points.xyz)
             none = Votes(np.zeros(count, np.int64), np.zeros(count, np.float32), {}, np.zeros(count, np.int32))
-            # The record is cleared first, so that points without a vote never count as voted on.
+            # The record is cleared first, so that points without a vote are never taken for the result of one.
             update_record(folder, votes=None)
             write_points(folder.points, capture.points, none)
             if folder.objects.exists():

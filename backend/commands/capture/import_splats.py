@@ -72,7 +72,7 @@ def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> No
 
 
 def _vote_on_splats(capture: Capture, splats: Splats, reporter: Reporter) -> np.ndarray:
-    """Vote on the object of each splat (N,); raises InputError if the splats are not inside the capture's views."""
+    """Return the voted object ID of each splat (N,); raise InputError if too few splats are in the capture's views."""
     votes = vote_points(capture, reporter=reporter, positions=splats.means)
     seen = float((votes.visible > 0).mean())
     if seen < _LEAST_VISIBLE:

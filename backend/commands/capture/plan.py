@@ -1,4 +1,4 @@
-"""`plan`: decides what training needs for a capture, in plan.json; `import`, `vote` and `train` do so too."""
+"""`plan`: decides what training needs for a capture, in plan.json; also used by `import`, `vote` and `train`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .votes import object_name, votes_are_current
 
 
 def plan(options: argparse.Namespace, reporter: StoppingReporter) -> None:
-    """Report what training would do and omit; with --out, use and write the files of that folder."""
+    """Report the steps that training would do and omit; with --out, use and write the files of that folder."""
     device, budget = devices.pick(options.device), budget_of(options)
     folder = Reconstruction(options.out) if options.out else None
     with ExitStack() as held:
@@ -34,7 +34,7 @@ def plan(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             held.enter_context(removed_if_refused(folder))
             folder.create()
             held.enter_context(locked(folder.folder))
-        # Images that are already prepared are read; a plan prepares none.
+        # A plan reads images that are already prepared, but does not prepare any.
         cache = folder.cache if folder is not None and folder.cameras.exists() else None
         capture = load_capture(options.capture, cache, memory_for_files(options), options.max_size, reporter)
         objects, _ = find_requested_objects(folder, capture, options)
@@ -50,7 +50,7 @@ def plan(options: argparse.Namespace, reporter: StoppingReporter) -> None:
 
 
 def write_default_plan(folder: Reconstruction, capture: Capture, max_size: int) -> None:
-    """Write plan.json for a training with the default settings, from known facts."""
+    """Write plan.json for a training with the default settings, from the facts known so far."""
     objects, _ = find_requested_objects(folder, capture)
     context = build_context(capture, Choices(max_size=max_size), objects, voted_ids(folder, capture))
     write_plan(folder.plan, decide(context))
@@ -63,7 +63,7 @@ def build_context(
     point_ids: np.ndarray | None = None,
     thorough: bool = False,
 ) -> PlanningContext:
-    """Collect the facts for decisions about a capture with the user's objects."""
+    """Collect the facts for the decisions; arguments are as in `PlanningContext`, but `capture` is unedited."""
     left_out = [entry.id for entry in objects if entry.left_out]
     capture = capture.edited({entry.id: entry.name for entry in objects}, left_out)
     point_ids = None if point_ids is None else capture.without_left_out(point_ids)
@@ -71,12 +71,12 @@ def build_context(
 
 
 def choices(options: argparse.Namespace) -> Choices:
-    """The choices that the options of `train` make."""
+    """Return the choices that the options of `train` make."""
     return Choices(settings(options), options.max_size, not options.no_meshes, options.keep, options.leave_out)
 
 
 def settings(options: argparse.Namespace) -> Settings:
-    """The settings that the options of `train` make, before the plan changes them."""
+    """Return the settings that the options of `train` make, before the plan changes them."""
     given = {
         "offsets": options.offsets, "max_anchors": options.max_anchors, "voxel": options.voxel,
         "semantic_weight": options.semantic_weight, "normal_weight": options.normal_weight,
@@ -118,7 +118,7 @@ def find_requested_objects(
 
 
 def change_objects(folder: Reconstruction, capture: Capture, options: argparse.Namespace) -> list[SceneObject]:
-    """Apply --groups and --only to objects.json; returns the objects."""
+    """Apply --groups and --only to objects.json and return the objects."""
     objects, changes = find_requested_objects(folder, capture, options)
     if changes:
         edit_objects(folder.objects, changes)
@@ -126,7 +126,7 @@ def change_objects(folder: Reconstruction, capture: Capture, options: argparse.N
 
 
 def voted_ids(folder: Reconstruction, capture: Capture) -> np.ndarray | None:
-    """The points' objects by the latest vote, of any strategy; None if it is not current."""
+    """Return the points' object IDs from the latest vote with any strategy; None if it is not current."""
     voted = read_record(folder).votes
     if not voted or not votes_are_current(folder, capture, voted.max_size, voted.strategy, voted.seed or 0):
         return None

@@ -1,4 +1,4 @@
-"""The votes on the objects of points, in points.ply and objects.json, and whether they are current."""
+"""Votes on the objects of points, stored in points.ply and objects.json, and the test whether they are current."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def cast_votes(folder: Reconstruction, capture: Capture, options: argparse.Names
 
 
 def votes_are_current(folder: Reconstruction, capture: Capture, max_size: int, strategy: str, seed: int) -> bool:
-    """Whether points.ply is complete and holds the result of the same vote."""
+    """Return whether points.ply is complete and contains the result of the same vote."""
     if not folder.points.exists() or not folder.objects.exists():
         return False
     if read_record(folder).votes != votes_key(capture, max_size, strategy, seed):
@@ -48,7 +48,7 @@ def votes_are_current(folder: Reconstruction, capture: Capture, max_size: int, s
 
 
 def votes_key(capture: Capture, max_size: int, strategy: str, seed: int) -> VotesRecord:
-    """Everything that votes depend on, as objectgs.json stores it; a mask file that was modified changes it."""
+    """Return the inputs of a vote for objectgs.json; they change if a mask file is modified."""
     masks = hashlib.sha256()
     for view in capture.views:
         if view.mask_file is not None:
@@ -64,5 +64,5 @@ def votes_key(capture: Capture, max_size: int, strategy: str, seed: int) -> Vote
 
 
 def object_name(capture: Capture, object_id: int) -> str:
-    """What an object is called: as in the capture, or by its number."""
+    """Return the name of an object in the capture, or its default name."""
     return capture.names.get(object_id, default_name(object_id))

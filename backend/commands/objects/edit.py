@@ -94,7 +94,7 @@ class _Edits:
 
 
 def _described(entry: SceneObject, new_splats: int | None) -> list[str]:
-    """The edits of an object in words; new_splats: that fill the hole it leaves, None where that was not asked for."""
+    """Describe the edits of an object; new_splats: number that fills its hole, None if it is not to be filled."""
     words = [f"merged into {entry.merged_into}"] if entry.merged_into is not None else []
     words += ["left out"] if entry.left_out else []
     if entry.removed:

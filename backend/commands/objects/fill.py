@@ -1,4 +1,4 @@
-"""The filling of holes of removed objects, computed once for each state of the edits, for Blender."""
+"""Filling of the holes of removed objects for Blender, computed once for each state of the edits."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class Target:
 
 
 def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
-    """Make the meshes of the options that do not exist yet; each is written as soon as it is complete."""
+    """Make the selected meshes that do not exist yet; each is written as soon as it is complete."""
     trained = open_trained(options, reporter)
     folder = trained.folder
     ensure_kernels(reporter, trained.model.device)
@@ -88,7 +88,7 @@ class _Part(Reporter):
         self._before, self._share, self._shown = 0.0, 0.0, float(done)
 
     def begin(self, step: str) -> _Part:
-        """Begin a step of the mesh; returns itself."""
+        """Begin a step of the mesh and return self."""
         self._before += self._share
         self._share = _SHARES[step]
         self.progress(0, 1)
@@ -190,7 +190,7 @@ def _stem(key: str) -> str:
 
 
 def _known_meshes(folder: Reconstruction) -> dict[str, MeshEntry]:
-    """The entries of meshes.json; none where it cannot be used, so that it is made anew."""
+    """Return the entries of meshes.json; none if it is invalid, so that the file is created anew."""
     try:
         return read_meshes(folder.meshes)
     except InputError:
@@ -198,13 +198,13 @@ def _known_meshes(folder: Reconstruction) -> dict[str, MeshEntry]:
 
 
 def _entry_of(target: Target, options: argparse.Namespace, trained: Trained) -> MeshEntry:
-    """The entry of a mesh with what decides how it comes out, and no files yet."""
+    """Return the entry of a mesh with the inputs that determine it, and without files."""
     settings = {"faces": options.faces, "closed": not options.open, "texture_size": options.texture_size}
     return MeshEntry(target.key, target.name, target.ids, trained.progress.step, settings)
 
 
 def _is_current(entry: MeshEntry | None, target: Target, options: argparse.Namespace, trained: Trained) -> bool:
-    """Whether the mesh of `target` is there and would come out the same."""
+    """Return whether `entry` is an existing mesh of `target` with the same inputs."""
     wanted = _entry_of(target, options, trained)
     if entry is None or (entry.ids, entry.trained_steps, entry.settings) != (
         wanted.ids, wanted.trained_steps, wanted.settings,

@@ -1,1 +1,1 @@
-"""The machine: the command doctor, compilation of kernels, threads and memory."""
+"""Setup of the machine: the command `doctor`, kernel compilation, threads and memory."""

@@ -1,4 +1,4 @@
-"""Compiles all kernels before training time is counted, once per machine."""
+"""Compilation of all kernels before a training's time is measured, once per machine."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from ...training.settings import Settings
 from ...training.trainer import Trainer
 
 STEPS = 220
-"""Takes a second or two, and is enough for growth: every 50 steps, in the first half of the training."""
+"""Takes a second or two, and includes growth, which occurs every 50 steps in the first half of the training."""
 
 
 def ensure_kernels(reporter: StoppingReporter, device: torch.device) -> None:
@@ -44,7 +44,7 @@ def ensure_kernels(reporter: StoppingReporter, device: torch.device) -> None:
         device: The device to compile for.
 
     Raises:
-        Cancelled: The user asked to stop.
+        Cancelled: The user stopped the command.
     """
     if not devices.simulated() and not _mark(device).exists():
         try_kernels(reporter, device)
@@ -65,9 +65,9 @@ def try_kernels(reporter: StoppingReporter, device: torch.device) -> None:
 
 
 def _mark(device: torch.device) -> Path:
-    """The file, beside numba's cache, whose existence means that the kernels of these sources are compiled.
+    """Return the path of the file, beside numba's cache, that marks the kernels of these sources as compiled.
 
-    Its name depends on the sources, their folder, which numba's cache depends on, numba's version and the device.
+    Its name depends on the sources, their folder (as numba's cache does), numba's version and the device.
     """
     sources = Path(__file__).resolve().parents[2]
     processor = f"{llvmlite.binding.get_host_cpu_name()} {devices.name_of(device)}"

@@ -19,19 +19,19 @@ _PACKAGES = ("torch", "numpy", "numba", "pycolmap", "scikit-image", "manifold3d"
 
 
 def set_threads(threads: int | None) -> None:
-    """Set the number of threads of kernels and of torch; None for every core that this process may use."""
+    """Set the number of threads of kernels and torch; None for all cores that this process may use."""
     count = max(min(threads or cores(), numba.config.NUMBA_NUM_THREADS), 1)
     numba.set_num_threads(count)
     torch.set_num_threads(count)
 
 
 def cores() -> int:
-    """The number of cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def machine_facts(device: torch.device) -> dict[str, Any]:
-    """Versions and hardware, to be stored with measurements; `device` trains and draws the splats."""
+    """Return versions and hardware, to store with measurements; `device` trains and renders the splats."""
     gpu = {}
     if device.type == "cuda":
         gpu = {
@@ -52,7 +52,7 @@ def machine_facts(device: torch.device) -> dict[str, Any]:
 
 
 def peak_mb() -> float:
-    """Peak memory of this process so far, in MB."""
+    """Return the peak memory of this process so far, in MB."""
     if sys.platform == "win32":
         return round(psutil.Process().memory_info().peak_wset / 1e6, 1)
     import resource

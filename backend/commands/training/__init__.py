@@ -1,1 +1,1 @@
-"""Commands around a training: train, render, evaluate, report."""
+"""Commands for training and its results: train, render, evaluate, report."""

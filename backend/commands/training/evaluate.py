@@ -40,7 +40,7 @@ def evaluate(options: argparse.Namespace, reporter: StoppingReporter) -> None:
 
 
 def _meshes(trained: Trained, reporter: StoppingReporter) -> dict[str, dict[str, Any]]:
-    """Measure every mesh in the folder that was made from this state of the model."""
+    """Measure the meshes in the folder that were made from the current model."""
     capture, folder = trained.capture, trained.folder.meshes
     entries = mesh_entries(folder, trained.progress.step, reporter)
     if not entries:

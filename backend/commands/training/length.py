@@ -1,4 +1,4 @@
-"""The length of a training, and the result to expect."""
+"""Length and expected result of a training."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def expected_of(
         done: The progress so far, if a training is resumed.
 
     Returns:
-        The sentence, or None if the training runs until converged or nothing is known.
+        The sentence, or None if the training runs until convergence or there is no basis for an estimate.
     """
     if budget.until_converged:
         return None

@@ -113,7 +113,7 @@ def _meshes(trained: Trained, evaluated: dict[str, Any], reporter: Reporter) -> 
 
 
 def _object_id(key: str, mesh: dict[str, Any]) -> int | None:
-    """The object whose own mesh it is; None for a set or the whole scene."""
+    """Return the object's ID if the mesh is that of one object; None for a set or the whole scene."""
     return MeshEntry(key, "", mesh["ids"]).object_id
 
 
@@ -123,7 +123,7 @@ def _mesh_name(capture: Capture, key: str, mesh: dict[str, Any]) -> str:
 
 
 def _mesh_sheet(trained: Trained, meshes: dict[str, dict[str, Any]], reporter: Reporter) -> Image.Image | None:
-    """Draw the sheet of the meshes; None if there are none."""
+    """Draw the overview image of the meshes; return None if there are none."""
     capture, folder = trained.capture, trained.folder.meshes
     cards = []
     if len(meshes) > MESHES_SHOWN:
@@ -183,7 +183,7 @@ def _objects(
 
 
 def _left_out(trained: Trained) -> list[dict[str, str]]:
-    """Return what was left out, by the plan or in the training, with the reasons."""
+    """Return the steps that were left out by the plan or in the training, with the reasons."""
     capture, progress = trained.capture, trained.progress
     settings = trained.training.settings
     counts = capture.counts

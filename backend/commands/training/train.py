@@ -75,7 +75,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             try:
                 _run(trainer, budget, folder, options.checkpoint_seconds, reporter)
             except Cancelled:
-                # The result of a stopped training is exported, too, if that takes no time.
+                # Also export the result of a stopped training if this takes no time.
                 if trainer.model.explicit and progress.step:
                     _export(trainer.shown, trainer.scene, folder, reporter)
                 raise
@@ -95,7 +95,7 @@ def _begin(
     reporter: StoppingReporter,
     device: torch.device,
 ) -> tuple[Trainer, Plan]:
-    """Resume the training of the folder or start a new one, with new votes if the present ones differ; and its plan."""
+    """Resume the folder's training or start one, with a new vote if necessary; return the trainer and the plan."""
     resuming = not options.restart and has_checkpoint(folder.checkpoint)
     voters = capture.without_masks() if "votes" in options.leave_out else capture
     current = votes_are_current(folder, voters, options.max_size, options.strategy, options.seed)
@@ -187,7 +187,7 @@ def _measure_held_out(folder: Reconstruction, reporter: StoppingReporter) -> Eva
     """Return a function that measures held-out views, and writes previews of the first one and of the curve."""
 
     def measure(model: ObjectModel, scene: Scene, progress: TrainingProgress) -> dict[str, Any]:
-        # Without SSIM, which would take most of the time, while the clock of the training runs.
+        # Without SSIM, which would take most of the time, since measuring counts as training time.
         found, ids = [], IdScores(scene.zero_is_object)
         capture = scene.capture
         every = max(len(capture.test_indices) // CURVE_VIEWS, 1)

@@ -1,1 +1,1 @@
-"""Colors: sRGB and linear light, one color for each object ID, and changes of color."""
+"""Color: the sRGB transfer function, the palette of object IDs, and recoloring."""

@@ -1,8 +1,7 @@
-"""Recoloring an object: one affine map of colors, the same for splats, textures and what the viewport draws.
+"""Recoloring of an object by an affine map of its colors, the same for splats, textures and the viewport.
 
-Colors are those of the photos, as they are encoded (sRGB), 0 .. 1: what splats' spherical harmonics hold and what
-textures store. An affine map of them is one of the harmonics too, exactly and in every band, and a shader needs three
-dot products for it. Standard library and NumPy only, so that Blender's own Python can import it.
+Colors are sRGB-encoded, 0 .. 1, as in photos, textures and the splats' spherical harmonics. An affine map of the colors
+is exactly an affine map of the harmonics' coefficients in every band, and takes three dot products in a shader.
 """
 
 from __future__ import annotations
@@ -15,21 +14,26 @@ from typing import Any
 import numpy as np
 
 LUMA = np.array([0.299, 0.587, 0.114])
-"""How bright the encoded channels look (ITU-R BT.601)."""
+"""Luma coefficients of the encoded channels (ITU-R BT.601)."""
 
 MIDDLE = 0.5
 DARKEST_MIDDLE = 0.05
-"""An object darker than this is recolored as if it were as bright: black has no shading to keep."""
+"""Lower limit of `middle`, since a black object has no shading to preserve."""
 
 
 @dataclass(frozen=True)
 class Recolor:
-    """What the user asks of an object's colors, applied in this order; the defaults change nothing.
+    """Color changes of an object, applied in this order; the defaults change nothing.
 
-    replace: the color that takes the place of the object's own, by the share `amount` (0 .. 1): shading, which is how
-    bright a place is beside `middle`, stays. middle: the luma of the object's average color. hue: turns of the color
-    wheel, -0.5 .. 0.5; brightness stays. saturation: 0 gray .. 1 as it is .. 2. contrast: about `middle`. value: times
-    this. tint: each channel times this.
+    Attributes:
+        replace: color that replaces the object's own; the shading, which is the luma relative to `middle`, is kept.
+        amount: fraction of `replace`, 0 .. 1.
+        hue: rotation of the hue in turns of the color wheel, -0.5 .. 0.5; the luma is kept.
+        saturation: 0: gray, 1: unchanged, up to 2.
+        contrast: factor about `middle`.
+        value: factor.
+        tint: factor of each channel.
+        middle: luma of the object's average color.
     """
 
     replace: tuple[float, float, float] = (0.5, 0.5, 0.5)
@@ -43,7 +47,7 @@ class Recolor:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Recolor:
-        """From what `stored` wrote; ValueError or TypeError where a value makes no sense. Unknown names are skipped."""
+        """Create from the result of `stored`, ignoring unknown names; raise ValueError or TypeError if invalid."""
         known = {field.name: values[field.name] for field in fields(cls) if field.name in values}
         for name, value in known.items():
             known[name] = _color(value) if name in ("replace", "tint") else float(value)
@@ -52,7 +56,7 @@ class Recolor:
         return cls(**known)
 
     def stored(self) -> dict[str, Any] | None:
-        """As objects.json holds it: what differs from the defaults; None where nothing is changed."""
+        """Return the values that differ from the defaults, for objects.json; None if no color changes."""
         if not self.changes:
             return None
         default = asdict(Recolor())
@@ -64,12 +68,12 @@ class Recolor:
 
     @property
     def changes(self) -> bool:
-        """Whether any color comes out another."""
+        """Whether any color changes."""
         matrix, offset = self.affine()
         return not (np.allclose(matrix, np.eye(3), atol=1e-7) and np.allclose(offset, 0.0, atol=1e-7))
 
     def affine(self) -> tuple[np.ndarray, np.ndarray]:
-        """matrix (3, 3) and offset (3,) in float64: new color = matrix @ color + offset."""
+        """Return matrix (3, 3) and offset (3,), float64, of the map: new color = matrix @ color + offset."""
         gray = np.outer(np.ones(3), LUMA)
         shaded = np.outer(np.array(self.replace), LUMA) / max(self.middle, DARKEST_MIDDLE)
         matrix = (1.0 - self.amount) * np.eye(3) + self.amount * shaded
@@ -80,9 +84,14 @@ class Recolor:
 
 
 def average_luma(colors: np.ndarray, weights: np.ndarray) -> float:
-    """The luma of an object's average color, 0 .. 1, by which recoloring keeps its shading.
+    """Compute the luma of an object's average color; recoloring keeps the shading relative to it.
 
-    colors (n, 3): of its splats, encoded; weights (n,): their opacities. `MIDDLE` where there is nothing to see.
+    Args:
+        colors: sRGB-encoded colors (n, 3) of the object's splats.
+        weights: their opacities (n,).
+
+    Returns:
+        The luma, 0 .. 1; `MIDDLE` if the weights sum to 0.
     """
     if not np.sum(weights) > 0.0:
         return MIDDLE
@@ -90,12 +99,12 @@ def average_luma(colors: np.ndarray, weights: np.ndarray) -> float:
 
 
 def _turned(turns: float) -> np.ndarray:
-    """(3, 3): colors turned around the gray axis; what has no luma keeps none."""
+    """Return the matrix (3, 3) that rotates colors about the gray axis by full `turns` and keeps their luma."""
     angle = 2.0 * math.pi * turns
     axis = np.full(3, 1.0 / math.sqrt(3.0))
     across = np.array([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]]) / math.sqrt(3.0)
     turn = math.cos(angle) * np.eye(3) + math.sin(angle) * across + (1.0 - math.cos(angle)) * np.outer(axis, axis)
-    # Along gray, so that brightness stays as it was.
+    # Shift along the gray axis to restore the luma.
     return turn - np.outer(np.ones(3), LUMA @ turn - LUMA @ np.eye(3))
 
 

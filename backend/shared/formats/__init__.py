@@ -1,1 +1,1 @@
-"""Files in general: atomic writes, JSON, PLY tables and mesh PLY."""
+"""File formats: JSON, PLY vertices and PLY meshes, with atomic writes."""

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Atomic file writes."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import BinaryIO
 
 @contextmanager
 def atomic_path(path: Path, part: Path) -> Iterator[Path]:
-    """`part`, beside `path`, for what writes files by itself; synced and renamed at the end, so that `path` is old or
-    new, never half.
+    """Yield `part` for code that writes to a path; sync it and rename it to `path` at the end, or delete it on errors.
 
-    An OSError names `path`, also where the system names nothing (a full disk).
+    `part` must be in the folder of `path`. The `filename` of an OSError is set to `path`, since some errors, such as a
+    full disk, have none.
     """
     try:
         yield part
@@ -30,12 +30,12 @@ def atomic_path(path: Path, part: Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
-    """A file to write to, which becomes `path` as with `atomic_path`."""
+    """Open a binary file for writing that replaces `path` as in `atomic_path`."""
     with atomic_path(path, path.with_name(path.name + ".part")) as part, part.open("wb") as file:
         yield file
 
 
 def write_atomic(path: Path, data: bytes) -> None:
-    """Write `data` to `path` as `atomic_file` does."""
+    """Write `data` to `path` atomically."""
     with atomic_file(path) as file:
         file.write(data)

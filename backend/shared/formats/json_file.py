@@ -1,4 +1,4 @@
-"""JSON files and the values they hold."""
+"""Reading and writing of JSON files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .atomic import write_atomic
 
 
 def plain(value: Any, where: str = "value") -> Any:
-    """NumPy numbers, paths and tuples as what JSON knows; NaN and infinity as None. Raises ValueError for the rest."""
+    """Convert NumPy values, paths and tuples to JSON types, NaN and infinity to None; raise ValueError for others."""
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, np.generic | np.ndarray):
@@ -32,12 +32,12 @@ def plain(value: Any, where: str = "value") -> Any:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write `value` as JSON, atomically; NaN is refused, since readers of JSON cannot take it."""
+    """Write `value` as JSON, atomically; raise ValueError for NaN and infinity, which are not valid JSON."""
     write_atomic(path, (json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
 
 
 def read_json(path: Path) -> Any:
-    """Read JSON; raises InputError that names the file when it is missing or broken."""
+    """Read a JSON file; raise InputError that names the file if it is missing or invalid."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:

@@ -1,4 +1,4 @@
-"""Meshes on disk: binary PLY with normals, vertex colors, UVs of each face's corners and unobserved faces."""
+"""Meshes as binary PLY with normals, vertex colors, UVs of each face's corners and a flag for unobserved faces."""
 
 from __future__ import annotations
 
@@ -35,15 +35,22 @@ end_header
 """
 
 _FORMER_NAME = "invented"
-"""Of the property `unobserved`, in files that older versions wrote."""
+"""Name of the property `unobserved` in files of older versions."""
 
 
 @dataclass
 class Mesh:
-    """vertices (V, 3) float64 in the capture's world; normals (V, 3) float32, unit, outward; colors (V, 3) uint8 sRGB;
-    faces (F, 3) int32, counter-clockwise from outside; uvs (F, 3, 2) float32 of each face's corners, (0, 0) at the
-    texture's lower left; unobserved (F,) bool: where no camera saw the surface; texture: the image's file name, beside
-    the mesh's file, or "" where there is none."""
+    """A textured triangle mesh.
+
+    Attributes:
+        vertices: (V, 3) float64 in the capture's coordinates.
+        normals: (V, 3) float32, unit length, outward.
+        colors: (V, 3) uint8 sRGB.
+        faces: (F, 3) int32, counterclockwise from outside.
+        uvs: (F, 3, 2) float32 for each face's corners; (0, 0) is the lower left of the texture.
+        unobserved: (F,) bool, faces that no camera saw.
+        texture: file name of the texture beside the mesh's file, or "" if there is none.
+    """
 
     vertices: np.ndarray
     normals: np.ndarray
@@ -69,7 +76,7 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Read what `write_mesh` wrote; raises InputError that names the file when it is missing, cut short or another."""
+    """Read a file of `write_mesh`; raise InputError that names the file if it is missing, truncated or different."""
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -1,7 +1,4 @@
-"""Vertices of binary PLY files as NumPy tables, one field a property.
-
-Standard library and NumPy only, so that Blender's own Python can import it.
-"""
+"""Vertices of binary PLY files as structured NumPy arrays with one field per property."""
 
 from __future__ import annotations
 
@@ -30,7 +27,7 @@ _KINDS = {word: kind for kind, words in _WORDS.items() for word in words}
 
 
 def vertex_header(dtype: np.dtype, count: int) -> bytes:
-    """The header of a little-endian file of `count` vertices; `dtype` has one number a field, of a PLY type."""
+    """Return the header of a little-endian file of `count` vertices; the fields of `dtype` are scalars of PLY types."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     for name in dtype.names or ():
         field = dtype[name]
@@ -41,7 +38,7 @@ def vertex_header(dtype: np.dtype, count: int) -> bytes:
 
 
 def write_vertices(path: Path, table: np.ndarray) -> None:
-    """Write a structured array (N,) of plain numbers as binary little-endian PLY, atomically."""
+    """Write a structured array (N,) of scalar fields as binary little-endian PLY, atomically."""
     packed = np.dtype([(name, table.dtype[name].newbyteorder("<")) for name in table.dtype.names or ()])
     with atomic_file(path) as file:
         file.write(vertex_header(packed, len(table)))
@@ -49,10 +46,13 @@ def write_vertices(path: Path, table: np.ndarray) -> None:
 
 
 def read_vertices(path: Path) -> np.ndarray:
-    """The vertices of a binary PLY file: (N,) structured, with the file's own property names, order and types.
+    """Read the vertices of a binary PLY file; later elements are ignored.
 
-    Elements after the vertices are left alone. Raises InputError that names the file when it is missing, cut short,
-    ASCII, or holds no vertices of plain numbers.
+    Returns:
+        A structured array (N,) with the file's property names, order and types.
+
+    Raises:
+        InputError: The file is missing, truncated or ASCII, or has no vertices with scalar properties.
     """
     try:
         with path.open("rb") as file:

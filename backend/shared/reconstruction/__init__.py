@@ -1,1 +1,1 @@
-"""The reconstruction folder: one module for each of its files, which alone knows the file's name and shape."""
+"""The files of a reconstruction folder: one module per file defines its name and format."""

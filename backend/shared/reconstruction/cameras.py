@@ -1,11 +1,11 @@
-"""cameras.json: the capture's cameras, and how to turn its coordinates upright.
+"""cameras.json: the capture's cameras, and the transform that turns its coordinates upright.
 
     {"capture": "/captures/garden", "origin": [x, y, z],
      "upright": {"rotation": [[...], ...], "translation": [x, y, z]},
      "cameras": [{"name": "0001.jpg", "image": "cache/images/0001.png", "mask": null, "width": 640, "height": 480,
                   "K": [[...], ...], "viewmat": [[...], ...], "held_out": false}, ...]}
 
-Images and masks are absolute paths, or relative to the reconstruction folder where they lie in it.
+Paths of images and masks are relative to the reconstruction folder if they are inside it, and absolute otherwise.
 """
 
 from __future__ import annotations
@@ -25,11 +25,16 @@ NAME = "cameras.json"
 
 @dataclass(frozen=True)
 class CameraView:
-    """One view.
+    """A view of the capture.
 
-    name: of its image in the capture; image, mask: the undistorted image and its object IDs (mask: or None), absolute;
-    width, height: in pixels; K (3, 3): intrinsics in pixels, the first pixel's center at (0.5, 0.5); viewmat (4, 4):
-    the capture's coordinates to the camera's, x right, y down, z forward; held_out: not trained on.
+    Attributes:
+        name: name of the image in the capture.
+        image: absolute path of the undistorted image.
+        mask: absolute path of the object ID mask, or None.
+        width, height: size in pixels.
+        K: intrinsics (3, 3) in pixels; the center of the first pixel is (0.5, 0.5).
+        viewmat: (4, 4) from the capture's coordinates to the camera's (x right, y down, z forward).
+        held_out: whether the view is excluded from training, for evaluation.
     """
 
     name: str
@@ -43,7 +48,7 @@ class CameraView:
 
     @property
     def aspect(self) -> float:
-        """Width of a pixel over its height, so that one focal length serves both axes: fy / fx."""
+        """Pixel aspect ratio, width over height: fy / fx."""
         return float(self.K[1, 1] / self.K[0, 0])
 
 
@@ -51,9 +56,11 @@ class CameraView:
 class Cameras:
     """The cameras of a reconstruction.
 
-    capture: the capture's folder, or None where there is none; origin (3,): subtracted from the capture's coordinates,
-    which may be large, in Blender; upright (4, 4): from there to coordinates with z up; views: by the order of the
-    capture.
+    Attributes:
+        capture: folder of the capture, or None.
+        origin: (3,) offset that Blender subtracts from the capture's coordinates, which may be large.
+        upright: (4, 4) from the coordinates relative to `origin` to coordinates with z up.
+        views: the views in the order of the capture.
     """
 
     capture: Path | None
@@ -91,10 +98,10 @@ def write_cameras(folder: Path, cameras: Cameras) -> None:
 
 
 def read_cameras(folder: Path) -> Cameras:
-    """Read cameras.json of the reconstruction `folder`.
+    """Read cameras.json from the reconstruction `folder`.
 
     Raises:
-        InputError: it is missing, or a field of it cannot be used.
+        InputError: The file is missing, or one of its fields is invalid.
     """
     path = folder / NAME
     if not path.is_file():
@@ -130,7 +137,7 @@ def _view(entry: Any, folder: Path) -> CameraView:
     if view.width < 1 or view.height < 1 or view.K[0, 0] <= 0 or view.K[1, 1] <= 0:
         raise ValueError(f"camera {view.name} has no size or no focal length")
     np.linalg.inv(view.viewmat)
-    view.name.encode()  # Blender takes no text that is not valid Unicode, which JSON's escapes need not be.
+    view.name.encode()  # Blender requires valid Unicode, but JSON escapes may encode lone surrogates.
     return view
 
 

@@ -1,7 +1,8 @@
-"""checkpoint/: the names of its files, and how far the training has come, which the header of each of them says.
+"""checkpoint/: names of its files, and the training progress in their headers.
 
-A file is safetensors: 8 bytes with the header's length, the header as JSON, the tensors. The header's metadata holds
-the training's state as a string of JSON: `format`, `progress`, `settings` and more, which `backend.training` knows.
+The files are safetensors: 8 bytes with the header's length, the header as JSON, and the tensors. The header's metadata
+contains the training state as a JSON string with `format`, `progress`, `settings` and other fields that
+`backend.training` defines.
 """
 
 from __future__ import annotations
@@ -14,27 +15,27 @@ from pathlib import Path
 CURRENT = "model.safetensors"
 PREVIOUS = "previous.safetensors"
 FORMAT = 1
-"""The version of a checkpoint's tensors and state."""
+"""Version of a checkpoint's tensors and state."""
 LONGEST_HEADER = 1 << 26
-"""Bytes; a longer header is none."""
+"""Maximum header length in bytes; longer headers are invalid."""
 
 
 @dataclass(frozen=True)
 class CheckpointHeader:
-    """How far a training has come: steps, and seconds of training."""
+    """Progress of a training in steps and seconds."""
 
     steps: int
     seconds: float
 
 
 def read_header(folder: Path) -> CheckpointHeader | None:
-    """The newest checkpoint's header, without its tensors.
+    """Read the header of the newest checkpoint, without its tensors.
 
     Args:
-        folder: `checkpoint` of a reconstruction folder.
+        folder: The `checkpoint` folder of a reconstruction.
 
     Returns:
-        None where there is no checkpoint, or its header cannot be read.
+        The header, or None if there is no checkpoint or its header cannot be read.
     """
     try:
         with (folder / CURRENT).open("rb") as file:

@@ -1,9 +1,9 @@
-"""Fill of the holes that removed objects leave, as a PLY file in a reconstruction's cache, from `edit` for Blender.
+"""Fills of the holes that removed objects leave: PLY files in the reconstruction's cache, from `edit` for Blender.
 
-Its rows are splats with the properties of splats.ply, `unobserved` as uchar (1: a new splat, 0: one of splats.ply that
-gives way to new ones) and `fills` as uint32: the ID of the removed object whose hole it fills. Places and colors are as
-they were captured, and IDs those of the surface that is continued. The file's name says which splats and edits it is
-for, so that undoing an edit finds the file of before.
+Each row is a splat with the properties of splats.ply and two more: `unobserved` as uchar (1: a new splat, 0: a splat of
+splats.ply that new ones replace) and `fills` as uint32, the ID of the removed object whose hole it fills. Positions and
+colors are as captured, and object IDs are those of the continued surface. The file name is a hash of the splats and the
+edits, so undoing an edit finds the previous file again.
 """
 
 from __future__ import annotations
@@ -19,17 +19,25 @@ from .objects import SceneObject
 UNOBSERVED, FILLS = "unobserved", "fills"
 
 _FORMAT = 2
-"""Version of how holes are filled: files of other versions are made anew."""
+"""Version of the fill algorithm; files of other versions are not reused."""
 _KEPT = 8
-"""The newest files that stay in a cache."""
+"""Number of fill files kept in a cache, newest first."""
 
 _digests: dict[Path, tuple[tuple[int, int], str]] = {}
 
 
 def fill_path(folder: Reconstruction, objects: Sequence[SceneObject]) -> Path | None:
-    """The file for a folder's splats and these edits, whether it is there or not; None where no place is to be closed.
+    """Return the path of the fill file for a folder's splats and edits.
 
-    Raises InputError where splats.ply cannot be read.
+    Args:
+        folder: The reconstruction.
+        objects: The objects with their edits.
+
+    Returns:
+        The path, whether or not the file exists; None if no hole is to be filled or splats.ply does not exist.
+
+    Raises:
+        InputError: splats.ply cannot be read.
     """
     if not any(entry.removed and entry.fill for entry in objects) or not folder.splats.is_file():
         return None
@@ -43,14 +51,14 @@ def fill_path(folder: Reconstruction, objects: Sequence[SceneObject]) -> Path | 
 
 
 def forget_old(newest: Path) -> None:
-    """Remove the files beside `newest` that were written the longest ago; none is needed but to save time."""
+    """Delete the oldest fill files beside `newest`; deleted files can be computed again."""
     written = {path: path.stat().st_mtime_ns for path in newest.parent.glob("fill-*.ply")}
     for path in sorted(written.keys() - {newest}, key=lambda path: -written[path])[_KEPT - 1 :]:
         path.unlink(missing_ok=True)
 
 
 def _digest(path: Path) -> str:
-    """Of a file's content, which is read again only where it was written since."""
+    """Return the SHA-256 of a file, which is cached until the file's modification time or size changes."""
     try:
         state = path.stat()
         stamp = state.st_mtime_ns, state.st_size

@@ -1,4 +1,4 @@
-"""Where the files of a reconstruction lie."""
+"""Paths of the files in a reconstruction folder."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from . import cameras, report
 
 
 class Reconstruction:
-    """Paths inside one reconstruction folder."""
+    """Paths in a reconstruction folder."""
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
@@ -32,7 +32,7 @@ class Reconstruction:
         self.pictures = self.folder / "pictures"
 
     def create(self) -> Reconstruction:
-        """Make the folder; raises InputError when it cannot be written to."""
+        """Create the folder and return self; raise InputError if it is not writable."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             probe = self.folder / f".write-test-{os.getpid()}"

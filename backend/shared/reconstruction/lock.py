@@ -1,7 +1,7 @@
-"""One process at a time writes to a reconstruction folder: it holds a lock of the operating system on DIR/.lock.
+"""Exclusive lock on a reconstruction folder: an operating system lock on DIR/.lock.
 
-The system gives the lock back when the process ends, however it ends, so that no lock is ever stale. The file holds the
-process ID, for messages alone.
+The system releases the lock when the process ends in any way, so locks are never stale. The file contains the process
+ID, which is used only in messages.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ except ImportError:  # Windows
 
 _NAME = ".lock"
 _PATIENCE = 0.5
-"""Seconds to try for, since `lock_holder` holds the lock for a moment to see whether it is free."""
+"""Time in seconds to retry for, since `lock_holder` briefly acquires the lock to test whether it is free."""
 _LOCKED_BYTE = 1 << 30
-"""On Windows a byte is locked, beyond the content, which can then be read."""
+"""Offset of the byte that is locked on Windows; it is beyond the content, which therefore stays readable."""
 
 
 class FolderInUse(InputError):
-    """Another process writes to the folder."""
+    """The folder is locked by another process."""
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keep `folder`, which must exist, for this process.
+    """Hold the lock on `folder`, which must exist.
 
     Raises:
-        FolderInUse: another process, or another part of this one, has it.
-        OSError: the lock cannot be written; its file name is the lock's.
+        FolderInUse: Another process, or another part of this process, holds the lock.
+        OSError: The lock file cannot be written; `filename` is its path.
     """
     path = folder / _NAME
     patience = time.monotonic() + _PATIENCE
@@ -60,7 +60,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def lock_holder(folder: Path) -> int | None:
-    """The ID of the process that writes to `folder`; 0 where it is unknown, None where there is no such process."""
+    """Return the ID of the process that holds the lock on `folder`: 0 if unknown, None if the folder is not locked."""
     path = folder / _NAME
     try:
         descriptor = os.open(path, os.O_RDWR)
@@ -75,9 +75,9 @@ def lock_holder(folder: Path) -> int | None:
 
 
 def _acquire(path: Path) -> int | None:
-    """A descriptor of the locked file; None where another one holds it."""
+    """Return a descriptor of the locked file, or None if the lock is held elsewhere."""
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    # The holder before removes the file: a lock on a removed file keeps nobody out.
+    # The previous holder deletes the file, and a lock on a deleted file excludes no other process.
     if _try_lock(descriptor) and _is_same_file(path, descriptor):
         return descriptor
     os.close(descriptor)
@@ -85,7 +85,11 @@ def _acquire(path: Path) -> int | None:
 
 
 def _release(path: Path, descriptor: int) -> None:
-    """Remove the lock's file and let go of it. Windows refuses to remove an open file, and then removes no other's."""
+    """Delete the lock file and release the lock.
+
+    Windows cannot delete an open file, so there the lock is released first; a file that another process has opened in
+    between is not deleted.
+    """
     if fcntl is not None:
         path.unlink(missing_ok=True)
     os.close(descriptor)

@@ -1,4 +1,4 @@
-"""meshes/meshes.json: what each mesh of a reconstruction was made of, and its files beside it.
+"""meshes/meshes.json: the source objects, settings and files of each mesh of a reconstruction.
 
 {"trained_steps": 2000,
  "meshes": {"1": {"name": "mug", "ids": [1], "trained_steps": 2000, "settings": {"faces": 20000, ...},
@@ -20,16 +20,22 @@ from ..formats.json_file import plain, read_json, write_json
 NAME = "meshes.json"
 
 _FORMER_NAMES = {"invented": "unobserved"}
-"""Of figures in files that older versions wrote."""
+"""Names of figures in files of older versions, and their present names."""
 
 
 @dataclass(frozen=True)
 class MeshEntry:
-    """One mesh: an object's (its key is the object's ID), that of a set of objects (a name) or the whole scene's.
+    """A mesh of an object, a set of objects, or the whole scene.
 
-    name: as shown; ids: the objects that it shows, None: everything; trained_steps: of the model that it was made from,
-    None: unknown; settings: that it was made with; file, texture: names beside meshes.json, None where there is no
-    mesh; why: then the reason, one sentence; figures: what was counted and measured when it was made.
+    Attributes:
+        key: the object's ID, the name of the set, or "scene".
+        name: display name.
+        ids: IDs of the objects in the mesh; None for everything.
+        trained_steps: training steps of the model that it was extracted from; None if unknown.
+        settings: settings of the extraction.
+        file, texture: file names beside meshes.json; None if there is no mesh.
+        why: the reason in one sentence if there is no mesh.
+        figures: counts and measurements of the extraction.
     """
 
     key: str
@@ -44,11 +50,11 @@ class MeshEntry:
 
     @property
     def object_id(self) -> int | None:
-        """The object whose own mesh it is; None for a set or the whole scene."""
+        """ID of the object if the mesh is that of one object; None for a set or the whole scene."""
         return int(self.key) if self.key.isdecimal() and int(self.key) in (self.ids or ()) else None
 
     def as_dict(self) -> dict[str, Any]:
-        """The entry as meshes.json holds it, without the key."""
+        """Return the entry as stored in meshes.json, without the key."""
         files = {"file": self.file, "texture": self.texture, "why": self.why}
         return {
             "name": self.name,
@@ -64,13 +70,13 @@ def read_meshes(folder: Path) -> dict[str, MeshEntry]:
     """Read meshes.json.
 
     Args:
-        folder: `meshes` of a reconstruction folder.
+        folder: The `meshes` folder of a reconstruction.
 
     Returns:
-        The entries by their keys, in the file's order; none where there is no file.
+        The entries by key, in the order of the file; empty if there is no file.
 
     Raises:
-        InputError: the file cannot be used.
+        InputError: The file is invalid.
     """
     path = folder / NAME
     if not path.exists():
@@ -85,7 +91,7 @@ def read_meshes(folder: Path) -> dict[str, MeshEntry]:
 
 
 def write_meshes(folder: Path, entries: Mapping[str, MeshEntry], trained_steps: int) -> None:
-    """Write meshes.json into `folder`; trained_steps: of the model that the latest meshes were made from."""
+    """Write meshes.json to `folder`; trained_steps: training steps of the model that the latest meshes are from."""
     meshes = {key: entries[key].as_dict() for key in sorted(entries)}
     write_json(folder / NAME, plain({"trained_steps": trained_steps, "meshes": meshes}))
 
@@ -108,6 +114,6 @@ def _entry(key: str, values: dict[str, Any]) -> MeshEntry:
 
 
 def _file_name(value: Any) -> str | None:
-    """A file's name: nothing outside of the folder is read."""
+    """Return the last component of a path, so that no file outside the folder is read."""
     name = None if value is None else Path(str(value).replace("\\", "/")).name
     return name or None

@@ -1,12 +1,11 @@
-"""objects.json: the objects of a reconstruction as the votes found them, and what the user changed about them.
+"""objects.json: the objects of a reconstruction as found by the vote, and the user's edits.
 
     {"objects": [{"id": 1, "name": "mug", "color": [59, 125, 216], "points": 812}, ...],
      "edits": {"1": {"name": "cup", "color": [255, 0, 0], "merged_into": 2, "left_out": true},
                "4": {"removed": true, "floaters": true, "fill": true},
                "5": {"recolor": {"hue": 0.3}, "transform": [[1, 0, 0, 2], ...], "copies": [[[1, 0, 0, 5], ...]]}, ...}}
 
-A new vote replaces "objects" and keeps "edits". Standard library and NumPy only, so that Blender's own Python can
-import it.
+A new vote replaces "objects" and keeps "edits".
 """
 
 from __future__ import annotations
@@ -28,22 +27,31 @@ EDITABLE = (
 )  # fmt: skip
 
 _FORMER_NAMES = {"colour": "color", "recolour": "recolor"}
-"""Of fields in files that older versions wrote."""
+"""Names of fields in files of older versions, and their present names."""
 
 Matrix = tuple[tuple[float, float, float, float], ...]
-"""Four rows of an affine map of the capture's coordinates, which moves an object from where it was captured."""
+"""The four rows of an affine map (4, 4) in the capture's coordinates, applied to an object as captured."""
 
 
 @dataclass(frozen=True)
 class SceneObject:
-    """One object: its ID in the masks, name, sRGB color 0 .. 255, how many points voted for it, and the user's edits.
+    """An object with the user's edits.
 
-    merged_into: the ID of the object that it is shown and meshed with, or None; left_out: not to be reconstructed;
-    removed: made, but not to be seen, its copies neither; floaters: then what belongs to no object and lies inside its
-    convex hull is not to be seen either; fill: then the ground or wall that it stands at is closed where it hid it;
-    recolor: of its splats and textures, or None; transform: where it was moved to, or None; copies: where its
-    duplicates are, from where it was captured. Edits of an object that is merged into
-    another have no effect but its name; those of the other count for both.
+    For an object that is merged into another, only the name takes effect; the other object's edits apply to both.
+
+    Attributes:
+        id: object ID in the masks.
+        name: display name.
+        color: display color, sRGB 0 .. 255.
+        points: number of points that the vote assigned to the object.
+        merged_into: ID of the object that it is shown and meshed with, or None.
+        left_out: exclude it from the reconstruction.
+        removed: hide the reconstructed object and its duplicates.
+        floaters: if removed, also hide unlabeled splats inside its convex hull.
+        fill: if removed, fill the hole that it leaves in the ground or wall.
+        recolor: color change of its splats and textures, or None.
+        transform: affine map that moves it from its captured place, or None.
+        copies: affine maps from its captured place to those of its duplicates.
     """
 
     id: int
@@ -61,7 +69,7 @@ class SceneObject:
 
 
 def read_objects(path: Path) -> list[SceneObject]:
-    """The objects with the user's edits applied, by ascending ID; InputError where the file is missing or broken."""
+    """Return the objects with the user's edits, by ascending ID; raise InputError if the file is missing or invalid."""
     content = read_json(path)
     edits = _edits(content, path)
     try:
@@ -74,17 +82,26 @@ def read_objects(path: Path) -> list[SceneObject]:
 
 
 def write_objects(path: Path, objects: Sequence[Mapping[str, Any]]) -> None:
-    """Replace the objects ({"id", "name", "color", "points"} each) and keep the edits that are there."""
+    """Replace the objects ({"id", "name", "color", "points"} each) and keep existing edits."""
     edits = _edits(read_json(path), path) if path.exists() else {}
     write_json(path, {"objects": list(objects), "edits": edits})
 
 
 def edit_objects(path: Path, changes: Mapping[int, Mapping[str, Any]]) -> None:
-    """Change what the user may (`EDITABLE`) about objects, by ID; None takes an edit back to what the vote says."""
+    """Store edits of objects.
+
+    Args:
+        path: objects.json.
+        changes: Object ID -> new values of fields in `EDITABLE`; None reverts an edit.
+
+    Raises:
+        InputError: The file is missing or invalid.
+        ValueError: A field is not editable.
+    """
     unknown = {key for change in changes.values() for key in change} - set(EDITABLE)
     if unknown:
         raise ValueError(f"{', '.join(sorted(unknown))} cannot be edited")
-    read_objects(path)  # Edits of objects that nobody can read would make a broken file look newer.
+    read_objects(path)  # Fail before writing if the file is invalid.
     content = read_json(path)
     edits = _edits(content, path)
     for object_id, change in changes.items():
@@ -94,7 +111,7 @@ def edit_objects(path: Path, changes: Mapping[int, Mapping[str, Any]]) -> None:
 
 
 def merged(objects: Sequence[SceneObject]) -> dict[int, int]:
-    """ID -> the ID that it is shown as, merges of merges followed; a merge into an unknown ID or itself is none."""
+    """Map each ID to the ID that it is shown as, following chains; merges into an unknown ID or itself are ignored."""
     into = {entry.id: entry.merged_into for entry in objects}
     found = {}
     for start in into:
@@ -107,8 +124,19 @@ def merged(objects: Sequence[SceneObject]) -> dict[int, int]:
 
 
 def find_object(objects: Sequence[SceneObject], word: str, path: Path) -> SceneObject:
-    """The object that a word names: its ID, its name in any case, or a part of one object's name alone. What is merged
-    into another stands for that one. InputError, which lists the objects of `path`, where none or several are meant."""
+    """Find an object by ID, by name (ignoring case), or by a part of its name that is unique.
+
+    Args:
+        objects: The objects to search.
+        word: The ID, name or part of a name.
+        path: objects.json, for error messages.
+
+    Returns:
+        The object, or the one that it is merged into.
+
+    Raises:
+        InputError: No object matches, or several do; the message lists the objects.
+    """
     shown, into = {entry.id: entry for entry in objects}, merged(objects)
     if word.isdecimal() and int(word) in shown:
         return shown[into[int(word)]]
@@ -128,7 +156,7 @@ def find_object(objects: Sequence[SceneObject], word: str, path: Path) -> SceneO
 
 
 def default_name(object_id: int) -> str:
-    """What an object is called that nobody has named; ID 0 is what belongs to no object."""
+    """Return the name of an object without one; ID 0 stands for everything without an object."""
     return f"object {object_id}" if object_id else "Unlabeled"
 
 
@@ -159,7 +187,11 @@ def _integer(value: Any, largest: int) -> int:
 
 
 def affine_map(value: Any) -> Matrix:
-    """Four rows of four numbers as a map; ValueError or TypeError where they are none, or flatten what they map."""
+    """Convert four rows of four numbers to an affine map.
+
+    Raises:
+        ValueError, TypeError: They are not an affine map, or the map is singular.
+    """
     matrix = np.array(value, np.float64)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.array_equal(matrix[3], (0, 0, 0, 1)):
         raise ValueError(f"{value} is no affine map of four rows")
@@ -170,7 +202,7 @@ def affine_map(value: Any) -> Matrix:
 
 
 def _name(text: str) -> str:
-    """`text` on one line and as valid Unicode, which JSON's escapes need not be and Blender's names must."""
+    """Return `text` on one line as valid Unicode, which Blender requires but JSON escapes do not guarantee."""
     return " ".join(text.encode("utf-8", "replace").decode().replace("\0", " ").split())
 
 
@@ -182,7 +214,7 @@ def _edits(content: Any, path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _renamed(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields under the names that they have now."""
+    """Replace field names of older versions by the present ones."""
     return {_FORMER_NAMES.get(key, key): value for key, value in values.items()}
 
 

@@ -1,10 +1,8 @@
-"""What is done for a capture and what is left out, and why: plan.json, which the commands write and Blender shows.
+"""plan.json: which steps are done for a capture, which are omitted, and why; the commands write it, Blender shows it.
 
-    {"decisions": [{"key": "exposure", "what": "undoing of exposure and white balance", "planned": false, "done": false,
-                    "why": "the photos agree about their points within 0.4 %; it is undone from 2.0 % on",
+    {"decisions": [{"key": "exposure", "what": "exposure and white balance correction", "planned": false, "done": false,
+                    "why": "the photos show the same points with a difference in brightness or color of 0.4%; ...",
                     "can_override": true, "views": []}, ...]}
-
-Standard library only, so that Blender's own Python can import it.
 """
 
 from __future__ import annotations
@@ -21,19 +19,24 @@ KEYS = (
     "votes", "objects", "groups", "rest", "labels", "undistortion", "duplicate-views", "blind-views", "other-views",
     "unseen-points", "exposure", "pyramid", "meshes", "surface",
 )  # fmt: skip
-"""What is decided about, in this order."""
+"""Keys of the decisions, in the order in which they are made."""
 
 EVERYTHING = "all"
-"""As a key to keep: whatever can be done."""
+"""Key for --keep that stands for every step that can be done."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """Whether something is needed, and why.
+    """The decision whether to do a step, with its reason.
 
-    key: its name on the command line; planned: whether it is needed (None: only known later), why: in a part of a
-    sentence, with the figure that it rests on; done: what the user wants, else as planned; can_override: whether that
-    may differ; views: the names of the views that it is about, where it is about some only.
+    Attributes:
+        key: name on the command line.
+        what: the step, as a noun phrase.
+        planned: whether the step is needed; None if this is only known later.
+        why: the reason as a clause, with the figure that it is based on.
+        can_override: whether the user may override the plan.
+        views: names of the views concerned, if the decision is about some views only.
+        wanted: the user's override, or None.
     """
 
     key: str
@@ -46,28 +49,29 @@ class Decision:
 
     @property
     def done(self) -> bool | None:
+        """Whether the step is done: the user's override, or else the plan."""
         return self.planned if self.wanted is None else self.wanted
 
     @property
     def overridden(self) -> bool:
-        """Whether the user has it otherwise than planned."""
+        """Whether the user's choice differs from the plan."""
         return self.done != self.planned
 
     @property
     def reason(self) -> str:
-        """Why it is as it is."""
+        """The reason for `done` as a clause."""
         option = "--keep" if self.done else "--leave-out"
         return f"{option} {self.key} was asked for" if self.overridden else self.why
 
     def sentence(self) -> str:
-        """For people: what becomes of it and why."""
+        """Return the decision and its reason as a sentence for the user."""
         verdict = {True: "Done", False: "Left out", None: "Known later"}[self.done]
         return f"{verdict}: {self.what}, since {self.reason}"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """All decisions about one capture."""
+    """All decisions about a capture."""
 
     decisions: tuple[Decision, ...] = ()
 
@@ -75,24 +79,29 @@ class Plan:
         return next((decision for decision in self.decisions if decision.key == key), None)
 
     def does(self, key: str) -> bool:
-        """Whether something is done; so is what nothing was decided about."""
+        """Return whether a step is done; True if there is no decision about it."""
         decision = self[key]
         return decision is None or decision.done is not False
 
     @property
     def left_out(self) -> tuple[Decision, ...]:
-        """What is not done."""
+        """Decisions to omit a step."""
         return tuple(decision for decision in self.decisions if decision.done is False)
 
     @property
     def views_left_out(self) -> frozenset[str]:
-        """The names of the views that are not trained on."""
+        """Names of the views that are excluded from training."""
         return frozenset(name for decision in self.left_out for name in decision.views)
 
     def overridden(self, keep: Iterable[str], leave_out: Iterable[str]) -> Plan:
-        """The plan with what the user wants otherwise; `EVERYTHING` among `keep` is whatever can be done.
+        """Return the plan with the user's overrides.
 
-        InputError where a decision cannot be overridden. What is as wanted already stays as it is.
+        Args:
+            keep: Keys of steps to do; `EVERYTHING` stands for all that can be overridden.
+            leave_out: Keys of steps to omit.
+
+        Raises:
+            InputError: A key is in both, or an override contradicts a decision that cannot be overridden.
         """
         keep, leave_out = set(keep), set(leave_out)
         if both := sorted(keep & leave_out):
@@ -100,15 +109,15 @@ class Plan:
         return Plan(tuple(_overridden(decision, keep, leave_out) for decision in self.decisions))
 
     def settled_by(self, other: Plan) -> Plan:
-        """The plan where what is not decided yet is as another plan of the same capture has it."""
+        """Return the plan with open decisions taken from another plan of the same capture."""
         return Plan(tuple((other[own.key] or own) if own.done is None else own for own in self.decisions))
 
     def difference(self, other: Plan, keys: Iterable[str]) -> list[str]:
-        """Those of `keys` that one plan does and the other leaves out."""
+        """Return those of `keys` that one plan does and the other omits."""
         return [key for key in keys if self.does(key) != other.does(key)]
 
     def as_list(self) -> list[dict[str, Any]]:
-        """For JSON."""
+        """Return the decisions as a list for JSON."""
         return [
             {
                 "key": own.key, "what": own.what, "planned": own.planned, "done": own.done, "why": own.why,
@@ -119,7 +128,7 @@ class Plan:
 
     @classmethod
     def of(cls, entries: Iterable[Mapping[str, Any]]) -> Plan:
-        """The plan that `as_list` gave; KeyError or TypeError where it is none."""
+        """Return the plan from the result of `as_list`; raise KeyError or TypeError if it is invalid."""
         return cls(
             tuple(
                 Decision(
@@ -155,7 +164,7 @@ def write_plan(path: Path, plan: Plan) -> None:
 
 
 def read_plan(path: Path) -> Plan:
-    """Read plan.json; InputError that names the file where it is missing or was not written by this program."""
+    """Read plan.json; raise InputError if it is missing or was not written by this program."""
     content = read_json(path)
     try:
         return Plan.of(content["decisions"])

@@ -1,4 +1,4 @@
-"""objectgs.json: what was asked for, so that a later command knows what the files beside it were made from.
+"""objectgs.json: the inputs and settings that the other files of the reconstruction folder were made from.
 
 {"version": "0.1.0",
  "capture": {"folder": "/captures/garden", "max_size": 1600, "digest": "0f..."},
@@ -26,7 +26,7 @@ _Part = TypeVar("_Part")
 
 @dataclass(frozen=True)
 class CaptureRecord:
-    """The capture: its folder, the longest side of its images in pixels, and a hash of its content."""
+    """The capture: its folder, the maximum length of its images' longer side in pixels, and a hash of its content."""
 
     folder: str
     max_size: int
@@ -35,10 +35,14 @@ class CaptureRecord:
 
 @dataclass(frozen=True)
 class VotesRecord:
-    """What the votes in points.ply depend on.
+    """The inputs of the vote in points.ply.
 
-    strategy, seed: of the vote (seed: None where none is used); max_size: longest side of the masks in pixels; capture,
-    masks: hashes (masks: None where there are none).
+    Attributes:
+        strategy: strategy of the vote.
+        seed: random seed, or None if the strategy uses none.
+        max_size: maximum length of the masks' longer side in pixels.
+        capture: hash of the capture.
+        masks: hash of the masks, or None without masks.
     """
 
     strategy: str
@@ -50,11 +54,15 @@ class VotesRecord:
 
 @dataclass(frozen=True)
 class TrainingRecord:
-    """What the training in checkpoint/ was asked for.
+    """The inputs of the training in checkpoint/.
 
-    settings: as `backend.training.settings.Settings` has them; minutes, steps, preset: its length; device: name of the
-    device; left_out: IDs of objects that were not made; votes: that it began with; plan: its decisions, as in
-    plan.json.
+    Attributes:
+        settings: the fields of `backend.training.settings.Settings`.
+        votes: the vote that it started from.
+        minutes, steps, preset: requested length.
+        device: name of the device.
+        left_out: IDs of the objects that were left out.
+        plan: the decisions, as in plan.json.
     """
 
     settings: dict[str, Any]
@@ -69,8 +77,11 @@ class TrainingRecord:
 
 @dataclass(frozen=True)
 class ExportRecord:
-    """How many splats and anchors splats.ply and anchors.ply hold; psnr_of_export: dB of the splats to the model's own
-    images, None where they are the same or it was not measured."""
+    """Sizes of splats.ply and anchors.ply.
+
+    psnr_of_export: PSNR in dB of the exported splats to renders of the model; None if they are identical or it was not
+    measured.
+    """
 
     splats: int
     anchors: int
@@ -79,7 +90,7 @@ class ExportRecord:
 
 @dataclass(frozen=True)
 class ImportRecord:
-    """The file of another program that splats.ply was made from, and how many splats it held."""
+    """The file of another program that splats.ply was imported from, and its number of splats."""
 
     file: str
     splats: int
@@ -87,7 +98,7 @@ class ImportRecord:
 
 @dataclass(frozen=True)
 class StageRecord:
-    """The latest run of a stage: its seconds, and the process's peak memory until its end."""
+    """The latest run of a stage: its duration, and the peak memory of the process up to its end."""
 
     name: str
     seconds: float
@@ -96,7 +107,7 @@ class StageRecord:
 
 @dataclass(frozen=True)
 class Record:
-    """The content of objectgs.json; what was not recorded is None."""
+    """The content of objectgs.json; parts that were not recorded are None."""
 
     capture: CaptureRecord | None = None
     votes: VotesRecord | None = None
@@ -107,10 +118,10 @@ class Record:
 
 
 def read_record(folder: Reconstruction) -> Record:
-    """Read objectgs.json; an empty record where there is none.
+    """Read objectgs.json; return an empty record if there is none.
 
     Raises:
-        InputError: the file cannot be used.
+        InputError: The file is invalid.
     """
     content = _content(folder)
     try:
@@ -129,7 +140,7 @@ def read_record(folder: Reconstruction) -> Record:
 
 
 def update_record(folder: Reconstruction, **parts: Any) -> None:
-    """Replace parts of objectgs.json, named and typed as the fields of `Record`; the others stay."""
+    """Replace parts of objectgs.json, given by the names and types of the fields of `Record`; keep the others."""
     stored = {
         name: [asdict(entry) for entry in part] if name == "stages" else None if part is None else asdict(part)
         for name, part in parts.items()
@@ -138,7 +149,7 @@ def update_record(folder: Reconstruction, **parts: Any) -> None:
 
 
 def record_stage(folder: Reconstruction, stage: StageRecord) -> None:
-    """Record the latest run of a stage in place of the one before."""
+    """Record the latest run of a stage, replacing the previous one."""
     stages = {entry.name: entry for entry in read_record(folder).stages}
     update_record(folder, stages=tuple({**stages, stage.name: stage}.values()))
 
@@ -157,7 +168,7 @@ def _part(content: Mapping[str, Any], name: str, read: Callable[[Any], _Part]) -
 
 
 def _as(cls: Callable[..., _Part]) -> Callable[[Any], _Part]:
-    """Reads a JSON object as a dataclass; what other versions added is passed over."""
+    """Return a function that converts a JSON object to a dataclass and ignores unknown fields of other versions."""
     known = {entry.name for entry in fields(cls)}  # type: ignore[arg-type]
     return lambda values: cls(**{name: value for name, value in values.items() if name in known})
 

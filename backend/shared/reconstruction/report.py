@@ -1,7 +1,7 @@
-"""evaluation.json and report.json: figures of a reconstruction on held-out views, for `report` and for other programs.
+"""evaluation.json and report.json: metrics of a reconstruction on held-out views, for `report` and other programs.
 
 evaluation.json   {"step": 2000, "quality": {"psnr": 34.1, ...}, "objects": [...], "views": [...], "meshes": {...}}
-report.json       the same with the capture, settings, machine, stages, curve and what was left out
+report.json       the same, with the capture, settings, machine, stages, training curve and omitted steps
 """
 
 from __future__ import annotations
@@ -20,10 +20,14 @@ REPORT = "report.json"
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What `evaluate` measured.
+    """The results of `evaluate`.
 
-    step: of the model that was measured; quality: means over the held-out views, by the metric's name; objects: figures
-    of each object; views: of each held-out view; meshes: of each mesh, by its key in meshes.json.
+    Attributes:
+        step: training step of the evaluated model.
+        quality: means over the held-out views by metric name.
+        objects: metrics of each object.
+        views: metrics of each held-out view.
+        meshes: metrics of each mesh by its key in meshes.json.
     """
 
     step: int
@@ -34,15 +38,15 @@ class Evaluation:
 
 
 def write_evaluation(folder: Path, evaluation: Evaluation) -> None:
-    """Write evaluation.json into the reconstruction `folder`."""
+    """Write evaluation.json to the reconstruction `folder`."""
     write_json(folder / EVALUATION, plain(asdict(evaluation)))
 
 
 def read_evaluation(folder: Path) -> Evaluation | None:
-    """Read evaluation.json of the reconstruction `folder`; None where there is none.
+    """Read evaluation.json from the reconstruction `folder`; return None if there is none.
 
     Raises:
-        InputError: the file cannot be used.
+        InputError: The file is invalid.
     """
     path = folder / EVALUATION
     if not path.exists():
@@ -61,15 +65,15 @@ def read_evaluation(folder: Path) -> Evaluation | None:
 
 
 def write_report_json(folder: Path, report: Mapping[str, Any]) -> None:
-    """Write report.json into the reconstruction `folder`."""
+    """Write report.json to the reconstruction `folder`."""
     write_json(folder / REPORT, plain(report))
 
 
 def read_report(folder: Path) -> dict[str, Any]:
-    """Read report.json of the reconstruction `folder`.
+    """Read report.json from the reconstruction `folder`.
 
     Raises:
-        InputError: it is missing or is no report.
+        InputError: The file is missing or is not a report.
     """
     content = read_json(folder / REPORT)
     if not isinstance(content, dict):

@@ -1,4 +1,4 @@
-"""shot.json: through which camera, at which moments and with which objects where, film frames are drawn.
+"""shot.json: the camera, sample times and object transforms of film frames.
 
     {"version": 1, "width": 960, "height": 540, "pixel_aspect": 1.0, "depth_scale": 1.0, "only_named": false,
      "objects": {"1": {"visible": true, "maps": [[[1, 0, 0, 0.2], ...]]}, "4": {"visible": false}},
@@ -6,19 +6,21 @@
          {"time": 1.0, "viewmat": [[...], ...], "K": [[...], ...], "clip": [0.1, 100.0],
           "objects": {"2": {"maps": [[[...], ...], [[...], ...]]}}}, ...]}, ...]}
 
-width and height are pixels; pixel_aspect, the width of one over its height, only goes into the pictures' headers, since
-K says what is seen. depth_scale: how many of the depth's units are one of the capture's. Each frame is the mean of its
-samples: one, or moments while the shutter is open, whose first and last are `shutter` (in frames).
+width, height: size of the images in pixels. pixel_aspect: width of a pixel over its height; it is only written to the
+headers of the images, since K defines the projection. depth_scale: factor from the capture's units to those of the
+depth channel. Each frame is the mean of its samples: a single one, or several times while the shutter is open. shutter:
+the times, in frames, at which the shutter opens and closes.
 
-viewmat (4, 4) maps the capture's coordinates to the camera's (OpenCV axes: x right, y down, looking along z) without
-scale. K (3, 3), in pixels with the first pixel's center at (0.5, 0.5), is that of a pinhole: lens shift moves its
-center, pixels that are not square make its focal lengths differ, skew is refused. Orthographic and panoramic cameras
-have no K and cannot be drawn. clip: nearest and farthest depth drawn, in the capture's units.
+viewmat (4, 4): rigid transform from the capture's coordinates to the camera's (OpenCV axes: x right, y down, z
+forward). K (3, 3): intrinsics of a pinhole camera in pixels; the center of the first pixel is (0.5, 0.5). Lens shift
+moves the principal point, and pixels that are not square have different focal lengths for x and y. Skew is not
+supported, nor are orthographic and panoramic cameras, which have no K. clip: smallest and largest depth to render, in
+the capture's units.
 
-objects: what is known of an object by its ID, in all samples and, where it differs, in one. `maps`: where it is, as
-4x4 affine maps of the capture's coordinates from where it was captured; several are copies, none is as `visible`:
-false. An object without maps is where objects.json says, one that is not named too, unless only_named is true: then it
-is not drawn. Standard library and NumPy only, so that Blender's own Python can import it.
+objects: the state of objects by ID, for all samples and, where it differs, for a single sample. maps: affine maps
+(4, 4) in the capture's coordinates, applied to the object as captured; several maps make duplicates, and an empty list
+hides the object, like "visible": false. An object that has no maps or is not listed is placed as in objects.json, but
+with only_named, objects that are not listed are not rendered.
 """
 
 from __future__ import annotations
@@ -45,25 +47,25 @@ LARGEST_FRAME = 9_999_999
 
 @dataclass(frozen=True)
 class Placed:
-    """An object at a moment: whether it is seen, and its maps (n, 4, 4); None: where objects.json says."""
+    """An object at a sample time: its visibility, and its maps (n, 4, 4); None for the placement in objects.json."""
 
     visible: bool = True
     maps: NDArray[np.float64] | None = None
 
     @property
     def is_seen(self) -> bool:
-        """Whether there is anything of it to draw."""
+        """Whether the object is visible and has at least one placement."""
         return self.visible and (self.maps is None or len(self.maps) > 0)
 
     def stored(self) -> dict[str, Any]:
-        """As shot.json holds it."""
+        """Return the entry as stored in shot.json."""
         maps = {} if self.maps is None else {"maps": self.maps.tolist()}
         return {**({} if self.visible else {"visible": False}), **maps}
 
 
 @dataclass(frozen=True)
 class Sample:
-    """A moment: time in frames, viewmat (4, 4), K (3, 3), clip (nearest, farthest) and the objects by ID."""
+    """A sample time of a frame: time in frames, viewmat (4, 4), K (3, 3), clip (near, far) and the objects by ID."""
 
     time: float
     viewmat: NDArray[np.float64]
@@ -74,7 +76,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Frame:
-    """A picture: the mean of its samples, in the order of their times; shutter: when it opens and closes."""
+    """A frame: its number, the times at which the shutter opens and closes, and its samples in the order of time."""
 
     number: int
     shutter: tuple[float, float]
@@ -82,13 +84,13 @@ class Frame:
 
     @property
     def middle(self) -> int:
-        """The sample in the middle, which depth is taken from."""
+        """Index of the middle sample, which provides the depth."""
         return len(self.samples) // 2
 
 
 @dataclass(frozen=True)
 class Shot:
-    """All of a shot file; see above. Every sample's objects are complete."""
+    """The content of a shot file; the objects of each sample include those that are the same in all samples."""
 
     width: int
     height: int
@@ -99,7 +101,7 @@ class Shot:
 
 
 def write_shot(path: Path, shot: Shot) -> None:
-    """Write a shot file; what does not change about objects is written once."""
+    """Write a shot file; objects that are the same in all samples are written once."""
     samples = [sample for frame in shot.frames for sample in frame.samples]
     stored = [{str(key): placed.stored() for key, placed in sample.objects.items()} for sample in samples]
     steady = {key: entry for key, entry in (stored[0] if stored else {}).items()
@@ -122,7 +124,7 @@ def write_shot(path: Path, shot: Shot) -> None:
 
 
 def read_shot(path: Path) -> Shot:
-    """Read a shot file; InputError says in one sentence what is wrong with it and where."""
+    """Read a shot file; raise InputError with a one-sentence message that locates the problem if it is invalid."""
     content = read_json(path)
     try:
         return _shot(content)
@@ -131,7 +133,18 @@ def read_shot(path: Path) -> Shot:
 
 
 def chosen_frames(text: str | None, shot: Shot) -> list[Frame]:
-    """The frames that `text` names, as 1-24, 1,5,9 or both mixed, in the shot's order; all of them where it is None."""
+    """Select frames of a shot.
+
+    Args:
+        text: Frame numbers such as 1-24 or 1,5,9-12; None for all frames.
+        shot: The shot.
+
+    Returns:
+        The frames in the order of the shot.
+
+    Raises:
+        InputError: `text` is invalid, or the shot has none of these frames.
+    """
     if text is None:
         return list(shot.frames)
     wanted = frame_ranges(text)
@@ -143,7 +156,7 @@ def chosen_frames(text: str | None, shot: Shot) -> list[Frame]:
 
 
 def frame_ranges(text: str) -> list[range]:
-    """The frames of a list such as 1-24 or 1,5,9-12; InputError where it is none."""
+    """Parse a list of frames such as 1-24 or 1,5,9-12; raise InputError if it is invalid."""
     found = []
     for word in text.split(","):
         match = re.fullmatch(r"\s*(\d{1,7})\s*(?:-\s*(\d{1,7})\s*)?", word)
@@ -155,7 +168,7 @@ def frame_ranges(text: str) -> list[range]:
 
 
 class _Wrong(Exception):
-    """What is wrong, as the second half of a sentence."""
+    """Invalid content of a shot file; the message is the second half of a sentence."""
 
 
 def _shot(content: Any) -> Shot:
@@ -239,7 +252,7 @@ def _objects(entries: Any, where: str) -> dict[int, Placed]:
 
 
 def _numbers(value: Any, shape: tuple[int, ...], what: str) -> Any:
-    """Finite numbers as nested lists (or one float), of a shape."""
+    """Convert a value of the given shape to nested lists of finite floats, or to one float for the shape ()."""
     try:
         array = np.array(value, np.float64)
     except (TypeError, ValueError):

@@ -1,1 +1,1 @@
-"""What drawing splats needs in both processes: blending constants, spherical harmonics, picking, convex hulls."""
+"""Splat code shared by backend and add-on: blending constants, spherical harmonics, picking, convex hulls."""

@@ -1,4 +1,4 @@
-"""Which points are inside an object: inside the convex hull of those of its splats that are reliable."""
+"""Test of which points are inside an object: in the convex hull of its reliable splats."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 MIN_OPACITY = 0.05
-"""Splats of an object below this opacity do not count for its extent."""
+"""Splats below this opacity are ignored in an object's extent."""
 MAX_DISTANCE_RATIO = 3.0
-"""Nor do splats farther from its median center than this times the third quartile of the distances: they are
+"""Splats farther from the object's median center than this times the third quartile of the distances are ignored as
 mislabeled."""
 
 

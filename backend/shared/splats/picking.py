@@ -249,13 +249,13 @@ def rotations(quats: NDArray) -> NDArray[np.float64]:
 
 
 def _grid_positions(first: float, last: float) -> NDArray[np.float64]:
-    """Evenly spaced pixel centers between two edges."""
+    """Return evenly spaced pixel centers between two edges."""
     count = max(1, min(_GRID, int(last - first)))
     return np.floor(first + (np.arange(count) + 0.5) * (last - first) / count) + 0.5
 
 
 def _neighbors(means: NDArray, extents: NDArray) -> NDArray[np.int64]:
-    """Sort splats by octave of size, then along a space-filling curve; returns the order."""
+    """Return the order of splats by octave of size, then along a space-filling curve."""
     if len(means) == 0:
         return np.zeros(0, np.int64)
     octave = np.floor(np.log2(np.maximum(extents, 1e-30))).astype(np.int64)
@@ -359,7 +359,7 @@ def _select(splats: _Footprints, which: NDArray) -> _Footprints:
 
 
 def _hit_at(splats: _Footprints, x: float, y: float) -> Hit | None:
-    """The object at a position, of the splats around it."""
+    """Return the object at a position among the given splats, or None where none is drawn."""
     off = (x, y) - splats.center
     near = np.flatnonzero((np.abs(off) <= splats.half).all(1))
     off = off[near]
