@@ -1,4 +1,4 @@
-"""Replaces a COLMAP camera by a pinhole camera: its intrinsics, and the resampling of images and masks."""
+"""Undistortion of COLMAP cameras to pinhole cameras: intrinsics, and resampling of images and masks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..shared.errors import InputError
 from .colmap import Camera
 
 MAX_TAN = math.tan(math.radians(60.0))
-"""A pinhole view extends at most 60 degrees to each side, since pixels stretch without bound beyond."""
+"""A pinhole view extends at most 60 degrees to each side, since pixels stretch without bound towards 90 degrees."""
 
 _POLYNOMIAL = {"SIMPLE_RADIAL": 3, "RADIAL": 3, "OPENCV": 4, "FULL_OPENCV": 4}
 _STRIP = 1 << 18
@@ -32,7 +32,7 @@ class Pinhole:
 
 
 def is_pinhole(camera: Camera) -> bool:
-    """Whether images of this camera need no undistortion."""
+    """Return whether images of this camera need no undistortion."""
     if camera.model in ("SIMPLE_PINHOLE", "PINHOLE"):
         return True
     return camera.model in _POLYNOMIAL and not any(camera.params[_POLYNOMIAL[camera.model] :])
@@ -70,11 +70,11 @@ def undistort(camera: pycolmap.Camera, pixels: np.ndarray, tolerance: float = 0.
 
 
 def pinhole_for(camera: Camera, file: Path, max_size: int) -> Pinhole:
-    """Compute the pinhole camera that replaces a camera: the largest upright rectangle without blank pixels.
+    """Compute the pinhole camera of the undistorted images: the largest upright rectangle without blank pixels.
 
     Args:
-        camera: The camera as COLMAP wrote it.
-        file: The file that error messages name.
+        camera: COLMAP's camera.
+        file: The file named in error messages.
         max_size: Limit of the longer side, in pixels; 0 for none. Up to this limit the focal lengths are kept.
 
     Returns:
@@ -91,7 +91,7 @@ def pinhole_for(camera: Camera, file: Path, max_size: int) -> Pinhole:
     lens = to_pycolmap(camera)
     fx, fy, cx, cy = lens.focal_length_x, lens.focal_length_y, lens.principal_point_x, lens.principal_point_y
     longest = max(camera.width, camera.height)
-    degenerate = "the model is degenerate: run COLMAP anew with more images or a simpler camera model"
+    degenerate = "the model is degenerate: run COLMAP again with more images or a simpler camera model"
     if not (0.02 * longest < min(fx, fy) and max(fx, fy) < 1000 * longest):
         raise InputError(
             f"{who} a focal length of {fx:.4g} pixels for an image of {camera.width}x{camera.height}; {degenerate}."
@@ -113,7 +113,7 @@ def pinhole_for(camera: Camera, file: Path, max_size: int) -> Pinhole:
             f"{who} a distortion that no real lens has (of {camera.width}x{camera.height} pixels {max(width, 0)}x"
             f"{max(height, 0)} would remain); {degenerate}."
         )
-    # The remainder of the floor is removed on both sides, so that the rectangle stays inside.
+    # The fraction of a pixel that was rounded off is split between both sides, so that the rectangle stays inside.
     cx, cy = -x0 * fx - ((x1 - x0) * fx - width) / 2, -y0 * fy - ((y1 - y0) * fy - height) / 2
     return _limited(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64), width, height, max_size)
 
@@ -127,10 +127,10 @@ def _limited(K: np.ndarray, width: int, height: int, max_size: int) -> Pinhole:
 
 
 def _inner_box(lens: pycolmap.Camera, width: int, height: int, fx: float, fy: float) -> tuple[float, ...] | None:
-    """The rectangle (x0, y0, x1, y1), in normalized coordinates, all of whose rays lie in the image.
+    """Return a rectangle (x0, y0, x1, y1), in normalized coordinates, all of whose rays project into the image.
 
     Rays are followed outward from the image's center until they leave the image or the projection folds over (the
-    determinant of its Jacobian is no longer positive): points beyond the fold project into the image a second time.
+    determinant of its Jacobian is no longer positive), because points beyond the fold project into the image again.
     """
     middle = undistort(lens, np.array([[width / 2, height / 2]]))[0]
     if not np.isfinite(middle).all() or np.abs(middle).max() > MAX_TAN:
@@ -154,14 +154,14 @@ def _inner_box(lens: pycolmap.Camera, width: int, height: int, fx: float, fy: fl
     edge = middle + low[:, None] * ray
     pixel = distort(lens, edge)
     near = 1e-3 * max(width, height)
-    # Each side is at the nearest ray that leaves through it, or at the limit if no ray does.
+    # Each side is placed at the nearest ray that leaves through it, or at the limit if no ray does.
     x0 = max([-MAX_TAN, *edge[pixel[:, 0] < near, 0]])
     x1 = min([MAX_TAN, *edge[pixel[:, 0] > width - near, 0]])
     y0 = max([-MAX_TAN, *edge[pixel[:, 1] < near, 1]])
     y1 = min([MAX_TAN, *edge[pixel[:, 1] > height - near, 1]])
     if not (x0 < middle[0] < x1 and y0 < middle[1] < y1):
         return None
-    # Rays may end at a fold instead of a side: the rectangle shrinks about its center until no ray ends inside.
+    # Rays may end at a fold instead of a side: shrink the rectangle about its center until no ray ends inside.
     sides = np.where(edge > middle, [x1, y1], [x0, y0]) - middle
     shrink = min(1.0, float(np.max((edge - middle) / sides, 1).min()))
     along = np.linspace(0, 1, 65)[:, None]
@@ -169,7 +169,7 @@ def _inner_box(lens: pycolmap.Camera, width: int, height: int, fx: float, fy: fl
         low_corner, high_corner = middle + ([x0, y0] - middle) * shrink, middle + ([x1, y1] - middle) * shrink
         other = np.array([high_corner[0], low_corner[1]]), np.array([low_corner[0], high_corner[1]])
         border = np.concatenate([a + (b - a) * along for a in (low_corner, high_corner) for b in other])
-        # Half a pixel of slack: that far out, the outermost pixel is still sampled.
+        # With half a pixel of slack, the samples still come from the outermost pixels.
         if _valid(lens, border, width, height, fx, fy, slack=0.5).all():
             return *map(float, low_corner), *map(float, high_corner)
         shrink *= 0.99
@@ -179,7 +179,7 @@ def _inner_box(lens: pycolmap.Camera, width: int, height: int, fx: float, fy: fl
 def _valid(
     lens: pycolmap.Camera, xy: np.ndarray, width: int, height: int, fx: float, fy: float, slack: float = 0.0
 ) -> np.ndarray:
-    """Which normalized coordinates (..., 2) project into the image, or `slack` pixels outside, without a fold."""
+    """Find which normalized coordinates (..., 2) project without a fold into the image, enlarged by `slack` pixels."""
     shape, flat = xy.shape[:-1], xy.reshape(-1, 2)
     right, down = np.array([_STEP, 0.0]), np.array([0.0, _STEP])
     with np.errstate(invalid="ignore", over="ignore"):
@@ -187,13 +187,13 @@ def _valid(
         dx = (distort(lens, flat + right) - at) / _STEP
         dy = (distort(lens, flat + down) - at) / _STEP
         determinant = (dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0]) / (fx * fy)
-        # Below 1% of the area at the axis, rays are at the rim of a fold.
+        # Rays with less than 1% of the area on the axis are close to a fold.
         good = (determinant > 0.01) & (at >= -slack).all(1) & (at <= np.array([width, height]) + slack).all(1)
     return good.reshape(shape)
 
 
 def _covered(lens: pycolmap.Camera, box: tuple[float, ...], camera: Camera) -> float:
-    """The fraction of the image's area that the rectangle `box` covers."""
+    """Return the fraction of the image's area that the normalized rectangle `box` covers."""
     x0, y0, x1, y1 = box
     s = np.linspace(0, 1, 65)[:-1]
     x = np.concatenate([x0 + (x1 - x0) * s, np.full(64, x1), x1 - (x1 - x0) * s, np.full(64, x0)])
@@ -204,7 +204,7 @@ def _covered(lens: pycolmap.Camera, box: tuple[float, ...], camera: Camera) -> f
 
 
 def source_pixels(camera: Camera, target: Pinhole, supersample: int = 1) -> np.ndarray:
-    """The position of each target pixel's center in the camera's image.
+    """Compute the position of each target pixel's center in the camera's image.
 
     Args:
         camera: The camera that took the image.
@@ -231,16 +231,16 @@ def source_pixels(camera: Camera, target: Pinhole, supersample: int = 1) -> np.n
 
 
 def resample_image(image: PilImage.Image, camera: Camera, target: Pinhole) -> PilImage.Image:
-    """Resample an RGB image of `camera` to `target`: bilinear, with averaging where the target is coarser."""
+    """Resample an RGB image of `camera` to `target`: bilinear, with averaging if the target is coarser."""
     if is_pinhole(camera):
         return image.resize((target.width, target.height), PilImage.Resampling.HAMMING)
-    # If coarser than the source: average whole blocks, then take 2 x 2 samples per pixel for the remaining factor.
+    # If the target is coarser, average whole blocks, then take 2 x 2 samples per pixel for the remaining factor.
     fx = to_pycolmap(camera).focal_length_x
     ratio = fx / target.K[0, 0]
     block = max(1, math.floor(ratio + 1e-6))
     supersample = 2 if ratio / block > 1.2 else 1
     source = image.reduce(block) if block > 1 else image
-    # Positions are relative to pixel edges; the array index i is the center i + 0.5.
+    # Positions are measured from pixel edges, but array indices from pixel centers.
     at = source_pixels(camera, target, supersample) / np.float32(block) - np.float32(0.5)
     planes = np.asarray(source)
     out = np.empty((*at.shape[1:], 3), np.uint8)
@@ -252,7 +252,7 @@ def resample_image(image: PilImage.Image, camera: Camera, target: Pinhole) -> Pi
 
 
 def resample_mask(mask: np.ndarray, camera: Camera, target: Pinhole) -> np.ndarray:
-    """Resample an ID map (h, w) of `camera` to `target`, with nearest-neighbor lookup, which adds no ID.
+    """Resample an ID map (h, w) of `camera` to `target` with nearest-neighbor sampling, which creates no new IDs.
 
     The map may have any size with the camera's aspect ratio; the result has the target's size.
     """

@@ -110,10 +110,10 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
     device = devices.pick(options.device)
     folder = Reconstruction(options.folder)
     if not folder.folder.is_dir():
-        raise InputError(f"{folder.folder} does not exist; give the folder that `train` was told with --out.")
+        raise InputError(f"{folder.folder} does not exist; specify the folder given to `train --out`.")
     if not folder.settings.exists():
         raise InputError(
-            f"{folder.folder} is no reconstruction, since it holds no {folder.settings.name}; train first."
+            f"{folder.folder} is not a reconstruction, since it has no {folder.settings.name}; train first."
         )
     record = read_record(folder)
     model, state, warning = load_model(folder.checkpoint, device)
@@ -122,13 +122,13 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
     training = record.training
     if training is None:
         raise InputError(
-            f"{folder.settings} does not say what {folder.checkpoint} was trained from; train again with --restart."
+            f"{folder.settings} has no record of the training in {folder.checkpoint}; train again with --restart."
         )
     if options.capture is None and record.capture is None:
-        raise InputError(f"{folder.settings} does not say where the capture is; say with --capture where it is now.")
+        raise InputError(f"{folder.settings} has no path of the capture; specify it with --capture.")
     source = Path(options.capture or (record.capture.folder if record.capture else ""))
     if not source.is_dir():
-        raise InputError(f"The capture {source} of {folder.folder} is gone; say with --capture where it is now.")
+        raise InputError(f"The capture {source} of {folder.folder} does not exist; specify its folder with --capture.")
     # The capture of the training; record.capture changes with a later import of another capture.
     max_size = training.votes.max_size
     capture = load_capture(source, folder.cache, memory_for_files(options), max_size, reporter)

@@ -1,8 +1,8 @@
-"""The true surfaces in a synthetic capture, and the parts of them that its cameras see.
+"""The true surfaces of a synthetic capture, and the parts of them that are visible in its views.
 
 truth/objects.json           {"objects": [{"id": 1, "mesh": "meshes/1_mug.ply"}, ...]}
-truth/meshes/*.ply           triangles in the capture's frame, faces turned to the outside
-truth/depth/<image>.npy      (H, W) float32, along the camera's axis
+truth/meshes/*.ply           triangles in the capture's frame, with outward faces
+truth/depth/<image>.npy      (H, W) float32, along the camera axis
 truth/masks/<image>.png      (H, W) object IDs
 """
 
@@ -23,16 +23,17 @@ from ..shared.formats.json_file import read_json
 from ..shared.formats.ply import LONGEST_HEADER, read_vertices
 
 VIEWS_TO_COUNT = 2
-"""Number of views that must see a piece of surface for it to count."""
+"""Number of views in which a point of the surface must be visible to count as seen."""
 _PIXELS_DEEP = 1.5
-"""Largest distance of a point from the depth at its pixel, in widths of the pixel there, since surfaces are slanted."""
+"""Largest difference of a point's depth from the depth map, in widths of a pixel at this depth; allows for slanted
+surfaces."""
 _BYTES_HELD = 400_000_000
 _FACES = "property list uchar int vertex_indices"
 
 
 @dataclass
 class TrueMesh:
-    """vertices (V, 3) float64 in the capture's world, faces (F, 3) int32."""
+    """A true surface: vertices (V, 3) float64 in the capture's world, faces (F, 3) int32."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -47,7 +48,7 @@ class _View:
 
 
 class Truth:
-    """True surfaces by object ID, and the parts of them that the views `indices` of `capture` see."""
+    """True surfaces by object ID, and the parts of them that are visible in the views `indices` of `capture`."""
 
     def __init__(self, meshes: dict[int, TrueMesh], capture: Capture, indices: Sequence[int]) -> None:
         self.meshes = meshes
@@ -57,7 +58,7 @@ class Truth:
         self._bytes = 0
 
     def of(self, ids: Collection[int]) -> TrueMesh | None:
-        """Return the joint surface of the objects `ids`; None if the truth lacks one of them."""
+        """Return the joined surface of the objects `ids`; None if the truth lacks one of them."""
         if not ids or not all(i in self.meshes for i in ids):
             return None
         parts = [self.meshes[i] for i in ids]
@@ -66,10 +67,10 @@ class Truth:
         return TrueMesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
 
     def seen(self, points: np.ndarray, normals: np.ndarray, ids: Collection[int]) -> np.ndarray:
-        """Find the points of the objects `ids` that at least `VIEWS_TO_COUNT` views see.
+        """Find the points of the objects `ids` that are visible in at least `VIEWS_TO_COUNT` views.
 
-        A view sees a point if it faces the outside of the surface, and the point's pixel shows one of `ids` at the
-        depth of the point.
+        A point is visible in a view if its normal faces the camera and the point's pixel shows one of `ids` at the
+        point's depth.
 
         Args:
             points: (n, 3) in the capture's world.
@@ -85,7 +86,10 @@ class Truth:
     def seen_alone(
         self, points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray
     ) -> np.ndarray:
-        """As `seen`, for points of another surface, vertices (V, 3) and faces (F, 3), without the rest of the scene."""
+        """Find the visible points of another surface, rendered without the rest of the scene; otherwise as `seen`.
+
+        vertices (V, 3) and faces (F, 3) are the surface.
+        """
 
         def drawn(view: _View) -> np.ndarray:
             fx, fy, cx, cy = view.intrinsics
@@ -106,7 +110,7 @@ class Truth:
 
 
 def _seen(points: np.ndarray, normals: np.ndarray, looks: Iterable[tuple[_View, np.ndarray]]) -> np.ndarray:
-    """Find the points that at least `VIEWS_TO_COUNT` views see; each comes with a depth map (H, W), 0: nothing."""
+    """Find the points visible in at least `VIEWS_TO_COUNT` views; each view has a depth map (H, W), 0 where empty."""
     views = np.zeros(len(points), np.int32)
     for view, depth in looks:
         fx, fy, cx, cy = view.intrinsics
@@ -129,13 +133,13 @@ def load_truth(capture: Capture, indices: Sequence[int]) -> Truth | None:
 
     Args:
         capture: The capture.
-        indices: The views that decide which parts of the surfaces count.
+        indices: The views that determine which parts of the surfaces count as seen.
 
     Returns:
         The truth, or None if the capture has none.
 
     Raises:
-        InputError: If a file of the truth cannot be used.
+        InputError: A file of the truth cannot be read.
     """
     listed = capture.folder / "truth" / "objects.json"
     if not listed.exists():
@@ -144,7 +148,7 @@ def load_truth(capture: Capture, indices: Sequence[int]) -> Truth | None:
     try:
         files = {int(entry["id"]): capture.folder / "truth" / entry["mesh"] for entry in content["objects"]}
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{listed} does not list meshes as expected ({error!r}); make the capture again.") from error
+        raise InputError(f"{listed} is not a valid list of meshes ({error!r}); make the capture again.") from error
     return Truth({i: _read_mesh(path) for i, path in files.items()}, capture, indices)
 
 
@@ -178,7 +182,7 @@ def _read_view(capture: Capture, index: int) -> _View:
         raise InputError(f"{depth_file} or {ids_file} cannot be read ({error}); make the capture again.") from error
     if depth.ndim != 2 or ids.shape != depth.shape:
         raise InputError(f"{depth_file} and {ids_file} differ in size; make the capture again.")
-    # The truth has the size of the images on disk, the capture's views may be smaller.
+    # The truth has the size of the images on disk; the capture's views may be smaller.
     across, down = depth.shape[1] / view.width, depth.shape[0] / view.height
     K = capture.K(index)
     intrinsics = np.array([K[0, 0] * across, K[1, 1] * down, K[0, 2] * across, K[1, 2] * down])

@@ -27,7 +27,9 @@ def read_groups(path: Path) -> dict[int, str]:
     groups = {}
     for word, name in content.items():
         if not word.isdecimal() or int(word) > LARGEST_ID:
-            raise InputError(f"{path} groups {word!r}, which is no ID; expected a whole number as in the masks.")
+            raise InputError(
+                f"{path} contains {word!r}, which is not an object ID; expected an integer as in the masks."
+            )
         if not isinstance(name, str) or not name.strip():
             raise InputError(f"{path} gives ID {word} the group {name!r}; expected a name.")
         if int(word):
@@ -43,7 +45,7 @@ def grouped(objects: Sequence[SceneObject], groups: Mapping[int, str], path: Pat
             members[groups[entry.id]].append(entry.id)
     if not members:
         there = ", ".join(str(entry.id) for entry in objects[:20]) or "none"
-        raise InputError(f"{path} groups none of the IDs that the masks show; there are: {there}.")
+        raise InputError(f"{path} contains none of the IDs in the masks; available IDs: {there}.")
     changes: Changes = {}
     for name, (first, *others) in members.items():
         changes[first] = {"name": name, "merged_into": None}

@@ -41,7 +41,7 @@ class StopRequest:
             while self.paused:
                 time.sleep(_ASKED_EVERY)
             if not self._stopped:
-                self._announce("Going on")
+                self._announce("Resumed")
         return self._stopped
 
     @property
@@ -107,7 +107,7 @@ class StoppingReporter(Reporter):
     def progress(self, done: float, total: float, **fields: Any) -> None:
         self.reporter.progress(done, total, **fields)
         if self.stop():
-            raise Cancelled("Stopped; what is finished is kept, run the same command again for the rest.")
+            raise Cancelled("Stopped; finished results are kept. Run the same command again to continue.")
 
     def preview(self, path: Path, **fields: Any) -> None:
         self.reporter.preview(path, **fields)

@@ -1,7 +1,7 @@
-"""The training loop: one view per step, growth at intervals, checkpoints, and a curve of held-out quality.
+"""The training loop: one view per step, growth at intervals, checkpoints, and a curve of the quality on held-out views.
 
-The model, its Adam moments and the images lie on one device, the CPU or a GPU. On a GPU no step waits for its results;
-they are read when the training reports or saves.
+The model, its Adam moments and the images are on one device, the CPU or a GPU. On a GPU, steps are asynchronous; their
+results are read when the training reports or saves.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ Evaluate = Callable[[ObjectModel, Scene, TrainingProgress], dict[str, Any]]
 
 
 class Trainer:
-    """A model in training, on the device where it lies. Create one with `start` or `resume`, then call `run`."""
+    """A model in training. Create one with `start` or `resume`, then call `run`."""
 
     def __init__(self, scene: Scene, settings: Settings, model: ObjectModel, rng: np.random.Generator) -> None:
         self.scene = scene
@@ -97,17 +97,17 @@ class Trainer:
         supervise_background: bool | None = None,
         gains: np.ndarray | None = None,
     ) -> Trainer:
-        """Begin a training with anchors on the capture's points.
+        """Start a training with anchors at the capture's points.
 
         Args:
             capture: the views and points.
-            point_ids: (M,) int64 object ID of each point, 0 where it belongs to none.
-            settings: of the training.
-            memory_mb: limit for the targets that are kept in memory.
-            device: where to train.
-            seeds: (M,) bool, the points that anchors start from, and that the scene's extent and density are measured
-                from; None: all.
-            supervise_background: as in `Scene`; None: as `background_is_masked` decides.
+            point_ids: (M,) int64 object ID of each point, 0 if it belongs to none.
+            settings: settings of the training.
+            memory_mb: memory limit for cached targets.
+            device: device to train on.
+            seeds: (M,) bool, the points that are used for the initial anchors and to measure the scene's extent and
+                density; None: all.
+            supervise_background: as in `Scene`; None: decided by `background_is_masked`.
             gains: as in `Scene`.
 
         Raises:
@@ -141,7 +141,7 @@ class Trainer:
         return self._average.of(self.model)
 
     def save(self, folder: Path) -> None:
-        """Write a checkpoint: everything that the next step depends on.
+        """Write a checkpoint with all data that the next step depends on.
 
         Raises:
             InputError: the checkpoint cannot be written; the previous one is kept.
@@ -173,17 +173,17 @@ class Trainer:
         device: torch.device = devices.CPU,
         gains: np.ndarray | None = None,
     ) -> tuple[Trainer, str | None] | None:
-        """Continue the training of the newest whole checkpoint.
+        """Resume the training of the latest complete checkpoint.
 
         Args:
-            capture: the one that the checkpoint was trained on.
-            folder: of the checkpoints.
-            settings: those asked for now; None: those of the checkpoint.
+            capture: the capture that the checkpoint was trained on.
+            folder: folder of the checkpoints.
+            settings: the requested settings; None: those of the checkpoint.
             memory_mb, gains: as in `start`.
-            device: where to train, whichever device the checkpoint was saved on.
+            device: device to train on; may differ from that of the checkpoint.
 
         Returns:
-            The trainer and a warning or None; None if there is no checkpoint.
+            The trainer, and a warning or None; None if there is no checkpoint.
 
         Raises:
             InputError: the checkpoint was trained with other settings, or cannot be read.
@@ -197,7 +197,7 @@ class Trainer:
             changed = [k for k, v in settings.as_dict().items() if stored.as_dict()[k] != v]
             raise InputError(
                 f"The checkpoint in {folder} was trained with other settings ({', '.join(changed)}); use the same, "
-                "another --out, or --restart to train anew."
+                "another --out, or --restart to start over."
             )
         model = model_from_checkpoint(tensors, state)
         scene = Scene(
@@ -227,20 +227,20 @@ class Trainer:
     ) -> None:
         """Train until the budget is spent.
 
-        Pauses do not count as time of the training.
+        Pauses do not count as training time.
 
         Args:
-            budget: how long to train in all.
-            checkpoints: folder for checkpoints: one at the end, before a pause, and at intervals.
+            budget: total length of the training.
+            checkpoints: folder for checkpoints, which are written at the end, before a pause, and at intervals.
             reporter: receives progress, quality and warnings.
-            evaluate: measures the model on held-out views.
-            stop: asked before each step.
-            checkpoint_seconds: the interval between checkpoints.
+            evaluate: function that measures the model on held-out views.
+            stop: stop and pause request, checked before each step.
+            checkpoint_seconds: interval between checkpoints.
 
         Raises:
-            Cancelled: `stop` asked for it; the training is saved.
-            InputError, OSError: an image cannot be read or a file cannot be written; the steps so far are saved where
-                that is possible.
+            Cancelled: a stop was requested; the training is saved.
+            InputError, OSError: an image cannot be read or a file cannot be written; the steps so far are saved if
+                possible.
         """
         first_step = self.progress.step
         try:
@@ -339,23 +339,23 @@ class Trainer:
 
     @property
     def splats(self) -> int:
-        """Splats drawn in the latest step. Waits for the GPU."""
+        """Number of splats generated in the latest step; synchronizes with the GPU."""
         return self._view_step.splats
 
     def step(self, progress: float) -> torch.Tensor:
         """Train on one view: forward, backward and update.
 
         Args:
-            progress: of the training, 0 .. 1, which learning rates, growth and resolution follow.
+            progress: progress of the training, 0 .. 1, which determines learning rates, growth and resolution.
 
         Returns:
-            The loss () float32; NaN where the view shows nothing or its loss is not finite.
+            The loss () float32; NaN if no anchor is in view or the loss is not finite.
         """
         p = self.progress
         if not p.queue:
             p.queue = self.rng.permutation(self.scene.capture.train_indices).tolist()
         gradients = self._view_step.compute(p.queue[-1], progress)
-        # Only now, so that an image that cannot be read stays the next one.
+        # Remove the view only now, so that it remains the next one if its image cannot be read.
         index = p.queue.pop()
         p.step += 1
         loss = torch.full((), math.nan, device=self.model.device)
@@ -371,8 +371,8 @@ class Trainer:
         return loss
 
     def _handle(self, fault: check_finite.Fault, index: int) -> None:
-        """Count a fault of the step on view `index`, warn if it is the first of its kind, and remove anchors that
-        cannot recover."""
+        """Count a fault in the step on view `index`, warn if it is the first of its kind, and remove anchors with
+        non-finite parameters."""
         p, model, capture = self.progress, self.model, self.scene.capture
         if fault.what not in p.faults:
             owner = None
@@ -402,7 +402,7 @@ class Trainer:
         finite = torch.cat([part for parts in of_heads.values() for part in parts]).isfinite().all()
         if gradients.finite is not None:
             finite = finite & gradients.finite
-        # As torch's gradient scaler does it: if set, the optimizer skips the update without telling the CPU.
+        # As in torch's gradient scaler: if set, the optimizer skips the update without synchronization.
         optimizer.found_inf = (~finite).float()  # type: ignore[attr-defined]
         optimizer.step()
         assert gradients.rows.grad is not None

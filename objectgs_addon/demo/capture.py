@@ -121,11 +121,13 @@ def _is_there(out: Path, settings: Settings, overwrite: bool) -> bool:
     if not any(out.iterdir()):
         return False
     if not (out / "truth" / "objects.json").is_file():
-        raise InputError(f"The folder {out} is not empty and holds no demo capture; choose another one.")
+        raise InputError(f"The folder {out} is not empty and is not a demo capture; choose another one.")
     if _recorded(out) == _record(settings):
         return True
     if not overwrite:
-        raise InputError(f"The folder {out} holds a demo capture with other settings; --overwrite replaces it.")
+        raise InputError(
+            f"The folder {out} contains a demo capture with other settings; use --overwrite to replace it."
+        )
     return False
 
 

@@ -18,7 +18,7 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
     height, width = pixels.shape[:2]
     color = 2 if pixels.ndim == 3 else 0
     if color == 2 and (pixels.shape[2] != 3 or pixels.dtype != np.uint8):
-        raise ValueError("RGB pictures are written as 8-bit with 3 channels")
+        raise ValueError("RGB images must be uint8 with 3 channels")
     depth = {np.dtype(np.uint8): 8, np.dtype(np.uint16): 16}[pixels.dtype]
     big_endian = np.ascontiguousarray(pixels.astype(pixels.dtype.newbyteorder(">")))
     rows = big_endian.view(np.uint8).reshape(height, -1)

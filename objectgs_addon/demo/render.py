@@ -107,7 +107,7 @@ class Renderer:
         if "FINISHED" not in result:
             raise Cancelled
         if not path.exists():
-            raise OSError(f"Blender did not write its rendering to {path}.")
+            raise OSError(f"Blender did not write the rendered image to {path}.")
         image = bpy.data.images.load(str(path), check_existing=False)
         try:
             image.colorspace_settings.name = "Non-Color"

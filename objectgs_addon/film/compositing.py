@@ -50,7 +50,7 @@ def set_up_compositor(
     """
     frames = _frames_in(folder)
     if not frames:
-        raise InputError(f"{folder} holds no film frames yet; render them first.")
+        raise InputError(f"{folder} contains no film frames; render them first.")
     tree = _tree(scene)
     if _image_node(tree) is None:
         _join(scene, view_layer, tree, _load(folder, frames), matte)
@@ -156,7 +156,7 @@ def _join(
     joined = _over(graph, is_nearer, middle, splats.outputs["Combined"])
     tree.links.new(joined, output)
     mattes = graph.node("CompositorNodeCryptomatteV2", source="IMAGE", image=image)
-    mattes.label = "Mattes of Objects"
+    mattes.label = "Object Mattes"
     mattes.matte_id = matte
     tree.links.new(joined, mattes.inputs["Image"])
 

@@ -16,16 +16,16 @@ class FilmProperties(bpy.types.PropertyGroup):
     folder: StringProperty(
         name="Output",
         subtype="DIR_PATH",
-        description="Folder of the film frames; empty: the folder film in the reconstruction's",
+        description="Output folder of the film frames; if empty, the folder film in the reconstruction folder",
     )
     subframes: IntProperty(
         name="Sub-Frames",
         default=SUBFRAMES,
         min=2,
         soft_max=33,
-        description="Moments that make a frame while the shutter is open",
+        description="Number of time samples of a frame while the shutter is open",
     )
-    png: BoolProperty(name="PNG Too", description="Each frame also as a picture of 8 bits with alpha")
+    png: BoolProperty(name="Also PNG", description="Also write each frame as an 8-bit PNG with alpha")
 
 
 def folder_of(scene: bpy.types.Scene, reconstruction: Path) -> Path:

@@ -57,11 +57,11 @@ def shot_of(
             start below 0, or the reconstruction is scaled to zero.
     """
     if parent_of(root) is None:
-        raise InputError(f"{root.name} has lost the empty that moves it; run Import again.")
-    if not frames or frames[0] < 0:
-        raise InputError(
-            "The first frame is below 0, but files in a sequence cannot have negative numbers; move the shot."
-        )
+        raise InputError(f"{root.name} has lost its parent empty; run Import again.")
+    if not frames:
+        raise InputError("The scene's frame range is empty; set its start and end.")
+    if frames[0] < 0:
+        raise InputError("The first frame is below 0, but image sequences have no negative numbers; move the shot.")
     instances = _instances_of(scene, view_layer, root)
     before = scene.frame_current, scene.frame_subframe
     made, scale = [], None
@@ -103,7 +103,7 @@ class _RootTransform:
         world = np.array(_world_of(parent_of(root)), np.float64)
         left, stretches, right = np.linalg.svd(world[:3, :3])
         if stretches[2] <= 1e-12 * stretches[0]:
-            raise InputError(f"{root.name} is scaled to nothing by its parent; give it a size again.")
+            raise InputError(f"{root.name} is scaled to zero by its parent; set a scale other than zero.")
         left[:, 2] *= np.sign(np.linalg.det(left @ right))
         return cls(origin_of(root), left @ right, scale or float(np.cbrt(stretches.prod())), world[:3, 3])
 
@@ -300,7 +300,7 @@ def _sample(
     if camera.data.type != "PERSP":
         kind = _UNSUPPORTED.get(camera.data.type, "special")
         raise InputError(
-            f"{camera.name} is {kind}, but splats can be drawn only through perspective cameras; choose one."
+            f"{camera.name} is {kind}, but splats can be rendered through perspective cameras only; choose one."
         )
     matrix = np.array(_world_of(camera).normalized(), np.float64)
     clip = camera.data.clip_start / transform.scale, camera.data.clip_end / transform.scale

@@ -126,16 +126,16 @@ def _warnings(views: Sequence[CameraView]) -> list[str]:
     aspects = [view.aspect for view in views]
     if aspects and max(aspects) / min(aspects) - 1.0 > LARGEST_ASPECT_ERROR:
         warnings.append(
-            "The capture's cameras have pixels of different shapes, but a Blender scene has one; select a camera and "
-            "use its size before rendering through it."
+            "The capture's cameras have different pixel aspect ratios, but a Blender scene has only one; select a "
+            "camera and apply its render size before rendering through it."
         )
     skewed = [view.name for view in views if abs(view.K[0, 1]) > 1e-6 * view.K[0, 0]]
     if skewed:
-        warnings.append(f"{len(skewed)} cameras are skewed ({skewed[0]} is one), which Blender's cameras cannot be.")
+        warnings.append(f"{len(skewed)} cameras have skew (for example {skewed[0]}), which Blender does not support.")
     missing = [view.image for view in views if not view.image.is_file()]
     if missing:
         warnings.append(
-            f"{len(missing)} of {len(views)} images are missing, {missing[0]} for one; their cameras have "
-            "no background. Run Import again."
+            f"{len(missing)} of {len(views)} images are missing (for example {missing[0]}); their cameras have "
+            "no background image. Run Import again."
         )
     return warnings

@@ -59,7 +59,7 @@ def show_capture(
     """
     folder = Path(folder).absolute()
     if any("\ud800" <= character <= "\udfff" for character in str(folder)):
-        raise InputError(f"{str(folder)!r} is not valid Unicode, which Blender cannot keep; rename the folder.")
+        raise InputError(f"{str(folder)!r} is not valid Unicode, which Blender cannot store; rename the folder.")
     cameras = read_cameras(folder)
     table = read_points(folder)
     objects = Objects.read(folder)

@@ -64,16 +64,16 @@ def scale_to_distance(root: bpy.types.Collection, p1: Any, p2: Any, distance: fl
     parent = _parent(root)
     apart = (Vector(p2) - Vector(p1)).length
     if apart < 1e-12:
-        raise InputError("The two points are at the same place; pick two that are apart.")
+        raise InputError("The two points coincide; pick two different points.")
     if not 0.0 < distance < float("inf"):
-        raise InputError("The distance must be above 0.")
+        raise InputError("The distance must be greater than 0.")
     _move(parent, Matrix.Scale(distance / apart, 4))
 
 
 def _parent(root: bpy.types.Collection) -> bpy.types.Object:
     parent = parent_of(root)
     if parent is None:
-        raise InputError(f"{root.name} has lost the empty that moves it; run Import again.")
+        raise InputError(f"{root.name} has lost its parent empty; run Import again.")
     return parent
 
 

@@ -51,7 +51,7 @@ def read_splats(folder: Path) -> tuple[np.ndarray, list[str]]:
     names = table.dtype.names
     missing = [name for name in _NEEDED if name not in names]
     if missing:
-        raise InputError(f"{path} is no file of Gaussian splats: it has no property {', '.join(missing)}.")
+        raise InputError(f"{path} is not a file of Gaussian splats: it lacks {', '.join(missing)}.")
     _rest_count(names, path)
     return _without_unusable(table, _NEEDED, path.name, "splats")
 
@@ -152,7 +152,7 @@ def _rest_count(names: Any, path: Path | None = None) -> int:
         or math.isqrt(count // 3 + 1) ** 2 != count // 3 + 1
         or any(f"f_rest_{i}" not in names for i in range(count))
     ):
-        raise InputError(f"{path} has {count} properties f_rest_*; 0, 9, 24 or 45, numbered from 0, were expected.")
+        raise InputError(f"{path} has {count} properties f_rest_*; expected 0, 9, 24 or 45, numbered from 0.")
     return count
 
 
@@ -168,5 +168,6 @@ def _without_unusable(table: np.ndarray, names: Any, file: str, what: str) -> tu
     if keep.all():
         return table, []
     return table[keep], [
-        f"{int((~keep).sum())} of {len(table)} {what} in {file} were left out: they hold NaN, infinity or no rotation."
+        f"{int((~keep).sum())} of {len(table)} {what} in {file} are left out: "
+        "they have NaN, infinite or too large values, or no rotation."
     ]

@@ -81,8 +81,8 @@ class ObjectItem(bpy.types.PropertyGroup):
     points: IntProperty(name="Points", description="Points of the capture that are assigned to this object")
     splats: IntProperty(name="Splats", description="Number of Gaussian splats of this object")
     faces: IntProperty(name="Faces", description="Number of faces of this object's mesh; 0 without a mesh")
-    is_merged: BoolProperty(name="Merged", description="Part of another object")
-    merged_into: IntProperty(name="Merged Into", description="ID of the object that this one is a part of")
+    is_merged: BoolProperty(name="Merged", description="Merged into another object")
+    merged_into: IntProperty(name="Merged Into", description="ID of the object that this one is merged into")
     removed: BoolProperty(name="Removed", description="Hidden until it is restored")
     floaters: BoolProperty(name="With Floaters", description="Removed with the unlabeled splats inside it")
     fill: BoolProperty(
@@ -104,7 +104,7 @@ class ObjectItem(bpy.types.PropertyGroup):
 class PlanChoice(bpy.types.PropertyGroup):
     """The user's choice for a decision of the plan; `name` is its key."""
 
-    done: BoolProperty(name="Done", description="Whether training does it")
+    done: BoolProperty(name="Done", description="Apply this decision in training")
 
 
 class ReconstructionProperties(bpy.types.PropertyGroup):
@@ -146,7 +146,7 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
         default=1,
         min=0,
         max=3,
-        description="Degree of the spherical harmonics: how much colors can depend on the view direction",
+        description="Degree of the spherical harmonics; higher degrees allow more view-dependent color",
     )
     primitive: EnumProperty(
         name="Splats",
@@ -205,7 +205,7 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
         min=100,
         soft_max=200_000,
         step=1000,
-        description="Maximum triangles of an object's mesh; the mesh of the whole scene may have five times as many",
+        description="Maximum number of triangles of an object's mesh; five times as many for the scene mesh",
     )
     mesh_closed: BoolProperty(
         name="Closed",

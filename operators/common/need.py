@@ -63,11 +63,11 @@ def require_unused(folder: Path) -> None:
 def _use_of(folder: Path) -> str | None:
     """Who uses a reconstruction folder, as a sentence; None where nobody does."""
     if background.busy(folder):
-        return f"A job is using {folder}; wait for it or stop it"
+        return f"A job is using {folder}; wait for it to finish or stop it"
     holder = lock_holder(folder)
     if holder is not None:
         process = f" (process {holder})" if holder else ""
-        return f"Another program{process} is using {folder}; wait for it or stop it"
+        return f"Another program{process} is using {folder}; wait for it to finish or stop it"
     return None
 
 

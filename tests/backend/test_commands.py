@@ -378,7 +378,7 @@ def test_a_capture_that_moved_is_found_again(write_capture, tmp_path, ask):
     assert ask("train", capture, "--out", out, "--steps", 5, *SMALL).code == EXIT_DONE
     moved = capture.rename(tmp_path / "moved")
     for command in ("evaluate", "render", "report"):
-        refused(ask(command, out), str(capture), "is gone", "--capture")
+        refused(ask(command, out), str(capture), "does not exist", "--capture")
     assert not (out / "renders").exists() and not (out / "report.json").exists()
     assert ask("evaluate", out, "--capture", moved).code == EXIT_DONE
     assert ask("render", out).code == EXIT_DONE, "the place is remembered"
@@ -700,7 +700,7 @@ def test_a_second_signal_ends_it_at_once(trained, ask, monkeypatch):
 
     monkeypatch.setattr(Trainer, "step", twice)
     answer = ask("train", capture, "--out", out, "--steps", 40, *SMALL)
-    assert answer.code == EXIT_CANCELLED and "Stopped at once" in answer.out and step_of(out) == 20
+    assert answer.code == EXIT_CANCELLED and "Stopped immediately" in answer.out and step_of(out) == 20
 
 
 def test_a_real_process_stops_on_a_signal_and_on_a_reader_that_left(write_capture, tmp_path):
@@ -744,7 +744,7 @@ def test_a_folder_is_trained_by_one_process_until_it_ends_or_is_killed(write_cap
             for words in (train, ("vote", capture, "--out", out), (*train, "--restart")):
                 sentence = refused(ask(*words))
                 assert sentence == (
-                    f"error: {out} is being trained by another process (pid {process.pid}); wait for it or stop it."
+                    f"error: {out} is in use by another process (pid {process.pid}); wait for it to finish or stop it."
                 )
             assert process.poll() is None and (out / "points.ply").exists()
         finally:
@@ -799,7 +799,7 @@ def test_an_unexpected_failure_is_exit_code_1(write_capture, ask, monkeypatch):
     monkeypatch.setattr(commands.check, "check_capture", broken)
     answer = ask("check", write_capture().folder, "--json")
     assert answer.code == EXIT_FAILED and "Traceback" in answer.err
-    assert answer.messages("error") == ["An unexpected failure: ZeroDivisionError: two lines"]
+    assert answer.messages("error") == ["Unexpected error: ZeroDivisionError: two lines"]
 
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])

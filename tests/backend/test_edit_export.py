@@ -70,7 +70,7 @@ def test_objects_are_removed_and_restored_by_name_part_or_id(ask, folder):
     (said,) = answer.messages("status")
     assert "1 mug: removed with floaters\n" in said and "3 box: as captured\n" in said
     filled = ask("edit", folder.folder, "--remove", "mug", "--fill").out
-    assert "1 mug: removed, nothing flat around it to fill its hole with" in filled
+    assert "1 mug: removed, its hole not filled, since there is no flat surface around it" in filled
     ask("edit", folder.folder, "--restore", "mug", "box")
     assert [entry.removed for entry in read_objects(folder.objects)] == [False, True, False, True]
     assert json.loads(folder.objects.read_text())["edits"].keys() == {"2", "7"}

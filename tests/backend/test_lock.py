@@ -48,7 +48,7 @@ def holder(tmp_path):
 def test_a_second_process_is_refused_by_the_first_ones_id(tmp_path, holder):
     assert lock_holder(tmp_path) == holder.pid
     with (
-        pytest.raises(FolderInUse, match=rf"another process \(pid {holder.pid}\); wait for it or stop it"),
+        pytest.raises(FolderInUse, match=rf"another process \(pid {holder.pid}\); wait for it to finish or stop it"),
         locked(tmp_path),
     ):
         pass

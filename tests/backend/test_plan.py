@@ -48,7 +48,7 @@ def test_a_plan_is_overridden_only_where_it_can_be(tmp_path):
     changed_plan = plan.overridden(["exposure", "pyramid"], ["labels"])
     assert [own.done for own in changed_plan.decisions] == [False, True, True, False]
     assert [own.overridden for own in changed_plan.decisions] == [False, True, False, True]
-    assert changed_plan["exposure"].reason == "--keep exposure was asked for"
+    assert changed_plan["exposure"].reason == "--keep exposure was given"
     assert changed_plan["votes"].reason == "there are no masks"
     assert [own.done for own in plan.overridden(["all"], []).decisions] == [False, True, True, True]
     assert plan.overridden(["all"], ["exposure"])["exposure"].done is False
@@ -236,8 +236,8 @@ def test_flat_splats_have_surfaces_where_meshes_are_made(write_capture, tmp_path
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("[]", "no groups"), ('{"one": "chair"}', "'one', which is no ID"), ('{"1": 3}', "the group 3"),
-        ('{"1": " "}', "expected a name"), ('{"9": "chair"}', "none of the IDs that the masks show; there are: 1, 2"),
+        ("[]", "no groups"), ('{"one": "chair"}', "'one', which is not an object ID"), ('{"1": 3}', "the group 3"),
+        ('{"1": " "}', "expected a name"), ('{"9": "chair"}', "none of the IDs in the masks; available IDs: 1, 2"),
     ],
 )  # fmt: skip
 def test_groups_that_make_no_sense_are_refused(tmp_path, content, words):
@@ -326,7 +326,7 @@ def test_training_follows_its_plan_to_the_report(write_capture, tmp_path, ask):
     assert ask("evaluate", out).code == EXIT_DONE and ask("report", out).code == EXIT_DONE
     report = json.loads((out / "report.json").read_text())
     left_out = {entry["what"]: entry["why"] for entry in report["left_out"]}
-    assert left_out["the label loss and its ID channel"] == "--leave-out labels was asked for"
+    assert left_out["the label loss and its ID channel"] == "--leave-out labels was given"
     assert "view_002.png" in left_out["training on 1 view"]
     assert not report["capture"]["exposure_varies"] and report["quality"]["miou"] is not None
     assert [own["key"] for own in report["plan"]] == [own.key for own in read_plan(out / "plan.json").decisions]

@@ -252,7 +252,7 @@ def test_a_truncated_file_is_named(tmp_path):
         with pytest.raises(InputError, match=r"cut\.ply"):
             read_splats(tmp_path / "cut.ply")
     (tmp_path / "cut.ply").write_bytes(data[:-1])
-    with pytest.raises(InputError, match="promises 10 vertices, but only 9"):
+    with pytest.raises(InputError, match="specifies 10 vertices, but only 9"):
         read_splats(tmp_path / "cut.ply")
 
 

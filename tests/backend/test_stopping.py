@@ -168,7 +168,7 @@ def test_a_pause_saves_waits_and_does_not_count(drive, endless):
     driven.say("resume")
     idle = time.monotonic() - begun
     before = len(driven.events)
-    driven.until("status", "Going on")
+    driven.until("status", "Resumed")
     assert len(driven.events) == before + 1, "nothing happened meanwhile"
     after = driven.until_it_trains()
     assert after["step"] > saved["step"] and after["seconds"] - saved["seconds"] < idle
@@ -194,7 +194,7 @@ def test_stopping_while_paused(drive, endless, how):
             driven.process.send_signal(signal.SIGINT)
     assert driven.end() == EXIT_CANCELLED
     assert driven.events[-1]["stopped"] is True and progress_of(out)["step"] == step > 0
-    assert not any(event.get("message") == "Going on" for event in driven.events)
+    assert not any(event.get("message") == "Resumed" for event in driven.events)
 
 
 def test_other_commands_wait_as_well(monkeypatch):
@@ -228,7 +228,7 @@ def test_other_commands_wait_as_well(monkeypatch):
         reporter = StoppingReporter(Told(), stop)
         later()
         reporter.progress(1, 3)
-        assert said == ["progress 1", "Paused", "Going on"] and not stop.paused
+        assert said == ["progress 1", "Paused", "Resumed"] and not stop.paused
         asked.clear()
         ask.set()
         assert asked.wait(60)

@@ -32,7 +32,7 @@ assert hear() == "attached"
 say("status", message="Training")
 say("progress", done=0.25, total=1.0, step=10, seconds_left=30.0, splats=5000, anchors=500, psnr=None)
 while (word := hear()) != "stop":
-    say("status", message={"pause": "Paused", "resume": "Going on", "": "Nobody there"}[word])
+    say("status", message={"pause": "Paused", "resume": "Resumed", "": "Nobody there"}[word])
     if not word:
         sys.exit(3)
 say("done", stopped=True, message="Saved at step 10.")
@@ -137,7 +137,7 @@ def test_pause_resume_stop(make):
     assert job.state is State.PAUSED and queue.running is job
     until(lambda: job.message == "Paused", queue.poll)
     job.resume()
-    until(lambda: job.message == "Going on", queue.poll)
+    until(lambda: job.message == "Resumed", queue.poll)
     assert job.state is State.RUNNING
     job.pause()
     job.stop()

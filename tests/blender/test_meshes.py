@@ -447,7 +447,7 @@ def test_a_mesh_without_a_surface_is_told(root, folder, change):
         bad.uvs, bad.unobserved = bad.uvs[:0], bad.unobserved[:0]
     rewrite(folder, _1=bad)
     (sentence,) = blender_scene.show_meshes(root, folder).warnings
-    assert "1.ply holds no surface" in sentence
+    assert "1.ply contains no surface" in sentence
 
 
 def test_faces_that_are_none_do_no_harm(root, folder):

@@ -125,7 +125,7 @@ def test_pixels_of_different_shapes_and_missing_photos_are_told(fresh, folder):
     (folder / "images" / "005.png").unlink()
     shown = blender_scene.show_capture(bpy.context.scene, folder)
     shape, missing = blender_scene.warnings_of(shown)
-    assert "pixels of different shapes" in shape
+    assert "pixel aspect ratios" in shape
     assert "1 of 8 images are missing" in missing and "005.png" in missing
     assert len(cameras_of(shown)[5].data.background_images) == 0
 
@@ -268,7 +268,9 @@ def test_what_cannot_be_shown_is_left_out_and_told(fresh, folder):
     root = blender_scene.show_capture(owner, folder)
     shown = blender_scene.show_result(root, folder)
     assert shown.splats == 16
-    assert shown.warnings == ["4 of 20 splats in splats.ply were left out: they hold NaN, infinity or no rotation."]
+    assert shown.warnings == [
+        "4 of 20 splats in splats.ply are left out: they have NaN, infinite or too large values, or no rotation."
+    ]
 
 
 # Updates in place.
@@ -404,11 +406,11 @@ def test_two_reconstructions_in_one_file_stay_apart(root, folder, tmp_path):
     ("name", "spoil", "sentence"),
     [
         ("cameras.json", None, "has no cameras.json; run Import again"),
-        ("cameras.json", b"{}", "does not list cameras as expected"),
+        ("cameras.json", b"{}", "is not a valid list of cameras"),
         ("cameras.json", b"{", "cannot be read as JSON"),
         ("points.ply", None, "has no points.ply; run Import again"),
         ("points.ply", b"ply\n", "no complete PLY header"),
-        ("objects.json", b"[]", "does not list objects"),
+        ("objects.json", b"[]", "is not a valid list of objects"),
     ],
 )
 def test_bad_captures_change_nothing(fresh, folder, name, spoil, sentence):
@@ -423,7 +425,7 @@ def test_bad_captures_change_nothing(fresh, folder, name, spoil, sentence):
     ("name", "spoil", "sentence"),
     [
         ("splats.ply", None, "has no splats.ply; train first"),
-        ("splats.ply", "points.ply", "no file of Gaussian splats"),
+        ("splats.ply", "points.ply", "not a file of Gaussian splats"),
         ("anchors.ply", "points.ply", "has no property scale_0"),
         ("splats.ply", "cut", "cut short"),
     ],
@@ -496,9 +498,9 @@ def test_two_points_become_a_distance_apart(root):
     blender_scene.scale_to_distance(root, (1, 0, 0), (3, 0, 0), 0.5)
     move = parent.matrix_world @ before.inverted()
     assert (move @ Vector((3, 0, 0)) - move @ Vector((1, 0, 0))).length == pytest.approx(0.5)
-    with pytest.raises(InputError, match="same place"):
+    with pytest.raises(InputError, match="coincide"):
         blender_scene.scale_to_distance(root, (1, 1, 1), (1, 1, 1), 2.0)
-    with pytest.raises(InputError, match="above 0"):
+    with pytest.raises(InputError, match="greater than 0"):
         blender_scene.scale_to_distance(root, (0, 0, 0), (1, 1, 1), 0.0)
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Take the screenshots in docs/ of the result of `make demo`, in the first Blender that `harness.blenders` finds.
 
-    .venv/bin/python -m tests.window.screenshots
+.venv/bin/python -m tests.window.screenshots
 """
 
 import shutil

@@ -100,7 +100,7 @@ def _described(entry: SceneObject, new_splats: int | None) -> list[str]:
     if entry.removed:
         words.append("removed" + " with floaters" * entry.floaters)
         if entry.fill and new_splats == 0:
-            words.append("nothing flat around it to fill its hole with")
+            words.append("its hole not filled, since there is no flat surface around it")
         elif entry.fill:
             words.append("its hole filled" + f" with {new_splats:,} new splats" * bool(new_splats))
     if entry.recolor:

@@ -193,7 +193,7 @@ def _left_out(trained: Trained) -> list[dict[str, str]]:
             "COLMAP could not place them",
         ),
         (
-            counts["missing"] > 0, f"{counts['missing']} images that the model names",
+            counts["missing"] > 0, f"{counts['missing']} images listed in the COLMAP model",
             "their files are not in the capture",
         ),
         (
@@ -202,7 +202,7 @@ def _left_out(trained: Trained) -> list[dict[str, str]]:
         ),
         (
             progress.last_growth == 0, "growth and pruning of anchors",
-            f"{progress.step} steps are too few to say where anchors are missing",
+            f"{progress.step} steps are too few to determine where anchors are missing",
         ),
         (
             len(trained.model.anchors) >= settings["max_anchors"], "further growth of anchors",
@@ -210,7 +210,7 @@ def _left_out(trained: Trained) -> list[dict[str, str]]:
         ),
         (
             settings["background"] != "learned", "a learned background",
-            f"--background {settings['background']} was asked for",
+            f"--background {settings['background']} was given",
         ),
         (not capture.test_indices, "quality on held-out views", "there are too few views for held-out ones"),
         (bool(capture.test_indices), "LPIPS", "it needs a trained network, which is not part of this program"),

@@ -53,7 +53,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         if progress.step and budget.progress(progress) >= 1:
             reporter.status(
                 f"Already trained for {progress.step} steps in {progress.seconds:.0f} s; ask for more --minutes or "
-                "--steps to extend it, or --restart to begin anew."
+                "--steps to extend it, or --restart to start over."
             )
         else:
             update_record(
@@ -140,9 +140,9 @@ def _plan_before(folder: Reconstruction) -> Plan:
 def _check_same_training(folder: Reconstruction, capture: Capture, plan: Plan, options: argparse.Namespace) -> None:
     """Raise InputError if the folder has a training of another capture or with other settings."""
     training = read_record(folder).training
-    otherwise = "use the same, another --out, or --restart to train anew."
+    otherwise = "use the same one, a different --out, or --restart to start over."
     if training is None:
-        raise InputError(f"{folder.settings} does not say what {folder.checkpoint} was trained from; {otherwise}")
+        raise InputError(f"{folder.settings} has no record of the training in {folder.checkpoint}; {otherwise}")
     votes = training.votes
     if votes.capture != digest(capture):
         raise InputError(f"{folder.checkpoint} was trained on another capture than {capture.folder}; {otherwise}")
@@ -155,12 +155,12 @@ def _check_same_training(folder: Reconstruction, capture: Capture, plan: Plan, o
         without = f"without {', '.join(map(str, before))}" if before else "with all objects"
         raise InputError(
             f"{folder.checkpoint} was trained {without}, and {folder.objects} leaves out "
-            f"{', '.join(map(str, left_out)) or 'none'}; leave out the same, or use --restart to train anew."
+            f"{', '.join(map(str, left_out)) or 'none'}; leave out the same objects, or use --restart to start over."
         )
     if training.plan is not None and (otherwise_now := plan.difference(plan_of(training), OF_TRAINING)):
         raise InputError(
-            f"{folder.checkpoint} was trained by another plan ({', '.join(otherwise_now)}); --keep and --leave-out the "
-            f"same, or use --restart to train anew."
+            f"{folder.checkpoint} was trained with another plan ({', '.join(otherwise_now)}); use the same --keep and "
+            "--leave-out, or --restart to start over."
         )
 
 

@@ -41,8 +41,8 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise InputError(f"{path} does not exist; run the step that makes it first.") from error
+        raise InputError(f"{path} does not exist; run the step that creates it first.") from error
     except (OSError, ValueError) as error:
         raise InputError(
-            f"{path} cannot be read as JSON ({error}); repair it, or delete it and run the step that makes it."
+            f"{path} cannot be read as JSON ({error}); repair it, or delete it and run the step that creates it."
         ) from error

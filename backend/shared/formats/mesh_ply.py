@@ -98,7 +98,7 @@ def read_mesh(path: Path) -> Mesh:
     vertices = np.frombuffer(data[end:middle], _VERTEX)
     faces = np.frombuffer(data[middle:], _FACE)
     if counts[1] and not 0 <= faces["vertices"].min() <= faces["vertices"].max() < counts[0]:
-        raise InputError(f"{path} has faces of vertices that it does not hold; make the meshes again.")
+        raise InputError(f"{path} has faces with invalid vertex indices; make the meshes again.")
     return Mesh(
         vertices["xyz"].copy(), vertices["normal"].copy(), vertices["color"].copy(), faces["vertices"].copy(),
         faces["uv"].reshape(-1, 3, 2).copy(), faces["unobserved"].astype(bool), texture,

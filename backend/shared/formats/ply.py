@@ -95,7 +95,7 @@ def _read(file: BinaryIO, path: Path) -> np.ndarray:
                 raise InputError(f"{path} has a vertex property that is not a plain number: {line.strip()!r}.")
             fields.append((words[2], _KINDS[words[1]]))
         elif words[0] != "property":
-            raise InputError(f"{path} has a PLY header line that makes no sense: {line.strip()!r}.")
+            raise InputError(f"{path} has an invalid PLY header line: {line.strip()!r}.")
     if not order or count < 0 or not fields:
         raise InputError(f"{path} has no format or no vertices in its PLY header.")
     try:
@@ -105,7 +105,7 @@ def _read(file: BinaryIO, path: Path) -> np.ndarray:
     available = os.fstat(file.fileno()).st_size - newline - 1
     if available < count * dtype.itemsize:
         raise InputError(
-            f"{path} is cut short: its header promises {count} vertices, "
+            f"{path} is cut short: its header specifies {count} vertices, "
             f"but only {available // dtype.itemsize} are there."
         )
     file.seek(newline + 1)

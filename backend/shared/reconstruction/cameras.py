@@ -119,7 +119,7 @@ def read_cameras(folder: Path) -> Cameras:
             [_view(entry, folder) for entry in content["cameras"]],
         )
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError, np.linalg.LinAlgError) as error:
-        raise InputError(f"{path} does not list cameras as expected ({error!r}); run Import again.") from error
+        raise InputError(f"{path} is not a valid list of cameras ({error!r}); run Import again.") from error
 
 
 def _view(entry: Any, folder: Path) -> CameraView:

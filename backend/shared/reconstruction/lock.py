@@ -45,7 +45,7 @@ def locked(folder: Path) -> Iterator[None]:
         if time.monotonic() > patience:
             holder = _process_id(path)
             who = f"another process (pid {holder})" if holder else "another process"
-            raise FolderInUse(f"{folder} is being trained by {who}; wait for it or stop it.")
+            raise FolderInUse(f"{folder} is in use by {who}; wait for it to finish or stop it.")
         time.sleep(0.02)
     try:
         try:

@@ -86,7 +86,7 @@ def read_meshes(folder: Path) -> dict[str, MeshEntry]:
         return {str(key): _entry(str(key), dict(values)) for key, values in content["meshes"].items()}
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(
-            f"{path} does not list meshes as expected ({error!r}); delete it and make the meshes again."
+            f"{path} is not a valid list of meshes ({error!r}); delete it and make the meshes again."
         ) from error
 
 

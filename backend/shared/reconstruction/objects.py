@@ -78,7 +78,7 @@ def read_objects(path: Path) -> list[SceneObject]:
             for entry in sorted(content["objects"], key=lambda entry: entry["id"])
         ]
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{path} does not list objects as expected ({error!r}); delete it and vote again.") from error
+        raise InputError(f"{path} is not a valid list of objects ({error!r}); delete it and vote again.") from error
 
 
 def write_objects(path: Path, objects: Sequence[Mapping[str, Any]]) -> None:
@@ -151,8 +151,8 @@ def find_object(objects: Sequence[SceneObject], word: str, path: Path) -> SceneO
     if len(among) > 20:
         there += f" and {len(among) - 20} more"
     if found:
-        raise InputError(f"{word} may be several objects of {path}: {there}; say which one.")
-    raise InputError(f"{path} has no object {word}; there are: {there}.")
+        raise InputError(f"{word} may be several objects of {path}: {there}; specify one of them.")
+    raise InputError(f"{path} has no object {word}; available objects: {there}.")
 
 
 def default_name(object_id: int) -> str:
@@ -194,9 +194,9 @@ def affine_map(value: Any) -> Matrix:
     """
     matrix = np.array(value, np.float64)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.array_equal(matrix[3], (0, 0, 0, 1)):
-        raise ValueError(f"{value} is no affine map of four rows")
+        raise ValueError(f"{value} is not an affine map with four rows")
     if abs(np.linalg.det(matrix[:3, :3])) < 1e-30:
-        raise ValueError(f"{value} flattens what it maps")
+        raise ValueError(f"{value} is a singular map")
     first, second, third, last = (tuple(row) for row in matrix.tolist())
     return first, second, third, last
 
@@ -209,7 +209,7 @@ def _name(text: str) -> str:
 def _edits(content: Any, path: Path) -> dict[str, dict[str, Any]]:
     edits = content.get("edits", {}) if isinstance(content, dict) else None
     if not isinstance(edits, dict) or not all(isinstance(edit, dict) for edit in edits.values()):
-        raise InputError(f"{path} does not list objects as expected; delete it and vote again.")
+        raise InputError(f"{path} is not a valid list of objects; delete it and vote again.")
     return {object_id: _renamed(edit) for object_id, edit in edits.items()}
 
 

@@ -1,8 +1,8 @@
 """plan.json: which steps are done for a capture, which are omitted, and why; the commands write it, Blender shows it.
 
-    {"decisions": [{"key": "exposure", "what": "exposure and white balance correction", "planned": false, "done": false,
-                    "why": "the photos show the same points with a difference in brightness or color of 0.4%; ...",
-                    "can_override": true, "views": []}, ...]}
+{"decisions": [{"key": "exposure", "what": "exposure and white balance correction", "planned": false, "done": false,
+                "why": "the photos show the same points with a difference in brightness or color of 0.4%; ...",
+                "can_override": true, "views": []}, ...]}
 """
 
 from __future__ import annotations
@@ -61,11 +61,11 @@ class Decision:
     def reason(self) -> str:
         """The reason for `done` as a clause."""
         option = "--keep" if self.done else "--leave-out"
-        return f"{option} {self.key} was asked for" if self.overridden else self.why
+        return f"{option} {self.key} was given" if self.overridden else self.why
 
     def sentence(self) -> str:
         """Return the decision and its reason as a sentence for the user."""
-        verdict = {True: "Done", False: "Left out", None: "Known later"}[self.done]
+        verdict = {True: "Done", False: "Left out", None: "Decided later"}[self.done]
         return f"{verdict}: {self.what}, since {self.reason}"
 
 

@@ -135,7 +135,7 @@ def read_record(folder: Reconstruction) -> Record:
         )
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"{folder.settings} does not hold what is expected ({error!r}); choose another folder, or make it anew."
+            f"{folder.settings} is invalid ({error!r}); choose another folder, or create it again."
         ) from error
 
 

@@ -61,7 +61,7 @@ def read_evaluation(folder: Path) -> Evaluation | None:
             {str(key): dict(values) for key, values in content.get("meshes", {}).items()},
         )
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{path} does not hold figures as expected ({error!r}); run `evaluate` again.") from error
+        raise InputError(f"{path} has invalid content ({error!r}); run `evaluate` again.") from error
 
 
 def write_report_json(folder: Path, report: Mapping[str, Any]) -> None:

@@ -129,7 +129,7 @@ def read_shot(path: Path) -> Shot:
     try:
         return _shot(content)
     except _Wrong as error:
-        raise InputError(f"{path} cannot be drawn: {error}.") from error
+        raise InputError(f"{path} cannot be rendered: {error}.") from error
 
 
 def chosen_frames(text: str | None, shot: Shot) -> list[Frame]:
@@ -162,7 +162,7 @@ def frame_ranges(text: str) -> list[range]:
         match = re.fullmatch(r"\s*(\d{1,7})\s*(?:-\s*(\d{1,7})\s*)?", word)
         first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, -1)
         if last < first:
-            raise InputError(f"--frames {text} makes no sense; give frames as 1-24 or 1,5,9-12.")
+            raise InputError(f"--frames {text} is not valid; specify frames as 1-24 or 1,5,9-12.")
         found.append(range(first, last + 1))
     return found
 
@@ -173,13 +173,13 @@ class _Wrong(Exception):
 
 def _shot(content: Any) -> Shot:
     if not isinstance(content, dict) or "frames" not in content:
-        raise _Wrong("it is no shot file, since it has no frames")
+        raise _Wrong("it is not a shot file, since it has no frames")
     if content.get("version") != VERSION:
         raise _Wrong(f"its version is {content.get('version')!r}, and {VERSION} was expected")
     steady = _objects(content.get("objects", {}), "objects")
     frames = content["frames"]
     if not isinstance(frames, list) or not frames:
-        raise _Wrong("its frames are no list, or an empty one")
+        raise _Wrong("its frames are not a list, or the list is empty")
     shot = Shot(
         width=_whole(content.get("width"), 1, LARGEST_SIDE, "width"),
         height=_whole(content.get("height"), 1, LARGEST_SIDE, "height"),
@@ -196,7 +196,7 @@ def _shot(content: Any) -> Shot:
 
 def _frame(entry: Any, steady: Mapping[int, Placed]) -> Frame:
     if not isinstance(entry, dict):
-        raise _Wrong("a frame is no object")
+        raise _Wrong("a frame is not a JSON object")
     number = _whole(entry.get("frame"), 0, LARGEST_FRAME, "frame")
     where = f"frame {number}"
     samples = entry.get("samples")
@@ -208,13 +208,13 @@ def _frame(entry: Any, steady: Mapping[int, Placed]) -> Frame:
 
 def _sample(entry: Any, steady: Mapping[int, Placed], where: str) -> Sample:
     if not isinstance(entry, dict):
-        raise _Wrong(f"a sample of {where} is no object")
+        raise _Wrong(f"a sample of {where} is not a JSON object")
     if "viewmat" not in entry or "K" not in entry:
         raise _Wrong(f"a sample of {where} has no viewmat or no K; only perspective cameras can be drawn")
     viewmat = np.array(_numbers(entry["viewmat"], (4, 4), f"viewmat of {where}"))
     turn = viewmat[:3, :3]
     if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-4) or np.linalg.det(turn) < 0:
-        raise _Wrong(f"the viewmat of {where} is no rotation and translation")
+        raise _Wrong(f"the viewmat of {where} is not a rigid transform")
     if not np.array_equal(viewmat[3], (0, 0, 0, 1)):
         raise _Wrong(f"the viewmat of {where} does not end in 0 0 0 1")
     K = np.array(_numbers(entry["K"], (3, 3), f"K of {where}"))
@@ -236,13 +236,13 @@ def _objects(entries: Any, where: str) -> dict[int, Placed]:
     found = {}
     for key, entry in entries.items():
         if not key.isdecimal() or not key.isascii() or int(key) > LARGEST_ID:
-            raise _Wrong(f"{key!r} among the {where} is no ID")
+            raise _Wrong(f"{key!r} in the {where} is not an object ID")
         if not isinstance(entry, dict):
             raise _Wrong(f"entry {key} of the {where} is no object")
         visible = _truth(entry.get("visible", True), f"visible of object {key}")
         maps = entry.get("maps")
         if maps is not None and not isinstance(maps, list):
-            raise _Wrong(f"the maps of object {key} are no list")
+            raise _Wrong(f"the maps of object {key} are not a list")
         try:
             places = None if maps is None else np.array([affine_map(place) for place in maps]).reshape(-1, 4, 4)
         except (TypeError, ValueError) as error:
@@ -272,7 +272,7 @@ def _above_zero(value: Any, what: str) -> float:
 
 def _whole(value: Any, least: int, largest: int, what: str) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= largest:
-        raise _Wrong(f"{what} is {value!r}, and a whole number from {least} to {largest} was expected")
+        raise _Wrong(f"{what} is {value!r}, expected an integer from {least} to {largest}")
     return value
 
 

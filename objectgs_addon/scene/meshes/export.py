@@ -45,7 +45,9 @@ def export(
         if (ids is None or object_id in ids) and not scene.is_removed(collections[object_id])
     ]
     if not chosen:
-        raise InputError("None of the objects has a mesh that is not removed; extract meshes, or choose others.")
+        raise InputError(
+            "No chosen object has a mesh, or all of them are removed; extract meshes, or choose other objects."
+        )
     if per_object and out.is_file():
         raise InputError(f"{out} is a file; choose another name for the folder.")
     files: dict[Path, list[int]] = {out: chosen}

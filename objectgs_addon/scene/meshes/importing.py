@@ -87,7 +87,7 @@ class MeshImporter:
         self._update_material(obj, listed)
         obj[WRITTEN] = written
         if not listed.texture.is_file():
-            self.warnings.append(f"{listed.texture} is missing, so {obj.name} has no texture; make the mesh again.")
+            self.warnings.append(f"{listed.texture} is missing, so {obj.name} has no texture; extract the mesh again.")
         return True
 
     def unlink(self, obj: bpy.types.Object) -> None:
@@ -164,7 +164,7 @@ def fill_mesh(mesh: bpy.types.Mesh, positions: np.ndarray, loaded: Mesh) -> None
 def _read(listed: ListedMesh) -> Mesh:
     loaded = read_mesh(listed.mesh)
     if not len(loaded.faces) or not np.isfinite(loaded.vertices).all():
-        raise InputError(f"{listed.mesh} holds no surface; make the meshes again.")
+        raise InputError(f"{listed.mesh} contains no surface; extract the meshes again.")
     return loaded
 
 

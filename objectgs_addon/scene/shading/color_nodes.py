@@ -27,7 +27,7 @@ def recolor_inputs() -> list[tuple[str, str, Any, None, str]]:
             "NodeSocketVector",
             tuple(float(i == j) for j in range(3)),
             None,
-            f"How much of red, green and blue makes the new {channel.lower()}",
+            f"Weights of red, green and blue in the new {channel.lower()}",
         )
         for i, channel in enumerate(CHANNELS)
     ]

@@ -124,10 +124,10 @@ def _make_splats_group(name: str) -> bpy.types.NodeTree:
     tree = _geometry_group(
         name,
         [
-            ("Ellipsoids", "NodeSocketBool", False, None, "The splats' true shapes instead of points; slow with many"),
+            ("Ellipsoids", "NodeSocketBool", False, None, "Show ellipsoids instead of points; slow for many splats"),
             ("Point Size", "NodeSocketFloat", 1.0, 0.0, "Radius of the points relative to the splats' size"),
-            ("Largest Point", "NodeSocketFloat", 1.0, 0.0, "Radius that no point exceeds"),
-            ("Minimum Opacity", "NodeSocketFloat", 0.1, 0.0, "Fainter splats have no point"),
+            ("Largest Point", "NodeSocketFloat", 1.0, 0.0, "Maximum radius of the points"),
+            ("Minimum Opacity", "NodeSocketFloat", 0.1, 0.0, "Splats of lower opacity are not shown as points"),
             ("Material", "NodeSocketMaterial", None, None, "Material of the points"),
             *recolor_inputs(),
         ],
