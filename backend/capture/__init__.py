@@ -1,4 +1,4 @@
-"""Captures: images, ID masks and COLMAP models, read as undistorted pinhole views."""
+"""Captures: images, ID masks and COLMAP models, loaded as undistorted pinhole views."""
 
 from .capture import Capture, Keypoints, Points, View
 from .prepare import load_capture

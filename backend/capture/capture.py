@@ -69,17 +69,17 @@ class Keypoints:
 
 
 class Capture:
-    """A capture's views, sorted by name, and points; images and ID maps are decoded on demand within a memory budget.
+    """The views (sorted by name) and points of a capture; images and ID maps are decoded on demand, with a cache.
 
     Returned arrays are shared and read-only. All methods are thread-safe.
 
     Attributes:
         names: Names of the labels by ID, without 0.
         left_out: (n,) int64, IDs that are treated as 0 (unlabeled).
-        warnings: Sentences for the user.
+        warnings: Warnings for the user.
         counts: Numbers of images, masks, points and cameras.
-        prepared: Whether `image` and `mask` are available; otherwise the files have to be resampled first.
-        train_indices, test_indices: Views to train on, and views held out.
+        prepared: Whether `image` and `mask` are available; otherwise the files must be resampled first.
+        train_indices, test_indices: Training views and held-out views.
     """
 
     def __init__(
@@ -117,21 +117,21 @@ class Capture:
         return len(self.views)
 
     def edited(self, names: Mapping[int, str], left_out: Iterable[int]) -> Capture:
-        """Return this capture with additional names and with the IDs `left_out` as 0; decoded files are shared."""
+        """Return this capture with additional names and with the IDs `left_out` as 0; the cache is shared."""
         other = copy.copy(self)
         other.left_out = np.unique(np.array(list(left_out), np.int64))
         other.names = {i: name for i, name in {**self.names, **names}.items() if i not in other.left_out}
         return other
 
     def without_masks(self) -> Capture:
-        """Return this capture without ID maps; decoded files are shared."""
+        """Return this capture without ID maps; the cache is shared."""
         other = copy.copy(self)
         other.views = tuple(replace(view, mask_file=None) for view in self.views)
         other._ids_of_views = [()] * len(self.views)
         return other
 
     def excluding_from_training(self, names: Collection[str]) -> Capture:
-        """Return this capture with the named views removed from the training views; held-out views stay as they are."""
+        """Return this capture with the named views removed from the training views; held-out views are unchanged."""
         other = copy.copy(self)
         other.train_indices = tuple(i for i in self.train_indices if self.views[i].name not in names)
         return other
@@ -152,20 +152,20 @@ class Capture:
         return ids[~np.isin(ids, self.left_out)]
 
     def ids_in(self, index: int) -> tuple[int, ...]:
-        """The IDs in a view's mask, including 0, ascending; empty if the view has no mask."""
+        """Return the IDs in a view's mask, including 0, ascending; empty if the view has no mask."""
         return tuple(np.unique(self.without_left_out(np.array(self._ids_of_views[index], np.int64))).tolist())
 
     def camera_model_of(self, index: int) -> str:
-        """COLMAP's name of the camera model of a view."""
+        """Return COLMAP's name of the camera model of a view."""
         return self._raw[index][0].model
 
     def is_original(self, index: int) -> bool:
-        """Whether a view's image file is used unchanged, since it is neither distorted nor too large."""
+        """Return whether a view's image file is used unchanged because it is neither distorted nor too large."""
         view = self.views[index]
         return needs_no_resampling(self._raw[index][0], view.width, view.height)
 
     def observed(self, index: int) -> np.ndarray:
-        """Indices of the points that COLMAP observed in a view: (n,) int64; an index may occur twice."""
+        """Return the indices of the points that COLMAP observed in a view: (n,) int64; an index may occur twice."""
         return self._raw[index][1].point_index.astype(np.int64)
 
     def image(self, index: int, downscale: int = 1) -> np.ndarray:
@@ -173,13 +173,13 @@ class Capture:
 
         Args:
             index: The view.
-            downscale: Side of the blocks of pixels that are averaged.
+            downscale: Downscale factor; blocks of downscale x downscale pixels are averaged.
 
         Returns:
-            (height // downscale, width // downscale, 3) uint8; a remainder at the right and bottom is cropped.
+            (height // downscale, width // downscale, 3) uint8; any remainder at the right and bottom is cropped.
 
         Raises:
-            InputError: The file is unreadable or has changed.
+            InputError: The file cannot be read, or its size has changed.
         """
         return self._cache.get(("image", index, downscale), lambda: self._read_image(index, downscale))
 
@@ -188,13 +188,13 @@ class Capture:
 
         Args:
             index: The view.
-            downscale: Side of the blocks of pixels, of which the center is sampled.
+            downscale: Downscale factor; the center of each block of downscale x downscale pixels is sampled.
 
         Returns:
-            (h, w) int64, of the size of `image`; None if the view has no mask.
+            (h, w) int64, the size of `image`; None if the view has no mask.
 
         Raises:
-            InputError: The file is unreadable or has changed.
+            InputError: The file cannot be read, or its size has changed.
         """
         if self.views[index].mask_file is None:
             return None
@@ -202,13 +202,13 @@ class Capture:
         return self.without_left_out(ids.astype(np.int64))
 
     def K(self, index: int, downscale: int = 1) -> np.ndarray:  # noqa: N802 - as in the equations
-        """The intrinsics of `image(index, downscale)`: (3, 3) float64."""
+        """Return the intrinsics of `image(index, downscale)`: (3, 3) float64."""
         K = self.views[index].K.copy()
         K[:2] /= downscale
         return K
 
     def keypoints(self, index: int) -> Keypoints:
-        """COLMAP's observations in a view, without those whose undistortion does not converge."""
+        """Return COLMAP's observations in a view, except those whose undistortion does not converge."""
         camera, image = self._raw[index]
         K = self.views[index].K
         if is_pinhole(camera):
@@ -254,12 +254,12 @@ class Capture:
 
 
 def needs_no_resampling(camera: Camera, width: int, height: int) -> bool:
-    """Whether a camera's image can be used unchanged as a view of this size."""
+    """Return whether a camera's image can be used unchanged as a view of this size."""
     return is_pinhole(camera) and (width, height) == (camera.width, camera.height)
 
 
 class _ArrayCache:
-    """Keeps the most recently used arrays within a number of bytes; thread-safe."""
+    """Least-recently-used cache of arrays with a limit in bytes; thread-safe."""
 
     def __init__(self, budget: float) -> None:
         self.budget = budget
@@ -272,7 +272,7 @@ class _ArrayCache:
             if key in self._arrays:
                 self._arrays.move_to_end(key)
                 return self._arrays[key]
-        # Outside the lock, so that threads decode concurrently; decoding a file twice is harmless.
+        # Decode outside the lock, so that threads run concurrently; decoding a file twice is harmless.
         array = make()
         array.setflags(write=False)
         with self._lock:

@@ -1,4 +1,4 @@
-"""Finds and reads a capture's files: images, ID masks in all accepted formats, and label names."""
+"""The files of a capture: images, ID masks in all accepted formats, and label names."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _OPENING_ERRORS = (OSError, ValueError, SyntaxError, EOFError, MemoryError, PilI
 
 
 class Files:
-    """The files below a folder, found by the names in a COLMAP model.
+    """The files below a folder, looked up by the names in a COLMAP model.
 
-    A name is matched exactly, then in composed Unicode (macOS writes it decomposed), then with backslashes as
-    separators (models made on Windows), then case-insensitively. An ambiguous match counts as none.
+    A name is matched exactly, then in composed Unicode (macOS writes decomposed names), then with backslashes as
+    separators (models made on Windows), then case-insensitively. An ambiguous match counts as no match.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -47,7 +47,7 @@ class Files:
             self._levels.append(index)
 
     def find(self, name: str) -> Path | None:
-        """The file with this name, or None."""
+        """Return the file with this name, or None."""
         for level, index in enumerate(self._levels):
             matches = index.get(_folded(name, level), [])
             if len(matches) == 1:
@@ -57,7 +57,7 @@ class Files:
         return None
 
     def first(self, names: Iterable[str]) -> Path | None:
-        """The first existing file of `names`, or None."""
+        """Return the first existing file of `names`, or None."""
         return next((path for name in names if (path := self.find(name)) is not None), None)
 
 
@@ -70,7 +70,7 @@ def _folded(name: str, level: int) -> str:
 
 
 def mask_names(image_name: str) -> tuple[list[str], list[str]]:
-    """Names that an image's mask may have below masks/: accepted ones, and lossy ones that are refused."""
+    """Return the names that an image's mask may have below masks/: accepted ones, and lossy ones that are refused."""
     stem = re.sub(r"\.[^./\\]*$", "", image_name)
     accepted = [image_name + suffix for suffix in MASK_SUFFIXES] + [stem + suffix for suffix in MASK_SUFFIXES]
     return accepted, [name + suffix for name in (image_name, stem) for suffix in LOSSY_SUFFIXES]
@@ -80,13 +80,13 @@ def mask_names(image_name: str) -> tuple[list[str], list[str]]:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Read the width and height from an image's header; raises InputError that names the file."""
+    """Read the width and height from an image's header; raises InputError with the file's path."""
     with _opened(path) as image:
         return image.size
 
 
 def read_image(path: Path) -> PilImage.Image:
-    """Read an image as 8-bit RGB, without alpha; orientation tags are ignored, as in COLMAP. Raises InputError."""
+    """Read an image as 8-bit RGB without alpha; as in COLMAP, orientation tags are ignored. Raises InputError."""
     with _opened(path) as image:
         try:
             image.load()
@@ -125,7 +125,7 @@ def _unreadable(path: Path, error: BaseException) -> InputError:
 
 
 def is_color_mask(path: Path) -> bool:
-    """Whether a mask file has three channels that differ, so that its IDs are encoded as colors."""
+    """Return whether a mask file has three channels that differ, so that its IDs are encoded as colors."""
     if path.suffix.lower() in (".npy", ".npz"):
         return False
     with _opened(path) as image:
@@ -139,7 +139,7 @@ def is_color_mask(path: Path) -> bool:
 
 
 def is_three_channel(path: Path) -> bool:
-    """Whether a mask file has three channels, and so may be gray or encode IDs as colors."""
+    """Return whether a mask file has three channels, and thus may be gray or encode IDs as colors."""
     if path.suffix.lower() in (".npy", ".npz"):
         return False
     with _opened(path) as image:
@@ -150,18 +150,18 @@ def read_mask(path: Path, color: bool | None = None) -> np.ndarray:
     """Read an ID map.
 
     8-bit or 16-bit gray: the value is the ID. Palette: the index is the ID. Three channels: the gray value is the ID
-    if the channels are equal in the whole capture, otherwise R + 256 G + 65536 B; alpha is ignored. .npy and .npz (its
+    if the channels are equal in the whole capture, otherwise R + 256 G + 65536 B; alpha is ignored. .npy and .npz (the
     only array, or the one named `ids`, `mask` or `masks`): integers, or floats with integer values.
 
     Args:
         path: The mask.
-        color: Whether three channels encode colors; None to decide by this file alone.
+        color: Whether three channels encode IDs as colors; None to decide from this file alone.
 
     Returns:
-        (h, w) uint8, uint16 or uint32, the smallest type that holds the IDs.
+        (h, w) uint8, uint16 or uint32, the smallest type that can represent the IDs.
 
     Raises:
-        InputError: The file is not an ID map; the message names it.
+        InputError: The file is not an ID map; the message contains its path.
     """
     suffix = path.suffix.lower()
     if suffix in LOSSY_SUFFIXES:
@@ -171,7 +171,7 @@ def read_mask(path: Path, color: bool | None = None) -> np.ndarray:
 
 
 def compact(ids: np.ndarray) -> np.ndarray:
-    """Convert IDs to the smallest unsigned type that holds them."""
+    """Convert IDs to the smallest unsigned type that can represent them."""
     largest = int(ids.max()) if ids.size else 0
     return ids.astype(np.uint8 if largest < 256 else np.uint16 if largest < 65536 else np.uint32, copy=False)
 
@@ -247,7 +247,7 @@ def _not_ids(path: Path, why: str) -> InputError:
 
 
 def encode_mask(ids: np.ndarray) -> tuple[str, bytes]:
-    """Encode an ID map for `read_mask`: the suffix and the bytes of a file, PNG up to 16 bits, else .npz."""
+    """Encode an ID map for `read_mask`; returns the suffix and bytes of a file: PNG up to 16 bits, otherwise .npz."""
     ids = compact(ids)
     buffer = io.BytesIO()
     if ids.dtype == np.uint32:

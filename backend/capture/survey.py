@@ -1,4 +1,4 @@
-"""Checks a capture and lists its contents before any image is prepared."""
+"""Validation of a capture and listing of its contents, before any image is prepared."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from .files import (
 from .undistort import Pinhole, is_pinhole, pinhole_for
 
 Problem = Callable[[str], None]
-"""Takes a sentence that describes a problem; either raises it or collects it."""
+"""Handler of a problem, given as a sentence; either raises or collects it."""
 
 _ASPECT_TOLERANCE = 0.01
 _T = TypeVar("_T")
@@ -44,7 +44,7 @@ _R = TypeVar("_R")
 
 @dataclass
 class Source:
-    """One image of the model that exists on disk, with its mask, camera and the pinhole camera that replaces it."""
+    """One image of the model that exists on disk, with its mask, its camera and the pinhole camera of its view."""
 
     image: Image
     camera: Camera
@@ -55,7 +55,7 @@ class Source:
 
 @dataclass
 class Survey:
-    """The contents of a capture, before its images are read."""
+    """The contents of a capture before its images are read."""
 
     folder: Path
     model: Model
@@ -76,15 +76,15 @@ def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Repo
 
     Args:
         folder: The capture.
-        max_size: Longer side of the views, in pixels; 0 for any size.
-        problem: Called with each problem that makes the capture unusable; may raise it or collect it.
+        max_size: Largest longer side of the views, in pixels; 0 for no limit.
+        problem: Called with each problem that makes the capture unusable; may raise or collect it.
         reporter: Receives the status.
 
     Returns:
-        The survey; if `problem` collects, of what can be used.
+        The survey; if `problem` only collects, the survey of the usable parts.
 
     Raises:
-        InputError: A problem that prevents further checks, whatever `problem` does.
+        InputError: A problem that prevents further checks, regardless of `problem`.
     """
     if not folder.is_dir():
         what = "is a file, not a folder" if folder.exists() else "does not exist"
@@ -190,7 +190,7 @@ def _tolerate(problem: Problem, make: Callable[[], _T], otherwise: _T) -> _T:
 
 
 def _is_color_coded(sources: list[Source], problem: Problem) -> bool:
-    """Whether three-channel masks encode IDs as colors; decided for the whole capture, since ID 65,793 is gray."""
+    """Return whether three-channel masks encode IDs as colors, for the whole capture, as ID 65,793 encodes as gray."""
     for source in sources:
         if source.mask_path is not None:
             if not _tolerate(problem, partial(is_three_channel, source.mask_path), True):
@@ -201,7 +201,7 @@ def _is_color_coded(sources: list[Source], problem: Problem) -> bool:
 
 
 def check_size(source: Source, size: tuple[int, int], cameras_file: Path) -> None:
-    """Raise InputError if an image's size (width, height) is not its camera's."""
+    """Raise InputError if an image's size (width, height) differs from its camera's."""
     camera = source.camera
     if size != (camera.width, camera.height):
         raise InputError(
@@ -211,7 +211,7 @@ def check_size(source: Source, size: tuple[int, int], cameras_file: Path) -> Non
 
 
 def check_mask(source: Source, color: bool) -> np.ndarray:
-    """Read a mask as it is on disk; raises InputError if its aspect ratio is not the image's."""
+    """Read a mask from disk without resampling; raises InputError if its aspect ratio differs from the image's."""
     assert source.mask_path is not None
     ids = read_mask(source.mask_path, color)
     height, width = ids.shape
@@ -227,7 +227,7 @@ def check_mask(source: Source, color: bool) -> np.ndarray:
 
 
 def run_in_parallel(work: Callable[[_T], _R], items: Iterable[_T]) -> Iterator[_R]:
-    """Yield the results in order; the first error cancels the items that have not started."""
+    """Process items in parallel and yield the results in order; the first error cancels items not yet started."""
     pool = ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1)))
     try:
         yield from pool.map(work, items)
@@ -240,12 +240,12 @@ def check_capture(folder: str | Path, max_size: int = MAX_SIZE, reporter: Report
 
     Args:
         folder: The capture.
-        max_size: Longer side of the views, in pixels; 0 for any size.
+        max_size: Largest longer side of the views, in pixels; 0 for no limit.
         reporter: Receives status and progress.
 
     Returns:
-        A JSON-compatible dict. "problems" holds a sentence for each reason why `load_capture` would refuse the
-        capture, "warnings" other sentences for the user. If the model cannot be read, the only other key is "folder".
+        A JSON-compatible dict. "problems" is a list of sentences, one for each reason why `load_capture` would refuse
+        the capture; "warnings" is a list of warnings. If the model cannot be read, the only other key is "folder".
     """
     reporter = reporter or Reporter()
     folder = Path(folder)
@@ -314,7 +314,7 @@ def _check_image(source: Source, cameras_file: Path) -> PilImage.Image:
 
 
 def distinct_ids(ids: np.ndarray) -> list[int]:
-    """The IDs of a mask, ascending. Small IDs are counted, which is faster than sorting all pixels."""
+    """Return the IDs in a mask, ascending. Small IDs are counted, which is faster than sorting all pixels."""
     if ids.size and ids.min() >= 0 and ids.max() < 1 << 16:
         return np.flatnonzero(np.bincount(ids.ravel())).tolist()
     return np.unique(ids).tolist()

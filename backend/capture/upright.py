@@ -1,7 +1,7 @@
-"""Estimates the up direction and the ground of a capture: COLMAP's frame is arbitrary, Blender has Z up.
+"""Estimation of the up direction and ground of a capture: COLMAP's frame is arbitrary, whereas Blender has Z up.
 
 The up direction is estimated from the cameras, since most photos are taken level, and refined by the largest
-horizontal plane of the points if there is one, such as a floor or the top of a table.
+horizontal plane of the points if there is one, such as a floor or a table top.
 """
 
 from __future__ import annotations
@@ -11,16 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 
 LEVEL_WITHIN = np.cos(np.radians(25.0))
-"""Largest angle, as its cosine, between the plane's normal and the cameras' up; beyond, it is a wall or a slope."""
+"""Cosine of the largest angle between the plane's normal and the cameras' up; beyond, it is a wall or a slope."""
 PLANE_FRACTION = 0.12
-"""Least fraction of the points in the plane, plus 4 standard deviations, since the best of thousands is chosen."""
+"""Smallest fraction of the points in the plane; 4 standard deviations are added, as it is the best of thousands."""
 PLANE_CONTRAST = 2.0
-"""Least density of points in the plane, relative to just above and below it; a shapeless cloud reaches 1.5."""
+"""Smallest density of points in the plane, relative to just above and below it; a shapeless cloud reaches 1.5."""
 PLANE_THICKNESS = 0.01
 """Largest distance of the plane's points from it, as a fraction of the scene's size."""
 UPRIGHT_WITHIN = np.radians(2.0)
 ON_GROUND_WITHIN = 0.02
-"""A capture within this angle of upright stays unchanged, as does a ground within this fraction of the size of 0."""
+"""A capture is not rotated if it is upright within this angle, and the ground is not moved if its height is within this
+fraction of the scene's size of 0."""
 LOWEST_PERCENT = 2.0
 
 _TRIPLES = 4000
@@ -28,7 +29,7 @@ _POINTS_SCORED = 4000
 _FEWEST_IN_PLANE = 12
 _FLOAT32_RELATIVE_ERROR = 2.0**-24
 _AGREE = 0.3
-"""Least length of the mean of the cameras' unit up vectors; below, they cancel out and give no direction."""
+"""Smallest length of the mean of the cameras' unit up vectors; below, they cancel out and give no direction."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +52,8 @@ def compute_upright(viewmats: np.ndarray, xyz: np.ndarray) -> Upright:
         xyz: (M, 3), points.
 
     Returns:
-        The transform. Its rotation is the smallest that takes up to +Z, which keeps the heading, and the identity if
-        the capture is upright already. Its origin is 0, unless the capture is so far from 0 that float32 coordinates
+        The transform. Its rotation is the smallest one that rotates up to +Z, which keeps the heading, or the identity
+        if the capture is already upright. Its origin is 0, unless the capture is so far from 0 that float32 coordinates
         would be inaccurate.
     """
     centers = -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
@@ -79,11 +80,11 @@ def compute_upright(viewmats: np.ndarray, xyz: np.ndarray) -> Upright:
 
 
 def _origin(middle: np.ndarray, size: float) -> np.ndarray:
-    """0, or for a capture far from 0 its center, rounded to the order of magnitude of the scene's size."""
+    """Return 0 or, for a capture far from 0, its center rounded to the order of magnitude of the scene's size."""
     far = float(np.abs(middle).max())
     if far * _FLOAT32_RELATIVE_ERROR <= 1e-6 * size or far == 0:
         return np.zeros(3)
-    # The least size is the precision of the coordinates.
+    # The precision of the coordinates is a lower limit of the size.
     step = 10.0 ** np.floor(np.log10(max(size, far * 1e-9)))
     return np.round(middle / step) * step
 
@@ -91,12 +92,12 @@ def _origin(middle: np.ndarray, size: float) -> np.ndarray:
 def _cameras_up(viewmats: np.ndarray) -> np.ndarray:
     """Estimate up (3,) from the cameras alone.
 
-    The cameras' up vectors tilt when the cameras look down, which averages out only over a full circle around the
-    scene. Their right vectors are horizontal at any pitch, so up is orthogonal to all of them, if they differ enough.
-    Iterative reweighting suppresses cameras that were turned on their side.
+    The up vectors of cameras that look down are tilted, which averages out only over a full circle around the scene.
+    The right vectors are horizontal at any pitch, so up is orthogonal to all of them, if they differ enough. Iterative
+    reweighting suppresses cameras that were turned on their side.
     """
     ups, rights, backs = -viewmats[:, 1, :3], viewmats[:, 0, :3], -viewmats[:, 2, :3]
-    # Cameras that look straight down have up vectors of any heading: then up is opposite to the view directions.
+    # The up vectors of cameras that look straight down have any heading; then up is opposite to the view directions.
     mean = _robust_mean(ups if np.linalg.norm(ups.mean(0)) >= _AGREE else backs)
     length = float(np.linalg.norm(mean))
     if length < 1e-6:
@@ -112,7 +113,7 @@ def _cameras_up(viewmats: np.ndarray) -> np.ndarray:
 
 
 def _robust_mean(vectors: np.ndarray) -> np.ndarray:
-    """The mean of unit vectors (n, 3), with less weight for outliers."""
+    """Return the mean of unit vectors (n, 3), with less weight for outliers."""
     mean = vectors.mean(0)
     for _ in range(10):
         weights = 1 / np.maximum(np.linalg.norm(vectors - mean, axis=1), 0.05)
@@ -123,7 +124,7 @@ def _robust_mean(vectors: np.ndarray) -> np.ndarray:
 def _level_plane(
     xyz: np.ndarray, up: np.ndarray, thickness: float, cameras: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Find the horizontal plane below most of the cameras (V, 3) with the most of the points xyz (M, 3).
+    """Find the horizontal plane below most of the cameras (V, 3) that contains the most of the points xyz (M, 3).
 
     Returns its normal (3,) and a mask of its points (M,) bool; None if it has too few points.
     """
@@ -134,7 +135,7 @@ def _level_plane(
     a, b, c = some[rng.integers(0, len(some), (3, _TRIPLES))]
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
-    # Three points closer together than the plane is thick do not determine its slope.
+    # Three points that are closer together than the plane's thickness do not determine its slope.
     keep = lengths > thickness**2
     normals, a = normals[keep] / lengths[keep, None], a[keep]
     normals *= np.sign(normals @ up)[:, None]
@@ -166,11 +167,11 @@ def _level_plane(
 
 
 def _smallest_rotation(up: np.ndarray) -> np.ndarray:
-    """The rotation (3, 3) that takes the unit vector `up` to +Z, about the axis orthogonal to both."""
+    """Return the rotation (3, 3) that rotates the unit vector `up` to +Z, about the axis orthogonal to both."""
     x, y, z = up
     level = x * x + y * y
     if z < 0 and level < 1e-24:
         return np.diag([1.0, -1.0, -1.0])
-    # 1 / (1 + z), without the cancellation near z = -1.
+    # 1 / (1 + z), without cancellation near z = -1.
     k = (1 - z) / level if z < 0 else 1 / (1 + z)
     return np.array([[1 - x * x * k, -x * y * k, -x], [-x * y * k, 1 - y * y * k, -y], [x, y, z]])

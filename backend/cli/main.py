@@ -59,7 +59,7 @@ def _run(arguments: list[str], reporter: Reporter) -> int:
         reporter.error(str(error))
         return EXIT_BAD_INPUT
     except (Cancelled, KeyboardInterrupt) as error:
-        reporter.stopped(str(error) or "Stopped at once.")
+        reporter.stopped(str(error) or "Stopped immediately.")
         return EXIT_CANCELLED
     except BrokenPipeError:
         raise
@@ -71,7 +71,7 @@ def _run(arguments: list[str], reporter: Reporter) -> int:
         import traceback
 
         traceback.print_exc(file=sys.stderr)
-        reporter.error(f"An unexpected failure: {type(error).__name__}: {' '.join(str(error).split())}")
+        reporter.error(f"Unexpected error: {type(error).__name__}: {' '.join(str(error).split())}")
         return EXIT_FAILED
 
 

@@ -1,4 +1,4 @@
-"""Quality of a reconstruction on held-out views, and the report about it."""
+"""Evaluation of a reconstruction on held-out views, and its report."""
 
 from .images import comparison, contact_sheet, curve_image, id_image, save_image, thumbnail
 from .metrics import IdScores, ImageScores, psnr, ssim

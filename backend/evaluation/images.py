@@ -38,14 +38,14 @@ def load_font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def as_bytes(image: NDArray) -> NDArray[np.uint8]:
-    """Convert an image (h, w, 3), float in [0, 1] or uint8, to uint8; values that are not finite become 0."""
+    """Convert an image (h, w, 3), float in [0, 1] or uint8, to uint8; NaN and Inf become 0."""
     if image.dtype == np.uint8:
         return image
     return np.rint(255.0 * np.clip(np.nan_to_num(image, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)).astype(np.uint8)
 
 
 def id_image(ids: NDArray, colors: Colors | None = None) -> NDArray[np.uint8]:
-    """Color object IDs (h, w) as an image (h, w, 3) uint8; IDs without an entry in `colors` get the palette's color."""
+    """Color an ID map (h, w) as an image (h, w, 3) uint8; IDs without an entry in `colors` get the palette's color."""
     found, inverse = np.unique(ids, return_inverse=True)
     table = colors_of(found)
     if colors:
@@ -63,16 +63,16 @@ def comparison(
     names: Mapping[int, str] | None = None,
     title: str = "",
 ) -> Image.Image:
-    """Show a photo, its render, the rendered IDs and the mask's IDs side by side, with a legend of the objects.
+    """Arrange a photo, its render, the rendered IDs and the mask's IDs side by side, with a legend of the objects.
 
     Args:
         truth: The photo, (h, w, 3), uint8 or float in [0, 1].
-        render: The render of the same view, as `truth`.
-        true_ids: The object IDs of the mask, (h, w); None leaves out this panel.
+        render: The render of the same view, in the format of `truth`.
+        true_ids: The object IDs of the mask, (h, w); None omits this panel.
         ids: The rendered object IDs, (h, w).
-        colors: Object ID -> (red, green, blue), 0 .. 255, where it is not the palette's color.
+        colors: Object ID -> (red, green, blue), 0 .. 255, for objects with a color other than the palette's.
         names: Object ID -> name for the legend.
-        title: A heading over the panels.
+        title: A heading above the panels.
     """
     size = _fit(truth.shape[1], truth.shape[0])
     panels = [
@@ -89,7 +89,7 @@ def comparison(
 def curve_image(curve: Sequence[Mapping[str, Any]]) -> Image.Image | None:
     """Draw the PSNR over the run time as a small image for a dark panel; None if there are fewer than two measurements.
 
-    The training waits for it, so it is drawn in a few milliseconds, without matplotlib.
+    It is drawn without matplotlib, in a few milliseconds, since it delays the training.
     """
     found = [(float(entry["seconds"]), float(entry["psnr"])) for entry in curve if entry.get("psnr") is not None]
     if len(found) < 2:
@@ -125,7 +125,7 @@ def thumbnail(image: NDArray, longest: int = 256) -> Image.Image:
 
 
 def contact_sheet(images: Sequence[NDArray | Image.Image], titles: Sequence[str], columns: int = 4) -> Image.Image:
-    """Arrange images in rows of `columns`, each under its title, scaled to fit the size of the first one."""
+    """Arrange images in rows of `columns`, each below its title, scaled to fit the size of the first one."""
     if not images:
         raise ValueError("a contact sheet needs at least one image")
     pictures = [
@@ -147,10 +147,10 @@ def save_image(image: Image.Image, path: Path, limit: int = 300_000, quick: bool
         image: The image to write.
         path: The file to write, with the suffix .png.
         limit: The largest size of the PNG in bytes.
-        quick: Compress less, in a fifth of the time, for images that are soon replaced.
+        quick: Compress less, in a fifth of the time, for temporary images.
 
     Returns:
-        The path of the file, whose suffix is .jpg if it is a JPEG.
+        The path of the file; its suffix is .jpg if it is a JPEG.
     """
     buffer = io.BytesIO()
     image.save(buffer, "PNG", **({"compress_level": 1} if quick else {"optimize": True}))
@@ -166,7 +166,7 @@ def save_image(image: Image.Image, path: Path, limit: int = 300_000, quick: bool
 
 
 def _fit(width: int, height: int, longest: int = PANEL_WIDTH) -> tuple[int, int]:
-    """The size of a panel: as large as the image, up to `longest` pixels on the longer side."""
+    """Return the size of a panel: as large as the image, up to `longest` pixels on the longer side."""
     scale = min(1.0, longest / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
@@ -180,7 +180,7 @@ _Legend = list[tuple[tuple[int, int, int] | None, str]]
 
 
 def _legend_entries(ids: NDArray, colors: Colors | None, names: Mapping[int, str] | None) -> _Legend:
-    """(color, name) of the objects in view, the largest first, then how many were left out, then "no object"."""
+    """Return (color, name) of the visible objects, largest first, then the number left out, then "no object"."""
     found, counts = np.unique(ids, return_counts=True)
     order = np.argsort(-counts, kind="stable")
     shown = [int(i) for i in found[order] if i != 0]
@@ -196,7 +196,7 @@ def _legend_entries(ids: NDArray, colors: Colors | None, names: Mapping[int, str
 
 
 def _sheet(cells: Sequence[tuple[str, Image.Image]], columns: int, title: str, legend: _Legend) -> Image.Image:
-    """Cells in a grid under their titles, with a heading and a legend."""
+    """Arrange cells in a grid below their titles, with a heading and a legend."""
     size = cells[0][1].size
     label_size = 14 if size[0] >= 200 else 11
     label, heading = load_font(label_size), load_font(label_size + 3)
@@ -232,7 +232,7 @@ def _sheet(cells: Sequence[tuple[str, Image.Image]], columns: int, title: str, l
 
 
 def _legend_lines(legend: _Legend, font: Any, width: int, size: int) -> list[list[tuple[int, tuple | None, str]]]:
-    """Legend entries broken into lines no wider than `width`: (x, color, text) each."""
+    """Break legend entries (x, color, text) into lines that are at most `width` pixels wide."""
     lines: list[list[tuple[int, tuple | None, str]]] = []
     x = width + 1
     for color, text in legend:
@@ -247,7 +247,7 @@ def _legend_lines(legend: _Legend, font: Any, width: int, size: int) -> list[lis
 
 
 def shorten(text: str, font: Any, width: float) -> str:
-    """`text` cut with an ellipsis so that it is no wider than `width` pixels."""
+    """Truncate `text` with an ellipsis to at most `width` pixels."""
     text = "".join(c if c.isprintable() else " " for c in text)
     if font.getlength(text) <= width:
         return text

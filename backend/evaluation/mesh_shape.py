@@ -12,16 +12,21 @@ from scipy.sparse.csgraph import connected_components
 _ROWS_AT_ONCE = 512
 _PAIRS_AT_ONCE = 2_000_000
 _ROUNDING = 1e-14
-"""Volumes up to this fraction of the product of their edges are 0: the corners are coplanar."""
+"""Volumes up to this fraction of the product of their edges count as 0: the corners are coplanar."""
 _TOUCHING = 1e-9
-"""Coplanar faces that overlap by less than this fraction of their own size only touch."""
+"""Coplanar faces that overlap by less than this fraction of their size count as touching."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """watertight: every edge has two faces, which run along it in opposite directions; manifold: the faces around each
-    vertex make a single fan as well; components: connected parts; self_intersections: how many faces cut or overlap
-    another one."""
+    """Topology of a mesh.
+
+    Attributes:
+        watertight: Each edge has exactly two faces, with opposite directions along it.
+        manifold: The mesh is watertight, and the faces around each vertex form a single fan.
+        components: Number of connected components.
+        self_intersections: Number of faces that intersect or overlap another face.
+    """
 
     watertight: bool
     manifold: bool
@@ -34,7 +39,7 @@ def shape_of(vertices: np.ndarray, faces: np.ndarray) -> Shape:
 
     Args:
         vertices: (V, 3).
-        faces: (F, 3) indices, F > 0. Faces are neighbors if they have the same vertex indices.
+        faces: (F, 3) indices, F > 0. Faces are connected only through common vertex indices.
     """
     used, faces = np.unique(faces, return_inverse=True)
     faces = faces.reshape(-1, 3)
@@ -51,15 +56,17 @@ def _groups(a: np.ndarray, b: np.ndarray, nodes: int) -> int:
 
 
 def _closed(start: np.ndarray, end: np.ndarray, vertices: int) -> tuple[bool, int]:
-    """Whether half-edges (3F,), a face's three one after another, meet in pairs, and how many fans their corners make
-    around the vertices (where they meet)."""
+    """Return whether the half-edges (3F,) form opposite pairs, and the number of fans around the vertices (0 if not).
+
+    The half-edges of a face are consecutive.
+    """
     along, against = start.astype(np.int64) * vertices + end, end.astype(np.int64) * vertices + start
     order, order_against = np.argsort(along, kind="stable"), np.argsort(against, kind="stable")
     there, back = along[order], against[order_against]
     watertight = bool((there[1:] != there[:-1]).all() and (there == back).all() and (start != end).all())
     if not watertight:
         return False, 0
-    # Half-edge h leaves the corner h; the one after it in the face leaves the corner where h ends.
+    # Half-edge h starts at corner h and ends at corner following[h].
     corner = np.arange(len(start))
     following = corner - corner % 3 + (corner + 1) % 3
     here, other = order, order_against
@@ -69,7 +76,7 @@ def _closed(start: np.ndarray, end: np.ndarray, vertices: int) -> tuple[bool, in
 def self_intersecting(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Find the faces that intersect or overlap another face.
 
-    Faces that share a corner or an edge, by position, count only if they meet elsewhere, too. Faces without area do not
+    Faces that share a corner or an edge (by position) count only if they also meet elsewhere. Faces without area do not
     count.
 
     Args:
@@ -98,14 +105,14 @@ def self_intersecting(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _overlapping_boxes(low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Pairs of boxes that overlap, each pair once, in batches: low, high (n, 3)."""
+    """Yield the pairs of overlapping boxes, each pair once, in batches; low, high (n, 3): the boxes' corners."""
     if not len(low):
         return
     axis = int(np.argmax(high.max(0) - low.min(0)))
     order = np.argsort(low[:, axis], kind="stable")
     columns = [(np.ascontiguousarray(low[order, k]), np.ascontiguousarray(high[order, k])) for k in range(3)]
     first, last = columns[axis]
-    # Sorted by where they begin, the boxes that overlap one along this axis follow it without a gap.
+    # The boxes are sorted by their start, so those that overlap a box along this axis directly follow it.
     stop = np.searchsorted(first, last, side="right")
     start = 0
     while start < len(order):
@@ -124,7 +131,7 @@ def _overlapping_boxes(low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.n
 
 
 def _volume_sign(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """On which side of the plane (a, b, c) d lies, (n, 3) each: -1, 0 or 1."""
+    """Return the side of the plane (a, b, c) on which d lies: -1, 0 or 1; all arguments (n, 3)."""
     ab, ac, ad = b - a, c - a, d - a
     volume = (np.cross(ab, ac) * ad).sum(1)
     size = np.sqrt((ab * ab).sum(1) * (ac * ac).sum(1) * (ad * ad).sum(1))
@@ -132,19 +139,24 @@ def _volume_sign(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> 
 
 
 def _sides(plane: np.ndarray, corners: np.ndarray, shared: np.ndarray) -> np.ndarray:
-    """The sides (n, 3) of `plane`'s triangles (n, 3, 3) on which `corners` (n, 3, 3) lie; shared ones lie in it."""
+    """Return the sides (n, 3) of the planes of triangles `plane` (n, 3, 3) on which `corners` (n, 3, 3) lie.
+
+    `shared` corners lie in the plane.
+    """
     signs = [_volume_sign(plane[:, 0], plane[:, 1], plane[:, 2], corners[:, k]) for k in range(3)]
     return np.where(shared, 0, np.stack(signs, 1))
 
 
 def _meet(p: np.ndarray, q: np.ndarray, p_names: np.ndarray, q_names: np.ndarray) -> np.ndarray:
-    """Whether pairs of triangles p, q (n, 3, 3) meet in more than shared corners and edges; names (n, 3): equal where
-    corners are."""
+    """Return whether pairs of triangles p, q (n, 3, 3) meet elsewhere than in shared corners and edges.
+
+    p_names, q_names (n, 3): indices of the corners; equal indices mean equal corners.
+    """
     equal = p_names[:, :, None] == q_names[:, None, :]
     p_shared, q_shared = equal.any(2), equal.any(1)
     q_sides = _sides(p, q, q_shared)
     apart = (q_sides > 0).all(1) | (q_sides < 0).all(1)
-    # A single corner off the plane, of a face that shares the other two: neighbors along an edge, not folded.
+    # Neighbors along an edge whose third corner is off the plane do not overlap.
     apart |= (p_shared.sum(1) == 2) & (q_sides != 0).any(1)
     out = np.zeros(len(p), bool)
     at = np.flatnonzero(~apart)
@@ -163,14 +175,14 @@ def _meet(p: np.ndarray, q: np.ndarray, p_names: np.ndarray, q_names: np.ndarray
 
 
 def _pierces(start: np.ndarray, end: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-    """Whether lines from `start` to `end` (n, 3), which cross the triangles' planes, pass within the triangles."""
+    """Return whether segments `start` to `end` (n, 3) that cross the triangles' planes pass through the triangles."""
     signs = [_volume_sign(start, end, triangle[:, k], triangle[:, (k + 1) % 3]) for k in range(3)]
     turns = np.stack(signs, 1)
     return np.asarray((turns >= 0).all(1) | (turns <= 0).all(1))
 
 
 def _overlap(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Whether pairs of triangles (n, 3, 3) that lie in one plane have more than their outlines in common."""
+    """Return whether pairs of coplanar triangles (n, 3, 3) overlap, not only touch."""
     normal = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
     size = np.abs(np.concatenate([p, q], 1) - p[:, :1]).max((1, 2))
     overlap = np.ones(len(p), bool)

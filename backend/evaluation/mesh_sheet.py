@@ -24,9 +24,9 @@ from .meshes import sample_texture
 MESHES_SHOWN = 24
 _CELL = 236
 _PIXELS = 1_260_000
-"""Largest number of pixels of all panels together, so that the file stays small; a panel is _CELL wide at most."""
+"""Largest total number of pixels of all panels, to limit the file size; a panel is at most _CELL wide."""
 _FINER = 3
-"""Factor by which panels are drawn larger than they are shown."""
+"""Supersampling factor of the panels."""
 _PAPER = (255, 255, 255)
 _PANEL = (246, 246, 248)
 _INK = (38, 38, 42)
@@ -37,13 +37,21 @@ _WIRE = np.array([0.24, 0.27, 0.33])
 _VIEWS_ASKED = 60
 _FIELD = np.radians(28.0)
 _FILLED = 0.88
-"""Fraction of a panel's width or height that the mesh takes."""
+"""Fraction of a panel's width or height that the mesh fills."""
 
 
 @dataclass
 class Card:
-    """The entry of one mesh in the sheet: its name, a line of figures, and the mesh with its texture (S, S, 3) uint8 or
-    None, as `view` sees it. Without a mesh, `why` is the reason."""
+    """The entry of one mesh in the sheet.
+
+    Attributes:
+        name: Heading.
+        figures: A line of figures.
+        mesh: The mesh, or None.
+        texture: (S, S, 3) uint8, or None.
+        view: The view from which the mesh is drawn.
+        why: The reason if there is no mesh.
+    """
 
     name: str
     figures: str
@@ -54,7 +62,7 @@ class Card:
 
 
 def view_of(capture: Capture, ids: Sequence[int] | None, indices: Sequence[int]) -> View:
-    """Return the one of the views `indices` with most pixels of the objects `ids`; with None, the first one."""
+    """Return the view among `indices` with the most pixels of the objects `ids`; if `ids` is None, the first view."""
     asked = list(indices)[:: max(1, len(indices) // _VIEWS_ASKED)]
     best, most = asked[0], -1
     for index in asked:
@@ -68,8 +76,8 @@ def view_of(capture: Capture, ids: Sequence[int] | None, indices: Sequence[int])
 def camera_for(vertices: np.ndarray, view: View, size: int) -> Camera:
     """Return a camera of size x size pixels that shows the vertices (V, 3).
 
-    If `view` lies inside their bounding box, as in a room, the camera is at the same position. Otherwise it has the
-    orientation of `view`, at the distance from which all vertices just fit in.
+    If `view` lies inside their bounding box, as in a room, the camera has the pose of `view`. Otherwise it has the
+    orientation of `view` and the distance at which all vertices just fit into the image.
     """
     low, high = vertices.min(0), vertices.max(0)
     viewmat = np.array(view.viewmat, np.float64)
@@ -82,7 +90,7 @@ def camera_for(vertices: np.ndarray, view: View, size: int) -> Camera:
         middle = (low + high) / 2
         seen = (vertices - middle) @ pose.T
         slope = np.tan(_FIELD / 2)
-        # Nearer parts look larger, so the center of the image is not that of the box.
+        # Due to the perspective, the center of the image differs from that of the bounding box.
         away, center = 0.0, np.zeros(2)
         for _ in range(5):
             away = max(float((np.abs(seen[:, :2] - center).max(1) / slope - seen[:, 2]).max()), 1e-12)
@@ -95,7 +103,7 @@ def camera_for(vertices: np.ndarray, view: View, size: int) -> Camera:
 
 
 def draw_card(card: Card, size: int = _CELL) -> list[Image.Image]:
-    """Draw a mesh shaded, as a wireframe and with its texture: three images of size x size pixels."""
+    """Draw a mesh shaded, as a wireframe and textured: three images of size x size pixels."""
     mesh = card.mesh
     assert mesh is not None and card.view is not None
     camera = camera_for(mesh.vertices[np.unique(mesh.faces)], card.view, size * _FINER)
@@ -137,7 +145,7 @@ def _unit(*xyz: float) -> np.ndarray:
 
 
 def _wires(mesh: Mesh, camera: Camera, hit: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return the fraction of each drawn pixel (n,) that an edge of its own face covers, 0 .. 1."""
+    """Return the fraction of each drawn pixel (n,) that is covered by an edge of its face, 0 .. 1."""
     seen = mesh.vertices @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     flat = seen[:, :2] / np.maximum(seen[:, 2:], camera.near) * camera.K[0, 0] + camera.K[:2, 2]
     corners = flat[mesh.faces[hit]]
@@ -152,7 +160,7 @@ def _wires(mesh: Mesh, camera: Camera, hit: np.ndarray, rows: np.ndarray, column
 
 
 def _panel(drawn: np.ndarray, colors: np.ndarray, size: int) -> Image.Image:
-    """Return the drawn pixels on the gray of the panel, reduced to size x size."""
+    """Return the drawn pixels on the panel's background, reduced to size x size."""
     picture = np.empty((*drawn.shape, 3), np.float32)
     picture[:] = np.array(_PANEL) / 255
     picture[drawn] = colors
@@ -161,7 +169,7 @@ def _panel(drawn: np.ndarray, colors: np.ndarray, size: int) -> Image.Image:
 
 
 def mesh_sheet(cards: Sequence[Card], reporter: Reporter | None = None) -> Image.Image:
-    """Arrange all cards in one image, each with its name and figures over three panels; four or more in two columns."""
+    """Arrange all cards in one image, each with name and figures above three panels; two columns from four cards on."""
     size = min(_CELL, int((_PIXELS / (3 * max(len(cards), 1))) ** 0.5))
     columns = 1 if len(cards) < 4 else 2
     gap, margin, gutter, head, below = 6, 24, 32, 38, 20
@@ -205,7 +213,7 @@ def _rounded(size: int) -> Image.Image:
 
 
 def save_sheet(sheet: Image.Image, path: Path, limit: int = 300_000) -> Path:
-    """Write `sheet` atomically as a PNG of at most `limit` bytes, with fewer colors or pixels where necessary."""
+    """Write `sheet` atomically as a PNG of at most `limit` bytes, with fewer colors or pixels if necessary."""
     picture, scale = sheet, 1.0
     while True:
         buffer = io.BytesIO()
@@ -223,14 +231,14 @@ def save_sheet(sheet: Image.Image, path: Path, limit: int = 300_000) -> Path:
 def _quantize(picture: Image.Image) -> Image.Image:
     """Reduce an image to 256 colors: the two background colors of the sheet exactly, and fitted ones for the rest."""
     pixels = np.asarray(picture)
-    # Every third row and column is enough. The power keeps frequent colors from displacing all others.
+    # Every third row and column suffices. The exponent below 1 prevents frequent colors from displacing all others.
     found, count = np.unique(pixels[::3, ::3].reshape(-1, 3) >> 2, axis=0, return_counts=True)
     several = np.repeat(4 * found + 2, np.ceil(count**0.3).astype(int), axis=0).astype(np.uint8)
     fitted = Image.fromarray(several[None]).quantize(254, Image.Quantize.MEDIANCUT, kmeans=3)
     palette = Image.new("P", (1, 1))
     palette.putpalette([*_PAPER, *_PANEL, *(fitted.getpalette() or [])[: 3 * 254]])
     placed = np.array(picture.quantize(palette=palette, dither=Image.Dither.NONE))
-    # Pillow treats similar colors as equal.
+    # Pillow may map the background colors to similar ones.
     for place, own in enumerate((_PAPER, _PANEL)):
         placed[(pixels == own).all(2)] = place
     few = Image.fromarray(placed, "P")

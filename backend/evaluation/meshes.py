@@ -1,5 +1,4 @@
-"""Evaluation of meshes: against true surfaces where the capture has them, their topology, and their texture on held-out
-views."""
+"""Evaluation of meshes: distances from true surfaces, if available; topology; texture quality on held-out views."""
 
 from __future__ import annotations
 
@@ -25,15 +24,15 @@ from .mesh_shape import Shape, shape_of
 from .truth import TrueMesh, Truth
 
 THRESHOLDS = (0.02, 0.005)
-"""Largest distances between corresponding points of two surfaces, in the capture's units: the one that papers on object
-meshes use, and a stricter one."""
+"""Distance thresholds of precision, recall and F1, in the capture's units: the one commonly used in papers on object
+meshes, and a stricter one."""
 SAMPLES = 30_000
 _NEIGHBORS = 6
 _SUBPIXELS = 3
 
 
 class SampledSurface:
-    """A triangle mesh to measure distances to and from.
+    """A triangle mesh with sample points, to measure distances to and from.
 
     points (SAMPLES, 3): uniform over the area, with a fixed seed; normals (SAMPLES, 3): unit normals.
     """
@@ -54,14 +53,14 @@ class SampledSurface:
         self.points = np.einsum("nc,ncx->nx", weights, self._corners[face])
         normals = cross / double_area[:, None]
         self.normals = normals[face]
-        # With the center of each face, so that the nearest anchors belong to the nearest faces.
+        # Includes the center of each face, so that the nearest anchors belong to the nearest faces.
         self.anchors = np.concatenate([self.points, self._corners.mean(1)])
         self.anchor_normals = np.concatenate([self.normals, normals])
         self._face = np.concatenate([face, np.arange(len(ends))])
         self._tree = cKDTree(self.anchors)
 
     def distances(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distances (n,) of points (n, 3) from this surface, and the nearest of `anchors`, (n,)."""
+        """Return the distances (n,) of points (n, 3) from this surface, and the index of the nearest anchor, (n,)."""
         _, near = self._tree.query(points, min(_NEIGHBORS, len(self.anchors)), workers=-1)
         near = near.reshape(len(points), -1)
         best = np.full(len(points), np.inf)
@@ -71,7 +70,7 @@ class SampledSurface:
 
 
 def _to_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return the squared distances (n,) of points (n, 3) from triangles (n, 3, 3) that have an area."""
+    """Return the squared distances (n,) of points (n, 3) from non-degenerate triangles (n, 3, 3)."""
     edges = np.roll(corners, -1, axis=1) - corners
     normal = np.cross(edges[:, 0], -edges[:, 2])
     within = np.ones(len(points), bool)
@@ -88,7 +87,7 @@ def _to_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def agreement(accuracy: np.ndarray, completeness: np.ndarray) -> dict[str, float | None]:
-    """Compute the chamfer distance, and precision, recall and F1 at each of THRESHOLDS.
+    """Compute the chamfer distance, and precision, recall and F1 score at each of THRESHOLDS.
 
     The chamfer distance is the mean of the two mean distances.
 
@@ -117,18 +116,18 @@ def agreement(accuracy: np.ndarray, completeness: np.ndarray) -> dict[str, float
 def against_truth(mesh: Mesh, true: TrueMesh, truth: Truth, ids: Sequence[int]) -> dict[str, float | None]:
     """Compare a mesh with the true surface of the objects `ids`.
 
-    The seen part of the truth is what at least two views see. The seen part of the mesh is what at least two views
-    would see of it without the rest of the scene, less the points whose nearest true point is unseen: the back of a
-    wall that no camera saw counts only in the figures over the whole surface.
+    The seen part of the true surface is visible in at least two views. The seen part of the mesh would be visible in at
+    least two views without the rest of the scene, and its nearest true points are seen. Thus, a surface that no camera
+    observed, such as the back of a wall, counts only in the figures over the whole surface.
 
     Args:
         mesh: The mesh to measure.
         true: The true surface.
-        truth: The truth that `true` is from.
+        truth: The truth that contains `true`.
         ids: The IDs of its objects.
 
     Returns:
-        `agreement` over the seen parts, the same over the whole surfaces (names that end in "_all"), and `seen`, the
+        `agreement` over the seen parts, the same over the whole surfaces (keys that end in "_all"), and `seen`, the
         seen fraction of the true surface's area.
     """
     made, wanted = SampledSurface(mesh.vertices, mesh.faces), SampledSurface(true.vertices, true.faces)
@@ -154,7 +153,7 @@ def read_texture(path: Path) -> np.ndarray:
 
 
 def sample_texture(texture: np.ndarray, uvs: np.ndarray) -> np.ndarray:
-    """Sample a texture bilinearly at uvs (n, 2), (0, 0) at its lower left: colors (n, 3) float32, 0 .. 1."""
+    """Sample a texture bilinearly at uvs (n, 2), (0, 0) at the lower left; returns colors (n, 3) float32, 0 .. 1."""
     height, width = texture.shape[:2]
     x = np.clip(uvs[:, 0] * width - 0.5, 0, width - 1)
     y = np.clip((1 - uvs[:, 1]) * height - 0.5, 0, height - 1)
@@ -168,15 +167,20 @@ def sample_texture(texture: np.ndarray, uvs: np.ndarray) -> np.ndarray:
 
 @dataclass
 class TextureScore:
-    """The number of pixels in the object's masks, the number of these that the mesh covers, and the sum of the squared
-    errors over the covered pixels and their three channels."""
+    """Sums over views for the quality of a texture.
+
+    Attributes:
+        pixels: Number of pixels in the object's masks.
+        covered: Number of these pixels that the mesh covers.
+        squares: Sum of the squared errors over the covered pixels and their three channels.
+    """
 
     pixels: int = 0
     covered: int = 0
     squares: float = 0.0
 
     def figures(self) -> dict[str, float | None]:
-        """Return texture_psnr in dB over the covered pixels of all views, and texture_coverage; None: not measured."""
+        """Return texture_psnr in dB over the covered pixels of all views, and texture_coverage; None if unknown."""
         if not self.covered:
             return {"texture_psnr": None, "texture_coverage": 0.0 if self.pixels else None}
         mean = max(self.squares / (3 * self.covered), 1e-10)
@@ -186,8 +190,15 @@ class TextureScore:
 def texture_score(
     mesh: Mesh, texture: np.ndarray, scene: Scene, ids: Sequence[int] | None, indices: Sequence[int]
 ) -> TextureScore:
-    """Compare renders of the textured mesh alone with the photos `indices`, at the common exposure, where their masks
-    show one of `ids` (None: everywhere)."""
+    """Compare renders of a textured mesh with photos, at the common exposure.
+
+    Args:
+        mesh: The mesh, rendered without the rest of the scene.
+        texture: (S, S, 3) uint8 sRGB.
+        scene: The scene with the photos and masks.
+        ids: The objects whose mask pixels are compared; None for all pixels.
+        indices: The views to compare.
+    """
     score = TextureScore()
     vertices = scene.normalization.to_scene(mesh.vertices)
     classes = None if ids is None else scene.classes.classes_among(ids)
@@ -216,7 +227,7 @@ def texture_score(
         colors[drawn] = sample_texture(texture, uvs)
         blocks = (height, _SUBPIXELS, width, _SUBPIXELS)
         count = drawn.reshape(blocks).sum((1, 3))
-        # The mesh covers a pixel if it covers at least half of it; the color is that of the covered part.
+        # A pixel counts as covered if at least half of it is; its color is the mean over the covered part.
         covered = wanted & (2 * count >= _SUBPIXELS**2)
         pixels = colors.reshape(*blocks, 3).sum((1, 3))[covered] / count[covered][:, None]
         error = pixels - devices.host(photo)[:, *part].transpose(1, 2, 0)[covered]
@@ -227,14 +238,15 @@ def texture_score(
 
 
 def mesh_entries(folder: Path, trained_steps: int, reporter: Reporter) -> dict[str, MeshEntry]:
-    """The meshes of the present state of the model: objects by their IDs, then sets and the whole scene.
+    """Return the meshes of the current state of the model: single objects by ID, then sets and the whole scene.
 
     Args:
-        folder: `meshes` of a reconstruction folder.
-        trained_steps: of the model. Meshes of another state are left out with a warning.
+        folder: The folder `meshes` of a reconstruction.
+        trained_steps: Number of training steps of the model. Meshes of another state are left out, with a warning.
+        reporter: Receives the warning.
 
     Raises:
-        InputError: meshes.json cannot be used.
+        InputError: meshes.json cannot be read.
     """
     entries = read_meshes(folder)
     current = [entry for entry in entries.values() if entry.trained_steps == trained_steps]
@@ -248,7 +260,7 @@ def mesh_entries(folder: Path, trained_steps: int, reporter: Reporter) -> dict[s
 
 
 def digest(folder: Path, entry: MeshEntry) -> str:
-    """A hash of a mesh's files, which tells them from those of another run."""
+    """Return a hash of a mesh's files, which identifies the run that wrote them."""
     sha = hashlib.sha256()
     for name in (entry.file, entry.texture):
         if name and (folder / name).exists():
@@ -264,10 +276,18 @@ def evaluate_mesh(
     indices: Sequence[int],
     reporter: Reporter,
 ) -> dict[str, Any]:
-    """Every figure of one mesh in `folder`, None for what cannot be measured; `entry` is its part of meshes.json,
-    `indices` are the held-out views.
+    """Measure all figures of one mesh; lengths are in the capture's units.
 
-    Lengths are in the capture's units. A file that cannot be read is a warning.
+    Args:
+        folder: The folder of the meshes.
+        entry: The mesh's entry in meshes.json.
+        scene: The scene with the photos and masks.
+        truth: The true surfaces, or None.
+        indices: The held-out views.
+        reporter: Receives a warning for each file that cannot be read.
+
+    Returns:
+        The figures by name; None for those that cannot be measured.
     """
     ids = entry.ids
     names = [*agreement(np.zeros(0), np.zeros(0))]

@@ -43,9 +43,9 @@ def psnr(a: NDArray, b: NDArray) -> float:
 
 
 def ssim(a: NDArray, b: NDArray) -> float:
-    """Compute the structural similarity of two images (Wang et al. 2004), as papers on splats report it.
+    """Compute the structural similarity of two images (Wang et al. 2004), as in papers on Gaussian splatting.
 
-    Gaussian window of 11 x 11 pixels with sigma 1.5, C1 = 0.01^2, C2 = 0.03^2, zeros beyond the image border.
+    Gaussian window of 11 x 11 pixels with sigma 1.5, C1 = 0.01^2, C2 = 0.03^2, zero padding.
 
     Args:
         a, b: Images of the same shape (h, w, 3), float in [0, 1] or uint8.
@@ -80,12 +80,12 @@ def boundary_distance(height: int, width: int) -> int:
 
 
 def boundaries(labels: NDArray, distance: int) -> NDArray[np.bool_]:
-    """Find the pixels in the boundary band of their own label's mask, (h, w) bool (Cheng et al. 2021).
+    """Find the pixels in the boundary band of their label's mask, (h, w) bool (Cheng et al. 2021).
 
     The band of a mask is the mask minus its erosion by a square of 2 `distance` + 1 pixels. Pixels beyond the image
-    border are outside of every mask, so that a mask has a band there, too. A pixel is outside of the erosion of its own
-    mask if and only if another label or the border lies in the square around it. Therefore a minimum and a maximum
-    filter find the bands of all masks at once.
+    border are outside every mask, so masks have a band there, too. A pixel is in the band of its mask if and only if
+    the square around it contains another label or the border. Therefore a minimum and a maximum filter find the bands
+    of all masks at once.
     """
     size = 2 * distance + 1
     _, compact = np.unique(labels, return_inverse=True)
@@ -96,14 +96,14 @@ def boundaries(labels: NDArray, distance: int) -> NDArray[np.bool_]:
 
 
 class IdScores:
-    """Accumulates the agreement of predicted and true object IDs over views.
+    """Accumulator of the agreement of predicted and true object IDs over views.
 
-    Pixels with the true ID 0 are unlabeled and are not counted, whatever is predicted there, unless `zero_is_class`
-    makes 0 an object like the others. For each object, intersections and unions are summed over the pixels of all views
-    and divided once. miou, mbiou and dice are the means over the objects that occur in the truth. A predicted ID that
-    does not occur there has no score of its own, but its pixels are misses of the objects that they cover. For the
-    boundary IoU, predictions on unlabeled pixels are replaced by "unlabeled" before the bands are computed. accuracy is
-    the fraction of the labeled pixels with the right ID.
+    Pixels with the true ID 0 are unlabeled and are ignored, unless `zero_is_class` makes 0 an object like the others.
+    For each object, intersections and unions are summed over the pixels of all views before the division. miou, mbiou
+    and dice are the means over the objects that occur in the ground truth. A predicted ID that does not occur there has
+    no score of its own, but its pixels count as misses of the true objects. For the boundary IoU, predictions on
+    unlabeled pixels are replaced by "unlabeled" before the bands are computed. accuracy is the fraction of the labeled
+    pixels with the correct ID.
     """
 
     _COLUMNS = ("intersection", "predicted", "truth", "band_intersection", "band_predicted", "band_truth")
@@ -160,7 +160,7 @@ class IdScores:
         self._ids, self._sums = merged, total
 
     def table(self) -> list[dict[str, Any]]:
-        """Return a row for each object in the truth, by ID: id, iou, biou, dice, pixels (true ones of all views)."""
+        """Return a row for each true object, by ID: id, iou, biou, dice, pixels (true ones in all views)."""
         rows = []
         for i, sums in zip(self._ids.tolist(), self._sums.tolist()):
             same, predicted, truth, band_same, band_predicted, band_truth = sums
@@ -178,7 +178,7 @@ class IdScores:
         return rows
 
     def result(self) -> dict[str, Any]:
-        """Return miou, mbiou, dice, accuracy, 0 .. 1, None if nothing was labeled, and objects {ID: IoU}."""
+        """Return miou, mbiou, dice and accuracy, 0 .. 1, None if no pixel was labeled, and objects {ID: IoU}."""
         rows = self.table()
         labeled = sum(row["pixels"] for row in rows)
         right = int(self._sums[:, 0].sum())
@@ -196,14 +196,14 @@ class IdScores:
 
 
 class ImageScores:
-    """Accumulates the means of PSNR and SSIM over views."""
+    """Accumulator of the mean PSNR and SSIM over views."""
 
     def __init__(self) -> None:
         self._psnr: list[float] = []
         self._ssim: list[float] = []
 
     def add(self, render: NDArray, truth: NDArray) -> tuple[float, float]:
-        """Add one view (h, w, 3) and return its own PSNR in dB and SSIM; the render is clipped to [0, 1]."""
+        """Add one view (h, w, 3) and return its PSNR in dB and SSIM; the render is clipped to [0, 1]."""
         render = np.clip(_as_float(render), 0.0, 1.0)
         self._psnr.append(psnr(render, truth))
         self._ssim.append(ssim(render, truth))

@@ -27,10 +27,10 @@ class EvaluatedCapture(Protocol):
     def names(self) -> Mapping[int, str]: ...
 
     def image(self, i: int) -> NDArray:
-        """(h, w, 3) uint8."""
+        """Return the image (h, w, 3) uint8 of view `i`."""
 
     def mask(self, i: int) -> NDArray | None:
-        """(h, w) int64 object IDs, or None where there is no mask."""
+        """Return the object IDs (h, w) int64 of view `i`, or None if it has no mask."""
 
 
 def evaluate(
@@ -44,8 +44,8 @@ def evaluate(
 
     Args:
         capture: The capture with the true images and masks.
-        render: Returns the image (h, w, 3), float in [0, 1], and the object IDs (h, w) int64 of view `i`.
-        indices: The views to measure; held-out views for results that are to be published.
+        render: Function that returns the image (h, w, 3), float in [0, 1], and the object IDs (h, w) int64 of a view.
+        indices: The views to measure; for comparable results, the held-out views.
         reporter: Receives the progress, and a warning for each render with NaN or Inf.
         zero_is_class: Count the ID 0 as an object, instead of as unlabeled.
 

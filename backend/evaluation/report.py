@@ -43,7 +43,7 @@ _TEXTS = ("what", "why", "name")
 
 
 def complete(report: Mapping[str, Any]) -> dict[str, Any]:
-    """Fill in every key of report.json that readers rely on.
+    """Fill in all keys of report.json.
 
     Args:
         report: The content of report.json; any key may be missing.
@@ -52,7 +52,7 @@ def complete(report: Mapping[str, Any]) -> dict[str, Any]:
         A copy with all keys, in a fixed order. Values that are missing, NaN or infinite are None.
 
     Raises:
-        ValueError: If an entry has the wrong type. The message names the entry.
+        ValueError: An entry has the wrong type; the message contains its name.
     """
     as_json = plain(report, "report")
     out: dict[str, Any] = {}
@@ -124,13 +124,13 @@ def write_report(
         pictures: (caption, image) of each image in report.md.
         colors: Object ID -> (red, green, blue), 0 .. 255, for objects whose color is not the palette's.
         title: The heading of report.md.
-        mesh_sheet: The image of all meshes. None removes the one of an earlier report.
+        mesh_sheet: The contact sheet of all meshes. None removes that of an earlier report.
 
     Returns:
-        The content of report.json as it was written.
+        The content of report.json as written.
 
     Raises:
-        ValueError: If an entry of `report` has the wrong type.
+        ValueError: An entry of `report` has the wrong type.
     """
     report = complete(report)
     folder = reconstruction.pictures
@@ -181,7 +181,7 @@ def write_report(
 def _write_swatches(
     folder: Path, objects: list[dict[str, Any]], colors: Mapping[int, Sequence[int]]
 ) -> dict[int, Path]:
-    """Write one small image of each object's color, because Markdown has no colors."""
+    """Write one small image of each object's color, since Markdown has no colors."""
     paths = {}
     if objects:
         folder.mkdir(exist_ok=True)

@@ -33,7 +33,7 @@ _STYLE: dict[Any, Any] = {
 
 
 def plot_curve(curve: Sequence[Mapping[str, Any]]) -> Image.Image | None:
-    """Plot PSNR and mIoU of the held-out views over the run time, one panel each; None if nothing was measured."""
+    """Plot PSNR and mIoU on held-out views over the run time, one panel each; None if nothing was measured."""
     panels = []
     for key, title, color, how in (
         ("psnr", "PSNR (dB), higher is better", "#3b7dd8", "{:.2f} dB"),
@@ -77,7 +77,7 @@ def plot_curve(curve: Sequence[Mapping[str, Any]]) -> Image.Image | None:
 
 
 def plot_objects(objects: Sequence[Mapping[str, Any]], colors: Mapping[int, Sequence[int]]) -> Image.Image | None:
-    """Plot the IoU of each object as a bar of its color, the best on top; None if no object was measured."""
+    """Plot the IoU of each object as a bar in its color, the best on top; None if no object was measured."""
     measured = sorted((entry for entry in objects if entry["iou"] is not None), key=lambda entry: entry["iou"])
     if not measured:
         return None

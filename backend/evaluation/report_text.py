@@ -60,7 +60,7 @@ def quality_section(report: dict[str, Any]) -> list[str]:
 
 
 def choose_objects(objects: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], str]:
-    """Return all objects by ID, or if there are many, those with the lowest IoU and a sentence about the selection."""
+    """Return all objects by ID or, if there are many, those with the lowest IoU, and a sentence about the selection."""
     by_id = sorted(objects, key=lambda entry: entry["id"])
     if len(objects) <= OBJECTS_SHOWN:
         return by_id, ""
@@ -145,7 +145,7 @@ def _mesh_cell(value: Any, how: str) -> str:
 
 
 def _mesh_summary(objects: Sequence[tuple[str, dict[str, Any]]]) -> str:
-    """Return one sentence: how many objects have a mesh, and how good these meshes are."""
+    """Return one sentence with the number of objects that have a mesh, and the quality of these meshes."""
     made = [(name, mesh) for name, mesh in objects if mesh.get("faces") is not None]
     facts = [f"{len(made)} of {len(objects)} objects have a mesh"]
     for key in ("watertight", "manifold"):

@@ -1,4 +1,4 @@
-"""Writing splats for other programs, and reading theirs."""
+"""Import and export of splats in the formats of other programs."""
 
 from .anchors import write_anchors
 from .fit import agreement, fit_splats

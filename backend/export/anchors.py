@@ -1,4 +1,4 @@
-"""The anchors of the model as PLY, which shows its structure."""
+"""Export of the model's anchors as PLY, for inspection of its structure."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ from .ply import position_kind
 def write_anchors(path: Path, model: ObjectModel, splats: Splats, source: np.ndarray) -> None:
     """Write the anchors of a model as PLY, atomically.
 
-    The properties are x, y, z in the capture's coordinates, of the same type as in a file of `splats`, object_id,
-    scale_0 .. 2 (the scales of the offsets), opacity (the mean of its splats, 0 without any) and splats (their number).
+    The properties are x, y, z in the capture's coordinates, of the same type as in a PLY file of `splats`; object_id;
+    scale_0 .. 2 (the scales of the offsets); opacity (the mean over the anchor's splats, 0 if it has none); and splats
+    (their number).
 
     Args:
         path: The file to write.
         model: The model with the anchors.
         splats: The N splats of the model.
-        source: (N,) int64, the offset that each splat is of, as anchor * offsets + offset.
+        source: (N,) int64, the offset that each splat was generated from: anchor * offsets + offset.
     """
     anchors = model.anchors
     count = len(anchors)
     owner = source // anchors.layout.offsets
     numbers = np.bincount(owner, minlength=count)
     opacity = np.bincount(owner, splats.opacities, count) / np.maximum(numbers, 1)
-    # The same limit as in the model.
+    # The same limit as in the model (LOG_EXTENT_MAX).
     logs = devices.host(anchors.rows[:, anchors.layout.extent_columns][:, :3])
     extents = np.exp(np.minimum(logs.astype(np.float64), 20.0))
     kind = position_kind(splats)

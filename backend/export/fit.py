@@ -1,10 +1,10 @@
 """Fitting of plain splats to a view-dependent model.
 
-In `view` mode, opacity, shape and color of a splat change with the camera, and in some views it does not exist. A file
-has one opacity, one shape and spherical harmonics for each splat, so these are fitted over the training cameras, each
-weighted by the splat's contribution to the image. `agreement` measures the loss. On a capture of a table top, the PSNR
-of the fit to the model's own renders of held-out views is 34.6 dB. It is 33.5 dB if covariances are averaged directly,
-32.6 dB with degree 1, and 29.2 dB for the model as seen from the center of the cameras. Degree 3 is not better.
+In `view` mode, opacity, shape and color of a splat depend on the camera, and in some views it does not exist. A file
+stores one opacity, one shape and spherical harmonics for each splat, so these are fitted over the training cameras,
+weighted by the splat's contribution to each image. `agreement` measures the loss of quality. On a table-top capture,
+the PSNR of the fit against the model's renders of held-out views is 34.6 dB. It is 33.5 dB if covariances are averaged
+directly, 32.6 dB with degree 1, and 29.2 dB for splats generated from the center of the cameras. Degree 3 is no better.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from ..shared.splats import spherical_harmonics
 SH_DEGREE = 2
 
 MAX_VIEWS = 200
-"""Largest number of cameras, chosen evenly, which is enough to see each splat from all sides."""
+"""Largest number of cameras, chosen evenly; enough to cover all viewing directions."""
 
 RIDGE = 0.002
-"""Regularization of the higher bands, as a fraction of the weight of a splat's views, for splats with few views."""
+"""Regularization of the higher bands for splats with few views, as a fraction of the total weight of the views."""
 
 _ANCHORS_AT_ONCE = 50_000
 _SPLATS_AT_ONCE = 50_000
@@ -51,8 +51,8 @@ def fit_splats(
         reporter: Receives the progress.
 
     Returns:
-        The N splats in world units, and (N,) int64 the offset that each one is of, as anchor * offsets + offset. Splats
-        that no camera sees are left out, since they were not trained.
+        The N splats in world units, and (N,) int64 the offset that each was generated from: anchor * offsets + offset.
+        Splats that are in view of no camera are left out, since they were not trained.
     """
     reporter = reporter or Reporter()
     taken = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), MAX_VIEWS)).astype(int))
@@ -78,7 +78,7 @@ def agreement(model: ObjectModel, splats: Splats, cameras: Sequence[Camera]) -> 
         cameras: The cameras in scene units.
 
     Returns:
-        The mean PSNR in dB of renders of `splats` against those of `model`; None without cameras.
+        The mean PSNR in dB of renders of `splats` against those of `model`; None if there are no cameras.
     """
 
     def tensor(values: NDArray) -> torch.Tensor:
@@ -102,10 +102,10 @@ def agreement(model: ObjectModel, splats: Splats, cameras: Sequence[Camera]) -> 
 class _Sums:
     """Sums over the views for each of the n offsets of the anchors start .. stop - 1.
 
-    weight (n,): the number of pixels that the splat covers in all views. Weighted with it: opacity (n,), shape (n, 6),
-    the upper triangle of the covariance's logarithm, whose mean keeps a thin splat thin, and the normal equations of
-    the color: normal (n, 45), the upper triangle of the matrix, and color (n, 9, 3), the right side. means (n, 3) are
-    the same in all views.
+    weight (n,) is the number of pixels that the splat covers in all views. The other sums are weighted with it: opacity
+    (n,); shape (n, 6), the upper triangle of the covariance's logarithm, whose mean keeps thin splats thin; normal (n,
+    45) and color (n, 9, 3), the upper triangle of the matrix and the right side of the normal equations of the color.
+    means (n, 3) are the same in all views.
     """
 
     def __init__(self, model: ObjectModel, start: int, stop: int) -> None:
@@ -126,7 +126,7 @@ class _Sums:
         viewmat, intrinsics = camera.arrays()
         seen = anchors_in_view(model.anchors, viewmat, intrinsics, camera.width, camera.height, camera.near)
         g = model.generate(seen, camera.center)
-        # The gradient of the image's sum with respect to a splat's color is the number of pixels that the splat covers.
+        # The gradient of the image's sum with respect to a splat's color is the number of pixels it covers.
         black = torch.zeros_like(g.sh).requires_grad_()
         drawn = rasterize(g.means, g.quats, g.scales, g.opacities, black, g.ids, camera, primitive=model.primitive)
         drawn.color[0].sum().backward()
@@ -151,7 +151,7 @@ class _Sums:
         self.color[slots] += (w[:, None] * basis)[:, :, None] * color[:, None, :]
 
     def used(self) -> NDArray[np.int64]:
-        """Return the slots of the splats that a camera sees, relative to the first one: (n,), ascending."""
+        """Return the offsets whose splats are visible in a view, relative to the first offset: (n,), ascending."""
         return np.flatnonzero(self.weight > 0)
 
     def splats(self) -> Splats:

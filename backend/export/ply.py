@@ -1,4 +1,4 @@
-"""Splats as the PLY file that programs for 3D Gaussian splatting exchange, with the additional property `object_id`."""
+"""Splats in the PLY format of 3D Gaussian splatting, with the additional property `object_id`."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ FLOAT32_RELATIVE_ERROR = 2.0**-24
 ROWS_AT_ONCE = 1 << 16
 
 _FORMER_UNOBSERVED = "invented"
-"""Of the property `unobserved`, in files that older versions wrote."""
+"""Name of the property `unobserved` in files written by older versions."""
 
 
 def property_names(degree: int) -> list[str]:
-    """The properties of a splat PLY of this spherical-harmonics degree, in the order of the file."""
+    """Return the properties of a splat PLY with this spherical-harmonics degree, in file order."""
     rest = 3 * ((degree + 1) ** 2 - 1)
     return [
         *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
@@ -40,18 +40,19 @@ def write_splats(path: Path, splats: Splats, with_ids: bool = True) -> list[str]
 
     Binary little-endian, float32 properties: opacity as its logit, scales as logarithms, `f_rest` with all red
     coefficients first, then green, then blue. Positions are double if float32 would change them by more than 1e-6 of
-    the splats' extent. After them come `object_id` as uint32 and, if any splat is unobserved, `unobserved` as uchar.
+    the splats' extent. The last properties are `object_id` as uint32 and, if any splat is unobserved, `unobserved` as
+    uchar.
 
     Args:
         path: The file to write.
         splats: The splats. Those with NaN, Inf or a zero quaternion are left out.
-        with_ids: Write `object_id` and `unobserved`, which some programs do not accept.
+        with_ids: Whether to write `object_id` and `unobserved`, which some programs do not accept.
 
     Returns:
         Warnings about splats that were left out.
 
     Raises:
-        ValueError: If an object ID is not in 0 .. 2^32 - 1.
+        ValueError: An object ID is not in 0 .. 2^32 - 1.
     """
     path = Path(path)
     keep = _usable(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
@@ -78,19 +79,19 @@ def write_splats(path: Path, splats: Splats, with_ids: bool = True) -> list[str]
 
 
 def splat_table(splats: Splats) -> NDArray:
-    """Return all splats as the records that `write_splats` writes, always with IDs and `unobserved`."""
+    """Return all splats as the records of `write_splats`, always with IDs and `unobserved`."""
     return _rows(splats, slice(None), _layout(splats, [*property_names(splats.degree), UNOBSERVED]))
 
 
 def _layout(splats: Splats, names: list[str]) -> np.dtype:
-    """Return the type of the records with these properties of `splats`."""
+    """Return the record type for these properties of `splats`."""
     position = position_kind(splats)
     kinds = {"x": position, "y": position, "z": position, "object_id": "u4", UNOBSERVED: "u1"}
     return np.dtype([(name, "<" + kinds.get(name, "f4")) for name in names])
 
 
 def _rows(splats: Splats, rows: slice, dtype: np.dtype) -> NDArray:
-    """Return the records of some splats."""
+    """Return the records of a slice of the splats."""
     means = splats.means[rows]
     table = np.zeros(len(means), dtype)
     for axis, name in enumerate("xyz"):
@@ -116,7 +117,7 @@ def _rows(splats: Splats, rows: slice, dtype: np.dtype) -> NDArray:
 
 
 def _usable(means: NDArray, quats: NDArray, scales: NDArray, opacities: NDArray, sh: NDArray) -> NDArray:
-    """Find the splats with finite values and a quaternion that is not zero, (N,) bool."""
+    """Find the splats with finite values and a nonzero quaternion, (N,) bool."""
     keep = np.isfinite(opacities)
     for values in (means, quats, scales, sh):
         keep &= np.isfinite(values.reshape(len(keep), math.prod(values.shape[1:]))).all(axis=1)
@@ -125,7 +126,7 @@ def _usable(means: NDArray, quats: NDArray, scales: NDArray, opacities: NDArray,
 
 
 def position_kind(splats: Splats) -> str:
-    """Return `f8` if float32 would change positions by more than 1e-6 of the splats' extent, else `f4`."""
+    """Return `f8` if float32 would change positions by more than 1e-6 of the splats' extent, otherwise `f4`."""
     if len(splats) == 0 or splats.means.dtype != np.float64:
         return "f4"
     extent = float(np.ptp(splats.means, axis=0).max() + splats.scales.max())
@@ -133,20 +134,20 @@ def position_kind(splats: Splats) -> str:
 
 
 def read_splats(path: Path) -> tuple[Splats, list[str]]:
-    """Read a PLY file of splats, of this or another program.
+    """Read a PLY file of splats, written by this or another program.
 
     Properties may have any order and number type; unknown ones are ignored. Without `object_id`, all IDs are 0.
-    Positions keep the precision of the file; scales and opacities are float64, so that writing the splats again gives
-    the same file.
+    Positions keep the precision of the file; scales and opacities are float64, so that writing the splats again
+    produces the same file.
 
     Args:
         path: The file to read.
 
     Returns:
-        The splats without those with NaN, Inf or a zero quaternion, and warnings about these.
+        The splats, except those with NaN, Inf or a zero quaternion, and warnings about these.
 
     Raises:
-        InputError: If the file is missing, truncated, ASCII, or not one of splats.
+        InputError: The file is missing, truncated, ASCII, or not a PLY of splats.
     """
     path = Path(path)
     table = read_vertices(path)
@@ -198,7 +199,7 @@ def read_splats(path: Path) -> tuple[Splats, list[str]]:
 
 
 def _columns(table: NDArray, names: list[str]) -> NDArray:
-    """Return columns (N, len(names)), float64 if the file has double or 32-bit integers, else float32."""
+    """Return columns (N, len(names)), float64 if the file has doubles or 32-bit integers, otherwise float32."""
     kind = np.result_type(np.float32, *(table.dtype[name] for name in names))
     out = np.empty((len(table), len(names)), kind)
     for i, name in enumerate(names):
@@ -207,7 +208,7 @@ def _columns(table: NDArray, names: list[str]) -> NDArray:
 
 
 def _object_ids(column: NDArray, warnings: list[str]) -> NDArray:
-    """Return IDs as int64; values that are not IDs (negative, too large, NaN) become 0, with a warning."""
+    """Return object IDs as int64; invalid values (negative, too large, NaN) become 0, with a warning."""
     if column.dtype.kind == "f":
         values = column.astype(np.float64)
         good = np.isfinite(values) & (values >= 0) & (values <= 0xFFFFFFFF)

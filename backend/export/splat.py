@@ -1,4 +1,4 @@
-"""Splats as .splat for web viewers: 32 bytes for each splat, one color, without object IDs."""
+"""Export of splats as .splat for web viewers: 32 bytes per splat, one color, no object IDs."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("q
 
 
 def write_splat(path: Path, splats: Splats) -> list[str]:
-    """Write splats as .splat, atomically, the largest and most opaque first, as viewers expect.
+    """Write splats as .splat, atomically, sorted from the largest and most opaque down, as viewers expect.
 
     Args:
         path: The file to write.
         splats: The splats.
 
     Returns:
-        A warning if colors that change with the view direction are lost.
+        A warning if view-dependent colors are lost.
     """
     order = np.argsort(-splats.opacities * splats.scales.astype(np.float64).prod(1) ** (1 / 3), kind="stable")
     splats = splats.select(order)

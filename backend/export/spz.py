@@ -1,7 +1,7 @@
-"""Splats as SPZ, version 3: Niantic's compressed format with Y up, a fifth of the PLY's size, without object IDs.
+"""Export of splats as SPZ, version 3: Niantic's compressed format, Y up, a fifth of the PLY's size, no object IDs.
 
-A gzip stream of a header of 16 bytes and, for all splats, positions, opacities, colors, scales, rotations and spherical
-harmonics as integers of 8 to 24 bits (https://github.com/nianticlabs/spz).
+A gzip stream of a 16-byte header, followed by the positions, opacities, colors, scales, rotations and spherical
+harmonics of all splats as integers of 8 to 24 bits (https://github.com/nianticlabs/spz).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _LARGEST_LOG = _SMALLEST_LOG + 255 / _SCALE_STEP
 def write_spz(path: Path, splats: Splats) -> list[str]:
     """Write splats as SPZ, atomically.
 
-    Positions are rounded to 2^-16 units or, in a large scene, to 24 bits; scales to 6 percent. Spherical harmonics are
+    Positions are rounded to 2^-16 units or, in large scenes, to 24 bits; scales to 6 percent. Spherical harmonics are
     clamped to -1 .. 1.
 
     Args:
@@ -40,7 +40,7 @@ def write_spz(path: Path, splats: Splats) -> list[str]:
         A warning about splats whose scales were clamped.
 
     Raises:
-        InputError: If the splats are too far from the origin.
+        InputError: The splats are too far from the origin.
     """
     farthest = float(np.abs(splats.means).max(initial=0.0))
     bits = _FINEST_BITS
@@ -60,7 +60,7 @@ def write_spz(path: Path, splats: Splats) -> list[str]:
         _rotations(splats.quats),
         _bytes(splats.sh[:, 1:] * 128.0 + 128.0),
     ]
-    # Without a time stamp, so that the same splats make the same file.
+    # No time stamp, so that the same splats produce the same file.
     write_atomic(path, gzip.compress(header + b"".join(part.tobytes() for part in sections), 9, mtime=0))
     extreme = int(((logs.max(1) < _SMALLEST_LOG) | (logs.max(1) > _LARGEST_LOG)).sum())
     if extreme:
@@ -81,7 +81,7 @@ def _positions(means: NDArray, bits: int) -> NDArray[np.uint8]:
 
 
 def _rotations(quats: NDArray) -> NDArray:
-    """Pack quaternions (N, 4) wxyz into 32 bits, (N,): the largest component's index, and the other three."""
+    """Pack quaternions (N, 4) wxyz into 32 bits, (N,): the index of the largest component, and the other three."""
     xyzw = quats[:, [1, 2, 3, 0]].astype(np.float64)
     largest = np.abs(xyzw).argmax(1)
     xyzw *= np.where(np.take_along_axis(xyzw, largest[:, None], 1) < 0, -1.0, 1.0)

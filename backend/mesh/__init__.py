@@ -1,1 +1,1 @@
-"""From splats to meshes, object by object: what views see of it -> signed distance -> surface -> UVs -> texture."""
+"""Meshes of single objects from splats: renders in each view -> signed distance field -> surface -> UVs -> texture."""

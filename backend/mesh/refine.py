@@ -1,8 +1,8 @@
 """Refinement of a surface by multi-view stereo in a thin layer around it.
 
-Each vertex is tried at several positions along its normal. A patch around it is sampled from the photos that show it
-best; at the right position they agree. The offsets are averaged over neighbors, weighted by their confidence, which
-also moves vertices where the photos show no texture.
+For each vertex, several positions along its normal are tested. A patch around it is sampled from the photos that show
+it best; at the correct position they agree. The offsets are averaged over neighbors, weighted by their confidence,
+which also moves vertices in areas without texture.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from .texture.photos import Photo, Photos, look
 from .views import Views
 
 _REACHES = (1.5, 1.0)
-"""Largest offset of a vertex in each round, in sizes of a pixel on the surface."""
+"""Largest offset of a vertex in each round, in pixel sizes on the surface."""
 
 _PHOTOS = 6
 _PLACES = 9
 _PATCH = 5
-"""Number of positions tried, over twice the reach; rows and columns of a patch, one pixel apart."""
+"""Number of tested positions, over twice the reach; number of rows and columns of a patch, one pixel apart."""
 
 _OUTSIDE = 1.0
-"""Clearance, in pixels, up to which a pixel may show something else."""
+"""Clearance in pixels up to which a pixel may show something other than the surface."""
 
 _AT_ONCE = 50_000
 """Number of vertices whose patches are sampled together."""
@@ -40,15 +40,15 @@ _NOISE = (2.5 / 255) ** 2
 _STIFFNESS = 3.0
 _STAY = 0.05
 _TURN = 0.5
-"""Cosine of the largest angle by which a face may turn."""
+"""Cosine of the largest angle by which a face may rotate."""
 
 _UNFOLDED = 40
 _SHARED = 3
-"""Rounds in which neighbors average the costs of their patches."""
+"""Number of rounds in which the costs of patches are averaged over neighbors."""
 
 
 def refine(surface: Surface, views: Views, classes: Sequence[int], reporter: Reporter | None = None) -> Surface:
-    """Move the vertices of a surface along their normals, by a few pixels at most, to where the photos agree.
+    """Move the vertices of a surface along their normals, by at most a few pixels, to positions where the photos agree.
 
     Args:
         surface: The surface in scene units.
@@ -139,8 +139,11 @@ def _seen_by(photo: Photo) -> tuple[np.ndarray, ...]:
 
 
 def _settled(cost: np.ndarray, away: np.ndarray, near: csr_matrix) -> np.ndarray:
-    """Compute the offset of each vertex, (V,) in pixels, from the disagreement of its patches (V, P) at the offsets
-    `away` (P,); NaN: not known."""
+    """Compute the offset of each vertex, (V,) in pixels.
+
+    cost (V, P): disagreement of the vertex's patches at the offsets `away` (P,), NaN if unknown; near: adjacency
+    matrix of the vertices.
+    """
     ties = np.maximum(np.asarray(near.sum(1)).ravel(), 1e-30)
     mean = diags(1 / ties) @ near
     known = np.isfinite(cost).all(1).astype(np.float64)
@@ -155,7 +158,7 @@ def _settled(cost: np.ndarray, away: np.ndarray, near: csr_matrix) -> np.ndarray
     spacing = away[1] - away[0]
     wanted = np.clip(away[best] + spacing * np.clip((before - after) / (2 * bend), -1, 1), away[0], away[-1])
     sure = np.where(weight > 0, np.minimum(bend / (spacing**2 * (np.minimum(at, cost.min(1)) + _NOISE)), 10), 0)
-    # sure (d - wanted) + stay d + stiffness (d - mean of the neighbors' d) = 0, times `ties`: symmetric.
+    # sure (d - wanted) + stay d + stiffness (d - mean of the neighbors' d) = 0, times `ties` for a symmetric matrix.
     diagonal = ties * (sure + _STAY + _STIFFNESS)
     system = diags(diagonal) - _STIFFNESS * near
     solved, _ = cg(system, ties * sure * wanted, rtol=1e-4, maxiter=300, M=diags(1 / diagonal))
@@ -199,7 +202,7 @@ def _look_up(
         if slot < 0:
             continue
         nx, ny, nz = normals[n, 0], normals[n, 1], normals[n, 2]
-        # Two directions across the normal (Duff et al. 2017).
+        # Two tangents orthogonal to the normal (Duff et al. 2017).
         sign = 1.0 if nz >= 0.0 else -1.0
         a = -1.0 / (sign + nz)
         b = nx * ny * a
@@ -237,7 +240,10 @@ def _look_up(
 
 @kernel(parallel=True)
 def _disagreement(patches, cost):
-    """Variance over the photos, of colors in 0..1, mean over the patch: cost (V, P); NaN where too little is seen."""
+    """Write to cost (V, P) the variance over the photos of colors in 0..1, averaged over the patch.
+
+    NaN where too little is visible.
+    """
     count, photos, places, points, _ = patches.shape
     for n in prange(count):
         for place in range(places):

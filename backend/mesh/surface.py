@@ -10,8 +10,13 @@ from scipy.sparse import coo_matrix, csr_matrix
 
 @dataclass
 class Surface:
-    """A triangle mesh: vertices (V, 3) float64 in scene units; faces (F, 3) int32, counter-clockwise from outside;
-    unobserved (F,) bool: faces that close the mesh where no camera saw the object."""
+    """A triangle mesh.
+
+    Attributes:
+        vertices: (V, 3) float64 in scene units.
+        faces: (F, 3) int32, counter-clockwise from outside.
+        unobserved: (F,) bool, faces that close the mesh where no camera observed the object.
+    """
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -47,7 +52,7 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def neighbors(vertices: np.ndarray, faces: np.ndarray) -> csr_matrix:
-    """Return the weighted adjacency matrix (V, V): 1 / length of the edge between two vertices; 0 without an edge."""
+    """Return the weighted adjacency matrix (V, V): 1 / length of the edge between two vertices, 0 if there is none."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges = np.concatenate([edges, edges[:, ::-1]])
     length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
@@ -56,4 +61,4 @@ def neighbors(vertices: np.ndarray, faces: np.ndarray) -> csr_matrix:
 
 
 class NoSurface(Exception):
-    """No surface can be extracted; the message is a sentence that gives the reason."""
+    """Error: no surface can be extracted. The message is a sentence with the reason."""

@@ -1,4 +1,4 @@
-"""Renders of the whole scene, and of objects alone and unoccluded, in each view."""
+"""Renders of the whole scene, and of single objects without occluders, in each view."""
 
 from __future__ import annotations
 
@@ -19,16 +19,19 @@ ALPHA_SEEN = 0.5
 _REACH = 3.4
 """Radius of a splat in standard deviations: sqrt(2 ln 255) and a margin."""
 _BORDER = 2.0
-"""Pixels that the blur of the renderer adds to the radius of a splat."""
+"""Number of pixels by which the renderer's low-pass filter enlarges the radius of a splat."""
 
 
 @dataclass(frozen=True)
 class SceneMap:
-    """The whole scene in one view.
+    """A render of the whole scene in one view.
 
-    depth (H, W) float32 along z in scene units, 0 where alpha is too small; depth_uncertainty (H, W) float32, the
-    expected error of the depth in the same units; ids (H, W) int32, the class index of the most probable object, -1
-    where nothing is drawn; probability (H, W) float32 of that object; alpha (H, W) float32.
+    Attributes:
+        depth: (H, W) float32, along z in scene units, 0 where alpha is too small.
+        depth_uncertainty: (H, W) float32, expected error of the depth in scene units.
+        ids: (H, W) int32, class index of the most probable object, -1 where nothing is drawn.
+        probability: (H, W) float32, probability of that object.
+        alpha: (H, W) float32.
     """
 
     camera: Camera
@@ -41,12 +44,16 @@ class SceneMap:
 
 @dataclass(frozen=True)
 class ObjectView:
-    """An object's own splats in one view, drawn without the rest of the scene, in a rectangle around them.
+    """A render of an object's splats in one view, without the rest of the scene, in a rectangle around them.
 
-    camera: the view's, cropped to the rectangle; x, y: the rectangle's upper left in the view, in pixels; depth (h, w)
-    float32 along z in scene units, 0 where alpha < 0.5; depth_uncertainty (h, w) float32, the expected error of the
-    depth; alpha (h, w) float32; color (h, w, 3) float32, not multiplied by alpha, at the capture's common exposure;
-    visible (h, w) float32, 0 .. 1: the fraction of the object's own light that reaches the camera in the whole scene.
+    Attributes:
+        camera: The view's camera, cropped to the rectangle.
+        x, y: Upper left pixel of the rectangle in the view.
+        depth: (h, w) float32, along z in scene units, 0 where alpha < 0.5.
+        depth_uncertainty: (h, w) float32, expected error of the depth in scene units.
+        alpha: (h, w) float32.
+        color: (h, w, 3) float32, not premultiplied by alpha, at the capture's common exposure.
+        visible: (h, w) float32, 0 .. 1, the fraction of the object's light that is not occluded in the whole scene.
     """
 
     camera: Camera
@@ -67,7 +74,8 @@ class Views:
         scene: The scene with the cameras and photos.
         indices: The views to use.
         downscale: The factor by which renders are smaller than the photos.
-        memory_mb: Room for a cache of renders. Maps of the scene are kept, views of objects until the object changes.
+        memory_mb: Memory limit of the cache of renders. Object views are cached until other objects are requested,
+            scene maps permanently.
     """
 
     def __init__(
@@ -94,7 +102,7 @@ class Views:
         return self.scene.camera(index, self.downscale)
 
     def splats(self, classes: Sequence[int]) -> Generated:
-        """Return the Gaussians of the objects `classes` in scene units, as seen from the origin if that matters."""
+        """Return the Gaussians of the objects `classes` in scene units; in view mode, generated for the origin."""
         self._turn_to(classes)
         return self._own_splats(None)
 
@@ -139,10 +147,10 @@ class Views:
         return ObjectView(camera, x, y, *self._depth(drawn), alpha, np.ascontiguousarray(color), visible)
 
     def _claimed(self, index: int) -> np.ndarray:
-        """Return the pixels (H, W) bool where the photo's mask allows the current objects.
+        """Return the pixels (H, W) bool that may show the current objects, according to the photo's mask.
 
-        Where a mask is 0, training supervises no object, so that splats of any object may show the background there. If
-        the mask shows an object elsewhere, these pixels are not part of it.
+        Pixels with the ID 0 are not supervised in training, so splats of any object may show the background there. If
+        the mask contains the objects, these pixels are not part of them.
         """
         camera = self.camera(index)
         mask = self.scene.capture.mask(index, self.downscale)
@@ -154,7 +162,7 @@ class Views:
     def _shown(self, index: int) -> np.ndarray:
         """Return the fraction (H, W) of each pixel's light in view `index` that comes from the current objects."""
         if len(self._classes) == 1:
-            # For one object the scene's map is enough: elsewhere another one is more probable.
+            # For a single object, the scene map suffices: in other pixels, another object is more probable.
             whole = self.scene_map(index)
             return np.where(whole.ids == self._classes[0], whole.probability, np.float32(0))
         camera = self.camera(index)
@@ -173,9 +181,10 @@ class Views:
     def _depth(self, drawn: Rendered) -> tuple[np.ndarray, np.ndarray]:
         """Return the depth (h, w), 0 where alpha is too small, and its uncertainty (h, w), both along z.
 
-        The uncertainty is the difference of the median and the mean depth, which agree if the light of a pixel comes
-        from one surface. For 2D Gaussians, intersected with the pixel's ray, the mean is their common surface, whereas
-        the median jumps from one to the next. 3D Gaussians extend through the surface, and their mean lies behind it.
+        The uncertainty is the difference between the median and the mean depth, which agree if a pixel shows a single
+        surface. For 2D Gaussians, which are intersected with the pixel's ray, the mean approximates their common
+        surface, whereas the median jumps between Gaussians. 3D Gaussians extend through the surface, and their mean
+        depth lies behind it, so the median is used.
         """
         assert drawn.median is not None and drawn.depth is not None
         alpha, median = devices.host(drawn.alpha), devices.host(drawn.median)
@@ -202,7 +211,7 @@ class Views:
         return self.model.generate(anchors, np.zeros(3) if camera is None else camera.center)
 
     def _are_ours(self, ids: torch.Tensor) -> torch.Tensor:
-        """Return which of the class indices `ids` are current, bool."""
+        """Return which of the class indices `ids` belong to the current objects, bool."""
         return torch.isin(ids, torch.tensor(self._classes, dtype=ids.dtype, device=ids.device))
 
     def _turn_to(self, classes: Sequence[int]) -> None:
@@ -225,7 +234,7 @@ def _bytes(view: ObjectView) -> int:
 
 
 def _rectangle(splats: Generated, camera: Camera) -> tuple[int, int, int, int] | None:
-    """Return x, y, width and height of the part of the image that the splats may cover; None if they cover none."""
+    """Return the rectangle of the image that the splats may cover: x, y, width, height; None if out of view."""
     points = devices.host(splats.means.double()) @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     before = points[:, 2] > camera.near
     points, scales = points[before], devices.host(splats.scales)[before]
@@ -233,7 +242,7 @@ def _rectangle(splats: Generated, camera: Camera) -> tuple[int, int, int, int] |
         return None
     focal = np.array([camera.K[0, 0], camera.K[1, 1]])
     centers = points[:, :2] / points[:, 2:] * focal + camera.K[:2, 2]
-    # Off the optical axis, a footprint is stretched along the radius.
+    # Away from the optical axis, footprints are stretched radially.
     slant = 1 + (points[:, :2] / points[:, 2:]) ** 2
     reach = _REACH * scales.max(1)[:, None] * focal * np.sqrt(slant) / points[:, 2:] + _BORDER
     size = np.array([camera.width, camera.height])

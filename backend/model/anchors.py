@@ -1,7 +1,7 @@
 """Anchors as in Scaffold-GS (Lu et al. 2024), each with an object ID (ObjectGS section 3.2).
 
-All trainable numbers of an anchor lie in one row of one matrix, so that the optimizer accesses a visible anchor once,
-and a checkpoint consists of few tensors.
+All trainable parameters of an anchor are stored in one row of a single matrix, so that the optimizer accesses a visible
+anchor once, and a checkpoint consists of few tensors.
 """
 
 from __future__ import annotations
@@ -20,13 +20,15 @@ LOG_EXTENT_MAX = 20.0
 
 @dataclass(frozen=True)
 class Layout:
-    """The columns of an anchor's row: offsets in units of the anchor's extent, log extents (3 for the offsets, 3 for
-    the splats' scales), features for the heads, and per offset a residual that is added to the heads' output: opacity,
-    scale and rotation, base color.
+    """The columns of an anchor's row.
+
+    In this order: offsets in units of the anchor's extent, log extents (3 for the offsets, 3 for the splats' scales),
+    features for the heads, and residuals for each offset, which are added to the output of the heads: opacity, scale
+    and rotation, base color.
 
     Attributes:
-        offsets: k, splats per anchor.
-        features: length of an anchor's feature.
+        offsets: k, number of splats per anchor.
+        features: length of an anchor's feature vector.
     """
 
     offsets: int = 10
@@ -71,7 +73,7 @@ class Anchors:
 
     Attributes:
         layout: the columns of `rows`.
-        voxel: edge of the finest cell in scene units.
+        voxel: edge length of the finest cell in scene units.
         positions: (N, 3) float32, cell centers in scene units.
         rows: (N, layout.columns) float32, trainable.
         ids: (N,) int32, class index in the model's `ClassTable`.
@@ -87,18 +89,18 @@ class Anchors:
         return len(self.positions)
 
     def to(self, device: torch.device) -> Anchors:
-        """The anchors on another device; tensors that are there already are shared."""
+        """Return the anchors on another device; tensors that are already on it are shared."""
         return Anchors(self.layout, self.voxel, self.positions.to(device), self.rows.to(device), self.ids.to(device))
 
 
 def median_spacing(xyz: np.ndarray) -> float:
-    """Median distance of points to their nearest neighbor.
+    """Compute the median distance of points to their nearest neighbors.
 
     Args:
         xyz: (M, 3); coincident points are counted once.
 
     Returns:
-        1/100 of the extent where the median is too small; 1 where there are fewer than two different points.
+        The median; 1/100 of the extent if the median is too small, 1 if there are fewer than two distinct points.
     """
     distinct = np.unique(xyz, axis=0)
     if len(distinct) < 2:
@@ -110,7 +112,7 @@ def median_spacing(xyz: np.ndarray) -> float:
 
 
 def cell_keys(xyz: np.ndarray, cell: float) -> np.ndarray:
-    """The cell of each position: (M, 3) int64, for cells of edge `cell` centered on its multiples."""
+    """Return the cell of each position, (M, 3) int64; cells have the edge `cell` and are centered on its multiples."""
     return np.round(np.asarray(xyz, np.float64) / cell).astype(np.int64)
 
 
@@ -123,13 +125,13 @@ def seed_anchors(
         xyz: (M, 3) in scene units.
         rgb: (M, 3) in [0, 1].
         ids: (M,) class index.
-        voxel: edge of a voxel in scene units.
-        layout: of the anchors' rows.
-        rng: for the offsets.
+        voxel: edge length of a voxel in scene units.
+        layout: columns of the anchors' rows.
+        rng: generator of the offsets.
 
     Returns:
-        Anchors with the majority class of their points (ties: that of the point nearest to the cell's center) and the
-        mean color of the points of that class.
+        Anchors with the majority class of their points (ties: the class of the point nearest to the cell's center) and
+        the mean color of the points of that class.
     """
     keys = cell_keys(xyz, voxel)
     cells, inverse = np.unique(keys, axis=0, return_inverse=True)
@@ -163,7 +165,7 @@ def seed_anchors(
 
 
 def new_rows(count: int, layout: Layout, rng: np.random.Generator) -> np.ndarray:
-    """Rows (count, columns) float32 of new anchors: random offsets, everything else 0."""
+    """Return rows (count, columns) float32 of new anchors: random offsets, everything else 0."""
     rows = np.zeros((count, layout.columns), np.float32)
     rows[:, layout.offset_columns] = rng.normal(0, 0.5, (count, 3 * layout.offsets))
     return rows

@@ -1,4 +1,4 @@
-"""Rendering a model to an image, for evaluation, previews and the render command."""
+"""Rendering of a model to images, for evaluation, previews and the render command."""
 
 from __future__ import annotations
 
@@ -15,9 +15,12 @@ from .object_model import ObjectModel, anchors_in_view
 class RenderedView(NamedTuple):
     """A rendered view of a model.
 
-    image (H, W, 3): float32 in [0, 1]. ids (H, W) int64: object IDs; probability (H, W) float32: their probabilities
-    (both None if not requested). alpha (H, W). depth (H, W): expected depth in world units, 0 where nothing is drawn
-    (None if not requested).
+    Attributes:
+        image: (H, W, 3) float32 in [0, 1].
+        ids: (H, W) int64, object IDs; None if not requested.
+        probability: (H, W) float32, probabilities of the IDs; None if not requested.
+        alpha: (H, W).
+        depth: (H, W), expected depth in world units, 0 where nothing is drawn; None if not requested.
     """
 
     image: np.ndarray
@@ -33,8 +36,8 @@ def draw(model: ObjectModel, camera: Camera, want_ids: bool = True, want_depth: 
     Args:
         model: the model.
         camera: the view, in scene units.
-        want_ids: requests the most probable object of every pixel.
-        want_depth: requests the expected depth.
+        want_ids: whether to compute the most probable object of each pixel.
+        want_depth: whether to compute the expected depth.
 
     Returns:
         The rendered view, as NumPy arrays.

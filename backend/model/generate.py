@@ -1,7 +1,7 @@
-"""Anchors and heads -> Gaussians, differentiable (ObjectGS equations 2 and 3).
+"""Differentiable generation of Gaussians from anchors and heads (ObjectGS equations 2 and 3).
 
 For offset j of an anchor at x with extents l, l': mean = x + o_j l, opacity = tanh(.), scale = l' sigmoid(.), rotation
-a quaternion, color as SH coefficients. Splats that are too transparent to be drawn are not generated.
+as a quaternion, color as SH coefficients. Splats that are too transparent to be drawn are not generated.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from .heads import Heads
 
 
 class Generated(NamedTuple):
-    """Gaussians as `backend.raster.rasterize` takes them.
+    """Gaussians in the format of `backend.raster.rasterize`.
 
     Attributes:
-        source: (N,) int64, anchor * k + offset of each.
-        made: (N,) bool, on the GPU, where every offset has an entry: False for those without a Gaussian, whose opacity
-            is 0. None: all entries are Gaussians.
+        source: (N,) int64, anchor * k + offset of each Gaussian.
+        made: (N,) bool. On the GPU, every offset has an entry; False marks those without a Gaussian, whose opacity is
+            0. None: all entries are Gaussians.
     """
 
     means: torch.Tensor
@@ -37,18 +37,18 @@ class Generated(NamedTuple):
     made: torch.Tensor | None = None
 
     def select(self, which: torch.Tensor) -> Generated:
-        """The Gaussians of a mask (N,), or of indices."""
+        """Return the Gaussians selected by a mask (N,) or by indices."""
         return self._each(lambda part: part[which])
 
     def cpu(self) -> Generated:
-        """The Gaussians in the CPU's memory."""
+        """Return the Gaussians in CPU memory."""
         return self._each(lambda part: part.cpu())
 
     def _each(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Generated:
         return Generated(*(change(part) for part in self if part is not None))
 
     def only_made(self) -> Generated:
-        """The entries that are Gaussians. Waits for the GPU to count them."""
+        """Return the entries that are Gaussians; synchronizes with the GPU."""
         return self if self.made is None else self.select(self.made)._replace(made=None)
 
 
@@ -61,9 +61,9 @@ def _on_gpu(
     seen_from: torch.Tensor | None,
     present: torch.Tensor | None,
 ) -> Generated:
-    """The same equations in torch, with an entry for every offset, so that nothing waits for a count."""
+    """Evaluate the equations in torch, with an entry for every offset, so that no synchronization is necessary."""
     n, k = len(rows), layout.offsets
-    # A single split, whose gradient is assembled in one pass.
+    # A single split, so that the gradient is assembled in one pass.
     offsets, extents, features, row_opacity, row_shape, row_color = rows.split(
         [3 * k, 6, layout.features, k, 7 * k, 3 * k], 1
     )
@@ -72,7 +72,7 @@ def _on_gpu(
     made = raw_opacity > float(RAW_OPACITY_MIN)
     if present is not None:
         made = made & present[:, None]
-    # The limit passes the gradient, so that an extent beyond it can return.
+    # The clamp passes the gradient, so that an extent beyond the limit can return.
     extent = (extents + (extents.clamp(max=LOG_EXTENT_MAX) - extents).detach()).exp()
     raw_scale, quats = (shape + row_shape).view(n, k, 7).split([3, 4], 2)
     means = positions[:, None] + offsets.view(n, k, 3) * extent[:, None, :3]
@@ -98,13 +98,13 @@ def generate(
     """Generate the Gaussians of n anchors (ObjectGS equations 2 and 3), differentiable in rows and heads.
 
     Args:
-        layout: of the rows.
+        layout: columns of the rows.
         positions: (n, 3) float32, in scene units.
         rows: (n, columns) float32.
         ids: (n,) int32 class index.
-        heads: of the model.
-        eye: (3,), the camera's center in scene units; needed only in view mode.
-        present: (n,) bool, only on the GPU: the other anchors generate none.
+        heads: the heads of the model.
+        eye: (3,), the camera's center in scene units; required only in view mode.
+        present: (n,) bool, only on the GPU: anchors for which it is False generate no Gaussians.
     """
     seen_from = None
     if heads.mode == "view":

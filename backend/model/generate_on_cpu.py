@@ -1,7 +1,7 @@
-"""Anchors and heads -> Gaussians on the CPU, with a hand-written gradient.
+"""Generation of Gaussians from anchors and heads on the CPU, with a hand-written gradient.
 
-Most offsets generate no splat, so the output of the shape and color heads is computed splat by splat, and so is its
-gradient: nothing is computed, stored or read for the other offsets, and anchors' rows are not copied.
+Since most offsets generate no splat, the output of the shape and color heads and its gradient are computed splat by
+splat: nothing is computed, stored or read for the other offsets, and the anchors' rows are not copied.
 """
 
 from __future__ import annotations
@@ -23,17 +23,16 @@ RAW_OPACITY_MIN = np.float32(math.atanh(1.0 / 255.0))
 """Splats with an opacity below 1/255 are not generated."""
 
 _CHUNK = 32
-"""Anchors per chunk, which goes through the offsets one by one, so that an offset's weights stay in the cache."""
+"""Number of anchors per chunk. Within a chunk, offsets are processed one by one, to keep their weights in the cache."""
 
 _PARTIAL_SUMS = 32
-"""The heads' gradients are summed in this number of parts, so that sums do not depend on the number of threads."""
+"""Number of partial sums of the heads' gradients; fixed, so that results do not depend on the number of threads."""
 
 _UNROLL = 4
-"""Independent sums that are computed side by side, so that none waits for the previous one."""
+"""Number of independent sums that are computed in parallel, to hide the latency of additions."""
 
 _SHAPE, _COLOR = _UNROLL, _UNROLL + 8
-"""Columns at which the gradients of an offset's shape and color begin, after that of its opacity; multiples of
-_UNROLL."""
+"""First columns of the gradients of an offset's shape and color, after that of its opacity; multiples of _UNROLL."""
 
 _LOG2_E = np.float32(math.log2(math.e))
 _UNITS = 3 * HIDDEN
@@ -42,13 +41,13 @@ assert HIDDEN == 2 * LANES
 
 @kernel()
 def _exp(x):
-    """e**x of x up to 80, lane by lane; NaN stays NaN."""
+    """Return e**x for x up to 80, lane by lane; propagates NaN."""
     return exp2(x * splat(_LOG2_E)) + (x - x)
 
 
 @kernel()
 def _add_hidden(values, at, count, weights, row, sums):
-    """sums (_UNITS,) += values[at : at + count] @ weights[row : row + count], with weights (inputs, _UNITS)."""
+    """Add values[at : at + count] @ weights[row : row + count] to sums (_UNITS,); weights (inputs, _UNITS)."""
     h0, h1, h2 = load(sums, 0), load(sums, LANES), load(sums, 2 * LANES)
     h3, h4, h5 = load(sums, 3 * LANES), load(sums, 4 * LANES), load(sums, 5 * LANES)
     for i in range(count):
@@ -70,9 +69,10 @@ def _add_hidden(values, at, count, weights, row, sums):
 
 @kernel()
 def _head_output(hidden, at, layer, j, output):
-    """output[:] = a head's output for offset j, from its hidden units hidden[at : at + HIDDEN].
+    """Write a head's output for offset j, computed from its hidden units hidden[at : at + HIDDEN], to `output`.
 
-    layer: as `_by_offset` returns it."""
+    layer: from `_by_offset`.
+    """
     for block in range(layer.shape[1]):
         start = (j * layer.shape[1] + block) * (HIDDEN + 1) * LANES
         one, two = load(layer, start + HIDDEN * LANES), splat(np.float32(0.0))
@@ -103,7 +103,7 @@ def _count(rows, seen_from, weights, biases, opacity_layer, k, features, hidden,
             _add_hidden(seen_from, a * extra, extra, weights, features, sums)
             for i in range(0, _UNITS, LANES):
                 units = load(sums, i)
-                # Written so that NaN stays.
+                # This form of ReLU propagates NaN.
                 store(hidden, a * _UNITS + i, where(above(zero, units), zero, units))
             _head_output(hidden, a * _UNITS, opacity_layer, 0, output)
             kept = 0
@@ -163,8 +163,11 @@ def _forward(positions, rows, opacity, hidden, shape_layer, color_layer, k, feat
 
 @kernel()
 def _head_gradient(raw, column, hidden, at, weights, row, g_hidden, to, g_weights):
-    """Add the contribution of a splat to the gradients of a head: _UNROLL of its outputs, in the weights' rows from
-    `row` on, have the gradients raw[column:]; the hidden units are hidden[at:], their gradients g_hidden[to:]."""
+    """Add the contribution of a splat to the gradients of a head, for _UNROLL of the head's outputs.
+
+    The outputs have the gradients raw[column:] and the rows of the weights from `row` on; the hidden units are
+    hidden[at:], their gradients g_hidden[to:].
+    """
     h0, h1 = load(hidden, at), load(hidden, at + LANES)
     g0, g1 = load(g_hidden, to), load(g_hidden, to + LANES)
     for c in range(_UNROLL):
@@ -180,9 +183,11 @@ def _head_gradient(raw, column, hidden, at, weights, row, g_hidden, to, g_weight
 
 @kernel()
 def _hidden_gradient(g_hidden, count, inputs, weights, g_inputs, g_weights):
-    """Add the contribution of `count` anchors, whose hidden units have the gradients g_hidden (_CHUNK, _UNITS), to
-    g_weights (_UNITS, width) of the hidden layer, and write the gradients of its inputs (_CHUNK, width) to g_inputs;
-    width is a multiple of LANES."""
+    """Backpropagate through the hidden layer for `count` anchors.
+
+    Adds to g_weights (_UNITS, width) and writes the gradients of the inputs (_CHUNK, width) to g_inputs. g_hidden
+    (_CHUNK, _UNITS) are the gradients of the hidden units; width is a multiple of LANES.
+    """
     width = inputs.shape[1]
     for block in range(0, width, LANES):
         for c in range(0, _UNITS, _UNROLL):
@@ -277,8 +282,8 @@ def _backward(rows, seen_from, hidden, weights, by_offset, k, features, coeffici
                     for i in range(0, outputs, LANES):
                         x = load(raw, (at * k + j) * outputs + i)
                         sound += x - x
-                # Numbers that are not finite leave NaN. Such an anchor adds nothing to the heads' gradients, and its
-                # row's gradient becomes NaN.
+                # x - x is NaN for a non-finite x. Such an anchor adds nothing to the heads' gradients, and the gradient
+                # of its row becomes NaN.
                 faulty[a - first] = not total(sound) == 0.0  # noqa: SIM201 - true of NaN
                 if faulty[a - first]:
                     made[a - first] = False
@@ -310,8 +315,11 @@ def _backward(rows, seen_from, hidden, weights, by_offset, k, features, coeffici
 
 
 class Generate(torch.autograd.Function):
-    """Heads and assembly as one node: (positions (n, 3), rows (n, columns), seen_from (n, 4 or 0), layout, weights and
-    biases of the four layers) -> means, quats, scales, opacities, sh and source, as in `Generated`."""
+    """Heads and generation of the Gaussians as one autograd function.
+
+    Inputs: positions (n, 3), rows (n, columns), seen_from (n, 4 or 0), layout, and the weights and biases of the four
+    layers. Outputs: means, quats, scales, opacities, sh and source, as in `Generated`.
+    """
 
     @staticmethod
     def forward(ctx: Any, positions, rows, seen_from, layout: Layout, *parameters):
@@ -367,8 +375,10 @@ class Generate(torch.autograd.Function):
 
 
 def _by_offset(weights: torch.Tensor, biases: torch.Tensor, k: int) -> np.ndarray:
-    """Rearrange a layer (k * m, HIDDEN) and its biases (k * m,) to (k, blocks, HIDDEN + 1, LANES), so that the
-    weights of LANES outputs of an offset are adjacent, the biases last."""
+    """Rearrange a layer (k * m, HIDDEN) and its biases (k * m,) to (k, blocks, HIDDEN + 1, LANES).
+
+    The weights of LANES outputs of an offset become adjacent, followed by the biases.
+    """
     m = len(biases) // k
     layer = torch.cat([weights, biases[:, None]], 1).view(k, m, HIDDEN + 1)
     layer = pad(layer, (0, 0, 0, -m % LANES)).view(k, -1, LANES, HIDDEN + 1)

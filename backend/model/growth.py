@@ -1,10 +1,10 @@
 """Growing and pruning of anchors (Scaffold-GS section 3.3, with IDs as in ObjectGS section 3.2).
 
-A new anchor takes its parent's ID. A cell holds at most one anchor; if two objects compete for a free cell, the one
-with the larger accumulated gradient gets it.
+A new anchor inherits its parent's ID. A cell contains at most one anchor; if splats of two objects request the same
+free cell, the one with the larger accumulated gradient gets it.
 
-Statistics are gathered on the model's device. Growth itself, once in many steps, sorts cells on the CPU; of the
-anchors' rows only those of splats that ask for a cell are copied there.
+Statistics are accumulated on the model's device. Growth, which is rare, sorts cells on the CPU; only the rows of
+anchors whose splats request a cell are copied to the CPU.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from ..raster import devices
 from .anchors import Anchors, cell_keys, new_rows
 
 LEVELS = (16, 4, 1)
-"""Edges of the cells that are tried, in voxels, coarse to fine."""
+"""Edge lengths in voxels of the cells in which anchors are added, coarse to fine."""
 
 MIN_VISITS = 5
-"""Splats and anchors that were seen less often are not judged yet."""
+"""Smallest number of views in which a splat or anchor must have been seen before it is considered."""
 
 
 @dataclass
 class GrowthStatistics:
-    """Sums since the splats and anchors were last judged.
+    """Sums over views since the splats and anchors were last considered for growth and pruning.
 
     Attributes:
         gradient: (N k,) float32, norm of the screen gradient (normalized device coordinates) of each offset's splat.
-        visits: (N k,) int32, the number of views that the splat was drawn in.
-        opacity: (N,) float32, opacity of an anchor's splats.
-        views: (N,) int32, the number of views that the anchor was in.
+        visits: (N k,) int32, number of views in which the splat was drawn.
+        opacity: (N,) float32, total opacity of an anchor's splats.
+        views: (N,) int32, number of views in which the anchor was in view.
     """
 
     gradient: torch.Tensor
@@ -43,7 +43,7 @@ class GrowthStatistics:
 
     @classmethod
     def zeros(cls, anchors: int, offsets: int, device: torch.device = devices.CPU) -> GrowthStatistics:
-        """Cleared sums."""
+        """Return statistics with all sums 0."""
 
         def cleared(count: int, kind: torch.dtype) -> torch.Tensor:
             return torch.zeros(count, dtype=kind, device=device)
@@ -69,13 +69,13 @@ class GrowthStatistics:
 
         Args:
             anchors_seen: (n,) int64, the anchors in view.
-            offsets: k, splats per anchor.
+            offsets: k, number of splats per anchor.
             source: (S,) int64, index in anchors_seen * k + offset of each splat.
-            opacities: (S,).
-            drawn: (S,) bool, the splats that touch the image.
-            screen_gradient: (S, 2), per pixel.
-            width, height: of the image in pixels.
-            usable: (n,) bool, only on the GPU: the other anchors do not count.
+            opacities: (S,), opacities of the splats.
+            drawn: (S,) bool, the splats that overlap the image.
+            screen_gradient: (S, 2), gradient with respect to the splats' centers in pixels.
+            width, height: size of the image in pixels.
+            usable: (n,) bool, only on the GPU: anchors for which it is False are ignored.
         """
         if devices.on_gpu(self.gradient):
             drawn, screen_gradient = torch.as_tensor(drawn), torch.as_tensor(screen_gradient)
@@ -103,21 +103,21 @@ class GrowthStatistics:
         height: int,
         usable: torch.Tensor | None,
     ) -> None:
-        """`add`, where every offset of the anchors has an entry among the splats."""
+        """Implement `add` on the GPU, where every offset of the anchors has an entry among the splats."""
         counted = torch.ones_like(anchors_seen, dtype=torch.bool) if usable is None else usable
         drawn = drawn.view(-1, offsets) & counted[:, None]
         norm = torch.hypot(screen_gradient[:, 0] * (width / 2), screen_gradient[:, 1] * (height / 2))
         norm = norm.view(-1, offsets)
         drawn = drawn & norm.isfinite()
         norm = torch.where(drawn, norm, 0.0)
-        # Each anchor occurs once, so the result does not depend on the order of the sums.
+        # Each anchor occurs once, so the result is deterministic.
         self.gradient.view(-1, offsets).index_add_(0, anchors_seen, norm)
         self.visits.view(-1, offsets).index_add_(0, anchors_seen, drawn.to(self.visits.dtype))
         self.opacity.index_add_(0, anchors_seen, torch.where(counted, opacities.view(-1, offsets).sum(1), 0.0))
         self.views.index_add_(0, anchors_seen, counted.to(self.views.dtype))
 
     def after(self, growth: Growth, offsets: int) -> GrowthStatistics:
-        """The statistics after a round of growth, which keep what was seen too rarely to be judged."""
+        """Return the statistics after a round of growth; the sums of what was seen too rarely are kept."""
 
         def follow(sums: torch.Tensor, count: torch.Tensor, width: int) -> torch.Tensor:
             kept = torch.where(count < MIN_VISITS, sums, 0).view(-1, width)[growth.kept]
@@ -131,7 +131,10 @@ class GrowthStatistics:
 
 @dataclass(frozen=True)
 class Growth:
-    """The changes of one round: `kept` (n,) indices of the anchors that stay, in order, then `added` new ones."""
+    """The result of one round.
+
+    The anchors consist of the old ones with the indices `kept` (n,), followed by `added` new ones.
+    """
 
     kept: torch.Tensor
     added: int
@@ -148,16 +151,18 @@ def grow_and_prune(
 ) -> Growth:
     """Add anchors where splats have large gradients and remove transparent ones, in place (Scaffold-GS section 3.3).
 
-    A splat with an average gradient >= threshold * 2^level asks for an anchor in the cell of LEVELS[level] voxels that
-    it lies in.
+    A splat with an average gradient >= threshold * 2^level requests an anchor in its cell of LEVELS[level] voxels.
 
     Args:
         anchors: changed in place.
-        statistics: since the previous round.
-        rng: for the offsets of new anchors.
+        statistics: the statistics since the previous round.
+        rng: generator of the offsets of new anchors.
         threshold: average norm of the screen gradient.
-        min_opacity: anchors whose splats have less opacity in all, on average over the views, are removed.
+        min_opacity: anchors are removed if the total opacity of their splats, averaged over views, is smaller.
         max_anchors: no anchors are added beyond this number.
+
+    Returns:
+        The changes.
     """
     layout, k = anchors.layout, anchors.layout.offsets
     summed, visits, opacity, views = (
@@ -190,7 +195,7 @@ def grow_and_prune(
         free = ~np.isin(cells[len(taken) :], cells[: len(taken)])
         index = np.flatnonzero(here)[free]
         keys, cells = keys[free], cells[len(taken) :][free]
-        # The largest accumulated gradient first; ties by index, so that the seed determines the result.
+        # The largest accumulated gradient first; ties are broken by index, so that the result is deterministic.
         order = np.lexsort((index, -summed[wanted[index]]))
         _, first = np.unique(cells[order], return_index=True)
         chosen = order[np.sort(first)][: max(room, 0)]
@@ -221,7 +226,7 @@ def grow_and_prune(
 
 
 def _numbered(rows: np.ndarray) -> np.ndarray:
-    """Number the rows (n, 3) int64 so that equal rows, and only those, have equal numbers: (n,) int64."""
+    """Map the rows (n, 3) int64 to numbers (n,) int64 that are equal if and only if the rows are equal."""
     low, high = rows.min(0, initial=0), rows.max(0, initial=0)
     spans = [int(last) - int(first) + 1 for first, last in zip(low, high, strict=True)]
     if math.prod(spans) >= 2**63:

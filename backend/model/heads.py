@@ -1,4 +1,4 @@
-"""The small networks that turn an anchor's feature into its splats' parameters (Scaffold-GS; ObjectGS section 3.2)."""
+"""MLP heads that map an anchor's feature to the parameters of its splats (Scaffold-GS; ObjectGS section 3.2)."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ HIDDEN = 32
 class Heads(nn.Module):
     """Opacity, shape and color heads, 32 hidden units each.
 
-    In `explicit` mode their only input is the anchor's feature, and color is spherical harmonics of `sh_degree`, so the
-    model can be exported as plain splats without loss. In `view` mode (that of the paper) the distance and direction
-    from the camera are further inputs, and color is one value per splat.
+    In `explicit` mode the only input is the anchor's feature, and colors are spherical harmonics of degree `sh_degree`,
+    so the model can be exported as plain splats without loss. In `view` mode (that of the paper), the distance and
+    direction from the camera are additional inputs, and each splat has a single color.
     """
 
     def __init__(self, layout: Layout, mode: str, sh_degree: int, generator: torch.Generator) -> None:
@@ -40,7 +40,7 @@ class Heads(nn.Module):
             self.opacity.bias.fill_(0.2)
 
     def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """(n, inputs) -> opacity (n, k), shape (n, 7 k), color (n, 3 K k), all before their activations."""
+        """Map features (n, inputs) to opacity (n, k), shape (n, 7 k), color (n, 3 K k), all before activation."""
         hidden = torch.relu(self.hidden(features))
         opacity, shape, color = hidden.split(HIDDEN, 1)
         return self.opacity(opacity), self.shape(shape), self.color(color)

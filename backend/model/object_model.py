@@ -1,4 +1,4 @@
-"""The trained model: anchors, heads, background, and how its scene units relate to the capture's world."""
+"""The trained model: anchors, heads, background, and the transform between world and scene units."""
 
 from __future__ import annotations
 
@@ -17,22 +17,25 @@ from .heads import Heads
 from .splats import Splats
 
 DISC_THICKNESS = 1e-3
-"""A disc's third scale in files, as a fraction of the smaller of the other two."""
+"""Third scale of a disc in files, as a fraction of the smaller of the other two."""
 
 
 @dataclass(frozen=True)
 class Normalization:
-    """scene = (world - center) * scale, so that float32 suffices for georeferenced, tiny and huge captures alike."""
+    """Transform from world to scene units: scene = (world - center) * scale.
+
+    In scene units, float32 suffices for georeferenced, tiny and huge captures.
+    """
 
     center: tuple[float, float, float]
     scale: float
 
     def to_scene(self, xyz: np.ndarray) -> np.ndarray:
-        """World positions (M, 3) -> scene units, float64."""
+        """Convert world positions (M, 3) to scene units, float64."""
         return (np.asarray(xyz, np.float64) - np.array(self.center)) * self.scale
 
     def to_world(self, xyz: np.ndarray) -> np.ndarray:
-        """Scene positions (M, 3) -> world units, float64."""
+        """Convert scene positions (M, 3) to world units, float64."""
         return np.asarray(xyz, np.float64) / self.scale + np.array(self.center)
 
     def viewmat(self, viewmat: np.ndarray) -> np.ndarray:
@@ -43,7 +46,10 @@ class Normalization:
 
     @classmethod
     def of(cls, camera_centers: np.ndarray, points: np.ndarray) -> Normalization:
-        """Center on the median of the points; their median distance becomes at most 1, that of the cameras 2."""
+        """Compute a normalization centered on the points' median.
+
+        The median distances from it become at most 1 for points and at most 2 for cameras.
+        """
         center = np.median(points, axis=0)
         spread = np.median(np.linalg.norm(points - center, axis=1))
         reach = np.median(np.linalg.norm(camera_centers - center, axis=1)) / 2
@@ -57,10 +63,10 @@ class ObjectModel:
     """A trained model.
 
     Attributes:
-        anchors, heads: in scene units.
+        anchors, heads: anchors in scene units, and the heads.
         background: (3,) RGB in display space, 0 .. 1.
         classes: the object IDs of the anchors' class indices; class 0 is "no object".
-        normalization: between the capture's world and scene units.
+        normalization: transform between the capture's world and scene units.
         primitive: "3d" Gaussians or "2d" discs.
     """
 
@@ -73,11 +79,11 @@ class ObjectModel:
 
     @property
     def device(self) -> torch.device:
-        """The device that the model lies on."""
+        """The device of the model's tensors."""
         return self.background.device
 
     def to(self, device: torch.device) -> ObjectModel:
-        """Move the model to another device; returns itself."""
+        """Move the model to another device; returns the model."""
         self.anchors, self.heads, self.background = (
             self.anchors.to(device), self.heads.to(device), self.background.detach().to(device)
         )  # fmt: skip
@@ -93,10 +99,10 @@ class ObjectModel:
 
         Args:
             seen: (n,) int64, the anchors; None: all.
-            eye: (3,), the camera's center in scene units; needed only in view mode.
+            eye: (3,), the camera's center in scene units; required only in view mode.
 
         Returns:
-            In scene units; discs have the third scale of the thin 3D Gaussians that stand for them in files.
+            The Gaussians in scene units; discs have the third scale of the thin 3D Gaussians used for them in files.
         """
         a = self.anchors
         pick = (lambda x: x) if seen is None else (lambda x: x[seen])
@@ -107,13 +113,13 @@ class ObjectModel:
             return g
 
     def splats(self, eye: np.ndarray | None = None) -> tuple[Splats, np.ndarray]:
-        """The whole model as plain splats.
+        """Convert the model to plain splats.
 
         Args:
-            eye: (3,), the camera's center in scene units; needed only in view mode.
+            eye: (3,), the camera's center in scene units; required only in view mode.
 
         Returns:
-            Splats in world units, and source (N,) int64: anchor * offsets + offset of each.
+            Splats in world units, and source (N,) int64: anchor * offsets + offset of each splat.
         """
         g = self.generate(eye=eye)
         g = g.cpu()
@@ -135,7 +141,7 @@ class ObjectModel:
 @kernel(parallel=True)
 def _in_view(positions, rows, k, viewmat, intrinsics, width, height, near, seen):
     fx, fy, cx, cy = intrinsics
-    # Distance from the four side planes of the frustum, in units of length.
+    # The four side planes of the frustum.
     planes = np.empty((4, 2))
     planes[0] = fx, cx
     planes[1] = -fx, width - cx
@@ -161,7 +167,7 @@ def _in_view(positions, rows, k, viewmat, intrinsics, width, height, near, seen)
         for p in range(4):
             side = px if p < 2 else py
             distance = (planes[p, 0] * side + planes[p, 1] * pz) / np.sqrt(planes[p, 0] ** 2 + planes[p, 1] ** 2)
-            # The anti-aliasing blur, or a disc's minimum footprint, adds up to 2.4 pixels at the border.
+            # The low-pass filter, or a disc's minimum footprint, adds up to 2.4 pixels at the border.
             margin = 2.4 * max(pz, near) / min(fx, fy)
             inside = inside and distance > -reach - margin
         seen[a] = inside
@@ -170,7 +176,7 @@ def _in_view(positions, rows, k, viewmat, intrinsics, width, height, near, seen)
 def _in_view_on_gpu(
     anchors: Anchors, viewmat: np.ndarray, intrinsics: np.ndarray, width: int, height: int, near: float
 ) -> torch.Tensor:
-    """The same as `_in_view` in torch: (N,) bool."""
+    """Compute the same as `_in_view` in torch; returns (N,) bool."""
     k, rows = anchors.layout.offsets, anchors.rows
     extent = rows[:, anchors.layout.extent_columns].clamp(max=LOG_EXTENT_MAX).exp()
     largest = rows[:, anchors.layout.offset_columns].abs().view(-1, k, 3).amax(1)
@@ -188,13 +194,13 @@ def _in_view_on_gpu(
 def anchors_in_view(
     anchors: Anchors, viewmat: np.ndarray, intrinsics: np.ndarray, width: int, height: int, near: float
 ) -> torch.Tensor:
-    """Find the anchors that may touch the image, conservatively. Waits for the GPU to count them.
+    """Find the anchors whose splats may overlap the image (conservatively); synchronizes with the GPU.
 
     Args:
-        anchors: of a model.
+        anchors: the anchors of a model.
         viewmat: (4, 4) float64, scene to camera.
         intrinsics: fx, fy, cx, cy in pixels.
-        width, height: of the image in pixels.
+        width, height: size of the image in pixels.
         near: near plane in scene units.
 
     Returns:
@@ -213,13 +219,14 @@ def anchors_in_view(
 def first_anchors_in_view(
     anchors: Anchors, viewmat: np.ndarray, intrinsics: np.ndarray, width: int, height: int, near: float, limit: int
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """`anchors_in_view` on a GPU, without waiting for it.
+    """Find the anchors in view on a GPU without synchronization; otherwise as `anchors_in_view`.
 
     Args:
+        anchors, viewmat, intrinsics, width, height, near: as in `anchors_in_view`.
         limit: upper bound of the number of anchors in view; if there are more, the last of them are left out.
 
     Returns:
-        index (n,) int64, n = min(limit, N): first the anchors in view, then others; in_view (n,) bool: which are in
+        index (n,) int64, n = min(limit, N): the anchors in view, followed by others; in_view (n,) bool: which are in
         view; () int64: the number of anchors in view.
     """
     inside = _in_view_on_gpu(anchors, viewmat, intrinsics, width, height, near)

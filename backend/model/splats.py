@@ -1,4 +1,4 @@
-"""Explicit Gaussians as plain arrays, for export, import and display."""
+"""Gaussians as plain arrays, for export, import and display."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Splats:
         opacities: (N,) in (0, 1), not their logits.
         sh: (N, K, 3), K = (degree + 1)^2 coefficients of the real spherical harmonics for red, green, blue;
             color = max(0, basis(direction) . sh + 0.5).
-        object_ids: (N,) int64 in 0 .. 2^32 - 1; 0 belongs to no object.
-        unobserved: (N,) bool, generated to fill a hole and seen in no image; all False if not given.
+        object_ids: (N,) int64 in 0 .. 2^32 - 1; 0 is "no object".
+        unobserved: (N,) bool, generated to fill a hole and visible in no image; all False if not given.
     """
 
     means: NDArray
@@ -55,12 +55,12 @@ class Splats:
 
     @property
     def degree(self) -> int:
-        """Degree of the spherical harmonics; 0: the color does not depend on the direction."""
+        """Degree of the spherical harmonics; 0 if the color does not depend on the direction."""
         return math.isqrt(self.sh.shape[1]) - 1
 
     @classmethod
     def empty(cls, degree: int = 0) -> Splats:
-        """Zero splats with spherical harmonics of `degree`."""
+        """Return an empty set of splats with spherical harmonics of `degree`."""
         return cls(
             means=np.zeros((0, 3), np.float32),
             quats=np.zeros((0, 4), np.float32),
@@ -71,7 +71,7 @@ class Splats:
         )
 
     def select(self, mask: NDArray) -> Splats:
-        """Copy the splats of a boolean mask (N,) or of an array of indices, in that order."""
+        """Copy the splats selected by a boolean mask (N,) or by an array of indices, in that order."""
         return Splats(
             self.means[mask],
             self.quats[mask],
@@ -83,7 +83,7 @@ class Splats:
         )
 
     def with_degree(self, degree: int) -> Splats:
-        """The splats with higher bands of spherical harmonics removed, or filled with zeros."""
+        """Return the splats with higher bands of spherical harmonics removed, or filled with zeros."""
         k = (degree + 1) ** 2
         sh = np.zeros((len(self), k, 3), self.sh.dtype)
         keep = min(k, self.sh.shape[1])
@@ -92,7 +92,7 @@ class Splats:
 
 
 def concatenate(parts: Sequence[Splats]) -> Splats:
-    """Concatenate splats; lower degrees are filled with zeros up to the highest one among them."""
+    """Concatenate splats; spherical harmonics are padded with zeros to the highest degree."""
     if not parts:
         return Splats.empty()
     degree = max(part.degree for part in parts)

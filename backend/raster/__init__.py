@@ -1,4 +1,4 @@
-"""The differentiable rasterizer of 3D Gaussians and discs: one interface to the CPU and the CUDA renderer."""
+"""Differentiable rasterization of 3D Gaussians and discs: a common interface to the CPU and CUDA renderers."""
 
 from __future__ import annotations
 
@@ -19,12 +19,16 @@ __all__ = ["Camera", "Rendered", "compile_kernels", "object_map", "object_ranks"
 class Rendered(NamedTuple):
     """A rendered image; planes that were not requested are None.
 
-    color (3, H, W): premultiplied, without background. alpha (H, W). label_probability (H, W): probability of the
-    pixel's label. depth (H, W): expected depth times alpha. median (H, W): the depth at which the transmittance falls
-    below one half, 0 where it does not; without gradient. normals (3, H, W): mean normal in camera space, towards the
-    camera, times alpha. distortion (H, W): sum_{i<j} w_i w_j (1 / z_i - 1 / z_j)^2 over the blending weights w. frame:
-    the renderer's own record, for `object_map` and for growth: its `seen` (N,) marks the visible splats, and its
-    `screen_gradient` (N, 2), after the backward pass, is the gradient with respect to their centers in pixels.
+    Attributes:
+        color: (3, H, W), premultiplied, without background.
+        alpha: (H, W).
+        label_probability: (H, W), probability of each pixel's label.
+        depth: (H, W), expected depth times alpha.
+        median: (H, W), the depth at which the transmittance falls below one half, 0 where it does not; no gradient.
+        normals: (3, H, W), mean normal in camera space, towards the camera, times alpha.
+        distortion: (H, W), sum_{i<j} w_i w_j (1 / z_i - 1 / z_j)^2 over the blending weights w.
+        frame: internal data of the renderer, for `object_map` and growth. Its `seen` (N,) marks the visible splats; its
+            `screen_gradient` (N, 2), after the backward pass, is the gradient with respect to their centers in pixels.
     """
 
     color: torch.Tensor
@@ -38,7 +42,7 @@ class Rendered(NamedTuple):
 
 
 def _renderer(device: torch.device) -> Any:
-    """The renderer module for tensors on `device`; in numba's simulator, the CUDA renderer for all."""
+    """Return the renderer module for tensors on `device`; in numba's simulator, always the CUDA renderer."""
     if device.type == "cuda" or config.ENABLE_CUDASIM:
         from .cuda import renderer as cuda
 
@@ -47,7 +51,7 @@ def _renderer(device: torch.device) -> Any:
 
 
 def _array(renderer: Any, tensor: torch.Tensor, kind: torch.dtype = torch.float32) -> Any:
-    """Convert a tensor to what the renderer takes: an array on the CPU, else a tensor."""
+    """Convert a tensor to the renderer's input type: an array for the CPU renderer, otherwise a tensor."""
     tensor = tensor.detach().to(kind).contiguous()
     return tensor.numpy() if renderer is cpu else tensor
 
@@ -75,7 +79,7 @@ class _Rasterize(torch.autograd.Function):
         renderer = ctx.renderer = _renderer(means.device)
         ctx.means_type = means.dtype
         if means.dtype == torch.float64:
-            # Far from the origin (georeferenced captures) float32 would round positions: subtract the camera's.
+            # Far from the origin (georeferenced captures), float32 is too coarse: subtract the camera's position.
             means = means - torch.from_numpy(camera.center).to(means.device, non_blocking=True)
             camera = camera.at_origin()
         gaussians = renderer.Gaussians(
@@ -126,32 +130,32 @@ def rasterize(
 ) -> Rendered:
     """Render 3D Gaussians (Kerbl et al. 2023) or discs (Huang et al. 2024), differentiable in the first five arguments.
 
-    Only what is requested is computed. Tensors on a CUDA device are rendered by the CUDA renderer, and everything
-    returned is on that device, the frame's `seen` and `screen_gradient` included.
+    Only the requested planes are computed. Tensors on a CUDA device are rendered by the CUDA renderer, and all results
+    are on that device, including the frame's `seen` and `screen_gradient`.
 
     Args:
-        means: centers (N, 3), float32. In float64 they are made relative to the camera before they are rounded, for
-            scenes far from the origin.
+        means: centers (N, 3), float32; or float64 for scenes far from the origin, in which case they are converted to
+            camera-relative positions before rounding to float32.
         quats: rotations (N, 4) wxyz of any length, float32.
         scales: standard deviations (N, 3), linear, float32. A disc spans the first two axes of its rotation; its third
             scale has no effect.
         opacities: (N,) in (0, 1), float32.
         sh: spherical harmonics (N, K, 3) with K = 1, 4, 9 or 16, float32; color = 0.5 + SH, clamped at 0.
         ids: (N,) int32, the object of each splat.
-        camera: the view.
-        labels: (H, W) int32; requests the probability that each pixel shows its label.
-        want_depth: requests the depth: in a pixel, a disc has that of the ray's intersection with its plane, a 3D
-            Gaussian that of its center.
-        want_median: requests the median depth.
-        want_normals: requests the normals, for discs only.
-        want_distortion: requests the distortion, for discs only.
+        camera: the camera.
+        labels: (H, W) int32; if given, the probability that each pixel shows its label is computed.
+        want_depth: whether to compute the depth. The depth of a disc in a pixel is that of the ray's intersection with
+            its plane; the depth of a 3D Gaussian is that of its center.
+        want_median: whether to compute the median depth.
+        want_normals: whether to compute the normals, for discs only.
+        want_distortion: whether to compute the distortion, for discs only.
         primitive: "3d" for 3D Gaussians, "2d" for discs.
 
     Returns:
         The image and the requested planes.
 
     Raises:
-        ValueError: if `primitive` is unknown, or normals or distortion are requested of 3D Gaussians.
+        ValueError: `primitive` is unknown, or normals or distortion are requested for 3D Gaussians.
     """
     if primitive not in ("2d", "3d"):
         raise ValueError(f"primitive is {primitive!r}, expected '2d' or '3d'")
@@ -170,10 +174,10 @@ def rasterize(
 
 
 def object_map(rendered: Rendered) -> tuple[Any, Any]:
-    """Find the most probable object of every pixel.
+    """Find the most probable object of each pixel.
 
     Args:
-        rendered: what `rasterize` returned.
+        rendered: result of `rasterize`.
 
     Returns:
         The ID (H, W) int32, -1 where nothing is drawn, and its probability (H, W) float32: the sum of the blending
@@ -184,10 +188,10 @@ def object_map(rendered: Rendered) -> tuple[Any, Any]:
 
 
 def object_ranks(rendered: Rendered, ranks: int) -> tuple[Any, Any]:
-    """Rank the most probable objects of every pixel.
+    """Rank the most probable objects of each pixel.
 
     Args:
-        rendered: what `rasterize` returned.
+        rendered: result of `rasterize`.
         ranks: number of objects per pixel.
 
     Returns:
@@ -205,22 +209,23 @@ _SURFACE = {"want_depth": True, "want_normals": True, "want_distortion": True}
 _KINDS: tuple[tuple[str, bool, dict[str, bool]], ...] = (
     ("3d", True, {}), ("3d", False, {}), ("2d", True, {}), ("2d", False, {}), ("2d", True, _SURFACE),
 )  # fmt: skip
-"""What training and its previews render: primitive, whether with labels and a gradient, and the further planes. On the
-CPU, one kernel serves all variants of a primitive."""
+"""The variants rendered in training and previews: primitive, whether with labels and gradients, and additional planes.
+On the CPU, all variants of a primitive use the same kernel."""
 
 
 def compile_kernels(device: torch.device | None = None, progress: Callable[[int, int], object] | None = None) -> float:
-    """Compile every kernel that training renders with, or load it from numba's cache on disk.
+    """Compile all rendering kernels that are used in training, or load them from numba's cache on disk.
 
-    Afterwards nothing is compiled in this process, on the CPU whatever is requested. Later processes read the cache: in
-    NUMBA_CACHE_DIR, in `__pycache__` beside the kernels, or in the user's cache folder where that is not writable.
+    Afterwards, this process compiles no rendering kernels in training, and on the CPU for any request. Later processes
+    read the cache, which is in NUMBA_CACHE_DIR, in `__pycache__` beside the kernels or, if that is not writable, in the
+    user's cache folder.
 
     Args:
         device: the device to compile for; None: the CPU.
-        progress: called as progress(done, total) before the first and after every kernel.
+        progress: called as progress(done, total) before the first and after each kernel.
 
     Returns:
-        The seconds it took.
+        The elapsed seconds.
     """
     started = time.perf_counter()
     ones = torch.ones((1, 4), device=device)

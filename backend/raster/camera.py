@@ -1,4 +1,4 @@
-"""The pinhole camera that the renderers take."""
+"""The pinhole camera of the renderers."""
 
 from __future__ import annotations
 
@@ -13,11 +13,14 @@ from .settings import NEAR
 class Camera:
     """A pinhole camera.
 
-    viewmat (4, 4) float64: world to camera, OpenCV axes (x right, y down, z forward). K (3, 3) float64: intrinsics in
-    pixels; the center of the first pixel is (0.5, 0.5). width, height: in pixels. near: depth of the near plane in
-    scene units. gain: per-channel brightness of the camera's photo relative to the scene; a rendered image is
-    multiplied by it. whole: bounds (left, top, right, bottom) of the image that this one is a crop of, in pixels from
-    this one's upper left corner; None: not a crop.
+    Attributes:
+        viewmat: (4, 4) float64, world to camera, OpenCV axes (x right, y down, z forward).
+        K: (3, 3) float64, intrinsics in pixels; the center of the first pixel is (0.5, 0.5).
+        width, height: size of the image in pixels.
+        near: depth of the near plane in scene units.
+        gain: per-channel brightness of the camera's photo relative to the scene; rendered images are multiplied by it.
+        whole: for a crop, the bounds (left, top, right, bottom) of the uncropped image, in pixels from the upper left
+            corner of the crop; None: not a crop.
     """
 
     viewmat: np.ndarray
@@ -29,7 +32,7 @@ class Camera:
     whole: tuple[float, float, float, float] | None = None
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        """The view and the intrinsics as arrays.
+        """Return the view matrix and the intrinsics as arrays.
 
         Returns:
             viewmat (4, 4) and (fx, fy, cx, cy), contiguous float64.
@@ -47,13 +50,13 @@ class Camera:
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
-        """Left, top, right and bottom of the uncropped image in pixels, from this one's upper left corner."""
+        """Left, top, right and bottom of the uncropped image, in pixels from the upper left corner of this one."""
         return self.whole or (0.0, 0.0, float(self.width), float(self.height))
 
     def crop(self, x: int, y: int, width: int, height: int) -> Camera:
-        """The camera of a part of the image; it draws exactly that part.
+        """Return a camera that renders exactly a part of this camera's image.
 
-        The projection is clamped beyond the bounds of the whole image, not of the part (see `bounds`).
+        The projection is clamped at the bounds of the whole image instead of the part's (see `bounds`).
 
         Args:
             x, y: the part's upper left pixel.
@@ -70,7 +73,7 @@ class Camera:
         return replace(self, K=K, width=width, height=height, whole=whole)
 
     def at_origin(self) -> Camera:
-        """The same camera, moved to the origin of the world."""
+        """Return a copy of the camera at the origin of the world."""
         viewmat = self.viewmat.copy()
         viewmat[:3, 3] = 0.0
         return replace(self, viewmat=viewmat)

@@ -1,7 +1,7 @@
-"""Choosing the device to compute on, the CPU or an NVIDIA GPU through CUDA, and why CUDA is not available.
+"""Selection of the compute device, the CPU or an NVIDIA GPU through CUDA, and diagnosis if CUDA is not available.
 
-Functions with a version for each device ask `on_gpu` about one of their tensors. In numba's simulator
-(NUMBA_ENABLE_CUDASIM=1), tensors stay in host memory and everything else takes the GPU's path.
+Functions with an implementation for each device call `on_gpu` with one of their tensors. In numba's simulator
+(NUMBA_ENABLE_CUDASIM=1), tensors stay in host memory, and the GPU implementations are used.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from ..shared.errors import InputError
 CHOICES = ("auto", "cpu", "cuda")
 
 MIN_FREE_MEMORY = 1e9
-"""Bytes of GPU memory that must be free; CUDA itself and torch's libraries take about half of them."""
+"""Bytes of GPU memory that must be free; CUDA itself and torch's libraries use about half of them."""
 
 _OUT_OF_MEMORY_TEXTS = ("CUDA_ERROR_OUT_OF_MEMORY", "CUDA error: out of memory", "CUBLAS_STATUS_ALLOC_FAILED")
-"""Of numba's driver, of the CUDA runtime and of cuBLAS."""
+"""Error texts of numba's driver, the CUDA runtime and cuBLAS."""
 
 CPU = torch.device("cpu")
 
@@ -31,14 +31,14 @@ def pick(asked: str) -> torch.device:
     """Select the device to compute on.
 
     Args:
-        asked: "cpu", "cuda", or "auto": CUDA where it works, else the CPU.
+        asked: "cpu", "cuda", or "auto" (CUDA if available, otherwise the CPU).
 
     Returns:
-        The torch device; in numba's simulator always the CPU.
+        The torch device; in numba's simulator, always the CPU.
 
     Raises:
-        InputError: if `asked` is "cuda" and CUDA is not available.
-        ValueError: if `asked` is none of CHOICES.
+        InputError: `asked` is "cuda" and CUDA is not available.
+        ValueError: `asked` is not in CHOICES.
     """
     if asked not in CHOICES:
         raise ValueError(f"the device is {asked!r}, expected one of {CHOICES}")
@@ -56,7 +56,7 @@ def simulated() -> bool:
 
 
 def on_gpu(tensor: torch.Tensor) -> bool:
-    """Return whether a tensor takes the GPU's path: torch and CUDA kernels instead of numba's kernels on arrays."""
+    """Return whether a tensor is processed by torch and CUDA kernels instead of numba's kernels on arrays."""
     return tensor.is_cuda or simulated()
 
 
@@ -72,13 +72,13 @@ def host(values: torch.Tensor | np.ndarray) -> np.ndarray:
         values: a tensor on any device, or an array.
 
     Returns:
-        The array; of a tensor in host memory, it shares the memory.
+        The array; it shares memory with a tensor in host memory.
     """
     return values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else values
 
 
 def upload(values: np.ndarray, like: torch.Tensor | torch.device) -> torch.Tensor:
-    """Copy an array to a device without waiting for the device to finish other work.
+    """Copy an array to a device asynchronously.
 
     Args:
         values: the array.
@@ -92,7 +92,7 @@ def upload(values: np.ndarray, like: torch.Tensor | torch.device) -> torch.Tenso
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether an error, of torch or numba, means that the GPU's memory is full."""
+    """Return whether an error of torch or numba means that the GPU's memory is full."""
     return isinstance(error, torch.cuda.OutOfMemoryError) or any(words in str(error) for words in _OUT_OF_MEMORY_TEXTS)
 
 
@@ -101,7 +101,7 @@ def why_not_cuda() -> str | None:
     """Explain why CUDA cannot be used on this computer.
 
     Returns:
-        One sentence with the reason and what helps; None where CUDA works.
+        One sentence with the reason and a remedy; None if CUDA works.
     """
     if simulated():
         return None
@@ -130,7 +130,7 @@ def _problem_with_driver() -> str | None:
 
 
 def explain_cuda_error(error: str, toolkit: str | None) -> str:
-    """Explain torch's error when CUDA does not start; toolkit: the CUDA version that torch is built for."""
+    """Explain torch's error if CUDA does not start; toolkit: the CUDA version that torch was built for."""
     text = error.lower()
     if "driver on your system is too old" in text or "driver version is insufficient" in text:
         return (
@@ -165,7 +165,7 @@ def _problem_with_gpu() -> str | None:
 
 
 def explain_low_memory(name: str, free: float, total: float) -> str | None:
-    """Explain that the GPU has fewer than MIN_FREE_MEMORY of its `total` bytes free; None if it has more."""
+    """Explain that fewer than MIN_FREE_MEMORY of the GPU's `total` bytes are free; None if there is enough memory."""
     if free >= MIN_FREE_MEMORY:
         return None
     if 0 < total < MIN_FREE_MEMORY:
@@ -177,7 +177,7 @@ def explain_low_memory(name: str, free: float, total: float) -> str | None:
 
 
 def _problem_with_kernels() -> str | None:
-    """Compile and run a minimal kernel: numba-cuda has a toolkit of its own, which the driver must support, too."""
+    """Compile and run a minimal kernel, since the driver must also support numba-cuda's separate CUDA toolkit."""
     try:
         from numba import cuda
 
@@ -190,7 +190,7 @@ def _problem_with_kernels() -> str | None:
         cuda.synchronize()
         if int(out[0]) != 1:
             return "A CUDA kernel ran without effect; restart the computer."
-    except Exception as error:  # Whatever it is, the CPU still works.
+    except Exception as error:  # For any error, the CPU can be used instead.
         first = f"{type(error).__name__}: {str(error).strip()}".partition("\n")[0].rstrip(".: ")
         if "PTX" in str(error) and "version" in str(error).lower():
             return "The NVIDIA driver is too old for the installed numba-cuda; install a newer driver from nvidia.com."

@@ -1,16 +1,17 @@
-"""Projecting discs (2D Gaussians, Huang et al. 2024): where a pixel's ray meets the disc's plane.
+"""Projection of discs (2D Gaussians, Huang et al. 2024) by intersection of pixels' rays with the discs' planes.
 
-With the center at (u, v), depth z, and the covariance [[a, b], [b, c]] of the footprint under the projection's
-derivative there (as for 3D Gaussians, but without low-pass filter and clamping),
+With the projected center (u, v), its depth z, and the covariance [[a, b], [b, c]] of the footprint from the
+projection's Jacobian (as for 3D Gaussians, but without low-pass filter and clamping),
 
     log2 alpha(x, y) = lop - (A d^2 + C dy^2) / Q^2,   d = x - u - s dy,   dy = y - v,
     Q(x, y) = 1 + qx (x - u) + qy (y - v) = z / (depth at the intersection),
 
-exactly: multiplied by Q, the intersection's coordinates in the disc are affine in the pixel. A disc is therefore a
-screen splat (splats.py) plus the numbers that determine Q, in a row of `tilts`. Rays parallel to the plane have Q = 0;
-rays that meet it behind the camera have Q < 0.
+This is exact, since Q times the intersection's coordinates in the disc is an affine function of the pixel. A disc is
+therefore a screen splat (splats.py) plus the values that determine Q, in a row of `tilts`. Rays parallel to the plane
+have Q = 0; rays that intersect it behind the camera have Q < 0.
 
-The exponent is never smaller than that of a spot around (u, v) in the image, whose depth is the center's.
+As a low-pass filter, the exponent is never smaller than that of a spot around (u, v) in the image, at the depth of the
+center.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ import numpy as np
 from .kernel import kernel
 from .settings import EPS_2D_DISC, MIN_DISC_WIDTH
 
-# Columns of a disc's row in `tilts`: Q at the point of the ridge d = 0 that the splat's column U refers to; Q's slope
-# in x, and along the ridge in y; the smallest 1 / Q that is drawn; u; the middle of the rows it may cover (which extend
-# HALF_H from there); the normal in camera space, towards the camera.
+# Columns of a disc's row in `tilts`: Q at the point of the ridge d = 0 that the splat's column U refers to; slope of Q
+# in x, and along the ridge in y; the smallest 1 / Q that is drawn; u; the center of the range of rows that it may cover
+# (center - HALF_H to center + HALF_H); the normal in camera space, towards the camera.
 Q0, QX, QY, NEAREST, SPOT_U, MIDDLE, NORMAL_X, NORMAL_Y, NORMAL_Z = range(9)
 TILT_COLUMNS = 12
 
@@ -34,10 +35,10 @@ SPOT = 0.5 / math.log(2.0) / EPS_2D_DISC
 
 @kernel()
 def disc_footprint(T, R, scales, n, V0, V1):
-    """V = T (first two columns of R, times scales[n]) as its rows.
+    """Compute V = T (first two columns of R, times scales[n]), as its two rows V0 and V1.
 
-    Returns a, b, c of V V^T, a - b^2 / c, V's determinant, and whether the disc is broad enough in the image for its
-    plane to be drawn.
+    Returns a, b, c of V V^T, a - b^2 / c, the determinant of V, and whether the disc is wide enough in the image for
+    its plane to be drawn.
     """
     for j in range(2):
         scale = np.float64(scales[n, j])
@@ -53,10 +54,10 @@ def disc_footprint(T, R, scales, n, V0, V1):
 
 @kernel()
 def disc_plane(px, py, pz, fx, fy, W, R):
-    """The disc's plane.
+    """Compute the plane of a disc.
 
-    Returns the normal towards the camera (3 numbers); 1 or -1, its sign relative to the third column of R; its product
-    with the center (< 0), minus the camera's distance from the plane; and qx, qy.
+    Returns the normal towards the camera (3 values); 1 or -1, its sign relative to the third column of R; its dot
+    product with the center (< 0), which is the negative distance of the camera from the plane; and qx, qy.
     """
     nx = W[0, 0] * R[0, 2] + W[0, 1] * R[1, 2] + W[0, 2] * R[2, 2]
     ny = W[1, 0] * R[0, 2] + W[1, 1] * R[1, 2] + W[1, 2] * R[2, 2]
@@ -70,11 +71,11 @@ def disc_plane(px, py, pz, fx, fy, W, R):
 
 @kernel()
 def disc_outline(a, b, c, area, broad, qx, qy, reach2, farthest):
-    """The ellipse around all that is drawn of a disc.
+    """Compute an ellipse that encloses the drawn part of a disc.
 
-    reach2: squared standard deviations up to which the disc is drawn; farthest: value of Q up to which it is drawn.
-    Returns the ellipse's center relative to (u, v), a, b, c, a - b^2 / c, and whether it is bounded: a disc that
-    reaches behind the camera may cover any part of the image.
+    reach2: squared number of standard deviations up to which the disc is drawn; farthest: value of Q up to which it is
+    drawn. Returns the ellipse's center relative to (u, v), a, b, c, a - b^2 / c, and whether it is bounded; a disc that
+    extends behind the camera may cover any part of the image.
     """
     spot2 = reach2 * EPS_2D_DISC
     if not broad:
@@ -89,7 +90,7 @@ def disc_outline(a, b, c, area, broad, qx, qy, reach2, farthest):
     out_b = reach2 * b / rest + du * dv
     out_c = reach2 * c / rest + dv * dv
     out_area2 = (reach2 * area) ** 2 / (rest * rest * rest)
-    # The spot adds nothing to a disc that is broader than it in every direction.
+    # The spot has no effect if the disc is wider in every direction.
     narrow2 = area * area / (0.5 * (a + c) + math.sqrt(0.25 * (a - c) * (a - c) + b * b))
     slack = math.sqrt(spot2 * (qx * qx + qy * qy))
     if not (1.0 + slack < farthest and slack < 1.0 and narrow2 * (1.0 - slack) * (1.0 - slack) > EPS_2D_DISC):

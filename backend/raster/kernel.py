@@ -1,12 +1,15 @@
-"""`kernel` compiles a function with numba and caches the result on disk until code that it may depend on changes."""
+"""Compilation of functions with numba, with a disk cache that is valid until code they may depend on changes."""
 
 from __future__ import annotations
 
 import contextlib
+import dis
 import functools
 import hashlib
+import inspect
 from collections.abc import Callable
 from importlib.machinery import SourceFileLoader
+from itertools import pairwise
 from pathlib import Path
 from types import CodeType
 from typing import Any, cast
@@ -14,43 +17,54 @@ from typing import Any, cast
 from numba import njit
 
 _LAYERS = ("raster", "model", "training", "mesh")
-"""The packages that contain kernels; each may use itself and those before it."""
+"""The packages that contain kernels; each one may depend on itself and on those before it."""
 _SHARED = ("blending.py", "spherical_harmonics.py")
 """The files of `backend.shared.splats` whose constants are compiled into kernels."""
 _BACKEND = Path(__file__).resolve().parents[1]
 
 
 def digest_of_code(code: CodeType) -> bytes:
-    """Hash what a code object does.
+    """Compute a hash of a code object that depends on names, constants and operations.
 
-    Comments, docstrings and line numbers do not change the hash; names, constants and operations do.
+    Comments, docstrings and line numbers do not affect the hash.
 
     Args:
-        code: a compiled module or function, with the functions that it contains.
+        code: a compiled module or function, including nested functions.
 
     Returns:
         The SHA-256 digest.
     """
     digest = hashlib.sha256(f"{code.co_name} {code.co_varnames} {code.co_names} {code.co_freevars}".encode())
     digest.update(code.co_code)
+    docstrings = _docstring_indices(code)
     for index, constant in enumerate(code.co_consts):
         if isinstance(constant, CodeType):
             digest.update(digest_of_code(constant))
-        # The first constant is the docstring, or None in its place.
-        elif (index or not isinstance(constant, str)) and constant is not None:
+        elif index not in docstrings and constant is not None:
             shown = sorted(map(repr, constant)) if isinstance(constant, frozenset) else repr(constant)
             digest.update(f"{index} {type(constant).__name__} {shown}".encode())
     return digest.digest()
 
 
+def _docstring_indices(code: CodeType) -> set[int]:
+    """Return the indices of the constants that are the docstring of a function, a class or a module."""
+    if code.co_flags & inspect.CO_NEWLOCALS:
+        return {0} if isinstance(next(iter(code.co_consts), None), str) else set()
+    if "__doc__" not in code.co_names:
+        return set()
+    steps = list(dis.get_instructions(code))
+    stores = [before for before, step in pairwise(steps) if step.opname == "STORE_NAME" and step.argval == "__doc__"]
+    return {before.arg for before in stores if before.arg is not None}
+
+
 def _digest_of_file(path: Path) -> bytes:
-    """`digest_of_code` of a source file, through Python's own cache of compiled files."""
+    """Return `digest_of_code` of a source file, using Python's cache of compiled files."""
     return digest_of_code(cast(CodeType, SourceFileLoader(path.stem, str(path)).get_code(path.stem)))
 
 
 @functools.cache
 def digest_up_to(layer: str) -> str:
-    """Hash the code that kernels of `layer` (one of `_LAYERS`) may depend on."""
+    """Compute a hash of the code that kernels of `layer` (one of `_LAYERS`) may depend on."""
     digest = hashlib.sha256()
     for name in _SHARED:
         digest.update(_digest_of_file(_BACKEND / "shared" / "splats" / name))
@@ -61,16 +75,16 @@ def digest_up_to(layer: str) -> str:
 
 
 def renew_with_layer(dispatcher: Any, function: Callable[..., Any]) -> None:
-    """Tie the disk cache of a compiled function to `digest_up_to` of its layer, instead of to its own file.
+    """Tie the disk cache of a compiled function to `digest_up_to` of its layer instead of its file.
 
-    The cache is also found again when the function has moved to another line of its file.
+    The cache remains valid if the function moves to another line of its file.
 
     Args:
-        dispatcher: what numba made of the function.
+        dispatcher: numba's dispatcher of the function.
         function: the function itself.
     """
     layer = next(part for part in function.__module__.split(".") if part in _LAYERS)
-    # Without a cache folder, or if numba's internals have changed, numba's own rule applies.
+    # Without a cache folder, or if numba's internals have changed, numba's default caching applies.
     with contextlib.suppress(AttributeError):
         cache = dispatcher._cache
         name = cache._impl.filename_base.replace(f"-{function.__code__.co_firstlineno}.py", ".py")
@@ -82,9 +96,9 @@ def kernel(
 ) -> Callable[[Callable[..., Any]], Any]:
     """Decorate a kernel: numba.njit with NumPy's division, cached on disk.
 
-    numba renews a function's cache when the function's own file changes, although the compiled code contains constants
-    and functions of other files, too. Here the cache is valid as long as the code of the function's layer, of the
-    layers below it, and of `_SHARED` is unchanged; comments and docstrings do not count.
+    By default, numba invalidates a function's cache only if the function's own file changes, although the compiled code
+    contains constants and functions of other files. Here, the cache is valid as long as the code of the function's
+    layer, of the layers below it, and of `_SHARED` is unchanged, apart from comments and docstrings.
 
     Args:
         parallel: whether `prange` loops run in parallel.

@@ -1,4 +1,4 @@
-"""Accumulating the ranked object IDs of several images, pixel by pixel."""
+"""Accumulation of the ranked object IDs of several images, pixel by pixel."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from .kernel import kernel
 
 @kernel(parallel=True)
 def add_ranked(total_ids, total_weights, ids, weights):
-    """Add the ranked IDs of an image to running totals, which stay ranked.
+    """Add the ranked IDs of an image to running totals, which remain ranked.
 
     Totals are exact as long as no pixel receives more than n different IDs.
 
     Args:
-        total_ids: (H, W, n) int32, initially -1; changed in at.
-        total_weights: (H, W, n) float32, initially 0; changed in at.
-        ids: (ranks, H, W) int32, in each pixel from the largest weight down; -1 ends a pixel's list.
+        total_ids: (H, W, n) int32, initially -1; changed in place.
+        total_weights: (H, W, n) float32, initially 0; changed in place.
+        ids: (ranks, H, W) int32, sorted by descending weight in each pixel; -1 terminates a pixel's list.
         weights: (ranks, H, W) float32, the weight of each ID.
     """
     height, width, room = total_ids.shape

@@ -1,6 +1,6 @@
-"""The reference renderer: plain torch in any float type, differentiable by autograd; the oracle of the tests.
+"""Reference renderer for tests: plain torch in any float type, differentiable by autograd.
 
-Every splat is blended into every pixel in one depth order, without tiles, which is slow.
+It is slow, since each splat is blended into all pixels in a global depth order, without tiles.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .settings import (
 
 
 class ReferenceRender(NamedTuple):
-    """What the reference renderer returns.
+    """An image of the reference renderer.
 
     color (3, H, W), alpha, depth, median and distortion (H, W), normals (3, H, W; 0 for 3D Gaussians) as in `Rendered`;
     probabilities (H, W, n): one channel per ID.
@@ -41,7 +41,7 @@ class ReferenceRender(NamedTuple):
 
 
 def rotation_matrices(quats: torch.Tensor) -> torch.Tensor:
-    """Rotation matrices (N, 3, 3) of unit quaternions (N, 4) wxyz."""
+    """Convert unit quaternions (N, 4) wxyz to rotation matrices (N, 3, 3)."""
     w, x, y, z = quats.unbind(-1)
     return torch.stack(
         [
@@ -54,7 +54,7 @@ def rotation_matrices(quats: torch.Tensor) -> torch.Tensor:
 
 
 def sh_colors(sh: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-    """Colors (N, 3) of SH coefficients (N, K, 3) in unit directions (N, 3): 0.5 + sum of real SH, clamped at 0."""
+    """Evaluate SH (N, K, 3) in unit directions (N, 3); returns colors (N, 3) = 0.5 + sum of real SH, clamped at 0."""
     x, y, z = directions.unbind(-1)
     one = torch.ones_like(x)
     basis = [one / (2 * math.sqrt(math.pi))]
@@ -76,10 +76,11 @@ def sh_colors(sh: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
 def _footprints(
     p: torch.Tensor, axes: torch.Tensor, camera: Camera, blur: float, tan_margin: float
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Project covariances by the perspective's Jacobian: a, b, c (N,) of [[a, b], [b, c]] and a - b^2 / c.
+    """Project covariances with the Jacobian of the projection: a, b, c (N,) of [[a, b], [b, c]] and a - b^2 / c.
 
-    p (N, 3): centers in camera space; axes (N, 3, 2 or 3): standard deviations; blur: variance of the low-pass filter;
-    tan_margin: margin beyond the image, as a fraction of its half size, up to which the Jacobian follows the direction.
+    p (N, 3): centers in camera space; axes (N, 3, 2 or 3): axes scaled by the standard deviations; blur: variance of
+    the low-pass filter; tan_margin: margin beyond the image, as a fraction of its half size, at which the direction is
+    clamped for the Jacobian.
     """
     fx, fy, cx, cy = (float(v) for v in camera.arrays()[1])
     x, y, z = p.unbind(-1)
@@ -92,7 +93,7 @@ def _footprints(
     M = J @ axes
     cov = M @ M.transpose(1, 2) + blur * torch.eye(2, dtype=p.dtype)
     a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
-    # a - b^2 / c, where a c - b^2 without the blur is the squared area that M's rows span.
+    # a - b^2 / c; without the blur, a c - b^2 is the squared area of the parallelogram spanned by M's rows.
     if axes.shape[-1] == 2:
         area2 = (M[:, 0, 0] * M[:, 1, 1] - M[:, 0, 1] * M[:, 1, 0]) ** 2
     else:
@@ -103,9 +104,10 @@ def _footprints(
 def _disc_power(
     rays: torch.Tensor, p: torch.Tensor, R: torch.Tensor, scales: torch.Tensor, spot: torch.Tensor, near: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Half the squared distance of each ray (H, W, 3) from a disc's center, in standard deviations, and its depth.
+    """Return half the squared distance of each ray (H, W, 3) from a disc's center, and the depth.
 
-    The distance is measured where the ray meets the disc's plane or, where that is smaller, in the image (`spot`).
+    The distance, in standard deviations, is measured at the ray's intersection with the disc's plane or, if smaller, in
+    the image (`spot`).
     """
     t1, t2, normal = R.unbind(-1)
     inverse = (rays @ normal) / (p @ normal)
@@ -128,7 +130,7 @@ def rasterize_reference(
     objects: int = 1,
     primitive: str = "3d",
 ) -> ReferenceRender:
-    """Render 3D Gaussians or, with primitive "2d", discs.
+    """Render 3D Gaussians or discs.
 
     Args:
         means, quats, scales, opacities, sh, camera, primitive: as in `backend.raster.rasterize`.
@@ -147,7 +149,7 @@ def rasterize_reference(
     eye = -(W.T @ t)
     if flat:
         scales = scales[:, :2]
-    # Splats below the thresholds are removed before any division, so that no NaN gradient passes a mask.
+    # Remove splats below the thresholds before any division, since NaN gradients would propagate through a mask.
     z = (means @ W.T + t)[:, 2]
     kept = (
         (z > camera.near) & (opacities > ALPHA_MIN) & torch.isfinite(opacities) & ((quats**2).sum(-1) > MIN_QUAT_NORM2)

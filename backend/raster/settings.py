@@ -1,4 +1,4 @@
-"""The blending constants of `backend.shared.splats.blending`, and those that only the renderers need."""
+"""The blending constants of `backend.shared.splats.blending`, and constants used only by the renderers."""
 
 from ..shared.splats.blending import (
     ALPHA_MAX,
@@ -23,11 +23,11 @@ __all__ = [
 ]
 
 EPS_2D_DISC = 0.5
-"""Variance in square pixels of the spot that a disc always covers (low-pass filter of 2D Gaussian splatting)."""
+"""Variance in square pixels of the smallest footprint (spot) of a disc (low-pass filter of 2D Gaussian splatting)."""
 
 MIN_DISC_WIDTH = 0.05
-"""A disc whose projected standard deviation is below this, in pixels, is drawn as its spot alone: whether so thin a
-line meets a pixel center is chance, and its gradients are unbounded."""
+"""Projected standard deviation in pixels below which only the spot of a disc is drawn, since such a thin line covers
+pixel centers only by chance, and its gradients are unbounded."""
 
 MAX_SH_COEFFICIENTS = 16
-"""Spherical harmonics up to degree 3."""
+"""Number of coefficients of spherical harmonics of degree 3."""

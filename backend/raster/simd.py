@@ -1,8 +1,8 @@
-"""Sixteen float32 lanes as one value inside numba kernels.
+"""SIMD vectors of sixteen float32 lanes for numba kernels.
 
-numba's own vectorizer keeps a tile's planes in memory and cannot vectorize a loop whose trip count is a splat's pixel
-span. These types are LLVM vectors instead, which LLVM compiles for every target (AVX, AVX-512, NEON, scalar code), so a
-kernel states what is held in registers, and no compiler is needed on the user's machine.
+numba's automatic vectorization keeps a tile's planes in memory and cannot vectorize a loop whose trip count is a
+splat's pixel span. These types are LLVM vectors, which are compiled for any target (AVX, AVX-512, NEON, scalar code).
+Kernels can thus control which values are kept in registers, without a C compiler on the user's machine.
 
 Lanes: `Floats` (float), `Ints` (int), `Mask` (bool). Arithmetic operators take equal lane types; `splat` (float32) and
 `splat_i` (int32) broadcast a scalar.
@@ -18,7 +18,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
 
 LANES = 16
-"""One AVX-512 register, two of AVX or four of NEON; wider than most splats, so a row is one step."""
+"""One AVX-512 register, two AVX registers or four NEON registers; wider than most splats, so a row is one step."""
 
 _FLOATS = ir.VectorType(ir.FloatType(), LANES)
 _INTS = ir.VectorType(ir.IntType(32), LANES)
@@ -67,7 +67,7 @@ def _broadcast(builder, value, vector):
 
 @intrinsic
 def splat(typingctx, value):
-    """All lanes equal to a float32."""
+    """Broadcast a float32 to all lanes."""
 
     def codegen(context, builder, signature, args):
         return _broadcast(builder, context.cast(builder, args[0], signature.args[0], types.float32), _FLOATS)
@@ -77,7 +77,7 @@ def splat(typingctx, value):
 
 @intrinsic
 def splat_i(typingctx, value):
-    """All lanes equal to an int32."""
+    """Broadcast an int32 to all lanes."""
 
     def codegen(context, builder, signature, args):
         return _broadcast(builder, args[0], _INTS)
@@ -87,7 +87,7 @@ def splat_i(typingctx, value):
 
 @intrinsic
 def ramp(typingctx, start):
-    """Lanes start, start + 1, ..., start + LANES - 1."""
+    """Return the lanes start, start + 1, ..., start + LANES - 1."""
 
     def codegen(context, builder, signature, args):
         steps = ir.Constant(_FLOATS, [float(i) for i in range(LANES)])
@@ -104,7 +104,7 @@ def _address(context, builder, array_type, array, index, vector):
 
 @intrinsic
 def load(typingctx, array, index):
-    """LANES neighbors of a contiguous float32 array, from `index` on; no bounds check."""
+    """Load LANES consecutive elements of a contiguous float32 array, from `index` on; no bounds check."""
 
     def codegen(context, builder, signature, args):
         pointer = _address(context, builder, signature.args[0], args[0], args[1], _FLOATS)
@@ -115,7 +115,7 @@ def load(typingctx, array, index):
 
 @intrinsic
 def spread(typingctx, array, index):
-    """All lanes equal to element `index` of a contiguous float32 array; no bounds check."""
+    """Broadcast element `index` of a contiguous float32 array to all lanes; no bounds check."""
 
     def codegen(context, builder, signature, args):
         view = context.make_array(signature.args[0])(context, builder, args[0])
@@ -126,7 +126,7 @@ def spread(typingctx, array, index):
 
 @intrinsic
 def load_i(typingctx, array, index):
-    """LANES neighbors of a contiguous int32 array, from `index` on; no bounds check."""
+    """Load LANES consecutive elements of a contiguous int32 array, from `index` on; no bounds check."""
 
     def codegen(context, builder, signature, args):
         pointer = _address(context, builder, signature.args[0], args[0], args[1], _INTS)
@@ -137,7 +137,7 @@ def load_i(typingctx, array, index):
 
 @intrinsic
 def store(typingctx, array, index, value):
-    """Write LANES neighbors of a contiguous float32 or int32 array, from `index` on; no bounds check."""
+    """Store to LANES consecutive elements of a contiguous float32 or int32 array, from `index` on; no bounds check."""
 
     def codegen(context, builder, signature, args):
         pointer = _address(context, builder, signature.args[0], args[0], args[1], signature.args[2].vector)
@@ -183,7 +183,7 @@ for _symbol, _implementation in (
 
 @intrinsic
 def at_least(typingctx, a, b):
-    """a >= b, lane by lane (false for NaN)."""
+    """Return a >= b, lane by lane (false for NaN)."""
 
     def codegen(context, builder, signature, args):
         return builder.fcmp_ordered(">=", args[0], args[1])
@@ -193,7 +193,7 @@ def at_least(typingctx, a, b):
 
 @intrinsic
 def above(typingctx, a, b):
-    """a > b, lane by lane (false for NaN)."""
+    """Return a > b, lane by lane (false for NaN)."""
 
     def codegen(context, builder, signature, args):
         return builder.fcmp_ordered(">", args[0], args[1])
@@ -203,7 +203,7 @@ def above(typingctx, a, b):
 
 @intrinsic
 def equal_i(typingctx, a, b):
-    """a == b for integer lanes."""
+    """Return a == b for integer lanes."""
 
     def codegen(context, builder, signature, args):
         return builder.icmp_signed("==", args[0], args[1])
@@ -213,7 +213,7 @@ def equal_i(typingctx, a, b):
 
 @intrinsic
 def both(typingctx, a, b):
-    """Logical and of two masks."""
+    """Return the logical and of two masks."""
 
     def codegen(context, builder, signature, args):
         return builder.and_(args[0], args[1])
@@ -223,7 +223,7 @@ def both(typingctx, a, b):
 
 @intrinsic
 def either(typingctx, a, b):
-    """Logical or of two masks."""
+    """Return the logical or of two masks."""
 
     def codegen(context, builder, signature, args):
         return builder.or_(args[0], args[1])
@@ -233,7 +233,7 @@ def either(typingctx, a, b):
 
 @intrinsic
 def where(typingctx, mask, a, b):
-    """a where the mask holds, else b."""
+    """Select a where the mask is true, otherwise b."""
 
     def codegen(context, builder, signature, args):
         return builder.select(args[0], args[1], args[2])
@@ -243,7 +243,7 @@ def where(typingctx, mask, a, b):
 
 @intrinsic
 def where_i(typingctx, mask, a, b):
-    """Integer lanes: a where the mask holds, else b."""
+    """Select a where the mask is true, otherwise b, for integer lanes."""
 
     def codegen(context, builder, signature, args):
         return builder.select(args[0], args[1], args[2])
@@ -253,7 +253,7 @@ def where_i(typingctx, mask, a, b):
 
 @intrinsic
 def keep(typingctx, mask, a):
-    """a where the mask holds, else 0."""
+    """Select a where the mask is true, otherwise 0."""
 
     def codegen(context, builder, signature, args):
         return builder.select(args[0], args[1], _constant(0.0))
@@ -263,7 +263,7 @@ def keep(typingctx, mask, a):
 
 @intrinsic
 def any_lane(typingctx, mask):
-    """Whether the mask holds in some lane."""
+    """Return whether the mask is true in any lane."""
 
     def codegen(context, builder, signature, args):
         bits = builder.bitcast(args[0], ir.IntType(LANES))
@@ -289,7 +289,7 @@ maximum = _minmax(">")
 
 @intrinsic
 def sqrt(typingctx, a):
-    """Square root of every lane."""
+    """Return the square root of each lane."""
 
     def codegen(context, builder, signature, args):
         kind = ir.FunctionType(_FLOATS, [_FLOATS])
@@ -301,7 +301,7 @@ def sqrt(typingctx, a):
 
 @intrinsic
 def truncate(typingctx, a):
-    """Lanes as int32, rounded towards 0."""
+    """Convert the lanes to int32, rounded towards 0."""
 
     def codegen(context, builder, signature, args):
         return builder.fptosi(args[0], _INTS)
@@ -311,7 +311,7 @@ def truncate(typingctx, a):
 
 @intrinsic
 def total(typingctx, a):
-    """Sum of the lanes as a float32, in a fixed tree order."""
+    """Return the sum of the lanes as a float32, in a fixed tree order."""
 
     def codegen(context, builder, signature, args):
         value = args[0]
@@ -327,13 +327,13 @@ def total(typingctx, a):
 
 @intrinsic
 def totals(typingctx, sums):
-    """Lane i: the sum of the lanes of sums[i], for a tuple of up to LANES; in a fixed tree order."""
+    """Return a vector whose lane i is the sum of the lanes of sums[i] (up to LANES), in a fixed tree order."""
     if not isinstance(sums, types.UniTuple) or sums.count > LANES:
         return None
 
     def codegen(context, builder, signature, args):
         rows = [builder.extract_value(args[0], i) for i in range(sums.count)]
-        # Each round adds the two halves of every block of lanes and lays a pair of vectors side by side.
+        # Each round adds the two halves of each block of lanes and combines pairs of vectors into one.
         half = LANES // 2
         while half:
             sides = [block + side * LANES for block in range(0, LANES, 2 * half) for side in (0, 1)]
@@ -357,12 +357,12 @@ _EXP2 = (1.3276461277e-3, 9.6755411419e-3, 5.5507133056e-2, 2.4022119729e-1, 6.9
 
 @intrinsic
 def exp2(typingctx, a):
-    """2**a for a in [-126, 127]; smaller a are taken as -126. Relative error below 3e-7."""
+    """Return 2**a for a in [-126, 127]; smaller a are clamped to -126. Relative error below 3e-7."""
 
     def codegen(context, builder, signature, args):
         low = _constant(-126.0)
         x = builder.select(builder.fcmp_ordered(">", args[0], low), args[0], low)
-        # Adding 1.5 * 2**23 leaves round(x) in the low bits of the significand.
+        # After adding 1.5 * 2**23, the low bits of the significand are round(x).
         magic = _constant(12582912.0)
         shifted = builder.fadd(x, magic)
         fraction = builder.fsub(x, builder.fsub(shifted, magic))

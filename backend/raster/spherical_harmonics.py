@@ -36,7 +36,7 @@ def sh_basis(x, y, z, count, out):
 
 @kernel()
 def sh_gradient(x, y, z, count, g):
-    """Gradient of sum_k g[k] Y_k(x, y, z) with respect to the direction, before its normalization."""
+    """Return the gradient of sum_k g[k] Y_k(x, y, z) with respect to the direction, before its normalization."""
     gx = gy = gz = 0.0
     if count > 1:
         gy -= C1 * g[1]

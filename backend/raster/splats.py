@@ -1,15 +1,15 @@
-"""Projecting a 3D Gaussian or disc to its screen splat, and the gradient; for the CPU and the GPU.
+"""Projection of a 3D Gaussian or disc to a screen splat, and its gradient, for the CPU and the GPU.
 
-3D Gaussians follow EWA splatting (Zwicker et al. 2001). A screen splat is stored such that no terms cancel within a
-pixel row: with the projected covariance [[a, b], [b, c]] (low-pass filter included) and dy = y - v,
+3D Gaussians follow EWA splatting (Zwicker et al. 2001). A screen splat is stored in a form without cancellation within
+a pixel row: with the projected covariance [[a, b], [b, c]] (including the low-pass filter) and dy = y - v,
 
     log2 alpha(x, y) = lop - A (x - u - s dy)^2 - C dy^2,
     s = b / c,  A = k / (a - b^2 / c),  C = k / c,  k = log2(e) / 2,
 
-which equals the usual quadratic form but stays exact for long diagonal needles. The ridge x = u + s dy is stored by
-its column U in the image row nearest to v, so that a needle whose center is far away keeps its position. Inputs and
-outputs are float32. The arithmetic between them is float64, because this stage takes a small fraction of the time and
-determinants underflow here; conversions are explicit, as float() of a float32 is a float32 in a kernel.
+which equals the usual quadratic form but remains accurate for long diagonal needles. The ridge x = u + s dy is stored
+as its column U in the image row nearest to v, so that a needle whose center is far away keeps its position. Inputs and
+outputs are float32. Intermediate computations are float64, because this stage takes a small fraction of the time and
+determinants would underflow; conversions are explicit, as float() of a float32 is a float32 in a kernel.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ U, V, SLOPE, A, C, LOP, RED, GREEN, BLUE, DEPTH, HALF_W, HALF_H = range(12)
 SPLAT_COLUMNS = 12
 # Columns of a gradient row: moments of dL/d(log2 alpha) over the splat's pixels, then color and depth.
 M0, MY, MYY, MX, MXY, MXX, G_RED, G_GREEN, G_BLUE, G_DEPTH = range(10)
-# Discs: all moments but the first are of the pixels in the plane, over Q^2; then moments of dL/dQ there, moments of
-# dL/d(log2 alpha) in the spot and, where requested, the normal's gradient.
+# For discs, all moments except the first are over the pixels where the plane is drawn, divided by Q^2; they are
+# followed by moments of dL/dQ there, moments of dL/d(log2 alpha) in the spot and, if requested, the normal's gradient.
 MQ, MQX, MQY, MSX, MSY = range(10, 15)
 G_NORMAL = 16
-GRADIENT_COLUMNS = 16  # the rest pads a row to one cache line, written as one vector
+GRADIENT_COLUMNS = 16  # Padded to one cache line, which is written as one vector.
 
-_MAX_COLOR = 3e38  # what float32 holds
+_MAX_COLOR = 3e38  # Within the range of float32.
 
 _HALF_LOG2E = 0.5 / math.log(2.0)
 _LN2 = math.log(2.0)
@@ -71,7 +71,7 @@ def _rotation(qw, qx, qy, qz, R):
 
 @kernel()
 def _jacobian(px, py, pz, fx, fy, tan_limits, T, W):
-    """T = J W, with the ray's tangents clamped so that the footprints of distant off-screen splats stay bounded."""
+    """Compute T = J W, with clamped tangents of the ray, to bound the footprints of distant off-screen splats."""
     tx = min(max(px / pz, tan_limits[0]), tan_limits[1])
     ty = min(max(py / pz, tan_limits[2]), tan_limits[3])
     for i in range(3):
@@ -82,7 +82,7 @@ def _jacobian(px, py, pz, fx, fy, tan_limits, T, W):
 
 @kernel()
 def _footprint(T, R, scales, n, V0, V1):
-    """V = T R diag(scales[n]) as its two rows; returns a, b, c of V V^T + blur and a - b^2 / c."""
+    """Compute V = T R diag(scales[n]) as its two rows; returns a, b, c of V V^T + blur and a - b^2 / c."""
     a = 0.0
     b = 0.0
     c = 0.0
@@ -93,7 +93,8 @@ def _footprint(T, R, scales, n, V0, V1):
         a += V0[j] * V0[j]
         b += V0[j] * V1[j]
         c += V1[j] * V1[j]
-    # The determinant of V V^T is the squared area that V's rows span; a c - b^2 would cancel for diagonal needles.
+    # The determinant of V V^T is the squared area of the parallelogram spanned by V's rows; a c - b^2 would cancel for
+    # diagonal needles.
     x = V0[1] * V1[2] - V0[2] * V1[1]
     y = V0[2] * V1[0] - V0[0] * V1[2]
     z = V0[0] * V1[1] - V0[1] * V1[0]
@@ -103,7 +104,7 @@ def _footprint(T, R, scales, n, V0, V1):
 
 @kernel()
 def tangent_limits(fx, fy, cx, cy, left, top, right, bottom):
-    """Limits of x/z and y/z: the field of view of the whole image with a margin on every side."""
+    """Return the limits of x/z and y/z: the field of view of the whole image with a margin on each side."""
     limits = np.empty(4)
     across, down = TAN_MARGIN * 0.5 * (right - left), TAN_MARGIN * 0.5 * (bottom - top)
     limits[0] = (left - across - cx) / fx
@@ -114,11 +115,11 @@ def tangent_limits(fx, fy, cx, cy, left, top, right, bottom):
 
 
 def view_of(camera: Camera, flat: bool) -> np.ndarray:
-    """The camera as the projection kernels take it.
+    """Return the camera in the format of the projection kernels.
 
     Args:
         camera: the camera.
-        flat: for discs, whose projection is not clamped.
+        flat: whether the primitives are discs, whose projection is not clamped.
 
     Returns:
         (6, 4) float64: three rows of the world-to-camera matrix; fx, fy, cx, cy; the limits of x/z and y/z; the
@@ -138,7 +139,7 @@ def project_splat(
 ):  # fmt: skip
     """Write row n of `splats`; HALF_H < 0 marks a splat that is not visible. Arrays as in `project`.
 
-    Scratch space: R (3, 3), T (2, 3), V0 and V1 (3,), basis (16,), float64.
+    Temporary arrays: R (3, 3), T (2, 3), V0 and V1 (3,), basis (16,), float64.
     """
     fx, fy, cx, cy = view[3, 0], view[3, 1], view[3, 2], view[3, 3]
     near = view[5, 3]
@@ -212,7 +213,7 @@ def project_splat(
         tilts[n, NORMAL_X] = nx
         tilts[n, NORMAL_Y] = ny
         tilts[n, NORMAL_Z] = nz
-    # Written such that a NaN or an infinity fails every test.
+    # The tests are false for NaN and Inf.
     if not (
         middle_u + half_w > 0.0 and middle_u - half_w < width and middle_v + half_h > 0.0 and middle_v - half_h < height
     ):
@@ -244,7 +245,7 @@ def project_splat(
 
 @kernel(inline=True)
 def no_gradient(n, g_means, g_quats, g_scales, g_opacities, g_sh, g_screen):
-    """Zero the gradients of splat n."""
+    """Set the gradients of splat n to 0."""
     for i in range(3):
         g_means[n, i] = 0.0
         g_scales[n, i] = 0.0
@@ -264,7 +265,7 @@ def project_splat_backward(
 ):  # fmt: skip
     """Propagate g, the sum of splat n's gradient rows in float64, to the gradients of its parameters.
 
-    Arguments as in `project_backward`; scratch space as in `project_splat`, and gR (3, 3), gT (2, 3), weights (16,),
+    Arguments as in `project_backward`; temporary arrays as in `project_splat`, and gR (3, 3), gT (2, 3), weights (16,),
     g_color (3,).
     """
     fx, fy = view[3, 0], view[3, 1]
@@ -317,8 +318,8 @@ def project_splat_backward(
     g_screen[n, 1] = g_v
     g_opacities[n] = g[M0] / (_LN2 * np.float64(opacities[n]))
 
-    # Covariance to V = T R diag(scale), then to its three factors. The conditional variance's gradient is along
-    # V0 - slope V1; split into a, b and c it would cancel for needles.
+    # From the covariance to V = T R diag(scale), then to its three factors. The gradient of the conditional variance is
+    # along V0 - slope V1; split into a, b and c, it would cancel for needles.
     for i in range(2):
         for j in range(3):
             gT[i, j] = 0.0
@@ -348,7 +349,7 @@ def project_splat_backward(
         for i in range(3):
             gR[i, 2] = side * (view[0, i] * gn_x + view[1, i] * gn_y + view[2, i] * gn_z)
 
-    # Quaternion, tangent to the unit sphere.
+    # Gradient of the quaternion, tangent to the unit sphere.
     gw = 2.0 * (qz * (gR[1, 0] - gR[0, 1]) + qy * (gR[0, 2] - gR[2, 0]) + qx * (gR[2, 1] - gR[1, 2]))
     gx = 2.0 * (
         qy * (gR[0, 1] + gR[1, 0]) + qz * (gR[0, 2] + gR[2, 0]) + qw * (gR[2, 1] - gR[1, 2])
@@ -407,7 +408,7 @@ def project_splat_backward(
 
 
 def gradient_columns(flat: bool, with_normals: bool) -> int:
-    """Number of columns of a gradient row that are in use."""
+    """Return the number of columns of a gradient row that are in use."""
     if not flat:
         return G_DEPTH + 1
     return G_NORMAL + 3 if with_normals else MSY + 1

@@ -1,4 +1,4 @@
-"""Where a splat's ellipse ends inside a row of tiles, and the order of splats of equal depth, for CPU and GPU."""
+"""Extents of a splat's ellipse in rows of tiles, and the order of splats with equal depth, for the CPU and the GPU."""
 
 from __future__ import annotations
 
@@ -18,14 +18,17 @@ _ZERO = np.float32(0.0)
 
 @kernel()
 def _floor(x):
-    """Floor of a float32 as an integer; on a GPU, math.floor would compute in float64."""
+    """Return the floor of a float32 as an integer; on a GPU, math.floor would compute in float64."""
     whole = np.int64(x)
     return whole - 1 if np.float32(whole) > x else whole
 
 
 @kernel()
 def row_ends(splats, n, row, columns, height, tile_w, tile_h):
-    """First and last + 1 tile column that splat n's ellipse overlaps in tile row `row`; tile sizes are powers of 2."""
+    """Return the first and last + 1 tile column that splat n's ellipse overlaps in tile row `row`.
+
+    Tile sizes must be powers of 2.
+    """
     per_tile_w = _ONE / np.float32(tile_w)
     v = splats[n, V]
     anchor = min(max(v, _ZERO), np.float32(height))
@@ -54,7 +57,7 @@ def row_ends(splats, n, row, columns, height, tile_w, tile_h):
 
 @kernel()
 def tile_rows(splats, n, lines, tile_h):
-    """First and last + 1 tile row that splat n's bounding box overlaps."""
+    """Return the first and last + 1 tile row that splat n's bounding box overlaps."""
     per_tile_h = _ONE / np.float32(tile_h)
     first = max(_floor((splats[n, V] - splats[n, HALF_H]) * per_tile_h), 0)
     last = min(_floor((splats[n, V] + splats[n, HALF_H]) * per_tile_h) + 1, lines)
@@ -63,7 +66,7 @@ def tile_rows(splats, n, lines, tile_h):
 
 @kernel()
 def order_ties(splats, ids, order, first, last):
-    """Sort order[first:last] by position, shape, opacity, color and ID; a heap sort, as thousands of splats may tie."""
+    """Sort order[first:last] by position, shape, opacity, color and ID; heap sort, as thousands of splats may tie."""
     n = last - first
     for start in range(n // 2 - 1, -1, -1):
         _sift(splats, ids, order, first, start, n)

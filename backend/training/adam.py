@@ -1,7 +1,7 @@
-"""Adam on the rows that a step used, in one pass over memory.
+"""Sparse Adam: updates only the rows used in a step, in one pass over memory.
 
-A row that was not used keeps its value and moments (Mallick et al. 2024, "Taming 3DGS"), so the cost of a step depends
-on the visible anchors, not on all.
+Unused rows keep their values and moments (Mallick et al. 2024, "Taming 3DGS"), so the cost of a step depends on the
+number of visible anchors instead of all anchors.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ BETA2 = 0.999
 EPSILON = 1e-15
 
 LARGEST_GRADIENT = 1e19
-"""The square of a larger gradient overflows in exp_avg_sq, after which the number would never change again."""
+"""Gradients above this limit are rejected, since their square would overflow exp_avg_sq and freeze the parameter."""
 
 _ROWS_AT_ONCE = 100_000
-"""Rows per batch on the GPU: intermediate results take five times their memory."""
+"""Number of rows per batch on the GPU, since intermediate results take five times the memory of the rows."""
 
 
 def step_rows(
@@ -35,19 +35,19 @@ def step_rows(
     correction2: float,
     usable: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Take one step of Adam in place (Kingma and Ba 2015, algorithm 1).
+    """Perform one step of Adam in place (Kingma and Ba 2015, algorithm 1).
 
     Args:
         values: (N, D) float32.
         exp_avg, exp_avg_sq: (N, D) float32, the moments.
-        seen: (n,) int64, the rows to step, each once.
-        gradients: (n, D), of those rows.
+        seen: (n,) int64, indices of the rows to update, each once.
+        gradients: (n, D), gradients of these rows.
         rates: (D,) float32, the learning rate of each column.
         correction1, correction2: 1 - BETA1**t and 1 - BETA2**t for the step count t.
-        usable: (n,) bool, only on the GPU: the other rows are left as they are.
+        usable: (n,) bool, only on the GPU: rows for which it is False are not changed.
 
     Returns:
-        The number () int64 of usable rows that were left as they are because their gradient is not finite, or beyond
+        The number () int64 of usable rows that were not changed because their gradient is not finite or exceeds
         LARGEST_GRADIENT.
     """
     if not devices.on_gpu(values):
@@ -89,7 +89,7 @@ def _step_rows(values, exp_avg, exp_avg_sq, seen, gradients, rates, correction1,
         row = seen[i]
         usable = True
         for j in range(values.shape[1]):
-            # Written so that NaN fails.
+            # False for NaN.
             usable &= abs(gradients[i, j]) < largest
         if not usable:
             bad[i] = 1
@@ -105,7 +105,7 @@ def _step_rows(values, exp_avg, exp_avg_sq, seen, gradients, rates, correction1,
 
 
 def take_rows(values: torch.Tensor, seen: torch.Tensor) -> torch.Tensor:
-    """Gather values[seen], (n, D), of values (N, D) and seen (n,) int64."""
+    """Return values[seen], (n, D), for values (N, D) and seen (n,) int64."""
     return values[seen] if devices.on_gpu(values) else torch.from_numpy(_take_rows(values.numpy(), seen.numpy()))
 
 

@@ -1,8 +1,8 @@
-"""The running mean of the model over the latest steps.
+"""Running mean of the model over the latest steps.
 
-While learning rates are high, the model oscillates around one that is better than any single step (Polyak and Juditsky
-1992, "Acceleration of stochastic approximation by averaging"). The mean is what a training displays, evaluates and
-exports, whether finished or stopped. Decaying rates are still needed: without them, 2D splats become worse.
+While learning rates are high, the model oscillates around a mean that is better than any single step (Polyak and
+Juditsky 1992, "Acceleration of stochastic approximation by averaging"). The mean is displayed, evaluated and exported,
+for finished and for stopped trainings. Learning rate decay is still required: without it, 2D splats become worse.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
     from ..model.object_model import ObjectModel
 
 EVERY = 4
-"""Steps between two models that count, as going through all rows takes time."""
+"""Number of steps between updates of the mean, since an update of all rows takes time."""
 
 FRACTION, MAX_STEPS = 0.1, 100
-"""The mean covers this fraction of the steps so far, as early ones may be far off, and at most this number."""
+"""The mean covers this fraction of the steps so far, since early models may be far off, but at most this number."""
 
 _PREFIX = "mean."
 
 
 class Average:
-    """The running mean of the models passed to `follow`; at first `model` itself."""
+    """Running mean of the models passed to `follow`; initially a copy of `model`."""
 
     def __init__(self, model: ObjectModel) -> None:
         self._rows = model.anchors.rows.clone()
@@ -36,7 +36,7 @@ class Average:
         self._background = model.background.detach().clone()
 
     def follow(self, model: ObjectModel, step: int) -> None:
-        """Include the model after a step, if the step counts."""
+        """Update the mean with the model after `step`; does nothing in most steps (see EVERY)."""
         if step % EVERY:
             return
         weight = EVERY / max(min(FRACTION * step, MAX_STEPS), EVERY)
@@ -46,24 +46,26 @@ class Average:
             mean.lerp_(parameter.detach(), weight)
 
     def take(self, kept: torch.Tensor, new: torch.Tensor) -> None:
-        """Follow a change of the anchors: keep the rows `kept` (a mask, or indices), then append `new` (n, columns)."""
+        """Apply a change of the anchors: keep the rows `kept` (mask or indices), then append `new` (n, columns)."""
         self._rows = torch.cat([self._rows[kept], new])
 
     def of(self, model: ObjectModel) -> ObjectModel:
-        """The mean as a model; `model` is the one that it follows."""
+        """Return the mean as a model; `model` is the model in training."""
         anchors = replace(model.anchors, rows=self._rows)
         return replace(model, anchors=anchors, heads=self._heads, background=self._background)
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """The mean as tensors of a checkpoint."""
+        """Return the mean as tensors for a checkpoint."""
         heads = {f"heads.{name}": value for name, value in self._heads.state_dict().items()}
         values = {"rows": self._rows, "background": self._background, **heads}
         return {_PREFIX + name: value for name, value in values.items()}
 
     @classmethod
     def from_checkpoint(cls, tensors: Mapping[str, np.ndarray], model: ObjectModel) -> Average:
-        """The mean in a checkpoint's tensors, on the device of the model that it follows; the model itself where the
-        checkpoint is of a version without a mean."""
+        """Restore the mean from a checkpoint's tensors, on the device of `model`.
+
+        For checkpoints of versions without a mean, it is initialized with `model`.
+        """
         average = cls(model)
         found = {name.removeprefix(_PREFIX): value for name, value in tensors.items() if name.startswith(_PREFIX)}
         if not found:

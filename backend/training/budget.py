@@ -1,4 +1,4 @@
-"""How long to train: for a number of steps, for a time, or until the training has converged."""
+"""Length of a training: a number of steps, a time, or until convergence."""
 
 from __future__ import annotations
 
@@ -13,46 +13,48 @@ from ..shared.expectation import PRESET_STEPS
 from .settings import GROW_UNTIL, PLATEAU_FROM, PLATEAU_UNTIL
 
 _EVALUATIONS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)
-"""Progress at which a training of known length is evaluated."""
+"""Progress values at which a training of known length is evaluated."""
 
 _EVALUATE_AFTER, _EVALUATE_EARLY, _EVALUATE_EVERY = 100, 1.3, 1.08
-"""A training until converged is evaluated first after this number of steps, then whenever the number of steps has grown
-by a factor: the first one during the warm-up, the second one later, where the evaluations decide."""
+"""A training until convergence is evaluated for the first time after this number of steps, then whenever the number of
+steps has grown by a factor: the first one during the warm-up, the second one later, when evaluations decide on the
+end."""
 
 WARM_UP = 600
-"""Steps until the plateau of a training until converged; large scenes differ in how long they stay there. During the
-warm-up, the error falls faster than it will later. Anchors that grow sooner become more and no better."""
+"""Number of steps until the plateau of a training until convergence; the scene's size only affects the length of the
+plateau. During the warm-up, the error decreases faster than later. Earlier growth would result in more anchors, but no
+better quality."""
 
 LOOKAHEAD, WORTHWHILE_DB = 1000, 0.36
 """A training has converged when this number of further steps would gain less than this number of dB."""
 
 OCTAVES, MIN_OCTAVES = 2, 1.25
-"""The gain of further steps is extrapolated from the evaluations of the latest octaves of steps (an octave: twice the
-steps). Evaluations that span fewer octaves than the second number are not used, as their noise hides the trend."""
+"""The gain of further steps is extrapolated from the evaluations in the latest octaves of steps (an octave doubles the
+number of steps). Evaluations that span fewer octaves than the second number are too noisy for an extrapolation."""
 
 GROWTH_OCTAVES, MIN_GROWTH = 0.5, 1.01
-"""Growth ends when the number of anchors has grown by less than this factor over the latest half octave of steps: from
-then on growth only moves anchors, which takes time and disturbs the others."""
+"""Growth ends when the number of anchors has grown by less than this factor over this number of octaves of steps; from
+then on, growth would only move anchors, which takes time and disturbs the others."""
 
 DECAY_FROM = 0.9
-"""A training until converged leaves the plateau of its learning rates at this fraction of its steps, later than others:
-the model is as good on the plateau as after an earlier decay of equally many steps."""
+"""Fraction of its steps at which a training until convergence leaves the plateau of the learning rates; later than
+other trainings, since the model on the plateau is as good as after an earlier decay with equally many steps."""
 
 
 @dataclass
 class TrainingProgress:
-    """Where a training stands; saved with every checkpoint.
+    """The progress of a training; saved with each checkpoint.
 
     Attributes:
         last_growth: step of the latest growth.
         skipped: number of updates that were not finite.
         faults: number of steps for each known cause of such updates.
-        queue: views that are still to come in this pass over the training views.
-        evaluated: for a training of known length the number of evaluations so far; for one until converged the step of
-            the latest.
+        queue: remaining views of this pass over the training views.
+        evaluated: for a training of known length, the number of evaluations so far; for a training until convergence,
+            the step of the latest one.
         grown: whether growth has ended.
-        converged_at: step at which the training converged, and from which its learning rates fall; 0 before.
-        curve: for each evaluation the seconds, step, number of anchors, loss (dB) and measured quality.
+        converged_at: step at which the training converged and the learning rate decay began; 0 before.
+        curve: for each evaluation, the seconds, step, number of anchors, loss (dB) and measured quality.
     """
 
     step: int = 0
@@ -68,16 +70,16 @@ class TrainingProgress:
 
     @property
     def causes(self) -> str:
-        """The faults and their steps, most frequent first, in words."""
+        """Description of the faults and their numbers of steps, most frequent first."""
         by_count = sorted(self.faults.items(), key=lambda entry: -entry[1])
         return ", ".join(f"{what} ({count} {'step' if count == 1 else 'steps'})" for what, count in by_count)
 
 
 @dataclass(frozen=True)
 class Budget:
-    """How long to train in all: a number of steps, or of seconds, by which the schedules then go.
+    """Total length of a training, in steps or seconds, which also determines the schedules.
 
-    until_converged: train until further steps would gain little; `seconds` is then the limit, None: no limit.
+    until_converged: train until further steps would gain little; `seconds` is then a limit, None: no limit.
     """
 
     steps: int | None = None
@@ -85,11 +87,11 @@ class Budget:
     until_converged: bool = False
 
     def progress(self, p: TrainingProgress) -> float:
-        """The progress that learning rates, growth and resolution follow.
+        """Return the progress that determines learning rates, growth and resolution.
 
         Returns:
-            0 .. 1. A training until converged stays on the plateau until `check_convergence` ends it: first where
-            anchors grow, then where they do not.
+            0 .. 1. A training until convergence stays at a progress on the plateau until `check_convergence` ends it,
+            first with growth, then without.
         """
         if self.until_converged:
             if not p.converged_at and p.step < WARM_UP:
@@ -104,14 +106,14 @@ class Budget:
         return min(p.seconds / self.seconds, 1.0)
 
     def remaining(self, p: TrainingProgress, pace: float) -> float | None:
-        """Estimate the seconds left.
+        """Estimate the remaining seconds.
 
         Args:
-            p: the training.
+            p: the progress of the training.
             pace: seconds per step.
 
         Returns:
-            None as long as the end of a training until converged cannot be estimated.
+            The seconds; None as long as the end of a training until convergence cannot be estimated.
         """
         if self.until_converged:
             end = expected_end(p)
@@ -124,8 +126,11 @@ class Budget:
         return max(self.seconds - p.seconds, 0.0)
 
     def displayed_progress(self, p: TrainingProgress) -> float:
-        """The progress to display, 0 .. 1: for a training until converged the fraction of the expected steps, where
-        `LOOKAHEAD` further steps are expected as long as there is no estimate."""
+        """Return the progress to display, 0 .. 1.
+
+        For a training until convergence, this is the fraction of the expected number of steps; as long as there is no
+        estimate, `LOOKAHEAD` further steps are expected.
+        """
         progress = self.progress(p)
         if not self.until_converged or progress >= 1.0:
             return progress
@@ -134,11 +139,11 @@ class Budget:
         return steps if self.seconds is None else min(max(steps, p.seconds / self.seconds), 1.0)
 
     def begin(self, p: TrainingProgress) -> None:
-        """Take over a training that may have been begun under another budget."""
+        """Initialize `p` for this budget; the training may have been started with a different one."""
         p.evaluated = p.step if self.until_converged else bisect_right(_EVALUATIONS, self.progress(p))
 
     def evaluation_is_due(self, p: TrainingProgress) -> bool:
-        """Whether it is time to evaluate; true once for each evaluation."""
+        """Return whether an evaluation is due, and mark it as done."""
         progress = self.progress(p)
         if self.until_converged:
             factor = _EVALUATE_EARLY if p.step < WARM_UP else _EVALUATE_EVERY
@@ -152,7 +157,7 @@ class Budget:
         return due
 
     def check_convergence(self, p: TrainingProgress) -> bool:
-        """End growth once it has ceased, and the plateau once the training has converged or time runs out.
+        """End growth if it has ceased, and end the plateau if the training has converged or the time limit requires it.
 
         Returns:
             Whether the plateau ends now.
@@ -167,14 +172,14 @@ class Budget:
         return True
 
     def _out_of_time(self, p: TrainingProgress) -> bool:
-        """Whether the plateau has to end now for the training to end in time."""
+        """Return whether the plateau must end now so that the training ends within the time limit."""
         if self.seconds is None or p.converged_at or not p.step:
             return False
         return p.seconds >= DECAY_FROM * self.seconds
 
 
 def expected_end(p: TrainingProgress) -> float | None:
-    """The number of steps after which a training until converged will end; None as long as there is no estimate."""
+    """Estimate the total number of steps of a training until convergence; None as long as there is no estimate."""
     if p.converged_at:
         return p.converged_at / DECAY_FROM
     converged = convergence_step(p.curve)
@@ -184,21 +189,21 @@ def expected_end(p: TrainingProgress) -> float | None:
 def convergence_step(curve: list[dict[str, Any]]) -> float | None:
     """Extrapolate the step from which on `LOOKAHEAD` further steps gain less than `WORTHWHILE_DB`.
 
-    An octave of steps is assumed to gain as many dB as it did of late, so that the step is the n with
+    Assuming that further octaves of steps gain as many dB as the latest ones, it is the step n for which
     octave * log2(1 + LOOKAHEAD / n) = WORTHWHILE_DB.
 
     Returns:
-        0 where an octave gains nothing; None where the curve is too short to tell.
+        The step; 0 if an octave gains nothing, None if the curve is too short for an estimate.
     """
     octave = _gain_per_octave(curve)
     if octave is None:
         return None
-    # An octave that gains next to nothing is one that gains nothing.
+    # Treat a negligible gain as none.
     return LOOKAHEAD / (2 ** (WORTHWHILE_DB / octave) - 1) if octave > WORTHWHILE_DB / 100 else 0.0
 
 
 def _growth_has_ceased(curve: list[dict[str, Any]]) -> bool:
-    """Whether the number of anchors hardly grows. Curves of older trainings may not contain it."""
+    """Return whether the number of anchors has stopped growing; curves of older trainings may not contain it."""
     counted = [(entry["step"], entry["anchors"]) for entry in curve if "anchors" in entry]
     last, now = counted[-1] if counted else (0, 0)
     before = [anchors for step, anchors in counted if WARM_UP <= step <= last / 2**GROWTH_OCTAVES]
@@ -206,8 +211,10 @@ def _growth_has_ceased(curve: list[dict[str, Any]]) -> bool:
 
 
 def _gain_per_octave(curve: list[dict[str, Any]]) -> float | None:
-    """The dB by which quality rises in twice the steps, as it rises with their logarithm: PSNR on held-out views or,
-    where there are none, the loss. None where the curve is too short to tell."""
+    """Return the quality gain in dB per doubling of the number of steps; None if the curve is too short.
+
+    The quality is the PSNR on held-out views or, if there are none, the loss in dB.
+    """
     last = curve[-1]["step"] if curve else 0
     recent = [entry for entry in curve if entry["step"] >= max(WARM_UP, last / 2**OCTAVES)]
     key = "psnr" if all(entry.get("psnr") is not None for entry in recent) else "loss_db"
@@ -216,9 +223,9 @@ def _gain_per_octave(curve: list[dict[str, Any]]) -> float | None:
         return None
     octaves, quality = np.array(found).T
     first, second = np.triu_indices(len(found), 1)
-    # The median of the slopes between any two evaluations (Theil and Sen), robust against single bad ones.
+    # The median of the slopes between all pairs of evaluations (Theil-Sen estimator) is robust against outliers.
     return float(np.median((quality[second] - quality[first]) / (octaves[second] - octaves[first])))
 
 
 PRESETS = {**{name: Budget(steps=steps) for name, steps in PRESET_STEPS.items()}, "final": Budget(until_converged=True)}
-"""Lengths by name."""
+"""Budgets by name."""

@@ -1,4 +1,4 @@
-"""Find the numbers at fault where a loss or a gradient is not finite, once a cheap check has failed."""
+"""Diagnosis of non-finite losses and gradients: finds the values that cause them, after a cheap check has failed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..raster import devices
 from .adam import LARGEST_GRADIENT
 
 BRIGHTEST = 1e9
-"""Larger colors are at fault, as their squares overflow in SSIM."""
+"""Larger colors are reported as faults, since their squares overflow in SSIM."""
 
 _COLUMNS = {
     "offsets": ("offset_columns", 3),
@@ -23,17 +23,17 @@ _COLUMNS = {
     "scales and rotations": ("shape_columns", 7),
     "colors": ("color_columns", 3),
 }
-"""The parts of an anchor's row: their columns, and the number of columns per splat (0: shared by all)."""
+"""The parts of an anchor's row: their columns, and the number of columns per splat (0: shared by all splats)."""
 
 
 class Fault(NamedTuple):
-    """Numbers that are not finite.
+    """Values that are not finite.
 
     Attributes:
         what: "the label loss", "the gradient of the offsets", ...
-        anchors: (n,) int64, the anchors at fault, where they are known.
-        splat: which splat of the first of them, where it is known.
-        unrecoverable: (m,) int64, the anchors whose values, and not only gradients, are at fault.
+        anchors: (n,) int64, the affected anchors, if known.
+        splat: index of the affected splat of the first anchor, if known.
+        unrecoverable: (m,) int64, the anchors with non-finite parameters, not only gradients.
     """
 
     what: str
@@ -42,7 +42,7 @@ class Fault(NamedTuple):
     unrecoverable: torch.Tensor
 
     def sentence(self, step: int, view: str, owner: str | None) -> str:
-        """The warning for the user; owner: the name of the first anchor's object."""
+        """Return a warning for the user; owner: the name of the first anchor's object."""
         first = f"Step {step}, {view}: {self.what} is not finite"
         if not len(self.anchors):
             return f"{first}; the update was skipped."
@@ -56,13 +56,13 @@ class Fault(NamedTuple):
 
 
 def find_fault_of_loss(terms: Mapping[str, torch.Tensor], g: Generated, seen: torch.Tensor, offsets: int) -> Fault:
-    """Find why the sum of a loss's terms is not finite.
+    """Find the cause of a non-finite loss.
 
     Args:
-        terms: the terms () by name.
-        g: the splats that were rendered.
+        terms: the terms () of the loss by name.
+        g: the rendered splats.
         seen: (n,) int64, their anchors.
-        offsets: splats per anchor.
+        offsets: number of splats per anchor.
     """
     named = [name for name, value in terms.items() if not value.isfinite()]
     numbers = torch.cat([g.means, g.quats, g.scales, g.opacities[:, None]], 1).detach()
@@ -80,8 +80,7 @@ def find_fault_of_loss(terms: Mapping[str, torch.Tensor], g: Generated, seen: to
 def find_fault_of_rows(
     gradients: torch.Tensor, values: torch.Tensor, seen: torch.Tensor, layout: Layout
 ) -> Fault | None:
-    """Find the gradients (n, columns) that cannot be used, of the anchors `seen` (n,) with the rows `values`
-    (n, columns)."""
+    """Find unusable gradients (n, columns) of the anchors `seen` (n,), whose rows are `values` (n, columns)."""
     bad = ~(gradients.abs() < LARGEST_GRADIENT)
     anchors = seen[bad.any(1)]
     if not len(anchors):
@@ -99,7 +98,7 @@ def find_fault_of_rows(
 
 
 def find_fault_of_heads(gradients: Mapping[str, list[torch.Tensor]]) -> Fault | None:
-    """Find a head whose gradients are not finite, by the heads' names."""
+    """Find a head with non-finite gradients; `gradients` are by the heads' names."""
     for name, parts in gradients.items():
         if not all(part.isfinite().all() for part in parts):
             none = torch.empty(0, dtype=torch.int64)
@@ -109,10 +108,10 @@ def find_fault_of_heads(gradients: Mapping[str, list[torch.Tensor]]) -> Fault | 
 
 
 class FiniteCheck:
-    """Counts updates that were skipped because a loss or gradient was not finite, and keeps the latest fault.
+    """Counter of updates that were skipped because a loss or gradient was not finite, with the latest fault.
 
-    On the CPU each step's numbers are checked at once. On a GPU that would wait for the device, so there it is done
-    only while updates are being skipped, which `watch` finds out now and then.
+    On the CPU, each step is checked immediately. On a GPU this would require synchronization, so it is done only while
+    updates are being skipped, as detected by occasional calls of `watch`.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -124,21 +123,24 @@ class FiniteCheck:
 
     @property
     def at_once(self) -> bool:
-        """Whether each step's numbers are checked before the next step."""
+        """Whether each step is checked before the next step."""
         return self._closely or not self._on_gpu
 
     def watch(self) -> None:
-        """Check at once from now on if updates were skipped since the last call. Waits for the GPU."""
+        """Enable immediate checks if updates were skipped since the last call, otherwise disable them on a GPU.
+
+        Synchronizes with the GPU.
+        """
         skipped = int(self.skipped)
         self._closely, self._noticed = skipped > self._noticed, skipped
 
     def take_fault(self) -> Fault | None:
-        """The latest fault, once."""
+        """Return the latest fault and clear it."""
         fault, self.fault = self.fault, None
         return fault
 
     def take_skipped(self) -> int:
-        """The number of skipped updates since the last call. Waits for the GPU."""
+        """Return the number of skipped updates since the last call; synchronizes with the GPU."""
         skipped = int(self.skipped)
         self.skipped.zero_()
         self._noticed = 0

@@ -1,8 +1,8 @@
-"""Measure the gain of each image, for cameras with automatic exposure and white balance.
+"""Estimation of the gain of each image, for cameras with automatic exposure and white balance.
 
-COLMAP observes its points in many images. Image i shows point p as gain_i * color_p, channel by channel; gains and
-colors are estimated alternately, as medians and means. Training then compares the splats with images of one common
-exposure.
+COLMAP's points are observed in several images. In each channel, image i shows point p with the color gain_i * color_p;
+gains and colors are estimated alternately, as medians and means. In training, the splats are compared with images at a
+common exposure.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ..capture import Capture
 
 VARIES_FROM = 0.02
-"""The exposure varies if the standard deviation of the log gains exceeds this."""
+"""Standard deviation of the log gains above which the exposure is considered to vary."""
 
 _ROUNDS = 10
 _MIN_OBSERVATIONS = 30
@@ -23,14 +23,14 @@ _LIMIT = 4.0
 
 
 def measure_gains(capture: Capture) -> np.ndarray:
-    """Measure the gains of all views from the training views alone.
+    """Estimate the gains of all views from the training views alone.
 
-    A held-out view's gain is interpolated between the training views of the same camera before and after it, in the
-    order of their names.
+    The gain of a held-out view is interpolated between the preceding and the following training view of the same
+    camera, in the order of their names.
 
     Returns:
         (V, 3) float64 in display space, with a geometric mean of 1 over the training views; 1 for views with too few
-        points, or without such neighbors.
+        points or without such neighbors.
 
     Raises:
         InputError: an image cannot be read.
@@ -66,18 +66,20 @@ def measure_gains(capture: Capture) -> np.ndarray:
 
 
 def differences(gains: np.ndarray) -> float:
-    """The largest standard deviation, over the channels, of the logarithms of the gains (V, 3)."""
+    """Return the largest standard deviation, over the channels, of the logarithms of the gains (V, 3)."""
     return float(np.log(gains).std(0).max())
 
 
 def varies(gains: np.ndarray) -> bool:
-    """Whether the gains (V, 3) differ by enough to be compensated."""
+    """Return whether the gains (V, 3) differ enough to be compensated."""
     return differences(gains) > VARIES_FROM
 
 
 def _ratio(colors: np.ndarray, model: np.ndarray) -> np.ndarray:
-    """The ratio (3,) of the colors (n, 3) to the model's (n, 3): the median over the points, weighted by the model's
-    color, and so robust against points at edges or on shiny surfaces."""
+    """Estimate the ratio (3,) of colors (n, 3) to the model's colors (n, 3).
+
+    The median over the points, weighted by the model's color, is robust against points at edges or on shiny surfaces.
+    """
     found = np.ones(3)
     for c in range(3):
         lit = model[:, c] > 0
@@ -89,7 +91,7 @@ def _ratio(colors: np.ndarray, model: np.ndarray) -> np.ndarray:
 
 
 def _observations(capture: Capture, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """The points observed in a view: their indices (n,) and colors (n, 3) in [0, 1], the mean of 3 x 3 pixels."""
+    """Return the points observed in a view: indices (n,), and colors (n, 3) in [0, 1], averaged over 3 x 3 pixels."""
     keypoints = capture.keypoints(index)
     pixels = capture.image(index)
     height, width = pixels.shape[:2]

@@ -1,4 +1,4 @@
-"""When anchors are grown and pruned during training, and on what evidence (Scaffold-GS section 3.3)."""
+"""Schedule and statistics of the growing and pruning of anchors in training (Scaffold-GS section 3.3)."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class ViewStatistics(NamedTuple):
     Attributes:
         anchors: (n,) int64, the anchors in view.
         source: (S,) int64, for each splat the index of its anchor in `anchors` * offsets + its offset.
-        opacities: (S,) of the splats.
-        drawn: (S,) bool, the splats that touch the image.
-        screen_gradient: (S, 2), the gradient of the loss by the splats' position on the screen, per pixel.
+        opacities: (S,), opacities of the splats.
+        drawn: (S,) bool, the splats that overlap the image.
+        screen_gradient: (S, 2), gradient of the loss with respect to the splats' centers in pixels.
     """
 
     anchors: torch.Tensor
@@ -32,8 +32,10 @@ class ViewStatistics(NamedTuple):
 
     @classmethod
     def together(cls, parts: Sequence[ViewStatistics], offsets: int) -> ViewStatistics:
-        """The parts of an image as one, on the GPU: a splat that touches several of them counts once, and its gradient
-        is the sum of theirs."""
+        """Merge the statistics of the parts of an image, on the GPU.
+
+        A splat that overlaps several parts counts once; its gradients are summed.
+        """
         anchors = torch.cat([part.anchors for part in parts]).unique()
         opacities = parts[0].opacities.new_zeros((len(anchors), offsets))
         drawn, gradient = torch.zeros_like(opacities, dtype=torch.bool), opacities.new_zeros((len(anchors), offsets, 2))
@@ -47,14 +49,14 @@ class ViewStatistics(NamedTuple):
 
 
 class GrowthStrategy:
-    """Gathers statistics of the views that are trained on, and grows and prunes anchors at regular steps."""
+    """Accumulates statistics of the training views, and grows and prunes anchors at intervals."""
 
     def __init__(self, settings: Settings, model: ObjectModel) -> None:
         self._settings = settings
         self.statistics = self._cleared(model)
 
     def observes(self, progress: float) -> bool:
-        """Whether views at this progress of the training, 0 .. 1, count for growth; they do so before it begins."""
+        """Return whether statistics are accumulated at this progress, 0 .. 1; this starts before growth."""
         return GROW_FROM / 2 <= progress < GROW_UNTIL
 
     def observe(
@@ -63,9 +65,11 @@ class GrowthStrategy:
         """Add the statistics of a view.
 
         Args:
-            parts: of the image of width x height pixels, which may be rendered in several.
-            offsets: splats of an anchor.
-            usable: (n,) bool, on the GPU, where the image is rendered as a whole: the other anchors do not count.
+            parts: statistics of the parts in which the image was rendered.
+            offsets: number of splats per anchor.
+            width, height: size of the whole image in pixels.
+            usable: (n,) bool, on the GPU, if the image is rendered in one part: anchors for which it is False are
+                ignored.
         """
         if not parts:
             return
@@ -77,18 +81,18 @@ class GrowthStrategy:
         )  # fmt: skip
 
     def is_due(self, progress: float, step: int, last_growth: int) -> bool:
-        """Whether anchors are to be grown after `step`; last_growth: the step after which they were last."""
+        """Return whether growth is due after `step`; last_growth: the step of the latest growth."""
         return progress >= GROW_FROM and step - last_growth >= growth_interval(step)
 
     def grow(self, model: ObjectModel, rng: np.random.Generator) -> Growth:
-        """Grow and prune the model's anchors in place by the statistics so far."""
+        """Grow and prune the model's anchors in place, based on the accumulated statistics."""
         anchors = model.anchors
         growth = grow_and_prune(anchors, self.statistics, rng, max_anchors=self._settings.max_anchors)
         self.statistics = self.statistics.after(growth, anchors.layout.offsets)
         return growth
 
     def clear(self, model: ObjectModel) -> None:
-        """Forget the statistics, for a model whose anchors have changed otherwise."""
+        """Reset the statistics after the model's anchors were changed by other means."""
         self.statistics = self._cleared(model)
 
     @staticmethod

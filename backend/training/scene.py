@@ -1,4 +1,4 @@
-"""A capture as training sees it: cameras in scene units, images as planes, labels as class indices."""
+"""A capture prepared for training: cameras in scene units, images as planes, labels as class indices."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ..capture import Capture
 
 _GPU_FRACTION = 0.25
-"""The fraction of the GPU's free memory that targets may take."""
+"""Largest fraction of the GPU's free memory for cached targets."""
 
 
 class Scene:
@@ -26,14 +26,14 @@ class Scene:
 
     Args:
         capture: the views, images and masks.
-        classes: of the objects that are supervised.
-        normalization: from the capture's world to scene units.
-        zero_is_object: whether pixels of ID 0 are supervised as a class.
-        memory_mb: limit for the targets that are kept; on a GPU its free memory is another.
-        supervise_background: whether pixels of ID 0 are supervised to show no object, or not at all.
-        device: where the targets lie.
-        gains: (V, 3), how much brighter each image is than the exposure that the splats are to have. None: measured,
-            and 1 where the exposure of the images does not vary (`exposure_varies`).
+        classes: class indices of the supervised objects.
+        normalization: transform from the capture's world to scene units.
+        zero_is_object: whether pixels with ID 0 are supervised as an object.
+        memory_mb: memory limit for cached targets; on a GPU, also limited by its free memory.
+        supervise_background: whether pixels with ID 0 are supervised to show no object; otherwise they are ignored.
+        device: device of the targets.
+        gains: (V, 3), brightness of each image relative to the common exposure of the splats. None: estimated, or 1 if
+            the exposure of the images does not vary (`exposure_varies`).
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Scene:
         self._lock = threading.Lock()
 
     def camera(self, index: int, downscale: int = 1) -> Camera:
-        """A view's camera in scene units."""
+        """Return a view's camera in scene units."""
         view = self.capture.views[index]
         return Camera(
             self.normalization.viewmat(view.viewmat),
@@ -77,11 +77,11 @@ class Scene:
         )
 
     def target(self, index: int, downscale: int = 1) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """The target of a view.
+        """Return the target of a view.
 
         Returns:
-            The image at the common exposure, (3, H, W) float32, and its labels (H, W) int32, -1 where not supervised;
-            None without a mask.
+            The image at the common exposure, (3, H, W) float32, and its labels (H, W) int32, -1 where not supervised,
+            or None if there is no mask.
 
         Raises:
             InputError: the image or mask cannot be read.
@@ -109,16 +109,16 @@ class Scene:
         if self._device.type == "cpu":
             planes = np.ascontiguousarray(pixels.transpose(2, 0, 1), np.float32)
             return torch.from_numpy(planes * scale[:, None, None])
-        # Sent as bytes, which take a quarter of the planes' memory.
+        # Transfer bytes, which take a quarter of the planes' memory.
         sent = self._send(torch.from_numpy(np.ascontiguousarray(pixels)))
         return sent.permute(2, 0, 1).float().contiguous() * devices.upload(scale, sent)[:, None, None]
 
     def _send(self, values: torch.Tensor) -> torch.Tensor:
-        """Copy `values` to the device, without waiting for it."""
+        """Copy `values` to the device asynchronously."""
         return values if self._device.type == "cpu" else values.pin_memory().to(self._device, non_blocking=True)
 
     def forget(self, shrink: float = 1.0) -> None:
-        """Release the targets that are kept, and keep only `shrink` times as much from now on."""
+        """Clear the cache of targets, and multiply its memory limit by `shrink`."""
         with self._lock:
             self._held.clear()
             self._bytes = 0

@@ -1,4 +1,4 @@
-"""The settings of a training, and its schedules: learning rates, growth and resolution over its progress."""
+"""Settings of a training, and schedules of learning rates, growth and resolution over its progress."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from ..model.anchors import Layout
 
 @dataclass(frozen=True)
 class Settings:
-    """Choices that the model depends on; a checkpoint continues only under the same ones.
+    """Settings that affect the model; a training can be resumed only with the same ones.
 
     Attributes:
         mode: `explicit` or `view`, see `Heads`.
-        sh_degree: of the colors in explicit mode.
-        offsets: splats per anchor.
-        voxel: edge of an anchor's cell in world units; None: the median spacing of the points.
-        max_anchors: growth stops there.
+        sh_degree: degree of the colors' spherical harmonics in explicit mode.
+        offsets: number of splats per anchor.
+        voxel: edge length of an anchor's cell in world units; None: the median spacing of the points.
+        max_anchors: largest number of anchors.
         background: `learned`, `black` or `white`.
-        semantic_weight, ssim_weight, volume_weight: of the terms of the loss. Discs take half of volume_weight, for
-            their area.
-        zero_is_object: whether pixels of ID 0 are supervised as a class.
+        semantic_weight, ssim_weight, volume_weight: weights of the terms of the loss. For discs, half of volume_weight
+            is applied to their area.
+        zero_is_object: whether pixels with ID 0 are supervised as an object.
         primitive: `3d` Gaussians or `2d` discs.
-        normal_weight: of the loss that aligns the normals of discs with the depth.
-        distortion_weight: of the loss that gathers the discs along a ray at one depth.
-        pyramid: whether images are reduced at the start of the training; None: large ones are.
+        normal_weight: weight of the loss that aligns the normals of discs with the depth.
+        distortion_weight: weight of the loss that concentrates the discs along a ray at one depth.
+        pyramid: whether images are downscaled at the start of the training; None: only large ones.
     """
 
     seed: int = 0
@@ -47,11 +47,11 @@ class Settings:
     pyramid: bool | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """The settings as JSON."""
+        """Return the settings as a JSON-compatible dict."""
         return asdict(self)
 
     def in_effect(self) -> dict[str, Any]:
-        """The settings that have an effect: for 3D Gaussians, normal_weight and distortion_weight have none."""
+        """Return the settings that have an effect; for 3D Gaussians, without normal_weight and distortion_weight."""
         surface = () if self.primitive == "2d" else ("normal_weight", "distortion_weight")
         return {name: value for name, value in asdict(self).items() if name not in surface}
 
@@ -62,42 +62,45 @@ class Settings:
 
 
 BACKGROUND_FROM = 0.05
-"""Unlabeled pixels are taken for background, rather than for gaps in the masks, if at least this fraction of the points
-belongs to no object. Without supervision there, objects would spread over the background."""
+"""Fraction of the points without an object from which on unlabeled pixels are considered background instead of gaps in
+the masks. Without supervision there, objects would spread over the background."""
 
 
 def background_is_masked(point_ids: np.ndarray) -> bool:
     """Decide whether unlabeled pixels show the background.
 
     Args:
-        point_ids: (M,) object ID of each point, 0 where it belongs to none.
+        point_ids: (M,) object ID of each point, 0 if it belongs to none.
 
     Returns:
-        Whether such pixels should be supervised to show no object.
+        Whether unlabeled pixels should be supervised to show no object.
     """
     return bool((np.asarray(point_ids) == 0).mean() >= BACKGROUND_FROM)
 
 
 GROW_FROM, GROW_UNTIL = 0.1, 0.6
-"""Anchors grow between these values of the progress; statistics are gathered from half the first one on."""
+"""Range of the progress in which anchors grow; statistics are accumulated from half of GROW_FROM on."""
 
 _MIN_INTERVAL, _MAX_INTERVAL, _INTERVAL_FRACTION = 25, 100, 0.02
 
 
 def growth_interval(step: int) -> int:
-    """Steps until anchors grow again: few at first, which shortens short trainings; later a fraction of the steps so
-    far, as there are more anchors to go through and each round changes less."""
+    """Return the number of steps until the next growth.
+
+    It is small at first, for short trainings; later it is a fraction of the steps so far, since there are more anchors
+    to process and each round changes less.
+    """
     return int(min(max(_MIN_INTERVAL, _INTERVAL_FRACTION * step), _MAX_INTERVAL))
 
 
 PLATEAU_FROM, PLATEAU_UNTIL = 0.2, 0.8
-"""Between these values of the progress the learning rates hardly fall. Most is learned there; the decay afterwards
-refines it."""
+"""Range of the progress in which the learning rates are nearly constant. Most is learned there; the decay afterwards
+refines the result."""
 _DECAY = {PLATEAU_FROM: 0.25, PLATEAU_UNTIL: 0.3}
-"""How far the rates have fallen at both ends of the plateau, from 0 (not at all) to 1."""
+"""Decay of the learning rates at both ends of the plateau, from 0 (none) to 1 (complete)."""
 
 SURFACE_FROM = 0.25
-"""Progress from which the normals and depth of discs are supervised: before, there is no surface yet."""
+"""Progress from which on the normals and depth of discs are supervised; before, there is no surface yet."""
 
 _ROW_RATES = {
     "offset_columns": (4e-2, 4e-4),
@@ -117,14 +120,16 @@ HEAD_RATES = {
 
 
 def rate(ends: tuple[float, float], progress: float) -> float:
-    """The learning rate at a progress of 0 .. 1: from the first end to the last, exponential before, on and after the
-    plateau."""
+    """Return the learning rate at a progress of 0 .. 1.
+
+    It decays from ends[0] to ends[1], exponentially before, on and after the plateau.
+    """
     fallen = np.interp(progress, [0.0, *_DECAY, 1.0], [0.0, *_DECAY.values(), 1.0])
     return float(ends[0] * (ends[1] / ends[0]) ** fallen)
 
 
 def row_rates(layout: Layout, progress: float) -> np.ndarray:
-    """The learning rate of each column of the anchors' rows: (columns,) float32."""
+    """Return the learning rate of each column of the anchors' rows: (columns,) float32."""
     rates = np.zeros(layout.columns, np.float32)
     for name, ends in _ROW_RATES.items():
         rates[getattr(layout, name)] = rate(ends, progress)
@@ -132,15 +137,15 @@ def row_rates(layout: Layout, progress: float) -> np.ndarray:
 
 
 _MIN_PIXELS, _MIN_PIXELS_OF_SMALL = 300, 50
-"""Images are not reduced below the first number of pixels; not below the second where `pyramid` asks for reduction."""
+"""Smallest longer side of downscaled images, in pixels; the second value applies if `pyramid` is True."""
 
 
 def downscale_at(progress: float, longest: int, pyramid: bool | None = None) -> int:
-    """The factor by which images are reduced, coarse to fine.
+    """Return the factor by which images are downscaled, coarse to fine.
 
     Args:
-        progress: of the training, 0 .. 1.
-        longest: pixels of the longer side of an image.
+        progress: progress of the training, 0 .. 1.
+        longest: longer side of an image in pixels.
         pyramid: as in `Settings`.
 
     Returns:

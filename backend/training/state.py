@@ -1,4 +1,4 @@
-"""A training's state as the tensors and the JSON of its checkpoint."""
+"""Conversion of a training's state to and from the tensors and JSON of a checkpoint."""
 
 from __future__ import annotations
 
@@ -26,14 +26,17 @@ _HEAD_ADAM = ("step", "exp_avg", "exp_avg_sq")
 
 _FORMER_TENSORS = {"adam.first": "adam.exp_avg", "adam.second": "adam.exp_avg_sq"}
 _FORMER_KEYS = {"teach_unlabelled": "supervise_background", "centre": "center", "settled_from": "converged_at"}
-"""Names in checkpoints that older versions wrote, and their names now."""
+"""Names in checkpoints written by older versions, and their current names."""
 
 
 def read_checkpoint(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None] | None:
-    """Tensors, state and a warning (or None) of the newest whole checkpoint in `folder`; None where there is none.
+    """Read the latest complete checkpoint in `folder`.
+
+    Returns:
+        The tensors, the state, and a warning or None; None if there is no checkpoint.
 
     Raises:
-        InputError: there are files, but none can be read.
+        InputError: there are checkpoint files, but none can be read.
     """
     found = load_checkpoint(folder)
     if found is None:
@@ -54,10 +57,9 @@ def training_tensors(
     average: Average,
     head_optimizer: torch.optim.Optimizer,
 ) -> dict[str, np.ndarray]:
-    """All tensors that the next step depends on, by their names in a checkpoint.
+    """Return all tensors that the next step depends on, by their names in a checkpoint.
 
-    Args:
-        exp_avg, exp_avg_sq: (N, columns) Adam's moments of the anchors' rows.
+    exp_avg, exp_avg_sq: (N, columns), Adam's moments of the anchors' rows.
     """
     anchors = model.anchors
     tensors: dict[str, torch.Tensor | np.ndarray] = {
@@ -78,7 +80,7 @@ def training_tensors(
 
 
 def restore_statistics(tensors: dict[str, np.ndarray], device: torch.device) -> GrowthStatistics:
-    """The growth statistics of a checkpoint."""
+    """Return the growth statistics in a checkpoint's tensors."""
     return GrowthStatistics(*(restore_tensor(tensors, f"growth.{name}", device) for name in _GROWTH))
 
 
@@ -97,12 +99,12 @@ def restore_head_optimizer(
 
 
 def restore_tensor(tensors: dict[str, np.ndarray], name: str, device: torch.device) -> torch.Tensor:
-    """A copy of a checkpoint's tensor on the device."""
+    """Return a copy of a checkpoint's tensor on `device`."""
     return torch.from_numpy(tensors[name].copy()).to(device)
 
 
 def model_from_checkpoint(tensors: dict[str, np.ndarray], state: dict[str, Any]) -> ObjectModel:
-    """The model of a checkpoint's tensors and state."""
+    """Return the model stored in a checkpoint's tensors and state."""
     settings = Settings(**state["settings"])
     anchors = Anchors(
         settings.layout, float(state["voxel"]),
@@ -121,10 +123,10 @@ def model_from_checkpoint(tensors: dict[str, np.ndarray], state: dict[str, Any])
 
 
 def load_model(folder: Path, device: torch.device = devices.CPU) -> tuple[ObjectModel, dict[str, Any], str | None]:
-    """Load the model that a training has come to, the mean over its latest steps.
+    """Load the result of a training, the mean of the model over the latest steps.
 
     Returns:
-        The model on the device, the checkpoint's state, and a warning or None.
+        The model on `device`, the checkpoint's state, and a warning or None.
 
     Raises:
         InputError: there is no checkpoint in `folder`, or none can be read.
@@ -138,5 +140,5 @@ def load_model(folder: Path, device: torch.device = devices.CPU) -> tuple[Object
 
 
 def progress_of(state: dict[str, Any]) -> TrainingProgress:
-    """The training's progress in a checkpoint's state."""
+    """Return the training's progress stored in a checkpoint's state."""
     return TrainingProgress(**json.loads(json.dumps(state["progress"])))

@@ -1,7 +1,7 @@
-"""One view's step: render it, compute its loss and the gradients of the anchors that it shows.
+"""The training step of one view: rendering, loss, and gradients of the visible anchors.
 
-On a GPU the CPU does not wait for results. Where the GPU's memory is too small for an image, it is rendered in strips,
-whose gradients add up to the image's.
+On a GPU, the step is asynchronous. If the GPU's memory is too small for an image, the image is rendered in strips,
+whose gradients are summed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from .scene import Scene
 from .settings import SURFACE_FROM, Settings, downscale_at
 
 MOST_PARTS = 16
-"""The largest number of parts in which an image is rendered that does not fit into the GPU's memory."""
+"""Largest number of parts in which an image is rendered if it does not fit into the GPU's memory."""
 
 _NO_ROOM = (
     "The GPU's memory is too small, even for a sixteenth of an image at a time; close programs that use it, or try a "
@@ -39,8 +39,11 @@ _IMAGE = "the image loss"
 
 
 class _Part(NamedTuple):
-    """An image, or a strip of one: its camera, target (3, h, w), labels (h, w), its fraction of the image's pixels, and
-    the fraction of its pixels that are labeled, relative to that of the whole image."""
+    """An image, or a strip of it.
+
+    Attributes: camera, target (3, h, w), labels (h, w), the strip's fraction of the image's pixels, and the fraction of
+    its pixels that are labeled, relative to that fraction in the whole image.
+    """
 
     camera: Camera
     image: torch.Tensor
@@ -50,16 +53,16 @@ class _Part(NamedTuple):
 
 
 class ViewGradients(NamedTuple):
-    """One view's loss and gradients; those of the heads lie in the heads' parameters.
+    """Loss and gradients of one view; the gradients of the heads are stored in the heads' parameters.
 
     Attributes:
-        camera: of the view.
-        loss: ().
+        camera: camera of the view.
+        loss: () loss.
         seen: (n,) int64, the anchors in view.
-        rows: (n, columns), copies of their rows, with the gradients.
-        finite: () bool, on the GPU: whether the loss is finite and the view shows any anchor.
+        rows: (n, columns), copies of their rows, with gradients.
+        finite: () bool, on the GPU: whether the loss is finite and any anchor is in view.
         usable: (n,) bool, on the GPU: the rows whose gradients may be used.
-        statistics: of the image or its parts, where growth asks for them.
+        statistics: statistics of the image or its parts, if growth requires them.
     """
 
     camera: Camera
@@ -72,8 +75,11 @@ class ViewGradients(NamedTuple):
 
 
 class _Limits:
-    """Upper limits of the number of anchors in a view, so that the processor need not wait for their number: somewhat
-    more than were in view last time, which the GPU has reported since; all for a view that is new."""
+    """Upper limits of the number of anchors in each view, to avoid synchronization with the GPU.
+
+    The limit is somewhat larger than the number when the view was last rendered, which has arrived from the GPU since
+    then. For a new view, it is the number of all anchors.
+    """
 
     _MARGIN, _STEP = 1.25, 4096
 
@@ -81,7 +87,7 @@ class _Limits:
         self._reports: dict[int, tuple[torch.Tensor, torch.cuda.Event | None, int]] = {}
 
     def of(self, view: int, anchors: int) -> int:
-        """The limit for a view of a model with a number of `anchors`."""
+        """Return the limit for a view of a model with this number of anchors."""
         if view not in self._reports:
             return anchors
         count, arrived, then = self._reports[view]
@@ -91,7 +97,7 @@ class _Limits:
         return min(anchors, math.ceil(self._MARGIN * expected / self._STEP + 1) * self._STEP)
 
     def note(self, view: int, count: torch.Tensor, anchors: int) -> None:
-        """Record that `count` () of all `anchors` were in view."""
+        """Record that `count` () of all `anchors` were in the view."""
         if not count.is_cuda:
             self._reports[view] = (count, None, anchors)
             return
@@ -104,7 +110,7 @@ class _Limits:
 def strips(
     camera: Camera, image: torch.Tensor, labels: torch.Tensor | None, count: int
 ) -> list[tuple[Camera, torch.Tensor, torch.Tensor | None]]:
-    """Cut an image (3, H, W), its labels (H, W) and its camera into `count` strips across its longer side."""
+    """Split an image (3, H, W), its labels (H, W) and its camera into `count` strips along its longer side."""
     wide = camera.width >= camera.height
     length = camera.width if wide else camera.height
     edges = [round(i * length / count) for i in range(count + 1)]
@@ -118,7 +124,7 @@ def strips(
 
 
 class ViewStep:
-    """Computes the loss of a view and its gradients, in as many parts as the GPU's memory asks for."""
+    """Computes the loss of a view and its gradients, in as many parts as the GPU's memory requires."""
 
     def __init__(
         self,
@@ -141,21 +147,21 @@ class ViewStep:
 
     @property
     def splats(self) -> int:
-        """Splats drawn in the latest step. Waits for the GPU."""
+        """Number of splats generated in the latest step; synchronizes with the GPU."""
         return int(self._splats)
 
     def compute(self, index: int, progress: float) -> ViewGradients | None:
-        """The loss and gradients of a view.
+        """Compute the loss and gradients of a view.
 
         Args:
-            index: of the view in the capture.
-            progress: of the training, 0 .. 1.
+            index: index of the view in the capture.
+            progress: progress of the training, 0 .. 1.
 
         Returns:
-            None where the view shows nothing or its loss is not finite.
+            The loss and gradients; None if no anchor is in view or the loss is not finite.
 
         Raises:
-            InputError: the GPU's memory does not suffice for the smallest parts, or the view's image cannot be read.
+            InputError: the GPU's memory is too small for the smallest parts, or the view's image cannot be read.
         """
         gradients, full = self._compute_if_it_fits(index, progress)
         while full:
@@ -164,7 +170,7 @@ class ViewStep:
         return gradients
 
     def _compute_if_it_fits(self, index: int, progress: float) -> tuple[ViewGradients | None, bool]:
-        """The result of `_compute`, and whether the GPU's memory was full instead."""
+        """Return the result of `_compute`, or None if the GPU's memory was full, and whether it was."""
         try:
             return self._compute(index, progress), False
         except Exception as error:
@@ -173,7 +179,7 @@ class ViewStep:
             return None, True
 
     def _make_room(self) -> None:
-        """Halve the parts and release memory, for another attempt at the same view."""
+        """Double the number of parts and release memory, for another attempt at the same view."""
         if self.parts >= MOST_PARTS:
             raise InputError(_NO_ROOM)
         self.parts *= 2
@@ -183,7 +189,7 @@ class ViewStep:
             torch.cuda.empty_cache()
 
     def _compute(self, index: int, progress: float) -> ViewGradients | None:
-        """`compute`, in the present number of parts."""
+        """Compute the loss and gradients of a view in the current number of parts."""
         anchors, on_gpu = self.model.anchors, devices.on_gpu(self.model.anchors.rows)
         view = self.scene.capture.views[index]
         downscale = downscale_at(progress, max(view.width, view.height), self.settings.pyramid)
@@ -228,7 +234,7 @@ class ViewStep:
         return ViewGradients(camera, loss, seen, rows, finite, usable, statistics)
 
     def _parts_of(self, camera: Camera, image: torch.Tensor, labels: torch.Tensor | None) -> Iterator[_Part]:
-        """The parts to render, one at a time. Their losses add up to the image's, except for SSIM beside the cuts."""
+        """Yield the parts to render; their losses add up to the image's, except for SSIM at the cuts."""
         if self.parts == 1:
             yield _Part(camera, image, labels, 1.0, 1.0)
             return
@@ -240,7 +246,7 @@ class ViewStep:
             yield _Part(crop, cut, cut_labels, fraction, more)
 
     def _anchors_of(self, part: _Part, seen: torch.Tensor, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """The anchors and rows of a part, among those of the whole image."""
+        """Return the anchors and rows in view of a part, selected from those of the whole image."""
         if self.parts == 1:
             return seen, rows
         a = self.model.anchors
@@ -252,7 +258,7 @@ class ViewStep:
     def _terms(
         self, part: _Part, seen: torch.Tensor, rows: torch.Tensor, present: torch.Tensor | None, progress: float
     ) -> tuple[dict[str, torch.Tensor], Generated, Rendered]:
-        """Render a part from the anchors' rows; returns the weighted terms () of its loss and the rendering."""
+        """Render a part from the anchors' rows; returns the weighted loss terms (), the Gaussians and the render."""
         anchors, settings = self.model.anchors, self.settings
         g = generate(
             anchors.layout, anchors.positions[seen], rows, anchors.ids[seen], self.model.heads, part.camera.center,
@@ -281,14 +287,14 @@ class ViewStep:
         return terms, g, drawn
 
     def _image_loss(self, part: _Part, drawn: Rendered, label_probability: torch.Tensor | None) -> torch.Tensor:
-        """The loss () of the image, and of the labels if their probability (h, w) is given."""
+        """Return the loss () of the image, including the label loss if the labels' probability (h, w) is given."""
         return image_loss(
             drawn.color, drawn.alpha, label_probability, self.model.background, part.image, part.labels,
             self.settings.ssim_weight, self.settings.semantic_weight * part.more_labels,
         )  # fmt: skip
 
     def _total(self, terms: dict[str, torch.Tensor], part: _Part) -> torch.Tensor:
-        """The loss of a part, weighted by its size."""
+        """Return the total loss of a part, weighted by its size."""
         first, *others = terms.values()
         loss = sum(others, start=first)
         return part.fraction * loss if self.parts > 1 else loss
@@ -296,7 +302,7 @@ class ViewStep:
     def _split_image_loss(
         self, terms: dict[str, torch.Tensor], part: _Part, drawn: Rendered
     ) -> dict[str, torch.Tensor]:
-        """The same terms with the image loss and the label loss apart."""
+        """Return the terms with the image loss and the label loss separated."""
         with torch.no_grad():
             image = self._image_loss(part, drawn, None)
         labels = torch.where(image.isfinite(), terms[_IMAGE].detach(), 0.0)
@@ -304,5 +310,5 @@ class ViewStep:
 
 
 def frustum(camera: Camera) -> tuple[np.ndarray, np.ndarray, int, int, float]:
-    """The arguments of `anchors_in_view` for a camera."""
+    """Return the arguments of `anchors_in_view` for a camera."""
     return (*camera.arrays(), camera.width, camera.height, camera.near)

@@ -171,3 +171,12 @@ def test_only_code_changes_a_kernels_digest(old, new, changes):
 
     assert digest(without_docstring) == digest(text)
     assert (digest(without_docstring.replace(old, new)) != digest(text)) == changes
+
+
+@pytest.mark.parametrize("place", ["{}\n", "class A:\n    {}\n    b = 1\n", "def f():\n    {}\n    return 1\n"])
+def test_no_docstring_is_in_a_digest(place):
+    def digest(text):
+        return digest_of_code(compile(place.format(repr(text)), "a.py", "exec"))
+
+    assert digest("one docstring") == digest("another docstring")
+    assert digest_of_code(compile("a = 'one'", "a.py", "exec")) != digest_of_code(compile("a = 'two'", "a.py", "exec"))

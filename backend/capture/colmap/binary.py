@@ -1,4 +1,4 @@
-"""Reads the binary files of a COLMAP model: cameras.bin, images.bin and points3D.bin."""
+"""Reader of the binary files of a COLMAP model: cameras.bin, images.bin and points3D.bin."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error",
 
 
 class _Reader:
-    """Reads values from a file's bytes in order; each read is checked against the file's length."""
+    """Sequential reader of a file's bytes; each read is checked against the file's length."""
 
     def __init__(self, path: Path, content: str) -> None:
         self.path, self.content = path, content
@@ -27,13 +27,13 @@ class _Reader:
         (self.count,) = self.take("<Q")
 
     def each(self) -> Iterator[int]:
-        """Count up to the number of entries in the header; `index` names the entry if the file ends early."""
+        """Iterate over the entries counted in the header; `index` is the entry reported if the file ends early."""
         while self.index < self.count:
             yield self.index
             self.index += 1
 
     def truncated(self) -> InputError:
-        """The error of a file that ends early."""
+        """Return the error for a file that ends early."""
         if len(self.data) < 8:
             return InputError(f"{self.path} is cut short: it has only {len(self.data)} bytes; {EXPORT_AGAIN}.")
         return InputError(
@@ -68,7 +68,7 @@ class _Reader:
 
 
 def read_cameras_binary(path: Path) -> dict[int, Camera]:
-    """Read cameras.bin: each camera by its ID."""
+    """Read cameras.bin; returns the cameras by ID."""
     reader = _Reader(path, "cameras")
     cameras: dict[int, Camera] = {}
     for _ in reader.each():

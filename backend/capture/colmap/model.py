@@ -1,4 +1,4 @@
-"""The parts of a COLMAP model, as its files hold them and as they are used after validation."""
+"""Data types of a COLMAP model, before and after validation."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ CAMERA_MODELS: dict[int, tuple[str, int]] = {
     16: ("EUCM", 6),
     17: ("EQUIRECTANGULAR", 2),
 }
-"""Camera models by COLMAP's number: name and number of parameters."""
+"""Camera models by COLMAP's model ID: name and number of parameters."""
 
 FILE_STEMS = ("cameras", "images", "points3D")
-"""The files of a model, without suffix."""
+"""The names of a model's files, without suffix."""
 
 EXPORT_AGAIN = "copy the model again, or export it again from COLMAP"
-"""The advice that ends the message about a damaged file."""
+"""The advice at the end of error messages about damaged files."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """One camera as COLMAP wrote it: size in pixels, parameters in COLMAP's order for `model`."""
+    """One COLMAP camera: size in pixels, parameters in COLMAP's order for `model`."""
 
     id: int
     model: str
@@ -75,13 +75,13 @@ class Model:
     warnings: list[str] = field(default_factory=list)
 
     def file(self, stem: str) -> Path:
-        """The path of cameras, images or points3D, with the model's suffix."""
+        """Return the path of cameras, images or points3D, with the model's suffix."""
         return self.folder / f"{stem}{self.suffix}"
 
 
 @dataclass
 class RawImage:
-    """One image as the file holds it, before validation: quaternion (w, x, y, z) and translation, world to camera."""
+    """One image as stored in the file, before validation: quaternion (w, x, y, z) and translation, world to camera."""
 
     name: str
     camera_id: int
@@ -93,7 +93,7 @@ class RawImage:
 
 @dataclass
 class RawPoints:
-    """All points as the file holds them, before validation."""
+    """All points as stored in the file, before validation."""
 
     ids: np.ndarray
     xyz: np.ndarray
@@ -102,7 +102,7 @@ class RawPoints:
 
 
 def decode_name(raw: bytes, path: Path) -> str:
-    """Decode an image name; raises InputError that names the file where it is not UTF-8."""
+    """Decode an image name; raises InputError with the file's path if it is not UTF-8."""
     try:
         return raw.decode("utf-8")
     except UnicodeDecodeError as error:

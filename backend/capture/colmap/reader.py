@@ -1,8 +1,8 @@
-"""Finds, reads and validates a COLMAP model, text or binary, with or without rigs and frames.
+"""Search, parsing and validation of COLMAP models, text or binary, with or without rigs and frames.
 
-The files are parsed here and not by pycolmap, whose text reader cuts an image name at its first space and whose
-binary reader trusts the counts in the file. COLMAP 3.12 and later writes each image's own pose to images.* even where
-rigs and frames exist, so rigs.* and frames.* are not needed.
+pycolmap is not used for parsing: its text reader truncates image names at the first space, and its binary reader does
+not check the counts in the file. COLMAP 3.12 and later writes each image's own pose to images.* even if rigs and frames
+exist, so rigs.* and frames.* are not needed.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def find_model(folder: Path) -> tuple[Path, list[str]]:
         folder: The capture.
 
     Returns:
-        The model's folder, and warnings.
+        The model's folder, and warnings for the user.
 
     Raises:
         InputError: There is no complete model.
@@ -64,7 +64,7 @@ def read_model(folder: Path) -> Model:
         folder: Folder with cameras, images and points3D, all .bin or all .txt.
 
     Returns:
-        The model; points that are not finite are left out with a warning.
+        The model; points with NaN or Inf are left out, with a warning.
 
     Raises:
         InputError: A file is missing or damaged; the message names it.
@@ -111,7 +111,7 @@ def _describe_missing(folder: Path) -> str:
 
 
 def _count_images(folder: Path) -> int:
-    """The number of images that the model announces; -1 if unknown."""
+    """Return the number of images according to the model's header; -1 if unknown."""
     try:
         if _suffix_of(folder) == ".bin":
             with (folder / "images.bin").open("rb") as file:

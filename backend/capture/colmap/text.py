@@ -1,4 +1,4 @@
-"""Reads the text files of a COLMAP model: cameras.txt, images.txt and points3D.txt."""
+"""Reader of the text files of a COLMAP model: cameras.txt, images.txt and points3D.txt."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _malformed_line(path: Path, number: int, expected: str) -> InputError:
 
 
 def _warn_if_count_differs(lines: list[bytes], found: int, path: Path, content: str, warnings: list[str]) -> None:
-    """Warn if the count in the file's header comment is wrong. That is no error, since people edit these files."""
+    """Warn if the count in the file's header comment is wrong; not an error, since these files are edited by hand."""
     for line in lines[:10]:
         match = re.match(rb"#\s*Number of \w+:\s*(\d+)", line)
         if match and int(match[1]) != found:
@@ -31,7 +31,7 @@ def _warn_if_count_differs(lines: list[bytes], found: int, path: Path, content: 
 
 
 def read_cameras_text(path: Path) -> dict[int, Camera]:
-    """Read cameras.txt: each camera by its ID."""
+    """Read cameras.txt; returns the cameras by ID."""
     cameras: dict[int, Camera] = {}
     for number, line in enumerate(_read_lines(path), 1):
         fields = line.split()
@@ -79,7 +79,7 @@ def read_images_text(path: Path, warnings: list[str]) -> list[RawImage]:
             except ValueError as error:
                 raise _malformed_line(path, at + 1, "X Y POINT3D_ID for each observation of an image") from error
             at += 1
-        # Observations without a point have -1, or 2^64 - 1 if a program printed it unsigned.
+        # Observations without a point have the ID -1, or 2^64 - 1 if it was printed as unsigned.
         observed = observed[(observed[:, 2] >= 0) & (observed[:, 2] < 2.0**62)]
         name = decode_name(fields[9], path)
         images.append(RawImage(name, camera_id, pose[:4], pose[4:], observed[:, :2], observed[:, 2].astype(np.int64)))

@@ -1,1 +1,1 @@
-"""From views of an object to a signed distance field, and from that to a surface."""
+"""Fusion of the views of an object into a signed distance field, and extraction of its surface."""

@@ -1,4 +1,4 @@
-"""Sparse grids: blocks of 8 x 8 x 8 samples, which exist only near a surface."""
+"""Sparse voxel grid: blocks of 8 x 8 x 8 samples, allocated only near a surface."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import itertools
 import numpy as np
 
 SIDE = 8
-"""Samples along a block's edge."""
+"""Number of samples along a block's edge."""
 SAMPLES = SIDE**3
 
 AROUND = np.array([o for o in itertools.product((-1, 0, 1), repeat=3) if o != (0, 0, 0)], np.int64)
-"""(26, 3): the offset to each neighbor."""
+"""(26, 3): the offsets to the neighbors of a block."""
 
 _HALF = 1 << 19
 _FARTHEST = _HALF - 2
@@ -30,7 +30,7 @@ def unpack(keys: np.ndarray) -> np.ndarray:
 
 
 def distinct(coords: np.ndarray) -> np.ndarray:
-    """Return the unique triples (n, 3) int64 in the order of their keys, without those too far out for a key."""
+    """Return the unique triples (n, 3) int64 in the order of their keys, without those out of the range of `pack`."""
     near = (np.abs(coords) < _FARTHEST).all(-1)
     return unpack(np.unique(pack(coords[near])))
 
@@ -56,5 +56,5 @@ class Blocks:
         return np.where(self._sorted[place] == keys, self._order[place], -1)
 
     def joined(self, coords: np.ndarray) -> Blocks:
-        """Append the blocks `coords`, none of which may exist yet."""
+        """Return these blocks followed by `coords`, which must be new."""
         return Blocks(np.concatenate([self.coords, coords]))

@@ -1,4 +1,4 @@
-"""Extraction of a triangle mesh from a signed distance field: watertight, two-manifold, of limited size."""
+"""Extraction of a watertight, two-manifold triangle mesh of limited size from a signed distance field."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FACES = 20_000
 
 _SMOOTHING = (0.5, -0.53) * 10
 _AGGRESSIONS = (7.0, 5.0, 10.0)
-"""Growth rates of the tolerance of the reduction; if one of them tears the surface, another may not."""
+"""Growth rates of the decimation's tolerance, tried in turn, since some of them may tear the surface."""
 
 
 def extract(field: Field, closed: bool = True, faces: int = FACES, reporter: Reporter | None = None) -> Surface:
@@ -26,8 +26,8 @@ def extract(field: Field, closed: bool = True, faces: int = FACES, reporter: Rep
 
     Args:
         field: The signed distance field.
-        closed: Return a watertight and two-manifold mesh, whose faces that no camera saw are marked as unobserved.
-            Otherwise the mesh ends where no camera saw the object.
+        closed: Whether to return a watertight, two-manifold mesh in which the faces that no camera observed are marked
+            as unobserved. Otherwise the mesh ends where no camera observed the object.
         faces: The largest number of triangles.
         reporter: Receives the progress.
 
@@ -35,7 +35,7 @@ def extract(field: Field, closed: bool = True, faces: int = FACES, reporter: Rep
         The surface in scene units.
 
     Raises:
-        NoSurface: If too little of the object was seen.
+        NoSurface: Too little of the object was observed.
     """
     reporter = reporter or Reporter()
     reporter.progress(0, 3)
@@ -56,7 +56,7 @@ def extract(field: Field, closed: bool = True, faces: int = FACES, reporter: Rep
 
 
 def _worth(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, closed: bool) -> np.ndarray:
-    """Find the faces of components that are large enough, seen somewhere and no bubbles inside, (F,) bool."""
+    """Find the faces of components that are large enough, partly observed and not interior bubbles, (F,) bool."""
     keep = of_size(vertices, faces)
     count, part = parts(faces, len(vertices))
     if closed and count:
@@ -68,7 +68,7 @@ def _worth(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, closed: bo
 
 
 def _smoothed(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Smooth noise of the size of a voxel with alternating Laplacian steps inward and outward (Taubin 1995)."""
+    """Smooth voxel-sized noise with alternating shrinking and inflating Laplacian steps (Taubin 1995)."""
     edges = np.concatenate([faces[:, :2], faces[:, 1:], faces[:, ::2]])
     ends = np.concatenate([edges, edges[:, ::-1]])
     graph = coo_matrix((np.ones(len(ends), np.float32), (ends[:, 0], ends[:, 1])), (len(vertices),) * 2).tocsr()
@@ -82,7 +82,7 @@ def _smoothed(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def _reduced(
     vertices: np.ndarray, faces: np.ndarray, budget: int, closed: bool
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Reduce to at most `budget` faces if that is possible without tears, else to the fewest that were reached."""
+    """Decimate to at most `budget` faces if possible without tears, otherwise to the fewest faces without tears."""
     best = vertices, faces
     for aggression in _AGGRESSIONS if len(faces) > budget else ():
         points, triangles = fast_simplification.simplify(
@@ -97,7 +97,7 @@ def _reduced(
 
 
 def _sound(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Split edges and vertices that are shared by several sheets; None if the surface is not a solid."""
+    """Split non-manifold edges and vertices; None if the surface does not bound a solid."""
     solid = manifold3d.Manifold(
         manifold3d.Mesh64(np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.uint64))
     )
@@ -105,13 +105,13 @@ def _sound(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
         return None
     mesh = solid.to_mesh64()
     vertices, faces = np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts).astype(np.int32)
-    # Where the reduction pinched the surface, slivers are separate components.
+    # Where the decimation pinched the surface, slivers are now separate components.
     vertices, faces = largest_parts(vertices, faces)
     return (vertices, faces) if is_watertight(faces) else None
 
 
 def is_watertight(faces: np.ndarray) -> bool:
-    """Return whether each edge of the faces (F, 3) belongs to two faces that run along it in opposite directions."""
+    """Return whether each edge of the faces (F, 3) belongs to exactly two faces, with opposite directions along it."""
     n = int(faces.max(initial=-1)) + 1
     a, b = faces.ravel().astype(np.int64), np.roll(faces, -1, 1).ravel().astype(np.int64)
     there, back = np.sort(a * n + b), np.sort(b * n + a)

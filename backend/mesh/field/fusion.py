@@ -1,8 +1,8 @@
 """Fusion of the views of an object into its signed distance field, in blocks around the surface.
 
-For each view, a point in front of the visible surface is outside of the object, a point near the visible surface of the
-object has a signed distance from it, and a point behind the visible surface, of the object or another one, is unknown.
-A point that is unknown in all views is inside if the observed surface surrounds it (winding number).
+In each view, a point in front of the visible surface is outside the object; a point near the visible surface of the
+object has a signed distance from it; and a point behind the visible surface, whether of this or another object, is
+unknown. A point that is unknown in all views is inside if the observed surface surrounds it (winding number).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .winding import Winding
 RESOLUTION = 256
 """Largest number of voxels along the object's longest side."""
 SMALLEST_PART = 0.03
-"""Components of the surface smaller than this fraction of the largest one are floaters."""
+"""Components of the surface with less than this fraction of the area of the largest one are removed as floaters."""
 
 _VOXEL_PER_PIXEL = 0.7
 _REACH_VOXELS, _REACH_PIXELS = 5.0, 3.5
@@ -34,19 +34,19 @@ _BACK_VOXELS, _BACK_PIXELS = 3.0, 2.0
 _BYTES_PER_BLOCK = 8 * SAMPLES * 4
 """Largest memory of a block: sums, values, flags and the triangles in it."""
 _COARSEST, _FEW = 16, 1000
-"""Smallest number of voxels along the longest side, whatever the memory; and blocks that are enough for so few."""
+"""Smallest number of voxels along the longest side, regardless of memory; additional blocks allowed in this case."""
 _FILLING = 8
-"""Time that filling the holes of the surface takes, in times of one view, for the progress."""
+"""Time to fill the holes of the surface, relative to the time of one view, for the progress bar."""
 _SURE = 1.0
-"""Weight from which on the distance depends only on the views."""
+"""Weight from which on the distance is determined by the views alone."""
 _SEEN = 0.1
 """Smallest weight of a seen sample."""
 _SKIN = 1.75
-"""Depth in voxels below the surface to which samples count as seen; no cell across the surface reaches deeper."""
+"""Depth in voxels below the surface to which samples count as seen; no cell across the surface extends deeper."""
 
 
 class SeesObjects(Protocol):
-    """The part of `Views` that `fuse` needs."""
+    """The part of the interface of `Views` that `fuse` uses."""
 
     indices: tuple[int, ...]
 
@@ -59,8 +59,8 @@ class SeesObjects(Protocol):
 class Field:
     """A signed distance field in voxels, negative inside.
 
-    values (B, 512) float32 at the samples of `blocks`; seen (B, 512) bool: samples that a view saw. Sample (i, j, k) of
-    block c lies at origin + voxel * (8 c + (i, j, k)) in scene units. The zero level lies within the blocks.
+    values (B, 512) float32 at the samples of `blocks`; seen (B, 512) bool: samples observed in a view. Sample (i, j, k)
+    of block c lies at origin + voxel * (8 c + (i, j, k)) in scene units. The zero level lies within the blocks.
     """
 
     origin: np.ndarray
@@ -72,8 +72,14 @@ class Field:
 
 @dataclass
 class _Extent:
-    """The extent of an object: observed points (n, 3), low and high corner without outliers, pixel size on it, and the
-    nearest depth."""
+    """The extent of an object.
+
+    Attributes:
+        points: Observed points (n, 3).
+        low, high: Corners of the bounding box without outliers.
+        pixel: Median size of a pixel on the object.
+        nearest: Smallest depth of the object in a view.
+    """
 
     points: np.ndarray
     low: np.ndarray
@@ -95,16 +101,16 @@ def fuse(
 
     Args:
         views: The renders of the model.
-        classes: The class indices of the objects, which are treated as one.
+        classes: The class indices of the objects, which are treated as one object.
         resolution: The largest number of voxels along the longest side.
-        memory_mb: The memory to use. If it is not enough, the voxel is enlarged, with a warning.
+        memory_mb: Memory limit. If it is too small, voxels are enlarged, with a warning.
         reporter: Receives the progress and the warning.
 
     Returns:
         The field around the surface.
 
     Raises:
-        NoSurface: If too little of the objects was seen.
+        NoSurface: Too little of the objects was observed.
     """
     reporter = reporter or Reporter()
     extent = _extent(views, classes, reporter)
@@ -119,7 +125,7 @@ def fuse(
         except _TooMany as error:
             voxel *= max(1.1, (error.blocks / room) ** 0.5)
             if voxel > size / _COARSEST:
-                # So few blocks that their memory does not matter.
+                # Allow a few more blocks, whose memory is negligible.
                 voxel, room = max(asked, size / _COARSEST), error.blocks + _FEW
     if voxel > asked:
         reporter.warning(
@@ -176,7 +182,7 @@ class _Fusion:
         self.back = max(_BACK_VOXELS * voxel, _BACK_PIXELS * extent.pixel)
         self.origin = (extent.low + extent.high) / 2
         self.sights: dict[int, Sight] = {}
-        # The object ends within this box: no blocks are added beyond it.
+        # The object lies within this box; no blocks are added outside it.
         pad = (extent.high - extent.low).max() * 0.5 + 4 * self.reach
         self.box = np.stack([extent.low - pad - self.origin, extent.high + pad - self.origin]) / (SIDE * voxel)
         self.rounds = 0
@@ -249,16 +255,16 @@ class _Fusion:
         )
 
     def _seen(self, total: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Return the samples that were seen, in front of the surface or just below it."""
+        """Return the samples observed in front of the surface or just below it, (B, 512) bool."""
         return (weights >= _SEEN) & (total > -_SKIN * self.voxel * weights)
 
     def _progress(self, views: float) -> None:
-        """Report how many views are integrated in the first round; later rounds have few samples."""
+        """Report the number of views integrated in the first round; later rounds have few samples."""
         count = len(self.views.indices)
         self.reporter.progress(2 * count if self.rounds else count + views, 2 * count + _FILLING)
 
     def _finished(self, coords: np.ndarray, total: np.ndarray, weights: np.ndarray, winding: Winding) -> np.ndarray:
-        """Return the distances in voxels; where they were not seen, from the winding number."""
+        """Return the distances in voxels; unobserved ones are computed from the winding number."""
         values = total / np.maximum(weights, 1e-9) / self.voxel
         unsure = weights < _SURE
         reach = self.reach / self.voxel
@@ -292,7 +298,7 @@ _FACES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 
 
 
 def _nudged(values: np.ndarray) -> np.ndarray:
-    """Keep values off 0, so that no two vertices coincide."""
+    """Move values away from 0, so that no two vertices coincide."""
     return np.where(values < 0, np.minimum(values, -1e-3), np.maximum(values, 1e-3)).astype(np.float32)
 
 

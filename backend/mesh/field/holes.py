@@ -1,7 +1,7 @@
-"""Filling holes that other objects leave in a flat surface, such as a cup in the surface of a table.
+"""Filling of holes that occluding objects leave in a flat surface, such as a cup on a table.
 
-The winding number cannot fill them, since a sheet has no inside. Therefore each hole is covered with a patch that is as
-thick as the sheet.
+The winding number cannot fill them, since an open sheet has no inside. Therefore each hole is covered with a patch of
+the thickness of the sheet.
 """
 
 from __future__ import annotations
@@ -13,21 +13,26 @@ from skimage.draw import polygon2mask
 from .blocks import SAMPLES, SIDE
 
 _FACING = 0.6
-"""Smallest cosine between the normals of the surface around a hole and of the hole's plane."""
+"""Smallest cosine between the normals of the surface around a hole and the normal of the hole's plane."""
 _FLATNESS = 0.15
 """Largest deviation of a hole's rim from its plane, as a fraction of the hole's size."""
 _SMALLEST = 6
 _LARGEST = 400
 """Smallest number of edges of a hole's rim, and largest number of voxels across a hole."""
 _RIM = 100
-"""Approximate number of points of the rim that the height of a patch is interpolated from."""
+"""Approximate number of rim points from which the height of a patch is interpolated."""
 
 _LOCAL = np.stack(np.unravel_index(np.arange(SAMPLES), (SIDE,) * 3), 1)
 
 
 class Patches:
-    """Patches over the holes in a surface (vertices in voxels): points (n, 3), one for each voxel, normals (n, 3),
-    outward, and faces (m, 3), triangles of the points for the winding number."""
+    """Patches over the holes in a surface with vertices in voxels.
+
+    Attributes:
+        points: (n, 3), one for each voxel.
+        normals: (n, 3), outward.
+        faces: (m, 3), triangles of the points, for the winding number.
+    """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         grids = [found for loop in _loops(faces) if (found := _patch(vertices[loop[0]], vertices, faces[loop[1]]))]
@@ -39,7 +44,10 @@ class Patches:
         self._tree = cKDTree(self.points) if len(self.points) else None
 
     def thicken(self, coords: np.ndarray, wanted: np.ndarray, thickness: float, values: np.ndarray) -> None:
-        """Make `values` (B, 512) of blocks `coords` negative to `thickness` voxels below a patch, where `wanted`."""
+        """Merge the patches, with a thickness in voxels, into `values` (B, 512) of the blocks `coords` where `wanted`.
+
+        Samples up to `thickness` below a patch become negative.
+        """
         if self._tree is None or not len(coords):
             return
         away, _ = self._tree.query(coords * SIDE + 0.5 * (SIDE - 1), distance_upper_bound=SIDE + thickness)
@@ -55,7 +63,7 @@ class Patches:
 
 
 def _loops(faces: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Find the boundary loops of a surface: their vertices in the order of the faces, and each edge's face."""
+    """Find the boundary loops of a surface: the vertices in the direction of the faces, and the face of each edge."""
     edges = np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2).astype(np.int64)
     size = int(faces.max(initial=0)) + 1
     there, back = edges[:, 0] * size + edges[:, 1], edges[:, 1] * size + edges[:, 0]
@@ -89,7 +97,7 @@ def _patch(
     a, b, c = (vertices[beside[:, i]] for i in range(3))
     around = np.cross(b - a, c - a)
     around /= np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-12)
-    # The loop around a hole runs in the opposite direction of the surface's outline.
+    # The loop around a hole has the opposite orientation of the surface's outline.
     normal /= -max(area, 1e-12)
     heights = (rim - center) @ normal
     if area < 1 or (around.mean(0) * normal).sum() < _FACING or heights.std() > _FLATNESS * np.sqrt(area):

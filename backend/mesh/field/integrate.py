@@ -1,4 +1,4 @@
-"""Integration of one view into the samples of a sparse signed distance field."""
+"""Integration of a view into the samples of a sparse signed distance field."""
 
 from __future__ import annotations
 
@@ -17,17 +17,22 @@ _UNCERTAINTY_HALF = 3.0
 """Uncertainty of a pixel's depth, in pixels, at which its weight is one half."""
 
 _MIN_SLOPE = 0.15
-"""Lower limit of the cosine between ray and normal."""
+"""Lower limit of the cosine between ray and surface normal."""
 
 
 @dataclass(frozen=True)
 class Sight:
-    """One view as evidence about one object.
+    """The observation of one object in one view.
 
-    front (H, W) float32: depth of the visible surface along z, infinite where there is none; trust (H, W): its weight,
-    0 .. 1. In a rectangle (h, w) with the upper left corner (x, y): own, the object's depth where the object is
-    visible, else 0; depth_uncertainty, the expected error of it; slope, the change of the distance from the surface for
-    a step along z; weight of the pixel; beside, distance from the object's outline in pixels.
+    Attributes:
+        front: (H, W) float32, depth of the visible surface along z, infinite where there is none.
+        trust: (H, W), weight of `front`, 0 .. 1.
+        x, y: Upper left corner of the rectangle (h, w) of the following arrays.
+        own: The object's depth where it is visible, otherwise 0.
+        depth_uncertainty: Expected error of `own`.
+        slope: Change of the distance from the surface per step along z.
+        weight: Weight of each pixel.
+        beside: Distance from the object's outline in pixels, negative inside.
     """
 
     camera: Camera
@@ -43,7 +48,7 @@ class Sight:
 
 
 def own_depth(view: ObjectView) -> np.ndarray:
-    """Return the object's depth (h, w) where the object is visible, elsewhere 0."""
+    """Return the object's depth (h, w), 0 where the object is not visible."""
     return np.where(view.visible * view.alpha >= ALPHA_SEEN, view.depth, np.float32(0))
 
 
@@ -53,8 +58,8 @@ def prepare_sight(scene: SceneMap, view: ObjectView | None, margin: int, jump: f
     Args:
         scene: The render of the whole scene.
         view: The render of the object alone; None if it is out of view.
-        margin: The width in pixels around the object where distances from its outline are needed.
-        jump: The difference of depth, in scene units, from which on neighboring pixels show different surfaces.
+        margin: The width in pixels of the border around the object in which distances from its outline are needed.
+        jump: The smallest difference of depth, in scene units, between neighboring pixels of different surfaces.
     """
     front = np.where(scene.depth > 0, scene.depth, np.float32(np.inf))
     trust = _trust(scene.depth_uncertainty, scene.depth, scene.camera)
@@ -82,31 +87,33 @@ def prepare_sight(scene: SceneMap, view: ObjectView | None, margin: int, jump: f
 
 
 def _trust(depth_uncertainty: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the weight of a depth by its uncertainty, 0 .. 1; 1 where there is no depth."""
+    """Compute the weight of a depth from its uncertainty, 0 .. 1; 1 where there is no depth."""
     pixels = depth_uncertainty / np.where(depth > 0, depth, 1) * np.float32(camera.K[0, 0])
     return (1 / (1 + (pixels / np.float32(_UNCERTAINTY_HALF)) ** 2)).astype(np.float32)
 
 
 def _beside(seen: np.ndarray, own: np.ndarray, front: np.ndarray, jump: float) -> np.ndarray:
-    """Return the distance (h, w) in pixels from the object's outline, negative inside and where the object may be
-    occluded."""
+    """Return the distance (h, w) in pixels from the object's outline.
+
+    It is negative inside and where the object may be occluded.
+    """
     nearest = distance_transform_edt(~seen, return_distances=False, return_indices=True)
     filled = seen | (front < own[tuple(nearest)] + jump)
-    # Pixel centers are at least half a pixel from the outline, on either side.
+    # On both sides, pixel centers are at least half a pixel from the outline.
     outside, inside = distance_transform_edt(~filled), distance_transform_edt(np.pad(filled, 1, mode="edge"))
     return np.where(filled, 0.5 - inside[1:-1, 1:-1], outside - 0.5).astype(np.float32)
 
 
 @kernel(parallel=True)
 def _slopes(own, fx, fy, cx, cy, jump, slope, weight):
-    """slope: the cosine between ray and normal times the ray's length for a step of 1 along z."""
+    """Compute slope, the cosine between ray and normal times the ray's length for a step of 1 along z, and weight."""
     height, width = own.shape
     for v in prange(height):
         for u in range(width):
             d = own[v, u]
             if d == 0.0:
                 continue
-            # Differences of the depth over one pixel, from the sides that lie on the same surface.
+            # Depth differences over one pixel, from the neighbors on the same surface.
             du = 0.0
             dv = 0.0
             sides_u = 0
@@ -124,7 +131,7 @@ def _slopes(own, fx, fy, cx, cy, jump, slope, weight):
                 du /= sides_u
             if sides_v:
                 dv /= sides_v
-            # Point (x d, y d, d): derivatives by u and v, and their cross product, the normal.
+            # Derivatives of the point (x d, y d, d) by u and v; the normal is their cross product.
             ux, uy, uz = d / fx + x * du, y * du, du
             vx, vy, vz = x * dv, d / fy + y * dv, dv
             nx = uy * vz - uz * vy
@@ -148,11 +155,11 @@ def add(
     Args:
         sight: The view.
         origin: (3,) position of grid point 0 in scene units.
-        voxel: The distance of the samples in scene units.
-        coords: (B, 3) the blocks.
-        reach: The largest distance in front of the surface in scene units; larger ones are clamped.
-        back: The distance behind the surface from which on samples stay unchanged. So do those that another object
-            occludes.
+        voxel: The spacing of the samples in scene units.
+        coords: (B, 3) coordinates of the blocks.
+        reach: Truncation distance in front of the surface in scene units.
+        back: Truncation distance behind the surface in scene units. Samples farther behind it, and samples occluded by
+            other objects, are not changed.
         total: (B, 512) float32 sums of weighted distances in scene units, changed in place.
         weights: (B, 512) float32 sums of weights, changed in place.
     """
@@ -189,7 +196,7 @@ def _add(
             x = viewmat[0, 0] * center[0] + viewmat[0, 1] * center[1] + viewmat[0, 2] * center[2] + viewmat[0, 3]
             y = viewmat[1, 0] * center[0] + viewmat[1, 1] * center[1] + viewmat[1, 2] * center[2] + viewmat[1, 3]
             u, v = fx * x / z + cx, fy * y / z + cy
-            # No point of the sphere around the block projects farther from its center than this.
+            # Upper limit of the projected radius of the sphere around the block.
             spread = 2 * radius / z * (1 + max(abs(x), abs(y)) / z)
             if u + fx * spread < 0 or u - fx * spread > width or v + fy * spread < 0 or v - fy * spread > height:
                 continue
@@ -220,7 +227,7 @@ def _add(
                 aside = beside[rv, ru] * z / fx
             if inside and own[rv, ru] > 0:
                 d = own[rv, ru]
-                # Between four pixels of one surface the depth is interpolated.
+                # Interpolate the depth between four pixels of the same surface.
                 if between:
                     d00, d01, d10, d11 = own[av, au], own[av, au + 1], own[av + 1, au], own[av + 1, au + 1]
                     low = min(min(d00, d01), min(d10, d11))
@@ -228,8 +235,8 @@ def _add(
                     if low > 0 and (high - low) * slope[rv, ru] < reach:
                         d = (d00 * (1 - tu) + d01 * tu) * (1 - tv) + (d10 * (1 - tu) + d11 * tu) * tv
                 distance = (d - z) * slope[rv, ru]
-                # What may be off is that much thicker, and as much less sharp, or what one view sees too near another
-                # one that sees it too far would wipe out.
+                # Widen and flatten the distance profile by the depth's uncertainty; otherwise, a view whose depth is
+                # too large would erase the surface of a view whose depth is too small.
                 off = depth_uncertainty[rv, ru] * slope[rv, ru]
                 if distance <= -back - off:
                     continue
@@ -244,7 +251,7 @@ def _add(
                 ahead = front[iv, iu] - z
                 if ahead <= 0:
                     continue
-                # Where the object may go on behind what is seen here, no outline bounds the distance.
+                # The outline does not limit the distance where the object may continue behind an occluder.
                 hides = inside and beside[rv, ru] < 0
                 gain = trust[iv, iu]
                 total[b, n] += gain * (min(reach, ahead) if hides else min(min(reach, ahead), aside))

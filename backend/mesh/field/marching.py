@@ -1,7 +1,7 @@
-"""Triangulation of the zero level of a sparse field: marching cubes of scikit-image on cubes of 64 cells.
+"""Triangulation of the zero level of a sparse field: scikit-image's marching cubes on dense cubes of 64 cells per side.
 
-Neighboring cubes share a layer of samples, so that both have the same vertices there, which are merged. Only one dense
-cube at a time is in memory.
+Neighboring cubes share a layer of samples, so they have identical vertices there, which are merged. Only one dense cube
+at a time is in memory.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def march(
         blocks: The B blocks of the field.
         values: (B, 512) distances, negative inside.
         seen: (B, 512) bool. A cell is seen if all its samples are.
-        closed: Triangulate all cells, instead of only the seen ones.
+        closed: Whether to triangulate all cells instead of only the seen ones.
 
     Returns:
         vertices (V, 3) float64 in voxels, faces (F, 3) int32, counter-clockwise from outside, and seen (F,) bool.
@@ -37,7 +37,7 @@ def march(
     cells = np.empty((_CELLS + 1,) * 3, np.uint8)
     all_vertices, all_faces, all_seen = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [np.zeros(0, bool)]
     count = 0
-    # A block is part of its own cube, and its first layers are part of the cubes before it.
+    # A block belongs to its own cube, and its first layers also to the preceding cubes.
     reach = np.stack(np.meshgrid(*[np.arange(_BLOCKS + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
     for cube in distinct(blocks.coords // _BLOCKS):
         found = blocks.find(cube * _BLOCKS + reach)
@@ -46,9 +46,9 @@ def march(
         crossed = _fill(values, seen, found[here], reach[here], volume, state, cells, closed)
         if not crossed:
             continue
-        # scikit-image looks a cell's mask up at its last corner.
+        # scikit-image reads a cell's mask at its last corner.
         vertices, faces, _, _ = marching_cubes(volume, 0.0, mask=cells > 0, allow_degenerate=True)
-        # Rounded, a face of the last cells may lie in the cube's border.
+        # Due to rounding, the center of a face of the last cells may lie in the cube's border.
         center = np.minimum(np.floor(vertices[faces].mean(1)).astype(np.int64), _CELLS - 1) + 1
         all_seen.append(cells[center[:, 0], center[:, 1], center[:, 2]] == 2)
         all_vertices.append(vertices.astype(np.float64) + cube * _CELLS)
@@ -61,7 +61,10 @@ def march(
 
 @kernel()
 def _fill(values, seen, found, place, volume, state, cells, closed):
-    """Copy blocks into the dense cube; cells: 0 none, 1 not wholly seen, 2 seen. Returns whether the level passes."""
+    """Copy blocks into the dense cube and set `cells` to 0 (not triangulated), 1 (not entirely seen) or 2 (seen).
+
+    Returns whether any cell is triangulated.
+    """
     size = volume.shape[0]
     volume[:] = 1.0
     cells[:] = 0
@@ -102,7 +105,7 @@ def _merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     off[rows, axis] = 0
     base = nearest.astype(np.int64)
     base[rows, axis] = np.floor(vertices[rows, axis]).astype(np.int64)
-    # Ambiguous cells have a vertex in their center, on no edge.
+    # Ambiguous cells have a vertex in their center instead of on an edge.
     on_edge = off.max(1, initial=0) < 1e-3
     half = 1 << 19
     keys = (((base[:, 0] + half) << 42) | ((base[:, 1] + half) << 22) | ((base[:, 2] + half) << 2)) + axis

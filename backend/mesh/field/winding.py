@@ -1,8 +1,8 @@
 """Generalized winding number of an open surface (Jacobson et al. 2013).
 
-It is 1 inside a closed surface and 0 outside. Where a part of the surface is missing, it changes smoothly, and is 1/2
-on the plane of a flat hole. It is computed from dipoles, one for each cluster of triangles; distant clusters are larger
-(Barill et al. 2018).
+It is 1 inside a closed surface and 0 outside. Across holes it changes smoothly, with 1/2 on the plane of a flat hole.
+It is approximated by dipoles, one for each cluster of triangles, with larger clusters at a distance (Barill et al.
+2018).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _FINE, _MIDDLE, _COARSE = 2, SIDE, 4 * SIDE
 
 
 class Winding:
-    """The winding number of the triangles `vertices` (V, 3), `faces` (F, 3), in voxels."""
+    """The winding number of a triangle mesh, vertices (V, 3) in voxels and faces (F, 3)."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         a, b, c = (vertices[faces[:, i]] for i in range(3))
@@ -30,7 +30,7 @@ class Winding:
         self.fine, first = _clusters(centers, normals, keys[0])
         self.middle, starts = _clusters(centers, normals, keys[1])
         self.coarse, coarse_starts = _clusters(centers, normals, keys[2])
-        # Where each middle cluster's fine ones begin, and each coarse one's middle ones.
+        # Index of the first fine cluster of each middle cluster, and of the first middle cluster of each coarse one.
         self.fine_of = np.append(np.searchsorted(first, starts), len(first)).astype(np.int64)
         self.middle_of = np.append(np.searchsorted(starts, coarse_starts), len(starts)).astype(np.int64)
 
@@ -42,7 +42,7 @@ class Winding:
 
 
 def _clusters(centers: np.ndarray, normals: np.ndarray, keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return center and normal (n, 6) of each run of equal keys, with the area as length, and the start of each run."""
+    """Return the center and area-scaled normal (n, 6) of each run of equal keys, and the start of each run."""
     starts = np.flatnonzero(np.append(True, keys[1:] != keys[:-1]))
     areas = np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
     weighted = np.add.reduceat(centers * areas[:, None], starts) / np.add.reduceat(areas, starts)[:, None]
@@ -72,7 +72,7 @@ def _evaluate(coords, wanted, fine, fine_of, middle, middle_of, coarse, out):
         for i in range(3):
             corner[i] = coords[b, i] * SIDE
         center = corner + 0.5 * (SIDE - 1)
-        # What is far is summed at the block's corners and interpolated; what is near, at each sample.
+        # Distant clusters are evaluated at the block's corners and interpolated, near ones at each sample.
         far = np.zeros(8)
         near = np.empty(middle.shape[0], np.int64)
         count = 0

@@ -1,1 +1,1 @@
-"""Texturing of a surface: UVs, texels, and their colors from the photos."""
+"""Texturing of a surface: UV unwrapping, texels, and baking of the photos."""

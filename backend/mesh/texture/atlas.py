@@ -1,4 +1,4 @@
-"""Texels of a texture: the point of the surface that each one shows, and colors for those that show none."""
+"""Texels of a texture: the surface point of each texel, and filling of texels without one."""
 
 from __future__ import annotations
 
@@ -11,12 +11,18 @@ from ...raster.kernel import kernel
 
 _BAND = 16
 _RIM = np.float32(1.0)
-"""Width of the border of a chart in texels, which bilinear sampling reads."""
+"""Width in texels of the border of a chart, which is read by bilinear sampling."""
 
 
 class Texels(NamedTuple):
-    """The texels of some rows that show a surface: place (N,) int64, row-major index in the whole texture; face (N,)
-    int32; weights (N, 3) float32 of the face's corners, which sum to 1 and may be negative in the border of a chart."""
+    """The texels of some rows that lie on a surface.
+
+    Attributes:
+        place: (N,) int64, row-major index in the whole texture.
+        face: (N,) int32.
+        weights: (N, 3) float32, barycentric weights of the face's corners, which sum to 1 and may be negative in the
+            border of a chart.
+    """
 
     place: np.ndarray
     face: np.ndarray
@@ -26,7 +32,7 @@ class Texels(NamedTuple):
 def find_texels(uvs: np.ndarray, size: int, first_row: int, rows: int) -> Texels:
     """Find the texels of `rows` rows from `first_row` on, counted from the top, of a texture of size x size.
 
-    uvs (F, 3, 2): of the faces' corners, (0, 0) at the texture's lower left.
+    uvs (F, 3, 2): UVs of the faces' corners, (0, 0) at the texture's lower left.
     """
     corners = np.asarray(uvs, np.float64) * size
     corners[..., 1] = size - corners[..., 1] - first_row
@@ -41,7 +47,7 @@ def find_texels(uvs: np.ndarray, size: int, first_row: int, rows: int) -> Texels
 
 @kernel(parallel=True)
 def _cover(corners, candidates, face, weights):
-    """Give each texel the face that its center lies in, or else the nearest within the rim."""
+    """Assign each texel the face that contains its center, or otherwise the nearest face within the border."""
     rows, size = face.shape
     for band in prange((rows + _BAND - 1) // _BAND):
         top, stop = band * _BAND, min((band + 1) * _BAND, rows)
@@ -83,7 +89,7 @@ def _cover(corners, candidates, face, weights):
                         continue
                     outside[row - top, column] = away
                     face[row, column] = f
-                    # Far beyond a needle's edge the weights say little.
+                    # Limit the extrapolation of the weights beyond the edges of thin faces.
                     for i in range(3):
                         share = (edges[i, 0] * (column + 0.5) + edges[i, 1] * (row + 0.5) + edges[i, 2]) / area
                         share = max(share, -0.5)
@@ -95,7 +101,7 @@ def _cover(corners, candidates, face, weights):
 
 @kernel(parallel=True)
 def interpolate(values, faces, face, weights, out):
-    """Write out (N, 3): the vertices' `values` (V, 3) at places on the faces `face` (N,) with `weights` (N, 3)."""
+    """Interpolate vertex values (V, 3) at points on the faces `face` (N,) with `weights` (N, 3); writes out (N, 3)."""
     for n in prange(face.size):
         a, b, c = faces[face[n], 0], faces[face[n], 1], faces[face[n], 2]
         for axis in range(3):
@@ -105,9 +111,9 @@ def interpolate(values, faces, face, weights, out):
 
 
 def fill(values: np.ndarray, known: np.ndarray) -> None:
-    """Extrapolate the texels that are `known` (H, W) smoothly to the others, by a pyramid of means.
+    """Extrapolate the `known` (H, W) texels smoothly to the others, with an image pyramid.
 
-    values: (H, W, C) float32, changed in place; 0 everywhere if nothing is known.
+    values: (H, W, C) float32, changed in place; becomes 0 everywhere if nothing is known.
     """
     height, width, _ = values.shape
     if height == width == 1:

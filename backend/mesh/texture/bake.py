@@ -1,4 +1,4 @@
-"""Baking of the photos into a texture and vertex colors of a surface."""
+"""Baking of the photos into the texture and vertex colors of a surface."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from .photos import Photo, Photos, Samples, add_photo, blend
 SIZES = (512, 1024, 2048, 4096)
 
 _USED = 0.5
-"""Approximate fraction of a texture that charts cover."""
+"""Approximate fraction of a texture that is covered by charts."""
 
 _AT_ONCE = 4_000_000
-"""Largest number of texels that are processed together, to limit the memory."""
+"""Largest number of texels that are processed together, to limit memory usage."""
 
 _EMPTY, _SEEN, _UNSEEN = 0, 1, 2
-"""State of a texel: it shows no surface; photos show it; it shows a surface, but no photo shows it."""
+"""State of a texel: not on the surface; visible in a photo; on the surface, but visible in no photo."""
 
 
 def texture_size(surface: Surface, views: Views) -> int:
@@ -37,8 +37,7 @@ def texture_size(surface: Surface, views: Views) -> int:
         views: The training views.
 
     Returns:
-        The smallest of SIZES in which texels are not larger than the pixels that show them best, on nearly all of the
-        surface.
+        The smallest of SIZES for which, on most of the surface, texels are not larger than pixels of the closest view.
     """
     vertices, faces = _arrays(surface)
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
@@ -46,7 +45,7 @@ def texture_size(surface: Surface, views: Views) -> int:
     area = np.linalg.norm(normal, axis=1) / 2
     normal /= np.maximum(2 * area, 1e-30)[:, None]
     center = (a + b + c) / 3
-    finest = np.zeros(len(faces))  # pixels on a unit of area
+    finest = np.zeros(len(faces))  # pixels per unit of area
     for index in views.indices:
         camera = views.scene.camera(index)
         pixels, depth = _project(center, camera)
@@ -58,7 +57,7 @@ def texture_size(surface: Surface, views: Views) -> int:
     seen = finest > 0
     if not seen.any():
         return SIZES[0]
-    # The density that is enough for 80% of the seen area, on the whole surface.
+    # The density that suffices for 80% of the seen area, applied to the whole surface.
     order = np.argsort(finest[seen])
     reached = np.cumsum(area[seen][order]) / max(float(area[seen].sum()), 1e-30)
     density = finest[seen][order][min(int(np.searchsorted(reached, 0.8)), len(order) - 1)]
@@ -76,7 +75,7 @@ def bake_texture(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Bake the photos into a texture.
 
-    Each texel is blended from the photos that show it best; texels that no photo shows continue their surroundings.
+    Each texel is blended from the photos that show it best; texels that are visible in no photo are extrapolated.
 
     Args:
         surface: The surface in scene units.
@@ -87,8 +86,8 @@ def bake_texture(
         reporter: Receives the progress.
 
     Returns:
-        The texture (size, size, 3) uint8 sRGB, top row first, and the vertices' colors (V, 3) uint8 sRGB, which are
-        those of the splats.
+        The texture (size, size, 3) uint8 sRGB, top row first, and the vertex colors (V, 3) uint8 sRGB, taken from the
+        splats.
     """
     reporter = reporter or Reporter()
     pictures = Photos(views, surface.vertices, surface.faces, classes)
@@ -161,7 +160,7 @@ def _add_splats(
     index: int,
     classes: Sequence[int],
 ) -> None:
-    """Add the colors of the objects' own splats in view `index` to the vertices that are visible in it."""
+    """Add the rendered colors of the objects' splats in view `index` to the vertices visible in it."""
     view = views.object_view(index, classes)
     if view is None:
         return
@@ -174,7 +173,7 @@ def _add_splats(
     at = np.flatnonzero(seen)
     nearest = photo.depth[row[at], column[at]]
     at = at[depth[at] <= nearest * 1.01]
-    # The view of the objects may be downscaled, and has a rectangle of its own.
+    # The object view may be downscaled, and covers a different rectangle.
     column = (column[at] + photo.x) // views.downscale - view.x
     row = (row[at] + photo.y) // views.downscale - view.y
     inside = (column >= 0) & (row >= 0) & (column < view.alpha.shape[1]) & (row < view.alpha.shape[0])
@@ -199,7 +198,7 @@ def _add_texels(faces, face, weights, color, seen, total, weight):
 def _extrapolate(mean: _Mean, vertices: np.ndarray, faces: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
     """Return colors (V, 3) float32: the means, extrapolated smoothly along the surface to vertices without one.
 
-    otherwise: (3,) or (V, 3), the colors if no vertex has a mean.
+    otherwise: (3,) or (V, 3), the default colors if no vertex has a mean.
     """
     known = mean.weight > 1e-6
     out = np.empty((len(vertices), 3), np.float32)
@@ -226,10 +225,10 @@ def _extrapolate(mean: _Mean, vertices: np.ndarray, faces: np.ndarray, otherwise
 def _complete(
     texture: np.ndarray, state: np.ndarray, base: np.ndarray, faces: np.ndarray, uvs: np.ndarray, steps: list
 ) -> None:
-    """Color the texels that no photo shows, and those between the charts, in place.
+    """Color the texels that are visible in no photo, and those between the charts, in place.
 
     An unseen texel gets the color `base`, interpolated between the vertices, plus the smoothly extrapolated difference
-    of the seen texels from it, so that there is no visible border.
+    of the seen texels from it, to avoid visible seams.
     """
     size = len(state)
     if (state == _UNSEEN).any():

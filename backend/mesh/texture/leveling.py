@@ -1,8 +1,8 @@
-"""Leveling of the colors of photos of one surface.
+"""Color leveling of the photos of one surface.
 
-Highlights and shading move with the camera, so that photos of the same point differ, with a seam wherever one photo
-follows another. Therefore the difference of each photo from the median of all photos, smoothed along the surface, is
-subtracted. Finer detail stays (cf. Waechter et al. 2014, who level photos against each other at the seams).
+View-dependent highlights and shading cause photos of the same point to differ, with seams between areas textured from
+different photos. Therefore the difference of each photo from the median of all photos, smoothed along the surface, is
+subtracted. Finer detail is preserved (cf. Waechter et al. 2014, who level photos against each other at the seams).
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from ..surface import neighbors
 from .photos import Photo, Photos, between, look
 
 _ASKED = 64
-"""Largest number of photos that the median is computed from."""
+"""Largest number of photos from which the median is computed."""
 _STEPS = 40
-"""Rounds of smoothing the differences; their radius in edges is the square root of it."""
+"""Number of smoothing steps of the differences; the radius in edges is its square root."""
 
 
 def level(photos: Photos, normals: np.ndarray, progress: Callable[[int], None]) -> dict[int, np.ndarray]:
     """Compute the offsets (V, 3) float32 to each photo's colors at the vertices, by the photo's index.
 
-    normals (V, 3): the vertices' unit normals; progress: called with the number of photos done. Photos that show no
-    vertex are left out.
+    normals (V, 3): unit normals of the vertices; progress: called with the number of processed photos. Photos that show
+    no vertex are left out.
     """
     asked = photos.indices[:: max(1, -(-len(photos.indices) // _ASKED))]
     seen: dict[int, tuple[np.ndarray, np.ndarray]] = {}
@@ -56,7 +56,7 @@ def level(photos: Photos, normals: np.ndarray, progress: Callable[[int], None]) 
 
 
 def _at_vertices(photo: Photo, vertices: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the photo's weight at each vertex, (V,) float32, 0: not visible, and its colors there, (V, 3) float32."""
+    """Return the photo's weights (V,) float32, 0 where not visible, and colors (V, 3) float32 at the vertices."""
     viewmat, intrinsics = photo.camera.arrays()
     weight = np.zeros(len(vertices), np.float32)
     color = np.zeros((len(vertices), 3), np.float32)
@@ -73,14 +73,14 @@ def _look(vertices, normals, planes, depth, clearance, viewmat, intrinsics, eye,
         score, u, v, _clear = look(vertices, normals, n, 0.0, eye, viewmat, intrinsics, depth, clearance, safe)
         if score <= 0.0:
             continue
-        # As many pixels as a side of the place has.
+        # Pixels per unit of length on the surface.
         weight[n] = np.sqrt(score)
         for c in range(3):
             color[n, c] = between(planes[c], u + corner[0], v + corner[1])
 
 
 def _medians(colors: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weighted median (V, 3) of P photos' colors (P, V, 3), weights (P, V), and where there is one, (V,)."""
+    """Return the weighted median (V, 3) of colors (P, V, 3) with weights (P, V), and where it exists, (V,) bool."""
     order = np.argsort(colors, 0)
     behind = np.cumsum(np.take_along_axis(np.broadcast_to(weights[..., None], colors.shape), order, 0), 0)
     middle = (behind >= behind[-1] / 2).argmax(0)[None]

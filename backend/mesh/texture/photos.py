@@ -1,4 +1,4 @@
-"""Photos of a surface: where each one shows nothing but the surface, and how well; blending of their colors."""
+"""Photos of a surface: the pixels that show only the surface, their quality, and blending of their colors."""
 
 from __future__ import annotations
 
@@ -15,45 +15,51 @@ from ..views import Views
 from .zbuffer import draw_mesh
 
 KEPT = 6
-"""Largest number of photos that color a texel."""
+"""Largest number of photos blended in a texel."""
 
 _CLEAR = 1.5
 """Distance in pixels from an outline of the surface up to which a pixel may show something beyond it."""
 
 _SAFE = 4.0
-"""Distance in pixels from an outline from which on it makes no difference, in photos of up to `_SMALL` pixels."""
+"""Distance in pixels from an outline at which it no longer reduces the score, in photos of up to `_SMALL` pixels."""
 
 _SMALL = 800
 _CUBIC = 2.5
 """Distance in pixels from an outline from which on bicubic interpolation reads no pixel beyond it."""
 
 _STEP = 6.0
-"""Difference of depth between neighboring pixels at an outline, in sizes of a pixel on the surface."""
+"""Smallest depth difference between neighboring pixels at an outline, in pixel sizes on the surface."""
 
 _BEHIND = 3.0
-"""Largest distance of a point behind the visible surface, in sizes of a pixel on it."""
+"""Largest distance of a visible point behind the depth map, in pixel sizes on the surface."""
 
 _GRAZING = 0.1
-"""Smallest cosine between normal and view direction in a photo that is used."""
+"""Smallest cosine between normal and view direction for a photo to be used."""
 
 _SHARPNESS = 3.0
 """Exponent of the score in the weight of a photo."""
 
 _ODD = 0.25
-"""Difference from the median color, 0 .. 1, that reduces the weight of a photo to 1 / e: highlights, passers-by."""
+"""Difference from the median color, 0 .. 1, that reduces the weight of a photo to 1 / e (highlights, passers-by)."""
 
 
 _HELD = 300e6
-"""Largest number of bytes of the cache of photos."""
+"""Size of the photo cache in bytes."""
 
 _NO_PLANES = np.zeros((0, 0, 0), np.float32)
 
 
 class Photo(NamedTuple):
-    """A photo of a surface. planes (3, H, W) float32 at the common exposure; camera: of a rectangle of it, whose upper
-    left is the pixel (x, y); depth (h, w) float32 of the surface there, 0 where it is not visible; clearance (h, w)
-    float32: distance in pixels from the next pixel that shows something else; safe: clearance from which on a larger
-    one is not better."""
+    """A photo of a surface.
+
+    Attributes:
+        planes: (3, H, W) float32, at the common exposure.
+        camera: Camera of the rectangle (h, w) that contains the surface.
+        x, y: Upper left pixel of the rectangle.
+        depth: (h, w) float32, depth of the surface, 0 where there is none.
+        clearance: (h, w) float32, distance in pixels from the nearest pixel that shows something else.
+        safe: Clearance above which the score does not increase.
+    """
 
     planes: np.ndarray
     camera: Camera
@@ -65,21 +71,21 @@ class Photo(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """The best photos of N points: score (N, KEPT + 1) float32, descending, 0: none; color (N, KEPT, 3) uint8."""
+    """The best photos of N points: score (N, KEPT + 1) float32, descending, 0 if none; color (N, KEPT, 3) uint8."""
 
     score: np.ndarray
     color: np.ndarray
 
     @classmethod
     def none(cls, count: int) -> Samples:
-        """Return samples of `count` points without a photo."""
+        """Return empty samples for `count` points."""
         return cls(np.zeros((count, KEPT + 1), np.float32), np.zeros((count, KEPT, 3), np.uint8))
 
 
 class Photos:
     """All photos of one surface: vertices (V, 3) float64 in scene units, faces (F, 3) int32, of the objects `classes`.
 
-    photos[i] is the photo of view i, None if the surface is out of view. Photos are cached as long as they fit.
+    photos[i] is the photo of view i, None if the surface is out of view. Photos are cached up to a memory limit.
     """
 
     def __init__(self, views: Views, vertices: np.ndarray, faces: np.ndarray, classes: Sequence[int]) -> None:
@@ -96,7 +102,7 @@ class Photos:
             if size > self._room:
                 return photo
             self._room -= size
-            # The scene has the planes in its own cache.
+            # The scene caches the planes.
             self._held[index] = None if photo is None else photo._replace(planes=_NO_PLANES)
         photo = self._held[index]
         if photo is None:
@@ -126,14 +132,14 @@ def _photo_of(
 def _allowed(
     views: Views, index: int, labels: np.ndarray | None, classes: Sequence[int], box: tuple[int, int, int, int]
 ) -> np.ndarray:
-    """Return which pixels of `box` show the objects, (h, w) bool, by the mask, or the model where it is unlabeled."""
+    """Return which pixels of `box` show the objects, (h, w) bool: from the mask, or from the model where unlabeled."""
     x, y, width, height = box
     ours = np.zeros(len(views.model.classes) + 1, np.bool_)  # the last one for the index -1
     ours[list(classes)] = True
     if labels is not None:
         shown = ours[labels]
         unlabeled = labels[y : y + height, x : x + width] < 0
-        # A mask that shows the objects is trusted to show all of them.
+        # A mask that contains the objects is assumed to be complete.
         if not unlabeled.any() or (shown.any() and 0 not in classes):
             return shown[y : y + height, x : x + width]
     ids = views.scene_map(index).ids
@@ -144,7 +150,7 @@ def _allowed(
 
 
 def _box(vertices: np.ndarray, camera: Camera) -> tuple[int, int, int, int] | None:
-    """Return x, y, width and height of the part of the image that shows the mesh; None if it is out of view."""
+    """Return the rectangle of the image that contains the mesh: x, y, width, height; None if it is out of view."""
     seen = vertices @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     front = seen[:, 2] > camera.near
     size = np.array([camera.width, camera.height])
@@ -163,9 +169,9 @@ def _box(vertices: np.ndarray, camera: Camera) -> tuple[int, int, int, int] | No
 
 @kernel()
 def _measure_clearance(depth, allowed, step, clearance):
-    """Distance from each pixel to the next that is not `allowed`, shows no surface, or is across a step in depth.
+    """Compute each pixel's distance to the nearest one that is not `allowed`, without depth or across a depth step.
 
-    step: of depth, as a share of the depth. By two passes of chamfer distances (Borgefors 1986).
+    Chamfer distance transform in two passes (Borgefors 1986). step: smallest depth step, as a fraction of the depth.
     """
     height, width = depth.shape
     far = np.float32(height + width)
@@ -214,7 +220,7 @@ def add_photo(
     photo: Photo, positions: np.ndarray, normals: np.ndarray, corners: np.ndarray, weights: np.ndarray,
     offsets: np.ndarray, samples: Samples,
 ) -> None:  # fmt: skip
-    """Add a photo to the best ones of N points, where it is one of them.
+    """Insert a photo into the best ones of each of N points, if its score is high enough.
 
     Args:
         photo: The photo.
@@ -222,7 +228,7 @@ def add_photo(
         normals: (N, 3) float32 unit normals.
         corners: (N, 3) int32 vertices of the faces that the points lie on.
         weights: (N, 3) float32 barycentric coordinates of the points.
-        offsets: (V, 3) float32 added to the photo's colors, given at the vertices.
+        offsets: (V, 3) float32, added to the photo's colors; one for each vertex, interpolated.
         samples: The best photos so far, changed in place.
     """
     viewmat, intrinsics = photo.camera.arrays()
@@ -234,7 +240,7 @@ def add_photo(
 
 @kernel()
 def _cubic(t, out):
-    """Weights of four neighbors at t of the way from the second to the third (Catmull-Rom)."""
+    """Write the Catmull-Rom weights of four neighbors, at the fraction t between the second and the third."""
     out[0] = ((2.0 - t) * t - 1.0) * t / 2.0
     out[1] = ((3.0 * t - 5.0) * t * t + 2.0) / 2.0
     out[2] = ((4.0 - 3.0 * t) * t + 1.0) * t / 2.0
@@ -243,8 +249,11 @@ def _cubic(t, out):
 
 @njit(inline="always", error_model="numpy")
 def look(positions, normals, n, least, eye, viewmat, intrinsics, depth, clearance, safe):
-    """How well a photo shows place `n`, 0: not at all, or not better than `least`; the pixel (u, v) there, counted from
-    pixels' centers, and its clearance. viewmat, intrinsics and eye: of the photo's camera."""
+    """Score a photo at point `n`.
+
+    viewmat, intrinsics and eye (the camera center) describe the photo's camera. Returns the score, 0 if the point is
+    not visible or the score is not greater than `least`; the pixel (u, v), relative to pixel centers; its clearance.
+    """
     fx, fy, cx, cy = intrinsics
     height, width = depth.shape
     focal = (fx + fy) / 2
@@ -274,7 +283,7 @@ def look(positions, normals, n, least, eye, viewmat, intrinsics, depth, clearanc
 
 @njit(inline="always", error_model="numpy")
 def between(plane, u, v):
-    """A plane's value at (u, v), counted from pixels' centers, between its four neighbors, all inside."""
+    """Interpolate a plane bilinearly at (u, v), relative to pixel centers; all four neighbors must be inside."""
     column, row = int(u), int(v)
     fu, fv = u - column, v - row
     return (plane[row, column] * (1 - fu) + plane[row, column + 1] * fu) * (1 - fv) + (
@@ -338,7 +347,7 @@ def _gather(
 
 
 def blend(samples: Samples) -> tuple[np.ndarray, np.ndarray]:
-    """Colors (N, 3) float32 in 0..1 of the places, and which of them any photo shows, (N,) bool."""
+    """Blend the photos of N points; returns colors (N, 3) float32 in 0..1 and which points are visible, (N,) bool."""
     color = np.zeros((len(samples.score), 3), np.float32)
     _blend(samples.score, samples.color, color)
     return color, samples.score[:, 0] > 0
@@ -354,7 +363,7 @@ def _blend(scores, colors, out):
         for n in range(b * block, min((b + 1) * block, scores.shape[0])):
             if scores[n, 0] <= 0.0:
                 continue
-            # Less the first that is left out: so that nothing jumps where two photos change places.
+            # Subtract the weight of the best photo that is left out, so that colors are continuous across the surface.
             floor = (scores[n, KEPT] / scores[n, 0]) ** _SHARPNESS
             count = 0
             total = 0.0

@@ -1,8 +1,8 @@
 """Rasterization of a mesh with a z-buffer: face, depth and barycentric coordinates of each pixel.
 
-A pixel's ray d meets the face (P0, P1, P2), in camera space, where d t = b0 P0 + b1 P1 + b2 P2 with weights that sum
-to 1. With the edge functions e_i = d . (P_j x P_k) that gives b_i = e_i / sum(e) and t = det / sum(e). Nothing is
-divided by a vertex's own depth, so faces that reach behind the camera need no clipping into pieces.
+A pixel's ray d intersects the face (P0, P1, P2), in camera space, where d t = b0 P0 + b1 P1 + b2 P2 with weights that
+sum to 1. With the edge functions e_i = d . (P_j x P_k), b_i = e_i / sum(e) and t = det / sum(e). There is no division
+by the depth of a vertex, so faces that extend behind the camera need no clipping.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from ...raster.camera import Camera
 from ...raster.kernel import kernel
 
 _BAND = 16
-"""Rows of the image that one thread draws at a time."""
+"""Number of image rows that one thread draws at a time."""
 
 _DET, _NEAREST, _FARTHEST = 9, 10, 11
 _COLUMNS = 12
-"""Of a prepared face: three edge functions' coefficients of (x, y, 1), then these."""
+"""Number of columns of a prepared face: the coefficients of (x, y, 1) of three edge functions, then these three."""
 
 
 def draw_mesh(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rasterize both sides of a mesh.
 
-    Of faces at the same depth the first is drawn. Faces without area, edge-on or with corners that are not finite are
+    Of faces at the same depth, the first is drawn. Faces that have no area, are edge-on or have non-finite corners are
     not drawn.
 
     Args:
@@ -52,7 +52,7 @@ def draw_mesh(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[
 
 @kernel(parallel=True)
 def _prepare(seen, corners, intrinsics, width, height, near, prepared, boxes):
-    """Edge functions of pixels, and boxes (first column, last + 1, first row, last + 1), empty: not drawn."""
+    """Compute edge functions and pixel boxes (first column, last + 1, first row, last + 1; empty if not drawn)."""
     fx, fy, cx, cy = intrinsics
     for f in prange(corners.shape[0]):
         boxes[f] = 0
@@ -82,7 +82,7 @@ def _prepare(seen, corners, intrinsics, width, height, near, prepared, boxes):
         for i in range(3):
             p = corners[f, (i + 1) % 3]
             q = corners[f, (i + 2) % 3]
-            # Exactly the negative of what the face across this edge computes, so that no pixel falls between them.
+            # Exactly the negative of the neighboring face's result for this edge, so that there are no gaps.
             nx = seen[p, 1] * seen[q, 2] - seen[p, 2] * seen[q, 1]
             ny = seen[p, 2] * seen[q, 0] - seen[p, 0] * seen[q, 2]
             nz = seen[p, 0] * seen[q, 1] - seen[p, 1] * seen[q, 0]
@@ -100,7 +100,7 @@ def _prepare(seen, corners, intrinsics, width, height, near, prepared, boxes):
         prepared[f, _DET] = abs(det)
         prepared[f, _NEAREST] = max(nearest, near)
         prepared[f, _FARTHEST] = farthest
-        # Columns and rows whose centers, at half-integers, lie inside; one more against rounding.
+        # Columns and rows whose centers, at half-integers, lie inside, plus one because of rounding.
         boxes[f, 0] = int(max(np.floor(left - 0.5), 0.0))
         boxes[f, 1] = int(min(np.floor(right - 0.5) + 2.0, width))
         boxes[f, 2] = int(max(np.floor(top - 0.5), 0.0))
@@ -109,7 +109,7 @@ def _prepare(seen, corners, intrinsics, width, height, near, prepared, boxes):
 
 @kernel()
 def _bin(boxes, bands):
-    """The faces of each band of rows, in their own order: starts (bands + 1,), members (n,)."""
+    """List the faces in each band of rows, in their original order: starts (bands + 1,), members (n,)."""
     starts = np.zeros(bands + 1, np.int64)
     for f in range(boxes.shape[0]):
         if boxes[f, 0] < boxes[f, 1] and boxes[f, 2] < boxes[f, 3]:
@@ -147,7 +147,7 @@ def _fill(prepared, boxes, starts, members, near, depth, face, barycentric):
                     total = e0 + e1 + e2
                     if e0 < 0.0 or e1 < 0.0 or e2 < 0.0 or total <= 0.0 or e[_DET] < near * total:
                         continue
-                    # Rounding can take nearly edge-on faces out of their own range.
+                    # Rounding can move the depth of nearly edge-on faces out of the face's range.
                     z = np.float32(min(max(e[_DET] / total, e[_NEAREST]), e[_FARTHEST]))
                     if face[row, column] < 0 or z < depth[row, column]:
                         depth[row, column] = z

@@ -1,8 +1,8 @@
-"""Tile intersections, front to back, on the CPU: which splats every tile blends.
+"""Tile intersections on the CPU: the splats of each tile, front to back.
 
-The depths are sorted once, by radix sort; a counting pass over the tiles keeps that order, so no key is sorted twice.
-The result does not depend on the number of threads. A tile row includes a splat only between the exact left and right
-ends of its ellipse inside that row.
+The depths are radix sorted once; a counting sort by tile preserves this order. The result does not depend on the number
+of threads. In each row of tiles, a splat is assigned only to the tiles between the exact left and right ends of its
+ellipse.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ TILE_W = 64
 TILE_H = 32
 
 _CHUNK, _CHUNKS = 2048, 16
-"""Splats that a thread processes at a time, at least; and the largest number of such chunks."""
+"""Smallest number of splats per chunk, and largest number of chunks, which are processed in parallel."""
 
 
 @njit(inline="always", error_model="numpy")
 def spread(index, columns, lines):
-    """The index-th tile to process: rows of tiles in an order that visits distant rows in turn, each left to right.
+    """Return the index-th tile to process: rows of tiles in an interleaved order, each row from left to right.
 
-    numba gives every thread one run of consecutive indices; this way all threads get a part of a busy image region,
-    and neighboring tiles in a row still find each other's splats in the cache.
+    numba assigns each thread a run of consecutive indices. With interleaved rows, complex image regions are distributed
+    over all threads, while neighboring tiles in a row still share cached splats.
     """
     step = int(lines * 0.6180339887) | 1
     while math.gcd(step, lines) > 1:
@@ -38,7 +38,7 @@ def spread(index, columns, lines):
 
 @kernel()
 def depth_order(splats, ids):
-    """Indices (int32) of the visible splats, nearest first; ties are broken by the splats' values and IDs."""
+    """Return the indices (int32) of the visible splats, nearest first; ties are broken by values and IDs."""
     n = splats.shape[0]
     order = np.empty(n, np.int32)
     keys = np.empty(n, np.uint32)
@@ -53,7 +53,7 @@ def depth_order(splats, ids):
     keys = keys[:count].copy()
     other = np.empty(count, np.int32)
     other_keys = np.empty(count, np.uint32)
-    # Depths are positive, so their bit patterns sort like the numbers.
+    # Depths are positive, so their bit patterns have the same order as the numbers.
     for shift in (0, 11, 22):
         starts = np.zeros(2049, np.int64)
         for i in range(count):
@@ -81,16 +81,16 @@ def depth_order(splats, ids):
 
 @kernel(parallel=True)
 def bin_splats(splats, order, width, height):
-    """Intersect tiles and splats.
+    """Find the intersections of tiles and splats.
 
     Returns isect_offsets (T + 1,): tile i blends the splats isect_ids[isect_offsets[i] : isect_offsets[i + 1]];
     isect_ids (M,) int32: splats of each tile, front to back; isect_rows (M,) int64: the gradient row of each
-    intersection; row_offsets (N + 1,): splat n has the gradient rows row_offsets[n] to row_offsets[n + 1].
+    intersection; row_offsets (N + 1,): splat n has the gradient rows row_offsets[n] to row_offsets[n + 1] - 1.
     """
     columns = (width + TILE_W - 1) // TILE_W
     lines = (height + TILE_H - 1) // TILE_H
     count = columns * lines
-    # Chunks of the depth order are counted in parallel, then each writes its own part of every tile's intersections.
+    # Chunks of the depth order are counted in parallel; then each one writes its own part of each tile's intersections.
     chunk = max(_CHUNK, (order.size + _CHUNKS - 1) // _CHUNKS)
     chunks = (order.size + chunk - 1) // chunk
     fills = np.zeros((chunks, count), np.int64)

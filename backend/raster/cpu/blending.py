@@ -1,7 +1,8 @@
-"""Blending splats front to back inside tiles, on the CPU.
+"""Front-to-back blending of splats in tiles, on the CPU.
 
-One thread processes a tile from start to end, so results do not depend on the number of threads. In each pixel row, a
-splat covers only the exact span of its ellipse, sixteen pixels at a time (simd.py); the tile's planes stay in cache.
+Each tile is processed by a single thread, so results do not depend on the number of threads. In each pixel row, a splat
+is evaluated only in the exact span of its ellipse, sixteen pixels at a time (simd.py); the tile's planes stay in the
+cache.
 
 Per pixel, with splats sorted by depth: w_i = alpha_i T_i, T_{i+1} = T_i (1 - alpha_i), while
 T_i >= TRANSMITTANCE_THRESHOLD.
@@ -40,14 +41,24 @@ def blend(
     splats, tilts, ids, labels, isect_offsets, isect_ids, want_labels, want_depth, want_median, want_normals,
     want_moments, color, transmittance, label_probability, depth, median, normals, moments, isect_counts,
 ):  # fmt: skip
-    """Blend every tile. All planes are float32 and written completely where requested.
+    """Blend all tiles. All planes are float32; requested planes are written completely.
 
-    splats (N, 12); tilts: None, or the discs' (N, 12); labels (H, W) int32; isect_offsets, isect_ids: see `bin_splats`.
-    color (3, H, W); transmittance (H, W); label_probability (H, W): the sum of w_i over the splats whose ID is the
-    pixel's label. depth (H, W): the sum of w_i z_i. median (H, W): the z_i with which T falls below 1/2, 0 where it
-    does not. For discs only: normals (3, H, W): the sum of w_i n_i; moments (2, H, W): the sums of w_i m_i and
-    w_i m_i^2 for m = 1 / z minus that of the first splat drawn, so that nothing cancels where depths differ little.
-    isect_counts (T,): how many intersections of each tile were blended, for `blend_backward`.
+    Args:
+        splats: (N, 12), projected splats.
+        tilts: (N, 12) for discs, otherwise None.
+        ids: (N,) int32.
+        labels: (H, W) int32.
+        isect_offsets, isect_ids: see `bin_splats`.
+        want_labels, want_depth, want_median, want_normals, want_moments: the requested planes.
+        color: (3, H, W).
+        transmittance: (H, W).
+        label_probability: (H, W), the sum of w_i over the splats whose ID is the pixel's label.
+        depth: (H, W), the sum of w_i z_i.
+        median: (H, W), the z_i at which T falls below 1/2, 0 where it does not.
+        normals: (3, H, W), the sum of w_i n_i; for discs only.
+        moments: (2, H, W), the sums of w_i m_i and w_i m_i^2; for discs only. m_i is 1 / z_i minus that of the first
+            splat in the pixel, to avoid cancellation where depths differ little.
+        isect_counts: (T,), the number of blended intersections of each tile, for `blend_backward`.
     """
     columns = (transmittance.shape[1] + TILE_W - 1) // TILE_W
     count = isect_offsets.size - 1

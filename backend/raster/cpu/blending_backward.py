@@ -1,6 +1,6 @@
-"""The gradient of blending splats inside tiles, on the CPU; see blending.py.
+"""Gradient of the blending of splats in tiles, on the CPU; see blending.py.
 
-Each splat's gradient is summed in a fixed order, so it does not depend on the number of threads.
+The gradient of each splat is summed in a fixed order, so it does not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ def blend_backward(
     want_normals, want_moments, color, transmittance, label_probability, depth, normals, moments,
     g_color, g_alpha, g_label_probability, g_depth, g_normals, g_moments, rows_out,
 ):  # fmt: skip
-    """Write the gradient row of every intersection: rows_out (M, GRADIENT_COLUMNS, or twice that with normals).
+    """Write the gradient row of each intersection to rows_out (M, GRADIENT_COLUMNS, or twice that with normals).
 
-    Front to back again: with dot_i = dL/dw_i, the light that is still to come is remaining = sum_{j>i} w_j dot_j, and
-    dL/dalpha_i = T_i dot_i - remaining / (1 - alpha_i). g_alpha is the gradient of 1 - transmittance. The other
-    arguments are as in `blend`; isect_rows (M,): the row of each intersection.
+    Splats are processed front to back. With dot_i = dL/dw_i and the remaining sum remaining = sum_{j>i} w_j dot_j,
+    dL/dalpha_i = T_i dot_i - remaining / (1 - alpha_i). g_alpha is the gradient with respect to 1 - transmittance;
+    isect_rows (M,) is the row of each intersection. The other arguments are as in `blend`.
     """
     columns = (transmittance.shape[1] + TILE_W - 1) // TILE_W
     count = isect_offsets.size - 1
@@ -248,7 +248,7 @@ def _blend_backward_tile(
                 sum_r = sum_r + w * wr
                 sum_g = sum_g + w * wg
                 sum_b = sum_b + w * wb
-                # Where alpha was clamped or dropped it has no gradient; else alpha is the exponential's derivative.
+                # A clamped or dropped alpha has no gradient; otherwise alpha is the derivative of the exponential.
                 slope = simd.keep(simd.at_least(alpha_max, raw), alpha) * (t * dot - left / clear)
                 if tilts is not None:
                     m0 = m0 + slope

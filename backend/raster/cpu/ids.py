@@ -1,8 +1,8 @@
-"""The most probable objects of every pixel, exactly, at a cost that does not grow with the number of objects.
+"""The exact most probable objects of each pixel, at a cost independent of the number of objects.
 
 P_i(x) is the sum of the blending weights of the splats with ID i. The weights are computed once, in depth order, and
 stored for the tile; a second pass sums them object by object, over the pixels that the object covers, and keeps the
-largest sums, as many as are requested.
+requested number of largest sums.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _SPOT = np.float32(SPOT)
 
 @njit(inline="always", error_model="numpy")
 def _contest(winner_weight, winner, ranks, plane, at, weight, owner):
-    """Insert `owner` into the ranking of the pixels from `at` on; what it displaces moves down."""
+    """Insert `owner` into the ranking of the pixels from `at` on; lower entries move down."""
     moves = simd.above(weight, weight)
     for rank in range(ranks):
         place = rank * plane + at
@@ -43,10 +43,10 @@ def _contest(winner_weight, winner, ranks, plane, at, weight, owner):
 
 @kernel(parallel=True)
 def most_probable(splats, tilts, ids, isect_offsets, isect_ids, best_id, best_probability):
-    """Write best_id (ranks, H, W) int32 and best_probability (ranks, H, W) float32: the objects of largest P_i, in
-    descending order; ID -1 and probability 0 where there are no more.
+    """Write the objects with the largest P_i to best_id (ranks, H, W) int32 and best_probability (ranks, H, W) float32.
 
-    tilts: None, or the discs'. Of objects with equal probability, the smallest ID comes first.
+    They are in descending order, with ID -1 and probability 0 where there are no more. Of objects with equal
+    probability, the smallest ID comes first. tilts: None for 3D Gaussians.
     """
     columns = (best_id.shape[2] + TILE_W - 1) // TILE_W
     count = isect_offsets.size - 1
@@ -149,7 +149,7 @@ def _contest_tile(tile, splats, tilts, ids, isect_offsets, isect_ids, best_id, b
         after = group + 1
         while after < count and owners[grouped[after]] == owner:
             after += 1
-        alone = after - group == 1  # nothing to add up
+        alone = after - group == 1  # A single splat: no sum is necessary.
         low, high = TILE_H, 0
         for k in grouped[group:after]:
             n = isect_ids[first + k]

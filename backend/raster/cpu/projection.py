@@ -1,4 +1,4 @@
-"""Projecting 3D Gaussians and discs and its gradient (splats.py), in parallel on the CPU."""
+"""Projection of 3D Gaussians and discs, and its gradient (splats.py), in parallel on the CPU."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from ..splats import G_DEPTH, G_NORMAL, MSY, no_gradient, project_splat, project
 
 @kernel(parallel=True)
 def project(means, quats, scales, opacities, sh, view, width, height, splats, tilts, outlines):
-    """Fill `splats` (N, 12) float32; HALF_H < 0 marks a splat that is not visible.
+    """Write the projected splats to `splats` (N, 12) float32; HALF_H < 0 marks splats that are not visible.
 
     means (N, 3), quats (N, 4) wxyz of any length, scales (N, 3), opacities (N,), sh (N, K, 3): float32. view: see
-    `view_of`. tilts: None, or the discs' (N, 12) float32 (discs.py); then outlines (N, 12) receives the ellipses around
-    the discs, as splats, for tile intersection.
+    `view_of`. tilts: None, or for discs (N, 12) float32 (discs.py); in this case outlines (N, 12) receives the ellipses
+    around the discs, as splats, for tile intersection.
     """
     chunks = (means.shape[0] + 255) // 256
     for chunk in prange(chunks):
@@ -37,11 +37,11 @@ def project_backward(
     means, quats, scales, opacities, sh, view, splats, tilts, row_offsets, rows,
     g_means, g_quats, g_scales, g_opacities, g_sh, g_screen,
 ):  # fmt: skip
-    """Sum each splat's gradient rows in order and propagate them to the Gaussian's parameters.
+    """Sum the gradient rows of each splat in order and propagate them to the Gaussian's parameters.
 
-    row_offsets (N + 1,): splat n has rows[row_offsets[n] : row_offsets[n + 1]]. tilts: None, or the discs'. g_* are
-    written for every n (0 where not visible); g_screen (N, 2) receives dL/du and dL/dv in pixels, with the footprint
-    moving along: the statistic that growth follows.
+    row_offsets (N + 1,): splat n has rows[row_offsets[n] : row_offsets[n + 1]]. tilts: None for 3D Gaussians. g_* are
+    written for all n (0 if not visible); g_screen (N, 2) receives dL/du and dL/dv in pixels for a translation of the
+    whole footprint, which is the statistic for growth.
     """
     for chunk in prange((means.shape[0] + 255) // 256):
         _project_backward_chunk(

@@ -1,4 +1,4 @@
-"""The CPU renderer: NumPy arrays in, images and gradients out. See `backend.raster` for the torch interface."""
+"""The CPU renderer on NumPy arrays; see `backend.raster` for the torch interface."""
 
 from __future__ import annotations
 
@@ -22,8 +22,11 @@ _NO_LABELS = np.zeros((1, 1), np.int32)
 
 @dataclass
 class Gaussians:
-    """Contiguous float32 arrays: means (N, 3), quats (N, 4) wxyz of any length, scales (N, 3) linear, opacities (N,),
-    sh (N, K, 3); and ids (N,) int32."""
+    """Parameters of Gaussians, as contiguous arrays.
+
+    means (N, 3), quats (N, 4) wxyz of any length, scales (N, 3) linear, opacities (N,), sh (N, K, 3): float32; ids (N,)
+    int32.
+    """
 
     means: np.ndarray
     quats: np.ndarray
@@ -35,12 +38,15 @@ class Gaussians:
 
 @dataclass
 class Frame:
-    """A rendered image and what its gradient needs.
+    """A rendered image and the data for its gradient.
 
-    color (3, H, W) and transmittance (H, W); label_probability, depth and median (H, W), normals (3, H, W) and moments
-    (2, H, W), where requested, see `blend`. splats and tilts are the projected splats (splats.py, discs.py);
-    isect_offsets, isect_ids, isect_rows and row_offsets the tile intersections, see `bin_splats`; isect_counts (T,) the
-    number of intersections that each tile blended. screen_gradient (N, 2) is set by `backward`.
+    Attributes:
+        color, transmittance: (3, H, W) and (H, W).
+        label_probability, depth, median, normals, moments: the requested planes, see `blend`.
+        splats, tilts: the projected splats (splats.py, discs.py).
+        isect_offsets, isect_ids, isect_rows, row_offsets: the tile intersections, see `bin_splats`.
+        isect_counts: (T,), number of blended intersections of each tile.
+        screen_gradient: (N, 2), set by `backward`.
     """
 
     gaussians: Gaussians
@@ -83,13 +89,14 @@ def forward(
     Args:
         gaussians: the splats.
         camera: the view.
-        labels: (H, W) int32; requests label_probability, the summed blending weights of the splats whose ID is the
-            pixel's label.
-        want_depth, want_median, want_normals, want_moments: further planes; normals and moments exist for discs only.
-        flat: render discs instead of 3D Gaussians.
+        labels: (H, W) int32; if given, label_probability is computed, the sum of the blending weights of the splats
+            whose ID is the pixel's label.
+        want_depth, want_median, want_normals, want_moments: whether to compute these planes; normals and moments are
+            available only for discs.
+        flat: whether to render discs instead of 3D Gaussians.
 
     Returns:
-        The frame, see `Frame`.
+        The frame.
     """
     g = gaussians
     count, height, width = g.means.shape[0], int(camera.height), int(camera.width)
@@ -134,13 +141,13 @@ def backward(
     g_normals: np.ndarray | None = None,
     g_moments: np.ndarray | None = None,
 ) -> Gaussians:
-    """Compute the gradients of a frame's Gaussians from those of its planes.
+    """Compute the gradients with respect to a frame's Gaussians from those with respect to its planes.
 
     Args:
-        frame: what `forward` returned; its screen_gradient (N, 2) is set to the gradient with respect to each splat's
+        frame: result of `forward`; its screen_gradient (N, 2) is set to the gradient with respect to each splat's
             center in pixels.
         g_color, g_alpha, g_label_probability, g_depth, g_normals, g_moments: gradients in the shapes of the planes;
-            g_alpha is that of 1 - transmittance.
+            g_alpha is with respect to 1 - transmittance.
 
     Returns:
         The gradients in the shapes of the parameters; ids is empty.
@@ -173,7 +180,7 @@ def backward(
 
 
 def object_ranks(frame: Frame, ranks: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rank the most probable IDs of every pixel; see `backend.raster.object_ranks`."""
+    """Rank the most probable IDs of each pixel; see `backend.raster.object_ranks`."""
     shape = (ranks, frame.camera.height, frame.camera.width)
     best_id = np.empty(shape, np.int32)
     best_probability = np.empty(shape, np.float32)

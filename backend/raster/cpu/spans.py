@@ -1,4 +1,4 @@
-"""The pixel spans that splats reach inside a tile, row by row, on the CPU."""
+"""The pixel spans of splats in the rows of a tile, on the CPU."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from ..splats import HALF_H, LOP, SLOPE, A, C, U, V
 from .binning import TILE_H, TILE_W
 
 STRIDE = TILE_W + simd.LANES
-"""Length of a tile row in memory: the last vector of a span may extend beyond the tile's right edge."""
+"""Length of a tile row in memory, since the last vector of a span may extend beyond the tile's right edge."""
 ROW_SLOTS = TILE_H + simd.LANES
-"""Length of the arrays that `splat_rows` fills: whole vectors, starting at any row of the tile."""
+"""Length of the arrays written by `splat_rows`, which stores whole vectors from any row of the tile on."""
 CHECK_EVERY = 32
-"""A tile's rows are tested for remaining transmittance after this many splats."""
+"""Number of splats after which the rows of a tile are tested for remaining transmittance."""
 
 _LOG2_CUT = np.float32(math.log2(ALPHA_MIN))
 _TRANSMITTANCE_THRESHOLD = np.float32(TRANSMITTANCE_THRESHOLD)
@@ -33,10 +33,10 @@ _SPOT = np.float32(SPOT)
 
 @njit(inline="always", error_model="numpy")
 def splat_rows(splats, n, tile_x, tile_y, rows, height, starts, stops, tops, centers):
-    """Rows [y0, y1) of a tile that splat n covers. For each of them, written to the last four arguments: the pixels
-    [start, stop) where the splat may reach ALPHA_MIN, and the terms of log2 alpha = top - A (x - center)^2.
+    """Compute the rows [y0, y1) of a tile that splat n covers, and the span in each row.
 
-    The span may be one pixel too wide, never too narrow.
+    For each row, the last four arguments receive the pixels [start, stop) where the splat may reach ALPHA_MIN, and the
+    terms of log2 alpha = top - A (x - center)^2. The span may be one pixel too wide, but never too narrow.
     """
     v = splats[n, V]
     y0 = max(int(math.floor(v - splats[n, HALF_H])) - tile_y, 0)
@@ -66,7 +66,7 @@ def splat_rows(splats, n, tile_x, tile_y, rows, height, starts, stops, tops, cen
 
 @njit(inline="always", error_model="numpy")
 def disc_rows(splats, tilts, n, tile_x, tile_y, rows, height, starts, stops, tops, centers, tilted):
-    """As `splat_rows` for a disc: tops receives C dy^2, and tilted Q at the row's center."""
+    """Compute the same as `splat_rows` for a disc; tops receives C dy^2, and tilted receives Q at the row's center."""
     middle, half_h = tilts[n, MIDDLE], splats[n, HALF_H]
     y0 = max(int(math.floor(middle - half_h)) - tile_y, 0)
     y1 = min(int(math.floor(middle + half_h)) + 1 - tile_y, rows)
@@ -77,7 +77,7 @@ def disc_rows(splats, tilts, n, tile_x, tile_y, rows, height, starts, stops, top
     reach = splats[n, LOP] - _LOG2_CUT
     a = splats[n, A]
     qx = tilts[n, QX]
-    # In a row, the disc ends where A d^2 + C dy^2 = reach Q^2; it is unbounded if Q grows as fast as d.
+    # In a row, the disc ends where A d^2 + C dy^2 = reach Q^2; it is unbounded if Q grows fast enough with d.
     square = a - reach * qx * qx
     bounded = square > np.float32(1e-4) * a
     per_square = simd.splat(_ONE / square)

@@ -1,12 +1,12 @@
-"""Tile intersections, front to back, on a GPU: which splats every tile blends.
+"""Tile intersections on a GPU: the splats of each tile, front to back.
 
-The splats are sorted by depth once; each then writes the tiles that it meets, in that order, and a stable sort by tile
-(two passes, as tiles have few bits) keeps the depth order inside every tile. Ties of the first sort are broken as on
-the CPU (tile_intersection.py), so that images do not depend on the order of the input.
+The splats are sorted by depth once. In this order, the tiles that each splat intersects are written, and a stable sort
+by tile (two passes, as tiles have few bits) preserves the depth order in each tile. Ties of the first sort are broken
+as on the CPU (tile_intersection.py), so that images do not depend on the order of the input.
 
-Only the GPU knows the number of intersections. The arrays have capacity for slightly more than in the last image, and
-the number is copied to the host asynchronously: the host reads it after the whole image is queued. Only if the capacity
-was too small are the intersections and the image computed again.
+The number of intersections is computed on the GPU. The arrays have capacity for slightly more than in the last image,
+and the number is copied to the host asynchronously: the host reads it after the whole image is queued. The
+intersections and the image are computed again only if the capacity was too small.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TILE = 16
 _UNSEEN = 2**63 - 1
 _SIGN = 2**31
 _SPARE = 1.125
-"""The capacity is this times the number of intersections in the last image."""
+"""Ratio of the capacity to the number of intersections in the last image."""
 
 _last_total: dict[torch.device, int] = {}
 
@@ -36,8 +36,10 @@ _last_total: dict[torch.device, int] = {}
 class Order:
     """The splats sorted by depth.
 
-    order (N,) int64: splats from near to far, those that are not visible last; counts (N,) int64: how many tiles each
-    of these meets; cumulative (N,): the inclusive cumulative sum of counts.
+    Attributes:
+        order: (N,) int64, splats from near to far, those that are not visible last.
+        counts: (N,) int64, number of tiles that each of these intersects.
+        cumulative: (N,), inclusive cumulative sum of counts.
     """
 
     order: torch.Tensor
@@ -49,9 +51,12 @@ class Order:
 class Intersections:
     """Intersections of tiles and splats, sorted by tile and depth.
 
-    isect_offsets (T + 1,): tile i's splats are isect_ids[isect_offsets[i] : isect_offsets[i + 1]] (int32), front to
-    back; isect_rows (int64): the gradient row of each intersection; splat n has the gradient rows first_rows[n] to
-    last_rows[n]; capacity: length of isect_ids and isect_rows.
+    Attributes:
+        isect_offsets: (T + 1,); tile i has the splats isect_ids[isect_offsets[i] : isect_offsets[i + 1]].
+        isect_ids: (capacity,) int32, splats of the tiles, front to back.
+        isect_rows: (capacity,) int64, the gradient row of each intersection.
+        first_rows, last_rows: (N,); splat n has the gradient rows first_rows[n] to last_rows[n] - 1.
+        capacity: length of isect_ids and isect_rows.
     """
 
     isect_offsets: torch.Tensor
@@ -64,7 +69,10 @@ class Intersections:
 
 @device_function
 def _key(bits, splats, n):
-    """Sort key: depth, then column. Depths are positive, so their bit patterns sort like the numbers."""
+    """Return the sort key of splat n: depth, then column.
+
+    Depths are positive, so their bit patterns have the same order as the numbers.
+    """
     if not splats[n, HALF_H] > 0.0:
         return np.int64(_UNSEEN)
     across = np.int64(0)
@@ -84,7 +92,7 @@ def _write_keys(bits, splats, keys):
 
 @cuda_kernel()
 def _order_equals(splats, ids, keys, order):
-    """The first thread among equal keys sorts all of them."""
+    """Sort runs of equal keys; each run is sorted by the thread of its first element."""
     first = cuda.grid(1)
     if first + 1 >= keys.size:
         return
@@ -99,7 +107,7 @@ def _order_equals(splats, ids, keys, order):
 
 @device_function
 def _count_tiles(outlines, n, columns, lines, height):
-    """Number of tiles that splat n meets."""
+    """Return the number of tiles that splat n intersects."""
     met = 0
     top, bottom = tile_rows(outlines, n, lines, TILE)
     for row in range(top, bottom):
@@ -110,7 +118,7 @@ def _count_tiles(outlines, n, columns, lines, height):
 
 @device_function
 def _write_tiles(outlines, n, columns, lines, height, row_id, tile_ids, splat_ids):
-    """Write the tiles that splat n meets from row `row_id` on, as far as the capacity allows."""
+    """Write the tiles that splat n intersects from row `row_id` on, as far as the capacity allows."""
     top, bottom = tile_rows(outlines, n, lines, TILE)
     for row in range(top, bottom):
         first, last = row_ends(outlines, n, row, columns, height, TILE, TILE)
@@ -145,12 +153,12 @@ def _write_intersections(
 
 
 def grid(width: int, height: int) -> tuple[int, int]:
-    """Number of tile columns and tile rows."""
+    """Return the numbers of tile columns and tile rows."""
     return math.ceil(width / TILE), math.ceil(height / TILE)
 
 
 def depth_order(splats: torch.Tensor, outlines: torch.Tensor, ids: torch.Tensor, width: int, height: int) -> Order:
-    """Sort splats by depth and count their tiles: splats, outlines (N, 12) float32; ids (N,) int32."""
+    """Sort splats by depth and count their tiles; splats, outlines (N, 12) float32; ids (N,) int32."""
     count = splats.shape[0]
     columns, lines = grid(width, height)
     keys = torch.empty(count, dtype=torch.int64, device=splats.device)
@@ -180,11 +188,11 @@ class IntersectionCount:
             self._host = cumulative[-1:]
 
     def expected_capacity(self) -> int:
-        """The capacity to use before the number has arrived."""
+        """Return the capacity to use before the number is available."""
         return max(int(_last_total.get(self._device, 0) * _SPARE), 1)
 
     def wait(self) -> int:
-        """The number of intersections, once it has arrived."""
+        """Wait for the number of intersections and return it."""
         if self._event is not None:
             self._event.synchronize()
         total = int(self._host[0])
@@ -193,11 +201,11 @@ class IntersectionCount:
 
 
 def tile_intersections(order: Order, outlines: torch.Tensor, width: int, height: int, capacity: int) -> Intersections:
-    """The first `capacity` intersections, counted splat by splat from near to far, sorted by tile."""
+    """Return the first `capacity` intersections, in the order of splats from near to far, sorted by tile."""
     device = outlines.device
     columns, lines = grid(width, height)
     count = columns * lines
-    # The fewer bits, the fewer passes of the sort.
+    # With fewer bits, the sort has fewer passes.
     kind = torch.int16 if count < 2**15 else torch.int32
     tile_ids = torch.full((capacity,), count, dtype=kind, device=device)
     splat_ids = torch.zeros(capacity, dtype=torch.int32, device=device)

@@ -1,7 +1,7 @@
-"""Blending splats front to back inside tiles, on a GPU.
+"""Front-to-back blending of splats in tiles, on a GPU.
 
-Splats are staged through shared memory (staging.py). Planes that are not requested are not compiled: a kernel is made
-for each combination that is used.
+Splats are staged in shared memory (staging.py). A specialized kernel is compiled for each combination of requested
+planes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from .staging import (
 )
 
 STAGED = 256
-"""Splats staged in shared memory at a time."""
+"""Number of splats staged in shared memory at a time."""
 
 _LOG2_CUT = np.float32(math.log2(ALPHA_MIN))
 _ALPHA_MAX = np.float32(ALPHA_MAX)
@@ -50,9 +50,10 @@ _ONE = np.float32(1.0)
 
 @functools.cache
 def blend_kernel(wanted: Wanted) -> Any:
-    """Kernel that blends every tile with a block of THREADS; see `backend.raster.cpu.blending.blend` for the planes.
+    """Return a kernel that blends each tile with a block of THREADS; see `backend.raster.cpu.blending.blend`.
 
-    Planes that are not wanted are not touched. isect_counts (T,) int32: intersections of each tile that were needed.
+    Planes that are not requested are not accessed. isect_counts (T,) int32 receives the number of intersections of each
+    tile up to the last one that contributed.
     """
     flat, want_labels, want_depth, want_median, want_normals, want_moments = wanted
     stride = staged_columns(flat)
@@ -61,8 +62,8 @@ def blend_kernel(wanted: Wanted) -> Any:
     def draw(stage, owners, count, x, y, label, state):
         """Blend the staged splats into a pixel.
 
-        The state: T, red, green, blue, label_probability, depth, median, three of the normal, two moments and their
-        origin, and how many of the staged splats were needed.
+        state: T, red, green, blue, label_probability, depth, median, the normal (3), the moments (2) and their origin,
+        and the number of staged splats up to the last one that contributed.
         """
         t, red, green, blue, label_probability, depth, median, nx, ny, nz, m1, m2, origin, _ = state
         needed = FIRST

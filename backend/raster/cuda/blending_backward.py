@@ -1,10 +1,10 @@
-"""The gradient of blending splats inside tiles, on a GPU; see blending.py.
+"""Gradient of the blending of splats in tiles, on a GPU; see blending.py.
 
-The gradient of a splat is a sum over pixels. Summing it across a warp for every splat would dominate the run time, so
-eight splats are processed together, one per warp. First every thread, as a pixel, visits the eight splats and writes
-each one's blending weight w and dL/d(log2 alpha) to shared memory. Then every warp, as a splat, visits the pixels with
-its sums in registers, which leaves only 32 partial sums. No two threads add to the same address, so the same input
-gives the same bits.
+The gradient of a splat is a sum over pixels. A reduction across a warp for each splat would dominate the run time, so
+eight splats are processed together, one per warp. In the first phase, each thread corresponds to a pixel: it visits the
+eight splats and writes their blending weights w and dL/d(log2 alpha) to shared memory. In the second phase, each warp
+corresponds to a splat: its lanes visit the pixels with sums in registers, which leaves only 32 partial sums. No two
+threads add to the same address, so the result is deterministic.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from .staging import (
 
 WARPS = THREADS // WARP
 STAGED_BACKWARD = 64
-"""Splats staged in shared memory at a time."""
+"""Number of splats staged in shared memory at a time."""
 
 _LOG2_CUT = np.float32(math.log2(ALPHA_MIN))
 _ALPHA_MAX = np.float32(ALPHA_MAX)
@@ -65,17 +65,19 @@ _ONE = np.float32(1.0)
 
 @functools.cache
 def blend_backward_kernel(wanted: Wanted) -> Any:
-    """Kernel that writes rows[isect_rows[i]], the gradient row (splats.py) of every intersection i, with a block of
-    THREADS per tile. `wanted` are the planes with a gradient; see
-    `backend.raster.cpu.blending_backward.blend_backward`."""
+    """Return a kernel that writes the gradient row (splats.py) of each intersection i to rows[isect_rows[i]].
+
+    It uses a block of THREADS per tile. `wanted` are the planes with a gradient; see
+    `backend.raster.cpu.blending_backward.blend_backward`.
+    """
     flat, want_labels, want_depth, _, want_normals, want_moments = wanted
     stride = staged_columns(flat)
     counted = G_NORMAL + 3 if want_normals else MSY + 1 if flat else G_DEPTH + 1
-    # A splat's part of shared memory: w, the slope and, for discs, 1 / Q of every pixel; later the sums of every lane,
-    # padded by one number each, so that 32 columns lie in 32 banks.
+    # A splat's part of shared memory: in the first phase w, the slope and, for discs, 1 / Q of each pixel; later the
+    # sums of each lane, with a padding of one number, so that 32 columns lie in 32 different banks.
     kinds = 3 if flat else 2
     splat_floats = max(kinds * THREADS, counted * (WARP + 1))
-    # Rows of `pixels`: a pixel's gradients, kept for the second half.
+    # Rows of `pixels`: the gradients of a pixel, kept for the second phase.
     at_depth = 3
     at_normals = at_depth + want_depth
     at_moments = at_normals + 3 * want_normals
@@ -86,10 +88,10 @@ def blend_backward_kernel(wanted: Wanted) -> Any:
     def weigh(
         stage, owners, base, count, thread, x, y, label, g_alpha, g_label_probability, pixels, weights, hits, state
     ):
-        """As a pixel: write w, slope and 1 / Q of `count` splats from staged row `base` on into `weights`; hits marks
-        the splats that are drawn in this warp.
+        """First phase, one pixel per thread: write w, slope and 1 / Q of `count` splats to `weights`.
 
-        state: T, and the part of the sum of w dL/dw that is still to come.
+        The splats are in the staged rows from `base` on; hits marks those that are drawn in this warp. state: T, and
+        the remaining part of the sum of w dL/dw.
         """
         t, remaining = state
         g_red, g_green, g_blue = pixels[0, thread], pixels[1, thread], pixels[2, thread]
@@ -134,7 +136,7 @@ def blend_backward_kernel(wanted: Wanted) -> Any:
                     dot += inverse * (pixels[at_moments, thread] + inverse * pixels[at_moments + 1, thread])
                 clear = _ONE - alpha
                 remaining -= w * dot
-                # Where alpha was clamped it has no gradient; else it is the exponential's own derivative.
+                # A clamped alpha has no gradient; otherwise alpha is the derivative of the exponential.
                 if raw <= _ALPHA_MAX:
                     slope = alpha * (t * dot - remaining * reciprocal(clear))
                 t *= clear
@@ -149,7 +151,7 @@ def blend_backward_kernel(wanted: Wanted) -> Any:
 
     @device_function
     def add_up(stage, k, s, lane, tile_y, warps, pixels, weights, hits):
-        """As a lane of splat k's warp: its gradient row over the pixels that this lane visits."""
+        """Second phase, one splat per warp: sum the gradient row of splat k over the pixels of this lane."""
         zero = _ZERO
         m0, my, myy, mx, mxy, mxx = zero, zero, zero, zero, zero, zero
         red, green, blue, depth = zero, zero, zero, zero
@@ -255,14 +257,14 @@ def blend_backward_kernel(wanted: Wanted) -> Any:
 
     @device_function
     def total(weights, s, column):
-        """Sum of a column over the lanes, in a fixed order."""
+        """Return the sum of a column over the lanes, in a fixed order."""
         a, b = _ZERO, _ZERO
         for lane in range(0, WARP, 2):
             a += weights[s, column * (WARP + 1) + lane]
             b += weights[s, column * (WARP + 1) + lane + 1]
         return a + b
 
-    # Registers for at least this many blocks per multiprocessor; no register is spilled for it.
+    # Limits registers to allow this number of blocks per multiprocessor; does not cause spilling.
     @cuda_kernel(launch_bounds=(THREADS, 3 if flat else 4))
     def blend_backward(
         splats, tilts, ids, labels, isect_offsets, isect_ids, isect_rows, isect_counts, columns, color, transmittance,
@@ -277,7 +279,7 @@ def blend_backward_kernel(wanted: Wanted) -> Any:
         height, width = transmittance.shape
         thread = cuda.threadIdx.x
         warp, lane = np.uint32(thread) // np.uint32(WARP), np.uint32(thread) % np.uint32(WARP)
-        # Not a compile-time constant: the unrolled loop over the warps would need too many registers.
+        # Not a compile-time constant, since the unrolled loop over the warps would need too many registers.
         warps = np.uint64(cuda.blockDim.x // WARP)
         tile = cuda.blockIdx.x
         tile_x = np.int32(tile % columns * TILE)

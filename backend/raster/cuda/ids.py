@@ -1,8 +1,8 @@
-"""The most probable objects of every pixel on a GPU, exactly, at a cost that does not grow with the number of objects.
+"""The exact most probable objects of each pixel on a GPU, at a cost independent of the number of objects.
 
 P_i(x) is the sum of the blending weights of the splats with ID i. A tile has few distinct IDs: they are numbered within
-the tile, and every pixel accumulates one sum for each of up to SLOTS of them in shared memory; a tile with more IDs
-visits its splats again.
+the tile, and each pixel accumulates the sums of up to SLOTS of them in shared memory. For tiles with more IDs, the
+splats are processed in several passes.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def _contest_kernel(flat: bool) -> Any:
 
     @device_function
     def weigh(stage, slots, count, x, y, lowest, sums, thread, t):
-        """Add the weights in a pixel of staged splats to their slots' sums; returns the remaining transmittance."""
+        """Add the weights of staged splats in a pixel to the sums of their slots; returns the transmittance."""
         k = FIRST
         while k < count and t >= _TRANSMITTANCE_THRESHOLD:
             if flat:
@@ -64,7 +64,7 @@ def _contest_kernel(flat: bool) -> Any:
 
     @device_function
     def rank(sums, names, lowest, count, thread, best_id, best_probability, px, py):
-        """Insert a pixel's sums into its ranking; of equal sums, the first stays in front."""
+        """Insert a pixel's sums into its ranking; of equal sums, the first one is ranked first."""
         last = best_probability.shape[0] - 1
         least = best_probability[last, py, px]
         for slot in range(count):
@@ -127,10 +127,10 @@ def _contest_kernel(flat: bool) -> Any:
 def _number(
     intersections: Intersections, ids: torch.Tensor, isect_counts: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Number the distinct (tile, ID) among the blended intersections, tile by tile, IDs in ascending order.
+    """Number the distinct (tile, ID) pairs among the blended intersections, tile by tile, IDs in ascending order.
 
-    slots (capacity,) int32: each intersection's number; names (capacity,) int32: the ID of each number; bounds (T + 1,)
-    int32: tile i has the numbers bounds[i] to bounds[i + 1].
+    Returns slots (capacity,) int32, the number of each intersection's pair; names (capacity,) int32, the ID of each
+    number; bounds (T + 1,) int32: tile i has the numbers bounds[i] to bounds[i + 1] - 1.
     """
     count = isect_counts.numel()
     device = ids.device
@@ -160,10 +160,11 @@ def most_probable(
     splats: torch.Tensor, tilts: torch.Tensor | None, ids: torch.Tensor, intersections: Intersections,
     isect_counts: torch.Tensor, columns: int, best_id: torch.Tensor, best_probability: torch.Tensor,
 ) -> None:  # fmt: skip
-    """Write into best_id (ranks, H, W) int32, initially -1, and best_probability (ranks, H, W) float32, initially 0,
-    the objects of largest P_i, in descending order.
+    """Write the objects with the largest P_i to best_id and best_probability, in descending order.
 
-    Of objects with equal probability, the smallest ID comes first. isect_counts (T,): blended intersections per tile.
+    best_id (ranks, H, W) int32 must be initialized with -1, and best_probability (ranks, H, W) float32 with 0. Of
+    objects with equal probability, the smallest ID comes first. isect_counts (T,): number of blended intersections per
+    tile.
     """
     slots, names, bounds = _number(intersections, ids, isect_counts)
     launch(

@@ -1,10 +1,12 @@
-"""`cuda_kernel` compiles a function for an NVIDIA GPU with numba-cuda; `launch` runs it on torch's tensors, in torch's
-current stream, without copying and without waiting.
+"""Compilation and launch of CUDA kernels with numba-cuda.
 
-Only code that runs on a GPU imports this module: elsewhere numba-cuda need not be installed. In numba's simulator
-(NUMBA_ENABLE_CUDASIM=1), which needs numba alone, the same kernels run as Python on tensors in host memory. A kernel's
-module uses `from numba import cuda`; the parts that would take most of the time in the simulator should be
-`device_function`s, which the simulator calls compiled.
+`cuda_kernel` compiles a function for an NVIDIA GPU; `launch` runs it on torch tensors, in torch's current stream,
+without copies or synchronization.
+
+This module is imported only by code that runs on a GPU, so numba-cuda is optional. In numba's simulator
+(NUMBA_ENABLE_CUDASIM=1), which requires only numba, the same kernels run as Python on tensors in host memory. A
+kernel's module uses `from numba import cuda`; parts that would dominate the run time in the simulator should be
+`device_function`s, which are compiled for the simulator.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from numba import cuda
 from ..devices import simulated
 from ..kernel import kernel, renew_with_layer
 
-# Small images and few splats make small grids; numba's warning about them is not helpful.
+# Small images and few splats result in small grids; numba's warning about them is not helpful.
 warnings.filterwarnings("ignore", message="Grid size .* will likely result in GPU under-utilization")
 
 WARP = 32
@@ -31,7 +33,7 @@ ALL_LANES = 0xFFFFFFFF
 
 
 def cuda_kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorate a CUDA kernel: numba.cuda.jit, cached on disk until code that it may depend on changes (see `kernel`).
+    """Decorate a CUDA kernel: numba.cuda.jit with a disk cache that is valid until dependencies change (see `kernel`).
 
     Args:
         options: passed to numba.cuda.jit, e.g. launch_bounds=256 for a kernel that is always launched with 256 threads.
@@ -48,10 +50,10 @@ def cuda_kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 def device_function(function: Callable[..., Any]) -> Any:
-    """Decorate a function that kernels call, inlined into them.
+    """Decorate a function that is inlined into the kernels that call it.
 
-    It uses nothing of `cuda`, so that the simulator can call it compiled for the CPU. Functions compiled by
-    `backend.raster.kernel.kernel` can be called from CUDA kernels, too.
+    It must not use `cuda`, since it is compiled for the CPU in the simulator. CUDA kernels can also call functions
+    compiled by `backend.raster.kernel.kernel`.
     """
     if simulated():
         return kernel()(function)
@@ -59,14 +61,14 @@ def device_function(function: Callable[..., Any]) -> Any:
 
 
 def launch(function: Any, blocks: int, threads: int, *arguments: Any) -> None:
-    """Run a kernel on `blocks` blocks of `threads` threads; with no block, nothing runs.
+    """Launch a kernel with `blocks` blocks of `threads` threads; does nothing for 0 blocks.
 
     Args:
         function: the kernel.
         blocks: number of blocks.
         threads: threads per block.
-        arguments: tensors (contiguous, at least one element, all on one device), tuples of tensors, and NumPy scalars,
-            whose type is the kernel's.
+        arguments: tensors (contiguous, at least one element, all on one device), tuples of tensors, and NumPy scalars
+            of the types that the kernel expects.
     """
     if not blocks:
         return
@@ -81,9 +83,9 @@ def launch(function: Any, blocks: int, threads: int, *arguments: Any) -> None:
 
 
 def launch_for_each(function: Any, count: int, *arguments: Any) -> None:
-    """Run a kernel without shared memory with one thread for each of `count` elements.
+    """Launch a kernel without shared memory with one thread for each of `count` elements.
 
-    Thread i is `cuda.grid(1)`, and must do nothing where i >= count.
+    The thread index i is `cuda.grid(1)`; threads with i >= count must do nothing.
     """
     threads = min(128, WARP * math.ceil(count / WARP)) or WARP
     launch(function, math.ceil(count / threads), threads, *arguments)
@@ -110,7 +112,7 @@ def _stream(pointer: int) -> Any:
     return cuda.external_stream(pointer) if pointer else 0
 
 
-# Functions that the simulator lacks, with an equivalent for it.
+# Functions that do not exist in the simulator, with replacements.
 
 if simulated():
 
@@ -120,17 +122,17 @@ if simulated():
 
     @kernel()
     def any_in_warp(condition):  # noqa: ARG001 - the simulator has no warps
-        """Whether the condition may hold in a thread of the warp; if not, it holds in none."""
+        """Return whether the condition may hold in a thread of the warp; if not, it holds in none."""
         return True
 
     @kernel()
     def exp2(x):
-        """2^x in float32."""
+        """Return 2^x in float32."""
         return np.exp2(np.float32(x))
 
     @kernel()
     def reciprocal(x):
-        """1 / x in float32."""
+        """Return 1 / x in float32."""
         return np.float32(1.0) / np.float32(x)
 
 else:
@@ -143,15 +145,15 @@ else:
 
     @cuda.jit(device=True, forceinline=True)
     def any_in_warp(condition):
-        """Whether the condition may hold in a thread of the warp; if not, it holds in none."""
+        """Return whether the condition may hold in a thread of the warp; if not, it holds in none."""
         return cuda.any_sync(ALL_LANES, condition)
 
     @cuda.jit(device=True, forceinline=True)
     def exp2(x):
-        """2^x in float32, to 2 units in the last place."""
+        """Return 2^x in float32, to 2 units in the last place."""
         return libdevice.exp2f(x)
 
     @cuda.jit(device=True, forceinline=True)
     def reciprocal(x):
-        """1 / x in float32, to 2 units in the last place; 1 / 0 is infinite."""
+        """Return 1 / x in float32, to 2 units in the last place; 1 / 0 is infinite."""
         return libdevice.fast_fdividef(np.float32(1.0), x)

@@ -1,4 +1,4 @@
-"""Projecting 3D Gaussians and discs and its gradient (splats.py), on a GPU with one thread per splat."""
+"""Projection of 3D Gaussians and discs, and its gradient (splats.py), on a GPU with one thread per splat."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ from .kernel import cuda_kernel, device_function
 SPLATS_PER_BLOCK = 128
 _COLUMNS = 16
 _ABREAST = SPLATS_PER_BLOCK // _COLUMNS
-"""Splats whose gradient rows a block sums at a time, with one thread per column."""
+"""Number of splats whose gradient rows a block sums at a time, with one thread per column."""
 
 
 @functools.cache
 def project_kernel(flat: bool) -> Any:
-    """Kernel with one thread per splat that fills its row of `splats` (N, 12) and, if `flat`, of `tilts` and
-    `outlines`; arguments as in `backend.raster.cpu.projection.project`."""
+    """Return a kernel with one thread per splat that writes its row of `splats` and, if `flat`, `tilts` and `outlines`.
+
+    Arguments as in `backend.raster.cpu.projection.project`.
+    """
 
     @cuda_kernel()
     def project(means, quats, scales, opacities, sh, view, width, height, splats, tilts, outlines):
@@ -48,7 +50,7 @@ def project_kernel(flat: bool) -> Any:
 
 @device_function
 def _total(rows, first, last, column):
-    """Sum of a column over the gradient rows of a splat, in order."""
+    """Return the sum of a column over the gradient rows of a splat, in order."""
     total = 0.0
     for row in range(first, last):
         total += rows[row, column]
@@ -57,8 +59,11 @@ def _total(rows, first, last, column):
 
 @functools.cache
 def project_backward_kernel(flat: bool, columns: int) -> Any:
-    """Kernel with one thread per splat that sums its gradient rows rows[first_rows[n] : last_rows[n], :columns] and
-    propagates them to its parameters; other arguments as in `backend.raster.cpu.projection.project_backward`."""
+    """Return a kernel with one thread per splat that sums its gradient rows and propagates them to its parameters.
+
+    The gradient rows are rows[first_rows[n] : last_rows[n], :columns]; other arguments as in
+    `backend.raster.cpu.projection.project_backward`.
+    """
     with_normals = columns > G_NORMAL
 
     @cuda_kernel(launch_bounds=SPLATS_PER_BLOCK)

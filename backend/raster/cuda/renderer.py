@@ -1,5 +1,4 @@
-"""The CUDA renderer: tensors on the device in, images and gradients on it out. See `backend.raster` for the torch
-interface and cpu/renderer.py for the same on the CPU."""
+"""The CUDA renderer on tensors in device memory; see `backend.raster` for the torch interface, and cpu/renderer.py."""
 
 from __future__ import annotations
 
@@ -22,8 +21,11 @@ from .staging import THREADS, Wanted
 
 @dataclass
 class Gaussians:
-    """Contiguous float32 tensors: means (N, 3), quats (N, 4) wxyz of any length, scales (N, 3) linear, opacities (N,),
-    sh (N, K, 3); and ids (N,) int32."""
+    """Parameters of Gaussians, as contiguous tensors.
+
+    means (N, 3), quats (N, 4) wxyz of any length, scales (N, 3) linear, opacities (N,), sh (N, K, 3): float32; ids (N,)
+    int32.
+    """
 
     means: torch.Tensor
     quats: torch.Tensor
@@ -35,7 +37,7 @@ class Gaussians:
 
 @dataclass
 class Frame:
-    """A rendered image and what its gradient needs; as `backend.raster.cpu.renderer.Frame`, with tensors."""
+    """A rendered image and the data for its gradient; as `backend.raster.cpu.renderer.Frame`, with tensors."""
 
     gaussians: Gaussians
     camera: Camera
@@ -115,14 +117,14 @@ def forward(
 
 
 def _or(plane: torch.Tensor | None, stand_in: torch.Tensor) -> torch.Tensor:
-    """A kernel needs an argument of the same type even for a plane that it was compiled not to touch."""
+    """Return the plane, or `stand_in` if it is None, since a kernel requires an argument also for unused planes."""
     return stand_in if plane is None else plane
 
 
 def _kernel_inputs(
     splats: torch.Tensor, tilts: torch.Tensor | None, ids: torch.Tensor, labels: torch.Tensor | None
 ) -> tuple[torch.Tensor, ...]:
-    """Splats, tilts, IDs and labels for the kernels, with at least one element each."""
+    """Return splats, tilts, IDs and labels for the kernels, with at least one element each."""
     if not splats.shape[0]:
         splats = splats.new_empty((1, SPLAT_COLUMNS))
         tilts, ids = splats, ids.new_empty(1)
@@ -173,7 +175,7 @@ def backward(
 
 
 def object_ranks(frame: Frame, ranks: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Rank the most probable IDs of every pixel; see `backend.raster.object_ranks`."""
+    """Rank the most probable IDs of each pixel; see `backend.raster.object_ranks`."""
     best_probability = frame.transmittance.new_zeros((ranks, *frame.transmittance.shape))
     best_id = torch.full_like(best_probability, -1, dtype=torch.int32)
     splats, tilts, ids, _ = _kernel_inputs(frame.splats, frame.tilts, frame.gaussians.ids, None)

@@ -1,8 +1,8 @@
-"""Run CUDA kernels as Python on the CPU: numba's simulator of threads and shared memory, with threads that take turns.
+"""Execution of CUDA kernels as Python on the CPU, with numba's simulator but a faster launcher.
 
-numba's own launcher runs all threads of a block at once and polls them at every barrier, which takes about 20 ms each.
-Here one thread runs at a time, up to the next barrier; then the next thread runs. Every other time the threads run in
-reverse order, so that a kernel that lacks a barrier gives a wrong result.
+numba's own launcher runs all threads of a block concurrently and polls them at each barrier, which takes about 20 ms
+each. Here, one thread runs at a time, up to the next barrier; then the next thread runs. After each barrier, the order
+of the threads is reversed, so that a kernel with a missing barrier produces a wrong result.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _BARRIERS = {"syncthreads", "syncthreads_and", "syncthreads_count", "syncthreads
 
 
 def run(function: Callable[..., Any], blocks: int, threads: int, arguments: tuple) -> None:
-    """Run the blocks one after the other; arguments are NumPy arrays, tuples of them, and scalars."""
+    """Run all blocks sequentially; arguments are NumPy arrays, tuples of them, and scalars."""
     has_barriers = bool(_BARRIERS & set(function.__code__.co_names))
     for block in range(blocks):
         module = FakeCUDAModule((blocks, 1, 1), (threads, 1, 1), 0)
@@ -33,7 +33,7 @@ def run(function: Callable[..., Any], blocks: int, threads: int, arguments: tupl
 
 
 class _Shared:
-    """Shared memory of a block: one array for each line of a kernel that requests one, filled with garbage."""
+    """Shared memory of a block: one array for each source line that allocates one, initialized with garbage values."""
 
     def __init__(self) -> None:
         self._arrays: dict[int, np.ndarray] = {}
@@ -47,7 +47,7 @@ class _Shared:
 
 
 class _Thread(threading.Thread):
-    """A thread as the simulated `cuda` module expects the running one to be, reused for every block."""
+    """A thread with the interface that the simulated `cuda` module expects; reused for all blocks."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
@@ -61,7 +61,7 @@ class _Thread(threading.Thread):
         return self
 
     def run(self) -> None:
-        # Divisions by zero and overflows are left to the kernel's guards, as on a GPU.
+        # As on a GPU, divisions by zero and overflows raise no errors.
         with np.errstate(all="ignore"):
             while True:
                 self.turn.acquire()
@@ -99,7 +99,7 @@ _THREADS: list[_Thread] = []
 
 
 class _Block:
-    """Runs the threads of a block in turns."""
+    """Runs the threads of a block alternately."""
 
     def __init__(self, work: Callable[[], Any], block: int, threads: int) -> None:
         self.failure: BaseException | None = None
@@ -118,12 +118,12 @@ class _Block:
             raise self.failure
 
     def reach_barrier(self) -> None:
-        """The running thread has reached a barrier."""
+        """Suspend the running thread at a barrier."""
         self.at_barrier.append(self.waiting.pop(0))
         self._next()
 
     def finish(self) -> None:
-        """The running thread has finished."""
+        """Remove the running thread, which has finished."""
         self.waiting.pop(0)
         self._next()
 

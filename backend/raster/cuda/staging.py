@@ -1,6 +1,6 @@
-"""What the CUDA blending kernels share: splats staged in shared memory, and their log2 alpha in a pixel.
+"""Common parts of the CUDA blending kernels: splats staged in shared memory, and their log2 alpha in a pixel.
 
-A block of 256 threads draws a tile of 16x16 pixels, one thread per pixel; a warp has 8x4 of them.
+A block of 256 threads draws a tile of 16x16 pixels, one thread per pixel; a warp draws 8x4 pixels.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from .kernel import WARP, device_function, reciprocal
 
 THREADS = TILE * TILE
 
-# Columns of a staged splat: its center's column within the tile and its row, the row that the column refers to, and
-# the other values of a splat and, for discs, a tilt (splats.py, discs.py).
+# Columns of a staged splat: its column U relative to the tile, the row of its center, the row that U refers to, and the
+# other values of a splat and, for discs, of a tilt (splats.py, discs.py).
 AT_U, AT_V, ANCHOR, LEAN, ACROSS, DOWN, TOP, S_RED, S_GREEN, S_BLUE, S_DEPTH = range(11)
 S_Q0, S_QX, S_QY, S_NEAREST, S_SPOT_U, S_NORMAL_X, S_NORMAL_Y, S_NORMAL_Z, PER_DEPTH = range(11, 20)
 
@@ -26,13 +26,13 @@ _ZERO = np.float32(0.0)
 _HALF = np.float32(0.5)
 _ONE = np.float32(1.0)
 
-# Loops over shared memory use unsigned counters: an index that might be negative costs a test each time.
+# Loops over shared memory use unsigned counters, since numba tests signed indices for negative values.
 FIRST = np.uint64(0)
 NEXT = np.uint64(1)
 
 
 class Wanted(NamedTuple):
-    """The planes that are requested beside color and transmittance; `flat`: of discs."""
+    """The planes requested in addition to color and transmittance; `flat`: discs instead of 3D Gaussians."""
 
     flat: bool = False
     labels: bool = False
@@ -43,7 +43,7 @@ class Wanted(NamedTuple):
 
 
 def staged_columns(flat: bool) -> int:
-    """Length of a staged row, a multiple of 16 bytes, so that four neighbors are read at once."""
+    """Return the number of columns of a staged row, a multiple of 16 bytes, for vectorized loads of four values."""
     return 20 if flat else 12
 
 
@@ -81,7 +81,7 @@ def stage_disc(splats, tilts, n, tile_x, height, stage, k):
 
 @device_function
 def offsets(stage, k, x, y):
-    """Horizontal distance of a pixel from the ridge of a splat, and vertical distance from its center.
+    """Return the horizontal distance of a pixel from the ridge of a splat, and the vertical distance from its center.
 
     x: the pixel's column in the tile (0 to 15); y: the row of its center in the image.
     """
@@ -90,21 +90,21 @@ def offsets(stage, k, x, y):
 
 @device_function
 def splat_exponent(stage, k, x, y):
-    """log2 alpha of a 3D Gaussian in a pixel, unclamped."""
+    """Return log2 alpha of a 3D Gaussian in a pixel, unclamped."""
     d, dy = offsets(stage, k, x, y)
     return stage[k, TOP] - stage[k, DOWN] * dy * dy - stage[k, ACROSS] * d * d
 
 
 @device_function
 def disc_exponent(stage, k, x, y):
-    """log2 alpha of a disc in a pixel, unclamped; Q; and 1 / Q where its plane is drawn, 0 where its spot is."""
+    """Return log2 alpha of a disc in a pixel, unclamped; Q; and 1 / Q where its plane is drawn, 0 where its spot is."""
     d, dy = offsets(stage, k, x, y)
     q = stage[k, S_Q0] + stage[k, S_QY] * (y - stage[k, ANCHOR]) + stage[k, S_QX] * d
     per_q = reciprocal(q)
     fall = (stage[k, ACROSS] * d * d + stage[k, DOWN] * dy * dy) * per_q * per_q
     ds = x - stage[k, S_SPOT_U]
     spot_fall = _SPOT * (ds * ds + dy * dy)
-    # False where Q = 0 and the fall is not a number.
+    # False if Q = 0, for which `fall` is NaN.
     if per_q >= stage[k, S_NEAREST] and spot_fall > fall:
         return stage[k, TOP] - fall, q, per_q
     return stage[k, TOP] - spot_fall, _ONE, _ZERO
@@ -112,7 +112,7 @@ def disc_exponent(stage, k, x, y):
 
 @device_function
 def pixel_of(thread):
-    """Column and row in the tile of a thread's pixel."""
+    """Return the column and row of a thread's pixel in the tile."""
     lane = thread % WARP
     warp = thread // WARP
     return np.int32(lane % 8 + warp % 2 * 8), np.int32(lane // 8 + warp // 2 * 4)

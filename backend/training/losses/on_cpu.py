@@ -1,8 +1,8 @@
 """The loss of a view with hand-written gradients: L1, SSIM and the probability of the labels.
 
-L = (1 - lambda_ssim) L1 + lambda_ssim (1 - SSIM) - lambda_semantic mean log P_label, over the composed image
-color + (1 - alpha) background (ObjectGS equation 8; SSIM of Wang et al. 2004 with an 11 x 11 Gaussian of sigma 1.5,
-zero beyond the borders).
+L = (1 - lambda_ssim) L1 + lambda_ssim (1 - SSIM) - lambda_semantic mean log P_label, for the composed image
+color + (1 - alpha) background (ObjectGS equation 8; SSIM of Wang et al. 2004 with an 11 x 11 Gaussian of sigma 1.5 and
+zero padding).
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ _C2 = 0.03**2
 _WINDOW = np.exp(-0.5 * (np.arange(-_RADIUS, _RADIUS + 1) / 1.5) ** 2)
 _WINDOW = (_WINDOW / _WINDOW.sum()).astype(np.float32)
 PROBABILITY_FLOOR = 1e-2
-"""Added to P under the logarithm, so that the gradient of a pixel whose object is absent is bounded."""
+"""Added to P in the logarithm, to bound the gradient of pixels whose object is not rendered there."""
 
 _SOLID = 0.5
-"""Pixels with a smaller alpha have no depth to compute a normal from."""
+"""Smallest alpha of pixels whose depth is used to compute a normal."""
 
 _GRAZING = 0.1
-"""Cosine between ray and normal below which a surface is taken for a discontinuity of the depth."""
+"""Cosine between ray and normal below which the depth is considered discontinuous."""
 
-# Sums may be reordered, so that they vectorize; NaN must still come through.
+# Allow reordering of sums, so that they vectorize; NaN must still propagate.
 _REORDER = {"reassoc", "contract", "nsz"}
 
 
 @njit(inline="always", error_model="numpy")
 def _blur_row(source, window, out, width):
-    """out[x] = sum_k window[k] source[x + k]; source is padded by the window's radius."""
+    """Write out[x] = sum_k window[k] source[x + k]; source is padded by the window's radius."""
     for x in range(0, width, simd.LANES):
         acc = simd.splat(window[0]) * simd.load(source, x)
         for k in range(1, 2 * _RADIUS + 1):
@@ -55,7 +55,7 @@ def _add_row(weight, source, at, out, width):
 
 @kernel(parallel=True, fastmath=_REORDER)
 def ssim_gradient(image, target, window, gradient):
-    """Mean SSIM of image and target (3, H, W); gradient (3, H, W) receives that of the mean."""
+    """Return the mean SSIM of image and target (3, H, W), and write its gradient (3, H, W) with respect to image."""
     channels, height, width = image.shape
     stride = (width + simd.LANES - 1) // simd.LANES * simd.LANES
     blurred = np.empty(channels * height * 5 * stride, np.float32)
@@ -99,7 +99,7 @@ def ssim_gradient(image, target, window, gradient):
             over_d, over_e = np.float32(1.0) / d, np.float32(1.0) / e
             value = a * b * over_d * over_e
             total += value
-            # d/d(blurred x), d/d(blurred x^2), d/d(blurred x y)
+            # Derivatives with respect to blurred x, blurred x^2 and blurred x y.
             g11 = -value * over_e
             g12 = 2 * a * over_d * over_e
             rows[0, x] = (2 * mu2 * b * over_d * over_e - 2 * mu1 * value * over_d - 2 * mu1 * g11 - mu2 * g12) * scale
@@ -127,7 +127,7 @@ def ssim_gradient(image, target, window, gradient):
 
 @kernel(parallel=True, fastmath=_REORDER)
 def _compose(color, alpha, background, target, image):
-    """image = color + (1 - alpha) background; returns mean |image - target|."""
+    """Write image = color + (1 - alpha) background; returns mean |image - target|."""
     _, height, width = color.shape
     sums = np.zeros(height)
     for y in prange(height):
@@ -166,7 +166,7 @@ def _image_gradient(image, target, alpha, background, g_ssim, l1_weight, ssim_we
 
 @kernel(parallel=True)
 def _label_loss(label_probability, labels, floor, scale, g_label_probability):
-    """-mean log((P + floor) / (1 + floor)) over pixels with a label >= 0, and its gradient times `scale`."""
+    """Return -mean log((P + floor) / (1 + floor)) over pixels with a label >= 0; writes its gradient times `scale`."""
     height, width = label_probability.shape
     counts = np.zeros(height, np.int64)
     sums = np.zeros(height)
@@ -231,7 +231,10 @@ class _ImageLoss(torch.autograd.Function):
 
 @kernel(parallel=True, fastmath=_REORDER)
 def _volumes(scales, flat, gradient):
-    """Mean product of the rows of scales (N, 3), or of their first two numbers if `flat`, and its gradient."""
+    """Return the mean product of the rows of scales (N, 3), or of their first two columns if `flat`.
+
+    Writes its gradient to `gradient`.
+    """
     n = scales.shape[0]
     chunks = (n + 1023) // 1024
     sums = np.zeros(chunks)
@@ -260,11 +263,11 @@ class _VolumeLoss(torch.autograd.Function):
 
 
 def volume_loss(scales: torch.Tensor, flat: bool = False, made: torch.Tensor | None = None) -> torch.Tensor:
-    """Mean volume of the splats, the product of their scales (Scaffold-GS equation 9, as a mean).
+    """Compute the mean volume of the splats, i.e. the product of their scales (Scaffold-GS equation 9, as a mean).
 
     Args:
         scales: (N, 3), N > 0.
-        flat: whether the splats are discs, of which the mean area is taken.
+        flat: whether the splats are discs, for which the mean area is computed.
         made: (N,) bool, only on the GPU: the entries that are splats.
 
     Returns:
@@ -277,10 +280,11 @@ def volume_loss(scales: torch.Tensor, flat: bool = False, made: torch.Tensor | N
 
 @kernel(parallel=True)
 def _normal_sums(normals, depth, alpha, intrinsics, partial):
-    """Sum of alpha - normals . N over the pixels where the depth has a normal N.
+    """Sum alpha - normals . N over the pixels for which the depth has a normal N.
 
-    N is perpendicular to the differences of the left and right neighbor's points, and of the upper and lower one's.
-    partial (9, H, W) receives the sum's gradient with respect to the two differences, then N; 0 where there is none.
+    N is perpendicular to the difference of the left and right neighbors' points, and to that of the upper and lower
+    ones. partial (9, H, W) receives the sum's gradient with respect to the two differences, then N; 0 where there is
+    none.
     """
     height, width = alpha.shape
     sums = np.zeros(height)
@@ -326,7 +330,7 @@ def _normal_sums(normals, depth, alpha, intrinsics, partial):
 
 @kernel(parallel=True)
 def _normal_gradient(depth, alpha, intrinsics, partial, g_normals, g_depth, g_alpha):
-    """The gradient of `_normal_sums` with respect to its first three arguments, over the number of pixels."""
+    """Compute the gradient of `_normal_sums`, divided by the number of pixels, for its first three arguments."""
     height, width = alpha.shape
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     per_pixel = 1.0 / (height * width)
@@ -373,11 +377,11 @@ class _NormalLoss(torch.autograd.Function):
 def normal_loss(
     normals: torch.Tensor, depth: torch.Tensor, alpha: torch.Tensor, intrinsics: np.ndarray
 ) -> torch.Tensor:
-    """Mean over the pixels of sum_i w_i (1 - n_i . N), where N is the normal of the depth (Huang et al. 2024, "2D
-    Gaussian Splatting", equation 14).
+    """Compute the normal consistency loss of discs (Huang et al. 2024, "2D Gaussian Splatting", equation 14).
 
-    Pixels count where they and their neighbors are covered, and the surface is not at a grazing angle, as it is at
-    discontinuities of the depth.
+    It is the mean over the pixels of sum_i w_i (1 - n_i . N), where N is the normal computed from the depth. Pixels are
+    included if they and their neighbors are covered, and the surface is not at a grazing angle, as it is at depth
+    discontinuities.
 
     Args:
         normals: (3, H, W), as in `Rendered`.
@@ -402,7 +406,7 @@ def image_loss(
     ssim_weight: float,
     semantic_weight: float | torch.Tensor,
 ) -> torch.Tensor:
-    """The loss of one view, see this module.
+    """Compute the loss of one view as defined in the module's docstring.
 
     Args:
         color: (3, H, W), rendered.
@@ -411,8 +415,8 @@ def image_loss(
         background: (3,) RGB.
         target: (3, H, W), the image.
         labels: (H, W) int32; -1 is ignored. None: no label loss.
-        ssim_weight: of SSIM, 0 .. 1; the rest is that of L1.
-        semantic_weight: of the label loss.
+        ssim_weight: weight of SSIM, 0 .. 1; the weight of L1 is 1 - ssim_weight.
+        semantic_weight: weight of the label loss.
 
     Returns:
         () float32.

@@ -1,4 +1,4 @@
-"""The losses of `on_cpu` as torch operations, with the same values and gradients, that do not wait for the GPU."""
+"""The losses of `on_cpu` as torch operations with the same values and gradients, without synchronization."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def image_loss(
     window: np.ndarray,
     floor: float,
 ) -> tuple[torch.Tensor, Gradients]:
-    """`on_cpu.image_loss` and its gradients with respect to color, alpha, label_probability and background.
+    """Compute `on_cpu.image_loss` and its gradients with respect to color, alpha, label_probability and background.
 
-    window: (11,) float32, of SSIM; floor: added to the probability under the logarithm.
+    window: (11,) float32, the window of SSIM; floor: added to the probability in the logarithm.
     """
     behind = background[:, None, None]
     image = color + (1 - alpha) * behind
@@ -48,7 +48,7 @@ def image_loss(
 def ssim_and_gradient(
     image: torch.Tensor, target: torch.Tensor, window: np.ndarray
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Mean SSIM of image and target (3, H, W), and its gradient (3, H, W) with respect to the image."""
+    """Compute the mean SSIM of image and target (3, H, W), and its gradient (3, H, W) with respect to the image."""
     taps = devices.upload(window, image)
     moments = torch.stack([image, target, image * image, target * target, image * target])
     mu1, mu2, square1, square2, product = _blur(moments, taps)
@@ -57,7 +57,7 @@ def ssim_and_gradient(
     a, b = 2 * mu1 * mu2 + c1, 2 * s12 + c2
     over_d, over_e = 1 / (mu1 * mu1 + mu2 * mu2 + c1), 1 / (s11 + s22 + c2)
     value = a * b * over_d * over_e
-    # With respect to the blurred image, its square, and its product with the target.
+    # Gradients with respect to the blurred square of the image and the blurred product with the target.
     g_square = -value * over_e
     g_product = 2 * a * over_d * over_e
     g_mean = 2 * over_d * (mu2 * b * over_e - mu1 * value) - 2 * mu1 * g_square - mu2 * g_product
@@ -66,10 +66,10 @@ def ssim_and_gradient(
 
 
 def _blur(planes: torch.Tensor, taps: torch.Tensor) -> torch.Tensor:
-    """Convolve planes (n, 3, H, W) with the window along rows and columns, zero beyond the borders."""
+    """Convolve planes (n, 3, H, W) with the window along rows and columns, with zero padding."""
     n, channels, height, width = planes.shape
     count, radius = n * channels, len(taps) // 2
-    # Depthwise, so that it is torch's own kernel in full float32: variances are small differences of large numbers.
+    # A depthwise convolution uses torch's own kernel in full float32; variances are small differences of large numbers.
     across = taps.view(1, 1, 1, -1).expand(count, 1, 1, -1)
     down = taps.view(1, 1, -1, 1).expand(count, 1, -1, 1)
     out = torch.conv2d(planes.view(1, count, height, width), across, padding=(0, radius), groups=count)
@@ -77,7 +77,7 @@ def _blur(planes: torch.Tensor, taps: torch.Tensor) -> torch.Tensor:
 
 
 def volume_loss(scales: torch.Tensor, flat: bool, made: torch.Tensor | None) -> torch.Tensor:
-    """`on_cpu.volume_loss`, differentiable in scales."""
+    """Compute `on_cpu.volume_loss`, differentiable in scales."""
     a, b, c = scales.unbind(1)
     size = a * b if flat else a * b * c
     return size.mean() if made is None else torch.where(made, size, 0.0).sum() / made.sum().clamp(min=1)
@@ -91,9 +91,9 @@ def normal_loss(
     solid: float,
     grazing: float,
 ) -> torch.Tensor:
-    """`on_cpu.normal_loss`, differentiable in the first three arguments.
+    """Compute `on_cpu.normal_loss`, differentiable in the first three arguments.
 
-    solid: the least alpha of a pixel with a depth; grazing: the least cosine between ray and normal.
+    solid: smallest alpha of a pixel with a depth; grazing: smallest cosine between ray and normal.
     """
     height, width = alpha.shape
     if height < 3 or width < 3:
