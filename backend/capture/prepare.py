@@ -1,4 +1,4 @@
-"""Loads a capture: undistorts and reduces its images once, into a cache."""
+"""Loading of a capture; images are undistorted and reduced once, into a cache."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from ..shared.defaults import MAX_SIZE
 from ..shared.errors import InputError
 from ..shared.events import Reporter
-from ..shared.formats.atomic import write_atomic
+from ..shared.formats.atomic import make_folder, write_atomic
 from ..shared.formats.json_file import write_json
 from .capture import Capture, Points, View, needs_no_resampling
 from .files import encode_mask, image_size, read_image, write_image
@@ -28,25 +28,25 @@ def load_capture(
     max_size: int = MAX_SIZE,
     reporter: Reporter | None = None,
 ) -> Capture:
-    """Load a capture: images/, a COLMAP model (sparse/0, sparse/ or beside images/), and optionally masks/ and
-    labels.json or labels.txt.
+    """Load a capture.
 
-    Images that are distorted or too large are resampled into the cache, once as long as their sources do not change.
-    A killed run leaves no incomplete file.
+    A capture has images/, a COLMAP model (sparse/0, sparse/ or beside images/), and optionally masks/ and labels.json
+    or labels.txt. Images that are distorted or too large are resampled into the cache, and again only if their source
+    files change. An interrupted run leaves no incomplete files.
 
     Args:
         folder: The capture.
-        cache: Folder for resampled files; None to resample and write nothing, so that the capture is only `prepared`
+        cache: Folder for resampled files. If None, nothing is resampled or written, and the capture is `prepared` only
             if no image needs resampling.
-        memory_mb: Limit of the memory for decoded images, in megabytes.
-        max_size: Longer side of the views, in pixels; 0 for any size.
+        memory_mb: Memory limit for decoded images, in megabytes.
+        max_size: Largest longer side of the views, in pixels; 0 for no limit.
         reporter: Receives status, progress and warnings.
 
     Returns:
         The capture; its images and masks are decoded on demand.
 
     Raises:
-        InputError: The capture cannot be used; the message names the file.
+        InputError: The capture cannot be used; the message contains the path of the file at fault.
     """
     reporter = reporter or Reporter()
     folder, cache = Path(folder), None if cache is None else Path(cache) / "views"
@@ -55,7 +55,7 @@ def load_capture(
         reporter.status("Reading the masks")
     else:
         try:
-            cache.mkdir(parents=True, exist_ok=True)
+            make_folder(cache)
         except OSError as error:
             what = f"The folder {cache.parent} cannot be written to ({error.strerror}); choose another."
             raise InputError(what) from error
@@ -91,7 +91,7 @@ def load_capture(
 
 
 def _read_view(source: Source, survey: Survey) -> tuple[View, tuple[int, ...]]:
-    """Check one view, without resampling, and return it and the IDs in its mask."""
+    """Check one view without resampling; returns the view and the IDs in its mask."""
     check_size(source, image_size(source.image_path), survey.model.file("cameras"))
     ids = () if source.mask_path is None else tuple(distinct_ids(check_mask(source, survey.color_masks)))
     return _view_of(source, source.image_path, source.mask_path), ids
@@ -106,13 +106,13 @@ def _view_of(source: Source, image_file: Path, mask_file: Path | None) -> View:
 
 
 def _prepare_view(source: Source, survey: Survey, cache: Path) -> tuple[View, tuple[int, ...]]:
-    """Check one view, resample it into the cache if necessary, and return it and the IDs in its mask.
+    """Check one view and resample it into the cache if necessary; returns the view and the IDs in its mask.
 
-    The stamp beside the cached files records their sources and is written last.
+    The stamp file beside the cached files records their sources and is written last.
     """
     name = source.image.name
     camera, target = source.camera, source.target
-    # The name includes the size, so that loading a capture at another size does not replace files in use.
+    # The digest includes the size, so that loading a capture at another size does not replace files in use.
     digest = hashlib.sha256(f"{name}\0{target.width}x{target.height}".encode()).hexdigest()[:12]
     stem = re.sub(r"[^A-Za-z0-9_-]+", "_", name)[-40:].strip("_") + "-" + digest
     stamp_path = cache / f"{stem}.json"
@@ -148,7 +148,7 @@ def _identify(path: Path) -> list[Any]:
 
 
 def _read_stamp(path: Path, made_from: dict[str, Any], cache: Path) -> dict[str, Any] | None:
-    """Read the stamp of valid cached files; None if they have to be made again. A damaged cache is not an error."""
+    """Read the stamp of cached files; None if they are invalid and must be rebuilt. A damaged cache is not an error."""
     try:
         stamp = json.loads(path.read_text(encoding="utf-8"))
         if stamp["made_from"] != made_from:

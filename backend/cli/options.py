@@ -44,9 +44,17 @@ def add_reconstruction(command: argparse.ArgumentParser) -> None:
 def add_preparation(command: argparse.ArgumentParser, out_required: bool = True) -> None:
     add_capture(command)
     add_memory(command)
+    add_output(command, out_required)
+
+
+def add_output(command: argparse.ArgumentParser, required: bool = True) -> None:
     command.add_argument(
-        "--out", type=Path, required=out_required, metavar="DIR",
+        "--out", type=Path, required=required, metavar="DIR",
         help="reconstruction folder; created if it does not exist",
+    )  # fmt: skip
+    command.add_argument(
+        "--overwrite", action="store_true",
+        help="use DIR even if it contains other files; files that have the names of a reconstruction's are replaced",
     )  # fmt: skip
 
 

@@ -220,7 +220,7 @@ def _add_import_splats(commands: _Commands) -> None:
         "point_cloud.ply --out garden-splats --capture garden",
     )  # fmt: skip
     import_splats.add_argument("ply", type=Path, metavar="PLY", help="splats in the format of 3D Gaussian splatting")
-    import_splats.add_argument("--out", type=Path, required=True, metavar="DIR", help="reconstruction folder to create")
+    options.add_output(import_splats)
     import_splats.add_argument(
         "--capture", type=Path, metavar="CAPTURE", help="folder with images/, sparse/0/ and masks/"
     )

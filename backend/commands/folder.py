@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import shutil
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,8 +17,9 @@ from ..planning.decisions import planned_capture
 from ..raster import devices
 from ..shared.errors import InputError
 from ..shared.events import Reporter
+from ..shared.formats.atomic import recorded
 from ..shared.reconstruction.folder import Reconstruction
-from ..shared.reconstruction.lock import FolderInUse, locked
+from ..shared.reconstruction.lock import locked
 from ..shared.reconstruction.objects import read_objects
 from ..shared.reconstruction.plan import Plan
 from ..shared.reconstruction.record import CaptureRecord, TrainingRecord, read_record, update_record
@@ -41,40 +41,68 @@ def memory_for_planes(options: argparse.Namespace) -> float:
     return options.memory_mb - memory_for_files(options)
 
 
+class Output:
+    """A reconstruction folder that this process has locked and writes to."""
+
+    def __init__(self, folder: Reconstruction) -> None:
+        self.folder = folder
+        self.is_accepted = False
+
+    def accept(self) -> None:
+        """Keep what has been written, whatever fails from now on."""
+        self.is_accepted = True
+
+
+@contextmanager
+def open_output(options: argparse.Namespace) -> Iterator[Output]:
+    """Create the folder of --out if necessary, and lock it.
+
+    If the input is refused before `Output.accept`, what this process has created is deleted: its files while the folder
+    is still locked, then those new folders that are empty.
+
+    Raises:
+        FolderInUse: another process uses the folder.
+        InputError: the folder contains files but no reconstruction, or cannot be written to.
+    """
+    output = Output(Reconstruction(options.out))
+    if not options.overwrite:
+        output.folder.require_own()
+    with recorded() as created:
+        try:
+            output.folder.create()
+            with locked(output.folder.folder):
+                try:
+                    update_record(output.folder)
+                    yield output
+                except (InputError, OSError):
+                    if not output.is_accepted:
+                        created.remove_files()
+                    raise
+        except (InputError, OSError):
+            if not output.is_accepted:
+                created.remove_folders()
+            raise
+
+
 @contextmanager
 def open_reconstruction(options: argparse.Namespace, reporter: Reporter) -> Iterator[tuple[Reconstruction, Capture]]:
-    """Create and lock the folder of --out, load the capture and write cameras.json.
+    """Create the folder of --out if necessary, lock it, read the capture and write cameras.json.
 
-    If the input is invalid, a new folder is removed again.
-
-    Yields:
-        The folder, locked for the duration of the context, and the capture.
+    Raises:
+        InputError: as `open_output`, or the capture cannot be used; what this process has created is deleted.
     """
-    folder = Reconstruction(options.out)
-    with ExitStack() as held:
-        with removed_if_refused(folder):
-            folder.create()
-            held.enter_context(locked(folder.folder))
-            with stage(folder, "read"):
-                capture = load_capture(
-                    options.capture, folder.cache, memory_for_files(options), options.max_size, reporter
-                )
-                write_capture_cameras(folder, capture)
-        yield folder, capture
+    with open_output(options) as output:
+        capture = read_capture(output.folder, options, reporter)
+        output.accept()
+        yield output.folder, capture
 
 
-@contextmanager
-def removed_if_refused(folder: Reconstruction) -> Iterator[None]:
-    """Remove newly created folders on InputError or OSError, unless the folder is in use by another process."""
-    absent = [path for path in (folder.cache, folder.folder, *folder.folder.parents) if not path.exists()]
-    try:
-        yield
-    except FolderInUse:
-        raise
-    except (InputError, OSError):
-        if absent:
-            shutil.rmtree(absent[-1], ignore_errors=True)
-        raise
+def read_capture(folder: Reconstruction, options: argparse.Namespace, reporter: Reporter) -> Capture:
+    """Read the capture of the options, prepare its images in the cache of `folder`, and write cameras.json."""
+    with stage(folder, "read"):
+        capture = load_capture(options.capture, folder.cache, memory_for_files(options), options.max_size, reporter)
+        write_capture_cameras(folder, capture)
+    return capture
 
 
 class Trained(NamedTuple):

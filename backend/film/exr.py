@@ -32,11 +32,9 @@ def write(path: Path, channels: Mapping[str, NDArray], header: Mapping[str, Any]
     Raises:
         OSError: If the file cannot be written.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     entries = {**header, DIGEST: digest, "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     planes = {name: np.ascontiguousarray(plane) for name, plane in channels.items()}
-    with atomic_path(path, part):
-        part.write_bytes(b"")  # Raises OSError with the reason, which OpenEXR's error lacks.
+    with atomic_path(path) as part:
         try:
             OpenEXR.File(entries, planes).write(str(part))
         except RuntimeError as error:

@@ -1,4 +1,4 @@
-"""A training's state on disk: safetensors, written to a temporary file and renamed; the previous one is kept."""
+"""Checkpoints of a training: safetensors, written to a temporary file and renamed; the previous one is kept."""
 
 from __future__ import annotations
 
@@ -12,36 +12,38 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from ..shared.errors import InputError
+from ..shared.formats.atomic import atomic_file, make_folder
 from ..shared.reconstruction.checkpoint import CURRENT, FORMAT, PREVIOUS
 
 
-def save_checkpoint(folder: Path, tensors: dict[str, np.ndarray], state: dict[str, Any]) -> None:
-    """Write a checkpoint. At every moment `folder` holds a whole one, once the first is written.
+def save_checkpoint(
+    folder: Path, tensors: dict[str, np.ndarray], state: dict[str, Any], keep_current: bool = True
+) -> None:
+    """Write a checkpoint; after the first one, `folder` contains a complete checkpoint at any time.
 
     Args:
         folder: created if necessary.
-        tensors: by name.
-        state: JSON-serializable.
+        tensors: tensors by name.
+        state: JSON-serializable state.
+        keep_current: keep the current checkpoint as the previous one. Without it, the current one is replaced and the
+            previous one is left, as is right if the current one may be damaged.
 
     Raises:
-        InputError: the file cannot be written; the previous checkpoint still loads.
+        InputError: the file cannot be written; the previous checkpoint can still be loaded.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     data = save(
         {name: np.ascontiguousarray(value) for name, value in tensors.items()},
         metadata={"state": json.dumps({"format": FORMAT, **state})},
     )
-    part = folder / (CURRENT + ".part")
     try:
-        with part.open("wb") as file:
+        make_folder(folder)
+        with atomic_file(folder / CURRENT) as file:
             file.write(data)
             file.flush()
-            os.fsync(file.fileno())
-        if (folder / CURRENT).exists():
-            (folder / CURRENT).replace(folder / PREVIOUS)
-        part.replace(folder / CURRENT)
+            if keep_current and (folder / CURRENT).exists():
+                os.fsync(file.fileno())
+                (folder / CURRENT).replace(folder / PREVIOUS)
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise InputError(
             f"The checkpoint {folder / CURRENT} could not be written ({error.strerror}); free some space and run "
             "the same command again to continue from the previous checkpoint."
@@ -49,18 +51,18 @@ def save_checkpoint(folder: Path, tensors: dict[str, np.ndarray], state: dict[st
 
 
 def has_checkpoint(folder: Path) -> bool:
-    """Whether `folder` holds files of a checkpoint, whole or damaged."""
+    """Return whether `folder` contains files of a checkpoint, complete or damaged."""
     return any((folder / name).exists() for name in (CURRENT, PREVIOUS))
 
 
 def load_checkpoint(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None] | None:
-    """Read the newest whole checkpoint.
+    """Read the latest complete checkpoint.
 
     Returns:
-        Its tensors, its state, and a warning or None; None if there is no checkpoint.
+        The tensors, the state, and a warning or None; None if there is no checkpoint.
 
     Raises:
-        InputError: there are files, but none can be read.
+        InputError: there are checkpoint files, but none can be read.
     """
     broken = None
     for name in (CURRENT, PREVIOUS):

@@ -71,6 +71,8 @@ class Trainer:
         self._exp_avg = torch.zeros_like(model.anchors.rows)
         self._exp_avg_sq = torch.zeros_like(model.anchors.rows)
         self._warnings: list[str] = []
+        # Not before the current checkpoint is known to be complete, and one of this training.
+        self._keeps_current = False
         self._average = Average(model)
         model.background.requires_grad_(settings.background == "learned")
         groups: list[dict[str, Any]] = [
@@ -161,7 +163,9 @@ class Trainer:
                 "rng": self.rng.bit_generator.state,
                 "progress": {**self.progress.__dict__},
             },
+            keep_current=self._keeps_current,
         )
+        self._keeps_current = True
 
     @classmethod
     def resume(
@@ -207,6 +211,7 @@ class Trainer:
         rng = np.random.default_rng()
         rng.bit_generator.state = state["rng"]
         trainer = cls(scene, stored, model.to(device), rng)
+        trainer._keeps_current = warning is None
         device = trainer.model.device
         trainer._exp_avg = restore_tensor(tensors, "adam.exp_avg", device)
         trainer._exp_avg_sq = restore_tensor(tensors, "adam.exp_avg_sq", device)
@@ -371,8 +376,10 @@ class Trainer:
         return loss
 
     def _handle(self, fault: check_finite.Fault, index: int) -> None:
-        """Count a fault in the step on view `index`, warn if it is the first of its kind, and remove anchors with
-        non-finite parameters."""
+        """Count a fault in the step on view `index`, and remove anchors with non-finite parameters.
+
+        Warns if the fault is the first of its kind.
+        """
         p, model, capture = self.progress, self.model, self.scene.capture
         if fault.what not in p.faults:
             owner = None

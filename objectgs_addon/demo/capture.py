@@ -14,6 +14,7 @@ All coordinates are in meters with Z up, in one frame. Equal settings produce an
 from __future__ import annotations
 
 import json
+import secrets
 import shutil
 import time
 from collections.abc import Callable, Iterable
@@ -26,10 +27,18 @@ import numpy as np
 
 from ...backend.shared.errors import Cancelled, InputError
 from ...backend.shared.events import Reporter
+from ...backend.shared.formats.atomic import make_folder, recorded
 from . import files, mask_noise, points, scene
 from .render import Renderer
 
 VERSION = 1  # Incremented when equal settings produce a different capture.
+
+_FILES = (
+    *("images/????.png", "masks/????.png", "truth/masks/????.png", "truth/depth/????.npy", "truth/meshes/*.ply"),
+    *("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin", "labels.json"),
+    *("truth/objects.json", "truth/points.npz", "truth/settings.json"),
+)
+"""Patterns of the files in a demo capture."""
 
 __all__ = ["Settings", "make"]
 
@@ -95,21 +104,25 @@ def make(
     if _is_there(out, settings, overwrite):
         reporter.status(f"The same demo capture is already in {out}; nothing to do.")
         return out
-    part = out.with_name(out.name + ".part")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        if part.exists():
-            shutil.rmtree(part)
-        part.mkdir()
-    except OSError as error:
-        raise InputError(f"The folder {out} cannot be written: {error.strerror or error}.") from error
-    try:
-        _fill(part, settings, reporter, stopped)
-        _swap(part, out)
-    except BaseException:
-        shutil.rmtree(part, ignore_errors=True)
-        raise
+    part = _beside(out)
+    with recorded() as created:
+        try:
+            make_folder(part)
+        except OSError as error:
+            raise InputError(f"The folder {out} cannot be written: {error.strerror or error}.") from error
+        try:
+            _fill(part, settings, reporter, stopped)
+            _swap(part, out)
+        except BaseException:
+            shutil.rmtree(part, ignore_errors=True)
+            created.remove_folders()
+            raise
     return out
+
+
+def _beside(out: Path) -> Path:
+    """Return a new hidden name in the folder of `out`."""
+    return out.with_name(f".{out.name[:60]}-{secrets.token_hex(8)}.part")
 
 
 def _is_there(out: Path, settings: Settings, overwrite: bool) -> bool:
@@ -128,7 +141,15 @@ def _is_there(out: Path, settings: Settings, overwrite: bool) -> bool:
         raise InputError(
             f"The folder {out} contains a demo capture with other settings; use --overwrite to replace it."
         )
+    foreign = [path for path in sorted(out.rglob("*")) if not path.is_dir() and not _is_written(path.relative_to(out))]
+    if foreign:
+        raise InputError(f"{foreign[0]} is not part of the demo capture in {out}; move it, or choose another folder.")
     return False
+
+
+def _is_written(path: Path) -> bool:
+    """Return whether a demo capture contains a file of this relative path."""
+    return any(path.match(pattern) and len(path.parts) == len(Path(pattern).parts) for pattern in _FILES)
 
 
 def _record(settings: Settings) -> dict:
@@ -144,10 +165,8 @@ def _recorded(out: Path) -> Any:
 
 def _swap(part: Path, out: Path) -> None:
     """Move the finished folder into place; the old one is deleted only after that succeeds."""
-    old = out.with_name(out.name + ".old")
+    old = _beside(out)
     if out.exists():
-        if old.exists():
-            shutil.rmtree(old)
         out.rename(old)
     try:
         part.rename(out)

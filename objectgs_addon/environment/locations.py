@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 
 import bpy
 
+from ...backend.shared.formats.file_names import file_stem
 from ..process.backend_process import backend_command, backend_environment
 from ..process.jobs import Job
 from . import environment
@@ -21,38 +21,38 @@ from .worker.layout import VERSIONS
 
 
 def preferences() -> Any:
-    """The preferences of the extension, or None without a window, where it is not enabled."""
+    """Return the extension's preferences, or None if it is not enabled, as without a window."""
     addon = bpy.context.preferences.addons.get(PACKAGE)
     return addon.preferences if addon else None
 
 
 def user_folder() -> Path:
-    """The folder for files that outlive updates of the extension, created if needed."""
+    """Return the folder for files that survive updates of the extension; create it if needed."""
     if PACKAGE.startswith("bl_ext."):
         return Path(bpy.utils.extension_path_user(PACKAGE, create=True))
     return Path(bpy.utils.user_resource("DATAFILES", path="objectgs", create=True))
 
 
 def environment_folder() -> Path:
-    """The folder of the backend's environment."""
+    """Return the folder of the backend's environment."""
     return user_folder() / "environment"
 
 
 def reconstructions_folder() -> Path:
-    """The default folder of new reconstructions."""
+    """Return the default folder for new reconstructions."""
     chosen = preferences().reconstructions if preferences() else ""
     return Path(bpy.path.abspath(chosen)) if chosen else user_folder() / "reconstructions"
 
 
 def new_reconstruction(name: str, is_free: Callable[[Path], bool]) -> Path:
-    """A folder for a reconstruction of this name, numbered until `is_free` is true."""
-    name = re.sub(r"[^\w.-]+", "_", name) or "capture"
+    """Return a folder for a new reconstruction named `name`, with a number if needed for `is_free` to be true."""
+    name = file_stem(name, "capture")
     numbered = (name if number == 1 else f"{name}-{number}" for number in itertools.count(1))
     return next(folder for each in numbered if is_free(folder := reconstructions_folder() / each))
 
 
 def backend_python() -> Path | None:
-    """The Python of the backend: the user's choice, or that of the environment; None without either."""
+    """Return the backend's Python: the user's choice, else that of the environment; None if it is not usable."""
     chosen = _chosen_python()
     if chosen is not None:
         return chosen if chosen.is_file() else None
@@ -61,7 +61,7 @@ def backend_python() -> Path | None:
 
 
 def backend_sentence() -> str:
-    """A sentence about the backend: its location, or why it cannot be run and what to do."""
+    """Describe the backend in a sentence: its location, or why it cannot run and what to do."""
     chosen = _chosen_python()
     if chosen is None:
         return environment.inspect(environment_folder()).sentence
@@ -71,23 +71,23 @@ def backend_sentence() -> str:
 
 
 def _chosen_python() -> Path | None:
-    """The Python that the user has chosen, whether it exists or not."""
+    """Return the Python chosen by the user, which may be missing, or None."""
     chosen = os.environ.get("OBJECTGS_PYTHON") or (preferences().backend_python if preferences() else "")
     return Path(bpy.path.abspath(chosen)) if chosen else None
 
 
 def base_python() -> Path:
-    """The Python for new environments: the user's choice, or Blender's own."""
+    """Return the Python for new environments: the user's choice, or else Blender's own."""
     chosen = preferences().base_python if preferences() else ""
     return Path(bpy.path.abspath(chosen)) if chosen else Path(sys.executable)
 
 
 def backend_job(title: str, kind: str, folder: Path | None, *arguments: str) -> Job:
-    """A job that runs `python -m backend ARGUMENTS --json`; `backend_python` must not be None.
+    """Return a job that runs `python -m backend ARGUMENTS --json`; `backend_python` must not return None.
 
     Args:
-        title: name for the user.
-        kind: as of `Job`.
+        title: name shown to the user.
+        kind: value of `Job.kind`.
         folder: the reconstruction folder, or None.
         arguments: command and options of the backend.
     """
@@ -107,12 +107,12 @@ def backend_job(title: str, kind: str, folder: Path | None, *arguments: str) -> 
 
 
 def demo_folder() -> Path:
-    """The folder of the demo capture."""
+    """Return the folder of the demo capture."""
     return user_folder() / "demo-capture"
 
 
 def demo_job() -> Job:
-    """A job that renders the demo capture in another Blender without a window."""
+    """Return a job that renders the demo capture in a second Blender without a window."""
     script = [str(ROOT / "headless.py"), "--", "demo", str(demo_folder()), "--json"]
     return Job(
         title="Make demo capture",

@@ -8,6 +8,7 @@ from bpy.props import BoolProperty, IntProperty, StringProperty
 
 from ...backend.shared.defaults import MAX_SIZE
 from ...backend.shared.errors import InputError
+from ...backend.shared.reconstruction.folder import Reconstruction
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
 from ...objectgs_addon.state.folder_state import folder_state
@@ -59,6 +60,7 @@ class ImportCapture(bpy.types.Operator):
             raise InputError(f"The folder {capture or 'of the capture'} does not exist; choose another")
         folder = Path(bpy.path.abspath(self.folder)).resolve() if self.folder else _folder_for(capture)
         need.require_unused(folder)
+        Reconstruction(folder).require_own()
         job = locations.backend_job(
             f"Import {capture.name}",
             "import",
@@ -76,10 +78,14 @@ class ImportCapture(bpy.types.Operator):
 def _folder_for(capture: Path) -> Path:
     """A reconstruction folder named after the capture, or after its parent where the capture has a generic name.
 
-    It is numbered where that name belongs to another capture.
+    It is numbered where that name belongs to another capture or to something else.
     """
     name = capture.name if capture.name.lower() not in ("capture", "colmap", "data") else capture.parent.name
-    return locations.new_reconstruction(name, lambda folder: folder_state(folder).capture in (None, capture))
+
+    def is_free(folder: Path) -> bool:
+        return folder_state(folder).capture in (None, capture) and Reconstruction(folder).foreign_file() is None
+
+    return locations.new_reconstruction(name, is_free)
 
 
 CLASSES = (ImportCapture,)

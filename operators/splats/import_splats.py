@@ -7,6 +7,7 @@ import bpy
 from bpy.props import StringProperty
 
 from ...backend.shared.errors import InputError
+from ...backend.shared.reconstruction.folder import Reconstruction
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
 from ..common import need
@@ -60,6 +61,7 @@ class ImportSplats(bpy.types.Operator):
             raise InputError(f"The file {self.filepath} does not exist; choose another")
         folder = Path(bpy.path.abspath(self.folder)).resolve() if self.folder else _folder_for(ply)
         need.require_unused(folder)
+        Reconstruction(folder).require_own()
         arguments = ["import-splats", str(ply), "--out", str(folder)]
         if self.capture:
             arguments += ["--capture", str(Path(bpy.path.abspath(self.capture)).resolve())]

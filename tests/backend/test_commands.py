@@ -331,7 +331,8 @@ def test_training_again_is_done_goes_on_or_begins_anew(trained, ask):
     anew = ask(*train, "--steps", 10, "--sh-degree", 2, "--strategy", "correspondence", "--restart", "--json")
     assert anew.events[-1]["steps"] == 10 and step_of(out) == 10
     assert read_splats(out / "splats.ply")[0].degree == 2
-    assert not (out / "checkpoint" / PREVIOUS).exists(), "nothing of the earlier training is left to fall back on"
+    (out / "checkpoint" / CURRENT).unlink()
+    assert step_of(out) == 0, "the previous checkpoint is the new training's first, not one of the earlier training"
 
 
 def test_another_capture_does_not_continue_a_training(trained, write_capture, ask):

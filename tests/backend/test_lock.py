@@ -10,6 +10,7 @@ import pytest
 
 from backend.shared.reconstruction import lock
 from backend.shared.reconstruction.lock import FolderInUse, lock_holder, locked
+from backend.shared.reconstruction.objects import read_objects, write_objects
 
 HOLD = """
 import sys, time
@@ -93,3 +94,32 @@ def test_processes_that_race_are_never_inside_together(tmp_path):
     ]
     assert [(racer.wait(), racer.stderr.read()) for racer in racers] == [(0, "")] * 4
     assert list(tmp_path.iterdir()) == []
+
+
+EDITS = """
+import sys
+from pathlib import Path
+from backend.shared.errors import InputError
+from backend.shared.reconstruction.objects import edit_objects
+path, first = Path(sys.argv[1]), int(sys.argv[2])
+refused = 0
+for number in range(first, first + 50):
+    try:
+        edit_objects(path, {number: {"name": f"name {number}"}})
+    except InputError:
+        refused += 1
+print(refused)
+"""
+
+
+def test_concurrent_edits_are_all_applied(tmp_path):
+    """300 of them, by 6 processes at a time."""
+    path = tmp_path / "objects.json"
+    write_objects(path, [{"id": i, "name": "", "color": [0, 0, 0], "points": 1} for i in range(1, 301)])
+    editors = [
+        subprocess.Popen([sys.executable, "-c", EDITS, str(path), str(first)], stdout=subprocess.PIPE)
+        for first in range(1, 301, 50)
+    ]
+    assert [int(editor.communicate(timeout=120)[0]) for editor in editors] == [0] * 6
+    assert [entry.name for entry in read_objects(path)] == [f"name {i}" for i in range(1, 301)]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["objects.json"]

@@ -295,7 +295,7 @@ def test_plan_says_all_and_writes_only_what_it_is_told_to(write_capture, tmp_pat
     refused(ask("plan", tmp_path / "none", "--out", out), "does not exist")
     assert not out.parent.exists()
     assert ask("plan", capture, "--out", out, "--only", "sphere 2").code == EXIT_DONE
-    assert {path.name for path in out.iterdir()} == {"plan.json"}
+    assert {path.name for path in out.iterdir()} == {"objectgs.json", "plan.json"}
     assert read_plan(out / "plan.json")["objects"].done is False
     assert ask("import", capture, "--out", out).code == EXIT_DONE
     assert read_plan(out / "plan.json")["rest"].done is None

@@ -2,10 +2,12 @@
 """The demo capture: consistent files, and equal bytes for equal settings."""
 
 import json
+import shutil
 import struct
 import subprocess
 import sys
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
-from objectgs.backend.shared.errors import Cancelled
+from objectgs.backend.shared.errors import Cancelled, InputError
 from objectgs.objectgs_addon.demo import capture as demo_capture
 from objectgs.objectgs_addon.demo import mask_noise
 
@@ -136,7 +138,8 @@ def test_files_and_ids(tiny):
         assert np.array_equal(ids, read_png(tiny / "masks" / name))
         found |= set(np.unique(ids).tolist())
     assert found == {int(key) for key in labels}
-    assert not list(tiny.parent.glob("*.part"))
+    assert not list(tiny.parent.glob("*.part")) and not list(tiny.parent.glob(".*"))
+    assert all(demo_capture._is_written(path.relative_to(tiny)) for path in tiny.rglob("*") if path.is_file())
 
 
 def test_masks_and_depth_agree_with_meshes(small):
@@ -233,3 +236,19 @@ def test_stop_leaves_nothing(tmp_path):
         demo_capture.make(tmp_path / "x", TINY, stopped=lambda: True)
     assert not list(tmp_path.iterdir())
     assert "ObjectGS demo" not in bpy.data.scenes
+
+
+def test_files_of_others_are_neither_deleted_nor_replaced(tiny, tmp_path, monkeypatch):
+    for name in ("demo.part", "demo.old"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "thesis.odt").write_text("not yours")
+    monkeypatch.setattr(demo_capture, "_fill", lambda part, *_: shutil.copytree(tiny, part, dirs_exist_ok=True))
+    out = demo_capture.make(tmp_path / "demo", TINY)
+    other = replace(TINY, seed=5)
+    demo_capture.make(out, other, overwrite=True)
+    (out / "images" / "holiday.jpg").write_text("not yours")
+    with pytest.raises(InputError, match=r"holiday\.jpg is not part of the demo capture"):
+        demo_capture.make(out, other, overwrite=True)
+    assert (out / "images" / "holiday.jpg").read_text() == "not yours"
+    assert all((tmp_path / name / "thesis.odt").read_text() == "not yours" for name in ("demo.part", "demo.old"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["demo", "demo.old", "demo.part"]

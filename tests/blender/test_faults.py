@@ -650,3 +650,19 @@ def test_points_that_say_nothing(shown):
     bpy.data.objects.remove(next(part for part in shown.objects if scene.kind_of(part) == "parent"))
     told = refusal(bpy.ops.objectgs.set_ground, points=(0, 0, 0, 1, 0, 0, 0, 1, 0))
     assert "has lost its parent empty" in told
+
+
+def test_a_folder_with_foreign_files_is_not_used(tmp_path, monkeypatch):
+    """A folder that the user names is refused; the automatic name gets a number."""
+    monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
+    monkeypatch.setattr(locations, "reconstructions_folder", lambda: tmp_path / "all")
+    jobs = []
+    monkeypatch.setattr(background, "submit", lambda job, *_: jobs.append(job) or {"FINISHED"})
+    (tmp_path / "garden").mkdir()
+    (tmp_path / "all" / "garden").mkdir(parents=True)
+    (tmp_path / "all" / "garden" / "thesis.odt").write_text("not yours")
+    capture = str(tmp_path / "garden")
+    told = refusal(bpy.ops.objectgs.import_capture, directory=capture, folder=str(tmp_path / "all" / "garden"))
+    assert "thesis.odt" in told and not jobs
+    bpy.ops.objectgs.import_capture(directory=capture)
+    assert jobs[0].folder == tmp_path / "all" / "garden-2"

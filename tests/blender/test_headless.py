@@ -311,6 +311,14 @@ def test_paths_are_those_of_the_working_directory(capture, backend_python, tmp_p
     assert (tmp_path / "made" / "cameras.json").is_file()
 
 
+def wait_for_any(folder, pattern, process):
+    """Wait until a file of this pattern exists, which must happen while the process runs."""
+    until = time.monotonic() + 120
+    while not any(folder.glob(pattern)):
+        assert process.poll() is None and time.monotonic() < until
+        time.sleep(0.05)
+
+
 def wait_for(path, process):
     for _ in range(1200):
         if path.exists():
@@ -343,7 +351,7 @@ def test_stopped_training_is_kept(capture, backend_python, tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stopped_demo_leaves_nothing(tmp_path, number):
     process = start("demo", tmp_path / "demo", "--views", "500")
-    wait_for(tmp_path / "demo.part", process)
+    wait_for_any(tmp_path, ".demo-*.part", process)
     process.send_signal(number)
     output, errors = process.communicate(timeout=120)
     assert process.returncode == 130, output + errors
@@ -367,7 +375,7 @@ def test_demo_stops_when_its_driver_is_gone(tmp_path):
     process = start("demo", tmp_path / "demo", "--views", "500", "--json")
     process.stdin.write("attached\n")
     process.stdin.flush()
-    wait_for(tmp_path / "demo.part", process)
+    wait_for_any(tmp_path, ".demo-*.part", process)
     output, errors = process.communicate(timeout=120)
     assert process.returncode == 130, output + errors
     assert not list(tmp_path.iterdir())

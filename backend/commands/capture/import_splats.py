@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import ExitStack
 
 import numpy as np
 
@@ -17,12 +16,11 @@ from ...shared.color.palette import object_colors
 from ...shared.errors import InputError
 from ...shared.events import Reporter
 from ...shared.reconstruction.folder import Reconstruction
-from ...shared.reconstruction.lock import locked
 from ...shared.reconstruction.objects import default_name, write_objects
 from ...shared.reconstruction.record import ImportRecord, update_record
 from ...shared.stopping import StoppingReporter
 from ..cameras import write_splat_cameras
-from ..folder import capture_record, open_reconstruction, removed_if_refused
+from ..folder import capture_record, open_output, read_capture
 from .votes import object_name
 
 _LEAST_VISIBLE = 0.5
@@ -41,14 +39,12 @@ def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> No
     for sentence in warnings:
         reporter.warning(sentence)
     names: dict[int, str] = {}
-    with removed_if_refused(folder), ExitStack() as opened:
+    with open_output(options):
         if options.capture is None:
-            folder.create()
-            opened.enter_context(locked(folder.folder))
             write_splat_cameras(folder, splats.means)
             write_points(folder.points, _no_points(), _no_votes(0))
         else:
-            _, capture = opened.enter_context(open_reconstruction(options, reporter))
+            capture = read_capture(folder, options, reporter)
             names = {i: object_name(capture, i) for i in capture.object_ids.tolist()}
             votes = _no_votes(len(capture.points.xyz))
             if capture.has_masks:

@@ -14,13 +14,12 @@ from ...raster import devices
 from ...shared.events import Reporter
 from ...shared.grouping import Changes, changed, chosen, grouped, read_groups
 from ...shared.reconstruction.folder import Reconstruction
-from ...shared.reconstruction.lock import locked
 from ...shared.reconstruction.objects import SceneObject, edit_objects, read_objects
 from ...shared.reconstruction.plan import Plan, write_plan
 from ...shared.reconstruction.record import read_record
 from ...shared.stopping import StoppingReporter
 from ...training.settings import Settings
-from ..folder import memory_for_files, removed_if_refused
+from ..folder import memory_for_files, open_output
 from ..training.length import budget_of, expected_of
 from .votes import object_name, votes_are_current
 
@@ -31,9 +30,7 @@ def plan(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     folder = Reconstruction(options.out) if options.out else None
     with ExitStack() as held:
         if folder is not None:
-            held.enter_context(removed_if_refused(folder))
-            folder.create()
-            held.enter_context(locked(folder.folder))
+            held.enter_context(open_output(options))
         # A plan reads images that are already prepared, but does not prepare any.
         cache = folder.cache if folder is not None and folder.cameras.exists() else None
         capture = load_capture(options.capture, cache, memory_for_files(options), options.max_size, reporter)

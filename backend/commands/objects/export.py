@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from ...editing import apply_edits, transformed
 from ...export import read_splats, write_splat, write_splats, write_spz
 from ...model.splats import Splats
 from ...shared.errors import InputError
+from ...shared.formats.file_names import distinct_stems
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.objects import SceneObject, default_name, find_object, read_objects
 from ...shared.reconstruction.record import read_record
@@ -50,6 +50,8 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         splats = splats.with_degree(options.sh_degree)
     splats = _in_coordinates(splats, options.coordinates, read_upright(folder), y_up=kind == "spz")
     files = _files(options, splats, objects, kind)
+    for path in files:
+        folder.require_foreign(path)
     for done, (path, ids) in enumerate(files.items(), 1):
         path.parent.mkdir(parents=True, exist_ok=True)
         part = splats if ids is None else splats.select(np.isin(splats.object_ids, ids))
@@ -102,11 +104,6 @@ def _files(
         return {options.out: None}
     if options.out.exists() and not options.out.is_dir():
         raise InputError(f"{options.out} is a file; with --per-object, name a folder.")
-    names = {entry.id: entry.name for entry in objects}
-    files: dict[Path, list[int] | None] = {}
-    for object_id in np.unique(splats.object_ids).tolist():
-        stem = re.sub(r"[^\w.-]+", "_", names.get(object_id, default_name(object_id).lower())).strip("._") or "object"
-        taken = {path.stem.casefold() for path in files}
-        stem = f"{stem}_{object_id}" if stem.casefold() in taken else stem
-        files[options.out / f"{stem}.{kind}"] = [object_id]
-    return files
+    known = {entry.id: entry.name for entry in objects}
+    names = {i: known.get(i, default_name(i).lower()) for i in np.unique(splats.object_ids).tolist()}
+    return {options.out / f"{stem}.{kind}": [i] for i, stem in distinct_stems(names).items()}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import io
-import re
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +23,7 @@ from ...model.object_model import ObjectModel
 from ...shared.errors import InputError
 from ...shared.events import Reporter
 from ...shared.formats.atomic import write_atomic
+from ...shared.formats.file_names import hashed_stem
 from ...shared.formats.mesh_ply import Mesh, write_mesh
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.lock import locked
@@ -170,7 +170,7 @@ def _targets(options: argparse.Namespace, folder: Reconstruction) -> list[Target
         targets += [groups[i] for i in dict.fromkeys(find(word) for word in options.objects)]
     for name, words in options.set or ():
         ids = {i for word in words for i in (groups[find(word)].ids or ())}
-        if name == SCENE or name in {str(i) for i in groups}:
+        if name == SCENE or name.isdecimal():
             raise InputError(f"--set {name}=... would replace another mesh; choose another name.")
         targets.append(Target(name, name, tuple(sorted(ids))))
     if options.scene:
@@ -185,8 +185,8 @@ def _with_merged(object_id: int, into: dict[int, int]) -> tuple[int, ...]:
 
 
 def _stem(key: str) -> str:
-    """Return a file name for a key: names of sets may contain characters that are not allowed there."""
-    return re.sub(r"[^\w.-]+", "_", key).strip("._") or "set"
+    """Return the stem of the files of a mesh; that of a set differs from those of all other keys."""
+    return hashed_stem(key)
 
 
 def _known_meshes(folder: Reconstruction) -> dict[str, MeshEntry]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import shutil
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from ...raster import devices
 from ...shared.errors import Cancelled, InputError
 from ...shared.events import Reporter
 from ...shared.formats.json_file import plain
+from ...shared.reconstruction.checkpoint import PREVIOUS
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.plan import Plan, write_plan
 from ...shared.reconstruction.record import ExportRecord, TrainingRecord, read_record, update_record
@@ -125,7 +125,9 @@ def _begin(
             seeds=seeds, supervise_background=planned.has_masks and plan.does("rest"), gains=gains,
         )  # fmt: skip
     if options.restart:
-        shutil.rmtree(folder.checkpoint, ignore_errors=True)
+        # The new training's first checkpoint replaces that of the old one before anything refers to it.
+        trainer.save(folder.checkpoint)
+        (folder.checkpoint / PREVIOUS).unlink(missing_ok=True)
     change_objects(folder, voters, options)
     write_plan(folder.plan, plan)
     report_plan(plan, reporter)

@@ -64,8 +64,13 @@ def distinct_stems(names: Mapping[Key, str], fallback: str = "object") -> dict[K
 
 
 def hashed_stem(name: str) -> str:
-    """Return a stem that depends on `name` alone and differs from those of other names and of numbers."""
-    return f"{file_stem(name)}-{zlib.crc32(name.encode('utf-8', 'replace')):08x}"
+    """Return a stem that depends on `name` alone and differs from those of other names.
+
+    It is the name itself if that is a valid stem in lower case, else the stem with a hash of the name.
+    """
+    stem = file_stem(name)
+    is_plain = stem == name == _folded(name)
+    return name if is_plain else f"{stem}-{zlib.crc32(name.encode('utf-8', 'replace')):08x}"
 
 
 def _folded(stem: str) -> str:

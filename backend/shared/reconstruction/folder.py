@@ -6,7 +6,11 @@ import os
 from pathlib import Path
 
 from ..errors import InputError
-from . import cameras, report
+from ..formats.atomic import PART_PREFIX, make_folder
+from . import cameras, lock, report
+
+_IGNORED = (lock.NAME, ".DS_Store", "Thumbs.db", "desktop.ini")
+"""Files that a folder without content may contain."""
 
 
 class Reconstruction:
@@ -31,10 +35,41 @@ class Reconstruction:
         self.report_md = self.folder / "report.md"
         self.pictures = self.folder / "pictures"
 
+    def require_foreign(self, path: Path) -> None:
+        """Raise InputError if `path` is a file of the reconstruction, or is in one of its folders."""
+        target = path.resolve()
+        for own in (self.folder / lock.NAME, *(own for own in vars(self).values() if own != self.folder)):
+            is_same = own.exists() and path.exists() and own.samefile(path)
+            if is_same or target == own.resolve() or own.resolve() in target.parents:
+                raise InputError(f"{path} belongs to the reconstruction itself; choose another file or folder.")
+
+    def foreign_file(self) -> str | None:
+        """Return the name of a file in a folder that is no reconstruction; None if commands may use the folder.
+
+        Raises:
+            InputError: The folder cannot be read.
+        """
+        if not self.folder.is_dir() or self.settings.exists():
+            return None
+        try:
+            names = sorted(entry.name for entry in os.scandir(self.folder))
+        except OSError as error:
+            raise InputError(f"The folder {self.folder} cannot be read ({error.strerror}).") from error
+        return next((name for name in names if name not in _IGNORED and not name.startswith(PART_PREFIX)), None)
+
+    def require_own(self) -> None:
+        """Raise InputError if the folder contains files, but no reconstruction."""
+        foreign = self.foreign_file()
+        if foreign is not None:
+            raise InputError(
+                f"The folder {self.folder} contains files (such as {foreign}), but no reconstruction; choose an "
+                "empty or new folder, or use the option --overwrite."
+            )
+
     def create(self) -> Reconstruction:
         """Create the folder and return self; raise InputError if it is not writable."""
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
+            make_folder(self.folder)
             probe = self.folder / f".write-test-{os.getpid()}"
             probe.write_bytes(b"")
             probe.unlink()

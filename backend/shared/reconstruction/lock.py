@@ -20,7 +20,7 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
     import msvcrt
 
-_NAME = ".lock"
+NAME = ".lock"
 _PATIENCE = 0.5
 """Time in seconds to retry for, since `lock_holder` briefly acquires the lock to test whether it is free."""
 _LOCKED_BYTE = 1 << 30
@@ -32,17 +32,22 @@ class FolderInUse(InputError):
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path, name: str = NAME, patience: float = _PATIENCE) -> Iterator[None]:
     """Hold the lock on `folder`, which must exist.
+
+    Args:
+        folder: The folder.
+        name: File name of the lock; locks of different names are independent.
+        patience: Seconds to wait for another holder.
 
     Raises:
         FolderInUse: Another process, or another part of this process, holds the lock.
         OSError: The lock file cannot be written; `filename` is its path.
     """
-    path = folder / _NAME
-    patience = time.monotonic() + _PATIENCE
+    path = folder / name
+    until = time.monotonic() + patience
     while (descriptor := _acquire(path)) is None:
-        if time.monotonic() > patience:
+        if time.monotonic() > until:
             holder = _process_id(path)
             who = f"another process (pid {holder})" if holder else "another process"
             raise FolderInUse(f"{folder} is in use by {who}; wait for it to finish or stop it.")
@@ -61,7 +66,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 def lock_holder(folder: Path) -> int | None:
     """Return the ID of the process that holds the lock on `folder`: 0 if unknown, None if the folder is not locked."""
-    path = folder / _NAME
+    path = folder / NAME
     try:
         descriptor = os.open(path, os.O_RDWR)
     except OSError:

@@ -10,7 +10,8 @@ A new vote replaces "objects" and keeps "edits".
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,11 +21,16 @@ import numpy as np
 from ..color.recolor import Recolor
 from ..errors import InputError
 from ..formats.json_file import read_json, write_json
+from .lock import FolderInUse, locked
 
 LARGEST_ID = 2**32 - 1
 EDITABLE = (
     "name", "color", "merged_into", "left_out", "removed", "floaters", "fill", "recolor", "transform", "copies",
 )  # fmt: skip
+
+_LOCK = ".objects.lock"
+_PATIENCE = 20.0
+"""Seconds to wait for other changes of objects.json, each of which takes milliseconds."""
 
 _FORMER_NAMES = {"colour": "color", "recolour": "recolor"}
 """Names of fields in files of older versions, and their present names."""
@@ -83,8 +89,9 @@ def read_objects(path: Path) -> list[SceneObject]:
 
 def write_objects(path: Path, objects: Sequence[Mapping[str, Any]]) -> None:
     """Replace the objects ({"id", "name", "color", "points"} each) and keep existing edits."""
-    edits = _edits(read_json(path), path) if path.exists() else {}
-    write_json(path, {"objects": list(objects), "edits": edits})
+    with _locked(path):
+        edits = _edits(read_json(path), path) if path.exists() else {}
+        write_json(path, {"objects": list(objects), "edits": edits})
 
 
 def edit_objects(path: Path, changes: Mapping[int, Mapping[str, Any]]) -> None:
@@ -95,19 +102,33 @@ def edit_objects(path: Path, changes: Mapping[int, Mapping[str, Any]]) -> None:
         changes: Object ID -> new values of fields in `EDITABLE`; None reverts an edit.
 
     Raises:
-        InputError: The file is missing or invalid.
+        InputError: The file is missing or invalid, or another process keeps changing it.
         ValueError: A field is not editable.
     """
     unknown = {key for change in changes.values() for key in change} - set(EDITABLE)
     if unknown:
         raise ValueError(f"{', '.join(sorted(unknown))} cannot be edited")
     read_objects(path)  # Fail before writing if the file is invalid.
-    content = read_json(path)
-    edits = _edits(content, path)
-    for object_id, change in changes.items():
-        kept = {**edits.get(str(object_id), {}), **change}
-        edits[str(object_id)] = {key: value for key, value in kept.items() if value is not None}
-    write_json(path, {**content, "edits": {key: value for key, value in edits.items() if value}})
+    with _locked(path):
+        content = read_json(path)
+        edits = _edits(content, path)
+        for object_id, change in changes.items():
+            kept = {**edits.get(str(object_id), {}), **change}
+            edits[str(object_id)] = {key: value for key, value in kept.items() if value is not None}
+        write_json(path, {**content, "edits": {key: value for key, value in edits.items() if value}})
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Wait until no other process changes objects.json, and exclude others; independent of the lock of the folder."""
+    try:
+        with locked(path.parent, _LOCK, _PATIENCE):
+            yield
+    except FolderInUse as error:
+        raise InputError(f"{path} is being changed by another process; try again.") from error
+    except OSError as error:
+        error.filename = str(path)
+        raise
 
 
 def merged(objects: Sequence[SceneObject]) -> dict[int, int]:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import re
 import tempfile
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +12,8 @@ import bpy
 from mathutils import Matrix
 
 from ....backend.shared.errors import InputError
+from ....backend.shared.formats.file_names import distinct_stems
+from ....backend.shared.reconstruction.folder import Reconstruction
 from ... import scene
 from ...blender.quiet import quiet
 
@@ -52,11 +53,10 @@ def export(
         raise InputError(f"{out} is a file; choose another name for the folder.")
     files: dict[Path, list[int]] = {out: chosen}
     if per_object:
-        files = {}
-        for object_id in chosen:
-            stem = re.sub(r"[^\w.-]+", "_", collections[object_id].name).strip("._") or f"object_{object_id}"
-            stem = f"{stem}_{object_id}" if out / f"{stem}.{suffix}" in files else stem
-            files[out / f"{stem}.{suffix}"] = [object_id]
+        stems = distinct_stems({object_id: collections[object_id].name for object_id in chosen})
+        files = {out / f"{stem}.{suffix}": [object_id] for object_id, stem in stems.items()}
+    for path in files:
+        Reconstruction(scene.folder_of(root)).require_foreign(path)
     for path, those in files.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         parts = [

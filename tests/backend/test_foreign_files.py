@@ -1,0 +1,169 @@
+"""Commands neither delete nor overwrite files that are not theirs."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from backend.export import read_splats
+from backend.shared.errors import EXIT_BAD_INPUT, EXIT_DONE, InputError
+from backend.shared.formats.atomic import atomic_file, make_folder, recorded, write_atomic
+from backend.shared.reconstruction.objects import edit_objects, read_objects
+from backend.training.trainer import Trainer
+
+from .asking import refused
+from .test_commands import SMALL, trained  # noqa: F401
+
+LENGTH = ("--steps", 5, *SMALL)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def capture(write_capture):
+    return write_capture(name="capture", views=9, size=(64, 48)).folder
+
+
+@pytest.fixture
+def bad_capture(tmp_path):
+    (tmp_path / "bad" / "images").mkdir(parents=True)
+    return tmp_path / "bad"
+
+
+@pytest.mark.parametrize("command", ["import", "vote", "train", "plan"])
+def test_a_refused_run_removes_what_it_made_alone(ask, tmp_path, bad_capture, monkeypatch, command):
+    """Others write into the new parent folder, and into the new folder itself, while the command runs."""
+    parent = tmp_path / "new"
+
+    def others_write(*_):
+        (parent / "b").mkdir()
+        (parent / "b" / "splats.ply").write_text("finished")
+        if command != "vote":
+            (parent / "a" / "notes.txt").write_text("mine")
+        raise InputError("The capture is bad.")
+
+    place = "plan" if command == "plan" else "folder"
+    monkeypatch.setattr(f"backend.commands.{'capture.' if command == 'plan' else ''}{place}.load_capture", others_write)
+    assert ask(command, bad_capture, "--out", parent / "a").code == EXIT_BAD_INPUT
+    left = {"b/splats.ply": b"finished"}
+    assert contents(parent) == (left if command == "vote" else {**left, "a/notes.txt": b"mine"})
+    assert (parent / "a").exists() == (command != "vote")
+
+
+def test_a_refused_run_leaves_an_empty_folder_that_was_there(ask, tmp_path, bad_capture):
+    out = tmp_path / "empty"
+    out.mkdir()
+    assert ask("train", bad_capture, "--out", out, *LENGTH).code == EXIT_BAD_INPUT
+    assert out.is_dir() and not list(out.iterdir())
+    assert ask("train", bad_capture, "--out", tmp_path / "new" / "out", *LENGTH).code == EXIT_BAD_INPUT
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("command", ["import", "vote", "train", "plan", "import-splats"])
+@pytest.mark.parametrize("foreign", ["points.ply", "cameras.json", "checkpoint/model.safetensors", "thesis.odt"])
+def test_a_folder_with_foreign_files_is_refused(ask, tmp_path, capture, trained, command, foreign):  # noqa: F811
+    out = tmp_path / "theirs"
+    (out / foreign).parent.mkdir(parents=True)
+    (out / foreign).write_text("not yours")
+    before = contents(out)
+    source = trained[1] / "splats.ply" if command == "import-splats" else capture
+    options = ["--restart", *LENGTH] if command == "train" else []
+    refused(ask(command, source, "--out", out, *options), str(out), "choose an")
+    assert contents(out) == before
+
+
+def test_a_folder_with_foreign_files_is_used_where_that_is_asked_for(ask, tmp_path, capture):
+    out = tmp_path / "theirs"
+    out.mkdir()
+    (out / "thesis.odt").write_text("not yours")
+    (out / "points.ply").write_text("to be replaced")
+    assert ask("vote", capture, "--out", out, "--overwrite").code == EXIT_DONE
+    assert (out / "thesis.odt").read_text() == "not yours"
+    assert (out / "points.ply").read_bytes()[:3] == b"ply" and ask("vote", capture, "--out", out).code == EXIT_DONE
+
+
+@pytest.mark.parametrize("name", [".DS_Store", "Thumbs.db", "desktop.ini"])
+def test_a_folder_that_looks_empty_is_used(ask, tmp_path, capture, name):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / name).write_bytes(b"made by the file browser")
+    assert ask("vote", capture, "--out", out).code == EXIT_DONE
+
+
+def test_restart_keeps_the_old_checkpoint_until_the_new_one_exists(ask, trained, monkeypatch):  # noqa: F811
+    capture, out = trained
+    before = contents(out / "checkpoint")
+
+    def full(*_):
+        raise InputError("The disk is full.")
+
+    monkeypatch.setattr(Trainer, "save", full)
+    assert ask("train", capture, "--out", out, *LENGTH, "--restart").code == EXIT_BAD_INPUT
+    assert contents(out / "checkpoint") == before
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links need a privilege on Windows")
+def test_writing_follows_no_link(tmp_path):
+    theirs = tmp_path / "theirs.txt"
+    theirs.write_text("not yours")
+    for name in ("objects.json", "objects.json.part"):
+        (tmp_path / name).symlink_to(theirs)
+    write_atomic(tmp_path / "objects.json", b"{}")
+    assert theirs.read_text() == "not yours"
+    assert (tmp_path / "objects.json").read_text() == "{}" and not (tmp_path / "objects.json").is_symlink()
+
+
+def test_writers_of_one_file_do_not_share_a_temporary_file(tmp_path):
+    path = tmp_path / "objects.json"
+    with atomic_file(path) as first, atomic_file(path) as second:
+        first.write(b"first")
+        second.write(b"second")
+    assert path.read_text() == "first" and [entry.name for entry in tmp_path.iterdir()] == ["objects.json"]
+
+
+def test_long_names_can_be_written(tmp_path):
+    write_atomic(tmp_path / ("x" * 240 + ".ply"), b"content")
+    write_atomic(tmp_path / ("\U0001f600" * 60), b"content")
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_only_new_files_and_folders_are_recorded(tmp_path):
+    write_atomic(tmp_path / "old", b"old")
+    with recorded() as created:
+        make_folder(tmp_path / "a" / "b")
+        write_atomic(tmp_path / "old", b"replaced")
+        write_atomic(tmp_path / "a" / "b" / "new", b"new")
+    write_atomic(tmp_path / "a" / "later", b"later")
+    created.remove_files()
+    created.remove_folders()
+    assert contents(tmp_path) == {"old": b"replaced", "a/later": b"later"} and not (tmp_path / "a" / "b").exists()
+
+
+OWN = ("splats.ply", "objects.json", "objectgs.json", "anchors.ply", "meshes/1.ply", "checkpoint/model.safetensors")
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_an_export_replaces_no_file_of_the_reconstruction(ask, trained, name):  # noqa: F811
+    _, out = trained
+    before = contents(out)
+    refused(ask("export", out, "--out", out / name, "--format", "ply"), name, "belongs to the reconstruction")
+    (out.parent / "link.ply").symlink_to(out / name)
+    refused(ask("export", out, "--out", out.parent / "link.ply"), "link.ply", "belongs to the reconstruction")
+    refused(ask("export", out, "--out", out / "meshes", "--per-object"), "meshes", "belongs to the reconstruction")
+    assert contents(out) == before
+
+
+def test_each_object_is_exported_whatever_the_names(ask, trained):  # noqa: F811
+    _, out = trained
+    ids = [entry.id for entry in read_objects(out / "objects.json")]
+    names = dict(zip(ids, ["CON", "mug", "MUG", "mug_3", "x" * 300]))
+    edit_objects(out / "objects.json", {i: {"name": name} for i, name in names.items()})
+    answer = ask("export", out, "--out", out.parent / "each", "--per-object", "--json")
+    files = list((out.parent / "each").iterdir())
+    assert answer.code == EXIT_DONE and len(files) == answer.events[-1]["files"] >= len(names)
+    assert (
+        len({path.name.casefold() for path in files}) == len(files) and not (out.parent / "each" / "CON.ply").exists()
+    )
+    assert sum(len(read_splats(path)[0]) for path in files) == answer.events[-1]["splats"]
