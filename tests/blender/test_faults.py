@@ -652,7 +652,7 @@ def test_points_that_say_nothing(shown):
     assert "has lost its parent empty" in told
 
 
-def test_a_folder_with_foreign_files_is_not_used(tmp_path, monkeypatch):
+def test_a_folder_with_foreign_files_is_not_used(extension, tmp_path, monkeypatch):
     """A folder that the user names is refused; the automatic name gets a number."""
     monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
     monkeypatch.setattr(locations, "reconstructions_folder", lambda: tmp_path / "all")
