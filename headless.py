@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""ObjectGS without a window.
+"""Command line of ObjectGS, for use without a window.
 
     blender -b -P headless.py -- COMMAND ...
     python headless.py COMMAND ...            (a Python that has the bpy wheel)
 
-`--help` lists the commands, which are in objectgs_addon/headless. Exit codes: 0 done, 2 bad input, 130 cancelled,
+`--help` lists the commands; objectgs_addon/headless implements them. Exit codes: 0 done, 2 bad input, 130 cancelled,
 1 any other failure.
 """
 
@@ -18,9 +18,9 @@ ROOT = Path(__file__).resolve().parent
 
 
 def extension() -> ModuleType:
-    """The extension's root package: the one that Blender has loaded from this folder, or else loaded as `objectgs`.
+    """Return the extension's root package: the one that Blender loaded from this folder, or else a new `objectgs`.
 
-    It is loaded by path, so that Blender's module search path is unchanged.
+    A new package is loaded by path, which leaves the module search path unchanged.
     """
     init = ROOT / "__init__.py"
     for module in list(sys.modules.values()):
@@ -41,7 +41,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _arguments() -> list[str]:
-    """The arguments after `--`, which separates them from Blender's own; a plain Python needs none."""
+    """Return the arguments after `--`, which ends Blender's own; plain Python requires no `--`."""
     if "--" in sys.argv:
         return sys.argv[sys.argv.index("--") + 1 :]
     return sys.argv[1:] if Path(sys.argv[0]).name == Path(__file__).name else []

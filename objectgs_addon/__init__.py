@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""ObjectGS inside Blender, and the demo capture that Blender renders itself.
+"""Blender side of ObjectGS.
 
-Some packages of this folder also work without bpy, so it is not imported here.
+Some of its packages also work without bpy, so this module does not import bpy.
 """
 
 from __future__ import annotations
@@ -39,6 +39,6 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Unregister them; background jobs are stopped and have saved when this returns."""
+    """Unregister everything in reverse order; wait for background jobs to save and stop."""
     for module in reversed(_modules()):
         module.unregister()

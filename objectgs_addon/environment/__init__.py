@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The Python environment of the backend: its location, state and set-up."""
+"""Python environment of the backend: location, state and setup."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The backend's environment: its state, and the jobs that make it or check another Python. No bpy."""
+"""State of the backend's environment, and jobs that create it or check another Python."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .worker import layout
 
 REQUIREMENTS = ROOT / "requirements"
 WORKER = Path(layout.__file__).resolve().parent
-"""The program that makes environments: a folder with `__main__.py`."""
+"""Program that creates environments: a folder with `__main__.py`."""
 
 _AGAIN = "press Set Up Backend"
 _removed = itertools.count()
@@ -29,7 +29,13 @@ _removed = itertools.count()
 
 @dataclass(frozen=True)
 class EnvironmentState:
-    """state: absent, incomplete, outdated, ready or broken. python: of a ready environment. sentence: for the user."""
+    """State of an environment.
+
+    Attributes:
+        state: absent, incomplete, outdated, ready or broken.
+        python: Python of a ready environment, else None.
+        sentence: description for the user.
+    """
 
     state: str
     python: Path | None
@@ -37,7 +43,7 @@ class EnvironmentState:
 
 
 def inspect(folder: str | Path) -> EnvironmentState:
-    """The state of the environment in `folder`, from a few files; cheap enough for every redraw."""
+    """Return the state of the environment in `folder`; reads few files, so panels can call this while drawing."""
     folder = Path(folder)
     python = layout.environment_python(folder)
     try:
@@ -54,7 +60,7 @@ def inspect(folder: str | Path) -> EnvironmentState:
         return EnvironmentState("incomplete", None, f"The set-up of the compute backend is not complete; {_AGAIN}.")
     if ready is None:
         return EnvironmentState("broken", None, f"{folder / layout.MARKER} cannot be read; {_AGAIN} again.")
-    # The environment's Python is a link to its base or, on Windows, a small program that starts it.
+    # The environment's Python is a link to the base Python or, on Windows, a small program that starts it.
     if not python.exists() or not Path(ready["base"]).exists():
         gone = ready["base"] if python.is_symlink() or python.exists() else python
         return EnvironmentState("broken", None, f"The backend's Python {gone} is missing; {_AGAIN} again.")
@@ -68,7 +74,7 @@ def inspect(folder: str | Path) -> EnvironmentState:
 
 @functools.lru_cache(4)
 def _ready(path: Path, _changed: int) -> dict[str, Any] | None:
-    """The content of the marker, cached until its file changes; None if it is not valid."""
+    """Return the content of the marker, cached until the file changes; None if it is invalid."""
     try:
         ready = json.loads(path.read_text(encoding="utf-8"))
         shape = {"python": str, "base": str, "requirements": str, "packages": dict, "device": str}
@@ -79,24 +85,26 @@ def _ready(path: Path, _changed: int) -> dict[str, Any] | None:
 
 @functools.lru_cache(2)
 def _wanted(device: str) -> str:
-    """The digest of this extension's requirements for a device."""
+    """Return the digest of this extension's requirements for a device."""
     return layout.requirements_digest(REQUIREMENTS, device)
 
 
 def cache_folder(folder: str | Path) -> Path:
-    """The folder of compiled kernels, next to the environment's folder, so that it outlives the environment."""
+    """Return the folder for compiled kernels, next to the environment, so that it survives a new setup."""
     return Path(folder).parent / "cache"
 
 
 def set_up_job(base_python: str | Path, folder: str | Path, device: str) -> Job:
-    """A job that makes the environment in `folder` for `device` (cpu or cuda), replacing an earlier one."""
+    """Return a job that creates the environment in `folder` for `device` (cpu or cuda), replacing an earlier one."""
     return _job("Set up backend", "setup", base_python, folder, "setup", "--folder", str(folder), "--device", device)
 
 
 def probe_job(python: str | Path, folder: str | Path) -> Job:
-    """A job that checks whether a Python has the packages of the backend, and runs the backend with it.
+    """Return a job that checks whether a Python has the backend's packages, and runs the backend with it.
 
-    folder: that of the environment, which identifies the job and need not exist.
+    Args:
+        python: the Python to check.
+        folder: folder of the environment; it identifies the job and may be missing.
     """
     return _job("Check backend", "doctor", python, folder, "probe")
 
@@ -118,10 +126,10 @@ def _job(title: str, kind: str, python: str | Path, folder: str | Path, *argumen
 
 
 def remove(folder: str | Path) -> None:
-    """Remove the environment: the folder at once, its many files in the background.
+    """Remove the environment: rename the folder immediately, and delete its many files in the background.
 
     Raises:
-        OSError: it is in use, or contains files that the set-up did not make.
+        OSError: the folder is in use, or contains files that the setup did not create.
     """
     folder = Path(folder)
     if not os.path.lexists(folder):
@@ -135,6 +143,6 @@ def remove(folder: str | Path) -> None:
 
 
 def _finish_removing(folder: Path) -> None:
-    # The stamp stays with what cannot be removed, and the next set-up removes both.
+    # On failure, the remaining files and the stamp are left for the next setup to remove.
     with contextlib.suppress(OSError):
         layout.remove_own(folder)

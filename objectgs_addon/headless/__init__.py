@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""ObjectGS without a window: runs the commands of headless.py and returns their exit codes."""
+"""Commands of headless.py, for use without a window."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def main(arguments: list[str]) -> int:
         reporter.error(str(error))
         return EXIT_BAD_INPUT
     except BrokenPipeError:
-        # The reader is gone. Python would raise again when it flushes at exit.
+        # The reader has closed the pipe. Replace stdout, since Python flushes it again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_CANCELLED
     except commands.StepFailed as error:
@@ -63,15 +63,15 @@ def main(arguments: list[str]) -> int:
             reporter.error(commands.sentence(error))
             return EXIT_BAD_INPUT
         traceback.print_exc()
-        reporter.error(f"An unexpected failure: {type(error).__name__}: {' '.join(str(error).split())}")
+        reporter.error(f"Unexpected error: {type(error).__name__}: {' '.join(str(error).split())}")
         return EXIT_FAILED
 
 
 @contextlib.contextmanager
 def _stoppable() -> Iterator[None]:
-    """Raise KeyboardInterrupt for Ctrl-C, which Blender would handle itself, and SIGTERM, which would end Blender.
+    """Raise KeyboardInterrupt on SIGINT, which Blender would handle itself, and on SIGTERM, which would end Blender.
 
-    SIGPIPE is ignored, so that a missing reader raises BrokenPipeError as in a plain Python, and does not end Blender.
+    SIGPIPE is ignored, so that a closed pipe raises BrokenPipeError as in plain Python instead of ending Blender.
     """
 
     def stop(*_: Any) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""An image of the objects' meshes pulled apart: lifted and moved outward from the center, in soft light."""
+"""Exploded view of the objects' meshes, lifted and moved outward from the center, in soft light."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from ..scene.shading.graph import Graph
 
 SIZE = (960, 600)
 SAMPLES = 32
-"""Samples per pixel for a good image within half a minute on two cores."""
+"""Samples per pixel; enough for a good image within half a minute on two CPU cores."""
 LARGE = 2.5
-"""Objects larger than the median size times this, such as a table, are not moved."""
+"""Size, relative to the median, above which objects such as tables are not moved."""
 
 OUTWARD = 0.7
-"""Outward movement of objects, relative to their distance from the center."""
+"""Outward movement of objects, relative to their horizontal distance from the center."""
 LIFT = 0.35
 """Upward movement of objects, relative to the median size."""
 
@@ -37,23 +37,23 @@ SUN_ANGLE = math.radians(20.0)
 
 
 def reconstructions(target: bpy.types.Scene) -> list[bpy.types.Collection]:
-    """The collections of the reconstructions in a scene."""
+    """Return the collections of the reconstructions in a scene."""
     return [child for child in target.collection.children_recursive if scene.kind_of(child) == "reconstruction"]
 
 
 def add_even_light(target: bpy.types.Scene) -> None:
-    """Add even white light from all directions, which shows a texture's own colors, with a black background."""
+    """Add uniform white light, which shows the unmodified colors of textures, and a black background."""
     world = target.world = bpy.data.worlds.new("ObjectGS Light")
     _light_evenly(world, 1.0, behind=0.0)
 
 
 def pull_apart(target: bpy.types.Scene) -> None:
-    """Pull the objects' meshes of a scene apart, with light, ground and camera, for rendering and not for saving.
+    """Pull the objects' meshes of a scene apart, and add lights, ground and camera, for a render that is not saved.
 
-    Large objects are not moved; those around the others, such as a room, are hidden.
+    Large objects are not moved; large objects that enclose most others, such as a room, are hidden.
 
     Raises:
-        InputError: there are no meshes.
+        InputError: the scene has no meshes of objects.
     """
     found = [(root, _seen_meshes(root)) for root in reconstructions(target)]
     found = [(root, meshes) for root, meshes in found if meshes]
@@ -91,7 +91,7 @@ def pull_apart(target: bpy.types.Scene) -> None:
 
 
 def _seen_meshes(root: bpy.types.Collection) -> dict[int, list[bpy.types.Object]]:
-    """Object ID -> meshes, for objects that are not removed."""
+    """Return object ID -> meshes for objects that are not removed."""
     collections = scene.object_collections(root)
     return {
         object_id: meshes
@@ -101,12 +101,12 @@ def _seen_meshes(root: bpy.types.Collection) -> dict[int, list[bpy.types.Object]
 
 
 def _corners(box: np.ndarray) -> np.ndarray:
-    """The corners (8, 3) of a box (2, 3)."""
+    """Return the corners (8, 3) of a box (2, 3)."""
     return np.array([[box[i][0], box[j][1], box[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 
 
 def _contains(box: np.ndarray, points: np.ndarray) -> bool:
-    """Whether most of the points (n, 3) are in a box (2, 3)."""
+    """Return whether most of the points (n, 3) are in a box (2, 3)."""
     return float(((points > box[0]) & (points < box[1])).all(1).mean()) > 0.5
 
 
@@ -137,7 +137,7 @@ def _add_ground(target: bpy.types.Scene, center: Vector, size: float) -> None:
 
 
 def _best_direction(root: bpy.types.Collection, corners: np.ndarray) -> Vector:
-    """The view direction, from the side of one of the photos, with the most visible area of the boxes (n, 8, 3)."""
+    """Return the view direction, from the side of a camera, that minimizes the overlap of the boxes (n, 8, 3)."""
     center = (corners.min((0, 1)) + corners.max((0, 1))) / 2
     eyes = [obj.matrix_world.translation for obj in root.all_objects if scene.kind_of(obj) == "camera"]
     sides = [Vector((eye.x - center[0], eye.y - center[1])) for eye in eyes[:: max(1, len(eyes) // 50)]]
@@ -148,7 +148,8 @@ def _best_direction(root: bpy.types.Collection, corners: np.ndarray) -> Vector:
         seen = (corners @ np.array(toward.to_track_quat("-Z", "Y").to_matrix()))[..., :2]
         low, high = seen.min(1), seen.max(1)
         both = np.clip(np.minimum(high[:, None], high) - np.maximum(low[:, None], low), 0.0, None).prod(2)
-        return float(2.0 * np.trace(both) - both.sum())  # The area of all boxes minus that of all overlaps, times two.
+        # Up to a constant: the area of all boxes minus the overlaps of all pairs, twice.
+        return float(2.0 * np.trace(both) - both.sum())
 
     return max(directions, key=in_view)
 
@@ -157,7 +158,7 @@ def _add_camera(target: bpy.types.Scene, toward: Vector, corners: np.ndarray) ->
     """Add a camera that looks `toward` and has all `corners` (n, 3) in view."""
     center = Vector((corners.min(0) + corners.max(0)) / 2)
     rotation = toward.to_track_quat("-Z", "Y")
-    # Coordinates to the right, up and toward the camera; find the nearest position from which all corners fit.
+    # Coordinates to the right, up and toward the camera. Find the nearest position from which all corners are in view.
     seen = (corners - np.array(center)) @ np.array(rotation.to_matrix())
     half = np.array([1.0, target.render.resolution_y / target.render.resolution_x]) * SENSOR / LENS / 2.0 / MARGIN
     x = y = 0.0
@@ -180,7 +181,7 @@ def _add_camera(target: bpy.types.Scene, toward: Vector, corners: np.ndarray) ->
 
 
 def _add_light(target: bpy.types.Scene, toward: Vector) -> None:
-    """Add a soft sun from behind the camera on the left, and a sky."""
+    """Add a soft sun light from behind the camera on the left, and a sky."""
     heading = math.atan2(toward.y, toward.x)
     sun = bpy.data.lights.new("Apart", "SUN")
     sun.energy, sun.angle = SUN, SUN_ANGLE
@@ -196,7 +197,13 @@ def _add_light(target: bpy.types.Scene, toward: Vector) -> None:
 
 
 def _light_evenly(world: bpy.types.World, strength: float, behind: float) -> None:
-    """Light a scene evenly with white light; `behind` is its strength as a background."""
+    """Set up a uniform white world.
+
+    Args:
+        world: the world to change.
+        strength: strength of its light.
+        behind: strength of the background in the image.
+    """
     if world.node_tree is None:
         world.use_nodes = True
     world.node_tree.nodes.clear()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The command line of headless.py."""
+"""Command line of headless.py."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ that several machines can share FOLDER, each with its own --frames.
 
 
 class UsageError(Exception):
-    """The command line is not valid; the message is one sentence."""
+    """The command line is invalid; the message is one sentence."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -98,10 +98,10 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     """Parse a command line.
 
     Returns:
-        The options, with `command` and, for commands that pass options to the backend, `rest`.
+        The options, with `command`; commands that pass options to the backend also have `source` and `rest`.
 
     Raises:
-        UsageError: the command line is not valid.
+        UsageError: the command line is invalid.
         SystemExit: after --help.
     """
     options, rest = _parser().parse_known_args(arguments)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Runs every capture of a folder, with a summary from which a later run continues."""
+"""The command `batch`, which runs every capture of a folder and writes a summary; a later run continues from it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,12 @@ DONE, BAD_INPUT, FAILED, UNFINISHED = "done", "bad input", "failed", "unfinished
 
 
 def batch(options: argparse.Namespace) -> None:
-    """Run every capture of a folder that is not done yet; raises the most severe error of all."""
+    """Run every capture of a folder that is not done yet.
+
+    Raises:
+        InputError: the folder or a capture cannot be used.
+        StepFailed: a capture failed for another reason.
+    """
     source, out = absolute(Path(options.source)), absolute(options.out)
     captures = _captures(source)
     find_backend(options.backend_python)
@@ -51,7 +56,7 @@ def batch(options: argparse.Namespace) -> None:
 
 
 def _captures(source: Path) -> list[Path]:
-    """Subfolders that look like captures, complete or not, sorted by name."""
+    """Return the subfolders with images/ or sparse/, sorted by name."""
     try:
         folders = sorted(entry for entry in source.iterdir() if entry.is_dir())
     except OSError as error:
@@ -63,7 +68,7 @@ def _captures(source: Path) -> list[Path]:
 
 
 def fingerprint(capture: Path) -> list[int]:
-    """Number, total bytes and latest change (ns) of the files of a capture."""
+    """Return the number, total size in bytes and latest modification time (ns) of a capture's files."""
     states = [
         path.stat()
         for part in ("images", "masks", "sparse", "labels.json")
@@ -86,7 +91,7 @@ def _run_one(
     summary: _Summary,
     options: argparse.Namespace,
 ) -> None:
-    """Run one capture; its entry in the summary stays correct even if the process is killed."""
+    """Run one capture; its entry in the summary stays valid even if the process is killed."""
     earlier = entry["seconds"] if entry["state"] == UNFINISHED and entry["settings"] == wanted else 0.0
     entry.update(state=UNFINISHED, settings=wanted, seconds=earlier, psnr=None, miou=None, splats=None, error=None)
     summary.write()
@@ -120,7 +125,7 @@ def _run_one(
 
 
 class _Summary:
-    """batch.json and batch.md in `folder`, with one entry for each capture."""
+    """Summary in batch.json and batch.md in `folder`, with one entry per capture."""
 
     def __init__(self, folder: Path, captures: list[Path]) -> None:
         self.json, self.table = folder / "batch.json", folder / "batch.md"

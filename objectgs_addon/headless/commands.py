@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The commands of headless.py, except `film` and `batch`."""
+"""Commands of headless.py, except `film` and `batch`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BLEND = "objectgs.blend"
 PICTURE = "render.png"
 APART_PICTURE = "pulled-apart.png"
 SAMPLES = 16
-"""Samples per pixel of a built .blend."""
+"""Samples per pixel set in a .blend made by `build`."""
 
 
 class StepFailed(Exception):
@@ -41,8 +41,7 @@ def sentence(error: OSError) -> str:
 
 
 def absolute(path: Path) -> Path:
-    """The absolute path, with links unresolved."""
-    # resolve() would follow links.
+    """Return the absolute path, with symbolic links unresolved."""
     return Path(os.path.abspath(path.expanduser()))  # noqa: PTH100
 
 
@@ -98,7 +97,7 @@ def on_result(options: argparse.Namespace) -> None:
 
 
 def import_splats(options: argparse.Namespace) -> None:
-    """Run the backend's import-splats command on splats of another program."""
+    """Run the backend's import-splats command on splats from another program."""
     find_backend(options.backend_python)
     folder = absolute(options.out)
     capture = ("--capture", absolute(options.capture)) if options.capture else ()
@@ -115,7 +114,7 @@ def import_splats(options: argparse.Namespace) -> None:
 
 
 def build(options: argparse.Namespace) -> None:
-    """Build a .blend of a reconstruction."""
+    """Build a .blend from a reconstruction."""
     folder = absolute(options.folder)
     build_blend(folder, absolute(options.blend) if options.blend else folder / BLEND, options.reporter)
 
@@ -145,13 +144,13 @@ def render(options: argparse.Namespace) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Train, evaluate, report, build and render one capture."""
+    """Run all steps from a capture to a .blend and images."""
     find_backend(options.backend_python)
     reconstruct(absolute(Path(options.source)), absolute(options.out), options)
 
 
 def reconstruct(capture: Path, folder: Path, options: argparse.Namespace) -> None:
-    """Make splats, meshes, a report, a .blend and images of `capture` in `folder`, continuing earlier work."""
+    """Create splats, meshes, a report, a .blend and images of `capture` in `folder`; continue an earlier run."""
     no_meshes = ["--no-meshes"] if options.no_meshes else []
     run_backend(
         options.reporter, "train", folder, capture, "--out", folder, *no_meshes, *_groups(options), *options.rest
@@ -159,7 +158,7 @@ def reconstruct(capture: Path, folder: Path, options: argparse.Namespace) -> Non
     if not options.no_meshes:
         try:
             run_backend(options.reporter, "mesh", folder, folder)
-        except InputError as error:  # Splats without a surface are still a result.
+        except InputError as error:  # Splats without a surface are still a valid result.
             options.reporter.warning(str(error))
     run_backend(options.reporter, "evaluate", folder, folder)
     run_backend(options.reporter, "report", folder, folder)
@@ -181,7 +180,7 @@ def reconstruct(capture: Path, folder: Path, options: argparse.Namespace) -> Non
 
 
 def _groups(options: argparse.Namespace) -> tuple[object, ...]:
-    """The option --groups for the backend, with an absolute path; empty if it was not given."""
+    """Return the backend's option --groups with an absolute path, or nothing if it was not given."""
     path = vars(options).get("groups")
     return ("--groups", absolute(path)) if path else ()
 
@@ -200,7 +199,7 @@ def _render_apart(blend: Path, out: Path, options: argparse.Namespace) -> None:
 
 
 def _showing(which: str) -> Callable[[bpy.types.Scene], None]:
-    """A function that makes a scene show splats, meshes or both."""
+    """Return a function that makes a scene show splats, meshes or both."""
 
     def prepare(target: bpy.types.Scene) -> None:
         for root in apart.reconstructions(target):
@@ -210,10 +209,10 @@ def _showing(which: str) -> Callable[[bpy.types.Scene], None]:
 
 
 def find_backend(python: str | None) -> None:
-    """Choose the Python of the backend: `python`, OBJECTGS_PYTHON, or that of the preferences or the set-up.
+    """Choose the backend's Python: `python`, OBJECTGS_PYTHON, or that of the preferences or the environment.
 
     Raises:
-        InputError: there is none.
+        InputError: no Python is found.
     """
     wanted = python or os.environ.get("OBJECTGS_PYTHON")
     if wanted:
@@ -232,10 +231,10 @@ def build_blend(folder: Path, blend: Path, reporter: Reporter) -> bool:
     """Show the reconstruction in `folder` in a new file and save it as `blend`.
 
     Returns:
-        Whether objects have meshes.
+        Whether any object has a mesh.
 
     Raises:
-        InputError: there is no reconstruction, or the file cannot be written.
+        InputError: `folder` contains no reconstruction, or the file cannot be written.
     """
     files = Reconstruction(folder)
     if not files.cameras.is_file():
@@ -252,7 +251,7 @@ def build_blend(folder: Path, blend: Path, reporter: Reporter) -> bool:
         has_meshes = bool(scene.object_meshes(root))
         if has_meshes or scene.scene_meshes(root):
             apart.add_even_light(target)
-        # Cycles works on every machine; EEVEE needs a display.
+        # Cycles works on every machine; EEVEE requires a display.
         target.render.engine = "CYCLES"
         target.cycles.samples = SAMPLES
     for warning in warnings:
@@ -262,7 +261,7 @@ def build_blend(folder: Path, blend: Path, reporter: Reporter) -> bool:
 
 
 def save_blend(path: Path, reporter: Reporter) -> None:
-    """Save the open file as `path`. Raises InputError if that cannot be written."""
+    """Save the open file as `path`; raise InputError if it cannot be written."""
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with quiet():
@@ -276,15 +275,15 @@ def run_backend(reporter: Reporter, command: str, folder: Path | None, *argument
     """Run a command of the backend.
 
     Args:
-        reporter: takes its messages, warnings and progress.
+        reporter: receives messages, warnings and progress.
         command: name of the command.
         folder: the reconstruction folder, or None.
-        arguments: of the command.
+        arguments: arguments of the command.
 
     Raises:
-        InputError: the input is refused.
+        InputError: the backend refused the input.
         Cancelled: the user cancelled.
-        StepFailed: it failed for another reason.
+        StepFailed: the command failed for another reason.
     """
     job = locations.backend_job(command.replace("-", " ").capitalize(), command, folder, command, *map(str, arguments))
     code = run_blocking(job, reporter)

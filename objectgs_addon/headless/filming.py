@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`film`: renders the splats of a .blend through its camera and combines them with Blender's own rendering."""
+"""The command `film`, which renders the splats of a .blend through its camera and combines them with its render."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .picture import choose_camera, choose_engine, open_blend, write_picture
 
 
 def film(options: argparse.Namespace) -> None:
-    """Render film frames of a .blend and, with --composite, combine them with Blender's rendering."""
+    """Render film frames of a .blend and, with --composite, combine them with Blender's render."""
     reporter = options.reporter
     find_backend(options.backend_python)
     blend, out = absolute(options.blend), absolute(options.out)
@@ -40,7 +40,7 @@ def film(options: argparse.Namespace) -> None:
     frames = _frames(options, target)
     shot = filming.shot_of(target, target.view_layers[0], root, frames, options.subframes or samples_of(target))
     out.mkdir(parents=True, exist_ok=True)
-    # Machines that share the folder must not write the same file.
+    # Machines that share the folder require separate files.
     path = out / (f"shot.{frames[0]:04d}-{frames[-1]:04d}.json" if options.frames else NAME)
     write_shot(path, shot)
     run_backend(

@@ -30,21 +30,21 @@ def render_picture(
     size: tuple[int, int] | None = None,
     prepare: Callable[[bpy.types.Scene], None] | None = None,
 ) -> None:
-    """Open a .blend and render its scene; settings that are None are those of the file.
+    """Open a .blend and render its scene; a setting of None keeps the value in the file.
 
     Args:
-        reporter: takes warnings.
+        reporter: receives warnings.
         blend: file to open.
-        out: image to write: .png, .jpg or .exr.
+        out: image to write: .png, .jpg, .jpeg or .exr.
         camera: name of a camera object.
         engine: CYCLES or EEVEE.
         samples: samples per pixel.
         size: (width, height) in pixels.
-        prepare: called with the scene after its size and before its camera, engine and samples are set.
+        prepare: called with the scene after its size is set and before its camera, engine and samples are set.
 
     Raises:
         InputError: the file, the camera or the format cannot be used.
-        Cancelled: the rendering was cancelled.
+        Cancelled: the render was cancelled.
     """
     if out.suffix.lower() not in FORMATS:
         raise InputError(f"{out.name} has no known image format; name it .png, .jpg or .exr.")
@@ -60,7 +60,12 @@ def render_picture(
 
 
 def write_picture(scene: bpy.types.Scene, out: Path) -> None:
-    """Render the scene to `out`, which is replaced only by a complete image. Raises InputError."""
+    """Render the scene and replace `out` with the complete image.
+
+    Raises:
+        InputError: the image cannot be rendered or written.
+        Cancelled: the render was cancelled.
+    """
     out.parent.mkdir(parents=True, exist_ok=True)
     part = out.with_name(f"{out.stem}.part{out.suffix}")
     try:
@@ -73,7 +78,7 @@ def write_picture(scene: bpy.types.Scene, out: Path) -> None:
 
 
 def open_blend(blend: Path) -> bpy.types.Scene:
-    """Open a .blend without running its scripts and return its scene. Raises InputError."""
+    """Open a .blend without running its scripts and return its scene; raise InputError if it cannot be opened."""
     try:
         with quiet():
             bpy.ops.wm.open_mainfile(filepath=str(blend), load_ui=False, use_scripts=False)
@@ -83,7 +88,7 @@ def open_blend(blend: Path) -> bpy.types.Scene:
 
 
 def choose_camera(scene: bpy.types.Scene, name: str | None, blend: Path) -> None:
-    """Set the scene's camera by name; without a name, the scene must have a camera. Raises InputError."""
+    """Set the scene's camera by name, or require one without a name; raise InputError if there is none."""
     cameras = [entry for entry in scene.objects if entry.type == "CAMERA"]
     if name is not None:
         scene.camera = next((entry for entry in cameras if entry.name == name), None)
@@ -102,7 +107,7 @@ def choose_engine(scene: bpy.types.Scene, engine: str | None, samples: int | Non
         scene.render.engine = "CYCLES"
     elif engine == "EEVEE":
         try:
-            scene.render.engine = "BLENDER_EEVEE_NEXT"  # 4.2 to 4.5
+            scene.render.engine = "BLENDER_EEVEE_NEXT"  # Blender 4.2 to 4.5
         except TypeError:
             scene.render.engine = "BLENDER_EEVEE"
     if scene.render.engine == "CYCLES" and scene.cycles.use_denoising and not scene.cycles.denoiser:
@@ -117,7 +122,7 @@ def choose_engine(scene: bpy.types.Scene, engine: str | None, samples: int | Non
 
 def _render(scene: bpy.types.Scene, path: Path) -> None:
     settings = scene.render.image_settings
-    if hasattr(settings, "media_type"):  # 5.0 and newer need the media type first
+    if hasattr(settings, "media_type"):  # Blender 5.0 and newer require the media type first.
         settings.media_type = "IMAGE"
     settings.file_format = FORMATS[path.suffix.lower()]
     scene.render.filepath = str(path)
@@ -134,9 +139,9 @@ def _render(scene: bpy.types.Scene, path: Path) -> None:
 
 @contextlib.contextmanager
 def _ended_by_signals(part: Path) -> Iterator[None]:
-    """End the process on a signal, since Python's own handlers would wait for the end of the rendering.
+    """End the process on SIGINT or SIGTERM, since Python's own handlers would run only after the render.
 
-    Only the image being rendered is lost; its file `part` is removed.
+    Only the image in progress is lost; its file `part` is removed.
     """
     listen, ring = os.pipe()
     os.set_blocking(ring, False)

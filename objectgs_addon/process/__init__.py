@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Backend commands as child processes, and the queue of jobs. No bpy."""
+"""Child processes that run backend commands, and the queue of jobs."""

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A command of the backend as a child process: JSON lines come out, single words go in, and no call waits."""
+"""Child process that runs a backend command.
+
+It writes events as JSON lines and reads one word per line. No call blocks.
+"""
 
 from __future__ import annotations
 
@@ -18,29 +21,33 @@ from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 LOG_LINES = 40
-"""Number of the last lines that are no events, kept to describe a crash."""
+"""Number of most recent lines that are not events, kept to describe a crash."""
 
 _LINE_BYTES = 1 << 20
 _LOG_CHARACTERS = 500
 _WAITING_EVENTS = 1000
 _EVENTS_A_POLL = 200
 _PIPES_STAY_OPEN = 2.0
-"""Seconds that the pipes may stay open after the process ended, since its children may have inherited them."""
+"""Time in seconds to wait for the pipes to close after the process ends; its children may have inherited them."""
 _NICENESS = 10
 
 
 def backend_command(python: str | Path, *arguments: str | Path) -> list[str]:
-    """The command line of a backend command with JSON events; it must run in the folder that contains backend/."""
+    """Return the command line of a backend command with JSON events; run it in the folder that contains backend/."""
     return [str(python), "-m", "backend", *map(str, arguments), "--json"]
 
 
 def backend_environment(cache_folder: str | Path) -> dict[str, str]:
-    """Additional variables for the backend; `cache_folder` for compiled kernels should outlive updates."""
+    """Return additional environment variables for the backend.
+
+    Args:
+        cache_folder: folder for compiled kernels; it should survive updates of the extension.
+    """
     return {"NUMBA_CACHE_DIR": str(cache_folder), "PYTHONUTF8": "1", "PYTHONFAULTHANDLER": "1"}
 
 
 def child_environment(extra: Mapping[str, str]) -> dict[str, str]:
-    """The variables of this process without those of its own Python (home, paths, options), and `extra`."""
+    """Return the environment variables of this process, without those that configure its Python, plus `extra`."""
     kept = {
         name: value
         for name, value in os.environ.items()
@@ -50,9 +57,9 @@ def child_environment(extra: Mapping[str, str]) -> dict[str, str]:
 
 
 class BackendProcess:
-    """One child process in its own process group.
+    """Child process in its own process group.
 
-    Its first input line is `attached`: from then on the end of its input means that its parent is gone.
+    Its first input line is `attached`; after that line, the end of its input means that its parent has ended.
 
     Args:
         command: program and arguments.
@@ -61,7 +68,7 @@ class BackendProcess:
         in_background: run with lower priority, so that a window stays responsive.
 
     Raises:
-        OSError: it cannot be started.
+        OSError: the program cannot be started.
     """
 
     def __init__(
@@ -75,8 +82,8 @@ class BackendProcess:
         self._events: queue.Queue[dict[str, Any]] = queue.Queue(_WAITING_EVENTS)
         self._log: deque[str] = deque(maxlen=LOG_LINES)
         self._ended_at: float | None = None
-        # A process group, so that Ctrl-C in Blender's terminal reaches Blender alone. Not a session: Linux would
-        # divide the processor equally between the two sessions and ignore the lower priority.
+        # With a separate process group, Ctrl-C in Blender's terminal reaches only Blender. A separate session would
+        # also do that, but Linux divides CPU time equally between sessions and would ignore the lower priority.
         options: dict[str, Any]
         if sys.platform == "win32":
             options = {
@@ -115,7 +122,7 @@ class BackendProcess:
             elif sys.platform != "win32":
                 os.setpriority(os.PRIO_PROCESS, self.pid, _NICENESS)
         except OSError:
-            pass  # It has ended, or the system forbids it.
+            pass  # The child has ended, or the system denies the change.
 
     @property
     def pid(self) -> int:
@@ -124,11 +131,11 @@ class BackendProcess:
 
     @property
     def log(self) -> list[str]:
-        """The last lines from either pipe that are no events, oldest first."""
+        """The most recent lines from both pipes that are not events, oldest first."""
         return list(self._log)
 
     def send(self, line: str) -> bool:
-        """Write a line to the child; returns False if it no longer reads."""
+        """Write a line to the child; return False if it no longer reads its input."""
         try:
             self._input.write(line.encode() + b"\n")
         except (OSError, ValueError):
@@ -136,11 +143,11 @@ class BackendProcess:
         return True
 
     def stop(self) -> bool:
-        """Ask the child to save and end; returns False if it no longer reads."""
+        """Request the child to save and end; return False if it no longer reads its input."""
         return self.send("stop")
 
     def kill(self) -> None:
-        """End the child and its children at once; does nothing if it has ended."""
+        """End the child and its children immediately; do nothing if the child has ended."""
         if self._process.poll() is not None:
             return
         try:
@@ -160,7 +167,7 @@ class BackendProcess:
             self._process.kill()
 
     def poll(self) -> list[dict[str, Any]]:
-        """The events since the last call, oldest first, without waiting; at most some hundreds."""
+        """Return the events since the last call, oldest first, at most `_EVENTS_A_POLL`; do not block."""
         events: list[dict[str, Any]] = []
         while len(events) < _EVENTS_A_POLL:
             try:
@@ -171,7 +178,7 @@ class BackendProcess:
 
     @property
     def exit_code(self) -> int | None:
-        """The child's exit code once `poll` has returned all its events, or None; negative for a signal."""
+        """The child's exit code (negative for a signal), or None until `poll` has returned all events."""
         code = self._process.poll()
         if code is None:
             return None
@@ -186,7 +193,7 @@ class BackendProcess:
         return code
 
     def _read(self, stream: Any) -> None:
-        """Sort the lines of a pipe into events and log; a full queue blocks the child, which bounds the memory."""
+        """Sort the lines of a pipe into events and log; a full queue blocks the child, which limits memory use."""
         with io.BufferedReader(stream) as lines:
             while line := lines.readline(_LINE_BYTES):
                 event = _event(line) if stream is self._process.stdout else None
@@ -197,14 +204,14 @@ class BackendProcess:
 
 
 def _ignore_broken_pipes() -> None:
-    """Blender leaves SIGPIPE at its default, so that writing to a child that has just ended would end Blender too."""
+    """Ignore SIGPIPE, which by default ends Blender on a write to a child that has ended."""
     is_main = threading.current_thread() is threading.main_thread()
     if hasattr(signal, "SIGPIPE") and is_main and signal.getsignal(signal.SIGPIPE) == signal.SIG_DFL:
         signal.signal(signal.SIGPIPE, signal.SIG_IGN)
 
 
 def _event(line: bytes) -> dict[str, Any] | None:
-    """Parse a line as an event; None if it is something else."""
+    """Parse a line as an event; return None if it is not one."""
     if not line.startswith(b"{"):
         return None
     try:

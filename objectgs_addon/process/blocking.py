@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Runs a job to its end, where no timer can poll it."""
+"""Blocking execution of a job, for use without a timer."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from .jobs import Job, State
 
 
 def run_blocking(job: Job, reporter: Reporter) -> int:
-    """Run a job to its end.
+    """Run a job until it ends.
 
-    Ctrl-C or a termination signal asks the job to stop and save; a second one ends it by force.
+    SIGINT (Ctrl-C) or SIGTERM requests the job to save and stop; a second signal kills it.
 
     Args:
         job: a waiting job.
-        reporter: takes messages, warnings and progress. An error is left in `job.error`, for the caller to report.
+        reporter: receives messages, warnings and progress. The caller must report an error, stored in `job.error`.
 
     Returns:
         The exit code: 0, 1, 2 or 130.
@@ -42,7 +42,7 @@ def run_blocking(job: Job, reporter: Reporter) -> int:
 
 @contextlib.contextmanager
 def _counted_signals() -> Iterator[list[int]]:
-    """The numbers of the signals that have arrived; in the main thread alone, where Python handles signals."""
+    """Yield a list of the signals received so far; outside the main thread, it stays empty."""
     arrived: list[int] = []
 
     def note(number: int, _frame: FrameType | None) -> None:
@@ -58,7 +58,7 @@ def _counted_signals() -> Iterator[list[int]]:
 
 
 def _watch(job: Job, reporter: Reporter, signals: list[int]) -> None:
-    """Poll the job until its end, and report what changes."""
+    """Poll the job until it ends, and report changes."""
     handled, told, warned, progress = 0, 0, 0, 0.0
     while not job.is_finished:
         if len(signals) > handled:

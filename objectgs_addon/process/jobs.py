@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Jobs of the backend, run one after another, with their progress, results and errors.
+"""Queue of backend jobs, with their progress, results and errors; one job runs at a time.
 
-In a window a timer calls `JobQueue.poll`; without one, `blocking.run_blocking` polls a single job.
+With a window, a timer calls `JobQueue.poll`; without a window, `blocking.run_blocking` polls a single job.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ...backend.shared.errors import EXIT_CANCELLED, EXIT_DONE
 from .backend_process import BackendProcess
 
 GRACE_SECONDS = 10.0
-"""Time that a job has for saving after the first request to stop; a second request then ends it by force."""
+"""Time in seconds that a job has to save after the first request to stop, before a second request kills it."""
 
 _WARNINGS = 50
 _ESTIMATE_FROM = 0.02
@@ -44,19 +44,21 @@ FINISHED = (State.DONE, State.STOPPED, State.FAILED)
 
 @dataclass(eq=False)
 class Job:
-    """One command of the backend, or another program with the same events.
+    """Backend command, or another program that writes the same events.
 
     Attributes:
-        title: name for the user.
+        title: name shown to the user.
         kind: import, import-splats, plan, vote, train, mesh, export, film, fill, demo, setup or doctor.
         folder: the reconstruction folder, or None.
+        command: program and arguments.
+        cwd: working directory.
         environment: additional environment variables.
-        if_silent: error message if the program ends without any event, since it is not the expected program.
+        if_silent: error message if the program ends without any event, because it is not the expected program.
 
     The other attributes change while the job runs: progress from 0 to 1, seconds_left (reported or estimated), message
-    (the current step), statuses (all messages so far), warnings and error (sentences), figures of the training, preview
-    (path of the newest image), curve (quality events: seconds, step, psnr, miou, mbiou), result (fields of the last
-    event), exit_code and log (last lines that were no events).
+    (the current step), statuses (all messages so far), warnings and error (sentences), training figures (step, splats,
+    anchors, psnr, miou), preview (path of the newest image), curve (quality events: seconds, step, psnr, miou, mbiou),
+    result (fields of the `done` event), exit_code and log (most recent lines that are not events).
     """
 
     title: str
@@ -109,25 +111,25 @@ class Job:
 
     @property
     def can_pause(self) -> bool:
-        """Whether the job can be paused, which only a running training can."""
+        """Whether the job can be paused; only a running training job can."""
         return self.kind == "train" and self.state is State.RUNNING
 
     def pause(self) -> None:
-        """Pause a running training."""
+        """Pause a running training job."""
         if self.can_pause and self._child.send("pause"):
             self._paused_at = time.monotonic()
             self._set(State.PAUSED)
 
     def resume(self) -> None:
-        """Resume a paused training."""
+        """Resume a paused training job."""
         if self.state is State.PAUSED and self._child.send("resume"):
             self._shift_clock()
             self._set(State.RUNNING)
 
     def stop(self) -> None:
-        """Ask the job to save and end; a waiting job ends at once.
+        """Request the job to save and end; a waiting job ends immediately.
 
-        A second call ends it by force after a grace period.
+        A second call kills the job `GRACE_SECONDS` after the first.
         """
         if self.state is State.WAITING:
             self._set(State.STOPPED, "Stopped before it began")
@@ -141,7 +143,7 @@ class Job:
             self.statuses.append(self.message)
 
     def kill(self) -> None:
-        """End the job at once; its last checkpoint is kept."""
+        """End the job immediately; its last checkpoint is kept."""
         if self.state is State.WAITING:
             self.stop()
         elif not self.is_finished:
@@ -149,9 +151,10 @@ class Job:
             self._child.kill()
 
     def start(self, in_background: bool = True) -> None:
-        """Start the process of a waiting job. If that fails, the job is FAILED, with an error.
+        """Start the process of a waiting job; on failure, set `error` and the state FAILED.
 
-        in_background: as for `BackendProcess`.
+        Args:
+            in_background: run with lower priority, so that a window stays responsive.
         """
         self._changed = True
         try:
@@ -167,7 +170,7 @@ class Job:
         self._set(State.RUNNING)
 
     def poll(self) -> bool:
-        """Process the events since the last call, without waiting; returns whether anything changed."""
+        """Process the events since the last call without blocking; return whether anything changed."""
         if self._process is not None and not self.is_finished:
             for event in self._process.poll():
                 self._take(event)
@@ -180,7 +183,7 @@ class Job:
         return changed
 
     def take_preview(self) -> bool:
-        """Whether a preview was written since the last call."""
+        """Return whether a preview was written since the last call."""
         new, self._new_preview = self._new_preview, False
         return new
 
@@ -191,20 +194,20 @@ class Job:
             self.message = message
 
     def _shift_clock(self) -> None:
-        """Exclude the pause from the time that the estimate is based on."""
+        """Exclude the pause from the elapsed time of the estimate."""
         if self._paused_at is not None:
             self._phase_began += time.monotonic() - self._paused_at
             self._paused_at = None
 
     def _take(self, event: dict[str, Any]) -> None:
-        """Apply an event; unexpected fields are ignored."""
+        """Apply an event; ignore unexpected fields."""
         self._answered = self._changed = True
         kind, message = event["type"], str(event.get("message", ""))
         if kind == "status":
             if self.state is State.RUNNING:
                 self._phase_began = time.monotonic()
                 self.seconds_left = None
-                if self.progress == 1.0:  # The previous phase is complete, not the job.
+                if self.progress == 1.0:  # Only the previous phase is complete.
                     self.progress = 0.0
             if self.state is not State.STOPPING:
                 self.message = message
@@ -268,7 +271,7 @@ class Job:
             self._set(State.FAILED, self.error)
 
     def _crash(self, code: int) -> str:
-        """Describe an unexplained end in one sentence, with the last message of the program."""
+        """Describe an unexpected end in one sentence, with the last message of the program."""
         if self.if_silent is not None and not self._answered and code >= 0:
             return self.if_silent
         text = _last_message(self.log)
@@ -296,13 +299,13 @@ def _how_it_ended(code: int) -> str:
 
 
 def _last_message(log: list[str]) -> str:
-    """The most informative line about a crash: the interpreter's fatal error, or else the last line."""
+    """Return the most informative line about a crash: the interpreter's fatal error, or else the last line."""
     named = [line for line in log if line.startswith("Fatal Python error")]
     return (named or log or [""])[-1].strip()
 
 
 class JobQueue:
-    """Jobs in the order of addition; one runs while the others wait."""
+    """Queue of jobs, run one at a time in the order they were added."""
 
     def __init__(self) -> None:
         self.jobs: list[Job] = []
@@ -313,23 +316,23 @@ class JobQueue:
         return next((job for job in self.jobs if job.state is not State.WAITING and not job.is_finished), None)
 
     def add(self, job: Job) -> None:
-        """Append a job; `poll` starts it when its turn comes."""
+        """Append a job; `poll` starts it after the earlier jobs."""
         job._changed = True
         self.jobs.append(job)
 
     def poll(self) -> list[Job]:
-        """Start the next job if none is running; returns the jobs that changed since the last call, without waiting."""
+        """Start the next job if none is running; return the jobs that changed since the last call. Does not block."""
         if self.running is None:
             waiting = next((job for job in self.jobs if job.state is State.WAITING), None)
             if waiting is not None:
                 waiting.start()
         changed = [job for job in self.jobs if job.poll()]
-        # A job that was stopped before it began is not kept.
+        # Remove jobs that were stopped before they began.
         self.jobs = [job for job in self.jobs if job._process or job.state is not State.STOPPED]
         return changed
 
     def of_folder(self, folder: str | Path) -> Job | None:
-        """The latest job of a reconstruction folder, or None."""
+        """Return the latest job of a reconstruction folder, or None."""
         wanted = _resolved(folder)
         return next((job for job in reversed(self.jobs) if job.folder and _resolved(job.folder) == wanted), None)
 
@@ -338,7 +341,7 @@ class JobQueue:
         self.jobs = [job for job in self.jobs if not job.is_finished]
 
     def stop_all(self, timeout: float) -> None:
-        """Stop all jobs; the running one has `timeout` seconds to save, then it is ended by force."""
+        """Stop all jobs; the running job is killed if it has not saved and ended after `timeout` seconds."""
         for job in self.jobs:
             job.stop()
         deadline = time.monotonic() + timeout

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Background jobs: a timer polls the queue, redraws panels and shows results.
 
-The queue belongs to Blender and not to the .blend: it survives undo and opening another file. A reconstruction finds
-its job by the folder.
+The queue belongs to the Blender process, not to the .blend file, so it survives undo and opening another file. Jobs
+and reconstructions are matched by folder.
 """
 
 from __future__ import annotations
@@ -26,33 +26,33 @@ from ..state import object_edits, object_list
 from . import previews, results
 
 INTERVAL = 0.1
-"""Seconds between two polls of the queue."""
+"""Time in seconds between two polls of the queue."""
 DRAW_EVERY = 1.0
-"""Seconds between two redraws for new figures."""
+"""Minimum time in seconds between two redraws for new figures."""
 
 queue = JobQueue()
 _drawn = 0.0
 _stale = False
 _submitted_in: dict[Job, int] = {}
-"""Job -> session UID of the scene that submitted it, which a new name does not change."""
+"""Job -> session UID of the scene that submitted it; unlike the name, the UID never changes."""
 _results: list[Job] = []
-"""Jobs with results that cannot be shown yet."""
+"""Finished jobs whose results are not shown yet."""
 _requested_fills: dict[Path, Path] = {}
-"""Reconstruction folder -> the file that its latest fill job was to write."""
+"""Reconstruction folder -> file requested from its latest fill job."""
 _announced: set[Job] = set()
-"""Those of `_results` for which the user was told why."""
+"""Jobs in `_results` whose delay was reported to the user."""
 
 
 def submit(job: Job, owner: bpy.types.Scene, report: Callable[[set[str], str], Any]) -> set[str]:
-    """Run a job in the background or, without a window, until it ends.
+    """Start a job in the background or, without a window, run it until it ends.
 
     Args:
         job: a new job.
-        owner: the scene that shows the result.
-        report: an operator's `report`, or a function like it.
+        owner: scene in which to show the result.
+        report: an operator's `report` method, or a function with the same parameters.
 
     Returns:
-        The result of the operator.
+        The return value for the operator's `execute`.
     """
     _submitted_in[job] = owner.session_uid
     if bpy.app.background:
@@ -73,9 +73,11 @@ def submit(job: Job, owner: bpy.types.Scene, report: Callable[[set[str], str], A
 
 
 def fill_holes(root: bpy.types.Collection, again: bool = True) -> None:
-    """Start a job that fills the holes behind removed objects, unless the folder holds its result.
+    """Start a job that fills the holes behind removed objects, unless the folder already contains the result.
 
-    again: also after an earlier attempt has failed.
+    Args:
+        root: the reconstruction's collection.
+        again: also start a job if the same fill was requested before.
     """
     folder = scene.folder_of(root)
     missing = scene.missing_fill(root, scene.Objects.read(folder))
@@ -95,12 +97,12 @@ def fill_holes(root: bpy.types.Collection, again: bool = True) -> None:
 
 
 def job_of(root: bpy.types.Collection) -> Job | None:
-    """The latest job of this Blender in a reconstruction's folder, or None."""
+    """Return the latest job in the queue for a reconstruction's folder, or None."""
     return queue.of_folder(scene.folder_of(root))
 
 
 def busy(folder: Path) -> bool:
-    """Whether a job of this Blender is waiting or running in `folder`."""
+    """Return whether the queue contains an unfinished job for `folder`."""
     job = queue.of_folder(folder)
     return job is not None and not job.is_finished
 
@@ -119,7 +121,7 @@ def _tick() -> float | None:
 
 
 def _redraw_soon(at_once: bool, changed: bool) -> None:
-    """Redraw a new state at once, and new figures once a second, since a redraw takes time."""
+    """Redraw immediately after a change of state, and at most once per `DRAW_EVERY` for new figures."""
     global _drawn, _stale
     _stale = _stale or changed
     now = time.monotonic()
@@ -129,15 +131,15 @@ def _redraw_soon(at_once: bool, changed: bool) -> None:
 
 
 def redraw() -> None:
-    """Redraw sidebars, status bars and preferences, but not the viewports, which are slow."""
+    """Redraw sidebars, status bars and preferences, but not the viewports, which redraw slowly."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             for region in area.regions:
                 if (area.type, region.type) in (("VIEW_3D", "UI"), ("PREFERENCES", "WINDOW")):
                     region.tag_redraw()
-        # The status bar is no area of a screen and is redrawn by setting its text, unless a modal operator uses it.
+        # The status bar has no area to tag. Setting its text redraws it; modal operators show their own text there.
         if not len(getattr(window, "modal_operators", ())):
-            # Right after a file is opened, timers have no window, without which Blender crashes here.
+            # After a file is opened, the timer's context has no window, and Blender would crash here.
             with bpy.context.temp_override(window=window):
                 window.workspace.status_text_set_internal(None)
 
@@ -152,7 +154,7 @@ def _handle_end(job: Job) -> None:
 
 
 def _show_results() -> None:
-    """Show pending results in order, unless Blender or the user is busy with the same data."""
+    """Show pending results in order, until one must wait for a render or the user."""
     while _results:
         job = _results[0]
         obstacle = _obstacle(job)
@@ -166,7 +168,7 @@ def _show_results() -> None:
 
 
 def _obstacle(job: Job) -> str | None:
-    """What must end before a result can be shown, since changes to data in use would crash Blender or be lost."""
+    """Describe what delays a result: data in use must not change, or Blender crashes or loses the change."""
     if bpy.app.is_job_running("RENDER") or bpy.app.is_job_running("OBJECT_BAKE"):
         return "rendering ends"
     for window in bpy.context.window_manager.windows:
@@ -180,7 +182,7 @@ def _obstacle(job: Job) -> str | None:
 
 
 def _guard(job: Job, action: Callable[..., object], *arguments: object) -> None:
-    """Call `action` and show its errors: an exception in a timer would end it, and with it every other job."""
+    """Call `action` and show its errors; an uncaught exception would end the timer, which all jobs require."""
     try:
         action(*arguments)
     except (InputError, OSError) as error:
@@ -191,7 +193,7 @@ def _guard(job: Job, action: Callable[..., object], *arguments: object) -> None:
 
 
 def finish(job: Job) -> None:
-    """Show the result of a job, in the scene that submitted it and wherever the reconstruction is shown."""
+    """Show the result of a job in the scene that submitted it and in all scenes that show the reconstruction."""
     object_edits.flush()
     submitted_in = _submitted_in.pop(job, None)
     owner = next((owner for owner in bpy.data.scenes if owner.session_uid == submitted_in), None)
@@ -203,7 +205,7 @@ def finish(job: Job) -> None:
 
 
 def _import_demo(job: Job, owner: bpy.types.Scene | None) -> bool:
-    """Import the new demo capture, if there is a backend."""
+    """Import the new demo capture if the backend is set up; return False."""
     if owner is None or locations.backend_python() is None:
         messages.show(f"The demo capture is in {job.folder}; set up the backend, then import it")
         return False
@@ -224,7 +226,7 @@ def _push_undo(title: str) -> None:
 
 
 def stop() -> None:
-    """Stop all jobs and forget what waits to be shown, as when the extension is disabled."""
+    """Stop all jobs and discard pending results, for when the extension is disabled."""
     object_edits.flush()
     if bpy.app.timers.is_registered(_tick):
         bpy.app.timers.unregister(_tick)

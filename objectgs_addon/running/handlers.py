@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What follows when a .blend is opened or saved, and on undo and redo."""
+"""Handlers for opening and saving a .blend file, undo and redo."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from . import background, results
 @bpy.app.handlers.persistent
 @writing.allowed
 def _undone(*_: Any) -> None:
-    """Update objects.json and the fills after an undo or redo."""
+    """Update objects.json and the fills after undo or redo."""
     for root in [root for root in bpy.data.collections if scene.kind_of(root) == "reconstruction"]:
         for action in (object_edits.store, results.show_fill, partial(background.fill_holes, again=False)):
             _try(action, root)
@@ -29,7 +29,7 @@ def _undone(*_: Any) -> None:
 @bpy.app.handlers.persistent
 @writing.allowed
 def _saving(*_: Any) -> None:
-    """Write pending colors and transforms to objects.json when the .blend is saved."""
+    """Write pending colors and transforms to objects.json before the .blend is saved."""
     for root in bpy.data.collections:
         if scene.kind_of(root) == "reconstruction" and root.library is None:
             _try(object_edits.store_edits, root)
@@ -45,12 +45,12 @@ def _try(action: Callable[[bpy.types.Collection], None], root: bpy.types.Collect
 @bpy.app.handlers.persistent
 @writing.allowed
 def _file_loaded(*_: Any) -> None:
-    """Fill the lists of objects and choose the active reconstruction, which files made without a window lack."""
+    """Fill empty lists of objects and set the active reconstruction; files built without a window lack both."""
     for owner in bpy.data.scenes:
         roots = [root for root in owner.collection.children_recursive if scene.kind_of(root) == "reconstruction"]
         for root in roots:
             if not root.objectgs.objects:
-                # The panel reports a missing or broken folder.
+                # The panel already reports a missing or invalid folder.
                 with contextlib.suppress(InputError, OSError):
                     object_edits.fill(root)
         if roots and owner.objectgs.active is None:

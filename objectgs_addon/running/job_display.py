@@ -13,11 +13,11 @@ from ..process.jobs import Job, State
 CHARACTER = 6.6
 """Average width of a character in pixels at a UI scale of 1."""
 AROUND = 60.0
-"""Width of borders and icon in pixels."""
+"""Width of borders and icon in pixels at a UI scale of 1."""
 
 
 def summary(job: Job) -> str:
-    """The state of a job in a few words."""
+    """Return the state of a job in a few words."""
     if job.state is State.WAITING:
         return f"{job.title}: waiting"
     if job.state is State.PAUSED:
@@ -29,7 +29,7 @@ def summary(job: Job) -> str:
 
 
 def draw_running(layout: bpy.types.UILayout, job: Job, index: int) -> None:
-    """Draw progress, buttons and figures of a job that has not ended."""
+    """Draw the progress, buttons and figures of an unfinished job."""
     row = layout.row(align=True)
     if job.state is State.WAITING:
         row.label(text=summary(job), icon="TIME")
@@ -49,7 +49,7 @@ def draw_running(layout: bpy.types.UILayout, job: Job, index: int) -> None:
 
 
 def draw_figures(layout: bpy.types.UILayout, job: Job) -> None:
-    """Draw the quality on held-out photos and the number of splats."""
+    """Draw the quality on held-out views and the number of splats."""
     figures = []
     if job.psnr is not None:
         figures.append(f"PSNR {job.psnr:.1f} dB")
@@ -62,7 +62,7 @@ def draw_figures(layout: bpy.types.UILayout, job: Job) -> None:
 
 
 def draw_over(layout: bpy.types.UILayout, job: Job) -> None:
-    """Draw how a job ended."""
+    """Draw the outcome of a finished job and up to three warnings."""
     if job.state is State.FAILED:
         write(layout, f"{job.title} failed. {job.error}", "ERROR")
     elif job.state is State.STOPPED:

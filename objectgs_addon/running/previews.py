@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Preview images of a training: icons for the panel, an image for the Image Editor."""
+"""Preview images of training: icons for the panel, an image for the Image Editor."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ import bpy.utils.previews
 from ...backend.shared.reconstruction.folder import Reconstruction
 
 COMPARISON = "latest"
-"""Photo, render and objects side by side, for the Image Editor."""
+"""Name of the photo, render and objects side by side, for the Image Editor."""
 RENDER = "render"
-"""The render alone, for the panel."""
+"""Name of the render alone, for the panel."""
 CURVE = "curve"
-"""PSNR over the run time, for the panel."""
+"""Name of the plot of PSNR over the run time, for the panel."""
 
 _icons: Any = None
 _shown: dict[str, tuple[str, int]] = {}
-"""Folder and name -> path and modification time of the image that its icon shows."""
+"""Folder and name -> path and modification time (ns) of the image in the icon."""
 
 
 def path_of(folder: Path, name: str) -> Path | None:
-    """The newest preview of that name, a PNG or JPEG file, or None."""
+    """Return the newest preview named `name`, a PNG or JPEG file, or None."""
     found = [
         (path.stat().st_mtime_ns, path)
         for suffix in (".png", ".jpg")
@@ -34,7 +34,7 @@ def path_of(folder: Path, name: str) -> Path | None:
 
 
 def icon_of(folder: Path, name: str) -> int:
-    """The icon value, for layouts, of the newest preview of that name; 0 without a preview."""
+    """Return the icon value, for layouts, of the newest preview named `name`; 0 without a preview."""
     global _icons
     path = path_of(folder, name)
     if path is None:
@@ -51,7 +51,7 @@ def icon_of(folder: Path, name: str) -> int:
 
 
 def image_of(folder: Path) -> bpy.types.Image:
-    """The image data-block that shows the newest preview in `folder`, created if needed."""
+    """Return the image data-block of the newest preview in `folder`; create it if needed."""
     image = next(iter(_images_of(folder)), None)
     if image is None:
         image = bpy.data.images.load(str(path_of(folder, COMPARISON)))
@@ -62,7 +62,7 @@ def image_of(folder: Path) -> bpy.types.Image:
 
 
 def refresh(folder: Path) -> None:
-    """Reload the image data-blocks of a training from its newest preview."""
+    """Reload the preview image data-blocks of a reconstruction folder."""
     path = path_of(folder, COMPARISON)
     for image in _images_of(folder):
         if path is not None:

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a finished job brings is shown in Blender: a function for each kind of job."""
+"""Display of the results of finished jobs, with one function per kind of job.
+
+Each function returns whether its changes require an undo step.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +19,13 @@ from ..state import viewports as view
 
 
 def _folder_of(job: Job) -> Path:
-    """The folder of a job whose result can be shown."""
+    """Return the folder of a job whose result can be shown."""
     assert job.folder is not None
     return job.folder
 
 
 def roots_of(folder: Path | None) -> list[bpy.types.Collection]:
+    """Return the local collections of the reconstruction in `folder`."""
     return [
         collection
         for collection in bpy.data.collections
@@ -32,7 +36,7 @@ def roots_of(folder: Path | None) -> list[bpy.types.Collection]:
 
 
 def _shown_roots(job: Job, owner: bpy.types.Scene | None) -> list[bpy.types.Collection]:
-    """The reconstruction's collections in scenes; one that the user unlinked from `owner` is linked again."""
+    """Return the reconstruction's collections that are in a scene; link one that is only active in `owner` again."""
     roots = roots_of(job.folder)
     for root in roots:
         if owner is not None and owner.objectgs.active == root and not object_list.scenes_of(root):
@@ -59,7 +63,7 @@ def _show_capture(job: Job, owner: bpy.types.Scene | None) -> bool:
 
 
 def _show_imported(job: Job, owner: bpy.types.Scene | None) -> bool:
-    """Splats of another program may come without cameras and points."""
+    """Show imported splats, for which cameras and points are optional."""
     return _show_capture(job, owner) and _show_result(job, owner)
 
 
@@ -86,7 +90,7 @@ def _show_result(job: Job, owner: bpy.types.Scene | None) -> bool:
 
 
 def _show_meshes(job: Job, owner: bpy.types.Scene | None) -> bool:
-    """Also shows the meshes of a stopped job."""
+    """Show the meshes of a finished or stopped job."""
     roots = _shown_roots(job, owner)
     for root in roots:
         shown = scene.show_meshes(root, _folder_of(job))
@@ -98,18 +102,19 @@ def _show_meshes(job: Job, owner: bpy.types.Scene | None) -> bool:
 
 
 def _show_fill_job(job: Job, _owner: bpy.types.Scene | None) -> bool:
-    """Makes no undo step, since the fill follows from the edits and is undone with them."""
+    """Show the fill without an undo step; undoing the edits also undoes the fill."""
     for root in _shown_roots(job, None):
         show_fill(root)
     return False
 
 
 def show_fill(root: bpy.types.Collection) -> None:
+    """Show the fills that objects.json requires."""
     scene.show_fills(root, scene.Objects.read(scene.folder_of(root)))
 
 
 def _announce_hidden(job: Job) -> bool:
-    """Tell the user where a result is that no scene shows; returns False, since nothing has changed."""
+    """Tell the user where to find a result that no scene shows; return False."""
     messages.show(
         f"{job.title} has finished, but its scene or collection is gone; open {job.folder} with Open Reconstruction."
     )
@@ -117,7 +122,7 @@ def _announce_hidden(job: Job) -> bool:
 
 
 def _show_film(job: Job, _owner: bpy.types.Scene | None) -> bool:
-    """Show new frames in the compositors that use their folder."""
+    """Show new frames in the compositors that use their folder; return False."""
     for other in bpy.data.scenes:
         film.show_frames(other, Path(job.result.get("film", "")))
     return False

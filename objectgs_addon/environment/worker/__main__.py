@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Runs the worker by its path, in a process of its own."""
+"""Entry point to run the worker by its path, in a separate process."""
 
 import sys
 from pathlib import Path
 
-# The folder that contains this package, in place of this folder, which Python puts there.
+# Replace this folder, which Python puts here, with its parent, from which the package can be imported.
 sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 from worker.command_line import main  # noqa: E402

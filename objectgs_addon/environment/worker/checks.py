@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checks of a Python, of the free disk space, and of the backend itself."""
+"""Checks of the Python, the free disk space and the backend."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from .events import Progress, Refused, emit, print_error
 from .programs import run
 
 GIGABYTES = {"cpu": 2.5, "cuda": 9.0}
-"""Free disk space that the set-up needs for the packages and their wheels."""
+"""Free disk space in GB that the setup requires for the packages and their wheels."""
 
 
 def check_python() -> None:
-    """Refuse a Python that the packages of the backend do not support."""
+    """Raise Refused if the backend's packages do not support this Python."""
     if not layout.OLDEST <= sys.version_info[:2] <= layout.NEWEST:
         raise Refused(
             f"{sys.executable} is Python {platform.python_version()}, and the backend needs {layout.VERSIONS}; "
@@ -34,7 +34,7 @@ def check_python() -> None:
 
 
 def check_can_make_environments() -> None:
-    """Refuse a Python that cannot make environments, as some systems package it."""
+    """Raise Refused if this Python cannot create environments; some systems package venv separately."""
     try:
         import ensurepip  # noqa: F401
         import venv  # noqa: F401
@@ -47,7 +47,7 @@ def check_can_make_environments() -> None:
 
 
 def check_space(folder: Path, device: str) -> None:
-    """Refuse a folder on a disk with too little free space."""
+    """Raise Refused if the disk of `folder` has too little free space."""
     existing = next(parent for parent in (folder, *folder.parents) if parent.is_dir())
     free, needed = shutil.disk_usage(existing).free / 1e9, GIGABYTES[device]
     if free < needed:
@@ -58,7 +58,12 @@ def check_space(folder: Path, device: str) -> None:
 
 
 def check_backend(python: Path, progress: Progress, stop: Callable[[], bool]) -> dict[str, Any]:
-    """Run the backend on a tiny scene (`doctor`), which also compiles its kernels; returns its last event."""
+    """Run the backend's `doctor` command on a tiny scene, which also compiles the kernels; return its `done` event.
+
+    Raises:
+        Refused: the backend failed.
+        Stopped: `stop` returned true.
+    """
     output = _DoctorOutput(progress)
     code = run([str(python), "-m", "backend", "doctor", "--json"], stop, output.take, first=b"attached\n")
     if code != 0:
@@ -71,7 +76,7 @@ def check_backend(python: Path, progress: Progress, stop: Callable[[], bool]) ->
 
 
 class _DoctorOutput:
-    """Turns the events of `doctor` into the worker's own."""
+    """Converter from events of `doctor` to events of the worker."""
 
     def __init__(self, progress: Progress) -> None:
         self.progress = progress
@@ -81,7 +86,7 @@ class _DoctorOutput:
         self._fraction = 0.0
 
     def take(self, line: str) -> None:
-        """Take a line of output."""
+        """Process a line of output."""
         try:
             event = json.loads(line)
         except ValueError:
@@ -95,7 +100,7 @@ class _DoctorOutput:
             self.progress.status(message)
         elif kind == "progress" and event.get("total"):
             fraction = event["done"] / event["total"]
-            # It compiles, which takes most of the time, and then trains with a progress from 0 again.
+            # Compilation takes most of the time; training then restarts the progress at 0.
             self._is_compiled = self._is_compiled or fraction < self._fraction
             self._fraction = fraction
             self.progress.at(0.8 + 0.2 * fraction if self._is_compiled else 0.8 * fraction)
@@ -108,7 +113,7 @@ class _DoctorOutput:
 
 
 def probe(options: argparse.Namespace, stop: Callable[[], bool]) -> None:
-    """Check whether this Python has the packages of the backend, then run the backend with it."""
+    """Check whether this Python has the backend's packages, then run the backend with it; raise Refused on failure."""
     check_python()
     missing, warnings = [], []
     for name in layout.REQUIREMENTS:

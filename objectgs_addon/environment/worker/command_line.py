@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The command line of the worker."""
+"""Command line of the worker."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .setup import set_up
 
 
 def main() -> int:
-    """Run the command line; returns the exit code."""
+    """Run the command line and return the exit code."""
     parser = argparse.ArgumentParser(prog="worker", description="Make or check the environment of ObjectGS's backend.")
     commands = parser.add_subparsers(dest="command", required=True)
     setup = commands.add_parser("setup", help="make an environment")
@@ -42,5 +42,5 @@ def main() -> int:
         return 2
     except Exception as error:
         traceback.print_exc()
-        emit("error", message=f"An unexpected failure: {type(error).__name__}: {' '.join(str(error).split())}")
+        emit("error", message=f"Unexpected error: {type(error).__name__}: {' '.join(str(error).split())}")
         return 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Events of the worker, its progress, and the request to stop."""
+"""Events and progress of the worker, and the request to stop."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from typing import Any
 
 
 class Refused(Exception):
-    """The environment cannot be made or used; the message is one plain sentence."""
+    """The environment cannot be created or used; the message is one plain sentence."""
 
 
 class Stopped(Exception):
-    """The user asked to stop."""
+    """The user requested a stop."""
 
 
 def emit(kind: str, **fields: Any) -> None:
-    """Write one event."""
+    """Write one event to stdout as a JSON line."""
     sys.stdout.write(json.dumps({"type": kind, "time": round(time.time(), 3), **fields}) + "\n")
     sys.stdout.flush()
 
 
 def print_error(line: str) -> None:
-    """Write a line to stderr, where it becomes part of the log."""
+    """Write a line to stderr, which Blender adds to the job's log."""
     print(line, file=sys.stderr, flush=True)
 
 
 class Progress:
-    """Progress over stages, of which the usual seconds are known."""
+    """Progress over stages; `stages` maps their names to typical durations in seconds."""
 
     def __init__(self, stages: dict[str, float]) -> None:
         self.stages = stages
@@ -41,17 +41,17 @@ class Progress:
         self._fraction = 0.0
 
     def begin(self, stage: str, message: str) -> None:
-        """Begin a stage, which completes those before; `message` describes it."""
+        """Begin a stage, described by `message`; the earlier stages are complete."""
         self._stage, self._began, self._fraction = stage, time.monotonic(), 0.0
         self.status(message)
 
     def status(self, message: str) -> None:
-        """Describe another step of the stage."""
+        """Report a new step of the stage."""
         emit("status", message=message)
         self._emit()
 
     def at(self, fraction: float) -> None:
-        """Set the completed fraction of the stage, 0 to 1, which never decreases. Emitted at most twice a second."""
+        """Set the completed fraction of the stage, from 0 to 1; it never decreases. Emit at most twice per second."""
         self._fraction = max(self._fraction, min(fraction, 1.0))
         if time.monotonic() - self._emitted >= 0.5:
             self._emit()
@@ -61,7 +61,7 @@ class Progress:
         names = list(self.stages)
         before = sum(self.stages[name] for name in names[: names.index(self._stage)])
         usual, total, elapsed = self.stages[self._stage], sum(self.stages.values()), now - self._began
-        # From the pace of the stage as soon as that is known, and from the usual seconds until then.
+        # Estimate from the typical duration until the pace of the stage is known.
         fraction = self._fraction
         paced = elapsed * (1 - fraction) / fraction if fraction > 0.05 and elapsed > 3 else None
         left = usual * (1 - fraction) if paced is None else paced
@@ -74,7 +74,7 @@ class Progress:
 
 
 class StopRequest:
-    """Set by a line `stop`, by a signal, or by the end of the input after a line `attached`."""
+    """Request to stop: the line `stop`, SIGINT, SIGTERM, or the end of the input after the line `attached`."""
 
     def __init__(self) -> None:
         self._event = threading.Event()

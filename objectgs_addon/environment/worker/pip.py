@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Installation of packages with pip, with progress and plain error messages."""
+"""Package installation with pip, with progress and plain error messages."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PROBE_SECONDS = 8
 
 
 class Pip:
-    """pip of the environment in `folder`."""
+    """The pip of the environment in `folder`."""
 
     def __init__(self, folder: Path, progress: Progress, stop: Callable[[], bool]) -> None:
         self.folder, self.progress, self.stop = folder, progress, stop
@@ -43,11 +43,11 @@ class Pip:
         return self.folder / VENV / ("Lib" if os.name == "nt" else f"lib/{version}") / "site-packages"
 
     def install(self, arguments: list[str], megabytes: float) -> None:
-        """`pip install`, wheels only, with the user's own settings of pip.
+        """Run `pip install` with wheels only and the user's pip configuration.
 
         Args:
-            arguments: of `pip install`.
-            megabytes: expected size of the downloads, for the progress.
+            arguments: arguments of `pip install`.
+            megabytes: expected size of the downloads in MB, for the progress.
 
         Raises:
             Refused: pip failed.
@@ -60,7 +60,13 @@ class Pip:
             raise Refused(why_pip_failed(self.lines))
 
     def offers(self, requirement: str, build: str, index: str | None = None) -> bool:
-        """Whether the user's indexes, or `index`, have this build; an unreachable index costs a few seconds."""
+        """Return whether a package index offers a build of a requirement; an unreachable index delays this by seconds.
+
+        Args:
+            requirement: `name==version`.
+            build: local version label, such as cpu or cu130.
+            index: URL of the index; None for the user's indexes.
+        """
         name, _, version = requirement.partition("==")
         where = ["--index-url", index] if index else []
         self._run(["index", "versions", name, *where, "--retries", "0", "--timeout", str(PROBE_SECONDS)])
@@ -68,7 +74,7 @@ class Pip:
 
     def _run(self, arguments: list[str], on_tick: Callable[[], None] = lambda: None) -> int:
         self.lines = []
-        # Temporary files can be larger than /tmp; and `user = true` in pip's settings excludes environments.
+        # Temporary files can exceed the space in /tmp. `user = true` in pip's configuration fails in environments.
         folder = str(self.temporary)
         environment = {
             "TMPDIR": folder,
@@ -99,7 +105,7 @@ class Pip:
             self.progress.status(f"Installing {len(self._installing)} packages")
 
     def _tick(self, megabytes: float) -> None:
-        """Update the progress from files, since pip does not report it: two thirds download, one third unpacking."""
+        """Update the progress from files, since pip reports none: 2/3 for the download, 1/3 for unpacking."""
         if self._installing:
             fraction = (len(self._installed()) - self._before) / len(self._installing)
             self.progress.at((2 + fraction) / 3)
@@ -115,7 +121,11 @@ class Pip:
 
 
 def why_pip_failed(lines: list[str]) -> str:
-    """The failure of pip in one sentence."""
+    """Return one sentence that explains why pip failed.
+
+    Args:
+        lines: output of pip.
+    """
     text = "\n".join(lines)
     lacking = re.search(r"No matching distribution found for (\S+)", text)
     unreached = re.search(r"Retrying \(|Could not fetch URL|connection error|Connection to \S+ timed out", text)
@@ -141,7 +151,7 @@ def why_pip_failed(lines: list[str]) -> str:
 
 
 def torch_options(pip: Pip, torch: str, device: str) -> list[str]:
-    """pip's options for the matching build of PyTorch; the usual index has CUDA's on Linux and the CPU's on Windows."""
+    """Return pip's options for the PyTorch build of `device`; PyPI has CUDA builds for Linux, CPU for Windows."""
     build = {("Linux", "cpu"): "cpu", ("Windows", "cuda"): "cu130"}.get((platform.system(), device))
     if build is None or pip.offers(torch, build):
         return []
@@ -157,6 +167,6 @@ def torch_options(pip: Pip, torch: str, device: str) -> list[str]:
 
 
 def brings_cuda(pip: Pip) -> bool:
-    """Whether the installed PyTorch needs the packages of CUDA on this system."""
+    """Return whether the installed PyTorch requires CUDA packages on this system."""
     wanted = next(iter(importlib.metadata.distributions(name="torch", path=[str(pip.site)]))).requires or []
     return platform.system() == "Linux" and any(line.startswith("nvidia-") for line in wanted)

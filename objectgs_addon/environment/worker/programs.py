@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Programs that the worker runs."""
+"""Child processes of the worker."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 
 from .events import Stopped
 
-# The end of the input means that the parent is gone; then the program ends as well.
+# The program ends when its input ends, which means that its parent has ended.
 _GUARDED = """\
 import os, runpy, sys, threading
 def watch():
@@ -29,7 +29,7 @@ runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
 
 
 def guarded(python: Path, module: str, *arguments: str) -> list[str]:
-    """The command line of a module that ends with this process and ignores environment variables and user folders."""
+    """Return a command line for a module that ends with this process and ignores PYTHON* variables and user folders."""
     return [str(python), "-I", "-u", "-X", "utf8", "-c", _GUARDED, module, *arguments]
 
 
@@ -41,13 +41,13 @@ def run(
     environment: dict[str, str] | None = None,
     first: bytes = b"",
 ) -> int:
-    """Run a program to its end.
+    """Run a program until it ends.
 
     Args:
         command: program and arguments.
-        stop: whether to stop.
-        on_line: takes each line of its output and errors.
-        on_tick: called several times a second.
+        stop: callback that returns whether to stop.
+        on_line: callback for each line from stdout and stderr.
+        on_tick: callback that is called several times per second.
         environment: additional environment variables.
         first: first input of the program.
 
@@ -55,9 +55,9 @@ def run(
         The exit code.
 
     Raises:
-        Stopped: `stop` was true; the program was ended.
+        Stopped: `stop` returned true; the program was killed.
     """
-    # A group, so that a stop reaches its children as well; Windows ends those with their parent.
+    # With a process group, a stop also reaches the program's children.
     options: dict[str, Any] = {} if os.name == "nt" else {"process_group": 0}
     child = subprocess.Popen(
         command,
@@ -94,7 +94,7 @@ def run(
 
 
 def _read_lines(stream: Any, lines: queue.Queue[str | None]) -> None:
-    """Put the lines of a pipe into a queue, and None at its end."""
+    """Put the lines of a pipe into a queue, followed by None."""
     with stream:
         for line in stream:
             lines.put(line.decode("utf-8", errors="replace").rstrip())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Set-up of an environment."""
+"""Setup of an environment."""
 
 from __future__ import annotations
 
@@ -22,13 +22,18 @@ from .pip import Pip, brings_cuda, torch_options
 from .programs import guarded, run
 
 MEGABYTES = {"cpu": 180, "cuda": 2500}
-"""Size of the downloads besides torch, for the progress."""
+"""Size of the downloads except torch in MB, for the progress."""
 
 _STAMP_TEXT = "ObjectGS for Blender keeps the Python packages of its backend here; its preferences remove them.\n"
 
 
 def set_up(options: argparse.Namespace, stop: Callable[[], bool]) -> None:
-    """Make the environment in `options.folder`, or leave nothing of it on failure."""
+    """Create the environment in `options.folder`; on failure, remove its files.
+
+    Raises:
+        Refused: the environment cannot be created.
+        Stopped: `stop` returned true.
+    """
     folder, device = options.folder.absolute(), options.device
     check_python()
     check_can_make_environments()
@@ -83,10 +88,10 @@ def _write_marker(folder: Path, ready: dict[str, Any], stop: Callable[[], bool])
 
 @contextlib.contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """Lock `folder` for this process, with nothing but the stamp in it; on any exception it is removed.
+    """Lock `folder` for this process and remove an earlier environment; on any exception, remove the folder.
 
     Raises:
-        Refused: the folder is not ours, or another process uses it.
+        Refused: the folder contains other files, or another process is using it.
     """
     if not layout.is_ours(folder):
         raise Refused(f"{folder} is not empty and was not made by ObjectGS, so it is not used; move it away.")
@@ -109,14 +114,14 @@ def claimed(folder: Path) -> Iterator[None]:
             stamp.flush()
             yield
         except BaseException:
-            # Windows does not remove open files.
+            # Windows cannot remove open files.
             opened.close()
             layout.remove_own(folder)
             raise
 
 
 def _lock(file: IO[str]) -> bool:
-    """Lock an open file until it is closed or this process ends; returns False if another process has it."""
+    """Lock an open file until it is closed or this process ends; return False if another process holds the lock."""
     try:
         if sys.platform == "win32":
             import msvcrt
@@ -127,6 +132,6 @@ def _lock(file: IO[str]) -> bool:
 
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        # Some network folders have no locks; there, two set-ups at once are not detected.
+        # Some network folders do not support locks; simultaneous setups are not detected there.
         return error.errno not in (errno.EACCES, errno.EAGAIN, errno.EDEADLK)
     return True
