@@ -78,7 +78,6 @@ class Verdict:
     """Variants that are better than a choice's default in some figure and worse in none; if there are none, the default
     lies on the front."""
 
-
     choice: Choice
     better: list[str] = field(default_factory=list)
 
