@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 import re
 import unicodedata
@@ -17,6 +16,7 @@ from PIL import Image as PilImage
 
 from ..shared.errors import InputError
 from ..shared.formats.atomic import write_atomic
+from ..shared.formats.json_file import parse_json
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm", ".pgm"}
 MASK_SUFFIXES = (".png", ".npy", ".npz", ".tif", ".tiff", ".bmp")
@@ -283,7 +283,7 @@ def read_names(folder: Path) -> dict[int, str]:
     as_json, as_text = folder / "labels.json", folder / "labels.txt"
     try:
         if as_json.is_file():
-            pairs = _json_names(json.loads(as_json.read_text(encoding="utf-8-sig")))
+            pairs = _json_names(parse_json(as_json.read_text(encoding="utf-8-sig")))
             path = as_json
         elif as_text.is_file():
             pairs = _text_names(as_text.read_text(encoding="utf-8-sig"))

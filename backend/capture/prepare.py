@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from ..shared.defaults import MAX_SIZE
 from ..shared.errors import InputError
 from ..shared.events import Reporter
 from ..shared.formats.atomic import make_folder, write_atomic
-from ..shared.formats.json_file import write_json
+from ..shared.formats.json_file import parse_json, write_json
 from .capture import Capture, Points, View, needs_no_resampling
 from .files import encode_mask, image_size, read_image, write_image
 from .survey import Source, Survey, check_mask, check_size, distinct_ids, refuse, run_in_parallel, survey_capture
@@ -150,7 +149,7 @@ def _identify(path: Path) -> list[Any]:
 def _read_stamp(path: Path, made_from: dict[str, Any], cache: Path) -> dict[str, Any] | None:
     """Read the stamp of cached files; None if they are invalid and must be rebuilt. A damaged cache is not an error."""
     try:
-        stamp = json.loads(path.read_text(encoding="utf-8"))
+        stamp = parse_json(path.read_text(encoding="utf-8"))
         if stamp["made_from"] != made_from:
             return None
         for key in ("image_file", "mask_file"):

@@ -13,6 +13,7 @@ from safetensors.numpy import save
 
 from ..shared.errors import InputError
 from ..shared.formats.atomic import atomic_file, make_folder
+from ..shared.formats.json_file import parse_json
 from ..shared.reconstruction.checkpoint import CURRENT, FORMAT, PREVIOUS
 
 
@@ -72,11 +73,11 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]
         try:
             with safe_open(path, framework="numpy") as file:
                 tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - no dict
-                state = json.loads(file.metadata()["state"])
+                state = parse_json(file.metadata()["state"])
         except (SafetensorError, OSError, ValueError, KeyError, TypeError):
             broken = path
             continue
-        if state.get("format") != FORMAT:
+        if not isinstance(state, dict) or state.get("format") != FORMAT:
             raise InputError(f"{path} was written by another version of ObjectGS; train again with --restart.")
         warning = None
         if broken is not None:

@@ -234,6 +234,7 @@ def test_two_captures_of_one_name_get_folders_of_their_own(extension, tmp_path):
     upright = {"rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}
     cameras = {"capture": str(first), "origin": [0.0, 0.0, 0.0], "upright": upright, "cameras": []}
     (taken / "cameras.json").write_text(json.dumps(cameras))
+    (taken / "objectgs.json").write_text("{}")
     assert _folder_for(first) == taken and _folder_for(second) == taken.with_name("mug-2")
 
 

@@ -13,6 +13,9 @@ import numpy as np
 from ..errors import InputError
 from .atomic import write_atomic
 
+LARGEST = 256 << 20
+"""Bytes of the largest file that `read_json` reads; cameras.json of 10,000 views has 10 MB."""
+
 
 def plain(value: Any, where: str = "value") -> Any:
     """Convert NumPy values, paths and tuples to JSON types, NaN and infinity to None; raise ValueError for others."""
@@ -36,10 +39,24 @@ def write_json(path: Path, value: Any) -> None:
     write_atomic(path, (json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
 
 
+def parse_json(text: str | bytes) -> Any:
+    """Parse JSON; raise ValueError if it is invalid, contains NaN or infinity, or is nested too deeply."""
+
+    def refuse(constant: str) -> None:
+        raise ValueError(f"{constant} is not valid in JSON")
+
+    try:
+        return json.loads(text, parse_constant=refuse)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+
+
 def read_json(path: Path) -> Any:
     """Read a JSON file; raise InputError that names the file if it is missing or invalid."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        if path.stat().st_size > LARGEST:
+            raise ValueError(f"it is larger than {LARGEST >> 20} MB")
+        return parse_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise InputError(f"{path} does not exist; run the step that creates it first.") from error
     except (OSError, ValueError) as error:

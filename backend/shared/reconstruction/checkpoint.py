@@ -7,10 +7,11 @@ contains the training state as a JSON string with `format`, `progress`, `setting
 
 from __future__ import annotations
 
-import json
 import struct
 from dataclasses import dataclass
 from pathlib import Path
+
+from ..formats.json_file import parse_json
 
 CURRENT = "model.safetensors"
 PREVIOUS = "previous.safetensors"
@@ -40,8 +41,8 @@ def read_header(folder: Path) -> CheckpointHeader | None:
     try:
         with (folder / CURRENT).open("rb") as file:
             (length,) = struct.unpack("<Q", file.read(8))
-            header = json.loads(file.read(min(length, LONGEST_HEADER)))
-        progress = json.loads(header["__metadata__"]["state"])["progress"]
+            header = parse_json(file.read(min(length, LONGEST_HEADER)))
+        progress = parse_json(header["__metadata__"]["state"])["progress"]
         return CheckpointHeader(int(progress["step"]), float(progress["seconds"]))
-    except (OSError, ValueError, KeyError, TypeError, struct.error, RecursionError):
+    except (OSError, ValueError, KeyError, TypeError, struct.error):
         return None

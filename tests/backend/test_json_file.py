@@ -1,0 +1,34 @@
+"""JSON files, whatever they contain."""
+
+import pytest
+
+from backend.capture.files import read_labels
+from backend.shared.errors import InputError
+from backend.shared.formats import json_file
+from backend.shared.formats.json_file import parse_json, read_json, write_json
+
+DEEP = "[" * 100_000
+BAD = [DEEP, '{"a": ' * 100_000, "1" * 5000, "[NaN]", "[Infinity]", "{", "", "\xff"]
+
+
+@pytest.mark.parametrize("text", BAD, ids=range(len(BAD)))
+def test_bad_json_is_one_sentence(tmp_path, text):
+    path = tmp_path / "objects.json"
+    path.write_text(text, encoding="latin-1")
+    with pytest.raises(InputError, match=r"objects\.json cannot be read as JSON .*; repair it"):
+        read_json(path)
+    (tmp_path / "labels.json").write_text(text, encoding="latin-1")
+    with pytest.raises(InputError, match=r"labels\.json is not a list of labels"):
+        read_labels(tmp_path)
+
+
+def test_a_huge_file_is_not_read(tmp_path, monkeypatch):
+    write_json(tmp_path / "plan.json", list(range(1000)))
+    assert read_json(tmp_path / "plan.json") == list(range(1000))
+    monkeypatch.setattr(json_file, "LARGEST", 1000)
+    with pytest.raises(InputError, match=r"plan\.json .*larger than"):
+        read_json(tmp_path / "plan.json")
+
+
+def test_good_json_is_read():
+    assert parse_json(b'{"a": [1, 2.5, null, "\\u00e4"]}') == {"a": [1, 2.5, None, "\u00e4"]}
