@@ -4,8 +4,10 @@ import json
 import sys
 
 from .shared.errors import describe_missing_package
+from .shared.signals import block_signals
 
 if __name__ == "__main__":
+    block_signals()
     try:
         from .cli.main import main
 

@@ -7,16 +7,19 @@ import os
 import re
 import unicodedata
 import warnings
-from collections.abc import Iterable
+import zipfile
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from PIL import Image as PilImage
 
 from ..shared.errors import InputError
 from ..shared.formats.atomic import write_atomic
-from ..shared.formats.json_file import parse_json
+from ..shared.formats.json_file import LARGEST, parse_json
+from ..shared.formats.regular_file import open_regular, read_regular, require_regular
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm", ".pgm"}
 MASK_SUFFIXES = (".png", ".npy", ".npz", ".tif", ".tiff", ".bmp")
@@ -109,7 +112,7 @@ def _opened(path: Path) -> PilImage.Image:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", PilImage.DecompressionBombWarning)
-            return PilImage.open(path)
+            return PilImage.open(require_regular(path))
     except _OPENING_ERRORS as error:
         raise _unreadable(path, error) from error
 
@@ -146,6 +149,15 @@ def is_three_channel(path: Path) -> bool:
         return image.mode in ("RGB", "RGBA")
 
 
+def mask_size(path: Path) -> tuple[int, int]:
+    """Read the width and height of a mask from its header; raises InputError with the file's path."""
+    if path.suffix.lower() not in (".npy", ".npz"):
+        return image_size(path)
+    with _opened_array(path) as file:
+        height, width = _array_size(path, file)
+    return width, height
+
+
 def read_mask(path: Path, color: bool | None = None) -> np.ndarray:
     """Read an ID map.
 
@@ -176,28 +188,51 @@ def compact(ids: np.ndarray) -> np.ndarray:
     return ids.astype(np.uint8 if largest < 256 else np.uint16 if largest < 65536 else np.uint32, copy=False)
 
 
-def _array_mask(path: Path) -> np.ndarray:
+@contextmanager
+def _opened_array(path: Path) -> Iterator[BinaryIO]:
+    """Open the array of a .npy or .npz mask for reading; errors are raised as InputError with the file's path."""
     try:
-        loaded: Any = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.lib.npyio.NpzFile):
-            with loaded:
-                names = [n for n in ("ids", "mask", "masks") if n in loaded.files] or loaded.files
+        with ExitStack() as stack:
+            file: Any = stack.enter_context(open_regular(path))
+            if file.read(2) == b"PK":
+                archive = stack.enter_context(zipfile.ZipFile(file))
+                stored = [name.removesuffix(".npy") for name in archive.namelist()]
+                names = [name for name in ("ids", "mask", "masks") if name in stored] or stored
                 if len(names) != 1:
-                    raise InputError(f"{path} holds the arrays {', '.join(names) or '(none)'}; expected one named ids.")
-                loaded = loaded[names[0]]
+                    arrays = ", ".join(names[:10]) or "(none)"
+                    raise InputError(f"{path} holds the arrays {arrays}; expected one named ids.")
+                file = stack.enter_context(archive.open(f"{names[0]}.npy"))
+            else:
+                file.seek(0)
+            yield file
     except InputError:
         raise
     except Exception as error:  # NumPy and zipfile raise many types on damaged files
         if isinstance(error, OSError) and error.strerror:
             raise _unreadable(path, error) from error
         raise InputError(f"{path} cannot be read as a NumPy array: it is damaged or not one; replace it.") from error
-    ids = np.asarray(loaded)
-    if ids.ndim == 3 and 1 in (ids.shape[0], ids.shape[2]):
-        ids = ids[0] if ids.shape[0] == 1 else ids[..., 0]
-    if ids.ndim != 2 or ids.size == 0:
-        raise _not_ids(path, f"its array has the shape {ids.shape}, expected height x width")
-    if ids.dtype.kind not in "buif":
-        raise _not_ids(path, f"its values are of type {ids.dtype}")
+
+
+def _array_size(path: Path, file: BinaryIO) -> tuple[int, int]:
+    """Read the header of an array (h, w), (1, h, w) or (h, w, 1) of numbers, and return its height and width."""
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    if dtype.kind not in "buif":
+        raise _not_ids(path, f"its values are of type {str(dtype)[:40]}")
+    size = shape
+    if len(size) == 3 and 1 in (size[0], size[2]):
+        size = size[1:] if size[0] == 1 else size[:2]
+    if len(size) != 2 or 0 in size:
+        raise _not_ids(path, f"its array has the shape {shape}, expected height x width")
+    return size
+
+
+def _array_mask(path: Path) -> np.ndarray:
+    with _opened_array(path) as file:
+        height, width = _array_size(path, file)
+    with _opened_array(path) as file:
+        ids = np.lib.format.read_array(file, allow_pickle=False).reshape(height, width)
     if ids.dtype.kind == "f":
         with np.errstate(invalid="ignore"):
             if not (np.isfinite(ids).all() and (ids == np.rint(ids)).all()):
@@ -282,16 +317,16 @@ def read_names(folder: Path) -> dict[int, str]:
     """
     as_json, as_text = folder / "labels.json", folder / "labels.txt"
     try:
-        if as_json.is_file():
-            pairs = _json_names(parse_json(as_json.read_text(encoding="utf-8-sig")))
+        if as_json.exists():
+            pairs = _json_names(parse_json(read_regular(as_json, LARGEST).decode("utf-8-sig")))
             path = as_json
-        elif as_text.is_file():
-            pairs = _text_names(as_text.read_text(encoding="utf-8-sig"))
+        elif as_text.exists():
+            pairs = _text_names(read_regular(as_text, LARGEST).decode("utf-8-sig"))
             path = as_text
         else:
             return {}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        path = as_json if as_json.is_file() else as_text
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        path = as_json if as_json.exists() else as_text
         raise InputError(
             f'{path} is not a list of labels; expected {{"1": "mug", "2": "box"}} in JSON or lines like "1 mug".'
         ) from error

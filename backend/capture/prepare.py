@@ -12,6 +12,7 @@ from ..shared.errors import InputError
 from ..shared.events import Reporter
 from ..shared.formats.atomic import make_folder, write_atomic
 from ..shared.formats.json_file import parse_json, write_json
+from ..shared.formats.regular_file import read_regular
 from .capture import Capture, Points, View, needs_no_resampling
 from .files import encode_mask, image_size, read_image, write_image
 from .survey import Source, Survey, check_mask, check_size, distinct_ids, refuse, run_in_parallel, survey_capture
@@ -149,7 +150,7 @@ def _identify(path: Path) -> list[Any]:
 def _read_stamp(path: Path, made_from: dict[str, Any], cache: Path) -> dict[str, Any] | None:
     """Read the stamp of cached files; None if they are invalid and must be rebuilt. A damaged cache is not an error."""
     try:
-        stamp = parse_json(path.read_text(encoding="utf-8"))
+        stamp = parse_json(read_regular(path))
         if stamp["made_from"] != made_from:
             return None
         for key in ("image_file", "mask_file"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -28,6 +28,7 @@ from .files import (
     is_color_mask,
     is_three_channel,
     mask_names,
+    mask_size,
     read_image,
     read_mask,
     read_names,
@@ -38,6 +39,12 @@ Problem = Callable[[str], None]
 """Handler of a problem, given as a sentence; either raises or collects it."""
 
 _ASPECT_TOLERANCE = 0.01
+_PIXELS_AT_ONCE = 100_000_000
+"""Number of pixels that may be processed at a time, with about 15 bytes for each."""
+_LARGEST_MASK = 4
+"""Largest factor by which a mask's sides may be longer than its image's, which limits the memory to read it."""
+_SMALL = 64
+"""Longer side in pixels of an image that is considered small; masks of smaller ones may be as large as its."""
 _T = TypeVar("_T")
 _R = TypeVar("_R")
 
@@ -193,6 +200,8 @@ def _is_color_coded(sources: list[Source], problem: Problem) -> bool:
     """Return whether three-channel masks encode IDs as colors, for the whole capture, as ID 65,793 encodes as gray."""
     for source in sources:
         if source.mask_path is not None:
+            if _tolerate(problem, partial(check_mask_size, source), None) is None:
+                continue
             if not _tolerate(problem, partial(is_three_channel, source.mask_path), True):
                 return False
             if _tolerate(problem, partial(is_color_mask, source.mask_path), False):
@@ -213,24 +222,39 @@ def check_size(source: Source, size: tuple[int, int], cameras_file: Path) -> Non
 def check_mask(source: Source, color: bool) -> np.ndarray:
     """Read a mask from disk without resampling; raises InputError if its aspect ratio differs from the image's."""
     assert source.mask_path is not None
-    ids = read_mask(source.mask_path, color)
-    height, width = ids.shape
+    check_mask_size(source)
+    return read_mask(source.mask_path, color)
+
+
+def check_mask_size(source: Source) -> tuple[int, int]:
+    """Return a mask's width and height from its header.
+
+    Raises InputError if the aspect ratio differs from the image's, or if the mask is far larger than the image.
+    """
+    assert source.mask_path is not None
     camera = source.camera
+    width, height = mask_size(source.mask_path)
     # A difference of one pixel is due to rounding.
     expected = height * camera.width / camera.height
-    if abs(width - expected) > max(1.0, _ASPECT_TOLERANCE * expected):
+    is_larger = max(width, height) > _LARGEST_MASK * max(camera.width, camera.height, _SMALL)
+    if is_larger or abs(width - expected) > max(1.0, _ASPECT_TOLERANCE * expected):
         raise InputError(
             f"{source.mask_path} is {width}x{height} pixels, but its image {source.image_path.name} is "
             f"{camera.width}x{camera.height}; make the mask the image's size."
         )
-    return ids
+    return width, height
 
 
-def run_in_parallel(work: Callable[[_T], _R], items: Iterable[_T]) -> Iterator[_R]:
-    """Process items in parallel and yield the results in order; the first error cancels items not yet started."""
-    pool = ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1)))
+def run_in_parallel(work: Callable[[Source], _R], sources: Sequence[Source]) -> Iterator[_R]:
+    """Process images in parallel and yield the results in order; the first error cancels images not yet started.
+
+    Large images are processed by fewer threads, to limit memory.
+    """
+    pixels = max((source.camera.width * source.camera.height for source in sources), default=1)
+    fitting = _PIXELS_AT_ONCE // max(pixels, 1)
+    pool = ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1, fitting)))
     try:
-        yield from pool.map(work, items)
+        yield from pool.map(work, sources)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import TextIO
 
 from ..shared.console import ConsoleReporter
 from ..shared.errors import (
@@ -18,8 +22,13 @@ from ..shared.errors import (
     describe_missing_package,
 )
 from ..shared.events import JsonReporter, Reporter
+from ..shared.signals import held_signals
 from ..shared.stopping import StoppingReporter, StopRequest
 from .parser import UsageError, build_parser
+
+_OUTPUT_ERRORS = (errno.EPIPE, errno.ENOSPC, errno.EIO, errno.EBADF, errno.EFBIG)
+_LONGEST = 1000
+"""Number of characters of an error message; names and paths in it may be longer."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -32,51 +41,92 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit code: `EXIT_DONE`, `EXIT_BAD_INPUT`, `EXIT_CANCELLED` or `EXIT_FAILED`.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    _prepare_streams()
     reporter = _reporter(as_json="--json" in arguments)
     try:
-        return _run(arguments, reporter)
-    except BrokenPipeError:
-        # The reader has closed the pipe. Otherwise Python would fail again when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return EXIT_CANCELLED
-    finally:
+        code = _run(arguments, reporter)
         reporter.close()
+        return code
+    except BrokenPipeError:
+        # The reader has closed the pipe.
+        _discard(sys.stdout)
+        return EXIT_CANCELLED
+    except OSError as error:
+        _discard(sys.stdout)
+        with suppress(OSError):
+            print(f"error: The output could not be written ({error.strerror}).", file=sys.stderr, flush=True)
+            return EXIT_FAILED
+        _discard(sys.stderr)
+        return EXIT_FAILED
+
+
+def _prepare_streams() -> None:
+    """Replace closed output streams, and let the others escape characters that their encoding does not have."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _tell(report: Callable[[str], None], sentence: str) -> None:
+    """Report how a command ended; if that cannot be written, the exit code alone says it."""
+    try:
+        report(sentence)
+    except OSError:
+        _discard(sys.stdout)
+        _discard(sys.stderr)
+
+
+def _discard(stream: TextIO) -> None:
+    """Discard the rest of a stream's output. Otherwise Python would fail again when it flushes it at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _run(arguments: list[str], reporter: Reporter) -> int:
     stop = StopRequest(announce=reporter.status)
     try:
         options = build_parser().parse_args(arguments)
-        # Before signals are handled, since pycolmap installs its own SIGTERM handler when it is imported.
-        from ..commands import COMMANDS
-        from ..commands.setup.machine import set_threads
+        with ExitStack() as stack:
+            with held_signals():
+                # Before signals are handled, since pycolmap installs its own SIGTERM handler when it is imported.
+                from ..commands import COMMANDS
+                from ..commands.setup.machine import set_threads
 
-        with stop.listening(read_stdin=options.json):
+                stack.enter_context(stop.listening(read_stdin=options.json))
             set_threads(options.threads)
             COMMANDS[options.command](options, StoppingReporter(reporter, stop))
         return EXIT_DONE
     except (InputError, UsageError) as error:
-        reporter.error(str(error))
+        _tell(reporter.error, _shortened(str(error)))
         return EXIT_BAD_INPUT
     except (Cancelled, KeyboardInterrupt) as error:
-        reporter.stopped(str(error) or "Stopped immediately.")
+        _tell(reporter.stopped, str(error) or "Stopped immediately.")
         return EXIT_CANCELLED
-    except BrokenPipeError:
-        raise
     except Exception as error:
+        if isinstance(error, OSError) and error.filename is None and error.errno in _OUTPUT_ERRORS:
+            raise  # Files are written with their names in the error, so this is a stream.
         sentence = _describe_error(error)
         if sentence:
-            reporter.error(sentence)
+            _tell(reporter.error, _shortened(sentence))
             return EXIT_BAD_INPUT
         import traceback
 
         traceback.print_exc(file=sys.stderr)
-        reporter.error(f"Unexpected error: {type(error).__name__}: {' '.join(str(error).split())}")
+        _tell(reporter.error, _shortened(f"Unexpected error: {type(error).__name__}: {error}"))
         return EXIT_FAILED
 
 
 def _reporter(as_json: bool) -> Reporter:
     return JsonReporter() if as_json else ConsoleReporter()
+
+
+def _shortened(sentence: str) -> str:
+    """Return a sentence without the middle of what the user's input has made longer than `_LONGEST`, on one line."""
+    sentence = " ".join(sentence.split())
+    half = _LONGEST // 2
+    return sentence if len(sentence) <= _LONGEST else f"{sentence[:half]} ... {sentence[-half:]}"
 
 
 def _describe_error(error: Exception) -> str | None:

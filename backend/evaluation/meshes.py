@@ -18,6 +18,7 @@ from ..raster import devices
 from ..shared.errors import InputError
 from ..shared.events import Reporter
 from ..shared.formats.mesh_ply import Mesh, read_mesh
+from ..shared.formats.regular_file import read_regular, require_regular
 from ..shared.reconstruction.meshes import MeshEntry, read_meshes
 from ..training.scene import Scene
 from .mesh_shape import Shape, shape_of
@@ -146,9 +147,9 @@ def against_truth(mesh: Mesh, true: TrueMesh, truth: Truth, ids: Sequence[int]) 
 def read_texture(path: Path) -> np.ndarray:
     """Read a mesh's texture (S, S, 3) uint8 sRGB. Raises InputError if the file cannot be read."""
     try:
-        with Image.open(path) as picture:
+        with Image.open(require_regular(path)) as picture:
             return np.asarray(picture.convert("RGB"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path} cannot be read ({error}); make the meshes again.") from error
 
 
@@ -264,7 +265,7 @@ def digest(folder: Path, entry: MeshEntry) -> str:
     sha = hashlib.sha256()
     for name in (entry.file, entry.texture):
         if name and (folder / name).exists():
-            sha.update((folder / name).read_bytes())
+            sha.update(read_regular(folder / name))
     return sha.hexdigest()[:16]
 
 

@@ -21,6 +21,7 @@ from ..raster import Camera
 from ..shared.errors import InputError
 from ..shared.formats.json_file import read_json
 from ..shared.formats.ply import LONGEST_HEADER, read_vertices
+from ..shared.formats.regular_file import read_regular, require_regular
 
 VIEWS_TO_COUNT = 2
 """Number of views in which a point of the surface must be visible to count as seen."""
@@ -147,7 +148,7 @@ def load_truth(capture: Capture, indices: Sequence[int]) -> Truth | None:
     content = read_json(listed)
     try:
         files = {int(entry["id"]): capture.folder / "truth" / entry["mesh"] for entry in content["objects"]}
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{listed} is not a valid list of meshes ({error!r}); make the capture again.") from error
     return Truth({i: _read_mesh(path) for i, path in files.items()}, capture, indices)
 
@@ -155,7 +156,7 @@ def load_truth(capture: Capture, indices: Sequence[int]) -> Truth | None:
 def _read_mesh(path: Path) -> TrueMesh:
     table = read_vertices(path)
     vertices = np.stack([table[name] for name in "xyz"], 1).astype(np.float64)
-    data = path.read_bytes()
+    data = read_regular(path)
     end = data.find(b"end_header\n", 0, LONGEST_HEADER) + len(b"end_header\n")
     lines = data[:end].decode("ascii", "replace").splitlines()
     counts = [int(line.split()[2]) for line in lines if line.startswith("element face ")]
@@ -175,10 +176,10 @@ def _read_view(capture: Capture, index: int) -> _View:
     depth_file = capture.folder / "truth" / "depth" / name.with_suffix(".npy")
     ids_file = capture.folder / "truth" / "masks" / name.with_suffix(".png")
     try:
-        depth = np.load(depth_file)
-        with Image.open(ids_file) as picture:
+        depth = np.load(require_regular(depth_file))
+        with Image.open(require_regular(ids_file)) as picture:
             ids = np.asarray(picture)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{depth_file} or {ids_file} cannot be read ({error}); make the capture again.") from error
     if depth.ndim != 2 or ids.shape != depth.shape:
         raise InputError(f"{depth_file} and {ids_file} differ in size; make the capture again.")

@@ -160,7 +160,7 @@ def read_splats(path: Path) -> tuple[Splats, list[str]]:
         )
     rest_count = sum(name.startswith("f_rest_") for name in names)
     coefficients = rest_count // 3 + 1
-    if rest_count % 3 or math.isqrt(coefficients) ** 2 != coefficients:
+    if rest_count not in (0, 9, 24, 45):
         raise InputError(f"{path} has {rest_count} properties f_rest_*; 0, 9, 24 or 45 were expected.")
     rest_names = [f"f_rest_{i}" for i in range(rest_count)]
     if any(name not in names for name in rest_names):

@@ -13,6 +13,7 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from ..shared.formats.atomic import atomic_path
+from ..shared.formats.regular_file import open_regular
 
 DIGEST = "objectgs/digest"
 _MAGIC = bytes.fromhex("762f3101")
@@ -38,13 +39,14 @@ def write(path: Path, channels: Mapping[str, NDArray], header: Mapping[str, Any]
         try:
             OpenEXR.File(entries, planes).write(str(part))
         except RuntimeError as error:
-            raise OSError(0, str(error)) from error
+            # Its message is of several sentences and contains the path of the temporary file.
+            raise OSError(0, "OpenEXR cannot write it; is the disk full?") from error
 
 
 def digest_of(path: Path) -> str | None:
     """Return the digest in a complete file of `write`; None if the file is truncated, missing or of another program."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
             if file.read(4) != _MAGIC:
                 return None

@@ -18,6 +18,7 @@ from ..model.splats import Splats, concatenate
 from ..raster import devices
 from ..shared.class_table import ClassTable
 from ..shared.events import Reporter
+from ..shared.formats.regular_file import open_regular
 from ..shared.reconstruction.folder import Reconstruction
 from ..shared.reconstruction.objects import SceneObject, default_name, read_objects
 from ..shared.reconstruction.shot import Frame, Placed, Sample, Shot
@@ -127,7 +128,7 @@ class Stage:
 
 
 def _digest_of(path: Path, objects: list[SceneObject], primitive: str) -> str:
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         content = hashlib.file_digest(file, "sha256").hexdigest()
     drawn = [replace(entry, color=(0, 0, 0), points=0) for entry in objects]
     return f"{_FORMAT} {content} {drawn!r} {primitive}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,15 @@ from safetensors.numpy import save
 from ..shared.errors import InputError
 from ..shared.formats.atomic import atomic_file, make_folder
 from ..shared.formats.json_file import parse_json
+from ..shared.formats.regular_file import require_regular
 from ..shared.reconstruction.checkpoint import CURRENT, FORMAT, PREVIOUS
+
+Tensors = dict[str, np.ndarray]
+Check = Callable[[Tensors, dict[str, Any]], None]
+
+
+def _accept(_tensors: Tensors, _state: dict[str, Any]) -> None:
+    """Accept any tensors and state."""
 
 
 def save_checkpoint(
@@ -56,8 +65,13 @@ def has_checkpoint(folder: Path) -> bool:
     return any((folder / name).exists() for name in (CURRENT, PREVIOUS))
 
 
-def load_checkpoint(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None] | None:
+def load_checkpoint(folder: Path, check: Check = _accept) -> tuple[Tensors, dict[str, Any], str | None] | None:
     """Read the latest complete checkpoint.
+
+    Args:
+        folder: Folder of the checkpoints.
+        check: Called with the tensors and the state, both as stored; raises ValueError, KeyError or TypeError if they
+            are not those of a training.
 
     Returns:
         The tensors, the state, and a warning or None; None if there is no checkpoint.
@@ -71,13 +85,16 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]
         if not path.exists():
             continue
         try:
-            with safe_open(path, framework="numpy") as file:
+            with safe_open(require_regular(path), framework="numpy") as file:
                 tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - no dict
-                state = parse_json(file.metadata()["state"])
-        except (SafetensorError, OSError, ValueError, KeyError, TypeError):
+                state = dict(parse_json(file.metadata()["state"]))
+            is_other_version = isinstance(state["format"], int) and state["format"] != FORMAT
+            if not is_other_version:
+                check(tensors, state)
+        except (SafetensorError, OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError):
             broken = path
             continue
-        if not isinstance(state, dict) or state.get("format") != FORMAT:
+        if is_other_version:
             raise InputError(f"{path} was written by another version of ObjectGS; train again with --restart.")
         warning = None
         if broken is not None:

@@ -47,7 +47,8 @@ class JsonReporter(Reporter):
 
     def _emit(self, type: str, **fields: Any) -> None:
         event = {"type": type, "time": round(time.time(), 3), **fields}
-        self.stream.write(json.dumps(plain(event), ensure_ascii=False, allow_nan=False) + "\n")
+        # ASCII, whatever the encoding of the stream; names of files may contain lone surrogates.
+        self.stream.write(json.dumps(plain(event), allow_nan=False) + "\n")
         self.stream.flush()
 
     def status(self, message: str) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 
 from .errors import Cancelled
 from .events import Reporter
+from .signals import STOPPING
 
 _ASKED_EVERY = 0.1
 """Polling interval in seconds while paused."""
@@ -66,7 +67,7 @@ class StopRequest:
         if threading.current_thread() is not threading.main_thread():
             yield
             return
-        before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+        before = {number: signal.signal(number, on_signal) for number in STOPPING}
         try:
             yield
         finally:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +19,17 @@ from ..model.object_model import Normalization, ObjectModel
 from ..raster import devices
 from ..shared.class_table import ClassTable
 from ..shared.errors import InputError
+from ..shared.formats.typed import typed
+from ..shared.reconstruction.objects import LARGEST_ID
 from .average import Average
 from .budget import TrainingProgress
-from .settings import Settings
+from .settings import HEAD_RATES, Settings
 
 _GROWTH = ("gradient", "visits", "opacity", "views")
 _HEAD_ADAM = ("step", "exp_avg", "exp_avg_sq")
+
+Expected = dict[str, tuple[type, tuple[int, ...]]]
+"""Type and shape of tensors by name."""
 
 _FORMER_TENSORS = {"adam.first": "adam.exp_avg", "adam.second": "adam.exp_avg_sq"}
 _FORMER_KEYS = {"teach_unlabelled": "supervise_background", "centre": "center", "settled_from": "converged_at"}
@@ -38,15 +45,20 @@ def read_checkpoint(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]
     Raises:
         InputError: there are checkpoint files, but none can be read.
     """
-    found = load_checkpoint(folder)
+    found = load_checkpoint(folder, lambda tensors, state: _check_training(*_renamed(tensors, state)))
     if found is None:
         return None
     tensors, state, warning = found
+    return *_renamed(tensors, state), warning
+
+
+def _renamed(tensors: dict[str, np.ndarray], state: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Replace names of older versions by the present ones."""
     tensors = {_FORMER_TENSORS.get(name, name): tensor for name, tensor in tensors.items()}
     state = {_FORMER_KEYS.get(key, key): value for key, value in state.items()}
     for part in ("normalization", "progress"):
         state[part] = {_FORMER_KEYS.get(key, key): value for key, value in state[part].items()}
-    return tensors, state, warning
+    return tensors, state
 
 
 def training_tensors(
@@ -142,3 +154,81 @@ def load_model(folder: Path, device: torch.device = devices.CPU) -> tuple[Object
 def progress_of(state: dict[str, Any]) -> TrainingProgress:
     """Return the training's progress stored in a checkpoint's state."""
     return TrainingProgress(**json.loads(json.dumps(state["progress"])))
+
+
+def _check_training(tensors: dict[str, np.ndarray], state: dict[str, Any]) -> None:
+    """Check that tensors and state are those that `training_tensors` and `Trainer.save` write.
+
+    Types, shapes, values that are not finite, and indices are checked, so that nothing fails later.
+
+    Raises:
+        ValueError, KeyError, TypeError: They are not.
+    """
+    settings = Settings(**typed(Settings, state["settings"]))
+    TrainingProgress(**typed(TrainingProgress, state["progress"]))
+    _check_state(settings, state)
+    columns, k = settings.layout.columns, settings.offsets
+    count, classes = len(tensors["anchors.positions"]), len(tensors["object_ids"])
+    f4, i4 = np.float32, np.int32
+    expected: Expected = {
+        "anchors.positions": (f4, (count, 3)),
+        "anchors.rows": (f4, (count, columns)),
+        "anchors.ids": (i4, (count,)),
+        "adam.exp_avg": (f4, (count, columns)),
+        "adam.exp_avg_sq": (f4, (count, columns)),
+        "growth.gradient": (f4, (count * k,)),
+        "growth.visits": (i4, (count * k,)),
+        "growth.opacity": (f4, (count,)),
+        "growth.views": (i4, (count,)),
+        "object_ids": (np.int64, (classes,)),
+        "background": (f4, (3,)),
+    }
+    _check_tensors(tensors, expected)
+    # The heads are created only now, since their size depends on settings that the tensors have confirmed.
+    heads = Heads(settings.layout, settings.mode, settings.sh_degree, torch.Generator())
+    shapes: Expected = {f"heads.{name}": (f4, tuple(value.shape)) for name, value in heads.state_dict().items()}
+    if any(name.startswith("mean.") for name in tensors):
+        shapes |= {f"mean.{name}": shape for name, shape in shapes.items()}
+        shapes |= {"mean.rows": (f4, (count, columns)), "mean.background": (f4, (3,))}
+    _check_tensors(tensors, shapes)
+    ordered = [value for name in HEAD_RATES if name != "background" for value in getattr(heads, name).parameters()]
+    _check_head_moments(tensors, [*(tuple(value.shape) for value in ordered), (3,)])
+    ids = tensors["object_ids"]
+    if not (np.diff(ids) > 0).all() or not (len(ids) and ids[0] == 0 and ids[-1] <= LARGEST_ID):
+        raise ValueError("object_ids are not ascending from 0")
+    if count and not 0 <= tensors["anchors.ids"].min() <= tensors["anchors.ids"].max() < classes:
+        raise ValueError("anchors have classes that do not exist")
+
+
+def _check_state(settings: Settings, state: dict[str, Any]) -> None:
+    if not isinstance(state["supervise_background"], bool):
+        raise TypeError("supervise_background is not a boolean")
+    center, scale = state["normalization"]["center"], state["normalization"]["scale"]
+    if len(center) != 3 or not all(map(math.isfinite, center)) or not (math.isfinite(scale) and scale > 0):
+        raise ValueError("the normalization is invalid")
+    if not (math.isfinite(state["voxel"]) and state["voxel"] > 0):
+        raise ValueError("the voxel size is invalid")
+    choices = {"mode": ("explicit", "view"), "primitive": ("3d", "2d"), "background": ("learned", "black", "white")}
+    if any(getattr(settings, name) not in values for name, values in choices.items()):
+        raise ValueError("a setting is unknown")
+    if not (0 <= settings.sh_degree <= 3 and 1 <= settings.offsets <= 1000 and settings.max_anchors >= 1):
+        raise ValueError("a setting is out of range")
+    np.random.default_rng().bit_generator.state = state["rng"]
+
+
+def _check_tensors(tensors: Mapping[str, np.ndarray], expected: Expected) -> None:
+    for name, (dtype, shape) in expected.items():
+        tensor = tensors[name]
+        if tensor.dtype != dtype or tensor.shape != shape:
+            raise ValueError(f"{name} is {tensor.dtype} {tensor.shape}, expected {np.dtype(dtype)} {shape}")
+        if tensor.dtype.kind == "f" and not np.isfinite(tensor).all():
+            raise ValueError(f"{name} is not finite")
+
+
+def _check_head_moments(tensors: Mapping[str, np.ndarray], shapes: Sequence[tuple[int, ...]]) -> None:
+    """Check the state of the heads' optimizer; shapes: those of its parameters, in order."""
+    for i, shape in enumerate(shapes):
+        if f"head_adam.{i}.step" in tensors:
+            # A scalar is stored with one dimension.
+            kinds: Expected = {f"head_adam.{i}.{name}": (np.float32, shape) for name in _HEAD_ADAM[1:]}
+            _check_tensors(tensors, {**kinds, f"head_adam.{i}.step": (np.float32, (1,))})

@@ -716,7 +716,7 @@ def spoil(scene, what: str) -> tuple[str, ...]:
         return "masks/view_000.npy", arrays[what][1]
     if what == "pickled mask":
         np.save(path.with_suffix(".npy"), np.array([{}], object), allow_pickle=True)
-        return "masks/view_000.npy", "cannot be read"
+        return "masks/view_000.npy", "values are of type object"
     assert what == "empty npz", what
     np.savez(path.with_suffix(".npz"))
     return "masks/view_000.npz", "(none)"

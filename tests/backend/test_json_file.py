@@ -2,7 +2,7 @@
 
 import pytest
 
-from backend.capture.files import read_labels
+from backend.capture.files import read_names
 from backend.shared.errors import InputError
 from backend.shared.formats import json_file
 from backend.shared.formats.json_file import parse_json, read_json, write_json
@@ -19,7 +19,7 @@ def test_bad_json_is_one_sentence(tmp_path, text):
         read_json(path)
     (tmp_path / "labels.json").write_text(text, encoding="latin-1")
     with pytest.raises(InputError, match=r"labels\.json is not a list of labels"):
-        read_labels(tmp_path)
+        read_names(tmp_path)
 
 
 def test_a_huge_file_is_not_read(tmp_path, monkeypatch):

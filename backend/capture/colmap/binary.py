@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ...shared.errors import InputError
+from ...shared.formats.regular_file import read_regular
 from .model import CAMERA_MODELS, EXPORT_AGAIN, Camera, RawImage, RawPoints, decode_name
 
 _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
@@ -20,7 +21,7 @@ class _Reader:
 
     def __init__(self, path: Path, content: str) -> None:
         self.path, self.content = path, content
-        self.data = path.read_bytes()
+        self.data = read_regular(path)
         self.at = 0
         self.index = 0
         self.count = 0

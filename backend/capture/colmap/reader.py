@@ -14,11 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from ...shared.errors import InputError
+from ...shared.formats.regular_file import open_regular
 from .binary import read_cameras_binary, read_images_binary, read_points_binary
 from .model import EXPORT_AGAIN, FILE_STEMS, Camera, Image, Model, RawImage
 from .text import read_cameras_text, read_images_text, read_points_text
 
 _LARGEST_SIDE = 1 << 20
+_FARTHEST = 1e12
+"""Largest absolute coordinate of points and cameras; beyond, distances have no precision left."""
 
 
 def find_model(folder: Path) -> tuple[Path, list[str]]:
@@ -114,9 +117,9 @@ def _count_images(folder: Path) -> int:
     """Return the number of images according to the model's header; -1 if unknown."""
     try:
         if _suffix_of(folder) == ".bin":
-            with (folder / "images.bin").open("rb") as file:
+            with open_regular(folder / "images.bin") as file:
                 return int(struct.unpack("<Q", file.read(8))[0])
-        with (folder / "images.txt").open("rb") as file:
+        with open_regular(folder / "images.txt") as file:
             return sum(1 for line in file if not line.startswith(b"#")) // 2
     except (OSError, struct.error):
         return -1
@@ -141,10 +144,12 @@ def _validate(model: Model, raw: list[RawImage]) -> Model:
     for camera_id in sorted(used):
         _check_camera(model.cameras[camera_id], model.file("cameras"))
 
-    finite = np.isfinite(model.xyz).all(1)
+    with np.errstate(invalid="ignore"):
+        finite = (np.abs(model.xyz) <= _FARTHEST).all(1)
     if not finite.all():
         model.warnings.append(
-            f"{points_file} holds {int((~finite).sum())} points that are not finite; they are left out."
+            f"{points_file} holds {int((~finite).sum())} points whose coordinates are not finite or exceed "
+            f"{_FARTHEST:g}; they are left out."
         )
     if int(finite.sum()) < 4:
         raise InputError(
@@ -180,6 +185,8 @@ def _compute_viewmat(image: RawImage, path: Path) -> np.ndarray:
         raise InputError(
             f"{path} gives image {image.name} a pose that is not a number (NaN, infinite or zero); {EXPORT_AGAIN}."
         )
+    if np.abs(t).max() > _FARTHEST:
+        raise InputError(f"{path} gives image {image.name} a position beyond {_FARTHEST:g}; {EXPORT_AGAIN}.")
     w, x, y, z = q / norm
     viewmat = np.eye(4)
     viewmat[:3, :3] = [

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from ...shared.errors import InputError
+from ...shared.formats.regular_file import read_regular
 from .model import CAMERA_MODELS, EXPORT_AGAIN, Camera, RawImage, RawPoints, decode_name
 
 _PARAMETER_COUNTS = {name: count for name, count in CAMERA_MODELS.values()}
 
 
 def _read_lines(path: Path) -> list[bytes]:
-    return [line.rstrip(b"\r") for line in path.read_bytes().split(b"\n")]
+    return [line.rstrip(b"\r") for line in read_regular(path).split(b"\n")]
 
 
 def _malformed_line(path: Path, number: int, expected: str) -> InputError:

@@ -92,7 +92,8 @@ def _write(options: argparse.Namespace, stage: Stage, shot: Shot, frame: Frame, 
         buffer = io.BytesIO()
         Image.fromarray(to_srgb_8bit(image.rgba), "RGBA").save(buffer, "PNG", compress_level=3)
         write_atomic(path.with_suffix(".png"), buffer.getvalue())
-    else:
+    elif exr.digest_of(path) is not None:
+        # An earlier frame of this command had a PNG, which would be out of date.
         path.with_suffix(".png").unlink(missing_ok=True)
     header = {
         **cryptomatte.header(MATTES, stage.names),

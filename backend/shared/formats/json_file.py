@@ -12,8 +12,9 @@ import numpy as np
 
 from ..errors import InputError
 from .atomic import write_atomic
+from .regular_file import read_regular
 
-LARGEST = 256 << 20
+LARGEST = 64 << 20
 """Bytes of the largest file that `read_json` reads; cameras.json of 10,000 views has 10 MB."""
 
 
@@ -54,9 +55,7 @@ def parse_json(text: str | bytes) -> Any:
 def read_json(path: Path) -> Any:
     """Read a JSON file; raise InputError that names the file if it is missing or invalid."""
     try:
-        if path.stat().st_size > LARGEST:
-            raise ValueError(f"it is larger than {LARGEST >> 20} MB")
-        return parse_json(path.read_text(encoding="utf-8"))
+        return parse_json(read_regular(path, LARGEST).decode("utf-8"))
     except FileNotFoundError as error:
         raise InputError(f"{path} does not exist; run the step that creates it first.") from error
     except (OSError, ValueError) as error:

@@ -10,6 +10,7 @@ import numpy as np
 from ..errors import InputError
 from .atomic import atomic_file
 from .ply import LONGEST_HEADER
+from .regular_file import read_regular
 
 _VERTEX = np.dtype([("xyz", "<f8", 3), ("normal", "<f4", 3), ("color", "u1", 3)])
 _FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3), ("values", "u1"), ("uv", "<f4", 6), ("unobserved", "u1")])
@@ -78,7 +79,7 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
 def read_mesh(path: Path) -> Mesh:
     """Read a file of `write_mesh`; raise InputError that names the file if it is missing, truncated or different."""
     try:
-        data = path.read_bytes()
+        data = read_regular(path)
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror or error}).") from error
     end = data.find(b"end_header\n", 0, LONGEST_HEADER) + len(b"end_header\n")

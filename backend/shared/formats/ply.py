@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import InputError
 from .atomic import atomic_file
+from .regular_file import open_regular
 
 LONGEST_HEADER = 1 << 20
 
@@ -55,7 +56,7 @@ def read_vertices(path: Path) -> np.ndarray:
         InputError: The file is missing, truncated or ASCII, or has no vertices with scalar properties.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             return _read(file, path)
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror or error}).") from error

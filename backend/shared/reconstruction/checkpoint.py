@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..formats.json_file import parse_json
+from ..formats.regular_file import open_regular
 
 CURRENT = "model.safetensors"
 PREVIOUS = "previous.safetensors"
@@ -39,7 +40,7 @@ def read_header(folder: Path) -> CheckpointHeader | None:
         The header, or None if there is no checkpoint or its header cannot be read.
     """
     try:
-        with (folder / CURRENT).open("rb") as file:
+        with open_regular(folder / CURRENT) as file:
             (length,) = struct.unpack("<Q", file.read(8))
             header = parse_json(file.read(min(length, LONGEST_HEADER)))
         progress = parse_json(header["__metadata__"]["state"])["progress"]

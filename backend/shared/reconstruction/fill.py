@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import InputError
+from ..formats.regular_file import open_regular
 from .folder import Reconstruction
 from .objects import SceneObject
 
@@ -63,7 +64,7 @@ def _digest(path: Path) -> str:
         state = path.stat()
         stamp = state.st_mtime_ns, state.st_size
         if _digests.get(path, (None, ""))[0] != stamp:
-            with path.open("rb") as file:
+            with open_regular(path) as file:
                 _digests[path] = stamp, hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror or error}).") from error

@@ -13,11 +13,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from typing import Any, TypeVar
 
 from ..errors import InputError
 from ..formats.json_file import read_json, write_json
+from ..formats.typed import typed
 from ..version import __version__
 from .folder import Reconstruction
 
@@ -167,10 +168,9 @@ def _part(content: Mapping[str, Any], name: str, read: Callable[[Any], _Part]) -
     return None if content.get(name) is None else read(content[name])
 
 
-def _as(cls: Callable[..., _Part]) -> Callable[[Any], _Part]:
+def _as(cls: type[_Part]) -> Callable[[Any], _Part]:
     """Return a function that converts a JSON object to a dataclass and ignores unknown fields of other versions."""
-    known = {entry.name for entry in fields(cls)}  # type: ignore[arg-type]
-    return lambda values: cls(**{name: value for name, value in values.items() if name in known})
+    return lambda values: cls(**typed(cls, values))
 
 
 def _training(values: Mapping[str, Any]) -> TrainingRecord:

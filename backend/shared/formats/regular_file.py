@@ -1,0 +1,32 @@
+"""Opening of files for reading; pipes and devices are refused, since they may block or never end."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from io import BufferedReader
+from pathlib import Path
+
+
+def require_regular(path: Path) -> Path:
+    """Return `path`; raise OSError with a `strerror` if it is missing, a folder, a pipe or a device."""
+    mode = path.stat().st_mode
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(mode):
+        raise OSError(errno.EINVAL, "it is a pipe or a device", str(path))
+    return path
+
+
+def open_regular(path: Path) -> BufferedReader:
+    """Open a file for reading; raise OSError as `require_regular`."""
+    return require_regular(path).open("rb")
+
+
+def read_regular(path: Path, largest: int | None = None) -> bytes:
+    """Read a file; raise OSError as `require_regular`, and ValueError if it has more than `largest` bytes."""
+    with open_regular(path) as file:
+        if largest is not None and os.fstat(file.fileno()).st_size > largest:
+            raise ValueError(f"it is larger than {largest >> 20} MB")
+        return file.read()
