@@ -64,7 +64,8 @@ def damaged_capture(folder: Path, templates: Templates, rng: random.Random) -> C
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         kind = rng.choice(kinds)
         path = rng.choice([path for path in files if (path.parent.name, path.suffix, path.name[:2]) == kind])
-        what.append(_damage(path, rng))
+        if path.is_file():
+            what.append(_damage(path, rng))
     command = rng.choice(("check", "import", "vote", "plan", "train", "train"))
     arguments: list[Any] = [command, capture]
     if command not in ("check", "plan"):
@@ -146,8 +147,8 @@ def damaged_reconstruction(folder: Path, templates: Templates, rng: random.Rando
     top = [path for path in files if path.parent in (out, out / "checkpoint") or path.suffix in (".json", ".ply")]
     path = rng.choice(top if rng.random() < 0.9 else files)
     what = _damage(path, rng)
-    if rng.random() < 0.1:
-        what += "; " + _damage(rng.choice(top), rng)
+    if rng.random() < 0.1 and (second := rng.choice(top)).is_file():
+        what += "; " + _damage(second, rng)
     return Case(
         "damaged reconstruction", what, _command_for(folder, templates, rng), writes=("out", "made"),
         keeps=("out/notes.txt", "out/scenes"),

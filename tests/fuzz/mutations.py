@@ -225,13 +225,13 @@ def png_bomb(width: int, height: int) -> bytes:
 
 
 def npz_bomb(entries: int) -> bytes:
-    """Return a small .npz whose array `ids` has this number of entries, all 0, of 8 bytes."""
+    """Return a small .npz whose array `ids` has this number of entries, all 0, of 8 bytes; at most 512 MB are there."""
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "<i8", "fortran_order": False, "shape": (1, entries)})
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("ids.npy", "w") as file:
         file.write(header.getvalue())
-        for _ in range(8 * entries >> 24):
+        for _ in range(min(8 * entries >> 24, 32)):
             file.write(bytes(1 << 24))
     return buffer.getvalue()
 

@@ -17,7 +17,7 @@ from backend.shared.formats.atomic import PART_PREFIX
 
 ROOT = Path(__file__).resolve().parents[2]
 MEMORY_MB = 2000
-SECONDS = 60
+SECONDS = 40
 _LONGEST_SENTENCE = 2000
 
 
