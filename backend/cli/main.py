@@ -19,6 +19,7 @@ from ..shared.errors import (
 )
 from ..shared.events import JsonReporter, Reporter
 from ..shared.stopping import StoppingReporter, StopRequest
+from .kernel_cache import use_private_cache
 from .parser import UsageError, build_parser
 
 
@@ -47,6 +48,9 @@ def _run(arguments: list[str], reporter: Reporter) -> int:
     stop = StopRequest(announce=reporter.status)
     try:
         options = build_parser().parse_args(arguments)
+        refused = use_private_cache()
+        if refused:
+            reporter.warning(refused)
         # Before signals are handled, since pycolmap installs its own SIGTERM handler when it is imported.
         from ..commands import COMMANDS
         from ..commands.setup.machine import set_threads
