@@ -31,7 +31,7 @@ GPU_PYTHONS = $(if $(filter command environment,$(firstword $(origin PYTHON))),$
 # The capture that benchmarks/gpu.py trains on, where there is one.
 CAPTURE ?= $(wildcard build/demo/capture)
 
-.PHONY: help venv demo zip test test-window test-blenders lint benchmarks gpu gpu-with clean
+.PHONY: help venv lock demo zip test test-window test-blenders lint benchmarks gpu gpu-with clean
 
 help:
 	@echo "make demo           a capture made by Blender becomes objects in a .blend, with a report, in $(DEMO)"
@@ -41,6 +41,7 @@ help:
 	@echo "make test-blenders  the tests of the Blender side in more versions of Blender"
 	@echo "make lint           what a change must pass beside the tests"
 	@echo "make venv           the backend's environment, .venv, alone"
+	@echo "make lock           requirements/locked/ anew, after a change of the backend's packages"
 	@echo "make benchmarks     speed of the rasterizer and of training"
 	@echo "make gpu            tests and benchmarks on an NVIDIA GPU; CAPTURE may name what to train on"
 	@echo "make clean          remove environments and build/"
@@ -53,6 +54,9 @@ venv: .venv/ready
 	$(BACKEND) -m pip install --quiet --disable-pip-version-check -r requirements/backend.txt -r requirements/dev.txt
 	$(BACKEND) -m backend doctor
 	@touch $@
+
+lock: .venv/ready
+	$(BACKEND) requirements/lock.py
 
 .venv-bpy/ready: requirements/blender.txt
 	$(PYTHON) -m venv .venv-bpy

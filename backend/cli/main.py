@@ -24,6 +24,7 @@ from ..shared.errors import (
 from ..shared.events import JsonReporter, Reporter
 from ..shared.signals import held_signals
 from ..shared.stopping import StoppingReporter, StopRequest
+from .kernel_cache import use_private_cache
 from .parser import UsageError, build_parser
 
 _OUTPUT_ERRORS = (errno.EPIPE, errno.ENOSPC, errno.EIO, errno.EBADF, errno.EFBIG)
@@ -88,6 +89,8 @@ def _run(arguments: list[str], reporter: Reporter) -> int:
     stop = StopRequest(announce=reporter.status)
     try:
         options = build_parser().parse_args(arguments)
+        if refused := use_private_cache():
+            reporter.warning(refused)
         with ExitStack() as stack:
             with held_signals():
                 # Before signals are handled, since pycolmap installs its own SIGTERM handler when it is imported.

@@ -217,8 +217,8 @@ def compile_kernels(device: torch.device | None = None, progress: Callable[[int,
     """Compile all rendering kernels that are used in training, or load them from numba's cache on disk.
 
     Afterwards, this process compiles no rendering kernels in training, and on the CPU for any request. Later processes
-    read the cache, which is in NUMBA_CACHE_DIR, in `__pycache__` beside the kernels or, if that is not writable, in the
-    user's cache folder.
+    read the cache, which is in NUMBA_CACHE_DIR, as the command line sets it, else in `__pycache__` beside the kernels
+    or, if that is not writable, in the user's cache folder.
 
     Args:
         device: the device to compile for; None: the CPU.

@@ -64,7 +64,8 @@ def inspect(folder: str | Path) -> EnvironmentState:
     if not python.exists() or not Path(ready["base"]).exists():
         gone = ready["base"] if python.is_symlink() or python.exists() else python
         return EnvironmentState("broken", None, f"The backend's Python {gone} is missing; {_AGAIN} again.")
-    if ready["requirements"] != _wanted(ready["device"]):
+    # The environment's Python can be for another processor than Blender's.
+    if ready["requirements"] != _wanted(ready["device"], ready.get("system") or layout.system()):
         return EnvironmentState(
             "outdated", None, f"The compute backend was set up for another version of ObjectGS; {_AGAIN} again."
         )
@@ -84,9 +85,9 @@ def _ready(path: Path, _changed: int) -> dict[str, Any] | None:
 
 
 @functools.lru_cache(2)
-def _wanted(device: str) -> str:
-    """Return the digest of this extension's requirements for a device."""
-    return layout.requirements_digest(REQUIREMENTS, device)
+def _wanted(device: str, system: str) -> str:
+    """Return the digest of this extension's packages for a device and a system."""
+    return layout.requirements_digest(REQUIREMENTS, device, system)
 
 
 def cache_folder(folder: str | Path) -> Path:

@@ -41,7 +41,8 @@ def backend_environment(cache_folder: str | Path) -> dict[str, str]:
     """Return additional environment variables for the backend.
 
     Args:
-        cache_folder: folder for compiled kernels; it should survive updates of the extension.
+        cache_folder: folder for compiled kernels, which the backend creates and uses only if nobody else can write it;
+            it should survive updates of the extension.
     """
     return {"NUMBA_CACHE_DIR": str(cache_folder), "PYTHONUTF8": "1", "PYTHONFAULTHANDLER": "1"}
 

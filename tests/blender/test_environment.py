@@ -2,6 +2,7 @@
 """Setup of the backend's environment, with two tiny local packages and a fake backend, without network."""
 
 import argparse
+import hashlib
 import json
 import os
 import subprocess
@@ -11,7 +12,7 @@ import zipfile
 
 import pytest
 from objectgs.objectgs_addon.environment import environment
-from objectgs.objectgs_addon.environment.worker import checks, events, layout, pip, setup
+from objectgs.objectgs_addon.environment.worker import checks, choice, events, layout, pip, setup
 from objectgs.objectgs_addon.process import backend_process
 from objectgs.objectgs_addon.process.jobs import JobQueue, State
 
@@ -34,12 +35,13 @@ say("done", message="It works.", machine={"torch": "2.13.0"})
 """
 
 
-def wheel(folder, name, version):
-    """Write a minimal package that pip can install."""
+def wheel(folder, name, version, requires=""):
+    """Write a minimal package that pip can install; `requires` names another one."""
+    needs = f"Requires-Dist: {requires}\n" if requires else ""
     info = f"{name}-{version}.dist-info"
     files = {
         f"{name}.py": f"__version__ = '{version}'\n",
-        f"{info}/METADATA": f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n",
+        f"{info}/METADATA": f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n{needs}",
         f"{info}/WHEEL": "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
     }
     files[f"{info}/RECORD"] = "".join(f"{path},,\n" for path in [*files, f"{info}/RECORD"])
@@ -48,15 +50,28 @@ def wheel(folder, name, version):
             archive.writestr(path, text)
 
 
+def lock(root, name, *packages):
+    """Write a file of locked packages with the hashes of the wheels, or with a wrong hash if there is no wheel."""
+    lines = []
+    for package in packages:
+        path = root / "wheels" / f"{package.replace('==', '-')}-py3-none-any.whl"
+        digest = hashlib.sha256(path.read_bytes() if path.exists() else b"").hexdigest()
+        lines.append(f"{package} \\\n    --hash=sha256:{digest}\n")
+    (root / "requirements" / "locked" / f"{name}.txt").write_text("".join(lines))
+    environment._wanted.cache_clear()
+
+
 @pytest.fixture
 def root(tmp_path, monkeypatch):
     """An extension folder with requirements/ and backend/; packages come only from its wheels/."""
-    for name in ("wheels", "requirements", "backend"):
-        (tmp_path / name).mkdir()
-    for name, version in ("torch", "2.13.0"), ("smallnumba", "0.68"):
+    for name in ("wheels", "requirements/locked", "backend"):
+        (tmp_path / name).mkdir(parents=True)
+    for name, version in ("torch", "2.13.0"), ("smallnumba", "0.68"), ("smallcuda", "0.30"):
         wheel(tmp_path / "wheels", name, version)
+    lock(tmp_path, layout.system(), "smallnumba==0.68")
+    lock(tmp_path, f"{layout.system()}-cpu", "torch==2.13.0")
+    lock(tmp_path, f"{layout.system()}-cuda", "torch==2.13.0", "smallcuda==0.30")
     (tmp_path / "requirements" / "torch.txt").write_text("torch==2.13.0\n")
-    (tmp_path / "requirements" / "cuda.txt").write_text("smallcuda==0.30\n")
     (tmp_path / "requirements" / "backend.txt").write_text("# Wheels only.\n\nsmallnumba==0.68  # kernels\n")
     (tmp_path / "backend" / "__init__.py").write_text("")
     (tmp_path / "backend" / "__main__.py").write_text(BACKEND)
@@ -119,8 +134,7 @@ def test_set_up_after_one_that_was_killed(root):
 
     ready = json.loads((folder / "ready.json").read_text())
     assert ready["packages"]["smallnumba"] == "0.68" and ready["device"] == "cpu"
-    (root / "requirements" / "backend.txt").write_text("smallnumba==0.69\n")
-    environment._wanted.cache_clear()
+    lock(root, layout.system(), "smallnumba==0.69")
     assert environment.inspect(folder).state == "outdated"
 
     environment.remove(folder)
@@ -128,7 +142,6 @@ def test_set_up_after_one_that_was_killed(root):
 
 
 def test_only_an_environment_for_nvidia_gpus_holds_their_packages(root):
-    wheel(root / "wheels", "smallcuda", "0.30")
     for device in ("cpu", "cuda"):
         folder = root / f"environment-{device}"
         job = environment.set_up_job(sys.executable, folder, device)
@@ -136,15 +149,14 @@ def test_only_an_environment_for_nvidia_gpus_holds_their_packages(root):
         assert job.state is State.DONE, (job.error, job.log)
         packages = json.loads((folder / "ready.json").read_text())["packages"]
         assert ("smallcuda" in packages) == (device == "cuda") and "smallnumba" in packages
-    (root / "requirements" / "cuda.txt").write_text("smallcuda==0.31\n")
-    environment._wanted.cache_clear()
+    lock(root, f"{layout.system()}-cuda", "torch==2.13.0", "smallcuda==0.31")
     assert environment.inspect(root / "environment-cuda").state == "outdated"
     assert environment.inspect(root / "environment-cpu").state == "ready"
 
 
 def test_failed_set_ups_leave_nothing(root):
     folder = root / "environment"
-    (root / "requirements" / "backend.txt").write_text("smallnumba==0.69\n")
+    lock(root, layout.system(), "smallnumba==0.69")
     job = environment.set_up_job(sys.executable, folder, "cpu")
     run(job)
     assert job.state is State.FAILED and job.exit_code == 2
@@ -155,6 +167,104 @@ def test_failed_set_ups_leave_nothing(root):
     run(job, lambda: job.message == "Making an environment", job.stop)
     assert job.state is State.STOPPED and job.message == "Stopped; nothing of the environment is kept."
     assert not folder.exists()
+
+
+def installed_torch(root, device):
+    """Set up an environment for `device`; return the job, the version of torch and whether packages for GPUs are in."""
+    folder = root / f"environment-{device}"
+    job = environment.set_up_job(sys.executable, folder, device)
+    run(job)
+    assert job.state is State.DONE, (job.error, job.log)
+    packages = json.loads((folder / "ready.json").read_text())["packages"]
+    return job, packages["torch"], "smallcuda" in packages
+
+
+def test_another_file_of_the_same_name_is_refused(root):
+    """The file that an index serves is replaced; the packages before it in the list are not installed either."""
+    with zipfile.ZipFile(root / "wheels" / "torch-2.13.0-py3-none-any.whl", "a") as archive:
+        archive.writestr("malice.pth", "import os\n")
+    folder = root / "user" / "environment"
+    job = environment.set_up_job(sys.executable, folder, "cpu")
+    run(job)
+    assert job.state is State.FAILED and job.exit_code == 2
+    assert job.error.startswith("torch==2.13.0 is not the file that ObjectGS was tested with (its hash differs), so no")
+    assert not folder.exists() and list((root / "user").iterdir()) == []
+
+
+def test_a_package_that_is_not_locked_is_refused(root):
+    wheel(root / "wheels", "smallnumba", "0.68", requires="extra")
+    wheel(root / "wheels", "extra", "1.0")
+    lock(root, layout.system(), "smallnumba==0.68")  # The wheel is new.
+    job = environment.set_up_job(sys.executable, root / "environment", "cpu")
+    run(job)
+    assert job.state is State.FAILED and "hash" in job.error and not (root / "environment").exists()
+
+
+def test_a_build_that_is_not_on_pypi_comes_alone(root):
+    """Its version names the build, it brings no other package, and the locked packages are checked as always."""
+    (root / "requirements" / "locked" / f"{layout.system()}-cpu.txt").unlink()
+    wheel(root / "wheels", "torch", "2.13.0+cpu", requires="extra")
+    wheel(root / "wheels", "extra", "1.0")
+    job, torch, for_gpus = installed_torch(root, "cpu")
+    assert (torch, for_gpus, job.warnings) == ("2.13.0+cpu", False, [])
+    assert "extra" not in json.loads((root / "environment-cpu" / "ready.json").read_text())["packages"]
+
+
+def test_the_other_build_if_the_one_that_was_chosen_cannot_be_reached(root):
+    (root / "requirements" / "locked" / f"{layout.system()}-cpu.txt").unlink()
+    job, torch, for_gpus = installed_torch(root, "cpu")
+    assert (torch, for_gpus) == ("2.13.0", True) and "takes about 9 GB" in job.warnings[0]
+    assert environment.inspect(root / "environment-cpu").state == "ready"
+
+
+def test_the_index_of_a_build_is_asked_for_torch_alone(root):
+    """And only if the user's own indexes lack the build."""
+    (root / "requirements" / "locked" / f"{layout.system()}-cpu.txt").unlink()
+
+    class Indexes:
+        asked = []
+
+        def offers(self, requirement, build, index):
+            self.asked.append((requirement, build, index))
+            return index is not None
+
+    chosen = choice.choose(Indexes(), root / "requirements", "cpu", 9.0)
+    index = "https://download.pytorch.org/whl/cpu"
+    assert Indexes.asked == [("torch==2.13.0", "cpu", None), ("torch==2.13.0", "cpu", index)]
+    assert chosen.torch == ["--index-url", index, "torch==2.13.0+cpu"]
+    assert [path.stem for path in chosen.files] == [layout.system()]
+    assert choice.choose(Indexes(), root / "requirements", "cuda", 9.0).torch == [] and len(Indexes.asked) == 2
+
+
+def test_systems_without_locked_packages(root, monkeypatch):
+    for name in ("", "-cpu", "-cuda"):
+        path = root / "requirements" / "locked" / f"{layout.system()}{name}.txt"
+        path.rename(path.with_name(f"amiga-m68k{name}.txt"))
+    job = environment.set_up_job(sys.executable, root / "environment", "cpu")
+    run(job)
+    assert job.state is State.FAILED and "only for amiga-m68k; choose" in job.error
+    monkeypatch.setattr(layout, "system", lambda: "amiga-m68k")
+    (root / "requirements" / "locked" / "amiga-m68k-cuda.txt").unlink()
+    with pytest.raises(events.Refused, match="choose the device CPU"):
+        choice.check_system(root / "requirements", "cuda")
+    choice.check_system(root / "requirements", "cpu")
+
+
+@pytest.mark.parametrize(
+    ("of_python", "machine", "build", "name"),
+    [
+        ("Linux", "x86_64", "linux-x86_64", "linux-x86_64"),
+        ("Linux", "aarch64", "linux-aarch64", "linux-aarch64"),
+        ("Darwin", "arm64", "macosx-11.0-universal2", "macos-arm64"),
+        ("Windows", "AMD64", "win-amd64", "windows-x86_64"),
+        ("Windows", "ARM64", "win-amd64", "windows-x86_64"),
+    ],
+)
+def test_names_of_systems(monkeypatch, of_python, machine, build, name):
+    monkeypatch.setattr(layout.platform, "system", lambda: of_python)
+    monkeypatch.setattr(layout.platform, "machine", lambda: machine)
+    monkeypatch.setattr(layout.sysconfig, "get_platform", lambda: build)
+    assert layout.system() == name
 
 
 def test_what_goes_wrong_while_the_driver_is_gone(root):
@@ -218,7 +328,7 @@ def test_inspect_is_cheap(root):
         "base": sys.executable,
         "packages": {},
         "device": "cpu",
-        "requirements": environment._wanted("cpu"),
+        "requirements": environment._wanted("cpu", layout.system()),
     }
     (folder / layout.MARKER).write_text(json.dumps(marker))
     assert environment.inspect(folder).state == "ready"
@@ -315,7 +425,7 @@ def test_probe_of_what_is_no_python(root, program):
         ),
         (["ERROR: No matching distribution found for numpy==2.4.6"], "no ready-made package numpy==2.4.6 for this"),
         (["ERROR: Could not install packages due to an OSError: [Errno 28] No space left on device"], "disk is full"),
-        (["ERROR: THESE PACKAGES DO NOT MATCH THE HASHES FROM THE REQUIREMENTS FILE."], "damaged"),
+        (["ERROR: THESE PACKAGES DO NOT MATCH THE HASHES FROM THE REQUIREMENTS FILE."], "A package is not the file"),
         (["Collecting x", "ERROR: Some new trouble."], "could not be installed: Some new trouble."),
         ([], "it said nothing"),
     ],
@@ -325,6 +435,6 @@ def test_why_pip_failed(lines, sentence):
 
 
 def test_requirements_of_this_extension():
-    for path in layout.requirement_files(environment.REQUIREMENTS, "cuda"):
-        for line in layout.requirement_lines(path):
+    for name in layout.REQUIREMENTS:
+        for line in layout.requirement_lines(environment.REQUIREMENTS / name):
             assert line.count("==") == 1 and line == line.replace(" ", ""), line

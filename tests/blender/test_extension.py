@@ -73,6 +73,7 @@ def test_zip_holds_what_is_needed_and_nothing_else(package):
         "requirements/backend.txt",
         "requirements/cuda.txt",
         "requirements/torch.txt",
+        *(f"requirements/locked/{path.name}" for path in (ROOT / "requirements" / "locked").iterdir()),
     }
     assert {PurePosixPath(name).suffix for name in names} <= {".py", ".toml", ".txt", ".md", ".json", ""}
 

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Layout of an environment's folder, and the requirements of the environment."""
+"""Layout of an environment's folder, and the packages of the environment."""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
 import os
+import platform
 import shutil
 import subprocess
+import sysconfig
 import tempfile
 import time
 from collections.abc import Iterator
@@ -23,8 +25,8 @@ REMOVED = ".removed-"
 OLDEST, NEWEST = (3, 11), (3, 13)
 VERSIONS = "3.11, 3.12 or 3.13"
 REQUIREMENTS = ("torch.txt", "backend.txt")
-CUDA_REQUIREMENTS = "cuda.txt"
-"""File with additional requirements for NVIDIA GPUs."""
+LOCKED = "locked"
+"""Folder in that of the requirements with the packages of each system and their hashes."""
 
 
 def environment_python(folder: Path) -> Path:
@@ -32,19 +34,30 @@ def environment_python(folder: Path) -> Path:
     return folder / VENV / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 
 
-def requirement_files(requirements: Path, device: str) -> list[Path]:
-    """Return the requirement files for a device (cpu or cuda), torch first."""
-    return [requirements / name for name in (*REQUIREMENTS, *([CUDA_REQUIREMENTS] if device == "cuda" else []))]
+def system() -> str:
+    """Return the system and processor of this Python, as in the names of locked files: linux-x86_64, macos-arm64."""
+    # An emulated Python needs packages for the processor that is emulated.
+    is_windows = platform.system() == "Windows"
+    machine = sysconfig.get_platform().rpartition("-")[2] if is_windows else platform.machine()
+    name = {"Darwin": "macos"}.get(platform.system(), platform.system().lower())
+    return f"{name}-{machine.lower().replace('amd64', 'x86_64')}"
 
 
-def requirements_digest(requirements: Path, device: str) -> str:
-    """Return a digest of the requirements without comments and blank lines; raise OSError if files are missing."""
-    lines = [line for path in requirement_files(requirements, device) for line in requirement_lines(path)]
+def locked_files(requirements: Path, device: str, system: str) -> list[Path]:
+    """Return the files of locked packages for a device (cpu or cuda) that exist; none for an unsupported system."""
+    paths = [requirements / LOCKED / f"{system}{part}.txt" for part in ("", f"-{device}")]
+    return [path for path in paths if path.is_file()]
+
+
+def requirements_digest(requirements: Path, device: str, system: str) -> str:
+    """Return a digest of the packages and their hashes, without comments; raise OSError if files are missing."""
+    paths = [requirements / "torch.txt", *locked_files(requirements, device, system)]
+    lines = [line for path in paths for line in requirement_lines(path)]
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
 
 
 def requirement_lines(path: Path) -> list[str]:
-    """Return the requirements in a file, as `name==version`."""
+    """Return the lines of a requirements file without comments and blank lines."""
     lines = (line.partition("#")[0].strip() for line in path.read_text(encoding="utf-8").splitlines())
     return [line for line in lines if line]
 

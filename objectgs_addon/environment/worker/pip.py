@@ -11,11 +11,10 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from .events import Progress, Refused, emit, print_error
+from .events import Progress, Refused, print_error
 from .layout import TEMPORARY, VENV, environment_python
 from .programs import guarded, run
 
-WHEELS = "https://download.pytorch.org/whl/"
 PROBE_SECONDS = 8
 
 
@@ -145,28 +144,10 @@ def why_pip_failed(lines: list[str]) -> str:
             "(LongPathsEnabled) and set the backend up again."
         )
     if "DO NOT MATCH THE HASHES" in text:
-        return "A package was damaged in the download; set the backend up again."
+        other = re.search(r"DO NOT MATCH THE HASHES.*\n\s+(\S+)", text)
+        return (
+            f"{other[1] if other else 'A package'} is not the file that ObjectGS was tested with (its hash differs), "
+            "so nothing was installed; set the backend up again or, if that does not help, check pip's mirror settings."
+        )
     errors = [line for line in lines if line.startswith("ERROR: ")] or lines or ["it said nothing"]
     return f"The packages could not be installed: {errors[-1].replace('ERROR: ', '', 1).rstrip('.')}."
-
-
-def torch_options(pip: Pip, torch: str, device: str) -> list[str]:
-    """Return pip's options for the PyTorch build of `device`; PyPI has CUDA builds for Linux, CPU for Windows."""
-    build = {("Linux", "cpu"): "cpu", ("Windows", "cuda"): "cu130"}.get((platform.system(), device))
-    if build is None or pip.offers(torch, build):
-        return []
-    if pip.offers(torch, build, WHEELS + build):
-        return ["--extra-index-url", WHEELS + build]
-    if device == "cuda":
-        emit(
-            "warning",
-            message="PyTorch's builds for NVIDIA GPUs could not be reached, so the one for processors is "
-            "installed; set the backend up again when they can be reached.",
-        )
-    return []
-
-
-def brings_cuda(pip: Pip) -> bool:
-    """Return whether the installed PyTorch requires CUDA packages on this system."""
-    wanted = next(iter(importlib.metadata.distributions(name="torch", path=[str(pip.site)]))).requires or []
-    return platform.system() == "Linux" and any(line.startswith("nvidia-") for line in wanted)

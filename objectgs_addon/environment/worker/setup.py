@@ -17,12 +17,13 @@ from typing import IO, Any
 
 from . import layout
 from .checks import GIGABYTES, check_backend, check_can_make_environments, check_python, check_space
+from .choice import check_system, choose
 from .events import Progress, Refused, Stopped, emit, print_error
-from .pip import Pip, brings_cuda, torch_options
+from .pip import Pip
 from .programs import guarded, run
 
-MEGABYTES = {"cpu": 180, "cuda": 2500}
-"""Size of the downloads except torch in MB, for the progress."""
+MEGABYTES = {"cpu": 180, "cuda": 3000}
+"""Size of the downloads in MB, for the progress; on most systems that of cpu includes torch."""
 
 _STAMP_TEXT = "ObjectGS for Blender keeps the Python packages of its backend here; its preferences remove them.\n"
 
@@ -38,35 +39,32 @@ def set_up(options: argparse.Namespace, stop: Callable[[], bool]) -> None:
     check_python()
     check_can_make_environments()
     check_space(folder, device)
-    torch = layout.requirement_lines(options.requirements / "torch.txt")[0]
-    digest = layout.requirements_digest(options.requirements, device)
-    progress = Progress({"venv": 5, "torch": 60, "packages": 60 if device == "cpu" else 300, "check": 60})
+    check_system(options.requirements, device)
+    progress = Progress({"venv": 5, "packages": 60 if device == "cpu" else 300, "torch": 60, "check": 60})
     with claimed(folder), layout.short_path(folder) as short:
         progress.begin("venv", "Making an environment")
         if run(guarded(Path(sys.executable), "venv", str(short / layout.VENV)), stop, print_error) != 0:
             raise Refused(f"{sys.executable} could not make an environment in {folder}; choose another Python.")
         pip = Pip(short, progress, stop)
-        progress.begin("torch", "Resolving PyTorch")
-        pip.install(["--no-deps", *torch_options(pip, torch, device), torch], megabytes=500)
-        installed = device
-        if device == "cpu" and brings_cuda(pip):
-            installed = "cuda"
-            emit(
-                "warning",
-                message="PyTorch's builds for processors could not be reached, so its build for NVIDIA GPUs "
-                f"is installed, which also works without one but takes about {GIGABYTES['cuda']:g} GB.",
-            )
-            check_space(folder, "cuda")
-        progress.begin("packages", "Resolving the other packages")
-        files = layout.requirement_files(options.requirements, device)
-        pip.install([argument for path in files for argument in ("-r", str(path))], MEGABYTES[installed])
+        progress.begin("packages", "Resolving the packages")
+        chosen = choose(pip, options.requirements, device, GIGABYTES["cuda"])
+        digest = layout.requirements_digest(options.requirements, chosen.device, layout.system())
+        if chosen.device != device:
+            check_space(folder, chosen.device)
+        files = [argument for path in chosen.files for argument in ("-r", str(path))]
+        pip.install(["--require-hashes", *files], MEGABYTES[chosen.device])
+        if chosen.torch:
+            # Without dependencies, so that no other package can come from the index of this build.
+            progress.begin("torch", "Resolving PyTorch")
+            pip.install(["--no-deps", *chosen.torch], megabytes=500)
         progress.begin("check", "Checking the backend")
         checked = check_backend(layout.environment_python(folder), progress, stop)
         shutil.rmtree(pip.temporary)
         ready = {
             "python": platform.python_version(),
             "base": getattr(sys, "_base_executable", None) or sys.executable,
-            "device": device,
+            "device": chosen.device,
+            "system": layout.system(),
             "requirements": digest,
             "packages": pip.packages,
             "machine": checked.get("machine", {}),
