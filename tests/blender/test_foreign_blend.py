@@ -4,8 +4,10 @@
 import json
 import os
 import shutil
+import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -16,10 +18,12 @@ bpy = pytest.importorskip("bpy")
 from objectgs.backend.shared.reconstruction.objects import edit_objects, read_objects
 from objectgs.objectgs_addon import scene
 from objectgs.objectgs_addon.environment import known_folders
+from objectgs.objectgs_addon.film import properties as film
 from objectgs.objectgs_addon.process.jobs import Job
 from objectgs.objectgs_addon.running import background
 from objectgs.objectgs_addon.scene import kinds
 from objectgs.objectgs_addon.state import folder_trust, object_edits
+from objectgs.operators.film.output_folder import UsesOutputFolder
 
 from .building import HUGE, write_folder
 
@@ -420,3 +424,37 @@ def test_a_capture_on_another_computer_must_be_imported_again(root, folder, monk
     bpy.ops.objectgs.use_folder()
     monkeypatch.setattr(Path, "is_dir", lambda path: pytest.fail(f"{path} was touched"))
     assert "is on another computer; import it again" in refusal(bpy.ops.objectgs.train)
+
+
+def test_an_output_folder_of_the_file_is_asked_about(root, folder, tmp_path, known):
+    owner = bpy.context.scene
+    bpy.ops.objectgs.use_folder()
+    assert film.is_accepted(owner, folder), "the folder film in the reconstruction"
+    owner.objectgs_film.folder = str(tmp_path / "frames")
+    assert film.is_accepted(owner, folder), "the user has just chosen it"
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "film.blend"))
+    known.write_text(json.dumps({"folders": [str(folder)]}))
+    opened(tmp_path / "film.blend")
+    owner, asked = bpy.context.scene, []
+
+    def confirm(operator, event, **options):
+        asked.append(options["message"])
+        return {"RUNNING_MODAL"}
+
+    button = UsesOutputFolder()
+    button.execute = lambda _context: {"FINISHED"}
+    context = SimpleNamespace(scene=owner, window_manager=SimpleNamespace(invoke_confirm=confirm))
+    assert button.invoke(context, None) == {"RUNNING_MODAL"} and str(tmp_path / "frames") in asked[0]
+    button.remember_output(context)
+    assert button.invoke(context, None) == {"FINISHED"} and len(asked) == 1
+
+
+def test_film_of_a_folder_on_another_computer_needs_the_command_line(root, folder, tmp_path):
+    owner = bpy.context.scene
+    owner.camera = next(obj for obj in owner.objects if obj.type == "CAMERA")
+    root[kinds.FOLDER] = REMOTE
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "film.blend"))
+    command = [sys.executable, headless.__file__, "film", tmp_path / "film.blend", "--out", tmp_path / "frames"]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert ran.returncode == 2 and "give it with --dir" in ran.stderr + ran.stdout
+    assert not (tmp_path / "frames").exists()
