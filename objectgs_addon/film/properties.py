@@ -1,13 +1,22 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Settings of film frames in addition to the scene's own camera, resolution, frame range and motion blur."""
 
+import os
 from pathlib import Path
 
 import bpy
 from bpy.props import BoolProperty, IntProperty, PointerProperty, StringProperty
 
+from ..environment import known_folders
+
 SUBFRAMES = 9
 """Default number of sub-frames, odd so that one is at the middle of the exposure."""
+
+
+def _folder_chosen(settings: bpy.types.PropertyGroup, _context: bpy.types.Context) -> None:
+    """Remember an output folder that the user has typed or chosen; Blender does not call this for one of a file."""
+    if settings.folder:
+        known_folders.remember(Path(bpy.path.abspath(settings.folder)))
 
 
 class FilmProperties(bpy.types.PropertyGroup):
@@ -16,6 +25,7 @@ class FilmProperties(bpy.types.PropertyGroup):
     folder: StringProperty(
         name="Output",
         subtype="DIR_PATH",
+        update=_folder_chosen,
         description="Output folder of the film frames; if empty, the folder film in the reconstruction folder",
     )
     subframes: IntProperty(
@@ -31,7 +41,13 @@ class FilmProperties(bpy.types.PropertyGroup):
 def folder_of(scene: bpy.types.Scene, reconstruction: Path) -> Path:
     """Return the output folder of the scene's film frames, by default `film` in the reconstruction folder."""
     chosen = scene.objectgs_film.folder
-    return Path(bpy.path.abspath(chosen)) if chosen else reconstruction / "film"
+    return Path(os.path.normpath(bpy.path.abspath(chosen))) if chosen else reconstruction / "film"
+
+
+def is_accepted(scene: bpy.types.Scene, reconstruction: Path) -> bool:
+    """Return whether film frames may be written to the output folder without asking the user."""
+    folder = folder_of(scene, reconstruction)
+    return known_folders.is_known(folder) or folder.is_relative_to(reconstruction)
 
 
 def samples_of(scene: bpy.types.Scene, subframes: int = SUBFRAMES) -> int:

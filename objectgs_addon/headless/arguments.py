@@ -268,7 +268,9 @@ def _film(sub: argparse.ArgumentParser) -> None:
         ),
     )
     sub.add_argument("--save", type=Path, metavar="FILE", help="save the .blend, with its compositor set up, as FILE")
-    sub.add_argument("--dir", type=Path, metavar="DIR", help="the reconstruction folder, if it was moved")
+    sub.add_argument(
+        "--dir", type=Path, metavar="DIR", help="the reconstruction folder, if it was moved or is on another computer"
+    )
     sub.add_argument("--camera", metavar="NAME", help="a camera of the file (the scene's own)")
     sub.add_argument(
         "--device", choices=("auto", "cpu", "cuda"), default="auto", help="device that renders the splats (auto)"

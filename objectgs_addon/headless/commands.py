@@ -20,6 +20,7 @@ from ..blender.quiet import quiet
 from ..demo import capture as demo_capture
 from ..environment import locations
 from ..process.blocking import run_blocking
+from ..state import folder_trust
 from ..state import viewports as view
 from . import apart
 from .picture import render_picture
@@ -256,6 +257,7 @@ def build_blend(folder: Path, blend: Path, reporter: Reporter) -> bool:
         target.cycles.samples = SAMPLES
     for warning in warnings:
         reporter.warning(warning)
+    folder_trust.store_relative(root, str(blend))
     save_blend(blend, reporter)
     return has_meshes
 

@@ -12,6 +12,7 @@ from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.shot import NAME, frame_ranges, write_shot
 from .. import film as filming
 from .. import scene
+from ..environment import known_folders
 from ..film.properties import samples_of
 from . import apart
 from .commands import absolute, find_backend, run_backend, save_blend
@@ -35,6 +36,8 @@ def film(options: argparse.Namespace) -> None:
     if len(found) > 1:
         reporter.warning(f"{blend} has {len(found)} reconstructions; {root.name} is rendered.")
     folder = absolute(options.dir) if options.dir else scene.folder_of(root)
+    if known_folders.is_remote(folder) and not options.dir:
+        raise InputError(f"{blend} names the folder {folder} on another computer; give it with --dir to use it.")
     if not Reconstruction(folder).splats.is_file():
         raise InputError(f"The reconstruction folder {folder} has no splats.ply; name its present location with --dir.")
     frames = _frames(options, target)

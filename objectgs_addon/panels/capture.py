@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import bpy
 
 from .. import scene
@@ -10,6 +12,7 @@ from ..environment import locations
 from ..process import jobs
 from ..running import background
 from ..running.job_display import write
+from ..state import folder_trust
 from ..state.folder_state import folder_state
 from .tab import Tab, draw_job
 
@@ -39,7 +42,10 @@ class CapturePanel(Tab, bpy.types.Panel):
 
 
 def _draw_folder(layout: bpy.types.UILayout, root: bpy.types.Collection) -> None:
-    """Draw the reconstruction's folder, or a message if it is missing."""
+    """Draw the reconstruction's folder, a message if it is missing, or the question whether to use it."""
+    if folder_trust.is_in_question(root):
+        _draw_question(layout, folder_trust.offered(root))
+        return
     folder = scene.folder_of(root)
     if not folder_state(folder).exists:
         write(
@@ -53,3 +59,17 @@ def _draw_folder(layout: bpy.types.UILayout, root: bpy.types.Collection) -> None
     row.label(text=folder.name, icon="FILE_FOLDER")
     row.operator("wm.path_open", text="", icon="FILEBROWSER").filepath = str(folder)
     row.operator("objectgs.show_result", text="", icon="FILE_REFRESH")
+
+
+def _draw_question(layout: bpy.types.UILayout, folder: Path) -> None:
+    """Ask whether to use the folder of a .blend that comes from elsewhere or was moved."""
+    box = layout.box()
+    write(box, "This file comes from elsewhere or was moved. Is this its reconstruction folder?", "QUESTION")
+    write(box, str(folder))
+    text = "Nothing is read, written or started there until you use it. Edits are kept in this file until then."
+    column = box.column()
+    column.active = False
+    write(column, text)
+    column = box.column(align=True)
+    column.operator("objectgs.use_folder", icon="CHECKMARK").folder = str(folder)
+    column.operator("objectgs.open_reconstruction", text="Choose Another...", icon="FILE_FOLDER").instead = True

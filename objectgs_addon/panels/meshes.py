@@ -8,7 +8,7 @@ import bpy
 from .. import scene
 from ..running import background
 from ..running.job_display import write
-from ..state.folder_state import folder_state
+from ..state import folder_trust
 from .tab import WithReconstruction, draw_job_of
 
 
@@ -21,7 +21,7 @@ class MeshesPanel(WithReconstruction, bpy.types.Panel):
         root = context.scene.objectgs.active
         properties = root.objectgs
         folder = scene.folder_of(root)
-        state = folder_state(folder)
+        state = folder_trust.state_of(root)
         job = background.job_of(root)
         column = layout.column()
         column.enabled = not background.busy(folder)

@@ -10,7 +10,7 @@ import bpy
 from .. import scene
 from ..running.job_display import write
 from ..state import visibility
-from .tab import WithReconstruction
+from .tab import WithReconstruction, draw_without_objects
 
 
 class ObjectList(bpy.types.UIList):
@@ -74,9 +74,10 @@ class ObjectsPanel(WithReconstruction, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
-        properties = context.scene.objectgs.active.objectgs
+        root = context.scene.objectgs.active
+        properties = root.objectgs
         if not properties.objects:
-            write(layout, "Use Assign Objects to find the objects.", "INFO")
+            draw_without_objects(layout, root)
             return
         row = layout.row()
         row.template_list("OBJECTGS_UL_objects", "", properties, "objects", properties, "active_object", rows=8)

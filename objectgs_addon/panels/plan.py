@@ -23,7 +23,7 @@ class PlanPanel(WithReconstruction, bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw_header_preset(self, context: bpy.types.Context) -> None:
-        left_out = len(planning.plan_of(scene.folder_of(context.scene.objectgs.active)).left_out)
+        left_out = len(planning.plan_for(context.scene.objectgs.active).left_out)
         if left_out:
             self.layout.label(text=f"{left_out} left out")
 
@@ -32,7 +32,7 @@ class PlanPanel(WithReconstruction, bpy.types.Panel):
         root = context.scene.objectgs.active
         folder = scene.folder_of(root)
         layout.enabled = not background.busy(folder)
-        for decision in planning.plan_of(folder).decisions:
+        for decision in planning.plan_for(root).decisions:
             _draw_decision(layout, root.objectgs, decision)
         row = layout.row(align=True)
         row.operator("objectgs.analyze_capture", icon="FILE_REFRESH")

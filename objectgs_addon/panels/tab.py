@@ -7,7 +7,8 @@ import bpy
 
 from ..process.jobs import Job
 from ..running import background
-from ..running.job_display import draw_over, draw_running
+from ..running.job_display import draw_over, draw_running, write
+from ..state import folder_trust
 
 
 class Tab:
@@ -20,6 +21,13 @@ class WithReconstruction(Tab):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         return context.scene.objectgs.active is not None
+
+
+def draw_without_objects(layout: bpy.types.UILayout, root: bpy.types.Collection) -> None:
+    """Say how an empty list of objects is filled."""
+    accepted = folder_trust.is_accepted(root)
+    text = "Use Assign Objects to find the objects." if accepted else "Objects are listed once the folder is used."
+    write(layout, text, "INFO")
 
 
 def draw_job_of(layout: bpy.types.UILayout, job: Job) -> None:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import bpy
@@ -16,7 +15,8 @@ from .. import scene
 from ..process.jobs import Job
 from ..running import background, previews
 from ..running.job_display import write
-from ..state.folder_state import FolderState, folder_state
+from ..state import folder_trust
+from ..state.folder_state import FolderState
 from .tab import WithReconstruction, draw_job_of
 
 
@@ -37,14 +37,18 @@ class TrainPanel(WithReconstruction, bpy.types.Panel):
         column.enabled = not active
         column.operator("objectgs.assign_objects", icon="GROUP_VERTEX")
         row = column.row(align=True)
-        row.operator("objectgs.train", icon="PLAY", text=_train_text(folder, properties))
+        state = folder_trust.state_of(root)
+        row.operator("objectgs.train", icon="PLAY", text="Resume" if _can_resume(state, properties) else "Train")
         row.prop(properties, "length", text="")
         if properties.length == "minutes":
             column.prop(properties, "minutes")
-        if not active:
-            _draw_expectation(column, folder_state(folder), properties)
+        is_accepted = folder_trust.is_accepted(root)
+        if not active and is_accepted:
+            _draw_expectation(column, state, properties)
         if job is not None:
             draw_job_of(layout, job)
+        if not is_accepted:
+            return
         if not active:
             _draw_folder_state(layout, root, job)
         icons = [icon for name in (previews.RENDER, previews.CURVE) if (icon := previews.icon_of(folder, name))]
@@ -55,10 +59,6 @@ class TrainPanel(WithReconstruction, bpy.types.Panel):
             layout.operator("objectgs.show_preview", icon="IMAGE_DATA")
 
 
-def _train_text(folder: Path, properties: Any) -> str:
-    return "Resume" if _can_resume(folder_state(folder), properties) else "Train"
-
-
 def _can_resume(state: FolderState, properties: Any) -> bool:
     return bool(state.steps) and (properties.length != "minutes" or state.seconds < 60 * properties.minutes - 0.5)
 
@@ -66,7 +66,7 @@ def _can_resume(state: FolderState, properties: Any) -> bool:
 def _draw_folder_state(layout: bpy.types.UILayout, root: bpy.types.Collection, job: Job | None) -> None:
     """What the folder holds that no job of this Blender has made."""
     folder, minutes = scene.folder_of(root), root.objectgs.minutes
-    state = folder_state(folder)
+    state = folder_trust.state_of(root)
     holder = lock_holder(folder)
     if holder is not None:
         process = f" (process {holder})" if holder else ""

@@ -22,7 +22,7 @@ from ..blender import messages, writing
 from ..environment import locations
 from ..process.blocking import run_blocking
 from ..process.jobs import Job, JobQueue, State
-from ..state import object_edits, object_list
+from ..state import folder_trust, object_edits, object_list
 from . import previews, results
 
 INTERVAL = 0.1
@@ -73,12 +73,14 @@ def submit(job: Job, owner: bpy.types.Scene, report: Callable[[set[str], str], A
 
 
 def fill_holes(root: bpy.types.Collection, again: bool = True) -> None:
-    """Start a job that fills the holes behind removed objects, unless the folder already contains the result.
+    """Start a job that fills the holes behind removed objects, unless its result exists or the folder is not accepted.
 
     Args:
         root: the reconstruction's collection.
         again: also start a job if the same fill was requested before.
     """
+    if not folder_trust.is_accepted(root):
+        return
     folder = scene.folder_of(root)
     missing = scene.missing_fill(root, scene.Objects.read(folder))
     is_asked = any(job.kind == "fill" and job.folder == folder and not job.is_finished for job in queue.jobs)

@@ -13,7 +13,7 @@ import bpy
 from ...backend.shared.errors import InputError
 from .. import scene
 from ..blender import messages, writing
-from ..state import object_edits
+from ..state import folder_trust, object_edits
 from . import background, results
 
 
@@ -21,18 +21,28 @@ from . import background, results
 @writing.allowed
 def _undone(*_: Any) -> None:
     """Update objects.json and the fills after undo or redo."""
-    for root in [root for root in bpy.data.collections if scene.kind_of(root) == "reconstruction"]:
+    for root in _accepted_roots():
         for action in (object_edits.store, results.show_fill, partial(background.fill_holes, again=False)):
             _try(action, root)
 
 
 @bpy.app.handlers.persistent
 @writing.allowed
-def _saving(*_: Any) -> None:
-    """Write pending colors and transforms to objects.json before the .blend is saved."""
-    for root in bpy.data.collections:
-        if scene.kind_of(root) == "reconstruction" and root.library is None:
-            _try(object_edits.store_edits, root)
+def _saving(path: str = "", *_: Any) -> None:
+    """Write pending colors and transforms to objects.json before the .blend is saved at `path`."""
+    for root in _accepted_roots():
+        _try(object_edits.store_edits, root)
+        if path:
+            folder_trust.store_relative(root, path)
+
+
+def _accepted_roots() -> list[bpy.types.Collection]:
+    """Return the local reconstructions whose folders may be used."""
+    return [
+        root
+        for root in bpy.data.collections
+        if scene.kind_of(root) == "reconstruction" and root.library is None and folder_trust.is_accepted(root)
+    ]
 
 
 def _try(action: Callable[[bpy.types.Collection], None], root: bpy.types.Collection) -> None:
@@ -45,11 +55,14 @@ def _try(action: Callable[[bpy.types.Collection], None], root: bpy.types.Collect
 @bpy.app.handlers.persistent
 @writing.allowed
 def _file_loaded(*_: Any) -> None:
-    """Fill empty lists of objects and set the active reconstruction; files built without a window lack both."""
+    """Set the active reconstruction and fill lists of objects, which files built without a window lack.
+
+    The lists are filled only from accepted folders, and no other folder is read.
+    """
     for owner in bpy.data.scenes:
         roots = [root for root in owner.collection.children_recursive if scene.kind_of(root) == "reconstruction"]
         for root in roots:
-            if not root.objectgs.objects:
+            if not root.objectgs.objects and folder_trust.is_accepted(root):
                 # The panel already reports a missing or invalid folder.
                 with contextlib.suppress(InputError, OSError):
                     object_edits.fill(root)

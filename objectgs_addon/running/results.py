@@ -13,9 +13,11 @@ import bpy
 from ...backend.shared.reconstruction.folder import Reconstruction
 from .. import film, scene
 from ..blender import messages
+from ..environment import known_folders
 from ..process.jobs import Job
 from ..state import object_edits, object_list
 from ..state import viewports as view
+from ..state.folder_state import folder_state
 
 
 def _folder_of(job: Job) -> Path:
@@ -45,6 +47,10 @@ def _shown_roots(job: Job, owner: bpy.types.Scene | None) -> list[bpy.types.Coll
 
 
 def _show_capture(job: Job, owner: bpy.types.Scene | None) -> bool:
+    known_folders.remember(_folder_of(job))
+    capture = folder_state(_folder_of(job)).capture
+    if capture is not None and known_folders.is_remote(capture):
+        known_folders.remember(capture)
     roots = _shown_roots(job, owner)
     for root in roots:
         scene.show_capture(object_list.scenes_of(root)[0], _folder_of(job), root)

@@ -16,6 +16,7 @@ from .kinds import (
     folder_of,
     from_stored,
     kind_of,
+    link_folder,
     object_collections,
     object_id_of,
     parts_of,
@@ -36,7 +37,7 @@ from .meshes.show import (
 from .objects_file import Objects
 from .orientation import orient_to_ground, scale_to_distance
 from .points import color_points_by
-from .result import Shown, result_is_newer, show_objects, show_result
+from .result import Shown, result_is_newer, show_label, show_objects, show_result
 from .shading.render_settings import prepare_render
 
 __all__ = [
@@ -57,6 +58,7 @@ __all__ = [
     "hidden_splats",
     "is_removed",
     "kind_of",
+    "link_folder",
     "luma_of",
     "mark_asset",
     "matrix_to_capture",
@@ -82,6 +84,7 @@ __all__ = [
     "show_edits",
     "show_fills",
     "show_kinds",
+    "show_label",
     "show_meshes",
     "show_objects",
     "show_result",

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ from .cameras import show_cameras, use_camera
 from .kinds import (
     CAMERA,
     CAPTURE,
-    FOLDER,
     MESH,
     OBJECT_PARENT,
     PARENT,
@@ -27,6 +27,7 @@ from .kinds import (
     capture_of,
     folder_of,
     kind_of,
+    link_folder,
     mark,
     object_id_of,
     parent_of,
@@ -57,7 +58,7 @@ def show_capture(
     Raises:
         InputError: The folder's files cannot be used, or the points are in Edit Mode; nothing is changed.
     """
-    folder = Path(folder).absolute()
+    folder = Path(os.path.abspath(folder))  # noqa: PTH100 - without links resolved, as `folder_of` returns it
     if any("\ud800" <= character <= "\udfff" for character in str(folder)):
         raise InputError(f"{str(folder)!r} is not valid Unicode, which Blender cannot store; rename the folder.")
     cameras = read_cameras(folder)
@@ -79,7 +80,7 @@ def show_capture(
     if root is None:
         root = bpy.data.collections.new(name or folder.name)
         mark(root, RECONSTRUCTION)
-    root[FOLDER] = str(folder)
+    link_folder(root, folder)
     root[ORIGIN] = cameras.origin.tolist()
     parent = _stand_up(root, cameras.upright, cameras.views)
     capture = capture_of(root)

@@ -6,6 +6,7 @@ Lookups never use names, since users rename data-blocks and Blender appends numb
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import bpy
 KIND = "objectgs_kind"  # Not "objectgs": before Blender 5.0, it would collide with the property group of that name.
 OBJECT_ID = "object_id"
 FOLDER = "objectgs_folder"
+RELATIVE_FOLDER = "objectgs_relative_folder"  # The folder relative to the .blend when it was saved.
 MESH_KEY = "objectgs_mesh"  # Key of a mesh in meshes.json.
 
 RECONSTRUCTION = "reconstruction"
@@ -63,8 +65,18 @@ def from_stored(value: int) -> int:
 
 
 def folder_of(root: bpy.types.Collection) -> Path:
-    """Return the absolute path of the reconstruction folder, which may no longer exist."""
-    return Path(root.get(FOLDER, ""))
+    """Return the path of the reconstruction folder as stored in the .blend, without `..`.
+
+    It may be missing or, in a .blend from elsewhere, any folder of any computer: see `state/folder_trust.py` before
+    using it.
+    """
+    stored = root.get(FOLDER)
+    return Path(os.path.normpath(stored)) if isinstance(stored, str) and "\0" not in stored else Path()
+
+
+def link_folder(root: bpy.types.Collection, folder: Path) -> None:
+    """Store the absolute path of the reconstruction folder."""
+    root[FOLDER] = str(folder)
 
 
 def parts_of(collection: bpy.types.Collection) -> list[bpy.types.Object]:

@@ -177,6 +177,14 @@ def show_objects(root: bpy.types.Collection, folder: Path) -> None:
     show_edits(root, objects)
 
 
+def show_label(root: bpy.types.Collection, object_id: int, name: str, rgb: tuple[int, int, int]) -> None:
+    """Show the name and the color, sRGB 0 .. 255, of an object and its duplicates without reading the folder."""
+    collection = object_collections(root).get(object_id)
+    for each in (collection, *duplicates_of(root).get(object_id, ())) if collection is not None else ():
+        rename(each, name)
+        paint(each, rgb)
+
+
 def _groups(table: np.ndarray, objects: Objects) -> dict[int, np.ndarray]:
     """Map the IDs of collections to their rows of the table, in file order, without rows of left-out objects."""
     ids, inverse = unique_ids(ids_of(table))

@@ -41,6 +41,20 @@ class FolderState:
     stale_meshes: int
 
 
+UNKNOWN = FolderState(
+    exists=False,
+    imported=False,
+    voted=False,
+    steps=0,
+    seconds=0.0,
+    trained=False,
+    capture=None,
+    pixels=0.0,
+    meshes=0,
+    stale_meshes=0,
+)
+"""What is known of a folder that is not read."""
+
 _known: dict[Path, tuple[tuple, FolderState]] = {}
 
 

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""User edits: the list of objects is filled from objects.json, and changes are written back to it."""
+"""User edits: the list of objects is filled from objects.json, and changes are written back to it.
+
+While the user has not accepted the folder (`folder_trust`), changes of rows stay in the list. `accept` writes those
+that differ from the row's `stored` state.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +22,10 @@ from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.objects import edit_objects, read_objects
 from .. import scene
 from ..blender import messages, writing
+from ..environment import known_folders
 from ..picking import selection
 from ..scene import from_stored, to_stored
-from . import object_list
+from . import folder_trust, object_list
 
 WRITE_AFTER = 0.4
 """Delay in seconds between the last change and writing new colors, since a dragged slider changes continuously."""
@@ -78,7 +83,7 @@ def store(root: bpy.types.Collection) -> None:
     """Write the list and the transforms to objects.json after an undo or redo."""
     _unwritten.difference_update([mark for mark in _unwritten if mark[0] == root.session_uid])
     path = Reconstruction(scene.folder_of(root)).objects
-    if not path.exists():
+    if not folder_trust.is_accepted(root) or not path.exists():
         return
     entries = {entry.id: entry for entry in read_objects(path)}
     items = {from_stored(item.object_id): item for item in root.objectgs.objects}
@@ -112,13 +117,59 @@ def store(root: bpy.types.Collection) -> None:
             changes[object_id] = changed
     if changes:
         edit_objects(path, changes)
+    for item in items.values():
+        _remember(item)
     scene.store_placements(root, everything=True)
 
 
 def store_edits(root: bpy.types.Collection) -> None:
-    """Write pending edits to objects.json before it is read elsewhere."""
+    """Write pending edits to objects.json before it is read elsewhere, if the folder is accepted."""
     flush()
-    scene.store_placements(root)
+    if folder_trust.is_accepted(root):
+        scene.store_placements(root)
+
+
+def accept(root: bpy.types.Collection, folder: Path) -> bool:
+    """Use `folder` for a reconstruction from now on, and write the edits that were kept in the .blend.
+
+    Returns:
+        Whether the folder is still accepted after Blender is closed.
+
+    Raises:
+        InputError: the path is not absolute, and nothing is changed; or the folder's files cannot be used, and the
+            folder is accepted all the same, so that its files can be made again.
+        OSError: objects.json cannot be written; nothing is changed.
+    """
+    if not known_folders.can_be_known(folder):
+        raise InputError(f"This file does not name its reconstruction folder ({folder}); choose another.")
+    failure = None
+    try:
+        written = _write_kept(root, Reconstruction(folder).objects)
+    except InputError as error:
+        failure, written = error, {}
+    if folder != scene.folder_of(root):
+        scene.link_folder(root, folder)
+    is_remembered = known_folders.remember(folder)
+    if failure is not None:
+        raise failure
+    store_edits(root)
+    if not root.objectgs.objects:
+        fill(root)
+    elif any("left_out" in change for change in written.values()):
+        show(root)
+    return is_remembered
+
+
+def _write_kept(root: bpy.types.Collection, path: Path) -> dict[int, dict[str, Any]]:
+    """Write the kept edits of rows to objects.json at `path`, and return them by object ID."""
+    known = {entry.id for entry in read_objects(path)} if path.exists() else set()
+    items = [item for item in root.objectgs.objects if from_stored(item.object_id) in known]
+    changes = {from_stored(item.object_id): change for item in items if (change := _kept(item))}
+    if changes:
+        edit_objects(path, changes)
+    for item in items:
+        _remember(item)
+    return changes
 
 
 def merge(root: bpy.types.Collection, object_ids: Iterable[int], into: int) -> None:
@@ -153,6 +204,7 @@ def _edit(root: bpy.types.Collection, changes: dict[int, dict]) -> None:
     """Write edits to objects.json and show them."""
     if not changes:
         return
+    folder_trust.require_accepted(root)
     _require_object_mode(root)
     store_edits(root)
     edit_objects(Reconstruction(scene.folder_of(root)).objects, changes)
@@ -203,6 +255,7 @@ def reset_colors(root: bpy.types.Collection, object_ids: Iterable[int]) -> None:
 
 def _show_edit(root: bpy.types.Collection, changes: dict[int, dict]) -> None:
     """Write edits to objects.json and show them, for edits that require no splats from the folder."""
+    folder_trust.require_accepted(root)
     _require_object_mode(root)
     flush()
     folder = scene.folder_of(root)
@@ -226,6 +279,8 @@ def flush() -> None:
         return
     _unwritten.clear()
     for root in [root for root in bpy.data.collections if scene.kind_of(root) == "reconstruction"]:
+        if not folder_trust.is_accepted(root):
+            continue
         items = [item for item in root.objectgs.objects if (root.session_uid, from_stored(item.object_id)) in waiting]
         if items:
             _write_colors(root, items)
@@ -312,6 +367,10 @@ def _row_changed(item: Any, **changes: Any) -> None:
         return
     root = item.id_data
     folder = scene.folder_of(root)
+    if not folder_trust.is_accepted(root):
+        red, green, blue = _rgb(item)
+        scene.show_label(root, from_stored(item.object_id), item.name, (red, green, blue))
+        return
     try:
         _require_object_mode(root)
         flush()
@@ -336,7 +395,24 @@ def _require_object_mode(root: bpy.types.Collection) -> None:
 
 def _remember(item: Any) -> None:
     """Store the state that a failed edit reverts to."""
-    item.stored = json.dumps([item.name, list(item.color), item.chosen, object_list.recolor_of(item).stored()])
+    stored = json.dumps([item.name, list(item.color), item.chosen, object_list.recolor_of(item).stored()])
+    if item.stored != stored:
+        item.stored = stored
+
+
+def _kept(item: Any) -> dict[str, Any]:
+    """Return the fields of a row that differ from its stored state, as edits of objects.json."""
+    try:
+        name, color, chosen, *recolor = json.loads(item.stored)
+    except (ValueError, TypeError):
+        return {}
+    now = json.loads(json.dumps(object_list.recolor_of(item).stored()))
+    return {
+        **({"name": item.name} if item.name != name else {}),
+        **({"color": _rgb(item)} if list(item.color) != color else {}),
+        **({"left_out": None if item.chosen else True} if item.chosen != chosen else {}),
+        **({"recolor": now} if recolor and now != recolor[0] else {}),
+    }
 
 
 def _restore(item: Any) -> None:

@@ -12,6 +12,7 @@ from ...backend.shared.errors import InputError
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.plan import Decision, Plan, read_plan
 from .. import scene
+from . import folder_trust
 
 _known: dict[Path, tuple[int, Plan]] = {}
 """Folder -> modification time and content of its plan, cached for panels."""
@@ -27,6 +28,11 @@ def plan_of(folder: Path) -> Plan:
         return _known[folder][1]
     except (InputError, OSError):
         return Plan()
+
+
+def plan_for(root: bpy.types.Collection) -> Plan:
+    """Return the plan of a reconstruction, or an empty plan if its folder is not accepted."""
+    return plan_of(scene.folder_of(root)) if folder_trust.is_accepted(root) else Plan()
 
 
 def is_wanted(properties: Any, decision: Decision) -> bool | None:
@@ -51,7 +57,7 @@ def arguments(root: bpy.types.Collection) -> list[str]:
     properties = root.objectgs
     wanted = {
         decision.key: is_wanted(properties, decision)
-        for decision in plan_of(scene.folder_of(root)).decisions
+        for decision in plan_for(root).decisions
         if decision.can_override and is_wanted(properties, decision) != decision.planned
     }
     keep = [key for key, done in wanted.items() if done]

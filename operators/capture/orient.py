@@ -27,7 +27,7 @@ class _PicksPoints:
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not need.reconstruction(cls, context):
+        if not need.shown(cls, context):
             return False
         if context.mode == "OBJECT":
             return True

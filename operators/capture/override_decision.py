@@ -5,7 +5,6 @@ import bpy
 from bpy.props import StringProperty
 
 from ...backend.shared.errors import InputError
-from ...objectgs_addon import scene
 from ...objectgs_addon.state import planning
 from ..common import need
 from ..common.reporting import reports_errors
@@ -21,7 +20,7 @@ class OverrideDecision(bpy.types.Operator):
 
     @classmethod
     def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        decision = planning.plan_of(scene.folder_of(need.active_root(context)))[properties.key]
+        decision = planning.plan_for(need.active_root(context))[properties.key]
         return cls.bl_description if decision is None else planning.sentence_case(decision.why)
 
     @classmethod
@@ -31,7 +30,7 @@ class OverrideDecision(bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:
         root = need.active_root(context)
-        decision = planning.plan_of(scene.folder_of(root))[self.key]
+        decision = planning.plan_for(root)[self.key]
         if decision is None or not decision.can_override:
             raise InputError(f"The plan leaves no choice about {self.key or 'nothing'}")
         planning.want(root.objectgs, self.key, not planning.is_wanted(root.objectgs, decision))

@@ -12,10 +12,10 @@ from ...backend.shared.errors import InputError
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.lock import lock_holder
 from ...objectgs_addon import scene
-from ...objectgs_addon.environment import locations
+from ...objectgs_addon.environment import known_folders, locations
 from ...objectgs_addon.picking import selection
 from ...objectgs_addon.running import background
-from ...objectgs_addon.state import object_list
+from ...objectgs_addon.state import folder_trust, object_list
 from ...objectgs_addon.state.folder_state import folder_state
 
 
@@ -32,11 +32,21 @@ def backend(cls: Any) -> bool:
     return False
 
 
-def reconstruction(cls: Any, context: bpy.types.Context) -> bool:
-    """Whether there is an active reconstruction whose folder exists."""
-    root = active_root(context)
-    if root is None:
+def shown(cls: Any, context: bpy.types.Context) -> bool:
+    """Whether there is an active reconstruction, for operators that do not use its folder."""
+    if active_root(context) is None:
         cls.poll_message_set("There is no reconstruction in this scene; import a capture first")
+        return False
+    return True
+
+
+def reconstruction(cls: Any, context: bpy.types.Context) -> bool:
+    """Whether there is an active reconstruction whose folder the user has accepted, and which exists."""
+    if not shown(cls, context):
+        return False
+    root = active_root(context)
+    if not folder_trust.is_accepted(root):
+        cls.poll_message_set(folder_trust.REFUSAL)
         return False
     folder = scene.folder_of(root)
     if not folder_state(folder).exists:
@@ -78,6 +88,9 @@ def capture(cls: Any, context: bpy.types.Context) -> bool:
     if location is None:
         cls.poll_message_set(f"{Reconstruction(folder).cameras} does not name the capture; import it again")
         return False
+    if known_folders.is_remote(location) and not known_folders.is_known(location):
+        cls.poll_message_set(f"The capture {location} is on another computer; import it again to use it")
+        return False
     if location.is_dir():
         return True
     cls.poll_message_set(f"The capture {location} is missing; put it back, or import it again from where it is now")
@@ -106,8 +119,13 @@ def work_on_capture(cls: Any, context: bpy.types.Context) -> bool:
 
 
 def objects(cls: Any, context: bpy.types.Context) -> bool:
-    """Whether the active reconstruction has a list of objects."""
-    if not reconstruction(cls, context):
+    """Whether the active reconstruction's folder can be used, and it has a list of objects."""
+    return reconstruction(cls, context) and listed_objects(cls, context)
+
+
+def listed_objects(cls: Any, context: bpy.types.Context) -> bool:
+    """Whether the active reconstruction has a list of objects, for operators that do not use its folder."""
+    if not shown(cls, context):
         return False
     if active_root(context).objectgs.objects:
         return True

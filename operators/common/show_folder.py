@@ -10,6 +10,7 @@ from ...backend.shared.errors import InputError
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...objectgs_addon import scene
 from ...objectgs_addon.blender import messages
+from ...objectgs_addon.environment import known_folders
 from ...objectgs_addon.running import background
 from ...objectgs_addon.state import object_edits
 from ...objectgs_addon.state import viewports as view
@@ -18,11 +19,12 @@ from ...objectgs_addon.state import viewports as view
 def show_folder(operator: bpy.types.Operator, context: bpy.types.Context, folder: Path, root: Any) -> None:
     """Show what a folder contains, and report it through `operator`.
 
-    root: the collection that shows the folder, or None to add one.
+    root: the collection to show it in, or None to add one. The folder counts as accepted once its cameras are shown.
 
     Raises InputError for unusable cameras; what is wrong with splats and meshes is reported.
     """
     root = scene.show_capture(context.scene, folder, root)
+    known_folders.remember(folder)
     object_edits.fill(root)
     context.scene.objectgs.active = root
     try:

@@ -11,9 +11,10 @@ from ...objectgs_addon.running import background
 from ...objectgs_addon.state import object_edits
 from ..common import need
 from ..common.reporting import reports_errors
+from .output_folder import UsesOutputFolder
 
 
-class FilmFrames(bpy.types.Operator):
+class FilmFrames(UsesOutputFolder, bpy.types.Operator):
     bl_idname = "objectgs.film_frames"
     bl_label = "Render Film Frames"
     bl_description = (
@@ -36,6 +37,7 @@ class FilmFrames(bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
         root, owner = need.active_root(context), context.scene
+        self.remember_output(context)
         reconstruction = scene.folder_of(root)
         folder = folder_of(owner, reconstruction)
         settings = owner.objectgs_film

@@ -8,9 +8,10 @@ from ...objectgs_addon.film.properties import folder_of
 from ...objectgs_addon.state import object_list
 from ..common import need
 from ..common.reporting import reports_errors
+from .output_folder import UsesOutputFolder
 
 
-class SetUpCompositor(bpy.types.Operator):
+class SetUpCompositor(UsesOutputFolder, bpy.types.Operator):
     bl_idname = "objectgs.set_up_compositor"
     bl_label = "Set Up Compositor"
     bl_description = (
@@ -26,6 +27,7 @@ class SetUpCompositor(bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:
         root, owner = need.active_root(context), context.scene
+        self.remember_output(context)
         item = object_list.active_item(root)
         film.set_up_compositor(
             owner,

@@ -19,7 +19,7 @@ class MarkAssets(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not need.objects(cls, context):
+        if not need.listed_objects(cls, context):
             return False
         if scene.object_meshes(need.active_root(context)):
             return True

@@ -16,7 +16,7 @@ class SoloObject(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not need.objects(cls, context):
+        if not need.listed_objects(cls, context):
             return False
         if scene.object_collections(need.active_root(context)):
             return True

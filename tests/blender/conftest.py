@@ -15,6 +15,7 @@ import headless
 headless.extension()
 
 from objectgs.objectgs_addon.demo import capture as demo_capture
+from objectgs.objectgs_addon.environment import known_folders
 
 _status = pytest.ExitCode.OK
 
@@ -38,6 +39,15 @@ def fresh():
     bpy.ops.wm.read_factory_settings(use_empty=True)
     yield
     bpy.ops.wm.read_factory_settings(use_empty=True)
+
+
+@pytest.fixture(autouse=True)
+def known(tmp_path_factory, monkeypatch) -> Path:
+    """The file of accepted folders, which is empty at the start of each test, and not the user's."""
+    path = tmp_path_factory.mktemp("user") / known_folders.NAME
+    monkeypatch.setattr(known_folders, "_path", lambda: path)
+    monkeypatch.setattr(known_folders, "_unwritten", [])
+    return path
 
 
 @pytest.fixture(scope="session")

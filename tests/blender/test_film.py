@@ -550,6 +550,7 @@ def test_the_buttons(shot_blend, backend_python, registered, monkeypatch, tmp_pa
     scene = bpy.context.scene
     root = next(child for child in scene.collection.children_recursive if kinds.kind_of(child) == "reconstruction")
     scene.objectgs.active = root
+    bpy.ops.objectgs.use_folder()
     scene.objectgs_film.folder = str(tmp_path / "frames")
     with pytest.raises(RuntimeError, match="no film frames"):
         bpy.ops.objectgs.set_up_compositor()
