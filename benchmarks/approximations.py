@@ -221,7 +221,7 @@ def mesh_choices() -> list[Choice]:
             "texture size",
             "by photos",
             {"by photos": {}, **{f"{size}": {"texture_size": size} for size in (256, 512, 2048, 4096)}},
-            "pixels along the side; by photos: the smallest from 512 on that holds what the photos show",
+            "pixels along the side; by photos: the smallest from 512 on that can hold the detail of the photos",
         ),
     ]  # fmt: skip
 
@@ -770,7 +770,7 @@ def run(demo: Path, steps: int) -> tuple[Found, dict[str, Sequence[Choice]], dic
     choices = {"raster": raster_choices(), "training": training_choices(), "meshes": mesh_choices()}
     copy = WORK / "reconstruction"
     if not (demo / "checkpoint").is_dir():
-        raise SystemExit(f"{demo} is no trained reconstruction; make one by `make demo`, or name one by --demo.")
+        raise SystemExit(f"{demo} is not a trained reconstruction; make one by `make demo`, or name one by --demo.")
     code = [*shared.sources(), *(ROOT / "benchmarks" / name for name in ("raster_variants.py", "shared.py"))]
     made_from = shared.digest(code, (demo / "objectgs.json").read_text(), (demo / "splats.ply").stat().st_size, TURNS)
     marker = WORK / "made-from.txt"

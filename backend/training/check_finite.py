@@ -51,7 +51,11 @@ class Fault(NamedTuple):
         more = f" and {others} more" if others else ""
         fate = "the update was skipped"
         if len(self.unrecoverable):
-            fate = f"{len(self.unrecoverable)} of them were taken out" if others else "it was taken out of the model"
+            fate = (
+                f"{len(self.unrecoverable)} of them were removed from the model"
+                if others
+                else "it was removed from the model"
+            )
         return f"{first}, because of {who} {int(self.anchors[0])} ({owner}){more}; {fate}."
 
 

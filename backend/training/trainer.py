@@ -290,7 +290,7 @@ class Trainer:
             started, last_saved, last_report = started + waited, last_saved + waited, last_report + waited
             if stopped:
                 self.save(checkpoints)
-                raise Cancelled(f"Stopped after {p.step} steps; run the same command again to go on.")
+                raise Cancelled(f"Stopped after {p.step} steps; run the same command again to resume.")
             loss = self.step(progress)
             while self._warnings:
                 reporter.warning(self._warnings.pop(0))

@@ -626,13 +626,13 @@ def spoil(scene, what: str) -> tuple[str, ...]:
         name = what.split()[0]
         (model / name).unlink()
         return name, "missing"
-    if what.endswith("is cut short"):
+    if what.endswith("is truncated"):
         path = model / what.split()[0]
         path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
-        return path.name, "cut short"
+        return path.name, "truncated"
     if what.endswith("is empty"):
         (model / what.split()[0]).write_bytes(b"")
-        return what.split()[0], "cut short"
+        return what.split()[0], "truncated"
     data = bytearray((model / "images.bin").read_bytes())
     if what == "no pose":
         (model / "images.bin").write_bytes(struct.pack("<Q", 0))
@@ -724,8 +724,8 @@ def spoil(scene, what: str) -> tuple[str, ...]:
 
 @pytest.mark.parametrize(
     "what",
-    ["cameras.bin is missing", "images.bin is missing", "points3D.bin is missing", "cameras.bin is cut short",
-     "images.bin is cut short", "points3D.bin is cut short", "images.bin is empty", "no pose", "NaN pose",
+    ["cameras.bin is missing", "images.bin is missing", "points3D.bin is missing", "cameras.bin is truncated",
+     "images.bin is truncated", "points3D.bin is truncated", "images.bin is empty", "no pose", "NaN pose",
      "zero rotation", "infinite position", "absent camera", "outside name", "3 points", "unknown model", "NaN camera",
      "degenerate camera", "image size", "damaged image", "not an image", "no images", "no images folder", "mask size",
      "JPEG mask", "JPEG mask in disguise", "picture mask", "damaged mask", "fractional mask", "NaN mask",
@@ -929,7 +929,7 @@ def test_subfolders(tmp_path):
 
 
 def test_refused_fixtures(tmp_path):
-    refused(fixture("truncated"), tmp_path, "images.bin is cut short", "82 images")
+    refused(fixture("truncated"), tmp_path, "images.bin is truncated", "82 images")
     refused(fixture("cameras_only"), tmp_path, "images.bin and points3D.bin are missing")
     refused(fixture("degenerate_two_images"), tmp_path, "cameras.bin", "SIMPLE_RADIAL", "degenerate")
 

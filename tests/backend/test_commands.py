@@ -357,7 +357,7 @@ def test_votes_are_cast_once_and_again_when_they_would_differ(write_capture, tmp
     Image.fromarray(np.full((48, 64), 2, np.uint8)).save(scene.folder / "masks" / scene.names[1])
     assert ask(*train).code == EXIT_DONE and len(cast) == 5, "a mask was edited"
     (out / "points.ply").write_bytes((out / "points.ply").read_bytes()[:200])
-    assert ask(*train).code == EXIT_DONE and len(cast) == 6, "points.ply was cut short"
+    assert ask(*train).code == EXIT_DONE and len(cast) == 6, "points.ply was truncated"
 
 
 def test_a_report_leaves_out_what_was_measured_on_an_earlier_model(trained, ask):
@@ -422,7 +422,7 @@ def spoil(scene, what: str) -> tuple[str, ...]:
     if what.startswith("truncated"):
         path = model / what.split()[1]
         path.write_bytes(path.read_bytes()[:-7])
-        return path.name, "cut short"
+        return path.name, "truncated"
     data = bytearray((model / "images.bin").read_bytes())
     if what == "no pose":
         (model / "images.bin").write_bytes(struct.pack("<Q", 0))
@@ -476,7 +476,7 @@ def test_bad_captures_are_one_sentence_and_leave_nothing(write_capture, tmp_path
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("truncated", ("images.bin", "cut short")),
+        ("truncated", ("images.bin", "truncated")),
         ("cameras_only", ("images.bin", "missing")),
         ("missing_cameras_subfolders_txt", ("images", "does not exist")),
         ("degenerate_two_images", ("cameras.bin", "degenerate")),
@@ -594,13 +594,13 @@ def test_a_checkpoint_cut_short_falls_back_and_says_so(trained, ask):
     current.write_bytes(current.read_bytes()[:5000])
     for command in ("evaluate", "render", "report"):
         answer = ask(command, out)
-        assert answer.code == EXIT_DONE and f"{current} is cut short" in answer.err
+        assert answer.code == EXIT_DONE and f"{current} is truncated" in answer.err
     answer = ask("train", capture, "--out", out, "--steps", 30, *SMALL)
-    assert answer.code == EXIT_DONE and f"{current} is cut short" in answer.err
+    assert answer.code == EXIT_DONE and f"{current} is truncated" in answer.err
     assert "Resuming after step 20" in answer.out and step_of(out) == 30
     for path in (current, out / "checkpoint" / PREVIOUS):
         path.write_bytes(b"")
-    refused(ask("render", out), str(out / "checkpoint"), "cut short")
+    refused(ask("render", out), str(out / "checkpoint"), "truncated")
     refused(ask("train", capture, "--out", out, "--steps", 40, *SMALL), str(out / "checkpoint"), "--restart")
     assert ask("train", capture, "--out", out, "--steps", 5, *SMALL, "--restart").code == EXIT_DONE
 

@@ -397,7 +397,7 @@ def test_what_cannot_be_imported_leaves_nothing(ask, write_capture, folder, tmp_
     made = tmp_path / "not" / "there"
     refused(ask("import-splats", tmp_path / "none.ply", "--out", made), "none.ply")
     write_splats(tmp_path / "empty.ply", Splats.empty())
-    refused(ask("import-splats", tmp_path / "empty.ply", "--out", made), "holds no splats")
+    refused(ask("import-splats", tmp_path / "empty.ply", "--out", made), "contains no splats")
     refused(ask("import-splats", scene.folder / "labels.json", "--out", made), "not a PLY")
     far = some_splats()
     far.means += 1000

@@ -312,4 +312,4 @@ def test_evaluate_warns_of_a_render_with_nan():
     heard = Heard()
     capture = _Capture([np.zeros((12, 16, 3), np.uint8)], [None])
     evaluate(capture, lambda i: (np.full((12, 16, 3), np.nan), np.zeros((12, 16), int)), [0], heard)
-    assert heard.warnings == ["The render of 0.png holds NaN or Inf."]
+    assert heard.warnings == ["The render of 0.png contains NaN or Inf."]

@@ -391,7 +391,7 @@ def test_a_checkpoint_cut_short_falls_back_to_the_one_before_and_says_so(tmp_pat
         assert state["step"] == 1 and tensors["x"][0] == 1
         assert CURRENT in warning and PREVIOUS in warning
     (tmp_path / PREVIOUS).unlink()
-    with pytest.raises(InputError, match="cut short"):
+    with pytest.raises(InputError, match="truncated"):
         load_checkpoint(tmp_path)
 
 

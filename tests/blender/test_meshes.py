@@ -422,7 +422,7 @@ def test_a_scene_without_objects_shows_its_one_mesh(fresh, folder):
     ("spoil", "sentence"),
     [
         (lambda path: path.unlink(), "2.ply cannot be read"),
-        (lambda path: path.write_bytes(path.read_bytes()[:-1]), "2.ply is cut short"),
+        (lambda path: path.write_bytes(path.read_bytes()[:-1]), "2.ply is truncated"),
         (lambda path: path.write_bytes(b"ply\n"), "2.ply is not a mesh"),
     ],
 )

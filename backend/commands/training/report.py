@@ -190,7 +190,7 @@ def _left_out(trained: Trained) -> list[dict[str, str]]:
     cases = [
         (
             counts["unregistered"] > 0, f"{counts['unregistered']} images without a pose",
-            "COLMAP could not place them",
+            "COLMAP could not register them",
         ),
         (
             counts["missing"] > 0, f"{counts['missing']} images listed in the COLMAP model",

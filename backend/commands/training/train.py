@@ -52,7 +52,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         progress = trainer.progress
         if progress.step and budget.progress(progress) >= 1:
             reporter.status(
-                f"Already trained for {progress.step} steps in {progress.seconds:.0f} s; ask for more --minutes or "
+                f"Already trained for {progress.step} steps in {progress.seconds:.0f} s; specify more --minutes or "
                 "--steps to extend it, or --restart to start over."
             )
         else:
@@ -247,7 +247,7 @@ def _write_export(model: ObjectModel, scene: Scene, folder: Reconstruction, repo
         )
         report = reporter.status if model.explicit else reporter.warning
         report(
-            f"{what}: {folder.splats.name} holds {has}, whose PSNR to renders of the model in the {where} views "
+            f"{what}: {folder.splats.name} contains {has}, whose PSNR to renders of the model in the {where} views "
             f"{how_well}."
         )
     for sentence in write_splats(folder.splats, splats):
