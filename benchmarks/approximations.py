@@ -250,9 +250,9 @@ def write_scene(folder: Path, path: Path) -> None:
     with torch.no_grad():
         g = model.generate(seen, camera.center)
         drawn = rasterize(*g[:6], camera, labels=labels)
-        picture = drawn.color + (1 - drawn.alpha) * model.background[:, None, None]
+        image = drawn.color + (1 - drawn.alpha) * model.background[:, None, None]
         known = labels >= 0
-        g_color = (picture - photo) / photo.numel()
+        g_color = (image - photo) / photo.numel()
         g_label_probability = torch.where(known, -0.1 / (drawn.label_probability + 0.01), 0.0) / known.sum()
     means = g.means.double() - torch.from_numpy(camera.center)
     names = dict(zip(raster_variants.PARAMETERS, (means, *g[1:5]), strict=True))

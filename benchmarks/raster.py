@@ -131,9 +131,9 @@ def against_reference(repeats: int) -> dict[str, float]:
 
     def reference() -> None:
         leaves = {name: torch.from_numpy(getattr(g, name)).double().requires_grad_() for name in names}
-        picture = rasterize_reference(**leaves, ids=torch.from_numpy(g.ids), camera=scene.camera, objects=8)
-        weight = picture.probabilities.gather(-1, labels)[..., 0]
-        planes = (picture.color, picture.alpha, weight)
+        expected = rasterize_reference(**leaves, ids=torch.from_numpy(g.ids), camera=scene.camera, objects=8)
+        weight = expected.probabilities.gather(-1, labels)[..., 0]
+        planes = (expected.color, expected.alpha, weight)
         sum((a * b).sum() for a, b in zip(planes, target, strict=True)).backward()
 
     slow = timed({"reference": reference}, 3)["reference"][0]

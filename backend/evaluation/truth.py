@@ -176,8 +176,8 @@ def _read_view(capture: Capture, index: int) -> _View:
     ids_file = capture.folder / "truth" / "masks" / name.with_suffix(".png")
     try:
         depth = np.load(depth_file)
-        with Image.open(ids_file) as picture:
-            ids = np.asarray(picture)
+        with Image.open(ids_file) as image:
+            ids = np.asarray(image)
     except (OSError, ValueError) as error:
         raise InputError(f"{depth_file} or {ids_file} cannot be read ({error}); make the capture again.") from error
     if depth.ndim != 2 or ids.shape != depth.shape:

@@ -71,8 +71,8 @@ def find_fault_of_loss(terms: Mapping[str, torch.Tensor], g: Generated, seen: to
     named = [name for name, value in terms.items() if not value.isfinite()]
     numbers = torch.cat([g.means, g.quats, g.scales, g.opacities[:, None]], 1).detach()
     broken = ~(numbers.isfinite().all(1) & (g.sh.detach().flatten(1).abs().amax(1) <= BRIGHTEST))
-    if g.made is not None:
-        broken &= g.made
+    if g.valid is not None:
+        broken &= g.valid
     sources = g.source[broken]
     anchors = seen[sources // offsets].unique()
     splat = None

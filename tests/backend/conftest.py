@@ -70,15 +70,15 @@ def sphere_ids(rays: np.ndarray, viewmat: np.ndarray, spheres: list) -> tuple[np
     return ids, best
 
 
-def look_at(eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the quaternion (w, x, y, z) and world-to-camera matrix of a camera at `eye` that looks at the origin."""
-    forward = -eye / np.linalg.norm(eye)
+def look_at(camera_center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the quaternion (w, x, y, z) and world-to-camera matrix of a camera that looks at the origin."""
+    forward = -camera_center / np.linalg.norm(camera_center)
     right = np.cross(forward, [0.0, -1.0, 0.0])
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
     x, y, z, w = pycolmap.Rotation3d(rotation).quat
     viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ camera_center
     return np.array([w, x, y, z]), viewmat
 
 

@@ -93,7 +93,7 @@ def test_gaussians_and_their_gradients(both, mode):
         rows = anchors.rows.clone().requires_grad_()
         g = generate(
             anchors.layout, anchors.positions, rows, anchors.ids, heads, np.array([0.1, 0.2, -9.0])
-        ).only_made()
+        ).only_valid()
         parts = (g.means, g.quats, g.scales, g.opacities, g.sh)
         total = sum((p.reshape(len(p), -1) * w[g.source][:, : p[0].numel()]).sum() for p, w in zip(parts, weights))
         return g, torch.autograd.grad(total, [rows, *heads.parameters()])
@@ -114,8 +114,8 @@ def test_absent_anchors_make_no_gaussian(as_on_gpu):
     heads = Heads(anchors.layout, "explicit", 0, torch.Generator())
     present = torch.arange(50) < 30
     g = generate(anchors.layout, anchors.positions, anchors.rows, anchors.ids, heads, present=present)
-    assert len(g.source) == 200 and (g.made == (g.opacities > 0)).all()
-    assert g.only_made().source.max() < 120 and g.only_made().made is None
+    assert len(g.source) == 200 and (g.valid == (g.opacities > 0)).all()
+    assert g.only_valid().source.max() < 120 and g.only_valid().valid is None
 
 
 def test_an_extent_beyond_the_limit_keeps_its_gradient(both):
@@ -125,7 +125,7 @@ def test_an_extent_beyond_the_limit_keeps_its_gradient(both):
 
     def gradient():
         rows = anchors.rows.clone().requires_grad_()
-        generate(anchors.layout, anchors.positions, rows, anchors.ids, heads).only_made().scales.sum().backward()
+        generate(anchors.layout, anchors.positions, rows, anchors.ids, heads).only_valid().scales.sum().backward()
         return rows.grad[:, anchors.layout.extent_columns]
 
     want, got = both(gradient)
@@ -172,9 +172,9 @@ def test_image_loss(both, size, weights):
 def test_volume_loss(both, as_on_gpu, flat):
     scales = torch.rand(2500, 3)
 
-    def loss(made=None):
+    def loss(valid=None):
         leaf = scales.clone().requires_grad_()
-        value = volume_loss(leaf, flat, made)
+        value = volume_loss(leaf, flat, valid)
         value.backward()
         return value, leaf.grad
 
@@ -182,10 +182,10 @@ def test_volume_loss(both, as_on_gpu, flat):
     close(got, want, 1e-5)
     close(gradient, want_gradient, 1e-5)
     as_on_gpu(True)
-    made = torch.rand(2500) < 0.4
-    value, gradient = loss(made)
-    close(value, scales[made][:, : 2 if flat else 3].prod(1).mean(), 1e-5)
-    assert (gradient[~made] == 0).all()
+    valid = torch.rand(2500) < 0.4
+    value, gradient = loss(valid)
+    close(value, scales[valid][:, : 2 if flat else 3].prod(1).mean(), 1e-5)
+    assert (gradient[~valid] == 0).all()
 
 
 def test_normal_loss(both):

@@ -84,8 +84,8 @@ def test_splats_that_move_with_the_camera_look_the_same():
 
 def test_a_scale_about_the_camera_looks_the_same():
     splats = some_splats()
-    eye = np.array([0, 0, -4.0])
-    scaled = transformed(splats, affine(2.5 * np.eye(3), eye - 2.5 * eye))
+    camera_center = np.array([0, 0, -4.0])
+    scaled = transformed(splats, affine(2.5 * np.eye(3), camera_center - 2.5 * camera_center))
     np.testing.assert_allclose(picture(scaled, camera()), picture(splats, camera()), atol=1e-10)
 
 

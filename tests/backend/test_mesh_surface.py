@@ -26,15 +26,15 @@ from backend.shared.errors import Cancelled
 from backend.shared.events import Reporter
 
 
-def camera_at(eye, width=64, height=48, focal=60.0):
-    """Return a camera at `eye` that looks at the origin, with z up."""
-    eye = np.asarray(eye, float)
-    forward = -eye / np.linalg.norm(eye)
+def camera_at(camera_center, width=64, height=48, focal=60.0):
+    """Return a camera at `camera_center` that looks at the origin, with z up."""
+    camera_center = np.asarray(camera_center, float)
+    forward = -camera_center / np.linalg.norm(camera_center)
     right = np.cross(forward, [0.0, 0.0, 1.0] if abs(forward[2]) < 0.99 else [0.0, 1.0, 0.0])
     right /= np.linalg.norm(right)
     viewmat = np.eye(4)
     viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    viewmat[:3, 3] = -viewmat[:3, :3] @ camera_center
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
     return Camera(viewmat, K, width, height)
 
@@ -63,8 +63,8 @@ def together(*parts):
 def views_of(splats, cameras, explicit=True, mask=None, primitive="3d", **options):
     """Return `Views` of plain splats; object IDs are ten times the class index."""
 
-    def generate(seen=None, eye=None):
-        assert explicit or eye is not None
+    def generate(seen=None, camera_center=None):
+        assert explicit or camera_center is not None
         return splats if seen is None else splats.select(seen)
 
     anchors = SimpleNamespace(ids=splats.ids)
@@ -236,15 +236,15 @@ class Exact:
         return self._alone[index]
 
     @staticmethod
-    def trace(shape, eye, rays):
+    def trace(shape, camera_center, rays):
         t, live = np.zeros(len(rays)), np.arange(len(rays))
         for _ in range(80):
-            step = shape(eye + t[live, None] * rays[live])
+            step = shape(camera_center + t[live, None] * rays[live])
             t[live] += step
             live = live[(np.abs(step) > 1e-6) & (t[live] < 20)]
             if not len(live):
                 break
-        t[live] = np.where(np.abs(shape(eye + t[live, None] * rays[live])) < 1e-4, t[live], np.inf)
+        t[live] = np.where(np.abs(shape(camera_center + t[live, None] * rays[live])) < 1e-4, t[live], np.inf)
         return np.where(t < 20, t, np.inf)
 
     def scene_map(self, index):

@@ -21,14 +21,14 @@ from backend.shared.errors import Cancelled
 from backend.shared.events import Reporter
 
 
-def camera_at(eye, target=(0.0, 0.0, 0.0), width=64, height=48, focal=60.0) -> Camera:
-    forward = np.asarray(target, np.float64) - eye
+def camera_at(camera_center, target=(0.0, 0.0, 0.0), width=64, height=48, focal=60.0) -> Camera:
+    forward = np.asarray(target, np.float64) - camera_center
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0] if abs(forward[2]) < 0.9 else [0.0, 1.0, 0.0])
     right /= np.linalg.norm(right)
     viewmat = np.eye(4)
     viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    viewmat[:3, 3] = -viewmat[:3, :3] @ camera_center
     return Camera(
         viewmat, np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float64), width, height
     )
@@ -132,13 +132,13 @@ def test_a_tiny_mesh_and_faces_without_area_are_unwrapped():
 def test_texels_know_their_place_on_the_face():
     uvs = np.array([[[0.1, 0.1], [0.6, 0.1], [0.1, 0.8]]], np.float32)
     whole = find_texels(uvs, 64, 0, 64)
-    x, y = (whole.place % 64 + 0.5) / 64, 1 - (whole.place // 64 + 0.5) / 64
+    x, y = (whole.indices % 64 + 0.5) / 64, 1 - (whole.indices // 64 + 0.5) / 64
     np.testing.assert_allclose(np.einsum("ij,nj->ni", uvs[0].T, whole.weights), np.stack([x, y], 1), atol=1e-5)
     inside = (x > 0.1) & (y > 0.1) & ((x - 0.1) / 0.5 + (y - 0.1) / 0.7 < 1)
     np.testing.assert_array_equal(inside, (whole.weights > 0).all(1))
     assert (~inside).sum() > 60  # a rim of one texel around it
     parts = [find_texels(uvs, 64, first, 24) for first in (0, 24, 48)]
-    np.testing.assert_array_equal(np.concatenate([part.place for part in parts]), whole.place)
+    np.testing.assert_array_equal(np.concatenate([part.indices for part in parts]), whole.indices)
     np.testing.assert_allclose(np.concatenate([part.weights for part in parts]), whole.weights, atol=1e-5)
 
 
@@ -168,12 +168,12 @@ LOUD = np.array([1.0, 0.0, 1.0], np.float32)
 class StubViews:
     """Photos of a mesh of known colors (class 1), partly hidden by another mesh of one loud color (class 2)."""
 
-    def __init__(self, mesh, other=None, eyes=24, size=160, masks=True, below=False):
+    def __init__(self, mesh, other=None, view_count=24, size=160, masks=True, below=False):
         self.downscale = 1
         self.model = SimpleNamespace(classes=ClassTable([0, 7, 9]))
         self.scene = self
-        angles = np.arange(eyes) * 2.4
-        heights = np.linspace(-0.9 if below else 0.1, 0.9, eyes)
+        angles = np.arange(view_count) * 2.4
+        heights = np.linspace(-0.9 if below else 0.1, 0.9, view_count)
         self.cameras = [
             camera_at(
                 4 * np.array([np.sqrt(1 - h * h) * np.cos(a), np.sqrt(1 - h * h) * np.sin(a), h]),
@@ -181,8 +181,8 @@ class StubViews:
             )
             for a, h in zip(angles, heights)
         ]  # fmt: skip
-        self.indices = tuple(i for i in range(eyes) if i % 6)
-        self.held_out = tuple(i for i in range(eyes) if i % 6 == 0)
+        self.indices = tuple(i for i in range(view_count) if i % 6)
+        self.held_out = tuple(i for i in range(view_count) if i % 6 == 0)
         self.masks = masks
         self.pictures, self.labels, self.drawn = [], [], []
         for camera in self.cameras:
@@ -259,14 +259,14 @@ def test_photos_give_the_surface_its_colors_back():
     # No foreign color bleeds in at the charts' edges.
     texels = find_texels(uvs, 512, 0, 512)
     points = np.einsum("nij,ni->nj", mesh.vertices[mesh.faces[texels.face]], texels.weights)
-    assert np.abs(texture.reshape(-1, 3)[texels.place] / 255 - colors_at(points)).max() < 0.2
+    assert np.abs(texture.reshape(-1, 3)[texels.indices] / 255 - colors_at(points)).max() < 0.2
     assert colors.shape == (len(mesh.vertices), 3) and colors.dtype == np.uint8
     np.testing.assert_allclose(colors / 255, np.broadcast_to([0.25, 0.5, 0.75], colors.shape), atol=0.01)
 
 
 def test_gloss_that_moves_with_the_camera_stays_off_the_texture():
     mesh = trimesh.creation.icosphere(4, 1.0)
-    views = StubViews(mesh, eyes=48, below=True)
+    views = StubViews(mesh, view_count=48, below=True)
     y, x = np.mgrid[:120, :160]
     for index, picture in enumerate(views.pictures[::2]):
         place = np.random.default_rng(index).uniform([60, 40], [100, 80])
@@ -277,7 +277,7 @@ def test_gloss_that_moves_with_the_camera_stays_off_the_texture():
     texture, _ = bake_texture(surface, uvs, 512, views, [1])
     texels = find_texels(uvs, 512, 0, 512)
     points = np.einsum("nij,ni->nj", mesh.vertices[mesh.faces[texels.face]], texels.weights)
-    wrong = np.abs(texture.reshape(-1, 3)[texels.place] / 255 - colors_at(points))
+    wrong = np.abs(texture.reshape(-1, 3)[texels.indices] / 255 - colors_at(points))
     # Plain blending of the photos gives 0.046 and 0.29.
     assert wrong.mean() < 0.022 and np.quantile(wrong, 0.99) < 0.14
 
@@ -293,7 +293,7 @@ def test_nothing_of_an_object_in_front_comes_in(masks):
     texture, _ = bake_texture(surface, uvs, 512, views, [1])
     texels = find_texels(uvs, 512, 0, 512)
     points = np.einsum("nij,ni->nj", mesh.vertices[mesh.faces[texels.face]], texels.weights)
-    color = texture.reshape(-1, 3)[texels.place] / 255
+    color = texture.reshape(-1, 3)[texels.indices] / 255
     seen = points[:, 2] > -0.7  # no camera looks from below
     truth = colors_at(points)
     assert np.abs(color - truth)[seen].mean() < 0.03
@@ -319,13 +319,13 @@ def test_a_part_behind_another_does_not_take_its_colors():
     points = np.einsum("nij,ni->nj", mesh.vertices[mesh.faces[texels.face]], texels.weights)
     behind = (points[:, 0] > 0.79) & (points[:, 0] < 0.81) & (np.abs(points[:, 1:] - [0.2, 0.3]) < 0.5).all(1)
     assert behind.sum() > 1000
-    wrong = np.abs(texture.reshape(-1, 3)[texels.place] / 255 - colors_at(points)).max(1)
+    wrong = np.abs(texture.reshape(-1, 3)[texels.indices] / 255 - colors_at(points)).max(1)
     assert wrong[behind].mean() < 0.03 and np.quantile(wrong, 0.99) < 0.12
 
 
 def test_what_no_photo_shows_has_the_splats_colors_and_a_stop_is_heard():
     mesh = trimesh.creation.icosphere(2, 1.0)
-    views = StubViews(mesh, eyes=6)
+    views = StubViews(mesh, view_count=6)
     views.labels = [np.where(label == 1, 2, label) for label in views.labels]
     surface = surface_of(mesh)
     uvs = unwrap(surface, 64)
@@ -379,11 +379,11 @@ def test_a_surface_stays_where_the_photos_say_nothing():
 
 def test_size_follows_the_photos():
     mesh = trimesh.creation.icosphere(2, 1.0)
-    views = StubViews(mesh, eyes=7, size=80)
+    views = StubViews(mesh, view_count=7, size=80)
     assert texture_size(surface_of(mesh), views) == 512
     for factor, size in ((2, 512), (4, 1024), (8, 2048), (16, 4096), (40, 4096)):
         views.cameras = [
             Camera(c.viewmat, np.diag([factor, factor, 1.0]) @ c.K, c.width * factor, c.height * factor)
-            for c in StubViews(mesh, eyes=7, size=80).cameras
+            for c in StubViews(mesh, view_count=7, size=80).cameras
         ]
         assert texture_size(surface_of(mesh), views) == size

@@ -76,17 +76,19 @@ def test_wrong_masks_are_outvoted():
 def test_an_anchor_at_the_camera_center(mode, primitive):
     layout = Layout(4, 8)
     rng = np.random.default_rng(0)
-    eye = np.array([0.3, -0.2, 1.0])
-    xyz = np.concatenate([np.zeros((1, 3)), rng.normal(0, 0.3, (20, 3)) + np.array([0, 0, 2])]) + eye
+    camera_center = np.array([0.3, -0.2, 1.0])
+    xyz = np.concatenate([np.zeros((1, 3)), rng.normal(0, 0.3, (20, 3)) + np.array([0, 0, 2])]) + camera_center
     seeded = seed_anchors(xyz, np.full((21, 3), 0.5), np.zeros(21, np.int64), 1e-3, layout, rng)
     positions = seeded.positions.clone()
-    positions[(positions - torch.tensor(eye).float()).norm(dim=1).argmin()] = torch.tensor(eye).float()
+    positions[(positions - torch.tensor(camera_center).float()).norm(dim=1).argmin()] = torch.tensor(
+        camera_center
+    ).float()
     anchors = Anchors(layout, 1e-3, positions, seeded.rows.requires_grad_(), seeded.ids)
     heads = Heads(layout, mode, 1, torch.Generator().manual_seed(0))
     viewmat = np.eye(4)
-    viewmat[:3, 3] = -eye
+    viewmat[:3, 3] = -camera_center
     camera = Camera(viewmat, np.array([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]]), 32, 24)
-    g = generate(layout, anchors.positions, anchors.rows, anchors.ids, heads, eye)
+    g = generate(layout, anchors.positions, anchors.rows, anchors.ids, heads, camera_center)
     drawn = rasterize(*g[:6], camera, want_depth=True, primitive=primitive)
     assert drawn.alpha.max() > 0.1
     (drawn.color.sum() + drawn.depth.sum()).backward()

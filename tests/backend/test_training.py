@@ -229,14 +229,14 @@ def test_generated_gaussians_have_the_gradients_of_their_equations(mode, sh_degr
     ids = torch.arange(n, dtype=torch.int32)
     heads = Heads(layout, mode, sh_degree, torch.Generator().manual_seed(0))
     k = layout.offsets
-    eye = np.array([0.1, 0.2, -3.0])
-    g = generate(layout, positions, rows, ids, heads, eye)
+    camera_center = np.array([0.1, 0.2, -3.0])
+    g = generate(layout, positions, rows, ids, heads, camera_center)
     assert 0 < len(g.source) < n * k and (g.ids == g.source // k).all()
 
     again = rows.detach().clone().requires_grad_()
     features = again[:, layout.feature_columns]
     if mode == "view":
-        to_anchor = positions - torch.tensor(eye, dtype=torch.float32)
+        to_anchor = positions - torch.tensor(camera_center, dtype=torch.float32)
         distance = to_anchor.norm(dim=1, keepdim=True)
         features = torch.cat([features, distance, to_anchor / distance], 1)
     raw_o, raw_s, raw_c = heads(features)
@@ -651,14 +651,14 @@ def test_explicit_splats_are_the_model(tiny, settings):
 @pytest.mark.parametrize(("scale", "offset"), [(1e-4, 0.0), (1e4, 0.0), (1.0, 1e6)])
 def test_normalization_makes_scale_and_place_irrelevant(scale, offset):
     rng = np.random.default_rng(0)
-    points, eyes = rng.normal(size=(500, 3)), rng.normal(size=(9, 3)) * 4
-    a = Normalization.of(eyes, points)
-    b = Normalization.of(eyes * scale + offset, points * scale + offset)
+    points, camera_centers = rng.normal(size=(500, 3)), rng.normal(size=(9, 3)) * 4
+    a = Normalization.of(camera_centers, points)
+    b = Normalization.of(camera_centers * scale + offset, points * scale + offset)
     np.testing.assert_allclose(a.to_scene(points), b.to_scene(points * scale + offset), atol=1e-6)
     viewmat = np.eye(4)
-    viewmat[:3, 3] = -eyes[0]
+    viewmat[:3, 3] = -camera_centers[0]
     moved = np.eye(4)
-    moved[:3, 3] = -(eyes[0] * scale + offset)
+    moved[:3, 3] = -(camera_centers[0] * scale + offset)
     np.testing.assert_allclose(a.viewmat(viewmat), b.viewmat(moved), atol=1e-6)
 
 

@@ -13,16 +13,16 @@ from backend.capture import compute_upright, load_capture
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
-def looking(eyes, targets, roll_degrees=0.0):
-    """Return viewmats (V, 4, 4) of cameras at `eyes` that look at `targets`, with Z up and some roll."""
+def looking(camera_centers, targets, roll_degrees=0.0):
+    """Return viewmats (V, 4, 4) of cameras at `camera_centers` that look at `targets`, with Z up and some roll."""
     viewmats = []
-    for eye, target, roll in zip(eyes, targets, np.broadcast_to(roll_degrees, len(eyes))):
-        forward = (target - eye) / np.linalg.norm(target - eye)
+    for camera_center, target, roll in zip(camera_centers, targets, np.broadcast_to(roll_degrees, len(camera_centers))):
+        forward = (target - camera_center) / np.linalg.norm(target - camera_center)
         right = np.cross(forward, [0, 0, 1])
         right /= np.linalg.norm(right)
         rotation = Rotation.from_euler("z", roll, degrees=True).as_matrix() @ [right, np.cross(forward, right), forward]
         viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ camera_center
         viewmats.append(viewmat)
     return np.array(viewmats)
 
@@ -31,9 +31,9 @@ def room(rng, arc=360.0, pitch=25.0, roll=2.0, views=40, floor=3000, ceiling=250
     """Return cameras on an arc around the middle of a room, the room's points with the floor at z = 0, and outliers."""
     angles = np.radians(np.linspace(0, arc, views, endpoint=False) + rng.normal(0, 2, views))
     down = np.tan(np.radians(pitch))
-    eyes = np.stack([2 * np.cos(angles), 2 * np.sin(angles), 0.4 + 2 * down + rng.normal(0, 0.05, views)], 1)
+    camera_centers = np.stack([2 * np.cos(angles), 2 * np.sin(angles), 0.4 + 2 * down + rng.normal(0, 0.05, views)], 1)
     viewmats = looking(
-        eyes, np.tile([0, 0, 0.4], (views, 1)) + rng.normal(0, 0.1, (views, 3)), rng.normal(0, roll, views)
+        camera_centers, np.tile([0, 0, 0.4], (views, 1)) + rng.normal(0, 0.1, (views, 3)), rng.normal(0, roll, views)
     )
     flat = rng.uniform(-3, 3, (floor, 3)) * [1, 1, 0]
     above = rng.uniform(-3, 3, (ceiling, 3)) * [1, 1, 0] + [0, 0, 4.5]
@@ -110,9 +110,9 @@ def test_photos_turned_on_their_side_do_not_tilt_it():
 
 def test_pictures_straight_down_have_up_behind_them():
     rng = np.random.default_rng(0)
-    eyes = rng.uniform(-5, 5, (40, 3)) * [1, 1, 0] + [0, 0, 8]
+    camera_centers = rng.uniform(-5, 5, (40, 3)) * [1, 1, 0] + [0, 0, 8]
     flown = np.where(np.arange(40) % 3 == 0, 180.0, 0.0)
-    viewmats = looking(eyes, eyes + np.array([0, 0.02, -1]) + rng.normal(0, 0.01, (40, 3)), flown)
+    viewmats = looking(camera_centers, camera_centers + np.array([0, 0.02, -1]) + rng.normal(0, 0.01, (40, 3)), flown)
     ground = rng.uniform(-6, 6, (2000, 3)) * [1, 1, 0] + rng.normal(0, 0.02, (2000, 3))
     turn = Rotation.random(random_state=1).as_matrix()
     assert degrees_between(proper(compute_upright(*moved(viewmats, ground, turn))), turn[:, 2]) < 1
@@ -182,9 +182,13 @@ def test_real_captures_stand_on_their_table(tmp_path, name, held):
     stood = compute_upright(viewmats, xyz)
     up = proper(stood)
     heights = (xyz @ stood.rotation.T + stood.translation)[:, 2]
-    eyes = -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3]) @ stood.rotation.T + stood.translation
-    size = np.median(np.linalg.norm(eyes, axis=1))
+    camera_centers = (
+        -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3]) @ stood.rotation.T + stood.translation
+    )
+    size = np.median(np.linalg.norm(camera_centers, axis=1))
     assert (np.abs(heights) < 0.01 * size).mean() > held, "the table holds most points"
-    assert (heights > -0.02 * size).mean() > 0.9 and (eyes[:, 2] > 0.1 * size).all(), "nearly nothing lies below it"
+    assert (heights > -0.02 * size).mean() > 0.9 and (camera_centers[:, 2] > 0.1 * size).all(), (
+        "nearly nothing lies below it"
+    )
     assert np.degrees(np.abs(np.median(viewmats[:, 0, :3] @ up))) < 3, "photos are taken level"
     assert degrees_between(-viewmats[:, 1, :3].mean(0), up) < 15

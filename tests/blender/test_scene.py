@@ -68,7 +68,9 @@ def test_cameras_project_as_the_capture_does(fresh, tmp_path, fy):
     upright = np.eye(4)
     upright[:3, :3] = np.array(Matrix.Rotation(0.7, 3, "X")) @ np.array(Matrix.Rotation(0.3, 3, "Z"))
     upright[:3, 3] = 1.0, 2.0, 3.0
-    views = [look_at(np.array(eye) + origin, origin) for eye in ((3, 0.5, 1), (-2, 3, 0.2), (0.1, -4, 3))]
+    views = [
+        look_at(np.array(camera_center) + origin, origin) for camera_center in ((3, 0.5, 1), (-2, 3, 0.2), (0.1, -4, 3))
+    ]
     intrinsics = K.copy()
     intrinsics[1, 1] = fy
     write_cameras(tmp_path, views, intrinsics, origin=origin, upright=upright)
@@ -549,16 +551,16 @@ def test_a_rendered_splat_is_the_gaussian_with_its_color_from_here(fresh, tmp_pa
     image = rendered(tmp_path)
 
     rotation = np.array(_rotation(table))
-    eye = -view[:3, :3].T @ view[:3, 3]
+    camera_center = -view[:3, :3].T @ view[:3, 3]
     v, u = np.mgrid[0:33, 0:33] + 0.5
     rays = np.stack([(u - 16.5) / 60.0, (v - 16.5) / 60.0, np.ones_like(u)], -1) @ view[:3, :3]
-    start = (eye - position) @ rotation / scales
+    start = (camera_center - position) @ rotation / scales
     rays = rays @ rotation / scales
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     squared = start @ start - (rays @ start) ** 2
     alpha = 0.8 * np.exp(-0.5 * squared)
     alpha[alpha < 1 / 255] = 0.0
-    color = np.clip(0.5 + _harmonics(table, position - eye), 0.0, None)
+    color = np.clip(0.5 + _harmonics(table, position - camera_center), 0.0, None)
     linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
     assert np.abs(image - alpha[..., None] * linear).max() < 0.002 * linear.max()
     assert image.max() > 0.5 * linear.max()

@@ -65,13 +65,13 @@ class Spheres:
         self.views, self._pictures, self._masks = [], [], []
         for i in range(VIEWS):
             angle = 2 * math.pi * i / VIEWS
-            eye = np.array([3 * math.cos(angle), -0.8 + 0.5 * (i % 2), 3 * math.sin(angle)])
-            forward = -eye / np.linalg.norm(eye)
+            camera_center = np.array([3 * math.cos(angle), -0.8 + 0.5 * (i % 2), 3 * math.sin(angle)])
+            forward = -camera_center / np.linalg.norm(camera_center)
             right = np.cross(forward, [0.0, -1.0, 0.0])
             right /= np.linalg.norm(right)
             viewmat = np.eye(4)
             viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-            viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+            viewmat[:3, 3] = -viewmat[:3, :3] @ camera_center
             K = np.array([[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1.0]])
             self.views.append(View(WIDTH, HEIGHT, K, viewmat))
             picture, mask = self._shaded(viewmat, K)
@@ -179,7 +179,7 @@ def test_losses_and_gaussians_are_those_of_the_processor(gpu):
         leaves = [v.clone().to(place).requires_grad_() for v in (*planes, depth, rows)]
         color, alpha, weight, background, z, row = leaves
         heads = Heads(layout, "explicit", 1, torch.Generator().manual_seed(0)).to(place)
-        g = generate(layout, positions.to(place), row, ids.to(place), heads).only_made()
+        g = generate(layout, positions.to(place), row, ids.to(place), heads).only_valid()
         values = [
             image_loss(color, alpha, weight, background, target.to(place), labels.to(place), 0.2, 0.1),
             normal_loss(color, z, alpha, np.array([150.0, 150, 100, 60])), volume_loss(g.scales),

@@ -64,15 +64,15 @@ def splats() -> Splats:
     )
 
 
-def viewmat(eye=(0.3, -3.0, 0.8)) -> np.ndarray:
-    """Return the viewmat of a camera at `eye` that looks at the center."""
-    forward = np.array([0, 0, 0.2]) - eye
+def viewmat(camera_center=(0.3, -3.0, 0.8)) -> np.ndarray:
+    """Return the viewmat of a camera at `camera_center` that looks at the center."""
+    forward = np.array([0, 0, 0.2]) - camera_center
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, (0, 0, 1.0))
     right /= np.linalg.norm(right)
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    matrix[:3, 3] = -matrix[:3, :3] @ eye
+    matrix[:3, 3] = -matrix[:3, :3] @ camera_center
     return matrix
 
 
@@ -228,11 +228,11 @@ def test_the_drawing_is_the_backends_picture(window):
 
 def test_parallel_projection(window):
     """It equals the image of a very distant camera."""
-    eye = np.array([200.0, -900.0, 300.0])
-    far = float(np.linalg.norm(eye - (0, 0, 0.2)))
+    camera_center = np.array([200.0, -900.0, 300.0])
+    far = float(np.linalg.norm(camera_center - (0, 0, 0.2)))
     lens = np.array([[50.0 * far, 0, 118.0], [0, 50.0 * far, 92.0], [0, 0, 1]])
-    picture = drawn(window, viewmat(eye), 50.0, orthographic=True)
-    assert psnr(picture, backend_draws(camera=Camera(viewmat(eye), lens, *SIZE))) > 35.0
+    picture = drawn(window, viewmat(camera_center), 50.0, orthographic=True)
+    assert psnr(picture, backend_draws(camera=Camera(viewmat(camera_center), lens, *SIZE))) > 35.0
 
 
 def test_recoloring_is_seen(window):
@@ -364,8 +364,8 @@ def test_a_mesh_in_front_is_picked(window):
             bpy.ops.mesh.primitive_cube_add(size=0.1)
             cube = bpy.context.active_object
             cube.name = "cube"
-            eye, ball = mathutils.Vector((0.3, -3.0, 0.8)), mathutils.Vector((-0.5, 0.0, 0.2))
-            cube.location = ball + (eye - ball).normalized() * -({at})
+            camera_center, ball = mathutils.Vector((0.3, -3.0, 0.8)), mathutils.Vector((-0.5, 0.0, 0.2))
+            cube.location = ball + (camera_center - ball).normalized() * -({at})
             bpy.context.view_layer.update()
         """)
         )
