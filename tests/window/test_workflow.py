@@ -75,7 +75,7 @@ def wait(blender, expression: str, timeout: float = 120.0):
             return value
         time.sleep(0.3)
     raise harness.Failed(
-        f"it never became true: {expression}; jobs: "
+        f"condition timed out: {expression}; jobs: "
         + json.dumps(
             blender.run(
                 script(
