@@ -1,8 +1,8 @@
-"""JSON files, whatever they contain."""
+"""Reading of valid, invalid and oversized JSON files."""
 
 import pytest
 
-from backend.capture.files import read_labels
+from backend.capture.files import read_names
 from backend.shared.errors import InputError
 from backend.shared.formats import json_file
 from backend.shared.formats.json_file import parse_json, read_json, write_json
@@ -12,17 +12,17 @@ BAD = [DEEP, '{"a": ' * 100_000, "1" * 5000, "[NaN]", "[Infinity]", "{", "", "\x
 
 
 @pytest.mark.parametrize("text", BAD, ids=range(len(BAD)))
-def test_bad_json_is_one_sentence(tmp_path, text):
+def test_invalid_json_is_rejected(tmp_path, text):
     path = tmp_path / "objects.json"
     path.write_text(text, encoding="latin-1")
     with pytest.raises(InputError, match=r"objects\.json cannot be read as JSON .*; repair it"):
         read_json(path)
     (tmp_path / "labels.json").write_text(text, encoding="latin-1")
     with pytest.raises(InputError, match=r"labels\.json is not a list of labels"):
-        read_labels(tmp_path)
+        read_names(tmp_path)
 
 
-def test_a_huge_file_is_not_read(tmp_path, monkeypatch):
+def test_oversized_json_is_rejected(tmp_path, monkeypatch):
     write_json(tmp_path / "plan.json", list(range(1000)))
     assert read_json(tmp_path / "plan.json") == list(range(1000))
     monkeypatch.setattr(json_file, "LARGEST", 1000)
@@ -30,5 +30,5 @@ def test_a_huge_file_is_not_read(tmp_path, monkeypatch):
         read_json(tmp_path / "plan.json")
 
 
-def test_good_json_is_read():
+def test_valid_json_is_parsed():
     assert parse_json(b'{"a": [1, 2.5, null, "\\u00e4"]}') == {"a": [1, 2.5, None, "\u00e4"]}
