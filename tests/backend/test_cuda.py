@@ -23,7 +23,7 @@ HERE = Path("tests") / "backend"
     ],
     ids=["random scenes", "stiff scenes", "stiff scenes of discs"],
 )
-def test_simulated(words):
+def test_kernels_in_simulator(words):
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist", "--durations=5", *words],
         cwd=ROOT, env=os.environ | {"NUMBA_ENABLE_CUDASIM": "1"}, capture_output=True, text=True,
@@ -32,7 +32,7 @@ def test_simulated(words):
     assert " passed" in done.stdout
 
 
-def test_the_cpu_renderer_needs_nothing_of_cuda():
+def test_cpu_renderer_works_without_numba_cuda():
     """numba-cuda may be missing or fail on import."""
     script = """
 import sys

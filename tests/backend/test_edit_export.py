@@ -63,7 +63,7 @@ def edited(folder, object_id):
 # --- edit ------------------------------------------------------------------------------------------------------------
 
 
-def test_objects_are_removed_and_restored_by_name_part_or_id(ask, folder):
+def test_objects_are_removed_and_restored_by_name_or_id(ask, folder):
     answer = ask("edit", folder.folder, "--remove", "MUG", "blue", "7", "--floaters", "--json")
     assert answer.code == EXIT_DONE and answer.events[-1]["edited"] == 3
     assert [entry.removed and entry.floaters for entry in read_objects(folder.objects)] == [True, True, False, True]
@@ -76,7 +76,7 @@ def test_objects_are_removed_and_restored_by_name_part_or_id(ask, folder):
     assert json.loads(folder.objects.read_text())["edits"].keys() == {"2", "7"}
 
 
-def test_fills_of_holes_are_cached_for_those_who_show_them(ask, folder):
+def test_fills_are_cached_per_edit_state(ask, folder):
     """One file per state of edits and splats; undoing an edit reuses the earlier file, and old files are removed."""
     rng = np.random.default_rng(0)
     ground = np.column_stack([rng.uniform(-1, 1, (9000, 2)), np.zeros(9000)])
@@ -92,7 +92,7 @@ def test_fills_of_holes_are_cached_for_those_who_show_them(ask, folder):
         return fill_path(folder, read_objects(folder.objects))
 
     ask("edit", folder.folder, "--remove", "mug")
-    assert path() is None and not folder.cache.exists(), "no hole is to be filled"
+    assert path() is None and not folder.cache.exists(), "no fill is requested"
     answer = ask("edit", folder.folder, "--remove", "mug", "--fill", "--json")
     first, table = path(), read_vertices(path())
     count = int(table["unobserved"].sum())
@@ -114,13 +114,13 @@ def test_fills_of_holes_are_cached_for_those_who_show_them(ask, folder):
     assert path().is_file() and len(list(folder.cache.glob("fill-*.ply"))) == 8
 
 
-def test_without_options_the_edits_are_said_and_nothing_is_written(ask, folder):
+def test_edit_without_options_lists_edits(ask, folder):
     before = folder.objects.read_bytes()
     answer = ask("edit", folder.folder)
     assert answer.code == EXIT_DONE and "7 can: as captured" in answer.out and folder.objects.read_bytes() == before
 
 
-def test_recoloring_takes_the_middle_from_the_splats(ask, folder):
+def test_recolor_middle_is_mean_luma(ask, folder):
     splats = read_splats(folder.splats)[0]
     own = splats.select(splats.object_ids == 7)
     ask("edit", folder.folder, "--recolor", "can:hue=0.3, saturation=0.5", "mug:replace=#ff0080,tint=#00ff00")
@@ -133,7 +133,7 @@ def test_recoloring_takes_the_middle_from_the_splats(ask, folder):
     assert edited(folder, 7).recolor is None
 
 
-def test_moves_are_along_blenders_axes_and_about_the_objects_middle(ask, folder):
+def test_moves_use_blender_axes_and_object_center(ask, folder):
     splats = read_splats(folder.splats)[0]
     middle = middle_of(splats.select(splats.object_ids == 7))
     ask("edit", folder.folder, "--move", "can:x=0.5,z=-1,rz=90,scale=2", "--duplicate", "can:y=1", "can:y=2")
@@ -154,7 +154,7 @@ def test_moves_are_along_blenders_axes_and_about_the_objects_middle(ask, folder)
     assert json.loads(folder.objects.read_text())["edits"] == {"1": {"name": "cup"}}
 
 
-def test_what_is_merged_into_another_stands_for_that_one(ask, folder):
+def test_edit_of_merged_object_applies_to_target(ask, folder):
     edit_objects(folder.objects, {1: {"merged_into": 7}})
     ask("edit", folder.folder, "--remove", "mug")
     assert edited(folder, 7).removed and not edited(folder, 1).removed
@@ -176,13 +176,13 @@ def test_what_is_merged_into_another_stands_for_that_one(ask, folder):
         (["--restore", "mug", "--fill"], ["--remove"]),
     ],
 )
-def test_what_cannot_be_edited_is_said_and_nothing_is_written(ask, folder, words, said):
+def test_invalid_edits_are_rejected_without_writing(ask, folder, words, said):
     before = folder.objects.read_bytes()
     refused(ask("edit", folder.folder, *words), *said)
     assert folder.objects.read_bytes() == before
 
 
-def test_an_object_without_splats_cannot_be_moved(ask, folder):
+def test_object_without_splats_cannot_be_moved(ask, folder):
     splats = some_splats()
     write_splats(folder.splats, splats.select(splats.object_ids != 7))
     refused(ask("edit", folder.folder, "--remove", "mug", "--move", "can:x=1"), "no splats of can")
@@ -193,7 +193,7 @@ def test_an_object_without_splats_cannot_be_moved(ask, folder):
 # --- export ----------------------------------------------------------------------------------------------------------
 
 
-def test_the_export_has_the_edits_and_other_programs_read_it(ask, folder, tmp_path):
+def test_export_applies_edits_and_is_readable_ply(ask, folder, tmp_path):
     ask("edit", folder.folder, "--remove", "mug", "--recolor", "can:hue=0.2", "--move", "blue:x=1")
     answer = ask("export", folder.folder, "--out", tmp_path / "all.ply", "--json")
     assert answer.code == EXIT_DONE and answer.events[-1]["splats"] == 48
@@ -210,7 +210,7 @@ def test_the_export_has_the_edits_and_other_programs_read_it(ask, folder, tmp_pa
     np.testing.assert_array_equal(rest, wanted.sh[:, 1:])
 
 
-def test_without_edits_the_export_is_splats_ply(ask, folder, tmp_path):
+def test_export_without_edits_equals_splats_ply(ask, folder, tmp_path):
     ask("export", folder.folder, "--out", tmp_path / "all.ply")
     assert (tmp_path / "all.ply").read_bytes() == folder.splats.read_bytes()
     ask("export", folder.folder, "--out", tmp_path / "plain.ply", "--no-ids", "--sh-degree", "1")
@@ -218,7 +218,7 @@ def test_without_edits_the_export_is_splats_ply(ask, folder, tmp_path):
     assert names[-1] == "rot_3" and "f_rest_8" in names and "f_rest_9" not in names
 
 
-def test_a_file_for_each_object(ask, folder, tmp_path):
+def test_export_per_object_writes_one_file_each(ask, folder, tmp_path):
     edit_objects(folder.objects, {3: {"name": "../BLUE box"}, 1: {"merged_into": 7}})
     ask("export", folder.folder, "--out", tmp_path / "parts", "--per-object")
     assert {path.name for path in (tmp_path / "parts").iterdir()} == {
@@ -229,7 +229,7 @@ def test_a_file_for_each_object(ask, folder, tmp_path):
     assert [path.name for path in (tmp_path / "one").iterdir()] == ["can.splat"]
 
 
-def test_blenders_coordinates_are_upright(ask, folder, tmp_path):
+def test_blender_coordinates_are_upright(ask, folder, tmp_path):
     ask("export", folder.folder, "--out", tmp_path / "up.ply", "--coordinates", "blender")
     found, captured = read_splats(tmp_path / "up.ply")[0], read_splats(folder.splats)[0]
     np.testing.assert_allclose(found.means, (captured.means - (1, 2, 3)) @ UPRIGHT.T + (0, 0, 1), atol=1e-6)
@@ -238,14 +238,14 @@ def test_blenders_coordinates_are_upright(ask, folder, tmp_path):
     np.testing.assert_allclose(found.sh, transformed(captured, stand).sh, atol=1e-6)
 
 
-def test_a_fit_is_exported_with_its_error(ask, folder, tmp_path):
+def test_export_of_fit_warns_with_psnr(ask, folder, tmp_path):
     training = TrainingRecord({"mode": "view"}, VotesRecord("majority", None, 1600, "0f", None))
     update_record(folder, training=training, export=ExportRecord(splats=9, anchors=3, psnr_of_export=34.62))
     answer = ask("export", folder.folder, "--out", tmp_path / "all.ply", "--json")
     assert any("34.6 dB" in sentence for sentence in answer.messages("warning"))
 
 
-def test_exports_that_make_no_sense_are_refused(ask, folder, tmp_path):
+def test_invalid_exports_are_rejected(ask, folder, tmp_path):
     refused(ask("export", folder.folder, "--out", tmp_path), "is a folder")
     (tmp_path / "file").touch()
     refused(ask("export", folder.folder, "--out", tmp_path / "file", "--per-object"), "is a file")
@@ -297,7 +297,7 @@ def assert_close(found, wanted, color):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_spz_holds_the_splats_y_up(ask, folder, tmp_path, degree):
+def test_spz_export_is_y_up(ask, folder, tmp_path, degree):
     write_splats(folder.splats, some_splats(degree=degree))
     ask("export", folder.folder, "--out", tmp_path / "all.spz")
     found = read_spz(tmp_path / "all.spz")
@@ -312,7 +312,7 @@ def test_spz_holds_the_splats_y_up(ask, folder, tmp_path, degree):
     np.testing.assert_allclose(read_spz(tmp_path / "up.spz").means, upright.means[:, [0, 2, 1]] * (1, 1, -1), atol=1e-5)
 
 
-def test_another_reader_finds_the_same_in_spz(tmp_path):
+def test_spz_matches_gsply_reader(tmp_path):
     gsply = pytest.importorskip("gsply")
     splats = some_splats(degree=3)
     write_spz(tmp_path / "a.spz", splats)
@@ -324,7 +324,7 @@ def test_another_reader_finds_the_same_in_spz(tmp_path):
     np.testing.assert_allclose(np.abs((found.quats * mine.quats).sum(1)), 1, atol=1e-5)
 
 
-def test_what_spz_cannot_hold_is_said(tmp_path):
+def test_spz_limits_are_reported(tmp_path):
     splats = some_splats()
     splats.means += 1e6
     write_spz(tmp_path / "far.spz", splats)
@@ -339,7 +339,7 @@ def test_what_spz_cannot_hold_is_said(tmp_path):
     assert write_spz(tmp_path / "none.spz", Splats.empty(1)) == []
 
 
-def test_splat_files_have_32_bytes_a_splat(tmp_path):
+def test_splat_file_has_32_bytes_per_splat(tmp_path):
     splats = some_splats(degree=0)
     assert write_splat(tmp_path / "a.splat", splats) == [] and write_splat(tmp_path / "b.splat", some_splats()) != []
     data = (tmp_path / "a.splat").read_bytes()
@@ -357,7 +357,7 @@ def test_splat_files_have_32_bytes_a_splat(tmp_path):
 # --- import ----------------------------------------------------------------------------------------------------------
 
 
-def test_splats_with_ids_become_a_reconstruction(ask, folder, tmp_path):
+def test_import_of_splats_with_ids(ask, folder, tmp_path):
     made = Reconstruction(tmp_path / "imported")
     answer = ask("import-splats", folder.splats, "--out", made.folder, "--json")
     assert answer.code == EXIT_DONE and answer.events[-1]["objects"] == 4
@@ -371,7 +371,7 @@ def test_splats_with_ids_become_a_reconstruction(ask, folder, tmp_path):
     refused(ask("render", made.folder), "checkpoint")
 
 
-def test_splats_without_ids_get_them_from_the_masks(ask, write_capture, tmp_path):
+def test_import_assigns_ids_from_masks(ask, write_capture, tmp_path):
     scene = write_capture(views=9, points=200)
     splats = some_splats(n=len(scene.xyz), degree=0)
     splats.means, splats.object_ids = scene.xyz.astype(np.float32), np.zeros(len(scene.xyz), np.int64)
@@ -385,14 +385,14 @@ def test_splats_without_ids_get_them_from_the_masks(ask, write_capture, tmp_path
     assert len(json.loads(made.cameras.read_text())["cameras"]) == 9
 
 
-def test_a_capture_without_masks_leaves_the_files_ids(ask, write_capture, folder, tmp_path):
+def test_import_without_masks_keeps_ids_of_file(ask, write_capture, folder, tmp_path):
     scene = write_capture(views=4, masks=False)
     answer = ask("import-splats", folder.splats, "--out", tmp_path / "made2", "--capture", scene.folder)
     assert answer.code == EXIT_DONE and "masks does not exist" in answer.err
     assert len(read_objects(tmp_path / "made2" / "objects.json")) == 4
 
 
-def test_what_cannot_be_imported_leaves_nothing(ask, write_capture, folder, tmp_path):
+def test_failed_import_leaves_no_files(ask, write_capture, folder, tmp_path):
     scene = write_capture(views=4)
     made = tmp_path / "not" / "there"
     refused(ask("import-splats", tmp_path / "none.ply", "--out", made), "none.ply")
@@ -409,7 +409,7 @@ def test_what_cannot_be_imported_leaves_nothing(ask, write_capture, folder, tmp_
     refused(ask("import-splats", folder.splats, "--out", folder.folder), "already contains a training")
 
 
-def test_splats_without_cameras_stand_on_their_ground(tmp_path):
+def test_splats_without_cameras_are_oriented_to_ground(tmp_path):
     rng = np.random.default_rng(0)
     ground = np.column_stack([rng.uniform(-1, 1, 3000), rng.normal(0.5, 0.001, 3000), rng.uniform(-1, 1, 3000)])
     above = rng.uniform(-0.2, 0.2, (500, 3))

@@ -150,7 +150,7 @@ def assert_same(picture, splats, at, primitive="3d") -> None:
 
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
-def test_a_frame_is_what_the_reference_draws(folder, film, primitive):
+def test_frame_matches_reference(folder, film, primitive):
     votes = VotesRecord("majority", None, 1600, "0f", None)
     update_record(folder, training=TrainingRecord({"primitive": primitive}, votes))
     picture = film(shot_of([sample()]), "--png")[0]
@@ -164,7 +164,7 @@ def test_a_frame_is_what_the_reference_draws(folder, film, primitive):
     assert np.abs(photo[..., 3] - 255 * rgba[..., 3]).max() < 0.7
 
 
-def test_edits_and_places(folder, film):
+def test_edits_and_shot_transforms_are_applied(folder, film):
     """Edits in objects.json apply, except that the shot's maps, copies and visibility replace its transforms."""
     recolor = Recolor(hue=0.3, value=0.8)
     place = moved(0.3, -0.1, 0.2)
@@ -186,7 +186,7 @@ def test_edits_and_places(folder, film):
         shot_of([sample(objects=objects)], [sample()], [sample(0.1, {2: Placed(maps=np.zeros((0, 4, 4)))})])
     )
     names = ["Unlabeled", "can", "mug", "große Kiste"]
-    assert list(manifest(folder.folder.parent / "film")) == names, "mug is alone with its name where the other is gone"
+    assert list(manifest(folder.folder.parent / "film")) == names, "mug is unique once the other mug is removed"
     np.testing.assert_allclose(rgba_of(pictures[0]), reference(expected, sample())[0], atol=2e-3, rtol=2e-3)
     static = concatenate([part[0], transformed(can, moved(0.2)), transformed(part[7], place),
                           transformed(part[7], moved(-0.4)), part[HUGE]])  # fmt: skip
@@ -209,7 +209,7 @@ def test_clip_range_and_depth_scale(folder, film):
         assert (picture["Z"][~seen] == np.float32(FAR)).all() and (~seen).any()
 
 
-def test_motion_blur_is_the_mean_of_the_moments(folder, film):
+def test_motion_blur_is_mean_of_samples(folder, film):
     moments = [sample(x, {2: Placed(maps=moved(3 * x)[None])}, time=1 + x) for x in (-0.1, -0.03, 0.05)]
     blurred, *single = film(shot_of(moments, *([moment] for moment in moments)))
     mean = np.mean([rgba_of(picture) for picture in single], 0)
@@ -221,7 +221,7 @@ def test_motion_blur_is_the_mean_of_the_moments(folder, film):
     assert (np.diff(ranked, axis=0) <= 0).all()
 
 
-def test_ranked_lists_add_up():
+def test_ranked_ids_are_summed():
     rng = np.random.default_rng(0)
     totals = np.full((3, 4, 8), -1, np.int32), np.zeros((3, 4, 8), np.float32)
     dense = np.zeros((3, 4, 8))
@@ -248,7 +248,7 @@ def header(out, number=1) -> dict:
         return dict(file.header())
 
 
-def test_cryptomatte_is_as_published(folder, film):
+def test_cryptomatte_matches_specification(folder, film):
     """Hashes match the specification's examples and known test vectors; the header has the names and keys."""
     for name, expected in (
         ("bunny", 0x13851A76), ("default", 0x42C9679F), ("test", 0xBA6BD213), ("Hello, world!", 0xC0363E43),
@@ -268,13 +268,13 @@ def test_cryptomatte_is_as_published(folder, film):
     assert found["pixelAspectRatio"] == 1.5 and found["objectgs/frame"] == "1"
 
 
-def test_colors_go_there_and_back():
+def test_srgb_encoding_round_trip():
     values = np.linspace(0, 1.5, 200, dtype=np.float32)
     np.testing.assert_allclose(encode(decode(values)), values, atol=1e-6)
     np.testing.assert_allclose(decode(np.float32([0.0, 0.5, 1.0])), [0.0, 0.2140411, 1.0], atol=1e-6)
 
 
-# --- resuming and stopping --------------------------------------------------------------------------------------------
+# --- resuming and stopping -------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -296,10 +296,10 @@ def drawn(answer) -> int:
     return answer.events[-1]["drawn"]
 
 
-def test_finished_frames_are_skipped_and_others_drawn_again(folder, shoot, tmp_path):
+def test_finished_frames_are_skipped(folder, shoot, tmp_path):
     out = tmp_path / "film"
     assert drawn(shoot("--frames", "2-3")) == 2 and not frame_path(out, 1).exists()
-    assert drawn(shoot()) == 1, "as another machine of a farm would leave the rest"
+    assert drawn(shoot()) == 1, "only the missing frame is rendered"
     before = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
     assert drawn(shoot()) == 0 and before == {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
     assert sorted(before) == ["splats.0001.exr", "splats.0002.exr", "splats.0003.exr"]
@@ -310,31 +310,31 @@ def test_finished_frames_are_skipped_and_others_drawn_again(folder, shoot, tmp_p
     assert drawn(shoot()) == 1 and frame_path(out, 2).read_bytes() == whole
     assert drawn(shoot(shot=shot_of([sample()], [sample(0.15)], [sample(0.2), sample(0.21)]))) == 1
     edit_objects(folder.objects, {1: {"color": [9, 9, 9]}})
-    assert drawn(shoot("--frames", "1")) == 0, "the color that stands for an object is not in its pictures"
+    assert drawn(shoot("--frames", "1")) == 0, "the display color of an object does not affect frames"
     edit_objects(folder.objects, {1: {"removed": True}})
     assert drawn(shoot()) == 3
     assert drawn(shoot("--png")) == 3 and len(list(out.glob("*.png"))) == 3
     assert drawn(shoot("--png", "--frames", "1,3")) == 0
     write_splats(folder.splats, some_splats(seed=1))
-    assert drawn(shoot("--frames", "1")) == 1 and len(list(out.glob("*.png"))) == 2, "the picture of other splats went"
+    assert drawn(shoot("--frames", "1")) == 1 and len(list(out.glob("*.png"))) == 2, "the outdated PNG was removed"
 
 
-def test_stopping_leaves_whole_frames(shoot, tmp_path, monkeypatch):
+def test_stopping_keeps_complete_frames(shoot, tmp_path, monkeypatch):
     stops = iter([False, False, True])
     monkeypatch.setattr("backend.shared.stopping.StopRequest.__call__", lambda self: next(stops))
     answer = shoot()
     assert answer.code == EXIT_CANCELLED and answer.events[-1]["stopped"] is True
     shares = [event["done"] for event in answer.events if event["type"] == "progress"]
-    assert shares == [1, 2, 2.5], "between the moments of a frame, too"
+    assert shares == [1, 2, 2.5], "stopping is also possible between samples"
     assert sorted(path.name for path in (tmp_path / "film").iterdir()) == ["splats.0001.exr", "splats.0002.exr"]
     monkeypatch.undo()
     assert drawn(shoot()) == 1
 
 
-# --- bad input --------------------------------------------------------------------------------------------------------
+# --- invalid input ---------------------------------------------------------------------------------------------------
 
 
-def test_what_was_written_is_read(tmp_path):
+def test_shot_round_trip(tmp_path):
     objects = {1: Placed(maps=np.array([moved(1), moved(2)])), 2: Placed(visible=False), HUGE: Placed()}
     moving = {**objects, 1: Placed(maps=moved(3)[None])}
     shot = shot_of([sample(objects=objects), sample(objects=moving)], [sample()], only_named=True, pixel_aspect=2.0)
@@ -349,7 +349,7 @@ def test_what_was_written_is_read(tmp_path):
             assert stored[0] == stored[1] and first.clip == second.clip and first.time == second.time
 
 
-def break_it(path, keys, value):
+def corrupt(path, keys, value):
     content = json.loads(path.read_text())
     at = content
     for key in keys[:-1]:
@@ -377,16 +377,16 @@ FIRST = ("frames", 0, "samples", 0)
         (("only_named",), "yes", "only_named"),
     ],
 )  # fmt: skip
-def test_bad_shots(tmp_path, keys, value, words):
+def test_invalid_shots_are_rejected(tmp_path, keys, value, words):
     path = tmp_path / "shot.json"
     write_shot(path, shot_of([sample()], [sample()]))
-    break_it(path, keys, value)
+    corrupt(path, keys, value)
     with pytest.raises(InputError) as caught:
         read_shot(path)
     assert str(path) in str(caught.value) and words in str(caught.value) and str(caught.value).endswith(".")
 
 
-def test_bad_requests(folder, tmp_path, ask):
+def test_invalid_film_requests_are_rejected(folder, tmp_path, ask):
     path = tmp_path / "shot.json"
     command = ("film", folder.folder, "--shot", path, "--out", tmp_path / "film")
     refused(ask(*command), str(path), "does not exist")
@@ -395,13 +395,13 @@ def test_bad_requests(folder, tmp_path, ask):
         refused(ask(*command, f"--frames={text}"), "--frames")
     refused(ask(*command, "--frames", "7-9"), "none of the frames", "1 to 2")
     refused(ask("film", tmp_path, "--shot", path, "--out", tmp_path / "film"), "splats.ply")
-    (tmp_path / "file").write_text("in the way")
+    (tmp_path / "file").write_text("not a folder")
     refused(ask(*command[:-1], tmp_path / "file"), "cannot be created")
     path.write_text("{")
     refused(ask(*command), str(path), "JSON")
 
 
-def test_ranges_of_frames():
+def test_frame_ranges_are_parsed():
     shot = shot_of(*([sample()] for _ in range(9)))
     for text, wanted in (("1-3", [1, 2, 3]), ("2, 5-6,9", [2, 5, 6, 9]), ("8-100", [8, 9]), (None, list(range(1, 10)))):
         assert [frame.number for frame in chosen_frames(text, shot)] == wanted

@@ -1,4 +1,4 @@
-"""Commands neither delete nor overwrite files that are not theirs."""
+"""Commands neither delete nor overwrite files of others."""
 
 import os
 from pathlib import Path
@@ -33,8 +33,8 @@ def bad_capture(tmp_path):
 
 
 @pytest.mark.parametrize("command", ["import", "vote", "train", "plan"])
-def test_a_refused_run_removes_what_it_made_alone(ask, tmp_path, bad_capture, monkeypatch, command):
-    """Others write into the new parent folder, and into the new folder itself, while the command runs."""
+def test_rejected_run_removes_only_its_own_files(ask, tmp_path, bad_capture, monkeypatch, command):
+    """While the command runs, other programs write to the new parent folder and to the new folder."""
     parent = tmp_path / "new"
 
     def others_write(*_):
@@ -52,7 +52,7 @@ def test_a_refused_run_removes_what_it_made_alone(ask, tmp_path, bad_capture, mo
     assert (parent / "a").exists() == (command != "vote")
 
 
-def test_a_refused_run_leaves_an_empty_folder_that_was_there(ask, tmp_path, bad_capture):
+def test_rejected_run_keeps_existing_empty_folder(ask, tmp_path, bad_capture):
     out = tmp_path / "empty"
     out.mkdir()
     assert ask("train", bad_capture, "--out", out, *LENGTH).code == EXIT_BAD_INPUT
@@ -63,7 +63,7 @@ def test_a_refused_run_leaves_an_empty_folder_that_was_there(ask, tmp_path, bad_
 
 @pytest.mark.parametrize("command", ["import", "vote", "train", "plan", "import-splats"])
 @pytest.mark.parametrize("foreign", ["points.ply", "cameras.json", "checkpoint/model.safetensors", "thesis.odt"])
-def test_a_folder_with_foreign_files_is_refused(ask, tmp_path, capture, trained, command, foreign):  # noqa: F811
+def test_folder_with_foreign_files_is_rejected(ask, tmp_path, capture, trained, command, foreign):  # noqa: F811
     out = tmp_path / "theirs"
     (out / foreign).parent.mkdir(parents=True)
     (out / foreign).write_text("not yours")
@@ -74,7 +74,7 @@ def test_a_folder_with_foreign_files_is_refused(ask, tmp_path, capture, trained,
     assert contents(out) == before
 
 
-def test_a_folder_with_foreign_files_is_used_where_that_is_asked_for(ask, tmp_path, capture):
+def test_overwrite_allows_folder_with_foreign_files(ask, tmp_path, capture):
     out = tmp_path / "theirs"
     out.mkdir()
     (out / "thesis.odt").write_text("not yours")
@@ -85,14 +85,14 @@ def test_a_folder_with_foreign_files_is_used_where_that_is_asked_for(ask, tmp_pa
 
 
 @pytest.mark.parametrize("name", [".DS_Store", "Thumbs.db", "desktop.ini"])
-def test_a_folder_that_looks_empty_is_used(ask, tmp_path, capture, name):
+def test_folder_with_only_system_files_is_used(ask, tmp_path, capture, name):
     out = tmp_path / "out"
     out.mkdir()
     (out / name).write_bytes(b"made by the file browser")
     assert ask("vote", capture, "--out", out).code == EXIT_DONE
 
 
-def test_restart_keeps_the_old_checkpoint_until_the_new_one_exists(ask, trained, monkeypatch):  # noqa: F811
+def test_restart_keeps_old_checkpoint_until_new_one_exists(ask, trained, monkeypatch):  # noqa: F811
     capture, out = trained
     before = contents(out / "checkpoint")
 
@@ -105,7 +105,7 @@ def test_restart_keeps_the_old_checkpoint_until_the_new_one_exists(ask, trained,
 
 
 @pytest.mark.skipif(os.name != "posix", reason="links need a privilege on Windows")
-def test_writing_follows_no_link(tmp_path):
+def test_atomic_write_does_not_follow_links(tmp_path):
     theirs = tmp_path / "theirs.txt"
     theirs.write_text("not yours")
     for name in ("objects.json", "objects.json.part"):
@@ -115,7 +115,7 @@ def test_writing_follows_no_link(tmp_path):
     assert (tmp_path / "objects.json").read_text() == "{}" and not (tmp_path / "objects.json").is_symlink()
 
 
-def test_writers_of_one_file_do_not_share_a_temporary_file(tmp_path):
+def test_concurrent_writers_use_separate_temporary_files(tmp_path):
     path = tmp_path / "objects.json"
     with atomic_file(path) as first, atomic_file(path) as second:
         first.write(b"first")
@@ -145,7 +145,7 @@ OWN = ("splats.ply", "objects.json", "objectgs.json", "anchors.ply", "meshes/1.p
 
 
 @pytest.mark.parametrize("name", OWN)
-def test_an_export_replaces_no_file_of_the_reconstruction(ask, trained, name):  # noqa: F811
+def test_export_does_not_replace_reconstruction_files(ask, trained, name):  # noqa: F811
     _, out = trained
     before = contents(out)
     refused(ask("export", out, "--out", out / name, "--format", "ply"), name, "belongs to the reconstruction")
@@ -155,7 +155,7 @@ def test_an_export_replaces_no_file_of_the_reconstruction(ask, trained, name):  
     assert contents(out) == before
 
 
-def test_each_object_is_exported_whatever_the_names(ask, trained):  # noqa: F811
+def test_export_per_object_handles_conflicting_names(ask, trained):  # noqa: F811
     _, out = trained
     ids = [entry.id for entry in read_objects(out / "objects.json")]
     names = dict(zip(ids, ["CON", "mug", "MUG", "mug_3", "x" * 300]))

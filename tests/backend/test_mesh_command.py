@@ -46,7 +46,7 @@ def entries(out) -> dict:
     return json.loads((out / "meshes" / "meshes.json").read_text())["meshes"]
 
 
-def test_each_object_becomes_a_mesh_in_its_place(trained, ask, write_capture):
+def test_objects_become_meshes_of_correct_position_and_size(trained, ask, write_capture):
     answer = ask("mesh", trained, "--faces", 2000, "--texture-size", 256, "--json")
     assert answer.code == EXIT_DONE and answer.events[-1]["made"] == 3
     shares = [event["done"] / event["total"] for event in answer.events if event.get("what") == "meshes"]
@@ -58,7 +58,7 @@ def test_each_object_becomes_a_mesh_in_its_place(trained, ask, write_capture):
         assert len(found.faces) == entry["faces"] <= 2000 and len(found.vertices) == entry["vertices"]
         assert entry["watertight"] is True and entry["unobserved"] == pytest.approx(found.unobserved.mean(), abs=1e-3)
         distance = np.linalg.norm(found.vertices - center, axis=1)
-        assert abs(np.median(distance) - radius) < 0.1 * radius, "where and as large as the sphere is"
+        assert abs(np.median(distance) - radius) < 0.1 * radius, "position and size match the sphere"
         outward = (found.normals * (found.vertices - center)).sum(1) / distance
         assert np.median(outward) > 0.9
         assert found.uvs.min() >= 0 and found.uvs.max() <= 1
@@ -68,7 +68,7 @@ def test_each_object_becomes_a_mesh_in_its_place(trained, ask, write_capture):
     assert not list(trained.rglob("*.part")) and not (trained / ".lock").exists()
 
 
-def test_merged_objects_sets_and_the_scene(trained, ask):
+def test_merged_objects_sets_and_scene_are_meshed(trained, ask):
     edit_objects(trained / "objects.json", {2: {"merged_into": 1}, 5: {"left_out": True}})
     quick = ("--faces", 1000, "--texture-size", 256)
     assert ask("mesh", trained, *quick).code == EXIT_DONE
@@ -93,7 +93,7 @@ def test_merged_objects_sets_and_the_scene(trained, ask):
         (("--texture-size", "1000"), ("1000",)),
     ],
 )
-def test_what_cannot_be_asked_for(trained, ask, words, said):
+def test_invalid_mesh_options_are_rejected(trained, ask, words, said):
     refused(ask("mesh", trained, *words), *said)
     assert not (trained / "meshes").exists()
 
@@ -111,7 +111,7 @@ class Stub:
             self.made.append(target.key)
             entry = command._entry_of(target, options, trained)
             if target.key in without:
-                return replace(entry, why=f"Nobody saw {target.name}.")
+                return replace(entry, why=f"No view shows {target.name}.")
             for suffix in ("ply", "png"):
                 (trained.folder.meshes / f"{target.key}.{suffix}").write_bytes(b"")
             return replace(entry, file=f"{target.key}.ply", texture=f"{target.key}.png")
@@ -119,21 +119,21 @@ class Stub:
         monkeypatch.setattr(command, "_make", make)
 
 
-def test_what_was_made_before_a_stop_is_not_made_again(trained, ask, monkeypatch):
+def test_existing_meshes_are_not_made_again(trained, ask, monkeypatch):
     first = Stub(monkeypatch, stop_at=2)
     assert ask("mesh", trained).code == EXIT_CANCELLED and first.made == ["1", "2"]
     assert set(entries(trained)) == {"1", "2"} and not (trained / ".lock").exists()
     second = Stub(monkeypatch)
     assert ask("mesh", trained).code == EXIT_DONE and second.made == ["5"]
     assert set(entries(trained)) == {"1", "2", "5"}
-    assert ask("mesh", trained).code == EXIT_DONE and second.made == ["5"], "all are there"
+    assert ask("mesh", trained).code == EXIT_DONE and second.made == ["5"], "all meshes exist"
     (trained / "meshes" / "2.png").unlink()
     assert ask("mesh", trained).code == EXIT_DONE and second.made == ["5", "2"]
     assert ask("mesh", trained, "--objects", "1", "--faces", 500).code == EXIT_DONE and second.made[2:] == ["1"]
     assert ask("mesh", trained, "--faces", 500, "--restart").code == EXIT_DONE and second.made[3:] == ["1", "2", "5"]
 
 
-def test_a_longer_training_makes_meshes_out_of_date(trained, kept, ask, monkeypatch):
+def test_further_training_outdates_meshes(trained, kept, ask, monkeypatch):
     made = Stub(monkeypatch).made
     assert ask("mesh", trained, "--objects", "1").code == EXIT_DONE
     more = ask("train", kept / "capture", "--out", trained, "--steps", 252, *TRAINING)
@@ -142,16 +142,16 @@ def test_a_longer_training_makes_meshes_out_of_date(trained, kept, ask, monkeypa
     assert entries(trained)["1"]["trained_steps"] == 252
 
 
-def test_an_object_without_a_surface_says_why(trained, ask, monkeypatch):
+def test_object_without_surface_is_reported(trained, ask, monkeypatch):
     Stub(monkeypatch, without={"2"})
     answer = ask("mesh", trained, "--json")
     assert answer.code == EXIT_DONE and answer.events[-1]["without"] == 1
-    assert answer.messages("warning") == ["Nobody saw sphere 2."] == [entries(trained)["2"]["why"]]
+    assert answer.messages("warning") == ["No view shows sphere 2."] == [entries(trained)["2"]["why"]]
     Stub(monkeypatch, without={"1", "2", "5"})
-    refused(ask("mesh", trained, "--restart", "--objects", "2"), "Nobody saw sphere 2.")
+    refused(ask("mesh", trained, "--restart", "--objects", "2"), "No view shows sphere 2.")
 
 
-def test_no_surface_takes_an_earlier_mesh_away(trained, ask, monkeypatch):
+def test_missing_surface_removes_earlier_mesh(trained, ask, monkeypatch):
     (trained / "meshes").mkdir()
     (trained / "meshes" / "1.ply").write_bytes(b"old")
 

@@ -25,7 +25,7 @@ def here():
 
 
 @pytest.mark.parametrize(("scale", "offset"), [(1e-4, 0.0), (1e4, 0.0), (1.0, 1e6)])
-def test_units_and_place_of_a_capture_do_not_matter(here, scale, offset):
+def test_training_is_independent_of_scale_and_offset(here, scale, offset):
     there = train(elsewhere(scale, offset), **SHORT)
     assert not there.lost and abs(there.psnr - here.psnr) < 0.1
     expected = scale * np.array(here.trainer.model.normalization.center) + offset
@@ -34,24 +34,24 @@ def test_units_and_place_of_a_capture_do_not_matter(here, scale, offset):
 
 @pytest.mark.parametrize("value", [0, 255])
 @pytest.mark.parametrize("options", [SHORT, FLAT], ids=["3d", "2d"])
-def test_images_of_one_color(options, value):
+def test_images_of_one_color_train_without_faults(options, value):
     found = train(each_image(lambda _, pixels: np.full_like(pixels, value)), **options)
     assert not found.lost and found.psnr > 10
 
 
 @pytest.mark.parametrize("views", [1, 2])
-def test_one_or_two_images(views):
+def test_one_or_two_images_train_without_faults(views):
     found = train(**{**SHORT, "views": views})
     assert not found.lost and found.psnr > 15
 
 
 @pytest.mark.parametrize("points", [1, 3])
-def test_fewer_than_four_points_are_refused(points):
+def test_fewer_than_four_points_are_rejected(points):
     with pytest.raises(InputError, match=f"only {points} points, and at least 4"):
         train(**{**SHORT, "points": points, "spheres": SPHERES[:1]})
 
 
-def test_coincident_points():
+def test_coincident_points_give_one_anchor():
     found = train(**{**SHORT, "spheres": [(1, (0.0, 0.0, 0.0), 0.0)]})
     assert not found.lost and len(found.trainer.model.anchors) == 1
 
@@ -73,7 +73,7 @@ def test_wrong_masks_are_outvoted():
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
 @pytest.mark.parametrize("mode", ["explicit", "view"])
-def test_an_anchor_at_the_camera_center(mode, primitive):
+def test_anchor_at_camera_center_stays_finite(mode, primitive):
     layout = Layout(4, 8)
     rng = np.random.default_rng(0)
     camera_center = np.array([0.3, -0.2, 1.0])
