@@ -91,7 +91,7 @@ def run(job, until=lambda: False, after=None):
     return shares
 
 
-def test_set_up_after_one_that_was_killed(root):
+def test_setup_succeeds_after_killed_setup(root):
     folder = root / "user" / "environment"
     assert environment.inspect(folder).state == "absent"
     assert environment.inspect(folder).python is None
@@ -127,7 +127,7 @@ def test_set_up_after_one_that_was_killed(root):
     assert environment.inspect(folder).state == "absent" and not folder.exists()
 
 
-def test_only_an_environment_for_nvidia_gpus_holds_their_packages(root):
+def test_cuda_packages_are_installed_only_for_cuda(root):
     wheel(root / "wheels", "smallcuda", "0.30")
     for device in ("cpu", "cuda"):
         folder = root / f"environment-{device}"
@@ -142,7 +142,7 @@ def test_only_an_environment_for_nvidia_gpus_holds_their_packages(root):
     assert environment.inspect(root / "environment-cpu").state == "ready"
 
 
-def test_failed_set_ups_leave_nothing(root):
+def test_failed_setup_leaves_no_files(root):
     folder = root / "environment"
     (root / "requirements" / "backend.txt").write_text("smallnumba==0.69\n")
     job = environment.set_up_job(sys.executable, folder, "cpu")
@@ -157,7 +157,7 @@ def test_failed_set_ups_leave_nothing(root):
     assert not folder.exists()
 
 
-def test_what_goes_wrong_while_the_driver_is_gone(root):
+def test_setup_stops_when_stdin_closes(root):
     """When its input ends, the setup stops its child processes and cleans up."""
     folder = root / "environment"
     job = environment.set_up_job(sys.executable, folder, "cpu")
@@ -165,7 +165,7 @@ def test_what_goes_wrong_while_the_driver_is_gone(root):
     assert job.state is State.STOPPED and not folder.exists()
 
 
-def test_other_peoples_files_are_left_alone(root):
+def test_foreign_files_are_kept(root):
     folder = root / "photos"
     folder.mkdir()
     (folder / "holiday.jpg").write_text("")
@@ -184,7 +184,7 @@ def test_other_peoples_files_are_left_alone(root):
     assert not layout.is_ours(root / "link") and layout.is_ours(root / "new")
 
 
-def test_states_of_a_broken_environment(root):
+def test_invalid_environment_states_are_detected(root):
     folder = root / "environment"
     python = layout.environment_python(folder)
     python.parent.mkdir(parents=True)
@@ -208,7 +208,7 @@ def test_states_of_a_broken_environment(root):
     assert state.state == "broken" and str(python) in state.sentence and state.python is None
 
 
-def test_inspect_is_cheap(root):
+def test_inspect_is_fast(root):
     folder = root / "environment"
     layout.environment_python(folder).parent.mkdir(parents=True)
     layout.environment_python(folder).write_text("")
@@ -228,7 +228,7 @@ def test_inspect_is_cheap(root):
     assert time.perf_counter() - started < 1.0
 
 
-def test_two_at_once(root):
+def test_concurrent_setups_are_rejected(root):
     folder = root / "environment"
     with setup.claimed(folder):
         with pytest.raises(events.Refused, match="Another Blender"), setup.claimed(folder):
@@ -236,7 +236,7 @@ def test_two_at_once(root):
         assert (folder / layout.STAMP).is_file()
 
 
-def test_what_a_removal_left_goes_with_the_next_set_up(root):
+def test_next_setup_deletes_remains_of_removal(root):
     old = root / "environment.removed-7-0"
     (old / "venv").mkdir(parents=True)
     (old / layout.STAMP).write_text("")
@@ -244,7 +244,7 @@ def test_what_a_removal_left_goes_with_the_next_set_up(root):
         assert not old.exists()
 
 
-def test_pythons_that_will_not_do(root, monkeypatch):
+def test_unsuitable_pythons_are_rejected(root, monkeypatch):
     options = argparse.Namespace(folder=root / "environment", requirements=root / "requirements", device="cpu")
 
     def refusal():
@@ -266,7 +266,7 @@ def test_pythons_that_will_not_do(root, monkeypatch):
     assert "free; make room" in refusal()
 
 
-def test_probe(root, monkeypatch):
+def test_probe_checks_packages_and_backend(root, monkeypatch):
     folder = root / "environment"
     job = environment.probe_job(sys.executable, folder)
     run(job)
@@ -296,7 +296,7 @@ def test_probe(root, monkeypatch):
 
 @pytest.mark.skipif(os.name != "posix", reason="POSIX programs")
 @pytest.mark.parametrize("program", ["/bin/ls", "/bin/true", "/bin/sh"])
-def test_probe_of_what_is_no_python(root, program):
+def test_probe_rejects_other_programs(root, program):
     job = environment.probe_job(program, root / "environment")
     run(job)
     assert job.error == f"{program} is not a Python, or it is older than 3.11; choose a Python 3.11, 3.12 or 3.13."
@@ -320,11 +320,11 @@ def test_probe_of_what_is_no_python(root, program):
         ([], "it said nothing"),
     ],
 )
-def test_why_pip_failed(lines, sentence):
+def test_pip_failures_are_explained(lines, sentence):
     assert sentence in pip.why_pip_failed(lines)
 
 
-def test_requirements_of_this_extension():
+def test_requirements_are_pinned():
     for path in layout.requirement_files(environment.REQUIREMENTS, "cuda"):
         for line in layout.requirement_lines(path):
             assert line.count("==") == 1 and line == line.replace(" ", ""), line
