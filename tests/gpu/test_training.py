@@ -152,7 +152,7 @@ def quality(trainer):
     return -10 * math.log10(np.mean(squares)), float(np.mean(right))
 
 
-def test_auto_takes_the_gpu(gpu):
+def test_auto_selects_gpu(gpu):
     assert devices.why_not_cuda() is None
     assert gpu.type == "cuda" and devices.pick("auto") == gpu and devices.pick("cpu").type == "cpu"
 
@@ -163,7 +163,7 @@ def close(got, want, relative, absolute):
     )
 
 
-def test_losses_and_gaussians_are_those_of_the_processor(gpu):
+def test_losses_and_gaussians_match_cpu(gpu):
     """On the GPU, tensor cores must not reduce the precision of SSIM's variances or of the heads."""
     rng = np.random.default_rng(0)
     h, w = 120, 200
@@ -197,7 +197,7 @@ def test_losses_and_gaussians_are_those_of_the_processor(gpu):
 
 
 @pytest.mark.parametrize("settings", [SETTINGS, FLAT], ids=["3d", "2d"])
-def test_a_step_waits_for_nothing(spheres, gpu, settings):
+def test_step_does_not_synchronize(spheres, gpu, settings):
     trainer = started(spheres, settings, gpu)
     for share in (0.3, 0.8):
         for _ in spheres.train_indices:  # targets are uploaded and kernels compiled
@@ -215,20 +215,20 @@ def test_a_step_waits_for_nothing(spheres, gpu, settings):
 
 @pytest.mark.parametrize("settings", [SETTINGS, FLAT, dataclasses.replace(SETTINGS, mode="view")],
                          ids=["3d", "2d", "view"])  # fmt: skip
-def test_training_is_as_good_as_on_the_processor(spheres, gpu, settings):
+def test_training_quality_matches_cpu(spheres, gpu, settings):
     want, want_right = quality(trained(spheres, settings, devices.CPU))
     begun = time.monotonic()
     trainer = trained(spheres, settings, gpu)
     got, right = quality(trainer)
     print(f"{settings.primitive} {settings.mode}: {got:.2f} dB after {time.monotonic() - begun:.1f} s on the GPU, "
-          f"{want:.2f} dB on the processor")  # fmt: skip
+          f"{want:.2f} dB on the CPU")  # fmt: skip
     assert trainer.model.device.type == "cuda"
     assert got > 25 and got > want - 0.7
     assert right > 0.95 and right > want_right - 0.02
 
 
 @pytest.mark.parametrize("first", ["cpu", "cuda"])
-def test_a_checkpoint_goes_on_on_the_other_device(spheres, gpu, tmp_path, first):
+def test_checkpoint_resumes_on_other_device(spheres, gpu, tmp_path, first):
     places = [devices.CPU, gpu] if first == "cpu" else [gpu, devices.CPU]
     begun = started(spheres, SETTINGS, places[0])
     begun.run(Budget(steps=150), tmp_path, Reporter())
@@ -241,7 +241,7 @@ def test_a_checkpoint_goes_on_on_the_other_device(spheres, gpu, tmp_path, first)
     assert found > 25 and right > 0.95
 
 
-def test_pictures_in_parts_teach_as_well(spheres, gpu, monkeypatch):
+def test_training_in_parts_reaches_same_quality(spheres, gpu, monkeypatch):
     def full(*arguments, **options):
         if arguments[6].width > WIDTH // 2:
             raise torch.cuda.OutOfMemoryError("CUDA out of memory.")

@@ -205,7 +205,7 @@ def psnr(first: np.ndarray, second: np.ndarray) -> float:
     return -10.0 * math.log10(((first - second) ** 2).mean() + 1e-12)
 
 
-def test_the_drawing_is_the_backends_picture(window):
+def test_drawing_matches_backend_image(window):
     """Includes a rotated object with harmonics of degree 3, and a hidden object."""
     picture = drawn(window)
     assert 0.3 < picture[..., 3].mean() < 1.0
@@ -226,7 +226,7 @@ def test_the_drawing_is_the_backends_picture(window):
     )
 
 
-def test_parallel_projection(window):
+def test_orthographic_drawing_matches_distant_camera(window):
     """It equals the image of a very distant camera."""
     camera_center = np.array([200.0, -900.0, 300.0])
     far = float(np.linalg.norm(camera_center - (0, 0, 0.2)))
@@ -235,7 +235,7 @@ def test_parallel_projection(window):
     assert psnr(picture, backend_draws(camera=Camera(viewmat(camera_center), lens, *SIZE))) > 35.0
 
 
-def test_recoloring_is_seen(window):
+def test_recolor_is_drawn(window):
     """The affine map applies to an object's colors in all directions."""
     window.run(
         script("""
@@ -281,7 +281,7 @@ def color_at(window, place, name: str) -> np.ndarray:
     return shot[y - 1 : y + 2, x - 1 : x + 2].mean((0, 1))
 
 
-def test_the_viewport_shows_it_behind_what_is_in_front(window):
+def test_drawing_respects_scene_depth(window):
     """The screen has the color of the photos; a cube hides what is behind it, but not what is in front."""
     wall = placement_of(window, (0.0, 1.5, 0.2))
     seen = color_at(window, wall, "11-drawn")
@@ -306,7 +306,7 @@ def test_the_viewport_shows_it_behind_what_is_in_front(window):
     assert np.abs(seen - again).max() < 6.0 < np.abs(seen - hidden).max()
 
 
-def test_clicks_pick_what_is_seen(window):
+def test_clicks_select_visible_objects(window):
     """Click, Shift-click, box select, undo and Esc work with the tool of the toolbar."""
     window.run(
         script("""
@@ -346,7 +346,7 @@ def wait(window, expression: str) -> None:
         time.sleep(0.3)
 
 
-def test_a_mesh_in_front_is_picked(window):
+def test_mesh_in_front_is_picked(window):
     """A mesh behind is not picked; a click on the background deselects everything."""
     x, y = window.run(
         script("""
@@ -387,7 +387,7 @@ def test_a_mesh_in_front_is_picked(window):
     assert window.run(script("result = selected()")) == []
 
 
-def test_words_find_objects(window):
+def test_select_by_name_finds_objects(window):
     window.run(
         script("""
         with bpy.context.temp_override(**window_context()):
@@ -397,7 +397,7 @@ def test_words_find_objects(window):
     assert window.run(script("result = [selected(), bpy.context.active_object.name]")) == [["right", "wall"], "wall"]
 
 
-def test_another_file_undo_and_the_end(window):
+def test_drawing_survives_undo_and_reopening(window):
     """Drawing continues after undo and in a reopened file; disabling the extension restores the modifiers."""
     before = drawn(window)
     window.run(script("bpy.ops.ed.undo_push(message='before')"))
