@@ -17,7 +17,7 @@ from backend.capture import load_capture
 from backend.cli import main as arguments
 from backend.labels import vote
 
-from .asking import Answer
+from .command_result import CommandResult
 
 MODELS = [
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
@@ -199,15 +199,15 @@ def write_capture(tmp_path):
 
 
 @pytest.fixture
-def ask(capsys):
-    """Function that runs a command in this process; with `--json`, the answer has events."""
+def run_command(capsys):
+    """Function that runs a command in this process; with `--json`, the result has events."""
     threads = numba.get_num_threads(), torch.get_num_threads()
 
-    def run(*words) -> Answer:
+    def run(*words) -> CommandResult:
         capsys.readouterr()
         code = arguments.main([*map(str, words), "--threads", "1"])
-        said = capsys.readouterr()
-        return Answer(code, said.out, said.err)
+        captured = capsys.readouterr()
+        return CommandResult(code, captured.out, captured.err)
 
     yield run
     numba.set_num_threads(threads[0])

@@ -31,10 +31,10 @@ def fixture(name: str) -> Path:
     return FIXTURES / name
 
 
-def refused(folder: Path, tmp_path: Path, *words: str, **options) -> str:
+def assert_load_rejected(folder: Path, tmp_path: Path, *words: str, **options) -> str:
     """Check that loading fails with a sentence that contains `words`, leaves no partial files, and that `check_capture`
     reports the same problem."""
-    cache = tmp_path / "cache-of-refused"
+    cache = tmp_path / "cache-of-rejected"
     with pytest.raises(InputError) as caught:
         load_capture(folder, cache, **options)
     sentence = str(caught.value)
@@ -343,7 +343,7 @@ def test_random_lenses_give_valid_pinholes_or_errors():
 def test_panorama_camera_is_rejected(write_capture, tmp_path):
     scene = write_capture(masks=False)
     (scene.folder / "sparse/0/cameras.bin").write_bytes(struct.pack("<QIiQQ2d", 1, 1, 17, 96, 72, 96, 72))
-    refused(scene.folder, tmp_path, "cameras.bin", "EQUIRECTANGULAR", "panorama")
+    assert_load_rejected(scene.folder, tmp_path, "cameras.bin", "EQUIRECTANGULAR", "panorama")
 
 
 # The cache
@@ -546,7 +546,7 @@ def test_few_missing_masks_are_allowed(write_capture, tmp_path):
     assert capture.mask(0) is None and capture.mask(4) is not None and capture.counts["masks"] == 3
     assert any("3 of 6 images have no mask" in warning for warning in capture.warnings)
     (scene.folder / "masks" / scene.names[3]).unlink()
-    refused(scene.folder, tmp_path, "masks/view_000.png", "missing", "4 of 6")
+    assert_load_rejected(scene.folder, tmp_path, "masks/view_000.png", "missing", "4 of 6")
 
 
 def test_capture_without_masks_loads(write_capture, tmp_path):
@@ -618,7 +618,7 @@ def test_largest_model_is_used(write_capture, tmp_path):
 # Invalid input
 
 
-def spoil(scene, what: str) -> tuple[str, ...]:
+def corrupt(scene, what: str) -> tuple[str, ...]:
     """Break the capture and return the words that the error must contain."""
     model, images, masks = scene.folder / "sparse/0", scene.folder / "images", scene.folder / "masks"
     first = scene.names[0]
@@ -733,15 +733,15 @@ def spoil(scene, what: str) -> tuple[str, ...]:
 )  # fmt: skip
 def test_invalid_input_is_reported_in_one_sentence(write_capture, tmp_path, what):
     scene = write_capture()
-    refused(scene.folder, tmp_path, *spoil(scene, what))
+    assert_load_rejected(scene.folder, tmp_path, *corrupt(scene, what))
 
 
 def test_missing_folder_model_or_cache_is_reported(write_capture, tmp_path):
-    refused(tmp_path / "nowhere", tmp_path, "nowhere", "does not exist")
+    assert_load_rejected(tmp_path / "nowhere", tmp_path, "nowhere", "does not exist")
     (tmp_path / "file").write_text("")
-    refused(tmp_path / "file", tmp_path, "is a file")
+    assert_load_rejected(tmp_path / "file", tmp_path, "is a file")
     (tmp_path / "empty").mkdir()
-    refused(tmp_path / "empty", tmp_path, "no COLMAP model", "sparse/0")
+    assert_load_rejected(tmp_path / "empty", tmp_path, "no COLMAP model", "sparse/0")
     with pytest.raises(InputError, match="cannot be written"):
         load_capture(write_capture().folder, tmp_path / "file" / "cache")
 
@@ -750,7 +750,7 @@ def test_missing_folder_model_or_cache_is_reported(write_capture, tmp_path):
 def test_invalid_label_files_are_rejected(write_capture, tmp_path, text):
     scene = write_capture()
     (scene.folder / "labels.json").write_text(text)
-    refused(scene.folder, tmp_path, "labels.json")
+    assert_load_rejected(scene.folder, tmp_path, "labels.json")
 
 
 @pytest.mark.parametrize("line", ["1 1 0 0 0 0 0", "1 a 0 0 0 0 0 0 1 x.png", "1 1 0 0 0 0 0 3 1 x.png\n1.0 2.0"])
@@ -758,7 +758,7 @@ def test_malformed_text_model_reports_line(write_capture, tmp_path, line):
     scene = write_capture(suffix=".txt")
     path = scene.folder / "sparse/0/images.txt"
     path.write_text("# comment\n" + line)
-    refused(scene.folder, tmp_path, "images.txt", f"line {2 + line.count(chr(10))}")
+    assert_load_rejected(scene.folder, tmp_path, "images.txt", f"line {2 + line.count(chr(10))}")
 
 
 def test_nonfinite_points_are_left_out(write_capture, tmp_path):
@@ -796,16 +796,16 @@ def test_damaged_models_raise_only_input_errors(write_capture, suffix):
                 if len(data):
                     data[rng.integers(len(data))] = rng.integers(256)
             path.write_bytes(data)
-            refused = None
+            message = None
             try:
                 model = read_model(folder)
                 for camera_id in {image.camera_id for image in model.images}:
                     pinhole_for(model.cameras[camera_id], path, 1600)
             except InputError as error:
-                refused = str(error)
-            if refused is not None:
+                message = str(error)
+            if message is not None:
                 refusals += 1
-                assert refused.endswith(".") and "\n" not in refused
+                assert message.endswith(".") and "\n" not in message
         path.write_bytes(whole)
     assert refusals > 50
     read_model(folder)
@@ -923,15 +923,15 @@ def test_three_images_load(tmp_path):
 
 def test_model_with_subfolders_is_read(tmp_path):
     folder = fixture("missing_cameras_subfolders_txt")
-    refused(folder, tmp_path, "images", "does not exist")
+    assert_load_rejected(folder, tmp_path, "images", "does not exist")
     model = read_model(folder)
     assert len(model.images) == 9 and all(image.name[:5] in ("sub1/", "sub2/") for image in model.images)
 
 
 def test_invalid_fixtures_are_rejected(tmp_path):
-    refused(fixture("truncated"), tmp_path, "images.bin is truncated", "82 images")
-    refused(fixture("cameras_only"), tmp_path, "images.bin and points3D.bin are missing")
-    refused(fixture("degenerate_two_images"), tmp_path, "cameras.bin", "SIMPLE_RADIAL", "degenerate")
+    assert_load_rejected(fixture("truncated"), tmp_path, "images.bin is truncated", "82 images")
+    assert_load_rejected(fixture("cameras_only"), tmp_path, "images.bin and points3D.bin are missing")
+    assert_load_rejected(fixture("degenerate_two_images"), tmp_path, "cameras.bin", "SIMPLE_RADIAL", "degenerate")
 
 
 def test_tabletop_capture_loads(tmp_path):

@@ -121,18 +121,18 @@ def test_unrecoverable_splat_is_reported_and_removed(trainer, monkeypatch, value
     assert trained.progress.faults == {what: 1}
 
 
-def spoiled(rasterize, splat, value):
+def corrupted(rasterize, splat, value):
     """Wrap `rasterize` so that the gradient of one splat's mean along y is `value`."""
 
     def call(means, *others, **options):
-        def spoil(g):
+        def corrupt(g):
             g = g.clone()
             g[splat, 1] = value
             return g
 
         if means.requires_grad:
             means = means * 1.0
-            means.register_hook(spoil)
+            means.register_hook(corrupt)
         return rasterize(means, *others, **options)
 
     return call
@@ -146,7 +146,7 @@ def test_nonfinite_gradient_affects_only_its_anchor(trainer, monkeypatch, value)
         trained = trainer()
         index = trained.scene.capture.train_indices[0]
         before, trained.progress.step = trained.model.anchors.rows.clone(), 1
-        monkeypatch.setattr(step, "rasterize", spoiled(step.rasterize, 41, given))
+        monkeypatch.setattr(step, "rasterize", corrupted(step.rasterize, 41, given))
         learned = trained._view_step.compute(index, 0.6)
         monkeypatch.undo()
         trained._update(learned, 0.6)

@@ -545,11 +545,11 @@ without_cuda = pytest.mark.skipif(devices.why_not_cuda() is None, reason="CUDA w
 
 @without_cuda
 @pytest.mark.parametrize("command", ["train", "render", "evaluate", "mesh", "report", "doctor"])
-def test_unavailable_cuda_is_rejected(ask, write_capture, tmp_path, command):
+def test_unavailable_cuda_is_rejected(run_command, write_capture, tmp_path, command):
     arguments = {"train": [write_capture().folder, "--out", tmp_path / "out"], "doctor": []}.get(command, [tmp_path])
-    answer = ask(command, *map(str, arguments), "--device", "cuda", "--json")
-    assert answer.code == 2
-    message = answer.events[-1]["message"]
+    result = run_command(command, *map(str, arguments), "--device", "cuda", "--json")
+    assert result.code == 2
+    message = result.events[-1]["message"]
     assert message == devices.why_not_cuda() and message.endswith(".") and "\n" not in message
     assert not (tmp_path / "out").exists()
 

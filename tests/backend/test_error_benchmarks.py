@@ -70,15 +70,15 @@ def test_plan_verdict_reports_savings_and_quality():
     whole = {"seconds": 100.0, "cpu_seconds": 150.0, "peak_mb": 1000.0, "psnr": 30.0, "error": 0.03}
     planned = {"seconds": 80.0, "cpu_seconds": 165.0, "peak_mb": 500.0, "psnr": 30.05, "error": 0.04}
     found = {"as planned": planned, "nothing left out": whole}
-    said = "As planned, the same number of steps takes 20% less time, 10% more CPU time, 50% less memory; "
-    assert plan.verdict(found) == f"{said}+0.05 ± 0.05 dB, equal."
+    text = "As planned, the same number of steps takes 20% less time, 10% more CPU time, 50% less memory; "
+    assert plan.verdict(found) == f"{text}+0.05 ± 0.05 dB, equal."
     planned["psnr"] = 29.5
     assert plan.verdict(found).endswith("; -0.50 ± 0.05 dB, worse.")
     assert plan.judged({**planned, "error": 0.4}, whole) == "equal"
     planned["psnr"] = 32.0
     found[plan.AS_GOOD] = {**planned, "steps": 400, "seconds": 45.0, "psnr": 29.95, "error": 0.0}
     assert plan.verdict(found) == (
-        f"{said}+2.00 ± 0.05 dB, better. "
+        f"{text}+2.00 ± 0.05 dB, better. "
         "In 400 steps it takes 55% less time, 10% more CPU time, 50% less memory; -0.05 ± 0.03 dB."
     )
     found[plan.EVERYWHERE] = {**whole, "seconds": 160.0, "psnr": 32.5}

@@ -27,7 +27,7 @@ from backend.shared.reconstruction.objects import edit_objects, write_objects
 from backend.shared.reconstruction.record import TrainingRecord, VotesRecord, update_record
 from backend.shared.reconstruction.shot import Frame, Placed, Sample, Shot, chosen_frames, read_shot, write_shot
 
-from .asking import refused
+from .command_result import assert_rejected
 
 HUGE = 3_000_000_001
 IDS = (0, 1, 2, 7, HUGE)
@@ -88,14 +88,16 @@ def shot_of(*frames, **settings) -> Shot:
 
 
 @pytest.fixture
-def film(folder, tmp_path, ask):
+def film(folder, tmp_path, run_command):
     """Function that renders a shot and returns the channels of each frame."""
 
     def draw(shot, *options):
         write_shot(tmp_path / "shot.json", shot)
         out = tmp_path / "film"
-        answer = ask("film", folder.folder, "--shot", tmp_path / "shot.json", "--out", out, "--device", "cpu", *options)
-        assert answer.code == EXIT_DONE, answer
+        result = run_command(
+            "film", folder.folder, "--shot", tmp_path / "shot.json", "--out", out, "--device", "cpu", *options
+        )
+        assert result.code == EXIT_DONE, result
         return [channels(frame_path(out, frame.number)) for frame in shot.frames]
 
     return draw
@@ -278,12 +280,12 @@ def test_srgb_encoding_round_trip():
 
 
 @pytest.fixture
-def shoot(folder, tmp_path, ask):
+def shoot(folder, tmp_path, run_command):
     """Function that runs the command on a shot of three frames, or on another shot."""
 
     def run(*options, shot=None):
         write_shot(tmp_path / "shot.json", shot or shot_of([sample()], [sample(0.1)], [sample(0.2), sample(0.21)]))
-        return ask(
+        return run_command(
             "film", folder.folder, "--shot", tmp_path / "shot.json", "--out", tmp_path / "film", "--device", "cpu",
             "--json", *options,
         )  # fmt: skip
@@ -291,9 +293,9 @@ def shoot(folder, tmp_path, ask):
     return run
 
 
-def drawn(answer) -> int:
-    assert answer.code == EXIT_DONE, answer
-    return answer.events[-1]["drawn"]
+def drawn(result) -> int:
+    assert result.code == EXIT_DONE, result
+    return result.events[-1]["drawn"]
 
 
 def test_finished_frames_are_skipped(folder, shoot, tmp_path):
@@ -322,9 +324,9 @@ def test_finished_frames_are_skipped(folder, shoot, tmp_path):
 def test_stopping_keeps_complete_frames(shoot, tmp_path, monkeypatch):
     stops = iter([False, False, True])
     monkeypatch.setattr("backend.shared.stopping.StopRequest.__call__", lambda self: next(stops))
-    answer = shoot()
-    assert answer.code == EXIT_CANCELLED and answer.events[-1]["stopped"] is True
-    shares = [event["done"] for event in answer.events if event["type"] == "progress"]
+    result = shoot()
+    assert result.code == EXIT_CANCELLED and result.events[-1]["stopped"] is True
+    shares = [event["done"] for event in result.events if event["type"] == "progress"]
     assert shares == [1, 2, 2.5], "stopping is also possible between samples"
     assert sorted(path.name for path in (tmp_path / "film").iterdir()) == ["splats.0001.exr", "splats.0002.exr"]
     monkeypatch.undo()
@@ -386,19 +388,19 @@ def test_invalid_shots_are_rejected(tmp_path, keys, value, words):
     assert str(path) in str(caught.value) and words in str(caught.value) and str(caught.value).endswith(".")
 
 
-def test_invalid_film_requests_are_rejected(folder, tmp_path, ask):
+def test_invalid_film_requests_are_rejected(folder, tmp_path, run_command):
     path = tmp_path / "shot.json"
     command = ("film", folder.folder, "--shot", path, "--out", tmp_path / "film")
-    refused(ask(*command), str(path), "does not exist")
+    assert_rejected(run_command(*command), str(path), "does not exist")
     write_shot(path, shot_of([sample()], [sample()]))
     for text in ("x", "3-1", "1;2", "", "-4"):
-        refused(ask(*command, f"--frames={text}"), "--frames")
-    refused(ask(*command, "--frames", "7-9"), "none of the frames", "1 to 2")
-    refused(ask("film", tmp_path, "--shot", path, "--out", tmp_path / "film"), "splats.ply")
+        assert_rejected(run_command(*command, f"--frames={text}"), "--frames")
+    assert_rejected(run_command(*command, "--frames", "7-9"), "none of the frames", "1 to 2")
+    assert_rejected(run_command("film", tmp_path, "--shot", path, "--out", tmp_path / "film"), "splats.ply")
     (tmp_path / "file").write_text("not a folder")
-    refused(ask(*command[:-1], tmp_path / "file"), "cannot be created")
+    assert_rejected(run_command(*command[:-1], tmp_path / "file"), "cannot be created")
     path.write_text("{")
-    refused(ask(*command), str(path), "JSON")
+    assert_rejected(run_command(*command), str(path), "JSON")
 
 
 def test_frame_ranges_are_parsed():

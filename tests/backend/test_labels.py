@@ -102,11 +102,11 @@ def test_points_behind_or_outside_do_not_vote():
 def test_only_training_views_with_masks_vote(write_capture, tmp_path):
     scene = write_capture(views=9, points=5)
     capture = load_capture(scene.folder, tmp_path / "cache")
-    asked = []
+    requested = []
     original = capture.mask
-    capture.mask = lambda index, downscale=1: (asked.append(index), original(index, downscale))[1]  # type: ignore
+    capture.mask = lambda index, downscale=1: (requested.append(index), original(index, downscale))[1]  # type: ignore
     vote(capture)
-    assert set(asked) == set(capture.train_indices) and 0 not in asked and 8 not in asked
+    assert set(requested) == set(capture.train_indices) and 0 not in requested and 8 not in requested
 
 
 def test_correspondence_uses_only_observations():
@@ -189,15 +189,15 @@ def test_objects_with_few_points_give_warnings():
     masks = [np.repeat([[1, 1, 1, 1, 2, 2, 2, 2]], 8, 0)]
     masks[0][0, 0] = 70_000
     xyz = np.concatenate([np.tile([[-0.2, 0, 1.0]], (30, 1)), np.tile([[0.2, 0, 1.0]], (5, 1))])
-    said = []
+    reported = []
 
     class RecordingReporter(Reporter):
         def warning(self, message):
-            said.append(message)
+            reported.append(message)
 
     votes = vote(given(masks, xyz, names={2: "cup", 70_000: "pin"}), reporter=RecordingReporter())
-    assert votes.counts == {1: 30, 2: 5, 70_000: 0} and said == votes.warnings and len(said) == 2
-    assert "70000 (pin)" in said[0] and "Fewer than 20" in said[1] and "2 (cup)" in said[1]
+    assert votes.counts == {1: 30, 2: 5, 70_000: 0} and reported == votes.warnings and len(reported) == 2
+    assert "70000 (pin)" in reported[0] and "Fewer than 20" in reported[1] and "2 (cup)" in reported[1]
 
 
 def test_ballots_stay_exact_beyond_their_slots(monkeypatch):

@@ -468,8 +468,8 @@ def test_meshes_of_earlier_state_are_left_out(tmp_path):
     found = mesh_entries(tmp_path, 20, reporter)
     assert list(found) == ["2", "10", "77", "scene"], "objects by ID, then a set called 77 and the scene"
     assert [entry.object_id for entry in found.values()] == [2, 10, None, None]
-    [said] = reporter.warnings
-    assert "1 of 5 meshes" in said and "earlier state" in said
+    [warning] = reporter.warnings
+    assert "1 of 5 meshes" in warning and "earlier state" in warning
     assert list(mesh_entries(tmp_path, 15, reporter)) == ["old"]
     for broken in ([1], {"1": 7}, {"one": {"ids": ["x"]}}):
         (tmp_path / "meshes.json").write_text(json.dumps({"trained_steps": 20, "meshes": broken}))
@@ -555,19 +555,19 @@ def test_sheet_shows_all_meshes_within_size_limit(true_capture, tmp_path):
 # --- the commands ----------------------------------------------------------------------------------------------------
 
 
-def test_evaluate_and_report_measure_meshes(write_capture, tmp_path, ask):
+def test_evaluate_and_report_measure_meshes(write_capture, tmp_path, run_command):
     scene, out = write_capture(views=9, size=(64, 48), spheres=SPHERES), tmp_path / "out"
     write_truth(scene, write_capture, SPHERES)
 
     def run(*words):
-        answer = ask(*words)
-        assert answer.code == EXIT_DONE, answer
-        return answer.err
+        result = run_command(*words)
+        assert result.code == EXIT_DONE, result
+        return result.err
 
     def reported():
-        said = run("report", out)
+        stderr = run("report", out)
         report = json.loads((out / "report.json").read_text())
-        return said, report, {entry["id"]: entry["mesh"] for entry in report["objects"]}
+        return stderr, report, {entry["id"]: entry["mesh"] for entry in report["objects"]}
 
     run("train", scene.folder, "--out", out, "--steps", 12, "--offsets", 4)
     folder = out / "meshes"
@@ -588,14 +588,14 @@ def test_evaluate_and_report_measure_meshes(write_capture, tmp_path, ask):
         },
     }  # fmt: skip
     (folder / "meshes.json").write_text(json.dumps(record))
-    said, _, meshes = reported()
-    assert "have not been measured" in said
+    stderr, _, meshes = reported()
+    assert "have not been measured" in stderr
     assert meshes[1]["faces"] == len(faces) and meshes[1]["f1"] is None
     assert (out / "pictures" / "meshes.png").exists()
 
     run("evaluate", out)
-    said, report, meshes = reported()
-    assert said == ""
+    stderr, report, meshes = reported()
+    assert stderr == ""
     assert meshes[1]["f1"] == 1.0 and meshes[1]["f1_005"] < 0.5
     assert meshes[1]["chamfer"] == pytest.approx(0.01, rel=0.1)
     assert meshes[1]["watertight"] and meshes[1]["manifold"] and meshes[1]["self_intersections"] == 0

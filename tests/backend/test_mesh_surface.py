@@ -530,12 +530,12 @@ def test_memory_scales_with_surface_and_respects_limit():
     views = ExactViews([ball()], around(6, width=128, height=96, focal=120.0))
     coarse, fine = (len(fuse(views, [0], resolution=n).blocks) for n in (32, 64))
     assert fine < 5 * coarse
-    said = []
+    warnings = []
     reporter = Reporter()
-    reporter.warning = said.append
+    reporter.warning = warnings.append
     small = fuse(views, [0], memory_mb=5, reporter=reporter)
     assert len(small.blocks) * SAMPLES * 16 < 5e6
-    assert len(said) == 1 and "memory" in said[0]
+    assert len(warnings) == 1 and "memory" in warnings[0]
     surface = extract(small)
     assert_valid_surface(surface)
     assert errors(surface, ball()).mean() < 0.3 * small.voxel

@@ -46,10 +46,10 @@ def test_older_meshes_and_checkpoint_are_read(earlier):
     assert header.steps == 60 and header.seconds > 0
 
 
-def test_older_reconstruction_is_evaluated_exported_and_trained(earlier, ask):
+def test_older_reconstruction_is_evaluated_exported_and_trained(earlier, run_command):
     rec, capture = earlier / "rec", earlier / "capture"
-    assert ask("evaluate", rec, "--capture", capture).code == EXIT_DONE
-    assert ask("export", rec, "--out", earlier / "all.ply").code == EXIT_DONE
+    assert run_command("evaluate", rec, "--capture", capture).code == EXIT_DONE
+    assert run_command("export", rec, "--out", earlier / "all.ply").code == EXIT_DONE
     train = ("train", capture, "--out", rec, "--steps", 62, "--offsets", 2, "--voxel", 0.12)
-    assert ask(*train).code == EXIT_DONE
+    assert run_command(*train).code == EXIT_DONE
     assert read_header(rec / "checkpoint").steps == 62

@@ -21,7 +21,7 @@ from backend.shared.reconstruction.plan import KEYS, Decision, Plan, read_plan, 
 from backend.training.settings import Settings, downscale_at
 from backend.training.trainer import Trainer
 
-from .asking import refused
+from .command_result import assert_rejected
 
 SMALL = ("--offsets", "2")
 
@@ -250,11 +250,11 @@ def test_invalid_groups_are_rejected(tmp_path, content, words):
     assert words in str(found.value)
 
 
-def test_only_and_groups_are_revertible_edits(write_capture, tmp_path, ask):
+def test_only_and_groups_are_revertible_edits(write_capture, tmp_path, run_command):
     capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"
     groups = tmp_path / "groups.json"
     groups.write_text('{"0": "rest", "2": "planet", "5": "planet", "77": "nobody"}')
-    assert ask("vote", capture, "--out", out, "--groups", groups, "--only", "planet").code == EXIT_DONE
+    assert run_command("vote", capture, "--out", out, "--groups", groups, "--only", "planet").code == EXIT_DONE
     objects = {entry.id: entry for entry in read_objects(out / "objects.json")}
     assert merged(list(objects.values())) == {1: 1, 2: 2, 5: 2} and objects[2].name == "planet"
     assert [i for i, entry in objects.items() if entry.left_out] == [1]
@@ -262,9 +262,9 @@ def test_only_and_groups_are_revertible_edits(write_capture, tmp_path, ask):
     assert "sphere 1" in plan["objects"].what and "2 IDs are grouped into 1" in plan["groups"].why
     edit_objects(out / "objects.json", {5: {"merged_into": None}, 1: {"left_out": None}})
     assert read_objects(out / "objects.json")[0].left_out is False
-    assert ask("vote", capture, "--out", out, "--only", "sphere 1", "5").code == EXIT_DONE
+    assert run_command("vote", capture, "--out", out, "--only", "sphere 1", "5").code == EXIT_DONE
     assert [entry.id for entry in read_objects(out / "objects.json") if entry.left_out] == [2]
-    refused(ask("vote", capture, "--out", out, "--only", "moon"), "no object moon", "objects.json")
+    assert_rejected(run_command("vote", capture, "--out", out, "--only", "moon"), "no object moon", "objects.json")
 
 
 def test_chosen_objects_include_merged_ones(tmp_path):
@@ -282,28 +282,28 @@ def test_chosen_objects_include_merged_ones(tmp_path):
 # --- the commands ----------------------------------------------------------------------------------------------------
 
 
-def test_plan_command_reports_decisions_and_writes_only_out(write_capture, tmp_path, ask):
+def test_plan_command_reports_decisions_and_writes_only_out(write_capture, tmp_path, run_command):
     capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "deep" / "out"
     before = sorted(path.name for path in tmp_path.rglob("*"))
-    answer = ask("plan", capture, "--minutes", 3, "--primitive", "2d", "--no-meshes", "--keep", "all", "--json")
-    assert answer.code == EXIT_DONE and sorted(path.name for path in tmp_path.rglob("*")) == before
-    plan = Plan.of(answer.events[-1]["plan"])
+    result = run_command("plan", capture, "--minutes", 3, "--primitive", "2d", "--no-meshes", "--keep", "all", "--json")
+    assert result.code == EXIT_DONE and sorted(path.name for path in tmp_path.rglob("*")) == before
+    plan = Plan.of(result.events[-1]["plan"])
     assert plan["pyramid"].overridden and plan["surface"].overridden and not plan.does("meshes")
-    assert len([text for text in answer.messages("status") if text.startswith(("Done: ", "Left out: "))]) > 5
-    assert answer.messages("status")[-1].startswith("Expected of ")
-    refused(ask("plan", capture, "--keep", "everything"), "invalid choice: 'everything'")
-    refused(ask("plan", tmp_path / "none", "--out", out), "does not exist")
+    assert len([text for text in result.messages("status") if text.startswith(("Done: ", "Left out: "))]) > 5
+    assert result.messages("status")[-1].startswith("Expected of ")
+    assert_rejected(run_command("plan", capture, "--keep", "everything"), "invalid choice: 'everything'")
+    assert_rejected(run_command("plan", tmp_path / "none", "--out", out), "does not exist")
     assert not out.parent.exists()
-    assert ask("plan", capture, "--out", out, "--only", "sphere 2").code == EXIT_DONE
+    assert run_command("plan", capture, "--out", out, "--only", "sphere 2").code == EXIT_DONE
     assert {path.name for path in out.iterdir()} == {"objectgs.json", "plan.json"}
     assert read_plan(out / "plan.json")["objects"].done is False
-    assert ask("import", capture, "--out", out).code == EXIT_DONE
+    assert run_command("import", capture, "--out", out).code == EXIT_DONE
     assert read_plan(out / "plan.json")["rest"].done is None
-    assert ask("vote", capture, "--out", out).code == EXIT_DONE
+    assert run_command("vote", capture, "--out", out).code == EXIT_DONE
     assert read_plan(out / "plan.json")["rest"].done is False
 
 
-def test_plan_affects_training_evaluation_and_report(write_capture, tmp_path, ask):
+def test_plan_affects_training_evaluation_and_report(write_capture, tmp_path, run_command):
     scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
     shutil.copy(scene.folder / "images/view_001.png", scene.folder / "images/view_002.png")
     shutil.copy(scene.folder / "masks/view_001.png", scene.folder / "masks/view_002.png")
@@ -311,19 +311,19 @@ def test_plan_affects_training_evaluation_and_report(write_capture, tmp_path, as
         part[2] = part[1]
     write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
     train = ("train", scene.folder, "--out", out, *SMALL)
-    began = ask(*train, "--steps", 4, "--keep", "pyramid", "--leave-out", "exposure", "labels", "--json")
+    began = run_command(*train, "--steps", 4, "--keep", "pyramid", "--leave-out", "exposure", "labels", "--json")
     assert began.code == EXIT_DONE
-    said = began.messages("status")
-    assert any(text.startswith("Left out: training on 1 view, since") for text in said)
-    assert any(text.startswith("Done: reduced images") and "--keep pyramid" in text for text in said)
-    assert any(text.startswith("Expected in ") and "dB below" in text for text in said)
+    statuses = began.messages("status")
+    assert any(text.startswith("Left out: training on 1 view, since") for text in statuses)
+    assert any(text.startswith("Done: reduced images") and "--keep pyramid" in text for text in statuses)
+    assert any(text.startswith("Expected in ") and "dB below" in text for text in statuses)
     training = json.loads((out / "objectgs.json").read_text())["training"]
     assert Plan.of(training["plan"]) == read_plan(out / "plan.json")
     kept = ("--keep", "pyramid", "--leave-out")
-    refused(ask(*train, "--steps", 6, *kept, "labels"), "another plan (exposure)", "--restart")
-    refused(ask(*train, "--steps", 6, *kept, "exposure"), "semantic_weight")
-    assert ask(*train, "--steps", 6, *kept, "labels", "exposure").code == EXIT_DONE
-    assert ask("evaluate", out).code == EXIT_DONE and ask("report", out).code == EXIT_DONE
+    assert_rejected(run_command(*train, "--steps", 6, *kept, "labels"), "another plan (exposure)", "--restart")
+    assert_rejected(run_command(*train, "--steps", 6, *kept, "exposure"), "semantic_weight")
+    assert run_command(*train, "--steps", 6, *kept, "labels", "exposure").code == EXIT_DONE
+    assert run_command("evaluate", out).code == EXIT_DONE and run_command("report", out).code == EXIT_DONE
     report = json.loads((out / "report.json").read_text())
     left_out = {entry["what"]: entry["why"] for entry in report["left_out"]}
     assert left_out["the label loss and its ID channel"] == "--leave-out labels was given"
@@ -331,18 +331,18 @@ def test_plan_affects_training_evaluation_and_report(write_capture, tmp_path, as
     assert not report["capture"]["exposure_varies"] and report["quality"]["miou"] is not None
     assert [own["key"] for own in report["plan"]] == [own.key for own in read_plan(out / "plan.json").decisions]
 
-    assert ask(*train, "--steps", 3, "--restart", "--leave-out", "votes").code == EXIT_DONE
+    assert run_command(*train, "--steps", 3, "--restart", "--leave-out", "votes").code == EXIT_DONE
     assert set(read_points(out / "points.ply").ids.tolist()) == {0}
-    assert ask("evaluate", out, "--json").events[-1].get("miou") is None
+    assert run_command("evaluate", out, "--json").events[-1].get("miou") is None
 
 
-def test_training_without_plan_resumes(write_capture, tmp_path, ask):
+def test_training_without_plan_resumes(write_capture, tmp_path, run_command):
     capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"
     train = ("train", capture, "--out", out, *SMALL, "--steps")
-    assert ask(*train, 2).code == EXIT_DONE
+    assert run_command(*train, 2).code == EXIT_DONE
     memory = json.loads((out / "objectgs.json").read_text())
     del memory["training"]["plan"]
     (out / "objectgs.json").write_text(json.dumps(memory))
     (out / "plan.json").unlink()
-    assert ask("report", out).code == EXIT_DONE and ask(*train, 3).code == EXIT_DONE
+    assert run_command("report", out).code == EXIT_DONE and run_command(*train, 3).code == EXIT_DONE
     assert read_plan(out / "plan.json")["votes"].done

@@ -202,7 +202,7 @@ def test_paused_training_can_be_stopped(drive, endless, how):
 def test_other_commands_can_be_paused(monkeypatch):
     """Pause before the first progress, resume, pause again, and stop while paused."""
     requested, read = threading.Event(), threading.Event()
-    said: list[str] = []
+    messages: list[str] = []
 
     class Typed:
         def __iter__(self):
@@ -216,9 +216,9 @@ def test_other_commands_can_be_paused(monkeypatch):
 
     class RecordingReporter(Reporter):
         def progress(self, done, total, **fields):
-            said.append(f"progress {done}")
+            messages.append(f"progress {done}")
 
-    stop = StopRequest(announce=said.append)
+    stop = StopRequest(announce=messages.append)
     monkeypatch.setattr(sys, "stdin", Typed())
 
     def later(wait=0.3):
@@ -230,14 +230,14 @@ def test_other_commands_can_be_paused(monkeypatch):
         reporter = StoppingReporter(RecordingReporter(), stop)
         later()
         reporter.progress(1, 3)
-        assert said == ["progress 1", "Paused", "Resumed"] and not stop.paused
+        assert messages == ["progress 1", "Paused", "Resumed"] and not stop.paused
         read.clear()
         requested.set()
         assert read.wait(60)
         later()
         with pytest.raises(Cancelled):
             reporter.progress(2, 3)
-        assert said[3:] == ["progress 2", "Paused"]
+        assert messages[3:] == ["progress 2", "Paused"]
 
 
 @pytest.mark.parametrize("masks", [True, False])

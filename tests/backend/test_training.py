@@ -497,10 +497,10 @@ def test_older_checkpoint_is_3d(tiny, tmp_path):
 
 def test_normals_and_distortion_are_computed_only_if_weighted(tiny, monkeypatch):
     capture, ids = tiny()
-    asked = []
+    requested = []
 
     def seen(*args, **kwargs):
-        asked.append([kwargs[f"want_{what}"] for what in ("depth", "normals", "distortion")])
+        requested.append([kwargs[f"want_{what}"] for what in ("depth", "normals", "distortion")])
         return rasterize(*args, **kwargs)
 
     monkeypatch.setattr("backend.training.step.rasterize", seen)
@@ -512,7 +512,7 @@ def test_normals_and_distortion_are_computed_only_if_weighted(tiny, monkeypatch)
         (dataclasses.replace(normals, normal_weight=0.0), 0.9, [False] * 3),
     ):  # fmt: skip
         assert Trainer.start(capture, ids, settings).step(share).isfinite()
-        assert asked.pop() == wanted
+        assert requested.pop() == wanted
 
 
 def test_normal_loss_aligns_normals_with_depth(tiny):
@@ -531,15 +531,15 @@ def test_normal_loss_aligns_normals_with_depth(tiny):
 
 def test_stopped_and_finished_training_store_average_model(tiny, tmp_path, monkeypatch):
     capture, ids = tiny()
-    budget, asked, seen = Budget(steps=60), [], []
+    budget, requested, seen = Budget(steps=60), [], []
     trainer = Trainer.start(capture, ids, SMALL)
     follow = Average.follow
     monkeypatch.setattr(Average, "follow", lambda own, model, step: (follow(own, model, step), seen.append(step))[0])
 
     class StopLater(StopRequest):
         def __call__(self):
-            asked.append(trainer.progress.step)
-            return len(asked) > 45
+            requested.append(trainer.progress.step)
+            return len(requested) > 45
 
     def measure(model, scene, progress):
         return {"psnr": 0.0, "is_model": model is trainer.model}

@@ -247,7 +247,7 @@ def test_next_setup_deletes_remains_of_removal(root):
 def test_unsuitable_pythons_are_rejected(root, monkeypatch):
     options = argparse.Namespace(folder=root / "environment", requirements=root / "requirements", device="cpu")
 
-    def refusal():
+    def error():
         with pytest.raises(events.Refused) as caught:
             setup.set_up(options, lambda: False)
         assert not options.folder.exists()
@@ -255,15 +255,15 @@ def test_unsuitable_pythons_are_rejected(root, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(layout, "OLDEST", (3, 99))
-        assert "needs 3.11, 3.12 or 3.13" in refusal()
+        assert "needs 3.11, 3.12 or 3.13" in error()
     with monkeypatch.context() as patch:
         patch.setattr(checks.struct, "calcsize", lambda _: 4)
-        assert "32-bit" in refusal()
+        assert "32-bit" in error()
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "ensurepip", None)
-        assert "ensurepip is missing" in refusal()
+        assert "ensurepip is missing" in error()
     monkeypatch.setitem(checks.GIGABYTES, "cpu", 1e9)
-    assert "free; make room" in refusal()
+    assert "free; make room" in error()
 
 
 def test_probe_checks_packages_and_backend(root, monkeypatch):

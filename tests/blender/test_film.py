@@ -527,12 +527,12 @@ def test_film_command_applies_edits_and_reports_errors(shot_blend, backend_pytho
     assert sorted(path.name for path in out.glob("*.exr")) == [f"splats.000{i}.exr" for i in (3, 5, 6)]
     picture = pixels_of(out / "splats.0003.png")
     assert picture.shape[:2] == (20, 40) and picture[10, 4, 3] < 0.01 and picture[10, 33, 3] > 0.98
-    for words, said in (
+    for words, expected in (
         ((shot_blend, "--out", out, "--frames", "x"), "--frames"),
         ((shot_blend, "--out", out, "--dir", out), "--dir"),
     ):
         ran = run(*words)
-        assert ran.returncode == 2 and said in ran.stderr and ran.stderr.count("\n") == 1, ran.stdout + ran.stderr
+        assert ran.returncode == 2 and expected in ran.stderr and ran.stderr.count("\n") == 1, ran.stdout + ran.stderr
 
 
 @pytest.fixture

@@ -100,8 +100,8 @@ def test_help_lists_commands(capsys):
 )
 def test_invalid_arguments_are_rejected(arguments, words, capsys):
     assert headless.main(list(arguments)) == 2
-    said = capsys.readouterr()
-    assert words in said.err and said.err.count("\n") == 1 and not said.out
+    captured = capsys.readouterr()
+    assert words in captured.err and captured.err.count("\n") == 1 and not captured.out
 
 
 def test_build_contains_reconstruction(blend, trained):

@@ -23,15 +23,15 @@ PRELUDE = """
 import json, os, signal, sys, time
 def say(kind, **fields):
     print(json.dumps({"type": kind, "time": 0, **fields}), flush=True)
-def hear():
+def read_line():
     return sys.stdin.readline().strip()
 """
 
 TRAINS = """
-assert hear() == "attached"
+assert read_line() == "attached"
 say("status", message="Training")
 say("progress", done=0.25, total=1.0, step=10, seconds_left=30.0, splats=5000, anchors=500, psnr=None)
-while (word := hear()) != "stop":
+while (word := read_line()) != "stop":
     say("status", message={"pause": "Paused", "resume": "Resumed", "": "Nobody there"}[word])
     if not word:
         sys.exit(3)

@@ -421,17 +421,17 @@ def test_scene_without_objects_shows_scene_mesh(fresh, folder):
 
 
 @pytest.mark.parametrize(
-    ("spoil", "sentence"),
+    ("corrupt", "sentence"),
     [
         (lambda path: path.unlink(), "2.ply cannot be read"),
         (lambda path: path.write_bytes(path.read_bytes()[:-1]), "2.ply is truncated"),
         (lambda path: path.write_bytes(b"ply\n"), "2.ply is not a mesh"),
     ],
 )
-def test_invalid_mesh_is_reported_and_others_are_updated(root, folder, spoil, sentence):
+def test_invalid_mesh_is_reported_and_others_are_updated(root, folder, corrupt, sentence):
     kept = mesh_of(root, 2)
     rewrite(folder, _1=tetrahedron(ORIGIN, 2.0), _2=tetrahedron(ORIGIN, 2.0))
-    spoil(folder / "meshes" / "2.ply")
+    corrupt(folder / "meshes" / "2.ply")
     shown = blender_scene.show_meshes(root, folder)
     assert (shown.meshes, shown.updated) == (2, 1)
     assert len(shown.warnings) == 1 and sentence in shown.warnings[0] and shown.warnings[0].endswith(".")

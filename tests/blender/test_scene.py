@@ -405,7 +405,7 @@ def test_reconstructions_in_one_file_are_separate(root, folder, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "spoil", "sentence"),
+    ("name", "corrupt", "sentence"),
     [
         ("cameras.json", None, "has no cameras.json; run Import again"),
         ("cameras.json", b"{}", "is not a valid list of cameras"),
@@ -415,8 +415,8 @@ def test_reconstructions_in_one_file_are_separate(root, folder, tmp_path):
         ("objects.json", b"[]", "is not a valid list of objects"),
     ],
 )
-def test_invalid_captures_change_nothing(fresh, folder, name, spoil, sentence):
-    (folder / name).unlink() if spoil is None else (folder / name).write_bytes(spoil)
+def test_invalid_captures_change_nothing(fresh, folder, name, corrupt, sentence):
+    (folder / name).unlink() if corrupt is None else (folder / name).write_bytes(corrupt)
     before = counts()
     with pytest.raises(InputError, match=sentence):
         blender_scene.show_capture(bpy.context.scene, folder)
@@ -424,7 +424,7 @@ def test_invalid_captures_change_nothing(fresh, folder, name, spoil, sentence):
 
 
 @pytest.mark.parametrize(
-    ("name", "spoil", "sentence"),
+    ("name", "corrupt", "sentence"),
     [
         ("splats.ply", None, "has no splats.ply; train first"),
         ("splats.ply", "points.ply", "not a file of Gaussian splats"),
@@ -432,14 +432,14 @@ def test_invalid_captures_change_nothing(fresh, folder, name, spoil, sentence):
         ("splats.ply", "cut", "truncated"),
     ],
 )
-def test_invalid_results_change_nothing(root, folder, name, spoil, sentence):
+def test_invalid_results_change_nothing(root, folder, name, corrupt, sentence):
     path = folder / name
-    if spoil is None:
+    if corrupt is None:
         path.unlink()
-    elif spoil == "cut":
+    elif corrupt == "cut":
         path.write_bytes(path.read_bytes()[:-1])
     else:
-        path.write_bytes((folder / spoil).read_bytes())
+        path.write_bytes((folder / corrupt).read_bytes())
     before = counts()
     with pytest.raises(InputError, match=sentence):
         again(root, folder)
