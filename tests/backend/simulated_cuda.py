@@ -97,12 +97,12 @@ def test_single_plane_matches_all_planes(wanted, primitive):
     for everything in (False, True):
         scene = {k: v.requires_grad_(k != "ids") for k, v in as_float32(random_scene(2, count=25)).items()}
         wanted_planes = {name: (everything and (flat or name in PLANES[:2])) or name == wanted for name in PLANES}
-        picture = rasterize(
+        rendered = rasterize(
             **scene, camera=cam, labels=labels if everything or wanted == "labels" else None, primitive=primitive,
             **wanted_planes,
         )  # fmt: skip
-        here = [picture.color, picture.alpha]
-        for name, plane in zip(("labels", *PLANES), picture[2:7], strict=True):
+        here = [rendered.color, rendered.alpha]
+        for name, plane in zip(("labels", *PLANES), rendered[2:7], strict=True):
             assert (plane is not None) == ((everything and (flat or name in ("labels", *PLANES[:2]))) or name == wanted)
             if name == wanted:
                 here.append(plane)
@@ -156,9 +156,9 @@ def test_splats_below_the_transmittance_threshold_have_no_gradient(primitive, fi
     scene["quats"] = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(20, 1)
     scene["opacities"][:] = 0.98
     leaves = {k: v.requires_grad_(k != "ids") for k, v in scene.items()}
-    picture = rasterize(**leaves, camera=camera(), want_depth=True, primitive=primitive)
-    assert picture.frame.isect_counts.tolist() == [3] * picture.frame.isect_counts.numel()
-    (picture.color.sum() + picture.alpha.sum() + picture.depth.sum()).backward()
+    rendered = rasterize(**leaves, camera=camera(), want_depth=True, primitive=primitive)
+    assert rendered.frame.isect_counts.tolist() == [3] * rendered.frame.isect_counts.numel()
+    (rendered.color.sum() + rendered.alpha.sum() + rendered.depth.sum()).backward()
     for name in NAMES:
         gradient = leaves[name].grad
         assert torch.isfinite(gradient).all() and not gradient[3:].any(), name

@@ -39,10 +39,10 @@ import sys
 sys.modules["numba.cuda"] = None
 from tests.backend.test_raster import as_float32, camera, mapped, random_scene, rasterize
 scene = {k: v.requires_grad_(k != "ids") for k, v in as_float32(random_scene(0)).items()}
-picture = rasterize(**scene, camera=camera())
-picture.color.sum().backward()
-mapped(picture)
-print(type(picture.frame).__module__)
+rendered = rasterize(**scene, camera=camera())
+rendered.color.sum().backward()
+mapped(rendered)
+print(type(rendered.frame).__module__)
 """
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
     assert (done.returncode, done.stdout.strip()) == (0, "backend.raster.cpu.renderer"), done.stderr

@@ -287,10 +287,10 @@ def quality(trainer):
     capture = trainer.scene.capture
     found, right = [], []
     for index in capture.train_indices:
-        picture = draw(trainer.shown, trainer.scene.camera(index))
+        rendered = draw(trainer.shown, trainer.scene.camera(index))
         truth = capture.mask(index)
-        found.append(psnr(picture.image, capture.image(index) / 255.0))
-        right.append((picture.ids[truth > 0] == truth[truth > 0]).mean())
+        found.append(psnr(rendered.image, capture.image(index) / 255.0))
+        right.append((rendered.ids[truth > 0] == truth[truth > 0]).mean())
     return float(np.mean(found)), float(np.mean(right))
 
 
@@ -431,10 +431,10 @@ def test_training_in_simulator_matches_cpu(write_capture, tmp_path):
 
 def test_strips_cover_image(tiny):
     camera = dataclasses.replace(CAMERA, gain=(1.0, 1.1, 1.2))
-    picture, labels = torch.rand(3, 48, 64), torch.randint(-1, 3, (48, 64))
+    image, labels = torch.rand(3, 48, 64), torch.randint(-1, 3, (48, 64))
     for count in (1, 2, 3):
-        found = strips(camera, picture, labels, count)
-        assert torch.equal(torch.cat([part for _, part, _ in found], 2), picture)
+        found = strips(camera, image, labels, count)
+        assert torch.equal(torch.cat([part for _, part, _ in found], 2), image)
         assert torch.equal(torch.cat([part for _, _, part in found], 1), labels)
         assert all((c.width, c.height) == (p.shape[2], p.shape[1]) for c, p, _ in found)
     anchors = some_anchors(100)
@@ -443,8 +443,8 @@ def test_strips_cover_image(tiny):
         g = generate(anchors.layout, anchors.positions, anchors.rows, anchors.ids, heads)
         whole = rasterize(*g[:6], camera).color
         upright = dataclasses.replace(camera, width=48)
-        parts = [rasterize(*g[:6], c).color for c, _, _ in strips(camera, picture, labels, 2)]
-        lower = [rasterize(*g[:6], c).color for c, _, _ in strips(upright, picture[..., :48], labels[:, :48], 2)]
+        parts = [rasterize(*g[:6], c).color for c, _, _ in strips(camera, image, labels, 2)]
+        lower = [rasterize(*g[:6], c).color for c, _, _ in strips(upright, image[..., :48], labels[:, :48], 2)]
     close(torch.cat(parts, 2), whole, 1e-4, 1e-5)
     assert lower[0].shape == (3, 48, 24)
 

@@ -114,8 +114,8 @@ def test_redundant_views_and_points_are_left_out(write_capture, tmp_path):
     folder = tmp_path / "more"
     folder.mkdir()
     more = load_capture(plan_captures.with_surplus(scene.folder, folder), tmp_path / "cache of more")
-    pictures = sorted(given.image(i).tobytes() for i in given.test_indices)
-    assert sorted(more.image(i).tobytes() for i in more.test_indices) == sorted(2 * pictures)
+    images = sorted(given.image(i).tobytes() for i in given.test_indices)
+    assert sorted(more.image(i).tobytes() for i in more.test_indices) == sorted(2 * images)
     blind, alike, unseen = blind_views(more), duplicate_views(more), unseen_points(more)
     assert len(blind) == 14 and len(alike) == 7 and unseen.sum() == round(plan_captures.UNSEEN * len(scene.xyz))
     left = [i for i in more.train_indices if i not in {*blind, *alike}]

@@ -46,8 +46,8 @@ def test_occluded_points_are_ignored():
     truth = np.exp(np.random.default_rng(1).normal(0, 0.15, (8, 3)))
     shares = np.linspace(0, 0.2, 8)
     views = photos(truth, [1] * 8, noise=0.01)
-    pictures = [photos(truth, [1] * 8, noise=0.01, hidden=share).image for share in shares]
-    views.image = lambda index, downscale=1: pictures[index](index)
+    images = [photos(truth, [1] * 8, noise=0.01, hidden=share).image for share in shares]
+    views.image = lambda index, downscale=1: images[index](index)
     np.testing.assert_allclose(measure_gains(views), truth / np.exp(np.log(truth).mean(0)), rtol=0.1)
 
 

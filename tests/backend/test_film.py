@@ -122,43 +122,43 @@ def reference(splats: Splats, at: Sample, primitive="3d") -> tuple[np.ndarray, .
     return np.concatenate([light, alpha[..., None]], -1), np.where(alpha > 0, depth, FAR), drawn.probabilities.numpy()
 
 
-def rgba_of(picture) -> np.ndarray:
-    return np.stack([picture[name].astype(np.float32) for name in "RGBA"], -1)
+def rgba_of(planes) -> np.ndarray:
+    return np.stack([planes[name].astype(np.float32) for name in "RGBA"], -1)
 
 
-def coverage_of(picture) -> np.ndarray:
+def coverage_of(planes) -> np.ndarray:
     """Return coverages (H, W, IDS) from the Cryptomatte channels."""
     hashes = [np.uint32(cryptomatte.name_bits(name)).view(np.float32) for name in SHOWN_NAMES]
-    found = np.zeros((*picture["A"].shape, len(IDS)))
+    found = np.zeros((*planes["A"].shape, len(IDS)))
     for layer in range(3):
         for of_id, of_coverage in ("RG", "BA"):
-            names, coverage = (picture[f"CryptoObject{layer:02d}.{side}"] for side in (of_id, of_coverage))
+            names, coverage = (planes[f"CryptoObject{layer:02d}.{side}"] for side in (of_id, of_coverage))
             for place, value in enumerate(hashes):
                 found[..., place] += np.where(names == value, coverage, 0)
     return found
 
 
-def assert_same(picture, splats, at, primitive="3d") -> None:
+def assert_same(planes, splats, at, primitive="3d") -> None:
     """Check that a frame of one sample equals the reference."""
     rgba, depth, coverage = reference(splats, at, primitive)
-    np.testing.assert_allclose(rgba_of(picture), rgba, atol=2e-3, rtol=2e-3)
-    np.testing.assert_allclose(coverage_of(picture), coverage, atol=1e-5)
-    np.testing.assert_allclose(coverage_of(picture).sum(-1), picture["A"], atol=6e-4)
+    np.testing.assert_allclose(rgba_of(planes), rgba, atol=2e-3, rtol=2e-3)
+    np.testing.assert_allclose(coverage_of(planes), coverage, atol=1e-5)
+    np.testing.assert_allclose(coverage_of(planes).sum(-1), planes["A"], atol=6e-4)
     # Where rounding decides the median, the two may choose neighboring splats.
-    assert (np.abs(picture["Z"] - depth) <= 1e-4 * depth).mean() > 0.995
+    assert (np.abs(planes["Z"] - depth) <= 1e-4 * depth).mean() > 0.995
     winner = np.array(IDS, np.uint32)[coverage.argmax(-1)]
     clear = np.sort(coverage, -1)[..., -1] - np.sort(coverage, -1)[..., -2] > 1e-4
-    assert np.array_equal(picture["IndexOB.X"][clear], winner[clear])
+    assert np.array_equal(planes["IndexOB.X"][clear], winner[clear])
 
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
 def test_frame_matches_reference(folder, film, primitive):
     votes = VotesRecord("majority", None, 1600, "0f", None)
     update_record(folder, training=TrainingRecord({"primitive": primitive}, votes))
-    picture = film(shot_of([sample()]), "--png")[0]
+    planes = film(shot_of([sample()]), "--png")[0]
     splats, _ = read_splats(folder.splats)
-    assert_same(picture, splats, sample(), primitive)
-    rgba = rgba_of(picture)
+    assert_same(planes, splats, sample(), primitive)
+    rgba = rgba_of(planes)
     photo = np.asarray(Image.open(frame_path(folder.folder.parent / "film", 1).with_suffix(".png")))
     straight = encode(rgba[..., :3] / np.maximum(rgba[..., 3:], 1e-6))
     solid = rgba[..., 3] > 0.1
@@ -184,17 +184,15 @@ def test_edits_and_shot_transforms_are_applied(folder, film):
         transformed(part[7], moved(-0.4)),
     ])  # fmt: skip
     named = shot_of([sample(objects=objects)], only_named=True)
-    pictures = film(
-        shot_of([sample(objects=objects)], [sample()], [sample(0.1, {2: Placed(maps=np.zeros((0, 4, 4)))})])
-    )
+    frames = film(shot_of([sample(objects=objects)], [sample()], [sample(0.1, {2: Placed(maps=np.zeros((0, 4, 4)))})]))
     names = ["Unlabeled", "can", "mug", "große Kiste"]
     assert list(manifest(folder.folder.parent / "film")) == names, "mug is unique once the other mug is removed"
-    np.testing.assert_allclose(rgba_of(pictures[0]), reference(expected, sample())[0], atol=2e-3, rtol=2e-3)
+    np.testing.assert_allclose(rgba_of(frames[0]), reference(expected, sample())[0], atol=2e-3, rtol=2e-3)
     static = concatenate([part[0], transformed(can, moved(0.2)), transformed(part[7], place),
                           transformed(part[7], moved(-0.4)), part[HUGE]])  # fmt: skip
-    np.testing.assert_allclose(rgba_of(pictures[1]), reference(static, sample())[0], atol=2e-3, rtol=2e-3)
+    np.testing.assert_allclose(rgba_of(frames[1]), reference(static, sample())[0], atol=2e-3, rtol=2e-3)
     gone = static.select(static.object_ids != 2)
-    np.testing.assert_allclose(rgba_of(pictures[2]), reference(gone, sample(0.1))[0], atol=2e-3, rtol=2e-3)
+    np.testing.assert_allclose(rgba_of(frames[2]), reference(gone, sample(0.1))[0], atol=2e-3, rtol=2e-3)
     alone = expected.select(expected.object_ids == 2)
     np.testing.assert_allclose(rgba_of(film(named)[0]), reference(alone, sample())[0], atol=2e-3, rtol=2e-3)
 
@@ -203,20 +201,20 @@ def test_clip_range_and_depth_scale(folder, film):
     near, far = film(shot_of([sample(clip=(2.5, 50.0))], [sample(clip=(0.05, 2.5))], depth_scale=10.0))
     splats, _ = read_splats(folder.splats)
     depths = splats.means @ view()[2, :3] + view()[2, 3]
-    for picture, kept in ((near, depths > 2.5), (far, depths <= 2.5)):
+    for planes, kept in ((near, depths > 2.5), (far, depths <= 2.5)):
         rgba, depth, _ = reference(splats.select(kept), sample())
-        np.testing.assert_allclose(rgba_of(picture), rgba, atol=2e-3, rtol=2e-3)
+        np.testing.assert_allclose(rgba_of(planes), rgba, atol=2e-3, rtol=2e-3)
         seen = depth < FAR
-        assert (np.abs(picture["Z"] - 10 * depth) <= 1e-3 * depth)[seen].mean() > 0.99
-        assert (picture["Z"][~seen] == np.float32(FAR)).all() and (~seen).any()
+        assert (np.abs(planes["Z"] - 10 * depth) <= 1e-3 * depth)[seen].mean() > 0.99
+        assert (planes["Z"][~seen] == np.float32(FAR)).all() and (~seen).any()
 
 
 def test_motion_blur_is_mean_of_samples(folder, film):
     moments = [sample(x, {2: Placed(maps=moved(3 * x)[None])}, time=1 + x) for x in (-0.1, -0.03, 0.05)]
     blurred, *single = film(shot_of(moments, *([moment] for moment in moments)))
-    mean = np.mean([rgba_of(picture) for picture in single], 0)
+    mean = np.mean([rgba_of(planes) for planes in single], 0)
     np.testing.assert_allclose(rgba_of(blurred), mean, atol=1e-3, rtol=1e-3)
-    coverage = np.mean([coverage_of(picture) for picture in single], 0)
+    coverage = np.mean([coverage_of(planes) for planes in single], 0)
     np.testing.assert_allclose(coverage_of(blurred), coverage, atol=1e-6)
     assert np.array_equal(blurred["Z"], single[1]["Z"])
     ranked = np.stack([blurred[f"CryptoObject{i:02d}.{side}"] for i in range(3) for side in "GA"])

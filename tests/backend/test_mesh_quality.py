@@ -453,8 +453,8 @@ def test_unmeasurable_figures_are_none(true_capture, tmp_path):
     assert measured({"file": "4.ply"})["why"] == "it has no surface"
     flat = textured(*box())
     flat.vertices[:] = 1
-    picture = np.asarray(draw_card(Card("", "", flat, None, true_capture[0].views[1]), 40)[0])
-    assert (picture == picture[0, 0]).all()
+    image = np.asarray(draw_card(Card("", "", flat, None, true_capture[0].views[1]), 40)[0])
+    assert (image == image[0, 0]).all()
     write_mesh(tmp_path / "4.ply", flat)
     assert measured({"file": "4.ply"})["watertight"] is None
 
@@ -513,7 +513,7 @@ def test_panels_show_surface_wires_unobserved_faces_and_texture(true_capture):
     uvs = np.zeros((12, 3, 2), np.float32)
     blue = np.zeros((4, 4, 3), np.uint8) + np.uint8([10, 20, 250])
     card = Card("box", "", textured(vertices, faces, uvs), blue, capture.views[1])
-    surface, wires, texture = (np.asarray(picture).astype(int) for picture in draw_card(card, 120))
+    surface, wires, texture = (np.asarray(image).astype(int) for image in draw_card(card, 120))
     assert (surface[0, 0] == surface[-1, -1]).all() and surface.shape == (120, 120, 3)
     drawn = (surface != surface[0, 0]).any(2)
     assert 0.2 < drawn.mean() < 0.8

@@ -268,10 +268,10 @@ def test_view_dependent_highlights_are_rejected():
     mesh = trimesh.creation.icosphere(4, 1.0)
     views = StubViews(mesh, view_count=48, below=True)
     y, x = np.mgrid[:120, :160]
-    for index, picture in enumerate(views.images[::2]):
+    for index, image in enumerate(views.images[::2]):
         place = np.random.default_rng(index).uniform([60, 40], [100, 80])
         away = ((x - place[0]) ** 2 + (y - place[1]) ** 2) / (2 * 14.0**2)
-        picture += 0.35 * np.exp(-away)[..., None].astype(np.float32)
+        image += 0.35 * np.exp(-away)[..., None].astype(np.float32)
     surface = surface_of(mesh)
     uvs = unwrap(surface, 512)
     texture, _ = bake_texture(surface, uvs, 512, views, [1])
@@ -365,8 +365,8 @@ def test_refinement_moves_surface_to_photo_consistency():
 def test_refinement_keeps_surface_without_texture():
     mesh = trimesh.creation.icosphere(3, 0.97)
     views = StubViews(trimesh.creation.icosphere(3, 1.0))
-    for picture in views.images:
-        picture[:] = 0.5
+    for image in views.images:
+        image[:] = 0.5
     surface = surface_of(mesh)
     moved = np.linalg.norm(refine(surface, views, [1]).vertices - mesh.vertices, axis=1)
     assert moved.max() < 0.2 * 4 / views.cameras[0].K[0, 0]

@@ -43,11 +43,11 @@ def drawn(view: View, means, quats, scales, opacities, ids) -> tuple[np.ndarray,
     K = np.array([[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1.0]])
     tensors = [torch.from_numpy(np.asarray(a, np.float32)) for a in (means, quats, scales, opacities)]
     sh = torch.zeros(len(means), 1, 3)
-    picture = rasterize(
+    rendered = rasterize(
         *tensors, sh, torch.from_numpy(ids.astype(np.int32)), Camera(view.viewmat, K, *SIZE, near=view.near)
     )
-    found, probability = object_map(picture)
-    return found, probability, picture.alpha.numpy()
+    found, probability = object_map(rendered)
+    return found, probability, rendered.alpha.numpy()
 
 
 def assert_agrees(objects: list[PickObject], view: View, ids: np.ndarray, probability: np.ndarray) -> None:

@@ -54,14 +54,14 @@ def as_float32(scene):
     return {k: v if k == "ids" else v.float() for k, v in scene.items()}
 
 
-def mapped(picture):
+def mapped(rendered):
     """Return the object map as NumPy arrays, for any renderer."""
-    return tuple(torch.as_tensor(a).cpu().numpy() for a in object_map(picture))
+    return tuple(torch.as_tensor(a).cpu().numpy() for a in object_map(rendered))
 
 
-def ranked(picture, ranks):
+def ranked(rendered, ranks):
     """Return the object ranks as NumPy arrays, for any renderer."""
-    return tuple(torch.as_tensor(a).cpu().numpy() for a in object_ranks(picture, ranks))
+    return tuple(torch.as_tensor(a).cpu().numpy() for a in object_ranks(rendered, ranks))
 
 
 def compare_ranks(ids, probabilities, dense, **tolerance):

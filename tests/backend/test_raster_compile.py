@@ -30,12 +30,12 @@ for coefficients in (1, 4, 9, 16):
             for primitive in ("3d", "2d"):
                 leaves = {k: v.requires_grad_(k != "ids") for k, v in scene.items()}
                 flat = wanted and primitive == "2d"
-                picture = rasterize(
+                rendered = rasterize(
                     **leaves, camera=cam, labels=labels, want_depth=wanted, want_median=wanted, want_normals=flat,
                     want_distortion=flat, primitive=primitive,
                 )
-                (picture.color.sum() + (picture.normals.sum() if flat else 0)).backward()
-                object_map(picture)
+                (rendered.color.sum() + (rendered.normals.sum() if flat else 0)).backward()
+                object_map(rendered)
 from backend.raster.cpu import binning, blending, blending_backward, ids, projection
 for variants, kernels in (
     (1, (binning.depth_order, binning.bin_splats)),

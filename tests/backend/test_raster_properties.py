@@ -75,12 +75,12 @@ def drawn(scene, cam=CAMERA, primitive="3d", gradient=True, labels=LABELS):
     """Return the planes by name, and the gradients of a fixed loss on them, as NumPy arrays."""
     flat = primitive == "2d"
     leaves = {k: v.clone().requires_grad_(gradient and k != "ids") for k, v in scene.items()}
-    picture = rasterize(
+    rendered = rasterize(
         **leaves, camera=cam, labels=labels, want_depth=True, want_normals=flat, want_distortion=flat,
         primitive=primitive,
     )  # fmt: skip
     return planes_and_gradients(
-        {name: getattr(picture, name) for name in PLANES if getattr(picture, name) is not None}, leaves, gradient
+        {name: getattr(rendered, name) for name in PLANES if getattr(rendered, name) is not None}, leaves, gradient
     )
 
 
@@ -200,11 +200,11 @@ def test_images_are_linear_in_colors(primitive, scene, data):
     count = len(scene["ids"])
     one, other = (torch.tensor([data.draw(colors) for _ in range(count)]) for _ in range(2))
 
-    def picture(color):
+    def render(color):
         return drawn({**scene, "sh": ((color - 0.5) / C0)[:, None].float()}, primitive=primitive, gradient=False)
 
-    total = picture(one + 2 * other)["color"]
-    np.testing.assert_allclose(total, picture(one)["color"] + 2 * picture(other)["color"], atol=1e-5)
+    total = render(one + 2 * other)["color"]
+    np.testing.assert_allclose(total, render(one)["color"] + 2 * render(other)["color"], atol=1e-5)
 
 
 @cpu_only

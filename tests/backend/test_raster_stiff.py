@@ -72,16 +72,16 @@ def draw(scene, cam, labels=None, seed=0, primitive="3d"):
     """Return the image and the gradients of a random loss as NumPy arrays."""
     leaves = {k: v.clone() if k == "ids" else v.clone().requires_grad_() for k, v in scene.items()}
     flat = primitive == "2d"
-    picture = rasterize(
+    rendered = rasterize(
         **leaves, camera=cam, labels=labels, want_depth=True, want_normals=flat, want_distortion=flat,
         primitive=primitive,
     )  # fmt: skip
-    planes = [p for p in picture[:7] if p is not None]
+    planes = [p for p in rendered[:7] if p is not None]
     rng = np.random.default_rng(seed)
     sum((p * torch.tensor(rng.normal(size=tuple(p.shape)), dtype=p.dtype)).sum() for p in planes).backward()
     arrays = {f"plane {i}": p.detach().numpy() for i, p in enumerate(planes)}
     arrays |= {name: leaves[name].grad.numpy() for name in NAMES}
-    arrays["object"], arrays["probability"] = mapped(picture)
+    arrays["object"], arrays["probability"] = mapped(rendered)
     return arrays
 
 
@@ -313,9 +313,9 @@ def test_no_labeled_pixel(primitive):
     cam = camera()
     scene = {k: v.requires_grad_(k != "ids") for k, v in as_float32(random_scene(0)).items()}
     labels = torch.full((cam.height, cam.width), -1, dtype=torch.int32)
-    picture = rasterize(**scene, camera=cam, labels=labels, primitive=primitive)
-    assert not picture.label_probability.any()
-    picture.label_probability.sum().backward()
+    rendered = rasterize(**scene, camera=cam, labels=labels, primitive=primitive)
+    assert not rendered.label_probability.any()
+    rendered.label_probability.sum().backward()
     assert not any(scene[name].grad.any() for name in NAMES)
 
 
@@ -324,8 +324,8 @@ def test_one_object_probability_equals_alpha(primitive):
     cam = camera()
     scene = as_float32(random_scene(0, objects=1))
     labels = torch.zeros(cam.height, cam.width, dtype=torch.int32)
-    picture = rasterize(**scene, camera=cam, labels=labels, primitive=primitive)
-    np.testing.assert_allclose(picture.label_probability, picture.alpha, atol=1e-6)
+    rendered = rasterize(**scene, camera=cam, labels=labels, primitive=primitive)
+    np.testing.assert_allclose(rendered.label_probability, rendered.alpha, atol=1e-6)
     compare(random_scene(0, objects=1), cam, objects=1, primitive=primitive)
 
 
@@ -337,9 +337,9 @@ def test_probability_zero_under_the_logarithm(primitive):
     fast = {k: v.clone().requires_grad_(k != "ids") for k, v in as_float32(scene).items()}
     slow = {k: v if k == "ids" else v.double().requires_grad_() for k, v in as_float32(scene).items()}
     floor = 1e-6
-    picture = rasterize(**fast, camera=cam, labels=labels, primitive=primitive)
-    assert not picture.label_probability[:, :20].any()
-    loss = -torch.log(picture.label_probability.clamp(min=floor)).mean()
+    rendered = rasterize(**fast, camera=cam, labels=labels, primitive=primitive)
+    assert not rendered.label_probability[:, :20].any()
+    loss = -torch.log(rendered.label_probability.clamp(min=floor)).mean()
     loss.backward()
     want = rasterize_reference(**slow, camera=cam, objects=5, primitive=primitive).probabilities[..., 4].clone()
     want = torch.where(labels == 4, want, torch.zeros(()).double())
@@ -410,8 +410,8 @@ def test_many_objects_and_large_ids(primitive):
     assert (names > 65_535).mean() > 0.99
     which = np.concatenate([np.arange(objects), rng.integers(0, objects, count - objects)])
     scene["ids"] = torch.tensor(names[which])
-    picture = rasterize(**scene, camera=cam, primitive=primitive)
-    ids, probability = mapped(picture)
+    rendered = rasterize(**scene, camera=cam, primitive=primitive)
+    ids, probability = mapped(rendered)
     labels = torch.tensor(ids)
     again = rasterize(**scene, camera=cam, labels=labels, primitive=primitive)
     np.testing.assert_allclose(again.label_probability, probability, rtol=1e-5, atol=1e-6)
@@ -594,13 +594,13 @@ def test_screen_gradient_matches_moving_footprint():
     """Growth uses this gradient, so it must include the plane's part, not only the spot's."""
     scene = as_float32(tilted(0.7, scale=(6 / FOCAL, 8 / FOCAL, 1)))
     leaves = {k: v.requires_grad_(k != "ids") for k, v in scene.items()}
-    picture = rasterize(**leaves, camera=straight(), primitive="2d")
+    rendered = rasterize(**leaves, camera=straight(), primitive="2d")
     pattern = torch.sin(torch.arange(WIDTH) / 5.0)[None, :].expand(HEIGHT, WIDTH)
-    (picture.alpha * pattern).sum().backward()
+    (rendered.alpha * pattern).sum().backward()
     columns = torch.arange(WIDTH) + 0.5
     # d/du of sum alpha(x - u) pattern(x) is sum alpha pattern'.
-    wanted = (picture.alpha * (torch.cos((columns - 0.5) / 5.0) / 5.0)[None, :]).sum()
-    assert float(picture.frame.screen_gradient[0, 0]) == pytest.approx(wanted.item(), rel=0.03)
+    wanted = (rendered.alpha * (torch.cos((columns - 0.5) / 5.0) / 5.0)[None, :]).sum()
+    assert float(rendered.frame.screen_gradient[0, 0]) == pytest.approx(wanted.item(), rel=0.03)
 
 
 # The reference itself
@@ -614,12 +614,12 @@ def test_reference_passes_gradcheck(primitive, coefficients):
     cam = straight(7, 5, focal=6.0)
     ids = scene.pop("ids")
 
-    def picture(*leaves):
+    def render(*leaves):
         out = rasterize_reference(*leaves, ids, cam, 5, primitive)
         discs = (out.normals, out.distortion) if primitive == "2d" else ()
         return out.color, out.alpha, out.depth, out.probabilities, *discs
 
-    assert torch.autograd.gradcheck(picture, [scene[name].requires_grad_() for name in NAMES], eps=1e-7, atol=1e-5)
+    assert torch.autograd.gradcheck(render, [scene[name].requires_grad_() for name in NAMES], eps=1e-7, atol=1e-5)
 
 
 def test_unused_planes_have_zero_gradient():

@@ -232,9 +232,9 @@ def test_object_plot_bars_are_proportional_to_iou():
         {"id": 2, "name": "$b$", "iou": 0.2},
         {"id": 3, "name": "c", "iou": None},
     ]
-    picture = np.asarray(plot_objects(objects, {1: (255, 0, 0), 2: (0, 0, 255), 3: (0, 255, 0)}))
+    image = np.asarray(plot_objects(objects, {1: (255, 0, 0), 2: (0, 0, 255), 3: (0, 255, 0)}))
     red, blue, green = (
-        (picture == np.array(color)).all(-1).any(0).sum() for color in ((255, 0, 0), (0, 0, 255), (0, 255, 0))
+        (image == np.array(color)).all(-1).any(0).sum() for color in ((255, 0, 0), (0, 0, 255), (0, 255, 0))
     )
     assert red / blue == pytest.approx(4.0, rel=0.05)
     assert green == 0
@@ -266,10 +266,10 @@ def test_to_linear_decodes_srgb():
 
 def test_id_images_use_given_colors_or_palette():
     ids = np.array([[0, 7], [2**32 - 1, 7]])
-    picture = id_image(ids, {7: (9, 8, 7)})
+    image = id_image(ids, {7: (9, 8, 7)})
     palette = object_colors([0, 2**32 - 1])
-    assert picture.dtype == np.uint8
-    assert picture.tolist() == [[list(palette[0]), [9, 8, 7]], [list(palette[2**32 - 1]), [9, 8, 7]]]
+    assert image.dtype == np.uint8
+    assert image.tolist() == [[list(palette[0]), [9, 8, 7]], [list(palette[2**32 - 1]), [9, 8, 7]]]
 
 
 def panels(sheet):

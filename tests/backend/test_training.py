@@ -431,10 +431,10 @@ def test_training_lowers_loss_and_learns_ids(tiny, settings):
     assert mean_loss(trainer, 8, 1.0) < 0.5 * before
     # The cameras are 40 degrees apart, too far for held-out views, so a training view is checked.
     index = capture.train_indices[0]
-    picture = draw(trainer.shown, trainer.scene.camera(index))
+    rendered = draw(trainer.shown, trainer.scene.camera(index))
     truth = capture.mask(index)
-    assert (picture.ids[truth > 0] == truth[truth > 0]).mean() > 0.95
-    assert picture.probability[truth > 0].mean() > 0.85
+    assert (rendered.ids[truth > 0] == truth[truth > 0]).mean() > 0.95
+    assert rendered.probability[truth > 0].mean() > 0.85
 
 
 def test_training_is_bitwise_reproducible_and_resumable(tiny, tmp_path):

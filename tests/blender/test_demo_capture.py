@@ -131,9 +131,9 @@ def test_capture_has_expected_files_and_ids(tiny):
     names = [f"{i:04d}.png" for i in range(4)]
     found = set()
     for name in names:
-        picture = read_png(tiny / "images" / name)
+        image = read_png(tiny / "images" / name)
         ids, depth = truth(tiny, name)
-        assert picture.shape == (48, 64, 3) and 40 < picture.mean() < 200
+        assert image.shape == (48, 64, 3) and 40 < image.mean() < 200
         assert ids.min() >= 1 and depth.dtype == np.float32 and depth.min() > 0.3 and depth.max() < 6
         assert np.array_equal(ids, read_png(tiny / "masks" / name))
         found |= set(np.unique(ids).tolist())

@@ -243,10 +243,10 @@ def test_rendered_texture_has_recolored_color(root):
     stage.render.engine, stage.cycles.samples, stage.cycles.use_denoising = "CYCLES", 1, False
     stage.render.dither_intensity = 0.0
     stage.render.resolution_x = stage.render.resolution_y = 4
-    picture = blender_scene.folder_of(root) / "plane.png"
-    stage.render.filepath = str(picture)
+    path = blender_scene.folder_of(root) / "plane.png"
+    stage.render.filepath = str(path)
     bpy.ops.render.render(write_still=True, scene=stage.name)
-    image = bpy.data.images.load(str(picture))
+    image = bpy.data.images.load(str(path))
     pixels = np.array(image.pixels[:]).reshape(-1, 4)[:, :3]
     wanted = expected(np.array([[200, 100, 50]]) / 255, object_list.recolor_of(item(root)))
     assert pixels == pytest.approx(np.repeat(np.clip(wanted, 0, 1), len(pixels), 0), abs=0.6 / 255)

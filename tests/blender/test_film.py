@@ -403,13 +403,13 @@ LEFT_BALL, RIGHT_BALL, LEFT_WALL, RIGHT_WALL = (40, 23), (40, 71), (30, 12), (30
 
 
 def test_composite_combines_by_depth(filmed):
-    picture = pixels_of(filmed / "composite.0007.png")
+    image = pixels_of(filmed / "composite.0007.png")
     splats = pixels_of(filmed / "splats.0007.png")
-    assert picture.shape[:2] == (SIZE, SIZE)
+    assert image.shape[:2] == (SIZE, SIZE)
     for place, color in ((LEFT_BALL, RED), (LEFT_WALL, RED), (RIGHT_WALL, GREEN), (RIGHT_BALL, encoded(BLUE))):
-        np.testing.assert_allclose(picture[place][:3], color, atol=0.015, err_msg=str(place))
+        np.testing.assert_allclose(image[place][:3], color, atol=0.015, err_msg=str(place))
         if place != RIGHT_BALL:
-            np.testing.assert_allclose(picture[place], splats[place], atol=0.006)
+            np.testing.assert_allclose(image[place], splats[place], atol=0.006)
 
 
 def test_depth_matches_blender(shot_blend, filmed, backend_python, tmp_path):
@@ -525,8 +525,8 @@ def test_film_command_applies_edits_and_reports_errors(shot_blend, backend_pytho
     assert ran.returncode == 0, ran.stdout + ran.stderr
     assert len(read_shot(out / "shot.0003-0006.json").frames) == 3
     assert sorted(path.name for path in out.glob("*.exr")) == [f"splats.000{i}.exr" for i in (3, 5, 6)]
-    picture = pixels_of(out / "splats.0003.png")
-    assert picture.shape[:2] == (20, 40) and picture[10, 4, 3] < 0.01 and picture[10, 33, 3] > 0.98
+    image = pixels_of(out / "splats.0003.png")
+    assert image.shape[:2] == (20, 40) and image[10, 4, 3] < 0.01 and image[10, 33, 3] > 0.98
     for words, expected in (
         ((shot_blend, "--out", out, "--frames", "x"), "--frames"),
         ((shot_blend, "--out", out, "--dir", out), "--dir"),

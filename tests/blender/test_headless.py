@@ -52,8 +52,8 @@ def error_report(*arguments, **variables):
     return ran.errors
 
 
-def size_of(picture):
-    image = bpy.data.images.load(str(picture))
+def size_of(path):
+    image = bpy.data.images.load(str(path))
     try:
         return tuple(image.size)
     finally:
@@ -187,9 +187,9 @@ def opened(blend):
     return bpy.data.objects
 
 
-def pixels(picture):
+def pixels(path):
     """Return the pixels (H, W, 3) of an image file, 0 .. 1."""
-    image = bpy.data.images.load(str(picture))
+    image = bpy.data.images.load(str(path))
     try:
         return np.array(image.pixels[:]).reshape(image.size[1], image.size[0], -1)[..., :3]
     finally:
@@ -209,14 +209,14 @@ def test_build_contains_meshes_with_textures(meshed, tmp_path):
 
 
 def test_render_shows_chosen_kind(meshed, tmp_path):
-    pictures = {}
+    images = {}
     for which in ("splats", "meshes", "both"):
         ran = run("render", meshed, "--out", tmp_path / f"{which}.png", "--engine", "CYCLES", "--show", which, *SIZE)
         assert ran.returncode == 0, ran.output + ran.errors
-        pictures[which] = pixels(tmp_path / f"{which}.png")
+        images[which] = pixels(tmp_path / f"{which}.png")
     for one, other in (("splats", "meshes"), ("splats", "both")):
-        assert np.abs(pictures[one] - pictures[other]).mean() > 0.02
-    assert pictures["meshes"].max() > 0.3, "the file has a light"
+        assert np.abs(images[one] - images[other]).mean() > 0.02
+    assert images["meshes"].max() > 0.3, "the file has a light"
 
 
 def test_render_apart_shows_separated_objects(meshed, tmp_path):

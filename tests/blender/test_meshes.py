@@ -140,12 +140,12 @@ def test_material_uses_texture(root, folder):
     assert materials[0] != materials[1]
     for material, name in zip(materials, ("1.png", "2.png")):
         shader = shader_of(material)
-        picture = shader.inputs["Base Color"].links[0].from_node.image
-        assert Path(picture.filepath) == folder / "meshes" / name
-        assert picture.colorspace_settings.name == "sRGB" and tuple(picture.size) == (4, 4)
+        image = shader.inputs["Base Color"].links[0].from_node.image
+        assert Path(image.filepath) == folder / "meshes" / name
+        assert image.colorspace_settings.name == "sRGB" and tuple(image.size) == (4, 4)
         assert shader.inputs["Roughness"].default_value > 0.5
         assert shader.inputs["Specular IOR Level"].default_value < 0.5
-        assert tuple(picture.pixels[:3]) == pytest.approx((200 / 255, 100 / 255, 50 / 255), abs=1e-3)
+        assert tuple(image.pixels[:3]) == pytest.approx((200 / 255, 100 / 255, 50 / 255), abs=1e-3)
 
 
 def test_moved_file_finds_its_textures(root, folder, tmp_path):

@@ -40,21 +40,21 @@ def step(scene, cam, primitive, device):
     rng = np.random.default_rng(0)
     labels = torch.tensor(rng.integers(0, 5, (cam.height, cam.width)), dtype=torch.int32).to(device)
     leaves = {k: v.detach().to(device).requires_grad_(k != "ids") for k, v in scene.items()}
-    picture = raster.rasterize(
+    rendered = raster.rasterize(
         **leaves, camera=cam, labels=labels, want_depth=True, want_median=True, want_normals=flat,
         want_distortion=flat, primitive=primitive,
     )  # fmt: skip
-    planes = {name: p for name, p in zip(picture._fields[:-1], picture[:-1], strict=True) if p is not None}
+    planes = {name: p for name, p in zip(rendered._fields[:-1], rendered[:-1], strict=True) if p is not None}
     loss = 0
     for name, plane in planes.items():
         if name != "median":
             loss = loss + (plane * torch.tensor(rng.normal(size=plane.shape), dtype=torch.float32).to(device)).sum()
     loss.backward()
-    ids, probability = (torch.as_tensor(a) for a in raster.object_map(picture))
+    ids, probability = (torch.as_tensor(a) for a in raster.object_map(rendered))
     arrays = {name: p.detach() for name, p in planes.items()}
     arrays |= {"ids": ids, "probability": probability} | {name: leaves[name].grad for name in NAMES}
-    arrays["screen"] = torch.as_tensor(picture.frame.screen_gradient)
-    return {name: a.cpu().numpy() for name, a in arrays.items()}, picture.frame
+    arrays["screen"] = torch.as_tensor(rendered.frame.screen_gradient)
+    return {name: a.cpu().numpy() for name, a in arrays.items()}, rendered.frame
 
 
 @KINDS
@@ -115,9 +115,9 @@ def test_torch_operations_do_not_synchronize(primitive):
     try:
         for mode in ("default", "error"):
             torch.cuda.set_sync_debug_mode(mode)
-            picture = raster.rasterize(**scene, camera=cam, labels=labels, want_depth=True, primitive=primitive)
+            rendered = raster.rasterize(**scene, camera=cam, labels=labels, want_depth=True, primitive=primitive)
             (
-                picture.color.sum() + picture.alpha.sum() + picture.label_probability.sum() + picture.depth.sum()
+                rendered.color.sum() + rendered.alpha.sum() + rendered.label_probability.sum() + rendered.depth.sum()
             ).backward()
     finally:
         torch.cuda.set_sync_debug_mode(before)

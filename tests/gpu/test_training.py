@@ -62,7 +62,7 @@ class Spheres:
 
     def __init__(self) -> None:
         rng = np.random.default_rng(0)
-        self.views, self._pictures, self._masks = [], [], []
+        self.views, self._images, self._masks = [], [], []
         for i in range(VIEWS):
             angle = 2 * math.pi * i / VIEWS
             camera_center = np.array([3 * math.cos(angle), -0.8 + 0.5 * (i % 2), 3 * math.sin(angle)])
@@ -74,8 +74,8 @@ class Spheres:
             viewmat[:3, 3] = -viewmat[:3, :3] @ camera_center
             K = np.array([[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1.0]])
             self.views.append(View(WIDTH, HEIGHT, K, viewmat))
-            picture, mask = self._shaded(viewmat, K)
-            self._pictures.append(picture)
+            image, mask = self._shaded(viewmat, K)
+            self._images.append(image)
             self._masks.append(mask)
         directions = rng.normal(size=(len(SPHERES), 200, 3))
         directions /= np.linalg.norm(directions, axis=2, keepdims=True)
@@ -91,7 +91,7 @@ class Spheres:
         x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
         rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
         nearest, mask = np.full(x.shape, np.inf), np.zeros(x.shape, np.int64)
-        picture = np.full((*x.shape, 3), 0.5)
+        image = np.full((*x.shape, 3), 0.5)
         for object_id, center, radius, color in SPHERES:
             c = viewmat[:3, :3] @ center + viewmat[:3, 3]
             a, b = (rays * rays).sum(-1), rays @ c
@@ -100,12 +100,12 @@ class Spheres:
             here = (root > 0) & (t < nearest)
             normal = (rays * t[..., None] - c) / radius @ viewmat[:3, :3]
             light = 0.6 + 0.4 * normal @ np.array([0.3, -0.9, 0.3])
-            picture = np.where(here[..., None], np.array(color) * light[..., None], picture)
+            image = np.where(here[..., None], np.array(color) * light[..., None], image)
             nearest, mask = np.where(here, t, nearest), np.where(here, object_id, mask)
-        return np.clip(255 * picture + 0.5, 0, 255).astype(np.uint8), mask
+        return np.clip(255 * image + 0.5, 0, 255).astype(np.uint8), mask
 
     def image(self, index: int, downscale: int = 1) -> np.ndarray:
-        return self._pictures[index][::downscale, ::downscale]
+        return self._images[index][::downscale, ::downscale]
 
     def mask(self, index: int, downscale: int = 1) -> np.ndarray:
         return self._masks[index][::downscale, ::downscale]
@@ -145,10 +145,10 @@ def quality(trainer):
     capture = trainer.scene.capture
     squares, right = [], []
     for index in capture.test_indices:
-        picture = draw(trainer.shown, trainer.scene.camera(index))
+        rendered = draw(trainer.shown, trainer.scene.camera(index))
         truth = capture.mask(index)
-        squares.append(((picture.image - capture.image(index) / 255.0) ** 2).mean())
-        right.append((picture.ids[truth > 0] == truth[truth > 0]).mean())
+        squares.append(((rendered.image - capture.image(index) / 255.0) ** 2).mean())
+        right.append((rendered.ids[truth > 0] == truth[truth > 0]).mean())
     return -10 * math.log10(np.mean(squares)), float(np.mean(right))
 
 

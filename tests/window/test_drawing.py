@@ -191,8 +191,8 @@ def backend_draws(without: int = 0, recolor: Recolor | None = None, camera: Came
         for name in ("means", "quats", "scales", "opacities", "sh")
     ]
     ids = torch.zeros(len(arrays[0]), dtype=torch.int32)
-    picture = rasterize(*map(torch.from_numpy, arrays), ids, camera)
-    return np.concatenate([picture.color.numpy(), picture.alpha.numpy()[None]]).transpose(1, 2, 0)
+    rendered = rasterize(*map(torch.from_numpy, arrays), ids, camera)
+    return np.concatenate([rendered.color.numpy(), rendered.alpha.numpy()[None]]).transpose(1, 2, 0)
 
 
 def subset(splats: Splats, which) -> Splats:
@@ -207,9 +207,9 @@ def psnr(first: np.ndarray, second: np.ndarray) -> float:
 
 def test_drawing_matches_backend_image(window):
     """Includes a rotated object with harmonics of degree 3, and a hidden object."""
-    picture = drawn(window)
-    assert 0.3 < picture[..., 3].mean() < 1.0
-    assert psnr(picture, backend_draws()) > 40.0
+    image = drawn(window)
+    assert 0.3 < image[..., 3].mean() < 1.0
+    assert psnr(image, backend_draws()) > 40.0
     window.run(
         script("""
         for part in scene.object_collections(root)[1].objects:
@@ -217,7 +217,7 @@ def test_drawing_matches_backend_image(window):
     """)
     )
     without = drawn(window)
-    assert psnr(without, backend_draws(without=1)) > 40.0 > psnr(without, picture)
+    assert psnr(without, backend_draws(without=1)) > 40.0 > psnr(without, image)
     window.run(
         script("""
         for part in scene.object_collections(root)[1].objects:
@@ -231,8 +231,8 @@ def test_orthographic_drawing_matches_distant_camera(window):
     camera_center = np.array([200.0, -900.0, 300.0])
     far = float(np.linalg.norm(camera_center - (0, 0, 0.2)))
     lens = np.array([[50.0 * far, 0, 118.0], [0, 50.0 * far, 92.0], [0, 0, 1]])
-    picture = drawn(window, viewmat(camera_center), 50.0, orthographic=True)
-    assert psnr(picture, backend_draws(camera=Camera(viewmat(camera_center), lens, *SIZE))) > 35.0
+    image = drawn(window, viewmat(camera_center), 50.0, orthographic=True)
+    assert psnr(image, backend_draws(camera=Camera(viewmat(camera_center), lens, *SIZE))) > 35.0
 
 
 def test_recolor_is_drawn(window):
@@ -243,7 +243,7 @@ def test_recolor_is_drawn(window):
         item.hue, item.value = 0.3, 0.8
     """)
     )
-    picture = drawn(window)
+    image = drawn(window)
     stored = window.run(script("result = scene.recolor_of(scene.object_collections(root)[3]).stored()"))
     assert (stored["hue"], stored["value"]) == pytest.approx((0.3, 0.8))
     window.run(
@@ -252,8 +252,8 @@ def test_recolor_is_drawn(window):
         item.hue, item.value = 0.0, 1.0
     """)
     )
-    assert psnr(picture, backend_draws(recolor=Recolor.of(stored))) > 40.0
-    assert psnr(picture, drawn(window)) < 30.0
+    assert psnr(image, backend_draws(recolor=Recolor.of(stored))) > 40.0
+    assert psnr(image, drawn(window)) < 30.0
 
 
 def placement_of(window, point) -> tuple[float, float]:
