@@ -106,10 +106,10 @@ def raster_choices() -> list[Choice]:
     )  # fmt: skip
     return [
         Choice(
-            "alpha cut-off", cuts[0], cut_variants, "a splat is dropped in pixels where its alpha is less",
-            why="other programs that show the splats drop them there, and are to show what was trained",
+            "alpha cut-off", cuts[0], cut_variants, "a splat is skipped in pixels where its alpha is less",
+            why="other viewers skip splats there, and should show them as they were trained",
         ),
-        Choice("transmittance stop", *stops, "a pixel takes no more splats below this light"),
+        Choice("transmittance stop", *stops, "blending stops below this transmittance"),
         Choice("degree of the exponential", *degrees, "of the polynomial for 2^x between -1/2 and 1/2"),
         Choice(
             "bounds",
@@ -121,10 +121,10 @@ def raster_choices() -> list[Choice]:
                 "tiles of the box": {"bounds": "box tiles"},
                 "tiles of 3 sigma": {"bounds": "square"},
             },
-            "the pixels that a splat is evaluated in; whole tiles are of 16x16, as on GPUs; 3 sigma: the published"
-            " rasterizers' square around the longer axis",
+            "the pixels in which a splat is evaluated; tiles have 16x16 pixels, as on GPUs; 3 sigma: the square around"
+            " the longer axis, as in the published rasterizers",
         ),
-        Choice("tile size", *tiles, "pixels that one thread works on at a time"),
+        Choice("tile size", *tiles, "pixels that one thread processes at a time"),
         Choice(
             "float precision",
             "float32",
@@ -147,8 +147,8 @@ def raster_choices() -> list[Choice]:
                 "tile and depth": {"sort": "keys"},
                 "none": {"sort": "none"},
             },
-            "once: one radix sort of all splats by depth, then tiles take them in that order; tile and depth: one sort"
-            " of all (tile, splat) meetings, as in the published rasterizers, here by NumPy",
+            "once: one radix sort of all splats by depth, kept within the tiles; tile and depth: one sort"
+            " of all (tile, splat) intersections, as in the published rasterizers, here by NumPy",
         ),
     ]  # fmt: skip
 
@@ -176,8 +176,8 @@ def training_choices() -> list[Choice]:
                 "half at first": {"pyramid": [[0.25, 2]]},
                 "quarter, then half": {"pyramid": [[0.08, 4], [0.25, 2]]},
             },
-            "pictures reduced until 8 % and 25 % of the training; by size: not where they have less than 300 pixels"
-            " then, so never on this capture",
+            "images are reduced until 8 % and 25 % of the training; by size: unless they would have less than 300"
+            " pixels, so never for this capture",
         ),
         Choice(
             "Adam",
@@ -195,8 +195,8 @@ def training_choices() -> list[Choice]:
         Choice(
             "offsets per anchor",
             *of_setting("offsets", (5, 10, 20), "k = {}"),
-            "splats that an anchor makes",
-            why="more splats weigh on files, memory and the viewport, and the paper has as many",
+            "splats per anchor",
+            why="more splats increase file size, memory use and drawing time, and the paper uses as many",
         ),
     ]
 
@@ -221,7 +221,7 @@ def mesh_choices() -> list[Choice]:
             "texture size",
             "by photos",
             {"by photos": {}, **{f"{size}": {"texture_size": size} for size in (256, 512, 2048, 4096)}},
-            "pixels along the side; by photos: the smallest from 512 on that holds what the photos show",
+            "pixels along the side; by photos: the smallest from 512 on that can hold the detail of the photos",
         ),
     ]  # fmt: skip
 
@@ -250,9 +250,9 @@ def write_scene(folder: Path, path: Path) -> None:
     with torch.no_grad():
         g = model.generate(seen, camera.center)
         drawn = rasterize(*g[:6], camera, labels=labels)
-        picture = drawn.color + (1 - drawn.alpha) * model.background[:, None, None]
+        image = drawn.color + (1 - drawn.alpha) * model.background[:, None, None]
         known = labels >= 0
-        g_color = (picture - photo) / photo.numel()
+        g_color = (image - photo) / photo.numel()
         g_label_probability = torch.where(known, -0.1 / (drawn.label_probability + 0.01), 0.0) / known.sum()
     means = g.means.double() - torch.from_numpy(camera.center)
     names = dict(zip(raster_variants.PARAMETERS, (means, *g[1:5]), strict=True))
@@ -289,7 +289,7 @@ def write_exact(scene_file: Path, path: Path) -> None:
 
         def found() -> Any:
             for done, future in enumerate(concurrent.futures.as_completed(waiting), 1):
-                print(f"exact picture: part {done} of {len(parts)}", flush=True)
+                print(f"exact image: part {done} of {len(parts)}", flush=True)
                 yield waiting[future], future.result()
 
         np.savez(path, **raster_variants.join(scene, found()))
@@ -312,7 +312,7 @@ class Worker:
         line = self._process.stdout.readline()
         if not line:
             self._errors.seek(0)
-            raise RuntimeError(" | ".join(self._errors.read().strip().splitlines()[-3:]) or "it ended without a word")
+            raise RuntimeError(" | ".join(self._errors.read().strip().splitlines()[-3:]) or "exited without output")
         return json.loads(line)
 
     def turn(self) -> dict[str, Any]:
@@ -553,7 +553,7 @@ def raster_plot(choices: Sequence[Choice], found: Mapping[str, Any]) -> Any:
     for ax in axes[len(panels) :]:
         ax.set_axis_off()
     figure.supxlabel("time of forward and backward, default = 1", fontsize=9)
-    figure.supylabel("error of the picture (RMSE, steps of 8 bits)", fontsize=9)
+    figure.supylabel("image error (RMSE, steps of 8 bits)", fontsize=9)
     return figure
 
 
@@ -640,8 +640,9 @@ def document(found: Found, choices: Mapping[str, Sequence[Choice]], scene: Mappi
         "# Error against run time",
         "",
         "Made by `python benchmarks/approximations.py`; every figure here was measured by it. Defaults are in bold.",
-        "A default lies on the Pareto front where no variant is better in something, time or error, and worse in",
-        "nothing, beyond the noise that is stated.",
+        "A default lies on the Pareto front if no variant is better in time or an error and worse in none of them,"
+        " beyond",
+        "the stated noise.",
         "",
         f"**{on} of {len(found.verdicts)} defaults lie on the front**"
         + (f"; the exception{'s' if len(off) > 1 else ''}:" if off else "."),
@@ -650,19 +651,21 @@ def document(found: Found, choices: Mapping[str, Sequence[Choice]], scene: Mappi
         *([""] if off else []),
         "## The rasterizer",
         "",
-        f"Forward and backward of {scene['splats']:,} trained splats in one held-out view of the demo,"
-        f" {scene['width']}x{scene['height']}, on {os.cpu_count()} cores. Errors are those against the float64",
-        "reference, in exact order and without any cut-off: of the picture as RMSE in steps of 8 bits and the largest;",
-        "of the gradients as a part of their length, the root mean square over means, rotations, scales, opacities and",
-        f"colors. All variants of a choice take turns, {TURNS // SETS} times in each of {SETS} sets of processes; the"
-        " median over",
-        "the sets of the median ratio to the default's time counts, and in brackets are the least and the greatest of",
-        f"the sets; where a variant seemed better, {MORE_SETS} more sets were timed, and all count."
-        f" Noise: {found.time_noise:.0%} of the time, as far",
-        "as the default's own times in two processes are apart but no less than"
+        f"Forward and backward passes of {scene['splats']:,} trained splats in one held-out view of the demo,"
+        f" {scene['width']}x{scene['height']}, on {os.cpu_count()} cores. Errors are relative to a float64",
+        "reference in exact order and without cut-offs: for the image, the RMSE and the largest error in steps of 8"
+        " bits;",
+        "for the gradients, a fraction of their norm, as the root mean square over means, rotations, scales, opacities"
+        " and",
+        f"colors. The variants of a choice are timed in turn, {TURNS // SETS} times in each of {SETS} sets of"
+        " processes. The time is the",
+        "median over the sets of the median ratio to the default's time; the minimum and maximum of the sets are in",
+        f"brackets. If a variant seemed better, {MORE_SETS} more sets were timed and included."
+        f" Noise: {found.time_noise:.0%} of the time, the",
+        "difference of the default's own times in two processes but at least"
         f" {TIME_NOISE:.0%}, and {ERROR_NOISE:.0%} of an error.",
         "",
-        "![Time against error of the picture for each choice of the rasterizer](error-against-time-raster.png)",
+        "![Time against image error for each choice of the rasterizer](error-against-time-raster.png)",
         "",
     ]  # fmt: skip
     for choice in choices["raster"]:
@@ -671,12 +674,14 @@ def document(found: Found, choices: Mapping[str, Sequence[Choice]], scene: Mappi
         "## Training",
         "",
         f"The demo, trained from its points for {found.steps:,} steps; quality on held-out views. Each variant was",
-        "trained beside the default, each on a core of its own, so that the ratio of their times is not touched by",
-        f"what else the machine did. The default, trained for {_listed(list(found.curve))} steps (the",
-        "line in the plot; between these: over the logarithm of the steps), tells what it comes to in a variant's",
-        "time: a variant is better where it comes to more. Noise of one training, twice the standard deviation of the",
-        f"default over {found.seeds} seeds: {found.noise[0]:.2f} dB and {found.noise[1]:.4f}. A variant that seemed"
-        " better by half of that was",
+        "trained at the same time as the default, each on its own core, so that the ratio of their times does not"
+        " depend",
+        f"on other load. The default was trained for {_listed(list(found.curve))} steps (the line in the plot,",
+        "interpolated over the logarithm of the steps). Its quality is interpolated at the variant's time; a variant"
+        " is",
+        "better if its quality is higher. Noise of one training, twice the standard deviation of the default over",
+        f"{found.seeds} seeds: {found.noise[0]:.2f} dB and {found.noise[1]:.4f}. A variant that seemed better by half"
+        " of that was",
         f"trained with {SEEDS} seeds; means over seeds have accordingly less noise, but at least {PSNR_NOISE} dB and"
         f" {SHARE_NOISE}.",
         "",
@@ -689,10 +694,10 @@ def document(found: Found, choices: Mapping[str, Sequence[Choice]], scene: Mappi
     lines += [
         "## Meshes and textures",
         "",
-        f"Of {', '.join(OBJECTS[:-1])} and {OBJECTS[-1]} of the trained demo, by `mesh` with all else as it is;"
-        " F1 against the true surface that training views see, PSNR of the",
-        f"textured meshes against held-out photos, means over the three. All take turns, {MESHED} times; the median of"
-        " the times counts."
+        f"Meshes of {', '.join(OBJECTS[:-1])} and {OBJECTS[-1]} of the trained demo, made by `mesh` with all other"
+        " settings unchanged; F1 against the true surface visible in training views, PSNR of the",
+        f"textured meshes against held-out photos, means over the three. The variants are timed in turn, {MESHED}"
+        " times; the time is the median."
         f" Noise: {MESH_TIME_NOISE:.0%} of the time, {SHARE_NOISE} of F1, {PSNR_NOISE} dB.",
         "",
         "![Time against errors of surfaces and textures](error-against-time-meshes.png)",
@@ -715,7 +720,7 @@ def _section(
     rows = results.get(choice.title)
     lines = [f"### {choice.title[0].upper()}{choice.title[1:]}", "", f"{choice.note[0].upper()}{choice.note[1:]}.", ""]
     if choice.why:
-        lines += [f"It stays at {choice.default} even where another is better by a little: {choice.why}.", ""]
+        lines += [f"It stays at {choice.default} even if another is slightly better: {choice.why}.", ""]
     if not rows:
         return [*lines, "Not measured: it failed.", ""]
     verdict = next(verdict for verdict in found.verdicts if verdict.choice == choice)
@@ -770,7 +775,7 @@ def run(demo: Path, steps: int) -> tuple[Found, dict[str, Sequence[Choice]], dic
     choices = {"raster": raster_choices(), "training": training_choices(), "meshes": mesh_choices()}
     copy = WORK / "reconstruction"
     if not (demo / "checkpoint").is_dir():
-        raise SystemExit(f"{demo} is no trained reconstruction; make one by `make demo`, or name one by --demo.")
+        raise SystemExit(f"{demo} is not a trained reconstruction; make one by `make demo`, or name one by --demo.")
     code = [*shared.sources(), *(ROOT / "benchmarks" / name for name in ("raster_variants.py", "shared.py"))]
     made_from = shared.digest(code, (demo / "objectgs.json").read_text(), (demo / "splats.ply").stat().st_size, TURNS)
     marker = WORK / "made-from.txt"
@@ -882,9 +887,9 @@ def main() -> None:
     """Measure, write the document and the plots, and print which defaults lie off the front."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--demo", type=Path, default=ROOT / "build/demo", help="a reconstruction of the demo capture")
-    parser.add_argument("--steps", type=int, default=750, help="how long a variant is trained")
-    parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="where document and plots go")
-    parser.add_argument("--restart", action="store_true", help="forget what earlier runs have left")
+    parser.add_argument("--steps", type=int, default=750, help="steps of the training of a variant")
+    parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="folder of the document and the plots")
+    parser.add_argument("--restart", action="store_true", help="discard earlier results")
     parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
     options = parser.parse_args()
     if options.restart:

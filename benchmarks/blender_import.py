@@ -82,7 +82,7 @@ def write_meshes(folder: Path, objects: int, mesh_file) -> None:
     image = bpy.data.images.new("texture", 64, 64)
     image.filepath_raw, image.file_format = str(place / "texture.png"), "PNG"
     image.save()
-    picture = (place / "texture.png").read_bytes()
+    image = (place / "texture.png").read_bytes()
     u, v = (index.reshape(-1) for index in np.mgrid[0:16, 0:16])
     here, right, above, across_it = (
         (u + i) % 16 * 16 + (v + j) % 16 for i, j in ((0, 0), (1, 0), (0, 1), (1, 1))
@@ -93,7 +93,7 @@ def write_meshes(folder: Path, objects: int, mesh_file) -> None:
     vertices[:, 2] = 0.4 * np.sin(v / 8 * np.pi)
     entries = {}
     for i in range(1, objects + 1):
-        (place / f"{i}.png").write_bytes(picture)
+        (place / f"{i}.png").write_bytes(image)
         mesh_file.write_mesh(place / f"{i}.ply", mesh_file.Mesh(
             vertices + i, across.astype(np.float32), np.full((256, 3), 100, np.uint8), faces.astype(np.int32),
             np.zeros((512, 3, 2), np.float32), np.zeros(512, bool), f"{i}.png"))  # fmt: skip

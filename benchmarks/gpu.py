@@ -254,8 +254,8 @@ def main() -> None:
     can = limits(options.repeats)
     say(f"{gpu}: {can['gb_per_s']:.0f} GB/s, {can['tflops']:.1f} TFLOP/s in float32.")
 
-    say(f"\n{'splats':>9} {'picture':>10} {'deep':>5} {'forward ms':>10} {'backward':>9} {'ns a pair':>9} {'MB':>7}"
-        f" {'as discs':>9} {'gsplat ms':>10} {'step over gsplat':>17}")  # fmt: skip
+    say(f"\n{'splats':>9} {'image':>10} {'splats per pixel':>16} {'forward ms':>10} {'backward':>9}"
+        f" {'ns per pair':>11} {'MB':>7} {'as discs':>9} {'gsplat ms':>10} {'step over gsplat':>17}")  # fmt: skip
     sizes = []
     for size in SIZES:
         scene = Scene(*size)
@@ -288,8 +288,8 @@ def main() -> None:
         both = row["forward_ns_per_pair"] + row["backward_ns_per_pair"]
         beside = f"{times['gsplat_step']:10.2f} {times['step'] / times['gsplat_step']:17.2f}" if other else f"{'-':>10}"
         say(
-            f"{size[0]:9d} {f'{size[1]}x{size[2]}':>10} {pairs / size[1] / size[2]:5.0f} {times['forward']:10.2f}"
-            f" {times['backward']:9.2f} {both:9.4f} {row['mb']:7.0f} {times['discs']:9.2f} {beside}"
+            f"{size[0]:9d} {f'{size[1]}x{size[2]}':>10} {pairs / size[1] / size[2]:16.0f} {times['forward']:10.2f}"
+            f" {times['backward']:9.2f} {both:11.4f} {row['mb']:7.0f} {times['discs']:9.2f} {beside}"
         )
         for name, share in shares.items():
             say(f"{name:>30}: {share['ms']:.2f} ms, {share['of_arithmetic']:.0%} of arithmetic,"

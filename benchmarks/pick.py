@@ -58,7 +58,7 @@ def measure(folder: Path, wanted: int) -> dict:
     chosen = [camera for camera in cameras["cameras"] if camera["held_out"]]
     chosen += [camera for camera in cameras["cameras"] if not camera["held_out"]]
     rng = np.random.default_rng(0)
-    right = inside = agreed = asked = 0
+    right = inside = agreed = compared = 0
     for camera in chosen[:VIEWS]:
         view = view_of(camera)
         ids = np.array(Image.open(truth / camera["name"]).convert("I"))
@@ -67,7 +67,7 @@ def measure(folder: Path, wanted: int) -> dict:
         for x, y in zip(rng.integers(0, view.width, PIXELS), rng.integers(0, view.height, PIXELS), strict=True):
             seen = pick(objects, view, x + 0.5, y + 0.5)
             found = -1 if seen is None else seen.object_id
-            asked += 1
+            compared += 1
             agreed += found == drawn[y, x]
             if uniform[y, x]:
                 inside += 1
@@ -76,7 +76,7 @@ def measure(folder: Path, wanted: int) -> dict:
     return {
         "pixels": inside,
         "agrees_with_truth": right / inside,
-        "agrees_with_renderer": agreed / asked,
+        "agrees_with_renderer": agreed / compared,
         "splats": wanted,
         "first_ms": first,
         "median_ms": float(np.median(times)),

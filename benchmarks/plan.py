@@ -43,7 +43,7 @@ DB_AN_OCTAVE, TRIES, MOST_TIMES = 1.5, 4, 2
 factor of the steps."""
 
 FLAT = ("--primitive", "2d")
-AS_GOOD, EVERYWHERE = "as planned, as good", "with an object everywhere"
+AS_GOOD, EVERYWHERE = "as planned, equal quality", "with an object everywhere"
 
 SURPLUS = ("duplicate-views", "blind-views", "unseen-points")
 """Plan keys of the redundant data that `plan_captures.with_surplus` adds."""
@@ -52,11 +52,11 @@ GROUPS = 3
 """Number of groups, to which objects are assigned in turn."""
 
 _COLUMNS = (
-    ("steps", "steps", "{:,}"), ("seconds", "seconds", "{:.0f}"), ("cpu_seconds", "of the processors", "{:.0f}"),
+    ("steps", "steps", "{:,}"), ("seconds", "seconds", "{:.0f}"), ("cpu_seconds", "CPU seconds", "{:.0f}"),
     ("train", "training", "{:.0f}"), ("peak_mb", "memory", "{:,.0f} MB"), ("psnr", "PSNR", "{:.2f} dB"),
     ("miou", "mIoU", "{:.4f}"), ("splats", "splats", "{:,.0f}"),
 )  # fmt: skip
-_ASKED_COLUMNS = (
+_PARTS_COLUMNS = (
     ("total", "seconds in all", "{:.0f}"), ("train", "training", "{:.0f}"), ("mesh_seconds", "meshes", "{:.0f}"),
     ("mesh_mb", "memory", "{:,.0f} MB"), ("psnr", "PSNR", "{:.2f} dB"), ("iou", "IoU of the object", "{:.4f}"),
     ("splats", "splats", "{:,}"),
@@ -205,7 +205,7 @@ def surplus_of(capture: Capture, steps: int) -> dict[str, dict[str, Any]]:
     Raises:
         RuntimeError: the plan does not omit the redundant data.
     """
-    more = capture.made("with more than it needs", plan_captures.with_surplus)
+    more = capture.made("with redundant data", plan_captures.with_surplus)
     if missing := set(SURPLUS) - set(more.train(steps)["left_out"]):
         raise RuntimeError(f"The plan does not leave {', '.join(sorted(missing))} out of {more.folder}.")
     train = functools.partial(more.train_often, SEEDS)
@@ -245,7 +245,7 @@ def imported(folder: Path) -> dict[str, Any]:
     return {"seconds": seconds, "peak_mb": max(stage["peak_rss_mb"] for stage in stages), "disk_mb": disk / 1e6}
 
 
-def asked_for(capture: Capture, steps: int) -> dict[str, dict[str, Any]]:
+def train_parts(capture: Capture, steps: int) -> dict[str, dict[str, Any]]:
     """Train and extract meshes of everything and of parts.
 
     `iou` is that of the object which is also extracted alone: the one with the median number of points.
@@ -276,19 +276,20 @@ def change(new: dict[str, Any], old: dict[str, Any], names: Mapping[str, str]) -
     )
 
 
-_COSTS = {"seconds": "time", "cpu_seconds": "time of the processors", "peak_mb": "memory"}
+_COSTS = {"seconds": "time", "cpu_seconds": "CPU time", "peak_mb": "memory"}
 
 
 def verdict(found: dict[str, dict[str, Any]]) -> str:
     """Return the effect of the omissions on cost and quality as text."""
     planned, whole = found["as planned"], found["nothing left out"]
-    text = f"As planned, as many steps take {change(planned, whole, _COSTS)}; {gain_of(planned, whole)}, "
+    text = f"As planned, the same number of steps takes {change(planned, whole, _COSTS)}; {gain_of(planned, whole)}, "
     text += f"{judged(planned, whole)}."
     if same := found.get(AS_GOOD):
         text += f" In {same['steps']:,} steps it takes {change(same, whole, _COSTS)}; {gain_of(same, whole)}."
     if labeled := found.get(EVERYWHERE):
         text += " Nothing left out: votes, the ID channel and the label loss with masks that are empty. Labels of one "
-        text += "object that is everywhere are more than that, since their loss asks for opaque pixels; against these: "
+        text += "object that is everywhere are more than that, since their loss favors opaque pixels; compared with "
+        text += "these: "
         text += f"{change(planned, labeled, _COSTS)}; {gain_of(planned, labeled)}, {judged(planned, labeled)}."
     return text
 
@@ -312,7 +313,7 @@ def judged(new: dict[str, Any], old: dict[str, Any]) -> str:
     return "better" if gain > 0 else "worse"
 
 
-def asked_verdict(found: dict[str, dict[str, Any]]) -> str:
+def parts_verdict(found: dict[str, dict[str, Any]]) -> str:
     """Return the savings of extracting less as text."""
     everything = found["everything"]
     lines = []
@@ -341,18 +342,18 @@ def heading(level: int, text: str) -> str:
 def section_of_omissions(capture: Capture, steps: int, needed: bool) -> tuple[dict[str, Any], list[str]]:
     """Measure the plan's omissions; returns the figures and lines of Markdown."""
     left_out, trainings = omissions(capture, steps, needed)
-    found = verdict(trainings) if left_out else f"{verdict(trainings)} Both did the same: what they differ by is noise."
+    found = verdict(trainings) if left_out else f"{verdict(trainings)} Both did the same; the difference is noise."
     lines = [f"Left out: {', '.join(left_out) or 'nothing'}.", "", *rows_of(_COLUMNS, trainings), "",
              found, ""]  # fmt: skip
     return {"left_out": left_out, "trainings": trainings}, lines
 
 
-def section_of_what_is_asked_for(capture: Capture, steps: int) -> tuple[dict[str, Any], list[str]]:
+def section_of_parts(capture: Capture, steps: int) -> tuple[dict[str, Any], list[str]]:
     """Measure the user's choices of results; returns the figures and lines of Markdown."""
-    asked = asked_for(capture, steps)
-    lines = ["With meshes, and with parts of the result only:", "", *rows_of(_ASKED_COLUMNS, asked), "",
-             asked_verdict(asked), ""]  # fmt: skip
-    return {"asked_for": asked}, lines
+    parts = train_parts(capture, steps)
+    lines = ["With meshes, and with parts of the result only:", "", *rows_of(_PARTS_COLUMNS, parts), "",
+             parts_verdict(parts), ""]  # fmt: skip
+    return {"parts": parts}, lines
 
 
 def section_of_pinholes(capture: Capture) -> tuple[dict[str, Any], list[str]]:
@@ -372,7 +373,7 @@ def section_of_surplus(capture: Capture, steps: int) -> tuple[dict[str, Any], li
     """Measure the savings for a capture with redundant data; returns the figures and lines of Markdown."""
     trainings = surplus_of(capture, steps)
     lines = [
-        heading(3, f"{capture.name}, with more than it needs"), "",
+        heading(3, f"{capture.name}, with redundant data"), "",
         "About twice as many photos: of those added, half are JPEG copies, and half show nothing reconstructed; "
         f"also {plan_captures.UNSEEN:.0%} more points, which no photo shows.", "",
         *rows_of(_COLUMNS, trainings), "", verdict(trainings), "",
@@ -387,7 +388,7 @@ def main() -> None:
     parser.add_argument("capture", type=Path, nargs="*", default=[DEMO])
     parser.add_argument("--steps", type=int, default=800)
     parser.add_argument("--surplus", type=Path, nargs="*", default=[DEMO], metavar="CAPTURE")
-    parser.add_argument("--needed", action="store_true", help="also without each thing that the plan does")
+    parser.add_argument("--needed", action="store_true", help="also without each planned step")
     parser.add_argument("--write", action="store_true")
     words = sys.argv[1:]
     own, extra = (words[: words.index("--")], words[words.index("--") + 1 :]) if "--" in words else (words, [])
@@ -407,7 +408,7 @@ def main() -> None:
         lines += [heading(2, capture.name), ""]
         sections = [
             section_of_omissions(capture, options.steps, options.needed),
-            section_of_what_is_asked_for(capture, options.steps),
+            section_of_parts(capture, options.steps),
             section_of_pinholes(capture),
             *([section_of_surplus(capture, options.steps)] if capture.folder in surplus else []),
         ]

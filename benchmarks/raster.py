@@ -131,9 +131,9 @@ def against_reference(repeats: int) -> dict[str, float]:
 
     def reference() -> None:
         leaves = {name: torch.from_numpy(getattr(g, name)).double().requires_grad_() for name in names}
-        picture = rasterize_reference(**leaves, ids=torch.from_numpy(g.ids), camera=scene.camera, objects=8)
-        weight = picture.probabilities.gather(-1, labels)[..., 0]
-        planes = (picture.color, picture.alpha, weight)
+        expected = rasterize_reference(**leaves, ids=torch.from_numpy(g.ids), camera=scene.camera, objects=8)
+        weight = expected.probabilities.gather(-1, labels)[..., 0]
+        planes = (expected.color, expected.alpha, weight)
         sum((a * b).sum() for a, b in zip(planes, target, strict=True)).backward()
 
     slow = timed({"reference": reference}, 3)["reference"][0]
@@ -183,7 +183,10 @@ def main() -> None:
     say = (lambda *_: None) if options.json else print
     say(f"Kernels ready in {compile_kernels():.1f} s; {numba.get_num_threads()} threads.")
 
-    say(f"\n{'splats':>8} {'picture':>10} {'deep':>5} {'forward ms':>16} {'backward ms':>16} {'ns a pair':>20}")
+    say(
+        f"\n{'splats':>8} {'image':>10} {'splats per pixel':>16} {'forward ms':>16} {'backward ms':>16}"
+        f" {'ns per pair':>20}"
+    )
     sizes = []
     for size in SIZES:
         scene = Scene(*size)
@@ -202,7 +205,7 @@ def main() -> None:
         }
         sizes.append(row)
         say(
-            f"{size[0]:8d} {f'{size[1]}x{size[2]}':>10} {pairs / size[1] / size[2]:5.0f}"
+            f"{size[0]:8d} {f'{size[1]}x{size[2]}':>10} {pairs / size[1] / size[2]:16.0f}"
             f" {forward:9.2f} +-{f_spread:5.2f} {backward:9.2f} +-{b_spread:5.2f}"
             f" {row['forward_ns_per_pair']:6.2f} + {row['backward_ns_per_pair']:5.2f} ="
             f" {row['forward_ns_per_pair'] + row['backward_ns_per_pair']:5.2f}"

@@ -67,19 +67,19 @@ def exact_part(scene_file: str, part: tuple[int, int, int, int]) -> dict[str, np
     camera = camera.crop(x, y, width, height)
     drawn = np.flatnonzero(_reaches(scene, camera))
     leaves = {name: torch.from_numpy(scene[name][drawn]).double().requires_grad_() for name in PARAMETERS}
-    picture = reference.rasterize_reference(
+    exact = reference.rasterize_reference(
         **leaves, ids=torch.from_numpy(scene["ids"][drawn]), camera=camera, objects=int(scene["objects"])
     )
     labels = torch.from_numpy(scene["labels"][here]).long()[..., None]
-    weight = picture.probabilities.gather(-1, labels.clamp(min=0))[..., 0] * (labels[..., 0] >= 0)
+    weight = exact.probabilities.gather(-1, labels.clamp(min=0))[..., 0] * (labels[..., 0] >= 0)
     towards = (
         torch.from_numpy(scene["g_color"][:, *here]).double(),
         torch.from_numpy(scene["g_label_probability"][here]).double(),
     )
-    ((picture.color * towards[0]).sum() + (weight * towards[1]).sum()).backward()
+    ((exact.color * towards[0]).sum() + (weight * towards[1]).sum()).backward()
     gradients = [leaf.grad if leaf.grad is not None else torch.zeros_like(leaf) for leaf in leaves.values()]
     return {
-        "color": picture.color.detach().numpy(),
+        "color": exact.color.detach().numpy(),
         "label_probability": weight.detach().numpy(),
         "drawn": drawn,
         **{f"g_{name}": gradient.numpy() for name, gradient in zip(PARAMETERS, gradients, strict=True)},
@@ -397,14 +397,14 @@ def errors(frame: Any, gradients: Any, exact: Any) -> dict[str, float]:
         relative to the exact gradient's norm, as root mean square over PARAMETERS.
     """
 
-    picture = 255 * (frame.color - exact["color"])
+    error = 255 * (frame.color - exact["color"])
     parts = []
     for name in PARAMETERS:
         true = exact[f"g_{name}"]
         parts.append(np.linalg.norm(getattr(gradients, name) - true) / max(np.linalg.norm(true), 1e-300))
     return {
-        "picture": float(np.sqrt(np.mean(picture**2))),
-        "largest": float(np.abs(picture).max()),
+        "picture": float(np.sqrt(np.mean(error**2))),
+        "largest": float(np.abs(error).max()),
         "gradient": float(np.sqrt(np.mean(np.square(parts)))),
     }
 

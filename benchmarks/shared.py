@@ -163,8 +163,8 @@ def train_and_measure(trainer: Any, capture: Any, budget: Any) -> dict[str, Any]
         trainer.run(budget, Path(folder), Reporter())
 
     def render(index: int) -> tuple[Any, Any]:
-        picture = draw(trainer.shown, trainer.scene.camera(index))
-        return picture.image, picture.ids
+        rendered = draw(trainer.shown, trainer.scene.camera(index))
+        return rendered.image, rendered.ids
 
     quality = evaluate(capture, render, capture.test_indices)["quality"]
     progress = trainer.progress
@@ -173,7 +173,7 @@ def train_and_measure(trainer: Any, capture: Any, budget: Any) -> dict[str, Any]
         "steps": progress.step,
         "steps_per_second": progress.step / progress.seconds,
         "anchors": len(trainer.model.anchors),
-        "splats": len(trainer.shown.generate(eye=np.zeros(3)).source),
+        "splats": len(trainer.shown.generate(camera_center=np.zeros(3)).source),
     }
 
 

@@ -218,10 +218,10 @@ def seeds() -> list[Row]:
         found.append(train(settings=settings, steps=150, size=(96, 72), seed=seed, scored=False))
     values = [t.psnr for t in found]
     spread = f"{min(values):.1f} to {max(values):.1f} dB"
-    return [row("20 seeds", "every number finite", spread, all(map(math.isfinite, values)), *found)]
+    return [row("20 seeds", "all numbers finite", spread, all(map(math.isfinite, values)), *found)]
 
 
-def places() -> list[Row]:
+def scale_and_offset() -> list[Row]:
     """Train on the same world scaled or translated, and compare means over seeds.
 
     A coordinate with 1e6 added keeps ten decimals. This changes at most the last bit of some float32 values, but over
@@ -297,7 +297,7 @@ def masks() -> list[Row]:
     clean = train()
     for name, change, expected in (
         ("30 % of the objects in the masks are another", wrong, "better than its masks"),
-        ("masks shifted by 5 pixels, every view its own way", shifted, "better than its masks"),
+        ("masks shifted by 5 pixels, in a random direction per view", shifted, "better than its masks"),
     ):
         found = train(each_mask(change))
         rows.append(
@@ -349,7 +349,7 @@ def large() -> list[Row]:
     view = found.trainer.scene.capture.views[0]
     rows = [
         row(
-            f"images of {view.width} x {view.height} pixels as they are", "six steps, every number finite",
+            f"images of {view.width} x {view.height} pixels as they are", "six steps, all numbers finite",
             f"{found.psnr:.1f} dB", math.isfinite(found.psnr), found,
         )
     ]  # fmt: skip
@@ -364,8 +364,8 @@ def large() -> list[Row]:
     )  # fmt: skip
     rng = np.random.default_rng(0)
     side = 13
-    places = np.stack(np.meshgrid(*3 * [np.linspace(-1.1, 1.1, side)], indexing="ij"), -1).reshape(-1, 3)[:2000]
-    spheres = [(i + 1, p + rng.uniform(-0.02, 0.02, 3), 0.06) for i, p in enumerate(places)]
+    centers = np.stack(np.meshgrid(*3 * [np.linspace(-1.1, 1.1, side)], indexing="ij"), -1).reshape(-1, 3)[:2000]
+    spheres = [(i + 1, p + rng.uniform(-0.02, 0.02, 3), 0.06) for i, p in enumerate(centers)]
     found = train(views=12, size=(320, 240), steps=200, spheres=spheres, points=5)
     objects = len(found.trainer.model.classes) - 1
     rows.append(
@@ -377,7 +377,7 @@ def large() -> list[Row]:
     return rows
 
 
-CASES = {f.__name__: f for f in (seeds, places, exposure, masks, images, large)}
+CASES = {f.__name__: f for f in (seeds, scale_and_offset, exposure, masks, images, large)}
 
 
 def table(rows: list[Row]) -> str:
@@ -408,11 +408,11 @@ def main() -> int:
         print(json.dumps([r._asdict() for r in rows], indent=1))
     if options.write:
         text = (
-            "# Trainings that could go wrong\n\n"
+            "# Stability tests\n\n"
             f"Made by `python benchmarks/stability.py --write`, with {os.cpu_count()} processors. Every case is a "
-            "whole training on a capture of spheres, whose truth is known; in none may a loss, a gradient or a number "
-            "of the model be NaN or infinite. PSNR is of held-out views where there are any, mIoU of the rendered IDs "
-            "of the training views against the truth. Seconds are a case's share of those of its group.\n\n"
+            "complete training on a capture of spheres with known ground truth; it fails if a loss, a gradient or a "
+            "value of the model is NaN or infinite. PSNR is that of held-out views if there are any; mIoU compares the "
+            "rendered IDs of the training views with the truth. Seconds are the mean over the cases of a group.\n\n"
         )
         DOCUMENT.write_text(text + table(rows) + "\n", encoding="utf-8")
     return 0 if all(r.held for r in rows) else 1

@@ -62,12 +62,14 @@ def _received(pipe: Connection) -> Any:
     try:
         return pipe.recv()
     except EOFError:
-        raise RuntimeError("a training ended without a word; what it said last is above") from None
+        raise RuntimeError("a training exited without output; its last messages are above") from None
 
 
 def _train(pipe: Connection, core: int, spec: dict[str, Any], capture: str, cache: str, steps: int, seed: int) -> None:
-    """Train in a child process when told, send the figures, and keep the core busy until killed, so that the other
-    training does not speed up at its end."""
+    """Train in a child process after the `go` message, send the figures, and keep the core busy until killed.
+
+    Otherwise, the other training would speed up at its end.
+    """
     if hasattr(os, "sched_setaffinity"):
         cores = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, {cores[core % len(cores)]})

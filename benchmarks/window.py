@@ -67,8 +67,8 @@ def measure(
     name: str, command, variables, capture: Path, archive: Path, seconds: float, size
 ) -> dict[str, dict[str, float]]:
     """Measure the timer's gaps in one Blender: at rest, during training, and for Blender on its own."""
-    place = Path(tempfile.mkdtemp(prefix="objectgs-window-"))
-    blender = harness.Blender(command, variables, place, place / "shots", size)
+    folder = Path(tempfile.mkdtemp(prefix="objectgs-window-"))
+    blender = harness.Blender(command, variables, folder, folder / "shots", size)
     found: dict[str, dict[str, float]] = {}
     try:
         blender.wait_for("True", timeout=120)
@@ -85,7 +85,7 @@ def measure(
         time.sleep(10)
         found["at rest"] = blender.run(STOP)
         blender.run(
-            NAMES + f"bpy.ops.objectgs.import_capture(directory={str(capture)!r}, folder={str(place / 'out')!r})"
+            NAMES + f"bpy.ops.objectgs.import_capture(directory={str(capture)!r}, folder={str(folder / 'out')!r})"
         )
         wait(blender, "owner.objectgs.active is not None")
         blender.run(NAMES + f"root.objectgs.minutes = {seconds / 60}; bpy.ops.objectgs.train()")
@@ -107,7 +107,7 @@ def measure(
         blender.run(START)
         time.sleep(10)
         found["Blender's own, no training"] = blender.run(STOP)
-        outside = train_outside(capture, place / "outside", seconds)
+        outside = train_outside(capture, folder / "outside", seconds)
         time.sleep(10)  # wait until the training has read the capture
         blender.run(START)
         while outside.poll() is None:
@@ -133,7 +133,7 @@ def wait(blender: harness.Blender, expression: str, interval: float = 0.5) -> No
         if blender.run(NAMES + f"result = bool({expression})"):
             return
         time.sleep(interval)
-    raise harness.Failed(f"it never became true: {expression}")
+    raise harness.Failed(f"condition timed out: {expression}")
 
 
 def main() -> None:

@@ -97,7 +97,7 @@ def read_image(path: Path) -> PilImage.Image:
                 values = np.asarray(image).astype(np.int64)
                 image = PilImage.fromarray((np.clip(values, 0, 65535) // 257).astype(np.uint8))
             elif image.mode == "F":
-                raise InputError(f"{path} holds floating-point pixels; save it as an 8- or 16-bit image.")
+                raise InputError(f"{path} contains floating-point pixels; save it as an 8- or 16-bit image.")
             if image.mode == "P" and "transparency" in image.info:
                 return image.convert("RGBA").convert("RGB")
             if image.mode in ("RGBA", "RGBX"):
@@ -200,7 +200,7 @@ def _opened_array(path: Path) -> Iterator[BinaryIO]:
                 names = [name for name in ("ids", "mask", "masks") if name in stored] or stored
                 if len(names) != 1:
                     arrays = ", ".join(names[:10]) or "(none)"
-                    raise InputError(f"{path} holds the arrays {arrays}; expected one named ids.")
+                    raise InputError(f"{path} contains the arrays {arrays}; expected one named ids.")
                 file = stack.enter_context(archive.open(f"{names[0]}.npy"))
             else:
                 file.seek(0)
@@ -258,7 +258,7 @@ def _image_mask(path: Path, color: bool | None) -> np.ndarray:
             # Pillow scales 2-bit and 4-bit gray to the full range.
             values = values // (85 if "L;2" in raw_mode else 17)
         if mode == "I" and int(values.min()) < 0:
-            raise _not_ids(path, "it holds negative values")
+            raise _not_ids(path, "it contains negative values")
         return values.astype(np.uint32)
     if mode == "LA":
         return values[..., 0].astype(np.uint32)

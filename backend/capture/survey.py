@@ -112,7 +112,7 @@ def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Repo
             problem, partial(pinhole_for, model.cameras[camera_id], model.file("cameras"), max_size), None
         )
     if not any(targets.values()):
-        raise InputError(f"{model.file('cameras')} holds no usable camera; run COLMAP again.")
+        raise InputError(f"{model.file('cameras')} contains no usable camera; run COLMAP again.")
 
     images_folder, masks_folder = folder / "images", folder / "masks"
     if not images_folder.is_dir():
@@ -144,8 +144,8 @@ def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Repo
     present = len(model.images) - len(absent)
     if absent and not present:
         raise InputError(
-            f"{images_folder} holds none of the {len(absent)} images that {model.file('images')} names, for instance "
-            f"{absent[0]}; put them there."
+            f"{images_folder} contains none of the {len(absent)} images that {model.file('images')} names, for "
+            f"instance {absent[0]}; put them there."
         )
     if absent:
         warnings.append(

@@ -162,8 +162,8 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
     capture = load_capture(source, folder.cache, memory_for_files(options), max_size, reporter)
     if digest(capture) != training.votes.capture:
         raise InputError(
-            f"The capture {source} is not the one that {folder.folder} was trained on; put that one back, say with "
-            "--capture where it is, or train again."
+            f"The capture {source} is not the one that {folder.folder} was trained on; put that one back, give "
+            "its location with --capture, or train again."
         )
     if options.capture:
         update_record(folder, capture=capture_record(capture, max_size))

@@ -98,8 +98,8 @@ def curve_image(curve: Sequence[Mapping[str, Any]]) -> Image.Image | None:
     left, top, right, bottom = 34, 22, width - 10, height - 24
     seconds, values = np.array(found).T
     low, high = math.floor(values.min()), math.ceil(values.max() + 0.01)
-    picture = Image.new("RGB", CURVE_SIZE, CURVE_PAPER)
-    pen = ImageDraw.Draw(picture)
+    image = Image.new("RGB", CURVE_SIZE, CURVE_PAPER)
+    pen = ImageDraw.Draw(image)
 
     def place(second: float, value: float) -> tuple[float, float]:
         return (
@@ -115,7 +115,7 @@ def curve_image(curve: Sequence[Mapping[str, Any]]) -> Image.Image | None:
     pen.text((left, 4), "PSNR of held-out views, dB", fill=CURVE_INK, font=load_font(12))
     whole = round(seconds[-1])
     pen.text((right, bottom + 6), f"{whole // 60}:{whole % 60:02d}", fill=CURVE_INK, font=load_font(12), anchor="ra")
-    return picture
+    return image
 
 
 def thumbnail(image: NDArray, longest: int = 256) -> Image.Image:
@@ -128,15 +128,15 @@ def contact_sheet(images: Sequence[NDArray | Image.Image], titles: Sequence[str]
     """Arrange images in rows of `columns`, each below its title, scaled to fit the size of the first one."""
     if not images:
         raise ValueError("a contact sheet needs at least one image")
-    pictures = [
+    converted = [
         image.convert("RGB") if isinstance(image, Image.Image) else Image.fromarray(as_bytes(image)) for image in images
     ]
-    size = _fit(*pictures[0].size, CELL_WIDTH)
+    size = _fit(*converted[0].size, CELL_WIDTH)
     cells = []
-    for picture, title in zip(pictures, titles):
-        scale = min(size[0] / picture.width, size[1] / picture.height)
-        fitted = (max(1, round(picture.width * scale)), max(1, round(picture.height * scale)))
-        cells.append((title, picture.resize(fitted, Image.Resampling.LANCZOS)))
+    for image, title in zip(converted, titles):
+        scale = min(size[0] / image.width, size[1] / image.height)
+        fitted = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
+        cells.append((title, image.resize(fitted, Image.Resampling.LANCZOS)))
     return _sheet(cells, min(columns, len(cells)), "", [])
 
 
@@ -213,11 +213,11 @@ def _sheet(cells: Sequence[tuple[str, Image.Image]], columns: int, title: str, l
     draw = ImageDraw.Draw(sheet)
     if title:
         draw.text((MARGIN, MARGIN - 2), shorten(title, heading, width - 2 * MARGIN), INK, heading)
-    for i, (text, picture) in enumerate(cells):
+    for i, (text, image) in enumerate(cells):
         x = MARGIN + (i % columns) * (size[0] + GAP)
         y = top + (i // columns) * (label_height + size[1] + GAP)
         draw.text((x, y), shorten(text, label, size[0]), FAINT_INK, label)
-        sheet.paste(picture, (x + (size[0] - picture.width) // 2, y + label_height))
+        sheet.paste(image, (x + (size[0] - image.width) // 2, y + label_height))
     swatch = label_size - 2
     y = bottom + GAP + 2
     for line in lines:

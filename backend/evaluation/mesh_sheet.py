@@ -34,7 +34,7 @@ _FAINT = (118, 118, 124)
 _CLAY = np.array([0.80, 0.80, 0.80])
 _UNOBSERVED = np.array([0.98, 0.66, 0.36])
 _WIRE = np.array([0.24, 0.27, 0.33])
-_VIEWS_ASKED = 60
+_MAX_SAMPLED_VIEWS = 60
 _FIELD = np.radians(28.0)
 _FILLED = 0.88
 """Fraction of a panel's width or height that the mesh fills."""
@@ -63,9 +63,9 @@ class Card:
 
 def view_of(capture: Capture, ids: Sequence[int] | None, indices: Sequence[int]) -> View:
     """Return the view among `indices` with the most pixels of the objects `ids`; if `ids` is None, the first view."""
-    asked = list(indices)[:: max(1, len(indices) // _VIEWS_ASKED)]
-    best, most = asked[0], -1
-    for index in asked:
+    sampled = list(indices)[:: max(1, len(indices) // _MAX_SAMPLED_VIEWS)]
+    best, most = sampled[0], -1
+    for index in sampled:
         mask = capture.mask(index)
         pixels = 0 if mask is None or ids is None else int(np.isin(mask, ids).sum())
         if pixels > most:
@@ -161,10 +161,10 @@ def _wires(mesh: Mesh, camera: Camera, hit: np.ndarray, rows: np.ndarray, column
 
 def _panel(drawn: np.ndarray, colors: np.ndarray, size: int) -> Image.Image:
     """Return the drawn pixels on the panel's background, reduced to size x size."""
-    picture = np.empty((*drawn.shape, 3), np.float32)
-    picture[:] = np.array(_PANEL) / 255
-    picture[drawn] = colors
-    blocks = picture.reshape(size, _FINER, size, _FINER, 3).mean((1, 3))
+    image = np.empty((*drawn.shape, 3), np.float32)
+    image[:] = np.array(_PANEL) / 255
+    image[drawn] = colors
+    blocks = image.reshape(size, _FINER, size, _FINER, 3).mean((1, 3))
     return Image.fromarray(np.rint(np.clip(blocks, 0, 1) * 255).astype(np.uint8))
 
 
@@ -199,8 +199,8 @@ def mesh_sheet(cards: Sequence[Card], reporter: Reporter | None = None) -> Image
             text = shorten(card.why or "no mesh", font, wide - 40)
             draw.text((x + (wide - font.getlength(text)) / 2, y + head + size / 2 - 8), text, _FAINT, font)
             continue
-        for k, picture in enumerate(draw_card(card, size)):
-            sheet.paste(picture, (x + k * (size + gap), y + head), _rounded(size))
+        for k, image in enumerate(draw_card(card, size)):
+            sheet.paste(image, (x + k * (size + gap), y + head), _rounded(size))
     if reporter is not None:
         reporter.progress(len(cards), len(cards), what="meshes")
     return sheet
@@ -214,30 +214,30 @@ def _rounded(size: int) -> Image.Image:
 
 def save_sheet(sheet: Image.Image, path: Path, limit: int = 300_000) -> Path:
     """Write `sheet` atomically as a PNG of at most `limit` bytes, with fewer colors or pixels if necessary."""
-    picture, scale = sheet, 1.0
+    image, scale = sheet, 1.0
     while True:
         buffer = io.BytesIO()
-        picture.save(buffer, "PNG", optimize=True)
-        if buffer.tell() <= limit or min(picture.size) < 64:
+        image.save(buffer, "PNG", optimize=True)
+        if buffer.tell() <= limit or min(image.size) < 64:
             write_atomic(path, buffer.getvalue())
             return path
-        if picture.mode == "P":
+        if image.mode == "P":
             scale *= min(0.95, (limit / buffer.tell()) ** 0.5)
         size = max(1, round(sheet.width * scale)), max(1, round(sheet.height * scale))
         smaller = sheet if size == sheet.size else sheet.resize(size, Image.Resampling.LANCZOS)
-        picture = _quantize(smaller)
+        image = _quantize(smaller)
 
 
-def _quantize(picture: Image.Image) -> Image.Image:
+def _quantize(image: Image.Image) -> Image.Image:
     """Reduce an image to 256 colors: the two background colors of the sheet exactly, and fitted ones for the rest."""
-    pixels = np.asarray(picture)
+    pixels = np.asarray(image)
     # Every third row and column suffices. The exponent below 1 prevents frequent colors from displacing all others.
     found, count = np.unique(pixels[::3, ::3].reshape(-1, 3) >> 2, axis=0, return_counts=True)
     several = np.repeat(4 * found + 2, np.ceil(count**0.3).astype(int), axis=0).astype(np.uint8)
     fitted = Image.fromarray(several[None]).quantize(254, Image.Quantize.MEDIANCUT, kmeans=3)
     palette = Image.new("P", (1, 1))
     palette.putpalette([*_PAPER, *_PANEL, *(fitted.getpalette() or [])[: 3 * 254]])
-    placed = np.array(picture.quantize(palette=palette, dither=Image.Dither.NONE))
+    placed = np.array(image.quantize(palette=palette, dither=Image.Dither.NONE))
     # Pillow may map the background colors to similar ones.
     for place, own in enumerate((_PAPER, _PANEL)):
         placed[(pixels == own).all(2)] = place

@@ -147,8 +147,8 @@ def against_truth(mesh: Mesh, true: TrueMesh, truth: Truth, ids: Sequence[int]) 
 def read_texture(path: Path) -> np.ndarray:
     """Read a mesh's texture (S, S, 3) uint8 sRGB. Raises InputError if the file cannot be read."""
     try:
-        with Image.open(require_regular(path)) as picture:
-            return np.asarray(picture.convert("RGB"))
+        with Image.open(require_regular(path)) as image:
+            return np.asarray(image.convert("RGB"))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path} cannot be read ({error}); make the meshes again.") from error
 

@@ -61,7 +61,7 @@ def evaluate(
         image, found = render(i)
         name = capture.views[i].name
         if not np.isfinite(image).all():
-            reporter.warning(f"The render of {name} holds NaN or Inf.")
+            reporter.warning(f"The render of {name} contains NaN or Inf.")
         psnr, ssim = images.add(image, capture.image(i))
         truth = capture.mask(i)
         miou = None

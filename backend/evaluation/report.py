@@ -111,7 +111,7 @@ def _numbers(values: dict[str, Any], where: str, keys: Sequence[str] | None = No
 def write_report(
     reconstruction: Reconstruction,
     report: Mapping[str, Any],
-    pictures: Sequence[tuple[str, Image.Image]] = (),
+    images: Sequence[tuple[str, Image.Image]] = (),
     colors: Mapping[int, Sequence[int]] | None = None,
     title: str = "Reconstruction",
     mesh_sheet: Image.Image | None = None,
@@ -121,7 +121,7 @@ def write_report(
     Args:
         reconstruction: The folder that receives the files.
         report: The content of report.json, see `complete`.
-        pictures: (caption, image) of each image in report.md.
+        images: (caption, image) of each image in report.md.
         colors: Object ID -> (red, green, blue), 0 .. 255, for objects whose color is not the palette's.
         title: The heading of report.md.
         mesh_sheet: The contact sheet of all meshes. None removes that of an earlier report.
@@ -142,7 +142,7 @@ def write_report(
     bars = plot_objects(shown, palette)
     bars_file = bars and save_image(bars, folder / "objects.png")
     files: list[tuple[str, Path]] = []
-    for i, (caption, image) in enumerate(pictures):
+    for i, (caption, image) in enumerate(images):
         slug = re.sub(r"[^a-z0-9]+", "-", caption.lower()).strip("-")[:40]
         files.append((caption, save_image(image, folder / f"{i + 1:02d}-{slug}.png")))
     sheet_file = folder / "meshes.png"

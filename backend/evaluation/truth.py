@@ -177,8 +177,8 @@ def _read_view(capture: Capture, index: int) -> _View:
     ids_file = capture.folder / "truth" / "masks" / name.with_suffix(".png")
     try:
         depth = np.load(require_regular(depth_file))
-        with Image.open(require_regular(ids_file)) as picture:
-            ids = np.asarray(picture)
+        with Image.open(require_regular(ids_file)) as image:
+            ids = np.asarray(image)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{depth_file} or {ids_file} cannot be read ({error}); make the capture again.") from error
     if depth.ndim != 2 or ids.shape != depth.shape:

@@ -25,7 +25,7 @@ _REACHES = (1.5, 1.0)
 """Largest offset of a vertex in each round, in pixel sizes on the surface."""
 
 _PHOTOS = 6
-_PLACES = 9
+_SAMPLES = 9
 _PATCH = 5
 """Number of tested positions, over twice the reach; number of rows and columns of a patch, one pixel apart."""
 
@@ -38,7 +38,7 @@ _AT_ONCE = 50_000
 _NONE = 255
 _NOISE = (2.5 / 255) ** 2
 _STIFFNESS = 3.0
-_STAY = 0.05
+_DAMPING = 0.05
 _TURN = 0.5
 """Cosine of the largest angle by which a face may rotate."""
 
@@ -92,10 +92,10 @@ def _moved(
             _choose(vertices, normals, index, *_seen_by(photo), photo.safe, score, chosen, size)
     known = size > 0
     pixel = np.where(known, size, np.median(size[known]) if known.any() else 0.0)
-    away = np.linspace(-reach, reach, _PLACES)
-    cost = np.empty((count, _PLACES))
+    offsets = np.linspace(-reach, reach, _SAMPLES)
+    cost = np.empty((count, _SAMPLES))
     for block in blocks:
-        patches = np.full((len(cost[block]), _PHOTOS, _PLACES, _PATCH * _PATCH, 3), _NONE, np.uint8)
+        patches = np.full((len(cost[block]), _PHOTOS, _SAMPLES, _PATCH * _PATCH, 3), _NONE, np.uint8)
         for index in views.indices:
             reporter.progress(done, total)
             done += 1
@@ -104,22 +104,22 @@ def _moved(
             photo = photos[index]
             assert photo is not None
             _look_up(
-                vertices[block], normals[block], pixel[block], away, chosen[block], index, *_seen_by(photo),
+                vertices[block], normals[block], pixel[block], offsets, chosen[block], index, *_seen_by(photo),
                 photo.planes, (photo.x, photo.y), patches,
             )  # fmt: skip
         _disagreement(patches, cost[block])
-    way = (_settled(cost, away, near) * pixel)[:, None] * normals
-    return vertices + _without_folds(vertices, faces, way, mean)
+    displacement = (_settled(cost, offsets, near) * pixel)[:, None] * normals
+    return vertices + _without_folds(vertices, faces, displacement, mean)
 
 
-def _without_folds(vertices: np.ndarray, faces: np.ndarray, way: np.ndarray, mean: csr_matrix) -> np.ndarray:
-    """Smooth the offsets `way` (V, 3) of the vertices where faces would fold over."""
+def _without_folds(vertices: np.ndarray, faces: np.ndarray, displacement: np.ndarray, mean: csr_matrix) -> np.ndarray:
+    """Smooth `displacement` (V, 3) of the vertices where faces would fold over."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     before = np.cross(b - a, c - a)
     even = mean.copy()
     even.data = 1 / np.repeat(np.maximum(np.diff(even.indptr), 1), np.diff(even.indptr))
     for round in range(_UNFOLDED):
-        a, b, c = np.moveaxis((vertices + way)[faces], 1, 0)
+        a, b, c = np.moveaxis((vertices + displacement)[faces], 1, 0)
         after = np.cross(b - a, c - a)
         least = _TURN * np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
         folded = (before * after).sum(1) < least
@@ -129,8 +129,8 @@ def _without_folds(vertices: np.ndarray, faces: np.ndarray, way: np.ndarray, mea
         near[faces[folded]] = 1
         for _ in range(1 + round // 4):
             near = near + even @ near
-        way = np.where(near[:, None] > 0, (way + even @ way) / 2, way)
-    return way
+        displacement = np.where(near[:, None] > 0, (displacement + even @ displacement) / 2, displacement)
+    return displacement
 
 
 def _seen_by(photo: Photo) -> tuple[np.ndarray, ...]:
@@ -138,10 +138,10 @@ def _seen_by(photo: Photo) -> tuple[np.ndarray, ...]:
     return photo.camera.center, viewmat, intrinsics, photo.depth, photo.clearance
 
 
-def _settled(cost: np.ndarray, away: np.ndarray, near: csr_matrix) -> np.ndarray:
+def _settled(cost: np.ndarray, offsets: np.ndarray, near: csr_matrix) -> np.ndarray:
     """Compute the offset of each vertex, (V,) in pixels.
 
-    cost (V, P): disagreement of the vertex's patches at the offsets `away` (P,), NaN if unknown; near: adjacency
+    cost (V, P): disagreement of the vertex's patches at `offsets` (P,), NaN if unknown; near: adjacency
     matrix of the vertices.
     """
     ties = np.maximum(np.asarray(near.sum(1)).ravel(), 1e-30)
@@ -151,26 +151,26 @@ def _settled(cost: np.ndarray, away: np.ndarray, near: csr_matrix) -> np.ndarray
     for _ in range(_SHARED):
         shared, weight = shared + mean @ shared, weight + mean @ weight
     cost = shared / np.maximum(weight, 1e-30)[:, None]
-    best = np.clip(cost.argmin(1), 1, len(away) - 2)
+    best = np.clip(cost.argmin(1), 1, len(offsets) - 2)
     row = np.arange(len(cost))
     before, at, after = cost[row, best - 1], cost[row, best], cost[row, best + 1]
     bend = np.maximum(before - 2 * at + after, 1e-12)
-    spacing = away[1] - away[0]
-    wanted = np.clip(away[best] + spacing * np.clip((before - after) / (2 * bend), -1, 1), away[0], away[-1])
+    spacing = offsets[1] - offsets[0]
+    wanted = np.clip(offsets[best] + spacing * np.clip((before - after) / (2 * bend), -1, 1), offsets[0], offsets[-1])
     sure = np.where(weight > 0, np.minimum(bend / (spacing**2 * (np.minimum(at, cost.min(1)) + _NOISE)), 10), 0)
-    # sure (d - wanted) + stay d + stiffness (d - mean of the neighbors' d) = 0, times `ties` for a symmetric matrix.
-    diagonal = ties * (sure + _STAY + _STIFFNESS)
+    # sure (d - wanted) + damping d + stiffness (d - mean of the neighbors' d) = 0, times `ties` for a symmetric matrix.
+    diagonal = ties * (sure + _DAMPING + _STIFFNESS)
     system = diags(diagonal) - _STIFFNESS * near
     solved, _ = cg(system, ties * sure * wanted, rtol=1e-4, maxiter=300, M=diags(1 / diagonal))
-    return np.clip(solved, away[0], away[-1])
+    return np.clip(solved, offsets[0], offsets[-1])
 
 
 @kernel(parallel=True)
-def _choose(vertices, normals, index, eye, viewmat, intrinsics, depth, clearance, safe, scores, chosen, size):
+def _choose(vertices, normals, index, camera_center, viewmat, intrinsics, depth, clearance, safe, scores, chosen, size):
     for n in prange(vertices.shape[0]):
         last = scores.shape[1] - 1
         score, _u, _v, _clear = look(
-            vertices, normals, n, scores[n, last], eye, viewmat, intrinsics, depth, clearance, safe
+            vertices, normals, n, scores[n, last], camera_center, viewmat, intrinsics, depth, clearance, safe
         )
         if score <= scores[n, last]:
             continue
@@ -190,7 +190,20 @@ def _choose(vertices, normals, index, eye, viewmat, intrinsics, depth, clearance
 
 @kernel(parallel=True)
 def _look_up(
-    vertices, normals, pixel, away, chosen, index, _eye, viewmat, intrinsics, depth, clearance, planes, corner, patches
+    vertices,
+    normals,
+    pixel,
+    offsets,
+    chosen,
+    index,
+    _camera_center,
+    viewmat,
+    intrinsics,
+    depth,
+    clearance,
+    planes,
+    corner,
+    patches,
 ):
     fx, fy, cx, cy = intrinsics
     height, width = depth.shape
@@ -208,11 +221,11 @@ def _look_up(
         b = nx * ny * a
         tx, ty, tz = 1.0 + sign * nx * nx * a, sign * b, -sign * nx
         sx, sy, sz = b, sign + ny * ny * a, -ny
-        for place in range(away.size):
+        for sample in range(offsets.size):
             for p in range(_PATCH * _PATCH):
                 s = (p % _PATCH - _PATCH // 2) * pixel[n]
                 t = (p // _PATCH - _PATCH // 2) * pixel[n]
-                d = away[place] * pixel[n]
+                d = offsets[sample] * pixel[n]
                 x = vertices[n, 0] + d * nx + s * sx + t * tx
                 y = vertices[n, 1] + d * ny + s * sy + t * ty
                 z = vertices[n, 2] + d * nz + s * sz + t * tz
@@ -235,7 +248,7 @@ def _look_up(
                     value = (planes[c, row, column] * (1 - fu) + planes[c, row, column + 1] * fu) * (1 - fv) + (
                         planes[c, row + 1, column] * (1 - fu) + planes[c, row + 1, column + 1] * fu
                     ) * fv
-                    patches[n, slot, place, p, c] = int(min(max(value * 254.0 + 0.5, 0.0), 254.0))
+                    patches[n, slot, sample, p, c] = int(min(max(value * 254.0 + 0.5, 0.0), 254.0))
 
 
 @kernel(parallel=True)
@@ -244,9 +257,9 @@ def _disagreement(patches, cost):
 
     NaN where too little is visible.
     """
-    count, photos, places, points, _ = patches.shape
+    count, photos, samples, points, _ = patches.shape
     for n in prange(count):
-        for place in range(places):
+        for sample in range(samples):
             total = 0.0
             seen = 0
             for p in range(points):
@@ -255,8 +268,8 @@ def _disagreement(patches, cost):
                     square = 0.0
                     many = 0
                     for k in range(photos):
-                        if patches[n, k, place, p, c] != _NONE:
-                            value = patches[n, k, place, p, c] / 254.0
+                        if patches[n, k, sample, p, c] != _NONE:
+                            value = patches[n, k, sample, p, c] / 254.0
                             mean += value
                             square += value * value
                             many += 1
@@ -264,4 +277,4 @@ def _disagreement(patches, cost):
                         mean /= many
                         total += max(square / many - mean * mean, 0.0) * many / (many - 1)
                         seen += 1
-            cost[n, place] = total / seen if 2 * seen >= 3 * points else np.nan
+            cost[n, sample] = total / seen if 2 * seen >= 3 * points else np.nan

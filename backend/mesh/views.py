@@ -195,7 +195,7 @@ class Views:
 
     def _scene_splats(self, camera: Camera) -> Generated:
         if not self.model.explicit:
-            return self.model.generate(eye=camera.center)
+            return self.model.generate(camera_center=camera.center)
         if self._all is None:
             self._all = self.model.generate()
         return self._all

@@ -98,10 +98,10 @@ def load_checkpoint(folder: Path, check: Check = _accept) -> tuple[Tensors, dict
             raise InputError(f"{path} was written by another version of ObjectGS; train again with --restart.")
         warning = None
         if broken is not None:
-            warning = f"{broken} is cut short or damaged; continuing from the previous checkpoint ({path.name})."
+            warning = f"{broken} is truncated or damaged; continuing from the previous checkpoint ({path.name})."
         elif name == PREVIOUS:
             warning = f"{folder / CURRENT} is missing; continuing from the previous checkpoint ({path.name})."
         return tensors, state, warning
     if broken is not None:
-        raise InputError(f"{broken} is cut short or damaged, and there is no older one; train again with --restart.")
+        raise InputError(f"{broken} is truncated or damaged, and there is no older one; train again with --restart.")
     return None

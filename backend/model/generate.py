@@ -23,7 +23,7 @@ class Generated(NamedTuple):
 
     Attributes:
         source: (N,) int64, anchor * k + offset of each Gaussian.
-        made: (N,) bool. On the GPU, every offset has an entry; False marks those without a Gaussian, whose opacity is
+        valid: (N,) bool. On the GPU, every offset has an entry; False marks those without a Gaussian, whose opacity is
             0. None: all entries are Gaussians.
     """
 
@@ -34,7 +34,7 @@ class Generated(NamedTuple):
     sh: torch.Tensor
     ids: torch.Tensor
     source: torch.Tensor
-    made: torch.Tensor | None = None
+    valid: torch.Tensor | None = None
 
     def select(self, which: torch.Tensor) -> Generated:
         """Return the Gaussians selected by a mask (N,) or by indices."""
@@ -47,9 +47,9 @@ class Generated(NamedTuple):
     def _each(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Generated:
         return Generated(*(change(part) for part in self if part is not None))
 
-    def only_made(self) -> Generated:
+    def only_valid(self) -> Generated:
         """Return the entries that are Gaussians; synchronizes with the GPU."""
-        return self if self.made is None else self.select(self.made)._replace(made=None)
+        return self if self.valid is None else self.select(self.valid)._replace(valid=None)
 
 
 def _on_gpu(
@@ -69,9 +69,9 @@ def _on_gpu(
     )
     raw_opacity, shape, color = heads(features if seen_from is None else torch.cat([features, seen_from], 1))
     raw_opacity = raw_opacity + row_opacity
-    made = raw_opacity > float(RAW_OPACITY_MIN)
+    valid = raw_opacity > float(RAW_OPACITY_MIN)
     if present is not None:
-        made = made & present[:, None]
+        valid = valid & present[:, None]
     # The clamp passes the gradient, so that an extent beyond the limit can return.
     extent = (extents + (extents.clamp(max=LOG_EXTENT_MAX) - extents).detach()).exp()
     raw_scale, quats = (shape + row_shape).view(n, k, 7).split([3, 4], 2)
@@ -81,8 +81,8 @@ def _on_gpu(
     sh = torch.cat([sh[:, :, :1] + row_color.view(n, k, 1, 3), sh[:, :, 1:]], 2)
     return Generated(
         means.reshape(-1, 3), quats.reshape(-1, 4), scales.reshape(-1, 3),
-        torch.where(made, raw_opacity.tanh(), 0.0).reshape(-1), sh.reshape(n * k, -1, 3),
-        ids[:, None].expand(n, k).reshape(-1), torch.arange(n * k, device=rows.device), made.reshape(-1),
+        torch.where(valid, raw_opacity.tanh(), 0.0).reshape(-1), sh.reshape(n * k, -1, 3),
+        ids[:, None].expand(n, k).reshape(-1), torch.arange(n * k, device=rows.device), valid.reshape(-1),
     )  # fmt: skip
 
 
@@ -92,7 +92,7 @@ def generate(
     rows: torch.Tensor,
     ids: torch.Tensor,
     heads: Heads,
-    eye: np.ndarray | None = None,
+    camera_center: np.ndarray | None = None,
     present: torch.Tensor | None = None,
 ) -> Generated:
     """Generate the Gaussians of n anchors (ObjectGS equations 2 and 3), differentiable in rows and heads.
@@ -103,14 +103,14 @@ def generate(
         rows: (n, columns) float32.
         ids: (n,) int32 class index.
         heads: the heads of the model.
-        eye: (3,), the camera's center in scene units; required only in view mode.
+        camera_center: (3,), the camera's center in scene units; required only in view mode.
         present: (n,) bool, only on the GPU: anchors for which it is False generate no Gaussians.
     """
     seen_from = None
     if heads.mode == "view":
-        if eye is None:
+        if camera_center is None:
             raise ValueError("view mode needs the camera's center")
-        to_anchor = positions - devices.upload(np.asarray(eye, np.float32), positions)
+        to_anchor = positions - devices.upload(np.asarray(camera_center, np.float32), positions)
         distance = torch.linalg.vector_norm(to_anchor, dim=1, keepdim=True).clamp(min=1e-6)
         seen_from = torch.cat([distance, to_anchor / distance], 1)
     if devices.on_gpu(rows):

@@ -184,7 +184,7 @@ def grow_and_prune(
     means = positions[parents] + numbers[:, :3] * np.exp(numbers[:, 3:])
 
     new_positions, new_children, new_extents = [], [], []
-    room = max_anchors - len(anchors)
+    remaining = max_anchors - len(anchors)
     occupied_by = [positions]
     for level, voxels in enumerate(LEVELS):
         cell = anchors.voxel * voxels
@@ -198,8 +198,8 @@ def grow_and_prune(
         # The largest accumulated gradient first; ties are broken by index, so that the result is deterministic.
         order = np.lexsort((index, -summed[wanted[index]]))
         _, first = np.unique(cells[order], return_index=True)
-        chosen = order[np.sort(first)][: max(room, 0)]
-        room -= len(chosen)
+        chosen = order[np.sort(first)][: max(remaining, 0)]
+        remaining -= len(chosen)
         found = (keys[chosen] * cell).astype(np.float32)
         occupied_by.append(found)
         new_positions.append(found)
@@ -218,8 +218,8 @@ def grow_and_prune(
     faint = (views >= MIN_VISITS) & (opacity < min_opacity * np.maximum(views, 1))
     kept = devices.upload(np.flatnonzero(~faint), anchors.rows)
     pruned = len(anchors) - len(kept)
-    born = devices.upload(np.concatenate(new_positions), anchors.rows)
-    anchors.positions = torch.cat([anchors.positions[kept], born])
+    added_positions = devices.upload(np.concatenate(new_positions), anchors.rows)
+    anchors.positions = torch.cat([anchors.positions[kept], added_positions])
     anchors.rows = torch.cat([anchors.rows[kept], devices.upload(rows, anchors.rows)])
     anchors.ids = torch.cat([anchors.ids[kept], anchors.ids[parent]])
     return Growth(kept, len(child), pruned)

@@ -94,12 +94,12 @@ class ObjectModel:
         """Whether the model can be exported as plain splats without loss."""
         return self.heads.mode == "explicit"
 
-    def generate(self, seen: torch.Tensor | None = None, eye: np.ndarray | None = None) -> Generated:
+    def generate(self, seen: torch.Tensor | None = None, camera_center: np.ndarray | None = None) -> Generated:
         """Generate Gaussians without gradients.
 
         Args:
             seen: (n,) int64, the anchors; None: all.
-            eye: (3,), the camera's center in scene units; required only in view mode.
+            camera_center: (3,), the camera's center in scene units; required only in view mode.
 
         Returns:
             The Gaussians in scene units; discs have the third scale of the thin 3D Gaussians used for them in files.
@@ -107,21 +107,21 @@ class ObjectModel:
         a = self.anchors
         pick = (lambda x: x) if seen is None else (lambda x: x[seen])
         with torch.no_grad():
-            g = generate(a.layout, pick(a.positions), pick(a.rows), pick(a.ids), self.heads, eye).only_made()
+            g = generate(a.layout, pick(a.positions), pick(a.rows), pick(a.ids), self.heads, camera_center).only_valid()
             if self.primitive == "2d":
                 g.scales[:, 2] = DISC_THICKNESS * g.scales[:, :2].amin(1)
             return g
 
-    def splats(self, eye: np.ndarray | None = None) -> tuple[Splats, np.ndarray]:
+    def splats(self, camera_center: np.ndarray | None = None) -> tuple[Splats, np.ndarray]:
         """Convert the model to plain splats.
 
         Args:
-            eye: (3,), the camera's center in scene units; required only in view mode.
+            camera_center: (3,), the camera's center in scene units; required only in view mode.
 
         Returns:
             Splats in world units, and source (N,) int64: anchor * offsets + offset of each splat.
         """
-        g = self.generate(eye=eye)
+        g = self.generate(camera_center=camera_center)
         g = g.cpu()
         quats = g.quats.double().numpy()
         norm = np.linalg.norm(quats, axis=1, keepdims=True)

@@ -27,25 +27,25 @@ _OUT_OF_MEMORY_TEXTS = ("CUDA_ERROR_OUT_OF_MEMORY", "CUDA error: out of memory",
 CPU = torch.device("cpu")
 
 
-def pick(asked: str) -> torch.device:
+def pick(requested: str) -> torch.device:
     """Select the device to compute on.
 
     Args:
-        asked: "cpu", "cuda", or "auto" (CUDA if available, otherwise the CPU).
+        requested: "cpu", "cuda", or "auto" (CUDA if available, otherwise the CPU).
 
     Returns:
         The torch device; in numba's simulator, always the CPU.
 
     Raises:
-        InputError: `asked` is "cuda" and CUDA is not available.
-        ValueError: `asked` is not in CHOICES.
+        InputError: `requested` is "cuda" and CUDA is not available.
+        ValueError: `requested` is not in CHOICES.
     """
-    if asked not in CHOICES:
-        raise ValueError(f"the device is {asked!r}, expected one of {CHOICES}")
-    why_not = None if asked == "cpu" else why_not_cuda()
-    if asked == "cuda" and why_not is not None:
+    if requested not in CHOICES:
+        raise ValueError(f"the device is {requested!r}, expected one of {CHOICES}")
+    why_not = None if requested == "cpu" else why_not_cuda()
+    if requested == "cuda" and why_not is not None:
         raise InputError(why_not)
-    if asked == "cpu" or why_not is not None or simulated():
+    if requested == "cpu" or why_not is not None or simulated():
         return CPU
     return torch.device("cuda", torch.cuda.current_device())
 

@@ -146,7 +146,7 @@ def rasterize_reference(
     viewmat = torch.as_tensor(camera.viewmat, dtype=torch.float64).to(dtype)
     fx, fy, cx, cy = (float(v) for v in camera.arrays()[1])
     W, t = viewmat[:3, :3], viewmat[:3, 3]
-    eye = -(W.T @ t)
+    camera_center = -(W.T @ t)
     if flat:
         scales = scales[:, :2]
     # Remove splats below the thresholds before any division, since NaN gradients would propagate through a mask.
@@ -169,7 +169,7 @@ def rasterize_reference(
     else:
         a, b, c, conditional = _footprints(p, axes, camera, EPS_2D, TAN_MARGIN)
     extent2 = 2 * torch.log(opacities / ALPHA_MIN) * torch.maximum(a, c)
-    directions = means - eye
+    directions = means - camera_center
     colors = sh_colors(sh, directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True))
 
     columns = torch.arange(width, dtype=dtype) + 0.5

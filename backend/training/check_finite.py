@@ -51,7 +51,11 @@ class Fault(NamedTuple):
         more = f" and {others} more" if others else ""
         fate = "the update was skipped"
         if len(self.unrecoverable):
-            fate = f"{len(self.unrecoverable)} of them were taken out" if others else "it was taken out of the model"
+            fate = (
+                f"{len(self.unrecoverable)} of them were removed from the model"
+                if others
+                else "it was removed from the model"
+            )
         return f"{first}, because of {who} {int(self.anchors[0])} ({owner}){more}; {fate}."
 
 
@@ -67,8 +71,8 @@ def find_fault_of_loss(terms: Mapping[str, torch.Tensor], g: Generated, seen: to
     named = [name for name, value in terms.items() if not value.isfinite()]
     numbers = torch.cat([g.means, g.quats, g.scales, g.opacities[:, None]], 1).detach()
     broken = ~(numbers.isfinite().all(1) & (g.sh.detach().flatten(1).abs().amax(1) <= BRIGHTEST))
-    if g.made is not None:
-        broken &= g.made
+    if g.valid is not None:
+        broken &= g.valid
     sources = g.source[broken]
     anchors = seen[sources // offsets].unique()
     splat = None

@@ -124,8 +124,8 @@ def rate(ends: tuple[float, float], progress: float) -> float:
 
     It decays from ends[0] to ends[1], exponentially before, on and after the plateau.
     """
-    fallen = np.interp(progress, [0.0, *_DECAY, 1.0], [0.0, *_DECAY.values(), 1.0])
-    return float(ends[0] * (ends[1] / ends[0]) ** fallen)
+    decay = np.interp(progress, [0.0, *_DECAY, 1.0], [0.0, *_DECAY.values(), 1.0])
+    return float(ends[0] * (ends[1] / ends[0]) ** decay)
 
 
 def row_rates(layout: Layout, progress: float) -> np.ndarray:

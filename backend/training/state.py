@@ -145,7 +145,7 @@ def load_model(folder: Path, device: torch.device = devices.CPU) -> tuple[Object
     """
     found = read_checkpoint(folder)
     if found is None:
-        raise InputError(f"{folder} holds no checkpoint; train first.")
+        raise InputError(f"{folder} contains no checkpoint; train first.")
     tensors, state, warning = found
     model = model_from_checkpoint(tensors, state)
     return Average.from_checkpoint(tensors, model).of(model).to(device), state, warning

@@ -220,7 +220,7 @@ class ViewStep:
                 return None
             of_part.backward()
             loss = loss + of_part.detach()
-            self._splats = self._splats + (len(g.source) if g.made is None else g.made.sum())
+            self._splats = self._splats + (len(g.source) if g.valid is None else g.valid.sum())
             if self._growth.observes(progress) and drawn.frame.screen_gradient is not None:
                 statistics.append(
                     ViewStatistics(
@@ -277,7 +277,7 @@ class ViewStep:
         terms = {_IMAGE: self._image_loss(part, drawn, drawn.label_probability)}
         if settings.volume_weight and len(g.scales):
             terms["the volume loss"] = (
-                settings.volume_weight * (0.5 if flat else 1.0) * volume_loss(g.scales, flat, g.made)
+                settings.volume_weight * (0.5 if flat else 1.0) * volume_loss(g.scales, flat, g.valid)
             )
         if drawn.normals is not None and drawn.depth is not None:
             intrinsics = part.camera.arrays()[1]

@@ -118,8 +118,8 @@ class Trainer:
         rng = np.random.default_rng(settings.seed)
         seeds = np.ones(len(capture.points.xyz), np.bool_) if seeds is None else seeds
         xyz, rgb = capture.points.xyz[seeds], capture.points.rgb[seeds]
-        eyes = np.array([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in capture.views])
-        normalization = Normalization.of(eyes, xyz)
+        camera_centers = np.array([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in capture.views])
+        normalization = Normalization.of(camera_centers, xyz)
         classes = ClassTable(np.concatenate([[0], point_ids]))
         scene_xyz = normalization.to_scene(xyz)
         voxel = settings.voxel * normalization.scale if settings.voxel else median_spacing(scene_xyz)
@@ -284,13 +284,13 @@ class Trainer:
             if stop.paused:
                 self.save(checkpoints)
                 last_saved = time.monotonic()
-            asked = time.monotonic()
+            wait_started = time.monotonic()
             stopped = stop()
-            waited = time.monotonic() - asked
+            waited = time.monotonic() - wait_started
             started, last_saved, last_report = started + waited, last_saved + waited, last_report + waited
             if stopped:
                 self.save(checkpoints)
-                raise Cancelled(f"Stopped after {p.step} steps; run the same command again to go on.")
+                raise Cancelled(f"Stopped after {p.step} steps; run the same command again to resume.")
             loss = self.step(progress)
             while self._warnings:
                 reporter.warning(self._warnings.pop(0))

@@ -85,7 +85,7 @@ def _rename_group(group: Any) -> None:
 
 def _rename_keys(owner: Any, names: dict[str, str]) -> None:
     for former, name in names.items():
-        if former in owner.keys():  # noqa: SIM118 - an ID is no mapping
+        if former in owner.keys():  # noqa: SIM118 - an ID is not a mapping
             if name not in owner.keys():  # noqa: SIM118
                 owner[name] = owner[former]
             del owner[former]

@@ -188,18 +188,18 @@ def _fill(part: Path, settings: Settings, reporter: Any, stopped: Any) -> None:
     built, objs = scene.build(settings.objects, settings.seed)
     try:
         views = scene.cameras(settings.views, settings.seed)
-        pictures, depths, ids = _render(built, views, settings, part, reporter, stopped)
+        images, depths, ids = _render(built, views, settings, part, reporter, stopped)
         _write_truth(part, objs)
     finally:
         scene.remove(built)
-    for view, picture, depth, labels, i in zip(views, pictures, depths, ids, range(len(views))):
-        files.write_png(part / "images" / view.name, picture)
+    for view, image, depth, labels, i in zip(views, images, depths, ids, range(len(views))):
+        files.write_png(part / "images" / view.name, image)
         files.write_png(part / "truth" / "masks" / view.name, labels)
         noisy = mask_noise.disturb(labels, settings.mask_noise, scene.rng_for(settings.seed, 6, i))
         files.write_png(part / "masks" / view.name, noisy)
         np.save(part / "truth" / "depth" / (view.name[:-4] + ".npy"), depth)
     intrinsics = scene.intrinsics(settings.width, settings.height)
-    cloud = points.make(views, intrinsics, pictures, depths, ids, scene.rng_for(settings.seed, 5))
+    cloud = points.make(views, intrinsics, images, depths, ids, scene.rng_for(settings.seed, 5))
     files.write_colmap(
         part / "sparse" / "0",
         intrinsics,
@@ -222,7 +222,7 @@ def _fill(part: Path, settings: Settings, reporter: Any, stopped: Any) -> None:
 def _render(built: Any, views: Any, settings: Settings, part: Path, reporter: Any, stopped: Any) -> Any:
     """Return images, depths and ID maps of all views; each kind is rendered in one pass, since switching is slow."""
     renderer = Renderer(built, settings.width, settings.height, settings.samples, settings.seed, part)
-    pictures, truth = [], []
+    images, truth = [], []
     total = 2 * len(views)
     try:
         reporter.status("Rendering IDs and depth")
@@ -238,12 +238,12 @@ def _render(built: Any, views: Any, settings: Settings, part: Path, reporter: An
         for i, view in enumerate(views, 1):
             if stopped():
                 raise Cancelled
-            pictures.append(renderer.picture(view))
+            images.append(renderer.picture(view))
             left = (time.monotonic() - begin) / i * (len(views) - i)
             reporter.progress(len(views) + i, total, seconds_left=round(left, 1))
     finally:
         renderer.close()
-    return pictures, [depth for _, depth in truth], [labels for labels, _ in truth]
+    return images, [depth for _, depth in truth], [labels for labels, _ in truth]
 
 
 def _write_truth(part: Path, objs: Iterable[bpy.types.Object]) -> None:

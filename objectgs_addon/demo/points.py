@@ -51,9 +51,9 @@ def _lift(xy: Any, depth: Any, view: Any, intrinsics: Any) -> np.ndarray:
     return (local - view.translation) @ view.rotation
 
 
-def _seeds(picture: Any, depth: Any, count: Any, rng: Any) -> np.ndarray:
+def _seeds(image: Any, depth: Any, count: Any, rng: Any) -> np.ndarray:
     """Sample (count, 2) pixel rows and columns in textured areas away from depth discontinuities."""
-    gray = picture.astype(np.float32).mean(2)
+    gray = image.astype(np.float32).mean(2)
     gy, gx = np.gradient(gray)
     weight = np.hypot(gx, gy) + 1.0
     step = np.maximum(*[np.abs(g) for g in np.gradient(depth)])
@@ -68,13 +68,13 @@ def _seeds(picture: Any, depth: Any, count: Any, rng: Any) -> np.ndarray:
     return np.stack(np.unravel_index(keep, gray.shape), 1)
 
 
-def make(views: Any, intrinsics: Any, pictures: Any, depths: Any, ids: Any, rng: Any, target: int = 13_500) -> Cloud:
+def make(views: Any, intrinsics: Any, images: Any, depths: Any, ids: Any, rng: Any, target: int = 13_500) -> Cloud:
     """Return about `target` points, fewer for few or small views.
 
     Args:
         views: the cameras.
         intrinsics: (fx, fy, cx, cy) in pixels.
-        pictures: image of each view.
+        images: image of each view.
         depths: depth of each view in meters.
         ids: ID map of each view.
         rng: random generator.
@@ -85,7 +85,7 @@ def make(views: Any, intrinsics: Any, pictures: Any, depths: Any, ids: Any, rng:
     per_view = max(1, int(np.ceil(target * 1.8 / len(views))))
     spots, source, label = [], [], []
     for v, view in enumerate(views):
-        at = _seeds(pictures[v], depths[v], min(per_view, height * width - 1), rng)
+        at = _seeds(images[v], depths[v], min(per_view, height * width - 1), rng)
         xy = at[:, ::-1] + 0.5
         spots.append(_lift(xy, depths[v][at[:, 0], at[:, 1]].astype(float), view, intrinsics))
         source.append(np.full(len(at), v))
@@ -124,7 +124,7 @@ def make(views: Any, intrinsics: Any, pictures: Any, depths: Any, ids: Any, rng:
     # A real reconstruction also filters points that the observations do not constrain.
     bad = ~np.isfinite(error) | (error > 4.0) | (np.linalg.norm(xyz - wrong, axis=1) > 0.05)
     kept = np.flatnonzero(~bad & (np.bincount(point[keep], minlength=len(spots)) >= 3))
-    return _pack(kept, point[keep], view_of[keep], xy[keep], xyz, error, outlier, label, views, pictures, rng)
+    return _pack(kept, point[keep], view_of[keep], xy[keep], xyz, error, outlier, label, views, images, rng)
 
 
 def _seen(spots: Any, source: Any, label: Any, views: Any, intrinsics: Any, depths: Any, ids: Any) -> Any:
@@ -179,14 +179,14 @@ def _pack(
     outlier: Any,
     label: Any,
     views: Any,
-    pictures: Any,
+    images: Any,
     rng: Any,
 ) -> Cloud:
     number = np.full(len(xyz), -1)
     number[kept] = np.arange(len(kept))
     rows = number[point] >= 0
     point, view_of, xy = number[point[rows]], view_of[rows], xy[rows]
-    height, width = pictures[0].shape[:2]
+    height, width = images[0].shape[:2]
     color = np.zeros((len(kept), 3))
     slot = np.zeros(len(point), int)
     observations = []
@@ -202,7 +202,7 @@ def _pack(
         slot[here] = back[: len(here)]
         col = np.clip(xy[here, 0].astype(int), 0, width - 1)
         row = np.clip(xy[here, 1].astype(int), 0, height - 1)
-        np.add.at(color, point[here], pictures[v][row, col].astype(float))
+        np.add.at(color, point[here], images[v][row, col].astype(float))
     count = np.bincount(point, minlength=len(kept))
     rgb = np.round(color / np.maximum(count, 1)[:, None]).astype(np.uint8)
     order = np.argsort(point, kind="stable")

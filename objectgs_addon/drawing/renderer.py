@@ -209,16 +209,16 @@ def _objects(objs: Sequence[DrawnObject], view: View) -> np.ndarray:
     """Return the shader's data for each object in this view, (n, OBJECT_TEXELS, 4) float32."""
     table = np.zeros((len(objs), shaders.OBJECT_TEXELS, 4), np.float32)
     matrices = np.array([obj.matrix for obj in objs])
-    eye = np.linalg.inv(view.viewmat)[:3]
+    camera_to_world = np.linalg.inv(view.viewmat)[:3]
     table[:, 0:3] = (view.viewmat @ matrices)[:, :3]
     # Harmonics rotate with the object but ignore its scale.
     left, _, right = np.linalg.svd(matrices[:, :3, :3])
     back = np.swapaxes(left @ right, 1, 2)
     if view.orthographic:
-        table[:, 3:6, 3] = back @ eye[:, 2]
+        table[:, 3:6, 3] = back @ camera_to_world[:, 2]
     else:
         table[:, 3:6, :3] = back @ matrices[:, :3, :3]
-        table[:, 3:6, 3] = np.einsum("nij,nj->ni", back, matrices[:, :3, 3] - eye[:, 3])
+        table[:, 3:6, 3] = np.einsum("nij,nj->ni", back, matrices[:, :3, 3] - camera_to_world[:, 3])
     table[:, 6:9] = [obj.recolor for obj in objs]
     table[:, 9], table[:, 10] = [obj.color for obj in objs], [obj.highlight for obj in objs]
     return table

@@ -139,8 +139,11 @@ def _add_ground(target: bpy.types.Scene, center: Vector, size: float) -> None:
 def _best_direction(root: bpy.types.Collection, corners: np.ndarray) -> Vector:
     """Return the view direction, from the side of a camera, that minimizes the overlap of the boxes (n, 8, 3)."""
     center = (corners.min((0, 1)) + corners.max((0, 1))) / 2
-    eyes = [obj.matrix_world.translation for obj in root.all_objects if scene.kind_of(obj) == "camera"]
-    sides = [Vector((eye.x - center[0], eye.y - center[1])) for eye in eyes[:: max(1, len(eyes) // 50)]]
+    camera_centers = [obj.matrix_world.translation for obj in root.all_objects if scene.kind_of(obj) == "camera"]
+    sides = [
+        Vector((camera_center.x - center[0], camera_center.y - center[1]))
+        for camera_center in camera_centers[:: max(1, len(camera_centers) // 50)]
+    ]
     sides = [side.normalized() for side in sides if side.length > 1e-6] or [Vector((0.0, -1.0))]
     directions = [-Vector((*(side * math.cos(ELEVATION)), math.sin(ELEVATION))) for side in sides]
 

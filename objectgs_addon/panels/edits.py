@@ -99,7 +99,7 @@ def _is_identity(place: np.ndarray) -> bool:
 
 
 def _describe_transform(root: bpy.types.Collection, collection: bpy.types.Collection, place: np.ndarray) -> str:
-    """An object's transform in words: distance of its center in Blender units, rotation angle and scale."""
+    """Return an object's transform as text: distance of its center in Blender units, rotation angle and scale."""
     _, rotation, scale = Matrix(place.tolist()).decompose()
     turn = math.degrees(rotation.angle)
     turn = min(turn, 360.0 - turn)

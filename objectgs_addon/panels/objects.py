@@ -99,7 +99,7 @@ class ObjectsPanel(WithReconstruction, bpy.types.Panel):
 
 
 def describe(item: Any, properties: Any) -> str:
-    """The ID, counts and state of a row in words."""
+    """Return the ID, counts and state of a row as text."""
     words = [f"ID {scene.from_stored(item.object_id)}", f"{item.points:,} points"]
     if item.splats:
         words.append(f"{item.splats:,} splats")
@@ -114,7 +114,7 @@ def describe(item: Any, properties: Any) -> str:
 
 
 def _count(item: Any) -> str:
-    """The number of splats or, before training, of points."""
+    """Return the number of splats or, before training, of points."""
     return "" if item.is_merged else _abbreviate(item.splats or item.points)
 
 

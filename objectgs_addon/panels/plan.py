@@ -40,7 +40,7 @@ class PlanPanel(WithReconstruction, bpy.types.Panel):
 
 
 def _draw_decision(layout: bpy.types.UILayout, properties: Any, decision: Decision) -> None:
-    """A decision as a row, with its reason unless it is carried out."""
+    """Draw a decision as a row, with its reason unless it is carried out."""
     done = planning.is_wanted(properties, decision)
     row = layout.row(align=True)
     if decision.can_override and done is not None:

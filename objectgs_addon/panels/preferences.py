@@ -72,7 +72,7 @@ def _draw_state(layout: bpy.types.UILayout) -> None:
 
 
 def backend_state() -> tuple[str, str]:
-    """The state of the backend as a sentence and an icon."""
+    """Return the state of the backend as a sentence and an icon."""
     return locations.backend_sentence(), "CHECKMARK" if locations.backend_python() is not None else "ERROR"
 
 

@@ -64,7 +64,7 @@ def _can_resume(state: FolderState, properties: Any) -> bool:
 
 
 def _draw_folder_state(layout: bpy.types.UILayout, root: bpy.types.Collection, job: Job | None) -> None:
-    """What the folder holds that no job of this Blender has made."""
+    """Draw the state of the folder that no job of this session has produced."""
     folder, minutes = scene.folder_of(root), root.objectgs.minutes
     state = folder_trust.state_of(root)
     holder = lock_holder(folder)
@@ -88,7 +88,7 @@ def _draw_folder_state(layout: bpy.types.UILayout, root: bpy.types.Collection, j
 
 
 def _draw_expectation(layout: bpy.types.UILayout, state: FolderState, properties: Any) -> None:
-    """The expected quality of a training that is not finished."""
+    """Draw the expected quality of a training that is not finished."""
     steps = PRESET_STEPS.get(properties.length)
     seconds = 60 * properties.minutes if properties.length == "minutes" else None
     if state.steps >= (steps or math.inf) or state.seconds >= (seconds or math.inf) - 0.5:

@@ -59,15 +59,15 @@ def _counted_signals() -> Iterator[list[int]]:
 
 def _watch(job: Job, reporter: Reporter, signals: list[int]) -> None:
     """Poll the job until it ends, and report changes."""
-    handled, told, warned, progress = 0, 0, 0, 0.0
+    handled, reported, warned, progress = 0, 0, 0, 0.0
     while not job.is_finished:
         if len(signals) > handled:
             handled += 1
             job.stop() if handled == 1 else job.kill()
         job.poll()
-        for message in job.statuses[told:]:
+        for message in job.statuses[reported:]:
             reporter.status(message)
-        told = len(job.statuses)
+        reported = len(job.statuses)
         for warning in job.warnings[warned:]:
             reporter.warning(warning)
         warned = len(job.warnings)

@@ -37,8 +37,8 @@ def orient_to_ground(root: bpy.types.Collection, p1: Any, p2: Any, p3: Any) -> N
     if normal.length <= SMALLEST_SINE * first.length * second.length or normal.length == 0.0:
         raise InputError("The three points lie on one line; pick three that span the ground.")
     normal.normalize()
-    eyes = _camera_centers(root)
-    above = sum((eye - p1).dot(normal) for eye in eyes) if eyes else normal.z
+    camera_centers = _camera_centers(root)
+    above = sum((camera_center - p1).dot(normal) for camera_center in camera_centers) if camera_centers else normal.z
     if above < 0.0:
         normal.negate()
     center = (p1 + p2 + p3) / 3.0

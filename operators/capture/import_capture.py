@@ -76,9 +76,9 @@ class ImportCapture(bpy.types.Operator):
 
 
 def _folder_for(capture: Path) -> Path:
-    """A reconstruction folder named after the capture, or after its parent where the capture has a generic name.
+    """Return a reconstruction folder named after the capture, or after its parent if the capture has a generic name.
 
-    It is numbered where that name belongs to another capture or to something else.
+    A number is appended if that name belongs to another capture or to something else.
     """
     name = capture.name if capture.name.lower() not in ("capture", "colmap", "data") else capture.parent.name
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Make the demo capture, for a first try without own photos."""
+"""Make the demo capture, for a first try without your own photos."""
 
 import bpy
 

@@ -58,7 +58,7 @@ class ExportDialog:
         return self._named(Path(bpy.path.abspath(self.filepath)).resolve()), ids
 
     def _named(self, path: Path) -> Path:
-        """The path with the suffix of the format or, of a folder, without a suffix."""
+        """Return the path with the suffix of the format or, for a folder, without a suffix."""
         suffixes = [item.identifier for item in self.properties.bl_rna.properties["format"].enum_items]
         bare = path.with_suffix("") if path.suffix[1:].lower() in suffixes else path
         return bare if self.per_object else bare.with_name(f"{bare.name}.{self.format}")

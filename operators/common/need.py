@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Conditions of operators; each that does not hold says why in the tooltip of the grayed-out button."""
+"""Conditions of operators; one that is not met gives the reason in the tooltip of the disabled button."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from ...objectgs_addon.state.folder_state import folder_state
 
 
 def active_root(context: bpy.types.Context) -> Any:
-    """The active reconstruction's collection, or None."""
+    """Return the active reconstruction's collection, or None."""
     return context.scene.objectgs.active
 
 
 def backend(cls: Any) -> bool:
-    """Whether the compute backend can be run."""
+    """Return whether the compute backend can be run."""
     if locations.backend_python() is not None:
         return True
     cls.poll_message_set(f"{locations.backend_sentence()} See the preferences of ObjectGS")
@@ -33,7 +33,7 @@ def backend(cls: Any) -> bool:
 
 
 def shown(cls: Any, context: bpy.types.Context) -> bool:
-    """Whether there is an active reconstruction, for operators that do not use its folder."""
+    """Return whether there is an active reconstruction, for operators that do not use its folder."""
     if active_root(context) is None:
         cls.poll_message_set("There is no reconstruction in this scene; import a capture first")
         return False
@@ -41,7 +41,7 @@ def shown(cls: Any, context: bpy.types.Context) -> bool:
 
 
 def reconstruction(cls: Any, context: bpy.types.Context) -> bool:
-    """Whether there is an active reconstruction whose folder the user has accepted, and which exists."""
+    """Return whether there is an active reconstruction whose folder the user has accepted, and which exists."""
     if not shown(cls, context):
         return False
     root = active_root(context)
@@ -56,7 +56,7 @@ def reconstruction(cls: Any, context: bpy.types.Context) -> bool:
 
 
 def idle(cls: Any, context: bpy.types.Context) -> bool:
-    """Whether no job uses the active reconstruction's folder, in this or another program."""
+    """Return whether no job uses the active reconstruction's folder, in this or another program."""
     sentence = _use_of(scene.folder_of(active_root(context)))
     if sentence is not None:
         cls.poll_message_set(sentence)
@@ -64,14 +64,14 @@ def idle(cls: Any, context: bpy.types.Context) -> bool:
 
 
 def require_unused(folder: Path) -> None:
-    """Raise InputError where a job uses a reconstruction folder, in this or another program."""
+    """Raise InputError if a job uses a reconstruction folder, in this or another program."""
     sentence = _use_of(folder)
     if sentence is not None:
         raise InputError(sentence)
 
 
 def _use_of(folder: Path) -> str | None:
-    """Who uses a reconstruction folder, as a sentence; None where nobody does."""
+    """Return a sentence about the job or program that uses a reconstruction folder; None if it is unused."""
     if background.busy(folder):
         return f"A job is using {folder}; wait for it to finish or stop it"
     holder = lock_holder(folder)
@@ -82,7 +82,7 @@ def _use_of(folder: Path) -> str | None:
 
 
 def capture(cls: Any, context: bpy.types.Context) -> bool:
-    """Whether the active reconstruction's capture is where it was."""
+    """Return whether the active reconstruction's capture folder exists."""
     folder = scene.folder_of(active_root(context))
     location = folder_state(folder).capture
     if location is None:
@@ -98,7 +98,7 @@ def capture(cls: Any, context: bpy.types.Context) -> bool:
 
 
 def splats(cls: Any, context: bpy.types.Context) -> bool:
-    """Whether the active reconstruction has splats."""
+    """Return whether the active reconstruction has splats."""
     if folder_state(scene.folder_of(active_root(context))).trained:
         return True
     cls.poll_message_set("There are no splats yet; train first")
@@ -106,7 +106,7 @@ def splats(cls: Any, context: bpy.types.Context) -> bool:
 
 
 def training(cls: Any, context: bpy.types.Context) -> bool:
-    """Whether the active reconstruction has a trained model, which imported splats lack."""
+    """Return whether the active reconstruction has a trained model, which imported splats lack."""
     if folder_state(scene.folder_of(active_root(context))).steps:
         return True
     cls.poll_message_set("Meshes need a trained model; train first")
@@ -114,17 +114,17 @@ def training(cls: Any, context: bpy.types.Context) -> bool:
 
 
 def work_on_capture(cls: Any, context: bpy.types.Context) -> bool:
-    """Whether a job on the active reconstruction's capture could start."""
+    """Return whether a job on the active reconstruction's capture could start."""
     return backend(cls) and reconstruction(cls, context) and idle(cls, context) and capture(cls, context)
 
 
 def objects(cls: Any, context: bpy.types.Context) -> bool:
-    """Whether the active reconstruction's folder can be used, and it has a list of objects."""
+    """Return whether the active reconstruction's folder can be used, and it has a list of objects."""
     return reconstruction(cls, context) and listed_objects(cls, context)
 
 
 def listed_objects(cls: Any, context: bpy.types.Context) -> bool:
-    """Whether the active reconstruction has a list of objects, for operators that do not use its folder."""
+    """Return whether the active reconstruction has a list of objects, for operators that do not use its folder."""
     if not shown(cls, context):
         return False
     if active_root(context).objectgs.objects:
@@ -134,7 +134,7 @@ def listed_objects(cls: Any, context: bpy.types.Context) -> bool:
 
 
 def edited(cls: Any, context: bpy.types.Context) -> bool:
-    """Whether the active object, or the one it is merged into, has splats or a mesh that can be edited."""
+    """Return whether the active object, or the one it is merged into, has splats or a mesh that can be edited."""
     if not objects(cls, context):
         return False
     root = active_root(context)
@@ -146,9 +146,9 @@ def edited(cls: Any, context: bpy.types.Context) -> bool:
 
 
 def not_removed(cls: Any, context: bpy.types.Context, addition: str) -> bool:
-    """Whether the active object can be edited and is not removed, unless objects are selected in the viewport.
+    """Return whether the active object can be edited and is not removed, unless objects are selected in the viewport.
 
-    addition: what follows "... is removed" in the message.
+    addition: the text after "... is removed" in the message.
     """
     if not edited(cls, context):
         return False

@@ -26,7 +26,7 @@ def _targets(_operator: Any, context: bpy.types.Context) -> list[tuple[str, str,
 
 
 def _sources(context: bpy.types.Context) -> list[int]:
-    """IDs to merge: the objects selected in the viewport if there are several, else the active one of the list."""
+    """Return the IDs to merge: the objects selected in the viewport if there are several, else the active one."""
     root = need.active_root(context)
     ids = [object_id for object_id in selection.selected_ids(context, root) if object_id]
     return ids if len(ids) > 1 else [scene.from_stored(object_list.active_item(root).object_id)]

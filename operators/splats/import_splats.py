@@ -70,7 +70,7 @@ class ImportSplats(bpy.types.Operator):
 
 
 def _folder_for(ply: Path) -> Path:
-    """A new reconstruction folder, named after the file, or after its parent where the file has a generic name."""
+    """Return a new reconstruction folder named after the file, or after its parent if the file has a generic name."""
     name = ply.parent.name if ply.stem.lower() in ("point_cloud", "splats", "splat") else ply.stem
     return locations.new_reconstruction(name, lambda folder: not folder.exists())
 

@@ -17,7 +17,7 @@ from backend.capture import load_capture
 from backend.cli import main as arguments
 from backend.labels import vote
 
-from .asking import Answer
+from .command_result import CommandResult
 
 MODELS = [
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
@@ -70,15 +70,15 @@ def sphere_ids(rays: np.ndarray, viewmat: np.ndarray, spheres: list) -> tuple[np
     return ids, best
 
 
-def look_at(eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the quaternion (w, x, y, z) and world-to-camera matrix of a camera at `eye` that looks at the origin."""
-    forward = -eye / np.linalg.norm(eye)
+def look_at(camera_center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the quaternion (w, x, y, z) and world-to-camera matrix of a camera that looks at the origin."""
+    forward = -camera_center / np.linalg.norm(camera_center)
     right = np.cross(forward, [0.0, -1.0, 0.0])
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
     x, y, z, w = pycolmap.Rotation3d(rotation).quat
     viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ camera_center
     return np.array([w, x, y, z]), viewmat
 
 
@@ -199,15 +199,15 @@ def write_capture(tmp_path):
 
 
 @pytest.fixture
-def ask(capsys):
-    """Function that runs a command in this process; with `--json`, the answer has events."""
+def run_command(capsys):
+    """Function that runs a command in this process; with `--json`, the result has events."""
     threads = numba.get_num_threads(), torch.get_num_threads()
 
-    def run(*words) -> Answer:
+    def run(*words) -> CommandResult:
         capsys.readouterr()
         code = arguments.main([*map(str, words), "--threads", "1"])
-        said = capsys.readouterr()
-        return Answer(code, said.out, said.err)
+        captured = capsys.readouterr()
+        return CommandResult(code, captured.out, captured.err)
 
     yield run
     numba.set_num_threads(threads[0])

@@ -17,7 +17,7 @@ from tests.backend.test_raster_stiff import assert_same_bits, draw
 PLANES = ("want_depth", "want_median", "want_normals", "want_distortion")
 
 
-def test_this_is_the_simulator():
+def test_simulator_is_enabled():
     assert simulated()
 
 
@@ -31,7 +31,7 @@ def turn_around(values, with_barrier):
     values[i] = shared[63 - i]
 
 
-def test_a_missing_barrier_gives_a_wrong_result():
+def test_missing_barrier_gives_wrong_result():
     right, wrong = (torch.arange(64.0) for _ in range(2))
     launch(turn_around, 1, 64, right, True)
     assert torch.equal(right, torch.arange(64.0).flip(0))
@@ -47,7 +47,7 @@ def fail_in_one_thread(values):
     cuda.syncthreads()
 
 
-def test_an_error_in_a_thread_ends_the_kernel():
+def test_error_in_thread_ends_kernel():
     with pytest.raises(ValueError, match="thread five"):
         launch(fail_in_one_thread, 3, 32, torch.zeros(1))
 
@@ -60,14 +60,14 @@ def count_up(values):
 
 
 @pytest.mark.parametrize("count", [0, 1, 31, 32, 129])
-def test_a_thread_for_each(count):
+def test_launch_runs_one_thread_per_element(count):
     values = torch.zeros(max(count, 1))
     launch_for_each(count_up, count, values)
     assert values.sum() == count
 
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
-def test_too_little_capacity_for_the_intersections(primitive, monkeypatch):
+def test_insufficient_intersection_capacity_is_increased(primitive, monkeypatch):
     """The intersections and the image are recomputed, with the same result."""
     made = []
     tile_intersections = cuda_bin.tile_intersections
@@ -88,7 +88,7 @@ def test_too_little_capacity_for_the_intersections(primitive, monkeypatch):
     ("primitive", "wanted"),
     [("3d", name) for name in ("", "labels", *PLANES[:2])] + [("2d", name) for name in ("", "labels", *PLANES)],
 )
-def test_each_plane_alone_is_as_among_the_others(wanted, primitive):
+def test_single_plane_matches_all_planes(wanted, primitive):
     flat = primitive == "2d"
     cam = camera()
     labels = torch.tensor(np.random.default_rng(0).integers(-1, 5, (cam.height, cam.width)), dtype=torch.int32)
@@ -96,13 +96,13 @@ def test_each_plane_alone_is_as_among_the_others(wanted, primitive):
     planes = []
     for everything in (False, True):
         scene = {k: v.requires_grad_(k != "ids") for k, v in as_float32(random_scene(2, count=25)).items()}
-        asked = {name: (everything and (flat or name in PLANES[:2])) or name == wanted for name in PLANES}
-        picture = rasterize(
+        wanted_planes = {name: (everything and (flat or name in PLANES[:2])) or name == wanted for name in PLANES}
+        rendered = rasterize(
             **scene, camera=cam, labels=labels if everything or wanted == "labels" else None, primitive=primitive,
-            **asked,
+            **wanted_planes,
         )  # fmt: skip
-        here = [picture.color, picture.alpha]
-        for name, plane in zip(("labels", *PLANES), picture[2:7], strict=True):
+        here = [rendered.color, rendered.alpha]
+        for name, plane in zip(("labels", *PLANES), rendered[2:7], strict=True):
             assert (plane is not None) == ((everything and (flat or name in ("labels", *PLANES[:2]))) or name == wanted)
             if name == wanted:
                 here.append(plane)
@@ -119,7 +119,7 @@ def test_each_plane_alone_is_as_among_the_others(wanted, primitive):
 
 
 @pytest.mark.parametrize("flat", [False, True])
-def test_meets_the_same_tiles_as_the_cpu_renderer(flat):
+def test_tile_intersections_match_cpu_renderer(flat):
     """In an image of one CPU tile, that tile has the same splats as the 8 small CUDA tiles together."""
     cam = camera(64, 32)
     scene = as_float32(random_scene(4, count=50))
@@ -141,7 +141,7 @@ def test_meets_the_same_tiles_as_the_cpu_renderer(flat):
 
 
 @pytest.fixture
-def uninitialized_memory_filled():
+def filled_uninitialized_memory():
     """Make torch fill uninitialized memory with NaN or the largest integer."""
     torch.use_deterministic_algorithms(True)
     yield
@@ -149,23 +149,23 @@ def uninitialized_memory_filled():
 
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
-def test_splats_below_the_transmittance_threshold_have_no_gradient(primitive, uninitialized_memory_filled):
+def test_splats_below_the_transmittance_threshold_have_no_gradient(primitive, filled_uninitialized_memory):
     scene = as_float32(random_scene(0, count=20))
     scene["means"] = torch.tensor([[0.0, 0.0, 1.0 + 0.1 * i] for i in range(20)])
     scene["scales"][:] = 50.0
     scene["quats"] = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(20, 1)
     scene["opacities"][:] = 0.98
     leaves = {k: v.requires_grad_(k != "ids") for k, v in scene.items()}
-    picture = rasterize(**leaves, camera=camera(), want_depth=True, primitive=primitive)
-    assert picture.frame.isect_counts.tolist() == [3] * picture.frame.isect_counts.numel()
-    (picture.color.sum() + picture.alpha.sum() + picture.depth.sum()).backward()
+    rendered = rasterize(**leaves, camera=camera(), want_depth=True, primitive=primitive)
+    assert rendered.frame.isect_counts.tolist() == [3] * rendered.frame.isect_counts.numel()
+    (rendered.color.sum() + rendered.alpha.sum() + rendered.depth.sum()).backward()
     for name in NAMES:
         gradient = leaves[name].grad
         assert torch.isfinite(gradient).all() and not gradient[3:].any(), name
     assert leaves["opacities"].grad[:2].all()
 
 
-def test_more_splats_in_a_tile_than_fit_in_shared_memory():
+def test_tile_with_more_splats_than_shared_memory():
     """The splats are faint, so that all of them are drawn."""
     scene = as_float32(random_scene(0, count=STAGED + 150, size=0.3))
     scene["opacities"] *= 0.02

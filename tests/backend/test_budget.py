@@ -49,7 +49,7 @@ def converged_after(octave):
     return LOOKAHEAD / (2 ** (WORTHWHILE_DB / octave) - 1)
 
 
-def test_convergence_follows_the_logarithm_of_the_steps():
+def test_convergence_step_follows_log_of_steps():
     steps = range(WARM_UP, 4100, 100)
     assert convergence_step(curve_of(steps, lambda s: 20 + 0.7 * math.log2(s))) == pytest.approx(converged_after(0.7))
     # Values before the latest octaves, and before convergence is first checked, have no effect.
@@ -60,23 +60,23 @@ def test_convergence_follows_the_logarithm_of_the_steps():
 
 
 @pytest.mark.parametrize("octave", [1e-9, 1e-3, 0.0, -1e-9, -1.0])
-def test_a_curve_that_hardly_rises_has_converged(octave):
+def test_nearly_flat_curve_has_converged(octave):
     assert convergence_step(curve_of(range(WARM_UP, 4100, 100), lambda s: 30 + octave * math.log2(s))) < 1
 
 
-def test_a_short_curve_has_not_converged():
+def test_short_curve_has_not_converged():
     assert convergence_step([]) is None
     assert convergence_step(curve_of([900, 950, 1000, 1010, 1020], lambda s: 30.0)) is None
     assert convergence_step(curve_of([700, 2000], lambda s: 30.0)) is None
 
 
-def test_without_held_out_views_the_loss_decides():
+def test_loss_is_used_without_held_out_views():
     steps = range(WARM_UP, 3 * WARM_UP, 100)
     entries = [{"step": s, "psnr": None, "loss_db": 10 + 2 * math.log2(s)} for s in steps]
     assert convergence_step(entries) == pytest.approx(converged_after(2.0))
 
 
-def test_a_curve_that_flattens_ends_the_training_soon_after():
+def test_training_ends_soon_after_plateau():
     flat = 3000
     end = walk(PRESETS["final"], lambda step: 20 + 3 * math.log2(min(step, flat) + 1))
     assert flat < end.converged_at < 2.5 * flat
@@ -84,14 +84,14 @@ def test_a_curve_that_flattens_ends_the_training_soon_after():
     assert end.curve[-1]["step"] == end.step
 
 
-def test_one_bad_measurement_does_not_end_a_rising_curve():
+def test_single_outlier_does_not_end_training():
     def psnr(step):
         return 20 + 2 * math.log2(step + 1) - 5 * (3000 < step < 3200)
 
     assert walk(PRESETS["final"], psnr, longest=int(0.95 * converged_after(2.0))).converged_at == 0
 
 
-def test_it_ends_where_more_steps_are_not_worth_it():
+def test_training_ends_when_gain_falls_below_threshold():
     where = converged_after(1.0)
     known = curve_of(range(WARM_UP, 2000, 100), lambda step: math.log2(step))
     assert convergence_step(known) == pytest.approx(where)
@@ -100,7 +100,7 @@ def test_it_ends_where_more_steps_are_not_worth_it():
     assert walk(PRESETS["final"], lambda step: step / LOOKAHEAD, longest=20_000).converged_at == 0
 
 
-def test_noise_of_the_measurements_moves_the_end_little():
+def test_convergence_is_robust_to_noise():
     rng = np.random.default_rng(0)
     where = converged_after(0.6)
     for noise, times in ((0.05, 1.4), (0.2, 2.0)):
@@ -113,11 +113,11 @@ def test_noise_of_the_measurements_moves_the_end_little():
             assert where / times < end.converged_at < times * where
 
 
-def test_no_training_converges_before_the_warm_up():
+def test_no_convergence_before_warm_up():
     assert walk(PRESETS["final"], lambda step: 30.0).converged_at >= WARM_UP
 
 
-def test_growth_goes_on_as_long_as_anchors_become_more():
+def test_growth_lasts_while_anchor_count_rises():
     def until(anchors):
         """Return the step of the measurement that ends growth; None: anchors grow to the end."""
         budget, p = PRESETS["final"], TrainingProgress()
@@ -138,19 +138,19 @@ def test_growth_goes_on_as_long_as_anchors_become_more():
     assert walk(PRESETS["final"], math.log1p, 5000, anchors=lambda step: 1000 + 500 * (step > 2500)).grown
 
 
-def test_curves_that_do_not_count_anchors_leave_growth_on():
+def test_curve_without_anchor_counts_keeps_growth():
     p = TrainingProgress(step=3000, curve=curve_of(range(WARM_UP, 3000, 300), lambda step: step))
     assert not PRESETS["final"].check_convergence(p) and not p.grown
 
 
-def test_a_training_until_converged_ends_at_its_time_limit():
+def test_time_limit_ends_training_until_converged():
     for a_step in (0.05, 1.0):
         end = walk(Budget(seconds=100.0, until_converged=True), lambda step: math.log2(step + 1), seconds_a_step=a_step)
         assert end.seconds == pytest.approx(100, abs=3 * a_step)
         assert end.converged_at
 
 
-def test_remaining_is_unknown_until_the_curve_tells():
+def test_remaining_time_is_estimated_from_curve():
     p, final = TrainingProgress(step=1000, seconds=50.0), PRESETS["final"]
     assert final.remaining(p, 0.05) is None and final.displayed_progress(p) == 1000 / (1000 + LOOKAHEAD)
     assert Budget(seconds=80.0, until_converged=True).remaining(p, 0.05) == pytest.approx(30.0)
@@ -167,17 +167,17 @@ def test_remaining_is_unknown_until_the_curve_tells():
     assert Budget(seconds=80.0).remaining(p, 0.05) == pytest.approx(30.0)
 
 
-def test_a_training_of_known_length_is_measured_ten_times_and_at_its_end():
+def test_fixed_length_training_is_evaluated_at_ten_steps():
     end = walk(Budget(steps=1000), lambda step: 30.0)
     assert [entry["step"] for entry in end.curve] == [20, 50, 100, 200, 350, 500, 650, 800, 900, 1000]
 
 
-def test_a_finished_training_is_finished_when_asked_again():
+def test_finished_training_has_full_progress():
     end = walk(PRESETS["final"], lambda step: 30.0)
     assert PRESETS["final"].progress(end) == 1.0
 
 
-def test_rates_fall_little_on_the_plateau_and_reach_their_end():
+def test_learning_rates_decay_slowly_on_plateau():
     ends = (1.0, 0.01)
     assert rate(ends, 0.0) == 1.0 and rate(ends, 1.0) == pytest.approx(0.01)
     assert rate(ends, PLATEAU_UNTIL) > 0.7 * rate(ends, PLATEAU_FROM)

@@ -31,10 +31,10 @@ def fixture(name: str) -> Path:
     return FIXTURES / name
 
 
-def refused(folder: Path, tmp_path: Path, *words: str, **options) -> str:
+def assert_load_rejected(folder: Path, tmp_path: Path, *words: str, **options) -> str:
     """Check that loading fails with a sentence that contains `words`, leaves no partial files, and that `check_capture`
     reports the same problem."""
-    cache = tmp_path / "cache-of-refused"
+    cache = tmp_path / "cache-of-rejected"
     with pytest.raises(InputError) as caught:
         load_capture(folder, cache, **options)
     sentence = str(caught.value)
@@ -47,10 +47,10 @@ def refused(folder: Path, tmp_path: Path, *words: str, **options) -> str:
     return sentence
 
 
-# What a capture is
+# Loading
 
 
-def test_views_points_and_masks_are_what_was_written(write_capture, tmp_path):
+def test_loading_restores_views_points_and_masks(write_capture, tmp_path):
     scene = write_capture(views=9)
     capture = load_capture(scene.folder, tmp_path / "cache")
     assert [view.name for view in capture.views] == sorted(scene.names)
@@ -76,10 +76,10 @@ def test_views_points_and_masks_are_what_was_written(write_capture, tmp_path):
     assert capture.test_indices == (0, HOLDOUT_EVERY) and len(capture.train_indices) == 7
     assert not set(capture.test_indices) & set(capture.train_indices)
     assert capture.counts["registered"] == capture.counts["masks"] == 9
-    assert list((tmp_path / "cache" / "views").glob("*.png")) == [], "a pinhole image is used where it lies"
+    assert list((tmp_path / "cache" / "views").glob("*.png")) == [], "pinhole images are used in place"
 
 
-def test_text_and_binary_models_are_the_same(write_capture, tmp_path):
+def test_text_and_binary_models_load_equally(write_capture, tmp_path):
     names = ["a b.png", "日本/x  y.png", " #1.png".strip(), "UPPER name.PNG", "back\\slash.png", "z.png"]
     one = write_capture(name="one", names=names, suffix=".bin")
     two = write_capture(name="two", names=names, suffix=".txt")
@@ -92,7 +92,7 @@ def test_text_and_binary_models_are_the_same(write_capture, tmp_path):
         np.testing.assert_array_equal(a.keypoints(i).point_index, b.keypoints(i).point_index)
 
 
-def test_reading_agrees_with_pycolmap(write_capture):
+def test_read_model_matches_pycolmap(write_capture):
     scene = write_capture(model="OPENCV", params=[80, 82, 47, 37, 0.05, -0.02, 0.001, 0.002])
     folder = scene.folder / "sparse" / "0"
     theirs, ours = pycolmap.Reconstruction(str(folder)), read_model(folder)
@@ -103,7 +103,7 @@ def test_reading_agrees_with_pycolmap(write_capture):
     assert list(theirs.cameras[1].params) == list(ours.cameras[1].params)
 
 
-def test_camera_models_are_colmaps():
+def test_camera_models_match_colmap():
     for number, (name, count) in CAMERA_MODELS.items():
         model = getattr(pycolmap.CameraModelId, name)
         assert int(model) == number
@@ -111,7 +111,7 @@ def test_camera_models_are_colmaps():
         assert len(made.params) == count
 
 
-def test_reduced_images_masks_and_intrinsics_belong_together(write_capture, tmp_path):
+def test_downscaled_images_masks_and_intrinsics_match(write_capture, tmp_path):
     scene = write_capture(size=(97, 74))
     capture = load_capture(scene.folder, tmp_path / "cache")
     full = np.asarray(Image.open(capture.views[1].image_file)).astype(float)
@@ -130,13 +130,13 @@ def test_reduced_images_masks_and_intrinsics_belong_together(write_capture, tmp_
         capture.image(1, 100)
 
 
-def test_few_views_hold_none_out(write_capture, tmp_path):
+def test_few_views_have_no_held_out_views(write_capture, tmp_path):
     capture = load_capture(write_capture(views=2).folder, tmp_path / "cache")
     assert capture.test_indices == () and capture.train_indices == (0, 1)
     assert any("held out" in warning for warning in capture.warnings)
 
 
-def test_memory_is_bounded_and_threads_agree(write_capture, tmp_path):
+def test_image_cache_limits_memory_across_threads(write_capture, tmp_path):
     scene = write_capture(views=8)
     size = 96 * 72 * 3
     capture = load_capture(scene.folder, tmp_path / "cache", memory_mb=2.5 * size / 1e6)
@@ -156,13 +156,13 @@ def test_memory_is_bounded_and_threads_agree(write_capture, tmp_path):
     assert not wrong
     assert 0 < capture._cache.bytes <= 2.5 * size
     assert capture._cache.bytes == sum(array.nbytes for array in capture._cache._arrays.values())
-    assert capture.image(7) is capture.image(7), "the last image is held"
+    assert capture.image(7) is capture.image(7), "the last image stays cached"
     with pytest.raises(ValueError):
         capture.image(7)[0] = 0
 
 
 @pytest.mark.parametrize("mode", ["L", "LA", "RGBA", "P", "I;16", "CMYK", "1"])
-def test_images_of_every_kind_become_rgb(write_capture, tmp_path, mode):
+def test_image_modes_are_converted_to_rgb(write_capture, tmp_path, mode):
     scene = write_capture(views=3, names=[f"{i}.{'tif' if mode == 'CMYK' else 'png'}" for i in range(3)])
     for name in scene.names:
         gray = np.tile(np.linspace(0, 255, 96).astype(np.uint8), (72, 1))
@@ -211,7 +211,7 @@ def lens_of(name: str, width: int = 640, height: int = 480) -> Camera:
 
 @pytest.mark.parametrize("name", LENSES)
 @pytest.mark.parametrize("max_size", [0, 400])
-def test_known_points_land_where_the_pinhole_says(write_capture, tmp_path, name, max_size):
+def test_undistorted_points_match_pinhole_projection(write_capture, tmp_path, name, max_size):
     """Spots painted at the projections of pycolmap's distorted camera appear at those of the undistorted K."""
     camera = lens_of(name)
     scene = write_capture(
@@ -274,7 +274,7 @@ def test_keypoints_are_undistorted(write_capture, tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["OPENCV", "THIN_PRISM_FISHEYE", "RADIAL with a barrel"])
-def test_undistorted_masks_are_the_pinholes(write_capture, tmp_path, name):
+def test_undistorted_masks_match_pinhole_rendering(write_capture, tmp_path, name):
     sphere_ids = write_capture.sphere_ids
 
     camera = lens_of(name)
@@ -296,7 +296,7 @@ def test_undistorted_masks_are_the_pinholes(write_capture, tmp_path, name):
         assert (mask == truth).mean() > 0.995
 
 
-def test_fold_over_is_culled():
+def test_distortion_fold_over_is_cropped():
     """The view must end before the fold, beyond which rays project into the image a second time."""
     camera = Camera(1, "SIMPLE_RADIAL", 200, 150, (100.0, 100.0, 75.0, -0.5))
     target = pinhole_for(camera, Path("cameras.bin"), 0)
@@ -306,7 +306,7 @@ def test_fold_over_is_culled():
     assert (np.diff(at[1], axis=1) > 0).all() and (np.diff(at[0], axis=0) > 0).all()
 
 
-def test_a_wide_fisheye_is_clamped():
+def test_wide_fisheye_is_limited_to_120_degrees():
     camera = Camera(1, "OPENCV_FISHEYE", 1000, 1000, (260.0, 260.0, 500.0, 500.0, 0.0, 0.0, 0.0, 0.0))
     target = pinhole_for(camera, Path("cameras.bin"), 0)
     assert 2 * np.degrees(np.arctan(target.width / 2 / target.K[0, 0])) == pytest.approx(120, abs=0.5)
@@ -317,12 +317,12 @@ def test_a_wide_fisheye_is_clamped():
     [(4.95, 960, 540, 343.1), (400, 960, 540, 343.1), (1000, 960, 540, -40.0), (0.0, 960, 540, 0.0),
      (1e9, 960, 540, 0.1), (-900.0, 960, 540, 0.0), (900.0, 1e7, 540, 0.0)],
 )  # fmt: skip
-def test_impossible_lenses_are_refused(params):
+def test_degenerate_lenses_are_rejected(params):
     with pytest.raises(InputError, match=r"cameras\.bin gives camera 1 \(SIMPLE_RADIAL\).*degenerate"):
         pinhole_for(Camera(1, "SIMPLE_RADIAL", 1920, 1080, tuple(map(float, params))), Path("cameras.bin"), 0)
 
 
-def test_random_lenses_never_make_garbage():
+def test_random_lenses_give_valid_pinholes_or_errors():
     rng = np.random.default_rng(0)
     made = 0
     for _ in range(200):
@@ -340,16 +340,16 @@ def test_random_lenses_never_make_garbage():
     assert made > 5
 
 
-def test_a_panorama_is_refused_by_name(write_capture, tmp_path):
+def test_panorama_camera_is_rejected(write_capture, tmp_path):
     scene = write_capture(masks=False)
     (scene.folder / "sparse/0/cameras.bin").write_bytes(struct.pack("<QIiQQ2d", 1, 1, 17, 96, 72, 96, 72))
-    refused(scene.folder, tmp_path, "cameras.bin", "EQUIRECTANGULAR", "panorama")
+    assert_load_rejected(scene.folder, tmp_path, "cameras.bin", "EQUIRECTANGULAR", "panorama")
 
 
 # The cache
 
 
-def test_the_cache_is_used_and_follows_its_sources(write_capture, tmp_path):
+def test_cache_is_reused_and_updated_with_sources(write_capture, tmp_path):
     scene = write_capture(views=3, model="SIMPLE_RADIAL", params=[90, 48, 36, 0.1])
     cache = tmp_path / "cache"
 
@@ -360,7 +360,7 @@ def test_the_cache_is_used_and_follows_its_sources(write_capture, tmp_path):
     first, times = load()
     assert all(view.image_file.parent == cache / "views" for view in first.views)
     second, again = load()
-    assert times == again, "nothing changed, so nothing is made anew"
+    assert times == again, "unchanged files are not recreated"
     np.testing.assert_array_equal(second.object_ids, first.object_ids)
     path = scene.folder / "images" / scene.names[1]
     Image.fromarray(np.full((72, 96, 3), 200, np.uint8)).save(path)
@@ -374,7 +374,7 @@ def test_the_cache_is_used_and_follows_its_sources(write_capture, tmp_path):
     assert {path.suffix for path in (cache / "views").iterdir()} <= {".png", ".json"}
 
 
-def test_a_killed_run_leaves_nothing_half_and_the_next_goes_on(write_capture, tmp_path, monkeypatch):
+def test_interrupted_load_leaves_no_partial_files_and_resumes(write_capture, tmp_path, monkeypatch):
     import backend.capture.prepare as module
 
     scene = write_capture(views=5, model="SIMPLE_RADIAL", params=[90, 48, 36, 0.1])
@@ -397,7 +397,7 @@ def test_a_killed_run_leaves_nothing_half_and_the_next_goes_on(write_capture, tm
     assert len(load_capture(scene.folder, tmp_path / "cache").views) == 5
 
 
-def test_a_full_disk_is_one_sentence(write_capture, tmp_path, monkeypatch):
+def test_full_disk_is_reported(write_capture, tmp_path, monkeypatch):
     import backend.capture.prepare as module
 
     def full(path, image):
@@ -409,7 +409,7 @@ def test_a_full_disk_is_one_sentence(write_capture, tmp_path, monkeypatch):
         load_capture(scene.folder, tmp_path / "cache")
 
 
-def test_images_are_reduced_to_the_largest_size(write_capture, tmp_path):
+def test_images_are_reduced_to_max_size(write_capture, tmp_path):
     scene = write_capture(views=3, size=(96, 72))
     capture = load_capture(scene.folder, tmp_path / "cache", max_size=50)
     view = capture.views[1]
@@ -424,7 +424,7 @@ def test_images_are_reduced_to_the_largest_size(write_capture, tmp_path):
     assert other.image(2).shape == (30, 40, 3) and capture.image(2).shape == (38, 50, 3), "both sizes stay usable"
 
 
-def test_a_file_that_changes_while_in_use_is_named(write_capture, tmp_path):
+def test_image_changed_after_loading_is_reported(write_capture, tmp_path):
     scene = write_capture(views=3)
     capture = load_capture(scene.folder, tmp_path / "cache")
     Image.new("RGB", (10, 10)).save(scene.folder / "images" / scene.names[0])
@@ -444,7 +444,7 @@ def expected_ids(scene, index: int, code) -> np.ndarray:
     ["8 bit", "16 bit", "palette", "1 bit", "2 bit", "4 bit", "gray rgb", "rgb", "rgba", "npy", "npy float", "npz",
      "npz named", "appended", "npy 3d", "bool", "tif"],
 )  # fmt: skip
-def test_every_mask_format(write_capture, tmp_path, kind):
+def test_mask_formats_are_read(write_capture, tmp_path, kind):
     scene = write_capture(views=4, names=[f"robot/{i}.png" for i in range(4)])
     code = {"16 bit": {1: 300, 2: 65_535}, "rgb": {1: 255, 2: 65_793, 5: 16_000_000}, "rgba": {1: 255, 2: 256},
             "npy": {1: 70_000, 2: 4_294_967_295}, "npz": {1: 70_000}, "1 bit": {2: 1, 5: 1}, "bool": {2: 1, 5: 1},
@@ -513,7 +513,7 @@ def low_bit_png(ids: np.ndarray, bits: int) -> bytes:
     )
 
 
-def test_gray_or_color_is_decided_for_the_capture(write_capture, tmp_path):
+def test_mask_color_coding_is_detected_per_capture(write_capture, tmp_path):
     """A color-coded ID can be gray, and a view may show no other ID: 65,793 is (1, 1, 1)."""
     scene = write_capture(views=3)
     for index, name in enumerate(scene.names):
@@ -527,7 +527,7 @@ def test_gray_or_color_is_decided_for_the_capture(write_capture, tmp_path):
 
 
 @pytest.mark.parametrize("size", [(48, 36), (192, 144), (95, 72)])
-def test_a_mask_of_another_size_and_equal_shape_is_taken_nearest(write_capture, tmp_path, size):
+def test_masks_of_other_size_are_resized_nearest(write_capture, tmp_path, size):
     scene = write_capture(views=3)
     for index, name in enumerate(scene.names):
         ids = Image.fromarray(scene.ids[index].astype(np.uint8)).resize(size, Image.Resampling.NEAREST)
@@ -538,7 +538,7 @@ def test_a_mask_of_another_size_and_equal_shape_is_taken_nearest(write_capture, 
         assert mask is not None and mask.shape == (72, 96) and (mask == scene.ids[index]).mean() > 0.95
 
 
-def test_some_masks_may_be_missing_but_not_most(write_capture, tmp_path):
+def test_few_missing_masks_are_allowed(write_capture, tmp_path):
     scene = write_capture(views=6)
     for name in scene.names[:3]:
         (scene.folder / "masks" / name).unlink()
@@ -546,10 +546,10 @@ def test_some_masks_may_be_missing_but_not_most(write_capture, tmp_path):
     assert capture.mask(0) is None and capture.mask(4) is not None and capture.counts["masks"] == 3
     assert any("3 of 6 images have no mask" in warning for warning in capture.warnings)
     (scene.folder / "masks" / scene.names[3]).unlink()
-    refused(scene.folder, tmp_path, "masks/view_000.png", "missing", "4 of 6")
+    assert_load_rejected(scene.folder, tmp_path, "masks/view_000.png", "missing", "4 of 6")
 
 
-def test_no_masks_at_all(write_capture, tmp_path):
+def test_capture_without_masks_loads(write_capture, tmp_path):
     capture = load_capture(write_capture(masks=False).folder, tmp_path / "cache")
     assert not capture.has_masks and capture.mask(0) is None and len(capture.object_ids) == 0
 
@@ -560,7 +560,7 @@ def test_no_masks_at_all(write_capture, tmp_path):
      ('[{"id": 7, "name": "cup"}]', {7: "cup"}), ("# names\n7 cup\n9: big box\n", {7: "cup", 9: "big box"}),
      ("{}", {})],
 )  # fmt: skip
-def test_names(write_capture, tmp_path, text, expected):
+def test_label_files_are_read(write_capture, tmp_path, text, expected):
     scene = write_capture(masks=False)
     (scene.folder / ("labels.json" if text[0] in "{[" else "labels.txt")).write_text(text)
     assert load_capture(scene.folder, tmp_path / "cache").names == expected
@@ -569,7 +569,7 @@ def test_names(write_capture, tmp_path, text, expected):
 # Finding files
 
 
-def test_names_are_found_however_unicode_and_separators_are_written(write_capture, tmp_path):
+def test_image_names_match_across_unicode_forms_and_separators(write_capture, tmp_path):
     names = ["Cámara.png", "dir/b.png", "plain.PNG"]
     scene = write_capture(names=names, masks=False)
     scene.names = [unicodedata.normalize("NFD", names[0]), "dir\\b.png", "PLAIN.png"]
@@ -595,7 +595,7 @@ def test_missing_and_unregistered_images_are_counted(write_capture, tmp_path):
 
 
 @pytest.mark.parametrize("layout", ["sparse/0", "sparse", "."])
-def test_where_a_model_may_lie(write_capture, tmp_path, layout):
+def test_model_is_found_in_supported_folders(write_capture, tmp_path, layout):
     scene = write_capture()
     target = scene.folder / layout
     for path in list((scene.folder / "sparse/0").iterdir()):
@@ -605,7 +605,7 @@ def test_where_a_model_may_lie(write_capture, tmp_path, layout):
     assert len(load_capture(scene.folder, tmp_path / "cache").views) == 6
 
 
-def test_the_largest_of_several_models_is_used(write_capture, tmp_path):
+def test_largest_model_is_used(write_capture, tmp_path):
     scene, other = write_capture(name="main", views=3), write_capture(name="other", views=6)
     (other.folder / "sparse/0").rename(scene.folder / "sparse/1")
     for name in other.names:
@@ -615,10 +615,10 @@ def test_the_largest_of_several_models_is_used(write_capture, tmp_path):
     assert len(capture.views) == 6 and any("1 (6 images) is used, not 0 (3 images)" in w for w in capture.warnings)
 
 
-# Bad input
+# Invalid input
 
 
-def spoil(scene, what: str) -> tuple[str, ...]:
+def corrupt(scene, what: str) -> tuple[str, ...]:
     """Break the capture and return the words that the error must contain."""
     model, images, masks = scene.folder / "sparse/0", scene.folder / "images", scene.folder / "masks"
     first = scene.names[0]
@@ -626,13 +626,13 @@ def spoil(scene, what: str) -> tuple[str, ...]:
         name = what.split()[0]
         (model / name).unlink()
         return name, "missing"
-    if what.endswith("is cut short"):
+    if what.endswith("is truncated"):
         path = model / what.split()[0]
         path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
-        return path.name, "cut short"
+        return path.name, "truncated"
     if what.endswith("is empty"):
         (model / what.split()[0]).write_bytes(b"")
-        return what.split()[0], "cut short"
+        return what.split()[0], "truncated"
     data = bytearray((model / "images.bin").read_bytes())
     if what == "no pose":
         (model / "images.bin").write_bytes(struct.pack("<Q", 0))
@@ -694,7 +694,7 @@ def spoil(scene, what: str) -> tuple[str, ...]:
     if what == "JPEG mask in disguise":
         Image.new("L", (96, 72)).save(path, "JPEG")
         return f"masks/{first}", "JPEG"
-    if what == "picture mask":
+    if what == "photo as mask":
         for name in scene.names:
             noise = np.random.default_rng(0).integers(0, 255, (72, 96, 3)).astype(np.uint8)
             Image.fromarray(noise).save(masks / name)
@@ -724,44 +724,44 @@ def spoil(scene, what: str) -> tuple[str, ...]:
 
 @pytest.mark.parametrize(
     "what",
-    ["cameras.bin is missing", "images.bin is missing", "points3D.bin is missing", "cameras.bin is cut short",
-     "images.bin is cut short", "points3D.bin is cut short", "images.bin is empty", "no pose", "NaN pose",
+    ["cameras.bin is missing", "images.bin is missing", "points3D.bin is missing", "cameras.bin is truncated",
+     "images.bin is truncated", "points3D.bin is truncated", "images.bin is empty", "no pose", "NaN pose",
      "zero rotation", "infinite position", "absent camera", "outside name", "3 points", "unknown model", "NaN camera",
      "degenerate camera", "image size", "damaged image", "not an image", "no images", "no images folder", "mask size",
-     "JPEG mask", "JPEG mask in disguise", "picture mask", "damaged mask", "fractional mask", "NaN mask",
+     "JPEG mask", "JPEG mask in disguise", "photo as mask", "damaged mask", "fractional mask", "NaN mask",
      "negative mask", "too large mask", "vector mask", "text mask", "pickled mask", "empty npz"],
 )  # fmt: skip
-def test_bad_input_is_one_sentence(write_capture, tmp_path, what):
+def test_invalid_input_is_reported_in_one_sentence(write_capture, tmp_path, what):
     scene = write_capture()
-    refused(scene.folder, tmp_path, *spoil(scene, what))
+    assert_load_rejected(scene.folder, tmp_path, *corrupt(scene, what))
 
 
-def test_no_folder_no_model_no_cache(write_capture, tmp_path):
-    refused(tmp_path / "nowhere", tmp_path, "nowhere", "does not exist")
+def test_missing_folder_model_or_cache_is_reported(write_capture, tmp_path):
+    assert_load_rejected(tmp_path / "nowhere", tmp_path, "nowhere", "does not exist")
     (tmp_path / "file").write_text("")
-    refused(tmp_path / "file", tmp_path, "is a file")
+    assert_load_rejected(tmp_path / "file", tmp_path, "is a file")
     (tmp_path / "empty").mkdir()
-    refused(tmp_path / "empty", tmp_path, "no COLMAP model", "sparse/0")
+    assert_load_rejected(tmp_path / "empty", tmp_path, "no COLMAP model", "sparse/0")
     with pytest.raises(InputError, match="cannot be written"):
         load_capture(write_capture().folder, tmp_path / "file" / "cache")
 
 
 @pytest.mark.parametrize("text", ["not json", "[1, 2]", '"x"', '{"a": "b"}', '{"-4": "b"}', '{"99999999999": "b"}'])
-def test_bad_names(write_capture, tmp_path, text):
+def test_invalid_label_files_are_rejected(write_capture, tmp_path, text):
     scene = write_capture()
     (scene.folder / "labels.json").write_text(text)
-    refused(scene.folder, tmp_path, "labels.json")
+    assert_load_rejected(scene.folder, tmp_path, "labels.json")
 
 
 @pytest.mark.parametrize("line", ["1 1 0 0 0 0 0", "1 a 0 0 0 0 0 0 1 x.png", "1 1 0 0 0 0 0 3 1 x.png\n1.0 2.0"])
-def test_malformed_text_names_the_line(write_capture, tmp_path, line):
+def test_malformed_text_model_reports_line(write_capture, tmp_path, line):
     scene = write_capture(suffix=".txt")
     path = scene.folder / "sparse/0/images.txt"
     path.write_text("# comment\n" + line)
-    refused(scene.folder, tmp_path, "images.txt", f"line {2 + line.count(chr(10))}")
+    assert_load_rejected(scene.folder, tmp_path, "images.txt", f"line {2 + line.count(chr(10))}")
 
 
-def test_points_that_are_not_finite_are_left_out(write_capture, tmp_path):
+def test_nonfinite_points_are_left_out(write_capture, tmp_path):
     scene = write_capture(suffix=".txt")
     path = scene.folder / "sparse/0/points3D.txt"
     lines = path.read_text().splitlines()
@@ -778,7 +778,7 @@ def test_points_that_are_not_finite_are_left_out(write_capture, tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
-def test_damaged_models_never_raise_anything_else(write_capture, suffix):
+def test_damaged_models_raise_only_input_errors(write_capture, suffix):
     scene = write_capture(
         suffix=suffix, views=3, points=4, model="OPENCV", params=[80, 82, 47, 37, 0.05, -0.02, 0.001, 0.002]
     )
@@ -796,16 +796,16 @@ def test_damaged_models_never_raise_anything_else(write_capture, suffix):
                 if len(data):
                     data[rng.integers(len(data))] = rng.integers(256)
             path.write_bytes(data)
-            refused = None
+            message = None
             try:
                 model = read_model(folder)
                 for camera_id in {image.camera_id for image in model.images}:
                     pinhole_for(model.cameras[camera_id], path, 1600)
             except InputError as error:
-                refused = str(error)
-            if refused is not None:
+                message = str(error)
+            if message is not None:
                 refusals += 1
-                assert refused.endswith(".") and "\n" not in refused
+                assert message.endswith(".") and "\n" not in message
         path.write_bytes(whole)
     assert refusals > 50
     read_model(folder)
@@ -814,7 +814,7 @@ def test_damaged_models_never_raise_anything_else(write_capture, suffix):
 # Checking
 
 
-def test_check_says_what_is_there_and_writes_nothing(write_capture):
+def test_check_reports_contents_without_writing(write_capture):
     scene = write_capture(views=9, model="SIMPLE_RADIAL", params=[90, 48, 36, 0.1])
     before = sorted(scene.folder.rglob("*"))
     steps = []
@@ -870,13 +870,13 @@ def with_images(model_folder: Path, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("suffix", ["bin", "txt"])
-def test_all_camera_models(tmp_path, suffix):
+def test_all_camera_models_load(tmp_path, suffix):
     folder = fixture(f"all_camera_models_{suffix}")
     capture = load_capture(with_images(folder, tmp_path / "capture"), tmp_path / "cache")
     assert [view.name for view in capture.views] == sorted(NAMES)
     assert {view.camera_id for view in capture.views} == set(range(10, 120, 10)) and len(capture.points.xyz) == 60
     for index, view in enumerate(capture.views):
-        assert (capture.image(index) == [90, 120, 30]).mean() > 0.99, "nothing but the image's color"
+        assert (capture.image(index) == [90, 120, 30]).mean() > 0.99, "all pixels have the image's color"
         keypoints = capture.keypoints(index)
         assert len(keypoints.xy) == (0 if view.name == "UPPER.PNG" else 50)
         if len(keypoints.xy):
@@ -886,7 +886,7 @@ def test_all_camera_models(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("suffix", ["bin", "txt"])
-def test_rigs_and_frames(tmp_path, suffix):
+def test_rigs_and_frames_load(tmp_path, suffix):
     folder = fixture(f"rigs_{suffix}")
     theirs = pycolmap.Reconstruction(str(folder))
     capture = load_capture(with_images(folder, tmp_path / "capture"), tmp_path / "cache", max_size=256)
@@ -899,7 +899,7 @@ def test_rigs_and_frames(tmp_path, suffix):
         np.testing.assert_allclose(keypoints.xy, p[:, :2] / p[:, 2:], atol=1e-3)
 
 
-def test_extreme_distortion(tmp_path):
+def test_extreme_distortion_is_cropped(tmp_path):
     folder = fixture("unicode_names_extreme_distortion")
     capture = load_capture(with_images(folder, tmp_path / "capture"), tmp_path / "cache", max_size=800)
     model = read_model(folder)
@@ -915,26 +915,26 @@ def test_extreme_distortion(tmp_path):
         assert len(capture.keypoints(index).xy) == 129
 
 
-def test_three_images(tmp_path):
+def test_three_images_load(tmp_path):
     capture = load_capture(with_images(fixture("three_images"), tmp_path / "capture"), tmp_path / "cache")
     assert len(capture.views) == 3 and len(capture.points.xyz) == 1334
     assert capture.test_indices == (0,) and capture.views[0].width == 699
 
 
-def test_subfolders(tmp_path):
+def test_model_with_subfolders_is_read(tmp_path):
     folder = fixture("missing_cameras_subfolders_txt")
-    refused(folder, tmp_path, "images", "does not exist")
+    assert_load_rejected(folder, tmp_path, "images", "does not exist")
     model = read_model(folder)
     assert len(model.images) == 9 and all(image.name[:5] in ("sub1/", "sub2/") for image in model.images)
 
 
-def test_refused_fixtures(tmp_path):
-    refused(fixture("truncated"), tmp_path, "images.bin is cut short", "82 images")
-    refused(fixture("cameras_only"), tmp_path, "images.bin and points3D.bin are missing")
-    refused(fixture("degenerate_two_images"), tmp_path, "cameras.bin", "SIMPLE_RADIAL", "degenerate")
+def test_invalid_fixtures_are_rejected(tmp_path):
+    assert_load_rejected(fixture("truncated"), tmp_path, "images.bin is truncated", "82 images")
+    assert_load_rejected(fixture("cameras_only"), tmp_path, "images.bin and points3D.bin are missing")
+    assert_load_rejected(fixture("degenerate_two_images"), tmp_path, "cameras.bin", "SIMPLE_RADIAL", "degenerate")
 
 
-def test_tabletop(tmp_path):
+def test_tabletop_capture_loads(tmp_path):
     if not (DATA / "tabletop").is_dir():
         pytest.skip("the capture tabletop is absent")
     capture = load_capture(DATA / "tabletop", tmp_path / "cache", max_size=400)
@@ -950,20 +950,20 @@ def test_tabletop(tmp_path):
     assert np.concatenate(errors).mean() * 640 / 400 < 1.0, "COLMAP's own mean reprojection error is 0.81 pixels"
 
 
-def test_banana(tmp_path):
+def test_banana_capture_loads(tmp_path):
     if not (DATA / "banana").is_dir():
         pytest.skip("the capture banana is absent")
     capture = load_capture(DATA / "banana", tmp_path / "cache")
     assert len(capture.views) == 14 and not capture.has_masks and capture.views[0].image_file.parent.name == "images"
 
 
-def test_masks_read_alone_decide_by_themselves(tmp_path):
+def test_single_mask_detects_color_coding(tmp_path):
     Image.fromarray(np.full((4, 4, 3), 7, np.uint8)).save(tmp_path / "gray.png")
     assert read_mask(tmp_path / "gray.png").tolist() == [[7] * 4] * 4
     assert read_mask(tmp_path / "gray.png", color=True)[0, 0] == 7 * 0x10101
 
 
-def test_an_edited_capture_shows_ids_that_are_left_out_as_0(write_capture, tmp_path):
+def test_edited_capture_maps_left_out_ids_to_0(write_capture, tmp_path):
     scene = write_capture()
     capture = load_capture(scene.folder, tmp_path / "cache")
     edited = capture.edited({5: "cup"}, [2])

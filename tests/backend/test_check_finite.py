@@ -20,7 +20,7 @@ SMALL = Settings(offsets=4)
 FLAT = Settings(offsets=4, primitive="2d")
 
 
-class Heard(Reporter):
+class RecordingReporter(Reporter):
     def __init__(self):
         self.warnings = []
 
@@ -61,7 +61,7 @@ def poisoned(wrapped, gradient, value):
         ("image_loss", "the image loss"), ("volume_loss", "the volume loss"), ("normal_loss", "the normal loss"),
     ],
 )  # fmt: skip
-def test_a_loss_that_is_not_finite_is_named_and_changes_nothing(trainer, tmp_path, monkeypatch, name, named, value):
+def test_nonfinite_loss_is_reported_and_skipped(trainer, tmp_path, monkeypatch, name, named, value):
     trained = trainer(FLAT)
     trained.step(0.6)
     before = [t.detach().clone() for t in numbers(trained)]
@@ -71,10 +71,10 @@ def test_a_loss_that_is_not_finite_is_named_and_changes_nothing(trainer, tmp_pat
     assert trained.progress.faults == {named: 2}
     monkeypatch.undo()
     assert trained.step(0.6).isfinite()
-    heard = Heard()
-    trained.run(Budget(steps=5), tmp_path, heard)
+    reporter = RecordingReporter()
+    trained.run(Budget(steps=5), tmp_path, reporter)
     view = {v.name for v in trained.scene.capture.views}
-    first, last = heard.warnings
+    first, last = reporter.warnings
     assert first.startswith("Step 2, ") and first.endswith(f": {named} is not finite; the update was skipped.")
     assert first.split(", ")[1].split(": ")[0] in view
     assert last == f"2 updates were not finite and were skipped: {named} (2 steps)."
@@ -82,7 +82,7 @@ def test_a_loss_that_is_not_finite_is_named_and_changes_nothing(trainer, tmp_pat
     assert again.progress.faults == {named: 2} and again.progress.skipped == 2
 
 
-def test_the_label_loss_is_told_from_the_pictures(trainer, monkeypatch):
+def test_label_loss_is_distinguished_from_image_loss(trainer, monkeypatch):
     trained = trainer()
     inner = step.image_loss
     monkeypatch.setattr(step, "image_loss", lambda *a: inner(*a) * (1 if a[2] is None else math.nan))
@@ -91,7 +91,7 @@ def test_the_label_loss_is_told_from_the_pictures(trainer, monkeypatch):
 
 
 @pytest.mark.parametrize("value", [1e30, math.nan])
-def test_a_splat_that_cannot_recover_is_named_and_taken_out(trainer, monkeypatch, value):
+def test_unrecoverable_splat_is_reported_and_removed(trainer, monkeypatch, value):
     """1e30: the color of an anchor's third splat overflows in SSIM. NaN: the size of the anchor is NaN."""
     trained = trainer()
     anchors, layout = trained.model.anchors, SMALL.layout
@@ -115,38 +115,38 @@ def test_a_splat_that_cannot_recover_is_named_and_taken_out(trainer, monkeypatch
     splat = 0 if math.isnan(value) else 2
     (sentence,) = trained._warnings
     assert f"{what} is not finite, because of splat {splat} of anchor {int(near)} ({name})" in sentence
-    assert sentence.endswith("it was taken out of the model.")
+    assert sentence.endswith("it was removed from the model.")
     for share in (0.3, 0.6):
         assert trained.step(share).isfinite()
     assert trained.progress.faults == {what: 1}
 
 
-def spoiled(rasterize, splat, value):
+def corrupted(rasterize, splat, value):
     """Wrap `rasterize` so that the gradient of one splat's mean along y is `value`."""
 
     def call(means, *others, **options):
-        def spoil(g):
+        def corrupt(g):
             g = g.clone()
             g[splat, 1] = value
             return g
 
         if means.requires_grad:
             means = means * 1.0
-            means.register_hook(spoil)
+            means.register_hook(corrupt)
         return rasterize(means, *others, **options)
 
     return call
 
 
 @pytest.mark.parametrize("value", [math.nan, -math.inf, 1e25])
-def test_a_gradient_that_is_not_finite_stays_with_its_anchor(trainer, monkeypatch, value):
+def test_nonfinite_gradient_affects_only_its_anchor(trainer, monkeypatch, value):
     """All other anchors and the heads get the same update as if that anchor had no gradient."""
     results = []
     for given in (0.0, value):
         trained = trainer()
         index = trained.scene.capture.train_indices[0]
         before, trained.progress.step = trained.model.anchors.rows.clone(), 1
-        monkeypatch.setattr(step, "rasterize", spoiled(step.rasterize, 41, given))
+        monkeypatch.setattr(step, "rasterize", corrupted(step.rasterize, 41, given))
         learned = trained._view_step.compute(index, 0.6)
         monkeypatch.undo()
         trained._update(learned, 0.6)
@@ -168,7 +168,7 @@ def test_a_gradient_that_is_not_finite_stays_with_its_anchor(trainer, monkeypatc
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_the_heads_learn_from_the_other_anchors(trainer, monkeypatch, value):
+def test_heads_learn_from_finite_anchors(trainer, monkeypatch, value):
     """A rotation's gradient passes through the heads; if it is not finite, the other anchors still train the heads."""
     trained = trainer()
     trained.step(0.6)  # at first, features are zero, and the hidden layer's weights have no gradient
@@ -189,7 +189,7 @@ def test_the_heads_learn_from_the_other_anchors(trainer, monkeypatch, value):
     assert int(trained._check.skipped) == 1 and "scales and rotations" in trained._check.fault.what
 
 
-def test_the_heads_gradient_is_named(trainer, monkeypatch):
+def test_nonfinite_head_gradient_is_reported(trainer, monkeypatch):
     trained = trainer()
     before = [p.detach().clone() for p in trained.model.heads.parameters()]
     trained.model.background.register_hook(lambda g: g * math.nan)
@@ -199,7 +199,7 @@ def test_the_heads_gradient_is_named(trainer, monkeypatch):
     assert trained.model.background.isfinite().all()
 
 
-def test_a_gradient_whose_square_overflows_does_not_freeze_its_row():
+def test_overflowing_squared_gradient_is_skipped():
     values, g = torch.ones(2, 3), torch.ones(2, 3)
     exp_avg, exp_avg_sq = torch.zeros_like(values), torch.zeros_like(values)
     g[1, 1] = 2 * LARGEST_GRADIENT
@@ -212,7 +212,7 @@ def test_a_gradient_whose_square_overflows_does_not_freeze_its_row():
 
 
 @pytest.mark.parametrize("on_gpu", [False, True])
-def test_growth_does_not_follow_what_is_not_finite(monkeypatch, on_gpu):
+def test_growth_statistics_ignore_nonfinite_gradients(monkeypatch, on_gpu):
     monkeypatch.setattr(devices, "on_gpu", lambda tensor: on_gpu)
     statistics = GrowthStatistics.zeros(2, 2)
     gradient = torch.tensor([[1.0, 0.0], [math.nan, 1.0], [math.inf, 0.0], [2.0, 0.0]])
@@ -221,9 +221,9 @@ def test_growth_does_not_follow_what_is_not_finite(monkeypatch, on_gpu):
     assert statistics.gradient.tolist() == [1.0, 0.0, 0.0, 2.0] and statistics.visits.tolist() == [1, 0, 0, 1]
 
 
-def test_nothing_is_looked_at_closely_while_all_is_finite(trainer, monkeypatch):
+def test_faults_are_not_searched_while_values_are_finite(trainer, monkeypatch):
     def called(*arguments):
-        raise AssertionError("looked closely")
+        raise AssertionError("searched for a fault")
 
     for name in ("find_fault_of_loss", "find_fault_of_rows", "find_fault_of_heads"):
         monkeypatch.setattr(check_finite, name, called)
@@ -232,13 +232,13 @@ def test_nothing_is_looked_at_closely_while_all_is_finite(trainer, monkeypatch):
         assert trained.step(i / 4).isfinite()
 
 
-def test_on_a_gpu_the_cause_is_looked_for_once_updates_are_skipped(trainer, tmp_path, monkeypatch):
+def test_gpu_searches_fault_after_skipped_updates(trainer, tmp_path, monkeypatch):
     monkeypatch.setattr(devices, "on_gpu", lambda tensor: True)
     monkeypatch.setattr(trainer_module, "_REPORT_SECONDS", 0.0)
     trained = trainer()
     monkeypatch.setattr(step, "volume_loss", poisoned(step.volume_loss, False, math.nan))
-    heard = Heard()
-    trained.run(Budget(steps=3), tmp_path, heard)
+    reporter = RecordingReporter()
+    trained.run(Budget(steps=3), tmp_path, reporter)
     assert trained.progress.faults == {"the volume loss": 2}
-    assert heard.warnings[0].startswith("Step 2, ") and "the volume loss is not finite" in heard.warnings[0]
+    assert reporter.warnings[0].startswith("Step 2, ") and "the volume loss is not finite" in reporter.warnings[0]
     assert all(t.isfinite().all() for t in numbers(trained))

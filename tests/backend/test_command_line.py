@@ -12,7 +12,7 @@ HEAVY = {"torch", "numba", "pycolmap", "scipy", "PIL"}
 
 
 @pytest.mark.parametrize("words", [["--help"], ["train", "--help"], ["--version"]])
-def test_help_and_version_load_no_compute_package(words):
+def test_help_and_version_import_no_compute_packages(words):
     code = (
         "import sys\n"
         "from backend.cli.main import main\n"

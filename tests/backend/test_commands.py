@@ -35,7 +35,7 @@ from backend.shared.reconstruction.objects import edit_objects, read_objects
 from backend.training.settings import Settings
 from backend.training.trainer import Trainer
 
-from .asking import Answer, refused
+from .command_result import CommandResult, assert_rejected
 
 LOCK = ".lock"
 ROOT = Path(__file__).resolve().parents[2]
@@ -43,22 +43,22 @@ FIXTURES = ROOT.parent / "shared" / "data" / "fixtures"
 SMALL = ("--offsets", "4")
 
 
-_kept: dict[str, Path] = {}
+_trained_once: dict[str, Path] = {}
 
 
 @pytest.fixture
-def trained(write_capture, tmp_path, tmp_path_factory, ask):
+def trained(write_capture, tmp_path, tmp_path_factory, run_command):
     """A capture and a copy of its reconstruction after 20 steps; both are made once."""
-    if not _kept:
+    if not _trained_once:
         place = tmp_path_factory.mktemp("trained")
         shutil.copytree(write_capture(name="first", views=9, size=(64, 48)).folder, place / "capture")
-        assert ask("train", place / "capture", "--out", place / "out", "--steps", 20, *SMALL).code == EXIT_DONE
-        _kept.update(capture=place / "capture", out=place / "out")
-    shutil.copytree(_kept["out"], tmp_path / "out")
-    return _kept["capture"], tmp_path / "out"
+        assert run_command("train", place / "capture", "--out", place / "out", "--steps", 20, *SMALL).code == EXIT_DONE
+        _trained_once.update(capture=place / "capture", out=place / "out")
+    shutil.copytree(_trained_once["out"], tmp_path / "out")
+    return _trained_once["capture"], tmp_path / "out"
 
 
-def no_halves(folder: Path) -> None:
+def assert_no_temporary_files(folder: Path) -> None:
     """Check that no temporary file of a command is left."""
     hidden = [path for path in folder.rglob(".*") if path.name == LOCK or path.name.startswith(".write-test")]
     assert not [*folder.rglob("*.part"), *hidden]
@@ -72,19 +72,19 @@ def step_of(out: Path) -> int:
 
 
 @pytest.mark.parametrize("masks", [True, False])
-def test_the_whole_chain(write_capture, tmp_path, ask, masks):
+def test_full_pipeline(write_capture, tmp_path, run_command, masks):
     capture, out = write_capture(views=9, size=(64, 48), masks=masks).folder, tmp_path / "deep" / "out"
-    found = ask("check", capture, "--json")
+    found = run_command("check", capture, "--json")
     assert found.code == EXIT_DONE and found.events[-1]["check"]["problems"] == []
     assert not out.exists()
 
-    voted = ask("vote", capture, "--out", out, "--json")
+    voted = run_command("vote", capture, "--out", out, "--json")
     assert voted.code == EXIT_DONE
     objects = json.loads((out / "objects.json").read_text())["objects"]
     assert [entry["id"] for entry in objects] == ([1, 2, 5] if masks else [])
     assert any("masks" in message for message in voted.messages("warning")) is not masks
 
-    ended = ask("train", capture, "--out", out, "--steps", 20, *SMALL, "--json")
+    ended = run_command("train", capture, "--out", out, "--steps", 20, *SMALL, "--json")
     assert ended.code == EXIT_DONE and ended.events[-1]["steps"] == 20
     assert (ended.events[-1]["miou"] is not None) is masks
     measured = [event for event in ended.events if event["type"] == "quality"]
@@ -97,8 +97,8 @@ def test_the_whole_chain(write_capture, tmp_path, ask, masks):
     assert len(splats) > 100 and warnings == []
     assert set(splats.object_ids.tolist()) == ({1, 2, 5} if masks else {0}) | ({0} & set(splats.object_ids.tolist()))
 
-    assert ask("evaluate", out, "--json").events[-1]["psnr"] > 5
-    drawn = ask("render", out, "--ids", "--depth", "--json")
+    assert run_command("evaluate", out, "--json").events[-1]["psnr"] > 5
+    drawn = run_command("render", out, "--ids", "--depth", "--json")
     assert drawn.events[-1]["views"] == 2
     assert {path.name for path in (out / "renders").iterdir()} == {
         f"view_{i}.{suffix}" for i in ("000", "008") for suffix in ("png", "ids.png", "depth.npy")
@@ -107,7 +107,7 @@ def test_the_whole_chain(write_capture, tmp_path, ask, masks):
     assert ids.shape == (48, 64) and set(np.unique(ids)) <= {0, 1, 2, 5}
     depth = np.load(out / "renders/view_008.depth.npy")
     assert depth.shape == (48, 64) and 2 < np.median(depth[depth > 0]) < 6, "cameras are 4 units away"
-    assert ask("report", out, "--json").code == EXIT_DONE
+    assert run_command("report", out, "--json").code == EXIT_DONE
 
     report = json.loads((out / "report.json").read_text())
     assert {"capture", "settings", "machine", "left_out", "stages", "curve", "model", "quality", "objects"} <= set(
@@ -131,34 +131,34 @@ def test_the_whole_chain(write_capture, tmp_path, ask, masks):
     assert any("votes" in what and "no masks" in why for what, why in left_out.items()) is not masks
     assert any("undistortion" in what for what in left_out)
     assert (out / "report.md").exists()
-    no_halves(out)
+    assert_no_temporary_files(out)
 
 
-def test_terminal_output_says_each_thing_once(write_capture, tmp_path, ask):
+def test_terminal_output_has_no_duplicate_lines(write_capture, tmp_path, run_command):
     scene = write_capture(views=9, size=(64, 48))
     (scene.folder / "masks" / scene.names[1]).unlink()
-    answer = ask("train", scene.folder, "--out", tmp_path / "out", "--steps", 2, *SMALL)
-    assert answer.code == EXIT_DONE
-    lines = answer.err.splitlines() + [line for line in answer.out.splitlines() if not line.startswith("  ")]
+    result = run_command("train", scene.folder, "--out", tmp_path / "out", "--steps", 2, *SMALL)
+    assert result.code == EXIT_DONE
+    lines = result.err.splitlines() + [line for line in result.out.splitlines() if not line.startswith("  ")]
     assert len(lines) == len(set(lines)), lines
-    assert answer.err.count("have no mask") == 1
+    assert result.err.count("have no mask") == 1
 
 
 @pytest.mark.parametrize(("mode", "far"), [("explicit", 0), ("explicit", 1e6), ("view", 0)])
-def test_anchors_say_where_the_splats_come_from(write_capture, tmp_path, ask, mode, far):
+def test_anchors_file_matches_splats(write_capture, tmp_path, run_command, mode, far):
     scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
     for viewmat in scene.viewmats:
         viewmat[:3, 3] -= viewmat[:3, :3] @ np.full(3, far)
     scene.xyz += far
     write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
-    answer = ask("train", scene.folder, "--out", out, "--steps", 40, "--mode", mode, *SMALL, "--json")
-    assert answer.code == EXIT_DONE
+    result = run_command("train", scene.folder, "--out", out, "--steps", 40, "--mode", mode, *SMALL, "--json")
+    assert result.code == EXIT_DONE
     anchors, splats = read_vertices(out / "anchors.ply"), read_vertices(out / "splats.ply")
     names = ("x", "y", "z", "object_id", "scale_0", "scale_1", "scale_2", "opacity", "splats")
     assert anchors.dtype.names == names and anchors.dtype["splats"] == anchors.dtype["object_id"] == np.uint32
     assert anchors.dtype["x"] == splats.dtype["x"] == (np.float64 if far else np.float32)
     exported = json.loads((out / "objectgs.json").read_text())["export"]
-    assert len(anchors) == exported["anchors"] == answer.events[-1]["anchors"]
+    assert len(anchors) == exported["anchors"] == result.events[-1]["anchors"]
     assert anchors["splats"].sum() == len(splats) == exported["splats"] and 0 < anchors["splats"].max() <= 4
     for i in np.unique(anchors["object_id"]):
         assert anchors["splats"][anchors["object_id"] == i].sum() == (splats["object_id"] == i).sum()
@@ -166,36 +166,36 @@ def test_anchors_say_where_the_splats_come_from(write_capture, tmp_path, ask, mo
     assert (anchors["opacity"] * anchors["splats"]).sum() == pytest.approx(opacity.sum(), rel=1e-3)
     xyz = np.stack([anchors[axis] for axis in "xyz"], 1) - far
     nearest = np.linalg.norm(xyz[:, None] - (scene.xyz - far), axis=2).min(1)
-    assert nearest.max() < 0.5, "anchors stand where points are"
+    assert nearest.max() < 0.5, "anchors are near the points"
     scale = np.stack([anchors[f"scale_{i}"] for i in range(3)], 1)
     assert np.isfinite(scale).all() and (scale > 1e-3).all() and (scale < 2).all()
 
 
-def test_a_view_dependent_model_trains_evaluates_and_exports_a_fit(write_capture, tmp_path, ask):
+def test_view_dependent_model_exports_fit(write_capture, tmp_path, run_command):
     capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"
-    answer = ask("train", capture, "--out", out, "--steps", 40, "--mode", "view", *SMALL, "--json")
-    assert answer.code == EXIT_DONE
-    (warning,) = [message for message in answer.messages("warning") if "fit" in message]
-    fidelity = answer.events[-1]["psnr_of_export"]
+    result = run_command("train", capture, "--out", out, "--steps", 40, "--mode", "view", *SMALL, "--json")
+    assert result.code == EXIT_DONE
+    (warning,) = [message for message in result.messages("warning") if "fit" in message]
+    fidelity = result.events[-1]["psnr_of_export"]
     assert f"{fidelity:.1f} dB" in warning and fidelity > 25
     splats, _ = read_splats(out / "splats.ply")
     assert splats.degree == 2 and set(splats.object_ids.tolist()) <= {0, 1, 2, 5}
     for command in ("evaluate", "report"):
-        assert ask(command, out).code == EXIT_DONE
+        assert run_command(command, out).code == EXIT_DONE
     model = json.loads((out / "report.json").read_text())["model"]
     assert model["psnr_of_export"] == fidelity and model["gaussians"] == len(splats)
 
 
-def test_unlabeled_pixels_count_where_they_are_declared_an_object(write_capture, tmp_path, ask):
+def test_unlabeled_pixels_can_be_an_object(write_capture, tmp_path, run_command):
     capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"
-    assert ask("train", capture, "--out", out, "--steps", 5, *SMALL, "--unlabeled-is-object").code == EXIT_DONE
-    assert ask("evaluate", out).code == EXIT_DONE
+    assert run_command("train", capture, "--out", out, "--steps", 5, *SMALL, "--unlabeled-is-object").code == EXIT_DONE
+    assert run_command("evaluate", out).code == EXIT_DONE
     found = json.loads((out / "evaluation.json").read_text())["objects"]
     assert [entry["id"] for entry in found] == [0, 1, 2, 5]
-    assert ask("report", out).code == EXIT_DONE
+    assert run_command("report", out).code == EXIT_DONE
 
 
-# --- a capture ready to be shown -------------------------------------------------------------------------------------
+# --- import ----------------------------------------------------------------------------------------------------------
 
 
 def cameras_of(out: Path) -> dict:
@@ -204,11 +204,11 @@ def cameras_of(out: Path) -> dict:
 
 @pytest.mark.parametrize("masks", [True, False])
 @pytest.mark.parametrize("bent", [True, False])
-def test_an_import_leaves_cameras_and_points_to_show(write_capture, tmp_path, ask, masks, bent):
+def test_import_writes_cameras_and_points(write_capture, tmp_path, run_command, masks, bent):
     lens = {"model": "SIMPLE_RADIAL", "params": [90, 48, 36, 0.1]} if bent else {"size": (64, 48)}
     scene, out = write_capture(views=9, masks=masks, **lens), tmp_path / "deep" / "out"
-    answer = ask("import", scene.folder, "--out", out, "--json")
-    assert answer.code == EXIT_DONE and answer.events[-1]["views"] == 9 and answer.events[-1]["masks"] is masks
+    result = run_command("import", scene.folder, "--out", out, "--json")
+    assert result.code == EXIT_DONE and result.events[-1]["views"] == 9 and result.events[-1]["masks"] is masks
     written = cameras_of(out)
     assert written["capture"] == str(scene.folder.resolve()) and written["origin"] == [0, 0, 0]
     capture = load_capture(scene.folder, out / "cache")
@@ -218,198 +218,206 @@ def test_an_import_leaves_cameras_and_points_to_show(write_capture, tmp_path, as
         assert camera["K"] == view.K.tolist() and camera["viewmat"] == view.viewmat.tolist()
         for place, file in ((camera["image"], view.image_file), (camera["mask"], view.mask_file)):
             assert (place is None) == (file is None)
-            assert place is None or (out / place).resolve() == file.resolve(), "a relative path is one in the folder"
+            assert place is None or (out / place).resolve() == file.resolve(), (
+                "relative paths start at the output folder"
+            )
         assert camera["image"].startswith("cache/views/" if bent else str(scene.folder))
         with Image.open(out / camera["image"]) as image:
             assert image.size == (view.width, view.height)
     rotation = np.array(written["upright"]["rotation"])
-    assert rotation[2] == pytest.approx([0, -1, 0], abs=0.02), "these cameras stand upright about -Y"
+    assert rotation[2] == pytest.approx([0, -1, 0], abs=0.02), "-Y points up in this capture"
     points = read_points(out / "points.ply")
     np.testing.assert_array_equal(points.xyz, capture.points.xyz)
     np.testing.assert_array_equal(points.rgb, capture.points.rgb)
     assert not points.ids.any() and not points.visible.any() and not (out / "objects.json").exists()
     assert json.loads((out / "objectgs.json").read_text())["capture"]["folder"] == str(scene.folder.resolve())
-    no_halves(out)
-    assert ask("train", scene.folder, "--out", out, "--steps", 2, *SMALL).code == EXIT_DONE
-    assert set(read_points(out / "points.ply").ids) - {0} == ({1, 2, 5} if masks else set()), "training votes, as ever"
+    assert_no_temporary_files(out)
+    assert run_command("train", scene.folder, "--out", out, "--steps", 2, *SMALL).code == EXIT_DONE
+    assert set(read_points(out / "points.ply").ids) - {0} == ({1, 2, 5} if masks else set())
     assert cameras_of(out) == written
 
 
-def test_an_import_keeps_a_vote_on_the_same_capture(write_capture, tmp_path, ask):
+def test_import_keeps_votes_of_unchanged_capture(write_capture, tmp_path, run_command):
     scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
     for vote in ((), ("--strategy", "probability", "--seed", 3)):
-        assert ask("vote", scene.folder, "--out", out, *vote).code == EXIT_DONE
+        assert run_command("vote", scene.folder, "--out", out, *vote).code == EXIT_DONE
         before = (out / "points.ply").read_bytes(), (out / "objects.json").read_bytes()
-        assert ask("import", scene.folder, "--out", out).code == EXIT_DONE
+        assert run_command("import", scene.folder, "--out", out).code == EXIT_DONE
         assert ((out / "points.ply").read_bytes(), (out / "objects.json").read_bytes()) == before
     edit_objects(out / "objects.json", {1: {"name": "cup"}})
     Image.fromarray(np.full((48, 64), 2, np.uint8)).save(scene.folder / "masks" / scene.names[1])
-    assert ask("import", scene.folder, "--out", out).code == EXIT_DONE
+    assert run_command("import", scene.folder, "--out", out).code == EXIT_DONE
     assert not read_points(out / "points.ply").ids.any() and read_objects(out / "objects.json") == []
-    assert ask("vote", scene.folder, "--out", out).code == EXIT_DONE
+    assert run_command("vote", scene.folder, "--out", out).code == EXIT_DONE
     assert [entry.name for entry in read_objects(out / "objects.json")] == ["cup", "sphere 2", "sphere 5"]
 
 
-def test_an_import_of_another_capture_does_not_pass_for_the_trained_one(trained, write_capture, ask):
+def test_import_of_another_capture_blocks_training_and_evaluation(trained, write_capture, run_command):
     capture, out = trained
     other = write_capture(name="other", views=9, size=(64, 48), seed=1).folder
-    assert ask("import", other, "--out", out).code == EXIT_DONE
-    refused(ask("train", other, "--out", out, "--steps", 30, *SMALL), "another capture", str(other))
-    refused(ask("evaluate", out), str(other), "not the one")
-    assert ask("evaluate", out, "--capture", capture).code == EXIT_DONE
+    assert run_command("import", other, "--out", out).code == EXIT_DONE
+    assert_rejected(run_command("train", other, "--out", out, "--steps", 30, *SMALL), "another capture", str(other))
+    assert_rejected(run_command("evaluate", out), str(other), "not the one")
+    assert run_command("evaluate", out, "--capture", capture).code == EXIT_DONE
     assert cameras_of(out)["capture"] == str(capture.resolve())
-    assert ask("train", other, "--out", out, "--steps", 5, *SMALL, "--restart").code == EXIT_DONE
+    assert run_command("train", other, "--out", out, "--steps", 5, *SMALL, "--restart").code == EXIT_DONE
 
 
 # --- the user's edits ------------------------------------------------------------------------------------------------
 
 
-def test_an_object_that_is_left_out_is_in_no_splat(write_capture, tmp_path, ask):
+def test_left_out_object_has_no_splats(write_capture, tmp_path, run_command):
     capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"
-    assert ask("vote", capture, "--out", out).code == EXIT_DONE
+    assert run_command("vote", capture, "--out", out).code == EXIT_DONE
     edit_objects(out / "objects.json", {2: {"left_out": True}, 5: {"name": "planet"}})
-    assert ask("vote", capture, "--out", out).code == EXIT_DONE
+    assert run_command("vote", capture, "--out", out).code == EXIT_DONE
     assert 2 in read_points(out / "points.ply").ids and read_objects(out / "objects.json")[1].points > 0
     train = ("train", capture, "--out", out, *SMALL)
-    ended = ask(*train, "--steps", 20, "--json")
+    ended = run_command(*train, "--steps", 20, "--json")
     assert ended.code == EXIT_DONE
     assert set(read_splats(out / "splats.ply")[0].object_ids.tolist()) <= {0, 1, 5}
     assert set(read_vertices(out / "anchors.ply")["object_id"].tolist()) <= {0, 1, 5}
     assert json.loads((out / "objectgs.json").read_text())["training"]["left_out"] == [2]
 
     edit_objects(out / "objects.json", {2: {"left_out": None}})
-    refused(ask(*train, "--steps", 30), "without 2", "objects.json leaves out none", "--restart")
-    assert ask("evaluate", out).code == EXIT_DONE and ask("report", out).code == EXIT_DONE
+    assert_rejected(run_command(*train, "--steps", 30), "without 2", "objects.json leaves out none", "--restart")
+    assert run_command("evaluate", out).code == EXIT_DONE and run_command("report", out).code == EXIT_DONE
     report = json.loads((out / "report.json").read_text())
     assert [(entry["id"], entry["name"]) for entry in report["objects"]] == [(1, "sphere 1"), (5, "planet")]
     assert all(entry["iou"] is not None for entry in report["objects"])
     assert any(entry["what"] == "splats of sphere 2" for entry in report["left_out"])
-    assert ask("render", out, "--ids").code == EXIT_DONE
+    assert run_command("render", out, "--ids").code == EXIT_DONE
 
     edit_objects(out / "objects.json", {2: {"left_out": True}})
-    assert ask(*train, "--steps", 25).code == EXIT_DONE and step_of(out) == 25
+    assert run_command(*train, "--steps", 25).code == EXIT_DONE and step_of(out) == 25
     edit_objects(out / "objects.json", {2: {"left_out": False}})
-    assert ask(*train, "--steps", 20, "--restart").code == EXIT_DONE
+    assert run_command(*train, "--steps", 20, "--restart").code == EXIT_DONE
     assert 2 in read_splats(out / "splats.ply")[0].object_ids
     edit_objects(out / "objects.json", {1: {"left_out": True}})
-    refused(ask(*train, "--steps", 30), "with all objects", "leaves out 1", "--restart")
+    assert_rejected(run_command(*train, "--steps", 30), "with all objects", "leaves out 1", "--restart")
 
 
-def test_all_objects_may_be_left_out(write_capture, tmp_path, ask):
+def test_all_objects_can_be_left_out(write_capture, tmp_path, run_command):
     capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"
-    assert ask("vote", capture, "--out", out).code == EXIT_DONE
+    assert run_command("vote", capture, "--out", out).code == EXIT_DONE
     edit_objects(out / "objects.json", {i: {"left_out": True} for i in (1, 2, 5)})
     for words in (("train", capture, "--out", out, "--steps", 10, *SMALL), ("evaluate", out), ("report", out)):
-        assert ask(*words).code == EXIT_DONE
+        assert run_command(*words).code == EXIT_DONE
     assert set(read_splats(out / "splats.ply")[0].object_ids.tolist()) == {0}
     assert json.loads((out / "report.json").read_text())["quality"]["miou"] is None
 
 
-def test_a_merge_is_a_view_that_training_ignores(trained, ask):
+def test_training_ignores_merges(trained, run_command):
     capture, out = trained
     edit_objects(out / "objects.json", {1: {"merged_into": 2}})
-    assert ask("train", capture, "--out", out, "--steps", 25, *SMALL).code == EXIT_DONE
+    assert run_command("train", capture, "--out", out, "--steps", 25, *SMALL).code == EXIT_DONE
     assert {1, 2} <= set(read_splats(out / "splats.ply")[0].object_ids.tolist())
 
 
-# --- going on --------------------------------------------------------------------------------------------------------
+# --- resuming --------------------------------------------------------------------------------------------------------
 
 
-def test_training_again_is_done_goes_on_or_begins_anew(trained, ask):
+def test_training_again_skips_resumes_or_restarts(trained, run_command):
     capture, out = trained
     train = ("train", capture, "--out", out, *SMALL)
-    again = ask(*train, "--steps", 20, "--json")
+    again = run_command(*train, "--steps", 20, "--json")
     assert again.code == EXIT_DONE and any("Already trained for 20 steps" in m for m in again.messages("status"))
     assert step_of(out) == 20
-    longer = ask(*train, "--steps", 30, "--json")
+    longer = run_command(*train, "--steps", 30, "--json")
     assert any("Resuming after step 20" in m for m in longer.messages("status"))
     assert longer.events[-1]["steps"] == 30 and step_of(out) == 30
-    refused(ask(*train, "--steps", 40, "--sh-degree", 2), "checkpoint", "sh_degree", "--restart")
-    refused(ask(*train, "--steps", 40, "--strategy", "correspondence"), "--strategy majority", "--restart")
-    refused(ask(*train, "--steps", 40, "--max-size", 40), "--max-size 1600", "--restart")
+    assert_rejected(run_command(*train, "--steps", 40, "--sh-degree", 2), "checkpoint", "sh_degree", "--restart")
+    assert_rejected(
+        run_command(*train, "--steps", 40, "--strategy", "correspondence"), "--strategy majority", "--restart"
+    )
+    assert_rejected(run_command(*train, "--steps", 40, "--max-size", 40), "--max-size 1600", "--restart")
     assert step_of(out) == 30
-    anew = ask(*train, "--steps", 10, "--sh-degree", 2, "--strategy", "correspondence", "--restart", "--json")
+    anew = run_command(*train, "--steps", 10, "--sh-degree", 2, "--strategy", "correspondence", "--restart", "--json")
     assert anew.events[-1]["steps"] == 10 and step_of(out) == 10
     assert read_splats(out / "splats.ply")[0].degree == 2
     (out / "checkpoint" / CURRENT).unlink()
-    assert step_of(out) == 0, "the previous checkpoint is the new training's first, not one of the earlier training"
+    assert step_of(out) == 0, "the previous checkpoint belongs to the new training"
 
 
-def test_another_capture_does_not_continue_a_training(trained, write_capture, ask):
+def test_training_does_not_resume_with_another_capture(trained, write_capture, run_command):
     _, out = trained
     other = write_capture(name="other", views=9, size=(64, 48), seed=1).folder
-    refused(ask("train", other, "--out", out, "--steps", 40, *SMALL), "another capture", str(other), "--restart")
-    refused(ask("render", out, "--capture", other), str(other), "not the one")
+    assert_rejected(
+        run_command("train", other, "--out", out, "--steps", 40, *SMALL), "another capture", str(other), "--restart"
+    )
+    assert_rejected(run_command("render", out, "--capture", other), str(other), "not the one")
 
 
-def test_votes_are_cast_once_and_again_when_they_would_differ(write_capture, tmp_path, ask, monkeypatch):
+def test_votes_are_reused_until_inputs_change(write_capture, tmp_path, run_command, monkeypatch):
     scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
     cast = []
     original = votes.vote_points
     monkeypatch.setattr(votes, "vote_points", lambda *a, **k: (cast.append(a[1]), original(*a, **k))[1])
     train = ("train", scene.folder, "--out", out, "--steps", 1, *SMALL, "--restart")
-    assert ask("vote", scene.folder, "--out", out).code == EXIT_DONE
-    assert ask(*train).code == EXIT_DONE and cast == ["majority"]
-    assert ask(*train, "--seed", 3).code == EXIT_DONE and cast == ["majority"], "no part of a majority is drawn"
-    assert ask(*train, "--strategy", "probability").code == EXIT_DONE and cast[1:] == ["probability"]
-    assert ask(*train, "--strategy", "probability", "--seed", 3).code == EXIT_DONE and len(cast) == 3
-    assert ask(*train).code == EXIT_DONE and len(cast) == 4
+    assert run_command("vote", scene.folder, "--out", out).code == EXIT_DONE
+    assert run_command(*train).code == EXIT_DONE and cast == ["majority"]
+    assert run_command(*train, "--seed", 3).code == EXIT_DONE and cast == ["majority"], (
+        "majority votes do not depend on the seed"
+    )
+    assert run_command(*train, "--strategy", "probability").code == EXIT_DONE and cast[1:] == ["probability"]
+    assert run_command(*train, "--strategy", "probability", "--seed", 3).code == EXIT_DONE and len(cast) == 3
+    assert run_command(*train).code == EXIT_DONE and len(cast) == 4
     Image.fromarray(np.full((48, 64), 2, np.uint8)).save(scene.folder / "masks" / scene.names[1])
-    assert ask(*train).code == EXIT_DONE and len(cast) == 5, "a mask was edited"
+    assert run_command(*train).code == EXIT_DONE and len(cast) == 5, "a mask was edited"
     (out / "points.ply").write_bytes((out / "points.ply").read_bytes()[:200])
-    assert ask(*train).code == EXIT_DONE and len(cast) == 6, "points.ply was cut short"
+    assert run_command(*train).code == EXIT_DONE and len(cast) == 6, "points.ply was truncated"
 
 
-def test_a_report_leaves_out_what_was_measured_on_an_earlier_model(trained, ask):
+def test_report_omits_outdated_evaluation(trained, run_command):
     capture, out = trained
-    missing = ask("report", out)
+    missing = run_command("report", out)
     assert "evaluation.json" in missing.err and "run `evaluate`" in missing.err
     report = json.loads((out / "report.json").read_text())
     assert set(report["quality"].values()) == {None}
     assert [(entry["id"], entry["iou"]) for entry in report["objects"]] == [(1, None), (2, None), (5, None)]
-    assert ask("evaluate", out).code == EXIT_DONE and ask("report", out).err == ""
+    assert run_command("evaluate", out).code == EXIT_DONE and run_command("report", out).err == ""
     assert json.loads((out / "report.json").read_text())["quality"]["psnr"] > 5
-    assert ask("train", capture, "--out", out, "--steps", 25, *SMALL).code == EXIT_DONE
-    assert "earlier state" in ask("report", out).err
+    assert run_command("train", capture, "--out", out, "--steps", 25, *SMALL).code == EXIT_DONE
+    assert "earlier state" in run_command("report", out).err
     assert json.loads((out / "report.json").read_text())["quality"]["psnr"] is None
 
 
-def test_a_capture_that_moved_is_found_again(write_capture, tmp_path, ask):
+def test_moved_capture_is_found_with_capture_option(write_capture, tmp_path, run_command):
     capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"
-    assert ask("train", capture, "--out", out, "--steps", 5, *SMALL).code == EXIT_DONE
+    assert run_command("train", capture, "--out", out, "--steps", 5, *SMALL).code == EXIT_DONE
     moved = capture.rename(tmp_path / "moved")
     for command in ("evaluate", "render", "report"):
-        refused(ask(command, out), str(capture), "does not exist", "--capture")
+        assert_rejected(run_command(command, out), str(capture), "does not exist", "--capture")
     assert not (out / "renders").exists() and not (out / "report.json").exists()
-    assert ask("evaluate", out, "--capture", moved).code == EXIT_DONE
-    assert ask("render", out).code == EXIT_DONE, "the place is remembered"
-    again = ask("train", moved, "--out", out, "--steps", 5, *SMALL)
+    assert run_command("evaluate", out, "--capture", moved).code == EXIT_DONE
+    assert run_command("render", out).code == EXIT_DONE, "the new location is stored"
+    again = run_command("train", moved, "--out", out, "--steps", 5, *SMALL)
     assert again.code == EXIT_DONE and "Already trained" in again.out
 
 
-def test_renders_do_not_overwrite_each_other(write_capture, tmp_path, ask):
+def test_renders_of_same_stem_get_distinct_names(write_capture, tmp_path, run_command):
     names = ["a/1.png", "a/1.jpg", "a/2.png", "b/1.png"]
     capture, out = write_capture(views=4, size=(64, 48), names=names, masks=False).folder, tmp_path / "out"
-    assert ask("train", capture, "--out", out, "--steps", 2, *SMALL).code == EXIT_DONE
-    assert ask("render", out, "--views", "all").code == EXIT_DONE
+    assert run_command("train", capture, "--out", out, "--steps", 2, *SMALL).code == EXIT_DONE
+    assert run_command("render", out, "--views", "all").code == EXIT_DONE
     found = {path.relative_to(out / "renders").as_posix() for path in (out / "renders").rglob("*.png")}
     assert found == {"a/1.png.png", "a/1.jpg.png", "a/2.png", "b/1.png"}
 
 
-def test_too_few_views_to_hold_any_out(write_capture, tmp_path, ask):
+def test_too_few_views_skip_evaluation(write_capture, tmp_path, run_command):
     capture, out = write_capture(views=2, size=(64, 48)).folder, tmp_path / "out"
-    assert ask("train", capture, "--out", out, "--steps", 3, *SMALL).code == EXIT_DONE
-    refused(ask("evaluate", out), str(capture), "too few views")
-    assert ask("render", out).code == EXIT_DONE and len(list((out / "renders").iterdir())) == 2
-    assert ask("report", out).code == EXIT_DONE
+    assert run_command("train", capture, "--out", out, "--steps", 3, *SMALL).code == EXIT_DONE
+    assert_rejected(run_command("evaluate", out), str(capture), "too few views")
+    assert run_command("render", out).code == EXIT_DONE and len(list((out / "renders").iterdir())) == 2
+    assert run_command("report", out).code == EXIT_DONE
     report = json.loads((out / "report.json").read_text())
     assert report["quality"]["psnr"] is None and report["curve"][-1]["psnr"] is None
 
 
-# --- bad input -------------------------------------------------------------------------------------------------------
+# --- invalid input ---------------------------------------------------------------------------------------------------
 
 
-def spoil(scene, what: str) -> tuple[str, ...]:
+def corrupt(scene, what: str) -> tuple[str, ...]:
     """Break the capture and return the words that the error must contain."""
     model, images, masks = scene.folder / "sparse/0", scene.folder / "images", scene.folder / "masks"
     first = scene.names[0]
@@ -422,7 +430,7 @@ def spoil(scene, what: str) -> tuple[str, ...]:
     if what.startswith("truncated"):
         path = model / what.split()[1]
         path.write_bytes(path.read_bytes()[:-7])
-        return path.name, "cut short"
+        return path.name, "truncated"
     data = bytearray((model / "images.bin").read_bytes())
     if what == "no pose":
         (model / "images.bin").write_bytes(struct.pack("<Q", 0))
@@ -445,7 +453,7 @@ def spoil(scene, what: str) -> tuple[str, ...]:
     if what == "mask size":
         Image.new("L", (50, 48)).save(masks / first)
         return f"masks/{first}", "50x48", "64x48"
-    assert what == "mask is a picture"
+    assert what == "mask is a photo"
     for name in scene.names:
         noise = np.random.default_rng(0).integers(0, 255, (96, 128, 3)).astype(np.uint8)
         Image.fromarray(noise).save(masks / name)
@@ -455,62 +463,64 @@ def spoil(scene, what: str) -> tuple[str, ...]:
 @pytest.mark.parametrize(
     "what",
     ["no folder", "missing cameras.bin", "missing points3D.bin", "truncated images.bin", "truncated points3D.bin",
-     "no pose", "NaN pose", "3 points", "image size", "masks missing", "mask size", "mask is a picture"],
+     "no pose", "NaN pose", "3 points", "image size", "masks missing", "mask size", "mask is a photo"],
 )  # fmt: skip
-def test_bad_captures_are_one_sentence_and_leave_nothing(write_capture, tmp_path, ask, what):
+def test_invalid_captures_are_rejected_without_files(write_capture, tmp_path, run_command, what):
     scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "made" / "out"
-    words = spoil(scene, what)
-    refused(ask("check", scene.folder), *words)
+    words = corrupt(scene, what)
+    assert_rejected(run_command("check", scene.folder), *words)
     for command in ("import", "vote", "train"):
-        refused(ask(command, scene.folder, "--out", out), *words)
-        assert not out.parent.exists(), "a refused command leaves no folder"
-    events = ask("train", scene.folder, "--out", out, "--json").events
+        assert_rejected(run_command(command, scene.folder, "--out", out), *words)
+        assert not out.parent.exists(), "a rejected command leaves no folder"
+    events = run_command("train", scene.folder, "--out", out, "--json").events
     assert events[-1]["type"] == "error" and all(word in events[-1]["message"] for word in words)
 
     out.mkdir(parents=True)
     (out / "mine.txt").write_text("kept")
-    assert ask("train", scene.folder, "--out", out).code == EXIT_BAD_INPUT
-    assert [path.name for path in out.iterdir()] == ["mine.txt"], "a folder that was there is left as it was"
+    assert run_command("train", scene.folder, "--out", out).code == EXIT_BAD_INPUT
+    assert [path.name for path in out.iterdir()] == ["mine.txt"], "an existing folder is unchanged"
 
 
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("truncated", ("images.bin", "cut short")),
+        ("truncated", ("images.bin", "truncated")),
         ("cameras_only", ("images.bin", "missing")),
         ("missing_cameras_subfolders_txt", ("images", "does not exist")),
         ("degenerate_two_images", ("cameras.bin", "degenerate")),
     ],
 )
-def test_bad_real_models(tmp_path, ask, name, words):
+def test_invalid_real_models_are_rejected(tmp_path, run_command, name, words):
     if not (FIXTURES / name).is_dir():
         pytest.skip(f"fixture {name} is absent")
-    refused(ask("check", FIXTURES / name), name, *words)
-    refused(ask("train", FIXTURES / name, "--out", tmp_path / "out"), name, *words)
+    assert_rejected(run_command("check", FIXTURES / name), name, *words)
+    assert_rejected(run_command("train", FIXTURES / name, "--out", tmp_path / "out"), name, *words)
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("below", ["file", "file/out"])
-def test_a_folder_that_cannot_be_written_to(write_capture, tmp_path, ask, below):
+def test_unwritable_output_folder_is_rejected(write_capture, tmp_path, run_command, below):
     (tmp_path / "file").write_text("mine")
-    refused(ask("vote", write_capture().folder, "--out", tmp_path / below), str(tmp_path / below), "--out")
+    assert_rejected(
+        run_command("vote", write_capture().folder, "--out", tmp_path / below), str(tmp_path / below), "--out"
+    )
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_folders_that_hold_no_reconstruction(trained, write_capture, tmp_path, ask):
+def test_folders_without_reconstruction_are_rejected(trained, write_capture, tmp_path, run_command):
     capture, out = trained
     (tmp_path / "empty").mkdir()
-    assert ask("vote", capture, "--out", tmp_path / "voted").code == EXIT_DONE
+    assert run_command("vote", capture, "--out", tmp_path / "voted").code == EXIT_DONE
     for command in ("evaluate", "render", "report"):
-        refused(ask(command, tmp_path / "nowhere"), "nowhere", "does not exist")
-        refused(ask(command, tmp_path / "empty"), "empty", "train first")
-        refused(ask(command, tmp_path / "voted"), "voted", "train first")
+        assert_rejected(run_command(command, tmp_path / "nowhere"), "nowhere", "does not exist")
+        assert_rejected(run_command(command, tmp_path / "empty"), "empty", "train first")
+        assert_rejected(run_command(command, tmp_path / "voted"), "voted", "train first")
     assert list((tmp_path / "empty").iterdir()) == []
     (out / "objectgs.json").write_text('{"stages": ')
-    refused(ask("report", out), "objectgs.json", "JSON")
+    assert_rejected(run_command("report", out), "objectgs.json", "JSON")
     (out / "objectgs.json").write_text("{}")
-    refused(ask("report", out), "objectgs.json", "train")
-    refused(ask("train", capture, "--out", out, "--steps", 30, *SMALL), "objectgs.json", "--restart")
+    assert_rejected(run_command("report", out), "objectgs.json", "train")
+    assert_rejected(run_command("train", capture, "--out", out, "--steps", 30, *SMALL), "objectgs.json", "--restart")
 
 
 @pytest.mark.parametrize(
@@ -521,13 +531,13 @@ def test_folders_that_hold_no_reconstruction(trained, write_capture, tmp_path, a
      ["train", "x", "--out", "y", "--semantic-weight", "-0.1"], ["train", "x", "--out", "y", "--sh-degree", "4"],
      ["check", "x", "--max-size", "many"], ["render", "x", "--views", "some"]],
 )  # fmt: skip
-def test_a_command_line_that_makes_no_sense(capsys, words):
+def test_invalid_command_lines_are_rejected(capsys, words):
     assert arguments.main(words) == EXIT_BAD_INPUT
-    said = capsys.readouterr()
-    refused(Answer(EXIT_BAD_INPUT, said.out, said.err), "--help")
-    assert "_" not in said.err.replace("command_line", ""), "no name of a function"
+    captured = capsys.readouterr()
+    assert_rejected(CommandResult(EXIT_BAD_INPUT, captured.out, captured.err), "--help")
+    assert "_" not in captured.err.replace("command_line", ""), "no internal names"
     assert arguments.main([*words, "--json"]) == EXIT_BAD_INPUT
-    assert Answer(EXIT_BAD_INPUT, *capsys.readouterr()).events[-1]["type"] == "error"
+    assert CommandResult(EXIT_BAD_INPUT, *capsys.readouterr()).events[-1]["type"] == "error"
 
 
 # --- a full disk, a damaged checkpoint -------------------------------------------------------------------------------
@@ -550,15 +560,15 @@ def full_disk_for(monkeypatch):
     return start
 
 
-def test_a_disk_full_while_a_checkpoint_is_written(trained, ask, full_disk_for, monkeypatch):
+def test_full_disk_during_checkpoint_keeps_previous_one(trained, run_command, full_disk_for, monkeypatch):
     capture, out = trained
     train = ("train", capture, "--out", out, "--steps", 30, *SMALL)
     full_disk_for(out, "safetensors")
-    refused(ask(*train), str(out / "checkpoint" / CURRENT), "No space left on device")
-    no_halves(out)
+    assert_rejected(run_command(*train), str(out / "checkpoint" / CURRENT), "No space left on device")
+    assert_no_temporary_files(out)
     assert step_of(out) == 20
     monkeypatch.undo()
-    resumed = ask(*train)
+    resumed = run_command(*train)
     assert resumed.code == EXIT_DONE and "Resuming after step 20" in resumed.out and step_of(out) == 30
 
 
@@ -568,41 +578,47 @@ def test_a_disk_full_while_a_checkpoint_is_written(trained, ask, full_disk_for, 
      ("train", "cameras.json"), ("train", "objectgs.json"), ("evaluate", "evaluation.json"),
      ("render", "view_000.png"), ("render", "view_000.ids.png"), ("report", "report.md")],
 )  # fmt: skip
-def test_a_disk_full_at_any_other_file(trained, ask, full_disk_for, command, ending):
+def test_full_disk_during_other_files_keeps_training(trained, run_command, full_disk_for, command, ending):
     capture, out = trained
     words = ("train", capture, "--out", out, "--steps", 25, *SMALL) if command == "train" else (command, out)
     before = (out / "splats.ply").read_bytes()
     full_disk_for(out, ending)
-    refused(ask(*words, *(["--ids"] if command == "render" else [])), ending, "No space left on device", "free some")
-    no_halves(out)
+    assert_rejected(
+        run_command(*words, *(["--ids"] if command == "render" else [])), ending, "No space left on device", "free some"
+    )
+    assert_no_temporary_files(out)
     assert step_of(out) == {"splats.ply": 25, "anchors.ply": 25, "latest.png": 23}.get(ending, 20), (
-        "what was trained is kept"
+        "the trained steps are kept"
     )
     assert ((out / "splats.ply").read_bytes() == before) is (ending != "anchors.ply")
 
 
-def test_a_disk_full_from_the_start_leaves_no_folder(write_capture, tmp_path, ask, full_disk_for):
+def test_full_disk_at_start_leaves_no_folder(write_capture, tmp_path, run_command, full_disk_for):
     full_disk_for(tmp_path, "")
-    refused(ask("vote", write_capture().folder, "--out", tmp_path / "out"), str(tmp_path / "out"), "No space left")
+    assert_rejected(
+        run_command("vote", write_capture().folder, "--out", tmp_path / "out"), str(tmp_path / "out"), "No space left"
+    )
     assert not (tmp_path / "out").exists()
 
 
-def test_a_checkpoint_cut_short_falls_back_and_says_so(trained, ask):
+def test_truncated_checkpoint_falls_back_with_warning(trained, run_command):
     capture, out = trained
-    assert ask("train", capture, "--out", out, "--steps", 25, *SMALL).code == EXIT_DONE
+    assert run_command("train", capture, "--out", out, "--steps", 25, *SMALL).code == EXIT_DONE
     current = out / "checkpoint" / CURRENT
     current.write_bytes(current.read_bytes()[:5000])
     for command in ("evaluate", "render", "report"):
-        answer = ask(command, out)
-        assert answer.code == EXIT_DONE and f"{current} is cut short" in answer.err
-    answer = ask("train", capture, "--out", out, "--steps", 30, *SMALL)
-    assert answer.code == EXIT_DONE and f"{current} is cut short" in answer.err
-    assert "Resuming after step 20" in answer.out and step_of(out) == 30
+        result = run_command(command, out)
+        assert result.code == EXIT_DONE and f"{current} is truncated" in result.err
+    result = run_command("train", capture, "--out", out, "--steps", 30, *SMALL)
+    assert result.code == EXIT_DONE and f"{current} is truncated" in result.err
+    assert "Resuming after step 20" in result.out and step_of(out) == 30
     for path in (current, out / "checkpoint" / PREVIOUS):
         path.write_bytes(b"")
-    refused(ask("render", out), str(out / "checkpoint"), "cut short")
-    refused(ask("train", capture, "--out", out, "--steps", 40, *SMALL), str(out / "checkpoint"), "--restart")
-    assert ask("train", capture, "--out", out, "--steps", 5, *SMALL, "--restart").code == EXIT_DONE
+    assert_rejected(run_command("render", out), str(out / "checkpoint"), "truncated")
+    assert_rejected(
+        run_command("train", capture, "--out", out, "--steps", 40, *SMALL), str(out / "checkpoint"), "--restart"
+    )
+    assert run_command("train", capture, "--out", out, "--steps", 5, *SMALL, "--restart").code == EXIT_DONE
 
 
 # --- stopping --------------------------------------------------------------------------------------------------------
@@ -623,27 +639,27 @@ def signal_at(monkeypatch, owner, name: str, call: int, number=signal.SIGINT) ->
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_saves_and_the_same_command_goes_on(trained, ask, monkeypatch, number):
+def test_signal_saves_and_next_run_resumes(trained, run_command, monkeypatch, number):
     capture, out = trained
     train = ("train", capture, "--out", out, "--steps", 40, *SMALL)
     handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     signal_at(monkeypatch, Trainer, "step", 7, number)
     before = (out / "splats.ply").read_bytes()
-    stopped = ask(*train, "--json")
+    stopped = run_command(*train, "--json")
     assert stopped.code == EXIT_CANCELLED
-    assert (out / "splats.ply").read_bytes() != before, "what the stopped training has come to is there to be seen"
+    assert (out / "splats.ply").read_bytes() != before, "the stopped training exported its splats"
     assert stopped.events[-1]["stopped"] is True and "after 27 steps" in stopped.events[-1]["message"]
     assert step_of(out) == 27
     stages = {s["name"]: s["seconds"] for s in json.loads((out / "objectgs.json").read_text())["stages"]}
     spent = load_checkpoint(out / "checkpoint")[1]["progress"]["seconds"]
-    assert stages["train"] == pytest.approx(spent, abs=0.02), "the time before the stop counts"
+    assert stages["train"] == pytest.approx(spent, abs=0.02), "the time before the stop is included"
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == handlers
     monkeypatch.undo()
-    resumed = ask(*train)
+    resumed = run_command(*train)
     assert resumed.code == EXIT_DONE and "Resuming after step 27" in resumed.out and step_of(out) == 40
 
 
-def test_a_line_stop_on_standard_input(trained, ask, monkeypatch):
+def test_stop_line_on_stdin_stops_training(trained, run_command, monkeypatch):
     capture, out = trained
     begun = threading.Event()
 
@@ -662,37 +678,37 @@ def test_a_line_stop_on_standard_input(trained, ask, monkeypatch):
 
     monkeypatch.setattr(Trainer, "step", step)
     monkeypatch.setattr(sys, "stdin", Typed())
-    stopped = ask("train", capture, "--out", out, "--steps", 100_000, *SMALL, "--json")
+    stopped = run_command("train", capture, "--out", out, "--steps", 100_000, *SMALL, "--json")
     assert stopped.code == EXIT_CANCELLED and stopped.events[-1]["stopped"] is True
     assert 20 < step_of(out) < 100_000
 
 
-def test_stopping_anything_else_leaves_whole_files(write_capture, trained, tmp_path, ask, monkeypatch):
+def test_stopping_other_commands_leaves_no_partial_files(write_capture, trained, tmp_path, run_command, monkeypatch):
     import backend.labels.voting as voting
 
     capture, out = trained
     with monkeypatch.context() as patch:
         signal_at(patch, voting, "_project", 3)
-        assert ask("vote", capture, "--out", tmp_path / "voted").code == EXIT_CANCELLED
+        assert run_command("vote", capture, "--out", tmp_path / "voted").code == EXIT_CANCELLED
     assert not (tmp_path / "voted/points.ply").exists() and not (tmp_path / "voted/objects.json").exists()
     for words in (("render", out, "--views", "all", "--ids"), ("evaluate", out), ("report", out)):
         with monkeypatch.context() as patch:
             signal_at(patch, getattr(commands, words[0]), "draw", 2)
-            answer = ask(*words)
-        assert answer.code == EXIT_CANCELLED and "Stopped" in answer.out and "error" not in answer.err
+            result = run_command(*words)
+        assert result.code == EXIT_CANCELLED and "Stopped" in result.out and "error" not in result.err
         assert len(list((out / "renders").glob("view_???.png"))) == 2
         assert not (out / "evaluation.json").exists() and not (out / "report.md").exists()
-    no_halves(out)
-    no_halves(tmp_path / "voted")
+    assert_no_temporary_files(out)
+    assert_no_temporary_files(tmp_path / "voted")
     scene = write_capture(name="bent", views=5, model="SIMPLE_RADIAL", params=[90, 48, 36, 0.1])
     with monkeypatch.context() as patch:
         signal_at(patch, commands.folder, "load_capture", 1)
-        assert ask("vote", scene.folder, "--out", tmp_path / "bent-out").code == EXIT_CANCELLED
-    no_halves(tmp_path / "bent-out")
-    assert ask("vote", scene.folder, "--out", tmp_path / "bent-out").code == EXIT_DONE
+        assert run_command("vote", scene.folder, "--out", tmp_path / "bent-out").code == EXIT_CANCELLED
+    assert_no_temporary_files(tmp_path / "bent-out")
+    assert run_command("vote", scene.folder, "--out", tmp_path / "bent-out").code == EXIT_DONE
 
 
-def test_a_second_signal_ends_it_at_once(trained, ask, monkeypatch):
+def test_second_signal_stops_immediately(trained, run_command, monkeypatch):
     capture, out = trained
 
     def twice(*_):
@@ -700,11 +716,11 @@ def test_a_second_signal_ends_it_at_once(trained, ask, monkeypatch):
         signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(Trainer, "step", twice)
-    answer = ask("train", capture, "--out", out, "--steps", 40, *SMALL)
-    assert answer.code == EXIT_CANCELLED and "Stopped immediately" in answer.out and step_of(out) == 20
+    result = run_command("train", capture, "--out", out, "--steps", 40, *SMALL)
+    assert result.code == EXIT_CANCELLED and "Stopped immediately" in result.out and step_of(out) == 20
 
 
-def test_a_real_process_stops_on_a_signal_and_on_a_reader_that_left(write_capture, tmp_path):
+def test_process_stops_on_signal_and_closed_stdout(write_capture, tmp_path):
     scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
     train = [sys.executable, "-m", "backend", "train", str(scene.folder), "--out", str(out), "--steps", "100000",
              *SMALL, "--threads", "1", "--json"]  # fmt: skip
@@ -716,8 +732,8 @@ def test_a_real_process_stops_on_a_signal_and_on_a_reader_that_left(write_captur
             process.send_signal(signal.SIGTERM)
             break
     rest, err = process.communicate(timeout=60)
-    answer = Answer(process.returncode, "".join(lines) + rest, err)
-    assert answer.code == EXIT_CANCELLED and answer.events[-1]["stopped"] is True and err == ""
+    result = CommandResult(process.returncode, "".join(lines) + rest, err)
+    assert result.code == EXIT_CANCELLED and result.events[-1]["stopped"] is True and err == ""
     assert step_of(out) > 0
 
     process = subprocess.Popen(train, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -726,13 +742,13 @@ def test_a_real_process_stops_on_a_signal_and_on_a_reader_that_left(write_captur
     assert process.wait(timeout=60) == EXIT_CANCELLED
     assert process.stderr.read() == ""
     assert step_of(out) > 0
-    no_halves(out)
+    assert_no_temporary_files(out)
 
 
-# --- two at once -----------------------------------------------------------------------------------------------------
+# --- locking ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_folder_is_trained_by_one_process_until_it_ends_or_is_killed(write_capture, tmp_path, ask):
+def test_folder_is_locked_by_training_process(write_capture, tmp_path, run_command):
     capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"
     train = ("train", str(capture), "--out", str(out), *SMALL)
     process = subprocess.Popen(
@@ -743,7 +759,7 @@ def test_a_folder_is_trained_by_one_process_until_it_ends_or_is_killed(write_cap
         try:
             assert any('"preview"' in line for line in process.stdout)
             for words in (train, ("vote", capture, "--out", out), (*train, "--restart")):
-                sentence = refused(ask(*words))
+                sentence = assert_rejected(run_command(*words))
                 assert sentence == (
                     f"error: {out} is in use by another process (pid {process.pid}); wait for it to finish or stop it."
                 )
@@ -753,20 +769,20 @@ def test_a_folder_is_trained_by_one_process_until_it_ends_or_is_killed(write_cap
         # The process has ended, but its exit status has not been collected.
         os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
         assert (out / LOCK).read_text() == f"{process.pid}\n"
-        assert ask(*train, "--steps", 5).code == EXIT_DONE
-    no_halves(out)
+        assert run_command(*train, "--steps", 5).code == EXIT_DONE
+    assert_no_temporary_files(out)
 
 
 @pytest.mark.parametrize("left", ["", "no number", "999999999", "0", "-1", pytest.param(str(os.getpid()), id="own")])
-def test_a_lock_without_its_process_is_taken_over(trained, ask, left):
+def test_stale_lock_is_taken_over(trained, run_command, left):
     capture, out = trained
     (out / LOCK).write_text(left)
-    assert ask("train", capture, "--out", out, "--steps", 20, *SMALL).code == EXIT_DONE
-    no_halves(out)
+    assert run_command("train", capture, "--out", out, "--steps", 20, *SMALL).code == EXIT_DONE
+    assert_no_temporary_files(out)
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt, OSError, MemoryError, InputError])
-def test_the_lock_goes_however_a_training_ends(trained, ask, monkeypatch, error):
+def test_lock_is_removed_after_any_error(trained, run_command, monkeypatch, error):
     capture, out = trained
     seen = []
 
@@ -775,12 +791,12 @@ def test_the_lock_goes_however_a_training_ends(trained, ask, monkeypatch, error)
         raise error("It ended.")
 
     monkeypatch.setattr(Trainer, "step", step)
-    assert ask("train", capture, "--out", out, "--steps", 30, *SMALL).code != EXIT_DONE
+    assert run_command("train", capture, "--out", out, "--steps", 30, *SMALL).code != EXIT_DONE
     assert seen == [f"{os.getpid()}\n"]
-    no_halves(out)
+    assert_no_temporary_files(out)
 
 
-def test_a_lock_that_cannot_be_written_leaves_nothing(tmp_path, monkeypatch):
+def test_failed_lock_write_leaves_no_file(tmp_path, monkeypatch):
     def full():
         raise OSError(28, "No space left on device")
 
@@ -793,42 +809,42 @@ def test_a_lock_that_cannot_be_written_leaves_nothing(tmp_path, monkeypatch):
 # --- other errors ----------------------------------------------------------------------------------------------------
 
 
-def test_an_unexpected_failure_is_exit_code_1(write_capture, ask, monkeypatch):
+def test_unexpected_error_returns_exit_code_1(write_capture, run_command, monkeypatch):
     def broken(*_):
         raise ZeroDivisionError("two\nlines")
 
     monkeypatch.setattr(commands.check, "check_capture", broken)
-    answer = ask("check", write_capture().folder, "--json")
-    assert answer.code == EXIT_FAILED and "Traceback" in answer.err
-    assert answer.messages("error") == ["Unexpected error: ZeroDivisionError: two lines"]
+    result = run_command("check", write_capture().folder, "--json")
+    assert result.code == EXIT_FAILED and "Traceback" in result.err
+    assert result.messages("error") == ["Unexpected error: ZeroDivisionError: two lines"]
 
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])
-def test_too_little_memory_is_one_sentence(write_capture, ask, monkeypatch, error):
+def test_out_of_memory_is_reported(write_capture, run_command, monkeypatch, error):
     def greedy(*_):
         raise error
 
     monkeypatch.setattr(commands.check, "check_capture", greedy)
-    refused(ask("check", write_capture().folder), "not enough memory", "--max-size")
+    assert_rejected(run_command("check", write_capture().folder), "not enough memory", "--max-size")
 
 
-def test_figures_without_a_finite_value_are_null_in_events(trained, ask, monkeypatch):
+def test_nonfinite_figures_are_null(trained, run_command, monkeypatch):
     _, out = trained
     monkeypatch.setattr("backend.evaluation.metrics.psnr", lambda a, b: float("inf"))
-    answer = ask("evaluate", out, "--json")
-    assert answer.code == EXIT_DONE and "Infinity" not in answer.out
+    result = run_command("evaluate", out, "--json")
+    assert result.code == EXIT_DONE and "Infinity" not in result.out
     assert json.loads((out / "evaluation.json").read_text())["quality"]["psnr"] is None
 
 
-def test_doctor_takes_a_small_scene_through_everything(ask):
-    answer = ask("doctor", "--json")
-    assert answer.code == EXIT_DONE and "works" in answer.events[-1]["message"]
+def test_doctor_runs_small_scene(run_command):
+    result = run_command("doctor", "--json")
+    assert result.code == EXIT_DONE and "works" in result.events[-1]["message"]
     if devices.why_not_cuda() is not None:
-        assert answer.events[-1]["machine"]["device"] == "cpu"
-        assert f"CUDA is not used: {devices.why_not_cuda()}" in answer.messages("status")
+        assert result.events[-1]["machine"]["device"] == "cpu"
+        assert f"CUDA is not used: {devices.why_not_cuda()}" in result.messages("status")
 
 
-def test_help_says_what_each_command_does_with_an_example(capsys):
+def test_help_has_examples_and_defaults(capsys):
     names = ["check", "import", "vote", "train", "render", "edit", "export", "import-splats", "evaluate", "report"]
     names.append("doctor")
     texts = {}
@@ -852,7 +868,7 @@ def test_help_says_what_each_command_does_with_an_example(capsys):
 # --- the fit of a view-dependent model -------------------------------------------------------------------------------
 
 
-def test_a_model_that_does_not_look_at_the_view_is_fitted_exactly(write_capture, tmp_path, ask, monkeypatch):
+def test_fit_of_view_independent_model_is_exact(write_capture, tmp_path, run_command, monkeypatch):
     scene = write_capture(views=9, size=(64, 48))
     capture = load_capture(scene.folder, tmp_path / "cache")
     ids = np.repeat([1, 2, 5], len(capture.points.xyz) // 3)

@@ -29,7 +29,7 @@ def reporter(stream=None):
     return ConsoleReporter(stream or io.StringIO(), io.StringIO())
 
 
-def test_clock():
+def test_clock_formats_seconds():
     assert [clock(s) for s in (0, 9.4, 59.6, 754, 3600, 3725)] == [
         "0:00",
         "0:09",
@@ -40,7 +40,7 @@ def test_clock():
     ]
 
 
-def test_a_log_file_gets_few_plain_lines(now):
+def test_log_file_gets_few_plain_lines(now):
     out = reporter()
     out.status("Training")
     for i in range(1000):
@@ -56,7 +56,7 @@ def test_a_log_file_gets_few_plain_lines(now):
     assert lines[-2] == "  100%  loss 0.5000, 12,345 splats"
 
 
-def test_time_left_is_estimated_where_it_is_not_given(now):
+def test_missing_time_left_is_estimated(now):
     out = reporter()
     out.status("Evaluating")
     now[0] += 10
@@ -64,7 +64,7 @@ def test_time_left_is_estimated_where_it_is_not_given(now):
     assert "25%  0:30 left" in out.stream.getvalue()
 
 
-def test_figures_that_come_now_and_then_stay_on_show(now):
+def test_occasional_figures_stay_displayed(now):
     out = reporter()
     out.status("Training")
     for fields in ({"psnr": 30.04, "miou": 0.9}, {"psnr": None}, {"loss": 0.1}):
@@ -76,7 +76,7 @@ def test_figures_that_come_now_and_then_stay_on_show(now):
     assert out.stream.getvalue().splitlines()[-1] == "   10%  0:05 left"
 
 
-def test_warnings_and_errors_go_to_their_own_stream():
+def test_warnings_and_errors_use_error_stream():
     out = reporter()
     out.warning("2 images have no pose.")
     out.error("a.png does not exist.")
@@ -84,7 +84,7 @@ def test_warnings_and_errors_go_to_their_own_stream():
     assert out.errors.getvalue() == "warning: 2 images have no pose.\nerror: a.png does not exist.\n"
 
 
-def test_done_says_the_figures_and_the_files():
+def test_done_lists_figures_and_files():
     out = reporter()
     out.done(psnr=31.24, miou=0.97, ssim=None, report=Path("out/report.md"))
     assert out.stream.getvalue().splitlines() == [
@@ -93,21 +93,21 @@ def test_done_says_the_figures_and_the_files():
     ]
 
 
-def test_previews_name_their_folder_once():
+def test_preview_folder_is_printed_once():
     out = reporter()
     for i in range(5):
         out.preview(Path("out/previews") / f"{i}.png")
     assert out.stream.getvalue().splitlines() == [f"  previews in {Path('out/previews')}"]
 
 
-def test_nothing_to_do_is_no_division_by_zero():
+def test_zero_total_is_handled():
     out = reporter()
     out.progress(0, 0)
     out.done()
     assert out.stream.getvalue().splitlines()[-1] == "Done."
 
 
-def test_a_terminal_gets_a_bar_that_fits_its_width(monkeypatch):
+def test_terminal_bar_fits_width(monkeypatch):
     monkeypatch.setenv("COLUMNS", "60")
     out = reporter(Terminal())
     out.status("Training")
@@ -124,7 +124,7 @@ def test_a_terminal_gets_a_bar_that_fits_its_width(monkeypatch):
     assert out.errors.getvalue() == "warning: careful\n"
 
 
-def test_a_warning_amid_the_bar_starts_on_a_line_of_its_own(monkeypatch):
+def test_warning_starts_new_line_after_bar(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     stream = Terminal()
     out = ConsoleReporter(stream, stream)

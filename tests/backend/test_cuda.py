@@ -23,7 +23,7 @@ HERE = Path("tests") / "backend"
     ],
     ids=["random scenes", "stiff scenes", "stiff scenes of discs"],
 )
-def test_simulated(words):
+def test_kernels_in_simulator(words):
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist", "--durations=5", *words],
         cwd=ROOT, env=os.environ | {"NUMBA_ENABLE_CUDASIM": "1"}, capture_output=True, text=True,
@@ -32,17 +32,17 @@ def test_simulated(words):
     assert " passed" in done.stdout
 
 
-def test_the_cpu_renderer_needs_nothing_of_cuda():
+def test_cpu_renderer_works_without_numba_cuda():
     """numba-cuda may be missing or fail on import."""
     script = """
 import sys
 sys.modules["numba.cuda"] = None
 from tests.backend.test_raster import as_float32, camera, mapped, random_scene, rasterize
 scene = {k: v.requires_grad_(k != "ids") for k, v in as_float32(random_scene(0)).items()}
-picture = rasterize(**scene, camera=camera())
-picture.color.sum().backward()
-mapped(picture)
-print(type(picture.frame).__module__)
+rendered = rasterize(**scene, camera=camera())
+rendered.color.sum().backward()
+mapped(rendered)
+print(type(rendered.frame).__module__)
 """
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
     assert (done.returncode, done.stdout.strip()) == (0, "backend.raster.cpu.renderer"), done.stderr

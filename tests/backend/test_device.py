@@ -83,22 +83,22 @@ FRUSTUM = (*CAMERA.arrays(), CAMERA.width, CAMERA.height, CAMERA.near)
 
 
 @pytest.mark.parametrize("mode", ["explicit", "view"])
-def test_gaussians_and_their_gradients(both, mode):
+def test_generated_gaussians_match(both, mode):
     anchors = some_anchors(200)
     heads = Heads(anchors.layout, mode, 2, torch.Generator().manual_seed(1))
     rng = np.random.default_rng(0)
     weights = [torch.tensor(rng.normal(size=(800, w)), dtype=torch.float32) for w in (3, 4, 3, 1, 27)]
 
-    def made():
+    def generated():
         rows = anchors.rows.clone().requires_grad_()
         g = generate(
             anchors.layout, anchors.positions, rows, anchors.ids, heads, np.array([0.1, 0.2, -9.0])
-        ).only_made()
+        ).only_valid()
         parts = (g.means, g.quats, g.scales, g.opacities, g.sh)
         total = sum((p.reshape(len(p), -1) * w[g.source][:, : p[0].numel()]).sum() for p, w in zip(parts, weights))
         return g, torch.autograd.grad(total, [rows, *heads.parameters()])
 
-    (want, want_gradients), (got, gradients) = both(made)
+    (want, want_gradients), (got, gradients) = both(generated)
     assert 100 < len(want.source) < 800
     for name in ("source", "ids"):
         assert torch.equal(getattr(got, name), getattr(want, name)), name
@@ -108,24 +108,24 @@ def test_gaussians_and_their_gradients(both, mode):
         close(a, b)
 
 
-def test_absent_anchors_make_no_gaussian(as_on_gpu):
+def test_absent_anchors_generate_no_gaussians(as_on_gpu):
     as_on_gpu(True)
     anchors = some_anchors(50)
     heads = Heads(anchors.layout, "explicit", 0, torch.Generator())
     present = torch.arange(50) < 30
     g = generate(anchors.layout, anchors.positions, anchors.rows, anchors.ids, heads, present=present)
-    assert len(g.source) == 200 and (g.made == (g.opacities > 0)).all()
-    assert g.only_made().source.max() < 120 and g.only_made().made is None
+    assert len(g.source) == 200 and (g.valid == (g.opacities > 0)).all()
+    assert g.only_valid().source.max() < 120 and g.only_valid().valid is None
 
 
-def test_an_extent_beyond_the_limit_keeps_its_gradient(both):
+def test_clamped_extent_keeps_gradient(both):
     anchors = some_anchors(6)
     anchors.rows[:, anchors.layout.extent_columns] = 25.0
     heads = Heads(anchors.layout, "explicit", 0, torch.Generator())
 
     def gradient():
         rows = anchors.rows.clone().requires_grad_()
-        generate(anchors.layout, anchors.positions, rows, anchors.ids, heads).only_made().scales.sum().backward()
+        generate(anchors.layout, anchors.positions, rows, anchors.ids, heads).only_valid().scales.sum().backward()
         return rows.grad[:, anchors.layout.extent_columns]
 
     want, got = both(gradient)
@@ -133,7 +133,7 @@ def test_an_extent_beyond_the_limit_keeps_its_gradient(both):
     assert (got[:, 3:] > 0).all()
 
 
-def test_anchors_in_view(both, as_on_gpu):
+def test_anchors_in_view_match(both, as_on_gpu):
     anchors = some_anchors(4000, spread=4.0)
     want, got = both(lambda: anchors_in_view(anchors, *FRUSTUM))
     assert torch.equal(got, want) and 100 < len(want) < 3900
@@ -146,7 +146,7 @@ def test_anchors_in_view(both, as_on_gpu):
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 33)])
 @pytest.mark.parametrize("weights", [(0.2, 0.1), (0.0, 0.0)])
-def test_image_loss(both, size, weights):
+def test_image_loss_matches(both, size, weights):
     rng = np.random.default_rng(3)
     h, w = size
     base = [torch.tensor(rng.uniform(0, 1, s), dtype=torch.float32) for s in ((3, h, w), (h, w), (h, w), (3,))]
@@ -169,12 +169,12 @@ def test_image_loss(both, size, weights):
 
 
 @pytest.mark.parametrize("flat", [False, True])
-def test_volume_loss(both, as_on_gpu, flat):
+def test_volume_loss_matches(both, as_on_gpu, flat):
     scales = torch.rand(2500, 3)
 
-    def loss(made=None):
+    def loss(valid=None):
         leaf = scales.clone().requires_grad_()
-        value = volume_loss(leaf, flat, made)
+        value = volume_loss(leaf, flat, valid)
         value.backward()
         return value, leaf.grad
 
@@ -182,13 +182,13 @@ def test_volume_loss(both, as_on_gpu, flat):
     close(got, want, 1e-5)
     close(gradient, want_gradient, 1e-5)
     as_on_gpu(True)
-    made = torch.rand(2500) < 0.4
-    value, gradient = loss(made)
-    close(value, scales[made][:, : 2 if flat else 3].prod(1).mean(), 1e-5)
-    assert (gradient[~made] == 0).all()
+    valid = torch.rand(2500) < 0.4
+    value, gradient = loss(valid)
+    close(value, scales[valid][:, : 2 if flat else 3].prod(1).mean(), 1e-5)
+    assert (gradient[~valid] == 0).all()
 
 
-def test_normal_loss(both):
+def test_normal_loss_matches(both):
     rng = np.random.default_rng(0)
     h, w = 19, 31
     x, y = np.meshgrid(np.arange(w), np.arange(h))
@@ -209,7 +209,7 @@ def test_normal_loss(both):
         close(a, b, 1e-3, 1e-4)
 
 
-def test_adam_steps_what_is_seen_usable_and_finite(both, monkeypatch):
+def test_adam_updates_seen_usable_finite_rows(both, monkeypatch):
     monkeypatch.setattr("backend.training.adam._ROWS_AT_ONCE", 4)
     rng = np.random.default_rng(0)
     base = torch.tensor(rng.normal(size=(20, 7)), dtype=torch.float32)
@@ -233,13 +233,13 @@ def test_adam_steps_what_is_seen_usable_and_finite(both, monkeypatch):
     assert torch.equal(values[9], got[1][9])
 
 
-def test_rows_taken(both):
+def test_take_rows_matches(both):
     values = torch.rand(9, 5)
     want, got = both(lambda: take_rows(values, torch.tensor([3, 1, 8])))
     assert torch.equal(got, want) and torch.equal(want, values[[3, 1, 8]])
 
 
-def test_growth_and_its_statistics(both, as_on_gpu):
+def test_growth_and_statistics_match(both, as_on_gpu):
     rng = np.random.default_rng(2)
     anchors = some_anchors(60)
     heads = Heads(anchors.layout, "explicit", 1, torch.Generator().manual_seed(0))
@@ -287,22 +287,22 @@ def quality(trainer):
     capture = trainer.scene.capture
     found, right = [], []
     for index in capture.train_indices:
-        picture = draw(trainer.shown, trainer.scene.camera(index))
+        rendered = draw(trainer.shown, trainer.scene.camera(index))
         truth = capture.mask(index)
-        found.append(psnr(picture.image, capture.image(index) / 255.0))
-        right.append((picture.ids[truth > 0] == truth[truth > 0]).mean())
+        found.append(psnr(rendered.image, capture.image(index) / 255.0))
+        right.append((rendered.ids[truth > 0] == truth[truth > 0]).mean())
     return float(np.mean(found)), float(np.mean(right))
 
 
 @pytest.mark.parametrize("settings", [SMALL, FLAT], ids=["3d", "2d"])
-def test_training_as_on_a_gpu_is_as_good(tiny, both, settings):
+def test_training_quality_matches(tiny, both, settings):
     capture, ids = tiny()
     (want, want_right), (got, right) = both(lambda: quality(trained(capture, ids, settings)))
     assert want > 20 and got > want - 0.7
     assert right > 0.95 and right > want_right - 0.02
 
 
-def test_the_first_steps_are_the_same(tiny, both):
+def test_first_losses_match(tiny, both):
     capture, ids = tiny()
 
     def losses():
@@ -314,7 +314,7 @@ def test_the_first_steps_are_the_same(tiny, both):
 
 
 @pytest.mark.parametrize("first", [False, True])
-def test_a_checkpoint_goes_on_on_the_other_device(tiny, tmp_path, as_on_gpu, first):
+def test_checkpoint_resumes_on_other_device(tiny, tmp_path, as_on_gpu, first):
     capture, ids = tiny()
     as_on_gpu(first)
     Trainer.start(capture, ids, SMALL).run(Budget(steps=70), tmp_path, Reporter())
@@ -328,7 +328,7 @@ def test_a_checkpoint_goes_on_on_the_other_device(tiny, tmp_path, as_on_gpu, fir
     assert found > 20 and right > 0.9
 
 
-class Numbers(TorchDispatchMode):
+class SyncRecorder(TorchDispatchMode):
     """Recorder of operations that make the CPU wait for a value from the device."""
 
     def __init__(self):
@@ -347,29 +347,29 @@ class Numbers(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("settings", [SMALL, FLAT, dataclasses.replace(SMALL, mode="view")], ids=["3d", "2d", "view"])
-def test_a_step_on_the_gpu_waits_for_no_number(tiny, as_on_gpu, settings):
+def test_gpu_step_does_not_synchronize(tiny, as_on_gpu, settings):
     as_on_gpu(True)
     capture, ids = tiny()
     trainer = Trainer.start(capture, ids, settings)
     for share in (0.3, 0.3, 0.8):
         trainer.step(share)
     trainer.progress.last_growth = trainer.progress.step
-    with Numbers() as numbers:
+    with SyncRecorder() as recorder:
         for share in (0.3, 0.8):
             trainer.step(share)
-    assert not numbers.found
-    with Numbers() as numbers:
+    assert not recorder.found
+    with SyncRecorder() as recorder:
         float(trainer.step(0.8))
-    assert numbers.found == ["_local_scalar_dense"]
+    assert recorder.found == ["_local_scalar_dense"]
 
 
-def test_fewer_anchors_are_taken_for_a_view_that_was_seen_before(tiny, as_on_gpu, monkeypatch):
+def test_anchor_limit_shrinks_for_known_views(tiny, as_on_gpu, monkeypatch):
     as_on_gpu(True)
     capture, ids = tiny()
     monkeypatch.setattr(step._Limits, "_STEP", 8)
     trainer = Trainer.start(capture, ids, SMALL)
     anchors = trainer.model.anchors
-    anchors.positions[: len(anchors) // 2] += 1000.0  # out of sight
+    anchors.positions[: len(anchors) // 2] += 1000.0  # out of view
     taken = []
 
     def limited(*args):
@@ -385,7 +385,7 @@ def test_fewer_anchors_are_taken_for_a_view_that_was_seen_before(tiny, as_on_gpu
     assert all(count <= limit < 0.8 * len(anchors) for limit, count in taken[views:])
 
 
-def test_a_picture_whose_loss_is_not_finite_changes_nothing(tiny, as_on_gpu, monkeypatch):
+def test_nonfinite_image_loss_changes_nothing(tiny, as_on_gpu, monkeypatch):
     as_on_gpu(True)
     capture, ids = tiny()
     trainer = Trainer.start(capture, ids, SMALL)
@@ -412,7 +412,7 @@ for primitive in ("3d", "2d"):
 """
 
 
-def test_the_whole_loop_runs_in_numbas_simulator(write_capture, tmp_path):
+def test_training_in_simulator_matches_cpu(write_capture, tmp_path):
     """With the CUDA kernels, losses and images equal those of the CPU."""
     folder = write_capture(views=3, size=(24, 18), points=20).folder
     found = []
@@ -429,12 +429,12 @@ def test_the_whole_loop_runs_in_numbas_simulator(write_capture, tmp_path):
 # --- out of memory ---------------------------------------------------------------------------------------------------
 
 
-def test_strips_are_the_picture(tiny):
+def test_strips_cover_image(tiny):
     camera = dataclasses.replace(CAMERA, gain=(1.0, 1.1, 1.2))
-    picture, labels = torch.rand(3, 48, 64), torch.randint(-1, 3, (48, 64))
+    image, labels = torch.rand(3, 48, 64), torch.randint(-1, 3, (48, 64))
     for count in (1, 2, 3):
-        found = strips(camera, picture, labels, count)
-        assert torch.equal(torch.cat([part for _, part, _ in found], 2), picture)
+        found = strips(camera, image, labels, count)
+        assert torch.equal(torch.cat([part for _, part, _ in found], 2), image)
         assert torch.equal(torch.cat([part for _, _, part in found], 1), labels)
         assert all((c.width, c.height) == (p.shape[2], p.shape[1]) for c, p, _ in found)
     anchors = some_anchors(100)
@@ -443,13 +443,13 @@ def test_strips_are_the_picture(tiny):
         g = generate(anchors.layout, anchors.positions, anchors.rows, anchors.ids, heads)
         whole = rasterize(*g[:6], camera).color
         upright = dataclasses.replace(camera, width=48)
-        parts = [rasterize(*g[:6], c).color for c, _, _ in strips(camera, picture, labels, 2)]
-        lower = [rasterize(*g[:6], c).color for c, _, _ in strips(upright, picture[..., :48], labels[:, :48], 2)]
+        parts = [rasterize(*g[:6], c).color for c, _, _ in strips(camera, image, labels, 2)]
+        lower = [rasterize(*g[:6], c).color for c, _, _ in strips(upright, image[..., :48], labels[:, :48], 2)]
     close(torch.cat(parts, 2), whole, 1e-4, 1e-5)
     assert lower[0].shape == (3, 48, 24)
 
 
-def test_parts_teach_the_same_as_the_whole(tiny, as_on_gpu):
+def test_strips_give_same_gradients(tiny, as_on_gpu):
     """Except SSIM beside the cuts, and the volume loss (a mean over each part's splats)."""
     as_on_gpu(True)
     capture, ids = tiny()
@@ -487,7 +487,7 @@ FULL = [
 
 
 @pytest.mark.parametrize("error", FULL, ids=["torch", "numba"])
-def test_out_of_memory_is_said_once_and_training_goes_on_in_parts(tiny, tmp_path, as_on_gpu, monkeypatch, error):
+def test_out_of_memory_warns_once_and_continues_in_parts(tiny, tmp_path, as_on_gpu, monkeypatch, error):
     as_on_gpu(True)
     capture, ids = tiny()
 
@@ -506,7 +506,7 @@ def test_out_of_memory_is_said_once_and_training_goes_on_in_parts(tiny, tmp_path
     assert found > 20 and right > 0.9
 
 
-def test_without_any_room_the_training_ends_with_a_sentence_and_a_checkpoint(tiny, tmp_path, as_on_gpu, monkeypatch):
+def test_persistent_out_of_memory_ends_with_checkpoint(tiny, tmp_path, as_on_gpu, monkeypatch):
     as_on_gpu(True)
     capture, ids = tiny()
     trainer = Trainer.start(capture, ids, SMALL)
@@ -524,7 +524,7 @@ def test_without_any_room_the_training_ends_with_a_sentence_and_a_checkpoint(tin
     assert resumed.progress.step == 3
 
 
-def test_other_errors_are_not_taken_for_a_lack_of_memory(tiny, as_on_gpu, monkeypatch):
+def test_other_errors_are_not_treated_as_out_of_memory(tiny, as_on_gpu, monkeypatch):
     as_on_gpu(True)
     capture, ids = tiny()
 
@@ -545,17 +545,17 @@ without_cuda = pytest.mark.skipif(devices.why_not_cuda() is None, reason="CUDA w
 
 @without_cuda
 @pytest.mark.parametrize("command", ["train", "render", "evaluate", "mesh", "report", "doctor"])
-def test_cuda_where_there_is_none_is_refused_with_a_sentence(ask, write_capture, tmp_path, command):
+def test_unavailable_cuda_is_rejected(run_command, write_capture, tmp_path, command):
     arguments = {"train": [write_capture().folder, "--out", tmp_path / "out"], "doctor": []}.get(command, [tmp_path])
-    answer = ask(command, *map(str, arguments), "--device", "cuda", "--json")
-    assert answer.code == 2
-    message = answer.events[-1]["message"]
+    result = run_command(command, *map(str, arguments), "--device", "cuda", "--json")
+    assert result.code == 2
+    message = result.events[-1]["message"]
     assert message == devices.why_not_cuda() and message.endswith(".") and "\n" not in message
     assert not (tmp_path / "out").exists()
 
 
 @without_cuda
-def test_auto_is_the_cpu_where_cuda_does_not_work():
+def test_auto_selects_cpu_without_cuda():
     assert devices.pick("auto") == devices.pick("cpu") == torch.device("cpu")
     with pytest.raises(InputError):
         devices.pick("cuda")
@@ -568,7 +568,7 @@ def test_auto_is_the_cpu_where_cuda_does_not_work():
     ("No CUDA GPUs are available", "shows no GPU"),
     ("CUDA unknown error - this may be due to an incorrectly set up environment", "does not start"),
 ])  # fmt: skip
-def test_torchs_errors_are_explained(error, part):
+def test_torch_errors_are_explained(error, part):
     sentence = devices.explain_cuda_error(error, "13.0")
     assert part in sentence and sentence.endswith(".") and "\n" not in sentence
 
@@ -587,7 +587,7 @@ def test_low_memory_is_explained_with_figures():
 
 @without_cuda
 @pytest.mark.skipif(shutil.which("make") is None or shutil.which("nvidia-smi") is not None, reason="no make, or a GPU")
-def test_make_gpu_without_a_gpu_says_so_and_passes_nothing():
+def test_make_gpu_reports_missing_gpu():
     done = subprocess.run(
         ["make", "--no-print-directory", "gpu", f"PYTHON={sys.executable}"],
         cwd=ROOT,
@@ -601,7 +601,7 @@ def test_make_gpu_without_a_gpu_says_so_and_passes_nothing():
     ]
 
 
-def test_training_needs_nothing_that_reads_captures():
+def test_training_imports_no_capture_packages():
     """A machine that has only torch and numba can benchmark the training."""
     absent = ("pycolmap", "xatlas", "manifold3d", "fast_simplification", "skimage", "matplotlib")
     code = (

@@ -26,7 +26,7 @@ from backend.shared.reconstruction.objects import edit_objects, read_objects, wr
 from backend.shared.reconstruction.record import ExportRecord, TrainingRecord, VotesRecord, update_record
 from backend.shared.splats.spherical_harmonics import C0
 
-from .asking import refused
+from .command_result import assert_rejected
 
 NAMES = {1: "mug", 2: "Blue box", 3: "box", 7: "can"}
 UPRIGHT = Rotation.from_euler("xyz", [0.3, 0.8, -0.5]).as_matrix()
@@ -63,20 +63,20 @@ def edited(folder, object_id):
 # --- edit ------------------------------------------------------------------------------------------------------------
 
 
-def test_objects_are_removed_and_restored_by_name_part_or_id(ask, folder):
-    answer = ask("edit", folder.folder, "--remove", "MUG", "blue", "7", "--floaters", "--json")
-    assert answer.code == EXIT_DONE and answer.events[-1]["edited"] == 3
+def test_objects_are_removed_and_restored_by_name_or_id(run_command, folder):
+    result = run_command("edit", folder.folder, "--remove", "MUG", "blue", "7", "--floaters", "--json")
+    assert result.code == EXIT_DONE and result.events[-1]["edited"] == 3
     assert [entry.removed and entry.floaters for entry in read_objects(folder.objects)] == [True, True, False, True]
-    (said,) = answer.messages("status")
-    assert "1 mug: removed with floaters\n" in said and "3 box: as captured\n" in said
-    filled = ask("edit", folder.folder, "--remove", "mug", "--fill").out
+    (status,) = result.messages("status")
+    assert "1 mug: removed with floaters\n" in status and "3 box: as captured\n" in status
+    filled = run_command("edit", folder.folder, "--remove", "mug", "--fill").out
     assert "1 mug: removed, its hole not filled, since there is no flat surface around it" in filled
-    ask("edit", folder.folder, "--restore", "mug", "box")
+    run_command("edit", folder.folder, "--restore", "mug", "box")
     assert [entry.removed for entry in read_objects(folder.objects)] == [False, True, False, True]
     assert json.loads(folder.objects.read_text())["edits"].keys() == {"2", "7"}
 
 
-def test_fills_of_holes_are_cached_for_those_who_show_them(ask, folder):
+def test_fills_are_cached_per_edit_state(run_command, folder):
     """One file per state of edits and splats; undoing an edit reuses the earlier file, and old files are removed."""
     rng = np.random.default_rng(0)
     ground = np.column_stack([rng.uniform(-1, 1, (9000, 2)), np.zeros(9000)])
@@ -91,52 +91,52 @@ def test_fills_of_holes_are_cached_for_those_who_show_them(ask, folder):
     def path():
         return fill_path(folder, read_objects(folder.objects))
 
-    ask("edit", folder.folder, "--remove", "mug")
-    assert path() is None and not folder.cache.exists(), "no hole is to be filled"
-    answer = ask("edit", folder.folder, "--remove", "mug", "--fill", "--json")
+    run_command("edit", folder.folder, "--remove", "mug")
+    assert path() is None and not folder.cache.exists(), "no fill is requested"
+    result = run_command("edit", folder.folder, "--remove", "mug", "--fill", "--json")
     first, table = path(), read_vertices(path())
     count = int(table["unobserved"].sum())
-    assert count > 50 and answer.events[-1]["new_splats"] == count and set(table["fills"].tolist()) == {1}
-    assert f"1 mug: removed, its hole filled with {count} new splats" in answer.messages("status")[-1]
+    assert count > 50 and result.events[-1]["new_splats"] == count and set(table["fills"].tolist()) == {1}
+    assert f"1 mug: removed, its hole filled with {count} new splats" in result.messages("status")[-1]
     wanted = apply_edits(read_splats(folder.splats)[0], read_objects(folder.objects))
     put = read_splats(first)[0]
     assert np.array_equal(put.select(put.unobserved).means, wanted.select(wanted.unobserved).means)
     written = first.stat().st_mtime_ns
-    ask("edit", folder.folder, "--remove", "can")
+    run_command("edit", folder.folder, "--remove", "can")
     assert path() != first and path().is_file()
-    ask("edit", folder.folder, "--restore", "can")
+    run_command("edit", folder.folder, "--restore", "can")
     assert path() == first and first.stat().st_mtime_ns == written
     for i in range(12):
         (folder.cache / f"fill-{i}.ply").touch()
     write_splats(folder.splats, splats.select(np.arange(len(splats)) > 0))
     assert path() != first
-    ask("edit", folder.folder)
+    run_command("edit", folder.folder)
     assert path().is_file() and len(list(folder.cache.glob("fill-*.ply"))) == 8
 
 
-def test_without_options_the_edits_are_said_and_nothing_is_written(ask, folder):
+def test_edit_without_options_lists_edits(run_command, folder):
     before = folder.objects.read_bytes()
-    answer = ask("edit", folder.folder)
-    assert answer.code == EXIT_DONE and "7 can: as captured" in answer.out and folder.objects.read_bytes() == before
+    result = run_command("edit", folder.folder)
+    assert result.code == EXIT_DONE and "7 can: as captured" in result.out and folder.objects.read_bytes() == before
 
 
-def test_recoloring_takes_the_middle_from_the_splats(ask, folder):
+def test_recolor_middle_is_mean_luma(run_command, folder):
     splats = read_splats(folder.splats)[0]
     own = splats.select(splats.object_ids == 7)
-    ask("edit", folder.folder, "--recolor", "can:hue=0.3, saturation=0.5", "mug:replace=#ff0080,tint=#00ff00")
+    run_command("edit", folder.folder, "--recolor", "can:hue=0.3, saturation=0.5", "mug:replace=#ff0080,tint=#00ff00")
     can, mug = edited(folder, 7).recolor, edited(folder, 1).recolor
     assert (can.hue, can.saturation, mug.amount, mug.tint) == (0.3, 0.5, 1.0, (0, 1, 0))
     assert mug.replace == pytest.approx((1, 0, 128 / 255))
     luma = np.clip(0.5 + C0 * own.sh[:, 0], 0, 1) @ [0.299, 0.587, 0.114]
     assert can.middle == pytest.approx((luma * own.opacities).sum() / own.opacities.sum())
-    ask("edit", folder.folder, "--recolor", "can:value=1")
+    run_command("edit", folder.folder, "--recolor", "can:value=1")
     assert edited(folder, 7).recolor is None
 
 
-def test_moves_are_along_blenders_axes_and_about_the_objects_middle(ask, folder):
+def test_moves_use_blender_axes_and_object_center(run_command, folder):
     splats = read_splats(folder.splats)[0]
     middle = middle_of(splats.select(splats.object_ids == 7))
-    ask("edit", folder.folder, "--move", "can:x=0.5,z=-1,rz=90,scale=2", "--duplicate", "can:y=1", "can:y=2")
+    run_command("edit", folder.folder, "--move", "can:x=0.5,z=-1,rz=90,scale=2", "--duplicate", "can:y=1", "can:y=2")
     can = edited(folder, 7)
     matrix = np.array(can.transform)
     # Blender shows upright coordinates.
@@ -144,24 +144,24 @@ def test_moves_are_along_blenders_axes_and_about_the_objects_middle(ask, folder)
     np.testing.assert_allclose(shift, (0.5, 0, -1), atol=1e-9)
     np.testing.assert_allclose(UPRIGHT @ matrix[:3, :3] @ UPRIGHT.T, [[0, -2, 0], [2, 0, 0], [0, 0, 2]], atol=1e-9)
     np.testing.assert_allclose(np.array(can.copies)[:, :3, 3] @ UPRIGHT.T, [[0, 1, 0], [0, 2, 0]], atol=1e-9)
-    assert "moved, scaled by 2, 2 copies" in ask("edit", folder.folder, "--duplicate", "mug:x=1").out
-    ask("edit", folder.folder, "--duplicate", "can:y=3")
+    assert "moved, scaled by 2, 2 copies" in run_command("edit", folder.folder, "--duplicate", "mug:x=1").out
+    run_command("edit", folder.folder, "--duplicate", "can:y=3")
     assert len(edited(folder, 7).copies) == 3
-    ask("edit", folder.folder, "--reset", "can")
+    run_command("edit", folder.folder, "--reset", "can")
     assert edited(folder, 7).transform is None and edited(folder, 1).copies
     edit_objects(folder.objects, {1: {"name": "cup"}})
-    ask("edit", folder.folder, "--reset", "ALL")
+    run_command("edit", folder.folder, "--reset", "ALL")
     assert json.loads(folder.objects.read_text())["edits"] == {"1": {"name": "cup"}}
 
 
-def test_what_is_merged_into_another_stands_for_that_one(ask, folder):
+def test_edit_of_merged_object_applies_to_target(run_command, folder):
     edit_objects(folder.objects, {1: {"merged_into": 7}})
-    ask("edit", folder.folder, "--remove", "mug")
+    run_command("edit", folder.folder, "--remove", "mug")
     assert edited(folder, 7).removed and not edited(folder, 1).removed
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "expected"),
     [
         (["--remove", "jug"], ["has no object jug", "1 mug, 2 Blue box, 3 box, 7 can"]),
         (["--remove", "mug", "b"], ["b may be several objects", "2 Blue box, 3 box"]),
@@ -176,27 +176,27 @@ def test_what_is_merged_into_another_stands_for_that_one(ask, folder):
         (["--restore", "mug", "--fill"], ["--remove"]),
     ],
 )
-def test_what_cannot_be_edited_is_said_and_nothing_is_written(ask, folder, words, said):
+def test_invalid_edits_are_rejected_without_writing(run_command, folder, words, expected):
     before = folder.objects.read_bytes()
-    refused(ask("edit", folder.folder, *words), *said)
+    assert_rejected(run_command("edit", folder.folder, *words), *expected)
     assert folder.objects.read_bytes() == before
 
 
-def test_an_object_without_splats_cannot_be_moved(ask, folder):
+def test_object_without_splats_cannot_be_moved(run_command, folder):
     splats = some_splats()
     write_splats(folder.splats, splats.select(splats.object_ids != 7))
-    refused(ask("edit", folder.folder, "--remove", "mug", "--move", "can:x=1"), "no splats of can")
+    assert_rejected(run_command("edit", folder.folder, "--remove", "mug", "--move", "can:x=1"), "no splats of can")
     assert not edited(folder, 1).removed
-    refused(ask("edit", folder.folder.parent), "objects.json does not exist")
+    assert_rejected(run_command("edit", folder.folder.parent), "objects.json does not exist")
 
 
 # --- export ----------------------------------------------------------------------------------------------------------
 
 
-def test_the_export_has_the_edits_and_other_programs_read_it(ask, folder, tmp_path):
-    ask("edit", folder.folder, "--remove", "mug", "--recolor", "can:hue=0.2", "--move", "blue:x=1")
-    answer = ask("export", folder.folder, "--out", tmp_path / "all.ply", "--json")
-    assert answer.code == EXIT_DONE and answer.events[-1]["splats"] == 48
+def test_export_applies_edits_and_is_readable_ply(run_command, folder, tmp_path):
+    run_command("edit", folder.folder, "--remove", "mug", "--recolor", "can:hue=0.2", "--move", "blue:x=1")
+    result = run_command("export", folder.folder, "--out", tmp_path / "all.ply", "--json")
+    assert result.code == EXIT_DONE and result.events[-1]["splats"] == 48
     wanted = apply_edits(read_splats(folder.splats)[0], read_objects(folder.objects))
     vertex = PlyData.read(str(tmp_path / "all.ply"))["vertex"]
     names = [f"f_rest_{i}" for i in range(24)]
@@ -210,27 +210,29 @@ def test_the_export_has_the_edits_and_other_programs_read_it(ask, folder, tmp_pa
     np.testing.assert_array_equal(rest, wanted.sh[:, 1:])
 
 
-def test_without_edits_the_export_is_splats_ply(ask, folder, tmp_path):
-    ask("export", folder.folder, "--out", tmp_path / "all.ply")
+def test_export_without_edits_equals_splats_ply(run_command, folder, tmp_path):
+    run_command("export", folder.folder, "--out", tmp_path / "all.ply")
     assert (tmp_path / "all.ply").read_bytes() == folder.splats.read_bytes()
-    ask("export", folder.folder, "--out", tmp_path / "plain.ply", "--no-ids", "--sh-degree", "1")
+    run_command("export", folder.folder, "--out", tmp_path / "plain.ply", "--no-ids", "--sh-degree", "1")
     names = read_vertices(tmp_path / "plain.ply").dtype.names
     assert names[-1] == "rot_3" and "f_rest_8" in names and "f_rest_9" not in names
 
 
-def test_a_file_for_each_object(ask, folder, tmp_path):
+def test_export_per_object_writes_one_file_each(run_command, folder, tmp_path):
     edit_objects(folder.objects, {3: {"name": "../BLUE box"}, 1: {"merged_into": 7}})
-    ask("export", folder.folder, "--out", tmp_path / "parts", "--per-object")
+    run_command("export", folder.folder, "--out", tmp_path / "parts", "--per-object")
     assert {path.name for path in (tmp_path / "parts").iterdir()} == {
         "unlabeled.ply", "Blue_box.ply", "BLUE_box_3.ply", "can.ply",
     }  # fmt: skip
     assert len(read_splats(tmp_path / "parts" / "can.ply")[0]) == 24
-    ask("export", folder.folder, "--out", tmp_path / "one", "--per-object", "--objects", "can", "--format", "splat")
+    run_command(
+        "export", folder.folder, "--out", tmp_path / "one", "--per-object", "--objects", "can", "--format", "splat"
+    )
     assert [path.name for path in (tmp_path / "one").iterdir()] == ["can.splat"]
 
 
-def test_blenders_coordinates_are_upright(ask, folder, tmp_path):
-    ask("export", folder.folder, "--out", tmp_path / "up.ply", "--coordinates", "blender")
+def test_blender_coordinates_are_upright(run_command, folder, tmp_path):
+    run_command("export", folder.folder, "--out", tmp_path / "up.ply", "--coordinates", "blender")
     found, captured = read_splats(tmp_path / "up.ply")[0], read_splats(folder.splats)[0]
     np.testing.assert_allclose(found.means, (captured.means - (1, 2, 3)) @ UPRIGHT.T + (0, 0, 1), atol=1e-6)
     stand = np.eye(4)
@@ -238,21 +240,23 @@ def test_blenders_coordinates_are_upright(ask, folder, tmp_path):
     np.testing.assert_allclose(found.sh, transformed(captured, stand).sh, atol=1e-6)
 
 
-def test_a_fit_is_exported_with_its_error(ask, folder, tmp_path):
+def test_export_of_fit_warns_with_psnr(run_command, folder, tmp_path):
     training = TrainingRecord({"mode": "view"}, VotesRecord("majority", None, 1600, "0f", None))
     update_record(folder, training=training, export=ExportRecord(splats=9, anchors=3, psnr_of_export=34.62))
-    answer = ask("export", folder.folder, "--out", tmp_path / "all.ply", "--json")
-    assert any("34.6 dB" in sentence for sentence in answer.messages("warning"))
+    result = run_command("export", folder.folder, "--out", tmp_path / "all.ply", "--json")
+    assert any("34.6 dB" in sentence for sentence in result.messages("warning"))
 
 
-def test_exports_that_make_no_sense_are_refused(ask, folder, tmp_path):
-    refused(ask("export", folder.folder, "--out", tmp_path), "is a folder")
+def test_invalid_exports_are_rejected(run_command, folder, tmp_path):
+    assert_rejected(run_command("export", folder.folder, "--out", tmp_path), "is a folder")
     (tmp_path / "file").touch()
-    refused(ask("export", folder.folder, "--out", tmp_path / "file", "--per-object"), "is a file")
-    refused(ask("export", folder.folder, "--out", tmp_path / "a.ply", "--objects", "jug"), "no object jug")
-    ask("edit", folder.folder, "--remove", "can")
-    refused(ask("export", folder.folder, "--out", tmp_path / "a.ply", "--objects", "can"), "No splats")
-    refused(ask("export", tmp_path / "nothing", "--out", tmp_path / "a.ply"), "splats.ply")
+    assert_rejected(run_command("export", folder.folder, "--out", tmp_path / "file", "--per-object"), "is a file")
+    assert_rejected(
+        run_command("export", folder.folder, "--out", tmp_path / "a.ply", "--objects", "jug"), "no object jug"
+    )
+    run_command("edit", folder.folder, "--remove", "can")
+    assert_rejected(run_command("export", folder.folder, "--out", tmp_path / "a.ply", "--objects", "can"), "No splats")
+    assert_rejected(run_command("export", tmp_path / "nothing", "--out", tmp_path / "a.ply"), "splats.ply")
     assert not (tmp_path / "a.ply").exists()
 
 
@@ -297,22 +301,22 @@ def assert_close(found, wanted, color):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_spz_holds_the_splats_y_up(ask, folder, tmp_path, degree):
+def test_spz_export_is_y_up(run_command, folder, tmp_path, degree):
     write_splats(folder.splats, some_splats(degree=degree))
-    ask("export", folder.folder, "--out", tmp_path / "all.spz")
+    run_command("export", folder.folder, "--out", tmp_path / "all.spz")
     found = read_spz(tmp_path / "all.spz")
     wanted = transformed(read_splats(folder.splats)[0], np.diag([1.0, -1, -1, 1]))
     assert_close(found, wanted, 0.02)
     np.testing.assert_allclose(found.sh[:, 1:], wanted.sh[:, 1:], atol=0.004)
-    ask("export", folder.folder, "--out", tmp_path / "again.spz")
+    run_command("export", folder.folder, "--out", tmp_path / "again.spz")
     assert (tmp_path / "all.spz").read_bytes() == (tmp_path / "again.spz").read_bytes()
-    ask("export", folder.folder, "--out", tmp_path / "up.spz", "--coordinates", "blender")
-    ask("export", folder.folder, "--out", tmp_path / "up.ply", "--coordinates", "blender")
+    run_command("export", folder.folder, "--out", tmp_path / "up.spz", "--coordinates", "blender")
+    run_command("export", folder.folder, "--out", tmp_path / "up.ply", "--coordinates", "blender")
     upright = read_splats(tmp_path / "up.ply")[0]
     np.testing.assert_allclose(read_spz(tmp_path / "up.spz").means, upright.means[:, [0, 2, 1]] * (1, 1, -1), atol=1e-5)
 
 
-def test_another_reader_finds_the_same_in_spz(tmp_path):
+def test_spz_matches_gsply_reader(tmp_path):
     gsply = pytest.importorskip("gsply")
     splats = some_splats(degree=3)
     write_spz(tmp_path / "a.spz", splats)
@@ -324,7 +328,7 @@ def test_another_reader_finds_the_same_in_spz(tmp_path):
     np.testing.assert_allclose(np.abs((found.quats * mine.quats).sum(1)), 1, atol=1e-5)
 
 
-def test_what_spz_cannot_hold_is_said(tmp_path):
+def test_spz_limits_are_reported(tmp_path):
     splats = some_splats()
     splats.means += 1e6
     write_spz(tmp_path / "far.spz", splats)
@@ -339,7 +343,7 @@ def test_what_spz_cannot_hold_is_said(tmp_path):
     assert write_spz(tmp_path / "none.spz", Splats.empty(1)) == []
 
 
-def test_splat_files_have_32_bytes_a_splat(tmp_path):
+def test_splat_file_has_32_bytes_per_splat(tmp_path):
     splats = some_splats(degree=0)
     assert write_splat(tmp_path / "a.splat", splats) == [] and write_splat(tmp_path / "b.splat", some_splats()) != []
     data = (tmp_path / "a.splat").read_bytes()
@@ -357,59 +361,64 @@ def test_splat_files_have_32_bytes_a_splat(tmp_path):
 # --- import ----------------------------------------------------------------------------------------------------------
 
 
-def test_splats_with_ids_become_a_reconstruction(ask, folder, tmp_path):
+def test_import_of_splats_with_ids(run_command, folder, tmp_path):
     made = Reconstruction(tmp_path / "imported")
-    answer = ask("import-splats", folder.splats, "--out", made.folder, "--json")
-    assert answer.code == EXIT_DONE and answer.events[-1]["objects"] == 4
+    result = run_command("import-splats", folder.splats, "--out", made.folder, "--json")
+    assert result.code == EXIT_DONE and result.events[-1]["objects"] == 4
     assert made.splats.read_bytes() == folder.splats.read_bytes()
     assert [(entry.id, entry.name, entry.points) for entry in read_objects(made.objects)] == [
         (1, "object 1", 12), (2, "object 2", 12), (3, "object 3", 12), (7, "object 7", 12),
     ]  # fmt: skip
     assert len(read_vertices(made.points)) == 0 and json.loads(made.cameras.read_text())["cameras"] == []
-    assert ask("edit", made.folder, "--move", "7:z=1").code == EXIT_DONE
-    assert ask("export", made.folder, "--out", tmp_path / "again.ply", "--coordinates", "blender").code == EXIT_DONE
-    refused(ask("render", made.folder), "checkpoint")
+    assert run_command("edit", made.folder, "--move", "7:z=1").code == EXIT_DONE
+    assert (
+        run_command("export", made.folder, "--out", tmp_path / "again.ply", "--coordinates", "blender").code
+        == EXIT_DONE
+    )
+    assert_rejected(run_command("render", made.folder), "checkpoint")
 
 
-def test_splats_without_ids_get_them_from_the_masks(ask, write_capture, tmp_path):
+def test_import_assigns_ids_from_masks(run_command, write_capture, tmp_path):
     scene = write_capture(views=9, points=200)
     splats = some_splats(n=len(scene.xyz), degree=0)
     splats.means, splats.object_ids = scene.xyz.astype(np.float32), np.zeros(len(scene.xyz), np.int64)
     write_splats(tmp_path / "foreign.ply", splats, with_ids=False)
     made = Reconstruction(tmp_path / "imported")
-    answer = ask("import-splats", tmp_path / "foreign.ply", "--out", made.folder, "--capture", scene.folder)
-    assert answer.code == EXIT_DONE
+    result = run_command("import-splats", tmp_path / "foreign.ply", "--out", made.folder, "--capture", scene.folder)
+    assert result.code == EXIT_DONE
     assert (read_splats(made.splats)[0].object_ids == scene.point_objects).mean() > 0.95
     assert [entry.name for entry in read_objects(made.objects)] == ["sphere 1", "sphere 2", "sphere 5"]
     assert len(read_vertices(made.points)) == len(scene.xyz)
     assert len(json.loads(made.cameras.read_text())["cameras"]) == 9
 
 
-def test_a_capture_without_masks_leaves_the_files_ids(ask, write_capture, folder, tmp_path):
+def test_import_without_masks_keeps_ids_of_file(run_command, write_capture, folder, tmp_path):
     scene = write_capture(views=4, masks=False)
-    answer = ask("import-splats", folder.splats, "--out", tmp_path / "made2", "--capture", scene.folder)
-    assert answer.code == EXIT_DONE and "masks does not exist" in answer.err
+    result = run_command("import-splats", folder.splats, "--out", tmp_path / "made2", "--capture", scene.folder)
+    assert result.code == EXIT_DONE and "masks does not exist" in result.err
     assert len(read_objects(tmp_path / "made2" / "objects.json")) == 4
 
 
-def test_what_cannot_be_imported_leaves_nothing(ask, write_capture, folder, tmp_path):
+def test_failed_import_leaves_no_files(run_command, write_capture, folder, tmp_path):
     scene = write_capture(views=4)
     made = tmp_path / "not" / "there"
-    refused(ask("import-splats", tmp_path / "none.ply", "--out", made), "none.ply")
+    assert_rejected(run_command("import-splats", tmp_path / "none.ply", "--out", made), "none.ply")
     write_splats(tmp_path / "empty.ply", Splats.empty())
-    refused(ask("import-splats", tmp_path / "empty.ply", "--out", made), "holds no splats")
-    refused(ask("import-splats", scene.folder / "labels.json", "--out", made), "not a PLY")
+    assert_rejected(run_command("import-splats", tmp_path / "empty.ply", "--out", made), "contains no splats")
+    assert_rejected(run_command("import-splats", scene.folder / "labels.json", "--out", made), "not a PLY")
     far = some_splats()
     far.means += 1000
     write_splats(tmp_path / "far.ply", far)
-    refused(ask("import-splats", tmp_path / "far.ply", "--out", made, "--capture", scene.folder), "coordinates")
-    refused(ask("import-splats", folder.splats, "--out", made, "--capture", tmp_path / "gone"), "gone")
+    assert_rejected(
+        run_command("import-splats", tmp_path / "far.ply", "--out", made, "--capture", scene.folder), "coordinates"
+    )
+    assert_rejected(run_command("import-splats", folder.splats, "--out", made, "--capture", tmp_path / "gone"), "gone")
     assert not made.parent.exists()
     folder.checkpoint.mkdir()
-    refused(ask("import-splats", folder.splats, "--out", folder.folder), "already contains a training")
+    assert_rejected(run_command("import-splats", folder.splats, "--out", folder.folder), "already contains a training")
 
 
-def test_splats_without_cameras_stand_on_their_ground(tmp_path):
+def test_splats_without_cameras_are_oriented_to_ground(tmp_path):
     rng = np.random.default_rng(0)
     ground = np.column_stack([rng.uniform(-1, 1, 3000), rng.normal(0.5, 0.001, 3000), rng.uniform(-1, 1, 3000)])
     above = rng.uniform(-0.2, 0.2, (500, 3))

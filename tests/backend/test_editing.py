@@ -41,7 +41,7 @@ def camera(moved=None):
     return Camera(viewmat, np.array([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]]), 40, 30)
 
 
-def picture(splats, view):
+def render(splats, view):
     """Render color and alpha, (30, 40, 4) float64."""
     arrays = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
     tensors = (torch.from_numpy(np.asarray(array, np.float64)) for array in arrays)
@@ -75,25 +75,25 @@ def same(a, b):
 TURN = Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix()
 
 
-def test_splats_that_move_with_the_camera_look_the_same():
+def test_rigid_move_with_camera_keeps_image():
     splats, move = some_splats(), affine(TURN, (0.3, -2.0, 5.0))
-    before = picture(splats, camera())
+    before = render(splats, camera())
     assert before[..., 3].max() > 0.5
-    np.testing.assert_allclose(picture(transformed(splats, move), camera(move)), before, atol=1e-10)
+    np.testing.assert_allclose(render(transformed(splats, move), camera(move)), before, atol=1e-10)
 
 
-def test_a_scale_about_the_camera_looks_the_same():
+def test_scaling_about_camera_keeps_image():
     splats = some_splats()
-    eye = np.array([0, 0, -4.0])
-    scaled = transformed(splats, affine(2.5 * np.eye(3), eye - 2.5 * eye))
-    np.testing.assert_allclose(picture(scaled, camera()), picture(splats, camera()), atol=1e-10)
+    camera_center = np.array([0, 0, -4.0])
+    scaled = transformed(splats, affine(2.5 * np.eye(3), camera_center - 2.5 * camera_center))
+    np.testing.assert_allclose(render(scaled, camera()), render(splats, camera()), atol=1e-10)
 
 
 SHEAR = np.array([[1, 0.5, 0], [0, 1, 0], [0, 0.2, -2.0]])
 
 
 @pytest.mark.parametrize("linear", [3.0 * TURN, np.diag([1.0, 1.0, -1.0]), TURN @ np.diag([1.0, 2.0, 0.3]), SHEAR])
-def test_shapes_follow_any_affine_map(linear):
+def test_covariances_follow_affine_map(linear):
     splats = some_splats()
     moved = transformed(splats, affine(linear, (1, 2, 3)))
     np.testing.assert_allclose(covariances(moved), linear @ covariances(splats) @ linear.T, rtol=1e-9, atol=1e-12)
@@ -103,34 +103,34 @@ def test_shapes_follow_any_affine_map(linear):
 
 
 @pytest.mark.parametrize("linear", [TURN, TURN @ np.diag([1.0, 2.0, 0.5])])
-def test_a_disc_stays_a_disc_whose_third_axis_is_its_normal(linear):
+def test_discs_stay_flat_along_third_axis(linear):
     splats = some_splats()
     splats.scales[:, 2] = 1e-6
     moved = transformed(splats, affine(linear))
     assert (moved.scales[:, 2] < 1e-5).all() and (moved.scales[:, :2] > 1e-3).all()
 
 
-def test_float32_stays_float32():
+def test_edits_keep_float32():
     moved = transformed(recolored(some_splats(dtype=np.float32), Recolor(hue=0.3)), affine(TURN))
     assert {getattr(moved, name).dtype for name in ("means", "quats", "scales", "opacities", "sh")} == {np.dtype("f4")}
 
 
-def test_a_recolored_object_is_its_picture_recolored():
+def test_recolored_splats_match_recolored_image():
     splats, recolor = some_splats(), Recolor(hue=0.3, saturation=0.5, value=0.8, contrast=0.9, tint=(1, 0.9, 0.8))
     splats.sh *= 0.3  # so that no color is clamped
-    before, after = picture(splats, camera()), picture(recolored(splats, recolor), camera())
+    before, after = render(splats, camera()), render(recolored(splats, recolor), camera())
     matrix, offset = recolor.affine()
     np.testing.assert_allclose(after[..., :3], before[..., :3] @ matrix.T + before[..., 3:] * offset, atol=1e-12)
     assert np.array_equal(after[..., 3], before[..., 3]) and np.abs(after - before).max() > 0.01
 
 
-def test_without_edits_nothing_changes():
+def test_no_edits_change_nothing():
     splats = some_splats(dtype=np.float32)
     assert same(apply_edits(splats, []), splats)
     assert same(apply_edits(splats, [scene_object(1), scene_object(2)]), splats)
 
 
-def test_others_stay_bit_for_bit_in_their_order():
+def test_unedited_splats_stay_identical():
     splats = some_splats(dtype=np.float32)
     objects = [scene_object(1, recolor=Recolor(hue=0.2), transform=rows(affine(TURN))), scene_object(2, removed=True)]
     edited = apply_edits(splats, objects)
@@ -140,7 +140,7 @@ def test_others_stay_bit_for_bit_in_their_order():
     assert same(edited.select(edited.object_ids == 1), transformed(recolored(own, Recolor(hue=0.2)), affine(TURN)))
 
 
-def test_copies_come_last_from_where_it_was_captured():
+def test_copies_are_appended_from_captured_pose():
     splats, away, further = some_splats(), affine(np.eye(3), (1, 0, 0)), affine(2 * TURN, (0, 3, 0))
     recolor = Recolor(value=0.5)
     edited = apply_edits(
@@ -153,7 +153,7 @@ def test_copies_come_last_from_where_it_was_captured():
     assert same(edited.select(np.flatnonzero(edited.object_ids == 1)[: len(own)]), transformed(own, away))
 
 
-def test_a_merged_object_goes_with_the_other():
+def test_merged_object_follows_target():
     splats = some_splats(ids=(0, 1, 2, 3))
     objects = [
         scene_object(1, merged_into=2, recolor=Recolor(value=0.1), removed=True),
@@ -171,11 +171,11 @@ def test_a_merged_object_goes_with_the_other():
                .object_ids.tolist()) == {0, 2, 3}  # fmt: skip
 
 
-def test_a_removed_object_takes_its_copies_along():
+def test_removed_object_has_no_copies():
     assert 1 not in apply_edits(some_splats(), [scene_object(1, removed=True, copies=(rows(np.eye(4)),))]).object_ids
 
 
-def test_floaters_inside_the_hull_go_where_that_is_asked_for():
+def test_floaters_inside_hull_are_removed_on_request():
     rng = np.random.default_rng(0)
     ball = rng.normal(size=(300, 3))
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)
@@ -239,7 +239,7 @@ def with_box_on_ground(place=HERE):
 
 
 @pytest.mark.parametrize("place", [HERE, affine(3 * TURN, (50, -20, 9))])
-def test_the_ground_under_a_removed_object_is_closed_by_what_is_around(place):
+def test_fill_continues_ground_under_removed_object(place):
     splats, hidden = with_box_on_ground(place)
     objects = [scene_object(1, removed=True, fill=True), scene_object(5), scene_object(6)]
     edited = apply_edits(splats, objects)
@@ -258,7 +258,7 @@ def test_the_ground_under_a_removed_object_is_closed_by_what_is_around(place):
     alphas = []
     for shown in (apply_edits(splats, [replace(objects[0], fill=False)]), edited):
         shown = transformed(shown, np.linalg.inv(place))
-        alphas.append(picture(shown.select((np.abs(shown.means[:, :2]) < 0.3).all(1)), view)[..., 3])
+        alphas.append(render(shown.select((np.abs(shown.means[:, :2]) < 0.3).all(1)), view)[..., 3])
     assert alphas[0][8:16, 8:16].max() < 0.1 and alphas[1].min() > 0.9
     # Splats away from the rim stay the same, in the same order.
     kept = edited.select(~edited.unobserved)
@@ -269,7 +269,7 @@ def test_the_ground_under_a_removed_object_is_closed_by_what_is_around(place):
     assert (np.abs(gone[:, :2]).max(1) < 0.2).all() and (np.abs(gone[:, :2]).max(1) > 0.1).all()
 
 
-def test_a_corner_is_closed_on_both_sides():
+def test_fill_continues_both_sides_of_corner():
     rng = np.random.default_rng(1)
     walls = [
         surface(rng, 12000, np.eye(3), (0, 0, 0), stripes, 5),
@@ -283,7 +283,7 @@ def test_a_corner_is_closed_on_both_sides():
     assert (unobserved.object_ids == 5).sum() > 100 and (unobserved.object_ids == 7).sum() > 100
 
 
-def test_sheets_that_meet_under_an_object_are_each_continued_to_their_edge():
+def test_fill_continues_each_surface_to_its_edge():
     splats, hidden = with_box_on_ground()
     for part in (splats, hidden):
         part.object_ids[(part.object_ids == 5) & (part.means[:, 0] > 0.02)] = 8
@@ -293,7 +293,7 @@ def test_sheets_that_meet_under_an_object_are_each_continued_to_their_edge():
     assert ((unobserved.object_ids == 8) == (unobserved.means[:, 0] > 0.02)).mean() > 0.85
 
 
-def test_rumpled_ground_is_closed_with_its_relief():
+def test_fill_follows_curved_ground():
     """On a dome that is too high to count as flat, the new splats lie on the dome, not in a plane."""
 
     def height(flat):
@@ -311,7 +311,7 @@ def test_rumpled_ground_is_closed_with_its_relief():
     assert np.abs(height(splats.means[splats.object_ids == 5])).mean() > 0.03
 
 
-def test_what_fill_puts_and_takes_is_what_the_edits_show():
+def test_compute_fill_matches_applied_edits():
     splats, _ = with_box_on_ground()
     objects = [scene_object(1, removed=True, fill=True), scene_object(6, removed=True, fill=True)]
     fill = compute_fill(splats, objects)
@@ -324,7 +324,7 @@ def test_what_fill_puts_and_takes_is_what_the_edits_show():
     assert len(taken) and same(still, edited.select(~edited.unobserved))
 
 
-def test_where_nothing_is_around_nothing_is_unobserved():
+def test_no_fill_without_surrounding_surface():
     splats, _ = with_box_on_ground()
     for without in (splats.select(splats.object_ids != 5), splats.select(splats.means[:, 0] < 0.1)):
         edited = apply_edits(without, [scene_object(1, removed=True, fill=True)])
@@ -332,7 +332,7 @@ def test_where_nothing_is_around_nothing_is_unobserved():
     assert not apply_edits(splats, [scene_object(1, fill=True)]).unobserved.any()
 
 
-def test_no_splats():
+def test_empty_splats_can_be_edited():
     for edited in (transformed(Splats.empty(2), affine(TURN)), recolored(Splats.empty(2), Recolor(hue=0.1)),
                    apply_edits(Splats.empty(2), [scene_object(1, removed=True)])):  # fmt: skip
         assert len(edited) == 0 and edited.degree == 2

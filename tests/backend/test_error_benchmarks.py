@@ -11,7 +11,7 @@ from backend.planning.coverage import blind_views, duplicate_views, unseen_point
 from benchmarks import approximations, mask_noise, plan, plan_captures, raster_variants, training_variants
 
 
-def test_only_a_variant_that_is_worse_in_nothing_is_better_than_the_default():
+def test_better_than_requires_no_worse_figure():
     default, noise = (1.0, 0.3), (0.03, 0.01)
     others = {
         "faster": (0.9, 0.305),
@@ -23,7 +23,7 @@ def test_only_a_variant_that_is_worse_in_nothing_is_better_than_the_default():
     assert approximations.better_than(default, others, noise) == ["faster", "closer"]
 
 
-def test_the_time_of_a_choice_is_the_median_over_sets_of_processes(monkeypatch):
+def test_choice_time_is_median_over_process_sets(monkeypatch):
     sets = iter([1.01, 1.09, 1.03, 1.04, 1.02])
 
     def measure_set(*_):
@@ -43,7 +43,7 @@ def a_pair(psnr, miou, times_default):
     return {"variant": {"psnr": psnr, "miou": miou, "splats": 100}, "times_default": times_default}
 
 
-def test_a_variant_is_compared_with_the_default_in_the_same_time():
+def test_variant_is_compared_with_default_in_same_time():
     curve = training_variants.curve_of(
         {"steps": steps, "psnr": psnr, "miou": 0.9} for steps, psnr in ((50, 29), (100, 30), (100, 32), (200, 33))
     )
@@ -56,7 +56,7 @@ def test_a_variant_is_compared_with_the_default_in_the_same_time():
 
 
 @pytest.mark.parametrize(("seeds", "better"), [(1, ["fast"]), (4, ["fast", "a little"])])
-def test_a_faster_variant_is_better_where_the_default_does_not_come_so_far_in_its_time(seeds, better):
+def test_training_verdict_uses_default_quality_in_same_time(seeds, better):
     choice = approximations.Choice("a choice", "default", {})
 
     def row(psnr, psnr_default):
@@ -66,27 +66,27 @@ def test_a_faster_variant_is_better_where_the_default_does_not_come_so_far_in_it
     assert approximations.training_verdict(choice, rows, [0.3, 0.002]).better == better
 
 
-def test_what_the_plan_saves_is_said_with_what_it_costs():
+def test_plan_verdict_reports_savings_and_quality():
     whole = {"seconds": 100.0, "cpu_seconds": 150.0, "peak_mb": 1000.0, "psnr": 30.0, "error": 0.03}
     planned = {"seconds": 80.0, "cpu_seconds": 165.0, "peak_mb": 500.0, "psnr": 30.05, "error": 0.04}
     found = {"as planned": planned, "nothing left out": whole}
-    said = "As planned, as many steps take 20% less time, 10% more time of the processors, 50% less memory; "
-    assert plan.verdict(found) == f"{said}+0.05 ± 0.05 dB, equal."
+    text = "As planned, the same number of steps takes 20% less time, 10% more CPU time, 50% less memory; "
+    assert plan.verdict(found) == f"{text}+0.05 ± 0.05 dB, equal."
     planned["psnr"] = 29.5
     assert plan.verdict(found).endswith("; -0.50 ± 0.05 dB, worse.")
     assert plan.judged({**planned, "error": 0.4}, whole) == "equal"
     planned["psnr"] = 32.0
     found[plan.AS_GOOD] = {**planned, "steps": 400, "seconds": 45.0, "psnr": 29.95, "error": 0.0}
     assert plan.verdict(found) == (
-        f"{said}+2.00 ± 0.05 dB, better. "
-        "In 400 steps it takes 55% less time, 10% more time of the processors, 50% less memory; -0.05 ± 0.03 dB."
+        f"{text}+2.00 ± 0.05 dB, better. "
+        "In 400 steps it takes 55% less time, 10% more CPU time, 50% less memory; -0.05 ± 0.03 dB."
     )
     found[plan.EVERYWHERE] = {**whole, "seconds": 160.0, "psnr": 32.5}
     assert "everywhere" in plan.verdict(found) and plan.verdict(found).endswith("-0.50 ± 0.05 dB, worse.")
 
 
 @pytest.mark.parametrize("slope", [0.7, 2.5])
-def test_as_many_steps_are_found_as_make_a_training_as_good_as_another(slope):
+def test_as_good_finds_steps_of_equal_quality(slope):
     tried = []
 
     def train(steps):
@@ -97,7 +97,7 @@ def test_as_many_steps_are_found_as_make_a_training_as_good_as_another(slope):
     assert found["psnr"] == pytest.approx(31.5, abs=plan.SAME_PSNR) and len(tried) <= 2
 
 
-def test_a_capture_without_masks_gets_masks_of_one_id(tmp_path):
+def test_with_masks_adds_uniform_masks(tmp_path):
     capture, other = tmp_path / "capture", tmp_path / "other"
     (capture / "images" / "left").mkdir(parents=True)
     other.mkdir()
@@ -108,26 +108,26 @@ def test_a_capture_without_masks_gets_masks_of_one_id(tmp_path):
     assert not (capture / "masks").exists()
 
 
-def test_a_capture_with_more_than_it_needs_holds_the_same_views_out_and_the_rest_is_left_out(write_capture, tmp_path):
+def test_redundant_views_and_points_are_left_out(write_capture, tmp_path):
     scene = write_capture(views=9, size=(64, 48))
     given = load_capture(scene.folder, tmp_path / "cache")
     folder = tmp_path / "more"
     folder.mkdir()
     more = load_capture(plan_captures.with_surplus(scene.folder, folder), tmp_path / "cache of more")
-    pictures = sorted(given.image(i).tobytes() for i in given.test_indices)
-    assert sorted(more.image(i).tobytes() for i in more.test_indices) == sorted(2 * pictures)
+    images = sorted(given.image(i).tobytes() for i in given.test_indices)
+    assert sorted(more.image(i).tobytes() for i in more.test_indices) == sorted(2 * images)
     blind, alike, unseen = blind_views(more), duplicate_views(more), unseen_points(more)
     assert len(blind) == 14 and len(alike) == 7 and unseen.sum() == round(plan_captures.UNSEEN * len(scene.xyz))
     left = [i for i in more.train_indices if i not in {*blind, *alike}]
 
-    def places(capture, views):
+    def camera_centers(capture, views):
         return sorted(tuple(capture.views[i].viewmat[:3, 3].round(6)) for i in views)
 
-    assert places(more, left) == places(given, given.train_indices)
+    assert camera_centers(more, left) == camera_centers(given, given.train_indices)
     assert sorted(map(more.ids_in, left)) == sorted(map(given.ids_in, given.train_indices))
 
 
-def test_a_lens_that_bends_next_to_nothing_shows_the_same(write_capture, tmp_path):
+def test_nearly_straight_lens_changes_little(write_capture, tmp_path):
     scene = write_capture(views=3, size=(64, 48))
     given = load_capture(scene.folder, tmp_path / "cache")
     folder = tmp_path / "bent"
@@ -140,7 +140,7 @@ def test_a_lens_that_bends_next_to_nothing_shows_the_same(write_capture, tmp_pat
     assert 1e-6 < np.abs(moved).max() < 0.01
 
 
-def test_every_choice_has_its_default_among_its_variants_and_no_other_like_it():
+def test_each_choice_has_one_default_variant():
     for choices in (approximations.raster_choices, approximations.training_choices, approximations.mesh_choices):
         for choice in choices():
             assert choice.variants[choice.default] == {}
@@ -148,13 +148,13 @@ def test_every_choice_has_its_default_among_its_variants_and_no_other_like_it():
 
 
 @pytest.mark.parametrize(("degree", "least"), [(2, 4e-3), (3, 2e-4), (5, 3e-7), (7, 1e-9)])
-def test_a_polynomial_of_higher_degree_is_closer_to_the_exponential(degree, least):
+def test_exponential_polynomial_error_falls_with_degree(degree, least):
     f = np.linspace(-0.5, 0.5, 999)
     values = np.polyval(raster_variants.exp2_coefficients(degree), f)
     assert np.abs(values / np.exp2(f) - 1).max() < least
 
 
-def test_the_kernels_can_still_be_read_as_float64():
+def test_kernels_can_be_converted_to_float64():
     finder, folder = raster_variants._DoubledFinder(), Path(raster_variants.__file__).parents[1] / "backend" / "raster"
     names = [f"backend.raster.{name}" for name in finder._SHARED]
     names += [f"backend.raster.cpu.{path.stem}" for path in (folder / "cpu").glob("[!_]*.py")]
@@ -164,19 +164,19 @@ def test_the_kernels_can_still_be_read_as_float64():
         assert spec.loader.get_code(spec.name)
 
 
-def test_a_constant_that_the_rasterizer_no_longer_has_is_named():
+def test_missing_constant_is_reported():
     with pytest.raises(RuntimeError, match="_NO_SUCH"):
         raster_variants._set_everywhere(_NO_SUCH=1.0)
 
 
-def test_the_parts_of_a_picture_cover_it_once():
+def test_parts_cover_image_once():
     covered = np.zeros((100, 130), int)
     for x, y, width, height in raster_variants.parts_of(130, 100):
         covered[y : y + height, x : x + width] += 1
     assert (covered == 1).all()
 
 
-def test_holes_are_what_an_object_encloses_of_itself():
+def test_holes_are_enclosed_by_their_object():
     true = np.ones((30, 40), int)
     true[10:16, 10:16] = 2  # in front of 1, so it is not a hole
     found = true.copy()
@@ -188,7 +188,7 @@ def test_holes_are_what_an_object_encloses_of_itself():
 
 
 @pytest.mark.parametrize("kind", ["wrong IDs", "holes", "segmenter", "missing masks"])
-def test_mistakes_grow_with_their_level_and_leave_the_truth_as_it_is(kind):
+def test_mask_noise_grows_with_level_and_keeps_truth(kind):
     true = np.repeat(np.arange(1, 9), 10)[None].repeat(60, 0)
     before = true.copy()
     mistake = mask_noise.KINDS[kind][0]

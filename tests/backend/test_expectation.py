@@ -16,13 +16,13 @@ def expected(*arguments):
     return expectation.expectation(*arguments)
 
 
-def test_between_measurements_the_logarithm_of_the_steps_counts():
+def test_shortfall_interpolates_over_log_steps():
     assert shortfall(400) == pytest.approx((1.0, 2.0))
     assert shortfall(200) == pytest.approx((1.5, 3.0)) and shortfall(800) == pytest.approx((0.5, 1.5))
     assert shortfall(10) == (2.0, 4.0) and shortfall(1e6) == (0.0, 1.0)
 
 
-def test_steps_say_how_long_and_how_good():
+def test_steps_give_duration_and_quality():
     assert expected(400, None, 100_000) == (
         "Expected in 20 s to 80 s on a CPU: 1.0 to 2.0 dB below a training until it stops improving"
     )
@@ -31,30 +31,30 @@ def test_steps_say_how_long_and_how_good():
     )
 
 
-def test_minutes_say_how_many_steps():
+def test_minutes_give_step_range():
     # 0.05 to 0.2 s per step: the lowest number of steps determines the largest loss of quality.
     assert expected(None, 80.0, 100_000) == (
         "Expected of 400 to 1,600 steps on a CPU: up to 2.0 dB below a training until it stops improving"
     )
 
 
-def test_what_was_measured_here_counts_more():
+def test_own_measurements_replace_typical_speed():
     assert expected(None, 100.0, 100_000, (200, 50.0)) == (
         "Expected of 400 steps: 1.0 to 2.0 dB below a training until it stops improving"
     )
     assert "in 1.7 min:" in expected(400, None, 100_000, (200, 50.0))
 
 
-def test_very_short_trainings_are_below_what_was_measured():
+def test_very_short_trainings_have_lower_bound_only():
     assert expected(30, None, None) == "Expected: more than 2.0 dB below a training until it stops improving"
 
 
-def test_nobody_knows_how_fast_another_device_is():
+def test_unknown_device_gives_no_duration():
     assert expected(None, 60.0, None) is None
     assert expected(400, None, None) == "Expected: 1.0 to 2.0 dB below a training until it stops improving"
     assert expected(None, None, 100_000) is None
 
 
-def test_no_loss_is_said_so(monkeypatch):
+def test_negligible_loss_is_reported(monkeypatch):
     monkeypatch.setattr(expectation, "SHORT_OF_FINAL", {400: (1.0, 2.0), 1600: (0.0, 0.04)})
     assert expected(1600, None, None) == "Expected: as good as a training until it stops improving"

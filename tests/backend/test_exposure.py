@@ -34,7 +34,7 @@ def photos(gains, cameras, held_out=(), points=200, noise=0.0, hidden=0.0):
     )
 
 
-def test_known_gains_are_found():
+def test_known_gains_are_recovered():
     truth = np.exp(np.random.default_rng(1).normal(0, 0.15, (8, 3)))
     found = measure_gains(photos(truth, [1] * 8, noise=0.01))
     truth /= np.exp(np.log(truth).mean(0))
@@ -42,20 +42,20 @@ def test_known_gains_are_found():
     assert varies(found)
 
 
-def test_points_that_other_things_hide_do_not_count():
+def test_occluded_points_are_ignored():
     truth = np.exp(np.random.default_rng(1).normal(0, 0.15, (8, 3)))
     shares = np.linspace(0, 0.2, 8)
     views = photos(truth, [1] * 8, noise=0.01)
-    pictures = [photos(truth, [1] * 8, noise=0.01, hidden=share).image for share in shares]
-    views.image = lambda index, downscale=1: pictures[index](index)
+    images = [photos(truth, [1] * 8, noise=0.01, hidden=share).image for share in shares]
+    views.image = lambda index, downscale=1: images[index](index)
     np.testing.assert_allclose(measure_gains(views), truth / np.exp(np.log(truth).mean(0)), rtol=0.1)
 
 
-def test_equal_photos_do_not_vary():
+def test_equal_photos_have_no_exposure_variation():
     assert not varies(measure_gains(photos(np.ones((8, 3)), [1] * 8, noise=0.02)))
 
 
-def test_a_held_out_view_takes_its_neighbors_gain_and_its_own_pixels_do_not_count():
+def test_held_out_view_interpolates_neighbor_gains():
     truth = np.array([[1.0] * 3, [1.1] * 3, [3.0] * 3, [1.3] * 3, [0.8] * 3])
     cameras = [1, 1, 1, 1, 2]
     found = measure_gains(photos(truth, cameras, held_out=(2,)))
@@ -65,5 +65,5 @@ def test_a_held_out_view_takes_its_neighbors_gain_and_its_own_pixels_do_not_coun
     np.testing.assert_array_equal(found, measure_gains(photos(darker, cameras, held_out=(2,))))
 
 
-def test_without_observations_gains_are_one():
+def test_gains_without_observations_are_one():
     assert (measure_gains(photos(np.full((4, 3), 0.5), [1] * 4, points=5)) == 1).all()

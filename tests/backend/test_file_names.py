@@ -22,20 +22,20 @@ from backend.shared.formats.file_names import LONGEST, distinct_stems, file_stem
         ("", "object"),
     ],
 )
-def test_stems_are_valid_everywhere(name, stem):
+def test_stems_are_valid_on_all_platforms(name, stem):
     assert file_stem(name) == stem
 
 
 @pytest.mark.parametrize("name", ["x" * 300, "ä" * 300, "\U0001f600" * 300 + "x", "e\u0301" * 200])
-def test_stems_are_short(name):
+def test_stems_have_limited_length(name):
     assert 0 < len(file_stem(name).encode()) <= LONGEST
 
 
-def test_equal_names_get_their_key():
+def test_duplicate_names_get_key_suffix():
     assert distinct_stems({1: "mug", 2: "can", 3: "mug"}) == {1: "mug", 2: "can", 3: "mug_3"}
 
 
-def test_stems_differ_whatever_the_names():
+def test_stems_are_unique_ignoring_case():
     names = {
         1: "mug",
         2: "mug_3",
@@ -53,7 +53,7 @@ def test_stems_differ_whatever_the_names():
     assert len({stem.casefold() for stem in stems.values()}) == len(names)
 
 
-def test_a_hashed_stem_is_never_that_of_another_name():
+def test_hashed_stems_are_unique():
     names = ["1", "1.", "_1", "scene", "Scene", "pair", "Pair", "pair ", "///", "...", "con", "con-file"]
     assert len({hashed_stem(name).casefold() for name in names}) == len(names)
     assert hashed_stem("pair") == "pair" and hashed_stem("Pair") == hashed_stem("Pair") != "Pair"

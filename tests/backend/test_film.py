@@ -27,7 +27,7 @@ from backend.shared.reconstruction.objects import edit_objects, write_objects
 from backend.shared.reconstruction.record import TrainingRecord, VotesRecord, update_record
 from backend.shared.reconstruction.shot import Frame, Placed, Sample, Shot, chosen_frames, read_shot, write_shot
 
-from .asking import refused
+from .command_result import assert_rejected
 
 HUGE = 3_000_000_001
 IDS = (0, 1, 2, 7, HUGE)
@@ -88,14 +88,16 @@ def shot_of(*frames, **settings) -> Shot:
 
 
 @pytest.fixture
-def film(folder, tmp_path, ask):
+def film(folder, tmp_path, run_command):
     """Function that renders a shot and returns the channels of each frame."""
 
     def draw(shot, *options):
         write_shot(tmp_path / "shot.json", shot)
         out = tmp_path / "film"
-        answer = ask("film", folder.folder, "--shot", tmp_path / "shot.json", "--out", out, "--device", "cpu", *options)
-        assert answer.code == EXIT_DONE, answer
+        result = run_command(
+            "film", folder.folder, "--shot", tmp_path / "shot.json", "--out", out, "--device", "cpu", *options
+        )
+        assert result.code == EXIT_DONE, result
         return [channels(frame_path(out, frame.number)) for frame in shot.frames]
 
     return draw
@@ -120,43 +122,43 @@ def reference(splats: Splats, at: Sample, primitive="3d") -> tuple[np.ndarray, .
     return np.concatenate([light, alpha[..., None]], -1), np.where(alpha > 0, depth, FAR), drawn.probabilities.numpy()
 
 
-def rgba_of(picture) -> np.ndarray:
-    return np.stack([picture[name].astype(np.float32) for name in "RGBA"], -1)
+def rgba_of(planes) -> np.ndarray:
+    return np.stack([planes[name].astype(np.float32) for name in "RGBA"], -1)
 
 
-def coverage_of(picture) -> np.ndarray:
+def coverage_of(planes) -> np.ndarray:
     """Return coverages (H, W, IDS) from the Cryptomatte channels."""
     hashes = [np.uint32(cryptomatte.name_bits(name)).view(np.float32) for name in SHOWN_NAMES]
-    found = np.zeros((*picture["A"].shape, len(IDS)))
+    found = np.zeros((*planes["A"].shape, len(IDS)))
     for layer in range(3):
         for of_id, of_coverage in ("RG", "BA"):
-            names, coverage = (picture[f"CryptoObject{layer:02d}.{side}"] for side in (of_id, of_coverage))
+            names, coverage = (planes[f"CryptoObject{layer:02d}.{side}"] for side in (of_id, of_coverage))
             for place, value in enumerate(hashes):
                 found[..., place] += np.where(names == value, coverage, 0)
     return found
 
 
-def assert_same(picture, splats, at, primitive="3d") -> None:
+def assert_same(planes, splats, at, primitive="3d") -> None:
     """Check that a frame of one sample equals the reference."""
     rgba, depth, coverage = reference(splats, at, primitive)
-    np.testing.assert_allclose(rgba_of(picture), rgba, atol=2e-3, rtol=2e-3)
-    np.testing.assert_allclose(coverage_of(picture), coverage, atol=1e-5)
-    np.testing.assert_allclose(coverage_of(picture).sum(-1), picture["A"], atol=6e-4)
+    np.testing.assert_allclose(rgba_of(planes), rgba, atol=2e-3, rtol=2e-3)
+    np.testing.assert_allclose(coverage_of(planes), coverage, atol=1e-5)
+    np.testing.assert_allclose(coverage_of(planes).sum(-1), planes["A"], atol=6e-4)
     # Where rounding decides the median, the two may choose neighboring splats.
-    assert (np.abs(picture["Z"] - depth) <= 1e-4 * depth).mean() > 0.995
+    assert (np.abs(planes["Z"] - depth) <= 1e-4 * depth).mean() > 0.995
     winner = np.array(IDS, np.uint32)[coverage.argmax(-1)]
     clear = np.sort(coverage, -1)[..., -1] - np.sort(coverage, -1)[..., -2] > 1e-4
-    assert np.array_equal(picture["IndexOB.X"][clear], winner[clear])
+    assert np.array_equal(planes["IndexOB.X"][clear], winner[clear])
 
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
-def test_a_frame_is_what_the_reference_draws(folder, film, primitive):
+def test_frame_matches_reference(folder, film, primitive):
     votes = VotesRecord("majority", None, 1600, "0f", None)
     update_record(folder, training=TrainingRecord({"primitive": primitive}, votes))
-    picture = film(shot_of([sample()]), "--png")[0]
+    planes = film(shot_of([sample()]), "--png")[0]
     splats, _ = read_splats(folder.splats)
-    assert_same(picture, splats, sample(), primitive)
-    rgba = rgba_of(picture)
+    assert_same(planes, splats, sample(), primitive)
+    rgba = rgba_of(planes)
     photo = np.asarray(Image.open(frame_path(folder.folder.parent / "film", 1).with_suffix(".png")))
     straight = encode(rgba[..., :3] / np.maximum(rgba[..., 3:], 1e-6))
     solid = rgba[..., 3] > 0.1
@@ -164,7 +166,7 @@ def test_a_frame_is_what_the_reference_draws(folder, film, primitive):
     assert np.abs(photo[..., 3] - 255 * rgba[..., 3]).max() < 0.7
 
 
-def test_edits_and_places(folder, film):
+def test_edits_and_shot_transforms_are_applied(folder, film):
     """Edits in objects.json apply, except that the shot's maps, copies and visibility replace its transforms."""
     recolor = Recolor(hue=0.3, value=0.8)
     place = moved(0.3, -0.1, 0.2)
@@ -182,17 +184,15 @@ def test_edits_and_places(folder, film):
         transformed(part[7], moved(-0.4)),
     ])  # fmt: skip
     named = shot_of([sample(objects=objects)], only_named=True)
-    pictures = film(
-        shot_of([sample(objects=objects)], [sample()], [sample(0.1, {2: Placed(maps=np.zeros((0, 4, 4)))})])
-    )
+    frames = film(shot_of([sample(objects=objects)], [sample()], [sample(0.1, {2: Placed(maps=np.zeros((0, 4, 4)))})]))
     names = ["Unlabeled", "can", "mug", "große Kiste"]
-    assert list(manifest(folder.folder.parent / "film")) == names, "mug is alone with its name where the other is gone"
-    np.testing.assert_allclose(rgba_of(pictures[0]), reference(expected, sample())[0], atol=2e-3, rtol=2e-3)
+    assert list(manifest(folder.folder.parent / "film")) == names, "mug is unique once the other mug is removed"
+    np.testing.assert_allclose(rgba_of(frames[0]), reference(expected, sample())[0], atol=2e-3, rtol=2e-3)
     static = concatenate([part[0], transformed(can, moved(0.2)), transformed(part[7], place),
                           transformed(part[7], moved(-0.4)), part[HUGE]])  # fmt: skip
-    np.testing.assert_allclose(rgba_of(pictures[1]), reference(static, sample())[0], atol=2e-3, rtol=2e-3)
+    np.testing.assert_allclose(rgba_of(frames[1]), reference(static, sample())[0], atol=2e-3, rtol=2e-3)
     gone = static.select(static.object_ids != 2)
-    np.testing.assert_allclose(rgba_of(pictures[2]), reference(gone, sample(0.1))[0], atol=2e-3, rtol=2e-3)
+    np.testing.assert_allclose(rgba_of(frames[2]), reference(gone, sample(0.1))[0], atol=2e-3, rtol=2e-3)
     alone = expected.select(expected.object_ids == 2)
     np.testing.assert_allclose(rgba_of(film(named)[0]), reference(alone, sample())[0], atol=2e-3, rtol=2e-3)
 
@@ -201,27 +201,27 @@ def test_clip_range_and_depth_scale(folder, film):
     near, far = film(shot_of([sample(clip=(2.5, 50.0))], [sample(clip=(0.05, 2.5))], depth_scale=10.0))
     splats, _ = read_splats(folder.splats)
     depths = splats.means @ view()[2, :3] + view()[2, 3]
-    for picture, kept in ((near, depths > 2.5), (far, depths <= 2.5)):
+    for planes, kept in ((near, depths > 2.5), (far, depths <= 2.5)):
         rgba, depth, _ = reference(splats.select(kept), sample())
-        np.testing.assert_allclose(rgba_of(picture), rgba, atol=2e-3, rtol=2e-3)
+        np.testing.assert_allclose(rgba_of(planes), rgba, atol=2e-3, rtol=2e-3)
         seen = depth < FAR
-        assert (np.abs(picture["Z"] - 10 * depth) <= 1e-3 * depth)[seen].mean() > 0.99
-        assert (picture["Z"][~seen] == np.float32(FAR)).all() and (~seen).any()
+        assert (np.abs(planes["Z"] - 10 * depth) <= 1e-3 * depth)[seen].mean() > 0.99
+        assert (planes["Z"][~seen] == np.float32(FAR)).all() and (~seen).any()
 
 
-def test_motion_blur_is_the_mean_of_the_moments(folder, film):
+def test_motion_blur_is_mean_of_samples(folder, film):
     moments = [sample(x, {2: Placed(maps=moved(3 * x)[None])}, time=1 + x) for x in (-0.1, -0.03, 0.05)]
     blurred, *single = film(shot_of(moments, *([moment] for moment in moments)))
-    mean = np.mean([rgba_of(picture) for picture in single], 0)
+    mean = np.mean([rgba_of(planes) for planes in single], 0)
     np.testing.assert_allclose(rgba_of(blurred), mean, atol=1e-3, rtol=1e-3)
-    coverage = np.mean([coverage_of(picture) for picture in single], 0)
+    coverage = np.mean([coverage_of(planes) for planes in single], 0)
     np.testing.assert_allclose(coverage_of(blurred), coverage, atol=1e-6)
     assert np.array_equal(blurred["Z"], single[1]["Z"])
     ranked = np.stack([blurred[f"CryptoObject{i:02d}.{side}"] for i in range(3) for side in "GA"])
     assert (np.diff(ranked, axis=0) <= 0).all()
 
 
-def test_ranked_lists_add_up():
+def test_ranked_ids_are_summed():
     rng = np.random.default_rng(0)
     totals = np.full((3, 4, 8), -1, np.int32), np.zeros((3, 4, 8), np.float32)
     dense = np.zeros((3, 4, 8))
@@ -248,7 +248,7 @@ def header(out, number=1) -> dict:
         return dict(file.header())
 
 
-def test_cryptomatte_is_as_published(folder, film):
+def test_cryptomatte_matches_specification(folder, film):
     """Hashes match the specification's examples and known test vectors; the header has the names and keys."""
     for name, expected in (
         ("bunny", 0x13851A76), ("default", 0x42C9679F), ("test", 0xBA6BD213), ("Hello, world!", 0xC0363E43),
@@ -268,22 +268,22 @@ def test_cryptomatte_is_as_published(folder, film):
     assert found["pixelAspectRatio"] == 1.5 and found["objectgs/frame"] == "1"
 
 
-def test_colors_go_there_and_back():
+def test_srgb_encoding_round_trip():
     values = np.linspace(0, 1.5, 200, dtype=np.float32)
     np.testing.assert_allclose(encode(decode(values)), values, atol=1e-6)
     np.testing.assert_allclose(decode(np.float32([0.0, 0.5, 1.0])), [0.0, 0.2140411, 1.0], atol=1e-6)
 
 
-# --- resuming and stopping --------------------------------------------------------------------------------------------
+# --- resuming and stopping -------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
-def shoot(folder, tmp_path, ask):
+def shoot(folder, tmp_path, run_command):
     """Function that runs the command on a shot of three frames, or on another shot."""
 
     def run(*options, shot=None):
         write_shot(tmp_path / "shot.json", shot or shot_of([sample()], [sample(0.1)], [sample(0.2), sample(0.21)]))
-        return ask(
+        return run_command(
             "film", folder.folder, "--shot", tmp_path / "shot.json", "--out", tmp_path / "film", "--device", "cpu",
             "--json", *options,
         )  # fmt: skip
@@ -291,15 +291,15 @@ def shoot(folder, tmp_path, ask):
     return run
 
 
-def drawn(answer) -> int:
-    assert answer.code == EXIT_DONE, answer
-    return answer.events[-1]["drawn"]
+def drawn(result) -> int:
+    assert result.code == EXIT_DONE, result
+    return result.events[-1]["drawn"]
 
 
-def test_finished_frames_are_skipped_and_others_drawn_again(folder, shoot, tmp_path):
+def test_finished_frames_are_skipped(folder, shoot, tmp_path):
     out = tmp_path / "film"
     assert drawn(shoot("--frames", "2-3")) == 2 and not frame_path(out, 1).exists()
-    assert drawn(shoot()) == 1, "as another machine of a farm would leave the rest"
+    assert drawn(shoot()) == 1, "only the missing frame is rendered"
     before = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
     assert drawn(shoot()) == 0 and before == {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
     assert sorted(before) == ["splats.0001.exr", "splats.0002.exr", "splats.0003.exr"]
@@ -310,31 +310,31 @@ def test_finished_frames_are_skipped_and_others_drawn_again(folder, shoot, tmp_p
     assert drawn(shoot()) == 1 and frame_path(out, 2).read_bytes() == whole
     assert drawn(shoot(shot=shot_of([sample()], [sample(0.15)], [sample(0.2), sample(0.21)]))) == 1
     edit_objects(folder.objects, {1: {"color": [9, 9, 9]}})
-    assert drawn(shoot("--frames", "1")) == 0, "the color that stands for an object is not in its pictures"
+    assert drawn(shoot("--frames", "1")) == 0, "the display color of an object does not affect frames"
     edit_objects(folder.objects, {1: {"removed": True}})
     assert drawn(shoot()) == 3
     assert drawn(shoot("--png")) == 3 and len(list(out.glob("*.png"))) == 3
     assert drawn(shoot("--png", "--frames", "1,3")) == 0
     write_splats(folder.splats, some_splats(seed=1))
-    assert drawn(shoot("--frames", "1")) == 1 and len(list(out.glob("*.png"))) == 2, "the picture of other splats went"
+    assert drawn(shoot("--frames", "1")) == 1 and len(list(out.glob("*.png"))) == 2, "the outdated PNG was removed"
 
 
-def test_stopping_leaves_whole_frames(shoot, tmp_path, monkeypatch):
+def test_stopping_keeps_complete_frames(shoot, tmp_path, monkeypatch):
     stops = iter([False, False, True])
     monkeypatch.setattr("backend.shared.stopping.StopRequest.__call__", lambda self: next(stops))
-    answer = shoot()
-    assert answer.code == EXIT_CANCELLED and answer.events[-1]["stopped"] is True
-    shares = [event["done"] for event in answer.events if event["type"] == "progress"]
-    assert shares == [1, 2, 2.5], "between the moments of a frame, too"
+    result = shoot()
+    assert result.code == EXIT_CANCELLED and result.events[-1]["stopped"] is True
+    shares = [event["done"] for event in result.events if event["type"] == "progress"]
+    assert shares == [1, 2, 2.5], "stopping is also possible between samples"
     assert sorted(path.name for path in (tmp_path / "film").iterdir()) == ["splats.0001.exr", "splats.0002.exr"]
     monkeypatch.undo()
     assert drawn(shoot()) == 1
 
 
-# --- bad input --------------------------------------------------------------------------------------------------------
+# --- invalid input ---------------------------------------------------------------------------------------------------
 
 
-def test_what_was_written_is_read(tmp_path):
+def test_shot_round_trip(tmp_path):
     objects = {1: Placed(maps=np.array([moved(1), moved(2)])), 2: Placed(visible=False), HUGE: Placed()}
     moving = {**objects, 1: Placed(maps=moved(3)[None])}
     shot = shot_of([sample(objects=objects), sample(objects=moving)], [sample()], only_named=True, pixel_aspect=2.0)
@@ -349,7 +349,7 @@ def test_what_was_written_is_read(tmp_path):
             assert stored[0] == stored[1] and first.clip == second.clip and first.time == second.time
 
 
-def break_it(path, keys, value):
+def corrupt(path, keys, value):
     content = json.loads(path.read_text())
     at = content
     for key in keys[:-1]:
@@ -377,31 +377,31 @@ FIRST = ("frames", 0, "samples", 0)
         (("only_named",), "yes", "only_named"),
     ],
 )  # fmt: skip
-def test_bad_shots(tmp_path, keys, value, words):
+def test_invalid_shots_are_rejected(tmp_path, keys, value, words):
     path = tmp_path / "shot.json"
     write_shot(path, shot_of([sample()], [sample()]))
-    break_it(path, keys, value)
+    corrupt(path, keys, value)
     with pytest.raises(InputError) as caught:
         read_shot(path)
     assert str(path) in str(caught.value) and words in str(caught.value) and str(caught.value).endswith(".")
 
 
-def test_bad_requests(folder, tmp_path, ask):
+def test_invalid_film_requests_are_rejected(folder, tmp_path, run_command):
     path = tmp_path / "shot.json"
     command = ("film", folder.folder, "--shot", path, "--out", tmp_path / "film")
-    refused(ask(*command), str(path), "does not exist")
+    assert_rejected(run_command(*command), str(path), "does not exist")
     write_shot(path, shot_of([sample()], [sample()]))
     for text in ("x", "3-1", "1;2", "", "-4"):
-        refused(ask(*command, f"--frames={text}"), "--frames")
-    refused(ask(*command, "--frames", "7-9"), "none of the frames", "1 to 2")
-    refused(ask("film", tmp_path, "--shot", path, "--out", tmp_path / "film"), "splats.ply")
-    (tmp_path / "file").write_text("in the way")
-    refused(ask(*command[:-1], tmp_path / "file"), "cannot be created")
+        assert_rejected(run_command(*command, f"--frames={text}"), "--frames")
+    assert_rejected(run_command(*command, "--frames", "7-9"), "none of the frames", "1 to 2")
+    assert_rejected(run_command("film", tmp_path, "--shot", path, "--out", tmp_path / "film"), "splats.ply")
+    (tmp_path / "file").write_text("not a folder")
+    assert_rejected(run_command(*command[:-1], tmp_path / "file"), "cannot be created")
     path.write_text("{")
-    refused(ask(*command), str(path), "JSON")
+    assert_rejected(run_command(*command), str(path), "JSON")
 
 
-def test_ranges_of_frames():
+def test_frame_ranges_are_parsed():
     shot = shot_of(*([sample()] for _ in range(9)))
     for text, wanted in (("1-3", [1, 2, 3]), ("2, 5-6,9", [2, 5, 6, 9]), ("8-100", [8, 9]), (None, list(range(1, 10)))):
         assert [frame.number for frame in chosen_frames(text, shot)] == wanted

@@ -8,7 +8,7 @@ import headless
 from backend.model.checkpoint import save_checkpoint
 
 
-def test_blender_reads_how_far_a_training_is(tmp_path):
+def test_blender_reads_steps_and_seconds_of_checkpoint(tmp_path):
     root = headless.extension().__name__
     folder_state = importlib.import_module(f"{root}.objectgs_addon.state.folder_state").folder_state
     save_checkpoint(tmp_path / "checkpoint", {"a": np.zeros(3, np.float32)}, {"progress": {"step": 3, "seconds": 0.5}})

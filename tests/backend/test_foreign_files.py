@@ -1,4 +1,4 @@
-"""Commands neither delete nor overwrite files that are not theirs."""
+"""Commands neither delete nor overwrite files of others."""
 
 import os
 from pathlib import Path
@@ -11,7 +11,7 @@ from backend.shared.formats.atomic import atomic_file, make_folder, recorded, wr
 from backend.shared.reconstruction.objects import edit_objects, read_objects
 from backend.training.trainer import Trainer
 
-from .asking import refused
+from .command_result import assert_rejected
 from .test_commands import SMALL, trained  # noqa: F401
 
 LENGTH = ("--steps", 5, *SMALL)
@@ -33,8 +33,8 @@ def bad_capture(tmp_path):
 
 
 @pytest.mark.parametrize("command", ["import", "vote", "train", "plan"])
-def test_a_refused_run_removes_what_it_made_alone(ask, tmp_path, bad_capture, monkeypatch, command):
-    """Others write into the new parent folder, and into the new folder itself, while the command runs."""
+def test_rejected_run_removes_only_its_own_files(run_command, tmp_path, bad_capture, monkeypatch, command):
+    """While the command runs, other programs write to the new parent folder and to the new folder."""
     parent = tmp_path / "new"
 
     def others_write(*_):
@@ -46,53 +46,55 @@ def test_a_refused_run_removes_what_it_made_alone(ask, tmp_path, bad_capture, mo
 
     place = "plan" if command == "plan" else "folder"
     monkeypatch.setattr(f"backend.commands.{'capture.' if command == 'plan' else ''}{place}.load_capture", others_write)
-    assert ask(command, bad_capture, "--out", parent / "a").code == EXIT_BAD_INPUT
+    assert run_command(command, bad_capture, "--out", parent / "a").code == EXIT_BAD_INPUT
     left = {"b/splats.ply": b"finished"}
     assert contents(parent) == (left if command == "vote" else {**left, "a/notes.txt": b"mine"})
     assert (parent / "a").exists() == (command != "vote")
 
 
-def test_a_refused_run_leaves_an_empty_folder_that_was_there(ask, tmp_path, bad_capture):
+def test_rejected_run_keeps_existing_empty_folder(run_command, tmp_path, bad_capture):
     out = tmp_path / "empty"
     out.mkdir()
-    assert ask("train", bad_capture, "--out", out, *LENGTH).code == EXIT_BAD_INPUT
+    assert run_command("train", bad_capture, "--out", out, *LENGTH).code == EXIT_BAD_INPUT
     assert out.is_dir() and not list(out.iterdir())
-    assert ask("train", bad_capture, "--out", tmp_path / "new" / "out", *LENGTH).code == EXIT_BAD_INPUT
+    assert run_command("train", bad_capture, "--out", tmp_path / "new" / "out", *LENGTH).code == EXIT_BAD_INPUT
     assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize("command", ["import", "vote", "train", "plan", "import-splats"])
 @pytest.mark.parametrize("foreign", ["points.ply", "cameras.json", "checkpoint/model.safetensors", "thesis.odt"])
-def test_a_folder_with_foreign_files_is_refused(ask, tmp_path, capture, trained, command, foreign):  # noqa: F811
+def test_folder_with_foreign_files_is_rejected(run_command, tmp_path, capture, trained, command, foreign):  # noqa: F811
     out = tmp_path / "theirs"
     (out / foreign).parent.mkdir(parents=True)
     (out / foreign).write_text("not yours")
     before = contents(out)
     source = trained[1] / "splats.ply" if command == "import-splats" else capture
     options = ["--restart", *LENGTH] if command == "train" else []
-    refused(ask(command, source, "--out", out, *options), str(out), "choose an")
+    assert_rejected(run_command(command, source, "--out", out, *options), str(out), "choose an")
     assert contents(out) == before
 
 
-def test_a_folder_with_foreign_files_is_used_where_that_is_asked_for(ask, tmp_path, capture):
+def test_overwrite_allows_folder_with_foreign_files(run_command, tmp_path, capture):
     out = tmp_path / "theirs"
     out.mkdir()
     (out / "thesis.odt").write_text("not yours")
     (out / "points.ply").write_text("to be replaced")
-    assert ask("vote", capture, "--out", out, "--overwrite").code == EXIT_DONE
+    assert run_command("vote", capture, "--out", out, "--overwrite").code == EXIT_DONE
     assert (out / "thesis.odt").read_text() == "not yours"
-    assert (out / "points.ply").read_bytes()[:3] == b"ply" and ask("vote", capture, "--out", out).code == EXIT_DONE
+    assert (out / "points.ply").read_bytes()[:3] == b"ply" and run_command(
+        "vote", capture, "--out", out
+    ).code == EXIT_DONE
 
 
 @pytest.mark.parametrize("name", [".DS_Store", "Thumbs.db", "desktop.ini"])
-def test_a_folder_that_looks_empty_is_used(ask, tmp_path, capture, name):
+def test_folder_with_only_system_files_is_used(run_command, tmp_path, capture, name):
     out = tmp_path / "out"
     out.mkdir()
     (out / name).write_bytes(b"made by the file browser")
-    assert ask("vote", capture, "--out", out).code == EXIT_DONE
+    assert run_command("vote", capture, "--out", out).code == EXIT_DONE
 
 
-def test_restart_keeps_the_old_checkpoint_until_the_new_one_exists(ask, trained, monkeypatch):  # noqa: F811
+def test_restart_keeps_old_checkpoint_until_new_one_exists(run_command, trained, monkeypatch):  # noqa: F811
     capture, out = trained
     before = contents(out / "checkpoint")
 
@@ -100,12 +102,12 @@ def test_restart_keeps_the_old_checkpoint_until_the_new_one_exists(ask, trained,
         raise InputError("The disk is full.")
 
     monkeypatch.setattr(Trainer, "save", full)
-    assert ask("train", capture, "--out", out, *LENGTH, "--restart").code == EXIT_BAD_INPUT
+    assert run_command("train", capture, "--out", out, *LENGTH, "--restart").code == EXIT_BAD_INPUT
     assert contents(out / "checkpoint") == before
 
 
 @pytest.mark.skipif(os.name != "posix", reason="links need a privilege on Windows")
-def test_writing_follows_no_link(tmp_path):
+def test_atomic_write_does_not_follow_links(tmp_path):
     theirs = tmp_path / "theirs.txt"
     theirs.write_text("not yours")
     for name in ("objects.json", "objects.json.part"):
@@ -115,7 +117,7 @@ def test_writing_follows_no_link(tmp_path):
     assert (tmp_path / "objects.json").read_text() == "{}" and not (tmp_path / "objects.json").is_symlink()
 
 
-def test_writers_of_one_file_do_not_share_a_temporary_file(tmp_path):
+def test_concurrent_writers_use_separate_temporary_files(tmp_path):
     path = tmp_path / "objects.json"
     with atomic_file(path) as first, atomic_file(path) as second:
         first.write(b"first")
@@ -145,25 +147,31 @@ OWN = ("splats.ply", "objects.json", "objectgs.json", "anchors.ply", "meshes/1.p
 
 
 @pytest.mark.parametrize("name", OWN)
-def test_an_export_replaces_no_file_of_the_reconstruction(ask, trained, name):  # noqa: F811
+def test_export_does_not_replace_reconstruction_files(run_command, trained, name):  # noqa: F811
     _, out = trained
     before = contents(out)
-    refused(ask("export", out, "--out", out / name, "--format", "ply"), name, "belongs to the reconstruction")
+    assert_rejected(
+        run_command("export", out, "--out", out / name, "--format", "ply"), name, "belongs to the reconstruction"
+    )
     (out.parent / "link.ply").symlink_to(out / name)
-    refused(ask("export", out, "--out", out.parent / "link.ply"), "link.ply", "belongs to the reconstruction")
-    refused(ask("export", out, "--out", out / "meshes", "--per-object"), "meshes", "belongs to the reconstruction")
+    assert_rejected(
+        run_command("export", out, "--out", out.parent / "link.ply"), "link.ply", "belongs to the reconstruction"
+    )
+    assert_rejected(
+        run_command("export", out, "--out", out / "meshes", "--per-object"), "meshes", "belongs to the reconstruction"
+    )
     assert contents(out) == before
 
 
-def test_each_object_is_exported_whatever_the_names(ask, trained):  # noqa: F811
+def test_export_per_object_handles_conflicting_names(run_command, trained):  # noqa: F811
     _, out = trained
     ids = [entry.id for entry in read_objects(out / "objects.json")]
     names = dict(zip(ids, ["CON", "mug", "MUG", "mug_3", "x" * 300]))
     edit_objects(out / "objects.json", {i: {"name": name} for i, name in names.items()})
-    answer = ask("export", out, "--out", out.parent / "each", "--per-object", "--json")
+    result = run_command("export", out, "--out", out.parent / "each", "--per-object", "--json")
     files = list((out.parent / "each").iterdir())
-    assert answer.code == EXIT_DONE and len(files) == answer.events[-1]["files"] >= len(names)
+    assert result.code == EXIT_DONE and len(files) == result.events[-1]["files"] >= len(names)
     assert (
         len({path.name.casefold() for path in files}) == len(files) and not (out.parent / "each" / "CON.ply").exists()
     )
-    assert sum(len(read_splats(path)[0]) for path in files) == answer.events[-1]["splats"]
+    assert sum(len(read_splats(path)[0]) for path in files) == result.events[-1]["splats"]

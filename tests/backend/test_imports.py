@@ -39,7 +39,7 @@ def imports_of(path: Path) -> list[tuple[tuple[str, ...], int]]:
     return found
 
 
-def room_of(module: tuple[str, ...]) -> str:
+def rule_folder_of(module: tuple[str, ...]) -> str:
     """Return the folder to which the rules apply: the top two levels, or the root package alone."""
     folder = ROOT.joinpath(*module[:2])
     return "/".join(module[:2]) if folder.is_dir() and len(module) > 1 else module[0]
@@ -61,11 +61,11 @@ def violations() -> list[str]:
     rules = documented_rules()
     found = []
     for path in SOURCES:
-        here = room_of(module_of(path))
+        here = rule_folder_of(module_of(path))
         for module, line in imports_of(path):
             if module[:1] not in {(package,) for package in PACKAGES}:
                 continue
-            there = room_of(module)
+            there = rule_folder_of(module)
             allowed = rules.get(here, set())
             if there != here and there not in allowed:
                 found.append(f"{path.relative_to(ROOT)}:{line} imports {'.'.join(module)}")
@@ -76,7 +76,7 @@ def test_imports_follow_the_documented_rules():
     assert not violations()
 
 
-def test_documented_rules_have_no_circle():
+def test_documented_rules_are_acyclic():
     rules = documented_rules()
     done: set[str] = set()
 
@@ -112,15 +112,15 @@ def outside_imports(folder: str) -> dict[str, str]:
         ("operators", {"numpy"} | BLENDER),
     ],
 )
-def test_what_blender_loads_needs_only_what_blender_brings(folder, allowed):
+def test_blender_side_imports_only_bundled_packages(folder, allowed):
     assert {name: place for name, place in outside_imports(folder).items() if name not in allowed} == {}
 
 
-def test_the_backend_does_not_know_blender():
+def test_backend_does_not_import_blender():
     assert not set(outside_imports("backend")) & BLENDER
 
 
-def test_blender_loads_no_compute_package_with_the_shared_modules():
+def test_shared_modules_import_no_compute_packages():
     modules = [".".join(module_of(path)) for path in SOURCES if path.is_relative_to(ROOT / "backend" / "shared")]
     code = f"import sys, importlib; [importlib.import_module(m) for m in {modules}]; print(*sys.modules)"
     import subprocess
@@ -129,7 +129,7 @@ def test_blender_loads_no_compute_package_with_the_shared_modules():
     assert not {"torch", "numba", "pycolmap", "xatlas", "PIL", "scipy", "psutil"} & set(loaded.split())
 
 
-def test_packages_import_relatively():
+def test_packages_use_relative_imports():
     absolute = [
         f"{path.relative_to(ROOT)}:{line}"
         for path in SOURCES
@@ -140,7 +140,7 @@ def test_packages_import_relatively():
     assert not absolute
 
 
-def test_folders_and_files_stay_small():
+def test_folder_and_file_sizes_are_limited():
     folders = {path.parent for path in SOURCES}
     crowded = {
         str(folder.relative_to(ROOT)): n for folder in folders if (n := len(list(folder.glob("*.py")))) > MOST_MODULES
@@ -171,7 +171,7 @@ OWNERS = {
 """File of a reconstruction folder -> the only module of backend/shared/reconstruction that contains its name."""
 
 
-def test_each_file_of_a_reconstruction_has_one_owner():
+def test_reconstruction_file_names_have_one_owner():
     places = defaultdict(set)
     for path in SOURCES:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -1,4 +1,4 @@
-"""JSON files, whatever they contain."""
+"""Reading of valid, invalid and oversized JSON files."""
 
 import pytest
 
@@ -12,7 +12,7 @@ BAD = [DEEP, '{"a": ' * 100_000, "1" * 5000, "[NaN]", "[Infinity]", "{", "", "\x
 
 
 @pytest.mark.parametrize("text", BAD, ids=range(len(BAD)))
-def test_bad_json_is_one_sentence(tmp_path, text):
+def test_invalid_json_is_rejected(tmp_path, text):
     path = tmp_path / "objects.json"
     path.write_text(text, encoding="latin-1")
     with pytest.raises(InputError, match=r"objects\.json cannot be read as JSON .*; repair it"):
@@ -22,7 +22,7 @@ def test_bad_json_is_one_sentence(tmp_path, text):
         read_names(tmp_path)
 
 
-def test_a_huge_file_is_not_read(tmp_path, monkeypatch):
+def test_oversized_json_is_rejected(tmp_path, monkeypatch):
     write_json(tmp_path / "plan.json", list(range(1000)))
     assert read_json(tmp_path / "plan.json") == list(range(1000))
     monkeypatch.setattr(json_file, "LARGEST", 1000)
@@ -30,5 +30,5 @@ def test_a_huge_file_is_not_read(tmp_path, monkeypatch):
         read_json(tmp_path / "plan.json")
 
 
-def test_good_json_is_read():
+def test_valid_json_is_parsed():
     assert parse_json(b'{"a": [1, 2.5, null, "\\u00e4"]}') == {"a": [1, 2.5, None, "\u00e4"]}

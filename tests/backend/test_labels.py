@@ -70,7 +70,7 @@ def plain(*ids: int) -> list[np.ndarray]:
     return [np.full((8, 8), i) for i in ids]
 
 
-def test_majority_wins_and_ties_go_to_the_smallest():
+def test_majority_wins_and_ties_go_to_smallest_id():
     votes = vote(given(plain(5, 2, 2, 5, 9, 0, 0, 0), [[0, 0, 1.0]]))
     assert votes.ids.tolist() == [2] and votes.margins.tolist() == [0.0] and votes.visible.tolist() == [8]
     votes = vote(given(plain(5, 5, 2, 5, 0), [[0, 0, 1.0]]))
@@ -78,13 +78,13 @@ def test_majority_wins_and_ties_go_to_the_smallest():
     assert votes.counts == {2: 0, 5: 1}
 
 
-def test_unlabeled_wins_only_where_nothing_else_voted():
+def test_unlabeled_wins_only_without_other_votes():
     assert vote(given(plain(0, 0, 0, 7), [[0, 0, 1.0]])).ids.tolist() == [7]
     votes = vote(given(plain(0, 0, 0), [[0, 0, 1.0]]))
     assert votes.ids.tolist() == [0] and votes.margins.tolist() == [0.0] and votes.visible.tolist() == [3]
 
 
-def test_the_pixel_that_holds_the_projection_votes():
+def test_pixel_containing_projection_votes():
     mask = np.arange(1, 65).reshape(8, 8)
     x, y = np.meshgrid(np.arange(8), np.arange(8))
     for within in (0.01, 0.5, 0.99):
@@ -102,11 +102,11 @@ def test_points_behind_or_outside_do_not_vote():
 def test_only_training_views_with_masks_vote(write_capture, tmp_path):
     scene = write_capture(views=9, points=5)
     capture = load_capture(scene.folder, tmp_path / "cache")
-    asked = []
+    requested = []
     original = capture.mask
-    capture.mask = lambda index, downscale=1: (asked.append(index), original(index, downscale))[1]  # type: ignore
+    capture.mask = lambda index, downscale=1: (requested.append(index), original(index, downscale))[1]  # type: ignore
     vote(capture)
-    assert set(asked) == set(capture.train_indices) and 0 not in asked and 8 not in asked
+    assert set(requested) == set(capture.train_indices) and 0 not in requested and 8 not in requested
 
 
 def test_correspondence_uses_only_observations():
@@ -116,7 +116,7 @@ def test_correspondence_uses_only_observations():
     assert votes.ids.tolist() == [1, 2] and votes.visible.tolist() == [1, 2]
 
 
-def test_occlusion_drops_hidden_views_but_not_observed_ones():
+def test_occlusion_ignores_hidden_views_except_observations():
     """A wall of points with ID 1 hides a point of ID 2 behind it, in two views of three."""
     x, y = np.meshgrid(np.arange(40) + 0.5, np.arange(40) + 0.5)
     wall = np.stack([(x.ravel() - 20) / 8, (y.ravel() - 20) / 8, np.ones(1600)], 1)
@@ -129,12 +129,14 @@ def test_occlusion_drops_hidden_views_but_not_observed_ones():
     votes = vote(given(masks, xyz, viewmats=viewmats))
     assert votes.ids[-1] == 2 and votes.visible[-1] == 1 and (votes.ids[:-1] == 1).all()
     seen = [np.array([1600]), np.array([1600]), np.zeros(0, np.int64)]
-    assert vote(given(masks, xyz, seen, viewmats)).ids[-1] == 1, "COLMAP saw it there"
+    assert vote(given(masks, xyz, seen, viewmats)).ids[-1] == 1, "COLMAP observed the point in these views"
     hidden = vote(given(masks[:2], xyz, viewmats=viewmats[:2]))
-    assert hidden.ids[-1] == 1 and hidden.visible[-1] == 2, "hidden everywhere: what projects there votes"
+    assert hidden.ids[-1] == 1 and hidden.visible[-1] == 2, (
+        "a point hidden in all views gets the votes of all projections"
+    )
 
 
-def test_a_synthetic_scene_has_its_known_answer(write_capture, tmp_path):
+def test_synthetic_scene_gives_known_ids(write_capture, tmp_path):
     scene = write_capture(views=24, size=(192, 144), points=800)
     capture = load_capture(scene.folder, tmp_path / "cache")
     share = {}
@@ -145,7 +147,7 @@ def test_a_synthetic_scene_has_its_known_answer(write_capture, tmp_path):
             assert votes.counts == {i: int((votes.ids == i).sum()) for i in (1, 2, 5)} and votes.warnings == []
             assert ((votes.margins >= 0) & (votes.margins <= 1)).all()
     assert share["majority", True] > 0.985 and share["correspondence", True] > 0.96
-    assert share["majority", False] > 0.985, "on convex objects seen from all around the hidden side is outvoted too"
+    assert share["majority", False] > 0.985, "on convex objects, the visible side outvotes the hidden one"
     assert share["probability", True] > share["probability", False] + 0.05
 
 
@@ -158,7 +160,7 @@ def test_noisy_masks_are_outvoted(write_capture, tmp_path):
     votes = vote(capture)
     right = votes.ids == scene.point_objects
     assert right.mean() > 0.93
-    assert votes.margins[right].mean() > votes.margins[~right].mean() + 0.2, "doubt shows in the margin"
+    assert votes.margins[right].mean() > votes.margins[~right].mean() + 0.2, "wrong IDs have small margins"
 
 
 def test_probability_follows_the_votes_and_the_seed():
@@ -171,34 +173,34 @@ def test_probability_follows_the_votes_and_the_seed():
     assert set(one.margins[one.ids == 3]) == {np.float32(0.5)} and set(one.margins[one.ids == 8]) == {np.float32(0)}
 
 
-def test_unknown_strategy():
+def test_unknown_strategy_is_rejected():
     with pytest.raises(ValueError):
         vote(given(plain(1), [[0, 0, 1.0]]), "loudest")  # type: ignore[arg-type]
 
 
-def test_without_masks_nothing_is_labeled(write_capture, tmp_path):
+def test_capture_without_masks_has_no_labels(write_capture, tmp_path):
     capture = load_capture(write_capture(masks=False).folder, tmp_path / "cache")
     for strategy in STRATEGIES:
         votes = vote(capture, strategy)
         assert not votes.ids.any() and not votes.visible.any() and votes.counts == {} and votes.warnings == []
 
 
-def test_objects_with_few_points_are_warned_of():
+def test_objects_with_few_points_give_warnings():
     masks = [np.repeat([[1, 1, 1, 1, 2, 2, 2, 2]], 8, 0)]
     masks[0][0, 0] = 70_000
     xyz = np.concatenate([np.tile([[-0.2, 0, 1.0]], (30, 1)), np.tile([[0.2, 0, 1.0]], (5, 1))])
-    said = []
+    reported = []
 
-    class Hearing(Reporter):
+    class RecordingReporter(Reporter):
         def warning(self, message):
-            said.append(message)
+            reported.append(message)
 
-    votes = vote(given(masks, xyz, names={2: "cup", 70_000: "pin"}), reporter=Hearing())
-    assert votes.counts == {1: 30, 2: 5, 70_000: 0} and said == votes.warnings and len(said) == 2
-    assert "70000 (pin)" in said[0] and "Fewer than 20" in said[1] and "2 (cup)" in said[1]
+    votes = vote(given(masks, xyz, names={2: "cup", 70_000: "pin"}), reporter=RecordingReporter())
+    assert votes.counts == {1: 30, 2: 5, 70_000: 0} and reported == votes.warnings and len(reported) == 2
+    assert "70000 (pin)" in reported[0] and "Fewer than 20" in reported[1] and "2 (cup)" in reported[1]
 
 
-def test_ballots_count_exactly_beyond_their_slots(monkeypatch):
+def test_ballots_stay_exact_beyond_their_slots(monkeypatch):
     """Many IDs at a point overflow the slots; the counts must stay exact."""
     import backend.labels.voting as module
 
@@ -220,7 +222,7 @@ def test_ballots_count_exactly_beyond_their_slots(monkeypatch):
         assert margins[point] == pytest.approx((counter[best] - others) / counter.total(), abs=1e-6)
 
 
-def test_many_points_views_and_ids_stay_fast_and_small():
+def test_large_votes_limit_time_and_memory():
     import tracemalloc
 
     rng = np.random.default_rng(0)
@@ -253,7 +255,7 @@ def test_many_points_views_and_ids_stay_fast_and_small():
 # The labeled point cloud
 
 
-def test_points_survive_the_file(tmp_path):
+def test_points_round_trip(tmp_path):
     rng = np.random.default_rng(0)
     count = 1000
     xyz = rng.normal(size=(count, 3)) + np.array([5e5, 4.5e6, 100])
@@ -275,7 +277,7 @@ def test_points_survive_the_file(tmp_path):
     assert not list(tmp_path.glob("*.part"))
 
 
-def test_damaged_point_clouds_are_refused(tmp_path):
+def test_damaged_point_clouds_are_rejected(tmp_path):
     path = tmp_path / "points.ply"
     with pytest.raises(InputError, match="does not exist"):
         read_points(path)
@@ -289,7 +291,7 @@ def test_damaged_point_clouds_are_refused(tmp_path):
             read_points(path)
 
 
-def test_the_file_opens_elsewhere(tmp_path):
+def test_points_file_is_readable_from_header(tmp_path):
     """The header alone is sufficient to read the file."""
     points = Points(np.array([[1.0, 2, 3]]), np.array([[4, 5, 6]], np.uint8), np.zeros(1, np.float32), np.zeros(1, int))
     write_points(tmp_path / "points.ply", points, vote(given(plain(7), [[0.0, 0.0, 1.0]])))

@@ -46,7 +46,7 @@ def holder(tmp_path):
     process.wait()
 
 
-def test_a_second_process_is_refused_by_the_first_ones_id(tmp_path, holder):
+def test_second_process_gets_pid_of_holder(tmp_path, holder):
     assert lock_holder(tmp_path) == holder.pid
     with (
         pytest.raises(FolderInUse, match=rf"another process \(pid {holder.pid}\); wait for it to finish or stop it"),
@@ -56,7 +56,7 @@ def test_a_second_process_is_refused_by_the_first_ones_id(tmp_path, holder):
     assert lock_holder(tmp_path) == holder.pid
 
 
-def test_a_killed_process_holds_nothing(tmp_path, holder):
+def test_lock_of_killed_process_is_released(tmp_path, holder):
     os.kill(holder.pid, signal.SIGKILL if hasattr(signal, "SIGKILL") else signal.SIGTERM)
     holder.wait()
     assert lock_holder(tmp_path) is None
@@ -65,20 +65,20 @@ def test_a_killed_process_holds_nothing(tmp_path, holder):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_lock_is_not_stale_whatever_its_file_says(tmp_path):
+def test_lock_file_content_alone_does_not_lock(tmp_path):
     (tmp_path / ".lock").write_text("1\n")
     assert lock_holder(tmp_path) is None
     with locked(tmp_path):
         pass
 
 
-def test_one_process_does_not_lock_twice(tmp_path, monkeypatch):
+def test_process_cannot_lock_twice(tmp_path, monkeypatch):
     monkeypatch.setattr(lock, "_PATIENCE", 0.05)
     with locked(tmp_path), pytest.raises(FolderInUse), locked(tmp_path):
         pass
 
 
-def test_looking_for_the_holder_refuses_nobody(tmp_path):
+def test_lock_holder_query_does_not_block_locking(tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-c", COUNT.replace("100", "50"), tmp_path], stderr=subprocess.PIPE, text=True
     )
@@ -88,7 +88,7 @@ def test_looking_for_the_holder_refuses_nobody(tmp_path):
     assert process.returncode == 0, process.stderr.read()
 
 
-def test_processes_that_race_are_never_inside_together(tmp_path):
+def test_racing_processes_lock_exclusively(tmp_path):
     racers = [
         subprocess.Popen([sys.executable, "-c", COUNT, tmp_path], stderr=subprocess.PIPE, text=True) for _ in range(4)
     ]
@@ -113,7 +113,7 @@ print(refused)
 
 
 def test_concurrent_edits_are_all_applied(tmp_path):
-    """300 of them, by 6 processes at a time."""
+    """300 edits by 6 concurrent processes."""
     path = tmp_path / "objects.json"
     write_objects(path, [{"id": i, "name": "", "color": [0, 0, 0], "points": 1} for i in range(1, 301)])
     editors = [

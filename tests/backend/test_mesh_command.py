@@ -16,7 +16,7 @@ from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE, Cancelled
 from backend.shared.formats.mesh_ply import read_mesh
 from backend.shared.reconstruction.objects import edit_objects
 
-from .asking import refused
+from .command_result import assert_rejected
 
 TRAINING = ("--offsets", 4, "--background", "black")
 
@@ -28,7 +28,7 @@ def kept(tmp_path_factory):
 
 
 @pytest.fixture
-def trained(kept, tmp_path, write_capture, ask):
+def trained(kept, tmp_path, write_capture, run_command):
     """A copy of a reconstruction of three spheres, trained until the spheres have a shape."""
     if not (kept / "out").exists():
         scene = write_capture(views=24, size=(96, 72))
@@ -37,7 +37,9 @@ def trained(kept, tmp_path, write_capture, ask):
             pixels = np.asarray(Image.open(scene.folder / "images" / name))
             Image.fromarray(pixels * (ids != 0).astype(np.uint8)[..., None]).save(scene.folder / "images" / name)
         shutil.copytree(scene.folder, kept / "capture")
-        assert ask("train", kept / "capture", "--out", kept / "out", "--steps", 250, *TRAINING).code == EXIT_DONE
+        assert (
+            run_command("train", kept / "capture", "--out", kept / "out", "--steps", 250, *TRAINING).code == EXIT_DONE
+        )
     shutil.copytree(kept / "out", tmp_path / "out")
     return tmp_path / "out"
 
@@ -46,10 +48,10 @@ def entries(out) -> dict:
     return json.loads((out / "meshes" / "meshes.json").read_text())["meshes"]
 
 
-def test_each_object_becomes_a_mesh_in_its_place(trained, ask, write_capture):
-    answer = ask("mesh", trained, "--faces", 2000, "--texture-size", 256, "--json")
-    assert answer.code == EXIT_DONE and answer.events[-1]["made"] == 3
-    shares = [event["done"] / event["total"] for event in answer.events if event.get("what") == "meshes"]
+def test_objects_become_meshes_of_correct_position_and_size(trained, run_command, write_capture):
+    result = run_command("mesh", trained, "--faces", 2000, "--texture-size", 256, "--json")
+    assert result.code == EXIT_DONE and result.events[-1]["made"] == 3
+    shares = [event["done"] / event["total"] for event in result.events if event.get("what") == "meshes"]
     assert shares == sorted(shares) and shares[-1] == pytest.approx(1, abs=0.02) and len(shares) > 10
     for object_id, center, radius in ((1, (-0.7, 0, 0), 0.5), (2, (0.7, 0.1, 0), 0.45), (5, (0, -0.2, 0.9), 0.35)):
         entry = entries(trained)[str(object_id)]
@@ -58,7 +60,7 @@ def test_each_object_becomes_a_mesh_in_its_place(trained, ask, write_capture):
         assert len(found.faces) == entry["faces"] <= 2000 and len(found.vertices) == entry["vertices"]
         assert entry["watertight"] is True and entry["unobserved"] == pytest.approx(found.unobserved.mean(), abs=1e-3)
         distance = np.linalg.norm(found.vertices - center, axis=1)
-        assert abs(np.median(distance) - radius) < 0.1 * radius, "where and as large as the sphere is"
+        assert abs(np.median(distance) - radius) < 0.1 * radius, "position and size match the sphere"
         outward = (found.normals * (found.vertices - center)).sum(1) / distance
         assert np.median(outward) > 0.9
         assert found.uvs.min() >= 0 and found.uvs.max() <= 1
@@ -68,14 +70,16 @@ def test_each_object_becomes_a_mesh_in_its_place(trained, ask, write_capture):
     assert not list(trained.rglob("*.part")) and not (trained / ".lock").exists()
 
 
-def test_merged_objects_sets_and_the_scene(trained, ask):
+def test_merged_objects_sets_and_scene_are_meshed(trained, run_command):
     edit_objects(trained / "objects.json", {2: {"merged_into": 1}, 5: {"left_out": True}})
     quick = ("--faces", 1000, "--texture-size", 256)
-    assert ask("mesh", trained, *quick).code == EXIT_DONE
+    assert run_command("mesh", trained, *quick).code == EXIT_DONE
     assert set(entries(trained)) == {"1"} and entries(trained)["1"]["ids"] == [1, 2]
     xs = read_mesh(trained / "meshes" / "1.ply").vertices[:, 0]
     assert xs.min() < -0.9 and xs.max() > 0.9, "both spheres"
-    assert ask("mesh", trained, *quick, "--set", "pair=1,sphere 5", "--scene", "--objects", "5").code == EXIT_DONE
+    assert (
+        run_command("mesh", trained, *quick, "--set", "pair=1,sphere 5", "--scene", "--objects", "5").code == EXIT_DONE
+    )
     found = entries(trained)
     assert set(found) == {"1", "5", "pair", "scene"}
     assert found["pair"]["ids"] == [1, 2, 5] and found["scene"]["ids"] is None
@@ -83,7 +87,7 @@ def test_merged_objects_sets_and_the_scene(trained, ask):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "expected"),
     [
         (("--objects", "7"), ("no object 7", "1 sphere 1")),
         (("--objects", "teapot"), ("no object teapot", "sphere 5")),
@@ -93,8 +97,8 @@ def test_merged_objects_sets_and_the_scene(trained, ask):
         (("--texture-size", "1000"), ("1000",)),
     ],
 )
-def test_what_cannot_be_asked_for(trained, ask, words, said):
-    refused(ask("mesh", trained, *words), *said)
+def test_invalid_mesh_options_are_rejected(trained, run_command, words, expected):
+    assert_rejected(run_command("mesh", trained, *words), *expected)
     assert not (trained / "meshes").exists()
 
 
@@ -111,7 +115,7 @@ class Stub:
             self.made.append(target.key)
             entry = command._entry_of(target, options, trained)
             if target.key in without:
-                return replace(entry, why=f"Nobody saw {target.name}.")
+                return replace(entry, why=f"No view shows {target.name}.")
             for suffix in ("ply", "png"):
                 (trained.folder.meshes / f"{target.key}.{suffix}").write_bytes(b"")
             return replace(entry, file=f"{target.key}.ply", texture=f"{target.key}.png")
@@ -119,39 +123,43 @@ class Stub:
         monkeypatch.setattr(command, "_make", make)
 
 
-def test_what_was_made_before_a_stop_is_not_made_again(trained, ask, monkeypatch):
+def test_existing_meshes_are_not_made_again(trained, run_command, monkeypatch):
     first = Stub(monkeypatch, stop_at=2)
-    assert ask("mesh", trained).code == EXIT_CANCELLED and first.made == ["1", "2"]
+    assert run_command("mesh", trained).code == EXIT_CANCELLED and first.made == ["1", "2"]
     assert set(entries(trained)) == {"1", "2"} and not (trained / ".lock").exists()
     second = Stub(monkeypatch)
-    assert ask("mesh", trained).code == EXIT_DONE and second.made == ["5"]
+    assert run_command("mesh", trained).code == EXIT_DONE and second.made == ["5"]
     assert set(entries(trained)) == {"1", "2", "5"}
-    assert ask("mesh", trained).code == EXIT_DONE and second.made == ["5"], "all are there"
+    assert run_command("mesh", trained).code == EXIT_DONE and second.made == ["5"], "all meshes exist"
     (trained / "meshes" / "2.png").unlink()
-    assert ask("mesh", trained).code == EXIT_DONE and second.made == ["5", "2"]
-    assert ask("mesh", trained, "--objects", "1", "--faces", 500).code == EXIT_DONE and second.made[2:] == ["1"]
-    assert ask("mesh", trained, "--faces", 500, "--restart").code == EXIT_DONE and second.made[3:] == ["1", "2", "5"]
+    assert run_command("mesh", trained).code == EXIT_DONE and second.made == ["5", "2"]
+    assert run_command("mesh", trained, "--objects", "1", "--faces", 500).code == EXIT_DONE and second.made[2:] == ["1"]
+    assert run_command("mesh", trained, "--faces", 500, "--restart").code == EXIT_DONE and second.made[3:] == [
+        "1",
+        "2",
+        "5",
+    ]
 
 
-def test_a_longer_training_makes_meshes_out_of_date(trained, kept, ask, monkeypatch):
+def test_further_training_outdates_meshes(trained, kept, run_command, monkeypatch):
     made = Stub(monkeypatch).made
-    assert ask("mesh", trained, "--objects", "1").code == EXIT_DONE
-    more = ask("train", kept / "capture", "--out", trained, "--steps", 252, *TRAINING)
+    assert run_command("mesh", trained, "--objects", "1").code == EXIT_DONE
+    more = run_command("train", kept / "capture", "--out", trained, "--steps", 252, *TRAINING)
     assert more.code == EXIT_DONE
-    assert ask("mesh", trained, "--objects", "1").code == EXIT_DONE and made == ["1", "1"]
+    assert run_command("mesh", trained, "--objects", "1").code == EXIT_DONE and made == ["1", "1"]
     assert entries(trained)["1"]["trained_steps"] == 252
 
 
-def test_an_object_without_a_surface_says_why(trained, ask, monkeypatch):
+def test_object_without_surface_is_reported(trained, run_command, monkeypatch):
     Stub(monkeypatch, without={"2"})
-    answer = ask("mesh", trained, "--json")
-    assert answer.code == EXIT_DONE and answer.events[-1]["without"] == 1
-    assert answer.messages("warning") == ["Nobody saw sphere 2."] == [entries(trained)["2"]["why"]]
+    result = run_command("mesh", trained, "--json")
+    assert result.code == EXIT_DONE and result.events[-1]["without"] == 1
+    assert result.messages("warning") == ["No view shows sphere 2."] == [entries(trained)["2"]["why"]]
     Stub(monkeypatch, without={"1", "2", "5"})
-    refused(ask("mesh", trained, "--restart", "--objects", "2"), "Nobody saw sphere 2.")
+    assert_rejected(run_command("mesh", trained, "--restart", "--objects", "2"), "No view shows sphere 2.")
 
 
-def test_no_surface_takes_an_earlier_mesh_away(trained, ask, monkeypatch):
+def test_missing_surface_removes_earlier_mesh(trained, run_command, monkeypatch):
     (trained / "meshes").mkdir()
     (trained / "meshes" / "1.ply").write_bytes(b"old")
 
@@ -159,5 +167,5 @@ def test_no_surface_takes_an_earlier_mesh_away(trained, ask, monkeypatch):
         raise NoSurface("No view shows sphere 1.")
 
     monkeypatch.setattr(command, "fuse", fuse)
-    refused(ask("mesh", trained, "--objects", "1"), "No view shows sphere 1.")
+    assert_rejected(run_command("mesh", trained, "--objects", "1"), "No view shows sphere 1.")
     assert not (trained / "meshes" / "1.ply").exists() and entries(trained)["1"]["why"] == "No view shows sphere 1."

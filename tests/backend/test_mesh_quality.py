@@ -70,10 +70,10 @@ def textured(vertices, faces, uvs=None, texture="", unobserved=None):
     )  # fmt: skip
 
 
-# --- soundness -------------------------------------------------------------------------------------------------------
+# --- defects ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_box_is_sound_and_every_harm_shows():
+def test_box_defects_are_detected():
     vertices, faces = box()
     assert vars(shape_of(vertices, faces)) == {
         "watertight": True, "manifold": True, "components": 1, "self_intersections": 0,
@@ -83,12 +83,14 @@ def test_a_box_is_sound_and_every_harm_shows():
     turned[3] = turned[3, ::-1]
     assert not shape_of(vertices, turned).watertight
     assert not shape_of(vertices, np.concatenate([faces, faces[:1]])).watertight
-    assert shape_of(np.concatenate([vertices, [[9.0, 9, 9]]]), faces).components == 1, "an unused vertex is no part"
+    assert shape_of(np.concatenate([vertices, [[9.0, 9, 9]]]), faces).components == 1, (
+        "unused vertices are not components"
+    )
     two = joined(box(), box((3, 0, 0), (4, 1, 1)))
     assert shape_of(*two).components == 2 and shape_of(*two).manifold
 
 
-def test_two_boxes_that_share_a_corner_are_closed_but_pinched():
+def test_boxes_sharing_a_corner_are_not_manifold():
     vertices, faces = joined(box(), box((1, 1, 1), (2, 2, 2)))
     faces[faces == 8] = 7
     pinched = shape_of(vertices, faces)
@@ -96,20 +98,20 @@ def test_two_boxes_that_share_a_corner_are_closed_but_pinched():
     assert pinched.self_intersections == 0
 
 
-def test_two_boxes_that_share_an_edge_are_not_watertight():
+def test_boxes_sharing_an_edge_are_not_watertight():
     vertices, faces = joined(box(), box((1, 1, 0), (2, 2, 1)))
     faces[faces == 8], faces[faces == 9] = 6, 7
     assert not shape_of(vertices, faces).watertight
 
 
-def test_a_sphere_of_many_faces_is_sound():
+def test_large_sphere_has_no_defects():
     vertices, faces = sphere(detail=200)
     assert len(faces) > 19_000
     shape = shape_of(vertices + 1e6, faces)
     assert (shape.watertight, shape.manifold, shape.self_intersections) == (True, True, 0)
 
 
-def test_crossing_boxes_cut_each_other_and_near_ones_do_not():
+def test_crossing_boxes_intersect_and_near_ones_do_not():
     cut = self_intersecting(*joined(box(), box((0.3, 0.3, 0.5), (0.6, 0.6, 2))))
     # All 8 wall faces of the pillar cross the lid, but perhaps only one of the lid's two faces.
     assert cut[12:].sum() == 8 and 1 <= cut[:12].sum() <= 2
@@ -126,12 +128,12 @@ def test_crossing_boxes_cut_each_other_and_near_ones_do_not():
         ((0.3, 0.3, 1e-3), False),
     ],
 )
-def test_neighbors_cut_where_they_are_folded_flat(last, cuts):
+def test_folded_neighbors_intersect(last, cuts):
     vertices = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), last], float)
     assert self_intersecting(vertices, np.array([(0, 1, 2), (2, 1, 3)])).tolist() == [cuts, cuts]
 
 
-def exactly_meet(p, q):
+def exactly_intersect(p, q):
     """Return whether two triangles with integer corners intersect beyond shared corners, by exact arithmetic."""
 
     def minus(a, b):
@@ -168,12 +170,14 @@ def exactly_meet(p, q):
     return True
 
 
-def test_cuts_agree_with_exact_arithmetic_where_everything_touches():
+def test_intersections_match_exact_arithmetic():
     rng = np.random.default_rng(3)
     corners = rng.integers(0, 4, (60, 3, 3))
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     corners = corners[(across != 0).any(1)]
-    pairs = [(i, j) for i, j in itertools.combinations(range(len(corners)), 2) if exactly_meet(corners[i], corners[j])]
+    pairs = [
+        (i, j) for i, j in itertools.combinations(range(len(corners)), 2) if exactly_intersect(corners[i], corners[j])
+    ]
     # Each pair is tested alone, so that the result belongs to that pair.
     for i, j in itertools.combinations(range(0, len(corners), 2), 2):
         found = self_intersecting(corners[[i, j]].reshape(-1, 3).astype(float), np.arange(6).reshape(2, 3))
@@ -190,7 +194,7 @@ def compared(made, wanted):
     return agreement(b.distances(a.points)[0], a.distances(b.points)[0])
 
 
-def test_a_larger_sphere_is_off_by_the_difference_and_f1_flips_at_the_threshold():
+def test_distance_of_concentric_spheres_and_f1_threshold():
     detail = 256
     near, far = (compared(sphere(1 + gap, detail=detail), sphere(1, detail=detail)) for gap in (0.019, 0.021))
     assert near["chamfer"] == pytest.approx(0.019, rel=0.02) and far["chamfer"] == pytest.approx(0.021, rel=0.02)
@@ -200,7 +204,7 @@ def test_a_larger_sphere_is_off_by_the_difference_and_f1_flips_at_the_threshold(
     assert same["chamfer"] < 1e-9 and same["f1_005"] == 1.0
 
 
-def test_half_a_surface_is_precise_and_half_complete():
+def test_half_surface_has_full_precision_and_half_recall():
     vertices, faces = sphere(detail=128)
     half = faces[vertices[faces][:, :, 2].min(1) >= 0]
     found = compared((vertices, half), (vertices, faces))
@@ -210,7 +214,7 @@ def test_half_a_surface_is_precise_and_half_complete():
     assert compared((vertices, faces), (vertices, half))["recall"] == 1.0
 
 
-def test_points_are_even_over_the_area_and_distances_exact():
+def test_sampled_points_are_uniform_and_distances_exact():
     vertices = np.array([(0, 0, 0), (3, 0, 0), (0, 1, 0), (0, 0, 5), (1, 0, 5), (0, 1, 5), (7, 7, 7)], float)
     surface = SampledSurface(vertices, np.array([(0, 1, 2), (3, 4, 5), (6, 6, 6)]))
     assert (surface.points[:, 2] < 1).mean() == pytest.approx(0.75, abs=0.01)
@@ -223,7 +227,7 @@ def test_points_are_even_over_the_area_and_distances_exact():
         SampledSurface(vertices, np.array([(6, 6, 6)]))
 
 
-def test_nothing_to_compare_is_none():
+def test_agreement_without_points_is_none():
     assert set(agreement(np.zeros(0), np.ones(4)).values()) == {None}
     apart = agreement(np.ones(3), np.ones(4))
     assert apart["f1"] == 0.0 and apart["chamfer"] == 1.0
@@ -270,13 +274,13 @@ def true_capture(write_capture, tmp_path):
     return load_capture(scene.folder, tmp_path / "cache"), scene
 
 
-def test_a_point_is_seen_where_two_views_show_it(true_capture):
+def test_points_are_seen_if_two_views_show_them(true_capture):
     capture, scene = true_capture
     points, _ = sphere(0.5)
     normals = points / 0.5
     every = load_truth(capture, range(9)).seen(points, normals, [1])
-    assert every[np.abs(points[:, 1] + 0.2) < 0.2].all(), "cameras stand at y = -0.8, all around"
-    assert not every[points[:, 1] > 0.48].any(), "nobody looks from below"
+    assert every[np.abs(points[:, 1] + 0.2) < 0.2].all(), "cameras surround the sphere at y = -0.8"
+    assert not every[points[:, 1] > 0.48].any(), "no camera looks from below"
     # With two cameras, only points that both see count, and not those behind the other sphere.
     nine = load_truth(capture, [1, 2])
     two = nine.seen(points, normals, [1])
@@ -284,13 +288,13 @@ def test_a_point_is_seen_where_two_views_show_it(true_capture):
     facing = [((center - points) * normals).sum(1) > 0 for center in centers]
     assert not two[~(facing[0] & facing[1])].any()
     assert two[facing[0] & facing[1]].mean() > 0.7
-    assert not load_truth(capture, [1]).seen(points, normals, [1]).any(), "one view is not two"
+    assert not load_truth(capture, [1]).seen(points, normals, [1]).any(), "two views are required"
     front = np.array([(0, 0, 0.5)])
-    assert not load_truth(capture, [0, 0]).seen(front, front / 0.5, [1]).any(), "the other sphere stands before it"
+    assert not load_truth(capture, [0, 0]).seen(front, front / 0.5, [1]).any(), "the other sphere occludes it"
     assert not nine.seen(points, normals, [5]).any(), "the masks show another object there"
 
 
-def test_hidden_parts_count_only_where_all_counts(true_capture, tmp_path):
+def test_unseen_parts_count_only_over_whole_surface(true_capture, tmp_path):
     capture, _ = true_capture
     truth = load_truth(capture, capture.train_indices)
     vertices, faces = sphere(0.5)
@@ -326,7 +330,7 @@ def test_hidden_parts_count_only_where_all_counts(true_capture, tmp_path):
     assert measured("5.ply")["precision"] < 0.05
 
 
-def test_several_objects_have_the_truth_of_all(true_capture):
+def test_truth_of_several_objects_is_joined(true_capture):
     capture, _ = true_capture
     truth = load_truth(capture, capture.train_indices)
     both = truth.of([1, 5])
@@ -335,7 +339,7 @@ def test_several_objects_have_the_truth_of_all(true_capture):
     assert truth.of([1, 7]) is None and truth.of([]) is None
 
 
-def test_a_capture_without_truth_has_none_and_a_broken_one_is_named(true_capture):
+def test_missing_truth_is_none_and_invalid_truth_is_reported(true_capture):
     capture, scene = true_capture
     place = scene.folder / "truth"
     mesh = place / "meshes" / "5.ply"
@@ -384,13 +388,13 @@ texture = np.rint(255 * np.concatenate([ramp, np.full((300, 400, 1), 0.5)], -1))
 photo = texture.reshape(30, 10, 40, 10, 3).mean((1, 3)) / 255
 
 
-def test_a_texture_is_read_as_blender_reads_it():
+def test_texture_sampling_matches_blender():
     corners = np.array([[(1, 0, 0), (0, 1, 0)], [(0, 0, 1), (1, 1, 1)]], np.uint8) * 255
     found = sample_texture(corners, np.array([(0.0, 0.0), (1, 0), (0, 1), (0.5, 0.5), (0.25, 0.75)]))
     assert found == pytest.approx(np.array([(0, 0, 1), (1, 1, 1), (1, 0, 0), (0.5, 0.5, 0.5), (1, 0, 0)]))
 
 
-def test_texture_psnr_is_of_the_mask_alone():
+def test_texture_psnr_uses_only_masked_pixels():
     labels = np.zeros((30, 40), np.int32)
     labels[5:20, 4:30] = 1
     elsewhere = np.where((labels == 1)[..., None], photo, 0)
@@ -407,7 +411,7 @@ def test_texture_psnr_is_of_the_mask_alone():
     assert texture_score(poster(), texture, FakeScene([photo], [None]), [4], [0]).pixels == 0
 
 
-def test_holes_cannot_hide():
+def test_holes_lower_texture_coverage():
     labels = np.full((30, 40), 1, np.int32)
     half = texture_score(poster(0.5), texture, FakeScene([photo], [labels]), [4], [0]).figures()
     assert half["texture_coverage"] == pytest.approx(0.5) and half["texture_psnr"] > 45
@@ -419,29 +423,29 @@ def test_holes_cannot_hide():
 # --- one mesh, and what cannot be measured ---------------------------------------------------------------------------
 
 
-class Warnings(Reporter):
+class RecordingReporter(Reporter):
     def __init__(self):
-        self.said = []
+        self.warnings = []
 
     def warning(self, message):
-        self.said.append(message)
+        self.warnings.append(message)
 
 
-def test_what_cannot_be_measured_is_none(true_capture, tmp_path):
-    heard = Warnings()
+def test_unmeasurable_figures_are_none(true_capture, tmp_path):
+    reporter = RecordingReporter()
 
     def measured(entry):
         return evaluate_mesh(
-            tmp_path, MeshEntry("4", "box", (4,), **entry), FakeScene([photo], [None]), None, [0], heard
+            tmp_path, MeshEntry("4", "box", (4,), **entry), FakeScene([photo], [None]), None, [0], reporter
         )
 
     absent = measured({"why": "too few views show it"})
     assert absent.pop("why") == "too few views show it" and set(absent.values()) == {None}
     gone = measured({"file": "4.ply"})
-    assert "4.ply" in heard.said[-1] and gone["faces"] is None and gone["why"]
+    assert "4.ply" in reporter.warnings[-1] and gone["faces"] is None and gone["why"]
     write_mesh(tmp_path / "4.ply", textured(*box(), texture="4.png"))
     found = measured({"file": "4.ply", "texture": "4.png"})
-    assert "4.png" in heard.said[-1] and found["texture_psnr"] is None
+    assert "4.png" in reporter.warnings[-1] and found["texture_psnr"] is None
     assert found["faces"] == 12 and found["watertight"] is True and found["f1"] is None and found["chamfer_all"] is None
     empty = textured(*box())
     empty.faces, empty.uvs, empty.unobserved = empty.faces[:0], empty.uvs[:0], empty.unobserved[:0]
@@ -449,35 +453,35 @@ def test_what_cannot_be_measured_is_none(true_capture, tmp_path):
     assert measured({"file": "4.ply"})["why"] == "it has no surface"
     flat = textured(*box())
     flat.vertices[:] = 1
-    picture = np.asarray(draw_card(Card("", "", flat, None, true_capture[0].views[1]), 40)[0])
-    assert (picture == picture[0, 0]).all()
+    image = np.asarray(draw_card(Card("", "", flat, None, true_capture[0].views[1]), 40)[0])
+    assert (image == image[0, 0]).all()
     write_mesh(tmp_path / "4.ply", flat)
     assert measured({"file": "4.ply"})["watertight"] is None
 
 
-def test_meshes_of_another_state_are_left_out(tmp_path):
-    heard = Warnings()
-    assert mesh_entries(tmp_path, 20, heard) == {} and heard.said == []
+def test_meshes_of_earlier_state_are_left_out(tmp_path):
+    reporter = RecordingReporter()
+    assert mesh_entries(tmp_path, 20, reporter) == {} and reporter.warnings == []
     ids = {"scene": None, "77": [2, 10], "10": [10], "2": [2, 3], "old": [2]}
     entries = {key: {"ids": value, "trained_steps": 20 if key != "old" else 15} for key, value in ids.items()}
     (tmp_path / "meshes.json").write_text(json.dumps({"trained_steps": 20, "meshes": entries}))
-    found = mesh_entries(tmp_path, 20, heard)
+    found = mesh_entries(tmp_path, 20, reporter)
     assert list(found) == ["2", "10", "77", "scene"], "objects by ID, then a set called 77 and the scene"
     assert [entry.object_id for entry in found.values()] == [2, 10, None, None]
-    [said] = heard.said
-    assert "1 of 5 meshes" in said and "earlier state" in said
-    assert list(mesh_entries(tmp_path, 15, heard)) == ["old"]
+    [warning] = reporter.warnings
+    assert "1 of 5 meshes" in warning and "earlier state" in warning
+    assert list(mesh_entries(tmp_path, 15, reporter)) == ["old"]
     for broken in ([1], {"1": 7}, {"one": {"ids": ["x"]}}):
         (tmp_path / "meshes.json").write_text(json.dumps({"trained_steps": 20, "meshes": broken}))
         with pytest.raises(InputError, match=r"meshes\.json"):
-            mesh_entries(tmp_path, 20, heard)
+            mesh_entries(tmp_path, 20, reporter)
 
 
-# --- pictures --------------------------------------------------------------------------------------------------------
+# --- images ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
-def test_a_mesh_fills_its_panel_but_stays_inside(true_capture, scale):
+def test_mesh_fits_panel(true_capture, scale):
     capture, _ = true_capture
     vertices, _ = sphere(0.3 * scale, (5 * scale, 0, 0))
     vertices[:, 1] *= 3
@@ -489,14 +493,14 @@ def test_a_mesh_fills_its_panel_but_stays_inside(true_capture, scale):
     assert np.ptp(pixels, axis=0).max() == pytest.approx(0.88 * 300, rel=0.02)
 
 
-def test_a_room_is_shown_from_within(true_capture):
+def test_room_is_shown_from_inside(true_capture):
     capture, _ = true_capture
     vertices, _ = box((-9, -9, -9), (9, 9, 9))
     camera = camera_for(vertices, capture.views[1], 300)
     assert camera.center == pytest.approx(-capture.views[1].viewmat[:3, :3].T @ capture.views[1].viewmat[:3, 3])
 
 
-def test_the_view_that_shows_most_is_taken(true_capture):
+def test_view_with_most_pixels_is_chosen(true_capture):
     capture, scene = true_capture
     pixels = [(ids == 5).sum() for ids in scene.ids]
     assert view_of(capture, [5], range(9)).name == capture.views[int(np.argmax(pixels))].name
@@ -509,12 +513,12 @@ def test_panels_show_surface_wires_unobserved_faces_and_texture(true_capture):
     uvs = np.zeros((12, 3, 2), np.float32)
     blue = np.zeros((4, 4, 3), np.uint8) + np.uint8([10, 20, 250])
     card = Card("box", "", textured(vertices, faces, uvs), blue, capture.views[1])
-    surface, wires, texture = (np.asarray(picture).astype(int) for picture in draw_card(card, 120))
+    surface, wires, texture = (np.asarray(image).astype(int) for image in draw_card(card, 120))
     assert (surface[0, 0] == surface[-1, -1]).all() and surface.shape == (120, 120, 3)
     drawn = (surface != surface[0, 0]).any(2)
     assert 0.2 < drawn.mean() < 0.8
     gray = surface[drawn]
-    assert np.ptp(gray, axis=1).max() < 40 and np.ptp(gray[:, 0]) > 20, "gray, and lit from a side"
+    assert np.ptp(gray, axis=1).max() < 40 and np.ptp(gray[:, 0]) > 20, "gray and shaded"
     assert (np.abs(texture - [10, 20, 250]).max(2) <= 1).sum() > 0.9 * drawn.sum()
     assert (wires != surface)[drawn].any()
     card.mesh.unobserved[:] = True
@@ -522,10 +526,10 @@ def test_panels_show_surface_wires_unobserved_faces_and_texture(true_capture):
     assert (orange[:, 0] - orange[:, 2] > 40).mean() > 0.7 > (wires[drawn][:, 0] - wires[drawn][:, 2] > 40).mean()
     card.texture = None
     plain = np.asarray(draw_card(card, 120)[2]).astype(int)
-    assert (np.abs(plain - 90).max(2) <= 1).sum() > 0.9 * drawn.sum(), "vertex colors, where there is no texture"
+    assert (np.abs(plain - 90).max(2) <= 1).sum() > 0.9 * drawn.sum(), "vertex colors are shown without a texture"
 
 
-def test_a_sheet_holds_every_mesh_and_stays_small(true_capture, tmp_path):
+def test_sheet_shows_all_meshes_within_size_limit(true_capture, tmp_path):
     capture, _ = true_capture
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 255, (256, 256, 3)).astype(np.uint8)
@@ -551,19 +555,19 @@ def test_a_sheet_holds_every_mesh_and_stays_small(true_capture, tmp_path):
 # --- the commands ----------------------------------------------------------------------------------------------------
 
 
-def test_evaluate_and_report_say_how_good_the_meshes_are(write_capture, tmp_path, ask):
+def test_evaluate_and_report_measure_meshes(write_capture, tmp_path, run_command):
     scene, out = write_capture(views=9, size=(64, 48), spheres=SPHERES), tmp_path / "out"
     write_truth(scene, write_capture, SPHERES)
 
     def run(*words):
-        answer = ask(*words)
-        assert answer.code == EXIT_DONE, answer
-        return answer.err
+        result = run_command(*words)
+        assert result.code == EXIT_DONE, result
+        return result.err
 
     def reported():
-        said = run("report", out)
+        stderr = run("report", out)
         report = json.loads((out / "report.json").read_text())
-        return said, report, {entry["id"]: entry["mesh"] for entry in report["objects"]}
+        return stderr, report, {entry["id"]: entry["mesh"] for entry in report["objects"]}
 
     run("train", scene.folder, "--out", out, "--steps", 12, "--offsets", 4)
     folder = out / "meshes"
@@ -584,14 +588,14 @@ def test_evaluate_and_report_say_how_good_the_meshes_are(write_capture, tmp_path
         },
     }  # fmt: skip
     (folder / "meshes.json").write_text(json.dumps(record))
-    said, _, meshes = reported()
-    assert "have not been measured" in said
+    stderr, _, meshes = reported()
+    assert "have not been measured" in stderr
     assert meshes[1]["faces"] == len(faces) and meshes[1]["f1"] is None
     assert (out / "pictures" / "meshes.png").exists()
 
     run("evaluate", out)
-    said, report, meshes = reported()
-    assert said == ""
+    stderr, report, meshes = reported()
+    assert stderr == ""
     assert meshes[1]["f1"] == 1.0 and meshes[1]["f1_005"] < 0.5
     assert meshes[1]["chamfer"] == pytest.approx(0.01, rel=0.1)
     assert meshes[1]["watertight"] and meshes[1]["manifold"] and meshes[1]["self_intersections"] == 0

@@ -26,15 +26,15 @@ from backend.shared.errors import Cancelled
 from backend.shared.events import Reporter
 
 
-def camera_at(eye, width=64, height=48, focal=60.0):
-    """Return a camera at `eye` that looks at the origin, with z up."""
-    eye = np.asarray(eye, float)
-    forward = -eye / np.linalg.norm(eye)
+def camera_at(camera_center, width=64, height=48, focal=60.0):
+    """Return a camera at `camera_center` that looks at the origin, with z up."""
+    camera_center = np.asarray(camera_center, float)
+    forward = -camera_center / np.linalg.norm(camera_center)
     right = np.cross(forward, [0.0, 0.0, 1.0] if abs(forward[2]) < 0.99 else [0.0, 1.0, 0.0])
     right /= np.linalg.norm(right)
     viewmat = np.eye(4)
     viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    viewmat[:3, 3] = -viewmat[:3, :3] @ camera_center
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
     return Camera(viewmat, K, width, height)
 
@@ -63,8 +63,8 @@ def together(*parts):
 def views_of(splats, cameras, explicit=True, mask=None, primitive="3d", **options):
     """Return `Views` of plain splats; object IDs are ten times the class index."""
 
-    def generate(seen=None, eye=None):
-        assert explicit or eye is not None
+    def generate(seen=None, camera_center=None):
+        assert explicit or camera_center is not None
         return splats if seen is None else splats.select(seen)
 
     anchors = SimpleNamespace(ids=splats.ids)
@@ -76,7 +76,7 @@ def views_of(splats, cameras, explicit=True, mask=None, primitive="3d", **option
 
 
 @pytest.mark.parametrize("explicit", [True, False])
-def test_an_object_is_drawn_unhidden_and_knows_how_much_of_it_is_hidden(explicit):
+def test_object_view_has_unoccluded_depth_and_visibility(explicit):
     near, far = sheet(1.0, 1, half=0.3), sheet(0.0, 2)
     splats = together(near, far)
     cameras = [camera_at((4, 0, 0)), camera_at((-4, 0, 0)), camera_at((4, 0.5, 0.3))]
@@ -103,7 +103,7 @@ def test_an_object_is_drawn_unhidden_and_knows_how_much_of_it_is_hidden(explicit
     assert seen.depth[0, 0] == 0
 
 
-def test_a_depth_is_sure_where_the_light_comes_from_one_place():
+def test_depth_is_certain_for_single_surface():
     veil, wall = sheet(1.0, 2, half=0.1), sheet(0.0, 2)
     veil = veil._replace(opacities=veil.opacities * 0.3)
     splats = together(veil, wall)
@@ -129,7 +129,7 @@ def test_a_depth_is_sure_where_the_light_comes_from_one_place():
     assert 3.973 < depth < 3.997
 
 
-def test_what_a_mask_leaves_unlabeled_beside_an_object_is_not_the_object():
+def test_unlabeled_pixels_beside_object_are_not_visible():
     mask = np.zeros((48, 64), np.int32)
     mask[:, :32] = 20
     splats = sheet(0.0, 2)
@@ -141,7 +141,7 @@ def test_what_a_mask_leaves_unlabeled_beside_an_object_is_not_the_object():
         assert view.alpha[:, middle:].max() > 0.9
 
 
-def test_a_view_through_the_crop_is_the_view_itself():
+def test_cropped_view_matches_full_view():
     splats = sheet(0.0, 2)
     camera = camera_at((4, 1.5, 0.3))
     view = views_of(splats, [camera]).object_view(0, [2])
@@ -163,7 +163,7 @@ def test_out_of_view_and_absent_objects_have_no_view():
     assert views_of(sheet(0.0, 2), [behind]).object_view(0, [2]) is None
 
 
-def test_views_stay_within_their_memory():
+def test_view_cache_respects_memory_limit():
     cameras = [camera_at((4, 0.1 * i, 0)) for i in range(6)]
     views = views_of(sheet(0.0, 2), cameras, memory_mb=0.12)
     for _ in range(2):
@@ -214,7 +214,7 @@ def rod(a, b, radius):
     return distance
 
 
-class Exact:
+class ExactViews:
     """Replacement for `Views` with exact depths and sharp edges, for shapes given by signed distance."""
 
     def __init__(self, shapes, cameras):
@@ -236,15 +236,15 @@ class Exact:
         return self._alone[index]
 
     @staticmethod
-    def trace(shape, eye, rays):
+    def trace(shape, camera_center, rays):
         t, live = np.zeros(len(rays)), np.arange(len(rays))
         for _ in range(80):
-            step = shape(eye + t[live, None] * rays[live])
+            step = shape(camera_center + t[live, None] * rays[live])
             t[live] += step
             live = live[(np.abs(step) > 1e-6) & (t[live] < 20)]
             if not len(live):
                 break
-        t[live] = np.where(np.abs(shape(eye + t[live, None] * rays[live])) < 1e-4, t[live], np.inf)
+        t[live] = np.where(np.abs(shape(camera_center + t[live, None] * rays[live])) < 1e-4, t[live], np.inf)
         return np.where(t < 20, t, np.inf)
 
     def scene_map(self, index):
@@ -292,7 +292,7 @@ def holes(surface):
     return count - euler / 2
 
 
-def assert_sound(surface):
+def assert_valid_surface(surface):
     """Check that a surface is closed, two-manifold, oriented outward and finite, without loose vertices."""
     assert len(surface.faces) and np.isfinite(surface.vertices).all()
     assert len(surface.unobserved) == len(surface.faces)
@@ -309,11 +309,11 @@ def errors(surface, shape, seen_only=True):
     return np.abs(shape(surface.vertices[keep]))
 
 
-def test_vertices_lie_exactly_on_a_ball():
+def test_ball_is_reconstructed_accurately():
     shape = ball((0.03, -0.02, 0.05), 0.5)
-    field = fuse(Exact([shape], around(12)), [0])
+    field = fuse(ExactViews([shape], around(12)), [0])
     surface = extract(field, faces=10**6)
-    assert_sound(surface)
+    assert_valid_surface(surface)
     error = errors(surface, shape)
     assert error.mean() < 0.1 * field.voxel and np.quantile(error, 0.95) < 0.35 * field.voxel
     assert np.abs(surface.vertices.mean(0) - [0.03, -0.02, 0.05]).max() < 0.1 * field.voxel
@@ -322,7 +322,7 @@ def test_vertices_lie_exactly_on_a_ball():
     assert surface.unobserved.mean() < 0.02
 
 
-def test_a_box_far_from_the_origin_keeps_its_place():
+def test_box_far_from_origin_is_accurate():
     low, high = np.array([1000.1, 0.2, -0.3]), np.array([1000.7, 0.5, 0.3])
     cameras = []
     for camera in around(12, heights=(-1.5, 0.3, 1.6)):
@@ -330,37 +330,37 @@ def test_a_box_far_from_the_origin_keeps_its_place():
         viewmat[:3, 3] -= viewmat[:3, :3] @ (low + high) / 2
         cameras.append(replace(camera, viewmat=viewmat))
     shape = box(low, high)
-    field = fuse(Exact([shape], cameras), [0])
+    field = fuse(ExactViews([shape], cameras), [0])
     surface = extract(field)
-    assert_sound(surface)
+    assert_valid_surface(surface)
     assert errors(surface, shape).mean() < 0.2 * field.voxel
     assert volume(surface) == pytest.approx(np.prod(high - low), rel=0.06)
 
 
-def test_a_ring_keeps_its_hole():
+def test_ring_keeps_its_hole():
     shape = ring()
-    surface = extract(fuse(Exact([shape], around(14)), [0]))
-    assert_sound(surface)
+    surface = extract(fuse(ExactViews([shape], around(14)), [0]))
+    assert_valid_surface(surface)
     assert holes(surface) == 1
     assert volume(surface) == pytest.approx(2 * np.pi**2 * 0.4 * 0.15**2, rel=0.06)
 
 
-def test_a_bowl_stays_open_where_cameras_saw_into_it():
+def test_bowl_stays_open():
     shape = bowl()
-    field = fuse(Exact([shape], around(14, heights=(-1.5, 1.5, 2.5))), [0])
+    field = fuse(ExactViews([shape], around(14, heights=(-1.5, 1.5, 2.5))), [0])
     surface = extract(field)
-    assert_sound(surface)
+    assert_valid_surface(surface)
     assert volume(surface) == pytest.approx(2 / 3 * np.pi * (0.56**3 - 0.44**3), rel=0.06)
     assert errors(surface, shape).mean() < 0.2 * field.voxel
 
 
-def test_what_stands_on_a_table_gets_a_flat_base_where_it_stands():
+def test_object_on_table_gets_flat_base():
     cup = box((-0.3, -0.3, 0.0), (0.3, 0.3, 0.7))
     table = box((-1.5, -1.5, -0.2), (1.5, 1.5, 0.0))
-    views = Exact([cup, table], around(12, heights=(0.8, 1.4, 2.2)))
+    views = ExactViews([cup, table], around(12, heights=(0.8, 1.4, 2.2)))
     field = fuse(views, [0])
     surface = extract(field)
-    assert_sound(surface)
+    assert_valid_surface(surface)
     base = surface.faces[surface.unobserved]
     assert len(base)
     assert np.abs(surface.vertices[base][..., 2]).mean() < 0.5 * field.voxel
@@ -377,13 +377,13 @@ def test_what_stands_on_a_table_gets_a_flat_base_where_it_stands():
     assert (down < -0.9 * area).sum() == 0
 
 
-def test_a_sheet_has_no_hole_where_something_stands_on_it():
+def test_covered_part_of_sheet_is_closed():
     cup = box((-0.3, -0.3, 0.0), (0.3, 0.3, 0.7))
     sheet_of_paper = box((-0.9, -0.9, -0.02), (0.9, 0.9, 0.0))
-    views = Exact([cup, sheet_of_paper], around(14, distance=3.0, heights=(1.8, 2.2, 2.8), width=96, height=72))
+    views = ExactViews([cup, sheet_of_paper], around(14, distance=3.0, heights=(1.8, 2.2, 2.8), width=96, height=72))
     field = fuse(views, [1])
     surface = extract(field)
-    assert_sound(surface)
+    assert_valid_surface(surface)
     assert holes(surface) == 0
     centers = surface.vertices[surface.faces].mean(1)
     normals = np.cross(*(surface.vertices[surface.faces[:, i]] - surface.vertices[surface.faces[:, 0]] for i in (1, 2)))
@@ -393,37 +393,37 @@ def test_a_sheet_has_no_hole_where_something_stands_on_it():
     assert np.ptp(surface.vertices[:, 2]) < 6 * field.voxel
 
 
-def test_behind_another_object_is_unknown_not_free():
+def test_occluded_space_is_unknown():
     target, wall = ball(radius=0.4), box((0.8, -1.5, -1.5), (0.9, 1.5, 1.5))
-    views = Exact([target, wall], around(12))
+    views = ExactViews([target, wall], around(12))
     hidden = sum(views.scene_map(i).ids[24, 32] == 1 for i in views.indices)
     assert hidden >= 4
     surface = extract(fuse(views, [0]))
-    assert_sound(surface)
+    assert_valid_surface(surface)
     # The other views fix the visible half of the ball; the hidden part is closed smoothly and not removed.
     assert volume(surface) == pytest.approx(4 / 3 * np.pi * 0.4**3, rel=0.12)
 
 
-def test_touching_objects_come_apart():
+def test_touching_objects_are_separated():
     left, right = box((-0.6, -0.3, -0.3), (0.0, 0.3, 0.3)), box((0.0, -0.3, -0.3), (0.6, 0.3, 0.3))
-    views = Exact([left, right], around(14, heights=(-1.5, 0.2, 1.6)))
+    views = ExactViews([left, right], around(14, heights=(-1.5, 0.2, 1.6)))
     surfaces = [extract(fuse(views, [c])) for c in (0, 1)]
     for surface in surfaces:
-        assert_sound(surface)
+        assert_valid_surface(surface)
         assert volume(surface) == pytest.approx(0.6**3, rel=0.08)
     assert surfaces[0].vertices[:, 0].max() < 0.08 and surfaces[1].vertices[:, 0].min() > -0.08
     both = extract(fuse(views, [0, 1]))
-    assert_sound(both)
+    assert_valid_surface(both)
     assert parts(both.faces, len(both.vertices))[0] == 1
     assert volume(both) == pytest.approx(2 * 0.6**3, rel=0.06)
 
 
-def test_a_poster_becomes_a_thin_flat_slab():
+def test_poster_becomes_thin_slab():
     poster = box((-0.5, -0.01, -0.4), (0.5, 0.0, 0.4))
     cameras = [camera_at((x, 2.2, z)) for x in (-0.8, 0, 0.8) for z in (-0.5, 0.5)]
-    field = fuse(Exact([poster], cameras), [0])
+    field = fuse(ExactViews([poster], cameras), [0])
     surface = extract(field)
-    assert_sound(surface)
+    assert_valid_surface(surface)
     assert np.ptp(surface.vertices[:, 1]) < 6 * field.voxel
     front = surface.vertices[np.unique(surface.faces[~surface.unobserved])]
     inner = np.abs(front[:, 0]) < 0.4
@@ -431,13 +431,13 @@ def test_a_poster_becomes_a_thin_flat_slab():
     assert surface.vertices[:, 0].max() == pytest.approx(0.5, abs=2 * field.voxel)
 
 
-def test_views_that_know_how_far_off_they_may_be_do_not_pierce_a_sheet():
-    class Unsure(Exact):
-        """Views with independent depth errors up to `most`, which are reported as uncertainty if `said`."""
+def test_depth_uncertainty_prevents_holes_in_sheet():
+    class NoisyViews(ExactViews):
+        """Views with independent depth errors up to `most`, which are reported as uncertainty if `reported`."""
 
-        def __init__(self, *scene, most, said):
+        def __init__(self, *scene, most, reported):
             super().__init__(*scene)
-            self.most, self.said = most, said
+            self.most, self.reported = most, reported
 
         def wrong(self, index):
             rough = np.random.default_rng(index).uniform(-self.most, self.most, (12, 16))
@@ -447,108 +447,108 @@ def test_views_that_know_how_far_off_they_may_be_do_not_pierce_a_sheet():
             view = super().object_view(index, classes)
             wrong = self.wrong(index)[view.y :, view.x :][: view.alpha.shape[0], : view.alpha.shape[1]]
             depth = np.where(view.depth > 0, view.depth + wrong, 0).astype(np.float32)
-            return replace(view, depth=depth, depth_uncertainty=np.abs(wrong) * self.said)
+            return replace(view, depth=depth, depth_uncertainty=np.abs(wrong) * self.reported)
 
         def scene_map(self, index):
             scene = super().scene_map(index)
             wrong = self.wrong(index)
             depth = np.where(scene.depth > 0, scene.depth + wrong, 0).astype(np.float32)
-            return replace(scene, depth=depth, depth_uncertainty=np.abs(wrong) * self.said)
+            return replace(scene, depth=depth, depth_uncertainty=np.abs(wrong) * self.reported)
 
     poster = box((-0.5, -0.01, -0.4), (0.5, 0.0, 0.4))
     cameras = [camera_at((x, 2.2, z), 128, 96, 120.0) for x in (-0.9, -0.3, 0.3, 0.9) for z in (-0.5, 0, 0.5)]
     in_front = camera_at((0, 2.2, 0), 128, 96, 120.0)
     seen = {}
-    for said in (False, True):
-        surface = extract(fuse(Unsure([poster], cameras, most=0.25, said=said), [0]))
-        assert_sound(surface)
+    for reported in (False, True):
+        surface = extract(fuse(NoisyViews([poster], cameras, most=0.25, reported=reported), [0]))
+        assert_valid_surface(surface)
         depth, _, _ = draw_mesh(surface.vertices, surface.faces, in_front)
-        seen[said] = depth[48 - 17 : 48 + 17, 64 - 22 : 64 + 22]
+        seen[reported] = depth[48 - 17 : 48 + 17, 64 - 22 : 64 + 22]
     assert (seen[False] == 0).mean() > 0.03 and (seen[True] > 0).all()
-    wrong = {said: np.abs(depth[depth > 0] - 2.2).mean() for said, depth in seen.items()}
+    wrong = {reported: np.abs(depth[depth > 0] - 2.2).mean() for reported, depth in seen.items()}
     assert wrong[True] < 0.04 and wrong[True] < wrong[False] / 2
 
 
-def test_a_thin_handle_and_a_second_part_stay():
+def test_thin_handle_and_second_part_are_kept():
     shapes = [ball((-0.3, 0, 0), 0.25), rod((-0.1, 0, 0), (0.5, 0, 0.1), 0.035), ball((0.1, 0, 0.6), 0.12)]
-    views = Exact([lambda p: np.min([s(p) for s in shapes], 0)], around(14))
+    views = ExactViews([lambda p: np.min([s(p) for s in shapes], 0)], around(14))
     surface = extract(fuse(views, [0]))
-    assert_sound(surface)
+    assert_valid_surface(surface)
     assert surface.vertices[:, 0].max() > 0.48
     assert parts(surface.faces, len(surface.vertices))[0] == 2
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_one_or_two_views_give_the_side_that_they_saw(count):
+def test_one_or_two_views_give_visible_side(count):
     shape = ball(radius=0.5)
-    surface = extract(fuse(Exact([shape], around(6)[:count]), [0]))
-    assert_sound(surface)
+    surface = extract(fuse(ExactViews([shape], around(6)[:count]), [0]))
+    assert_valid_surface(surface)
     assert errors(surface, shape).mean() < 0.02
     assert 0.15 < surface.unobserved.mean() < 0.8
     assert np.linalg.norm(surface.vertices, axis=1).max() < 0.6
 
 
-def test_an_object_that_the_pictures_cut_off_ends_there():
+def test_object_cut_off_by_images_is_closed():
     beam = box((-5, -0.2, -0.2), (5, 0.2, 0.2))
     cameras = [camera_at((0.3 * i - 0.7, *at)) for i in range(5) for at in ((2.5, 1.2), (-2.5, 1.2), (0.1, -2.5))]
-    surface = extract(fuse(Exact([beam], cameras), [0]))
-    assert_sound(surface)
+    surface = extract(fuse(ExactViews([beam], cameras), [0]))
+    assert_valid_surface(surface)
     assert errors(surface, beam).mean() < 0.02
     assert 1.5 < np.ptp(surface.vertices[:, 0]) < 6
 
 
-def test_no_view_of_it_is_said_in_a_sentence():
+def test_object_without_views_is_reported():
     wall, hidden = box((1.0, -2, -2), (1.1, 2, 2)), ball(radius=0.3)
-    views = Exact([hidden, wall], [camera_at((2.5, 0.1 * i, 0)) for i in range(3)])
+    views = ExactViews([hidden, wall], [camera_at((2.5, 0.1 * i, 0)) for i in range(3)])
     for classes in ([0], []):
         with pytest.raises(NoSurface, match=r"^[A-Z].*\.$"):
-            fuse(views, classes) if classes else fuse(Exact([ball((9, 9, 9))], around(3)), [0])
+            fuse(views, classes) if classes else fuse(ExactViews([ball((9, 9, 9))], around(3)), [0])
 
 
-def test_a_speck_is_a_mesh_or_a_sentence():
+def test_tiny_object_gives_mesh_or_error():
     for radius in (0.02, 0.05, 0.08):
         shape = ball((0.1, 0.2, 0), radius)
         try:
-            surface = extract(fuse(Exact([shape], around(6)), [0]))
+            surface = extract(fuse(ExactViews([shape], around(6)), [0]))
         except NoSurface:
             assert radius < 0.05
             continue
-        assert_sound(surface)
+        assert_valid_surface(surface)
         assert errors(surface, shape, seen_only=False).mean() < 0.03
 
 
-def test_a_few_splats_are_a_mesh_or_a_sentence():
+def test_three_splats_give_closed_mesh():
     cloud = sheet(0.0, 1, half=0.1, step=0.1)
     splats = cloud.select(slice(3))
     splats.scales[:] = 0.06
     surface = extract(fuse(views_of(splats, around(8)), [1]))
-    assert_sound(surface)
+    assert_valid_surface(surface)
     assert np.abs(surface.vertices).max() < 0.4
 
 
-def test_memory_grows_with_the_surface_and_is_kept():
-    views = Exact([ball()], around(6, width=128, height=96, focal=120.0))
+def test_memory_scales_with_surface_and_respects_limit():
+    views = ExactViews([ball()], around(6, width=128, height=96, focal=120.0))
     coarse, fine = (len(fuse(views, [0], resolution=n).blocks) for n in (32, 64))
     assert fine < 5 * coarse
-    said = []
+    warnings = []
     reporter = Reporter()
-    reporter.warning = said.append
+    reporter.warning = warnings.append
     small = fuse(views, [0], memory_mb=5, reporter=reporter)
     assert len(small.blocks) * SAMPLES * 16 < 5e6
-    assert len(said) == 1 and "memory" in said[0]
+    assert len(warnings) == 1 and "memory" in warnings[0]
     surface = extract(small)
-    assert_sound(surface)
+    assert_valid_surface(surface)
     assert errors(surface, ball()).mean() < 0.3 * small.voxel
-    assert_sound(extract(fuse(views, [0], memory_mb=0.1)))
+    assert_valid_surface(extract(fuse(views, [0], memory_mb=0.1)))
 
 
-def test_the_budget_of_faces_holds_and_unobserved_faces_stay_marked():
+def test_simplification_respects_face_budget_and_keeps_unobserved_marks():
     cup = box((-0.3, -0.3, 0.0), (0.3, 0.3, 0.7))
-    views = Exact([cup, box((-1.5, -1.5, -0.2), (1.5, 1.5, 0.0))], around(12, heights=(0.8, 1.4, 2.2)))
+    views = ExactViews([cup, box((-1.5, -1.5, -0.2), (1.5, 1.5, 0.0))], around(12, heights=(0.8, 1.4, 2.2)))
     field = fuse(views, [0])
     for budget in (4000, 500):
         surface = extract(field, faces=budget)
-        assert_sound(surface)
+        assert_valid_surface(surface)
         assert budget // 2 < len(surface.faces) <= budget
         centers = surface.vertices[surface.faces].mean(1)
         inner = (np.abs(centers[:, :2]) < 0.22).all(1)
@@ -558,7 +558,7 @@ def test_the_budget_of_faces_holds_and_unobserved_faces_stay_marked():
     assert len(extract(field, closed=False, faces=500).faces) <= 500
 
 
-def test_stopping_and_progress():
+def test_fusion_reports_progress_and_stops():
     class Stopping(Reporter):
         seen = 0
 
@@ -569,10 +569,10 @@ def test_stopping_and_progress():
                 raise Cancelled
 
     with pytest.raises(Cancelled):
-        fuse(Exact([ball()], around(6)), [0], reporter=Stopping())
+        fuse(ExactViews([ball()], around(6)), [0], reporter=Stopping())
 
 
-def test_cubes_of_cells_join_without_a_seam():
+def test_marching_cubes_blocks_join_without_seam():
     grid = np.stack(np.meshgrid(*[np.arange(-5, 5)] * 3, indexing="ij"), -1).reshape(-1, 3)
     blocks = Blocks(grid)
     local = np.stack(np.meshgrid(*[np.arange(8)] * 3, indexing="ij"), -1).reshape(-1, 3)
@@ -588,7 +588,7 @@ def test_cubes_of_cells_join_without_a_seam():
     assert np.abs(np.linalg.norm(vertices - [0.4, -0.3, 1.2], axis=1) - 30).max() < 0.02
 
 
-def test_the_winding_number_closes_a_flat_hole_flat():
+def test_winding_number_closes_hole_flat():
     points = trimesh.creation.icosphere(5, 20.0)
     grid = np.stack(np.meshgrid(*[np.arange(-5, 5)] * 3, indexing="ij"), -1).reshape(-1, 3)
     local = np.stack(np.meshgrid(*[np.arange(8)] * 3, indexing="ij"), -1).reshape(-1, 3)
@@ -605,7 +605,7 @@ def test_the_winding_number_closes_a_flat_hole_flat():
     assert (found[hole & (place[:, 2] == -2)] < 0.5).all()
 
 
-def test_torn_surfaces_are_found_out():
+def test_open_surfaces_are_not_watertight():
     solid = trimesh.creation.box()
     assert is_watertight(solid.faces)
     assert not is_watertight(solid.faces[1:])
@@ -616,7 +616,7 @@ def test_torn_surfaces_are_found_out():
     assert not is_watertight(np.zeros((0, 3), int))
 
 
-def test_a_surface_in_the_border_of_two_cubes_is_there_once():
+def test_surface_on_block_border_appears_once():
     # The surface is so close below sample 64, a border of the marching cubes, that float32 rounds it to the sample.
     grid = np.stack(np.meshgrid([0, 1], [0, 1], [7, 8], indexing="ij"), -1).reshape(-1, 3)
     blocks = Blocks(grid)

@@ -21,20 +21,20 @@ from backend.shared.errors import Cancelled
 from backend.shared.events import Reporter
 
 
-def camera_at(eye, target=(0.0, 0.0, 0.0), width=64, height=48, focal=60.0) -> Camera:
-    forward = np.asarray(target, np.float64) - eye
+def camera_at(camera_center, target=(0.0, 0.0, 0.0), width=64, height=48, focal=60.0) -> Camera:
+    forward = np.asarray(target, np.float64) - camera_center
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0] if abs(forward[2]) < 0.9 else [0.0, 1.0, 0.0])
     right /= np.linalg.norm(right)
     viewmat = np.eye(4)
     viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    viewmat[:3, 3] = -viewmat[:3, :3] @ camera_center
     return Camera(
         viewmat, np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float64), width, height
     )
 
 
-def test_each_pixel_sees_what_a_ray_hits_first():
+def test_drawn_pixels_match_ray_casting():
     mesh = trimesh.util.concatenate(
         [trimesh.creation.icosphere(2, 1.0), trimesh.creation.box((3.0, 0.4, 0.4)), trimesh.creation.torus(1.6, 0.2)]
     )
@@ -59,7 +59,7 @@ def test_each_pixel_sees_what_a_ray_hits_first():
     np.testing.assert_allclose(points, camera.center + nearest[same, None] * rays[same], atol=1e-5)
 
 
-def test_faces_that_reach_behind_the_camera_or_have_no_area():
+def test_faces_behind_camera_or_without_area_are_handled():
     camera = camera_at(np.zeros(3), (0.0, 1.0, 0.0))
     floor = np.array([[-90, -90, -0.5], [90, -90, -0.5], [90, 90, -0.5], [-90, 90, -0.5]], np.float64)
     depth, face, weights = draw_mesh(floor, np.array([[0, 1, 2], [0, 2, 3]]), camera)
@@ -75,7 +75,7 @@ def test_faces_that_reach_behind_the_camera_or_have_no_area():
     assert depth.shape == face.shape == (48, 64) and (face < 0).all()
 
 
-def test_no_pixel_falls_between_faces_and_the_first_of_equal_faces_wins():
+def test_drawn_faces_have_no_gaps_and_first_of_equal_faces_wins():
     mesh = trimesh.creation.icosphere(4, 1.0)
     _, face, _ = draw_mesh(mesh.vertices, mesh.faces, camera_at(np.zeros(3), (1.0, 1.0, 0.0)))
     assert (face >= 0).all()
@@ -95,7 +95,7 @@ def areas(uvs: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", [1024, 4096])
-def test_layout_is_free_of_overlaps_and_proportional_to_area(size):
+def test_uv_layout_has_no_overlaps_and_is_proportional_to_area(size):
     mesh = trimesh.creation.torus(1.0, 0.3, major_sections=60, minor_sections=30)
     mesh.vertices += np.random.default_rng(0).normal(0, 0.004, mesh.vertices.shape)
     uvs = unwrap(surface_of(mesh), size)
@@ -112,7 +112,7 @@ def test_layout_is_free_of_overlaps_and_proportional_to_area(size):
     np.testing.assert_allclose(covered, flat.sum(), rtol=0.02)
 
 
-def test_a_tiny_mesh_and_faces_without_area_are_unwrapped():
+def test_tiny_mesh_and_degenerate_faces_are_unwrapped():
     tetrahedron = trimesh.Trimesh(
         np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]) * 1e-4 + 7,
         [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]],
@@ -129,20 +129,20 @@ def test_a_tiny_mesh_and_faces_without_area_are_unwrapped():
     assert unwrap(nothing, 1024).shape == (0, 3, 2)
 
 
-def test_texels_know_their_place_on_the_face():
+def test_texels_have_barycentric_weights():
     uvs = np.array([[[0.1, 0.1], [0.6, 0.1], [0.1, 0.8]]], np.float32)
     whole = find_texels(uvs, 64, 0, 64)
-    x, y = (whole.place % 64 + 0.5) / 64, 1 - (whole.place // 64 + 0.5) / 64
+    x, y = (whole.indices % 64 + 0.5) / 64, 1 - (whole.indices // 64 + 0.5) / 64
     np.testing.assert_allclose(np.einsum("ij,nj->ni", uvs[0].T, whole.weights), np.stack([x, y], 1), atol=1e-5)
     inside = (x > 0.1) & (y > 0.1) & ((x - 0.1) / 0.5 + (y - 0.1) / 0.7 < 1)
     np.testing.assert_array_equal(inside, (whole.weights > 0).all(1))
     assert (~inside).sum() > 60  # a rim of one texel around it
     parts = [find_texels(uvs, 64, first, 24) for first in (0, 24, 48)]
-    np.testing.assert_array_equal(np.concatenate([part.place for part in parts]), whole.place)
+    np.testing.assert_array_equal(np.concatenate([part.indices for part in parts]), whole.indices)
     np.testing.assert_allclose(np.concatenate([part.weights for part in parts]), whole.weights, atol=1e-5)
 
 
-def test_filling_continues_what_is_known():
+def test_fill_extrapolates_known_texels():
     values = np.zeros((33, 50, 3), np.float32)
     known = np.zeros((33, 50), bool)
     values[:, :20] = [0.2, 0.4, 0.6]
@@ -168,12 +168,12 @@ LOUD = np.array([1.0, 0.0, 1.0], np.float32)
 class StubViews:
     """Photos of a mesh of known colors (class 1), partly hidden by another mesh of one loud color (class 2)."""
 
-    def __init__(self, mesh, other=None, eyes=24, size=160, masks=True, below=False):
+    def __init__(self, mesh, other=None, view_count=24, size=160, masks=True, below=False):
         self.downscale = 1
         self.model = SimpleNamespace(classes=ClassTable([0, 7, 9]))
         self.scene = self
-        angles = np.arange(eyes) * 2.4
-        heights = np.linspace(-0.9 if below else 0.1, 0.9, eyes)
+        angles = np.arange(view_count) * 2.4
+        heights = np.linspace(-0.9 if below else 0.1, 0.9, view_count)
         self.cameras = [
             camera_at(
                 4 * np.array([np.sqrt(1 - h * h) * np.cos(a), np.sqrt(1 - h * h) * np.sin(a), h]),
@@ -181,13 +181,13 @@ class StubViews:
             )
             for a, h in zip(angles, heights)
         ]  # fmt: skip
-        self.indices = tuple(i for i in range(eyes) if i % 6)
-        self.held_out = tuple(i for i in range(eyes) if i % 6 == 0)
+        self.indices = tuple(i for i in range(view_count) if i % 6)
+        self.held_out = tuple(i for i in range(view_count) if i % 6 == 0)
         self.masks = masks
-        self.pictures, self.labels, self.drawn = [], [], []
+        self.images, self.labels, self.drawn = [], [], []
         for camera in self.cameras:
             image, label, drawn = self._photo(mesh, other, camera)
-            self.pictures.append(image)
+            self.images.append(image)
             self.labels.append(label)
             self.drawn.append(drawn)
 
@@ -213,7 +213,7 @@ class StubViews:
 
     def target(self, index, downscale=1):
         labels = torch.from_numpy(self.labels[index]) if self.masks else None
-        return torch.from_numpy(np.ascontiguousarray(self.pictures[index].transpose(2, 0, 1))), labels
+        return torch.from_numpy(np.ascontiguousarray(self.images[index].transpose(2, 0, 1))), labels
 
     def scene_map(self, index):
         assert index in self.indices
@@ -229,7 +229,7 @@ class StubViews:
         )
 
 
-def looked_up(texture, uvs, mesh, camera):
+def draw_textured(texture, uvs, mesh, camera):
     """Draw the textured mesh; return its colors (H, W, 3) float32 and its mask (H, W)."""
     _, face, weights = draw_mesh(mesh.vertices, mesh.faces, camera)
     image = np.zeros((*face.shape, 3), np.float32)
@@ -244,7 +244,7 @@ def psnr(a, b):
     return 10 * np.log10(1 / np.mean((a - b) ** 2))
 
 
-def test_photos_give_the_surface_its_colors_back():
+def test_baked_texture_matches_surface_colors():
     mesh = trimesh.creation.icosphere(3, 1.0)
     views = StubViews(mesh, below=True)
     surface = surface_of(mesh)
@@ -252,38 +252,38 @@ def test_photos_give_the_surface_its_colors_back():
     texture, colors = bake_texture(surface, uvs, 512, views, [1])
     assert texture.shape == (512, 512, 3) and texture.dtype == np.uint8
     for index in views.held_out:
-        image, shown = looked_up(texture, uvs, mesh, views.cameras[index])
+        image, shown = draw_textured(texture, uvs, mesh, views.cameras[index])
         whole = shown & (views.labels[index] == 1)
-        inner = whole & (views.pictures[index][..., 1] < 0.99)
-        assert psnr(image[inner], views.pictures[index][inner]) > 30
+        inner = whole & (views.images[index][..., 1] < 0.99)
+        assert psnr(image[inner], views.images[index][inner]) > 30
     # No foreign color bleeds in at the charts' edges.
     texels = find_texels(uvs, 512, 0, 512)
     points = np.einsum("nij,ni->nj", mesh.vertices[mesh.faces[texels.face]], texels.weights)
-    assert np.abs(texture.reshape(-1, 3)[texels.place] / 255 - colors_at(points)).max() < 0.2
+    assert np.abs(texture.reshape(-1, 3)[texels.indices] / 255 - colors_at(points)).max() < 0.2
     assert colors.shape == (len(mesh.vertices), 3) and colors.dtype == np.uint8
     np.testing.assert_allclose(colors / 255, np.broadcast_to([0.25, 0.5, 0.75], colors.shape), atol=0.01)
 
 
-def test_gloss_that_moves_with_the_camera_stays_off_the_texture():
+def test_view_dependent_highlights_are_rejected():
     mesh = trimesh.creation.icosphere(4, 1.0)
-    views = StubViews(mesh, eyes=48, below=True)
+    views = StubViews(mesh, view_count=48, below=True)
     y, x = np.mgrid[:120, :160]
-    for index, picture in enumerate(views.pictures[::2]):
+    for index, image in enumerate(views.images[::2]):
         place = np.random.default_rng(index).uniform([60, 40], [100, 80])
         away = ((x - place[0]) ** 2 + (y - place[1]) ** 2) / (2 * 14.0**2)
-        picture += 0.35 * np.exp(-away)[..., None].astype(np.float32)
+        image += 0.35 * np.exp(-away)[..., None].astype(np.float32)
     surface = surface_of(mesh)
     uvs = unwrap(surface, 512)
     texture, _ = bake_texture(surface, uvs, 512, views, [1])
     texels = find_texels(uvs, 512, 0, 512)
     points = np.einsum("nij,ni->nj", mesh.vertices[mesh.faces[texels.face]], texels.weights)
-    wrong = np.abs(texture.reshape(-1, 3)[texels.place] / 255 - colors_at(points))
+    wrong = np.abs(texture.reshape(-1, 3)[texels.indices] / 255 - colors_at(points))
     # Plain blending of the photos gives 0.046 and 0.29.
     assert wrong.mean() < 0.022 and np.quantile(wrong, 0.99) < 0.14
 
 
 @pytest.mark.parametrize("masks", [True, False])
-def test_nothing_of_an_object_in_front_comes_in(masks):
+def test_occluding_object_does_not_color_texture(masks):
     mesh = trimesh.creation.box((1.6, 1.6, 1.6)).subdivide().subdivide().subdivide()
     other = trimesh.creation.icosphere(3, 0.4)
     other.vertices += [1.3, 0.2, 0.3]
@@ -293,7 +293,7 @@ def test_nothing_of_an_object_in_front_comes_in(masks):
     texture, _ = bake_texture(surface, uvs, 512, views, [1])
     texels = find_texels(uvs, 512, 0, 512)
     points = np.einsum("nij,ni->nj", mesh.vertices[mesh.faces[texels.face]], texels.weights)
-    color = texture.reshape(-1, 3)[texels.place] / 255
+    color = texture.reshape(-1, 3)[texels.indices] / 255
     seen = points[:, 2] > -0.7  # no camera looks from below
     truth = colors_at(points)
     assert np.abs(color - truth)[seen].mean() < 0.03
@@ -307,7 +307,7 @@ def test_nothing_of_an_object_in_front_comes_in(masks):
     assert (color[bottom] >= sides.min(0) - 0.1).all() and (color[bottom] <= sides.max(0) + 0.1).all()
 
 
-def test_a_part_behind_another_does_not_take_its_colors():
+def test_occluded_part_does_not_take_colors_of_occluder():
     box = trimesh.creation.box((1.6, 1.6, 1.6)).subdivide().subdivide().subdivide()
     ball = trimesh.creation.icosphere(3, 0.5)
     ball.vertices += [1.5, 0.2, 0.3]
@@ -319,13 +319,13 @@ def test_a_part_behind_another_does_not_take_its_colors():
     points = np.einsum("nij,ni->nj", mesh.vertices[mesh.faces[texels.face]], texels.weights)
     behind = (points[:, 0] > 0.79) & (points[:, 0] < 0.81) & (np.abs(points[:, 1:] - [0.2, 0.3]) < 0.5).all(1)
     assert behind.sum() > 1000
-    wrong = np.abs(texture.reshape(-1, 3)[texels.place] / 255 - colors_at(points)).max(1)
+    wrong = np.abs(texture.reshape(-1, 3)[texels.indices] / 255 - colors_at(points)).max(1)
     assert wrong[behind].mean() < 0.03 and np.quantile(wrong, 0.99) < 0.12
 
 
-def test_what_no_photo_shows_has_the_splats_colors_and_a_stop_is_heard():
+def test_unseen_texels_get_splat_colors_and_baking_stops():
     mesh = trimesh.creation.icosphere(2, 1.0)
-    views = StubViews(mesh, eyes=6)
+    views = StubViews(mesh, view_count=6)
     views.labels = [np.where(label == 1, 2, label) for label in views.labels]
     surface = surface_of(mesh)
     uvs = unwrap(surface, 64)
@@ -346,7 +346,7 @@ def test_what_no_photo_shows_has_the_splats_colors_and_a_stop_is_heard():
         bake_texture(surface, uvs, 64, views, [1], Stopping())
 
 
-def test_a_surface_moves_to_where_the_photos_agree():
+def test_refinement_moves_surface_to_photo_consistency():
     mesh = trimesh.creation.icosphere(4, 1.0)
     views = StubViews(mesh, below=True)
     surface = surface_of(mesh)
@@ -362,11 +362,11 @@ def test_a_surface_moves_to_where_the_photos_agree():
     assert ((np.cross(b - a, c - a) * (a + b + c)).sum(1) > 0).all()  # nothing folded
 
 
-def test_a_surface_stays_where_the_photos_say_nothing():
+def test_refinement_keeps_surface_without_texture():
     mesh = trimesh.creation.icosphere(3, 0.97)
     views = StubViews(trimesh.creation.icosphere(3, 1.0))
-    for picture in views.pictures:
-        picture[:] = 0.5
+    for image in views.images:
+        image[:] = 0.5
     surface = surface_of(mesh)
     moved = np.linalg.norm(refine(surface, views, [1]).vertices - mesh.vertices, axis=1)
     assert moved.max() < 0.2 * 4 / views.cameras[0].K[0, 0]
@@ -377,13 +377,13 @@ def test_a_surface_stays_where_the_photos_say_nothing():
     np.testing.assert_allclose(refine(surface, views, [1]).vertices, mesh.vertices, atol=1e-12)
 
 
-def test_size_follows_the_photos():
+def test_texture_size_follows_photo_resolution():
     mesh = trimesh.creation.icosphere(2, 1.0)
-    views = StubViews(mesh, eyes=7, size=80)
+    views = StubViews(mesh, view_count=7, size=80)
     assert texture_size(surface_of(mesh), views) == 512
     for factor, size in ((2, 512), (4, 1024), (8, 2048), (16, 4096), (40, 4096)):
         views.cameras = [
             Camera(c.viewmat, np.diag([factor, factor, 1.0]) @ c.K, c.width * factor, c.height * factor)
-            for c in StubViews(mesh, eyes=7, size=80).cameras
+            for c in StubViews(mesh, view_count=7, size=80).cameras
         ]
         assert texture_size(surface_of(mesh), views) == size

@@ -89,7 +89,7 @@ def blobs(rng, height, width, ids):
     return np.asarray(ids)[nearest]
 
 
-def test_psnr_by_hand():
+def test_psnr_matches_manual_values():
     a = np.zeros((4, 5, 3))
     assert psnr(a, a + 0.1) == pytest.approx(20.0)
     assert psnr(a, a + 0.01) == pytest.approx(40.0)
@@ -99,14 +99,14 @@ def test_psnr_by_hand():
     assert psnr(a, one_pixel) == pytest.approx(10 * math.log10(20))
 
 
-def test_psnr_takes_bytes_as_the_same_image():
+def test_metrics_accept_uint8_images():
     rng = np.random.default_rng(0)
     a, b = rng.integers(0, 256, (2, 7, 6, 3), dtype=np.uint8)
     assert psnr(a, b) == pytest.approx(psnr(a / 255.0, b / 255.0))
     assert ssim(a, b) == pytest.approx(ssim(a / 255.0, b / 255.0))
 
 
-def test_ssim_equals_its_definition():
+def test_ssim_matches_definition():
     rng = np.random.default_rng(1)
     a = rng.random((17, 14, 3))
     b = np.clip(a + 0.2 * rng.normal(size=a.shape), 0, 1)
@@ -115,21 +115,21 @@ def test_ssim_equals_its_definition():
     assert ssim(a, a) == pytest.approx(1.0)
 
 
-def test_images_of_two_sizes_are_refused():
+def test_images_of_different_sizes_are_rejected():
     with pytest.raises(ValueError, match="one size"):
         psnr(np.zeros((4, 4, 3)), np.zeros((4, 5, 3)))
     with pytest.raises(ValueError, match="one size"):
         IdScores().add(np.zeros((4, 4), int), np.zeros((4, 5), int))
 
 
-def test_fractional_ids_are_refused():
+def test_fractional_ids_are_rejected():
     with pytest.raises(ValueError, match="integer"):
         IdScores().add(np.zeros((4, 4)), np.zeros((4, 4), int))
 
 
 @pytest.mark.parametrize("zero_is_class", [False, True])
 @pytest.mark.parametrize("seed", range(4))
-def test_id_scores_equal_their_definitions(seed, zero_is_class):
+def test_id_scores_match_definitions(seed, zero_is_class):
     rng = np.random.default_rng(seed)
     ids = [0, 1, 2, 7, 70_000, 2**32 - 1]
     views = []
@@ -156,7 +156,7 @@ def test_equal_ids_score_one():
     }
 
 
-def test_a_shifted_square_by_hand():
+def test_scores_of_shifted_square():
     truth = np.ones((20, 20), int)
     truth[5:15, 5:15] = 2
     predicted = np.ones((20, 20), int)
@@ -169,7 +169,7 @@ def test_a_shifted_square_by_hand():
     assert result["accuracy"] == pytest.approx(360 / 400)
 
 
-def test_boundary_iou_of_a_shifted_square_by_hand():
+def test_boundary_iou_of_shifted_square():
     truth = np.zeros((20, 20), int)
     truth[5:15, 5:15] = 2
     predicted = np.zeros((20, 20), int)
@@ -181,7 +181,7 @@ def test_boundary_iou_of_a_shifted_square_by_hand():
     assert row["biou"] == pytest.approx(16 / (36 + 36 - 16))
 
 
-def test_the_image_border_bounds_a_mask():
+def test_image_border_counts_as_mask_boundary():
     band = boundaries(np.ones((7, 9), int), 2)
     expected = np.ones((7, 9), bool)
     expected[2:-2, 2:-2] = False
@@ -194,7 +194,7 @@ def test_boundary_distance_is_two_percent_of_the_diagonal():
     assert boundary_distance(1, 1) == 1
 
 
-def test_unlabeled_pixels_count_nowhere():
+def test_unlabeled_pixels_are_ignored():
     rng = np.random.default_rng(6)
     truth = blobs(rng, 40, 50, [0, 1, 2, 3])
     predicted = np.roll(truth, 2, 1)
@@ -207,7 +207,7 @@ def test_unlabeled_pixels_count_nowhere():
     assert scores((predicted, truth)) != expected
 
 
-def test_predicting_nothing_on_labeled_pixels_is_a_miss():
+def test_missing_prediction_on_labeled_pixels_is_an_error():
     truth = np.full((10, 10), 4)
     predicted = truth.copy()
     predicted[:, :5] = 0
@@ -222,25 +222,25 @@ def test_views_are_summed_before_dividing():
     assert result["miou"] == pytest.approx(90 / 100)
 
 
-def test_an_id_predicted_only_where_it_never_is_takes_no_part_in_the_mean():
+def test_id_absent_from_truth_is_not_averaged():
     truth = np.full((10, 10), 4)
     predicted = truth.copy()
     predicted[0] = 99
     assert scores((predicted, truth))["objects"] == {4: 0.9}
 
 
-def test_ids_that_agree_in_16_bits_are_told_apart():
+def test_ids_equal_in_16_bits_are_distinguished():
     truth = np.full((6, 6), 65_536 + 7, np.uint32)
     assert scores((np.full((6, 6), 7), truth))["miou"] == 0.0
 
 
-def test_nothing_labeled_gives_none_and_not_zero():
+def test_scores_without_labels_are_none():
     result = scores((np.ones((5, 5), int), np.zeros((5, 5), int)))
     assert result == {"miou": None, "mbiou": None, "dice": None, "accuracy": None, "objects": {}}
     assert ImageScores().result() == {"psnr": None, "ssim": None}
 
 
-def test_ten_thousand_objects_are_no_slower_than_a_few():
+def test_many_objects_are_scored_quickly():
     rng = np.random.default_rng(7)
     many = rng.permutation(10_000).repeat(32)[: 400 * 800].reshape(400, 800) + 1
     few = many % 3 + 1
@@ -257,7 +257,7 @@ def test_ten_thousand_objects_are_no_slower_than_a_few():
     assert many_seconds < 5 * few_seconds + 1.0
 
 
-def test_renders_are_clipped_before_they_are_compared():
+def test_renders_are_clipped_before_comparison():
     truth = np.full((12, 12, 3), 255, np.uint8)
     assert ImageScores().add(np.full((12, 12, 3), 1.5), truth)[0] == math.inf
 
@@ -281,7 +281,7 @@ class _Capture:
         return self.masks[i]
 
 
-def test_evaluate_compares_the_chosen_views_only():
+def test_evaluate_uses_only_chosen_views():
     images = [np.full((12, 16, 3), 255 * i, np.uint8) for i in (0, 1)]
     masks = [np.full((12, 16), 1), np.full((12, 16), 70_000)]
     found = [np.full((12, 16), 5), np.full((12, 16), 70_000)]
@@ -293,7 +293,7 @@ def test_evaluate_compares_the_chosen_views_only():
     assert [view["name"] for view in result["views"]] == ["1.png"]
 
 
-def test_evaluate_without_masks_leaves_id_scores_unmeasured():
+def test_evaluate_without_masks_has_no_id_scores():
     capture = _Capture([np.zeros((12, 16, 3), np.uint8)], [None])
     result = evaluate(capture, lambda i: (np.full((12, 16, 3), 0.1), np.zeros((12, 16), int)), [0])
     assert result["quality"]["psnr"] == pytest.approx(20.0)
@@ -302,14 +302,14 @@ def test_evaluate_without_masks_leaves_id_scores_unmeasured():
     assert result["views"][0]["miou"] is None
 
 
-def test_evaluate_warns_of_a_render_with_nan():
-    class Heard(Reporter):
+def test_evaluate_warns_of_nan_in_render():
+    class RecordingReporter(Reporter):
         warnings: list[str] = []
 
         def warning(self, message):
             self.warnings.append(message)
 
-    heard = Heard()
+    reporter = RecordingReporter()
     capture = _Capture([np.zeros((12, 16, 3), np.uint8)], [None])
-    evaluate(capture, lambda i: (np.full((12, 16, 3), np.nan), np.zeros((12, 16), int)), [0], heard)
-    assert heard.warnings == ["The render of 0.png holds NaN or Inf."]
+    evaluate(capture, lambda i: (np.full((12, 16, 3), np.nan), np.zeros((12, 16), int)), [0], reporter)
+    assert reporter.warnings == ["The render of 0.png contains NaN or Inf."]

@@ -21,14 +21,14 @@ def path(tmp_path):
     return tmp_path / "objects.json"
 
 
-def test_objects_are_as_the_votes_found_them(path):
+def test_objects_match_votes(path):
     assert read_objects(path) == [
         SceneObject(1, "mug", (10, 20, 30), 812),
         SceneObject(2**32 - 1, "box", (40, 50, 60), 7),
     ]
 
 
-def test_edits_are_seen_and_outlive_a_vote(path):
+def test_edits_are_applied_and_survive_new_votes(path):
     edit_objects(path, {1: dict(name="cup", color=(255, 0, 0))})
     edit_objects(path, {1: dict(merged_into=2**32 - 1, left_out=True)})
     edited = SceneObject(1, "cup", (255, 0, 0), 812, 2**32 - 1, True)
@@ -39,10 +39,10 @@ def test_edits_are_seen_and_outlive_a_vote(path):
     write_objects(path, [BOX])
     assert read_objects(path) == [SceneObject(2**32 - 1, "box", (40, 50, 60), 7)]
     write_objects(path, [MUG])
-    assert read_objects(path) == [edited], "an edit waits for its object to come back"
+    assert read_objects(path) == [edited], "edits are kept while their object is missing"
 
 
-def test_an_edit_is_taken_back(path):
+def test_edits_can_be_reverted(path):
     edit_objects(path, {1: dict(name="cup", left_out=True)})
     edit_objects(path, {1: dict(name=None)})
     assert read_objects(path)[0] == SceneObject(1, "mug", (10, 20, 30), 812, None, True)
@@ -53,7 +53,7 @@ def test_an_edit_is_taken_back(path):
 MOVED = ((1.0, 0.0, 0.0, 2.0), (0.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, 0.5), (0.0, 0.0, 0.0, 1.0))
 
 
-def test_color_place_and_copies_are_edits(path):
+def test_recolor_transform_and_copies_are_stored(path):
     edit_objects(path, {1: dict(removed=True, recolor=Recolor(hue=0.2).stored(), transform=MOVED, copies=[MOVED])})
     mug = read_objects(path)[0]
     assert (mug.removed, mug.recolor, mug.transform, mug.copies) == (True, Recolor(hue=0.2), MOVED, (MOVED,))
@@ -68,13 +68,13 @@ def test_color_place_and_copies_are_edits(path):
     {"transform": [[0] * 4] * 3 + [[0, 0, 0, 1]]},
     {"copies": [1]}, {"transform": [*MOVED[:3], [0, 0, 1, 1]]},
 ])  # fmt: skip
-def test_edits_that_make_no_sense_are_named(path, edit):
+def test_invalid_edits_are_reported(path, edit):
     edit_objects(path, {1: edit})
     with pytest.raises(InputError, match=r"objects\.json"):
         read_objects(path)
 
 
-def test_only_what_may_be_edited_is(path):
+def test_only_editable_fields_are_changed(path):
     before = path.read_text()
     with pytest.raises(ValueError, match="points"):
         edit_objects(path, {1: dict(points=3)})
@@ -94,11 +94,11 @@ def test_only_what_may_be_edited_is(path):
         ({1: 0}, {1: 1, 2: 2, 3: 3}),
     ],
 )
-def test_merges_are_followed(into, shown):
+def test_chained_merges_are_resolved(into, shown):
     assert merged([SceneObject(i, "", (0, 0, 0), 1, into.get(i)) for i in (1, 2, 3)]) == shown
 
 
-def test_merges_in_a_circle_end():
+def test_circular_merges_terminate():
     circle = merged([SceneObject(i, "", (0, 0, 0), 1, i % 3 + 1) for i in (1, 2, 3)])
     assert set(circle) == {1, 2, 3} and set(circle.values()) <= {1, 2, 3}
 
@@ -110,7 +110,7 @@ def test_merges_in_a_circle_end():
      '{"objects": [{"id": 1, "name": "a", "color": [1, 2], "points": 1}]}',
      '{"objects": [{"id": 1, "name": "a", "color": [1, 2, 3], "points": 1}], "edits": {"1": {"merged_into": "x"}}}'],
 )  # fmt: skip
-def test_broken_files_are_one_sentence(tmp_path, text):
+def test_invalid_files_are_reported_in_one_sentence(tmp_path, text):
     path = tmp_path / "objects.json"
     path.write_text(text)
     with pytest.raises(InputError, match=r"objects\.json") as caught:
@@ -118,6 +118,6 @@ def test_broken_files_are_one_sentence(tmp_path, text):
     assert "\n" not in str(caught.value) and path.read_text() == text
 
 
-def test_a_missing_file_is_named(tmp_path):
+def test_missing_file_is_reported(tmp_path):
     with pytest.raises(InputError, match=r"objects\.json does not exist"):
         read_objects(tmp_path / "objects.json")

@@ -26,7 +26,7 @@ def earlier(tmp_path):
     return tmp_path
 
 
-def test_objects_keep_their_colors_and_edits(earlier):
+def test_older_objects_keep_colors_and_edits(earlier):
     path = earlier / "rec" / "objects.json"
     assert "colour" in path.read_text() and "recolour" in path.read_text()
     mug, bottle, ring, *_ = read_objects(path)
@@ -37,7 +37,7 @@ def test_objects_keep_their_colors_and_edits(earlier):
     assert set(read_json(path)["edits"]["1"]) == {"color", "recolor"}
 
 
-def test_meshes_and_the_checkpoint_are_read(earlier):
+def test_older_meshes_and_checkpoint_are_read(earlier):
     meshes = read_meshes(earlier / "rec" / "meshes")
     assert [entry.object_id for entry in meshes.values()] == [1, 2]
     mesh = read_mesh(earlier / "rec" / "meshes" / meshes["1"].file)
@@ -46,10 +46,10 @@ def test_meshes_and_the_checkpoint_are_read(earlier):
     assert header.steps == 60 and header.seconds > 0
 
 
-def test_it_is_measured_exported_and_trained_further(earlier, ask):
+def test_older_reconstruction_is_evaluated_exported_and_trained(earlier, run_command):
     rec, capture = earlier / "rec", earlier / "capture"
-    assert ask("evaluate", rec, "--capture", capture).code == EXIT_DONE
-    assert ask("export", rec, "--out", earlier / "all.ply").code == EXIT_DONE
+    assert run_command("evaluate", rec, "--capture", capture).code == EXIT_DONE
+    assert run_command("export", rec, "--out", earlier / "all.ply").code == EXIT_DONE
     train = ("train", capture, "--out", rec, "--steps", 62, "--offsets", 2, "--voxel", 0.12)
-    assert ask(*train).code == EXIT_DONE
+    assert run_command(*train).code == EXIT_DONE
     assert read_header(rec / "checkpoint").steps == 62

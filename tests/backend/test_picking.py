@@ -43,31 +43,31 @@ def drawn(view: View, means, quats, scales, opacities, ids) -> tuple[np.ndarray,
     K = np.array([[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1.0]])
     tensors = [torch.from_numpy(np.asarray(a, np.float32)) for a in (means, quats, scales, opacities)]
     sh = torch.zeros(len(means), 1, 3)
-    picture = rasterize(
+    rendered = rasterize(
         *tensors, sh, torch.from_numpy(ids.astype(np.int32)), Camera(view.viewmat, K, *SIZE, near=view.near)
     )
-    found, probability = object_map(picture)
-    return found, probability, picture.alpha.numpy()
+    found, probability = object_map(rendered)
+    return found, probability, rendered.alpha.numpy()
 
 
 def assert_agrees(objects: list[PickObject], view: View, ids: np.ndarray, probability: np.ndarray) -> None:
     """Check on every third pixel that the pick has the rendered ID and its probability."""
-    asked = 0
+    compared = 0
     for y in range(1, SIZE[1], 3):
         for x in range(1, SIZE[0], 3):
             seen = pick(objects, view, x + 0.5, y + 0.5)
-            asked += 1
+            compared += 1
             if seen is None:
                 assert ids[y, x] == -1
                 continue
             assert seen.probability == pytest.approx(probability[y, x], abs=2e-4)
             assert seen.object_id == ids[y, x] or abs(seen.probability - probability[y, x]) < 1e-5
-    assert asked > 300
+    assert compared > 300
 
 
 @pytest.mark.parametrize("distance", [3.0, 0.4])
-def test_it_is_what_the_renderer_draws(distance):
-    """From outside, and from among the splats, where many are behind the camera or huge."""
+def test_pick_matches_renderer(distance):
+    """From outside and from inside the scene, where many splats are behind the camera or huge."""
     given = splats(600)
     seen = view(distance)
     ids, probability, _ = drawn(seen, *given)
@@ -75,7 +75,7 @@ def test_it_is_what_the_renderer_draws(distance):
     assert_agrees(objects_of(*given), seen, ids, probability)
 
 
-def test_an_object_moved_turned_and_stretched_is_picked_where_it_is():
+def test_transformed_object_is_picked():
     """An affine map has the same effect on the object as on the camera."""
     given = splats(200, seed=1)
     outer = np.array([[0.9, -0.3, 0, 0.4], [0.3, 0.9, 0.1, 0], [0, -0.1, 1.4, 0.2], [0, 0, 0, 1]])
@@ -87,7 +87,7 @@ def test_an_object_moved_turned_and_stretched_is_picked_where_it_is():
         )
 
 
-def test_a_splat_in_front_hides_what_it_covers_and_hidden_ones_are_not_there():
+def test_front_splats_occlude_and_hidden_objects_are_ignored():
     front = PickObject(7, one_splat((0, 0, -1), 0.2, 0.999), np.eye(4))
     behind = PickObject(9, one_splat((0, 0, 1), 0.4, 0.999), np.eye(4))
     middle = View(np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1.0]]), 60, 60, 32, 24, *SIZE)
@@ -109,7 +109,7 @@ def one_splat(place, size: float, opacity: float) -> Cloud:
     return Cloud(np.array([place], float), np.array([[1.0, 0, 0, 0]]), np.full((1, 3), size), np.array([opacity]))
 
 
-def test_parallel_projection():
+def test_pick_in_orthographic_view():
     """A splat's size is the same at every depth, and nearer splats hide farther ones."""
     flat = View(np.eye(4), 20.0, 20.0, 32.0, 24.0, *SIZE, near=-50.0, orthographic=True)
     far = PickObject(1, one_splat((0.5, 0, 30.0), 0.25, 0.9), np.eye(4))
@@ -120,7 +120,7 @@ def test_parallel_projection():
     assert pick([far, near], flat, 42, 24).object_id == 2
 
 
-def test_rectangles():
+def test_objects_in_rectangle():
     """Small objects in large rectangles are found; hidden objects are not."""
     camera = View(np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1.0]]), 600, 600, 320, 240, 640, 480)
     wall = PickObject(5, one_splat((0, 0, 1), 5.0, 0.999), np.eye(4))
@@ -133,7 +133,7 @@ def test_rectangles():
     assert ids_in(everything, camera, (640, 0, 700, 480)) == set() == ids_in([], camera, (0, 0, 9, 9))
 
 
-def test_matrices_of_a_viewport():
+def test_view_from_opengl_matrices():
     """A `View` from OpenGL matrices projects to the same pixels as the matrices."""
     near, far = 0.1, 50.0
     perspective = np.array(
@@ -155,12 +155,12 @@ def test_matrices_of_a_viewport():
         assert found.near == pytest.approx(nearest) and found.orthographic == (projection is parallel)
 
 
-def test_what_no_renderer_draws_is_left_out():
+def test_undrawable_splats_are_left_out():
     means, quats, scales, opacities, _ = splats(8)
     means[0, 0], quats[1], scales[2, 1], opacities[3], opacities[4] = np.nan, 0.0, np.inf, 0.003, np.nan
     assert Cloud(means, quats, scales, opacities).count == 3 < BLOCK
 
 
-def test_blender_can_import_it():
+def test_picking_imports_no_compute_packages():
     code = "import sys; import backend.shared.splats.picking; sys.exit(bool({'torch', 'numba'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

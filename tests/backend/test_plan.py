@@ -21,7 +21,7 @@ from backend.shared.reconstruction.plan import KEYS, Decision, Plan, read_plan, 
 from backend.training.settings import Settings, downscale_at
 from backend.training.trainer import Trainer
 
-from .asking import refused
+from .command_result import assert_rejected
 
 SMALL = ("--offsets", "2")
 
@@ -37,14 +37,14 @@ def loaded(scene, tmp_path, **options):
 # --- a plan ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_plan_is_overridden_only_where_it_can_be(tmp_path):
+def test_plan_overrides_apply_only_to_overridable_decisions(tmp_path):
     plan = Plan((
         Decision("votes", "votes", False, "there are no masks", can_override=False),
         Decision("exposure", "exposure", False, "it does not vary"),
         Decision("pyramid", "pyramid", True, "they are large"),
         Decision("labels", "labels", None, "votes will tell"),
     ))  # fmt: skip
-    assert plan.does("pyramid") and plan.does("labels") and plan.does("never heard of") and not plan.does("exposure")
+    assert plan.does("pyramid") and plan.does("labels") and plan.does("unknown key") and not plan.does("exposure")
     changed_plan = plan.overridden(["exposure", "pyramid"], ["labels"])
     assert [own.done for own in changed_plan.decisions] == [False, True, True, False]
     assert [own.overridden for own in changed_plan.decisions] == [False, True, False, True]
@@ -65,7 +65,7 @@ def test_a_plan_is_overridden_only_where_it_can_be(tmp_path):
         read_plan(tmp_path / "plan.json")
 
 
-def test_what_is_known_later_is_done_until_then_and_settled_by_what_was_known():
+def test_undecided_steps_are_done_until_settled():
     later, known = Decision("labels", "", None, ""), Decision("labels", "", False, "")
     assert Plan((later,)).does("labels")
     assert Plan((later,)).settled_by(Plan((known,)))["labels"] == known
@@ -76,7 +76,7 @@ def test_what_is_known_later_is_done_until_then_and_settled_by_what_was_known():
 # --- basis of decisions ----------------------------------------------------------------------------------------------
 
 
-def test_a_capture_with_objects_needs_nearly_everything(write_capture, tmp_path):
+def test_plan_of_capture_with_objects(write_capture, tmp_path):
     scene = write_capture(views=9, size=(64, 48))
     plan = planned(loaded(scene, tmp_path), point_ids=scene.point_objects, thorough=True)
     done = {own.key: own.done for own in plan.decisions}
@@ -87,7 +87,7 @@ def test_a_capture_with_objects_needs_nearly_everything(write_capture, tmp_path)
     assert planned_settings(Settings(), plan) == Settings()
 
 
-def test_without_masks_there_is_nothing_about_objects(write_capture, tmp_path):
+def test_plan_without_masks_has_no_object_steps(write_capture, tmp_path):
     plan = planned(loaded(write_capture(views=9, size=(64, 48), masks=False), tmp_path))
     assert plan["votes"].done is False and not plan["votes"].can_override
     assert plan["labels"] is None and plan["rest"] is None
@@ -95,10 +95,10 @@ def test_without_masks_there_is_nothing_about_objects(write_capture, tmp_path):
         planned(loaded(write_capture(name="again", masks=False), tmp_path), keep=["votes"])
 
 
-def test_one_object_is_taught_only_where_something_else_is(write_capture, tmp_path):
+def test_labels_of_single_object_need_unlabeled_rest(write_capture, tmp_path):
     scene = write_capture(views=9, size=(64, 48), spheres=[(7, np.zeros(3), 1.0)], points=200)
     beside = loaded(scene, tmp_path)
-    assert planned(beside)["labels"].done is None, "unlabeled pixels may be gaps, or the rest of the scene"
+    assert planned(beside)["labels"].done is None, "undecided before votes: unlabeled pixels may be gaps or background"
     ids = scene.point_objects.copy()
     gaps = planned(beside, point_ids=ids)
     assert gaps["labels"].done is False and planned_settings(Settings(), gaps).semantic_weight == 0
@@ -114,7 +114,7 @@ def test_one_object_is_taught_only_where_something_else_is(write_capture, tmp_pa
     assert "--semantic-weight 0" in planned(beside, settings=Settings(semantic_weight=0.0))["labels"].why
 
 
-def test_views_that_repeat_others_are_found(write_capture, tmp_path):
+def test_duplicate_views_are_found(write_capture, tmp_path):
     scene = write_capture(views=9, size=(64, 48))
 
     def repeat(at: int, of: int, shift: float = 0.0) -> None:
@@ -129,7 +129,7 @@ def test_views_that_repeat_others_are_found(write_capture, tmp_path):
         repeat(at, of, shift)
     repeat(2, 0)  # View 0 is held out and not trained on, so view 2 is kept.
     write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
-    assert duplicate_views(loaded(scene, tmp_path)) == [3, 4], "6 stands elsewhere"
+    assert duplicate_views(loaded(scene, tmp_path)) == [3, 4], "view 6 has a different pose"
     plan = planned(loaded(scene, tmp_path))
     assert plan.views_left_out == {"view_003.png", "view_004.png"} and "view_003.png" in plan["duplicate-views"].why
     assert not planned(loaded(scene, tmp_path), keep=["duplicate-views"]).views_left_out
@@ -138,10 +138,10 @@ def test_views_that_repeat_others_are_found(write_capture, tmp_path):
     Image.fromarray(np.clip(pixels + 4, 0, 255).astype(np.uint8)).save(scene.folder / "images/view_003.png")
     other = scene.folder / "masks/view_004.png"
     Image.fromarray(np.full((48, 64), 1, np.uint16)).save(other)
-    assert duplicate_views(loaded(scene, tmp_path)) == [], "another exposure, and another mask"
+    assert duplicate_views(loaded(scene, tmp_path)) == [], "exposure and mask differ"
 
 
-def test_views_and_points_that_nothing_sees_are_found(write_capture, tmp_path):
+def test_blind_views_and_unseen_points_are_found(write_capture, tmp_path):
     scene = write_capture(views=9, size=(64, 48))
     away = np.diag([-1.0, 1.0, -1.0, 1.0])
     for view in (3, 5):
@@ -157,7 +157,7 @@ def test_views_and_points_that_nothing_sees_are_found(write_capture, tmp_path):
     assert np.flatnonzero(unseen_points(capture)).tolist() == [len(scene.xyz) - 2]
     plan = planned(capture)
     assert plan.views_left_out == {"view_003.png", "view_005.png"} and "1 of" in plan["unseen-points"].why
-    assert plan["duplicate-views"] is None, "two views of nothing are blind rather than alike"
+    assert plan["duplicate-views"] is None, "blind views are not duplicates"
     ids = np.append(scene.point_objects, [0, 0])
     seeds = ~unseen_points(capture)
     for chosen_points, highest in ((seeds, 1), (None, 500)):
@@ -166,10 +166,10 @@ def test_views_and_points_that_nothing_sees_are_found(write_capture, tmp_path):
         assert reach == pytest.approx(highest, rel=0.5)
 
     nothing = capture.excluding_from_training(set(scene.names) - {"view_003.png"})
-    assert blind_views(nothing) == [] and not unseen_points(nothing).any(), "something is left to train on"
+    assert blind_views(nothing) == [] and not unseen_points(nothing).any(), "at least one view and point remain"
 
 
-def test_points_that_no_view_shows_say_nothing_about_the_scene(write_capture, tmp_path):
+def test_unseen_points_do_not_affect_scene(write_capture, tmp_path):
     scene = write_capture(views=9, size=(64, 48))
     ids = scene.point_objects
     alone = Trainer.start(loaded(scene, tmp_path), ids, Settings(offsets=2))
@@ -187,10 +187,10 @@ def test_points_that_no_view_shows_say_nothing_about_the_scene(write_capture, tm
     assert found.model.anchors.voxel == alone.model.anchors.voxel
     assert torch.equal(found.model.anchors.rows, alone.model.anchors.rows)
     assert found.scene.supervise_background == alone.scene.supervise_background
-    assert planned(crowded, point_ids=ids)["rest"].done is False, "nothing could vote for them"
+    assert planned(crowded, point_ids=ids)["rest"].done is False, "unseen points do not count as unlabeled"
 
 
-def test_chosen_objects_are_told_apart_alone_and_their_other_views_show_the_rest(write_capture, tmp_path):
+def test_chosen_objects_limit_labels_and_views(write_capture, tmp_path):
     scene = write_capture(views=9, size=(64, 48))
     mask = scene.folder / "masks/view_003.png"
     ids = np.array(Image.open(mask))
@@ -202,7 +202,7 @@ def test_chosen_objects_are_told_apart_alone_and_their_other_views_show_the_rest
     assert planned(capture, leave_out=["other-views"]).views_left_out == {"view_003.png"}
 
 
-def test_pictures(write_capture, tmp_path):
+def test_undistortion_exposure_and_pyramid_are_planned(write_capture, tmp_path):
     size = (640, 480)
     bent = write_capture(views=3, size=size, model="SIMPLE_RADIAL", params=[640.0, 320.0, 240.0, 0.05])
     unprepared = load_capture(bent.folder, None)
@@ -219,7 +219,7 @@ def test_pictures(write_capture, tmp_path):
     assert downscale_at(1.0, 640, True) == 1
 
 
-def test_flat_splats_have_surfaces_where_meshes_are_made(write_capture, tmp_path):
+def test_surface_losses_need_meshes(write_capture, tmp_path):
     capture = loaded(write_capture(views=3), tmp_path)
     flat = Settings(primitive="2d")
     assert planned(capture)["surface"] is None and planned(capture, settings=flat)["surface"].done
@@ -240,7 +240,7 @@ def test_flat_splats_have_surfaces_where_meshes_are_made(write_capture, tmp_path
         ('{"1": " "}', "expected a name"), ('{"9": "chair"}', "none of the IDs in the masks; available IDs: 1, 2"),
     ],
 )  # fmt: skip
-def test_groups_that_make_no_sense_are_refused(tmp_path, content, words):
+def test_invalid_groups_are_rejected(tmp_path, content, words):
     path = tmp_path / "groups.json"
     path.write_text(content)
     edit = {"objects": [{"id": i, "name": f"thing {i}", "color": [0, 0, 0], "points": 1} for i in (1, 2)]}
@@ -250,11 +250,11 @@ def test_groups_that_make_no_sense_are_refused(tmp_path, content, words):
     assert words in str(found.value)
 
 
-def test_only_and_groups_are_edits_that_can_be_taken_back(write_capture, tmp_path, ask):
+def test_only_and_groups_are_revertible_edits(write_capture, tmp_path, run_command):
     capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"
     groups = tmp_path / "groups.json"
     groups.write_text('{"0": "rest", "2": "planet", "5": "planet", "77": "nobody"}')
-    assert ask("vote", capture, "--out", out, "--groups", groups, "--only", "planet").code == EXIT_DONE
+    assert run_command("vote", capture, "--out", out, "--groups", groups, "--only", "planet").code == EXIT_DONE
     objects = {entry.id: entry for entry in read_objects(out / "objects.json")}
     assert merged(list(objects.values())) == {1: 1, 2: 2, 5: 2} and objects[2].name == "planet"
     assert [i for i, entry in objects.items() if entry.left_out] == [1]
@@ -262,12 +262,12 @@ def test_only_and_groups_are_edits_that_can_be_taken_back(write_capture, tmp_pat
     assert "sphere 1" in plan["objects"].what and "2 IDs are grouped into 1" in plan["groups"].why
     edit_objects(out / "objects.json", {5: {"merged_into": None}, 1: {"left_out": None}})
     assert read_objects(out / "objects.json")[0].left_out is False
-    assert ask("vote", capture, "--out", out, "--only", "sphere 1", "5").code == EXIT_DONE
+    assert run_command("vote", capture, "--out", out, "--only", "sphere 1", "5").code == EXIT_DONE
     assert [entry.id for entry in read_objects(out / "objects.json") if entry.left_out] == [2]
-    refused(ask("vote", capture, "--out", out, "--only", "moon"), "no object moon", "objects.json")
+    assert_rejected(run_command("vote", capture, "--out", out, "--only", "moon"), "no object moon", "objects.json")
 
 
-def test_choosing_takes_what_is_merged_along(tmp_path):
+def test_chosen_objects_include_merged_ones(tmp_path):
     (tmp_path / "objects.json").write_text(
         json.dumps({
             "objects": [{"id": i, "name": f"thing {i}", "color": [0, 0, 0], "points": 1} for i in (1, 2, 3)],
@@ -282,28 +282,28 @@ def test_choosing_takes_what_is_merged_along(tmp_path):
 # --- the commands ----------------------------------------------------------------------------------------------------
 
 
-def test_plan_says_all_and_writes_only_what_it_is_told_to(write_capture, tmp_path, ask):
+def test_plan_command_reports_decisions_and_writes_only_out(write_capture, tmp_path, run_command):
     capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "deep" / "out"
     before = sorted(path.name for path in tmp_path.rglob("*"))
-    answer = ask("plan", capture, "--minutes", 3, "--primitive", "2d", "--no-meshes", "--keep", "all", "--json")
-    assert answer.code == EXIT_DONE and sorted(path.name for path in tmp_path.rglob("*")) == before
-    plan = Plan.of(answer.events[-1]["plan"])
+    result = run_command("plan", capture, "--minutes", 3, "--primitive", "2d", "--no-meshes", "--keep", "all", "--json")
+    assert result.code == EXIT_DONE and sorted(path.name for path in tmp_path.rglob("*")) == before
+    plan = Plan.of(result.events[-1]["plan"])
     assert plan["pyramid"].overridden and plan["surface"].overridden and not plan.does("meshes")
-    assert len([text for text in answer.messages("status") if text.startswith(("Done: ", "Left out: "))]) > 5
-    assert answer.messages("status")[-1].startswith("Expected of ")
-    refused(ask("plan", capture, "--keep", "everything"), "invalid choice: 'everything'")
-    refused(ask("plan", tmp_path / "none", "--out", out), "does not exist")
+    assert len([text for text in result.messages("status") if text.startswith(("Done: ", "Left out: "))]) > 5
+    assert result.messages("status")[-1].startswith("Expected of ")
+    assert_rejected(run_command("plan", capture, "--keep", "everything"), "invalid choice: 'everything'")
+    assert_rejected(run_command("plan", tmp_path / "none", "--out", out), "does not exist")
     assert not out.parent.exists()
-    assert ask("plan", capture, "--out", out, "--only", "sphere 2").code == EXIT_DONE
+    assert run_command("plan", capture, "--out", out, "--only", "sphere 2").code == EXIT_DONE
     assert {path.name for path in out.iterdir()} == {"objectgs.json", "plan.json"}
     assert read_plan(out / "plan.json")["objects"].done is False
-    assert ask("import", capture, "--out", out).code == EXIT_DONE
+    assert run_command("import", capture, "--out", out).code == EXIT_DONE
     assert read_plan(out / "plan.json")["rest"].done is None
-    assert ask("vote", capture, "--out", out).code == EXIT_DONE
+    assert run_command("vote", capture, "--out", out).code == EXIT_DONE
     assert read_plan(out / "plan.json")["rest"].done is False
 
 
-def test_training_follows_its_plan_to_the_report(write_capture, tmp_path, ask):
+def test_plan_affects_training_evaluation_and_report(write_capture, tmp_path, run_command):
     scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
     shutil.copy(scene.folder / "images/view_001.png", scene.folder / "images/view_002.png")
     shutil.copy(scene.folder / "masks/view_001.png", scene.folder / "masks/view_002.png")
@@ -311,19 +311,19 @@ def test_training_follows_its_plan_to_the_report(write_capture, tmp_path, ask):
         part[2] = part[1]
     write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
     train = ("train", scene.folder, "--out", out, *SMALL)
-    began = ask(*train, "--steps", 4, "--keep", "pyramid", "--leave-out", "exposure", "labels", "--json")
+    began = run_command(*train, "--steps", 4, "--keep", "pyramid", "--leave-out", "exposure", "labels", "--json")
     assert began.code == EXIT_DONE
-    said = began.messages("status")
-    assert any(text.startswith("Left out: training on 1 view, since") for text in said)
-    assert any(text.startswith("Done: reduced images") and "--keep pyramid" in text for text in said)
-    assert any(text.startswith("Expected in ") and "dB below" in text for text in said)
+    statuses = began.messages("status")
+    assert any(text.startswith("Left out: training on 1 view, since") for text in statuses)
+    assert any(text.startswith("Done: reduced images") and "--keep pyramid" in text for text in statuses)
+    assert any(text.startswith("Expected in ") and "dB below" in text for text in statuses)
     training = json.loads((out / "objectgs.json").read_text())["training"]
     assert Plan.of(training["plan"]) == read_plan(out / "plan.json")
     kept = ("--keep", "pyramid", "--leave-out")
-    refused(ask(*train, "--steps", 6, *kept, "labels"), "another plan (exposure)", "--restart")
-    refused(ask(*train, "--steps", 6, *kept, "exposure"), "semantic_weight")
-    assert ask(*train, "--steps", 6, *kept, "labels", "exposure").code == EXIT_DONE
-    assert ask("evaluate", out).code == EXIT_DONE and ask("report", out).code == EXIT_DONE
+    assert_rejected(run_command(*train, "--steps", 6, *kept, "labels"), "another plan (exposure)", "--restart")
+    assert_rejected(run_command(*train, "--steps", 6, *kept, "exposure"), "semantic_weight")
+    assert run_command(*train, "--steps", 6, *kept, "labels", "exposure").code == EXIT_DONE
+    assert run_command("evaluate", out).code == EXIT_DONE and run_command("report", out).code == EXIT_DONE
     report = json.loads((out / "report.json").read_text())
     left_out = {entry["what"]: entry["why"] for entry in report["left_out"]}
     assert left_out["the label loss and its ID channel"] == "--leave-out labels was given"
@@ -331,18 +331,18 @@ def test_training_follows_its_plan_to_the_report(write_capture, tmp_path, ask):
     assert not report["capture"]["exposure_varies"] and report["quality"]["miou"] is not None
     assert [own["key"] for own in report["plan"]] == [own.key for own in read_plan(out / "plan.json").decisions]
 
-    assert ask(*train, "--steps", 3, "--restart", "--leave-out", "votes").code == EXIT_DONE
+    assert run_command(*train, "--steps", 3, "--restart", "--leave-out", "votes").code == EXIT_DONE
     assert set(read_points(out / "points.ply").ids.tolist()) == {0}
-    assert ask("evaluate", out, "--json").events[-1].get("miou") is None
+    assert run_command("evaluate", out, "--json").events[-1].get("miou") is None
 
 
-def test_a_training_of_an_older_version_has_no_plan(write_capture, tmp_path, ask):
+def test_training_without_plan_resumes(write_capture, tmp_path, run_command):
     capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"
     train = ("train", capture, "--out", out, *SMALL, "--steps")
-    assert ask(*train, 2).code == EXIT_DONE
+    assert run_command(*train, 2).code == EXIT_DONE
     memory = json.loads((out / "objectgs.json").read_text())
     del memory["training"]["plan"]
     (out / "objectgs.json").write_text(json.dumps(memory))
     (out / "plan.json").unlink()
-    assert ask("report", out).code == EXIT_DONE and ask(*train, 3).code == EXIT_DONE
+    assert run_command("report", out).code == EXIT_DONE and run_command(*train, 3).code == EXIT_DONE
     assert read_plan(out / "plan.json")["votes"].done

@@ -63,7 +63,7 @@ def minimal(path, *changes, names=MINIMAL, **options):
     return foreign(path, names, [[{**ROW, **change}[name] for name in names] for change in changes], **options)
 
 
-def test_the_bytes_of_one_splat(tmp_path):
+def test_single_splat_has_expected_bytes(tmp_path):
     splats = Splats(
         means=np.array([[1, 2, 3]], np.float32),
         quats=np.array([[0.5, -0.5, 0.5, 0.5]], np.float32),
@@ -83,7 +83,7 @@ def test_the_bytes_of_one_splat(tmp_path):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_an_independent_reader_finds_what_was_written(tmp_path, degree):
+def test_independent_reader_gets_written_values(tmp_path, degree):
     splats = some_splats(degree=degree)
     write_splats(tmp_path / "a.ply", splats)
     names, rows = parse((tmp_path / "a.ply").read_bytes())
@@ -101,7 +101,7 @@ def test_an_independent_reader_finds_what_was_written(tmp_path, degree):
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_round_trip(tmp_path, degree):
+def test_splats_round_trip(tmp_path, degree):
     splats = some_splats(n=70_000, degree=degree)
     write_splats(tmp_path / "a.ply", splats)
     again, warnings = read_splats(tmp_path / "a.ply")
@@ -115,7 +115,7 @@ def test_round_trip(tmp_path, degree):
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
-def test_what_is_unobserved_is_marked(tmp_path):
+def test_unobserved_splats_are_marked(tmp_path):
     splats = some_splats(n=5)
     splats.unobserved = np.array([0, 1, 0, 0, 1], bool)
     write_splats(tmp_path / "a.ply", splats)
@@ -130,13 +130,13 @@ def test_what_is_unobserved_is_marked(tmp_path):
     assert both.unobserved.tolist() == [*splats.unobserved.tolist(), False, False]
 
 
-def test_no_splats(tmp_path):
+def test_empty_splats_round_trip(tmp_path):
     write_splats(tmp_path / "a.ply", Splats.empty(2))
     again, warnings = read_splats(tmp_path / "a.ply")
     assert len(again) == 0 and again.degree == 2 and warnings == []
 
 
-def test_far_from_the_origin_positions_are_double(tmp_path):
+def test_distant_positions_use_double(tmp_path):
     splats = some_splats(n=50, dtype=np.float64)
     splats.means += 1e6
     write_splats(tmp_path / "far.ply", splats)
@@ -150,7 +150,7 @@ def test_far_from_the_origin_positions_are_double(tmp_path):
     assert b"double" not in (tmp_path / "near.ply").read_bytes()
 
 
-def test_opacity_of_zero_and_one_and_a_flat_axis_stay_finite(tmp_path):
+def test_extreme_opacities_and_scales_stay_finite(tmp_path):
     splats = some_splats(n=3)
     splats.opacities = np.array([0.0, 1.0, 0.5])
     splats.scales[0, 0] = 0.0
@@ -165,7 +165,7 @@ def test_opacity_of_zero_and_one_and_a_flat_axis_stay_finite(tmp_path):
 
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_splats_that_are_not_finite_are_not_written(tmp_path, name, value):
+def test_nonfinite_splats_are_not_written(tmp_path, name, value):
     splats = some_splats(n=4)
     getattr(splats, name)[2] = value
     warnings = write_splats(tmp_path / "a.ply", splats)
@@ -173,7 +173,7 @@ def test_splats_that_are_not_finite_are_not_written(tmp_path, name, value):
     assert np.array_equal(read_splats(tmp_path / "a.ply")[0].object_ids, splats.object_ids[[0, 1, 3]])
 
 
-def test_ids_beyond_32_bits_are_refused_and_leave_no_file(tmp_path):
+def test_ids_beyond_32_bits_are_rejected(tmp_path):
     splats = some_splats(n=2)
     splats.object_ids[0] = 2**32
     with pytest.raises(ValueError, match="2\\^32"):
@@ -181,7 +181,7 @@ def test_ids_beyond_32_bits_are_refused_and_leave_no_file(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+def test_failed_write_keeps_old_file(tmp_path, monkeypatch):
     write_splats(tmp_path / "a.ply", some_splats(n=2))
     before = (tmp_path / "a.ply").read_bytes()
 
@@ -196,7 +196,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_another_programs_file_in_another_order_without_ids(tmp_path, order):
+def test_foreign_property_order_and_endianness_are_read(tmp_path, order):
     splats, warnings = read_splats(minimal(tmp_path / "a.ply", {}, {"x": 9}, order=order))
     assert warnings == []
     assert splats.means.tolist() == [[1, 2, 3], [9, 2, 3]]
@@ -207,7 +207,7 @@ def test_another_programs_file_in_another_order_without_ids(tmp_path, order):
     assert splats.object_ids.tolist() == [0, 0]
 
 
-def test_unknown_properties_and_double_positions(tmp_path):
+def test_unknown_properties_are_ignored_and_doubles_kept(tmp_path):
     names = [*MINIMAL, "red", "object_id"]
     kinds = {"x": "d", "y": "d", "z": "d", "red": "B", "object_id": "I"}
     change = {"x": 1e9 + 0.125, "red": 3, "object_id": 70_000}
@@ -216,7 +216,7 @@ def test_unknown_properties_and_double_positions(tmp_path):
     assert splats.object_ids.tolist() == [70_000]
 
 
-def test_object_ids_as_floats_and_bad_ones(tmp_path):
+def test_float_ids_are_read_and_invalid_ones_become_0(tmp_path):
     names = [*MINIMAL, "object_id"]
     rows = [{"object_id": 7.0}, {"object_id": -1.0}, {"object_id": np.nan}]
     splats, warnings = read_splats(minimal(tmp_path / "a.ply", *rows, names=names))
@@ -237,14 +237,14 @@ def test_object_ids_as_floats_and_bad_ones(tmp_path):
         {"rot_0": 0},
     ],
 )
-def test_broken_rows_are_dropped_and_counted(tmp_path, bad):
+def test_nonfinite_rows_are_dropped_with_warning(tmp_path, bad):
     splats, warnings = read_splats(minimal(tmp_path / "a.ply", {"x": 10}, bad, {"x": 30}))
     assert splats.means[:, 0].tolist() == [10, 30]
     assert len(warnings) == 1 and "1 of 3" in warnings[0] and "a.ply" in warnings[0]
     assert all(np.isfinite(getattr(splats, name)).all() for name in ("means", "quats", "scales", "opacities", "sh"))
 
 
-def test_a_truncated_file_is_named(tmp_path):
+def test_truncated_file_is_reported(tmp_path):
     write_splats(tmp_path / "a.ply", some_splats(n=10))
     data = (tmp_path / "a.ply").read_bytes()
     for keep in (len(data) - 1, len(data) // 2, 200, 3, 0):
@@ -270,7 +270,7 @@ def test_a_truncated_file_is_named(tmp_path):
         ("ply\nformat binary_little_endian 1.0\nelement face 1\nproperty float x\nelement vertex 1\n", "PLY header"),
     ],
 )
-def test_what_is_no_splat_file_is_refused_in_one_sentence(tmp_path, text, why):
+def test_non_splat_files_are_rejected(tmp_path, text, why):
     path = tmp_path / "odd.ply"
     path.write_text(text)
     with pytest.raises(InputError, match=why) as caught:
@@ -278,13 +278,13 @@ def test_what_is_no_splat_file_is_refused_in_one_sentence(tmp_path, text, why):
     assert "odd.ply" in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_missing_file_is_named(tmp_path):
+def test_missing_file_is_reported(tmp_path):
     with pytest.raises(InputError, match=r"none\.ply"):
         read_splats(tmp_path / "none.ply")
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_a_table_of_every_type_survives_the_file(tmp_path, order):
+def test_table_of_all_types_round_trip(tmp_path, order):
     kinds = ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"]
     table = np.zeros(3, np.dtype([(f"p{kind}", order + kind) for kind in kinds], align=True))
     for kind in kinds:
@@ -298,7 +298,7 @@ def test_a_table_of_every_type_survives_the_file(tmp_path, order):
     assert len(read_vertices(tmp_path / "a.ply")) == 0
 
 
-def test_a_table_that_ply_cannot_hold_leaves_the_old_file(tmp_path):
+def test_unsupported_table_keeps_old_file(tmp_path):
     write_vertices(tmp_path / "a.ply", np.zeros(1, [("x", "f4")]))
     before = (tmp_path / "a.ply").read_bytes()
     for field in ("i8", ("f4", 3), "U3"):
@@ -307,7 +307,7 @@ def test_a_table_that_ply_cannot_hold_leaves_the_old_file(tmp_path):
     assert (tmp_path / "a.ply").read_bytes() == before and len(list(tmp_path.iterdir())) == 1
 
 
-def test_elements_after_the_vertices_are_left_alone(tmp_path):
+def test_elements_after_vertices_are_ignored(tmp_path):
     path = tmp_path / "mesh.ply"
     head = "ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nelement face 1\n"
     head += "property list uchar int vertex_indices\nend_header\n"
@@ -328,7 +328,7 @@ def test_select_and_concatenate():
     assert len(concatenate([])) == 0
 
 
-def test_arrays_of_wrong_shapes_are_refused():
+def test_arrays_of_wrong_shape_are_rejected():
     good = some_splats(n=2)
     with pytest.raises(ValueError, match="quats"):
         Splats(good.means, good.quats[:, :3], good.scales, good.opacities, good.sh, good.object_ids)

@@ -21,9 +21,9 @@ def fewer(values, simulated):
     return [values[i] for i in simulated] if SIMULATED else values
 
 
-def rasterize(**asked):
+def rasterize(**arguments):
     """Run `backend.raster.rasterize` on DEVICE with CPU tensors as input and output."""
-    moved = {k: v.to(DEVICE) if isinstance(v, torch.Tensor) else v for k, v in asked.items()}
+    moved = {k: v.to(DEVICE) if isinstance(v, torch.Tensor) else v for k, v in arguments.items()}
     *planes, frame = raster.rasterize(**moved)
     return raster.Rendered(*(p if p is None else p.cpu() for p in planes), frame)
 
@@ -54,14 +54,14 @@ def as_float32(scene):
     return {k: v if k == "ids" else v.float() for k, v in scene.items()}
 
 
-def mapped(picture):
+def mapped(rendered):
     """Return the object map as NumPy arrays, for any renderer."""
-    return tuple(torch.as_tensor(a).cpu().numpy() for a in object_map(picture))
+    return tuple(torch.as_tensor(a).cpu().numpy() for a in object_map(rendered))
 
 
-def ranked(picture, ranks):
+def ranked(rendered, ranks):
     """Return the object ranks as NumPy arrays, for any renderer."""
-    return tuple(torch.as_tensor(a).cpu().numpy() for a in object_ranks(picture, ranks))
+    return tuple(torch.as_tensor(a).cpu().numpy() for a in object_ranks(rendered, ranks))
 
 
 def compare_ranks(ids, probabilities, dense, **tolerance):
@@ -147,11 +147,11 @@ PRIMITIVES = pytest.mark.parametrize("primitive", ["3d", "2d"])
 @pytest.mark.parametrize(
     ("primitive", "coefficients"), [("3d", 1), ("3d", 4), ("3d", 9), ("3d", 16), ("2d", 1), ("2d", 4)]
 )
-def test_agrees_with_reference_on_random_scenes(seed, coefficients, primitive):
+def test_random_scenes_match_reference(seed, coefficients, primitive):
     compare(random_scene(seed, coefficients=coefficients), camera(), seed=seed, primitive=primitive)
 
 
-def test_median_depth_is_that_of_the_splat_at_half_of_the_light():
+def test_median_depth_is_at_half_transmittance():
     cam = camera()
     layers = random_scene(0, count=4, size=30.0)
     layers["means"] = torch.tensor([[0, 0, z] for z in (2.0, 3.0, 4.0, 5.0)], dtype=torch.float64)
@@ -166,7 +166,7 @@ def test_median_depth_is_that_of_the_splat_at_half_of_the_light():
 
 
 @PRIMITIVES
-def test_a_part_of_a_picture_is_drawn_as_in_the_whole(primitive):
+def test_crop_matches_full_image(primitive):
     """Splats far outside a narrow crop are projected as in the whole image."""
     scene, whole = as_float32(random_scene(3, size=0.4)), camera()
     want = rasterize(**scene, camera=whole, primitive=primitive).color

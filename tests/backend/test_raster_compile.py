@@ -30,12 +30,12 @@ for coefficients in (1, 4, 9, 16):
             for primitive in ("3d", "2d"):
                 leaves = {k: v.requires_grad_(k != "ids") for k, v in scene.items()}
                 flat = wanted and primitive == "2d"
-                picture = rasterize(
+                rendered = rasterize(
                     **leaves, camera=cam, labels=labels, want_depth=wanted, want_median=wanted, want_normals=flat,
                     want_distortion=flat, primitive=primitive,
                 )
-                (picture.color.sum() + (picture.normals.sum() if flat else 0)).backward()
-                object_map(picture)
+                (rendered.color.sum() + (rendered.normals.sum() if flat else 0)).backward()
+                object_map(rendered)
 from backend.raster.cpu import binning, blending, blending_backward, ids, projection
 for variants, kernels in (
     (1, (binning.depth_order, binning.bin_splats)),
@@ -61,25 +61,24 @@ def copy_backend(place):
     shutil.copytree(ROOT / "backend", place / "backend", ignore=shutil.ignore_patterns("__pycache__"))
 
 
-def test_progress_is_reported():
+def test_compile_kernels_reports_progress():
     seen = []
     assert compile_kernels(progress=lambda done, total: seen.append((done, total))) > 0
     assert seen == [(i, len(seen) - 1) for i in range(len(seen))]
 
 
-def test_second_process_compiles_nothing():
-    """Every way in which training and rendering call the kernels finds them in the cache, as `compile_kernels` has left
-    them there: no kernel has more variants than that made, and none is compiled."""
+def test_second_process_uses_cached_kernels():
+    """Every call finds its kernel in the cache."""
     compile_kernels()
     run(DRAW)
 
 
-@pytest.mark.skipif(os.name == "nt", reason="the user's cache folder is found another way")
-def test_read_only_installation(tmp_path):
-    """Where nothing can be written beside the kernels, the cache goes to the user's own folder."""
+@pytest.mark.skipif(os.name == "nt", reason="the user's cache folder is determined differently")
+def test_read_only_installation_uses_user_cache(tmp_path):
+    """If the installation cannot be written to, the cache is in the user's cache folder."""
     copy_backend(tmp_path)
     for folder in ("raster", "raster/cpu"):
-        (tmp_path / "backend" / folder / "__pycache__").write_text("in the way of a cache, whoever runs the test")
+        (tmp_path / "backend" / folder / "__pycache__").write_text("blocks the cache folder for any user")
     script = """
 import sys, numpy as np
 sys.path.insert(0, sys.argv[1])
@@ -97,7 +96,7 @@ print(sum(depth_order.stats.cache_hits.values()))
     assert list((tmp_path / "home").rglob("*.nbi"))
 
 
-def test_cache_is_renewed_when_any_file_of_the_package_changes(tmp_path):
+def test_change_of_any_package_file_invalidates_cache(tmp_path):
     """A constant of one file is compiled into kernels of other files."""
     copy_backend(tmp_path)
     script = """
@@ -121,7 +120,7 @@ print(tangent_limits(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 2.0, 2.0)[1], sum(tangent_lim
 @pytest.mark.parametrize(
     ("changed", "renewed"), [("raster/camera.py", True), ("model/heads.py", True), ("training/settings.py", False)]
 )
-def test_a_models_kernels_are_renewed_with_the_layers_below(tmp_path, changed, renewed):
+def test_model_kernels_depend_only_on_lower_layers(tmp_path, changed, renewed):
     copy_backend(tmp_path)
     script = """
 import numpy as np
@@ -159,8 +158,7 @@ print(sum(_head_output.stats.cache_hits.values()))
         ("out[2] = C1 * z", "out[2] = C1 * x", True),
     ],
 )
-def test_only_code_changes_a_kernels_digest(old, new, changes):
-    """Not its comments and docstrings."""
+def test_digest_ignores_comments_and_docstrings(old, new, changes):
     path = ROOT / "backend" / "raster" / "spherical_harmonics.py"
     text = path.read_text()
     without_docstring = re.sub(r'(def sh_gradient\(.*\n) +""".*"""\n', r"\1", text)
@@ -174,7 +172,7 @@ def test_only_code_changes_a_kernels_digest(old, new, changes):
 
 
 @pytest.mark.parametrize("place", ["{}\n", "class A:\n    {}\n    b = 1\n", "def f():\n    {}\n    return 1\n"])
-def test_no_docstring_is_in_a_digest(place):
+def test_digest_excludes_all_docstrings(place):
     def digest(text):
         return digest_of_code(compile(place.format(repr(text)), "a.py", "exec"))
 

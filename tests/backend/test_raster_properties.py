@@ -23,7 +23,7 @@ anything = settings(
     max_examples=4 if SIMULATED else 40, deadline=None, derandomize=True, database=None,
     phases=(Phase.generate, Phase.shrink),
 )  # fmt: skip
-cpu_only = pytest.mark.skipif(SIMULATED, reason="the two renderers share what this is about")
+cpu_only = pytest.mark.skipif(SIMULATED, reason="CPU and CUDA share this code")
 
 
 def powers(low, high):
@@ -75,12 +75,12 @@ def drawn(scene, cam=CAMERA, primitive="3d", gradient=True, labels=LABELS):
     """Return the planes by name, and the gradients of a fixed loss on them, as NumPy arrays."""
     flat = primitive == "2d"
     leaves = {k: v.clone().requires_grad_(gradient and k != "ids") for k, v in scene.items()}
-    picture = rasterize(
+    rendered = rasterize(
         **leaves, camera=cam, labels=labels, want_depth=True, want_normals=flat, want_distortion=flat,
         primitive=primitive,
     )  # fmt: skip
     return planes_and_gradients(
-        {name: getattr(picture, name) for name in PLANES if getattr(picture, name) is not None}, leaves, gradient
+        {name: getattr(rendered, name) for name in PLANES if getattr(rendered, name) is not None}, leaves, gradient
     )
 
 
@@ -128,7 +128,7 @@ def assert_close(a, b, tolerance, names=None):
 @PRIMITIVES
 @anything
 @given(scene=scenes())
-def test_kernels_are_finite_and_equal_the_reference(primitive, scene):
+def test_kernels_are_finite_and_match_reference(primitive, scene):
     """If only one of them draws a pixel at the cut-off of 1/255, gradients need only be finite."""
     scene = with_distinct_depths(scene)
     got, want = drawn(scene, primitive=primitive), by_reference(scene, CAMERA, primitive)
@@ -148,7 +148,7 @@ def test_kernels_are_finite_and_equal_the_reference(primitive, scene):
 @PRIMITIVES
 @anything
 @given(scene=scenes(), seed=st.integers(0, 9))
-def test_the_order_of_the_input_does_not_matter(primitive, scene, seed):
+def test_result_is_independent_of_input_order(primitive, scene, seed):
     order = torch.tensor(np.random.default_rng(seed).permutation(len(scene["ids"])))
     first = drawn(scene, primitive=primitive)
     again = drawn({k: v[order] for k, v in scene.items()}, primitive=primitive)
@@ -162,7 +162,7 @@ def test_the_order_of_the_input_does_not_matter(primitive, scene, seed):
 @PRIMITIVES
 @anything
 @given(scene=scenes(), power=st.integers(-20, 20))
-def test_the_unit_of_length_does_not_matter(primitive, scene, power):
+def test_result_is_independent_of_length_unit(primitive, scene, power):
     """Scaling by powers of two involves no rounding, so results are identical bit for bit."""
     unit = 2.0**power
     here = drawn(scene, primitive=primitive)
@@ -177,7 +177,7 @@ def test_the_unit_of_length_does_not_matter(primitive, scene, power):
 @PRIMITIVES
 @anything
 @given(scene=scenes(), place=st.tuples(*3 * [st.floats(-1e6, 1e6)]))
-def test_the_place_in_the_world_does_not_matter(primitive, scene, place):
+def test_result_is_independent_of_world_offset(primitive, scene, place):
     offset = torch.tensor(place, dtype=torch.float64)
     # Multiples of 1/4096 and 1/64, so that the float64 sum is exact.
     means = torch.round(scene["means"].double() * 4096) / 4096
@@ -194,24 +194,24 @@ def test_the_place_in_the_world_does_not_matter(primitive, scene, place):
 @PRIMITIVES
 @anything
 @given(scene=scenes(), data=st.data())
-def test_pictures_are_linear_in_the_colors(primitive, scene, data):
+def test_images_are_linear_in_colors(primitive, scene, data):
     """Splats of equal depth are ordered by their other values, so each gets a distinct depth."""
     scene = with_distinct_depths(scene)
     count = len(scene["ids"])
     one, other = (torch.tensor([data.draw(colors) for _ in range(count)]) for _ in range(2))
 
-    def picture(color):
+    def render(color):
         return drawn({**scene, "sh": ((color - 0.5) / C0)[:, None].float()}, primitive=primitive, gradient=False)
 
-    total = picture(one + 2 * other)["color"]
-    np.testing.assert_allclose(total, picture(one)["color"] + 2 * picture(other)["color"], atol=1e-5)
+    total = render(one + 2 * other)["color"]
+    np.testing.assert_allclose(total, render(one)["color"] + 2 * render(other)["color"], atol=1e-5)
 
 
 @cpu_only
 @PRIMITIVES
 @anything
 @given(scene=scenes())
-def test_the_weights_and_what_passes_are_all_of_the_light(primitive, scene):
+def test_weights_plus_transmittance_sum_to_one(primitive, scene):
     white = {**scene, "sh": torch.full((len(scene["ids"]), 1, 3), 0.5 / C0), "ids": torch.zeros_like(scene["ids"])}
     found = drawn(white, primitive=primitive, gradient=False, labels=torch.zeros_like(LABELS))
     assert ((found["alpha"] >= 0) & (found["alpha"] <= 1)).all()
@@ -223,7 +223,7 @@ def test_the_weights_and_what_passes_are_all_of_the_light(primitive, scene):
 @PRIMITIVES
 @anything
 @given(scene=scenes(), left=st.integers(0, 20), top=st.integers(0, 14), data=st.data())
-def test_a_part_is_that_part_of_the_whole(primitive, scene, left, top, data):
+def test_crop_matches_part_of_full_image(primitive, scene, left, top, data):
     """Splats of equal depth are ordered by their other values, so each gets a distinct depth."""
     scene = with_distinct_depths(scene)
     width = data.draw(st.integers(1, CAMERA.width - left))

@@ -72,16 +72,16 @@ def draw(scene, cam, labels=None, seed=0, primitive="3d"):
     """Return the image and the gradients of a random loss as NumPy arrays."""
     leaves = {k: v.clone() if k == "ids" else v.clone().requires_grad_() for k, v in scene.items()}
     flat = primitive == "2d"
-    picture = rasterize(
+    rendered = rasterize(
         **leaves, camera=cam, labels=labels, want_depth=True, want_normals=flat, want_distortion=flat,
         primitive=primitive,
     )  # fmt: skip
-    planes = [p for p in picture[:7] if p is not None]
+    planes = [p for p in rendered[:7] if p is not None]
     rng = np.random.default_rng(seed)
     sum((p * torch.tensor(rng.normal(size=tuple(p.shape)), dtype=p.dtype)).sum() for p in planes).backward()
     arrays = {f"plane {i}": p.detach().numpy() for i, p in enumerate(planes)}
     arrays |= {name: leaves[name].grad.numpy() for name in NAMES}
-    arrays["object"], arrays["probability"] = mapped(picture)
+    arrays["object"], arrays["probability"] = mapped(rendered)
     return arrays
 
 
@@ -90,7 +90,7 @@ def assert_same_bits(a, b):
         assert np.array_equal(a[name].view(np.uint8), b[name].view(np.uint8)), name
 
 
-def assert_unharmed(bad, seed=1, primitive="3d"):
+def assert_dropped_without_effect(bad, seed=1, primitive="3d"):
     """Check that a dropped splat has no gradient and changes no bit of the others' image and gradients."""
     others = as_float32(random_scene(seed, count=OTHERS))
     bad = as_float32(bad)
@@ -109,8 +109,8 @@ def assert_unharmed(bad, seed=1, primitive="3d"):
 
 
 def test_zero_quaternion_is_dropped(primitive):
-    assert_unharmed(one(quat=(0, 0, 0, 0)), primitive=primitive)
-    assert_unharmed(one(quat=(1e-5, 0, 0, 0)), primitive=primitive)
+    assert_dropped_without_effect(one(quat=(0, 0, 0, 0)), primitive=primitive)
+    assert_dropped_without_effect(one(quat=(1e-5, 0, 0, 0)), primitive=primitive)
     compare(among_others(one(quat=(0, 0, 0, 0))), camera(), primitive=primitive)
 
 
@@ -135,7 +135,7 @@ def test_edge_on_disc(primitive):
     compare(among_others(one(scale=(0.0, 0.3, 0.3))), straight(), primitive=primitive)
 
 
-def test_all_scales_zero_is_a_blurred_point(primitive):
+def test_zero_scales_give_blurred_point(primitive):
     got, _ = compare(among_others(one(scale=(0, 0, 0))), straight(), primitive=primitive)
     assert got.alpha[HEIGHT // 2, WIDTH // 2] > 0.5
 
@@ -159,20 +159,20 @@ def test_needle(ratio, angle, thin, primitive):
 
 
 @pytest.mark.parametrize("seed", fewer(range(5), [0, 1]))
-def test_needles_in_any_direction(seed, primitive):
+def test_needles_in_random_directions(seed, primitive):
     rng = np.random.default_rng(seed)
     scene = random_scene(seed, count=20)
     scene["scales"] = torch.tensor(10.0 ** rng.uniform(-6, 1, (20, 3)))
     compare(scene, camera(), seed=seed, primitive=primitive)
 
 
-def test_huge_splat_off_the_picture(primitive):
+def test_huge_splat_outside_image(primitive):
     for mean in ((300.0, 0, 2.0), (-250.0, 180.0, 2.0), (0, 1e4, 2.0)):
         scale = np.linalg.norm(mean) / 2
         compare(among_others(one(mean=mean, scale=(scale, scale / 3, scale))), straight(), primitive=primitive)
 
 
-def test_long_diagonal_needle_centered_off_the_picture(primitive):
+def test_long_needle_centered_outside_image(primitive):
     half = np.pi / 8
     quat = (np.cos(half), 0, 0, np.sin(half))
     for distance in (10.0, 1e3, 1e5):
@@ -183,8 +183,8 @@ def test_long_diagonal_needle_centered_off_the_picture(primitive):
         )
 
 
-def test_splat_that_misses_the_picture_has_no_gradient(primitive):
-    assert_unharmed(one(mean=(50.0, 0, 2.0)), primitive=primitive)
+def test_splat_outside_image_has_no_gradient(primitive):
+    assert_dropped_without_effect(one(mean=(50.0, 0, 2.0)), primitive=primitive)
 
 
 @pytest.mark.parametrize("scale", fewer([np.inf, 3e38, 1e20, 1e9], [0, 2]))
@@ -210,7 +210,7 @@ def test_sixteen_opaque_splats_stacked(scale, opacity, primitive):
     compare(join(*layers), straight(), gradient_tolerance=BEHIND_OPAQUE, primitive=primitive)
 
 
-def test_hundreds_of_layers_stop_where_the_reference_does(primitive):
+def test_many_layers_stop_like_reference(primitive):
     rng = np.random.default_rng(0)
     scene = random_scene(0, count=400)
     scene["opacities"] = torch.tensor(rng.uniform(0.3, 1.0, 400))
@@ -218,7 +218,7 @@ def test_hundreds_of_layers_stop_where_the_reference_does(primitive):
 
 
 @pytest.mark.parametrize("opacity", [0.0, -1.0, ALPHA_MIN * 0.999])
-def test_nothing_visible(opacity, primitive):
+def test_invisible_splats_give_empty_image(opacity, primitive):
     scene = random_scene(0)
     scene["opacities"] = torch.full_like(scene["opacities"], opacity)
     got, _ = compare(scene, camera(), primitive=primitive)
@@ -227,7 +227,7 @@ def test_nothing_visible(opacity, primitive):
     assert (ids == -1).all() and not probability.any()
 
 
-def test_no_splats(primitive):
+def test_empty_scene(primitive):
     scene = {k: v[:0] for k, v in random_scene(0).items()}
     got, _ = compare(scene, camera(), primitive=primitive)
     assert not got.alpha.any()
@@ -238,7 +238,7 @@ def test_no_splats(primitive):
 
 
 @pytest.mark.parametrize("near", [NEAR, 0.2])
-def test_depth_around_the_near_plane(near, primitive):
+def test_depths_around_near_plane(near, primitive):
     edge = np.float32(near)
     depths = (0.0, np.nextafter(edge, np.float32(0)), edge, np.nextafter(edge, np.float32(1)), -2.0, -near)
     for z in depths:
@@ -272,7 +272,7 @@ def test_coincident_points(primitive):
 
 
 @pytest.mark.parametrize("same", ["depth", "everything but the id"])
-def test_equal_depths_do_not_depend_on_the_input_order(same, primitive):
+def test_equal_depths_are_independent_of_input_order(same, primitive):
     count = 30 if SIMULATED else 80
     scene = as_float32(random_scene(3, count=count))
     if same == "depth":
@@ -297,12 +297,12 @@ def test_equal_depths_do_not_depend_on_the_input_order(same, primitive):
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("value", fewer([np.nan, np.inf, -np.inf], [0, 1]))
-def test_splat_that_is_not_finite_is_dropped(name, value, primitive):
+def test_nonfinite_splat_is_dropped(name, value, primitive):
     bad = one()
     bad[name].view(-1)[0] = value
     if name == "opacities" and value == -np.inf:
         bad = join(bad, bad)
-    assert_unharmed(bad, primitive=primitive)
+    assert_dropped_without_effect(bad, primitive=primitive)
     compare(among_others(bad), camera(), primitive=primitive)
 
 
@@ -313,19 +313,19 @@ def test_no_labeled_pixel(primitive):
     cam = camera()
     scene = {k: v.requires_grad_(k != "ids") for k, v in as_float32(random_scene(0)).items()}
     labels = torch.full((cam.height, cam.width), -1, dtype=torch.int32)
-    picture = rasterize(**scene, camera=cam, labels=labels, primitive=primitive)
-    assert not picture.label_probability.any()
-    picture.label_probability.sum().backward()
+    rendered = rasterize(**scene, camera=cam, labels=labels, primitive=primitive)
+    assert not rendered.label_probability.any()
+    rendered.label_probability.sum().backward()
     assert not any(scene[name].grad.any() for name in NAMES)
 
 
-def test_one_class(primitive):
+def test_one_object_probability_equals_alpha(primitive):
     """With one object, the label probability equals alpha."""
     cam = camera()
     scene = as_float32(random_scene(0, objects=1))
     labels = torch.zeros(cam.height, cam.width, dtype=torch.int32)
-    picture = rasterize(**scene, camera=cam, labels=labels, primitive=primitive)
-    np.testing.assert_allclose(picture.label_probability, picture.alpha, atol=1e-6)
+    rendered = rasterize(**scene, camera=cam, labels=labels, primitive=primitive)
+    np.testing.assert_allclose(rendered.label_probability, rendered.alpha, atol=1e-6)
     compare(random_scene(0, objects=1), cam, objects=1, primitive=primitive)
 
 
@@ -337,9 +337,9 @@ def test_probability_zero_under_the_logarithm(primitive):
     fast = {k: v.clone().requires_grad_(k != "ids") for k, v in as_float32(scene).items()}
     slow = {k: v if k == "ids" else v.double().requires_grad_() for k, v in as_float32(scene).items()}
     floor = 1e-6
-    picture = rasterize(**fast, camera=cam, labels=labels, primitive=primitive)
-    assert not picture.label_probability[:, :20].any()
-    loss = -torch.log(picture.label_probability.clamp(min=floor)).mean()
+    rendered = rasterize(**fast, camera=cam, labels=labels, primitive=primitive)
+    assert not rendered.label_probability[:, :20].any()
+    loss = -torch.log(rendered.label_probability.clamp(min=floor)).mean()
     loss.backward()
     want = rasterize_reference(**slow, camera=cam, objects=5, primitive=primitive).probabilities[..., 4].clone()
     want = torch.where(labels == 4, want, torch.zeros(()).double())
@@ -362,7 +362,7 @@ def dense_probabilities(scene, cam, values, primitive="3d"):
 
 
 @pytest.mark.parametrize("seed", fewer(range(4), [0]))
-def test_object_map_equals_the_dense_computation(seed, primitive):
+def test_object_map_matches_dense_probabilities(seed, primitive):
     rng = np.random.default_rng(seed)
     count, objects, cam = (80, 8, camera()) if SIMULATED else (300, 40, camera(150, 71))
     scene = as_float32(random_scene(seed, count=count))
@@ -377,7 +377,7 @@ def test_object_map_equals_the_dense_computation(seed, primitive):
     np.testing.assert_allclose(picked, dense.max(-1)[drawn], rtol=1e-5, atol=1e-7)
 
 
-def test_object_map_gives_ties_to_the_smallest_id():
+def test_object_map_resolves_ties_to_smallest_id():
     """Two objects with equal probability, in both orders of input."""
     cam = straight() if SIMULATED else straight(65, 33)
     left, right = (one(mean=(x, 0, 2.0), scale=(0.5, 0.5, 0.1), opacity=0.2) for x in (-0.1, 0.1))
@@ -399,7 +399,7 @@ def test_object_map_gives_ties_to_the_smallest_id():
         assert np.array_equal(probabilities.sum(0)[both], dense.sum(-1)[both])
 
 
-def test_ten_thousand_objects_and_large_ids(primitive):
+def test_many_objects_and_large_ids(primitive):
     """In the simulator, 200 objects: more per pixel than the GPU sums up at once."""
     rng = np.random.default_rng(0)
     objects, count, size, cam = (200, 240, 0.2, camera()) if SIMULATED else (10_000, 12_000, 0.02, camera(97, 71))
@@ -410,8 +410,8 @@ def test_ten_thousand_objects_and_large_ids(primitive):
     assert (names > 65_535).mean() > 0.99
     which = np.concatenate([np.arange(objects), rng.integers(0, objects, count - objects)])
     scene["ids"] = torch.tensor(names[which])
-    picture = rasterize(**scene, camera=cam, primitive=primitive)
-    ids, probability = mapped(picture)
+    rendered = rasterize(**scene, camera=cam, primitive=primitive)
+    ids, probability = mapped(rendered)
     labels = torch.tensor(ids)
     again = rasterize(**scene, camera=cam, labels=labels, primitive=primitive)
     np.testing.assert_allclose(again.label_probability, probability, rtol=1e-5, atol=1e-6)
@@ -430,11 +430,11 @@ SIZES = [(1, 1), (1, 40), (67, 1), (63, 31), (64, 32), (65, 33), (129, 65), (127
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 18), (15, 15), (16, 16), (17, 33)] if SIMULATED else SIZES)
-def test_odd_sizes(size, primitive):
+def test_unusual_image_sizes(size, primitive):
     compare(random_scene(0, count=40), camera(*size), gradient_tolerance=2e-5, primitive=primitive)
 
 
-def test_scene_far_from_the_origin(primitive):
+def test_scene_far_from_origin(primitive):
     """Georeferenced float64 means are made relative to the camera before conversion to float32."""
     offset = torch.tensor([4.6e6, -1.2e6, 3.1e6], dtype=torch.float64)
     scene = {k: v if k in ("ids", "means") else v.float() for k, v in random_scene(0).items()}
@@ -470,14 +470,14 @@ def dense_scene():
     return as_float32(random_scene(5, count=3000, size=0.05)), camera(200, 133)
 
 
-def test_same_input_gives_the_same_bits(primitive):
+def test_same_input_gives_identical_bits(primitive):
     scene, cam = dense_scene()
     labels = torch.zeros(cam.height, cam.width, dtype=torch.int32)
     assert_same_bits(draw(scene, cam, labels, primitive=primitive), draw(scene, cam, labels, primitive=primitive))
 
 
 @pytest.mark.skipif(SIMULATED or numba.config.NUMBA_NUM_THREADS < 2, reason="one thread only")
-def test_one_and_two_threads_give_the_same_bits(primitive):
+def test_thread_count_does_not_change_bits(primitive):
     scene, cam = dense_scene()
     labels = torch.zeros(cam.height, cam.width, dtype=torch.int32)
     before = numba.get_num_threads()
@@ -499,7 +499,7 @@ def tilted(angle, scale=(0.5, 0.3, 1.0), **kwargs):
     return one(quat=(np.cos(angle / 2), np.sin(angle / 2), 0, 0), scale=scale, **kwargs)
 
 
-def facts(scene, cam):
+def render_all_planes(scene, cam):
     """Render discs with all planes."""
     return rasterize(
         **as_float32(scene), camera=cam, want_depth=True, want_median=True, want_normals=True, want_distortion=True,
@@ -508,7 +508,7 @@ def facts(scene, cam):
 
 
 @pytest.mark.parametrize("turn", fewer([1e-6, 1e-4, 1e-3, 1e-2, 0.1], [0, 2, 4]))
-def test_disc_seen_almost_from_its_edge(turn):
+def test_disc_seen_almost_edge_on(turn):
     # Not at a pixel center, where plane and spot are equal and gradients depend on only one of them.
     for mean in ((0.003, 0.002, 2.0), (0.011, -0.023, 2.0), (0.403, 0.001, 2.0)):
         scene = tilted(np.pi / 2 - turn, mean=mean)
@@ -519,7 +519,7 @@ def test_disc_seen_almost_from_its_edge(turn):
         compare(among_others(scene), straight(), primitive="2d")
 
 
-def test_disc_seen_from_its_very_edge():
+def test_disc_seen_exactly_edge_on():
     """Its visible side is undefined, but it is drawn and everything is finite."""
     arrays = draw(as_float32(among_others(tilted(np.pi / 2))), straight(), primitive="2d")
     assert all(np.isfinite(array).all() for array in arrays.values())
@@ -527,7 +527,7 @@ def test_disc_seen_from_its_very_edge():
 
 
 @pytest.mark.parametrize("turn", fewer([0.0, 1e-6, 1e-3, 0.1], [0, 2]))
-def test_plane_through_the_camera(turn):
+def test_disc_plane_through_camera(turn):
     """The distance along the ray to the plane is zero or nearly zero in some or all pixels."""
     lying = (np.cos(np.pi / 4 + turn), np.sin(np.pi / 4 + turn), 0, 0)
     for mean in ((0.001, 0.003, 0.5), (0.001, 1e-4, 0.5), (0.1, 0.01, 0.02), (0.001, 0.02, 2.0)):
@@ -536,7 +536,7 @@ def test_plane_through_the_camera(turn):
             compare(scene, straight(), gradient_tolerance=5e-5, value_tolerance=1e-4, primitive="2d")
 
 
-def test_disc_that_reaches_behind_the_camera():
+def test_disc_reaching_behind_camera():
     """A floor below the camera is drawn up to its end, but not above the horizon, where its plane is behind."""
     floor = one(mean=(0.003, 0.302, 1.0), quat=(np.sqrt(0.5), np.sqrt(0.5), 0, 0), scale=(4, 4, 1), opacity=0.9)
     got, _ = compare(floor, straight(), primitive="2d")
@@ -544,7 +544,7 @@ def test_disc_that_reaches_behind_the_camera():
     compare(among_others(floor), straight(), gradient_tolerance=2e-5, primitive="2d")
 
 
-def test_disc_is_cut_at_the_near_plane():
+def test_disc_is_clipped_at_near_plane():
     floor = one(mean=(0.003, 0.052, 1.0), quat=(np.sqrt(0.5), np.sqrt(0.5), 0, 0), scale=(4, 4, 1), opacity=0.9)
     got, _ = compare(floor, straight(near=0.2), primitive="2d")
     assert not got.alpha[-1].any() and got.alpha[HEIGHT // 2 + int(FOCAL * 0.052 / 0.22)].all()
@@ -553,8 +553,8 @@ def test_disc_is_cut_at_the_near_plane():
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.6, -1.2, np.pi])
-def test_depth_and_normal_are_those_of_the_plane(angle):
-    got = facts(tilted(angle, scale=(0.8, 0.8, 1), opacity=0.9), straight())
+def test_disc_depth_and_normal_match_plane(angle):
+    got = render_all_planes(tilted(angle, scale=(0.8, 0.8, 1), opacity=0.9), straight())
     inside = got.alpha.numpy() > 0.5
     normal = np.array([0, np.sin(angle), -np.cos(angle)])
     normal *= -np.sign(normal[2])
@@ -568,12 +568,12 @@ def test_depth_and_normal_are_those_of_the_plane(angle):
 
 
 def test_distortion_of_two_discs():
-    got = facts(join(*(one(mean=(0, 0, z), scale=(9, 9, 1), opacity=0.5) for z in (1.0, 2.0))), straight())
+    got = render_all_planes(join(*(one(mean=(0, 0, z), scale=(9, 9, 1), opacity=0.5) for z in (1.0, 2.0))), straight())
     middle = got.distortion[HEIGHT // 2, WIDTH // 2].item()
     assert middle == pytest.approx(0.5 * 0.25 * (1 - 0.5) ** 2, rel=1e-4)
 
 
-def test_the_third_scale_of_a_disc_has_no_effect():
+def test_third_scale_of_disc_has_no_effect():
     scene = random_scene(1, count=30)
     cam = camera()
     first = draw(as_float32(scene), cam, primitive="2d")
@@ -583,46 +583,46 @@ def test_the_third_scale_of_a_disc_has_no_effect():
     assert not first["scales"][:, 2].any()
 
 
-def test_what_3d_gaussians_do_not_have():
+def test_disc_outputs_are_rejected_for_3d_gaussians():
     scene = as_float32(one())
     for wanted in ({"want_normals": True}, {"want_distortion": True}, {"primitive": "4d"}):
         with pytest.raises(ValueError, match=r"3D Gaussians have no|expected '2d' or '3d'"):
             rasterize(**scene, camera=straight(), **wanted)
 
 
-def test_screen_gradient_is_that_of_a_moving_footprint():
+def test_screen_gradient_matches_moving_footprint():
     """Growth uses this gradient, so it must include the plane's part, not only the spot's."""
     scene = as_float32(tilted(0.7, scale=(6 / FOCAL, 8 / FOCAL, 1)))
     leaves = {k: v.requires_grad_(k != "ids") for k, v in scene.items()}
-    picture = rasterize(**leaves, camera=straight(), primitive="2d")
+    rendered = rasterize(**leaves, camera=straight(), primitive="2d")
     pattern = torch.sin(torch.arange(WIDTH) / 5.0)[None, :].expand(HEIGHT, WIDTH)
-    (picture.alpha * pattern).sum().backward()
+    (rendered.alpha * pattern).sum().backward()
     columns = torch.arange(WIDTH) + 0.5
     # d/du of sum alpha(x - u) pattern(x) is sum alpha pattern'.
-    wanted = (picture.alpha * (torch.cos((columns - 0.5) / 5.0) / 5.0)[None, :]).sum()
-    assert float(picture.frame.screen_gradient[0, 0]) == pytest.approx(wanted.item(), rel=0.03)
+    wanted = (rendered.alpha * (torch.cos((columns - 0.5) / 5.0) / 5.0)[None, :]).sum()
+    assert float(rendered.frame.screen_gradient[0, 0]) == pytest.approx(wanted.item(), rel=0.03)
 
 
 # The reference itself
 
 
-@pytest.mark.skipif(SIMULATED, reason="is not of the kernels")
+@pytest.mark.skipif(SIMULATED, reason="tests only the reference")
 @pytest.mark.parametrize(("primitive", "coefficients"), [("3d", 1), ("3d", 4), ("3d", 9), ("3d", 16), ("2d", 4)])
-def test_gradcheck_of_the_reference(primitive, coefficients):
+def test_reference_passes_gradcheck(primitive, coefficients):
     scene = random_scene(2, count=4, coefficients=coefficients, size=0.3)
     scene["opacities"] *= 0.8
     cam = straight(7, 5, focal=6.0)
     ids = scene.pop("ids")
 
-    def picture(*leaves):
+    def render(*leaves):
         out = rasterize_reference(*leaves, ids, cam, 5, primitive)
         discs = (out.normals, out.distortion) if primitive == "2d" else ()
         return out.color, out.alpha, out.depth, out.probabilities, *discs
 
-    assert torch.autograd.gradcheck(picture, [scene[name].requires_grad_() for name in NAMES], eps=1e-7, atol=1e-5)
+    assert torch.autograd.gradcheck(render, [scene[name].requires_grad_() for name in NAMES], eps=1e-7, atol=1e-5)
 
 
-def test_backward_of_unused_planes():
+def test_unused_planes_have_zero_gradient():
     """Planes without a gradient (None from autograd) count as zero."""
     scene = {k: v.requires_grad_(k != "ids") for k, v in as_float32(random_scene(0)).items()}
     cam = camera()

@@ -53,7 +53,7 @@ def strictly(text):
     return json.loads(text, parse_constant=refuse)
 
 
-def test_report_json_holds_every_name_and_null_for_what_was_not_measured(reconstruction):
+def test_report_json_has_all_keys_and_null_if_unmeasured(reconstruction):
     returned = write_report(reconstruction, a_report())
     report = strictly(reconstruction.report_json.read_text(encoding="utf-8"))
     assert report == returned
@@ -76,7 +76,7 @@ def test_report_json_holds_every_name_and_null_for_what_was_not_measured(reconst
     assert report["capture"]["images"] == 48
 
 
-def test_an_empty_report_is_all_null(reconstruction):
+def test_empty_report_has_only_null(reconstruction):
     report = write_report(reconstruction, {})
     assert set(report["quality"].values()) == {None}
     assert report["model"] == {"anchors": None, "gaussians": None, "bytes": None}
@@ -105,13 +105,13 @@ def test_an_empty_report_is_all_null(reconstruction):
         ({"model": {"anchors": "many"}}, "model.anchors"),
     ],
 )
-def test_a_wrong_entry_is_named_and_nothing_is_written(reconstruction, change, where):
+def test_invalid_entry_is_reported_and_nothing_written(reconstruction, change, where):
     with pytest.raises(ValueError, match=where):
         write_report(reconstruction, {**a_report(), **change})
     assert not reconstruction.report_json.exists() and not reconstruction.report_md.exists()
 
 
-def test_report_md_shows_figures_pictures_and_what_was_left_out(reconstruction):
+def test_report_md_shows_figures_images_and_omissions(reconstruction):
     gray = Image.new("RGB", (40, 30), (128, 128, 128))
     write_report(reconstruction, a_report(), [("View a.png", gray), ("View ../b", gray)], title="Demo")
     text = reconstruction.report_md.read_text(encoding="utf-8")
@@ -149,13 +149,13 @@ def with_meshes():
             {"id": 1, "name": "mug", "mesh": mesh},
             {"id": 2, "name": "ring", "mesh": leaky},
             {"id": 3, "name": "po|ster", "mesh": {"why": "one view shows it"}},
-            {"id": 4, "name": "not asked for"},
+            {"id": 4, "name": "not meshed"},
         ],
         "meshes": [{"name": "whole scene", "objects": None, **mesh, "faces": 20_000}],
     }
 
 
-def test_meshes_have_a_section_with_their_figures_and_why_there_is_none(reconstruction):
+def test_report_md_lists_meshes_and_reasons_for_missing_ones(reconstruction):
     sheet = Image.new("RGB", (300, 200), (250, 250, 250))
     returned = write_report(reconstruction, with_meshes(), mesh_sheet=sheet)
     report = strictly(reconstruction.report_json.read_text(encoding="utf-8"))
@@ -172,14 +172,14 @@ def test_meshes_have_a_section_with_their_figures_and_why_there_is_none(reconstr
         assert f" {value} |" in rows["mug"], value
     assert rows["ring"].count("**no**") == 2 and " — |" in rows["ring"]
     assert "one view shows it" in rows[r"po\|ster"] and "20,000" in rows["whole scene"]
-    assert "not asked for" not in section
+    assert "not meshed" not in section
     assert "![Each mesh: surface, wireframe and texture](pictures/meshes.png)" in section
     assert (np.asarray(Image.open(reconstruction.pictures / "meshes.png")) == np.asarray(sheet)).all()
     write_report(reconstruction, a_report())
-    assert not (reconstruction.pictures / "meshes.png").exists(), "no picture of meshes that are gone"
+    assert not (reconstruction.pictures / "meshes.png").exists(), "the image of removed meshes is deleted"
 
 
-def test_without_truth_the_mesh_table_has_no_empty_columns(reconstruction):
+def test_mesh_table_without_truth_omits_columns(reconstruction):
     report = with_meshes()
     for entry in (report["objects"][0]["mesh"], report["objects"][1]["mesh"], report["meshes"][0]):
         for name in ("chamfer", "precision", "recall", "f1", "f1_005", "f1_all"):
@@ -189,7 +189,7 @@ def test_without_truth_the_mesh_table_has_no_empty_columns(reconstruction):
     assert "F1" not in section and "Chamfer" not in section and "Texture" in section
 
 
-def test_names_cannot_break_the_tables(reconstruction):
+def test_names_are_escaped_in_tables(reconstruction):
     write_report(reconstruction, a_report())
     lines = reconstruction.report_md.read_text(encoding="utf-8").splitlines()
     row = next(line for line in lines if "tea" in line and line.startswith("|"))
@@ -197,14 +197,14 @@ def test_names_cannot_break_the_tables(reconstruction):
     assert len(re.findall(r"(?<!\\)\|", row)) == 6
 
 
-def test_a_swatch_has_the_color_of_its_object(reconstruction):
+def test_swatches_have_object_colors(reconstruction):
     write_report(reconstruction, a_report(), colors={2: (1, 2, 3)})
     swatches = reconstruction.pictures / "swatches"
     assert Image.open(swatches / "2.png").getpixel((4, 4)) == (1, 2, 3)
     assert Image.open(swatches / "70000.png").getpixel((4, 4)) == object_colors([70_000])[70_000]
 
 
-def test_of_many_objects_the_worst_are_shown_and_the_rest_counted(reconstruction):
+def test_only_worst_of_many_objects_are_listed(reconstruction):
     objects = [{"id": i, "name": f"thing {i}", "iou": i / 1000} for i in range(1, 501)]
     report = write_report(reconstruction, {"objects": objects})
     text = reconstruction.report_md.read_text(encoding="utf-8")
@@ -214,7 +214,7 @@ def test_of_many_objects_the_worst_are_shown_and_the_rest_counted(reconstruction
     assert len(list((reconstruction.pictures / "swatches").iterdir())) == 40
 
 
-def test_the_plot_over_run_time_has_a_panel_for_each_measure():
+def test_curve_plot_has_one_panel_per_measure():
     curve = complete(a_report())["curve"]
     both = plot_curve(curve)
     one = plot_curve([{**point, "miou": None} for point in curve])
@@ -226,28 +226,28 @@ def test_the_plot_over_run_time_has_a_panel_for_each_measure():
     assert plot_curve([{"seconds": 1.0, "psnr": None, "miou": None}]) is None
 
 
-def test_the_objects_plot_has_bars_as_long_as_the_iou():
+def test_object_plot_bars_are_proportional_to_iou():
     objects = [
         {"id": 1, "name": "a", "iou": 0.8},
         {"id": 2, "name": "$b$", "iou": 0.2},
         {"id": 3, "name": "c", "iou": None},
     ]
-    picture = np.asarray(plot_objects(objects, {1: (255, 0, 0), 2: (0, 0, 255), 3: (0, 255, 0)}))
+    image = np.asarray(plot_objects(objects, {1: (255, 0, 0), 2: (0, 0, 255), 3: (0, 255, 0)}))
     red, blue, green = (
-        (picture == np.array(color)).all(-1).any(0).sum() for color in ((255, 0, 0), (0, 0, 255), (0, 255, 0))
+        (image == np.array(color)).all(-1).any(0).sum() for color in ((255, 0, 0), (0, 0, 255), (0, 255, 0))
     )
     assert red / blue == pytest.approx(4.0, rel=0.05)
     assert green == 0
     assert plot_objects([objects[2]], {}) is None
 
 
-def test_durations():
+def test_durations_are_formatted():
     assert [duration(s) for s in (0.04, 9.9, 9.96, 59.4, 59.6, 150, 3599.6, 3900)] == [
         "0.0 s", "9.9 s", "10 s", "59 s", "1 min 00 s", "2 min 30 s", "1 h 00 min", "1 h 05 min",
     ]  # fmt: skip
 
 
-def test_colors_depend_on_the_id_alone_and_differ():
+def test_object_colors_depend_only_on_id():
     few, many = object_colors([0, 5, 2**32 - 1]), object_colors(range(2000))
     assert few[0] == UNLABELED and few[5] == many[5]
     assert all(isinstance(channel, int) for color in few.values() for channel in color)
@@ -260,16 +260,16 @@ def test_colors_depend_on_the_id_alone_and_differ():
     assert colors_of([]).shape == (0, 3)
 
 
-def test_colors_for_blender_are_linear():
+def test_to_linear_decodes_srgb():
     assert to_linear((0, 255, 188)) == pytest.approx((0.0, 1.0, 0.5029), abs=1e-4)
 
 
-def test_id_pictures_use_given_colors_and_the_palette_elsewhere():
+def test_id_images_use_given_colors_or_palette():
     ids = np.array([[0, 7], [2**32 - 1, 7]])
-    picture = id_image(ids, {7: (9, 8, 7)})
+    image = id_image(ids, {7: (9, 8, 7)})
     palette = object_colors([0, 2**32 - 1])
-    assert picture.dtype == np.uint8
-    assert picture.tolist() == [[list(palette[0]), [9, 8, 7]], [list(palette[2**32 - 1]), [9, 8, 7]]]
+    assert image.dtype == np.uint8
+    assert image.tolist() == [[list(palette[0]), [9, 8, 7]], [list(palette[2**32 - 1]), [9, 8, 7]]]
 
 
 def panels(sheet):
@@ -278,7 +278,7 @@ def panels(sheet):
     return {tuple(color): int(count) for color, count in zip(colors.tolist(), counts)}
 
 
-def test_a_comparison_shows_all_four_pictures_unchanged():
+def test_comparison_shows_four_unchanged_images():
     truth = np.full((60, 80, 3), (200, 10, 10), np.uint8)
     render = np.full((60, 80, 3), (0.0, 1.0, 0.0), np.float32)
     ids, true_ids = np.full((60, 80), 3), np.full((60, 80), 70_000)
@@ -291,7 +291,7 @@ def test_a_comparison_shows_all_four_pictures_unchanged():
     assert panels(without).get((250, 2, 250), 0) == 0
 
 
-def test_large_pictures_are_fitted_and_many_names_do_not_overflow():
+def test_comparison_limits_size_of_images_and_legend():
     rng = np.random.default_rng(0)
     ids = rng.integers(1, 400, (30, 40)).repeat(40, 0).repeat(40, 1)
     image = rng.random((1200, 1600, 3))
@@ -300,7 +300,7 @@ def test_large_pictures_are_fitted_and_many_names_do_not_overflow():
     assert sheet.width <= 2000 and sheet.height < 700
 
 
-def test_a_contact_sheet_holds_each_picture():
+def test_contact_sheet_shows_all_images():
     images = [np.full((30, 40, 3), 40 * i, np.uint8) for i in range(1, 6)]
     found = panels(contact_sheet([*images[:4], Image.fromarray(images[4])], list("abcde"), columns=3))
     for i in range(1, 6):
@@ -309,7 +309,7 @@ def test_a_contact_sheet_holds_each_picture():
         contact_sheet([], [])
 
 
-def test_pictures_are_saved_small(tmp_path):
+def test_saved_images_are_small(tmp_path):
     flat = save_image(Image.new("RGB", (900, 700), (1, 2, 3)), tmp_path / "flat.png")
     assert flat.suffix == ".png" and Image.open(flat).getpixel((0, 0)) == (1, 2, 3)
     y, x = np.mgrid[:600, :1800]

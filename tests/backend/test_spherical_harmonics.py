@@ -16,7 +16,7 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_the_basis_is_the_rasterizers(degree):
+def test_basis_matches_rasterizer(degree):
     sh = RNG.normal(size=(200, (degree + 1) ** 2, 3)) * 0.05
     wanted = sh_colors(torch.from_numpy(sh), torch.from_numpy(DIRECTIONS)).numpy()
     found = np.einsum("nk,nkc->nc", basis(DIRECTIONS, degree), sh) + 0.5
@@ -24,14 +24,14 @@ def test_the_basis_is_the_rasterizers(degree):
     assert basis(DIRECTIONS.astype(np.float32), degree).dtype == np.float32
 
 
-def test_there_is_no_fourth_degree():
+def test_fourth_degree_is_rejected():
     with pytest.raises(ValueError, match="degree 4"):
         basis(DIRECTIONS, 4)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_what_turns_with_its_viewer_keeps_its_color(degree, mirrored):
+def test_rotation_keeps_color_for_rotated_directions(degree, mirrored):
     for turn in Rotation.random(20, rng=1).as_matrix():
         turn = turn @ np.diag([1, -1 if mirrored else 1, 1])
         sh = RNG.normal(size=(5, (degree + 1) ** 2, 3))

@@ -25,7 +25,7 @@ def here():
 
 
 @pytest.mark.parametrize(("scale", "offset"), [(1e-4, 0.0), (1e4, 0.0), (1.0, 1e6)])
-def test_units_and_place_of_a_capture_do_not_matter(here, scale, offset):
+def test_training_is_independent_of_scale_and_offset(here, scale, offset):
     there = train(elsewhere(scale, offset), **SHORT)
     assert not there.lost and abs(there.psnr - here.psnr) < 0.1
     expected = scale * np.array(here.trainer.model.normalization.center) + offset
@@ -34,24 +34,24 @@ def test_units_and_place_of_a_capture_do_not_matter(here, scale, offset):
 
 @pytest.mark.parametrize("value", [0, 255])
 @pytest.mark.parametrize("options", [SHORT, FLAT], ids=["3d", "2d"])
-def test_images_of_one_color(options, value):
+def test_images_of_one_color_train_without_faults(options, value):
     found = train(each_image(lambda _, pixels: np.full_like(pixels, value)), **options)
     assert not found.lost and found.psnr > 10
 
 
 @pytest.mark.parametrize("views", [1, 2])
-def test_one_or_two_images(views):
+def test_one_or_two_images_train_without_faults(views):
     found = train(**{**SHORT, "views": views})
     assert not found.lost and found.psnr > 15
 
 
 @pytest.mark.parametrize("points", [1, 3])
-def test_fewer_than_four_points_are_refused(points):
+def test_fewer_than_four_points_are_rejected(points):
     with pytest.raises(InputError, match=f"only {points} points, and at least 4"):
         train(**{**SHORT, "points": points, "spheres": SPHERES[:1]})
 
 
-def test_coincident_points():
+def test_coincident_points_give_one_anchor():
     found = train(**{**SHORT, "spheres": [(1, (0.0, 0.0, 0.0), 0.0)]})
     assert not found.lost and len(found.trainer.model.anchors) == 1
 
@@ -73,20 +73,22 @@ def test_wrong_masks_are_outvoted():
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
 @pytest.mark.parametrize("mode", ["explicit", "view"])
-def test_an_anchor_at_the_camera_center(mode, primitive):
+def test_anchor_at_camera_center_stays_finite(mode, primitive):
     layout = Layout(4, 8)
     rng = np.random.default_rng(0)
-    eye = np.array([0.3, -0.2, 1.0])
-    xyz = np.concatenate([np.zeros((1, 3)), rng.normal(0, 0.3, (20, 3)) + np.array([0, 0, 2])]) + eye
+    camera_center = np.array([0.3, -0.2, 1.0])
+    xyz = np.concatenate([np.zeros((1, 3)), rng.normal(0, 0.3, (20, 3)) + np.array([0, 0, 2])]) + camera_center
     seeded = seed_anchors(xyz, np.full((21, 3), 0.5), np.zeros(21, np.int64), 1e-3, layout, rng)
     positions = seeded.positions.clone()
-    positions[(positions - torch.tensor(eye).float()).norm(dim=1).argmin()] = torch.tensor(eye).float()
+    positions[(positions - torch.tensor(camera_center).float()).norm(dim=1).argmin()] = torch.tensor(
+        camera_center
+    ).float()
     anchors = Anchors(layout, 1e-3, positions, seeded.rows.requires_grad_(), seeded.ids)
     heads = Heads(layout, mode, 1, torch.Generator().manual_seed(0))
     viewmat = np.eye(4)
-    viewmat[:3, 3] = -eye
+    viewmat[:3, 3] = -camera_center
     camera = Camera(viewmat, np.array([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]]), 32, 24)
-    g = generate(layout, anchors.positions, anchors.rows, anchors.ids, heads, eye)
+    g = generate(layout, anchors.positions, anchors.rows, anchors.ids, heads, camera_center)
     drawn = rasterize(*g[:6], camera, want_depth=True, primitive=primitive)
     assert drawn.alpha.max() > 0.1
     (drawn.color.sum() + drawn.depth.sum()).backward()

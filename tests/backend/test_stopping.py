@@ -44,7 +44,9 @@ class Driven:
             self.events.append(json.loads(line))
             if self.events[-1]["type"] == kind and message in self.events[-1].get("message", ""):
                 return self.events[-1]
-        raise AssertionError(f"it ended without {kind} {message}: {self.events[-3:]} {self.process.stderr.read()}")
+        raise AssertionError(
+            f"the command ended without {kind} {message}: {self.events[-3:]} {self.process.stderr.read()}"
+        )
 
     def until_it_trains(self) -> dict:
         """Read events up to the first progress of the training."""
@@ -88,7 +90,7 @@ def progress_of(out: Path) -> dict:
     return load_checkpoint(out / "checkpoint")[1]["progress"]
 
 
-def test_a_driver_that_goes_away_stops_the_training(drive, endless):
+def test_closed_stdin_stops_attached_training(drive, endless):
     train, out = endless
     driven = drive(*train)
     driven.say("attached")
@@ -101,7 +103,7 @@ def test_a_driver_that_goes_away_stops_the_training(drive, endless):
 
 
 @pytest.mark.parametrize("paused", [False, True])
-def test_a_driver_that_is_killed_leaves_a_checkpoint_and_no_process(drive, endless, paused):
+def test_closed_pipes_stop_training_with_checkpoint(drive, endless, paused):
     train, out = endless
     driven = drive(*train)
     driven.say("attached")
@@ -117,7 +119,7 @@ def test_a_driver_that_is_killed_leaves_a_checkpoint_and_no_process(drive, endle
 
 
 @pytest.mark.skipif(os.name != "posix", reason="kills a process group's leader")
-def test_a_driver_that_is_killed_for_real(endless, tmp_path):
+def test_killed_parent_stops_training_with_checkpoint(endless, tmp_path):
     train, out = endless
     driver = tmp_path / "driver.py"
     command = [sys.executable, "-m", "backend", *map(str, train), "--threads", "1", "--json"]
@@ -137,7 +139,7 @@ def test_a_driver_that_is_killed_for_real(endless, tmp_path):
 
 
 @pytest.mark.parametrize("attached", [True, False])
-def test_a_command_ends_by_itself_while_its_input_is_open(drive, endless, attached):
+def test_command_ends_with_open_stdin(drive, endless, attached):
     train, out = endless
     driven = drive(*train[:6], "--steps", 5)
     if attached:
@@ -147,14 +149,14 @@ def test_a_command_ends_by_itself_while_its_input_is_open(drive, endless, attach
     assert driven.end() == EXIT_DONE and progress_of(out)["step"] == 5
 
 
-def test_the_end_of_an_input_that_nobody_attached_to_means_nothing(drive, endless):
+def test_closed_stdin_without_attaching_is_ignored(drive, endless):
     train, out = endless
     driven = drive(*train[:6], "--steps", 5)
     driven.say("hello")
     assert driven.end() == EXIT_DONE and progress_of(out)["step"] == 5
 
 
-def test_a_pause_saves_waits_and_does_not_count(drive, endless):
+def test_pause_saves_and_excludes_time(drive, endless):
     train, out = endless
     driven = drive(*train)
     driven.until_it_trains()
@@ -164,23 +166,23 @@ def test_a_pause_saves_waits_and_does_not_count(drive, endless):
     process = psutil.Process(driven.process.pid)
     cpu, begun = sum(process.cpu_times()[:2]), time.monotonic()
     time.sleep(3)
-    assert sum(process.cpu_times()[:2]) - cpu < 0.5, "waiting takes no processor"
+    assert sum(process.cpu_times()[:2]) - cpu < 0.5, "waiting uses no CPU time"
     driven.say("resume")
     idle = time.monotonic() - begun
     before = len(driven.events)
     driven.until("status", "Resumed")
-    assert len(driven.events) == before + 1, "nothing happened meanwhile"
+    assert len(driven.events) == before + 1, "no events while paused"
     after = driven.until_it_trains()
     assert after["step"] > saved["step"] and after["seconds"] - saved["seconds"] < idle
     driven.say("stop")
     assert driven.end() == EXIT_CANCELLED
     times = [event["time"] for event in driven.events if event["type"] in ("progress", "done")]
-    assert progress_of(out)["seconds"] < times[-1] - times[0] - 0.9 * idle + 3, "its clock stood still"
+    assert progress_of(out)["seconds"] < times[-1] - times[0] - 0.9 * idle + 3, "paused time is not counted"
     assert progress_of(out)["step"] > saved["step"]
 
 
 @pytest.mark.parametrize("how", ["stop", "one signal", "two signals"])
-def test_stopping_while_paused(drive, endless, how):
+def test_paused_training_can_be_stopped(drive, endless, how):
     train, out = endless
     driven = drive(*train)
     driven.until_it_trains()
@@ -197,49 +199,49 @@ def test_stopping_while_paused(drive, endless, how):
     assert not any(event.get("message") == "Resumed" for event in driven.events)
 
 
-def test_other_commands_wait_as_well(monkeypatch):
+def test_other_commands_can_be_paused(monkeypatch):
     """Pause before the first progress, resume, pause again, and stop while paused."""
-    ask, asked = threading.Event(), threading.Event()
-    said: list[str] = []
+    requested, read = threading.Event(), threading.Event()
+    messages: list[str] = []
 
     class Typed:
         def __iter__(self):
             yield "pause\n"
-            asked.set()
+            read.set()
             for word in ("resume\n", "pause\n", "stop\n"):
-                ask.wait(60)
-                ask.clear()
+                requested.wait(60)
+                requested.clear()
                 yield word
-                asked.set()
+                read.set()
 
-    class Told(Reporter):
+    class RecordingReporter(Reporter):
         def progress(self, done, total, **fields):
-            said.append(f"progress {done}")
+            messages.append(f"progress {done}")
 
-    stop = StopRequest(announce=said.append)
+    stop = StopRequest(announce=messages.append)
     monkeypatch.setattr(sys, "stdin", Typed())
 
     def later(wait=0.3):
-        threading.Timer(wait, ask.set).start()
+        threading.Timer(wait, requested.set).start()
 
     with stop.listening(read_stdin=True):
-        assert asked.wait(60)
-        asked.clear()
-        reporter = StoppingReporter(Told(), stop)
+        assert read.wait(60)
+        read.clear()
+        reporter = StoppingReporter(RecordingReporter(), stop)
         later()
         reporter.progress(1, 3)
-        assert said == ["progress 1", "Paused", "Resumed"] and not stop.paused
-        asked.clear()
-        ask.set()
-        assert asked.wait(60)
+        assert messages == ["progress 1", "Paused", "Resumed"] and not stop.paused
+        read.clear()
+        requested.set()
+        assert read.wait(60)
         later()
         with pytest.raises(Cancelled):
             reporter.progress(2, 3)
-        assert said[3:] == ["progress 2", "Paused"]
+        assert messages[3:] == ["progress 2", "Paused"]
 
 
 @pytest.mark.parametrize("masks", [True, False])
-def test_a_capture_deleted_while_training_is_one_sentence_and_keeps_a_checkpoint(drive, endless, masks):
+def test_deleted_capture_ends_training_with_checkpoint(drive, endless, masks):
     train, out = endless
     driven = drive(*train, "--memory-mb", 1)
     capture = Path(train[1])

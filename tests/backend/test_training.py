@@ -53,7 +53,7 @@ def slow_ssim(a, b):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 33), (24, 50)])
-def test_image_loss_and_gradients_equal_autograd(size):
+def test_image_loss_and_gradients_match_autograd(size):
     rng = np.random.default_rng(3)
     h, w = size
     base = [rng.uniform(0, 1, s) for s in ((3, h, w), (h, w), (h, w), (3,))]
@@ -78,7 +78,7 @@ def test_image_loss_and_gradients_equal_autograd(size):
 
 
 @pytest.mark.parametrize("axes", [2, 3])
-def test_volume_loss_is_the_mean_product_of_the_scales(axes):
+def test_volume_loss_is_mean_product_of_scales(axes):
     fast = torch.rand(2500, 3, requires_grad=True)
     slow = fast.detach().double().requires_grad_()
     got, want = volume_loss(fast, flat=axes == 2), slow[:, :axes].prod(1).mean()
@@ -105,7 +105,7 @@ def slow_normal_loss(normals, depth, alpha, intrinsics):
     return torch.where(counted, loss, 0).sum() / (h * w), counted
 
 
-def test_normal_loss_and_gradients_equal_autograd():
+def test_normal_loss_and_gradients_match_autograd():
     rng = np.random.default_rng(0)
     h, w = 19, 31
     x, y = np.meshgrid(np.arange(w), np.arange(h))
@@ -125,7 +125,7 @@ def test_normal_loss_and_gradients_equal_autograd():
         np.testing.assert_allclose(a.grad, b.grad, rtol=1e-4, atol=1e-5 * b.grad.abs().max().item())
 
 
-def test_normal_loss_of_a_plane_is_nothing():
+def test_normal_loss_of_plane_is_zero():
     """Rendered discs of one plane have the plane's normal and depth."""
     camera = Camera(np.eye(4), np.array([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]]), 32, 24)
     spread = torch.linspace(-1, 1, 12)
@@ -143,7 +143,7 @@ def test_normal_loss_of_a_plane_is_nothing():
     assert float(normal_loss(-drawn.normals, drawn.depth, drawn.alpha, camera.arrays()[1])) > 1
 
 
-def test_loss_of_a_picture_without_labels_has_no_semantic_term():
+def test_image_loss_without_labels_has_no_semantic_term():
     color, target = torch.rand(3, 8, 9), torch.rand(3, 8, 9)
     labels = torch.full((8, 9), -1, dtype=torch.int32)
     weight = torch.zeros(8, 9, requires_grad=True)
@@ -153,7 +153,7 @@ def test_loss_of_a_picture_without_labels_has_no_semantic_term():
     assert (weight.grad == 0).all()
 
 
-def test_probability_zero_under_the_logarithm_is_finite():
+def test_zero_probability_gives_finite_loss():
     weight = torch.zeros(4, 4, requires_grad=True)
     labels = torch.zeros(4, 4, dtype=torch.int32)
     loss = image_loss(
@@ -163,7 +163,7 @@ def test_probability_zero_under_the_logarithm_is_finite():
     assert torch.isfinite(loss) and torch.isfinite(weight.grad).all() and (weight.grad < 0).all()
 
 
-def test_adam_equals_torch_on_seen_rows_and_leaves_the_others():
+def test_adam_matches_torch_and_updates_only_seen_rows():
     rng = np.random.default_rng(0)
     values = torch.tensor(rng.normal(size=(20, 7)), dtype=torch.float32)
     before = values.clone()
@@ -182,7 +182,7 @@ def test_adam_equals_torch_on_seen_rows_and_leaves_the_others():
     assert (values[others] == before[others]).all()
 
 
-def test_adam_skips_a_row_that_is_not_finite():
+def test_adam_skips_nonfinite_row():
     values = torch.ones(3, 4)
     exp_avg, exp_avg_sq = torch.zeros_like(values), torch.zeros_like(values)
     g = torch.ones(3, 4)
@@ -194,7 +194,7 @@ def test_adam_skips_a_row_that_is_not_finite():
 # --- anchors, heads, growth ------------------------------------------------------------------------------------------
 
 
-def test_one_anchor_a_voxel_with_the_majority_id():
+def test_seeding_gives_one_anchor_per_voxel_with_majority_id():
     xyz = np.array([[0.1, 0, 0], [0.2, 0, 0], [-0.1, 0, 0], [3, 0, 0], [3.2, 0.1, 0]])
     ids = np.array([2, 2, 1, 3, 1])
     anchors = seed_anchors(xyz, np.zeros((5, 3)), ids, 1.0, Layout(4, 8), np.random.default_rng(0))
@@ -222,21 +222,21 @@ def test_coincident_points_give_one_finite_anchor(count):
         ("explicit", 2, Layout(), 1500),
     ],
 )
-def test_generated_gaussians_have_the_gradients_of_their_equations(mode, sh_degree, layout, n):
+def test_generated_gaussians_match_equations_and_gradients(mode, sh_degree, layout, n):
     rng = np.random.default_rng(1)
     rows = torch.tensor(rng.normal(0, 0.5, (n, layout.columns)), dtype=torch.float32, requires_grad=True)
     positions = torch.tensor(rng.normal(size=(n, 3)), dtype=torch.float32)
     ids = torch.arange(n, dtype=torch.int32)
     heads = Heads(layout, mode, sh_degree, torch.Generator().manual_seed(0))
     k = layout.offsets
-    eye = np.array([0.1, 0.2, -3.0])
-    g = generate(layout, positions, rows, ids, heads, eye)
+    camera_center = np.array([0.1, 0.2, -3.0])
+    g = generate(layout, positions, rows, ids, heads, camera_center)
     assert 0 < len(g.source) < n * k and (g.ids == g.source // k).all()
 
     again = rows.detach().clone().requires_grad_()
     features = again[:, layout.feature_columns]
     if mode == "view":
-        to_anchor = positions - torch.tensor(eye, dtype=torch.float32)
+        to_anchor = positions - torch.tensor(camera_center, dtype=torch.float32)
         distance = to_anchor.norm(dim=1, keepdim=True)
         features = torch.cat([features, distance, to_anchor / distance], 1)
     raw_o, raw_s, raw_c = heads(features)
@@ -267,7 +267,7 @@ def test_generated_gaussians_have_the_gradients_of_their_equations(mode, sh_degr
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5 * float(b.abs().max()))
 
 
-def test_a_gradient_that_is_not_finite_stays_with_its_anchor():
+def test_nonfinite_gradient_affects_only_its_anchor():
     layout, n = Layout(4, 8), 40
     rng = np.random.default_rng(2)
     rows = torch.tensor(rng.normal(0, 0.5, (n, layout.columns)), dtype=torch.float32, requires_grad=True)
@@ -288,7 +288,7 @@ def test_a_gradient_that_is_not_finite_stays_with_its_anchor():
     assert found[[i for i in range(n) if i != at_fault]].isfinite().all()
 
 
-def test_no_anchor_that_would_be_drawn_is_left_out_of_a_view():
+def test_anchors_in_view_include_all_drawn_anchors():
     rng = np.random.default_rng(5)
     layout = Layout(4, 8)
     n = 400
@@ -321,7 +321,7 @@ def statistics_of(gradient, opacity=1.0):
     return GrowthStatistics(torch.tensor(gradient) * 10, visits, torch.full((2,), opacity * 10), visits)
 
 
-def test_a_child_takes_its_parents_id_and_a_free_cell():
+def test_new_anchor_inherits_id_and_uses_free_cell():
     anchors, growth = grown([1.0, 0.0], offset=(2.2, 0, 0))
     assert growth.added >= 1 and growth.pruned == 0
     assert set(anchors.ids[2:].tolist()) == {1}
@@ -329,14 +329,14 @@ def test_a_child_takes_its_parents_id_and_a_free_cell():
 
 
 @pytest.mark.parametrize("far", [(0.0, 8, 0), (-8.0, 0, -8), (1e9, -1e9, 1e9), (1e18, 1e18, 1e18)])
-def test_where_anchors_lie_changes_nothing_elsewhere(far):
+def test_growth_is_independent_of_distant_anchors(far):
     anchors, growth = grown([1.0, 0.0], positions=((0.0, 0, 0), far), offset=(2.2, 0, 0))
     near, alone = grown([1.0, 0.0], offset=(2.2, 0, 0))
     assert growth.added == alone.added > 0
     assert anchors.positions[2:].tolist() == near.positions[2:].tolist()
 
 
-def test_of_two_objects_that_want_one_cell_the_larger_gradient_wins():
+def test_larger_gradient_wins_shared_cell():
     positions = ((0.0, 0, 0), (4.0, 0, 0))
     layout = Layout(1, 4)
     for gradient, winner in (([1.0, 2.0], 2), ([2.0, 1.0], 1)):
@@ -353,7 +353,7 @@ def test_transparent_anchors_are_pruned():
     assert growth.pruned == 2 and len(anchors) == 0
 
 
-def test_what_was_seen_too_seldom_to_be_judged_is_judged_later():
+def test_growth_statistics_of_rarely_seen_anchors_are_kept():
     layout = Layout(2, 4)
 
     def anchors():
@@ -380,7 +380,7 @@ def test_what_was_seen_too_seldom_to_be_judged_is_judged_later():
 # --- checkpoints -----------------------------------------------------------------------------------------------------
 
 
-def test_a_checkpoint_cut_short_falls_back_to_the_one_before_and_says_so(tmp_path):
+def test_truncated_checkpoint_falls_back_with_warning(tmp_path):
     for step in (1, 2):
         save_checkpoint(tmp_path, {"x": np.full(1000, step, np.float32)}, {"step": step})
     assert load_checkpoint(tmp_path)[1]["step"] == 2
@@ -391,11 +391,11 @@ def test_a_checkpoint_cut_short_falls_back_to_the_one_before_and_says_so(tmp_pat
         assert state["step"] == 1 and tensors["x"][0] == 1
         assert CURRENT in warning and PREVIOUS in warning
     (tmp_path / PREVIOUS).unlink()
-    with pytest.raises(InputError, match="cut short"):
+    with pytest.raises(InputError, match="truncated"):
         load_checkpoint(tmp_path)
 
 
-def test_a_full_disk_leaves_the_checkpoint_before(tmp_path, monkeypatch):
+def test_full_disk_keeps_previous_checkpoint(tmp_path, monkeypatch):
     save_checkpoint(tmp_path, {"x": np.zeros(3)}, {"step": 1})
 
     def full(descriptor):
@@ -422,7 +422,7 @@ FLAT = dataclasses.replace(SMALL, primitive="2d")
 
 
 @pytest.mark.parametrize("settings", [SMALL, FLAT], ids=["3d", "2d"])
-def test_training_lowers_the_loss_and_draws_the_right_objects(tiny, settings):
+def test_training_lowers_loss_and_learns_ids(tiny, settings):
     capture, ids = tiny()
     trainer = Trainer.start(capture, ids, settings)
     before = mean_loss(trainer, 8)
@@ -431,13 +431,13 @@ def test_training_lowers_the_loss_and_draws_the_right_objects(tiny, settings):
     assert mean_loss(trainer, 8, 1.0) < 0.5 * before
     # The cameras are 40 degrees apart, too far for held-out views, so a training view is checked.
     index = capture.train_indices[0]
-    picture = draw(trainer.shown, trainer.scene.camera(index))
+    rendered = draw(trainer.shown, trainer.scene.camera(index))
     truth = capture.mask(index)
-    assert (picture.ids[truth > 0] == truth[truth > 0]).mean() > 0.95
-    assert picture.probability[truth > 0].mean() > 0.85
+    assert (rendered.ids[truth > 0] == truth[truth > 0]).mean() > 0.95
+    assert rendered.probability[truth > 0].mean() > 0.85
 
 
-def test_equal_seeds_give_bitwise_equal_models_and_resuming_changes_nothing(tiny, tmp_path):
+def test_training_is_bitwise_reproducible_and_resumable(tiny, tmp_path):
     capture, ids = tiny()
     whole = Trainer.start(capture, ids, SMALL)
     whole.run(Budget(steps=40), tmp_path / "a", Reporter())
@@ -466,7 +466,7 @@ def test_equal_seeds_give_bitwise_equal_models_and_resuming_changes_nothing(tiny
     assert not np.array_equal(whole.model.anchors.rows, other.model.anchors.rows)
 
 
-def test_a_checkpoint_of_other_settings_is_refused(tiny, tmp_path):
+def test_checkpoint_of_other_settings_is_rejected(tiny, tmp_path):
     capture, ids = tiny()
     Trainer.start(capture, ids, SMALL).run(Budget(steps=2), tmp_path / "a", Reporter())
     with pytest.raises(InputError, match="sh_degree"):
@@ -475,7 +475,7 @@ def test_a_checkpoint_of_other_settings_is_refused(tiny, tmp_path):
         Trainer.resume(capture, tmp_path / "a", FLAT)
 
 
-def test_a_checkpoint_of_3d_gaussians_goes_on_whatever_is_asked_of_flat_ones(tiny, tmp_path):
+def test_checkpoint_of_3d_gaussians_ignores_disc_settings(tiny, tmp_path):
     capture, ids = tiny()
     Trainer.start(capture, ids, SMALL).run(Budget(steps=2), tmp_path, Reporter())
     trainer, _ = Trainer.resume(capture, tmp_path, dataclasses.replace(SMALL, distortion_weight=3.0, normal_weight=0.0))
@@ -484,7 +484,7 @@ def test_a_checkpoint_of_3d_gaussians_goes_on_whatever_is_asked_of_flat_ones(tin
         Trainer.resume(capture, tmp_path, FLAT)
 
 
-def test_a_checkpoint_from_before_2d_splats_is_one_of_3d_gaussians(tiny, tmp_path):
+def test_older_checkpoint_is_3d(tiny, tmp_path):
     capture, ids = tiny()
     Trainer.start(capture, ids, SMALL).run(Budget(steps=2), tmp_path, Reporter())
     tensors, state, _ = load_checkpoint(tmp_path)
@@ -495,12 +495,12 @@ def test_a_checkpoint_from_before_2d_splats_is_one_of_3d_gaussians(tiny, tmp_pat
     assert trainer.model.primitive == "3d"
 
 
-def test_normals_and_distortion_are_only_computed_where_they_count(tiny, monkeypatch):
+def test_normals_and_distortion_are_computed_only_if_weighted(tiny, monkeypatch):
     capture, ids = tiny()
-    asked = []
+    requested = []
 
     def seen(*args, **kwargs):
-        asked.append([kwargs[f"want_{what}"] for what in ("depth", "normals", "distortion")])
+        requested.append([kwargs[f"want_{what}"] for what in ("depth", "normals", "distortion")])
         return rasterize(*args, **kwargs)
 
     monkeypatch.setattr("backend.training.step.rasterize", seen)
@@ -512,10 +512,10 @@ def test_normals_and_distortion_are_only_computed_where_they_count(tiny, monkeyp
         (dataclasses.replace(normals, normal_weight=0.0), 0.9, [False] * 3),
     ):  # fmt: skip
         assert Trainer.start(capture, ids, settings).step(share).isfinite()
-        assert asked.pop() == wanted
+        assert requested.pop() == wanted
 
 
-def test_normal_loss_makes_normals_agree_with_the_depth(tiny):
+def test_normal_loss_aligns_normals_with_depth(tiny):
     capture, ids = tiny()
     found = []
     for weight in (0.0, 0.2):
@@ -529,17 +529,17 @@ def test_normal_loss_makes_normals_agree_with_the_depth(tiny):
     assert found[1] < 0.8 * found[0]
 
 
-def test_a_training_shows_the_mean_of_its_latest_steps_stopped_and_finished(tiny, tmp_path, monkeypatch):
+def test_stopped_and_finished_training_store_average_model(tiny, tmp_path, monkeypatch):
     capture, ids = tiny()
-    budget, asked, seen = Budget(steps=60), [], []
+    budget, requested, seen = Budget(steps=60), [], []
     trainer = Trainer.start(capture, ids, SMALL)
     follow = Average.follow
     monkeypatch.setattr(Average, "follow", lambda own, model, step: (follow(own, model, step), seen.append(step))[0])
 
     class StopLater(StopRequest):
         def __call__(self):
-            asked.append(trainer.progress.step)
-            return len(asked) > 45
+            requested.append(trainer.progress.step)
+            return len(requested) > 45
 
     def measure(model, scene, progress):
         return {"psnr": 0.0, "is_model": model is trainer.model}
@@ -552,7 +552,9 @@ def test_a_training_shows_the_mean_of_its_latest_steps_stopped_and_finished(tiny
     assert not torch.equal(mean.anchors.rows, trainer.model.anchors.rows)
     stored, _, _ = load_model(tmp_path)
     resumed, _ = Trainer.resume(capture, tmp_path, SMALL)
-    assert torch.equal(resumed.model.anchors.rows, trainer.model.anchors.rows), "it goes on from the step itself"
+    assert torch.equal(resumed.model.anchors.rows, trainer.model.anchors.rows), (
+        "training resumes from the model, not from its average"
+    )
     for other in (stored, resumed.shown):
         assert torch.equal(other.anchors.rows, mean.anchors.rows) and torch.equal(other.background, mean.background)
         pairs = zip(other.heads.parameters(), mean.heads.parameters(), strict=True)
@@ -563,7 +565,7 @@ def test_a_training_shows_the_mean_of_its_latest_steps_stopped_and_finished(tiny
     assert not any(entry["is_model"] for entry in trainer.progress.curve)
 
 
-def test_the_mean_follows_what_is_learned_and_leaves_out_the_noise(tiny):
+def test_average_model_follows_values_and_reduces_noise(tiny):
     capture, ids = tiny()
     model = Trainer.start(capture, ids, SMALL).model
     average, rows, rng = Average(model), model.anchors.rows, np.random.default_rng(0)
@@ -577,7 +579,7 @@ def test_the_mean_follows_what_is_learned_and_leaves_out_the_noise(tiny):
             weight = EVERY / max(min(FRACTION * step, MAX_STEPS), EVERY)
             expected += weight * (rows - expected)
         if step == EVERY:
-            assert torch.equal(average.of(model).anchors.rows, rows), "of a single one"
+            assert torch.equal(average.of(model).anchors.rows, rows), "the average of one step is that step"
     mean = average.of(model)
     assert torch.allclose(mean.anchors.rows.double(), expected, atol=1e-4)
     assert (mean.anchors.rows - 3).std() < 0.25 and 880 < float(mean.heads.opacity.bias.detach().mean()) < 930
@@ -588,7 +590,7 @@ def test_the_mean_follows_what_is_learned_and_leaves_out_the_noise(tiny):
     assert torch.equal(average.of(model).anchors.rows, torch.cat([before, rows[:3]]))
 
 
-def test_the_clock_ends_a_training_by_minutes(tiny, tmp_path):
+def test_time_budget_ends_training(tiny, tmp_path):
     capture, ids = tiny()
     trainer = Trainer.start(capture, ids, SMALL)
     started = time.monotonic()
@@ -597,7 +599,7 @@ def test_the_clock_ends_a_training_by_minutes(tiny, tmp_path):
     assert trainer.progress.step > 1
 
 
-def test_a_capture_without_masks_trains_as_one_scene(tiny):
+def test_capture_without_masks_trains_as_one_class(tiny):
     capture, ids = tiny(masks=False)
     trainer = Trainer.start(capture, ids, SMALL)
     before = mean_loss(trainer, 8)
@@ -607,7 +609,7 @@ def test_a_capture_without_masks_trains_as_one_scene(tiny):
     assert trainer.model.classes.ids.tolist() == [0]
 
 
-def test_unlabeled_pixels_are_taught_where_many_points_have_no_object(tiny):
+def test_unlabeled_pixels_are_supervised_if_many_points_are_unlabeled(tiny):
     capture, ids = tiny()
     gaps = Trainer.start(capture, ids, SMALL)
     bare = ids.copy()
@@ -625,7 +627,7 @@ def test_unlabeled_pixels_are_taught_where_many_points_have_no_object(tiny):
 
 
 @pytest.mark.parametrize("settings", [SMALL, FLAT], ids=["3d", "2d"])
-def test_explicit_splats_are_the_model(tiny, settings):
+def test_explicit_splats_match_model_render(tiny, settings):
     capture, ids = tiny()
     trainer = Trainer.start(capture, ids, settings)
     for i in range(20):
@@ -649,20 +651,20 @@ def test_explicit_splats_are_the_model(tiny, settings):
 
 
 @pytest.mark.parametrize(("scale", "offset"), [(1e-4, 0.0), (1e4, 0.0), (1.0, 1e6)])
-def test_normalization_makes_scale_and_place_irrelevant(scale, offset):
+def test_normalization_is_invariant_to_scale_and_offset(scale, offset):
     rng = np.random.default_rng(0)
-    points, eyes = rng.normal(size=(500, 3)), rng.normal(size=(9, 3)) * 4
-    a = Normalization.of(eyes, points)
-    b = Normalization.of(eyes * scale + offset, points * scale + offset)
+    points, camera_centers = rng.normal(size=(500, 3)), rng.normal(size=(9, 3)) * 4
+    a = Normalization.of(camera_centers, points)
+    b = Normalization.of(camera_centers * scale + offset, points * scale + offset)
     np.testing.assert_allclose(a.to_scene(points), b.to_scene(points * scale + offset), atol=1e-6)
     viewmat = np.eye(4)
-    viewmat[:3, 3] = -eyes[0]
+    viewmat[:3, 3] = -camera_centers[0]
     moved = np.eye(4)
-    moved[:3, 3] = -(eyes[0] * scale + offset)
+    moved[:3, 3] = -(camera_centers[0] * scale + offset)
     np.testing.assert_allclose(a.viewmat(viewmat), b.viewmat(moved), atol=1e-6)
 
 
-def test_kill_9_and_resume_loses_nothing_but_time(write_capture, tmp_path):
+def test_killed_training_resumes_to_same_model(write_capture, tmp_path):
     """A run that is killed between two checkpoints and resumed gives the same model as an uninterrupted run."""
     scene = write_capture(views=9, size=(64, 48))
     common = ["--steps", "260", "--offsets", "4", "--threads", "1"]

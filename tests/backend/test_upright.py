@@ -13,16 +13,16 @@ from backend.capture import compute_upright, load_capture
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
-def looking(eyes, targets, roll_degrees=0.0):
-    """Return viewmats (V, 4, 4) of cameras at `eyes` that look at `targets`, with Z up and some roll."""
+def viewmats_looking_at(camera_centers, targets, roll_degrees=0.0):
+    """Return viewmats (V, 4, 4) of cameras at `camera_centers` that look at `targets`, with Z up and some roll."""
     viewmats = []
-    for eye, target, roll in zip(eyes, targets, np.broadcast_to(roll_degrees, len(eyes))):
-        forward = (target - eye) / np.linalg.norm(target - eye)
+    for camera_center, target, roll in zip(camera_centers, targets, np.broadcast_to(roll_degrees, len(camera_centers))):
+        forward = (target - camera_center) / np.linalg.norm(target - camera_center)
         right = np.cross(forward, [0, 0, 1])
         right /= np.linalg.norm(right)
         rotation = Rotation.from_euler("z", roll, degrees=True).as_matrix() @ [right, np.cross(forward, right), forward]
         viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ camera_center
         viewmats.append(viewmat)
     return np.array(viewmats)
 
@@ -31,9 +31,9 @@ def room(rng, arc=360.0, pitch=25.0, roll=2.0, views=40, floor=3000, ceiling=250
     """Return cameras on an arc around the middle of a room, the room's points with the floor at z = 0, and outliers."""
     angles = np.radians(np.linspace(0, arc, views, endpoint=False) + rng.normal(0, 2, views))
     down = np.tan(np.radians(pitch))
-    eyes = np.stack([2 * np.cos(angles), 2 * np.sin(angles), 0.4 + 2 * down + rng.normal(0, 0.05, views)], 1)
-    viewmats = looking(
-        eyes, np.tile([0, 0, 0.4], (views, 1)) + rng.normal(0, 0.1, (views, 3)), rng.normal(0, roll, views)
+    camera_centers = np.stack([2 * np.cos(angles), 2 * np.sin(angles), 0.4 + 2 * down + rng.normal(0, 0.05, views)], 1)
+    viewmats = viewmats_looking_at(
+        camera_centers, np.tile([0, 0, 0.4], (views, 1)) + rng.normal(0, 0.1, (views, 3)), rng.normal(0, roll, views)
     )
     flat = rng.uniform(-3, 3, (floor, 3)) * [1, 1, 0]
     above = rng.uniform(-3, 3, (ceiling, 3)) * [1, 1, 0] + [0, 0, 4.5]
@@ -60,77 +60,79 @@ def degrees_between(a, b):
     return np.degrees(np.arccos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1, 1)))
 
 
-def proper(stood):
+def proper(upright):
     """Check that rotation and offsets are valid and finite; return the direction that becomes Z."""
-    np.testing.assert_allclose(stood.rotation @ stood.rotation.T, np.eye(3), atol=1e-9)
-    assert np.linalg.det(stood.rotation) == pytest.approx(1)
-    assert np.isfinite(stood.origin).all() and np.isfinite(stood.translation).all()
-    return stood.rotation[2]
+    np.testing.assert_allclose(upright.rotation @ upright.rotation.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(upright.rotation) == pytest.approx(1)
+    assert np.isfinite(upright.origin).all() and np.isfinite(upright.translation).all()
+    return upright.rotation[2]
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_a_room_turned_at_random_stands_on_its_floor(seed):
+def test_randomly_rotated_room_is_placed_on_its_floor(seed):
     rng = np.random.default_rng(seed)
     options = [{}, {"arc": 100, "pitch": 45}, {"arc": 50, "pitch": 40}, {"pitch": 70}][seed % 4]
     viewmats, xyz, stray = room(rng, **options)
     turn, scale, shift = Rotation.random(random_state=seed).as_matrix(), 10 ** rng.uniform(-4, 3), rng.normal(0, 1, 3)
     viewmats, xyz = moved(viewmats, np.concatenate([xyz, stray]), turn, scale, scale * shift)
-    stood = compute_upright(viewmats, xyz)
-    assert degrees_between(proper(stood), turn[:, 2]) < 0.5
-    floor = xyz[:3000] @ stood.rotation.T + stood.translation
-    assert (stood.origin == 0).all() and np.abs(np.median(floor[:, 2])) < 0.02 * scale
+    upright = compute_upright(viewmats, xyz)
+    assert degrees_between(proper(upright), turn[:, 2]) < 0.5
+    floor = xyz[:3000] @ upright.rotation.T + upright.translation
+    assert (upright.origin == 0).all() and np.abs(np.median(floor[:, 2])) < 0.02 * scale
     # It is the smallest such rotation: its axis is perpendicular to Z and to the direction that becomes Z.
 
-    angle = np.degrees(np.linalg.norm(Rotation.from_matrix(stood.rotation).as_rotvec()))
-    assert angle == pytest.approx(degrees_between(proper(stood), np.array([0, 0, 1.0])), abs=1e-6)
+    angle = np.degrees(np.linalg.norm(Rotation.from_matrix(upright.rotation).as_rotvec()))
+    assert angle == pytest.approx(degrees_between(proper(upright), np.array([0, 0, 1.0])), abs=1e-6)
     again = compute_upright(viewmats, xyz)
-    assert all(np.array_equal(getattr(stood, name), getattr(again, name)) for name in ("rotation", "translation"))
+    assert all(np.array_equal(getattr(upright, name), getattr(again, name)) for name in ("rotation", "translation"))
 
 
 @pytest.mark.parametrize(("tilt", "lift"), [(0, 0.0), (1.5, 0.0), (0, 0.05), (0, 3.0), (10, 0.0)])
-def test_what_is_upright_already_is_left_alone(tilt, lift):
+def test_upright_capture_is_unchanged(tilt, lift):
     viewmats, xyz, _ = room(np.random.default_rng(0))
     viewmats, xyz = moved(viewmats, xyz, Rotation.from_euler("x", tilt, degrees=True).as_matrix(), 1, (5, -3, lift))
-    stood = compute_upright(viewmats, xyz)
-    proper(stood)
-    assert (stood.rotation == np.eye(3)).all() == (tilt < 2)
-    assert (stood.translation == 0).all() == (tilt < 2 and lift < 1)
-    assert (stood.translation[:2] == 0).all()
+    upright = compute_upright(viewmats, xyz)
+    proper(upright)
+    assert (upright.rotation == np.eye(3)).all() == (tilt < 2)
+    assert (upright.translation == 0).all() == (tilt < 2 and lift < 1)
+    assert (upright.translation[:2] == 0).all()
     if lift == 3:
-        assert stood.translation[2] == pytest.approx(-3, abs=0.02)
+        assert upright.translation[2] == pytest.approx(-3, abs=0.02)
 
 
-def test_photos_turned_on_their_side_do_not_tilt_it():
+def test_rolled_photos_do_not_tilt_result():
     rng = np.random.default_rng(0)
     viewmats, xyz, _ = room(rng, floor=0, ceiling=0, roll=np.where(np.arange(40) % 5 == 0, 90.0, 1.0))
     turn = Rotation.random(random_state=5).as_matrix()
-    stood = compute_upright(*moved(viewmats, xyz, turn))
-    assert degrees_between(proper(stood), turn[:, 2]) < 4
+    upright = compute_upright(*moved(viewmats, xyz, turn))
+    assert degrees_between(proper(upright), turn[:, 2]) < 4
 
 
-def test_pictures_straight_down_have_up_behind_them():
+def test_nadir_photos_have_up_behind_camera():
     rng = np.random.default_rng(0)
-    eyes = rng.uniform(-5, 5, (40, 3)) * [1, 1, 0] + [0, 0, 8]
-    flown = np.where(np.arange(40) % 3 == 0, 180.0, 0.0)
-    viewmats = looking(eyes, eyes + np.array([0, 0.02, -1]) + rng.normal(0, 0.01, (40, 3)), flown)
+    camera_centers = rng.uniform(-5, 5, (40, 3)) * [1, 1, 0] + [0, 0, 8]
+    roll = np.where(np.arange(40) % 3 == 0, 180.0, 0.0)
+    viewmats = viewmats_looking_at(
+        camera_centers, camera_centers + np.array([0, 0.02, -1]) + rng.normal(0, 0.01, (40, 3)), roll
+    )
     ground = rng.uniform(-6, 6, (2000, 3)) * [1, 1, 0] + rng.normal(0, 0.02, (2000, 3))
     turn = Rotation.random(random_state=1).as_matrix()
     assert degrees_between(proper(compute_upright(*moved(viewmats, ground, turn))), turn[:, 2]) < 1
 
 
-def test_without_a_level_plane_the_cameras_say_and_the_lowest_points_lie_near_the_ground():
+def test_cameras_give_up_without_ground_plane():
     rng = np.random.default_rng(0)
     viewmats, _, _ = room(rng, roll=1.0)
     cloud = rng.normal([0, 0, 5], 0.3, (3000, 3))
     turn = Rotation.random(random_state=2).as_matrix()
     viewmats, cloud = moved(viewmats, cloud, turn)
-    stood = compute_upright(viewmats, cloud)
-    assert degrees_between(proper(stood), turn[:, 2]) < 3
-    heights = (cloud @ stood.rotation.T + stood.translation)[:, 2]
+    upright = compute_upright(viewmats, cloud)
+    assert degrees_between(proper(upright), turn[:, 2]) < 3
+    heights = (cloud @ upright.rotation.T + upright.translation)[:, 2]
     assert 0 < (heights < 0).mean() < 0.05 and np.median(heights) == pytest.approx(0.6, abs=0.1)
 
 
-def test_a_wall_is_no_ground():
+def test_wall_is_not_taken_as_ground():
     rng = np.random.default_rng(0)
     viewmats, _, _ = room(rng, arc=60, pitch=10)
     wall = rng.uniform(-2, 2, (3000, 3)) * [0, 1, 1] + [-3, 0, 2]
@@ -139,7 +141,7 @@ def test_a_wall_is_no_ground():
 
 @pytest.mark.parametrize("views", [1, 2, 40])
 @pytest.mark.parametrize("points", ["four", "one place", "a line", "a line far away", "stray"])
-def test_captures_that_say_little_are_still_stood_up(views, points):
+def test_sparse_captures_are_oriented(views, points):
     rng = np.random.default_rng(0)
     viewmats, xyz, _ = room(rng)
     xyz = {
@@ -150,41 +152,45 @@ def test_captures_that_say_little_are_still_stood_up(views, points):
         "stray": np.concatenate([xyz, [[1e9, 0, 0], [np.nan, 0, 0]]]),
     }[points]
     turn = Rotation.random(random_state=3).as_matrix()
-    stood = compute_upright(*moved(viewmats[:views], xyz, turn))
-    assert degrees_between(proper(stood), turn[:, 2]) < (30 if views < 40 else 3)
+    upright = compute_upright(*moved(viewmats[:views], xyz, turn))
+    assert degrees_between(proper(upright), turn[:, 2]) < (30 if views < 40 else 3)
 
 
 @pytest.mark.parametrize("upside_down", [False, True])
-def test_upside_down_is_turned_over(upside_down):
+def test_upside_down_capture_is_flipped(upside_down):
     viewmats, xyz, _ = room(np.random.default_rng(0), roll=0)
     turn = np.diag([1.0, -1, -1]) if upside_down else np.eye(3)
     assert degrees_between(proper(compute_upright(*moved(viewmats, xyz, turn))), turn[:, 2]) < 0.5
 
 
-def test_far_away_coordinates_get_a_round_origin_that_float32_can_follow():
+def test_distant_coordinates_get_rounded_origin():
     viewmats, xyz, stray = room(np.random.default_rng(0))
     turn = Rotation.random(random_state=4).as_matrix()
     viewmats, xyz = moved(viewmats, np.concatenate([xyz, stray]), turn, 1, (500_000, 4_500_000, 120))
-    stood = compute_upright(viewmats, xyz)
-    assert degrees_between(proper(stood), turn[:, 2]) < 0.5
-    assert np.abs(stood.origin - [500_000, 4_500_000, 120]).max() < 10
-    assert (stood.origin == np.round(stood.origin)).all()
-    floor = (xyz[:3000] - stood.origin) @ stood.rotation.T + stood.translation
+    upright = compute_upright(viewmats, xyz)
+    assert degrees_between(proper(upright), turn[:, 2]) < 0.5
+    assert np.abs(upright.origin - [500_000, 4_500_000, 120]).max() < 10
+    assert (upright.origin == np.round(upright.origin)).all()
+    floor = (xyz[:3000] - upright.origin) @ upright.rotation.T + upright.translation
     assert np.abs(np.median(floor[:, 2])) < 0.02 and np.abs(floor).max() < 100
 
 
 @pytest.mark.parametrize(("name", "held"), [("tabletop", 0.3), ("banana", 0.6)])
-def test_real_captures_stand_on_their_table(tmp_path, name, held):
+def test_real_captures_are_placed_on_table(tmp_path, name, held):
     if not (DATA / name).is_dir():
         pytest.skip(f"{name} is absent")
     capture = load_capture(DATA / name, tmp_path)
     viewmats, xyz = np.array([view.viewmat for view in capture.views]), capture.points.xyz
-    stood = compute_upright(viewmats, xyz)
-    up = proper(stood)
-    heights = (xyz @ stood.rotation.T + stood.translation)[:, 2]
-    eyes = -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3]) @ stood.rotation.T + stood.translation
-    size = np.median(np.linalg.norm(eyes, axis=1))
-    assert (np.abs(heights) < 0.01 * size).mean() > held, "the table holds most points"
-    assert (heights > -0.02 * size).mean() > 0.9 and (eyes[:, 2] > 0.1 * size).all(), "nearly nothing lies below it"
-    assert np.degrees(np.abs(np.median(viewmats[:, 0, :3] @ up))) < 3, "photos are taken level"
+    upright = compute_upright(viewmats, xyz)
+    up = proper(upright)
+    heights = (xyz @ upright.rotation.T + upright.translation)[:, 2]
+    camera_centers = (
+        -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3]) @ upright.rotation.T + upright.translation
+    )
+    size = np.median(np.linalg.norm(camera_centers, axis=1))
+    assert (np.abs(heights) < 0.01 * size).mean() > held, "most points lie on the table"
+    assert (heights > -0.02 * size).mean() > 0.9 and (camera_centers[:, 2] > 0.1 * size).all(), (
+        "few points lie below the table"
+    )
+    assert np.degrees(np.abs(np.median(viewmats[:, 0, :3] @ up))) < 3, "photos are nearly level"
     assert degrees_between(-viewmats[:, 1, :3].mean(0), up) < 15

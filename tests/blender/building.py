@@ -16,16 +16,16 @@ OBJECTS = {1: "mug", 2: "can", HUGE: "box"}
 K = np.array([[500.0, 0.0, 310.0], [0.0, 500.0, 250.5], [0.0, 0.0, 1.0]])
 
 
-def look_at(eye, target=(0.0, 0.0, 0.0)) -> np.ndarray:
-    """Return the world-to-camera matrix (4, 4) of an OpenCV camera at `eye` that looks at `target`."""
-    eye = np.asarray(eye, float)
-    forward = np.asarray(target, float) - eye
+def look_at(camera_center, target=(0.0, 0.0, 0.0)) -> np.ndarray:
+    """Return the world-to-camera matrix (4, 4) of an OpenCV camera at `camera_center` that looks at `target`."""
+    camera_center = np.asarray(camera_center, float)
+    forward = np.asarray(target, float) - camera_center
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
     view = np.eye(4)
-    view[:3, :3], view[:3, 3] = rotation, -rotation @ eye
+    view[:3, :3], view[:3, 3] = rotation, -rotation @ camera_center
     return view
 
 

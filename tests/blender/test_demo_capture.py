@@ -125,15 +125,15 @@ def truth(capture, name):
     return read_png(capture / "truth/masks" / name), np.load(capture / "truth/depth" / (name[:-4] + ".npy"))
 
 
-def test_files_and_ids(tiny):
+def test_capture_has_expected_files_and_ids(tiny):
     labels = json.loads((tiny / "labels.json").read_text())
     assert len(labels) == TINY.objects + 2 and set(labels.values()) >= {"mug", "table", "backdrop"}
     names = [f"{i:04d}.png" for i in range(4)]
     found = set()
     for name in names:
-        picture = read_png(tiny / "images" / name)
+        image = read_png(tiny / "images" / name)
         ids, depth = truth(tiny, name)
-        assert picture.shape == (48, 64, 3) and 40 < picture.mean() < 200
+        assert image.shape == (48, 64, 3) and 40 < image.mean() < 200
         assert ids.min() >= 1 and depth.dtype == np.float32 and depth.min() > 0.3 and depth.max() < 6
         assert np.array_equal(ids, read_png(tiny / "masks" / name))
         found |= set(np.unique(ids).tolist())
@@ -142,7 +142,7 @@ def test_files_and_ids(tiny):
     assert all(demo_capture._is_written(path.relative_to(tiny)) for path in tiny.rglob("*") if path.is_file())
 
 
-def test_masks_and_depth_agree_with_meshes(small):
+def test_masks_and_depth_match_meshes(small):
     camera, images, _ = read_model(small / "sparse/0")
     (width, height), intrinsics = camera
     assert intrinsics[2:] == (80.0, 60.0)
@@ -164,7 +164,7 @@ def test_masks_and_depth_agree_with_meshes(small):
         assert same > 0.93 * front, entry["name"]
 
 
-def test_points_agree_with_depth_and_tracks(small):
+def test_points_match_depth_and_tracks(small):
     camera, images, points = read_model(small / "sparse/0")
     hidden = np.load(small / "truth/points.npz")
     outlier, label = hidden["outlier"], hidden["object_id"]
@@ -195,7 +195,7 @@ def test_points_agree_with_depth_and_tracks(small):
     assert np.mean(ids_agree) > 0.9
 
 
-def test_same_seed_same_bytes(tiny, tmp_path):
+def test_same_seed_gives_identical_files(tiny, tmp_path):
     again = demo_capture.make(tmp_path / "again", TINY)
     files = sorted(p.relative_to(tiny) for p in tiny.rglob("*") if p.is_file())
     assert files == sorted(p.relative_to(again) for p in again.rglob("*") if p.is_file())
@@ -203,7 +203,7 @@ def test_same_seed_same_bytes(tiny, tmp_path):
         assert (tiny / file).read_bytes() == (again / file).read_bytes(), file
 
 
-def test_mask_noise():
+def test_mask_noise_grows_with_level():
     ids = np.ones((60, 80), np.uint16)
     ids[20:40, 20:60] = 2
     ids[30:50, 50:70] = 3
@@ -219,7 +219,7 @@ def run(*arguments):
     return subprocess.run(command, capture_output=True, text=True, timeout=300)
 
 
-def test_command_line(tiny, tmp_path):
+def test_demo_command_reports_existing_and_foreign_files(tiny, tmp_path):
     same = run("demo", str(tiny), "--objects=7", "--views=4", "--width=64", "--height=48", "--samples=2")
     assert same.returncode == 0 and "already" in same.stdout
     other = run("demo", str(tiny), "--objects=8")
@@ -231,14 +231,14 @@ def test_command_line(tiny, tmp_path):
     assert run("demo", str(tmp_path / "x"), "--views=1").returncode == 2
 
 
-def test_stop_leaves_nothing(tmp_path):
+def test_stopping_leaves_no_files(tmp_path):
     with pytest.raises(Cancelled):
         demo_capture.make(tmp_path / "x", TINY, stopped=lambda: True)
     assert not list(tmp_path.iterdir())
     assert "ObjectGS demo" not in bpy.data.scenes
 
 
-def test_files_of_others_are_neither_deleted_nor_replaced(tiny, tmp_path, monkeypatch):
+def test_foreign_files_are_kept(tiny, tmp_path, monkeypatch):
     for name in ("demo.part", "demo.old"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "thesis.odt").write_text("not yours")

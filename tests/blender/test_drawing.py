@@ -44,7 +44,7 @@ def evaluated_size(obj) -> int:
     return len(shape.data.vertices)
 
 
-def test_arrays_are_those_of_the_file_and_are_read_again_when_the_mesh_changes(root):
+def test_splat_arrays_match_file_and_follow_mesh_changes(root):
     obj = part(root, 2)
     arrays = splat_arrays.arrays_of(obj.data)
     assert arrays.means.shape == (10, 3) and arrays.harmonics.shape == (10, 4, 3) and arrays.opacities.shape == (10,)
@@ -59,7 +59,7 @@ def test_arrays_are_those_of_the_file_and_are_read_again_when_the_mesh_changes(r
     assert splat_arrays.arrays_of(obj.data) is None
 
 
-def test_what_is_hidden_is_not_drawn(root):
+def test_hidden_objects_are_not_drawn(root):
     layer = bpy.context.view_layer
     ids = lambda: sorted(scene.object_id_of(obj) for obj in gather.splat_parts(layer))  # noqa: E731
     assert ids() == [0, 1, 2, HUGE]
@@ -70,7 +70,7 @@ def test_what_is_hidden_is_not_drawn(root):
     assert ids() == [0, HUGE]
 
 
-def test_places_marks_and_colors_are_those_of_now(root, monkeypatch):
+def test_transforms_highlights_and_colors_are_current(root, monkeypatch):
     """Moving, selecting and recoloring reuse the arrays."""
     obj = part(root, 1)
     before = gather.gather([obj])[0]
@@ -89,7 +89,7 @@ def test_places_marks_and_colors_are_those_of_now(root, monkeypatch):
     assert gather.gather([obj], marks=False)[0].highlight == gather.NONE
 
 
-def test_a_drawn_carrier_shows_nothing_itself(root):
+def test_preview_is_hidden_while_drawing(root):
     """Its preview is restored with the user's settings; renders are unaffected."""
     obj = part(root, 1)
     kept = [(modifier.name, modifier.show_viewport, modifier.show_render) for modifier in obj.modifiers]
@@ -107,7 +107,7 @@ def test_a_drawn_carrier_shows_nothing_itself(root):
 
 
 @pytest.mark.parametrize("orthographic", [False, True])
-def test_splats_come_from_far_to_near(orthographic):
+def test_splats_are_sorted_back_to_front(orthographic):
     depths = np.random.default_rng(0).uniform(-1.0, 50.0, 20_000).astype(np.float32)
     order = back_to_front(depths, -100.0 if orthographic else 0.01, orthographic)
     ahead = depths > (-100.0 if orthographic else 0.01)
@@ -116,7 +116,7 @@ def test_splats_come_from_far_to_near(orthographic):
     assert (steps <= (0.001 if orthographic else 3e-4 * depths[order][1:])).all()
 
 
-def test_splats_at_one_depth_keep_their_order():
+def test_splats_of_equal_depth_keep_order():
     assert back_to_front(np.full(5, 2.0, np.float32), 0.1, False).tolist() == [0, 1, 2, 3, 4]
     assert back_to_front(np.full(5, 2.0, np.float32), 0.1, True).tolist() == [0, 1, 2, 3, 4]
     assert len(back_to_front(np.full(5, -2.0, np.float32), 0.1, False)) == 0

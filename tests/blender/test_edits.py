@@ -167,7 +167,7 @@ def expected(colors, recolor=None) -> np.ndarray:
 # Colors.
 
 
-def test_points_show_exactly_the_map_of_the_encoded_colors(root):
+def test_viewport_colors_match_recolor(root):
     splats = part(root, "splats")
     blender_scene.show_kinds(root, "splats")
     show_faint(splats)
@@ -178,13 +178,13 @@ def test_points_show_exactly_the_map_of_the_encoded_colors(root):
     wanted = object_list.recolor_of(item(root))
     assert wanted.middle == pytest.approx(blender_scene.luma_of(collection_of(root)), abs=1e-5)
     assert encoded(evaluated_colors(splats)[:, :3]) == pytest.approx(expected(raw, wanted), abs=5e-5)
-    assert np.array_equal(carrier.read(splats.data, "radiance:base"), before), "attributes stay as they are"
+    assert np.array_equal(carrier.read(splats.data, "radiance:base"), before), "attributes are unchanged"
     assert bpy.ops.objectgs.reset_object(what="COLORS") == {"FINISHED"}
     assert blender_scene.recolor_of(collection_of(root)) is None
     assert encoded(evaluated_colors(splats)[:, :3]) == pytest.approx(expected(raw), abs=2e-5)
 
 
-def test_renders_show_the_map_of_all_bands(root):
+def test_rendered_colors_match_recolor(root):
     camera = next(obj for obj in root.all_objects if blender_scene.kind_of(obj) == "camera")
     bpy.context.scene.camera = camera
     blender_scene.show_kinds(root, "splats")
@@ -200,7 +200,7 @@ def test_renders_show_the_map_of_all_bands(root):
     assert seen[positive] == pytest.approx(expected(plain[positive], hue), abs=1e-4)
 
 
-def test_textures_are_mapped_by_the_same_control_and_left_as_they_were(root):
+def test_texture_recolor_is_applied_and_reverted(root):
     mesh = part(root, "mesh")
     tree = mesh.data.materials[0].node_tree
     before = sorted((link.from_socket.name, link.to_socket.name) for link in tree.links)
@@ -218,7 +218,7 @@ def test_textures_are_mapped_by_the_same_control_and_left_as_they_were(root):
     assert not [node for node in tree.nodes if node.type == "GROUP"]
 
 
-def test_a_rendered_texture_has_the_mapped_color(root):
+def test_rendered_texture_has_recolored_color(root):
     """A plane with the shader's nodes as emission is rendered and compared with the mapped texel color."""
     mesh = part(root, "mesh")
     set_sliders(root)
@@ -243,16 +243,16 @@ def test_a_rendered_texture_has_the_mapped_color(root):
     stage.render.engine, stage.cycles.samples, stage.cycles.use_denoising = "CYCLES", 1, False
     stage.render.dither_intensity = 0.0
     stage.render.resolution_x = stage.render.resolution_y = 4
-    picture = blender_scene.folder_of(root) / "plane.png"
-    stage.render.filepath = str(picture)
+    path = blender_scene.folder_of(root) / "plane.png"
+    stage.render.filepath = str(path)
     bpy.ops.render.render(write_still=True, scene=stage.name)
-    image = bpy.data.images.load(str(picture))
+    image = bpy.data.images.load(str(path))
     pixels = np.array(image.pixels[:]).reshape(-1, 4)[:, :3]
     wanted = expected(np.array([[200, 100, 50]]) / 255, object_list.recolor_of(item(root)))
     assert pixels == pytest.approx(np.repeat(np.clip(wanted, 0, 1), len(pixels), 0), abs=0.6 / 255)
 
 
-def test_colors_are_stored_and_shown_again_from_the_folder(root, folder):
+def test_recolor_is_stored_and_reloaded(root, folder):
     set_sliders(root)
     stored = entry(root).recolor
     assert stored.hue == 0.2 and stored.tint == (1.0, 0.8, 0.6) and stored.amount == 0.6
@@ -264,7 +264,7 @@ def test_colors_are_stored_and_shown_again_from_the_folder(root, folder):
     assert object_list.recolor_of(item(root, 2)) == RECOLOR
 
 
-def test_older_groups_are_exchanged_when_they_are_to_recolor(root):
+def test_older_node_groups_are_replaced_for_recoloring(root):
     splats = part(root, "splats")
     modifier = modifiers.modifier_of(splats, node_groups.SPLATS_GROUP)
     modifiers.set_input(modifier, "Point Size", 0.25)
@@ -277,7 +277,7 @@ def test_older_groups_are_exchanged_when_they_are_to_recolor(root):
     modifier.node_group = older
     modifiers.set_input(modifier, "Point Size", 0.25)
     show_again(root)
-    assert modifier.node_group == older, "nothing is asked of it that it cannot do"
+    assert modifier.node_group == older, "the older group suffices without recoloring"
     item(root).hue = 0.5
     assert modifier.node_group == newest
     assert modifiers.inputs_of(modifier)["Point Size"] == 0.25
@@ -287,7 +287,7 @@ def test_older_groups_are_exchanged_when_they_are_to_recolor(root):
 # Removal.
 
 
-def test_removed_and_restored(root, folder):
+def test_object_is_removed_and_restored(root, folder):
     collection = collection_of(root)
     collection.hide_render = True
     part(root, "object_parent").location.x += 3.0
@@ -302,12 +302,12 @@ def test_removed_and_restored(root, folder):
     assert collection_of(root) == collection and collection.hide_viewport
     assert bpy.ops.objectgs.restore_object() == {"FINISHED"}
     assert not entry(root).removed and not item(root).removed
-    assert not collection.hide_viewport and collection.hide_render, "hidden in renders, as it was before"
+    assert not collection.hide_viewport and collection.hide_render, "the previous render visibility is restored"
     assert part(root, "object_parent").matrix_basis == where
     assert not bpy.ops.objectgs.restore_object.poll()
 
 
-def test_floaters_go_by_the_backends_rule_and_come_back(root, folder, backend_python):
+def test_floaters_match_backend_and_are_restored(root, folder, backend_python):
     activate(root, 1)
     bpy.ops.objectgs.remove_object(floaters=True)
     unlabeled = part(root, "splats", 0)
@@ -330,7 +330,7 @@ def test_floaters_go_by_the_backends_rule_and_come_back(root, folder, backend_py
     blender_scene.show_kinds(root, "splats")
     show_faint(unlabeled)
     assert len(evaluated_colors(unlabeled)) == (~hidden).sum()
-    assert len(arrays_of(unlabeled.data).means) == (~hidden).sum(), "nor drawn and picked"
+    assert len(arrays_of(unlabeled.data).means) == (~hidden).sum(), "hidden splats are neither drawn nor picked"
     show_again(root)
     assert np.array_equal(blender_scene.hidden_splats(part(root, "splats", 0).data), hidden)
     bpy.ops.objectgs.restore_object(object="1")
@@ -338,14 +338,14 @@ def test_floaters_go_by_the_backends_rule_and_come_back(root, folder, backend_py
     assert len(evaluated_colors(unlabeled)) == len(rows)
 
 
-def test_the_hull_is_right_where_it_can_be_computed_by_hand():
+def test_inside_hull_matches_box():
     rng = np.random.default_rng(3)
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 2) for z in (0, 3)], float) + 1000.0
     means = np.concatenate([corners, 1000.0 + rng.uniform(0, 1, (50, 3)) * (1, 2, 3)])
     points = 1000.0 + rng.uniform(-0.5, 1.5, (500, 3)) * (1, 2, 3)
     inside = ((points > 1000) & (points < 1000 + np.array([1, 2, 3]))).all(1)
     assert np.array_equal(floaters.inside_hull(points, means, np.ones(len(means))), inside)
-    assert not floaters.inside_hull(points, corners[:4] * (1, 1, 0), np.ones(4)).any(), "a flat one has no inside"
+    assert not floaters.inside_hull(points, corners[:4] * (1, 1, 0), np.ones(4)).any(), "a flat hull has no interior"
     assert not floaters.inside_hull(points, corners[:3], np.ones(3)).any()
 
 
@@ -365,7 +365,7 @@ def independent(root, local) -> np.ndarray:
     return moved + ORIGIN
 
 
-def test_a_moved_object_is_stored_in_the_captures_coordinates(root, folder, backend_python, tmp_path):
+def test_transform_is_stored_in_capture_coordinates(root, folder, backend_python, tmp_path):
     parent = next(obj for obj in root.objects if blender_scene.kind_of(obj) == "parent")
     parent.matrix_world = Matrix.Scale(2.5, 4) @ parent.matrix_world  # as after setting a distance
     pivot = part(root, "object_parent")
@@ -388,7 +388,7 @@ def test_a_moved_object_is_stored_in_the_captures_coordinates(root, folder, back
     assert np.stack([table[axis] for axis in "xyz"], 1) == pytest.approx(independent(root, splats), abs=2e-4)
 
 
-def test_what_nobody_moved_is_exactly_where_it_was(root, folder):
+def test_unmoved_objects_keep_exact_transform(root, folder):
     before = (folder / "objects.json").read_bytes()
     for collection in blender_scene.object_collections(root).values():
         assert np.array_equal(blender_scene.placement_of(root, collection), np.eye(4))
@@ -405,7 +405,7 @@ def test_what_nobody_moved_is_exactly_where_it_was(root, folder):
         np.diag([-1.0, 1.0, 1.0]),
     ],
 )
-def test_places_from_the_folder_are_shown_and_stay_as_they_are(root, folder, linear):
+def test_transforms_from_folder_are_shown_and_kept(root, folder, linear):
     place = np.eye(4)
     place[:3, :3] = linear
     place[:3, 3] = np.array([0.5, -1.0, 2.0]) + ORIGIN - linear @ ORIGIN
@@ -422,7 +422,7 @@ def test_places_from_the_folder_are_shown_and_stay_as_they_are(root, folder, lin
     part(root, "object_parent").location.x += 1.0
     show_again(root)
     moved = independent(root, part(root, "splats"))
-    assert not np.allclose(moved, after, atol=0.1), "what the user moved since stays"
+    assert not np.allclose(moved, after, atol=0.1), "transforms by the user are kept"
     blender_scene.store_placements(root)
     assert np.abs(np.array(entry(root).transform) - place).max() > 0.1
     assert bpy.ops.objectgs.reset_object(what="TRANSFORM") == {"FINISHED"}
@@ -430,7 +430,7 @@ def test_places_from_the_folder_are_shown_and_stay_as_they_are(root, folder, lin
     assert entry(root).transform is None
 
 
-def test_a_part_that_is_moved_alone_and_pivots_elsewhere_count(root):
+def test_moved_parts_and_parented_pivots_are_included(root):
     pivot, splats = part(root, "object_parent"), part(root, "splats")
     before = independent(root, splats)
     splats.location.z += 0.5
@@ -451,7 +451,7 @@ def test_a_part_that_is_moved_alone_and_pivots_elsewhere_count(root):
 # Duplicates.
 
 
-def test_a_duplicate_shares_its_data_and_is_kept(root, folder):
+def test_duplicate_shares_data_and_is_stored(root, folder):
     activate(root, 1)
     item(root).hue = 0.25
     assert bpy.ops.objectgs.duplicate_object() == {"FINISHED"}
@@ -492,13 +492,13 @@ def test_a_duplicate_shares_its_data_and_is_kept(root, folder):
     assert entry(root).copies == () and not entry(root).removed and not blender_scene.duplicates_of(root)
 
 
-def test_duplicates_from_the_folder_come_and_go(root, folder):
+def test_duplicates_follow_folder(root, folder):
     first, second = np.eye(4), np.eye(4)
     first[0, 3], second[1, 3] = 2.0, 3.0
     edit_objects(folder / "objects.json", {1: {"copies": [first.tolist(), second.tolist()], "removed": True}})
     show_again(root)
     one, two = blender_scene.duplicates_of(root)[1]
-    assert one.hide_render and two.hide_viewport, "removed with what they are duplicates of"
+    assert one.hide_render and two.hide_viewport, "duplicates are removed with their original"
     edit_objects(folder / "objects.json", {1: {"copies": [second.tolist()], "removed": None}})
     show_again(root)
     assert blender_scene.duplicates_of(root)[1] == [two] and not two.hide_render
@@ -508,7 +508,7 @@ def test_duplicates_from_the_folder_come_and_go(root, folder):
     assert entry(root).copies == () and not blender_scene.duplicates_of(root)
 
 
-def test_blenders_own_duplicates_become_ours(root):
+def test_blender_duplicates_become_stored_duplicates(root):
     blender_scene.show_kinds(root, "splats")
     selection.select_object(bpy.context, root, 1)
     chosen = set(bpy.context.selected_objects)
@@ -519,7 +519,7 @@ def test_blenders_own_duplicates_become_ours(root):
     blender_scene.store_placements(root)
     (copy,) = blender_scene.duplicates_of(root)[1]
     assert kinds.part_of(copy, "object_parent") == twin
-    assert kinds.part_of(copy, "splats").data == part(root, "splats").data, "its splats are trained with the others"
+    assert kinds.part_of(copy, "splats").data == part(root, "splats").data, "the duplicate shares the original's data"
     assert len([obj for obj in collection_of(root).objects if blender_scene.kind_of(obj) == "splats"]) == 1
     assert np.array(entry(root).copies[0])[:3, 3] == pytest.approx([2, 0, 0], abs=1e-4)
     selection.select_object(bpy.context, root, 2)
@@ -559,7 +559,7 @@ def state(root) -> dict:
     }
 
 
-def test_undo_and_redo_restore_everything(root, tmp_path):
+def test_undo_and_redo_restore_all_edits(root, tmp_path):
     def recolor():
         set_sliders(active())
 
@@ -592,10 +592,10 @@ def test_undo_and_redo_restore_everything(root, tmp_path):
     bpy.ops.ed.undo()
     wanted = state(active())
     show_again(active())
-    assert state(active()) == wanted, "the folder has what Blender has"
+    assert state(active()) == wanted, "the folder matches Blender's state"
 
 
-def test_edits_survive_merging_and_splitting(root):
+def test_edits_survive_merge_and_split(root):
     part(root, "object_parent").location.x += 1.0
     item(root).hue = 0.1
     object_edits.merge(root, [1], 2)
@@ -605,7 +605,7 @@ def test_edits_survive_merging_and_splitting(root):
     assert blender_scene.recolor_of(collection_of(root)).hue == 0.1
 
 
-def test_a_folder_that_cannot_be_written_takes_the_color_back(root, folder):
+def test_failed_write_reverts_color(root, folder):
     item(root).hue = 0.1
     (folder / "objects.json").write_text("{")
     item(root).hue = 0.3
@@ -616,7 +616,7 @@ def test_a_folder_that_cannot_be_written_takes_the_color_back(root, folder):
 # Files.
 
 
-def test_a_blend_built_without_a_window_shows_the_edits(fresh, folder):
+def test_headless_build_shows_edits(fresh, folder):
     place = np.eye(4)
     place[0, 3] = 2.0
     edit_objects(
@@ -640,7 +640,7 @@ def test_a_blend_built_without_a_window_shows_the_edits(fresh, folder):
     assert blender_scene.placement_of(root, collection_of(root, HUGE)) == pytest.approx(place, abs=1e-4)
 
 
-def test_splats_are_exported_with_the_edits_and_imported_again(root, folder, backend_python, tmp_path):
+def test_exported_splats_have_edits_and_can_be_imported(root, folder, backend_python, tmp_path):
     activate(root, 1)
     bpy.ops.objectgs.remove_object()
     part(root, "object_parent", 2).location.x += 1.0
@@ -656,7 +656,7 @@ def test_splats_are_exported_with_the_edits_and_imported_again(root, folder, bac
 
 
 @pytest.mark.parametrize("suffix", ["glb", "usdc", "obj"])
-def test_meshes_are_exported_as_they_are_seen(root, tmp_path, suffix):
+def test_exported_meshes_have_edits(root, tmp_path, suffix):
     blender_scene.show_kinds(root, "splats")
     item(root).hue = 0.3
     activate(root, 1)
@@ -685,7 +685,7 @@ def test_meshes_are_exported_as_they_are_seen(root, tmp_path, suffix):
     assert {path.name for path in (tmp_path / "each").glob(f"*.{suffix}")} == {f"mug.{suffix}", f"can.{suffix}"}
 
 
-def test_turned_by_a_right_angle(root):
+def test_rotation_by_right_angle(root):
     """A rotation about the center has a known result."""
     pivot = part(root, "object_parent")
     pivot.rotation_euler.z = math.pi / 2
@@ -698,7 +698,7 @@ def test_turned_by_a_right_angle(root):
 # Filled holes of removed objects.
 
 
-CLOSING = """
+FILL_HOLES = """
 import json, sys
 from backend.commands.objects.fill import fill_holes
 from backend.editing import apply_edits
@@ -721,10 +721,10 @@ print(json.dumps(shown))
 
 
 @pytest.fixture(scope="module")
-def closed(made, tmp_path_factory, backend_python) -> tuple[Path, list[np.ndarray]]:
+def filled_ground(made, tmp_path_factory, backend_python) -> tuple[Path, list[np.ndarray]]:
     """A folder with a flat ground (object 2) around a box (object 1), and another box, with cached fills for removal of
     the first box and of both; and the positions of the ground's splats in both cases."""
-    folder = Path(shutil.copytree(made, tmp_path_factory.mktemp("closed") / "table top"))
+    folder = Path(shutil.copytree(made, tmp_path_factory.mktemp("filled") / "table top"))
     rng = np.random.default_rng(0)
     flat = np.column_stack([rng.uniform(-1, 1, (4000, 2)), np.zeros(4000)])
     flat = flat[np.abs(flat).max(1) > 0.15]
@@ -737,7 +737,7 @@ def closed(made, tmp_path_factory, backend_python) -> tuple[Path, list[np.ndarra
         splats[name] = value
     write_vertices(folder / "splats.ply", splats)
     ran = subprocess.run(
-        [backend_python, "-c", CLOSING, folder, str(HUGE)],
+        [backend_python, "-c", FILL_HOLES, folder, str(HUGE)],
         cwd=headless.ROOT,
         capture_output=True,
         text=True,
@@ -747,9 +747,9 @@ def closed(made, tmp_path_factory, backend_python) -> tuple[Path, list[np.ndarra
 
 
 @pytest.fixture
-def ground(closed, folder) -> Path:
-    """A copy of the `closed` folder."""
-    return Path(shutil.copytree(closed[0], folder, dirs_exist_ok=True))
+def ground(filled_ground, folder) -> Path:
+    """A copy of the `filled_ground` folder."""
+    return Path(shutil.copytree(filled_ground[0], folder, dirs_exist_ok=True))
 
 
 def surface(root) -> dict:
@@ -760,7 +760,7 @@ def surface(root) -> dict:
     }
 
 
-def test_the_place_of_a_removed_object_is_closed_and_opened_again(ground, closed, root):
+def test_hole_is_filled_and_reopened(ground, filled_ground, root):
     """Drawing and picking show exactly what the backend exports, also after the splats are reloaded."""
     captured, count = surface(root), item(root, 2).splats
     luma = blender_scene.luma_of(collection_of(root, 2))
@@ -777,12 +777,12 @@ def test_the_place_of_a_removed_object_is_closed_and_opened_again(ground, closed
     drawn = [arrays_of(mesh).means @ there[:3, :3].T + there[:3, 3]]
     bpy.ops.objectgs.restore_object(object=str(HUGE))
     drawn.insert(0, arrays_of(mesh).means @ there[:3, :3].T + there[:3, 3])
-    for found, wanted in zip(drawn, closed[1]):
-        assert np.allclose(found, wanted, atol=1e-4) and len(found) < len(mesh.vertices), "some give way"
-    assert surface(root) == one, "the file of before"
+    for found, wanted in zip(drawn, filled_ground[1]):
+        assert np.allclose(found, wanted, atol=1e-4) and len(found) < len(mesh.vertices), "some splats are replaced"
+    assert surface(root) == one, "the earlier fill is reused"
     show_again(root)
     assert surface(root) == one
-    assert not bpy.ops.objectgs.fill_hole.poll(), "the active one is not removed"
+    assert not bpy.ops.objectgs.fill_hole.poll(), "the active object is not removed"
     activate(root, 1)
     bpy.ops.objectgs.fill_hole(filled=False)
     assert surface(root) == captured and blender_scene.is_removed(collection_of(root))
@@ -792,7 +792,7 @@ def test_the_place_of_a_removed_object_is_closed_and_opened_again(ground, closed
     assert surface(root) == captured and blender_scene.UNOBSERVED_COUNT not in collection_of(root)
 
 
-def test_until_the_backend_has_found_it_nothing_wrong_is_shown(ground, root, monkeypatch):
+def test_outdated_fill_is_hidden_until_recomputed(ground, root, monkeypatch):
     """An object's fill disappears with its edit at once; other fills stay until newer ones exist."""
     captured = surface(root)
     object_edits.remove(root, [1, HUGE], False, True)
@@ -804,13 +804,15 @@ def test_until_the_backend_has_found_it_nothing_wrong_is_shown(ground, root, mon
     stale = surface(root)
     monkeypatch.setenv("OBJECTGS_PYTHON", python)
     show_again(root)
-    assert blender_scene.missing_fill(root, blender_scene.Objects.read(ground)) is None, "it was asked, and answered"
+    assert blender_scene.missing_fill(root, blender_scene.Objects.read(ground)) is None, (
+        "fill was requested and completed"
+    )
     assert surface(root).keys() == stale.keys()
     object_edits.restore(root, [HUGE])
     assert surface(root) == captured
 
 
-def test_holes_that_an_earlier_version_filled_are_filled_again_and_restored(ground, root):
+def test_fills_of_earlier_version_are_updated_and_restored(ground, root):
     captured = surface(root)
     object_edits.remove(root, [1], False, True)
     mesh, filled = part(root, "splats", 2).data, surface(root)

@@ -106,7 +106,7 @@ def run(job, until=lambda: False, after=None):
     return shares
 
 
-def test_set_up_after_one_that_was_killed(root):
+def test_setup_succeeds_after_killed_setup(root):
     folder = root / "user" / "environment"
     assert environment.inspect(folder).state == "absent"
     assert environment.inspect(folder).python is None
@@ -141,7 +141,7 @@ def test_set_up_after_one_that_was_killed(root):
     assert environment.inspect(folder).state == "absent" and not folder.exists()
 
 
-def test_only_an_environment_for_nvidia_gpus_holds_their_packages(root):
+def test_cuda_packages_are_installed_only_for_cuda(root):
     for device in ("cpu", "cuda"):
         folder = root / f"environment-{device}"
         job = environment.set_up_job(sys.executable, folder, device)
@@ -154,7 +154,7 @@ def test_only_an_environment_for_nvidia_gpus_holds_their_packages(root):
     assert environment.inspect(root / "environment-cpu").state == "ready"
 
 
-def test_failed_set_ups_leave_nothing(root):
+def test_failed_setup_leaves_no_files(root):
     folder = root / "environment"
     lock(root, layout.system(), "smallnumba==0.69")
     job = environment.set_up_job(sys.executable, folder, "cpu")
@@ -179,7 +179,7 @@ def installed_torch(root, device):
     return job, packages["torch"], "smallcuda" in packages
 
 
-def test_another_file_of_the_same_name_is_refused(root):
+def test_wheel_with_other_hash_is_rejected(root):
     """The file that an index serves is replaced; the packages before it in the list are not installed either."""
     with zipfile.ZipFile(root / "wheels" / "torch-2.13.0-py3-none-any.whl", "a") as archive:
         archive.writestr("malice.pth", "import os\n")
@@ -191,7 +191,7 @@ def test_another_file_of_the_same_name_is_refused(root):
     assert not folder.exists() and list((root / "user").iterdir()) == []
 
 
-def test_a_package_that_is_not_locked_is_refused(root):
+def test_package_that_is_not_locked_is_rejected(root):
     wheel(root / "wheels", "smallnumba", "0.68", requires="extra")
     wheel(root / "wheels", "extra", "1.0")
     lock(root, layout.system(), "smallnumba==0.68")  # The wheel is new.
@@ -200,7 +200,7 @@ def test_a_package_that_is_not_locked_is_refused(root):
     assert job.state is State.FAILED and "hash" in job.error and not (root / "environment").exists()
 
 
-def test_a_build_that_is_not_on_pypi_comes_alone(root):
+def test_build_from_another_index_brings_no_other_package(root):
     """Its version names the build, it brings no other package, and the locked packages are checked as always."""
     (root / "requirements" / "locked" / f"{layout.system()}-cpu.txt").unlink()
     wheel(root / "wheels", "torch", "2.13.0+cpu", requires="extra")
@@ -210,14 +210,14 @@ def test_a_build_that_is_not_on_pypi_comes_alone(root):
     assert "extra" not in json.loads((root / "environment-cpu" / "ready.json").read_text())["packages"]
 
 
-def test_the_other_build_if_the_one_that_was_chosen_cannot_be_reached(root):
+def test_other_build_is_installed_if_index_is_unreachable(root):
     (root / "requirements" / "locked" / f"{layout.system()}-cpu.txt").unlink()
     job, torch, for_gpus = installed_torch(root, "cpu")
     assert (torch, for_gpus) == ("2.13.0", True) and "takes about 9 GB" in job.warnings[0]
     assert environment.inspect(root / "environment-cpu").state == "ready"
 
 
-def test_the_index_of_a_build_is_asked_for_torch_alone(root):
+def test_index_of_a_build_is_used_for_torch_alone(root):
     """And only if the user's own indexes lack the build."""
     (root / "requirements" / "locked" / f"{layout.system()}-cpu.txt").unlink()
 
@@ -236,7 +236,7 @@ def test_the_index_of_a_build_is_asked_for_torch_alone(root):
     assert choice.choose(Indexes(), root / "requirements", "cuda", 9.0).torch == [] and len(Indexes.asked) == 2
 
 
-def test_systems_without_locked_packages(root, monkeypatch):
+def test_system_without_locked_packages_is_rejected(root, monkeypatch):
     for name in ("", "-cpu", "-cuda"):
         path = root / "requirements" / "locked" / f"{layout.system()}{name}.txt"
         path.rename(path.with_name(f"amiga-m68k{name}.txt"))
@@ -267,7 +267,7 @@ def test_names_of_systems(monkeypatch, of_python, machine, build, name):
     assert layout.system() == name
 
 
-def test_what_goes_wrong_while_the_driver_is_gone(root):
+def test_setup_stops_when_stdin_closes(root):
     """When its input ends, the setup stops its child processes and cleans up."""
     folder = root / "environment"
     job = environment.set_up_job(sys.executable, folder, "cpu")
@@ -275,7 +275,7 @@ def test_what_goes_wrong_while_the_driver_is_gone(root):
     assert job.state is State.STOPPED and not folder.exists()
 
 
-def test_other_peoples_files_are_left_alone(root):
+def test_foreign_files_are_kept(root):
     folder = root / "photos"
     folder.mkdir()
     (folder / "holiday.jpg").write_text("")
@@ -294,7 +294,7 @@ def test_other_peoples_files_are_left_alone(root):
     assert not layout.is_ours(root / "link") and layout.is_ours(root / "new")
 
 
-def test_states_of_a_broken_environment(root):
+def test_invalid_environment_states_are_detected(root):
     folder = root / "environment"
     python = layout.environment_python(folder)
     python.parent.mkdir(parents=True)
@@ -318,7 +318,7 @@ def test_states_of_a_broken_environment(root):
     assert state.state == "broken" and str(python) in state.sentence and state.python is None
 
 
-def test_inspect_is_cheap(root):
+def test_inspect_is_fast(root):
     folder = root / "environment"
     layout.environment_python(folder).parent.mkdir(parents=True)
     layout.environment_python(folder).write_text("")
@@ -338,7 +338,7 @@ def test_inspect_is_cheap(root):
     assert time.perf_counter() - started < 1.0
 
 
-def test_two_at_once(root):
+def test_concurrent_setups_are_rejected(root):
     folder = root / "environment"
     with setup.claimed(folder):
         with pytest.raises(events.Refused, match="Another Blender"), setup.claimed(folder):
@@ -346,7 +346,7 @@ def test_two_at_once(root):
         assert (folder / layout.STAMP).is_file()
 
 
-def test_what_a_removal_left_goes_with_the_next_set_up(root):
+def test_next_setup_deletes_remains_of_removal(root):
     old = root / "environment.removed-7-0"
     (old / "venv").mkdir(parents=True)
     (old / layout.STAMP).write_text("")
@@ -354,10 +354,10 @@ def test_what_a_removal_left_goes_with_the_next_set_up(root):
         assert not old.exists()
 
 
-def test_pythons_that_will_not_do(root, monkeypatch):
+def test_unsuitable_pythons_are_rejected(root, monkeypatch):
     options = argparse.Namespace(folder=root / "environment", requirements=root / "requirements", device="cpu")
 
-    def refusal():
+    def error():
         with pytest.raises(events.Refused) as caught:
             setup.set_up(options, lambda: False)
         assert not options.folder.exists()
@@ -365,18 +365,18 @@ def test_pythons_that_will_not_do(root, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(layout, "OLDEST", (3, 99))
-        assert "needs 3.11, 3.12 or 3.13" in refusal()
+        assert "needs 3.11, 3.12 or 3.13" in error()
     with monkeypatch.context() as patch:
         patch.setattr(checks.struct, "calcsize", lambda _: 4)
-        assert "32-bit" in refusal()
+        assert "32-bit" in error()
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "ensurepip", None)
-        assert "ensurepip is missing" in refusal()
+        assert "ensurepip is missing" in error()
     monkeypatch.setitem(checks.GIGABYTES, "cpu", 1e9)
-    assert "free; make room" in refusal()
+    assert "free; make room" in error()
 
 
-def test_probe(root, monkeypatch):
+def test_probe_checks_packages_and_backend(root, monkeypatch):
     folder = root / "environment"
     job = environment.probe_job(sys.executable, folder)
     run(job)
@@ -406,7 +406,7 @@ def test_probe(root, monkeypatch):
 
 @pytest.mark.skipif(os.name != "posix", reason="POSIX programs")
 @pytest.mark.parametrize("program", ["/bin/ls", "/bin/true", "/bin/sh"])
-def test_probe_of_what_is_no_python(root, program):
+def test_probe_rejects_other_programs(root, program):
     job = environment.probe_job(program, root / "environment")
     run(job)
     assert job.error == f"{program} is not a Python, or it is older than 3.11; choose a Python 3.11, 3.12 or 3.13."
@@ -430,11 +430,11 @@ def test_probe_of_what_is_no_python(root, program):
         ([], "it said nothing"),
     ],
 )
-def test_why_pip_failed(lines, sentence):
+def test_pip_failures_are_explained(lines, sentence):
     assert sentence in pip.why_pip_failed(lines)
 
 
-def test_requirements_of_this_extension():
+def test_requirements_are_pinned():
     for name in layout.REQUIREMENTS:
         for line in layout.requirement_lines(environment.REQUIREMENTS / name):
             assert line.count("==") == 1 and line == line.replace(" ", ""), line

@@ -37,7 +37,7 @@ def test_zip_is_valid(package):
     assert package.stat().st_size < 1_000_000
 
 
-def test_zip_holds_what_is_needed_and_nothing_else(package):
+def test_zip_has_expected_files_only(package):
     with zipfile.ZipFile(package) as archive:
         names = {name for name in archive.namelist() if not name.endswith("/")}
     assert {
@@ -78,7 +78,7 @@ def test_zip_holds_what_is_needed_and_nothing_else(package):
     assert {PurePosixPath(name).suffix for name in names} <= {".py", ".toml", ".txt", ".md", ".json", ""}
 
 
-def test_versions_agree():
+def test_versions_match():
     manifest = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     from objectgs.backend.shared.version import __version__
@@ -155,7 +155,7 @@ print(json.dumps([before, during, state()]))
 """
 
 
-def test_unregister_leaves_nothing_behind():
+def test_unregister_removes_everything():
     before, during, after = in_blender(REGISTER_TEN_TIMES)
     assert during["operators"] and during["menus"] and during["owners"]
     assert "objectgs" in during["properties"]["Scene"]
@@ -181,7 +181,7 @@ print(json.dumps(sorted({name.split(".")[0] for name in sys.modules})))
 """
 
 
-def test_blender_never_imports_the_backends_packages(trained):
+def test_blender_side_imports_no_backend_packages(trained):
     loaded = in_blender(IMPORT_A_RESULT, trained)
     assert "objectgs" in loaded
     assert not {"torch", "numba", "llvmlite", "pycolmap", "xatlas", "scipy", "matplotlib", "safetensors"} & set(loaded)

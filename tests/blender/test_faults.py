@@ -61,7 +61,7 @@ def extension(fresh, tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def said(monkeypatch):
+def popups(monkeypatch):
     """Messages of pop-ups."""
     sentences = []
     monkeypatch.setattr(messages, "show", lambda text, kind="INFO": sentences.append(text))
@@ -81,14 +81,14 @@ def shown(extension, folder):
     return bpy.context.scene.objectgs.active
 
 
-def refusal(operator, **options) -> str:
+def error_report(operator, **options) -> str:
     """Return the error message of an operator that fails."""
     with pytest.raises(RuntimeError) as failed:
         operator(**options)
     return str(failed.value)
 
 
-def plain(sentence: str) -> bool:
+def is_plain_sentence(sentence: str) -> bool:
     return sentence.strip() != "" and "Traceback" not in sentence and "Errno" not in sentence
 
 
@@ -110,7 +110,7 @@ def tick_until(condition) -> None:
     """Run the background timer until `condition()` holds."""
     deadline = time.monotonic() + WAIT
     while not condition():
-        assert time.monotonic() < deadline, "it never came"
+        assert time.monotonic() < deadline, "condition timed out"
         background._tick()
         time.sleep(0.01)
 
@@ -136,14 +136,14 @@ def blocks() -> dict[str, list[str]]:
 # The backend
 
 
-def test_no_backend(extension, shown, capture):
+def test_missing_backend_is_reported(extension, shown, capture):
     for operator in (bpy.ops.objectgs.assign_objects, bpy.ops.objectgs.train, bpy.ops.objectgs.check_backend):
         assert not operator.poll()
-    assert "is not set up; press Set Up Backend" in refusal(bpy.ops.objectgs.train)
-    assert "is not set up" in refusal(bpy.ops.objectgs.import_capture, directory=str(capture))
+    assert "is not set up; press Set Up Backend" in error_report(bpy.ops.objectgs.train)
+    assert "is not set up" in error_report(bpy.ops.objectgs.import_capture, directory=str(capture))
 
 
-def test_backend_of_another_version(extension, shown):
+def test_outdated_backend_is_reported(extension, shown):
     place = locations.environment_folder()
     python = layout.environment_python(place)
     python.parent.mkdir(parents=True)
@@ -157,14 +157,14 @@ def test_backend_of_another_version(extension, shown):
         "device": "cpu",
     }
     (place / layout.MARKER).write_text(json.dumps(marker))
-    assert "was set up for another version of ObjectGS" in refusal(bpy.ops.objectgs.train)
+    assert "was set up for another version of ObjectGS" in error_report(bpy.ops.objectgs.train)
     (place / layout.MARKER).write_text("{")
-    assert "ready.json cannot be read" in refusal(bpy.ops.objectgs.train)
+    assert "ready.json cannot be read" in error_report(bpy.ops.objectgs.train)
 
 
-def test_python_that_is_not_there(extension, shown, monkeypatch, tmp_path):
+def test_missing_python_is_reported(extension, shown, monkeypatch, tmp_path):
     monkeypatch.setenv("OBJECTGS_PYTHON", str(tmp_path / "gone"))
-    assert f"{tmp_path / 'gone'} does not exist" in refusal(bpy.ops.objectgs.train)
+    assert f"{tmp_path / 'gone'} does not exist" in error_report(bpy.ops.objectgs.train)
 
 
 @pytest.mark.parametrize(
@@ -175,22 +175,22 @@ def test_python_that_is_not_there(extension, shown, monkeypatch, tmp_path):
         ("too old", "#!/bin/sh\necho 'SyntaxError: invalid syntax' >&2\nexit 1\n", "cannot run the backend; choose a"),
     ],
 )
-def test_wrong_python(extension, monkeypatch, capture, tmp_path, name, program, sentence):
+def test_unsuitable_python_is_reported(extension, monkeypatch, capture, tmp_path, name, program, sentence):
     python = tmp_path / "python"
     python.write_text(program or "text")
     python.chmod(0o755 if program else 0o644)
     monkeypatch.setenv("OBJECTGS_PYTHON", str(python))
     before = blocks()
-    told = refusal(bpy.ops.objectgs.import_capture, directory=str(capture), folder=str(tmp_path / "out"))
-    assert sentence in told and str(python) in told and plain(told)
+    report = error_report(bpy.ops.objectgs.import_capture, directory=str(capture), folder=str(tmp_path / "out"))
+    assert sentence in report and str(python) in report and is_plain_sentence(report)
     assert blocks() == before and not (tmp_path / "out").exists()
 
 
-def test_python_without_the_packages(extension, monkeypatch, capture, tmp_path):
+def test_python_without_packages_is_reported(extension, monkeypatch, capture, tmp_path):
     """The Python of these tests has only bpy and NumPy."""
     monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
-    told = refusal(bpy.ops.objectgs.import_capture, directory=str(capture), folder=str(tmp_path / "out"))
-    assert "lacks the package" in told and sys.executable in told and not (tmp_path / "out").exists()
+    report = error_report(bpy.ops.objectgs.import_capture, directory=str(capture), folder=str(tmp_path / "out"))
+    assert "lacks the package" in report and sys.executable in report and not (tmp_path / "out").exists()
 
 
 # Importing
@@ -199,13 +199,13 @@ def test_python_without_the_packages(extension, monkeypatch, capture, tmp_path):
 @pytest.mark.parametrize(
     "name", ["cameras_only", "truncated", "degenerate_two_images", "missing_cameras_subfolders_txt"]
 )
-def test_broken_model_is_refused(extension, backend_python, monkeypatch, tmp_path, name):
+def test_invalid_model_is_rejected(extension, backend_python, monkeypatch, tmp_path, name):
     if not (FIXTURES / name).is_dir():
         pytest.skip(f"{FIXTURES / name} is not here")
     monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
     before = blocks()
-    told = refusal(bpy.ops.objectgs.import_capture, directory=str(FIXTURES / name), folder=str(tmp_path / "out"))
-    assert name in told and plain(told) and len(told.strip().splitlines()) == 1
+    report = error_report(bpy.ops.objectgs.import_capture, directory=str(FIXTURES / name), folder=str(tmp_path / "out"))
+    assert name in report and is_plain_sentence(report) and len(report.strip().splitlines()) == 1
     assert blocks() == before and not (tmp_path / "out").exists()
 
 
@@ -217,15 +217,17 @@ def test_broken_model_is_refused(extension, backend_python, monkeypatch, tmp_pat
         (lambda place: place.write_text("a file"), "does not exist"),
     ],
 )
-def test_folder_that_is_no_capture(extension, backend_python, monkeypatch, tmp_path, make, sentence):
+def test_folder_without_capture_is_rejected(extension, backend_python, monkeypatch, tmp_path, make, sentence):
     monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
     make(tmp_path / "capture")
-    told = refusal(bpy.ops.objectgs.import_capture, directory=str(tmp_path / "capture"), folder=str(tmp_path / "out"))
-    assert plain(told) and str(tmp_path / "capture") in told
+    report = error_report(
+        bpy.ops.objectgs.import_capture, directory=str(tmp_path / "capture"), folder=str(tmp_path / "out")
+    )
+    assert is_plain_sentence(report) and str(tmp_path / "capture") in report
     assert not (tmp_path / "out").exists() and not bpy.data.collections
 
 
-def test_two_captures_of_one_name_get_folders_of_their_own(extension, tmp_path):
+def test_captures_of_equal_name_get_separate_folders(extension, tmp_path):
     from objectgs.operators.capture.import_capture import _folder_for
 
     first, second = tmp_path / "a" / "mug", tmp_path / "b" / "mug"
@@ -238,28 +240,28 @@ def test_two_captures_of_one_name_get_folders_of_their_own(extension, tmp_path):
     assert _folder_for(first) == taken and _folder_for(second) == taken.with_name("mug-2")
 
 
-def test_import_where_another_works(extension, shown, folder, capture, tmp_path, monkeypatch):
+def test_import_into_folder_in_use_is_rejected(extension, shown, folder, capture, tmp_path, monkeypatch):
     monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
-    held = start(job(tmp_path, UNTIL_STOPPED, folder=folder), bpy.context.scene)
+    running = start(job(tmp_path, UNTIL_STOPPED, folder=folder), bpy.context.scene)
     before = snapshot(folder)
-    assert f"A job is using {folder}" in refusal(
+    assert f"A job is using {folder}" in error_report(
         bpy.ops.objectgs.import_capture, directory=str(capture), folder=str(folder)
     )
-    assert f"A job is using {folder}" in refusal(bpy.ops.objectgs.train)
-    held.stop()
-    tick_until(lambda: held.is_finished)
-    holds = f"""
+    assert f"A job is using {folder}" in error_report(bpy.ops.objectgs.train)
+    running.stop()
+    tick_until(lambda: running.is_finished)
+    hold_lock = f"""
 from pathlib import Path
 from backend.shared.reconstruction.lock import locked
 with locked(Path({str(folder)!r})):
     print("locked", flush=True)
     input()
 """
-    command, pipes = [sys.executable, "-c", holds], {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    command, pipes = [sys.executable, "-c", hold_lock], {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen(command, cwd=Path(headless.__file__).parent, **pipes) as other:
         assert other.stdout.readline().strip() == b"locked"
-        told = refusal(bpy.ops.objectgs.import_capture, directory=str(capture), folder=str(folder))
-        assert f"Another program (process {other.pid}) is using {folder}" in told
+        report = error_report(bpy.ops.objectgs.import_capture, directory=str(capture), folder=str(folder))
+        assert f"Another program (process {other.pid}) is using {folder}" in report
         other.communicate(b"\n")
     assert snapshot(folder) == before
 
@@ -267,7 +269,7 @@ with locked(Path({str(folder)!r})):
 # Files that disappear or break while in use
 
 
-def test_capture_deleted(extension, backend_python, capture, tmp_path, monkeypatch):
+def test_deleted_capture_is_reported(extension, backend_python, capture, tmp_path, monkeypatch):
     """A running training keeps its result or reports an error; the Train operator then reports the missing capture."""
     monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
     place = Path(shutil.copytree(capture, tmp_path / "capture"))
@@ -280,12 +282,12 @@ def test_capture_deleted(extension, backend_python, capture, tmp_path, monkeypat
     tick_until(lambda: training.step or training.is_finished)
     shutil.rmtree(place)
     tick_until(lambda: training.is_finished and not background._results)
-    assert training.state is State.DONE or plain(training.error)
+    assert training.state is State.DONE or is_plain_sentence(training.error)
     assert not (tmp_path / "out" / ".lock").exists() and not list((tmp_path / "out").rglob("*.part"))
     assert scene.kind_of(root) == "reconstruction"
-    assert f"The capture {place} is missing" in refusal(bpy.ops.objectgs.train)
+    assert f"The capture {place} is missing" in error_report(bpy.ops.objectgs.train)
     (tmp_path / "out" / "cameras.json").write_text("{}")
-    assert "does not name the capture" in refusal(bpy.ops.objectgs.train)
+    assert "does not name the capture" in error_report(bpy.ops.objectgs.train)
 
 
 @pytest.fixture
@@ -300,15 +302,15 @@ def tiny_disk(tmp_path):
     subprocess.run(["umount", "-l", place], check=True)
 
 
-def test_full_disk(extension, backend_python, capture, tiny_disk, monkeypatch):
+def test_full_disk_is_reported(extension, backend_python, capture, tiny_disk, monkeypatch):
     monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
     (tiny_disk / "filler").write_bytes(bytes(88 * 1024))
-    told = refusal(bpy.ops.objectgs.import_capture, directory=str(capture), folder=str(tiny_disk / "out"))
-    assert "No space left" in told and "free some space" in told and plain(told)
+    report = error_report(bpy.ops.objectgs.import_capture, directory=str(capture), folder=str(tiny_disk / "out"))
+    assert "No space left" in report and "free some space" in report and is_plain_sentence(report)
     assert not bpy.data.collections and not list(tiny_disk.rglob("*.part"))
 
 
-def test_full_disk_while_editing(shown, folder, said, monkeypatch):
+def test_full_disk_reverts_edits(shown, folder, popups, monkeypatch):
     def full(_descriptor):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -317,14 +319,14 @@ def test_full_disk_while_editing(shown, folder, said, monkeypatch):
     monkeypatch.setattr(os, "fsync", full)
     row.name, row.color, row.chosen = "cup", (0.1, 0.2, 0.3), False
     assert (row.name, tuple(row.color), row.chosen) == (name, color, True)
-    assert len(said) == 3 and all("objects.json" in text and "free some space" in text for text in said)
-    assert "free some space" in refusal(
+    assert len(popups) == 3 and all("objects.json" in text and "free some space" in text for text in popups)
+    assert "free some space" in error_report(
         bpy.ops.objectgs.merge_objects, into=str(scene.from_stored(shown.objectgs.objects[2].object_id))
     )
     assert snapshot(folder) == before
 
 
-def test_old_file_without_its_folder(shown, folder, said, tmp_path, monkeypatch):
+def test_file_without_folder_reports_errors(shown, folder, popups, tmp_path, monkeypatch):
     monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "old.blend"))
     shutil.rmtree(folder)
@@ -341,7 +343,7 @@ def test_old_file_without_its_folder(shown, folder, said, tmp_path, monkeypatch)
         operators.split_objects,
         operators.choose_objects,
     ):
-        assert f"The folder {folder} of this reconstruction is missing" in refusal(operator)
+        assert f"The folder {folder} of this reconstruction is missing" in error_report(operator)
     for operator in (operators.set_ground, operators.set_distance, operators.solo_object, operators.select_object):
         assert operator.poll(), "it does not use the folder"
     row = root.objectgs.objects[1]
@@ -349,8 +351,10 @@ def test_old_file_without_its_folder(shown, folder, said, tmp_path, monkeypatch)
     row.name, row.color, row.chosen = "cup", (0.1, 0.2, 0.3), False
     row.name = "  "
     assert (row.name, tuple(row.color), row.chosen) == (name, color, True)
-    assert len(said) == 3 and all(plain(text) and "objects.json does not exist" in text for text in said)
-    assert "has no cameras.json" in refusal(operators.open_reconstruction, directory=str(folder))
+    assert len(popups) == 3 and all(
+        is_plain_sentence(text) and "objects.json does not exist" in text for text in popups
+    )
+    assert "has no cameras.json" in error_report(operators.open_reconstruction, directory=str(folder))
     assert blocks() == before and not folder.exists()
 
 
@@ -364,15 +368,15 @@ def test_old_file_without_its_folder(shown, folder, said, tmp_path, monkeypatch)
         '{"objects": [{"id": 1, "name": "a", "color": [1, 2, Infinity], "points": 1}]}',
     ],
 )
-def test_broken_objects_file(shown, folder, said, tmp_path, content):
+def test_invalid_objects_file_is_reported(shown, folder, popups, tmp_path, content):
     (folder / "objects.json").write_text(content)
     before, there = snapshot(folder), blocks()
     row = shown.objectgs.objects[1]
     name = row.name
     row.name = "cup"
-    assert row.name == name and len(said) == 1 and "objects.json" in said[0]
-    told = refusal(bpy.ops.objectgs.show_result)
-    assert "objects.json" in told and "delete it" in told and plain(told)
+    assert row.name == name and len(popups) == 1 and "objects.json" in popups[0]
+    report = error_report(bpy.ops.objectgs.show_result)
+    assert "objects.json" in report and "delete it" in report and is_plain_sentence(report)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "broken.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "broken.blend"))
     handlers._undone()
@@ -388,17 +392,17 @@ def test_broken_objects_file(shown, folder, said, tmp_path, content):
         ("objects.json", b"[]"),
     ],
 )
-def test_broken_folder_leaves_no_half_made_collection(extension, folder, name, content):
+def test_invalid_folder_adds_no_data_blocks(extension, folder, name, content):
     (folder / name).write_bytes(content)
     before = blocks()
-    told = refusal(bpy.ops.objectgs.open_reconstruction, directory=str(folder))
-    assert name in told and plain(told) and blocks() == before
+    report = error_report(bpy.ops.objectgs.open_reconstruction, directory=str(folder))
+    assert name in report and is_plain_sentence(report) and blocks() == before
     assert bpy.context.scene.objectgs.active is None
 
 
-def test_broken_splats_leave_cameras_and_points(extension, folder):
+def test_invalid_splats_keep_cameras_and_points(extension, folder):
     (folder / "splats.ply").write_bytes((folder / "splats.ply").read_bytes()[:-7])
-    assert "splats.ply" in refusal(bpy.ops.objectgs.open_reconstruction, directory=str(folder))
+    assert "splats.ply" in error_report(bpy.ops.objectgs.open_reconstruction, directory=str(folder))
     root = bpy.context.scene.objectgs.active
     assert not scene.object_collections(root) and len(root.objectgs.objects)
 
@@ -406,7 +410,7 @@ def test_broken_splats_leave_cameras_and_points(extension, folder):
 # Jobs whose scene changes while they run
 
 
-def test_each_result_lands_in_its_own_scene(extension, folder, trained, tmp_path):
+def test_results_are_shown_in_their_scenes(extension, folder, trained, tmp_path):
     first = bpy.context.scene
     second, third = bpy.data.scenes.new("second"), bpy.data.scenes.new("third")
     other = Path(shutil.copytree(trained, tmp_path / "other"))
@@ -427,7 +431,7 @@ def test_each_result_lands_in_its_own_scene(extension, folder, trained, tmp_path
 
 
 @pytest.mark.parametrize("kind", ["import", "vote", "train"])
-def test_scene_and_collection_deleted_meanwhile(extension, folder, said, tmp_path, kind):
+def test_result_after_scene_and_collection_were_deleted(extension, folder, popups, tmp_path, kind):
     owner = bpy.data.scenes.new("owner")
     root = scene.show_capture(owner, folder)
     work = start(job(tmp_path, kind=kind, folder=folder), owner)
@@ -435,19 +439,19 @@ def test_scene_and_collection_deleted_meanwhile(extension, folder, said, tmp_pat
     bpy.data.scenes.remove(owner)
     before = blocks()
     tick_until(lambda: work.is_finished and not background._results)
-    assert len(said) == 1 and "Open Reconstruction" in said[0] and str(folder) in said[0]
+    assert len(popups) == 1 and "Open Reconstruction" in popups[0] and str(folder) in popups[0]
     assert blocks() == before
-    said.clear()
+    popups.clear()
     run(job(tmp_path, kind=kind, folder=folder), bpy.context.scene)
-    assert bool(bpy.context.scene.objectgs.active) == (kind == "import") and bool(said) == (kind != "import")
+    assert bool(bpy.context.scene.objectgs.active) == (kind == "import") and bool(popups) == (kind != "import")
 
 
-def test_collection_renamed_or_taken_out_meanwhile(shown, folder, said, tmp_path):
+def test_result_after_collection_was_renamed_and_unlinked(shown, folder, popups, tmp_path):
     work = start(job(tmp_path, folder=folder), bpy.context.scene)
     shown.name = "mine"
     bpy.context.scene.collection.children.unlink(shown)
     tick_until(lambda: work.is_finished and not background._results)
-    assert shown.name == "mine" and shown in list(bpy.context.scene.collection.children) and not said
+    assert shown.name == "mine" and shown in list(bpy.context.scene.collection.children) and not popups
 
 
 def positions(root) -> dict[str, list[float]]:
@@ -466,7 +470,7 @@ def positions(root) -> dict[str, list[float]]:
     }
 
 
-def test_parents_deleted(shown, folder, tmp_path):
+def test_result_after_parents_were_deleted(shown, folder, tmp_path):
     before = positions(shown)
     parents = [part for part in shown.all_objects if scene.kind_of(part) in ("parent", "object_parent")]
     for part in parents[:3]:
@@ -477,7 +481,7 @@ def test_parents_deleted(shown, folder, tmp_path):
 
 
 @pytest.mark.parametrize("with_objects", [True, False])
-def test_collections_dissolved(shown, folder, tmp_path, with_objects):
+def test_result_after_collections_were_deleted(shown, folder, tmp_path, with_objects):
     """As with Delete in the Outliner, which moves objects to the parent collection, and with Delete Hierarchy."""
     before = positions(shown)
     for collection in list(shown.children_recursive):
@@ -494,7 +498,7 @@ def test_collections_dissolved(shown, folder, tmp_path, with_objects):
 
 
 @pytest.mark.parametrize("mode", ["EDIT", "SCULPT"])
-def test_result_waits_for_object_mode(shown, folder, said, tmp_path, mode):
+def test_result_waits_for_object_mode(shown, folder, popups, tmp_path, mode):
     part = next(part for part in shown.all_objects if scene.kind_of(part) == "splats")
     name = part.name
     part.hide_set(False)
@@ -502,20 +506,20 @@ def test_result_waits_for_object_mode(shown, folder, said, tmp_path, mode):
     bpy.ops.object.mode_set(mode=mode)
     row = shown.objectgs.objects[1]
     row.name = "cup"
-    assert row.name != "cup" and f"{name} is in {mode.title()} Mode" in said.pop()
-    assert f"is in {mode.title()} Mode" in refusal(bpy.ops.objectgs.show_result)
+    assert row.name != "cup" and f"{name} is in {mode.title()} Mode" in popups.pop()
+    assert f"is in {mode.title()} Mode" in error_report(bpy.ops.objectgs.show_result)
     work = start(job(tmp_path, folder=folder), bpy.context.scene)
     tick_until(lambda: work.is_finished)
     for _ in range(5):
         assert background._tick() is not None
-    assert said == [f"Fake has finished; the result will be shown when {name} is in Object Mode again."]
+    assert popups == [f"Fake has finished; the result will be shown when {name} is in Object Mode again."]
     assert background._results == [work]
     bpy.ops.object.mode_set(mode="OBJECT")
     background._tick()
-    assert not background._results and len(said) == 1
+    assert not background._results and len(popups) == 1
 
 
-def test_result_waits_for_the_end_of_rendering(shown, folder, said, tmp_path, monkeypatch):
+def test_result_waits_for_end_of_rendering(shown, folder, popups, tmp_path, monkeypatch):
     class Rendering:
         """bpy.app during a render."""
 
@@ -539,10 +543,10 @@ def test_result_waits_for_the_end_of_rendering(shown, folder, said, tmp_path, mo
     assert background._tick() is not None and not calls
     monkeypatch.setattr(background, "bpy", bpy)
     background._tick()
-    assert calls == [work] and said == ["Fake has finished; the result will be shown when rendering ends."]
+    assert calls == [work] and popups == ["Fake has finished; the result will be shown when rendering ends."]
 
 
-def test_a_failure_of_one_result_stops_no_other_job(extension, folder, said, tmp_path, monkeypatch):
+def test_failed_result_does_not_stop_other_jobs(extension, folder, popups, tmp_path, monkeypatch):
     def fails(_job, _owner):
         raise ZeroDivisionError("on purpose")
 
@@ -551,10 +555,10 @@ def test_a_failure_of_one_result_stops_no_other_job(extension, folder, said, tmp
     works = start(job(tmp_path, kind="import", folder=folder), bpy.context.scene)
     tick_until(lambda: works.is_finished and not background._results)
     assert broken.state is State.DONE and bpy.context.scene.objectgs.active is not None
-    assert said == ["Vote: the result could not be shown (ZeroDivisionError: on purpose)"]
+    assert popups == ["Vote: the result could not be shown (ZeroDivisionError: on purpose)"]
 
 
-def test_registered_ten_times_while_a_job_runs(extension, folder, said, tmp_path):
+def test_unregister_stops_running_job(extension, folder, popups, tmp_path):
     for _ in range(10):
         work = start(job(tmp_path, UNTIL_STOPPED, folder=folder), bpy.context.scene)
         tick_until(lambda work=work: work.message)
@@ -562,7 +566,7 @@ def test_registered_ten_times_while_a_job_runs(extension, folder, said, tmp_path
         assert work.state is State.STOPPED and work.exit_code == 130
         extension.register()
         assert not background.busy(folder) and not background._submitted_in
-    assert not said
+    assert not popups
 
 
 # Names and numbers
@@ -577,7 +581,7 @@ def rename(folder, names: dict[int, str]) -> None:
     path.write_text(json.dumps(content))
 
 
-def test_odd_names(shown, folder):
+def test_unusual_names_are_shown(shown, folder):
     ids = [scene.from_stored(row.object_id) for row in shown.objectgs.objects if row.object_id][:5]
     odd = ["", 'Tasse\n☕\t/ \\ % "q"', "x" * 5000, "\ud800\0", "same", "same"]
     for names in (dict(zip(ids, odd)), dict(zip(ids, odd[2:])), dict.fromkeys(ids, "same")):
@@ -591,7 +595,7 @@ def test_odd_names(shown, folder):
     assert row.name == "Größe 日本" and row.name in {entry.name for entry in read_objects(folder / "objects.json")}
 
 
-def test_many_objects_and_large_ids(shown, folder):
+def test_many_objects_and_large_ids_are_supported(shown, folder):
     """300 rows with IDs up to 2^32 - 1 can be listed, chosen, merged, split and selected."""
     path = Reconstruction(folder).objects
     content = json.loads(path.read_text())
@@ -643,15 +647,15 @@ def with_large_ids(path: Path, ids: dict[int, int]) -> bytes:
 # Placing
 
 
-def test_points_that_say_nothing(shown):
-    assert "on one line" in refusal(bpy.ops.objectgs.set_ground, points=(0, 0, 0, 1, 0, 0, 2, 0, 0))
-    assert "coincide" in refusal(bpy.ops.objectgs.set_distance, points=(1, 1, 1, 1, 1, 1))
+def test_degenerate_points_are_rejected(shown):
+    assert "on one line" in error_report(bpy.ops.objectgs.set_ground, points=(0, 0, 0, 1, 0, 0, 2, 0, 0))
+    assert "coincide" in error_report(bpy.ops.objectgs.set_distance, points=(1, 1, 1, 1, 1, 1))
     bpy.data.objects.remove(next(part for part in shown.objects if scene.kind_of(part) == "parent"))
-    told = refusal(bpy.ops.objectgs.set_ground, points=(0, 0, 0, 1, 0, 0, 0, 1, 0))
-    assert "has lost its parent empty" in told
+    report = error_report(bpy.ops.objectgs.set_ground, points=(0, 0, 0, 1, 0, 0, 0, 1, 0))
+    assert "has lost its parent empty" in report
 
 
-def test_a_folder_with_foreign_files_is_not_used(extension, tmp_path, monkeypatch):
+def test_folder_with_foreign_files_is_not_used(extension, tmp_path, monkeypatch):
     """A folder that the user names is refused; the automatic name gets a number."""
     monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
     monkeypatch.setattr(locations, "reconstructions_folder", lambda: tmp_path / "all")
@@ -661,7 +665,7 @@ def test_a_folder_with_foreign_files_is_not_used(extension, tmp_path, monkeypatc
     (tmp_path / "all" / "garden").mkdir(parents=True)
     (tmp_path / "all" / "garden" / "thesis.odt").write_text("not yours")
     capture = str(tmp_path / "garden")
-    told = refusal(bpy.ops.objectgs.import_capture, directory=capture, folder=str(tmp_path / "all" / "garden"))
-    assert "thesis.odt" in told and not jobs
+    report = error_report(bpy.ops.objectgs.import_capture, directory=capture, folder=str(tmp_path / "all" / "garden"))
+    assert "thesis.odt" in report and not jobs
     bpy.ops.objectgs.import_capture(directory=capture)
     assert jobs[0].folder == tmp_path / "all" / "garden-2"

@@ -106,7 +106,7 @@ def assert_placed(root, shot, sample, object_id, splats, place=0) -> None:
 @pytest.mark.parametrize(
     ("size", "aspect"), [((640, 360), (1.0, 1.0)), ((300, 500), (1.0, 2.0)), ((330, 220), (1.5, 1.0))]
 )
-def test_lenses_are_blenders_own(root, fit, size, aspect):
+def test_shot_cameras_match_blender_projection(root, fit, size, aspect):
     scene = bpy.context.scene
     scene.render.resolution_x, scene.render.resolution_y = size
     scene.render.resolution_percentage = 60
@@ -123,11 +123,11 @@ def test_lenses_are_blenders_own(root, fit, size, aspect):
     assert shot.pixel_aspect == pytest.approx(aspect[0] / aspect[1]) and shot.depth_scale == pytest.approx(2.5)
     assert sample.clip == pytest.approx((0.2, 30.0))
     for object_id in OBJECTS:
-        assert sample.objects[object_id].maps is None, "nothing has been moved"
+        assert sample.objects[object_id].maps is None, "no object has been moved"
         assert_placed(root, shot, sample, object_id, splats_of(root, object_id))
 
 
-def test_cameras_of_the_capture_come_back_as_they_were(root):
+def test_capture_cameras_round_trip(root):
     scene = bpy.context.scene
     camera = next(obj for obj in root.all_objects if kinds.kind_of(obj) == "camera")
     blender_scene.use_camera(scene, camera)
@@ -138,7 +138,7 @@ def test_cameras_of_the_capture_come_back_as_they_were(root):
     np.testing.assert_allclose(sample.K, [[500, 0, 310], [0, 500, 250.5], [0, 0, 1]], atol=1e-3)
 
 
-def test_moving_things_move_in_every_frame(root):
+def test_animation_is_sampled_in_every_frame(root):
     """Camera, lens, an object and the whole reconstruction have keyframes; the scene's current frame is restored."""
     scene = bpy.context.scene
     pivot, parent = ensure_pivot(root, 1), kinds.parent_of(root)
@@ -165,7 +165,7 @@ def test_moving_things_move_in_every_frame(root):
     assert lenses[0] < lenses[1] < lenses[2]
 
 
-def test_what_viewports_hide_moves_nevertheless(root):
+def test_objects_hidden_in_viewport_are_animated(root):
     scene = bpy.context.scene
     pivot = ensure_pivot(root, 1)
     before = splats_of(root, 1).matrix_world.copy()
@@ -183,7 +183,7 @@ def test_what_viewports_hide_moves_nevertheless(root):
     assert np.linalg.norm(last[:3, 3] - first[:3, 3]) == pytest.approx(2.0, rel=1e-3)
 
 
-def test_what_is_not_rendered_is_not_in_the_shot(root):
+def test_objects_hidden_in_renders_are_omitted(root):
     scene, layer = bpy.context.scene, bpy.context.view_layer.layer_collection.children[root.name]
     collections = blender_scene.object_collections(root)
     ids = set(OBJECTS) | {0}
@@ -193,7 +193,7 @@ def test_what_is_not_rendered_is_not_in_the_shot(root):
 
     assert shown() == ids and shoot(root).only_named
     root.hide_render = True
-    assert shown() == ids, "the whole reconstruction is hidden where film frames take its place"
+    assert shown() == ids, "hiding the reconstruction does not omit its objects"
     collections[1].hide_render = True
     assert shown() == ids - {1}
     layer.children[collections[2].name].exclude = True
@@ -210,7 +210,7 @@ def test_what_is_not_rendered_is_not_in_the_shot(root):
     assert objects == [ids - {0, 1, 2}, ids - {0, 1, 2}, ids - {1, 2}]
 
 
-def test_copies_are_drawn_too(root):
+def test_duplicates_and_instances_are_included(root):
     """A duplicated object, and an empty that instances a collection elsewhere."""
     scene = bpy.context.scene
     collection = blender_scene.object_collections(root)[2]
@@ -240,7 +240,7 @@ def test_copies_are_drawn_too(root):
     np.testing.assert_allclose(seen(shot, sample, points)[:, 2], expected, rtol=1e-3, atol=1e-3)
 
 
-def test_shutter(root):
+def test_shutter_times_match_motion_blur_settings(root):
     render = bpy.context.scene.render
     render.motion_blur_shutter = 0.5
     for position, opens in (("START", 5.0), ("CENTER", 4.75), ("END", 4.5)):
@@ -252,7 +252,7 @@ def test_shutter(root):
     assert shoot(root, (5,)).frames[0].samples[0].time == 5.0
 
 
-def test_what_cannot_be_shot(root):
+def test_unsupported_cameras_are_rejected(root):
     scene = bpy.context.scene
     for kind, word in (("ORTHO", "orthographic"), ("PANO", "panoramic")):
         scene.camera.data.type = kind
@@ -268,7 +268,7 @@ def test_what_cannot_be_shot(root):
         shoot(root)
 
 
-# --- frames in Blender ------------------------------------------------------------------------------------------------
+# --- frames in Blender -----------------------------------------------------------------------------------------------
 
 RED, GREEN, BLUE = (0.8, 0.2, 0.2), (0.1, 0.7, 0.2), (0.1, 0.2, 0.9)
 SIZE = 80
@@ -402,17 +402,17 @@ LEFT_BALL, RIGHT_BALL, LEFT_WALL, RIGHT_WALL = (40, 23), (40, 71), (30, 12), (30
 """(row, column) of a pixel in the middle of each of these."""
 
 
-def test_the_composite_is_joined_by_depth(filmed):
-    picture = pixels_of(filmed / "composite.0007.png")
+def test_composite_combines_by_depth(filmed):
+    image = pixels_of(filmed / "composite.0007.png")
     splats = pixels_of(filmed / "splats.0007.png")
-    assert picture.shape[:2] == (SIZE, SIZE)
+    assert image.shape[:2] == (SIZE, SIZE)
     for place, color in ((LEFT_BALL, RED), (LEFT_WALL, RED), (RIGHT_WALL, GREEN), (RIGHT_BALL, encoded(BLUE))):
-        np.testing.assert_allclose(picture[place][:3], color, atol=0.015, err_msg=str(place))
+        np.testing.assert_allclose(image[place][:3], color, atol=0.015, err_msg=str(place))
         if place != RIGHT_BALL:
-            np.testing.assert_allclose(picture[place], splats[place], atol=0.006)
+            np.testing.assert_allclose(image[place], splats[place], atol=0.006)
 
 
-def test_depth_is_blenders_own(shot_blend, filmed, backend_python, tmp_path):
+def test_depth_matches_blender(shot_blend, filmed, backend_python, tmp_path):
     """The depth of a disc equals Blender's depth of a plane in its place, and so does the depth of the background."""
     bpy.ops.wm.open_mainfile(filepath=str(shot_blend))
     scene = bpy.context.scene
@@ -440,7 +440,7 @@ def test_depth_is_blenders_own(shot_blend, filmed, backend_python, tmp_path):
     assert of_plane.max() == of_disc.max() == np.float32(1e10)
 
 
-def test_blender_reads_the_mattes(filmed, backend_python):
+def test_blender_reads_cryptomattes(filmed, backend_python):
     """Blender's Cryptomatte node finds the objects by the hash of their name, and extracts their mattes."""
     bpy.ops.wm.open_mainfile(filepath=str(filmed / "joined.blend"))
     scene = bpy.context.scene
@@ -463,7 +463,7 @@ def test_blender_reads_the_mattes(filmed, backend_python):
     assert matte[RIGHT_WALL] > 0.98 and matte[LEFT_WALL] < 0.02
 
 
-def test_the_compositor_is_set_up_once(shot_blend, filmed):
+def test_compositor_setup_is_idempotent(shot_blend, filmed):
     bpy.ops.wm.open_mainfile(filepath=str(shot_blend))
     scene, layer = bpy.context.scene, bpy.context.view_layer
     root = next(child for child in scene.collection.children_recursive if kinds.kind_of(child) == "reconstruction")
@@ -483,7 +483,7 @@ def test_the_compositor_is_set_up_once(shot_blend, filmed):
     assert node.image.source == "SEQUENCE" and not [link for link in tree.links if not link.is_valid]
 
 
-def test_what_led_to_the_output_is_taken_for_the_rendering(shot_blend, filmed):
+def test_compositor_setup_keeps_existing_nodes(shot_blend, filmed):
     bpy.ops.wm.open_mainfile(filepath=str(shot_blend))
     scene, layer = bpy.context.scene, bpy.context.view_layer
     root = next(child for child in scene.collection.children_recursive if kinds.kind_of(child) == "reconstruction")
@@ -504,7 +504,7 @@ def test_what_led_to_the_output_is_taken_for_the_rendering(shot_blend, filmed):
     assert sum(node.type == "R_LAYERS" for node in tree.nodes) == 1
 
 
-def test_edits_reach_the_frames_and_refusals_are_one_sentence(shot_blend, backend_python):
+def test_film_command_applies_edits_and_reports_errors(shot_blend, backend_python):
     out = shot_blend.parent / "edited"
 
     def run(*words):
@@ -525,14 +525,14 @@ def test_edits_reach_the_frames_and_refusals_are_one_sentence(shot_blend, backen
     assert ran.returncode == 0, ran.stdout + ran.stderr
     assert len(read_shot(out / "shot.0003-0006.json").frames) == 3
     assert sorted(path.name for path in out.glob("*.exr")) == [f"splats.000{i}.exr" for i in (3, 5, 6)]
-    picture = pixels_of(out / "splats.0003.png")
-    assert picture.shape[:2] == (20, 40) and picture[10, 4, 3] < 0.01 and picture[10, 33, 3] > 0.98
-    for words, said in (
+    image = pixels_of(out / "splats.0003.png")
+    assert image.shape[:2] == (20, 40) and image[10, 4, 3] < 0.01 and image[10, 33, 3] > 0.98
+    for words, expected in (
         ((shot_blend, "--out", out, "--frames", "x"), "--frames"),
         ((shot_blend, "--out", out, "--dir", out), "--dir"),
     ):
         ran = run(*words)
-        assert ran.returncode == 2 and said in ran.stderr and ran.stderr.count("\n") == 1, ran.stdout + ran.stderr
+        assert ran.returncode == 2 and expected in ran.stderr and ran.stderr.count("\n") == 1, ran.stdout + ran.stderr
 
 
 @pytest.fixture
@@ -543,7 +543,7 @@ def registered():
     extension.unregister()
 
 
-def test_the_buttons(shot_blend, backend_python, registered, monkeypatch, tmp_path):
+def test_film_operators_use_panel_settings(shot_blend, backend_python, registered, monkeypatch, tmp_path):
     """Operators for film frames and the compositor use the panel's folder, and report why they fail."""
     monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
     bpy.ops.wm.open_mainfile(filepath=str(shot_blend))

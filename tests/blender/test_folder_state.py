@@ -22,12 +22,12 @@ def write_checkpoint(folder, step, seconds):
     (folder / "checkpoint" / "model.safetensors").write_bytes(struct.pack("<Q", len(header)) + header)
 
 
-def test_a_folder_that_is_gone(tmp_path):
+def test_missing_folder_has_no_state(tmp_path):
     state = folder_state(tmp_path / "gone")
     assert not state.exists and not state.imported and state.capture is None and state.steps == 0
 
 
-def test_each_step_is_seen(tmp_path):
+def test_folder_state_follows_each_step(tmp_path):
     folder = tmp_path / "rec"
     folder.mkdir()
     assert folder_state(folder).exists and not folder_state(folder).imported
@@ -49,7 +49,7 @@ def test_each_step_is_seen(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff" * 8, b'\x05\0\0\0\0\0\0\0{"a":', struct.pack("<Q", 2) + b"{}"])
-def test_broken_files_count_as_nothing(tmp_path, content):
+def test_invalid_files_count_as_missing(tmp_path, content):
     (tmp_path / "checkpoint").mkdir()
     (tmp_path / "checkpoint" / "model.safetensors").write_bytes(content)
     (tmp_path / "cameras.json").write_text("{nonsense")

@@ -112,7 +112,7 @@ def edits(folder: Path) -> dict:
     return json.loads((folder / "objects.json").read_text())["edits"]
 
 
-def refusal(operator, **options) -> str:
+def error_report(operator, **options) -> str:
     with pytest.raises(RuntimeError) as failed:
         operator(**options)
     return str(failed.value)
@@ -202,7 +202,7 @@ def test_operators_say_why_they_do_nothing(root, folder):
         operators.film_frames,
         operators.set_up_compositor,
     ):
-        told = refusal(operator)
+        told = error_report(operator)
         assert told.strip().endswith(folder_trust.REFUSAL)
     with pytest.raises(Exception, match="comes from elsewhere"):
         object_edits.remove(root, [1], floaters=False)
@@ -275,7 +275,7 @@ def test_undo_keeps_the_acceptance_and_undoes_the_edits(root, folder):
 def test_a_damaged_folder_can_be_accepted_and_repaired(root, folder):
     item_of(1).name = "cup"
     (folder / "objects.json").write_text("{")
-    assert "objects.json" in refusal(bpy.ops.objectgs.use_folder)
+    assert "objects.json" in error_report(bpy.ops.objectgs.use_folder)
     assert not folder_trust.is_in_question(active()) and item_of(1).name == "cup"
 
 
@@ -327,7 +327,7 @@ def test_a_path_relative_to_the_blend_is_accepted_by_one_click(root, folder):
 def test_a_file_without_a_folder_can_only_choose_another(root, path):
     root[kinds.FOLDER] = path
     del root[kinds.RELATIVE_FOLDER]
-    told = refusal(bpy.ops.objectgs.use_folder)
+    told = error_report(bpy.ops.objectgs.use_folder)
     assert "does not name its reconstruction folder" in told
     assert folder_trust.is_in_question(root) and not (Path.cwd() / "objects.json").exists()
 
@@ -423,7 +423,7 @@ def test_a_capture_on_another_computer_must_be_imported_again(root, folder, monk
     (folder / "cameras.json").write_text(json.dumps({**content, "capture": REMOTE}))
     bpy.ops.objectgs.use_folder()
     monkeypatch.setattr(Path, "is_dir", lambda path: pytest.fail(f"{path} was touched"))
-    assert "is on another computer; import it again" in refusal(bpy.ops.objectgs.train)
+    assert "is on another computer; import it again" in error_report(bpy.ops.objectgs.train)
 
 
 def test_an_output_folder_of_the_file_is_asked_about(root, folder, tmp_path, known):

@@ -44,7 +44,7 @@ def run(*arguments, **variables):
     return process
 
 
-def refusal(*arguments, **variables):
+def error_report(*arguments, **variables):
     """Return the error of a command that must fail with one sentence and exit code 2."""
     ran = run(*arguments, **variables)
     assert ran.returncode == 2, ran.output + ran.errors
@@ -52,8 +52,8 @@ def refusal(*arguments, **variables):
     return ran.errors
 
 
-def size_of(picture):
-    image = bpy.data.images.load(str(picture))
+def size_of(path):
+    image = bpy.data.images.load(str(path))
     try:
         return tuple(image.size)
     finally:
@@ -69,7 +69,7 @@ def blend(trained, tmp_path_factory):
     return file
 
 
-def test_help(capsys):
+def test_help_lists_commands(capsys):
     ran = run("--help")
     assert ran.returncode == 0
     for command in COMMANDS:
@@ -98,13 +98,13 @@ def test_help(capsys):
         (("export", "somewhere"), "--out"),
     ],
 )
-def test_arguments_that_make_no_sense(arguments, words, capsys):
+def test_invalid_arguments_are_rejected(arguments, words, capsys):
     assert headless.main(list(arguments)) == 2
-    said = capsys.readouterr()
-    assert words in said.err and said.err.count("\n") == 1 and not said.out
+    captured = capsys.readouterr()
+    assert words in captured.err and captured.err.count("\n") == 1 and not captured.out
 
 
-def test_build_holds_the_reconstruction(blend, trained):
+def test_build_contains_reconstruction(blend, trained):
     bpy.ops.wm.open_mainfile(filepath=str(blend))
     kinds = {collection.get("objectgs_kind") for collection in bpy.data.collections}
     assert {"reconstruction", "capture", "object"} <= kinds
@@ -115,20 +115,20 @@ def test_build_holds_the_reconstruction(blend, trained):
     bpy.ops.wm.read_factory_settings(use_empty=True)
 
 
-def test_build_and_render_refuse(trained, blend, tmp_path):
-    assert "no reconstruction" in refusal("build", tmp_path)
-    assert "build" in refusal("render", tmp_path, "--out", tmp_path / "a.png")
-    assert ".png" in refusal("render", blend, "--out", tmp_path / "a.tiff")
-    assert "no camera 'nobody'" in refusal("render", blend, "--out", tmp_path / "a.png", "--camera", "nobody")
+def test_build_and_render_reject_invalid_input(trained, blend, tmp_path):
+    assert "no reconstruction" in error_report("build", tmp_path)
+    assert "build" in error_report("render", tmp_path, "--out", tmp_path / "a.png")
+    assert ".png" in error_report("render", blend, "--out", tmp_path / "a.tiff")
+    assert "no camera 'nobody'" in error_report("render", blend, "--out", tmp_path / "a.png", "--camera", "nobody")
     broken = tmp_path / "broken.blend"
     broken.write_bytes(b"not a blend")
-    assert str(broken) in refusal("render", broken, "--out", tmp_path / "a.png")
+    assert str(broken) in error_report("render", broken, "--out", tmp_path / "a.png")
     (tmp_path / "file").write_text("")
-    assert str(tmp_path / "file") in refusal("build", trained, "--blend", tmp_path / "file" / "a.blend")
+    assert str(tmp_path / "file") in error_report("build", trained, "--blend", tmp_path / "file" / "a.blend")
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["broken.blend", "file"]
 
 
-def test_render_from_any_camera(blend, tmp_path):
+def test_render_uses_chosen_camera(blend, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(blend))
     camera = next(
         entry.name
@@ -146,7 +146,7 @@ def test_render_from_any_camera(blend, tmp_path):
     assert len(list(tmp_path.iterdir())) == 3
 
 
-def test_objects_are_edited_exported_and_imported_again(trained, backend_python, tmp_path, monkeypatch):
+def test_edit_export_and_import_commands(trained, backend_python, tmp_path, monkeypatch):
     folder = shutil.copytree(trained, tmp_path / "made")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
@@ -164,8 +164,8 @@ def test_objects_are_edited_exported_and_imported_again(trained, backend_python,
     shown = {obj.name for obj in opened(tmp_path / "again" / "objectgs.blend") if obj.get("objectgs_kind") == "splats"}
     bpy.ops.wm.read_factory_settings(use_empty=True)
     assert f"object {second['id']} splats" in shown and f"object {first['id']} splats" not in shown
-    assert "no object nobody" in refusal("edit", "made", "--remove", "nobody")
-    assert "not a PLY" in refusal("import-splats", "made/objects.json", "--out", "third")
+    assert "no object nobody" in error_report("edit", "made", "--remove", "nobody")
+    assert "not a PLY" in error_report("import-splats", "made/objects.json", "--out", "third")
     assert not (tmp_path / "third").exists()
 
 
@@ -187,39 +187,39 @@ def opened(blend):
     return bpy.data.objects
 
 
-def pixels(picture):
+def pixels(path):
     """Return the pixels (H, W, 3) of an image file, 0 .. 1."""
-    image = bpy.data.images.load(str(picture))
+    image = bpy.data.images.load(str(path))
     try:
         return np.array(image.pixels[:]).reshape(image.size[1], image.size[0], -1)[..., :3]
     finally:
         bpy.data.images.remove(image)
 
 
-def test_build_holds_meshes_with_their_textures(meshed, tmp_path):
+def test_build_contains_meshes_with_textures(meshed, tmp_path):
     moved = shutil.copytree(meshed, tmp_path / "moved")
     meshes = [obj for obj in opened(moved / "objectgs.blend") if obj.get("objectgs_kind") == "mesh"]
     assert len(meshes) >= 3 and not any(obj.hide_render for obj in meshes)
     splats = [obj for obj in bpy.data.objects if obj.get("objectgs_kind") == "splats"]
-    assert [obj.hide_render for obj in splats].count(False) == 1, "that of the object without a mesh"
+    assert [obj.hide_render for obj in splats].count(False) == 1, "only the object without a mesh shows its splats"
     for obj in meshes:
         image = next(node for node in obj.data.materials[0].node_tree.nodes if node.type == "TEX_IMAGE").image
         assert image.filepath.startswith("//meshes/") and tuple(image.size) == (4, 4)
     bpy.ops.wm.read_factory_settings(use_empty=True)
 
 
-def test_render_shows_what_is_asked_for(meshed, tmp_path):
-    pictures = {}
+def test_render_shows_chosen_kind(meshed, tmp_path):
+    images = {}
     for which in ("splats", "meshes", "both"):
         ran = run("render", meshed, "--out", tmp_path / f"{which}.png", "--engine", "CYCLES", "--show", which, *SIZE)
         assert ran.returncode == 0, ran.output + ran.errors
-        pictures[which] = pixels(tmp_path / f"{which}.png")
+        images[which] = pixels(tmp_path / f"{which}.png")
     for one, other in (("splats", "meshes"), ("splats", "both")):
-        assert np.abs(pictures[one] - pictures[other]).mean() > 0.02
-    assert pictures["meshes"].max() > 0.3, "there is light in the file"
+        assert np.abs(images[one] - images[other]).mean() > 0.02
+    assert images["meshes"].max() > 0.3, "the file has a light"
 
 
-def test_a_picture_of_the_objects_pulled_apart(meshed, tmp_path):
+def test_render_apart_shows_separated_objects(meshed, tmp_path):
     before = (meshed / "objectgs.blend").read_bytes()
     for size in ("96x60", "60x96"):
         ran = run("render", meshed, "--apart", "--out", tmp_path / f"{size}.png", "--size", size, "--samples", "4")
@@ -227,18 +227,18 @@ def test_a_picture_of_the_objects_pulled_apart(meshed, tmp_path):
         seen = pixels(tmp_path / f"{size}.png")
         bright = seen.min(2) > 0.6
         assert seen.shape[1::-1] == tuple(map(int, size.split("x")))
-        assert bright[[0, -1]].all() and bright[:, [0, -1]].all(), "all objects are inside, the room is not there"
+        assert bright[[0, -1]].all() and bright[:, [0, -1]].all(), "all objects are in the image, without the room"
         assert 0.02 < 1 - bright.mean() < 0.7
     assert (meshed / "objectgs.blend").read_bytes() == before
-    assert "omit --camera" in refusal("render", meshed, "--apart", "--camera", "x", "--out", tmp_path / "a.png")
+    assert "omit --camera" in error_report("render", meshed, "--apart", "--camera", "x", "--out", tmp_path / "a.png")
 
 
-def test_nothing_to_pull_apart(blend, tmp_path):
-    assert "no meshes to pull apart" in refusal("render", blend, "--apart", "--out", tmp_path / "a.png")
+def test_render_apart_requires_meshes(blend, tmp_path):
+    assert "no meshes to pull apart" in error_report("render", blend, "--apart", "--out", tmp_path / "a.png")
     assert not list(tmp_path.iterdir())
 
 
-def stand_in(place, backend_python, meshes: str):
+def fake_python(place, backend_python, meshes: str):
     """Return a fake Python that runs `meshes` as shell code instead of the mesh command, and the file of its calls."""
     calls, python = place / "calls", place / "python"
     python.write_text(f"""#!/bin/sh
@@ -250,9 +250,9 @@ echo "$3" >> '{calls}'
     return python, calls
 
 
-def test_run_makes_meshes_before_it_measures(capture, trained, meshed, backend_python, tmp_path):
+def test_run_makes_meshes_before_evaluation(capture, trained, meshed, backend_python, tmp_path):
     folder = shutil.copytree(trained, tmp_path / "out")
-    python, calls = stand_in(
+    python, calls = fake_python(
         tmp_path, backend_python, f'cp -r \'{meshed}/meshes\' "$4/meshes" && echo \'{{"type": "done"}}\''
     )
     arguments = ("run", capture, "--out", folder, "--steps", "30", *SIZE, "--backend-python", python)
@@ -271,39 +271,43 @@ def test_run_makes_meshes_before_it_measures(capture, trained, meshed, backend_p
     assert "mesh" not in calls.read_text().split() and not (folder / "pulled-apart.png").exists()
 
 
-def test_splats_without_meshes_are_a_result_still(capture, trained, backend_python, tmp_path):
+def test_run_succeeds_without_meshes(capture, trained, backend_python, tmp_path):
     folder = shutil.copytree(trained, tmp_path / "out")
-    python, _ = stand_in(
-        tmp_path, backend_python, 'echo \'{"type": "error", "message": "There is no mesh to be had."}\'; exit 2'
+    python, _ = fake_python(
+        tmp_path, backend_python, 'echo \'{"type": "error", "message": "No mesh can be made."}\'; exit 2'
     )
     ran = run("run", capture, "--out", folder, "--steps", "30", *SIZE, "--backend-python", python)
     assert ran.returncode == 0, ran.output + ran.errors
-    assert "warning: There is no mesh to be had." in ran.errors
+    assert "warning: No mesh can be made." in ran.errors
     assert (folder / "render.png").is_file() and not (folder / "pulled-apart.png").exists()
-    assert "no mesh to be had" in refusal("mesh", folder, "--backend-python", python)
+    assert "No mesh can be made" in error_report("mesh", folder, "--backend-python", python)
 
 
-def test_no_backend(capture, tmp_path):
+def test_missing_backend_is_reported(capture, tmp_path):
     user = {"OBJECTGS_PYTHON": "", "BLENDER_USER_RESOURCES": str(tmp_path / "user")}
     for command in ("import", "vote", "train", "run"):
-        assert "not set up" in refusal(command, capture, "--out", tmp_path / "out", **user)
-    assert "not set up" in refusal("mesh", tmp_path, **user)
-    assert "nowhere" in refusal("train", capture, "--out", tmp_path / "out", "--backend-python", tmp_path / "nowhere")
+        assert "not set up" in error_report(command, capture, "--out", tmp_path / "out", **user)
+    assert "not set up" in error_report("mesh", tmp_path, **user)
+    assert "nowhere" in error_report(
+        "train", capture, "--out", tmp_path / "out", "--backend-python", tmp_path / "nowhere"
+    )
     assert not (tmp_path / "out").exists()
 
 
-def test_backend_commands(capture, backend_python, tmp_path):
+def test_backend_commands_run(capture, backend_python, tmp_path):
     for command in ("import", "vote"):
         out = tmp_path / command
         ran = run(command, capture, "--out", out, "--backend-python", backend_python, OBJECTGS_PYTHON="")
         assert ran.returncode == 0, ran.output + ran.errors
         assert (out / "cameras.json").is_file() and (out / "points.ply").is_file()
-    assert "images" in refusal("vote", tmp_path, "--out", tmp_path / "x", OBJECTGS_PYTHON=backend_python)
-    assert "--wrong" in refusal("train", capture, "--out", tmp_path / "x", "--wrong", OBJECTGS_PYTHON=backend_python)
+    assert "images" in error_report("vote", tmp_path, "--out", tmp_path / "x", OBJECTGS_PYTHON=backend_python)
+    assert "--wrong" in error_report(
+        "train", capture, "--out", tmp_path / "x", "--wrong", OBJECTGS_PYTHON=backend_python
+    )
     assert not (tmp_path / "x").exists()
 
 
-def test_paths_are_those_of_the_working_directory(capture, backend_python, tmp_path, monkeypatch):
+def test_paths_are_relative_to_working_directory(capture, backend_python, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     here = os.path.relpath(capture)
     ran = run("import", here, "--out", "made", OBJECTGS_PYTHON=os.path.relpath(backend_python))
@@ -325,10 +329,10 @@ def wait_for(path, process):
             return
         assert process.poll() is None, process.communicate()
         time.sleep(0.1)
-    raise AssertionError(f"{path} never came")
+    raise AssertionError(f"{path} was not written")
 
 
-def test_stopped_training_is_kept(capture, backend_python, tmp_path):
+def test_stopped_training_keeps_checkpoint(capture, backend_python, tmp_path):
     process = start(
         "run",
         capture,
@@ -349,7 +353,7 @@ def test_stopped_training_is_kept(capture, backend_python, tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_stopped_demo_leaves_nothing(tmp_path, number):
+def test_stopped_demo_leaves_no_files(tmp_path, number):
     process = start("demo", tmp_path / "demo", "--views", "500")
     wait_for_any(tmp_path, ".demo-*.part", process)
     process.send_signal(number)
@@ -358,7 +362,7 @@ def test_stopped_demo_leaves_nothing(tmp_path, number):
     assert not list(tmp_path.iterdir())
 
 
-def test_demo_speaks_json(tmp_path):
+def test_demo_prints_json_events(tmp_path):
     small = ("--objects", "1", "--views", "4", "--width", "32", "--height", "32", "--samples", "1")
     ran = run("demo", tmp_path / "demo", "--json", *small)
     assert ran.returncode == 0, ran.errors
@@ -371,7 +375,7 @@ def test_demo_speaks_json(tmp_path):
     assert json.loads(refused.output.splitlines()[-1])["type"] == "error"
 
 
-def test_demo_stops_when_its_driver_is_gone(tmp_path):
+def test_demo_stops_when_stdin_closes(tmp_path):
     process = start("demo", tmp_path / "demo", "--views", "500", "--json")
     process.stdin.write("attached\n")
     process.stdin.flush()
@@ -381,7 +385,7 @@ def test_demo_stops_when_its_driver_is_gone(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_stopped_rendering_ends_soon(blend, tmp_path):
+def test_stopped_rendering_ends_quickly(blend, tmp_path):
     process = start(
         "render", blend, "--out", tmp_path / "a.png", "--engine", "CYCLES", "--size", "4000x3000", "--samples", "4000"
     )
@@ -407,7 +411,7 @@ def summary(out):
     return {entry["name"]: entry for entry in json.loads((out / "batch.json").read_text())["captures"]}
 
 
-def test_batch_survives_a_bad_capture(batch):
+def test_batch_continues_after_invalid_capture(batch):
     _, out, _, ran = batch
     assert ran.returncode == 2, ran.output + ran.errors
     bad, good = summary(out).values()
@@ -419,7 +423,7 @@ def test_batch_survives_a_bad_capture(batch):
     assert (out / "good" / "objectgs.blend").is_file() and size_of(out / "good" / "render.png") == (48, 36)
 
 
-def test_batch_goes_on_with_what_is_not_done(batch, capture, backend_python):
+def test_batch_resumes_unfinished_captures(batch, capture, backend_python):
     captures, out, arguments, _ = batch
     first = summary(out)
     shutil.copytree(capture, captures / "bad", dirs_exist_ok=True)
@@ -430,7 +434,7 @@ def test_batch_goes_on_with_what_is_not_done(batch, capture, backend_python):
     assert second["bad"]["state"] == "done" and second["bad"]["error"] is None
 
 
-def test_batch_does_a_changed_capture_again(capture, tmp_path):
+def test_batch_fingerprint_changes_with_capture(capture, tmp_path):
     shutil.copytree(capture, tmp_path / "a")
     before = fingerprint(tmp_path / "a")
     assert fingerprint(tmp_path / "a") == before
@@ -439,13 +443,13 @@ def test_batch_does_a_changed_capture_again(capture, tmp_path):
     assert fingerprint(tmp_path / "a") != before
 
 
-def test_batch_refuses(tmp_path):
-    assert "captures" in refusal("batch", tmp_path, "--out", tmp_path / "out")
-    assert "nowhere" in refusal("batch", tmp_path / "nowhere", "--out", tmp_path / "out")
+def test_batch_rejects_invalid_arguments(tmp_path):
+    assert "captures" in error_report("batch", tmp_path, "--out", tmp_path / "out")
+    assert "nowhere" in error_report("batch", tmp_path / "nowhere", "--out", tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
 
-def test_cancelled_batch_writes_its_summary(capture, backend_python, tmp_path):
+def test_stopped_batch_writes_summary(capture, backend_python, tmp_path):
     shutil.copytree(capture, tmp_path / "captures" / "a")
     process = start(
         "batch",
@@ -466,7 +470,7 @@ def test_cancelled_batch_writes_its_summary(capture, backend_python, tmp_path):
     assert entry["state"] == "unfinished" and "Cancelled" in entry["error"] and entry["seconds"] > 0
 
 
-def test_a_crash_of_the_backend_is_told(capture, tmp_path):
+def test_backend_crash_is_reported(capture, tmp_path):
     python = tmp_path / "python"
     python.write_text("""#!/bin/sh\necho '{"type": "status", "message": "Hello"}'\necho 'out of luck' >&2\nexit 3\n""")
     python.chmod(0o755)

@@ -23,15 +23,15 @@ PRELUDE = """
 import json, os, signal, sys, time
 def say(kind, **fields):
     print(json.dumps({"type": kind, "time": 0, **fields}), flush=True)
-def hear():
+def read_line():
     return sys.stdin.readline().strip()
 """
 
 TRAINS = """
-assert hear() == "attached"
+assert read_line() == "attached"
 say("status", message="Training")
 say("progress", done=0.25, total=1.0, step=10, seconds_left=30.0, splats=5000, anchors=500, psnr=None)
-while (word := hear()) != "stop":
+while (word := read_line()) != "stop":
     say("status", message={"pause": "Paused", "resume": "Resumed", "": "Nobody there"}[word])
     if not word:
         sys.exit(3)
@@ -39,7 +39,7 @@ say("done", stopped=True, message="Saved at step 10.")
 sys.exit(130)
 """
 
-DEAF = """
+UNRESPONSIVE = """
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
 say("status", message="Busy")
 time.sleep(60)
@@ -67,7 +67,7 @@ def until(condition, look=lambda: None):
     """Call `look` until `condition()` holds."""
     deadline = time.monotonic() + WAIT
     while not condition():
-        assert time.monotonic() < deadline, "it never came"
+        assert time.monotonic() < deadline, "condition timed out"
         look()
         time.sleep(0.01)
 
@@ -88,7 +88,7 @@ def started(job, queue=None):
     return queue
 
 
-def test_figures_of_a_whole_run(make, tmp_path):
+def test_job_collects_figures_of_run(make, tmp_path):
     job = run(
         make("""
 say("status", message="Reading the capture")
@@ -111,7 +111,7 @@ say("done", steps=12, splats="splats.ply", anchors=11, psnr=27.0)
     assert job.result == {"steps": 12, "splats": "splats.ply", "anchors": 11, "psnr": 27.0}
 
 
-def test_the_one_after_waits_and_all_changes_are_told(make):
+def test_jobs_run_in_order_and_changes_are_reported(make):
     queue, order = JobQueue(), []
     first, second = make('say("done")', title="first"), make('say("done")', title="second")
     queue.add(first)
@@ -128,7 +128,7 @@ def test_the_one_after_waits_and_all_changes_are_told(make):
     assert queue.jobs == []
 
 
-def test_pause_resume_stop(make):
+def test_job_pauses_resumes_and_stops(make):
     job = make(TRAINS)
     queue = started(job)
     until(lambda: job.step, queue.poll)
@@ -146,7 +146,7 @@ def test_pause_resume_stop(make):
     assert job.state is State.STOPPED and job.message == "Saved at step 10." and job.exit_code == 130
 
 
-def test_only_training_pauses(make):
+def test_only_training_jobs_pause(make):
     job = make(TRAINS, kind="import")
     started(job)
     assert not job.can_pause
@@ -154,7 +154,7 @@ def test_only_training_pauses(make):
     assert job.state is State.RUNNING
 
 
-def test_stopping_a_waiting_job_removes_it(make):
+def test_stopping_waiting_job_removes_it(make):
     busy, waiting = make(TRAINS), make(TRAINS)
     queue = started(busy)
     queue.add(waiting)
@@ -166,9 +166,9 @@ def test_stopping_a_waiting_job_removes_it(make):
     assert queue.jobs == [busy]
 
 
-def test_stop_twice_ends_a_deaf_one_by_force(make, monkeypatch):
+def test_second_stop_kills_unresponsive_job(make, monkeypatch):
     monkeypatch.setattr(jobs, "GRACE_SECONDS", 0.5)
-    job = make(DEAF)
+    job = make(UNRESPONSIVE)
     queue = started(job)
     job.stop()
     time.sleep(0.7)
@@ -179,8 +179,8 @@ def test_stop_twice_ends_a_deaf_one_by_force(make, monkeypatch):
     assert job.state is State.STOPPED and "force" in job.message
 
 
-def test_stop_all_waits_for_those_that_save_and_kills_the_deaf(make):
-    for code, how in (TRAINS, "Saved at step 10."), (DEAF, "Ended by force; the last checkpoint is kept"):
+def test_stop_all_waits_for_saving_and_kills_unresponsive_jobs(make):
+    for code, how in (TRAINS, "Saved at step 10."), (UNRESPONSIVE, "Ended by force; the last checkpoint is kept"):
         job, waiting = make(code), make(code)
         queue = started(job)
         queue.add(waiting)
@@ -191,7 +191,7 @@ def test_stop_all_waits_for_those_that_save_and_kills_the_deaf(make):
 
 
 @posix
-def test_crash_shows_the_last_message(make):
+def test_crash_reports_last_message(make):
     job = run(
         make("""
 print("reading", file=sys.stderr)
@@ -207,13 +207,13 @@ os.abort()
 
 
 @posix
-def test_segfault_is_named_by_the_interpreter(make, tmp_path):
+def test_segfault_is_reported(make, tmp_path):
     job = run(make("import ctypes; ctypes.string_at(0)", environment=backend_environment(tmp_path)))
     assert job.state is State.FAILED and "Segmentation fault" in job.error.split(";")[0]
     assert job.error.endswith("Fatal Python error: Segmentation fault")
 
 
-def test_error_and_exit_codes(make):
+def test_errors_and_exit_codes_are_reported(make):
     job = run(make('say("error", message="garden has no images."); sys.exit(2)'))
     assert (job.state, job.error, job.message) == (State.FAILED, "garden has no images.", "garden has no images.")
     job = run(make("sys.exit(130)"))
@@ -227,7 +227,7 @@ def test_error_and_exit_codes(make):
     assert job.state is State.DONE and job.message == "All there." and "exit code 3" in job.warnings[0]
 
 
-def test_garbage_between_events(make):
+def test_invalid_lines_between_events_are_ignored(make):
     job = run(
         make(r"""
 out = sys.stdout.buffer
@@ -244,7 +244,7 @@ out.write(b'{"type": "done", "message": "without an end of line"}')
     assert len(job.log) == 40 and job.log[-1] == "line 99" and job.step is None
 
 
-def test_a_flood_of_events_is_taken_in_parts(make):
+def test_many_events_are_processed_in_parts(make):
     job = make('[say("progress", done=i, total=5000, step=i) for i in range(5000)]; say("done")')
     queue, longest = started(make('say("done", message="first")')), 0.0
     queue.add(job)
@@ -256,7 +256,7 @@ def test_a_flood_of_events_is_taken_in_parts(make):
     assert longest <= 200
 
 
-def test_closed_pipes_are_no_end(make):
+def test_closed_pipes_do_not_end_job(make):
     job = make("""
 os.close(0)
 say("status", message="Closed")
@@ -270,7 +270,7 @@ say("done")
     assert job.state is State.DONE
 
 
-def test_a_grandchild_that_keeps_the_pipes_holds_nothing_up(make, monkeypatch):
+def test_grandchild_with_open_pipes_does_not_block_job(make, monkeypatch):
     monkeypatch.setattr("objectgs.objectgs_addon.process.backend_process._PIPES_STAY_OPEN", 0.2)
     job = make("""
 import subprocess
@@ -283,7 +283,7 @@ say("done", child=child.pid)
 
 
 @posix
-def test_kill_takes_the_children_along(make):
+def test_kill_ends_child_processes(make):
     job = make("""
 import subprocess
 child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
@@ -304,7 +304,7 @@ time.sleep(60)
 
 
 @posix
-def test_own_group_lower_priority_clean_environment(make, monkeypatch, tmp_path):
+def test_child_has_own_group_low_priority_and_clean_environment(make, monkeypatch, tmp_path):
     monkeypatch.setenv("PYTHONHOME", "/nowhere")
     monkeypatch.setenv("PYTHONPATH", "/nowhere")
     monkeypatch.setenv("OBJECTGS_TEST", "stays")
@@ -324,14 +324,14 @@ say("done", group=os.getpgid(0), pid=os.getpid(), gives_way=way, variables=dict(
     assert variables["NUMBA_CACHE_DIR"] == str(tmp_path / "cache") and variables["PYTHONUTF8"] == "1"
 
 
-def test_without_a_window_nobody_has_to_give_way(make):
+def test_blocking_jobs_keep_priority(make):
     job = make("""say("done", policy=os.sched_getscheduler(0) if hasattr(os, "SCHED_IDLE") else os.nice(0))""")
     run_blocking(job, Reporter())
     assert job.result["policy"] == (os.sched_getscheduler(0) if hasattr(os, "SCHED_IDLE") else os.nice(0))
 
 
 @posix
-def test_a_word_to_a_process_that_has_ended_harms_nobody(tmp_path):
+def test_sending_to_ended_process_is_safe(tmp_path):
     """With the system's default for SIGPIPE, as in Blender."""
     before = signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     try:
@@ -342,7 +342,7 @@ def test_a_word_to_a_process_that_has_ended_harms_nobody(tmp_path):
         signal.signal(signal.SIGPIPE, before)
 
 
-def test_what_cannot_be_started(make, tmp_path):
+def test_failed_starts_are_reported(make, tmp_path):
     job = run(make("", command=[str(tmp_path / "no-python"), "-m", "backend"]))
     assert job.state is State.FAILED and "no-python could not be started" in job.error
     job = run(make("", cwd=tmp_path / "gone"))
@@ -354,7 +354,7 @@ def test_what_cannot_be_started(make, tmp_path):
     assert job.error == "tar is no Python."
 
 
-def test_the_end_of_the_driver_is_seen(tmp_path):
+def test_child_detects_closed_stdin(tmp_path):
     script = tmp_path / "fake.py"
     script.write_text(PRELUDE + TRAINS)
     process = BackendProcess([sys.executable, str(script)], tmp_path)
@@ -365,7 +365,7 @@ def test_the_end_of_the_driver_is_seen(tmp_path):
     assert not process.send("pause")
 
 
-def test_time_left_is_estimated_where_the_backend_says_none(make, monkeypatch):
+def test_missing_time_left_is_estimated(make, monkeypatch):
     clock = [100.0]
     monkeypatch.setattr(jobs.time, "monotonic", lambda: clock[0])
     job = Job(title="", kind="train", folder=None, command=[], cwd=Path())
@@ -383,7 +383,7 @@ def test_time_left_is_estimated_where_the_backend_says_none(make, monkeypatch):
     assert job.seconds_left == pytest.approx(5)
 
 
-def test_folder_by_any_name(make, tmp_path):
+def test_job_of_folder_is_found_by_equivalent_paths(make, tmp_path):
     (tmp_path / "a").mkdir()
     queue = JobQueue()
     older, newer = make("", folder=tmp_path / "a"), make("", folder=tmp_path / "b" / ".." / "a")
@@ -443,13 +443,13 @@ def test_run_blocking_saves_on_a_signal(make, number):
 
 
 @posix
-def test_run_blocking_a_second_signal_ends_it_by_force(make):
+def test_run_blocking_second_signal_kills_job(make):
     for seconds in (0.7, 1.0):
         threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT)).start()
-    assert run_blocking(make(DEAF), Reporter()) == 130
+    assert run_blocking(make(UNRESPONSIVE), Reporter()) == 130
 
 
-def test_command_line():
+def test_backend_command_line():
     assert backend_command("/py", "train", Path("a"), "--out", "b") == [
         "/py",
         "-m",

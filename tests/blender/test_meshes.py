@@ -91,14 +91,14 @@ def shader_of(material):
     return next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
 
 
-def picture_of(material):
+def image_of(material):
     return next(node for node in material.node_tree.nodes if node.type == "TEX_IMAGE").image
 
 
 # What a mesh is.
 
 
-def test_a_mesh_is_exactly_where_the_file_says(root, folder):
+def test_mesh_position_matches_file(root, folder):
     bpy.context.view_layer.update()
     upright = np.array(kinds.parent_of(root).matrix_world)
     for object_id, center, size in ((1, 0.5, 1.0), (2, -0.5, 0.5)):
@@ -106,7 +106,7 @@ def test_a_mesh_is_exactly_where_the_file_says(root, folder):
         expected = tetrahedron(ORIGIN + center, size).vertices - ORIGIN
         assert coordinates(obj) == pytest.approx(expected @ upright[:3, :3].T + upright[:3, 3], abs=2e-6)
         assert obj.parent == parts(root, object_id, "object_parent")[0]
-        assert tuple(obj.matrix_basis.translation) == (0, 0, 0), "its origin is the pivot's, as the splats' is"
+        assert tuple(obj.matrix_basis.translation) == (0, 0, 0), "mesh and splats have the origin of the pivot"
         assert blender_scene.object_id_of(obj) == object_id
         assert blender_scene.root_of(obj, bpy.context.scene) == root
     assert parts(root, HUGE, "mesh") == []
@@ -115,7 +115,7 @@ def test_a_mesh_is_exactly_where_the_file_says(root, folder):
     assert parts(root, 1, "splats")[0].matrix_world == mesh_of(root, 1).matrix_world
 
 
-def test_a_mesh_carries_all_that_the_file_holds(root):
+def test_mesh_data_matches_file(root):
     obj, given = mesh_of(root, 1), tetrahedron()
     mesh = obj.data
     assert [tuple(polygon.vertices) for polygon in mesh.polygons] == [tuple(face) for face in given.faces]
@@ -135,20 +135,20 @@ def test_a_mesh_carries_all_that_the_file_holds(root):
     assert (obj.name, mesh.name) == ("mug mesh", "mug mesh")
 
 
-def test_the_material_shows_the_texture(root, folder):
+def test_material_uses_texture(root, folder):
     materials = [mesh_of(root, object_id).data.materials[0] for object_id in (1, 2)]
     assert materials[0] != materials[1]
     for material, name in zip(materials, ("1.png", "2.png")):
         shader = shader_of(material)
-        picture = shader.inputs["Base Color"].links[0].from_node.image
-        assert Path(picture.filepath) == folder / "meshes" / name
-        assert picture.colorspace_settings.name == "sRGB" and tuple(picture.size) == (4, 4)
+        image = shader.inputs["Base Color"].links[0].from_node.image
+        assert Path(image.filepath) == folder / "meshes" / name
+        assert image.colorspace_settings.name == "sRGB" and tuple(image.size) == (4, 4)
         assert shader.inputs["Roughness"].default_value > 0.5
         assert shader.inputs["Specular IOR Level"].default_value < 0.5
-        assert tuple(picture.pixels[:3]) == pytest.approx((200 / 255, 100 / 255, 50 / 255), abs=1e-3)
+        assert tuple(image.pixels[:3]) == pytest.approx((200 / 255, 100 / 255, 50 / 255), abs=1e-3)
 
 
-def test_a_saved_file_finds_its_textures_wherever_it_goes(root, folder, tmp_path):
+def test_moved_file_finds_its_textures(root, folder, tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "objectgs.blend"))
     folder.rename(tmp_path / "elsewhere")
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "elsewhere" / "objectgs.blend"))
@@ -157,7 +157,7 @@ def test_a_saved_file_finds_its_textures_wherever_it_goes(root, folder, tmp_path
     assert all(tuple(image.size) == (4, 4) for image in found)
 
 
-def test_a_mesh_can_be_used_in_another_file(root, folder, tmp_path):
+def test_mesh_asset_can_be_used_in_another_file(root, folder, tmp_path):
     """As when dropped from the asset browser, which appends the collection and adds an instance of it."""
     bpy.context.view_layer.update()
     before = coordinates(mesh_of(root, 1))
@@ -183,14 +183,16 @@ def test_a_mesh_can_be_used_in_another_file(root, folder, tmp_path):
     placed = local @ instance[:3, :3].T + instance[:3, 3]
     low, high = before.min(0), before.max(0)
     stand = np.array([*((low + high) / 2)[:2], low[2]])
-    assert placed == pytest.approx(before - stand + (10, 20, 30), abs=1e-5), "upright, in size, on what is below"
-    assert tuple(picture_of(obj.data.materials[0]).size) == (4, 4)
+    assert placed == pytest.approx(before - stand + (10, 20, 30), abs=1e-5), (
+        "the asset is upright, in scale and has its origin at the base"
+    )
+    assert tuple(image_of(obj.data.materials[0]).size) == (4, 4)
 
 
 # Updates in place.
 
 
-def test_meshes_made_again_keep_what_the_user_did(root, folder):
+def test_updated_meshes_keep_user_changes(root, folder):
     obj = mesh_of(root, 1)
     pivot = obj.parent
     ours = obj.data.materials[0]
@@ -203,7 +205,7 @@ def test_meshes_made_again_keep_what_the_user_did(root, folder):
     obj.shape_key_add(name="Basis")
     obj.hide_render = True
     obj.hide_set(True)
-    before, image = counts(), picture_of(ours)
+    before, image = counts(), image_of(ours)
     rewrite(folder)
     shown = blender_scene.show_meshes(root, folder)
     assert (shown.meshes, shown.updated, shown.warnings) == (1, 1, [])
@@ -216,7 +218,7 @@ def test_meshes_made_again_keep_what_the_user_did(root, folder):
     assert obj.hide_render and obj.hide_get()
     assert np.ptp([vertex.co for vertex in obj.data.vertices], axis=0) == pytest.approx([2, 2, 2])
     assert [layer.name for layer in obj.data.uv_layers] == ["UVMap"]
-    assert picture_of(ours) == image and tuple(image.pixels[:3]) == pytest.approx((0, 1, 0))
+    assert image_of(ours) == image and tuple(image.pixels[:3]) == pytest.approx((0, 1, 0))
     after = counts()
     assert after == {
         **before,
@@ -224,15 +226,15 @@ def test_meshes_made_again_keep_what_the_user_did(root, folder):
         "meshes": before["meshes"] - 1,
         "materials": before["materials"] - 1,
         "images": before["images"] - 1,
-    }, "the can has none any more"
+    }, "the can no longer has a mesh"
 
 
-def test_a_material_of_the_users_own_stays_and_our_texture_in_it_follows(root, folder):
+def test_user_material_is_kept_and_its_texture_updated(root, folder):
     obj = mesh_of(root, 1)
     own = bpy.data.materials.new("own")
     if own.node_tree is None:
         own.use_nodes = True
-    image = picture_of(obj.data.materials[0])
+    image = image_of(obj.data.materials[0])
     own.node_tree.nodes.new("ShaderNodeTexImage").image = image
     obj.data.materials[0] = own
     image.pack()
@@ -242,7 +244,7 @@ def test_a_material_of_the_users_own_stays_and_our_texture_in_it_follows(root, f
     assert image.packed_file is not None and tuple(image.pixels[:3]) == pytest.approx((0, 1, 0))
 
 
-def test_a_mesh_whose_files_are_the_same_is_not_touched(root, folder):
+def test_unchanged_mesh_is_not_updated(root, folder):
     obj = mesh_of(root, 1)
     obj.data.vertices[0].co.x += 5
     moved = coordinates(obj)
@@ -250,10 +252,10 @@ def test_a_mesh_whose_files_are_the_same_is_not_touched(root, folder):
     assert blender_scene.show_meshes(root, folder).updated == 0
     assert coordinates(obj) == pytest.approx(moved)
     bpy.data.objects.remove(obj)
-    assert blender_scene.show_meshes(root, folder).updated == 1, "and comes again where it was deleted"
+    assert blender_scene.show_meshes(root, folder).updated == 1, "a deleted mesh is shown again"
 
 
-def test_meshes_come_back_to_their_pivots(root, folder):
+def test_meshes_are_parented_to_restored_pivots(root, folder):
     bpy.context.view_layer.update()
     before = coordinates(mesh_of(root, 1))
     bpy.data.objects.remove(parts(root, 1, "object_parent")[0])
@@ -265,7 +267,7 @@ def test_meshes_come_back_to_their_pivots(root, folder):
     assert len(mesh_of(root, 2).data.polygons) == 4
 
 
-def test_names_and_colors_follow_the_list(root, folder):
+def test_mesh_names_and_colors_follow_objects(root, folder):
     edit_objects(folder / "objects.json", {1: dict(name="cup", color=[255, 0, 0])})
     blender_scene.show_objects(root, folder)
     obj = mesh_of(root, 1)
@@ -276,7 +278,7 @@ def test_names_and_colors_follow_the_list(root, folder):
 # Merged and left out.
 
 
-def test_merged_objects_bring_their_meshes_along_until_they_have_one(root, folder):
+def test_merged_objects_keep_meshes_until_remeshed(root, folder):
     bpy.context.view_layer.update()
     can, before = mesh_of(root, 2), coordinates(mesh_of(root, 2))
     edit_objects(folder / "objects.json", {2: dict(merged_into=1)})
@@ -298,7 +300,7 @@ def test_merged_objects_bring_their_meshes_along_until_they_have_one(root, folde
     assert not parts(root, 1, "splats")[0].hide_render
 
 
-def test_split_objects_get_their_meshes_back_with_their_materials(root, folder):
+def test_split_objects_regain_meshes_and_materials(root, folder):
     can = mesh_of(root, 2)
     material = can.data.materials[0]
     for into in (1, None):
@@ -323,8 +325,8 @@ def hidden(objs) -> set[bool]:
     return {value for obj in objs for value in (obj.hide_viewport, obj.hide_render)}
 
 
-def test_meshes_take_the_place_of_splats(root):
-    assert blender_scene.shown_kinds(root) == "meshes", "since there are meshes from the beginning"
+def test_show_kinds_switches_meshes_and_splats(root):
+    assert blender_scene.shown_kinds(root) == "meshes", "meshes are shown by default if there are any"
     expected = {
         "splats": ({True}, {False}, {False}, {False}),
         "both": ({False}, {False}, {False}, {False}),
@@ -336,25 +338,25 @@ def test_meshes_take_the_place_of_splats(root):
         for object_id in (1, 2):
             assert hidden(parts(root, object_id, "mesh")) == meshes
             assert hidden(parts(root, object_id, "splats")) == splats
-        assert hidden(parts(root, HUGE, "splats")) == without, "it has no mesh to show"
+        assert hidden(parts(root, HUGE, "splats")) == without, "an object without a mesh shows its splats"
         assert hidden(parts(root, 0, "splats")) == rest
         assert hidden(parts(root, 1, "anchors")) == {True}
     with pytest.raises(ValueError):
         blender_scene.show_kinds(root, "points")
 
 
-def test_what_comes_later_follows_the_choice(root, folder):
+def test_new_meshes_follow_shown_kind(root, folder):
     rewrite(folder, **{"_1": tetrahedron(ORIGIN), f"_{HUGE}": tetrahedron(ORIGIN)})
     blender_scene.show_meshes(root, folder)
     assert hidden(parts(root, HUGE, "mesh")) == {False} and hidden(parts(root, HUGE, "splats")) == {True}
-    assert hidden(parts(root, 2, "splats")) == {False}, "its mesh is gone"
+    assert hidden(parts(root, 2, "splats")) == {False}, "its mesh was removed"
     blender_scene.show_kinds(root, "splats")
     rewrite(folder, _2=tetrahedron(ORIGIN))
     blender_scene.show_meshes(root, folder)
     assert hidden(parts(root, 2, "mesh")) == {True} and hidden(parts(root, 2, "splats")) == {False}
 
 
-def test_what_the_user_hid_stays_hidden(root, folder):
+def test_objects_hidden_by_user_stay_hidden(root, folder):
     blender_scene.show_kinds(root, "both")
     objs = [*parts(root, 0, "splats"), *parts(root, 1, "splats"), mesh_of(root, 1)]
     for obj in objs:
@@ -365,7 +367,7 @@ def test_what_the_user_hid_stays_hidden(root, folder):
     assert hidden(objs) == {True}
 
 
-def test_splats_are_shown_until_there_are_meshes(fresh, folder):
+def test_splats_are_shown_until_meshes_exist(fresh, folder):
     (folder / "meshes" / "meshes.json").rename(folder / "later.json")
     root = blender_scene.show_capture(bpy.context.scene, folder)
     blender_scene.show_result(root, folder)
@@ -376,7 +378,7 @@ def test_splats_are_shown_until_there_are_meshes(fresh, folder):
     assert blender_scene.shown_kinds(root) == "meshes" and hidden(parts(root, 1, "splats")) == {True}
 
 
-def test_the_whole_scene_and_sets_are_hidden_beside_the_objects(root, folder):
+def test_scene_and_set_meshes_are_hidden_by_default(root, folder):
     write_meshes(
         folder,
         {
@@ -399,13 +401,13 @@ def test_the_whole_scene_and_sets_are_hidden_beside_the_objects(root, folder):
     assert coordinates(whole["name of scene mesh"]) == pytest.approx(expected, abs=2e-6)
     whole["name of pair mesh"].hide_viewport = False
     blender_scene.show_kinds(root, "both")
-    assert not whole["name of pair mesh"].hide_viewport, "only the user shows and hides them"
+    assert not whole["name of pair mesh"].hide_viewport, "only the user changes their visibility"
     write_meshes(folder, {"1": tetrahedron(ORIGIN)})
     blender_scene.show_meshes(root, folder)
     assert blender_scene.scene_meshes(root) == []
 
 
-def test_a_scene_without_objects_shows_its_one_mesh(fresh, folder):
+def test_scene_without_objects_shows_scene_mesh(fresh, folder):
     write_vertices(folder / "splats.ply", splat_table(np.zeros(20, int)))
     write_meshes(folder, {"scene": tetrahedron(ORIGIN)})
     root = blender_scene.show_capture(bpy.context.scene, folder)
@@ -419,17 +421,17 @@ def test_a_scene_without_objects_shows_its_one_mesh(fresh, folder):
 
 
 @pytest.mark.parametrize(
-    ("spoil", "sentence"),
+    ("corrupt", "sentence"),
     [
         (lambda path: path.unlink(), "2.ply cannot be read"),
-        (lambda path: path.write_bytes(path.read_bytes()[:-1]), "2.ply is cut short"),
+        (lambda path: path.write_bytes(path.read_bytes()[:-1]), "2.ply is truncated"),
         (lambda path: path.write_bytes(b"ply\n"), "2.ply is not a mesh"),
     ],
 )
-def test_a_broken_mesh_is_told_and_the_others_come(root, folder, spoil, sentence):
+def test_invalid_mesh_is_reported_and_others_are_updated(root, folder, corrupt, sentence):
     kept = mesh_of(root, 2)
     rewrite(folder, _1=tetrahedron(ORIGIN, 2.0), _2=tetrahedron(ORIGIN, 2.0))
-    spoil(folder / "meshes" / "2.ply")
+    corrupt(folder / "meshes" / "2.ply")
     shown = blender_scene.show_meshes(root, folder)
     assert (shown.meshes, shown.updated) == (2, 1)
     assert len(shown.warnings) == 1 and sentence in shown.warnings[0] and shown.warnings[0].endswith(".")
@@ -440,7 +442,7 @@ def test_a_broken_mesh_is_told_and_the_others_come(root, folder, spoil, sentence
     "change",
     [lambda mesh: mesh.vertices.__setitem__((0, 0), np.nan), lambda mesh: setattr(mesh, "faces", mesh.faces[:0])],
 )
-def test_a_mesh_without_a_surface_is_told(root, folder, change):
+def test_mesh_without_surface_is_reported(root, folder, change):
     bad = tetrahedron(ORIGIN)
     change(bad)
     if not len(bad.faces):
@@ -450,7 +452,7 @@ def test_a_mesh_without_a_surface_is_told(root, folder, change):
     assert "1.ply contains no surface" in sentence
 
 
-def test_faces_that_are_none_do_no_harm(root, folder):
+def test_degenerate_faces_are_removed(root, folder):
     strange = tetrahedron(ORIGIN)
     strange.faces[0] = 1, 1, 1
     strange.uvs[1], strange.normals[2] = np.nan, np.nan
@@ -470,7 +472,7 @@ def test_faces_that_are_none_do_no_harm(root, folder):
         '{"meshes": {"1": {"file": "1.ply", "ids": ["x"]}}}',
     ],
 )
-def test_a_broken_list_of_meshes_changes_nothing(root, folder, content):
+def test_invalid_mesh_list_changes_nothing(root, folder, content):
     (folder / "meshes" / "meshes.json").write_text(content)
     before = counts()
     with pytest.raises(InputError, match=r"meshes\.json"):
@@ -479,18 +481,18 @@ def test_a_broken_list_of_meshes_changes_nothing(root, folder, content):
     assert "meshes.json" in sentence and counts() == before
 
 
-def test_a_missing_texture_is_told_and_comes_later(fresh, folder):
+def test_missing_texture_is_reported_and_loaded_later(fresh, folder):
     (folder / "meshes" / "1.png").rename(folder / "away.png")
     root = blender_scene.show_capture(bpy.context.scene, folder)
     (sentence,) = blender_scene.show_result(root, folder).warnings
     assert "1.png is missing" in sentence
     (folder / "away.png").rename(folder / "meshes" / "1.png")
     assert blender_scene.show_meshes(root, folder).warnings == []
-    image = picture_of(mesh_of(root, 1).data.materials[0])
+    image = image_of(mesh_of(root, 1).data.materials[0])
     assert tuple(image.pixels[:3]) == pytest.approx((200 / 255, 100 / 255, 50 / 255), abs=1e-3)
 
 
-def test_nothing_outside_of_the_folder_is_read(root, folder):
+def test_files_outside_folder_are_not_read(root, folder):
     rewrite(folder, _1=tetrahedron(ORIGIN))
     listed = folder / "meshes" / "meshes.json"
     content = json.loads(listed.read_text())
@@ -503,7 +505,7 @@ def test_nothing_outside_of_the_folder_is_read(root, folder):
     assert str(folder / "meshes" / "points.ply") in sentence
 
 
-def test_a_mesh_in_edit_mode_is_not_overwritten(root, folder):
+def test_mesh_in_edit_mode_is_not_overwritten(root, folder):
     bpy.context.view_layer.objects.active = mesh_of(root, 1)
     bpy.ops.object.mode_set(mode="EDIT")
     rewrite(folder)
@@ -529,7 +531,7 @@ def active(fresh, folder, monkeypatch, tmp_path):
 
 
 @pytest.fixture
-def asked(monkeypatch):
+def submitted(monkeypatch):
     """Backend arguments of each submitted job; jobs do not run."""
     jobs = []
 
@@ -542,7 +544,7 @@ def asked(monkeypatch):
     return jobs
 
 
-def test_the_operator_asks_for_what_the_panel_says(active, asked, folder):
+def test_extract_meshes_uses_panel_settings(active, submitted, folder):
     extract, properties = bpy.ops.objectgs.extract_meshes, active.objectgs
     extract()
     properties.mesh_faces, properties.texture_size, properties.mesh_closed = 5000, "2048", False
@@ -560,19 +562,19 @@ def test_the_operator_asks_for_what_the_panel_says(active, asked, folder):
     extract()
     options = ["--faces", "5000", "--open", "--texture-size", "2048"]
     named = ["mesh", str(folder), "--faces", "5000"]
-    assert asked[0] == ["mesh", str(folder), "--faces", "20000"]
-    assert asked[1] == [*named, "--objects", "1", "2", str(HUGE), "--scene", *options[2:]]
-    assert asked[2] == [*named, "--objects", "2", *options[2:]]
-    assert asked[3] == [*named, "--objects", "1", *options[2:]]
+    assert submitted[0] == ["mesh", str(folder), "--faces", "20000"]
+    assert submitted[1] == [*named, "--objects", "1", "2", str(HUGE), "--scene", *options[2:]]
+    assert submitted[2] == [*named, "--objects", "2", *options[2:]]
+    assert submitted[3] == [*named, "--objects", "1", *options[2:]]
 
 
-def test_the_operator_says_what_it_needs(active):
-    assert not bpy.ops.objectgs.extract_meshes.poll(), "nothing was trained"
+def test_extract_meshes_requires_training(active):
+    assert not bpy.ops.objectgs.extract_meshes.poll(), "the reconstruction is not trained"
     with pytest.raises(RuntimeError, match="train first"):
         bpy.ops.objectgs.extract_meshes()
 
 
-def test_a_job_that_ends_shows_its_meshes(active, folder, monkeypatch):
+def test_finished_job_shows_meshes(active, folder, monkeypatch):
     properties = active.objectgs
     assert properties.shown == "meshes"
     properties.shown = "splats"
@@ -585,16 +587,16 @@ def test_a_job_that_ends_shows_its_meshes(active, folder, monkeypatch):
     assert properties.objects[0].faces == 4 and properties.objects[1].faces == 0
     properties.shown = "both"
     background.finish(job)
-    assert properties.shown == "both", "the user's choice stays where meshes are shown already"
+    assert properties.shown == "both", "the user's choice is kept if it includes meshes"
 
 
-def test_the_folder_tells_of_meshes_that_are_out_of_date(folder):
+def test_folder_state_counts_outdated_meshes(folder):
     state = folder_state(folder)
     assert (state.meshes, state.stale_meshes) == (2, 2)
     assert folder_state(folder.parent).meshes == 0
 
 
-def test_assets(active):
+def test_mark_assets_sets_origin_at_base(active):
     bpy.ops.objectgs.mark_assets()
     marked = {collection.name for collection in bpy.data.collections if collection.asset_data}
     assert marked == {"mug", "can"}
@@ -606,5 +608,5 @@ def test_assets(active):
     assert blender_scene.object_collections(active)[1].instance_offset[2] == pytest.approx(low, abs=1e-5)
 
 
-def test_points_make_room_wherever_a_result_is_opened(active):
+def test_points_are_hidden_when_result_is_opened(active):
     assert kinds.points_of(active).hide_get()

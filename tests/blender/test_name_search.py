@@ -25,5 +25,5 @@ OBJECTS = {10 + i: name for i, name in enumerate(NAMES)}
         (" , ", []),
     ],
 )
-def test_words_and_parts_of_words(query, ids):
+def test_search_finds_words_and_word_parts(query, ids):
     assert find_by_name(query, OBJECTS) == ids

@@ -44,7 +44,7 @@ def activate(root, object_id: int) -> None:
     root.objectgs.active_object = rows.index(object_id)
 
 
-def test_rows_say_what_the_file_says(root):
+def test_rows_match_objects_file(root):
     entries = read_objects(scene.folder_of(root) / "objects.json")
     items = root.objectgs.objects
     assert [(scene.from_stored(i.object_id), i.name, i.points) for i in items] == [
@@ -57,7 +57,7 @@ def test_rows_say_what_the_file_says(root):
     assert f"{items[0].points:,} points" in describe(items[0], root.objectgs)
 
 
-def test_a_new_name_and_color_reach_the_file_and_the_collection(root):
+def test_name_and_color_are_stored_and_shown(root):
     object_id = first_ids(root)[0]
     item = next(i for i in root.objectgs.objects if scene.from_stored(i.object_id) == object_id)
     item.name = "  tall thing "
@@ -69,7 +69,7 @@ def test_a_new_name_and_color_reach_the_file_and_the_collection(root):
     assert splats.color[0] == pytest.approx(1.0) and splats.color[1] == pytest.approx(0.2159, abs=0.001)
 
 
-def test_solo_hides_the_others_and_once_more_shows_all(root):
+def test_solo_toggles_visibility_of_others(root):
     object_id = first_ids(root)[0]
     activate(root, object_id)
     bpy.ops.objectgs.solo_object()
@@ -85,7 +85,7 @@ def test_solo_hides_the_others_and_once_more_shows_all(root):
     assert not any(layer.hide_viewport for layer in layers.values())
 
 
-def test_a_row_selects_its_object_and_the_selection_is_read_back(root):
+def test_active_row_selects_object(root):
     first, second = first_ids(root)[:2]
     activate(root, first)
     assert selection.selected_ids(bpy.context, root) == [first]
@@ -94,10 +94,10 @@ def test_a_row_selects_its_object_and_the_selection_is_read_back(root):
     activate(root, second)
     bpy.ops.objectgs.select_object(extend=True)
     selection.select_object(bpy.context, root, first, extend=True)
-    assert selection.selected_ids(bpy.context, root) == [second, first], "the active one comes last"
+    assert selection.selected_ids(bpy.context, root) == [second, first], "the active object comes last"
 
 
-def test_selected_objects_are_merged_into_the_active_one_and_split(root):
+def test_selected_objects_are_merged_and_split(root):
     first, second = first_ids(root)[:2]
     before = object_list.splat_counts(root)
     selection.select_object(bpy.context, root, first)
@@ -112,7 +112,7 @@ def test_selected_objects_are_merged_into_the_active_one_and_split(root):
     assert object_list.splat_counts(root) == before and entry(root, first).merged_into is None
 
 
-def test_leaving_out_the_rest(root):
+def test_choose_objects_leaves_out_others(root):
     first, *others = [scene.from_stored(item.object_id) for item in root.objectgs.objects]
     activate(root, first)
     bpy.ops.objectgs.choose_objects(which="ACTIVE")
@@ -124,7 +124,7 @@ def test_leaving_out_the_rest(root):
     assert not any(found.left_out for found in read_objects(scene.folder_of(root) / "objects.json"))
 
 
-def test_distance_and_ground_by_points(root):
+def test_set_distance_and_ground(root):
     parent = next(part for part in root.objects if scene.kind_of(part) == "parent")
     bpy.ops.objectgs.set_distance(points=(0, 0, 0, 0.25, 0, 0), distance=1.0)
     assert parent.matrix_world.to_scale().x == pytest.approx(4.0, rel=1e-5)
@@ -136,7 +136,7 @@ def test_distance_and_ground_by_points(root):
         bpy.ops.objectgs.set_distance(points=(1, 1, 1, 1, 1, 1), distance=2.0)
 
 
-def test_points_take_the_color_that_is_asked_for(root):
+def test_color_by_selects_point_colors(root):
     points = next(part for part in root.all_objects if scene.kind_of(part) == "points")
     root.objectgs.color_by = "object"
     assert points.data.color_attributes.active_color_name == "object"
@@ -144,7 +144,7 @@ def test_points_take_the_color_that_is_asked_for(root):
     assert points.data.color_attributes.active_color_name == "photo"
 
 
-def test_another_result_in_the_folder_is_noticed(root):
+def test_newer_result_is_detected(root):
     assert not scene.result_is_newer(root)
     splats = scene.folder_of(root) / "splats.ply"
     splats.write_bytes(splats.read_bytes())

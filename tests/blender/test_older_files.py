@@ -97,7 +97,7 @@ def check(root) -> None:
     assert color_attributes() == {COLOR}
 
 
-def test_an_older_file_opens_with_all_its_values(older_file):
+def test_older_file_keeps_all_values(older_file):
     bpy.ops.wm.open_mainfile(filepath=str(older_file))
     scene = bpy.context.scene
     root = scene.objectgs.active
@@ -118,7 +118,7 @@ def former_names() -> list[str]:
     ]
 
 
-def test_an_older_file_can_be_recolored_and_updated(older_file):
+def test_older_file_can_be_recolored_and_updated(older_file):
     """Also if older and current node groups are used with the same material."""
     bpy.ops.wm.open_mainfile(filepath=str(older_file))
     root = bpy.context.scene.objectgs.active
@@ -136,19 +136,21 @@ def test_an_older_file_can_be_recolored_and_updated(older_file):
         for n in m.data.materials[0].node_tree.nodes
         if n.type == "TEX_IMAGE"
     ]
-    assert [link.to_node.type for link in texture.outputs["Color"].links] == ["BSDF_PRINCIPLED"], "the group is gone"
+    assert [link.to_node.type for link in texture.outputs["Color"].links] == ["BSDF_PRINCIPLED"], (
+        "the recolor group was removed"
+    )
 
 
-@pytest.mark.skipif(bpy.app.version < (4, 3, 0), reason="has no handler for what is appended")
+@pytest.mark.skipif(bpy.app.version < (4, 3, 0), reason="has no handler for appended data")
 @pytest.mark.parametrize("link", [False, True])
-def test_an_object_of_an_older_file_can_be_appended_and_linked(older_file, link):
+def test_objects_of_older_file_can_be_appended_and_linked(older_file, link):
     with bpy.data.libraries.load(str(older_file), link=link) as (there, here):
         here.collections = list(there.collections)
     root = next(collection for collection in bpy.data.collections if kinds.kind_of(collection) == "reconstruction")
     check(root)
 
 
-def test_a_file_of_now_stays_as_it_is(older_file):
+def test_current_file_is_unchanged(older_file):
     bpy.ops.wm.open_mainfile(filepath=str(older_file))
     before = {block: list(block.keys()) for block in older_files._blocks()}
     assert bpy.context.scene.objectgs.active is not None

@@ -24,19 +24,19 @@ def perspective(near=0.1, far=100.0):
     )
 
 
-def test_a_click_takes_the_point_under_it():
+def test_click_picks_nearest_point():
     points = np.array([[0.0, 0, -5], [1, 0, -5]])
     assert nearest(points, perspective(), SIZE, np.array([100, 50]), 12) == 0
     assert nearest(points, perspective(), SIZE, np.array([121, 51]), 12) == 1
     assert nearest(points, perspective(), SIZE, np.array([160, 80]), 12) is None
 
 
-def test_the_point_in_front_hides_the_one_behind():
+def test_front_point_occludes_point_behind():
     points = np.array([[0.0, 0, -9], [0.02, 0, -3]])
     assert nearest(points, perspective(), SIZE, np.array([100, 50]), 12) == 1
 
 
-def test_points_behind_the_eye_and_no_points_are_never_taken():
+def test_points_behind_camera_are_not_picked():
     points = np.array([[0.0, 0, 5], [np.nan, 0, -5], [0, 0, 0]])
     assert nearest(points, perspective(), SIZE, np.array([100, 50]), 12) is None
     assert nearest(np.zeros((0, 3)), perspective(), SIZE, np.array([100, 50]), 12) is None

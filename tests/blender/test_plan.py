@@ -47,26 +47,26 @@ def root(fresh, trained, tmp_path):
     extension.unregister()
 
 
-def test_training_did_leave_a_plan(trained):
+def test_training_writes_plan(trained):
     assert planning.plan_of(trained).does("votes") and not planning.plan_of(trained / "none").decisions
 
 
-def test_what_is_overridden_is_told_to_training_and_undone(root):
+def test_overrides_are_passed_to_training_and_undone(root):
     toggle = bpy.ops.objectgs.override_decision
-    asked = planning.arguments(root)
-    assert asked[asked.index("--keep") :] == ["--keep", "blind-views"], "as the folder has it already"
+    arguments = planning.arguments(root)
+    assert arguments[arguments.index("--keep") :] == ["--keep", "blind-views"], "overrides in plan.json are kept"
     assert toggle(key="exposure") == {"FINISHED"} and toggle(key="pyramid") == {"FINISHED"}
-    asked = planning.arguments(root)
-    assert asked[asked.index("--keep") :] == ["--keep", "exposure", "blind-views", "--leave-out", "pyramid"]
+    arguments = planning.arguments(root)
+    assert arguments[arguments.index("--keep") :] == ["--keep", "exposure", "blind-views", "--leave-out", "pyramid"]
     assert toggle(key="exposure") == {"FINISHED"} and toggle(key="blind-views") == {"FINISHED"}
-    asked = planning.arguments(root)
-    assert "--keep" not in asked and asked[-2:] == ["--leave-out", "pyramid"]
+    arguments = planning.arguments(root)
+    assert "--keep" not in arguments and arguments[-2:] == ["--leave-out", "pyramid"]
     for key in ("votes", "unheard-of"):
         with pytest.raises(RuntimeError, match="leaves no choice"):
             toggle(key=key)
 
 
-def test_a_broken_plan_is_none(root):
+def test_invalid_plan_counts_as_missing(root):
     path = Reconstruction(scene.folder_of(root)).plan
     path.write_text("[]")
     assert planning.plan_of(scene.folder_of(root)).decisions == () and "--keep" not in planning.arguments(root)
@@ -74,25 +74,25 @@ def test_a_broken_plan_is_none(root):
     assert planning.plan_of(scene.folder_of(root)).decisions == ()
 
 
-def test_plan_and_train_ask_the_backend_for_the_same(root, monkeypatch):
-    asked = []
+def test_analyze_and_train_use_same_arguments(root, monkeypatch):
+    calls = []
     monkeypatch.setattr(locations, "backend_python", lambda: "python")
     monkeypatch.setattr(
         locations,
         "backend_job",
         lambda title, kind, folder, *words: (
-            asked.append(words) or jobs.Job(title=title, kind=kind, folder=folder, command=["true"], cwd=folder)
+            calls.append(words) or jobs.Job(title=title, kind=kind, folder=folder, command=["true"], cwd=folder)
         ),
     )
     monkeypatch.setattr(background, "submit", lambda *_: {"FINISHED"})
     bpy.ops.objectgs.override_decision(key="exposure")
     assert bpy.ops.objectgs.analyze_capture() == {"FINISHED"} and bpy.ops.objectgs.train() == {"FINISHED"}
     wanted = tuple(planning.arguments(root))
-    assert [words[0] for words in asked] == ["plan", "train"]
-    assert all(words[-len(wanted) :] == wanted and "exposure" in words for words in asked)
+    assert [words[0] for words in calls] == ["plan", "train"]
+    assert all(words[-len(wanted) :] == wanted and "exposure" in words for words in calls)
 
 
-def test_a_labels_file_groups_objects(root, tmp_path):
+def test_labels_file_groups_objects(root, tmp_path):
     path = Reconstruction(scene.folder_of(root)).objects
     first, second, *_ = [entry.id for entry in read_objects(path)]
     labels = tmp_path / "groups.json"
@@ -105,17 +105,17 @@ def test_a_labels_file_groups_objects(root, tmp_path):
         bpy.ops.objectgs.group_objects(filepath=str(labels))
 
 
-def test_headless_hands_groups_on_from_where_it_was_called(monkeypatch, tmp_path):
-    asked = []
+def test_headless_passes_absolute_group_paths(monkeypatch, tmp_path):
+    calls = []
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(commands, "find_backend", lambda _python: None)
-    monkeypatch.setattr(commands, "run_backend", lambda _reporter, *words: asked.append(words))
+    monkeypatch.setattr(commands, "run_backend", lambda _reporter, *words: calls.append(words))
     monkeypatch.setattr(argparse.Namespace, "reporter", Reporter(), raising=False)
     commands.plan(parse(["plan", "garden", "--no-meshes"]))
     commands.plan(parse(["plan", "garden", "--out", "made", "--groups", "g.json", "--keep", "all"]))
     commands.backend(parse(["vote", "garden", "--out", "made", "--groups", "g.json"]))
     garden, made, groups = tmp_path / "garden", tmp_path / "made", ("--groups", tmp_path / "g.json")
-    assert asked == [
+    assert calls == [
         ("plan", None, garden, "--no-meshes"),
         ("plan", made, garden, "--out", made, *groups, "--keep", "all"),
         ("vote", made, garden, "--out", made, *groups),

@@ -63,12 +63,14 @@ def counts():
 
 
 @pytest.mark.parametrize("fy", [500.0, 501.5, 498.0])
-def test_cameras_project_as_the_capture_does(fresh, tmp_path, fy):
+def test_cameras_match_capture_projection(fresh, tmp_path, fy):
     origin = np.array([1000.0, -2000.0, 30.0])
     upright = np.eye(4)
     upright[:3, :3] = np.array(Matrix.Rotation(0.7, 3, "X")) @ np.array(Matrix.Rotation(0.3, 3, "Z"))
     upright[:3, 3] = 1.0, 2.0, 3.0
-    views = [look_at(np.array(eye) + origin, origin) for eye in ((3, 0.5, 1), (-2, 3, 0.2), (0.1, -4, 3))]
+    views = [
+        look_at(np.array(camera_center) + origin, origin) for camera_center in ((3, 0.5, 1), (-2, 3, 0.2), (0.1, -4, 3))
+    ]
     intrinsics = K.copy()
     intrinsics[1, 1] = fy
     write_cameras(tmp_path, views, intrinsics, origin=origin, upright=upright)
@@ -90,7 +92,7 @@ def test_cameras_project_as_the_capture_does(fresh, tmp_path, fy):
             assert depth > 0
 
 
-def test_a_camera_shows_its_photo_and_gives_the_render_its_size(root, folder):
+def test_camera_has_photo_and_sets_render_size(root, folder):
     owner = bpy.context.scene
     cameras = cameras_of(root)
     assert [camera.name for camera in cameras] == [f"{i:03}.png" for i in range(8)]
@@ -105,7 +107,7 @@ def test_a_camera_shows_its_photo_and_gives_the_render_its_size(root, folder):
         assert 0.05 < camera.data.display_size < 3
 
 
-def test_the_users_camera_and_render_size_stay(fresh, folder):
+def test_user_camera_and_render_size_are_kept(fresh, folder):
     owner = bpy.context.scene
     own = bpy.data.objects.new("own", bpy.data.cameras.new("own"))
     owner.collection.objects.link(own)
@@ -118,7 +120,7 @@ def test_the_users_camera_and_render_size_stay(fresh, folder):
     assert owner.view_settings.view_transform == view_transform
 
 
-def test_pixels_of_different_shapes_and_missing_photos_are_told(fresh, folder):
+def test_pixel_aspect_and_missing_photos_are_reported(fresh, folder):
     content = json.loads((folder / "cameras.json").read_text())
     content["cameras"][3]["K"][1][1] *= 1.05
     (folder / "cameras.json").write_text(json.dumps(content))
@@ -130,7 +132,7 @@ def test_pixels_of_different_shapes_and_missing_photos_are_told(fresh, folder):
     assert len(cameras_of(shown)[5].data.background_images) == 0
 
 
-def test_cameras_that_the_capture_has_lost_go(root, folder):
+def test_removed_capture_cameras_are_deleted(root, folder):
     write_cameras(folder, [look_at((3, 0, 1)), look_at((0, 3, 1))])
     before = len(bpy.data.cameras)
     assert blender_scene.show_capture(bpy.context.scene, folder) == root
@@ -141,7 +143,7 @@ def test_cameras_that_the_capture_has_lost_go(root, folder):
 # Points.
 
 
-def test_points_carry_both_colors_and_show_the_chosen_one(root, folder):
+def test_points_show_chosen_color(root, folder):
     points = kinds.points_of(root)
     mesh = points.data
     assert points.hide_render
@@ -161,7 +163,7 @@ def test_points_carry_both_colors_and_show_the_chosen_one(root, folder):
         assert shown.materials[0].name == "ObjectGS Points"
 
 
-def test_a_vote_recolors_points_and_edits_rename(root, folder):
+def test_new_vote_and_edits_update_points_and_names(root, folder):
     blender_scene.color_points_by(root, "object")
     edit_objects(folder / "objects.json", {1: dict(name="cup", color=[255, 0, 0])})
     write_points(folder, np.zeros((5, 3)), [1, 1, 1, 1, 2])
@@ -181,7 +183,7 @@ def test_a_vote_recolors_points_and_edits_rename(root, folder):
 # Objects.
 
 
-def test_every_object_has_a_collection_with_its_splats_and_anchors(root, folder):
+def test_object_collections_have_splats_and_anchors(root, folder):
     collections = blender_scene.object_collections(root)
     assert {object_id: collection.name for object_id, collection in collections.items()} == {**OBJECTS, 0: "Unlabeled"}
     for object_id, collection in collections.items():
@@ -207,7 +209,7 @@ def test_every_object_has_a_collection_with_its_splats_and_anchors(root, folder)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_splats_have_the_attributes_of_blenders_own(fresh, folder, degree):
+def test_splat_attributes_match_blender_names(fresh, folder, degree):
     table = splat_table(np.resize([1, 2], 20), degree)
     write_vertices(folder / "splats.ply", table)
     owner = bpy.context.scene
@@ -239,7 +241,7 @@ def test_splats_have_the_attributes_of_blenders_own(fresh, folder, degree):
     assert (types["radiance:base"], types["rotation"], types["scale"]) == ("FLOAT_COLOR", "QUATERNION", "FLOAT_VECTOR")
 
 
-def test_the_viewport_shows_points_or_ellipsoids(root):
+def test_viewport_shows_points_or_ellipsoids(root):
     splats = part(root, 1, "splats")
     modifier = modifiers.modifier_of(splats, node_groups.SPLATS_GROUP)
     instances = [
@@ -258,7 +260,7 @@ def test_the_viewport_shows_points_or_ellipsoids(root):
     assert len(instances) == 10
 
 
-def test_what_cannot_be_shown_is_left_out_and_told(fresh, folder):
+def test_invalid_splats_are_left_out_and_reported(fresh, folder):
     table = splat_table(np.resize([1, 2], 20))
     table["x"][3], table["opacity"][4], table["scale_1"][5] = np.nan, np.inf, 200.0
     for i in range(4):
@@ -276,7 +278,7 @@ def test_what_cannot_be_shown_is_left_out_and_told(fresh, folder):
 # Updates in place.
 
 
-def test_showing_again_keeps_what_the_user_did(root, folder):
+def test_update_keeps_user_changes(root, folder):
     owner = bpy.context.scene
     kitchen = bpy.data.collections.new("Kitchen")
     owner.collection.children.link(kitchen)
@@ -319,7 +321,7 @@ def test_showing_again_keeps_what_the_user_did(root, folder):
     assert blender_scene.root_of(mug, owner) == root
 
 
-def test_a_result_of_other_size_replaces_the_one_before(root, folder):
+def test_result_of_different_size_replaces_previous_one(root, folder):
     write_vertices(folder / "splats.ply", splat_table(np.resize([0, *OBJECTS], 84), degree=0, seed=3))
     shown = again(root, folder)
     assert (shown.objects, shown.splats, shown.anchors) == (3, 84, 8)
@@ -329,7 +331,7 @@ def test_a_result_of_other_size_replaces_the_one_before(root, folder):
     assert len(kinds.part_of(blender_scene.object_collections(root)[1], "splats").data.materials) == 1
 
 
-def test_objects_that_vanish_go_but_the_users_things_stay(root, folder):
+def test_vanished_objects_are_removed_and_user_objects_kept(root, folder):
     cube = bpy.data.objects.new("cube", bpy.data.meshes.new("cube"))
     blender_scene.object_collections(root)[2].objects.link(cube)
     write_vertices(folder / "splats.ply", splat_table(np.resize([1], 10)))
@@ -346,7 +348,7 @@ def test_objects_that_vanish_go_but_the_users_things_stay(root, folder):
     assert before["collections"] - after["collections"] == 2
 
 
-def test_merged_objects_come_into_one_collection_and_apart_again(root, folder):
+def test_merged_objects_share_collection_until_split(root, folder):
     edit_objects(folder / "objects.json", {2: dict(merged_into=1)})
     blender_scene.show_objects(root, folder)
     collections = blender_scene.object_collections(root)
@@ -362,7 +364,7 @@ def test_merged_objects_come_into_one_collection_and_apart_again(root, folder):
     } == {0: 10, 1: 10, 2: 10, HUGE: 10}
 
 
-def test_left_out_objects_go_nowhere(root, folder):
+def test_left_out_objects_are_not_shown(root, folder):
     edit_objects(folder / "objects.json", {2: dict(left_out=True)})
     blender_scene.show_objects(root, folder)
     assert set(blender_scene.object_collections(root)) == {0, 1, HUGE}
@@ -371,7 +373,7 @@ def test_left_out_objects_go_nowhere(root, folder):
     assert colors[ids == 2] == pytest.approx(np.repeat(colors[ids == 0][:1], np.count_nonzero(ids == 2), 0))
 
 
-def test_what_the_user_deleted_comes_back_with_the_next_result(root, folder):
+def test_deleted_parts_are_restored_with_next_result(root, folder):
     bpy.data.objects.remove(part(root, 1, "splats"))
     bpy.data.collections.remove(blender_scene.object_collections(root)[2])
     bpy.data.objects.remove(kinds.parent_of(root))
@@ -382,7 +384,7 @@ def test_what_the_user_deleted_comes_back_with_the_next_result(root, folder):
     assert part(root, HUGE, "object_parent").parent == kinds.parent_of(root)
 
 
-def test_two_reconstructions_in_one_file_stay_apart(root, folder, tmp_path):
+def test_reconstructions_in_one_file_are_separate(root, folder, tmp_path):
     other_folder = tmp_path / "other"
     other_folder.mkdir()
     write_cameras(other_folder, [look_at((3, 0, 1))])
@@ -403,7 +405,7 @@ def test_two_reconstructions_in_one_file_stay_apart(root, folder, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "spoil", "sentence"),
+    ("name", "corrupt", "sentence"),
     [
         ("cameras.json", None, "has no cameras.json; run Import again"),
         ("cameras.json", b"{}", "is not a valid list of cameras"),
@@ -413,8 +415,8 @@ def test_two_reconstructions_in_one_file_stay_apart(root, folder, tmp_path):
         ("objects.json", b"[]", "is not a valid list of objects"),
     ],
 )
-def test_bad_captures_change_nothing(fresh, folder, name, spoil, sentence):
-    (folder / name).unlink() if spoil is None else (folder / name).write_bytes(spoil)
+def test_invalid_captures_change_nothing(fresh, folder, name, corrupt, sentence):
+    (folder / name).unlink() if corrupt is None else (folder / name).write_bytes(corrupt)
     before = counts()
     with pytest.raises(InputError, match=sentence):
         blender_scene.show_capture(bpy.context.scene, folder)
@@ -422,22 +424,22 @@ def test_bad_captures_change_nothing(fresh, folder, name, spoil, sentence):
 
 
 @pytest.mark.parametrize(
-    ("name", "spoil", "sentence"),
+    ("name", "corrupt", "sentence"),
     [
         ("splats.ply", None, "has no splats.ply; train first"),
         ("splats.ply", "points.ply", "not a file of Gaussian splats"),
         ("anchors.ply", "points.ply", "has no property scale_0"),
-        ("splats.ply", "cut", "cut short"),
+        ("splats.ply", "cut", "truncated"),
     ],
 )
-def test_bad_results_change_nothing(root, folder, name, spoil, sentence):
+def test_invalid_results_change_nothing(root, folder, name, corrupt, sentence):
     path = folder / name
-    if spoil is None:
+    if corrupt is None:
         path.unlink()
-    elif spoil == "cut":
+    elif corrupt == "cut":
         path.write_bytes(path.read_bytes()[:-1])
     else:
-        path.write_bytes((folder / spoil).read_bytes())
+        path.write_bytes((folder / corrupt).read_bytes())
     before = counts()
     with pytest.raises(InputError, match=sentence):
         again(root, folder)
@@ -445,7 +447,7 @@ def test_bad_results_change_nothing(root, folder, name, spoil, sentence):
     assert len(part(root, 1, "splats").data.vertices) == 10
 
 
-def test_an_object_in_edit_mode_is_not_overwritten(root, folder):
+def test_object_in_edit_mode_is_not_overwritten(root, folder):
     splats = part(root, 1, "splats")
     bpy.context.view_layer.objects.active = splats
     bpy.ops.object.mode_set(mode="EDIT")
@@ -454,7 +456,7 @@ def test_an_object_in_edit_mode_is_not_overwritten(root, folder):
     bpy.ops.object.mode_set(mode="OBJECT")
 
 
-def test_a_blend_file_without_its_folder_still_opens(root, folder, tmp_path):
+def test_blend_file_without_folder_opens(root, folder, tmp_path):
     blend = tmp_path / "old.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(blend))
     folder.rename(tmp_path / "gone")
@@ -472,7 +474,7 @@ def test_a_blend_file_without_its_folder_still_opens(root, folder, tmp_path):
 # Orientation.
 
 
-def test_three_points_become_the_ground_below_the_cameras(root):
+def test_orient_to_ground_places_points_below_cameras(root):
     parent = kinds.parent_of(root)
     parent.matrix_world = Matrix.Rotation(2.1, 4, "X") @ Matrix.Translation((1, 2, 3))
     bpy.context.view_layer.update()
@@ -492,7 +494,7 @@ def test_three_points_become_the_ground_below_the_cameras(root):
         blender_scene.orient_to_ground(root, (0, 0, 0), (1, 1, 1), (3, 3, 3))
 
 
-def test_two_points_become_a_distance_apart(root):
+def test_scale_to_distance_sets_point_distance(root):
     parent = kinds.parent_of(root)
     before = parent.matrix_world.copy()
     blender_scene.scale_to_distance(root, (1, 0, 0), (3, 0, 0), 0.5)
@@ -524,7 +526,7 @@ def rendered(tmp_path, size=(33, 33)) -> np.ndarray:
     return pixels
 
 
-def test_a_rendered_splat_is_the_gaussian_with_its_color_from_here(fresh, tmp_path):
+def test_rendered_splat_matches_gaussian_and_view_color(fresh, tmp_path):
     """Every pixel of a degree-3 splat under a moved and rotated parent agrees with the formula."""
     view = look_at((2.0, -3.0, 1.5))
     intrinsics = np.array([[60.0, 0.0, 16.5], [0.0, 60.0, 16.5], [0.0, 0.0, 1.0]])
@@ -549,16 +551,16 @@ def test_a_rendered_splat_is_the_gaussian_with_its_color_from_here(fresh, tmp_pa
     image = rendered(tmp_path)
 
     rotation = np.array(_rotation(table))
-    eye = -view[:3, :3].T @ view[:3, 3]
+    camera_center = -view[:3, :3].T @ view[:3, 3]
     v, u = np.mgrid[0:33, 0:33] + 0.5
     rays = np.stack([(u - 16.5) / 60.0, (v - 16.5) / 60.0, np.ones_like(u)], -1) @ view[:3, :3]
-    start = (eye - position) @ rotation / scales
+    start = (camera_center - position) @ rotation / scales
     rays = rays @ rotation / scales
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     squared = start @ start - (rays @ start) ** 2
     alpha = 0.8 * np.exp(-0.5 * squared)
     alpha[alpha < 1 / 255] = 0.0
-    color = np.clip(0.5 + _harmonics(table, position - eye), 0.0, None)
+    color = np.clip(0.5 + _harmonics(table, position - camera_center), 0.0, None)
     linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
     assert np.abs(image - alpha[..., None] * linear).max() < 0.002 * linear.max()
     assert image.max() > 0.5 * linear.max()
@@ -603,7 +605,7 @@ def _harmonics(table, direction):
     return coefficients @ basis
 
 
-def test_nearer_splats_hide_farther_ones(fresh, tmp_path):
+def test_nearer_splats_occlude_farther_ones(fresh, tmp_path):
     write_cameras(tmp_path, [look_at((0.0, -3.0, 0.0))], [[60, 0, 16.5], [0, 60, 16.5], [0, 0, 1]], size=(33, 33))
     write_points(tmp_path, np.zeros((1, 3)), [1])
     table = splat_table([1, 2], degree=0)

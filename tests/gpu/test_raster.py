@@ -19,7 +19,7 @@ from tests.backend.test_raster import NAMES, as_float32, random_scene
 from tests.backend.test_raster_stiff import *  # noqa: F403
 
 # These test only the reference, and CPU threads.
-del test_gradcheck_of_the_reference, test_one_and_two_threads_give_the_same_bits  # noqa: F821
+del test_reference_passes_gradcheck, test_thread_count_does_not_change_bits  # noqa: F821
 
 GPU = torch.device("cuda")
 KINDS = pytest.mark.parametrize("primitive", ["3d", "2d"])
@@ -40,26 +40,26 @@ def step(scene, cam, primitive, device):
     rng = np.random.default_rng(0)
     labels = torch.tensor(rng.integers(0, 5, (cam.height, cam.width)), dtype=torch.int32).to(device)
     leaves = {k: v.detach().to(device).requires_grad_(k != "ids") for k, v in scene.items()}
-    picture = raster.rasterize(
+    rendered = raster.rasterize(
         **leaves, camera=cam, labels=labels, want_depth=True, want_median=True, want_normals=flat,
         want_distortion=flat, primitive=primitive,
     )  # fmt: skip
-    planes = {name: p for name, p in zip(picture._fields[:-1], picture[:-1], strict=True) if p is not None}
+    planes = {name: p for name, p in zip(rendered._fields[:-1], rendered[:-1], strict=True) if p is not None}
     loss = 0
     for name, plane in planes.items():
         if name != "median":
             loss = loss + (plane * torch.tensor(rng.normal(size=plane.shape), dtype=torch.float32).to(device)).sum()
     loss.backward()
-    ids, probability = (torch.as_tensor(a) for a in raster.object_map(picture))
+    ids, probability = (torch.as_tensor(a) for a in raster.object_map(rendered))
     arrays = {name: p.detach() for name, p in planes.items()}
     arrays |= {"ids": ids, "probability": probability} | {name: leaves[name].grad for name in NAMES}
-    arrays["screen"] = torch.as_tensor(picture.frame.screen_gradient)
-    return {name: a.cpu().numpy() for name, a in arrays.items()}, picture.frame
+    arrays["screen"] = torch.as_tensor(rendered.frame.screen_gradient)
+    return {name: a.cpu().numpy() for name, a in arrays.items()}, rendered.frame
 
 
 @KINDS
 @pytest.mark.parametrize(("count", "size"), [(5_000, 0.03), (60_000, 0.01)])
-def test_agrees_with_the_cpu_renderer(count, size, primitive):
+def test_large_scenes_match_cpu_renderer(count, size, primitive):
     scene = as_float32(random_scene(1, count=count, size=size))
     cam = large_camera()
     here, _ = step(scene, cam, primitive, GPU)
@@ -84,7 +84,7 @@ def test_agrees_with_the_cpu_renderer(count, size, primitive):
 
 
 @KINDS
-def test_the_same_bits_every_time(primitive):
+def test_results_are_bitwise_reproducible(primitive):
     scene = as_float32(random_scene(2, count=50_000, size=0.01))
     first, _ = step(scene, large_camera(), primitive, GPU)
     for _ in range(5):
@@ -94,7 +94,7 @@ def test_the_same_bits_every_time(primitive):
 
 
 @KINDS
-def test_memory_is_given_back(primitive):
+def test_memory_is_released(primitive):
     scene = as_float32(random_scene(3, count=20_000, size=0.02))
     sizes = []
     for _ in range(4):
@@ -106,7 +106,7 @@ def test_memory_is_given_back(primitive):
 
 
 @KINDS
-def test_torch_waits_for_nothing(primitive):
+def test_torch_operations_do_not_synchronize(primitive):
     """No torch operation of a step waits for the GPU, except for the object map, which is copied to the host."""
     scene = {k: v.to(GPU).requires_grad_(k != "ids") for k, v in as_float32(random_scene(3, count=2_000)).items()}
     cam = large_camera()
@@ -115,15 +115,15 @@ def test_torch_waits_for_nothing(primitive):
     try:
         for mode in ("default", "error"):
             torch.cuda.set_sync_debug_mode(mode)
-            picture = raster.rasterize(**scene, camera=cam, labels=labels, want_depth=True, primitive=primitive)
+            rendered = raster.rasterize(**scene, camera=cam, labels=labels, want_depth=True, primitive=primitive)
             (
-                picture.color.sum() + picture.alpha.sum() + picture.label_probability.sum() + picture.depth.sum()
+                rendered.color.sum() + rendered.alpha.sum() + rendered.label_probability.sum() + rendered.depth.sum()
             ).backward()
     finally:
         torch.cuda.set_sync_debug_mode(before)
 
 
-def test_another_stream():
+def test_kernels_use_current_stream():
     """Kernels run in torch's current stream, also if it is not the default one."""
     scene = {k: v.to(GPU) for k, v in as_float32(random_scene(3, count=5_000)).items()}
     expected = raster.rasterize(**scene, camera=large_camera()).color
@@ -136,7 +136,7 @@ def test_another_stream():
 
 
 @KINDS
-def test_pixel_kernels_stay_in_registers(primitive):
+def test_pixel_kernels_do_not_spill_registers(primitive):
     step(as_float32(random_scene(3, count=100)), large_camera(64, 48), primitive, GPU)
     flat = primitive == "2d"
     wanted = Wanted(flat, True, True, True, flat, flat)
@@ -144,12 +144,12 @@ def test_pixel_kernels_stay_in_registers(primitive):
         blend_kernel(wanted),
         blend_backward_kernel(wanted._replace(median=False)),
     ):
-        assert kernel.overloads, "the test looks at another kernel than was run"
+        assert kernel.overloads, "the tested kernel was not run"
         assert max(kernel.get_local_mem_per_thread().values()) == 0
         assert max(kernel.get_regs_per_thread().values()) <= 128
 
 
-def test_a_thousand_objects_cost_what_one_costs():
+def test_image_is_independent_of_object_count():
     """The blending kernels do not depend on the number of objects, so the image is the same for any IDs."""
     scene = as_float32(random_scene(4, count=20_000, size=0.02, objects=1_000))
     many, _ = step(scene, large_camera(), "3d", GPU)
@@ -159,7 +159,7 @@ def test_a_thousand_objects_cost_what_one_costs():
     assert set(np.unique(one["ids"])) <= {-1, 0} and len(np.unique(many["ids"])) > 100
 
 
-def test_frames_are_of_the_device():
+def test_frames_are_on_gpu():
     _, frame = step(as_float32(random_scene(3, count=100)), large_camera(64, 48), "3d", GPU)
     assert isinstance(frame, renderer.Frame)
     assert frame.seen.device.type == frame.screen_gradient.device.type == "cuda"

@@ -62,20 +62,20 @@ class Spheres:
 
     def __init__(self) -> None:
         rng = np.random.default_rng(0)
-        self.views, self._pictures, self._masks = [], [], []
+        self.views, self._images, self._masks = [], [], []
         for i in range(VIEWS):
             angle = 2 * math.pi * i / VIEWS
-            eye = np.array([3 * math.cos(angle), -0.8 + 0.5 * (i % 2), 3 * math.sin(angle)])
-            forward = -eye / np.linalg.norm(eye)
+            camera_center = np.array([3 * math.cos(angle), -0.8 + 0.5 * (i % 2), 3 * math.sin(angle)])
+            forward = -camera_center / np.linalg.norm(camera_center)
             right = np.cross(forward, [0.0, -1.0, 0.0])
             right /= np.linalg.norm(right)
             viewmat = np.eye(4)
             viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-            viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+            viewmat[:3, 3] = -viewmat[:3, :3] @ camera_center
             K = np.array([[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1.0]])
             self.views.append(View(WIDTH, HEIGHT, K, viewmat))
-            picture, mask = self._shaded(viewmat, K)
-            self._pictures.append(picture)
+            image, mask = self._shaded(viewmat, K)
+            self._images.append(image)
             self._masks.append(mask)
         directions = rng.normal(size=(len(SPHERES), 200, 3))
         directions /= np.linalg.norm(directions, axis=2, keepdims=True)
@@ -91,7 +91,7 @@ class Spheres:
         x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
         rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
         nearest, mask = np.full(x.shape, np.inf), np.zeros(x.shape, np.int64)
-        picture = np.full((*x.shape, 3), 0.5)
+        image = np.full((*x.shape, 3), 0.5)
         for object_id, center, radius, color in SPHERES:
             c = viewmat[:3, :3] @ center + viewmat[:3, 3]
             a, b = (rays * rays).sum(-1), rays @ c
@@ -100,12 +100,12 @@ class Spheres:
             here = (root > 0) & (t < nearest)
             normal = (rays * t[..., None] - c) / radius @ viewmat[:3, :3]
             light = 0.6 + 0.4 * normal @ np.array([0.3, -0.9, 0.3])
-            picture = np.where(here[..., None], np.array(color) * light[..., None], picture)
+            image = np.where(here[..., None], np.array(color) * light[..., None], image)
             nearest, mask = np.where(here, t, nearest), np.where(here, object_id, mask)
-        return np.clip(255 * picture + 0.5, 0, 255).astype(np.uint8), mask
+        return np.clip(255 * image + 0.5, 0, 255).astype(np.uint8), mask
 
     def image(self, index: int, downscale: int = 1) -> np.ndarray:
-        return self._pictures[index][::downscale, ::downscale]
+        return self._images[index][::downscale, ::downscale]
 
     def mask(self, index: int, downscale: int = 1) -> np.ndarray:
         return self._masks[index][::downscale, ::downscale]
@@ -145,14 +145,14 @@ def quality(trainer):
     capture = trainer.scene.capture
     squares, right = [], []
     for index in capture.test_indices:
-        picture = draw(trainer.shown, trainer.scene.camera(index))
+        rendered = draw(trainer.shown, trainer.scene.camera(index))
         truth = capture.mask(index)
-        squares.append(((picture.image - capture.image(index) / 255.0) ** 2).mean())
-        right.append((picture.ids[truth > 0] == truth[truth > 0]).mean())
+        squares.append(((rendered.image - capture.image(index) / 255.0) ** 2).mean())
+        right.append((rendered.ids[truth > 0] == truth[truth > 0]).mean())
     return -10 * math.log10(np.mean(squares)), float(np.mean(right))
 
 
-def test_auto_takes_the_gpu(gpu):
+def test_auto_selects_gpu(gpu):
     assert devices.why_not_cuda() is None
     assert gpu.type == "cuda" and devices.pick("auto") == gpu and devices.pick("cpu").type == "cpu"
 
@@ -163,7 +163,7 @@ def close(got, want, relative, absolute):
     )
 
 
-def test_losses_and_gaussians_are_those_of_the_processor(gpu):
+def test_losses_and_gaussians_match_cpu(gpu):
     """On the GPU, tensor cores must not reduce the precision of SSIM's variances or of the heads."""
     rng = np.random.default_rng(0)
     h, w = 120, 200
@@ -179,7 +179,7 @@ def test_losses_and_gaussians_are_those_of_the_processor(gpu):
         leaves = [v.clone().to(place).requires_grad_() for v in (*planes, depth, rows)]
         color, alpha, weight, background, z, row = leaves
         heads = Heads(layout, "explicit", 1, torch.Generator().manual_seed(0)).to(place)
-        g = generate(layout, positions.to(place), row, ids.to(place), heads).only_made()
+        g = generate(layout, positions.to(place), row, ids.to(place), heads).only_valid()
         values = [
             image_loss(color, alpha, weight, background, target.to(place), labels.to(place), 0.2, 0.1),
             normal_loss(color, z, alpha, np.array([150.0, 150, 100, 60])), volume_loss(g.scales),
@@ -197,7 +197,7 @@ def test_losses_and_gaussians_are_those_of_the_processor(gpu):
 
 
 @pytest.mark.parametrize("settings", [SETTINGS, FLAT], ids=["3d", "2d"])
-def test_a_step_waits_for_nothing(spheres, gpu, settings):
+def test_step_does_not_synchronize(spheres, gpu, settings):
     trainer = started(spheres, settings, gpu)
     for share in (0.3, 0.8):
         for _ in spheres.train_indices:  # targets are uploaded and kernels compiled
@@ -215,20 +215,20 @@ def test_a_step_waits_for_nothing(spheres, gpu, settings):
 
 @pytest.mark.parametrize("settings", [SETTINGS, FLAT, dataclasses.replace(SETTINGS, mode="view")],
                          ids=["3d", "2d", "view"])  # fmt: skip
-def test_training_is_as_good_as_on_the_processor(spheres, gpu, settings):
+def test_training_quality_matches_cpu(spheres, gpu, settings):
     want, want_right = quality(trained(spheres, settings, devices.CPU))
     begun = time.monotonic()
     trainer = trained(spheres, settings, gpu)
     got, right = quality(trainer)
     print(f"{settings.primitive} {settings.mode}: {got:.2f} dB after {time.monotonic() - begun:.1f} s on the GPU, "
-          f"{want:.2f} dB on the processor")  # fmt: skip
+          f"{want:.2f} dB on the CPU")  # fmt: skip
     assert trainer.model.device.type == "cuda"
     assert got > 25 and got > want - 0.7
     assert right > 0.95 and right > want_right - 0.02
 
 
 @pytest.mark.parametrize("first", ["cpu", "cuda"])
-def test_a_checkpoint_goes_on_on_the_other_device(spheres, gpu, tmp_path, first):
+def test_checkpoint_resumes_on_other_device(spheres, gpu, tmp_path, first):
     places = [devices.CPU, gpu] if first == "cpu" else [gpu, devices.CPU]
     begun = started(spheres, SETTINGS, places[0])
     begun.run(Budget(steps=150), tmp_path, Reporter())
@@ -241,7 +241,7 @@ def test_a_checkpoint_goes_on_on_the_other_device(spheres, gpu, tmp_path, first)
     assert found > 25 and right > 0.95
 
 
-def test_pictures_in_parts_teach_as_well(spheres, gpu, monkeypatch):
+def test_training_in_parts_reaches_same_quality(spheres, gpu, monkeypatch):
     def full(*arguments, **options):
         if arguments[6].width > WIDTH // 2:
             raise torch.cuda.OutOfMemoryError("CUDA out of memory.")

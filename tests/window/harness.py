@@ -122,7 +122,7 @@ class Blender:
             found[:] = [self.run(f"result = {expression}")]
             return bool(found[0])
 
-        _wait(true, timeout, f"it never became true: {expression}", 0.3)
+        _wait(true, timeout, f"condition timed out: {expression}", 0.3)
         return found[0]
 
     def shot(self, name: str) -> Path:

@@ -64,15 +64,15 @@ def splats() -> Splats:
     )
 
 
-def viewmat(eye=(0.3, -3.0, 0.8)) -> np.ndarray:
-    """Return the viewmat of a camera at `eye` that looks at the center."""
-    forward = np.array([0, 0, 0.2]) - eye
+def viewmat(camera_center=(0.3, -3.0, 0.8)) -> np.ndarray:
+    """Return the viewmat of a camera at `camera_center` that looks at the center."""
+    forward = np.array([0, 0, 0.2]) - camera_center
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, (0, 0, 1.0))
     right /= np.linalg.norm(right)
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    matrix[:3, 3] = -matrix[:3, :3] @ eye
+    matrix[:3, 3] = -matrix[:3, :3] @ camera_center
     return matrix
 
 
@@ -191,8 +191,8 @@ def backend_draws(without: int = 0, recolor: Recolor | None = None, camera: Came
         for name in ("means", "quats", "scales", "opacities", "sh")
     ]
     ids = torch.zeros(len(arrays[0]), dtype=torch.int32)
-    picture = rasterize(*map(torch.from_numpy, arrays), ids, camera)
-    return np.concatenate([picture.color.numpy(), picture.alpha.numpy()[None]]).transpose(1, 2, 0)
+    rendered = rasterize(*map(torch.from_numpy, arrays), ids, camera)
+    return np.concatenate([rendered.color.numpy(), rendered.alpha.numpy()[None]]).transpose(1, 2, 0)
 
 
 def subset(splats: Splats, which) -> Splats:
@@ -205,11 +205,11 @@ def psnr(first: np.ndarray, second: np.ndarray) -> float:
     return -10.0 * math.log10(((first - second) ** 2).mean() + 1e-12)
 
 
-def test_the_drawing_is_the_backends_picture(window):
+def test_drawing_matches_backend_image(window):
     """Includes a rotated object with harmonics of degree 3, and a hidden object."""
-    picture = drawn(window)
-    assert 0.3 < picture[..., 3].mean() < 1.0
-    assert psnr(picture, backend_draws()) > 40.0
+    image = drawn(window)
+    assert 0.3 < image[..., 3].mean() < 1.0
+    assert psnr(image, backend_draws()) > 40.0
     window.run(
         script("""
         for part in scene.object_collections(root)[1].objects:
@@ -217,7 +217,7 @@ def test_the_drawing_is_the_backends_picture(window):
     """)
     )
     without = drawn(window)
-    assert psnr(without, backend_draws(without=1)) > 40.0 > psnr(without, picture)
+    assert psnr(without, backend_draws(without=1)) > 40.0 > psnr(without, image)
     window.run(
         script("""
         for part in scene.object_collections(root)[1].objects:
@@ -226,16 +226,16 @@ def test_the_drawing_is_the_backends_picture(window):
     )
 
 
-def test_parallel_projection(window):
+def test_orthographic_drawing_matches_distant_camera(window):
     """It equals the image of a very distant camera."""
-    eye = np.array([200.0, -900.0, 300.0])
-    far = float(np.linalg.norm(eye - (0, 0, 0.2)))
+    camera_center = np.array([200.0, -900.0, 300.0])
+    far = float(np.linalg.norm(camera_center - (0, 0, 0.2)))
     lens = np.array([[50.0 * far, 0, 118.0], [0, 50.0 * far, 92.0], [0, 0, 1]])
-    picture = drawn(window, viewmat(eye), 50.0, orthographic=True)
-    assert psnr(picture, backend_draws(camera=Camera(viewmat(eye), lens, *SIZE))) > 35.0
+    image = drawn(window, viewmat(camera_center), 50.0, orthographic=True)
+    assert psnr(image, backend_draws(camera=Camera(viewmat(camera_center), lens, *SIZE))) > 35.0
 
 
-def test_recoloring_is_seen(window):
+def test_recolor_is_drawn(window):
     """The affine map applies to an object's colors in all directions."""
     window.run(
         script("""
@@ -243,7 +243,7 @@ def test_recoloring_is_seen(window):
         item.hue, item.value = 0.3, 0.8
     """)
     )
-    picture = drawn(window)
+    image = drawn(window)
     stored = window.run(script("result = scene.recolor_of(scene.object_collections(root)[3]).stored()"))
     assert (stored["hue"], stored["value"]) == pytest.approx((0.3, 0.8))
     window.run(
@@ -252,8 +252,8 @@ def test_recoloring_is_seen(window):
         item.hue, item.value = 0.0, 1.0
     """)
     )
-    assert psnr(picture, backend_draws(recolor=Recolor.of(stored))) > 40.0
-    assert psnr(picture, drawn(window)) < 30.0
+    assert psnr(image, backend_draws(recolor=Recolor.of(stored))) > 40.0
+    assert psnr(image, drawn(window)) < 30.0
 
 
 def placement_of(window, point) -> tuple[float, float]:
@@ -281,7 +281,7 @@ def color_at(window, place, name: str) -> np.ndarray:
     return shot[y - 1 : y + 2, x - 1 : x + 2].mean((0, 1))
 
 
-def test_the_viewport_shows_it_behind_what_is_in_front(window):
+def test_drawing_respects_scene_depth(window):
     """The screen has the color of the photos; a cube hides what is behind it, but not what is in front."""
     wall = placement_of(window, (0.0, 1.5, 0.2))
     seen = color_at(window, wall, "11-drawn")
@@ -306,7 +306,7 @@ def test_the_viewport_shows_it_behind_what_is_in_front(window):
     assert np.abs(seen - again).max() < 6.0 < np.abs(seen - hidden).max()
 
 
-def test_clicks_pick_what_is_seen(window):
+def test_clicks_select_visible_objects(window):
     """Click, Shift-click, box select, undo and Esc work with the tool of the toolbar."""
     window.run(
         script("""
@@ -346,7 +346,7 @@ def wait(window, expression: str) -> None:
         time.sleep(0.3)
 
 
-def test_a_mesh_in_front_is_picked(window):
+def test_mesh_in_front_is_picked(window):
     """A mesh behind is not picked; a click on the background deselects everything."""
     x, y = window.run(
         script("""
@@ -364,8 +364,8 @@ def test_a_mesh_in_front_is_picked(window):
             bpy.ops.mesh.primitive_cube_add(size=0.1)
             cube = bpy.context.active_object
             cube.name = "cube"
-            eye, ball = mathutils.Vector((0.3, -3.0, 0.8)), mathutils.Vector((-0.5, 0.0, 0.2))
-            cube.location = ball + (eye - ball).normalized() * -({at})
+            camera_center, ball = mathutils.Vector((0.3, -3.0, 0.8)), mathutils.Vector((-0.5, 0.0, 0.2))
+            cube.location = ball + (camera_center - ball).normalized() * -({at})
             bpy.context.view_layer.update()
         """)
         )
@@ -387,7 +387,7 @@ def test_a_mesh_in_front_is_picked(window):
     assert window.run(script("result = selected()")) == []
 
 
-def test_words_find_objects(window):
+def test_select_by_name_finds_objects(window):
     window.run(
         script("""
         with bpy.context.temp_override(**window_context()):
@@ -397,7 +397,7 @@ def test_words_find_objects(window):
     assert window.run(script("result = [selected(), bpy.context.active_object.name]")) == [["right", "wall"], "wall"]
 
 
-def test_another_file_undo_and_the_end(window):
+def test_drawing_survives_undo_and_reopening(window):
     """Drawing continues after undo and in a reopened file; disabling the extension restores the modifiers."""
     before = drawn(window)
     window.run(script("bpy.ops.ed.undo_push(message='before')"))

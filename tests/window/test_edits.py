@@ -4,7 +4,7 @@
 import json
 import time
 
-from .test_faults import draws, folder, soon, trained, window  # noqa: F401
+from .test_faults import assert_draws, folder, trained, wait_briefly, window  # noqa: F401
 from .test_workflow import script
 
 MOUSE = (600, 450)
@@ -22,7 +22,7 @@ def hue(window) -> float:  # noqa: F811
 
 
 def drag(window, x: int, y: int, by: int) -> None:  # noqa: F811
-    """Slowly enough that Blender sees the slider's start."""
+    """Drag a slider slowly enough that Blender registers the start of the drag."""
     window.move(x - 10, y)
     window.move(x, y)
     time.sleep(1)
@@ -33,7 +33,7 @@ def drag(window, x: int, y: int, by: int) -> None:  # noqa: F811
         time.sleep(0.2)
 
 
-def test_a_dragged_slider_and_a_removed_object_are_undone_and_redone(window, folder):  # noqa: F811
+def test_slider_and_removal_are_undone_and_redone(window, folder):  # noqa: F811
     window.run(script("root.objectgs.active_object = 0"))
     first = window.run(script("result = str(scene.from_stored(root.objectgs.objects[0].object_id))"))
     window.move(*MOUSE)
@@ -44,7 +44,7 @@ def test_a_dragged_slider_and_a_removed_object_are_undone_and_redone(window, fol
     time.sleep(1)
     drag(window, MOUSE[0], MOUSE[1] + HUE, 60)
     dragged = hue(window)
-    assert dragged > 0.05, "shown while the button is still held"
+    assert dragged > 0.05, "the color is updated while the button is held"
     assert window.run(
         script(f"""
         recolor = scene.recolor_of(scene.object_collections(root)[{first}])
@@ -64,18 +64,18 @@ def test_a_dragged_slider_and_a_removed_object_are_undone_and_redone(window, fol
     """)
     )
     assert edits(folder)[first]["removed"]
-    draws(window)
+    assert_draws(window)
     window.shot("edits-removed")
     window.move(400, 500)
     window.key("ctrl+z")
-    soon(window, "not root.objectgs.objects[0].removed")
+    wait_briefly(window, "not root.objectgs.objects[0].removed")
     assert "removed" not in edits(folder)[first] and edits(folder)[first]["recolor"]
     assert window.run(script(f"result = not scene.object_collections(root)[{first}].hide_viewport"))
     window.key("ctrl+z")
-    soon(window, "root.objectgs.objects[0].hue == 0")
+    wait_briefly(window, "root.objectgs.objects[0].hue == 0")
     assert first not in edits(folder)
     window.key("ctrl+shift+z")
     window.key("ctrl+shift+z")
-    soon(window, "root.objectgs.objects[0].removed")
+    wait_briefly(window, "root.objectgs.objects[0].removed")
     assert edits(folder)[first]["removed"] and edits(folder)[first]["recolor"]
-    draws(window)
+    assert_draws(window)

@@ -93,7 +93,7 @@ def folder(window, trained, request) -> Path:
     shutil.rmtree(place, ignore_errors=True)
 
 
-def soon(window, expression: str) -> None:
+def wait_briefly(window, expression: str) -> None:
     """Wait like `wait`, with a shorter timeout."""
     wait(window, expression, 40.0)
 
@@ -118,7 +118,7 @@ def start_fake(window, folder: Path, kind: str = "train", owner: str = "owner") 
     return go
 
 
-def draws(window) -> None:
+def assert_draws(window) -> None:
     """Redraw everything and check that no panel or callback fails."""
     window.run("""
         for window in bpy.context.window_manager.windows:
@@ -130,25 +130,25 @@ def draws(window) -> None:
     assert "Traceback" not in log(window)
 
 
-def test_panels_of_a_file_whose_folder_is_gone(window, folder):
+def test_panels_draw_without_folder(window, folder):
     window.run(f"bpy.ops.wm.save_as_mainfile(filepath={str(window.folder / 'old.blend')!r})")
     shutil.rmtree(folder)
     window.run(f"bpy.ops.wm.open_mainfile(filepath={str(window.folder / 'old.blend')!r})")
-    draws(window)
+    assert_draws(window)
     name = window.run(script("result = root.objectgs.objects[1].name"))
     assert window.run(script("root.objectgs.objects[1].name = 'cup'; result = root.objectgs.objects[1].name")) == name
-    draws(window)
+    assert_draws(window)
     window.shot("faults-folder-gone")
     assert "was not changed" in log(window)
     window.key("Escape")
 
 
-def test_panels_of_a_folder_with_broken_objects(window, folder):
+def test_panels_draw_with_invalid_objects_file(window, folder):
     (folder / "objects.json").write_text("{")
     window.run(script("root.objectgs.objects.clear()"))
     window.run(f"bpy.ops.wm.save_as_mainfile(filepath={str(window.folder / 'broken.blend')!r})")
     window.run(f"bpy.ops.wm.open_mainfile(filepath={str(window.folder / 'broken.blend')!r})")
-    draws(window)
+    assert_draws(window)
     window.run(
         script("""
         with bpy.context.temp_override(**window_context()):
@@ -158,7 +158,7 @@ def test_panels_of_a_folder_with_broken_objects(window, folder):
                 result = str(error)
     """)
     )
-    draws(window)
+    assert_draws(window)
     assert (folder / "objects.json").read_text() == "{"
 
 
@@ -175,7 +175,7 @@ def test_result_waits_for_edit_mode(window, folder):
     """)
     )
     go.touch()
-    soon(window, f"{IDLE} and len(background._results)")
+    wait_briefly(window, f"{IDLE} and len(background._results)")
     assert "the result will be shown when" in log(window)
     window.shot("faults-edit-mode")
     window.key("Escape")
@@ -186,11 +186,11 @@ def test_result_waits_for_edit_mode(window, folder):
             bpy.ops.object.mode_set(mode="OBJECT")
     """)
     )
-    soon(window, "not background._results")
-    draws(window)
+    wait_briefly(window, "not background._results")
+    assert_draws(window)
 
 
-def test_result_waits_for_the_end_of_a_render(window, folder):
+def test_result_waits_for_end_of_render(window, folder):
     """The render engine runs until the test ends it or the render is canceled."""
     end = window.folder / "end-of-render"
     window.run(
@@ -210,18 +210,18 @@ def test_result_waits_for_the_end_of_a_render(window, folder):
     try:
         go = start_fake(window, folder)
         window.run(script("call(bpy.ops.render.render)"))
-        soon(window, "bpy.app.is_job_running('RENDER')")
+        wait_briefly(window, "bpy.app.is_job_running('RENDER')")
         go.touch()
-        soon(window, f"{IDLE} and len(background._results)")
+        wait_briefly(window, f"{IDLE} and len(background._results)")
         assert window.run("result = bpy.app.is_job_running('RENDER')")
         window.shot("faults-rendering")
     finally:
         end.touch()
-    soon(window, "not bpy.app.is_job_running('RENDER') and not background._results")
-    draws(window)
+    wait_briefly(window, "not bpy.app.is_job_running('RENDER') and not background._results")
+    assert_draws(window)
 
 
-def test_result_comes_where_blender_forgot_to_allow_writing(window, folder):
+def test_result_is_shown_after_writing_was_forbidden(window, folder):
     """Blender 4 forbids timers to write data after a render that started during drawing; the result is still shown."""
 
     window.run(
@@ -267,21 +267,21 @@ def test_result_comes_where_blender_forgot_to_allow_writing(window, folder):
         names["write"] = write
     """)
     )
-    soon(window, "not bpy.app.is_job_running('RENDER')")
+    wait_briefly(window, "not bpy.app.is_job_running('RENDER')")
     window.run("bpy.app.timers.register(bpy.app.driver_namespace['write'])")
-    soon(window, "'refused' in bpy.app.driver_namespace")
+    wait_briefly(window, "'refused' in bpy.app.driver_namespace")
     assert window.run("result = bpy.app.driver_namespace['overlap']")
     if not window.run("result = bpy.app.driver_namespace['refused']"):
         assert window.run("result = bpy.app.version[0]") > 4
-        pytest.skip("Blender 5 does not forget it")
+        pytest.skip("Blender 5 allows timers to write after this render")
     go = start_fake(window, folder)
     go.touch()
-    soon(window, f"{IDLE} and not background._results")
-    draws(window)
+    wait_briefly(window, f"{IDLE} and not background._results")
+    assert_draws(window)
     window.shot("faults-writing-forgotten")
 
 
-def test_undo_while_a_job_runs(window, folder):
+def test_undo_while_job_runs(window, folder):
     """Undo and redo harm neither the running job nor its result."""
     go = start_fake(window, folder)
     middle = window.run(
@@ -302,16 +302,16 @@ def test_undo_while_a_job_runs(window, folder):
     window.key("ctrl+shift+z")
     assert window.run(script("result = root.objectgs.objects[1].name")) == "cup"
     go.touch()
-    soon(window, f"{IDLE} and not background._results")
+    wait_briefly(window, f"{IDLE} and not background._results")
     window.key("ctrl+z")
     window.key("ctrl+z")
     window.key("ctrl+shift+z")
     window.key("ctrl+shift+z")
     assert window.run(script("result = sum(object_list.splat_counts(root).values())")) > 100
-    draws(window)
+    assert_draws(window)
 
 
-def test_two_scenes_with_two_jobs(window, folder):
+def test_results_of_two_scenes_are_shown(window, folder):
     """Results arrive for both scenes while one of them is open."""
     other = Path(shutil.copytree(folder, window.folder / "other"))
     window.run("bpy.data.scenes.new('Second')")
@@ -321,16 +321,16 @@ def test_two_scenes_with_two_jobs(window, folder):
     second.touch()
     time.sleep(0.5)
     first.touch()
-    soon(window, f"{IDLE} and not background._results")
+    wait_briefly(window, f"{IDLE} and not background._results")
     assert window.run(
         script("""
         result = [str(scene.folder_of(each.objectgs.active)) for each in (owner, bpy.data.scenes["Renamed"])]
     """)
     ) == [str(folder), str(other)]
-    draws(window)
+    assert_draws(window)
 
 
-def test_collection_deleted_while_its_job_runs(window, folder):
+def test_collection_is_deleted_while_job_runs(window, folder):
     go = start_fake(window, folder)
     window.run(
         script("""
@@ -339,24 +339,24 @@ def test_collection_deleted_while_its_job_runs(window, folder):
     """)
     )
     go.touch()
-    soon(window, f"{IDLE} and not background._results")
+    wait_briefly(window, f"{IDLE} and not background._results")
     assert "with Open Reconstruction" in log(window)
-    draws(window)
+    assert_draws(window)
 
 
-def test_disabled_while_a_job_runs(window, folder):
+def test_extension_is_disabled_while_job_runs(window, folder):
     """After the extension is disabled and enabled, its job has ended and the operators work again."""
     go = start_fake(window, folder)
-    soon(window, "background.queue.running is not None and background.queue.running.message")
+    wait_briefly(window, "background.queue.running is not None and background.queue.running.message")
     window.run(f"""
         import addon_utils
         addon_utils.disable("{PACKAGE}")
     """)
-    draws(window)
+    assert_draws(window)
     window.run(f"""
         import addon_utils
         addon_utils.enable("{PACKAGE}", default_set=True)
     """)
     go.touch()
-    draws(window)
+    assert_draws(window)
     assert window.run(script("result = list(bpy.ops.objectgs.show_result('EXEC_DEFAULT'))")) == ["FINISHED"]

@@ -127,7 +127,7 @@ def is_brown(window, name: str) -> bool:
     return bool(np.abs(color - BROWN).max() < 0.1)
 
 
-def test_the_place_is_closed_in_the_background_and_comes_and_goes_with_the_edit(window):
+def test_hole_is_filled_in_background_and_follows_undo(window):
     before = ground_splats(window)
     assert before[1:] == [0, 0] and not is_brown(window, "fill-1-box")
     window.run(

@@ -75,7 +75,7 @@ def wait(blender, expression: str, timeout: float = 120.0):
             return value
         time.sleep(0.3)
     raise harness.Failed(
-        f"it never became true: {expression}; jobs: "
+        f"condition timed out: {expression}; jobs: "
         + json.dumps(
             blender.run(
                 script(
@@ -100,7 +100,7 @@ def test_import_shows_cameras_photos_and_points(window):
     window.shot("1-imported")
 
 
-def test_vote_fills_the_list(window):
+def test_vote_fills_object_list(window):
     window.run(script("call(bpy.ops.objectgs.assign_objects)"))
     wait(window, f"len(root.objectgs.objects) and {IDLE}")
     names = window.run(script("result = [item.name for item in root.objectgs.objects]"))
@@ -123,11 +123,11 @@ def test_training_shows_objects(window):
     window.shot("4-trained")
 
 
-def test_nothing_heavy_is_loaded(window):
+def test_no_compute_packages_are_loaded(window):
     assert window.run("import sys; result = sorted({'torch', 'numba', 'pycolmap', 'xatlas'} & set(sys.modules))") == []
 
 
-def test_click_selects_the_whole_object(window):
+def test_click_selects_all_parts_of_object(window):
     """A real click in the viewport on the center of an object selects it."""
     place = window.run(
         script("""
@@ -183,7 +183,7 @@ def test_click_selects_the_whole_object(window):
     assert window.run(script("result = object_list.active_item(root).name")) == place[0]
 
 
-def test_merge_is_undone_and_split(window):
+def test_merge_is_undone_redone_and_split(window):
     """objects.json follows the list through merge, undo, redo and split."""
     first = window.run(
         script("""
@@ -229,7 +229,7 @@ def test_merge_is_undone_and_split(window):
     assert window.run(script(state)) == apart
 
 
-def test_extracted_meshes_take_the_place_of_splats(window):
+def test_extracted_meshes_replace_splats(window):
     """Two objects become meshes in the background; the others still show their splats."""
     chosen = window.run(
         script("""
@@ -276,7 +276,7 @@ def test_extracted_meshes_take_the_place_of_splats(window):
     window.run("window_context()['area'].spaces.active.shading.type = 'SOLID'")
 
 
-def test_pause_resume_and_stop(window):
+def test_training_pauses_resumes_and_stops(window):
     """A paused training does not advance, a stopped one is saved, and undo in between does no harm."""
     window.run(script("root.objectgs.minutes = 5; call(bpy.ops.objectgs.train)"))
     wait(window, "background.queue.running is not None and background.queue.running.step")
@@ -300,7 +300,7 @@ def test_pause_resume_and_stop(window):
     )
 
 
-def test_another_file_in_between_finds_the_job_again(window):
+def test_reopened_file_finds_running_job(window):
     """The file is saved, replaced by an empty one, and reopened while training runs."""
     path = window.folder / "scene.blend"
     window.run(
@@ -325,7 +325,7 @@ def test_another_file_in_between_finds_the_job_again(window):
     wait(window, "background.job_of(root) is background.queue.running")
 
 
-def test_quitting_saves_and_the_file_explains(window):
+def test_quitting_saves_training(window):
     """If Blender quits during training, the training is saved and its process ends."""
 
     folder = Path(window.run(script("result = str(scene.folder_of(root))")))

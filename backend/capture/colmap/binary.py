@@ -36,9 +36,9 @@ class _Reader:
     def truncated(self) -> InputError:
         """Return the error for a file that ends early."""
         if len(self.data) < 8:
-            return InputError(f"{self.path} is cut short: it has only {len(self.data)} bytes; {EXPORT_AGAIN}.")
+            return InputError(f"{self.path} is truncated: it has only {len(self.data)} bytes; {EXPORT_AGAIN}.")
         return InputError(
-            f"{self.path} is cut short: it announces {self.count} {self.content} but ends within number "
+            f"{self.path} is truncated: it declares {self.count} {self.content} but ends within number "
             f"{self.index + 1}; {EXPORT_AGAIN}."
         )
 

@@ -46,7 +46,8 @@ def find_model(folder: Path) -> tuple[Path, list[str]]:
     candidates = [path for path in [*numbered, *parents] if _has_any_file(path)]
     if not candidates:
         raise InputError(
-            f"{folder} holds no COLMAP model: expected cameras, images and points3D (.bin or .txt) in {sparse / '0'}."
+            f"{folder} contains no COLMAP model: expected cameras, images and points3D (.bin or .txt) in "
+            f"{sparse / '0'}."
         )
     complete = [path for path in candidates if _suffix_of(path) is not None]
     if not complete:
@@ -57,7 +58,7 @@ def find_model(folder: Path) -> tuple[Path, list[str]]:
     sizes = {path: _count_images(path) for path in within}
     best = max(within, key=lambda path: (sizes[path], -within.index(path)))
     others = ", ".join(f"{path.name} ({sizes[path]} images)" for path in within if path != best)
-    return best, [f"{sparse} holds {len(within)} models: {best.name} ({sizes[best]} images) is used, not {others}."]
+    return best, [f"{sparse} contains {len(within)} models: {best.name} ({sizes[best]} images) is used, not {others}."]
 
 
 def read_model(folder: Path) -> Model:
@@ -128,7 +129,7 @@ def _count_images(folder: Path) -> int:
 def _validate(model: Model, raw: list[RawImage]) -> Model:
     images_file, points_file = model.file("images"), model.file("points3D")
     if not raw:
-        raise InputError(f"{images_file} holds no image with a pose; run COLMAP's mapper until it registers images.")
+        raise InputError(f"{images_file} contains no image with a pose; run COLMAP's mapper until it registers images.")
     used: set[int] = set()
     names: set[str] = set()
     for image in raw:
@@ -138,7 +139,7 @@ def _validate(model: Model, raw: list[RawImage]) -> Model:
                 f"{model.file('cameras').name} does not hold; {EXPORT_AGAIN}."
             )
         if image.name in names:
-            raise InputError(f"{images_file} holds two images named {image.name}; {EXPORT_AGAIN}.")
+            raise InputError(f"{images_file} contains two images named {image.name}; {EXPORT_AGAIN}.")
         names.add(image.name)
         used.add(image.camera_id)
     for camera_id in sorted(used):
@@ -148,12 +149,12 @@ def _validate(model: Model, raw: list[RawImage]) -> Model:
         finite = (np.abs(model.xyz) <= _FARTHEST).all(1)
     if not finite.all():
         model.warnings.append(
-            f"{points_file} holds {int((~finite).sum())} points whose coordinates are not finite or exceed "
+            f"{points_file} contains {int((~finite).sum())} points whose coordinates are not finite or exceed "
             f"{_FARTHEST:g}; they are left out."
         )
     if int(finite.sum()) < 4:
         raise InputError(
-            f"{points_file} holds only {int(finite.sum())} points, and at least 4 are needed; {EXPORT_AGAIN}."
+            f"{points_file} contains only {int(finite.sum())} points, and at least 4 are needed; {EXPORT_AGAIN}."
         )
     xyz, ids = model.xyz[finite], model.ids[finite]
     order = np.argsort(ids, kind="stable")

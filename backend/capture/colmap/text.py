@@ -19,7 +19,7 @@ def _read_lines(path: Path) -> list[bytes]:
 
 
 def _malformed_line(path: Path, number: int, expected: str) -> InputError:
-    return InputError(f"{path} is malformed or cut short at line {number}: expected {expected}; {EXPORT_AGAIN}.")
+    return InputError(f"{path} is malformed or truncated at line {number}: expected {expected}; {EXPORT_AGAIN}.")
 
 
 def _warn_if_count_differs(lines: list[bytes], found: int, path: Path, content: str, warnings: list[str]) -> None:
@@ -27,7 +27,7 @@ def _warn_if_count_differs(lines: list[bytes], found: int, path: Path, content: 
     for line in lines[:10]:
         match = re.match(rb"#\s*Number of \w+:\s*(\d+)", line)
         if match and int(match[1]) != found:
-            warnings.append(f"{path} announces {int(match[1])} {content} but holds {found}.")
+            warnings.append(f"{path} declares {int(match[1])} {content} but contains {found}.")
             return
 
 

@@ -35,7 +35,7 @@ def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> No
     reporter.status(f"Reading {options.ply.name}")
     splats, warnings = read_splats(options.ply)
     if len(splats) == 0:
-        raise InputError(f"{options.ply} holds no splats.")
+        raise InputError(f"{options.ply} contains no splats.")
     for sentence in warnings:
         reporter.warning(sentence)
     names: dict[int, str] = {}

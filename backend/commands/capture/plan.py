@@ -55,7 +55,7 @@ def write_default_plan(folder: Reconstruction, capture: Capture, max_size: int) 
 
 def build_context(
     capture: Capture,
-    asked: Choices,
+    requested: Choices,
     objects: list[SceneObject],
     point_ids: np.ndarray | None = None,
     thorough: bool = False,
@@ -64,7 +64,7 @@ def build_context(
     left_out = [entry.id for entry in objects if entry.left_out]
     capture = capture.edited({entry.id: entry.name for entry in objects}, left_out)
     point_ids = None if point_ids is None else capture.without_left_out(point_ids)
-    return PlanningContext(capture, asked, objects, point_ids, thorough)
+    return PlanningContext(capture, requested, objects, point_ids, thorough)
 
 
 def choices(options: argparse.Namespace) -> Choices:

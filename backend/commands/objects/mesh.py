@@ -38,7 +38,7 @@ SCENE = "scene"
 SCENE_BUDGET = 5
 """Factor by which the whole scene may have more faces than an object."""
 
-_SHARES = {"fuse": 0.4, "extract": 0.1, "refine": 0.2, "unwrap": 0.1, "bake": 0.2}
+_PROGRESS_FRACTIONS = {"fuse": 0.4, "extract": 0.1, "refine": 0.2, "unwrap": 0.1, "bake": 0.2}
 """Fractions of the time of one mesh, for the progress."""
 
 
@@ -85,12 +85,12 @@ class _Part(Reporter):
 
     def __init__(self, reporter: StoppingReporter, done: int, total: int, started: float) -> None:
         self._reporter, self._done, self._total, self._started = reporter, done, total, started
-        self._before, self._share, self._shown = 0.0, 0.0, float(done)
+        self._before, self._fraction, self._shown = 0.0, 0.0, float(done)
 
     def begin(self, step: str) -> _Part:
         """Begin a step of the mesh and return self."""
-        self._before += self._share
-        self._share = _SHARES[step]
+        self._before += self._fraction
+        self._fraction = _PROGRESS_FRACTIONS[step]
         self.progress(0, 1)
         return self
 
@@ -98,7 +98,7 @@ class _Part(Reporter):
         self._reporter.warning(message)
 
     def progress(self, done: float, total: float, **_: Any) -> None:
-        fraction = self._before + self._share * min(done / max(total, 1e-9), 1.0)
+        fraction = self._before + self._fraction * min(done / max(total, 1e-9), 1.0)
         # A step may pass over the views several times, each with a progress from 0.
         self._shown = max(self._shown, self._done + fraction)
         behind = self._shown / self._total

@@ -27,9 +27,9 @@ def evaluate(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     reporter.status(f"Measuring on the {len(capture.test_indices)} held-out views")
 
     def drawn(index: int) -> tuple[np.ndarray, np.ndarray]:
-        picture = draw(trained.model, trained.scene.camera(index))
-        assert picture.ids is not None
-        return picture.image, picture.ids
+        rendered = draw(trained.model, trained.scene.camera(index))
+        assert rendered.ids is not None
+        return rendered.image, rendered.ids
 
     with stage(folder, "evaluate"):
         found = evaluate_views(capture, drawn, capture.test_indices, reporter, trained.scene.zero_is_object)

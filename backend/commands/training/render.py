@@ -29,14 +29,14 @@ def render(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     paths = _render_paths(folder.renders, [view.name for view in capture.views])
     with stage(folder, "render"):
         for done, index in enumerate(indices, 1):
-            picture = draw(trained.model, trained.scene.camera(index), options.ids, options.depth)
+            rendered = draw(trained.model, trained.scene.camera(index), options.ids, options.depth)
             path = paths[index]
             path.parent.mkdir(parents=True, exist_ok=True)
-            _save_png(path, as_bytes(picture.image))
-            if picture.ids is not None:
-                _save_ids(path, picture.ids)
-            if picture.depth is not None:
-                _save_array(path.with_suffix(".depth.npy"), picture.depth)
+            _save_png(path, as_bytes(rendered.image))
+            if rendered.ids is not None:
+                _save_ids(path, rendered.ids)
+            if rendered.depth is not None:
+                _save_array(path.with_suffix(".depth.npy"), rendered.depth)
             reporter.progress(done, len(indices), what="views")
     reporter.done(renders=str(folder.renders), views=len(indices))
 
@@ -62,9 +62,9 @@ def _save_array(path: Path, values: np.ndarray) -> None:
     write_atomic(path, buffer.getvalue())
 
 
-def _save_ids(picture: Path, ids: np.ndarray) -> None:
+def _save_ids(image_path: Path, ids: np.ndarray) -> None:
     """Write the IDs of a render beside it, as 16-bit PNG, or as .npy if one is larger."""
     if ids.max(initial=0) > 0xFFFF:
-        _save_array(picture.with_suffix(".ids.npy"), ids.astype(np.uint32))
+        _save_array(image_path.with_suffix(".ids.npy"), ids.astype(np.uint32))
     else:
-        _save_png(picture.with_suffix(".ids.png"), ids.astype(np.uint16))
+        _save_png(image_path.with_suffix(".ids.png"), ids.astype(np.uint16))

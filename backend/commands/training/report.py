@@ -38,7 +38,7 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     folder, capture, model, progress = trained.folder, trained.capture, trained.model, trained.progress
     evaluation = _evaluation(folder, progress, reporter)
     with stage(folder, "report"):
-        pictures = _pictures(trained, reporter)
+        images = _sample_images(trained, reporter)
         meshes = _meshes(trained, evaluation.meshes, reporter)
         sheet = _mesh_sheet(trained, meshes, reporter)
     record = read_record(folder)
@@ -77,7 +77,7 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             for key, mesh in meshes.items() if _object_id(key, mesh) is None
         ],
     }  # fmt: skip
-    write_report(folder, value, pictures, title=capture.folder.resolve().name, mesh_sheet=sheet)
+    write_report(folder, value, images, title=capture.folder.resolve().name, mesh_sheet=sheet)
     reporter.done(report=str(folder.report_md))
 
 
@@ -148,19 +148,19 @@ def _mesh_sheet(trained: Trained, meshes: dict[str, dict[str, Any]], reporter: R
     return mesh_sheet(cards, reporter)
 
 
-def _pictures(trained: Trained, reporter: Reporter) -> list[tuple[str, Image.Image]]:
+def _sample_images(trained: Trained, reporter: Reporter) -> list[tuple[str, Image.Image]]:
     capture = trained.capture
     views = capture.test_indices or tuple(range(len(capture.views)))
     views = views[:: max(len(views) // IMAGES_IN_REPORT, 1)][:IMAGES_IN_REPORT]
     reporter.status("Rendering the images of the report")
-    pictures = []
+    images = []
     for done, index in enumerate(views, 1):
         drawn = draw(trained.model, trained.scene.camera(index))
         assert drawn.ids is not None
         shown = comparison(capture.image(index), drawn.image, capture.mask(index), drawn.ids, None, capture.names)
-        pictures.append((f"View {capture.views[index].name}", shown))
+        images.append((f"View {capture.views[index].name}", shown))
         reporter.progress(done, len(views), what="images")
-    return pictures
+    return images
 
 
 def _objects(
@@ -190,7 +190,7 @@ def _left_out(trained: Trained) -> list[dict[str, str]]:
     cases = [
         (
             counts["unregistered"] > 0, f"{counts['unregistered']} images without a pose",
-            "COLMAP could not place them",
+            "COLMAP could not register them",
         ),
         (
             counts["missing"] > 0, f"{counts['missing']} images listed in the COLMAP model",

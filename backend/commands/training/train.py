@@ -52,7 +52,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         progress = trainer.progress
         if progress.step and budget.progress(progress) >= 1:
             reporter.status(
-                f"Already trained for {progress.step} steps in {progress.seconds:.0f} s; ask for more --minutes or "
+                f"Already trained for {progress.step} steps in {progress.seconds:.0f} s; specify more --minutes or "
                 "--steps to extend it, or --restart to start over."
             )
         else:
@@ -195,17 +195,17 @@ def _measure_held_out(folder: Reconstruction, reporter: StoppingReporter) -> Eva
         every = max(len(capture.test_indices) // CURVE_VIEWS, 1)
         for number, index in enumerate(capture.test_indices[::every][:CURVE_VIEWS] or (0,)):
             photo, truth = capture.image(index), capture.mask(index)
-            picture = draw(model, scene.camera(index), want_ids=truth is not None or number == 0)
+            rendered = draw(model, scene.camera(index), want_ids=truth is not None or number == 0)
             if number == 0:
-                assert picture.ids is not None
-                preview = comparison(photo, picture.image, truth, picture.ids, None, capture.names)
-                render = save_image(thumbnail(picture.image), folder.previews / "render.png", quick=True)
+                assert rendered.ids is not None
+                preview = comparison(photo, rendered.image, truth, rendered.ids, None, capture.names)
+                render = save_image(thumbnail(rendered.image), folder.previews / "render.png", quick=True)
                 latest = save_image(preview, folder.previews / "latest.png", quick=True)
                 reporter.preview(latest, render=render)
             if capture.test_indices:
-                found.append(psnr(picture.image, photo))
-                if truth is not None and picture.ids is not None:
-                    ids.add(picture.ids, truth)
+                found.append(psnr(rendered.image, photo))
+                if truth is not None and rendered.ids is not None:
+                    ids.add(rendered.ids, truth)
         scores = ids.result()
         figures = {
             "psnr": float(np.mean(found)) if found else None, "miou": scores["miou"], "mbiou": scores["mbiou"],
@@ -247,7 +247,7 @@ def _write_export(model: ObjectModel, scene: Scene, folder: Reconstruction, repo
         )
         report = reporter.status if model.explicit else reporter.warning
         report(
-            f"{what}: {folder.splats.name} holds {has}, whose PSNR to renders of the model in the {where} views "
+            f"{what}: {folder.splats.name} contains {has}, whose PSNR to renders of the model in the {where} views "
             f"{how_well}."
         )
     for sentence in write_splats(folder.splats, splats):

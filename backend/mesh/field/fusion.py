@@ -19,7 +19,7 @@ from ..surface import NoSurface
 from ..views import ObjectView, SceneMap
 from .blocks import AROUND, SAMPLES, SIDE, Blocks, distinct
 from .holes import Patches
-from .integrate import Sight, add, own_depth, prepare_sight
+from .integrate import Observation, add, prepare_observation, visible_depth
 from .marching import compact, march, parts
 from .winding import Winding
 
@@ -116,21 +116,21 @@ def fuse(
     extent = _extent(views, classes, reporter)
     size = float((extent.high - extent.low).max())
     voxel = max(_VOXEL_PER_PIXEL * extent.pixel, size / resolution)
-    room = max(int(memory_mb * 1e6 / _BYTES_PER_BLOCK), 64)
-    asked = voxel
+    max_blocks = max(int(memory_mb * 1e6 / _BYTES_PER_BLOCK), 64)
+    requested_voxel = voxel
     while True:
         try:
-            field = _Fusion(views, classes, extent, voxel, room, reporter).run()
+            field = _Fusion(views, classes, extent, voxel, max_blocks, reporter).run()
             break
         except _TooMany as error:
-            voxel *= max(1.1, (error.blocks / room) ** 0.5)
+            voxel *= max(1.1, (error.blocks / max_blocks) ** 0.5)
             if voxel > size / _COARSEST:
                 # Allow a few more blocks, whose memory is negligible.
-                voxel, room = max(asked, size / _COARSEST), error.blocks + _FEW
-    if voxel > asked:
+                voxel, max_blocks = max(requested_voxel, size / _COARSEST), error.blocks + _FEW
+    if voxel > requested_voxel:
         reporter.warning(
             f"The memory is enough for {size / voxel:.0f} voxels along the longest side, not for the "
-            f"{size / asked:.0f} that the photos allow; the mesh is coarser."
+            f"{size / requested_voxel:.0f} that the photos allow; the mesh is coarser."
         )
     return field
 
@@ -143,7 +143,7 @@ def _extent(views: SeesObjects, classes: Sequence[int], reporter: Reporter) -> _
         view = views.object_view(index, classes)
         if view is None:
             continue
-        depth = own_depth(view)
+        depth = visible_depth(view)
         v, u = np.nonzero(depth)
         d = depth[v, u].astype(np.float64)
         points.append(_lifted(view.camera, u + 0.5, v + 0.5, d))
@@ -170,18 +170,19 @@ class _TooMany(Exception):
 
 class _Fusion:
     def __init__(
-        self, views: SeesObjects, classes: Sequence[int], extent: _Extent, voxel: float, room: int, reporter: Reporter
+        self, views: SeesObjects, classes: Sequence[int], extent: _Extent, voxel: float, max_blocks: int,
+        reporter: Reporter,
     ) -> None:  # fmt: skip
         self.views = views
         self.classes = classes
         self.extent = extent
         self.voxel = voxel
-        self.room = room
+        self.max_blocks = max_blocks
         self.reporter = reporter
         self.reach = max(_REACH_VOXELS * voxel, _REACH_PIXELS * extent.pixel)
         self.back = max(_BACK_VOXELS * voxel, _BACK_PIXELS * extent.pixel)
         self.origin = (extent.low + extent.high) / 2
-        self.sights: dict[int, Sight] = {}
+        self.observations: dict[int, Observation] = {}
         # The object lies within this box; no blocks are added outside it.
         pad = (extent.high - extent.low).max() * 0.5 + 4 * self.reach
         self.box = np.stack([extent.low - pad - self.origin, extent.high + pad - self.origin]) / (SIDE * voxel)
@@ -209,7 +210,7 @@ class _Fusion:
         return Field(self.origin, self.voxel, blocks, values, seen)
 
     def _check(self, blocks: int) -> None:
-        if blocks > self.room:
+        if blocks > self.max_blocks:
             raise _TooMany(blocks)
 
     def _touched(self) -> np.ndarray:
@@ -224,21 +225,21 @@ class _Fusion:
     def _in_box(self, coords: np.ndarray) -> np.ndarray:
         return coords[((coords >= np.floor(self.box[0])) & (coords <= self.box[1])).all(1)]
 
-    def _sight(self, index: int) -> Sight:
-        if index not in self.sights:
+    def _observation(self, index: int) -> Observation:
+        if index not in self.observations:
             scene = self.views.scene_map(index)
             view = self.views.object_view(index, self.classes)
             margin = 0
             if view is not None:
                 margin = int(np.ceil(self.reach * scene.camera.K[0, 0] / max(self.extent.nearest, 1e-9))) + 1
-            self.sights[index] = prepare_sight(scene, view, min(margin, 64), 2 * self.reach)
-        return self.sights[index]
+            self.observations[index] = prepare_observation(scene, view, min(margin, 64), 2 * self.reach)
+        return self.observations[index]
 
     def _integrated(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         total = np.zeros((len(coords), SAMPLES), np.float32)
         weights = np.zeros((len(coords), SAMPLES), np.float32)
         for done, index in enumerate(self.views.indices):
-            add(self._sight(index), self.origin, self.voxel, coords, self.reach, self.back, total, weights)
+            add(self._observation(index), self.origin, self.voxel, coords, self.reach, self.back, total, weights)
             self._progress(done + 1)
         return total, weights
 

@@ -21,38 +21,38 @@ _MIN_SLOPE = 0.15
 
 
 @dataclass(frozen=True)
-class Sight:
+class Observation:
     """The observation of one object in one view.
 
     Attributes:
-        front: (H, W) float32, depth of the visible surface along z, infinite where there is none.
-        trust: (H, W), weight of `front`, 0 .. 1.
+        surface_depth: (H, W) float32, depth of the visible surface along z, infinite where there is none.
+        confidence: (H, W), weight of `surface_depth`, 0 .. 1.
         x, y: Upper left corner of the rectangle (h, w) of the following arrays.
-        own: The object's depth where it is visible, otherwise 0.
-        depth_uncertainty: Expected error of `own`.
+        object_depth: The object's depth where it is visible, otherwise 0.
+        depth_uncertainty: Expected error of `object_depth`.
         slope: Change of the distance from the surface per step along z.
         weight: Weight of each pixel.
-        beside: Distance from the object's outline in pixels, negative inside.
+        silhouette_distance: Distance from the object's outline in pixels, negative inside.
     """
 
     camera: Camera
-    front: np.ndarray
-    trust: np.ndarray
+    surface_depth: np.ndarray
+    confidence: np.ndarray
     x: int
     y: int
-    own: np.ndarray
+    object_depth: np.ndarray
     depth_uncertainty: np.ndarray
     slope: np.ndarray
     weight: np.ndarray
-    beside: np.ndarray
+    silhouette_distance: np.ndarray
 
 
-def own_depth(view: ObjectView) -> np.ndarray:
+def visible_depth(view: ObjectView) -> np.ndarray:
     """Return the object's depth (h, w), 0 where the object is not visible."""
     return np.where(view.visible * view.alpha >= ALPHA_SEEN, view.depth, np.float32(0))
 
 
-def prepare_sight(scene: SceneMap, view: ObjectView | None, margin: int, jump: float) -> Sight:
+def prepare_observation(scene: SceneMap, view: ObjectView | None, margin: int, jump: float) -> Observation:
     """Prepare a view for `add`.
 
     Args:
@@ -61,56 +61,69 @@ def prepare_sight(scene: SceneMap, view: ObjectView | None, margin: int, jump: f
         margin: The width in pixels of the border around the object in which distances from its outline are needed.
         jump: The smallest difference of depth, in scene units, between neighboring pixels of different surfaces.
     """
-    front = np.where(scene.depth > 0, scene.depth, np.float32(np.inf))
-    trust = _trust(scene.depth_uncertainty, scene.depth, scene.camera)
+    surface_depth = np.where(scene.depth > 0, scene.depth, np.float32(np.inf))
+    confidence = _confidence(scene.depth_uncertainty, scene.depth, scene.camera)
     if view is None:
         nothing = np.zeros((0, 0), np.float32)
-        return Sight(scene.camera, front, trust, 0, 0, nothing, nothing, nothing, nothing, nothing)
+        return Observation(scene.camera, surface_depth, confidence, 0, 0, nothing, nothing, nothing, nothing, nothing)
     height, width = view.alpha.shape
     x0, y0 = max(view.x - margin, 0), max(view.y - margin, 0)
-    x1, y1 = min(view.x + width + margin, front.shape[1]), min(view.y + height + margin, front.shape[0])
-    own = np.zeros((y1 - y0, x1 - x0), np.float32)
-    depth_uncertainty = np.zeros_like(own)
+    x1, y1 = min(view.x + width + margin, surface_depth.shape[1]), min(view.y + height + margin, surface_depth.shape[0])
+    object_depth = np.zeros((y1 - y0, x1 - x0), np.float32)
+    depth_uncertainty = np.zeros_like(object_depth)
     inside = slice(view.y - y0, view.y - y0 + height), slice(view.x - x0, view.x - x0 + width)
-    own[inside], depth_uncertainty[inside] = own_depth(view), view.depth_uncertainty
-    seen = own > 0
+    object_depth[inside], depth_uncertainty[inside] = visible_depth(view), view.depth_uncertainty
+    seen = object_depth > 0
     if seen.any():
-        beside = _beside(seen, own, front[y0:y1, x0:x1], jump)
+        silhouette_distance = _silhouette_distance(seen, object_depth, surface_depth[y0:y1, x0:x1], jump)
     else:
-        beside = np.full(own.shape, max(margin, 1), np.float32)
+        silhouette_distance = np.full(object_depth.shape, max(margin, 1), np.float32)
     K = scene.camera.K
-    slope = np.zeros_like(own)
-    weight = np.zeros_like(own)
-    _slopes(own, K[0, 0], K[1, 1], K[0, 2] - x0, K[1, 2] - y0, jump, slope, weight)
-    weight *= _trust(depth_uncertainty, own, scene.camera)
-    return Sight(scene.camera, front, trust, x0, y0, own, depth_uncertainty, slope, weight, beside)
+    slope = np.zeros_like(object_depth)
+    weight = np.zeros_like(object_depth)
+    _slopes(object_depth, K[0, 0], K[1, 1], K[0, 2] - x0, K[1, 2] - y0, jump, slope, weight)
+    weight *= _confidence(depth_uncertainty, object_depth, scene.camera)
+    return Observation(
+        scene.camera,
+        surface_depth,
+        confidence,
+        x0,
+        y0,
+        object_depth,
+        depth_uncertainty,
+        slope,
+        weight,
+        silhouette_distance,
+    )
 
 
-def _trust(depth_uncertainty: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
+def _confidence(depth_uncertainty: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
     """Compute the weight of a depth from its uncertainty, 0 .. 1; 1 where there is no depth."""
     pixels = depth_uncertainty / np.where(depth > 0, depth, 1) * np.float32(camera.K[0, 0])
     return (1 / (1 + (pixels / np.float32(_UNCERTAINTY_HALF)) ** 2)).astype(np.float32)
 
 
-def _beside(seen: np.ndarray, own: np.ndarray, front: np.ndarray, jump: float) -> np.ndarray:
+def _silhouette_distance(
+    seen: np.ndarray, object_depth: np.ndarray, surface_depth: np.ndarray, jump: float
+) -> np.ndarray:
     """Return the distance (h, w) in pixels from the object's outline.
 
     It is negative inside and where the object may be occluded.
     """
     nearest = distance_transform_edt(~seen, return_distances=False, return_indices=True)
-    filled = seen | (front < own[tuple(nearest)] + jump)
+    filled = seen | (surface_depth < object_depth[tuple(nearest)] + jump)
     # On both sides, pixel centers are at least half a pixel from the outline.
     outside, inside = distance_transform_edt(~filled), distance_transform_edt(np.pad(filled, 1, mode="edge"))
     return np.where(filled, 0.5 - inside[1:-1, 1:-1], outside - 0.5).astype(np.float32)
 
 
 @kernel(parallel=True)
-def _slopes(own, fx, fy, cx, cy, jump, slope, weight):
+def _slopes(object_depth, fx, fy, cx, cy, jump, slope, weight):
     """Compute slope, the cosine between ray and normal times the ray's length for a step of 1 along z, and weight."""
-    height, width = own.shape
+    height, width = object_depth.shape
     for v in prange(height):
         for u in range(width):
-            d = own[v, u]
+            d = object_depth[v, u]
             if d == 0.0:
                 continue
             # Depth differences over one pixel, from the neighbors on the same surface.
@@ -119,11 +132,11 @@ def _slopes(own, fx, fy, cx, cy, jump, slope, weight):
             sides_u = 0
             sides_v = 0
             for s in (-1, 1):
-                if 0 <= u + s < width and own[v, u + s] > 0 and abs(own[v, u + s] - d) < jump:
-                    du += s * (own[v, u + s] - d)
+                if 0 <= u + s < width and object_depth[v, u + s] > 0 and abs(object_depth[v, u + s] - d) < jump:
+                    du += s * (object_depth[v, u + s] - d)
                     sides_u += 1
-                if 0 <= v + s < height and own[v + s, u] > 0 and abs(own[v + s, u] - d) < jump:
-                    dv += s * (own[v + s, u] - d)
+                if 0 <= v + s < height and object_depth[v + s, u] > 0 and abs(object_depth[v + s, u] - d) < jump:
+                    dv += s * (object_depth[v + s, u] - d)
                     sides_v += 1
             x = (u + 0.5 - cx) / fx
             y = (v + 0.5 - cy) / fy
@@ -147,13 +160,13 @@ def _slopes(own, fx, fy, cx, cy, jump, slope, weight):
 
 
 def add(
-    sight: Sight, origin: np.ndarray, voxel: float, coords: np.ndarray, reach: float, back: float,
+    observation: Observation, origin: np.ndarray, voxel: float, coords: np.ndarray, reach: float, back: float,
     total: np.ndarray, weights: np.ndarray,
 ) -> None:  # fmt: skip
     """Add a view to the samples of blocks.
 
     Args:
-        sight: The view.
+        observation: The view.
         origin: (3,) position of grid point 0 in scene units.
         voxel: The spacing of the samples in scene units.
         coords: (B, 3) coordinates of the blocks.
@@ -163,24 +176,23 @@ def add(
         total: (B, 512) float32 sums of weighted distances in scene units, changed in place.
         weights: (B, 512) float32 sums of weights, changed in place.
     """
-    viewmat, intrinsics = sight.camera.arrays()
+    viewmat, intrinsics = observation.camera.arrays()
     _add(
-        viewmat, intrinsics, float(sight.camera.near), sight.front, sight.trust, sight.x, sight.y, sight.own,
-        sight.depth_uncertainty, sight.slope, sight.weight, sight.beside, np.asarray(origin, np.float64), float(voxel),
-        coords,
+        viewmat, intrinsics, float(observation.camera.near), observation.surface_depth, observation.confidence,
+        observation.x, observation.y, observation.object_depth, observation.depth_uncertainty, observation.slope,
+        observation.weight, observation.silhouette_distance, np.asarray(origin, np.float64), float(voxel), coords,
         float(reach), float(back), total, weights,
     )  # fmt: skip
 
 
 @kernel(parallel=True)
 def _add(
-    viewmat, intrinsics, near, front, trust, x0, y0, own, depth_uncertainty, slope, weight, beside, origin, voxel,
-    coords, reach,
-    back, total, weights,
+    viewmat, intrinsics, near, surface_depth, confidence, x0, y0, object_depth, depth_uncertainty, slope, weight,
+    silhouette_distance, origin, voxel, coords, reach, back, total, weights,
 ):  # fmt: skip
     fx, fy, cx, cy = intrinsics
-    height, width = front.shape
-    h, w = own.shape
+    height, width = surface_depth.shape
+    h, w = object_depth.shape
     half = 0.5 * (SIDE - 1) * voxel
     radius = half * np.sqrt(3.0)
     for b in prange(coords.shape[0]):
@@ -220,16 +232,17 @@ def _add(
             between = 0 <= au < w - 1 and 0 <= av < h - 1
             aside = reach
             if between:
-                above = beside[av, au] * (1 - tu) + beside[av, au + 1] * tu
-                below = beside[av + 1, au] * (1 - tu) + beside[av + 1, au + 1] * tu
+                above = silhouette_distance[av, au] * (1 - tu) + silhouette_distance[av, au + 1] * tu
+                below = silhouette_distance[av + 1, au] * (1 - tu) + silhouette_distance[av + 1, au + 1] * tu
                 aside = (above * (1 - tv) + below * tv) * z / fx
             elif inside:
-                aside = beside[rv, ru] * z / fx
-            if inside and own[rv, ru] > 0:
-                d = own[rv, ru]
+                aside = silhouette_distance[rv, ru] * z / fx
+            if inside and object_depth[rv, ru] > 0:
+                d = object_depth[rv, ru]
                 # Interpolate the depth between four pixels of the same surface.
                 if between:
-                    d00, d01, d10, d11 = own[av, au], own[av, au + 1], own[av + 1, au], own[av + 1, au + 1]
+                    d00, d01 = object_depth[av, au], object_depth[av, au + 1]
+                    d10, d11 = object_depth[av + 1, au], object_depth[av + 1, au + 1]
                     low = min(min(d00, d01), min(d10, d11))
                     high = max(max(d00, d01), max(d10, d11))
                     if low > 0 and (high - low) * slope[rv, ru] < reach:
@@ -248,11 +261,11 @@ def _add(
                 total[b, n] += gain * min(distance, reach)
                 weights[b, n] += gain
             else:
-                ahead = front[iv, iu] - z
+                ahead = surface_depth[iv, iu] - z
                 if ahead <= 0:
                     continue
                 # The outline does not limit the distance where the object may continue behind an occluder.
-                hides = inside and beside[rv, ru] < 0
-                gain = trust[iv, iu]
+                hides = inside and silhouette_distance[rv, ru] < 0
+                gain = confidence[iv, iu]
                 total[b, n] += gain * (min(reach, ahead) if hides else min(min(reach, ahead), aside))
                 weights[b, n] += gain

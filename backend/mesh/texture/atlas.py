@@ -18,13 +18,13 @@ class Texels(NamedTuple):
     """The texels of some rows that lie on a surface.
 
     Attributes:
-        place: (N,) int64, row-major index in the whole texture.
+        indices: (N,) int64, row-major index in the whole texture.
         face: (N,) int32.
         weights: (N, 3) float32, barycentric weights of the face's corners, which sum to 1 and may be negative in the
             border of a chart.
     """
 
-    place: np.ndarray
+    indices: np.ndarray
     face: np.ndarray
     weights: np.ndarray
 
@@ -78,23 +78,23 @@ def _cover(corners, candidates, face, weights):
             last = min(int(np.floor(right + 1.5)) + 1, size)
             for row in range(max(int(np.floor(low - 1.5)), top), min(int(np.floor(high + 1.5)) + 1, stop)):
                 for column in range(first, last):
-                    away = np.float32(0.0)
+                    distance = np.float32(0.0)
                     total = 0.0
                     for i in range(3):
-                        share = (edges[i, 0] * (column + 0.5) + edges[i, 1] * (row + 0.5) + edges[i, 2]) / area
-                        if share < 0.0:
+                        barycentric = (edges[i, 0] * (column + 0.5) + edges[i, 1] * (row + 0.5) + edges[i, 2]) / area
+                        if barycentric < 0.0:
                             height = abs(area) / np.sqrt(edges[i, 0] ** 2 + edges[i, 1] ** 2)
-                            away = max(away, np.float32(-share * height))
-                    if away > _RIM or away >= outside[row - top, column]:
+                            distance = max(distance, np.float32(-barycentric * height))
+                    if distance > _RIM or distance >= outside[row - top, column]:
                         continue
-                    outside[row - top, column] = away
+                    outside[row - top, column] = distance
                     face[row, column] = f
                     # Limit the extrapolation of the weights beyond the edges of thin faces.
                     for i in range(3):
-                        share = (edges[i, 0] * (column + 0.5) + edges[i, 1] * (row + 0.5) + edges[i, 2]) / area
-                        share = max(share, -0.5)
-                        weights[row, column, i] = share
-                        total += share
+                        barycentric = (edges[i, 0] * (column + 0.5) + edges[i, 1] * (row + 0.5) + edges[i, 2]) / area
+                        barycentric = max(barycentric, -0.5)
+                        weights[row, column, i] = barycentric
+                        total += barycentric
                     for i in range(3):
                         weights[row, column, i] /= total
 

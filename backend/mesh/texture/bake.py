@@ -90,18 +90,18 @@ def bake_texture(
         splats.
     """
     reporter = reporter or Reporter()
-    pictures = Photos(views, surface.vertices, surface.faces, classes)
-    vertices, faces = pictures.vertices, pictures.faces
+    photos = Photos(views, surface.vertices, surface.faces, classes)
+    vertices, faces = photos.vertices, photos.faces
     normals = vertex_normals(vertices, faces)
     texture = np.zeros((size, size, 3), np.uint8)
     state = np.zeros((size, size), np.uint8)
     splats = _Mean(len(vertices))
-    photos = _Mean(len(vertices))
+    photo_colors = _Mean(len(vertices))
     rows = max(1, _AT_ONCE // size)
     steps = [(first, min(rows, size - first)) for first in range(0, size, rows)]
     passes = (1 + len(steps)) * len(views.indices)
     no_offsets = np.zeros((len(vertices), 3), np.float32)
-    offsets = level(pictures, normals, lambda done: reporter.progress(done, passes))
+    offsets = level(photos, normals, lambda done: reporter.progress(done, passes))
     for step, (first, count) in enumerate(steps):
         texels = find_texels(uvs, size, first, count)
         positions = _on_faces(vertices, faces, texels)
@@ -110,18 +110,18 @@ def bake_texture(
         corners = faces[texels.face]
         for done, index in enumerate(views.indices):
             reporter.progress((step + 1) * len(views.indices) + done, passes)
-            photo = pictures[index]
+            photo = photos[index]
             if photo is None:
                 continue
             add_photo(photo, positions, facing, corners, texels.weights, offsets.get(index, no_offsets), samples)
             if step == 0:
                 _add_splats(splats, photo, vertices, normals, views, index, classes)
         color, seen = blend(samples)
-        texture.reshape(-1, 3)[texels.place] = np.rint(color * 255)
-        state.ravel()[texels.place] = np.where(seen, _SEEN, _UNSEEN)
-        _add_texels(faces, texels.face, texels.weights, color, seen, photos.total, photos.weight)
+        texture.reshape(-1, 3)[texels.indices] = np.rint(color * 255)
+        state.ravel()[texels.indices] = np.where(seen, _SEEN, _UNSEEN)
+        _add_texels(faces, texels.face, texels.weights, color, seen, photo_colors.total, photo_colors.weight)
     vertex_colors = _extrapolate(splats, vertices, faces, np.full(3, 0.5, np.float32))
-    base = _extrapolate(photos, vertices, faces, vertex_colors)
+    base = _extrapolate(photo_colors, vertices, faces, vertex_colors)
     _complete(texture, state, base, faces, uvs, steps)
     return texture, np.rint(np.clip(vertex_colors, 0, 1) * 255).astype(np.uint8)
 
@@ -235,7 +235,7 @@ def _complete(
         smooth = np.zeros((size, size, 3), np.float32)
         for first, count in steps:
             texels = find_texels(uvs, size, first, count)
-            smooth.reshape(-1, 3)[texels.place] = _on_faces(base, faces, texels)
+            smooth.reshape(-1, 3)[texels.indices] = _on_faces(base, faces, texels)
         difference = texture.astype(np.float32) / 255 - smooth
         fill(difference, state == _SEEN)
         unseen = state == _UNSEEN

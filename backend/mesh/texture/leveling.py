@@ -17,7 +17,7 @@ from ...raster.kernel import kernel
 from ..surface import neighbors
 from .photos import Photo, Photos, between, look
 
-_ASKED = 64
+_MAX_SAMPLES = 64
 """Largest number of photos from which the median is computed."""
 _STEPS = 40
 """Number of smoothing steps of the differences; the radius in edges is its square root."""
@@ -29,7 +29,7 @@ def level(photos: Photos, normals: np.ndarray, progress: Callable[[int], None]) 
     normals (V, 3): unit normals of the vertices; progress: called with the number of processed photos. Photos that show
     no vertex are left out.
     """
-    asked = photos.indices[:: max(1, -(-len(photos.indices) // _ASKED))]
+    sampled = photos.indices[:: max(1, -(-len(photos.indices) // _MAX_SAMPLES))]
     seen: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     for done, index in enumerate(photos.indices):
         progress(done)
@@ -40,7 +40,7 @@ def level(photos: Photos, normals: np.ndarray, progress: Callable[[int], None]) 
                 seen[index] = weight, color
     if not seen:
         return {}
-    samples = [seen[index] for index in asked if index in seen] or list(seen.values())[:_ASKED]
+    samples = [seen[index] for index in sampled if index in seen] or list(seen.values())[:_MAX_SAMPLES]
     medians, known = _medians(np.stack([color for _, color in samples]), np.stack([weight for weight, _ in samples]))
     near = neighbors(photos.vertices, photos.faces)
     mean = diags(1 / np.maximum(np.asarray(near.sum(1)).ravel(), 1e-30)) @ near
@@ -68,9 +68,11 @@ def _at_vertices(photo: Photo, vertices: np.ndarray, normals: np.ndarray) -> tup
 
 
 @kernel(parallel=True)
-def _look(vertices, normals, planes, depth, clearance, viewmat, intrinsics, eye, corner, safe, weight, color):
+def _look(vertices, normals, planes, depth, clearance, viewmat, intrinsics, camera_center, corner, safe, weight, color):
     for n in prange(vertices.shape[0]):
-        score, u, v, _clear = look(vertices, normals, n, 0.0, eye, viewmat, intrinsics, depth, clearance, safe)
+        score, u, v, _clear = look(
+            vertices, normals, n, 0.0, camera_center, viewmat, intrinsics, depth, clearance, safe
+        )
         if score <= 0.0:
             continue
         # Pixels per unit of length on the surface.

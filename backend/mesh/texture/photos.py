@@ -120,13 +120,13 @@ def _photo_of(
     x, y, width, height = box
     camera = whole.crop(x, y, width, height)
     depth, _, _ = draw_mesh(vertices, faces, camera)
-    picture, labels = views.scene.target(index)
+    image, labels = views.scene.target(index)
     allowed = _allowed(views, index, None if labels is None else devices.host(labels), classes, box)
     clearance = np.empty((height, width), np.float32)
     focal = (camera.K[0, 0] + camera.K[1, 1]) / 2
     _measure_clearance(depth, allowed, _STEP / focal, clearance)
     safe = _SAFE * max(1.0, max(whole.width, whole.height) / _SMALL)
-    return Photo(devices.host(picture), camera, x, y, depth, clearance, safe)
+    return Photo(devices.host(image), camera, x, y, depth, clearance, safe)
 
 
 def _allowed(
@@ -248,17 +248,17 @@ def _cubic(t, out):
 
 
 @njit(inline="always", error_model="numpy")
-def look(positions, normals, n, least, eye, viewmat, intrinsics, depth, clearance, safe):
+def look(positions, normals, n, least, camera_center, viewmat, intrinsics, depth, clearance, safe):
     """Score a photo at point `n`.
 
-    viewmat, intrinsics and eye (the camera center) describe the photo's camera. Returns the score, 0 if the point is
-    not visible or the score is not greater than `least`; the pixel (u, v), relative to pixel centers; its clearance.
+    viewmat, intrinsics and camera_center describe the photo's camera. Returns the score, 0 if the point is not visible
+    or the score is not greater than `least`; the pixel (u, v), relative to pixel centers; its clearance.
     """
     fx, fy, cx, cy = intrinsics
     height, width = depth.shape
     focal = (fx + fy) / 2
     x, y, z = positions[n, 0], positions[n, 1], positions[n, 2]
-    dx, dy, dz = eye[0] - x, eye[1] - y, eye[2] - z
+    dx, dy, dz = camera_center[0] - x, camera_center[1] - y, camera_center[2] - z
     facing = dx * normals[n, 0] + dy * normals[n, 1] + dz * normals[n, 2]
     if facing <= 0.0:
         return 0.0, 0.0, 0.0, 0.0
@@ -293,8 +293,8 @@ def between(plane, u, v):
 
 @kernel(parallel=True)
 def _gather(
-    positions, normals, corners, weights, offsets, planes, depth, clearance, viewmat, intrinsics, eye, corner, safe,
-    scores, colors,
+    positions, normals, corners, weights, offsets, planes, depth, clearance, viewmat, intrinsics, camera_center,
+    corner, safe, scores, colors,
 ):  # fmt: skip
     block = 1024
     for b in prange((positions.shape[0] + block - 1) // block):
@@ -303,7 +303,7 @@ def _gather(
         color = np.empty(3)
         for n in range(b * block, min((b + 1) * block, positions.shape[0])):
             score, u, v, clear = look(
-                positions, normals, n, scores[n, KEPT], eye, viewmat, intrinsics, depth, clearance, safe
+                positions, normals, n, scores[n, KEPT], camera_center, viewmat, intrinsics, depth, clearance, safe
             )
             if score <= scores[n, KEPT]:
                 continue

@@ -95,7 +95,7 @@ def read_mesh(path: Path) -> Mesh:
         raise InputError(f"{path} is not a mesh that `python -m backend mesh` wrote; make the meshes again.")
     middle = end + counts[0] * _VERTEX.itemsize
     if len(data) != middle + counts[1] * _FACE.itemsize:
-        raise InputError(f"{path} is cut short; make the meshes again.")
+        raise InputError(f"{path} is truncated; make the meshes again.")
     vertices = np.frombuffer(data[end:middle], _VERTEX)
     faces = np.frombuffer(data[middle:], _FACE)
     if counts[1] and not 0 <= faces["vertices"].min() <= faces["vertices"].max() < counts[0]:

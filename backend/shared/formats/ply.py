@@ -69,7 +69,7 @@ def _read(file: BinaryIO, path: Path) -> np.ndarray:
     end = head.find(b"end_header")
     newline = head.find(b"\n", end)
     if end < 0 or newline < 0:
-        raise InputError(f"{path} has no complete PLY header; it may be cut short.")
+        raise InputError(f"{path} has no complete PLY header; it may be truncated.")
     order = ""
     count = -1
     fields: list[tuple[str, str]] = []
@@ -106,7 +106,7 @@ def _read(file: BinaryIO, path: Path) -> np.ndarray:
     available = os.fstat(file.fileno()).st_size - newline - 1
     if available < count * dtype.itemsize:
         raise InputError(
-            f"{path} is cut short: its header specifies {count} vertices, "
+            f"{path} is truncated: its header specifies {count} vertices, "
             f"but only {available // dtype.itemsize} are there."
         )
     file.seek(newline + 1)

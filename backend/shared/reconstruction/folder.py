@@ -44,7 +44,7 @@ class Reconstruction:
                 raise InputError(f"{path} belongs to the reconstruction itself; choose another file or folder.")
 
     def foreign_file(self) -> str | None:
-        """Return the name of a file in a folder that is no reconstruction; None if commands may use the folder.
+        """Return the name of a file in a folder that is not a reconstruction; None if commands may use the folder.
 
         Raises:
             InputError: The folder cannot be read.

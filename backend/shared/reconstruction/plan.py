@@ -155,7 +155,7 @@ def _overridden(decision: Decision, keep: set[str], leave_out: set[str]) -> Deci
 def _verdict(value: Any) -> bool | None:
     if value is None or isinstance(value, bool):
         return value
-    raise TypeError(f"{value!r} is no decision")
+    raise TypeError(f"{value!r} is not a decision")
 
 
 def write_plan(path: Path, plan: Plan) -> None:

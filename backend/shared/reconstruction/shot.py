@@ -238,7 +238,7 @@ def _objects(entries: Any, where: str) -> dict[int, Placed]:
         if not key.isdecimal() or not key.isascii() or int(key) > LARGEST_ID:
             raise _Wrong(f"{key!r} in the {where} is not an object ID")
         if not isinstance(entry, dict):
-            raise _Wrong(f"entry {key} of the {where} is no object")
+            raise _Wrong(f"entry {key} of the {where} is not an object")
         visible = _truth(entry.get("visible", True), f"visible of object {key}")
         maps = entry.get("maps")
         if maps is not None and not isinstance(maps, list):

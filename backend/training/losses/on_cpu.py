@@ -262,19 +262,19 @@ class _VolumeLoss(torch.autograd.Function):
         return torch.from_numpy(ctx.gradient) * g, None
 
 
-def volume_loss(scales: torch.Tensor, flat: bool = False, made: torch.Tensor | None = None) -> torch.Tensor:
+def volume_loss(scales: torch.Tensor, flat: bool = False, valid: torch.Tensor | None = None) -> torch.Tensor:
     """Compute the mean volume of the splats, i.e. the product of their scales (Scaffold-GS equation 9, as a mean).
 
     Args:
         scales: (N, 3), N > 0.
         flat: whether the splats are discs, for which the mean area is computed.
-        made: (N,) bool, only on the GPU: the entries that are splats.
+        valid: (N,) bool, only on the GPU: the entries that are splats.
 
     Returns:
         () float32.
     """
     if devices.on_gpu(scales):
-        return losses_on_gpu.volume_loss(scales, flat, made)
+        return losses_on_gpu.volume_loss(scales, flat, valid)
     return _VolumeLoss.apply(scales, flat)
 
 

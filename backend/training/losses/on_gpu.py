@@ -76,11 +76,11 @@ def _blur(planes: torch.Tensor, taps: torch.Tensor) -> torch.Tensor:
     return torch.conv2d(out, down, padding=(radius, 0), groups=count).view(planes.shape)
 
 
-def volume_loss(scales: torch.Tensor, flat: bool, made: torch.Tensor | None) -> torch.Tensor:
+def volume_loss(scales: torch.Tensor, flat: bool, valid: torch.Tensor | None) -> torch.Tensor:
     """Compute `on_cpu.volume_loss`, differentiable in scales."""
     a, b, c = scales.unbind(1)
     size = a * b if flat else a * b * c
-    return size.mean() if made is None else torch.where(made, size, 0.0).sum() / made.sum().clamp(min=1)
+    return size.mean() if valid is None else torch.where(valid, size, 0.0).sum() / valid.sum().clamp(min=1)
 
 
 def normal_loss(

@@ -60,8 +60,8 @@ def luma_of(collection: bpy.types.Collection) -> float:
 def _recolor_textures(material: bpy.types.Material, affine: Any) -> None:
     """Insert or update the recolor node after each of the add-on's textures; None removes it."""
     tree = material.node_tree
-    for picture in [node for node in tree.nodes if node.type == "TEX_IMAGE" and kind_of(node.image) == TEXTURE]:
-        color = picture.outputs["Color"]
+    for image_node in [node for node in tree.nodes if node.type == "TEX_IMAGE" and kind_of(node.image) == TEXTURE]:
+        color = image_node.outputs["Color"]
         between = [link.to_node for link in color.links if _is_ours(link.to_node)]
         if affine is None:
             for node in between:
@@ -70,7 +70,7 @@ def _recolor_textures(material: bpy.types.Material, affine: Any) -> None:
                 tree.nodes.remove(node)
             continue
         if not between:
-            between = [_insert(tree, picture)]
+            between = [_insert(tree, image_node)]
         matrix, offset = affine
         for node in between:
             for channel, row in zip(CHANNELS, matrix):
@@ -115,13 +115,13 @@ def _is_ours(node: bpy.types.Node) -> bool:
     return node.type == "GROUP" and kind_of(node.node_tree) == TEXTURE_GROUP
 
 
-def _insert(tree: bpy.types.NodeTree, picture: Any) -> bpy.types.Node:
-    color = picture.outputs["Color"]
+def _insert(tree: bpy.types.NodeTree, image_node: Any) -> bpy.types.Node:
+    color = image_node.outputs["Color"]
     targets = [link.to_socket for link in color.links]
     node = tree.nodes.new("ShaderNodeGroup")
     node.node_tree = find_or_make(bpy.data.node_groups, TEXTURE_GROUP, 1, "ObjectGS Recolor", _make_group)
     node.label = "Recolor"
-    node.location = picture.location[0] + 20.0, picture.location[1] - 280.0
+    node.location = image_node.location[0] + 20.0, image_node.location[1] - 280.0
     for target in targets:
         tree.links.new(node.outputs[0], target)
     tree.links.new(color, node.inputs["Color"])

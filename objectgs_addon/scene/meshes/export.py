@@ -97,7 +97,7 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool) -> Any:
     window = bpy.context.window or bpy.context.window_manager.windows[0]
     before = window.scene
     stage = bpy.data.scenes.new("ObjectGS export")
-    made, pictures = [], {}
+    made, copies = [], {}
     try:
         with tempfile.TemporaryDirectory() as folder:
             for collection, mesh in parts:
@@ -112,11 +112,11 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool) -> Any:
                 for slot, own in zip(obj.material_slots, mesh.material_slots):
                     material = own.material
                     if scene.recolor_of(collection) is not None and material is not None:
-                        if material not in pictures:
-                            pictures[material] = scene.with_own_textures(
+                        if material not in copies:
+                            copies[material] = scene.with_own_textures(
                                 material, scene.recolor_of(collection), Path(folder)
                             )
-                        material = pictures[material][0]
+                        material = copies[material][0]
                     slot.link, slot.material = "OBJECT", material
             window.scene = stage
             stage.view_layers[0].update()
@@ -125,7 +125,7 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool) -> Any:
         window.scene = before
         for obj in made:
             bpy.data.objects.remove(obj)
-        for material, images in pictures.values():
+        for material, images in copies.values():
             bpy.data.materials.remove(material)
             for image in images:
                 bpy.data.images.remove(image)

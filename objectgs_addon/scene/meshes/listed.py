@@ -48,17 +48,17 @@ def read_listed(folder: Path) -> list[ListedMesh]:
     Raises:
         InputError: meshes.json cannot be used.
     """
-    place = Reconstruction(folder).meshes
+    meshes_folder = Reconstruction(folder).meshes
     return [
         ListedMesh(
             entry.key,
             entry.ids,
             entry.object_id,
-            place / entry.file,
-            place / (entry.texture or f"{entry.key}.png"),
+            meshes_folder / entry.file,
+            meshes_folder / (entry.texture or f"{entry.key}.png"),
             entry.name,
         )
-        for entry in read_meshes(place).values()
+        for entry in read_meshes(meshes_folder).values()
         if entry.file is not None
     ]
 

@@ -76,14 +76,14 @@ def _make_ellipsoids_material(name: str) -> bpy.types.Material:
     color = graph.node("ShaderNodeAttribute", attribute_type="INSTANCER", attribute_name=COLOR)
     geometry = graph.node("ShaderNodeNewGeometry")
     position = graph.node("ShaderNodeTexCoord").outputs["Object"]
-    eye = graph.node(
+    incoming = graph.node(
         "ShaderNodeVectorTransform",
         {"Vector": geometry.outputs["Incoming"]},
         vector_type="VECTOR",
         convert_from="WORLD",
         convert_to="OBJECT",
     ).outputs[0]
-    along = graph.vector("DOT_PRODUCT", position, graph.vector("NORMALIZE", eye), output="Value")
+    along = graph.vector("DOT_PRODUCT", position, graph.vector("NORMALIZE", incoming), output="Value")
     squared_distance = graph.math(
         "SUBTRACT",
         graph.vector("DOT_PRODUCT", position, position, output="Value"),

@@ -195,8 +195,10 @@ def _make_render_group(name: str) -> bpy.types.NodeTree:
     splat = _Splat(graph)
     position = graph.node("GeometryNodeInputPosition").outputs[0]
     camera = graph.node("GeometryNodeInputActiveCamera").outputs[0]
-    eye = graph.node("GeometryNodeObjectInfo", {"Object": camera}, transform_space="RELATIVE").outputs["Location"]
-    towards = graph.vector("SUBTRACT", eye, position)
+    camera_center = graph.node("GeometryNodeObjectInfo", {"Object": camera}, transform_space="RELATIVE").outputs[
+        "Location"
+    ]
+    towards = graph.vector("SUBTRACT", camera_center, position)
 
     # In the space where the splat is a unit sphere: the direction to the camera and two directions orthogonal to it.
     sigmas = graph.vector("MAXIMUM", splat.scale, splat.thinnest)

@@ -11,7 +11,7 @@ TYPES = {"status", "progress", "preview", "quality", "warning", "error", "done"}
 
 
 @dataclass
-class Answer:
+class CommandResult:
     """Exit code and output of a command."""
 
     code: int
@@ -31,12 +31,12 @@ class Answer:
         return [event["message"] for event in self.events if event["type"] == kind]
 
 
-def refused(answer: Answer, *words: str) -> str:
-    """Check that the command was refused with a single sentence that contains `words`, and return the sentence."""
-    assert answer.code == EXIT_BAD_INPUT, answer
-    sentences = [line for line in answer.err.splitlines() if line.startswith("error: ")]
-    assert len(sentences) == 1 and "Traceback" not in answer.err, answer.err
-    assert all(line.startswith(("error: ", "warning: ")) for line in answer.err.splitlines()), answer.err
+def assert_rejected(result: CommandResult, *words: str) -> str:
+    """Check that the command was rejected with a single sentence that contains `words`, and return it."""
+    assert result.code == EXIT_BAD_INPUT, result
+    sentences = [line for line in result.err.splitlines() if line.startswith("error: ")]
+    assert len(sentences) == 1 and "Traceback" not in result.err, result.err
+    assert all(line.startswith(("error: ", "warning: ")) for line in result.err.splitlines()), result.err
     assert sentences[0].endswith(".")
     for word in words:
         assert word in sentences[0], sentences[0]
