@@ -11,9 +11,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from .class_table import LARGEST_ID
 from .errors import InputError
 from .formats.json_file import read_json
-from .reconstruction.objects import LARGEST_ID, SceneObject, find_object, merged
+from .reconstruction.objects import SceneObject, find_object, merged
 
 Changes = dict[int, dict[str, Any]]
 """Object ID -> edits, as for `edit_objects`."""

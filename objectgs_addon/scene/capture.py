@@ -61,7 +61,7 @@ def show_capture(
     if any("\ud800" <= character <= "\udfff" for character in str(folder)):
         raise InputError(f"{str(folder)!r} is not valid Unicode, which Blender cannot store; rename the folder.")
     cameras = read_cameras(folder)
-    table = read_points(folder)
+    points = read_points(folder)
     objects = Objects.read(folder)
     if root is None:
         root = next(
@@ -89,7 +89,7 @@ def show_capture(
         mark(capture, CAPTURE)
         adopt(capture, root, (CAMERA, POINTS))
     root[WARNINGS] = "\n".join(show_cameras(capture, parent, cameras))
-    show_points(capture, parent, f"{root.name} points", table, cameras.origin, objects)
+    show_points(capture, parent, f"{root.name} points", points, cameras.origin, objects)
 
     # Linked last, since Blender updates all view layers for each link below a scene.
     if new_capture:

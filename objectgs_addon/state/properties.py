@@ -21,7 +21,7 @@ from bpy.props import (
 
 from ...backend.shared.defaults import MAX_SIZE
 from ...backend.shared.expectation import PRESET_STEPS
-from ...backend.shared.reconstruction.fill import UNOBSERVED
+from ...backend.shared.formats.splat_ply import UNOBSERVED
 from .. import drawing
 from ..scene import SHOWS, color_points_by, kind_of, show_kinds, shown_kinds
 from . import object_edits

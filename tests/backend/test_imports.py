@@ -180,3 +180,13 @@ def test_each_file_of_a_reconstruction_has_one_owner():
     # Captures have a separate truth/objects.json.
     places["objects.json"] -= {"objectgs_addon/demo/capture.py", "backend/evaluation/truth.py"}
     assert places == {name: {f"backend/shared/reconstruction/{owner}.py"} for name, owner in OWNERS.items()}
+
+
+def test_the_properties_of_splats_have_one_owner():
+    places = {
+        str(path.relative_to(ROOT))
+        for path in SOURCES
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and node.value in ("f_dc_0", "f_rest_", "rot_0")
+    }
+    assert places == {"backend/shared/formats/splat_ply.py"}

@@ -5,6 +5,7 @@ import bpy
 import numpy as np
 import pytest
 from objectgs.backend.shared.color.recolor import Recolor
+from objectgs.backend.shared.formats.splat_ply import UNOBSERVED
 from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.blender import older_files
 from objectgs.objectgs_addon.scene import carrier, kinds, object_collection
@@ -45,7 +46,7 @@ def older_file(extension, tmp_path):
     blender_scene.recolor(root, 1, Recolor(hue=0.3))
     mesh = splats_of(root).data
     carrier.write(mesh, fills.FILLS, "INT", np.arange(len(mesh.vertices)))
-    carrier.write(mesh, fills.UNOBSERVED, "BOOLEAN", np.ones(len(mesh.vertices), bool))
+    carrier.write(mesh, UNOBSERVED, "BOOLEAN", np.ones(len(mesh.vertices), bool))
     blender_scene.object_collections(root)[1][fills.UNOBSERVED_COUNT] = 7
     give_former_names()
     assert set(former_names()) >= {*older_files.CUSTOM_PROPERTIES, "colour_by", "splat_colours"}

@@ -425,7 +425,7 @@ def test_bad_captures_change_nothing(fresh, folder, name, spoil, sentence):
     ("name", "spoil", "sentence"),
     [
         ("splats.ply", None, "has no splats.ply; train first"),
-        ("splats.ply", "points.ply", "not a file of Gaussian splats"),
+        ("splats.ply", "points.ply", "not one of Gaussian splats"),
         ("anchors.ply", "points.ply", "has no property scale_0"),
         ("splats.ply", "cut", "cut short"),
     ],

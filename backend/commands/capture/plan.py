@@ -8,10 +8,10 @@ from contextlib import ExitStack
 import numpy as np
 
 from ...capture import Capture, load_capture
-from ...labels.points import read_points
 from ...planning.decisions import Choices, PlanningContext, decide
 from ...raster import devices
 from ...shared.events import Reporter
+from ...shared.formats.points_ply import read_points
 from ...shared.grouping import Changes, changed, chosen, grouped, read_groups
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.objects import SceneObject, edit_objects, read_objects

@@ -7,10 +7,11 @@ import hashlib
 
 from ...capture import Capture
 from ...labels import vote as vote_points
-from ...labels.points import read_points, write_points
+from ...labels.points import write_points
 from ...shared.color.palette import object_colors
 from ...shared.errors import InputError
 from ...shared.events import Reporter
+from ...shared.formats.points_ply import read_points
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.objects import default_name, write_objects
 from ...shared.reconstruction.record import VotesRecord, read_record, update_record

@@ -7,7 +7,8 @@ import numpy as np
 from ...editing import Fill, compute_fill
 from ...export import read_splats, splat_table
 from ...shared.formats.ply import read_vertices, write_vertices
-from ...shared.reconstruction.fill import FILLS, UNOBSERVED, fill_path, forget_old
+from ...shared.formats.splat_ply import UNOBSERVED
+from ...shared.reconstruction.fill import FILLS, fill_path, forget_old
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.objects import read_objects
 from ...shared.stopping import StoppingReporter

@@ -11,7 +11,6 @@ import torch
 from ...capture import Capture
 from ...evaluation import IdScores, comparison, curve_image, psnr, save_image, thumbnail
 from ...export import agreement, fit_splats, write_anchors, write_splats
-from ...labels.points import read_points
 from ...model.checkpoint import has_checkpoint
 from ...model.draw import draw
 from ...model.object_model import ObjectModel
@@ -21,6 +20,7 @@ from ...raster import devices
 from ...shared.errors import Cancelled, InputError
 from ...shared.events import Reporter
 from ...shared.formats.json_file import plain
+from ...shared.formats.points_ply import read_points
 from ...shared.reconstruction.checkpoint import PREVIOUS
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.plan import Plan, write_plan

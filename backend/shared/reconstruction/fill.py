@@ -16,7 +16,7 @@ from ..errors import InputError
 from .folder import Reconstruction
 from .objects import SceneObject
 
-UNOBSERVED, FILLS = "unobserved", "fills"
+FILLS = "fills"
 
 _FORMAT = 2
 """Version of the fill algorithm; files of other versions are not reused."""

@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 
+from ..class_table import LARGEST_ID
 from ..color.recolor import Recolor
 from ..errors import InputError
 from ..formats.json_file import read_json, write_json
 from .lock import FolderInUse, locked
 
-LARGEST_ID = 2**32 - 1
 EDITABLE = (
     "name", "color", "merged_into", "left_out", "removed", "floaters", "fill", "recolor", "transform", "copies",
 )  # fmt: skip

@@ -35,9 +35,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..class_table import LARGEST_ID
 from ..errors import InputError
 from ..formats.json_file import read_json, write_json
-from .objects import LARGEST_ID, affine_map
+from .objects import affine_map
 
 VERSION = 1
 NAME = "shot.json"

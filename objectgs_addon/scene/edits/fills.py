@@ -13,17 +13,17 @@ import bpy
 import numpy as np
 
 from ....backend.shared.formats.ply import read_vertices
-from ....backend.shared.reconstruction.fill import FILLS, UNOBSERVED, fill_path
+from ....backend.shared.formats.splat_ply import UNOBSERVED, ids_of
+from ....backend.shared.reconstruction.fill import FILLS, fill_path
 from ....backend.shared.reconstruction.folder import Reconstruction
 from .. import carrier
 from ..capture import origin_of
 from ..kinds import OBJECT_PARENT, SPLATS, folder_of, object_collections, part_of
 from ..object_collection import center_of
 from ..objects_file import Objects
-from ..points import positions_of
 from ..shading.modifiers import update_groups
 from ..shading.node_groups import HIDDEN
-from ..splats import ids_of, splat_attributes
+from ..splats import positions_of, splat_attributes
 
 SHOWN_FILL = "objectgs_fill"
 """Custom property of a carrier's mesh: the name of the fill file that it shows."""

@@ -9,6 +9,7 @@ import numpy as np
 from ....backend.shared.color.palette import to_linear
 from ....backend.shared.errors import InputError
 from ....backend.shared.formats.mesh_ply import Mesh, read_mesh
+from ....backend.shared.formats.splat_ply import UNOBSERVED
 from .. import carrier
 from ..capture import origin_of
 from ..kinds import ANCHORS, MESH, MESH_KEY, OBJECT_PARENT, SPLATS, adopt, mark, parent_of
@@ -21,7 +22,7 @@ from .textures import load_texture, reload_texture
 WRITTEN = "objectgs_written"
 """Custom property of a mesh object: the modification times of the files it shows."""
 
-UV_MAP, COLORS, UNOBSERVED = "UVMap", "Col", "unobserved"
+UV_MAP, COLORS = "UVMap", "Col"
 
 
 class MeshImporter:
