@@ -32,7 +32,7 @@ from .kinds import (
     parent_of,
     points_of,
 )
-from .objects_file import Objects
+from .object_display import Objects
 from .points import read_points, show_points
 
 ORIGIN = "objectgs_origin"

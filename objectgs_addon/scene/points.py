@@ -11,7 +11,7 @@ from ...backend.shared.formats.points_ply import LabeledPoints, read_shown_point
 from ...backend.shared.reconstruction.folder import Reconstruction
 from . import carrier
 from .kinds import POINTS, mark, part_of, points_of
-from .objects_file import Objects, linear_colors
+from .object_display import Objects, linear_colors
 from .shading.materials import points_material
 from .shading.modifiers import modifier_of, set_input
 from .shading.node_groups import POINTS_GROUP, points_group

@@ -37,7 +37,7 @@ from .kinds import (
 )
 from .meshes.show import apply_shown, update_meshes
 from .object_collection import NAME, center_of, ensure_pivot, new_collection, paint, remove, remove_if_empty, rename
-from .objects_file import Objects
+from .object_display import Objects
 from .points import read_points, show_points
 from .shading.materials import splats_material
 from .shading.modifiers import add_splats_modifiers, use_material

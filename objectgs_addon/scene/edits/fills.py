@@ -19,7 +19,7 @@ from .. import carrier
 from ..capture import origin_of
 from ..kinds import OBJECT_PARENT, SPLATS, folder_of, object_collections, part_of
 from ..object_collection import center_of
-from ..objects_file import Objects
+from ..object_display import Objects
 from ..shading.modifiers import update_groups
 from ..shading.node_groups import HIDDEN
 from ..splats import positions_of, splat_attributes

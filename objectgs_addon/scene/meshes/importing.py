@@ -14,7 +14,7 @@ from .. import carrier
 from ..capture import origin_of
 from ..kinds import ANCHORS, MESH, MESH_KEY, OBJECT_PARENT, SPLATS, adopt, mark, parent_of
 from ..object_collection import NAME, center_of, ensure_pivot, new_collection, textures_of
-from ..objects_file import Objects
+from ..object_display import Objects
 from ..shading.materials import mesh_material
 from .listed import ListedMesh
 from .textures import load_texture, reload_texture
