@@ -57,23 +57,33 @@ def documented_rules() -> dict[str, set[str]]:
     return rules
 
 
+def project_imports() -> list[tuple[Path, int, str, str, tuple[str, ...]]]:
+    """Return file, line, importing folder, imported folder and module of each import inside the project."""
+    return [
+        (path, line, room_of(module_of(path)), room_of(module), module)
+        for path in SOURCES
+        for module, line in imports_of(path)
+        if module and module[0] in PACKAGES
+    ]
+
+
 def violations() -> list[str]:
     rules = documented_rules()
-    found = []
-    for path in SOURCES:
-        here = room_of(module_of(path))
-        for module, line in imports_of(path):
-            if module[:1] not in {(package,) for package in PACKAGES}:
-                continue
-            there = room_of(module)
-            allowed = rules.get(here, set())
-            if there != here and there not in allowed:
-                found.append(f"{path.relative_to(ROOT)}:{line} imports {'.'.join(module)}")
-    return found
+    return [
+        f"{path.relative_to(ROOT)}:{line} imports {'.'.join(module)}"
+        for path, line, here, there, module in project_imports()
+        if there != here and there not in rules.get(here, set())
+    ]
 
 
 def test_imports_follow_the_documented_rules():
     assert not violations()
+
+
+def test_every_documented_rule_is_used():
+    used = {(here, there) for _, _, here, there, _ in project_imports()}
+    documented = {(here, there) for here, targets in documented_rules().items() for there in targets}
+    assert not documented - used
 
 
 def test_documented_rules_have_no_circle():
@@ -89,6 +99,16 @@ def test_documented_rules_have_no_circle():
 
     for folder in list(rules):
         visit(folder, ())
+
+
+def test_no_two_subfolders_import_each_other():
+    pairs = set()
+    for path, *_, module in project_imports():
+        here, there = path.parent.relative_to(ROOT), Path(*module)
+        there = there if (ROOT / there).is_dir() else there.parent
+        if not here.is_relative_to(there) and not there.is_relative_to(here):
+            pairs.add((here, there))
+    assert not {pair for pair in pairs if pair[::-1] in pairs}
 
 
 def outside_imports(folder: str) -> dict[str, str]:

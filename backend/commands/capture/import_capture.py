@@ -12,8 +12,8 @@ from ...shared.reconstruction.objects import write_objects
 from ...shared.reconstruction.record import read_record, update_record
 from ...shared.stopping import StoppingReporter
 from ..folder import capture_record, open_reconstruction
-from .plan import write_default_plan
-from .votes import votes_are_current
+from ..planning import write_default_plan
+from ..votes import votes_are_current
 
 
 def import_capture(options: argparse.Namespace, reporter: StoppingReporter) -> None:

@@ -6,8 +6,8 @@ import argparse
 
 from ...shared.stopping import StoppingReporter
 from ..folder import open_reconstruction
-from .plan import change_objects, write_default_plan
-from .votes import cast_votes
+from ..planning import change_objects, write_default_plan
+from ..votes import cast_votes
 
 
 def vote(options: argparse.Namespace, reporter: StoppingReporter) -> None:

@@ -24,10 +24,10 @@ from ...shared.reconstruction.record import read_record
 from ...shared.reconstruction.report import Evaluation, Report, read_evaluation
 from ...shared.stopping import StoppingReporter
 from ...training.budget import TrainingProgress
-from ..capture.votes import object_name
 from ..folder import Trained, open_trained
 from ..setup.machine import machine_facts
 from ..stages import stage
+from ..votes import object_name
 
 IMAGES_IN_REPORT = 3
 

@@ -29,12 +29,12 @@ from ...shared.stopping import StoppingReporter
 from ...training.budget import Budget, TrainingProgress
 from ...training.scene import Scene
 from ...training.trainer import Evaluate, Trainer
-from ..capture.plan import build_context, change_objects, choices, find_requested_objects, report_plan, settings
-from ..capture.votes import cast_votes, votes_are_current, votes_key
 from ..folder import capture_record, digest, memory_for_planes, open_reconstruction, plan_of
+from ..length import budget_of, expected_of
+from ..planning import build_context, change_objects, choices, find_requested_objects, report_plan, settings
 from ..setup.kernels import ensure_kernels
 from ..stages import finish_stage, stage
-from .length import budget_of, expected_of
+from ..votes import cast_votes, votes_are_current, votes_key
 
 CURVE_VIEWS = 20
 """Largest number of held-out views that are measured during training; `evaluate` measures all."""

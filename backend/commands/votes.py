@@ -5,18 +5,18 @@ from __future__ import annotations
 import argparse
 import hashlib
 
-from ...capture import Capture
-from ...labels import vote as vote_points
-from ...labels.points import write_points
-from ...shared.color.palette import object_colors
-from ...shared.errors import InputError
-from ...shared.events import Reporter
-from ...shared.formats.points_ply import read_points
-from ...shared.reconstruction.folder import Reconstruction
-from ...shared.reconstruction.objects import default_name, write_objects
-from ...shared.reconstruction.record import VotesRecord, read_record, update_record
-from ..folder import digest
-from ..stages import stage
+from ..capture import Capture
+from ..labels import vote as vote_points
+from ..labels.points import write_points
+from ..shared.color.palette import object_colors
+from ..shared.errors import InputError
+from ..shared.events import Reporter
+from ..shared.formats.points_ply import read_points
+from ..shared.reconstruction.folder import Reconstruction
+from ..shared.reconstruction.objects import default_name, write_objects
+from ..shared.reconstruction.record import VotesRecord, read_record, update_record
+from .folder import digest
+from .stages import stage
 
 
 def cast_votes(folder: Reconstruction, capture: Capture, options: argparse.Namespace, reporter: Reporter) -> None:
