@@ -656,9 +656,9 @@ def test_a_line_stop_on_standard_input(trained, ask, monkeypatch):
 
     original = Trainer.step
 
-    def step(self, share):
+    def step(self, progress):
         begun.set()
-        return original(self, share)
+        return original(self, progress)
 
     monkeypatch.setattr(Trainer, "step", step)
     monkeypatch.setattr(sys, "stdin", Typed())

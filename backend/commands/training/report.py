@@ -48,7 +48,7 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             "folder": capture.folder.name, "views": len(capture.views), "held_out": len(capture.test_indices),
             "objects": len(capture.object_ids), **capture.counts,
             "exposure_varies": trained.scene.exposure_varies,
-            "unlabeled_is_taught": trained.scene.supervise_background,
+            "supervise_background": trained.scene.supervise_background,
             "cameras": ", ".join(f"{count} {name}" for name, count in capture.counts["cameras"].items()),
         },
         settings={
