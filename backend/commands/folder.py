@@ -98,7 +98,19 @@ def open_reconstruction(options: argparse.Namespace, reporter: Reporter) -> Iter
 
 
 def read_capture(folder: Reconstruction, options: argparse.Namespace, reporter: Reporter) -> Capture:
-    """Read the capture of the options, prepare its images in the cache of `folder`, and write cameras.json."""
+    """Read a capture, prepare its images in the cache of the reconstruction, and write cameras.json.
+
+    Args:
+        folder: The reconstruction, locked by this process.
+        options: capture (its folder), max_size (longest side in pixels) and the limits of memory.
+        reporter: Receives progress and warnings.
+
+    Returns:
+        The prepared capture.
+
+    Raises:
+        InputError: The capture cannot be used.
+    """
     with stage(folder, "read"):
         capture = load_capture(options.capture, folder.cache, memory_for_files(options), options.max_size, reporter)
         write_capture_cameras(folder, capture)

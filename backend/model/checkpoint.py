@@ -59,11 +59,15 @@ def has_checkpoint(folder: Path) -> bool:
 def load_checkpoint(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None] | None:
     """Read the latest complete checkpoint.
 
+    Args:
+        folder: The folder of the checkpoint.
+
     Returns:
-        The tensors, the state, and a warning or None; None if there is no checkpoint.
+        The tensors by name, the state, and a warning or None if the checkpoint is not the latest one that was written;
+        None if there is no checkpoint.
 
     Raises:
-        InputError: there are checkpoint files, but none can be read.
+        InputError: There are checkpoint files, but none can be read.
     """
     broken = None
     for name in (CURRENT, PREVIOUS):
