@@ -56,6 +56,17 @@ def _color_edit(name: str, default: float, description: str) -> Any:
     )
 
 
+def image_size() -> Any:
+    """Return the property of the longest side of the images, for a reconstruction and for its import."""
+    return IntProperty(
+        name="Image Size",
+        default=MAX_SIZE,
+        min=64,
+        soft_max=8192,
+        description="Longest side in pixels; larger photos are scaled down",
+    )
+
+
 class ObjectItem(bpy.types.PropertyGroup):
     """A row of the objects list; IDs above 2^31 - 1 are stored as the int32 with the same bits."""
 
@@ -166,13 +177,7 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
             ("correspondence", "Correspondence", "Only photos in which COLMAP matched the point"),
         ],
     )
-    max_size: IntProperty(
-        name="Image Size",
-        default=MAX_SIZE,
-        min=64,
-        soft_max=8192,
-        description="Longest side in pixels; larger photos are scaled down",
-    )
+    max_size: image_size()
     color_by: EnumProperty(
         name="Color Points By",
         default="photo",
