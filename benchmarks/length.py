@@ -26,10 +26,10 @@ from benchmarks import shared
 SECONDS = (15, 30, 60, 120, 300)
 PRESETS = ("preview", "standard", "final")
 STEPS = (150, 300, 600, 1000, 1500)
-OPEN_END = "final"
+CONVERGED = "final"
 """The preset that trains until it stops improving, and the only preset whose meshes are measured."""
 SEEDS = 2
-"""Number of seeds over which OPEN_END and the longest training are averaged for their comparison, since trainings that
+"""Number of seeds over which CONVERGED and the longest training are averaged for their comparison, since trainings that
 differ only in the seed are 0.1 dB and more apart."""
 
 _COLUMNS = (
@@ -64,14 +64,14 @@ def main() -> None:
             lambda found: f"{found['steps']} steps, {found['psnr']:.2f} dB, {found['train_seconds']:.0f} s",
         )  # fmt: skip
 
-    presets = {preset: get(preset, "--preset", preset, meshes=preset == OPEN_END) for preset in PRESETS}
-    # The longest training directly follows OPEN_END, since they are compared and a machine's speed varies over hours.
+    presets = {preset: get(preset, "--preset", preset, meshes=preset == CONVERGED) for preset in PRESETS}
+    # The longest training directly follows CONVERGED, since they are compared and a machine's speed varies over hours.
     lengths = {f"{seconds} s": get(f"{seconds} s", "--minutes", seconds / 60, meshes=True) for seconds in SECONDS[::-1]}
     found = dict(reversed(lengths.items())) | presets
     longest = f"{SECONDS[-1]} s", "--minutes", SECONDS[-1] / 60
     compared = [
         [found[name], *(get(f"{name}, seed {seed}", *words, "--seed", seed, meshes=False) for seed in range(1, SEEDS))]
-        for name, *words in (longest, (OPEN_END, "--preset", OPEN_END))
+        for name, *words in (longest, (CONVERGED, "--preset", CONVERGED))
     ]
     if results.failures:
         sys.exit("\n".join(f"{name}: {why}" for name, why in results.failures.items()))
@@ -97,7 +97,7 @@ def shortfalls(captures: list[Path]) -> dict[str, dict[str, float]]:
                 "psnr"
             ]
 
-        best = psnr(OPEN_END, "--preset", OPEN_END)
+        best = psnr(CONVERGED, "--preset", CONVERGED)
         found[capture.name] = {str(steps): best - psnr(f"{steps}", "--steps", steps) for steps in STEPS}
     return found
 
@@ -113,7 +113,7 @@ def table(found: dict[str, dict[str, Any]]) -> list[str]:
 
 
 def comparison(longest: list[dict[str, Any]], ends: list[dict[str, Any]]) -> str:
-    """Compare trainings with an open end with the longest ones, each over several seeds; returns text."""
+    """Compare converged trainings with the longest ones, each over several seeds; returns text."""
 
     def mean(rows: list[dict[str, Any]], key: str) -> float:
         return statistics.fmean(row[key] for row in rows)
@@ -140,7 +140,7 @@ def plot(found: dict[str, dict[str, Any]]) -> Any:
                 row = found[name]
                 if row[key] is not None:
                     axes.plot(row["train_seconds"], row[key], "D", color=shared.MARKED, markersize=5)
-                    below = -11 if name != OPEN_END else 5  # its point is near the previous one
+                    below = -11 if name != CONVERGED else 5  # its point is near the previous one
                     axes.annotate(
                         name,
                         (row["train_seconds"], row[key]),

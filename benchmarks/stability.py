@@ -175,9 +175,9 @@ def train(
         lost = 0
         inner = trainer.step
 
-        def step(share: float) -> torch.Tensor:
+        def step(progress: float) -> torch.Tensor:
             nonlocal lost
-            loss = inner(share)
+            loss = inner(progress)
             lost += not math.isfinite(float(loss))
             return loss
 

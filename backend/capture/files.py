@@ -16,6 +16,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from PIL import Image as PilImage
 
+from ..shared.class_table import LARGEST_ID
 from ..shared.errors import InputError
 from ..shared.formats.atomic import write_atomic
 from ..shared.formats.json_file import LARGEST, parse_json
@@ -24,7 +25,6 @@ from ..shared.formats.regular_file import open_regular, read_regular, require_re
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm", ".pgm"}
 MASK_SUFFIXES = (".png", ".npy", ".npz", ".tif", ".tiff", ".bmp")
 LOSSY_SUFFIXES = (".jpg", ".jpeg")
-_LARGEST_ID = 2**32 - 1
 _OPENING_ERRORS = (OSError, ValueError, SyntaxError, EOFError, MemoryError, PilImage.DecompressionBombError)
 
 
@@ -237,8 +237,8 @@ def _array_mask(path: Path) -> np.ndarray:
         with np.errstate(invalid="ignore"):
             if not (np.isfinite(ids).all() and (ids == np.rint(ids)).all()):
                 raise _not_ids(path, "its values are not whole numbers")
-    if ids.min() < 0 or ids.max() > _LARGEST_ID:
-        raise _not_ids(path, f"its values lie outside 0 to {_LARGEST_ID}")
+    if ids.min() < 0 or ids.max() > LARGEST_ID:
+        raise _not_ids(path, f"its values lie outside 0 to {LARGEST_ID}")
     return ids.astype(np.uint32)
 
 
@@ -331,9 +331,9 @@ def read_names(folder: Path) -> dict[int, str]:
             f'{path} is not a list of labels; expected {{"1": "mug", "2": "box"}} in JSON or lines like "1 mug".'
         ) from error
     names = dict(pairs)
-    outside = [key for key in names if not 0 <= key <= _LARGEST_ID]
+    outside = [key for key in names if not 0 <= key <= LARGEST_ID]
     if outside:
-        raise InputError(f"{path} names the ID {outside[0]}, which lies outside 0 to {_LARGEST_ID}.")
+        raise InputError(f"{path} names the ID {outside[0]}, which lies outside 0 to {LARGEST_ID}.")
     names.pop(0, None)
     return dict(sorted(names.items()))
 

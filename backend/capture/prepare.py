@@ -153,6 +153,8 @@ def _read_stamp(path: Path, made_from: dict[str, Any], cache: Path) -> dict[str,
         stamp = parse_json(read_regular(path))
         if stamp["made_from"] != made_from:
             return None
+        if not all(type(number) is int and number >= 0 for number in stamp["ids"]):
+            return None
         for key in ("image_file", "mask_file"):
             if stamp[key] and (cache / stamp[key]).stat().st_size != stamp[f"{key}_bytes"]:
                 return None

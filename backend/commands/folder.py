@@ -46,19 +46,27 @@ class Output:
 
     def __init__(self, folder: Reconstruction) -> None:
         self.folder = folder
-        self.is_accepted = False
+        self._kept_from: tuple[type[Exception], ...] = ()
+
+    def read(self) -> None:
+        """Keep what has been written if the disk is full or fails, but not if the input is refused."""
+        self._kept_from = (OSError,)
 
     def accept(self) -> None:
         """Keep what has been written, whatever fails from now on."""
-        self.is_accepted = True
+        self._kept_from = (Exception,)
+
+    def is_kept_from(self, error: Exception) -> bool:
+        """Return whether what has been written is kept in spite of an error."""
+        return isinstance(error, self._kept_from)
 
 
 @contextmanager
 def open_output(options: argparse.Namespace) -> Iterator[Output]:
     """Create the folder of --out if necessary, and lock it.
 
-    If the input is refused before `Output.accept`, what this process has created is deleted: its files while the folder
-    is still locked, then those new folders that are empty.
+    If the input is refused before `Output.accept`, or writing fails before `Output.read`, what this process has created
+    is deleted: its files while the folder is still locked, then those new folders that are empty.
 
     Raises:
         FolderInUse: another process uses the folder.
@@ -74,18 +82,18 @@ def open_output(options: argparse.Namespace) -> Iterator[Output]:
                 try:
                     update_record(output.folder)
                     yield output
-                except (InputError, OSError):
-                    if not output.is_accepted:
+                except (InputError, OSError) as error:
+                    if not output.is_kept_from(error):
                         created.remove_files()
                     raise
-        except (InputError, OSError):
-            if not output.is_accepted:
+        except (InputError, OSError) as error:
+            if not output.is_kept_from(error):
                 created.remove_folders()
             raise
 
 
 @contextmanager
-def open_reconstruction(options: argparse.Namespace, reporter: Reporter) -> Iterator[tuple[Reconstruction, Capture]]:
+def open_reconstruction(options: argparse.Namespace, reporter: Reporter) -> Iterator[tuple[Output, Capture]]:
     """Create the folder of --out if necessary, lock it, read the capture and write cameras.json.
 
     Raises:
@@ -93,12 +101,24 @@ def open_reconstruction(options: argparse.Namespace, reporter: Reporter) -> Iter
     """
     with open_output(options) as output:
         capture = read_capture(output.folder, options, reporter)
-        output.accept()
-        yield output.folder, capture
+        output.read()
+        yield output, capture
 
 
 def read_capture(folder: Reconstruction, options: argparse.Namespace, reporter: Reporter) -> Capture:
-    """Read the capture of the options, prepare its images in the cache of `folder`, and write cameras.json."""
+    """Read a capture, prepare its images in the cache of the reconstruction, and write cameras.json.
+
+    Args:
+        folder: The reconstruction, locked by this process.
+        options: capture (its folder), max_size (longest side in pixels) and the limits of memory.
+        reporter: Receives progress and warnings.
+
+    Returns:
+        The prepared capture.
+
+    Raises:
+        InputError: The capture cannot be used.
+    """
     with stage(folder, "read"):
         capture = load_capture(options.capture, folder.cache, memory_for_files(options), options.max_size, reporter)
         write_capture_cameras(folder, capture)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ..model.splats import Splats, concatenate
 from ..shared.color.recolor import Recolor
-from ..shared.reconstruction.objects import SceneObject, merged
+from ..shared.reconstruction.objects import SceneObject, members_of, shown_as
 from ..shared.splats import spherical_harmonics
 from .fill import fill_hole
 from .floaters import inside_hull
@@ -118,7 +118,7 @@ def recolored(splats: Splats, recolor: Recolor) -> Splats:
 def _remove_and_fill(splats: Splats, objects: Sequence[SceneObject]) -> tuple[Splats, Fill]:
     """Return the visible splats, with the IDs that they are shown as and with filled holes, and the filling itself."""
     known, slots = np.unique(splats.object_ids, return_inverse=True)
-    shown = _shown_as(known, objects)[slots]
+    shown = _visible_as(known, objects)[slots]
     keep = shown != _DROPPED
     for entry in objects:
         if entry.removed and entry.floaters:
@@ -141,22 +141,16 @@ def _remove_and_fill(splats: Splats, objects: Sequence[SceneObject]) -> tuple[Sp
     return edited, Fill(concatenate(parts), np.arange(sum(counts)) < counts[0], whose)
 
 
-def _shown_as(ids: NDArray[np.int64], objects: Sequence[SceneObject]) -> NDArray[np.int64]:
+def _visible_as(ids: NDArray[np.int64], objects: Sequence[SceneObject]) -> NDArray[np.int64]:
     """Return for each ID the one that it is shown as, `_DROPPED` if it is not visible."""
-    entries = {entry.id: entry for entry in objects}
-    into = merged(objects)
-    found = []
-    for object_id in ids.tolist():
-        target = into.get(object_id, object_id)
-        unseen = any(at in entries and entries[at].left_out for at in (object_id, target))
-        unseen = unseen or (target in entries and entries[target].removed)
-        found.append(_DROPPED if unseen else target)
-    return np.array(found, np.int64)
+    shown, removed = shown_as(objects), {entry.id for entry in objects if entry.removed}
+    targets = [shown.get(object_id, object_id) for object_id in ids.tolist()]
+    return np.array([_DROPPED if target is None or target in removed else target for target in targets], np.int64)
 
 
 def _with_id(splats: Splats, object_id: int, objects: Sequence[SceneObject]) -> NDArray[np.bool_]:
     """Find the splats of an object, including those merged into it: (N,)."""
-    return np.isin(splats.object_ids, [i for i, target in merged(objects).items() if target == object_id])
+    return np.isin(splats.object_ids, members_of(objects, object_id))
 
 
 def _floaters(splats: Splats, mine: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from ..shared.color.palette import colors_of, object_colors
+from ..shared.durations import clock
 from ..shared.formats.atomic import write_atomic
 from ..shared.reconstruction.objects import default_name
 
@@ -113,8 +114,7 @@ def curve_image(curve: Sequence[Mapping[str, Any]]) -> Image.Image | None:
         pen.text((left - 6, y), str(value), fill=CURVE_INK, font=load_font(12), anchor="rm")
     pen.line([place(*point) for point in found], fill=CURVE_LINE, width=3, joint="curve")
     pen.text((left, 4), "PSNR of held-out views, dB", fill=CURVE_INK, font=load_font(12))
-    whole = round(seconds[-1])
-    pen.text((right, bottom + 6), f"{whole // 60}:{whole % 60:02d}", fill=CURVE_INK, font=load_font(12), anchor="ra")
+    pen.text((right, bottom + 6), clock(seconds[-1]), fill=CURVE_INK, font=load_font(12), anchor="ra")
     return image
 
 

@@ -62,7 +62,19 @@ class Card:
 
 
 def view_of(capture: Capture, ids: Sequence[int] | None, indices: Sequence[int]) -> View:
-    """Return the view among `indices` with the most pixels of the objects `ids`; if `ids` is None, the first view."""
+    """Choose the view to draw a mesh from.
+
+    Args:
+        capture: The capture, with masks of its views.
+        ids: IDs of the objects of the mesh; None for the whole scene.
+        indices: The views to choose from, at least one; a sample of them is looked at.
+
+    Returns:
+        The view with the most pixels of these objects, the first of equals; the first view if `ids` is None.
+
+    Raises:
+        InputError: A mask cannot be read.
+    """
     sampled = list(indices)[:: max(1, len(indices) // _MAX_SAMPLED_VIEWS)]
     best, most = sampled[0], -1
     for index in sampled:

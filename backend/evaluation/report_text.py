@@ -9,8 +9,9 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ..shared.reconstruction.report import QUALITY, Report
+
 OBJECTS_SHOWN = 40
-QUALITY = ("psnr", "ssim", "lpips", "miou", "mbiou", "dice", "accuracy")
 
 _MEANINGS = {
     "psnr": (
@@ -27,13 +28,13 @@ _MEANINGS = {
 }
 
 
-def summarize(report: dict[str, Any]) -> str:
+def summarize(report: Report) -> str:
     """Return one sentence with the numbers of objects and splats, the quality and the computing time."""
-    quality, model = report["quality"], report["model"]
-    seconds = sum(stage["seconds"] or 0 for stage in report["stages"])
+    quality, model = report.quality, report.model
+    seconds = sum(stage["seconds"] or 0 for stage in report.stages)
     facts = []
-    if report["objects"]:
-        facts.append(f"{len(report['objects']):,} object{'s' if len(report['objects']) != 1 else ''}")
+    if report.objects:
+        facts.append(f"{len(report.objects):,} object{'s' if len(report.objects) != 1 else ''}")
     if model["gaussians"] is not None:
         facts.append(f"{model['gaussians']:,.0f} splats")
     if quality["psnr"] is not None:
@@ -45,11 +46,11 @@ def summarize(report: dict[str, Any]) -> str:
     return (", ".join(facts) or "Nothing has been measured yet") + "."
 
 
-def quality_section(report: dict[str, Any]) -> list[str]:
+def quality_section(report: Report) -> list[str]:
     rows = []
     for key in QUALITY:
         label, unit, meaning = _MEANINGS[key]
-        value = report["quality"][key]
+        value = report.quality[key]
         text = "—" if value is None else f"{value:.2f} {unit}" if unit else f"{value:.4f}"
         rows.append((label, f"**{text}**" if value is not None else text, meaning))
     intro = (
@@ -115,10 +116,10 @@ _TEXTURE_INTRO = """\
 mask that the mesh covers."""
 
 
-def meshes_section(report: dict[str, Any], sheet: str | None) -> list[str]:
+def meshes_section(report: Report, sheet: str | None) -> list[str]:
     """Return the section about the meshes; empty if there are none. `sheet` links to the image of all meshes."""
-    objects = [(entry["name"], entry["mesh"]) for entry in report["objects"]]
-    named = [*objects, *((entry["name"], entry) for entry in report.get("meshes") or [])]
+    objects = [(entry["name"], entry["mesh"]) for entry in report.objects]
+    named = [*objects, *((entry["name"], entry) for entry in report.meshes)]
     made = [(name, mesh) for name, mesh in named if mesh.get("faces") is not None]
     without = [(name, mesh["why"]) for name, mesh in named if mesh.get("faces") is None and mesh.get("why")]
     if not made and not without:
@@ -165,8 +166,8 @@ def _mesh_summary(objects: Sequence[tuple[str, dict[str, Any]]]) -> str:
     return "; ".join(facts) + "."
 
 
-def stages_section(report: dict[str, Any]) -> list[str]:
-    if not report["stages"]:
+def stages_section(report: Report) -> list[str]:
+    if not report.stages:
         return []
     rows = [
         (
@@ -174,15 +175,15 @@ def stages_section(report: dict[str, Any]) -> list[str]:
             "—" if stage["seconds"] is None else duration(stage["seconds"]),
             _number(stage["peak_rss_mb"], "{:,.0f} MB"),
         )
-        for stage in report["stages"]
+        for stage in report.stages
     ]
     return ["## Stages", table(("Stage", "Time", "Peak memory"), rows, right=(1, 2))]
 
 
-def left_out_section(report: dict[str, Any]) -> list[str]:
-    if not report["left_out"]:
+def left_out_section(report: Report) -> list[str]:
+    if not report.left_out:
         return ["## Left out", "Nothing was left out."]
-    rows = [(escape(entry["what"]), escape(entry["why"])) for entry in report["left_out"]]
+    rows = [(escape(entry["what"]), escape(entry["why"])) for entry in report.left_out]
     return ["## Left out", table(("What", "Why"), rows)]
 
 

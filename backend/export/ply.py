@@ -9,10 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.splats import Splats
-from ..shared.errors import InputError
+from ..shared.class_table import LARGEST_ID
 from ..shared.formats.atomic import atomic_file
-from ..shared.formats.ply import read_vertices, vertex_header
-from ..shared.reconstruction.fill import UNOBSERVED
+from ..shared.formats.ply import vertex_header
+from ..shared.formats.splat_ply import (
+    MEANS,
+    OBJECT_ID,
+    OPACITY,
+    QUATS,
+    SCALES,
+    SMALLEST_QUAT,
+    UNOBSERVED,
+    coefficients_of,
+    property_names,
+    read_splat_table,
+    sh_names,
+    splat_dtype,
+    unobserved_of,
+)
 
 OPACITY_MARGIN = 1e-7
 """Smallest distance of opacities from 0 and 1, so that their logits are finite in float32."""
@@ -21,27 +35,12 @@ SMALLEST_SCALE = float(np.finfo(np.float32).tiny)
 FLOAT32_RELATIVE_ERROR = 2.0**-24
 ROWS_AT_ONCE = 1 << 16
 
-_FORMER_UNOBSERVED = "invented"
-"""Name of the property `unobserved` in files written by older versions."""
-
-
-def property_names(degree: int) -> list[str]:
-    """Return the properties of a splat PLY with this spherical-harmonics degree, in file order."""
-    rest = 3 * ((degree + 1) ** 2 - 1)
-    return [
-        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
-        *(f"f_rest_{i}" for i in range(rest)),
-        *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "object_id"),
-    ]
-
 
 def write_splats(path: Path, splats: Splats, with_ids: bool = True) -> list[str]:
     """Write splats as PLY, atomically.
 
-    Binary little-endian, float32 properties: opacity as its logit, scales as logarithms, `f_rest` with all red
-    coefficients first, then green, then blue. Positions are double if float32 would change them by more than 1e-6 of
-    the splats' extent. The last properties are `object_id` as uint32 and, if any splat is unobserved, `unobserved` as
-    uchar.
+    The layout is that of `shared/formats/splat_ply.py`. Positions are double if float32 would change them by more than
+    1e-6 of the splats' extent.
 
     Args:
         path: The file to write.
@@ -63,13 +62,13 @@ def write_splats(path: Path, splats: Splats, with_ids: bool = True) -> list[str]
             "they hold NaN, Inf or a zero quaternion."
         )
         splats = splats.select(keep)
-    if len(splats) and (splats.object_ids.min() < 0 or splats.object_ids.max() > 0xFFFFFFFF):
+    if len(splats) and (splats.object_ids.min() < 0 or splats.object_ids.max() > LARGEST_ID):
         raise ValueError("object IDs must be from 0 to 2^32 - 1")
 
-    names = [name for name in property_names(splats.degree) if with_ids or name != "object_id"]
+    names = [name for name in property_names(splats.degree) if with_ids or name != OBJECT_ID]
     if with_ids and splats.unobserved.any():
         names.append(UNOBSERVED)
-    dtype = _layout(splats, names)
+    dtype = splat_dtype(names, position_kind(splats))
 
     with atomic_file(path) as file:
         file.write(vertex_header(dtype, len(splats)))
@@ -80,37 +79,29 @@ def write_splats(path: Path, splats: Splats, with_ids: bool = True) -> list[str]
 
 def splat_table(splats: Splats) -> NDArray:
     """Return all splats as the records of `write_splats`, always with IDs and `unobserved`."""
-    return _rows(splats, slice(None), _layout(splats, [*property_names(splats.degree), UNOBSERVED]))
-
-
-def _layout(splats: Splats, names: list[str]) -> np.dtype:
-    """Return the record type for these properties of `splats`."""
-    position = position_kind(splats)
-    kinds = {"x": position, "y": position, "z": position, "object_id": "u4", UNOBSERVED: "u1"}
-    return np.dtype([(name, "<" + kinds.get(name, "f4")) for name in names])
+    dtype = splat_dtype([*property_names(splats.degree), UNOBSERVED], position_kind(splats))
+    return _rows(splats, slice(None), dtype)
 
 
 def _rows(splats: Splats, rows: slice, dtype: np.dtype) -> NDArray:
     """Return the records of a slice of the splats."""
     means = splats.means[rows]
     table = np.zeros(len(means), dtype)
-    for axis, name in enumerate("xyz"):
+    for axis, name in enumerate(MEANS):
         table[name] = means[:, axis]
     sh = splats.sh[rows]
-    for channel in range(3):
-        table[f"f_dc_{channel}"] = sh[:, 0, channel]
-    rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(means), 3 * (sh.shape[1] - 1))
-    for i in range(rest.shape[1]):
-        table[f"f_rest_{i}"] = rest[:, i]
+    for k, names in enumerate(sh_names(sh.shape[1])):
+        for channel, name in enumerate(names):
+            table[name] = sh[:, k, channel]
     opacity = np.clip(splats.opacities[rows].astype(np.float64), OPACITY_MARGIN, 1.0 - OPACITY_MARGIN)
-    table["opacity"] = np.log(opacity) - np.log1p(-opacity)
+    table[OPACITY] = np.log(opacity) - np.log1p(-opacity)
     scales = np.log(np.maximum(splats.scales[rows].astype(np.float64), SMALLEST_SCALE))
-    for axis in range(3):
-        table[f"scale_{axis}"] = scales[:, axis]
+    for axis, name in enumerate(SCALES):
+        table[name] = scales[:, axis]
     quats = splats.quats[rows]
-    for i in range(4):
-        table[f"rot_{i}"] = quats[:, i]
-    for name, values in (("object_id", splats.object_ids), (UNOBSERVED, splats.unobserved)):
+    for i, name in enumerate(QUATS):
+        table[name] = quats[:, i]
+    for name, values in ((OBJECT_ID, splats.object_ids), (UNOBSERVED, splats.unobserved)):
         if name in (dtype.names or ()):
             table[name] = values[rows]
     return table
@@ -121,7 +112,7 @@ def _usable(means: NDArray, quats: NDArray, scales: NDArray, opacities: NDArray,
     keep = np.isfinite(opacities)
     for values in (means, quats, scales, sh):
         keep &= np.isfinite(values.reshape(len(keep), math.prod(values.shape[1:]))).all(axis=1)
-    keep &= np.abs(quats).max(axis=1, initial=0.0) > 1e-12
+    keep &= np.abs(quats).max(axis=1, initial=0.0) > SMALLEST_QUAT
     return keep
 
 
@@ -150,36 +141,20 @@ def read_splats(path: Path) -> tuple[Splats, list[str]]:
         InputError: The file is missing, truncated, ASCII, or not a PLY of splats.
     """
     path = Path(path)
-    table = read_vertices(path)
-    names = table.dtype.names or ()
-    needed = [name for name in property_names(0) if name not in ("nx", "ny", "nz", "object_id")]
-    missing = [name for name in needed if name not in names]
-    if missing:
-        raise InputError(
-            f"{path} is a PLY file but not one of Gaussian splats: it has no property {', '.join(missing)}."
-        )
-    rest_count = sum(name.startswith("f_rest_") for name in names)
-    coefficients = rest_count // 3 + 1
-    if rest_count not in (0, 9, 24, 45):
-        raise InputError(f"{path} has {rest_count} properties f_rest_*; 0, 9, 24 or 45 were expected.")
-    rest_names = [f"f_rest_{i}" for i in range(rest_count)]
-    if any(name not in names for name in rest_names):
-        raise InputError(f"{path} has {rest_count} properties f_rest_*, but they are not numbered from 0.")
-
+    table = read_splat_table(path)
     n = len(table)
-    means = _columns(table, ["x", "y", "z"])
-    quats = _columns(table, [f"rot_{i}" for i in range(4)])
-    scales = _columns(table, [f"scale_{i}" for i in range(3)]).astype(np.float64)
-    opacities = table["opacity"].astype(np.float64)
-    sh = np.empty((n, coefficients, 3), np.float32)
-    for channel in range(3):
-        sh[:, 0, channel] = table[f"f_dc_{channel}"]
-        for k in range(1, coefficients):
-            sh[:, k, channel] = table[rest_names[channel * (coefficients - 1) + k - 1]]
+    means = _columns(table, MEANS)
+    quats = _columns(table, QUATS)
+    scales = _columns(table, SCALES).astype(np.float64)
+    opacities = table[OPACITY].astype(np.float64)
+    sh = np.empty((n, coefficients_of(table), 3), np.float32)
+    for k, names in enumerate(sh_names(sh.shape[1])):
+        for channel, name in enumerate(names):
+            sh[:, k, channel] = table[name]
     warnings: list[str] = []
-    object_ids = _object_ids(table["object_id"], warnings) if "object_id" in names else np.zeros(n, np.int64)
-    marked = next((name for name in (UNOBSERVED, _FORMER_UNOBSERVED) if name in names), None)
-    unobserved = np.zeros(n, bool) if marked is None else table[marked] != 0
+    has_ids = OBJECT_ID in (table.dtype.names or ())
+    object_ids = _object_ids(table[OBJECT_ID], warnings) if has_ids else np.zeros(n, np.int64)
+    unobserved = unobserved_of(table)
 
     keep = _usable(means, quats, scales, opacities, sh)
     keep &= (scales < math.log(np.finfo(np.float32).max)).all(axis=1)
@@ -198,7 +173,7 @@ def read_splats(path: Path) -> tuple[Splats, list[str]]:
     return Splats(means, quats, scales, opacities, sh, object_ids, unobserved), warnings
 
 
-def _columns(table: NDArray, names: list[str]) -> NDArray:
+def _columns(table: NDArray, names: tuple[str, ...]) -> NDArray:
     """Return columns (N, len(names)), float64 if the file has doubles or 32-bit integers, otherwise float32."""
     kind = np.result_type(np.float32, *(table.dtype[name] for name in names))
     out = np.empty((len(table), len(names)), kind)
@@ -211,7 +186,7 @@ def _object_ids(column: NDArray, warnings: list[str]) -> NDArray:
     """Return object IDs as int64; invalid values (negative, too large, NaN) become 0, with a warning."""
     if column.dtype.kind == "f":
         values = column.astype(np.float64)
-        good = np.isfinite(values) & (values >= 0) & (values <= 0xFFFFFFFF)
+        good = np.isfinite(values) & (values >= 0) & (values <= LARGEST_ID)
         ids = np.where(good, np.rint(np.where(good, values, 0)), 0).astype(np.int64)
     else:
         ids = column.astype(np.int64)

@@ -69,15 +69,16 @@ def load_checkpoint(folder: Path, check: Check = _accept) -> tuple[Tensors, dict
     """Read the latest complete checkpoint.
 
     Args:
-        folder: Folder of the checkpoints.
+        folder: The folder of the checkpoint.
         check: Called with the tensors and the state, both as stored; raises ValueError, KeyError or TypeError if they
             are not those of a training.
 
     Returns:
-        The tensors, the state, and a warning or None; None if there is no checkpoint.
+        The tensors by name, the state, and a warning or None if the checkpoint is not the latest one that was written;
+        None if there is no checkpoint.
 
     Raises:
-        InputError: there are checkpoint files, but none can be read.
+        InputError: There are checkpoint files, but none can be read.
     """
     broken = None
     for name in (CURRENT, PREVIOUS):

@@ -16,11 +16,12 @@ from torch.nn.functional import pad
 
 from ..raster.kernel import kernel
 from ..raster.simd import LANES, above, exp2, keep, load, splat, spread, store, total, where
+from ..shared.splats.blending import ALPHA_MIN
 from .anchors import LOG_EXTENT_MAX, Layout
 from .heads import HIDDEN
 
-RAW_OPACITY_MIN = np.float32(math.atanh(1.0 / 255.0))
-"""Splats with an opacity below 1/255 are not generated."""
+RAW_OPACITY_MIN = np.float32(math.atanh(ALPHA_MIN))
+"""Splats with an opacity below ALPHA_MIN, which are never drawn, are not generated."""
 
 _CHUNK = 32
 """Number of anchors per chunk. Within a chunk, offsets are processed one by one, to keep their weights in the cache."""

@@ -99,7 +99,15 @@ def planned_capture(capture: Capture, plan: Plan) -> Capture:
 
 
 def planned_settings(settings: Settings, plan: Plan) -> Settings:
-    """Return the settings of a training as changed by its plan."""
+    """Change the settings of a training as its plan decides.
+
+    Args:
+        settings: The settings that were asked for.
+        plan: The plan, with the user's overrides.
+
+    Returns:
+        The settings without the weights of losses that the plan leaves out, and with an overridden image pyramid.
+    """
     if not plan.does("labels"):
         settings = replace(settings, semantic_weight=0.0)
     if not plan.does("surface"):

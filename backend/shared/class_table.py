@@ -7,6 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+LARGEST_ID = 2**32 - 1
+"""Largest object ID; 0 is "no object"."""
+
 
 class ClassTable:
     """The classes of a set of objects, in the order of their IDs.

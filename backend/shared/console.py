@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import Any, TextIO
 
-from .durations import clock
+from .durations import time_left
 from .events import Reporter
 
 SECONDS_BETWEEN_LINES = 5.0
@@ -71,7 +71,7 @@ class ConsoleReporter(Reporter):
         seconds_left = fields.get("seconds_left")
         if seconds_left is None and 0 < done <= total:
             seconds_left = (now - self._started) * (total - done) / done
-        left = [] if seconds_left is None or finished else [f"{clock(seconds_left)} left"]
+        left = [] if seconds_left is None or finished else [time_left(seconds_left)]
         text = ", ".join(left + _figures(self._kept))
         if self.on_terminal:
             self._draw_bar(done / total if total else 1.0, text)

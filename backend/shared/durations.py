@@ -8,3 +8,8 @@ def clock(seconds: float) -> str:
     whole = round(max(seconds, 0.0))
     hours, minutes = divmod(whole // 60, 60)
     return f"{hours}:{minutes:02d}:{whole % 60:02d}" if hours else f"{minutes}:{whole % 60:02d}"
+
+
+def time_left(seconds: float) -> str:
+    """Describe the estimated time until a job or step ends."""
+    return f"{clock(seconds)} left"

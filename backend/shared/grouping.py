@@ -11,9 +11,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from .class_table import LARGEST_ID
 from .errors import InputError
 from .formats.json_file import read_json
-from .reconstruction.objects import LARGEST_ID, SceneObject, find_object, merged
+from .reconstruction.objects import SceneObject, find_object, merged
 
 Changes = dict[int, dict[str, Any]]
 """Object ID -> edits, as for `edit_objects`."""
@@ -38,7 +39,19 @@ def read_groups(path: Path) -> dict[int, str]:
 
 
 def grouped(objects: Sequence[SceneObject], groups: Mapping[int, str], path: Path) -> Changes:
-    """Return edits that merge the IDs with the same name in `groups`, read from `path`, into the smallest of them."""
+    """Merge the objects of each group into the one with the smallest ID, which gets the name of the group.
+
+    Args:
+        objects: The objects of a reconstruction.
+        groups: ID -> name of its group, as from `read_groups`; IDs of no object are ignored.
+        path: The file of the groups, for error messages.
+
+    Returns:
+        The edits, which also undo earlier merges of these objects.
+
+    Raises:
+        InputError: `groups` contains none of the objects.
+    """
     members: dict[str, list[int]] = defaultdict(list)
     for entry in sorted(objects, key=lambda entry: entry.id):
         if entry.id in groups:
@@ -54,7 +67,19 @@ def grouped(objects: Sequence[SceneObject], groups: Mapping[int, str], path: Pat
 
 
 def chosen(objects: Sequence[SceneObject], words: Sequence[str], path: Path) -> Changes:
-    """Return edits that leave out all objects of `path` but those that `words` select and those merged into them."""
+    """Leave out all objects but the selected ones and those merged into them.
+
+    Args:
+        objects: The objects of a reconstruction.
+        words: IDs, names or parts of names, as in `find_object`.
+        path: objects.json or the folder of the masks, for error messages.
+
+    Returns:
+        The edits, which also undo that a selected object was left out.
+
+    Raises:
+        InputError: A word matches no object or several.
+    """
     wanted, into = {find_object(objects, word, path).id for word in words}, merged(objects)
     return {entry.id: {"left_out": None if into[entry.id] in wanted else True} for entry in objects}
 

@@ -64,17 +64,27 @@ def step_rows(
     return bad
 
 
-def _step_rows_on_gpu(values, exp_avg, exp_avg_sq, seen, gradients, rates, correction1, correction2, usable):
+def _step_rows_on_gpu(
+    values: torch.Tensor,
+    exp_avg: torch.Tensor,
+    exp_avg_sq: torch.Tensor,
+    seen: torch.Tensor,
+    gradients: torch.Tensor,
+    rates: torch.Tensor,
+    correction1: float,
+    correction2: float,
+    usable: torch.Tensor | None,
+) -> torch.Tensor:
     finite = gradients.abs().amax(1) < LARGEST_GRADIENT
     counted = torch.ones_like(finite) if usable is None else usable
     stepped = (finite & counted)[:, None]
     old_value, old_exp_avg, old_exp_avg_sq = values[seen], exp_avg[seen], exp_avg_sq[seen]
-    m = torch.lerp(gradients, old_exp_avg, BETA1)
-    v = (BETA2 * old_exp_avg_sq).addcmul_(gradients, gradients, value=1 - BETA2)
-    change = (m / correction1).div_((v / correction2).sqrt_().add_(EPSILON)).mul_(rates)
+    new_exp_avg = torch.lerp(gradients, old_exp_avg, BETA1)
+    new_exp_avg_sq = (BETA2 * old_exp_avg_sq).addcmul_(gradients, gradients, value=1 - BETA2)
+    change = (new_exp_avg / correction1).div_((new_exp_avg_sq / correction2).sqrt_().add_(EPSILON)).mul_(rates)
     values.index_copy_(0, seen, torch.where(stepped, old_value - change, old_value))
-    exp_avg.index_copy_(0, seen, torch.where(stepped, m, old_exp_avg))
-    exp_avg_sq.index_copy_(0, seen, torch.where(stepped, v, old_exp_avg_sq))
+    exp_avg.index_copy_(0, seen, torch.where(stepped, new_exp_avg, old_exp_avg))
+    exp_avg_sq.index_copy_(0, seen, torch.where(stepped, new_exp_avg_sq, old_exp_avg_sq))
     return (counted & ~finite).sum()
 
 
@@ -96,11 +106,11 @@ def _step_rows(values, exp_avg, exp_avg_sq, seen, gradients, rates, correction1,
             continue
         for j in range(values.shape[1]):
             g = gradients[i, j]
-            m = b1 * exp_avg[row, j] + (one - b1) * g
-            v = b2 * exp_avg_sq[row, j] + (one - b2) * g * g
-            exp_avg[row, j] = m
-            exp_avg_sq[row, j] = v
-            values[row, j] -= rates[j] * (m * c1) / (np.sqrt(v * c2) + np.float32(EPSILON))
+            new_exp_avg = b1 * exp_avg[row, j] + (one - b1) * g
+            new_exp_avg_sq = b2 * exp_avg_sq[row, j] + (one - b2) * g * g
+            exp_avg[row, j] = new_exp_avg
+            exp_avg_sq[row, j] = new_exp_avg_sq
+            values[row, j] -= rates[j] * (new_exp_avg * c1) / (np.sqrt(new_exp_avg_sq * c2) + np.float32(EPSILON))
     return bad.sum()
 
 

@@ -28,6 +28,9 @@ def measure_gains(capture: Capture) -> np.ndarray:
     The gain of a held-out view is interpolated between the preceding and the following training view of the same
     camera, in the order of their names.
 
+    Args:
+        capture: A prepared capture with V views, whose points COLMAP observed.
+
     Returns:
         (V, 3) float64 in display space, with a geometric mean of 1 over the training views; 1 for views with too few
         points or without such neighbors.

@@ -137,11 +137,15 @@ def model_from_checkpoint(tensors: dict[str, np.ndarray], state: dict[str, Any])
 def load_model(folder: Path, device: torch.device = devices.CPU) -> tuple[ObjectModel, dict[str, Any], str | None]:
     """Load the result of a training, the mean of the model over the latest steps.
 
+    Args:
+        folder: The folder of the checkpoint.
+        device: Where the model is to be.
+
     Returns:
         The model on `device`, the checkpoint's state, and a warning or None.
 
     Raises:
-        InputError: there is no checkpoint in `folder`, or none can be read.
+        InputError: There is no checkpoint in `folder`, or none can be read.
     """
     found = read_checkpoint(folder)
     if found is None:

@@ -19,7 +19,7 @@ RINGS = ((1.40, 0.47), (1.16, 0.98))  # Radius and height in meters.
 
 
 @dataclass
-class Thing:
+class DemoObject:
     """An object of the scene with its ID."""
 
     id: int
@@ -46,7 +46,7 @@ def rng_for(seed: int, *key: int) -> np.random.Generator:
     return np.random.default_rng([seed, *key])
 
 
-def build(objects: int, seed: int) -> tuple[bpy.types.Scene, list[Thing]]:
+def build(objects: int, seed: int) -> tuple[bpy.types.Scene, list[DemoObject]]:
     """Create a scene with `objects` objects on a table in a backdrop; IDs are 1..N, then table and backdrop."""
     scene = bpy.data.scenes.new("ObjectGS demo")
     kinds = list(shapes.MAKERS)
@@ -59,7 +59,7 @@ def build(objects: int, seed: int) -> tuple[bpy.types.Scene, list[Thing]]:
         if round_:
             mesh.transform(Matrix.Scale(float(rng.uniform(0.75, 0.95)), 4))
         mesh.materials.append(materials.material(kind, rng))
-        obj = Thing(i + 1, name, bpy.data.objects.new(name, mesh))
+        obj = DemoObject(i + 1, name, bpy.data.objects.new(name, mesh))
         scene.collection.objects.link(obj.object)
         objs.append(obj)
         sizes.append(_size(mesh))
@@ -73,7 +73,7 @@ def build(objects: int, seed: int) -> tuple[bpy.types.Scene, list[Thing]]:
     ):
         for i, look in enumerate(looks):
             mesh.materials.append(look(rng_for(seed, 2, len(objs), i)))
-        obj = Thing(len(objs) + 1, name, bpy.data.objects.new(name, mesh))
+        obj = DemoObject(len(objs) + 1, name, bpy.data.objects.new(name, mesh))
         scene.collection.objects.link(obj.object)
         objs.append(obj)
     for obj in objs:
@@ -186,7 +186,7 @@ def intrinsics(width: int, height: int) -> tuple[float, float, float, float]:
     return FOCAL * width, FOCAL * width, width / 2, height / 2
 
 
-def triangles(obj: Thing) -> tuple[np.ndarray, np.ndarray]:
+def triangles(obj: DemoObject) -> tuple[np.ndarray, np.ndarray]:
     """Return an object's vertices (V, 3) in world coordinates (meters) and its triangles (F, 3)."""
     mesh = obj.object.data
     mesh.calc_loop_triangles()

@@ -7,6 +7,7 @@ They use GPUShaderCreateInfo, which works with OpenGL, Metal and Vulkan.
 import gpu
 
 from ...backend.shared.color import srgb
+from ...backend.shared.color.recolor import LUMA
 from ...backend.shared.splats import spherical_harmonics as sh
 from ...backend.shared.splats.blending import ALPHA_MAX, ALPHA_MIN, EPS_2D, MAX_EXTENT
 
@@ -28,6 +29,7 @@ _CONSTANTS = f"""
 #define ALPHA_MIN {ALPHA_MIN!r}
 #define EPS_2D {EPS_2D!r}
 #define MAX_EXTENT {MAX_EXTENT!r}
+#define LUMA vec3({", ".join(repr(float(weight)) for weight in LUMA)})
 #define SH_C0 {sh.C0!r}
 #define SH_C1 {sh.C1!r}
 #define SH_C2 {sh.C2!r}
@@ -129,7 +131,7 @@ void main() {
     color = max(color, 0.0);
     vec4 own = at(objects, object + 9);
     // Keeps the brightness, so that shapes remain visible.
-    float shade = 0.5 + dot(color, vec3(0.299, 0.587, 0.114));
+    float shade = 0.5 + dot(color, LUMA);
     color = mix(color, own.rgb * shade, own.a);
     vec4 mark = at(objects, object + 10);
     color = mix(color, mark.rgb, mark.a);

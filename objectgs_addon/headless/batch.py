@@ -13,6 +13,7 @@ from ...backend.shared.errors import Cancelled, InputError
 from ...backend.shared.formats.atomic import write_atomic
 from ...backend.shared.formats.json_file import read_json, write_json
 from ...backend.shared.reconstruction.folder import Reconstruction
+from ...backend.shared.reconstruction.report import read_report
 from ...backend.shared.version import __version__
 from .commands import BLEND, PICTURE, StepFailed, absolute, find_backend, reconstruct, sentence
 
@@ -98,12 +99,12 @@ def _run_one(
     started = time.monotonic()
     try:
         reconstruct(capture, folder, options)
-        report = read_json(Reconstruction(folder).report_json)
+        report = read_report(folder)
         entry.update(
             state=DONE,
-            psnr=report["quality"]["psnr"],
-            miou=report["quality"]["miou"],
-            splats=report["model"]["gaussians"],
+            psnr=report.quality["psnr"],
+            miou=report.quality["miou"],
+            splats=report.model["gaussians"],
         )
     except (Cancelled, KeyboardInterrupt):
         entry["error"] = "Cancelled; the same command continues from there."

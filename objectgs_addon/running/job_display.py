@@ -7,7 +7,7 @@ import textwrap
 
 import bpy
 
-from ...backend.shared.durations import clock
+from ...backend.shared.durations import time_left
 from ..process.jobs import Job, State
 
 CHARACTER = 6.6
@@ -24,7 +24,7 @@ def summary(job: Job) -> str:
         return f"{job.title}: paused at {100 * job.progress:.0f} %"
     if job.state is State.STOPPING:
         return f"{job.title}: saving and stopping"
-    left = f", {clock(job.seconds_left)} left" if job.seconds_left is not None else ""
+    left = f", {time_left(job.seconds_left)}" if job.seconds_left is not None else ""
     return f"{job.title}: {100 * job.progress:.0f} %{left}"
 
 
@@ -34,7 +34,7 @@ def draw_running(layout: bpy.types.UILayout, job: Job, index: int) -> None:
     if job.state is State.WAITING:
         row.label(text=summary(job), icon="TIME")
     else:
-        left = f"{clock(job.seconds_left)} left" if job.seconds_left is not None else ""
+        left = time_left(job.seconds_left) if job.seconds_left is not None else ""
         text = {State.PAUSED: "Paused", State.STOPPING: "Saving and stopping"}.get(job.state, left)
         row.progress(factor=job.progress, text=f"{100 * job.progress:.0f} %   {text}")
     if job.can_pause:

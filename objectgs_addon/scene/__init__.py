@@ -34,7 +34,7 @@ from .meshes.show import (
     show_meshes,
     shown_kinds,
 )
-from .objects_file import Objects
+from .object_display import Objects
 from .orientation import orient_to_ground, scale_to_distance
 from .points import color_points_by
 from .result import Shown, result_is_newer, show_label, show_objects, show_result

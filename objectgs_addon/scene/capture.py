@@ -33,7 +33,7 @@ from .kinds import (
     parent_of,
     points_of,
 )
-from .objects_file import Objects
+from .object_display import Objects
 from .points import read_points, show_points
 
 ORIGIN = "objectgs_origin"
@@ -62,7 +62,7 @@ def show_capture(
     if any("\ud800" <= character <= "\udfff" for character in str(folder)):
         raise InputError(f"{str(folder)!r} is not valid Unicode, which Blender cannot store; rename the folder.")
     cameras = read_cameras(folder)
-    table = read_points(folder)
+    points = read_points(folder)
     objects = Objects.read(folder)
     if root is None:
         root = next(
@@ -90,7 +90,7 @@ def show_capture(
         mark(capture, CAPTURE)
         adopt(capture, root, (CAMERA, POINTS))
     root[WARNINGS] = "\n".join(show_cameras(capture, parent, cameras))
-    show_points(capture, parent, f"{root.name} points", table, cameras.origin, objects)
+    show_points(capture, parent, f"{root.name} points", points, cameras.origin, objects)
 
     # Linked last, since Blender updates all view layers for each link below a scene.
     if new_capture:

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 import bpy
 import numpy as np
 
+from ...backend.shared.class_table import LARGEST_ID
 from ...backend.shared.errors import InputError
 
 # Attribute type -> field name for foreach_set, NumPy type and number of components per vertex.
@@ -79,3 +80,8 @@ def read(mesh: bpy.types.Mesh, name: str) -> np.ndarray:
 def stored_ids(ids: np.ndarray) -> np.ndarray:
     """Reinterpret the bits of IDs 0 .. 2^32 - 1 as int32, the integer type of attributes."""
     return np.asarray(ids, np.int64).astype(np.uint32).view(np.int32)
+
+
+def read_ids(mesh: bpy.types.Mesh, name: str) -> np.ndarray:
+    """Return the object IDs of an attribute written with `stored_ids`, (n,) int64 in 0 .. 2^32 - 1."""
+    return read(mesh, name).astype(np.int64) & LARGEST_ID

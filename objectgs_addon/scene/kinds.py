@@ -12,6 +12,8 @@ from typing import Any
 
 import bpy
 
+from ...backend.shared.class_table import LARGEST_ID
+
 KIND = "objectgs_kind"  # Not "objectgs": before Blender 5.0, it would collide with the property group of that name.
 OBJECT_ID = "object_id"
 FOLDER = "objectgs_folder"
@@ -61,7 +63,7 @@ def to_stored(object_id: int) -> int:
 
 def from_stored(value: int) -> int:
     """Convert the result of `to_stored` back to an object ID."""
-    return value & 0xFFFFFFFF
+    return value & LARGEST_ID
 
 
 def folder_of(root: bpy.types.Collection) -> Path:

@@ -20,7 +20,7 @@ from .kinds import (
     part_of,
     parts_of,
 )
-from .objects_file import Objects
+from .object_display import Objects
 
 NAME = "objectgs_name"
 CENTER = "objectgs_center"

@@ -7,11 +7,11 @@ import bpy
 import numpy as np
 
 from ...backend.shared.errors import InputError
-from ...backend.shared.formats.ply import read_vertices
+from ...backend.shared.formats.points_ply import LabeledPoints, read_shown_points
 from ...backend.shared.reconstruction.folder import Reconstruction
 from . import carrier
 from .kinds import POINTS, mark, part_of, points_of
-from .objects_file import Objects, linear_colors
+from .object_display import Objects, linear_colors
 from .shading.materials import points_material
 from .shading.modifiers import modifier_of, set_input
 from .shading.node_groups import POINTS_GROUP, points_group
@@ -22,8 +22,8 @@ SIZE = 0.004
 COLORINGS = ("photo", "object")
 
 
-def read_points(folder: Path) -> np.ndarray:
-    """Return points.ply as a structured array.
+def read_points(folder: Path) -> LabeledPoints:
+    """Return the labeled points of a reconstruction folder.
 
     Raises:
         InputError: points.ply is missing or lacks required properties.
@@ -31,28 +31,19 @@ def read_points(folder: Path) -> np.ndarray:
     path = Reconstruction(folder).points
     if not path.is_file():
         raise InputError(f"{folder} has no points.ply; run Import again.")
-    table = read_vertices(path)
-    missing = {"x", "y", "z", "red", "green", "blue", "object_id"} - set(table.dtype.names)
-    if missing:
-        raise InputError(f"{path} has no property {', '.join(sorted(missing))}; run Import again.")
-    return table
-
-
-def positions_of(table: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """Return the (n, 3) float64 positions of a table in reconstruction coordinates."""
-    return np.stack([table[axis].astype(np.float64) - origin[i] for i, axis in enumerate("xyz")], axis=1)
+    return read_shown_points(path)
 
 
 def show_points(
     capture: bpy.types.Collection,
     parent: bpy.types.Object,
     name: str,
-    table: np.ndarray,
+    points: LabeledPoints,
     origin: np.ndarray,
     objects: Objects,
 ) -> None:
     """Create or update the Blender object of the point cloud in `capture`."""
-    positions = positions_of(table, origin)
+    positions = points.xyz - origin
     obj = part_of(capture, POINTS)
     if obj is None:
         mesh = bpy.data.meshes.new(name)
@@ -66,18 +57,15 @@ def show_points(
         set_input(modifier, "Size", SIZE * _diagonal(positions))
         set_input(modifier, "Material", mesh.materials[0])
         capture.objects.link(obj)
-    ids = table["object_id"].astype(np.int64)
-    margins = table["margin"] if "margin" in (table.dtype.names or ()) else np.zeros(len(table), np.float32)
-    photo = np.stack([table[channel] for channel in ("red", "green", "blue")], axis=1)
     active = obj.data.attributes.active_color_name
     carrier.fill(
         obj.data,
         positions,
         {
-            "photo": ("FLOAT_COLOR", linear_colors(photo)),
-            "object": ("FLOAT_COLOR", objects.colors(ids)),
-            "object_id": ("INT", carrier.stored_ids(ids)),
-            "margin": ("FLOAT", margins),
+            "photo": ("FLOAT_COLOR", linear_colors(points.rgb)),
+            "object": ("FLOAT_COLOR", objects.colors(points.ids)),
+            "object_id": ("INT", carrier.stored_ids(points.ids)),
+            "margin": ("FLOAT", points.margins),
         },
     )
     _activate(obj, active if active in COLORINGS else "photo")

@@ -14,6 +14,7 @@ import numpy as np
 
 from ...backend.shared.color.palette import to_linear
 from ...backend.shared.errors import InputError
+from ...backend.shared.formats.splat_ply import ids_of
 from ...backend.shared.reconstruction.folder import Reconstruction
 from . import carrier
 from .capture import origin_of
@@ -36,11 +37,19 @@ from .kinds import (
 )
 from .meshes.show import apply_shown, update_meshes
 from .object_collection import NAME, center_of, ensure_pivot, new_collection, paint, remove, remove_if_empty, rename
-from .objects_file import Objects
-from .points import positions_of, read_points, show_points
+from .object_display import Objects
+from .points import read_points, show_points
 from .shading.materials import splats_material
 from .shading.modifiers import add_splats_modifiers, use_material
-from .splats import anchor_attributes, ids_of, median_scale, read_anchors, read_splats, splat_attributes, unique_ids
+from .splats import (
+    anchor_attributes,
+    median_scale,
+    positions_of,
+    read_anchors,
+    read_splats,
+    splat_attributes,
+    unique_ids,
+)
 
 GROUPING = "objectgs_grouping"
 SHOWN = "objectgs_shown"

@@ -431,4 +431,4 @@ def active_changed(properties: Any, context: bpy.types.Context) -> None:
     root = properties.id_data
     item = object_list.active_item(root)
     if item is not None:
-        selection.select_object(context, root, object_list.shown_as(root, from_stored(item.object_id)))
+        selection.select_object(context, root, object_list.merge_target(root, from_stored(item.object_id)))

@@ -9,7 +9,7 @@ import bpy
 
 from ...backend.shared.color.recolor import Recolor
 from ...backend.shared.errors import InputError
-from ...backend.shared.reconstruction.objects import SceneObject, merged
+from ...backend.shared.reconstruction.objects import follow_merges
 from .. import scene
 from ..picking import selection
 from ..scene import from_stored
@@ -35,22 +35,16 @@ def item_of(root: bpy.types.Collection, object_id: int) -> Any:
 def shown_item(root: bpy.types.Collection) -> Any:
     """Return the active row or the row it is merged into; None if the list is empty."""
     item = active_item(root)
-    return item and item_of(root, shown_as(root, from_stored(item.object_id)))
+    return item and item_of(root, merge_target(root, from_stored(item.object_id)))
 
 
-def shown_as(root: bpy.types.Collection, object_id: int) -> int:
+def merge_target(root: bpy.types.Collection, object_id: int) -> int:
     """Return the ID of the object into which `object_id` is merged, or `object_id` itself."""
-    rows = [
-        SceneObject(
-            from_stored(item.object_id),
-            item.name,
-            (0, 0, 0),
-            0,
-            from_stored(item.merged_into) if item.is_merged else None,
-        )
+    into = {
+        from_stored(item.object_id): from_stored(item.merged_into) if item.is_merged else None
         for item in root.objectgs.objects
-    ]
-    return merged(rows).get(object_id, object_id)
+    }
+    return follow_merges(into).get(object_id, object_id)
 
 
 def chosen_ids(context: bpy.types.Context, root: bpy.types.Collection) -> list[int]:
@@ -59,7 +53,7 @@ def chosen_ids(context: bpy.types.Context, root: bpy.types.Collection) -> list[i
     item = active_item(root)
     if not ids and item is not None:
         ids = [from_stored(item.object_id)]
-    return list(dict.fromkeys(shown_as(root, object_id) for object_id in ids if object_id))
+    return list(dict.fromkeys(merge_target(root, object_id) for object_id in ids if object_id))
 
 
 def require_chosen_ids(context: bpy.types.Context, root: bpy.types.Collection) -> list[int]:

@@ -21,7 +21,7 @@ from bpy.props import (
 
 from ...backend.shared.defaults import MAX_SIZE
 from ...backend.shared.expectation import PRESET_STEPS
-from ...backend.shared.reconstruction.fill import UNOBSERVED
+from ...backend.shared.formats.splat_ply import UNOBSERVED
 from .. import drawing
 from ..scene import SHOWS, color_points_by, kind_of, show_kinds, shown_kinds
 from . import object_edits
@@ -53,6 +53,17 @@ def _color_edit(name: str, default: float, description: str) -> Any:
         options=set(),
         description=description,
         update=object_edits.recolor_changed,
+    )
+
+
+def image_size() -> Any:
+    """Return the property of the longest side of the images, for a reconstruction and for its import."""
+    return IntProperty(
+        name="Image Size",
+        default=MAX_SIZE,
+        min=64,
+        soft_max=8192,
+        description="Longest side in pixels; larger photos are scaled down",
     )
 
 
@@ -166,13 +177,7 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
             ("correspondence", "Correspondence", "Only photos in which COLMAP matched the point"),
         ],
     )
-    max_size: IntProperty(
-        name="Image Size",
-        default=MAX_SIZE,
-        min=64,
-        soft_max=8192,
-        description="Longest side in pixels; larger photos are scaled down",
-    )
+    max_size: image_size()
     color_by: EnumProperty(
         name="Color Points By",
         default="photo",

@@ -3,12 +3,9 @@
 
 import bpy
 
-from ...objectgs_addon import scene
-from ...objectgs_addon.environment import locations
-from ...objectgs_addon.running import background
 from ...objectgs_addon.state import planning
-from ...objectgs_addon.state.folder_state import folder_state
 from ..common import need
+from ..common.jobs import submit_for_capture
 
 
 class AnalyzeCapture(bpy.types.Operator):
@@ -22,19 +19,8 @@ class AnalyzeCapture(bpy.types.Operator):
         return need.work_on_capture(cls, context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        root = need.active_root(context)
-        folder = scene.folder_of(root)
-        job = locations.backend_job(
-            f"Analyze {root.name}",
-            "plan",
-            folder,
-            "plan",
-            str(folder_state(folder).capture),
-            "--out",
-            str(folder),
-            *planning.arguments(root),
-        )
-        return background.submit(job, context.scene, self.report)
+        arguments = planning.arguments(need.active_root(context))
+        return submit_for_capture(self, context, "Analyze", "plan", *arguments)
 
 
 CLASSES = (AnalyzeCapture,)

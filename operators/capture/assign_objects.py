@@ -3,11 +3,8 @@
 
 import bpy
 
-from ...objectgs_addon import scene
-from ...objectgs_addon.environment import locations
-from ...objectgs_addon.running import background
-from ...objectgs_addon.state.folder_state import folder_state
 from ..common import need
+from ..common.jobs import submit_for_capture
 
 
 class AssignObjects(bpy.types.Operator):
@@ -21,22 +18,9 @@ class AssignObjects(bpy.types.Operator):
         return need.work_on_capture(cls, context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        root = need.active_root(context)
-        folder = scene.folder_of(root)
-        job = locations.backend_job(
-            f"Assign objects of {root.name}",
-            "vote",
-            folder,
-            "vote",
-            str(folder_state(folder).capture),
-            "--out",
-            str(folder),
-            "--strategy",
-            root.objectgs.strategy,
-            "--max-size",
-            str(root.objectgs.max_size),
-        )
-        return background.submit(job, context.scene, self.report)
+        properties = need.active_root(context).objectgs
+        arguments = ("--strategy", properties.strategy, "--max-size", str(properties.max_size))
+        return submit_for_capture(self, context, "Assign objects of", "vote", *arguments)
 
 
 CLASSES = (AssignObjects,)

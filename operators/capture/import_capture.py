@@ -4,15 +4,16 @@
 from pathlib import Path
 
 import bpy
-from bpy.props import BoolProperty, IntProperty, StringProperty
+from bpy.props import BoolProperty, StringProperty
 
-from ...backend.shared.defaults import MAX_SIZE
 from ...backend.shared.errors import InputError
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
 from ...objectgs_addon.state.folder_state import folder_state
+from ...objectgs_addon.state.properties import image_size
 from ..common import need
+from ..common.jobs import folder_to_import_to
 from ..common.reporting import reports_errors
 
 
@@ -32,13 +33,7 @@ class ImportCapture(bpy.types.Operator):
         description="Path of the reconstruction folder, which may grow to gigabytes. If empty, it is named after the "
         "capture, in the folder set in the preferences",
     )
-    max_size: IntProperty(
-        name="Image Size",
-        default=MAX_SIZE,
-        min=64,
-        soft_max=8192,
-        description="Longest side in pixels; larger photos are scaled down",
-    )
+    max_size: image_size()
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
@@ -58,9 +53,7 @@ class ImportCapture(bpy.types.Operator):
         capture = Path(bpy.path.abspath(self.directory)).resolve() if self.directory else None
         if capture is None or not capture.is_dir():
             raise InputError(f"The folder {capture or 'of the capture'} does not exist; choose another")
-        folder = Path(bpy.path.abspath(self.folder)).resolve() if self.folder else _folder_for(capture)
-        need.require_unused(folder)
-        Reconstruction(folder).require_own()
+        folder = folder_to_import_to(self.folder, lambda: _folder_for(capture))
         job = locations.backend_job(
             f"Import {capture.name}",
             "import",

@@ -5,11 +5,22 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-from bpy.props import BoolProperty, StringProperty
+from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from ...backend.shared.errors import InputError
 from ...objectgs_addon.state import object_list
 from . import need
+
+
+def objects_choice(all_objects: str) -> Any:
+    """Return the property of the objects to export; `all_objects` describes the choice of all."""
+    return EnumProperty(
+        name="Objects",
+        items=[
+            ("ALL", "All", all_objects),
+            ("SELECTED", "Selected", "The objects selected in the viewport, or the active one of the list"),
+        ],
+    )
 
 
 class ExportDialog:

@@ -7,7 +7,7 @@ from bpy.props import EnumProperty, StringProperty
 from ...objectgs_addon import scene
 from ...objectgs_addon.scene.meshes import export as mesh_export
 from ..common import need
-from ..common.export_dialog import ExportDialog
+from ..common.export_dialog import ExportDialog, objects_choice
 from ..common.reporting import reports_errors
 
 
@@ -29,13 +29,7 @@ class ExportMeshes(ExportDialog, bpy.types.Operator):
             ("obj", "OBJ", "Materials and textures in files next to the file"),
         ],
     )
-    objects: EnumProperty(
-        name="Objects",
-        items=[
-            ("ALL", "All", "Every object that has a mesh and is not removed"),
-            ("SELECTED", "Selected", "The objects selected in the viewport, or the active one of the list"),
-        ],
-    )
+    objects: objects_choice("Every object that has a mesh and is not removed")
     coordinates: EnumProperty(
         name="Coordinates",
         items=[

@@ -4,7 +4,7 @@
 import bpy
 from bpy.props import BoolProperty
 
-from ...backend.shared.reconstruction.fill import UNOBSERVED
+from ...backend.shared.formats.splat_ply import UNOBSERVED
 from ...objectgs_addon import scene
 from ...objectgs_addon.state import object_edits, object_list
 from ..common import need

@@ -34,7 +34,7 @@ class SelectByName(bpy.types.Operator):
             return {"CANCELLED"}
         names = {scene.from_stored(item.object_id): item.name for item in root.objectgs.objects}
         found = list(
-            dict.fromkeys(object_list.shown_as(root, object_id) for object_id in find_by_name(self.query, names))
+            dict.fromkeys(object_list.merge_target(root, object_id) for object_id in find_by_name(self.query, names))
         )
         if not found:
             self.report({"WARNING"}, f"No object is called {self.query}")

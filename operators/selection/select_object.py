@@ -25,7 +25,7 @@ class SelectObject(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         root = need.active_root(context)
         item = object_list.active_item(root)
-        object_id = object_list.shown_as(root, scene.from_stored(item.object_id))
+        object_id = object_list.merge_target(root, scene.from_stored(item.object_id))
         if not selection.select_object(context, root, object_id, self.extend):
             self.report({"WARNING"}, f"{item.name} is hidden or has no splats and no mesh yet")
             return {"CANCELLED"}

@@ -26,7 +26,7 @@ class SoloObject(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         root = need.active_root(context)
         item = object_list.active_item(root)
-        object_id = object_list.shown_as(root, scene.from_stored(item.object_id))
+        object_id = object_list.merge_target(root, scene.from_stored(item.object_id))
         if not visibility.toggle_solo(context.view_layer, root, object_id):
             self.report({"WARNING"}, f"{item.name} has no splats to show")
             return {"CANCELLED"}

@@ -9,7 +9,7 @@ from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
 from ...objectgs_addon.state import object_edits
 from ..common import need
-from ..common.export_dialog import ExportDialog
+from ..common.export_dialog import ExportDialog, objects_choice
 from ..common.reporting import reports_errors
 
 
@@ -28,13 +28,7 @@ class ExportSplats(ExportDialog, bpy.types.Operator):
             ("splat", "Splat", "For web viewers: one color per splat, independent of the view direction"),
         ],
     )
-    objects: EnumProperty(
-        name="Objects",
-        items=[
-            ("ALL", "All", "Everything except objects that are removed or left out"),
-            ("SELECTED", "Selected", "The objects selected in the viewport, or the active one of the list"),
-        ],
-    )
+    objects: objects_choice("Everything except objects that are removed or left out")
     coordinates: EnumProperty(
         name="Coordinates",
         items=[

@@ -7,10 +7,10 @@ import bpy
 from bpy.props import StringProperty
 
 from ...backend.shared.errors import InputError
-from ...backend.shared.reconstruction.folder import Reconstruction
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
 from ..common import need
+from ..common.jobs import folder_to_import_to
 from ..common.reporting import reports_errors
 
 
@@ -59,9 +59,7 @@ class ImportSplats(bpy.types.Operator):
         ply = Path(bpy.path.abspath(self.filepath)).resolve()
         if not self.filepath or not ply.is_file():
             raise InputError(f"The file {self.filepath} does not exist; choose another")
-        folder = Path(bpy.path.abspath(self.folder)).resolve() if self.folder else _folder_for(ply)
-        need.require_unused(folder)
-        Reconstruction(folder).require_own()
+        folder = folder_to_import_to(self.folder, lambda: _folder_for(ply))
         arguments = ["import-splats", str(ply), "--out", str(folder)]
         if self.capture:
             arguments += ["--capture", str(Path(bpy.path.abspath(self.capture)).resolve())]

@@ -116,8 +116,8 @@ def test_unrecoverable_splat_is_reported_and_removed(trainer, monkeypatch, value
     (sentence,) = trained._warnings
     assert f"{what} is not finite, because of splat {splat} of anchor {int(near)} ({name})" in sentence
     assert sentence.endswith("it was removed from the model.")
-    for share in (0.3, 0.6):
-        assert trained.step(share).isfinite()
+    for progress in (0.3, 0.6):
+        assert trained.step(progress).isfinite()
     assert trained.progress.faults == {what: 1}
 
 

@@ -22,7 +22,7 @@ from PIL import Image
 from backend import commands
 from backend.capture import load_capture
 from backend.cli import main as arguments
-from backend.commands.capture import votes
+from backend.commands import votes
 from backend.commands.setup.machine import set_threads
 from backend.export import agreement, fit_splats, read_splats
 from backend.labels import read_points
@@ -672,9 +672,9 @@ def test_stop_line_on_stdin_stops_training(trained, run_command, monkeypatch):
 
     original = Trainer.step
 
-    def step(self, share):
+    def step(self, progress):
         begun.set()
-        return original(self, share)
+        return original(self, progress)
 
     monkeypatch.setattr(Trainer, "step", step)
     monkeypatch.setattr(sys, "stdin", Typed())

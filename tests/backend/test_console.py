@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from backend.shared import console
-from backend.shared.console import ConsoleReporter, clock
+from backend.shared.console import ConsoleReporter
+from backend.shared.durations import clock
 
 
 class Terminal(io.StringIO):

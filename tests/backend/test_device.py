@@ -351,12 +351,12 @@ def test_gpu_step_does_not_synchronize(tiny, as_on_gpu, settings):
     as_on_gpu(True)
     capture, ids = tiny()
     trainer = Trainer.start(capture, ids, settings)
-    for share in (0.3, 0.3, 0.8):
-        trainer.step(share)
+    for progress in (0.3, 0.3, 0.8):
+        trainer.step(progress)
     trainer.progress.last_growth = trainer.progress.step
     with SyncRecorder() as recorder:
-        for share in (0.3, 0.8):
-            trainer.step(share)
+        for progress in (0.3, 0.8):
+            trainer.step(progress)
     assert not recorder.found
     with SyncRecorder() as recorder:
         float(trainer.step(0.8))
@@ -407,7 +407,7 @@ from backend.training.settings import Settings
 capture = load_capture(sys.argv[1], sys.argv[2])
 for primitive in ("3d", "2d"):
     trainer = Trainer.start(capture, vote(capture).ids, Settings(offsets=1, primitive=primitive, voxel=0.3))
-    print(*(float(trainer.step(share)) for share in (0.3, 0.8)))
+    print(*(float(trainer.step(progress)) for progress in (0.3, 0.8)))
     print(draw(trainer.model, trainer.scene.camera(0)).image.mean())
 """
 

@@ -57,23 +57,33 @@ def documented_rules() -> dict[str, set[str]]:
     return rules
 
 
+def project_imports() -> list[tuple[Path, int, str, str, tuple[str, ...]]]:
+    """Return file, line, importing folder, imported folder and module of each import inside the project."""
+    return [
+        (path, line, rule_folder_of(module_of(path)), rule_folder_of(module), module)
+        for path in SOURCES
+        for module, line in imports_of(path)
+        if module and module[0] in PACKAGES
+    ]
+
+
 def violations() -> list[str]:
     rules = documented_rules()
-    found = []
-    for path in SOURCES:
-        here = rule_folder_of(module_of(path))
-        for module, line in imports_of(path):
-            if module[:1] not in {(package,) for package in PACKAGES}:
-                continue
-            there = rule_folder_of(module)
-            allowed = rules.get(here, set())
-            if there != here and there not in allowed:
-                found.append(f"{path.relative_to(ROOT)}:{line} imports {'.'.join(module)}")
-    return found
+    return [
+        f"{path.relative_to(ROOT)}:{line} imports {'.'.join(module)}"
+        for path, line, here, there, module in project_imports()
+        if there != here and there not in rules.get(here, set())
+    ]
 
 
 def test_imports_follow_the_documented_rules():
     assert not violations()
+
+
+def test_every_documented_rule_is_used():
+    used = {(here, there) for _, _, here, there, _ in project_imports()}
+    documented = {(here, there) for here, targets in documented_rules().items() for there in targets}
+    assert not documented - used
 
 
 def test_documented_rules_are_acyclic():
@@ -89,6 +99,16 @@ def test_documented_rules_are_acyclic():
 
     for folder in list(rules):
         visit(folder, ())
+
+
+def test_no_two_subfolders_import_each_other():
+    pairs = set()
+    for path, *_, module in project_imports():
+        here, there = path.parent.relative_to(ROOT), Path(*module)
+        there = there if (ROOT / there).is_dir() else there.parent
+        if not here.is_relative_to(there) and not there.is_relative_to(here):
+            pairs.add((here, there))
+    assert not {pair for pair in pairs if pair[::-1] in pairs}
 
 
 def outside_imports(folder: str) -> dict[str, str]:
@@ -180,3 +200,13 @@ def test_reconstruction_file_names_have_one_owner():
     # Captures have a separate truth/objects.json.
     places["objects.json"] -= {"objectgs_addon/demo/capture.py", "backend/evaluation/truth.py"}
     assert places == {name: {f"backend/shared/reconstruction/{owner}.py"} for name, owner in OWNERS.items()}
+
+
+def test_the_properties_of_splats_have_one_owner():
+    places = {
+        str(path.relative_to(ROOT))
+        for path in SOURCES
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and node.value in ("f_dc_0", "f_rest_", "rot_0")
+    }
+    assert places == {"backend/shared/formats/splat_ply.py"}

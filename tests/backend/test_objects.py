@@ -8,7 +8,15 @@ import pytest
 
 from backend.shared.color.recolor import Recolor
 from backend.shared.errors import InputError
-from backend.shared.reconstruction.objects import SceneObject, edit_objects, merged, read_objects, write_objects
+from backend.shared.reconstruction.objects import (
+    SceneObject,
+    edit_objects,
+    members_of,
+    merged,
+    read_objects,
+    shown_as,
+    write_objects,
+)
 
 MUG = {"id": 1, "name": "mug", "color": [10, 20, 30], "points": 812}
 BOX = {"id": 2**32 - 1, "name": "box", "color": [40, 50, 60], "points": 7}
@@ -101,6 +109,19 @@ def test_chained_merges_are_resolved(into, shown):
 def test_circular_merges_terminate():
     circle = merged([SceneObject(i, "", (0, 0, 0), 1, i % 3 + 1) for i in (1, 2, 3)])
     assert set(circle) == {1, 2, 3} and set(circle.values()) <= {1, 2, 3}
+
+
+def test_what_is_left_out_is_not_shown_nor_what_is_merged_into_it():
+    objects = [
+        SceneObject(1, "", (0, 0, 0), 1, merged_into=2),
+        SceneObject(2, "", (0, 0, 0), 1, merged_into=3),
+        SceneObject(3, "", (0, 0, 0), 1),
+        SceneObject(4, "", (0, 0, 0), 1, merged_into=5),
+        SceneObject(5, "", (0, 0, 0), 1, left_out=True),
+        SceneObject(6, "", (0, 0, 0), 1, merged_into=3, left_out=True),
+    ]
+    assert shown_as(objects) == {1: 3, 2: 3, 3: 3, 4: None, 5: None, 6: None}
+    assert members_of(objects, 3) == [1, 2, 3, 6] and members_of(objects, 5) == [4, 5] and members_of(objects, 1) == []
 
 
 @pytest.mark.parametrize(

@@ -11,11 +11,12 @@ import pytest
 from PIL import Image
 
 from backend.evaluation import comparison, contact_sheet, id_image, save_image, write_report
-from backend.evaluation.report import complete
 from backend.evaluation.report_plots import plot_curve, plot_objects
 from backend.evaluation.report_text import duration
 from backend.shared.color.palette import UNLABELED, colors_of, object_colors, to_linear
+from backend.shared.errors import InputError
 from backend.shared.reconstruction.folder import Reconstruction
+from backend.shared.reconstruction.report import Report, complete, read_report
 
 
 def a_report():
@@ -54,7 +55,7 @@ def strictly(text):
 
 
 def test_report_json_has_all_keys_and_null_if_unmeasured(reconstruction):
-    returned = write_report(reconstruction, a_report())
+    returned = write_report(reconstruction, Report(**a_report())).as_dict()
     report = strictly(reconstruction.report_json.read_text(encoding="utf-8"))
     assert report == returned
     assert report["quality"] == {
@@ -76,8 +77,17 @@ def test_report_json_has_all_keys_and_null_if_unmeasured(reconstruction):
     assert report["capture"]["images"] == 48
 
 
+def test_report_is_read_as_written(reconstruction):
+    written = write_report(reconstruction, Report(**a_report()))
+    assert read_report(reconstruction.folder) == written
+    for content in ("[]", '{"quality": [1]}', "{"):
+        reconstruction.report_json.write_text(content)
+        with pytest.raises(InputError, match=r"report\.json"):
+            read_report(reconstruction.folder)
+
+
 def test_empty_report_has_only_null(reconstruction):
-    report = write_report(reconstruction, {})
+    report = write_report(reconstruction, Report()).as_dict()
     assert set(report["quality"].values()) == {None}
     assert report["model"] == {"anchors": None, "gaussians": None, "bytes": None}
     assert [report[name] for name in ("left_out", "stages", "curve", "objects")] == [[]] * 4
@@ -107,13 +117,13 @@ def test_empty_report_has_only_null(reconstruction):
 )
 def test_invalid_entry_is_reported_and_nothing_written(reconstruction, change, where):
     with pytest.raises(ValueError, match=where):
-        write_report(reconstruction, {**a_report(), **change})
+        write_report(reconstruction, Report(**{**a_report(), **change}))
     assert not reconstruction.report_json.exists() and not reconstruction.report_md.exists()
 
 
 def test_report_md_shows_figures_images_and_omissions(reconstruction):
     gray = Image.new("RGB", (40, 30), (128, 128, 128))
-    write_report(reconstruction, a_report(), [("View a.png", gray), ("View ../b", gray)], title="Demo")
+    write_report(reconstruction, Report(**a_report()), [("View a.png", gray), ("View ../b", gray)], title="Demo")
     text = reconstruction.report_md.read_text(encoding="utf-8")
     for wanted in (
         "# Demo",
@@ -157,7 +167,7 @@ def with_meshes():
 
 def test_report_md_lists_meshes_and_reasons_for_missing_ones(reconstruction):
     sheet = Image.new("RGB", (300, 200), (250, 250, 250))
-    returned = write_report(reconstruction, with_meshes(), mesh_sheet=sheet)
+    returned = write_report(reconstruction, Report(**with_meshes()), mesh_sheet=sheet).as_dict()
     report = strictly(reconstruction.report_json.read_text(encoding="utf-8"))
     assert report == returned
     assert report["objects"][0]["mesh"]["f1_005"] == 0.61 and report["objects"][1]["mesh"]["f1"] is None
@@ -175,7 +185,7 @@ def test_report_md_lists_meshes_and_reasons_for_missing_ones(reconstruction):
     assert "not meshed" not in section
     assert "![Each mesh: surface, wireframe and texture](pictures/meshes.png)" in section
     assert (np.asarray(Image.open(reconstruction.pictures / "meshes.png")) == np.asarray(sheet)).all()
-    write_report(reconstruction, a_report())
+    write_report(reconstruction, Report(**a_report()))
     assert not (reconstruction.pictures / "meshes.png").exists(), "the image of removed meshes is deleted"
 
 
@@ -184,13 +194,13 @@ def test_mesh_table_without_truth_omits_columns(reconstruction):
     for entry in (report["objects"][0]["mesh"], report["objects"][1]["mesh"], report["meshes"][0]):
         for name in ("chamfer", "precision", "recall", "f1", "f1_005", "f1_all"):
             entry[name] = None
-    write_report(reconstruction, report)
+    write_report(reconstruction, Report(**report))
     section = reconstruction.report_md.read_text(encoding="utf-8").split("## Meshes")[1]
     assert "F1" not in section and "Chamfer" not in section and "Texture" in section
 
 
 def test_names_are_escaped_in_tables(reconstruction):
-    write_report(reconstruction, a_report())
+    write_report(reconstruction, Report(**a_report()))
     lines = reconstruction.report_md.read_text(encoding="utf-8").splitlines()
     row = next(line for line in lines if "tea" in line and line.startswith("|"))
     assert r"tea\|pot" in row
@@ -198,7 +208,7 @@ def test_names_are_escaped_in_tables(reconstruction):
 
 
 def test_swatches_have_object_colors(reconstruction):
-    write_report(reconstruction, a_report(), colors={2: (1, 2, 3)})
+    write_report(reconstruction, Report(**a_report()), colors={2: (1, 2, 3)})
     swatches = reconstruction.pictures / "swatches"
     assert Image.open(swatches / "2.png").getpixel((4, 4)) == (1, 2, 3)
     assert Image.open(swatches / "70000.png").getpixel((4, 4)) == object_colors([70_000])[70_000]
@@ -206,16 +216,16 @@ def test_swatches_have_object_colors(reconstruction):
 
 def test_only_worst_of_many_objects_are_listed(reconstruction):
     objects = [{"id": i, "name": f"thing {i}", "iou": i / 1000} for i in range(1, 501)]
-    report = write_report(reconstruction, {"objects": objects})
+    report = write_report(reconstruction, Report(objects=objects))
     text = reconstruction.report_md.read_text(encoding="utf-8")
-    assert len(report["objects"]) == 500
+    assert len(report.objects) == 500
     assert "the other 460 are in `report.json`" in text
     assert "thing 40 " in text and "thing 41 " not in text
     assert len(list((reconstruction.pictures / "swatches").iterdir())) == 40
 
 
 def test_curve_plot_has_one_panel_per_measure():
-    curve = complete(a_report())["curve"]
+    curve = complete(Report(**a_report())).curve
     both = plot_curve(curve)
     one = plot_curve([{**point, "miou": None} for point in curve])
     assert both is not None and one is not None

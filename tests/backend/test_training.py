@@ -414,8 +414,8 @@ def test_full_disk_keeps_previous_checkpoint(tmp_path, monkeypatch):
 SMALL = Settings(offsets=4, sh_degree=1)
 
 
-def mean_loss(trainer, steps, share=0.3):
-    return float(np.mean([trainer.step(share) for _ in range(steps)]))
+def mean_loss(trainer, steps, progress=0.3):
+    return float(np.mean([trainer.step(progress) for _ in range(steps)]))
 
 
 FLAT = dataclasses.replace(SMALL, primitive="2d")
@@ -505,13 +505,13 @@ def test_normals_and_distortion_are_computed_only_if_weighted(tiny, monkeypatch)
 
     monkeypatch.setattr("backend.training.step.rasterize", seen)
     normals = dataclasses.replace(FLAT, distortion_weight=0.0)
-    for settings, share, wanted in (
+    for settings, progress, wanted in (
         (SMALL, 0.9, [False] * 3), (FLAT, 0.1, [False] * 3), (FLAT, 0.9, [True] * 3),
         (normals, 0.9, [True, True, False]),
         (dataclasses.replace(FLAT, normal_weight=0.0), 0.9, [False, False, True]),
         (dataclasses.replace(normals, normal_weight=0.0), 0.9, [False] * 3),
     ):  # fmt: skip
-        assert Trainer.start(capture, ids, settings).step(share).isfinite()
+        assert Trainer.start(capture, ids, settings).step(progress).isfinite()
         assert requested.pop() == wanted
 
 

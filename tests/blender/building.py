@@ -8,8 +8,12 @@ import zlib
 from pathlib import Path
 
 import numpy as np
+from objectgs.backend.shared.formats import points_ply
+from objectgs.backend.shared.formats.anchors_ply import AnchorTable, write_anchor_table
 from objectgs.backend.shared.formats.mesh_ply import Mesh, write_mesh
 from objectgs.backend.shared.formats.ply import write_vertices
+from objectgs.backend.shared.formats.points_ply import LabeledPoints
+from objectgs.backend.shared.formats.splat_ply import NORMALS, OBJECT_ID, property_names, splat_dtype
 
 HUGE = 0xFFFFFFF0
 OBJECTS = {1: "mug", 2: "can", HUGE: "box"}
@@ -60,24 +64,10 @@ def write_cameras(folder: Path, views, intrinsics=K, size=(640, 480), origin=(0.
 
 
 def write_points(folder: Path, xyz, ids) -> None:
-    table = np.zeros(
-        len(xyz),
-        [
-            ("x", "<f8"),
-            ("y", "<f8"),
-            ("z", "<f8"),
-            ("red", "u1"),
-            ("green", "u1"),
-            ("blue", "u1"),
-            ("object_id", "<u4"),
-            ("margin", "<f4"),
-            ("votes", "<u4"),
-        ],
-    )
-    for axis, name in enumerate("xyz"):
-        table[name] = np.asarray(xyz)[:, axis]
-    table["red"], table["object_id"], table["margin"] = 200, ids, 0.5
-    write_vertices(folder / "points.ply", table)
+    count = len(xyz)
+    rgb = np.tile(np.array([200, 0, 0], np.uint8), (count, 1))
+    points = LabeledPoints(np.asarray(xyz), rgb, np.asarray(ids), np.full(count, 0.5), np.zeros(count, int))
+    points_ply.write_points(folder / "points.ply", points)
 
 
 def write_objects(folder: Path, objects=OBJECTS) -> None:
@@ -89,23 +79,8 @@ def write_objects(folder: Path, objects=OBJECTS) -> None:
 
 
 def splat_table(ids, degree: int = 1, seed: int = 0) -> np.ndarray:
-    rest = 3 * ((degree + 1) ** 2 - 1)
-    names = [
-        *"xyz",
-        "f_dc_0",
-        "f_dc_1",
-        "f_dc_2",
-        *(f"f_rest_{i}" for i in range(rest)),
-        "opacity",
-        "scale_0",
-        "scale_1",
-        "scale_2",
-        "rot_0",
-        "rot_1",
-        "rot_2",
-        "rot_3",
-    ]
-    table = np.zeros(len(ids), [*((name, "<f4") for name in names), ("object_id", "<u4")])
+    names = [name for name in property_names(degree) if name not in (*NORMALS, OBJECT_ID)]
+    table = np.zeros(len(ids), splat_dtype([*names, OBJECT_ID]))
     rng = np.random.default_rng(seed)
     for name in names:
         table[name] = rng.normal(size=len(ids))
@@ -114,22 +89,10 @@ def splat_table(ids, degree: int = 1, seed: int = 0) -> np.ndarray:
 
 
 def write_anchors(folder: Path, ids) -> None:
-    table = np.zeros(
-        len(ids),
-        [
-            ("x", "<f4"),
-            ("y", "<f4"),
-            ("z", "<f4"),
-            ("object_id", "<u4"),
-            ("scale_0", "<f4"),
-            ("scale_1", "<f4"),
-            ("scale_2", "<f4"),
-            ("opacity", "<f4"),
-            ("splats", "<u4"),
-        ],
-    )
-    table["object_id"], table["opacity"], table["splats"], table["x"] = ids, 0.25, 7, 3.0
-    write_vertices(folder / "anchors.ply", table)
+    count = len(ids)
+    positions = np.tile([3.0, 0.0, 0.0], (count, 1))
+    anchors = AnchorTable(positions, ids, np.zeros((count, 3)), np.full(count, 0.25), np.full(count, 7))
+    write_anchor_table(folder / "anchors.ply", anchors, "f4")
 
 
 def write_folder(place: Path) -> Path:

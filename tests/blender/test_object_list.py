@@ -106,7 +106,7 @@ def test_selected_objects_are_merged_and_split(root):
     assert entry(root, first).merged_into == second and entry(root, second).merged_into is None
     after = object_list.splat_counts(root)
     assert after[second] == before[first] + before[second] and first not in after
-    assert object_list.shown_as(root, first) == second
+    assert object_list.merge_target(root, first) == second
     activate(root, second)
     bpy.ops.objectgs.split_objects()
     assert object_list.splat_counts(root) == before and entry(root, first).merged_into is None

@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Files with names from older versions are opened with the current names."""
 
+import zipfile
+from pathlib import Path
+
 import bpy
 import numpy as np
 import pytest
 from objectgs.backend.shared.color.recolor import Recolor
+from objectgs.backend.shared.formats.splat_ply import UNOBSERVED
 from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.blender import older_files
 from objectgs.objectgs_addon.scene import carrier, kinds, object_collection
@@ -18,6 +22,9 @@ import headless
 from .building import tetrahedron, write_folder, write_meshes
 
 RED = (1.0, 0.0, 0.0)
+
+EARLIER = Path(__file__).resolve().parents[1] / "data" / "earlier-reconstruction.zip"
+"""Contains objectgs.blend, which the headless command `build` of an earlier version saved in Blender 4.2."""
 
 
 @pytest.fixture
@@ -45,7 +52,7 @@ def older_file(extension, tmp_path):
     blender_scene.recolor(root, 1, Recolor(hue=0.3))
     mesh = splats_of(root).data
     carrier.write(mesh, fills.FILLS, "INT", np.arange(len(mesh.vertices)))
-    carrier.write(mesh, fills.UNOBSERVED, "BOOLEAN", np.ones(len(mesh.vertices), bool))
+    carrier.write(mesh, UNOBSERVED, "BOOLEAN", np.ones(len(mesh.vertices), bool))
     blender_scene.object_collections(root)[1][fills.UNOBSERVED_COUNT] = 7
     give_former_names()
     assert set(former_names()) >= {*older_files.CUSTOM_PROPERTIES, "colour_by", "splat_colours"}
@@ -156,3 +163,33 @@ def test_current_file_is_unchanged(older_file):
     assert bpy.context.scene.objectgs.active is not None
     older_files.rename_all()
     assert {block: list(block.keys()) for block in older_files._blocks()} == before
+
+
+@pytest.mark.skipif(bpy.app.version < (4, 2, 0), reason="is older than the Blender that saved the file, 4.2")
+def test_a_file_that_an_earlier_version_saved_opens_and_is_updated(extension, tmp_path):
+    zipfile.ZipFile(EARLIER).extractall(tmp_path)
+    folder = tmp_path / "rec"
+    saved = (folder / "objectgs.blend").read_bytes()
+    assert b"objectgs_centre" in saved and b"objectgs_recolour" in saved
+    bpy.ops.wm.open_mainfile(filepath=str(folder / "objectgs.blend"))
+    root = bpy.context.scene.objectgs.active
+    assert not former_names() and color_attributes() == {COLOR}
+    collections = blender_scene.object_collections(root)
+    assert {i: c.name for i, c in collections.items()} == dict(
+        enumerate(("mug", "bottle", "ring", "table", "backdrop"), 1)
+    )
+    assert recolor.recolor_of(collections[1]).hue == 0.3 and collections[3][fills.UNOBSERVED_COUNT] == 0
+    pivots = [kinds.part_of(collection, "object_parent") for collection in collections.values()]
+    assert all(object_collection.center_of(pivot).any() for pivot in pivots)
+    assert {i: len(found) for i, found in blender_scene.object_meshes(root).items() if found} == {1: 1, 2: 1}
+    before = {i: len(splats_of(root, i).data.vertices) for i in collections}
+
+    # The folder has moved since.
+    root[kinds.FOLDER] = str(folder)
+    shown = blender_scene.show_result(root, folder)
+    assert (shown.objects, shown.splats, shown.warnings) == (5, sum(before.values()), [])
+    object_edits.fill(root)
+    mug, bottle, ring, *_ = root.objectgs.objects
+    assert [row.name for row in (mug, bottle, ring)] == ["mug", "bottle", "ring"]
+    assert ring.removed and ring.fill and mug.hue == pytest.approx(0.3)
+    assert not former_names()

@@ -427,7 +427,7 @@ def test_invalid_captures_change_nothing(fresh, folder, name, corrupt, sentence)
     ("name", "corrupt", "sentence"),
     [
         ("splats.ply", None, "has no splats.ply; train first"),
-        ("splats.ply", "points.ply", "not a file of Gaussian splats"),
+        ("splats.ply", "points.ply", "not one of Gaussian splats"),
         ("anchors.ply", "points.ply", "has no property scale_0"),
         ("splats.ply", "cut", "truncated"),
     ],

@@ -199,15 +199,15 @@ def test_losses_and_gaussians_match_cpu(gpu):
 @pytest.mark.parametrize("settings", [SETTINGS, FLAT], ids=["3d", "2d"])
 def test_step_does_not_synchronize(spheres, gpu, settings):
     trainer = started(spheres, settings, gpu)
-    for share in (0.3, 0.8):
+    for progress in (0.3, 0.8):
         for _ in spheres.train_indices:  # targets are uploaded and kernels compiled
-            trainer.step(share)
+            trainer.step(progress)
     trainer.progress.last_growth = trainer.progress.step
     torch.cuda.synchronize()
     torch.cuda.set_sync_debug_mode("error")
     try:
-        for share in (0.3, 0.3, 0.8, 0.8):
-            loss = trainer.step(share)
+        for progress in (0.3, 0.3, 0.8, 0.8):
+            loss = trainer.step(progress)
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert loss.is_cuda and loss.isfinite() and trainer.model.anchors.rows.is_cuda

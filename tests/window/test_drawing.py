@@ -15,7 +15,7 @@ from backend.export import write_splats
 from backend.model.splats import Splats
 from backend.raster import Camera, rasterize
 from backend.shared.color.recolor import Recolor
-from backend.shared.formats.ply import write_vertices
+from backend.shared.formats.points_ply import LabeledPoints, write_points
 
 from .harness import PACKAGE
 
@@ -40,6 +40,12 @@ selected = lambda: sorted({{thing.users_collection[0].name for thing in bpy.cont
 
 def script(body: str) -> str:
     return PRELUDE + textwrap.dedent(body)
+
+
+def three_points() -> LabeledPoints:
+    """Three points of no object at the origin."""
+    none = np.zeros(3, int)
+    return LabeledPoints(np.zeros((3, 3)), np.zeros((3, 3), np.uint8), none, np.zeros(3), none)
 
 
 def splats() -> Splats:
@@ -82,21 +88,7 @@ def folder(blender, tmp_path_factory):
     place = tmp_path_factory.mktemp("drawing") / "balls"
     (place / "images").mkdir(parents=True)
     write_splats(place / "splats.ply", splats())
-    points = np.zeros(
-        3,
-        [
-            ("x", "<f8"),
-            ("y", "<f8"),
-            ("z", "<f8"),
-            ("red", "u1"),
-            ("green", "u1"),
-            ("blue", "u1"),
-            ("object_id", "<u4"),
-            ("margin", "<f4"),
-            ("votes", "<u4"),
-        ],
-    )
-    write_vertices(place / "points.ply", points)
+    write_points(place / "points.ply", three_points())
     camera = {
         "name": "0.png",
         "image": "images/0.png",

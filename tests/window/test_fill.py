@@ -9,10 +9,10 @@ import pytest
 
 from backend.export import write_splats
 from backend.model.splats import Splats
-from backend.shared.formats.ply import write_vertices
+from backend.shared.formats.points_ply import write_points
 from backend.shared.splats.spherical_harmonics import C0
 
-from .test_drawing import color_at, placement_of
+from .test_drawing import color_at, placement_of, three_points
 from .test_workflow import IDLE, script, wait
 
 BROWN = np.array([0.6, 0.4, 0.2])
@@ -42,23 +42,7 @@ def folder(blender, tmp_path_factory):
             np.where(is_box, 1, 2),
         ),
     )
-    write_vertices(
-        place / "points.ply",
-        np.zeros(
-            3,
-            [
-                ("x", "<f8"),
-                ("y", "<f8"),
-                ("z", "<f8"),
-                ("red", "u1"),
-                ("green", "u1"),
-                ("blue", "u1"),
-                ("object_id", "<u4"),
-                ("margin", "<f4"),
-                ("votes", "<u4"),
-            ],
-        ),
-    )
+    write_points(place / "points.ply", three_points())
     (place / "cameras.json").write_text(
         json.dumps(
             {

@@ -12,8 +12,8 @@ from ...shared.reconstruction.objects import write_objects
 from ...shared.reconstruction.record import read_record, update_record
 from ...shared.stopping import StoppingReporter
 from ..folder import capture_record, open_reconstruction
-from .plan import write_default_plan
-from .votes import votes_are_current
+from ..planning import write_default_plan
+from ..votes import votes_are_current
 
 
 def import_capture(options: argparse.Namespace, reporter: StoppingReporter) -> None:
@@ -21,7 +21,9 @@ def import_capture(options: argparse.Namespace, reporter: StoppingReporter) -> N
 
     Points keep the objects of an earlier vote on this capture; without a vote they belong to no object.
     """
-    with open_reconstruction(options, reporter) as (folder, capture):
+    with open_reconstruction(options, reporter) as (output, capture):
+        folder = output.folder
+        output.accept()
         update_record(folder, capture=capture_record(capture, options.max_size))
         voted = read_record(folder).votes
         cast = voted and (options.max_size, voted.strategy, voted.seed or 0)

@@ -21,7 +21,7 @@ from ...shared.reconstruction.record import ImportRecord, update_record
 from ...shared.stopping import StoppingReporter
 from ..cameras import write_splat_cameras
 from ..folder import capture_record, open_output, read_capture
-from .votes import object_name
+from ..votes import object_name
 
 _LEAST_VISIBLE = 0.5
 """Least fraction of the splats inside a view; with fewer, they are probably not in the capture's coordinates."""

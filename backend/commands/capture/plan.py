@@ -1,27 +1,19 @@
-"""`plan`: decides what training needs for a capture, in plan.json; also used by `import`, `vote` and `train`."""
+"""`plan`: decides what training needs for a capture, in plan.json."""
 
 from __future__ import annotations
 
 import argparse
 from contextlib import ExitStack
 
-import numpy as np
-
-from ...capture import Capture, load_capture
-from ...labels.points import read_points
-from ...planning.decisions import Choices, PlanningContext, decide
+from ...capture import load_capture
+from ...planning.decisions import decide
 from ...raster import devices
-from ...shared.events import Reporter
-from ...shared.grouping import Changes, changed, chosen, grouped, read_groups
 from ...shared.reconstruction.folder import Reconstruction
-from ...shared.reconstruction.objects import SceneObject, edit_objects, read_objects
-from ...shared.reconstruction.plan import Plan, write_plan
-from ...shared.reconstruction.record import read_record
+from ...shared.reconstruction.plan import write_plan
 from ...shared.stopping import StoppingReporter
-from ...training.settings import Settings
 from ..folder import memory_for_files, open_output
-from ..training.length import budget_of, expected_of
-from .votes import object_name, votes_are_current
+from ..length import budget_of, expected_of
+from ..planning import build_context, choices, find_requested_objects, voted_ids
 
 
 def plan(options: argparse.Namespace, reporter: StoppingReporter) -> None:
@@ -44,94 +36,3 @@ def plan(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     if expected := expected_of(budget, capture, device):
         reporter.status(expected)
     reporter.done(plan=found.as_list())
-
-
-def write_default_plan(folder: Reconstruction, capture: Capture, max_size: int) -> None:
-    """Write plan.json for a training with the default settings, from the facts known so far."""
-    objects, _ = find_requested_objects(folder, capture)
-    context = build_context(capture, Choices(max_size=max_size), objects, voted_ids(folder, capture))
-    write_plan(folder.plan, decide(context))
-
-
-def build_context(
-    capture: Capture,
-    requested: Choices,
-    objects: list[SceneObject],
-    point_ids: np.ndarray | None = None,
-    thorough: bool = False,
-) -> PlanningContext:
-    """Collect the facts for the decisions; arguments are as in `PlanningContext`, but `capture` is unedited."""
-    left_out = [entry.id for entry in objects if entry.left_out]
-    capture = capture.edited({entry.id: entry.name for entry in objects}, left_out)
-    point_ids = None if point_ids is None else capture.without_left_out(point_ids)
-    return PlanningContext(capture, requested, objects, point_ids, thorough)
-
-
-def choices(options: argparse.Namespace) -> Choices:
-    """Return the choices that the options of `train` make."""
-    return Choices(settings(options), options.max_size, not options.no_meshes, options.keep, options.leave_out)
-
-
-def settings(options: argparse.Namespace) -> Settings:
-    """Return the settings that the options of `train` make, before the plan changes them."""
-    given = {
-        "offsets": options.offsets, "max_anchors": options.max_anchors, "voxel": options.voxel,
-        "semantic_weight": options.semantic_weight, "normal_weight": options.normal_weight,
-        "distortion_weight": options.distortion_weight,
-    }  # fmt: skip
-    return Settings(
-        seed=options.seed, mode=options.mode, sh_degree=options.sh_degree, background=options.background,
-        zero_is_object=options.unlabeled_is_object, primitive=options.primitive,
-        **{k: v for k, v in given.items() if v is not None},
-    )  # fmt: skip
-
-
-def find_requested_objects(
-    folder: Reconstruction | None, capture: Capture, options: argparse.Namespace | None = None
-) -> tuple[list[SceneObject], Changes]:
-    """Find the objects as --groups and --only change them, without writing the changes.
-
-    Args:
-        folder: The reconstruction with objects.json; None if there is none.
-        capture: Its masks give the objects before a vote.
-        options: The options of `train`; None for no changes.
-
-    Returns:
-        The changed objects, and the changes for `edit_objects`.
-
-    Raises:
-        InputError: An option names an object that does not exist.
-    """
-    known = read_objects(folder.objects) if folder is not None and folder.objects.exists() else []
-    known = known or [SceneObject(i, object_name(capture, i), (0, 0, 0), 0) for i in capture.object_ids.tolist()]
-    path = folder.objects if folder is not None else capture.folder / "masks"
-    changes: Changes = {}
-    if options is not None and options.groups is not None:
-        changes = grouped(known, read_groups(options.groups), options.groups)
-    if options is not None and options.only:
-        for object_id, change in chosen(changed(known, changes), options.only, path).items():
-            changes[object_id] = {**changes.get(object_id, {}), **change}
-    return changed(known, changes), changes
-
-
-def change_objects(folder: Reconstruction, capture: Capture, options: argparse.Namespace) -> list[SceneObject]:
-    """Apply --groups and --only to objects.json and return the objects."""
-    objects, changes = find_requested_objects(folder, capture, options)
-    if changes:
-        edit_objects(folder.objects, changes)
-    return objects
-
-
-def voted_ids(folder: Reconstruction, capture: Capture) -> np.ndarray | None:
-    """Return the points' object IDs from the latest vote with any strategy; None if it is not current."""
-    voted = read_record(folder).votes
-    if not voted or not votes_are_current(folder, capture, voted.max_size, voted.strategy, voted.seed or 0):
-        return None
-    return read_points(folder.points).ids
-
-
-def report_plan(found: Plan, reporter: Reporter) -> None:
-    """Report the decisions to omit something, and the decisions that the user overrode."""
-    for decision in found.decisions:
-        if decision.done is False or decision.overridden:
-            reporter.status(decision.sentence())

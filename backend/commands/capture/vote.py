@@ -6,16 +6,18 @@ import argparse
 
 from ...shared.stopping import StoppingReporter
 from ..folder import open_reconstruction
-from .plan import change_objects, write_default_plan
-from .votes import cast_votes
+from ..planning import change_objects, write_default_plan
+from ..votes import cast_votes
 
 
 def vote(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Write points.ply, objects.json and plan.json."""
-    with open_reconstruction(options, reporter) as (folder, capture):
+    with open_reconstruction(options, reporter) as (output, capture):
+        folder = output.folder
         if not capture.has_masks:
             reporter.warning(f"{capture.folder / 'masks'} does not exist, so no point belongs to an object.")
         cast_votes(folder, capture, options, reporter)
         change_objects(folder, capture, options)
+        output.accept()
         write_default_plan(folder, capture, options.max_size)
     reporter.done(points=str(folder.points), objects=str(folder.objects))

@@ -15,7 +15,7 @@ from ...export import read_splats
 from ...model.splats import Splats
 from ...shared.errors import InputError
 from ...shared.reconstruction.folder import Reconstruction
-from ...shared.reconstruction.objects import Matrix, SceneObject, edit_objects, find_object, merged, read_objects
+from ...shared.reconstruction.objects import Matrix, SceneObject, edit_objects, find_object, members_of, read_objects
 from ...shared.stopping import StoppingReporter
 from ..cameras import read_upright
 from .fill import fill_holes
@@ -79,8 +79,7 @@ class _Edits:
 
     def splats_of(self, entry: SceneObject) -> Splats:
         """Return the captured splats of an object, including those merged into it; InputError if there are none."""
-        ids = [i for i, target in merged(self.objects).items() if target == entry.id]
-        own = self._splats.select(np.isin(self._splats.object_ids, ids))
+        own = self._splats.select(np.isin(self._splats.object_ids, members_of(self.objects, entry.id)))
         if len(own) == 0:
             raise InputError(f"{self.folder.splats} has no splats of {entry.name}, so it cannot be edited.")
         return own

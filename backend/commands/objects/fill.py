@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from ...editing import Fill, compute_fill
+from ...editing import compute_fill
 from ...export import read_splats, splat_table
-from ...shared.formats.ply import read_vertices, write_vertices
-from ...shared.reconstruction.fill import FILLS, UNOBSERVED, fill_path, forget_old
+from ...shared.reconstruction.fill import FillRows, fill_path, read_fill, write_fill
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.objects import read_objects
 from ...shared.stopping import StoppingReporter
@@ -28,17 +25,7 @@ def fill_holes(folder: Reconstruction, reporter: StoppingReporter) -> dict[int, 
     if not path.is_file():
         reporter.status("Filling the holes of removed objects")
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_vertices(path, _table(compute_fill(read_splats(folder.splats)[0], objects)))
-        forget_old(path)
-    table = read_vertices(path)
-    fills = table[FILLS][table[UNOBSERVED] != 0]
-    return {entry.id: int((fills == entry.id).sum()) for entry in objects if entry.removed and entry.fill}
-
-
-def _table(fill: Fill) -> np.ndarray:
-    rows = splat_table(fill.splats)
-    table = np.zeros(len(rows), [*rows.dtype.descr, (FILLS, "<u4")])
-    for name in rows.dtype.names or ():
-        table[name] = rows[name]
-    table[UNOBSERVED], table[FILLS] = fill.put, fill.fills
-    return table
+        fill = compute_fill(read_splats(folder.splats)[0], objects)
+        write_fill(path, FillRows(splat_table(fill.splats), fill.put, fill.fills))
+    rows = read_fill(path)
+    return {entry.id: rows.count_new(entry.id) for entry in objects if entry.removed and entry.fill}

@@ -35,12 +35,12 @@ def film(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         raise InputError(f"{folder.folder} has no {folder.splats.name}; give the --out folder of a training.")
     shot = read_shot(options.shot)
     frames = chosen_frames(options.frames, shot)
-    _create_folder(options.out)
     reporter.status("Reading the splats")
     primitive = training.settings.get("primitive", "3d") if (training := read_record(folder).training) else "3d"
     stage = Stage(folder, primitive, device, reporter)
     wanted = [(frame, stage.digest(shot, frame)) for frame in frames]
     missing = [(frame, digest) for frame, digest in wanted if not _is_done(options, frame, digest)]
+    _create_folder(options.out)
     if missing:
         ensure_kernels(reporter, device)
     reporter.status(_progress_text(len(missing), len(frames)))

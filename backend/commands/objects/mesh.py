@@ -28,7 +28,7 @@ from ...shared.formats.mesh_ply import Mesh, write_mesh
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.lock import locked
 from ...shared.reconstruction.meshes import MeshEntry, read_meshes, write_meshes
-from ...shared.reconstruction.objects import find_object, merged, read_objects
+from ...shared.reconstruction.objects import find_object, members_of, read_objects, shown_as
 from ...shared.stopping import StoppingReporter
 from ..folder import Trained, open_trained
 from ..setup.kernels import ensure_kernels
@@ -158,9 +158,8 @@ def _write_image(path: Path, pixels: np.ndarray) -> None:
 def _targets(options: argparse.Namespace, folder: Reconstruction) -> list[Target]:
     """Return the meshes that the options select; without a selection, those of all objects, merged ones as one."""
     objects = [entry for entry in read_objects(folder.objects) if entry.id] if folder.objects.exists() else []
-    into = merged(objects)
-    groups = {entry.id: Target(str(entry.id), entry.name, _with_merged(entry.id, into)) for entry in objects}
-    shown = [entry.id for entry in objects if into[entry.id] == entry.id and not entry.left_out]
+    groups = {entry.id: Target(str(entry.id), entry.name, tuple(members_of(objects, entry.id))) for entry in objects}
+    shown = [object_id for object_id, target in shown_as(objects).items() if target == object_id]
 
     def find(word: str) -> int:
         return find_object(objects, word, folder.objects).id
@@ -178,10 +177,6 @@ def _targets(options: argparse.Namespace, folder: Reconstruction) -> list[Target
     if not targets:
         targets = [groups[i] for i in shown] or [Target(SCENE, "the whole scene", None)]
     return targets
-
-
-def _with_merged(object_id: int, into: dict[int, int]) -> tuple[int, ...]:
-    return tuple(sorted(i for i, shown_as in into.items() if shown_as == object_id))
 
 
 def _stem(key: str) -> str:

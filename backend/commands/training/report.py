@@ -21,13 +21,13 @@ from ...shared.formats.mesh_ply import read_mesh
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.meshes import MeshEntry
 from ...shared.reconstruction.record import read_record
-from ...shared.reconstruction.report import Evaluation, read_evaluation
+from ...shared.reconstruction.report import Evaluation, Report, read_evaluation
 from ...shared.stopping import StoppingReporter
 from ...training.budget import TrainingProgress
-from ..capture.votes import object_name
 from ..folder import Trained, open_trained
 from ..setup.machine import machine_facts
 from ..stages import stage
+from ..votes import object_name
 
 IMAGES_IN_REPORT = 3
 
@@ -43,25 +43,25 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         sheet = _mesh_sheet(trained, meshes, reporter)
     record = read_record(folder)
     training, export = trained.training, record.export
-    value = {
-        "capture": {
+    value = Report(
+        capture={
             "folder": capture.folder.name, "views": len(capture.views), "held_out": len(capture.test_indices),
             "objects": len(capture.object_ids), **capture.counts,
             "exposure_varies": trained.scene.exposure_varies,
-            "unlabeled_is_taught": trained.scene.supervise_background,
+            "supervise_background": trained.scene.supervise_background,
             "cameras": ", ".join(f"{count} {name}" for name, count in capture.counts["cameras"].items()),
         },
-        "settings": {
+        settings={
             "minutes": training.minutes, "steps": training.steps,
             "max_size": training.votes.max_size, "strategy": training.votes.strategy,
             **training.settings,
         },
-        "machine": {**machine_facts(model.device), "device": trained.trained_on},
-        "left_out": _left_out(trained),
-        "plan": trained.plan.as_list(),
-        "stages": [asdict(stage) for stage in record.stages],
-        "curve": progress.curve,
-        "model": {
+        machine={**machine_facts(model.device), "device": trained.trained_on},
+        left_out=_left_out(trained),
+        plan=trained.plan.as_list(),
+        stages=[asdict(stage) for stage in record.stages],
+        curve=progress.curve,
+        model={
             "anchors": len(model.anchors),
             "gaussians": len(model.generate().source) if model.explicit else (export and export.splats),
             "bytes": folder.splats.stat().st_size if folder.splats.exists() else None,
@@ -69,14 +69,14 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             "psnr_of_export": export.psnr_of_export if export else None,
             "skipped_updates": progress.skipped, "skipped_because_of": progress.causes or None,
         },
-        "quality": evaluation.quality,
-        "objects": _objects(trained, evaluation.objects, meshes),
-        "views": evaluation.views,
-        "meshes": [
+        quality=evaluation.quality,
+        objects=_objects(trained, evaluation.objects, meshes),
+        views=evaluation.views,
+        meshes=[
             {**mesh, "name": _mesh_name(capture, key, mesh)}
             for key, mesh in meshes.items() if _object_id(key, mesh) is None
         ],
-    }  # fmt: skip
+    )  # fmt: skip
     write_report(folder, value, images, title=capture.folder.resolve().name, mesh_sheet=sheet)
     reporter.done(report=str(folder.report_md))
 

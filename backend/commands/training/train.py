@@ -11,7 +11,6 @@ import torch
 from ...capture import Capture
 from ...evaluation import IdScores, comparison, curve_image, psnr, save_image, thumbnail
 from ...export import agreement, fit_splats, write_anchors, write_splats
-from ...labels.points import read_points
 from ...model.checkpoint import has_checkpoint
 from ...model.draw import draw
 from ...model.object_model import ObjectModel
@@ -21,6 +20,7 @@ from ...raster import devices
 from ...shared.errors import Cancelled, InputError
 from ...shared.events import Reporter
 from ...shared.formats.json_file import plain
+from ...shared.formats.points_ply import read_points
 from ...shared.reconstruction.checkpoint import PREVIOUS
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.plan import Plan, write_plan
@@ -29,12 +29,12 @@ from ...shared.stopping import StoppingReporter
 from ...training.budget import Budget, TrainingProgress
 from ...training.scene import Scene
 from ...training.trainer import Evaluate, Trainer
-from ..capture.plan import build_context, change_objects, choices, find_requested_objects, report_plan, settings
-from ..capture.votes import cast_votes, votes_are_current, votes_key
 from ..folder import capture_record, digest, memory_for_planes, open_reconstruction, plan_of
+from ..length import budget_of, expected_of
+from ..planning import build_context, change_objects, choices, find_requested_objects, report_plan, settings
 from ..setup.kernels import ensure_kernels
 from ..stages import finish_stage, stage
-from .length import budget_of, expected_of
+from ..votes import cast_votes, votes_are_current, votes_key
 
 CURVE_VIEWS = 20
 """Largest number of held-out views that are measured during training; `evaluate` measures all."""
@@ -47,8 +47,10 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Begin, resume or extend a training, and write a checkpoint, previews, splats.ply and anchors.ply."""
     device = devices.pick(options.device)
     budget = budget_of(options)
-    with open_reconstruction(options, reporter) as (folder, capture):
+    with open_reconstruction(options, reporter) as (output, capture):
+        folder = output.folder
         trainer, plan = _begin(folder, capture, options, reporter, device)
+        output.accept()
         progress = trainer.progress
         if progress.step and budget.progress(progress) >= 1:
             reporter.status(

@@ -11,9 +11,10 @@ from ..errors import InputError
 from .atomic import atomic_file
 from .ply import LONGEST_HEADER
 from .regular_file import read_regular
+from .splat_ply import FORMER_UNOBSERVED, UNOBSERVED
 
 _VERTEX = np.dtype([("xyz", "<f8", 3), ("normal", "<f4", 3), ("color", "u1", 3)])
-_FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3), ("values", "u1"), ("uv", "<f4", 6), ("unobserved", "u1")])
+_FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3), ("values", "u1"), ("uv", "<f4", 6), (UNOBSERVED, "u1")])
 _HEADER = """\
 ply
 format binary_little_endian 1.0
@@ -31,12 +32,13 @@ property uchar blue
 element face {faces}
 property list uchar int vertex_indices
 property list uchar float texcoord
-property uchar unobserved
+property uchar {unobserved}
 end_header
 """
 
-_FORMER_NAME = "invented"
-"""Name of the property `unobserved` in files of older versions."""
+
+def _header(texture: str, vertices: int, faces: int) -> str:
+    return _HEADER.format(texture=texture, vertices=vertices, faces=faces, unobserved=UNOBSERVED)
 
 
 @dataclass
@@ -68,8 +70,8 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
     vertices["xyz"], vertices["normal"], vertices["color"] = mesh.vertices, mesh.normals, mesh.colors
     faces = np.empty(len(mesh.faces), _FACE)
     faces["corners"], faces["values"] = 3, 6
-    faces["vertices"], faces["uv"], faces["unobserved"] = mesh.faces, mesh.uvs.reshape(-1, 6), mesh.unobserved
-    header = _HEADER.format(texture=mesh.texture, vertices=len(vertices), faces=len(faces))
+    faces["vertices"], faces["uv"], faces[UNOBSERVED] = mesh.faces, mesh.uvs.reshape(-1, 6), mesh.unobserved
+    header = _header(mesh.texture, len(vertices), len(faces))
     with atomic_file(path) as file:
         file.write(header.encode())
         file.write(vertices.data)
@@ -90,8 +92,8 @@ def read_mesh(path: Path) -> Mesh:
         texture = named["comment TextureFile"]
     except (KeyError, ValueError):
         counts, texture = (0, 0), ""
-    header = "\n".join([*lines, ""]).replace(f"property uchar {_FORMER_NAME}\n", "property uchar unobserved\n")
-    if header != _HEADER.format(texture=texture, vertices=counts[0], faces=counts[1]):
+    header = "\n".join([*lines, ""]).replace(f"property uchar {FORMER_UNOBSERVED}\n", f"property uchar {UNOBSERVED}\n")
+    if header != _header(texture, *counts):
         raise InputError(f"{path} is not a mesh that `python -m backend mesh` wrote; make the meshes again.")
     middle = end + counts[0] * _VERTEX.itemsize
     if len(data) != middle + counts[1] * _FACE.itemsize:
@@ -102,5 +104,5 @@ def read_mesh(path: Path) -> Mesh:
         raise InputError(f"{path} has faces with invalid vertex indices; make the meshes again.")
     return Mesh(
         vertices["xyz"].copy(), vertices["normal"].copy(), vertices["color"].copy(), faces["vertices"].copy(),
-        faces["uv"].reshape(-1, 3, 2).copy(), faces["unobserved"].astype(bool), texture,
+        faces["uv"].reshape(-1, 3, 2).copy(), faces[UNOBSERVED].astype(bool), texture,
     )  # fmt: skip

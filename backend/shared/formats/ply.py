@@ -49,6 +49,9 @@ def write_vertices(path: Path, table: np.ndarray) -> None:
 def read_vertices(path: Path) -> np.ndarray:
     """Read the vertices of a binary PLY file; later elements are ignored.
 
+    Args:
+        path: The file to read.
+
     Returns:
         A structured array (N,) with the file's property names, order and types.
 

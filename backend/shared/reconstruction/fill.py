@@ -10,14 +10,20 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from ..errors import InputError
+from ..formats.ply import write_vertices
 from ..formats.regular_file import open_regular
+from ..formats.splat_ply import UNOBSERVED, read_splat_table
 from .folder import Reconstruction
 from .objects import SceneObject
 
-UNOBSERVED, FILLS = "unobserved", "fills"
+FILLS = "fills"
+"""Also the name of the attribute that has these IDs in Blender."""
 
 _FORMAT = 2
 """Version of the fill algorithm; files of other versions are not reused."""
@@ -25,6 +31,51 @@ _KEPT = 8
 """Number of fill files kept in a cache, newest first."""
 
 _digests: dict[Path, tuple[tuple[int, int], str]] = {}
+
+
+@dataclass(frozen=True)
+class FillRows:
+    """The n splats of a fill file.
+
+    Attributes:
+        splats: (n,) rows with the properties of splats.ply.
+        new: (n,) bool; true for unobserved splats, false for splats of splats.ply that these replace.
+        fills: (n,) int64 IDs of the removed objects whose holes are filled.
+    """
+
+    splats: np.ndarray
+    new: np.ndarray
+    fills: np.ndarray
+
+    def select(self, mask: np.ndarray) -> FillRows:
+        """Return the splats selected by a boolean mask (n,)."""
+        return FillRows(self.splats[mask], self.new[mask], self.fills[mask])
+
+    def count_new(self, object_id: int) -> int:
+        """Return the number of new splats that fill the hole of an object."""
+        return int((self.new & (self.fills == object_id)).sum())
+
+
+def write_fill(path: Path, rows: FillRows) -> None:
+    """Write a fill file, atomically, and delete the oldest fill files beside it."""
+    table = np.zeros(len(rows.splats), [*rows.splats.dtype.descr, (FILLS, "<u4")])
+    for name in rows.splats.dtype.names or ():
+        table[name] = rows.splats[name]
+    table[UNOBSERVED], table[FILLS] = rows.new, rows.fills
+    write_vertices(path, table)
+    _forget_old(path)
+
+
+def read_fill(path: Path) -> FillRows:
+    """Read a fill file.
+
+    Raises:
+        InputError: The file is missing, truncated, or was not written by `write_fill`.
+    """
+    table = read_splat_table(path)
+    if not {UNOBSERVED, FILLS} <= set(table.dtype.names or ()):
+        raise InputError(f"{path} is not a file of splats that fill holes; delete it.")
+    return FillRows(table, table[UNOBSERVED] != 0, table[FILLS].astype(np.int64))
 
 
 def fill_path(folder: Reconstruction, objects: Sequence[SceneObject]) -> Path | None:
@@ -51,7 +102,7 @@ def fill_path(folder: Reconstruction, objects: Sequence[SceneObject]) -> Path | 
     return folder.cache / f"fill-{hashlib.sha256(made_of.encode()).hexdigest()[:24]}.ply"
 
 
-def forget_old(newest: Path) -> None:
+def _forget_old(newest: Path) -> None:
     """Delete the oldest fill files beside `newest`; deleted files can be computed again."""
     written = {path: path.stat().st_mtime_ns for path in newest.parent.glob("fill-*.ply")}
     for path in sorted(written.keys() - {newest}, key=lambda path: -written[path])[_KEPT - 1 :]:

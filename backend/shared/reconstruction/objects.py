@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 
+from ..class_table import LARGEST_ID
 from ..color.recolor import Recolor
 from ..errors import InputError
 from ..formats.json_file import read_json, write_json
 from .lock import FolderInUse, locked
 
-LARGEST_ID = 2**32 - 1
 EDITABLE = (
     "name", "color", "merged_into", "left_out", "removed", "floaters", "fill", "recolor", "transform", "copies",
 )  # fmt: skip
@@ -133,7 +133,11 @@ def _locked(path: Path) -> Iterator[None]:
 
 def merged(objects: Sequence[SceneObject]) -> dict[int, int]:
     """Map each ID to the ID that it is shown as, following chains; merges into an unknown ID or itself are ignored."""
-    into = {entry.id: entry.merged_into for entry in objects}
+    return follow_merges({entry.id: entry.merged_into for entry in objects})
+
+
+def follow_merges(into: Mapping[int, int | None]) -> dict[int, int]:
+    """Do the work of `merged` on a mapping of each ID to the one that it is merged into, or None."""
     found = {}
     for start in into:
         at, seen = start, {start}
@@ -142,6 +146,25 @@ def merged(objects: Sequence[SceneObject]) -> dict[int, int]:
             at = after
         found[start] = at
     return found
+
+
+def shown_as(objects: Sequence[SceneObject]) -> dict[int, int | None]:
+    """Return which object stands for each object after merges.
+
+    Args:
+        objects: The objects with their edits.
+
+    Returns:
+        ID -> ID of the object that it is shown, meshed and exported as; None if that one or itself is left out. IDs of
+        no object, which are not in the result, stand for themselves.
+    """
+    left_out = {entry.id for entry in objects if entry.left_out}
+    return {i: None if {i, target} & left_out else target for i, target in merged(objects).items()}
+
+
+def members_of(objects: Sequence[SceneObject], object_id: int) -> list[int]:
+    """Return the ascending IDs of an object and of those that are merged into it; none if it is merged itself."""
+    return sorted(i for i, target in merged(objects).items() if target == object_id)
 
 
 def find_object(objects: Sequence[SceneObject], word: str, path: Path) -> SceneObject:

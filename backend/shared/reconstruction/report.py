@@ -6,8 +6,8 @@ report.json       the same, with the capture, settings, machine, stages, trainin
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,20 @@ from ..formats.json_file import plain, read_json, write_json
 
 EVALUATION = "evaluation.json"
 REPORT = "report.json"
+
+QUALITY = ("psnr", "ssim", "lpips", "miou", "mbiou", "dice", "accuracy")
+"""Metrics over the held-out views."""
+
+MESH_FIGURES = ("vertices", "faces", "watertight", "chamfer", "precision", "recall", "f1")
+_MODEL = ("anchors", "gaussians", "bytes")
+_ENTRIES = {
+    "left_out": ("what", "why"),
+    "stages": ("name", "seconds", "peak_rss_mb"),
+    "curve": ("seconds", "step", "psnr", "miou"),
+    "objects": ("id", "name", "iou", "anchors", "mesh"),
+}
+_REQUIRED = {"left_out": ("what", "why"), "stages": ("name",), "curve": ("seconds",), "objects": ("id",)}
+_TEXTS = ("what", "why", "name")
 
 
 @dataclass(frozen=True)
@@ -64,18 +78,131 @@ def read_evaluation(folder: Path) -> Evaluation | None:
         raise InputError(f"{path} has invalid content ({error!r}); run `evaluate` again.") from error
 
 
-def write_report_json(folder: Path, report: Mapping[str, Any]) -> None:
-    """Write report.json to the reconstruction `folder`."""
-    write_json(folder / REPORT, plain(report))
+@dataclass(frozen=True)
+class Report:
+    """The content of report.json, in the order of the file.
+
+    Attributes:
+        capture: folder name, numbers of views, objects and images.
+        settings: what the training was asked for.
+        machine: the computer, and the device that trained.
+        left_out: {"what", "why"} of each omitted step.
+        stages: {"name", "seconds", "peak_rss_mb"} of each command.
+        curve: {"seconds", "step", "psnr", "miou"} on held-out views over the training.
+        model: numbers of anchors and Gaussians, size in bytes, trained steps.
+        quality: means over the held-out views by metric name, with all of `QUALITY`.
+        objects: {"id", "name", "iou", "anchors", "mesh"} and other metrics of each object; "mesh" has all of
+            `MESH_FIGURES`.
+        plan: the decisions of plan.json.
+        views: metrics of each held-out view.
+        meshes: figures of the meshes that are not of one object.
+    """
+
+    capture: dict[str, Any] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict)
+    machine: dict[str, Any] = field(default_factory=dict)
+    left_out: list[dict[str, Any]] = field(default_factory=list)
+    stages: list[dict[str, Any]] = field(default_factory=list)
+    curve: list[dict[str, Any]] = field(default_factory=list)
+    model: dict[str, Any] = field(default_factory=dict)
+    quality: dict[str, Any] = field(default_factory=dict)
+    objects: list[dict[str, Any]] = field(default_factory=list)
+    plan: list[dict[str, Any]] = field(default_factory=list)
+    views: list[dict[str, Any]] = field(default_factory=list)
+    meshes: list[dict[str, Any]] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields as they stand in report.json."""
+        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
 
 
-def read_report(folder: Path) -> dict[str, Any]:
-    """Read report.json from the reconstruction `folder`.
+def complete(report: Report) -> Report:
+    """Return a copy that has all figures and can be written as JSON.
+
+    Args:
+        report: A report whose entries may lack figures.
+
+    Returns:
+        A report with plain numbers. Figures that are missing, NaN or infinite are None.
+
+    Raises:
+        ValueError: An entry has the wrong type; the message contains its name.
+    """
+    content = plain(report.as_dict(), "report")
+    model = {**dict.fromkeys(_MODEL), **_mapping(content, "model")}
+    quality = {**dict.fromkeys(QUALITY), **_mapping(content, "quality")}
+    objects = _entries(content, "objects")
+    for entry in objects:
+        if entry["name"] is None:
+            entry["name"] = str(entry["id"])
+        entry["mesh"] = {**dict.fromkeys(MESH_FIGURES), **(entry["mesh"] or {})}
+    return Report(
+        capture=_mapping(content, "capture"),
+        settings=_mapping(content, "settings"),
+        machine=_mapping(content, "machine"),
+        left_out=_entries(content, "left_out"),
+        stages=_entries(content, "stages"),
+        curve=sorted(_entries(content, "curve"), key=lambda entry: entry["seconds"]),
+        model=_numbers(model, "model", _MODEL),
+        quality=_numbers(quality, "quality", QUALITY),
+        objects=objects,
+        plan=content["plan"],
+        views=content["views"],
+        meshes=content["meshes"],
+    )
+
+
+def write_report_json(folder: Path, report: Report) -> None:
+    """Write report.json to the reconstruction `folder`; raise ValueError if `report` has a wrong entry."""
+    write_json(folder / REPORT, complete(report).as_dict())
+
+
+def read_report(folder: Path) -> Report:
+    """Read report.json from the reconstruction `folder`; figures that it lacks are None, unknown names are left out.
 
     Raises:
         InputError: The file is missing or is not a report.
     """
     content = read_json(folder / REPORT)
-    if not isinstance(content, dict):
-        raise InputError(f"{folder / REPORT} is not a report; run `report` again.")
-    return content
+    try:
+        if not isinstance(content, dict):
+            raise ValueError("it is not a JSON object")
+        known = {entry.name: content[entry.name] for entry in fields(Report) if entry.name in content}
+        return complete(Report(**known))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{folder / REPORT} is not a report ({error}); run `report` again.") from error
+
+
+def _mapping(as_json: Mapping[str, Any], name: str) -> dict[str, Any]:
+    value = as_json.get(name)
+    if value is not None and not isinstance(value, dict):
+        raise ValueError(f"report.{name} must be an object, not a {type(value).__name__}")
+    return value or {}
+
+
+def _entries(as_json: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
+    value = as_json.get(name) or []
+    if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
+        raise ValueError(f"report.{name} must be a list of objects")
+    entries = [{**dict.fromkeys(_ENTRIES[name]), **entry} for entry in value]
+    for i, entry in enumerate(entries):
+        for key in _REQUIRED[name]:
+            if entry[key] is None:
+                raise ValueError(f"report.{name}[{i}] has no {key}")
+        for key in _ENTRIES[name]:
+            if key == "mesh":
+                if entry[key] is not None and not isinstance(entry[key], dict):
+                    raise ValueError(f"report.{name}[{i}].mesh must be an object")
+            elif key in _TEXTS:
+                if entry[key] is not None and not isinstance(entry[key], str):
+                    raise ValueError(f"report.{name}[{i}].{key} must be text, not {entry[key]!r}")
+            else:
+                _numbers(entry, f"{name}[{i}]", (key,))
+    return entries
+
+
+def _numbers(values: dict[str, Any], where: str, keys: Sequence[str]) -> dict[str, Any]:
+    for key in keys:
+        if values[key] is not None and (isinstance(values[key], bool) or not isinstance(values[key], int | float)):
+            raise ValueError(f"report.{where}.{key} must be a number or null, not {values[key]!r}")
+    return values

@@ -35,9 +35,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..class_table import LARGEST_ID
 from ..errors import InputError
 from ..formats.json_file import read_json, write_json
-from .objects import LARGEST_ID, affine_map
+from .objects import affine_map
 
 VERSION = 1
 NAME = "shot.json"
@@ -183,7 +184,7 @@ def _shot(content: Any) -> Shot:
     shot = Shot(
         width=_whole(content.get("width"), 1, LARGEST_SIDE, "width"),
         height=_whole(content.get("height"), 1, LARGEST_SIDE, "height"),
-        pixel_aspect=_above_zero(content.get("pixel_aspect", 1.0), "pixel_aspect"),
+        pixel_aspect=_pixel_aspect(content.get("pixel_aspect", 1.0)),
         depth_scale=_above_zero(content.get("depth_scale", 1.0), "depth_scale"),
         only_named=_truth(content.get("only_named", False), "only_named"),
         frames=[_frame(entry, steady) for entry in frames],
@@ -267,6 +268,13 @@ def _above_zero(value: Any, what: str) -> float:
     number = _numbers(value, (), what)
     if number <= 0:
         raise _Wrong(f"{what} is not above 0")
+    return number
+
+
+def _pixel_aspect(value: Any) -> float:
+    number = _above_zero(value, "pixel_aspect")
+    if not 1e-6 <= number <= 1e6:  # The limits of OpenEXR.
+        raise _Wrong("pixel_aspect is not between 1e-6 and 1e6")
     return number
 
 

@@ -12,18 +12,17 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ....backend.shared.formats.ply import read_vertices
-from ....backend.shared.reconstruction.fill import FILLS, UNOBSERVED, fill_path
+from ....backend.shared.formats.splat_ply import UNOBSERVED, ids_of
+from ....backend.shared.reconstruction.fill import FILLS, FillRows, fill_path, read_fill
 from ....backend.shared.reconstruction.folder import Reconstruction
 from .. import carrier
 from ..capture import origin_of
 from ..kinds import OBJECT_PARENT, SPLATS, folder_of, object_collections, part_of
 from ..object_collection import center_of
-from ..objects_file import Objects
-from ..points import positions_of
+from ..object_display import Objects
 from ..shading.modifiers import update_groups
 from ..shading.node_groups import HIDDEN
-from ..splats import ids_of, splat_attributes
+from ..splats import positions_of, splat_attributes
 
 SHOWN_FILL = "objectgs_fill"
 """Custom property of a carrier's mesh: the name of the fill file that it shows."""
@@ -46,7 +45,7 @@ def show_fills(root: bpy.types.Collection, objects: Objects) -> None:
         InputError: A file cannot be read, or a carrier is in Edit Mode; nothing is changed.
     """
     path = _path(root, objects)
-    rows = read_vertices(path) if path is not None and path.is_file() else None
+    rows = read_fill(path) if path is not None and path.is_file() else None
     filled = [entry.id for entry in objects.entries.values() if entry.removed and entry.fill]
     changes = []
     for object_id, collection in object_collections(root).items():
@@ -58,8 +57,8 @@ def show_fills(root: bpy.types.Collection, objects: Objects) -> None:
             if not np.isin(fills, [0, *filled]).all():
                 changes.append((collection, obj, np.where(np.isin(fills, filled), fills, 0), None, ""))
             continue
-        own = rows[ids_of(rows) == object_id]
-        shows = path.name if len(own) else ""
+        own = rows.select(ids_of(rows.splats) == object_id)
+        shows = path.name if len(own.new) else ""
         if shows != (obj.data.get(SHOWN_FILL, "") if fills.any() else ""):
             changes.append((collection, obj, np.zeros_like(fills), own, shows))
     carrier.require_object_mode(obj for _, obj, *_ in changes)
@@ -71,7 +70,7 @@ def show_fills(root: bpy.types.Collection, objects: Objects) -> None:
         obj.data[SHOWN_FILL] = shows
     for object_id, collection in object_collections(root).items():
         if rows is not None and object_id in filled:
-            collection[UNOBSERVED_COUNT] = int(((rows[FILLS] == object_id) & (rows[UNOBSERVED] != 0)).sum())
+            collection[UNOBSERVED_COUNT] = rows.count_new(object_id)
         elif UNOBSERVED_COUNT in collection:
             del collection[UNOBSERVED_COUNT]
 
@@ -80,7 +79,7 @@ def filled_objects(mesh: bpy.types.Mesh) -> np.ndarray:
     """Return the (n,) int64 IDs of the removed objects whose fill adds or replaces each splat of a carrier; else 0."""
     if FILLS not in mesh.attributes:
         return np.zeros(len(mesh.vertices), np.int64)
-    return carrier.read(mesh, FILLS).astype(np.int64) & 0xFFFFFFFF
+    return carrier.read_ids(mesh, FILLS)
 
 
 def unobserved_splats(mesh: bpy.types.Mesh) -> np.ndarray:
@@ -115,25 +114,25 @@ def _keep(obj: bpy.types.Object, fills: np.ndarray) -> None:
     )
 
 
-def _put(obj: bpy.types.Object, rows: np.ndarray, origin: np.ndarray, center: np.ndarray) -> None:
+def _put(obj: bpy.types.Object, rows: FillRows, origin: np.ndarray, center: np.ndarray) -> None:
     """Append the unobserved splats in `rows` to a carrier, and hide its splats that match the other rows.
 
     Args:
         obj: the carrier.
-        rows: rows of the fill file for this carrier.
+        rows: splats of the fill file for this carrier.
         origin: (3,) origin of the reconstruction in capture coordinates.
         center: (3,) origin of the carrier in reconstruction coordinates.
     """
     mesh = obj.data
-    is_put = rows[UNOBSERVED] != 0
-    positions, new = positions_of(rows, origin) - center, splat_attributes(rows)
+    is_put = rows.new
+    positions, new = positions_of(rows.splats, origin) - center, splat_attributes(rows.splats)
     before = _attributes(mesh)
     before[HIDDEN] = "BOOLEAN", _hidden_otherwise(mesh)
     there = carrier.read(mesh, "position")
     taken = _among(
         _keys(there, before["radiance:base"][1]),
         _keys(positions[~is_put], new["radiance:base"][1][~is_put]),
-        rows[FILLS][~is_put],
+        rows.fills[~is_put],
     )
     count = int(is_put.sum())
     attributes = {}
@@ -141,7 +140,7 @@ def _put(obj: bpy.types.Object, rows: np.ndarray, origin: np.ndarray, center: np
         added = new[name][1][is_put] if name in new else np.zeros((count, *values.shape[1:]), values.dtype)
         attributes[name] = kind, np.concatenate([values, added])
     attributes[UNOBSERVED] = "BOOLEAN", np.arange(len(there) + count) >= len(there)
-    attributes[FILLS] = "INT", carrier.stored_ids(np.concatenate([taken, rows[FILLS][is_put]]))
+    attributes[FILLS] = "INT", carrier.stored_ids(np.concatenate([taken, rows.fills[is_put]]))
     _fill(obj, np.concatenate([there, positions[is_put]]), attributes)
 
 

@@ -18,7 +18,7 @@ from ....backend.shared.reconstruction.folder import Reconstruction
 from ....backend.shared.reconstruction.objects import SceneObject, edit_objects, read_objects
 from .. import carrier
 from ..kinds import OBJECT_PARENT, SPLATS, duplicates_of, folder_of, object_collections, part_of
-from ..objects_file import Objects
+from ..object_display import Objects
 from .duplicates import DUPLICATES, adopt_blender_duplicates, bring_up_to_date, duplicate, remove_duplicate
 from .fills import show_fills
 from .floaters import hide_floaters

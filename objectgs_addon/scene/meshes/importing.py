@@ -9,11 +9,12 @@ import numpy as np
 from ....backend.shared.color.palette import to_linear
 from ....backend.shared.errors import InputError
 from ....backend.shared.formats.mesh_ply import Mesh, read_mesh
+from ....backend.shared.formats.splat_ply import UNOBSERVED
 from .. import carrier
 from ..capture import origin_of
 from ..kinds import ANCHORS, MESH, MESH_KEY, OBJECT_PARENT, SPLATS, adopt, mark, parent_of
 from ..object_collection import NAME, center_of, ensure_pivot, new_collection, textures_of
-from ..objects_file import Objects
+from ..object_display import Objects
 from ..shading.materials import mesh_material
 from .listed import ListedMesh
 from .textures import load_texture, reload_texture
@@ -21,7 +22,7 @@ from .textures import load_texture, reload_texture
 WRITTEN = "objectgs_written"
 """Custom property of a mesh object: the modification times of the files it shows."""
 
-UV_MAP, COLORS, UNOBSERVED = "UVMap", "Col", "unobserved"
+UV_MAP, COLORS = "UVMap", "Col"
 
 
 class MeshImporter:

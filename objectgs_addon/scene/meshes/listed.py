@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ....backend.shared.reconstruction.folder import Reconstruction
 from ....backend.shared.reconstruction.meshes import read_meshes
-from ..objects_file import Objects
+from ..object_display import Objects
 
 
 @dataclass(frozen=True)

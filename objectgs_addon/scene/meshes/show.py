@@ -19,7 +19,7 @@ from .. import carrier
 from ..edits.show import show_edits
 from ..kinds import MESH, MESH_KEY, SPLATS, duplicates_of, kind_of, object_collections, object_id_of, parts_of
 from ..object_collection import remove, remove_if_empty
-from ..objects_file import Objects
+from ..object_display import Objects
 from .importing import MeshImporter
 from .listed import assign_to_collections, read_listed
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 
 import bpy
 
+from ....backend.shared.splats.blending import ALPHA_MIN
 from ..kinds import MESH_MATERIAL, SPLATS_MATERIAL, mark
 from .graph import Graph, find_or_make
-
-SMALLEST_ALPHA = 1.0 / 255.0
-"""Alpha at which a splat is cut off."""
 
 COLOR = "display_color"
 """Linear RGBA attribute of shown points and splats. Cycles uses the name "color" for the color of volumes."""
@@ -112,7 +110,7 @@ def _falloff(
         hidden: 1 where alpha is forced to 0, or None.
     """
     falloff = graph.math(
-        "POWER", graph.math("MULTIPLY", opacity, 1.0 / SMALLEST_ALPHA), graph.math("MULTIPLY", squared_distance, -1.0)
+        "POWER", graph.math("MULTIPLY", opacity, 1.0 / ALPHA_MIN), graph.math("MULTIPLY", squared_distance, -1.0)
     )
     alpha = graph.math(
         "MULTIPLY", graph.math("MULTIPLY", opacity, falloff), graph.math("LESS_THAN", squared_distance, 1.0)

@@ -13,11 +13,12 @@ from typing import Any
 
 import bpy
 
-from ....backend.shared.splats.spherical_harmonics import C0
+from ....backend.shared.splats import spherical_harmonics as sh
+from ....backend.shared.splats.blending import ALPHA_MIN
 from ..kinds import kind_of, mark
 from .color_nodes import linear_channel, recolor_inputs, recolored
 from .graph import Graph, find_or_make
-from .materials import COLOR, SMALLEST_ALPHA, ellipsoids_material
+from .materials import COLOR, ellipsoids_material
 
 POINTS_GROUP = "points_preview"
 SPLATS_GROUP = "splats_preview"
@@ -135,7 +136,7 @@ def _make_splats_group(name: str) -> bpy.types.NodeTree:
     graph = Graph(tree)
     group_input = graph.node("NodeGroupInput")
     splat = _Splat(graph)
-    raw = recolored(graph, graph.vector("MULTIPLY_ADD", splat.base, (C0,) * 3, (0.5,) * 3), group_input)
+    raw = recolored(graph, graph.vector("MULTIPLY_ADD", splat.base, (sh.C0,) * 3, (0.5,) * 3), group_input)
     points = graph.node("GeometryNodeMeshToPoints", {"Mesh": group_input.outputs["Geometry"]}).outputs[0]
 
     first, second, third = splat.sides
@@ -229,7 +230,7 @@ def _make_render_group(name: str) -> bpy.types.NodeTree:
     )
     extent = graph.math("MULTIPLY", splat.reach, widened)
 
-    raw = graph.vector("MULTIPLY_ADD", splat.base, (C0,) * 3, (0.5,) * 3)
+    raw = graph.vector("MULTIPLY_ADD", splat.base, (sh.C0,) * 3, (0.5,) * 3)
     raw = _add_harmonics(graph, raw, graph.vector("NORMALIZE", graph.vector("SCALE", towards, -1.0)))
     raw = recolored(graph, raw, group_input)
     kept = graph.node("FunctionNodeBooleanMath", {0: splat.is_seen, 1: outside}, operation="AND").outputs[0]
@@ -294,13 +295,13 @@ class _Splat:
         longest = graph.math("MAXIMUM", graph.math("MAXIMUM", *self.sides[:2]), self.sides[2])
         self.thinnest = graph.math("MULTIPLY", longest, MINIMUM_FLATNESS)
         # Distance from the center in sigmas at which alpha falls to 1/255.
-        ratio = graph.math("MAXIMUM", graph.math("MULTIPLY", self.opacity, 1.0 / SMALLEST_ALPHA), 1.0)
+        ratio = graph.math("MAXIMUM", graph.math("MULTIPLY", self.opacity, 1.0 / ALPHA_MIN), 1.0)
         self.reach = graph.math("SQRT", graph.math("MULTIPLY", graph.math("LOGARITHM", ratio, math.e), 2.0))
         self.hidden = graph.attribute(HIDDEN, "BOOLEAN")
         shown = graph.node("FunctionNodeBooleanMath", {0: self.hidden}, operation="NOT").outputs[0]
         self.is_seen = graph.node(
             "FunctionNodeBooleanMath",
-            {0: graph.math("GREATER_THAN", self.opacity, 1.01 * SMALLEST_ALPHA), 1: shown},
+            {0: graph.math("GREATER_THAN", self.opacity, 1.01 * ALPHA_MIN), 1: shown},
             operation="AND",
         ).outputs[0]
 
@@ -329,21 +330,21 @@ def _add_harmonics(graph: Graph, color: bpy.types.NodeSocket, direction: bpy.typ
 
     round_ = combined((4.0, zz), (-1.0, xx), (-1.0, yy))
     terms = (
-        (-0.4886025119029199, y),
-        (0.4886025119029199, z),
-        (-0.4886025119029199, x),
-        (1.0925484305920792, xy),
-        (-1.0925484305920792, yz),
-        (0.31539156525252005, combined((2.0, zz), (-1.0, xx), (-1.0, yy))),
-        (-1.0925484305920792, xz),
-        (0.5462742152960396, combined((1.0, xx), (-1.0, yy))),
-        (-0.5900435899266435, times(y, combined((3.0, xx), (-1.0, yy)))),
-        (2.890611442640554, times(xy, z)),
-        (-0.4570457994644658, times(y, round_)),
-        (0.3731763325901154, times(z, combined((2.0, zz), (-3.0, xx), (-3.0, yy)))),
-        (-0.4570457994644658, times(x, round_)),
-        (1.445305721320277, times(z, combined((1.0, xx), (-1.0, yy)))),
-        (-0.5900435899266435, times(x, combined((1.0, xx), (-3.0, yy)))),
+        (-sh.C1, y),
+        (sh.C1, z),
+        (-sh.C1, x),
+        (sh.C2, xy),
+        (-sh.C2, yz),
+        (sh.C20, combined((2.0, zz), (-1.0, xx), (-1.0, yy))),
+        (-sh.C2, xz),
+        (sh.C2 / 2, combined((1.0, xx), (-1.0, yy))),
+        (-sh.C33, times(y, combined((3.0, xx), (-1.0, yy)))),
+        (sh.C32, times(xy, z)),
+        (-sh.C31, times(y, round_)),
+        (sh.C30, times(z, combined((2.0, zz), (-3.0, xx), (-3.0, yy)))),
+        (-sh.C31, times(x, round_)),
+        (sh.C32 / 2, times(z, combined((1.0, xx), (-1.0, yy)))),
+        (-sh.C33, times(x, combined((1.0, xx), (-3.0, yy)))),
     )
     for k, (factor, value) in enumerate(terms, start=1):
         weight = graph.math("MULTIPLY", value, factor)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Display data of objects from objects.json: names, colors, merges and left-out objects."""
+"""Names and colors that objects are displayed with, and the collections that show them, as objects.json says."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 
 from ...backend.shared.color.palette import UNLABELED, colors_of, to_linear
 from ...backend.shared.reconstruction.folder import Reconstruction
-from ...backend.shared.reconstruction.objects import SceneObject, default_name, merged, read_objects
+from ...backend.shared.reconstruction.objects import SceneObject, default_name, read_objects, shown_as
 
 _LINEAR = np.array([to_linear((value,))[0] for value in range(256)], np.float32)
 
@@ -26,11 +26,11 @@ class Objects:
 
     Attributes:
         entries: ID -> object with the user's edits.
-        target: ID -> ID of the object it is merged into, or its own.
+        shown: ID -> ID of the object that shows it, or None if it is left out.
     """
 
     entries: dict[int, SceneObject]
-    target: dict[int, int]
+    shown: dict[int, int | None]
 
     @classmethod
     def read(cls, folder: Path) -> "Objects":
@@ -41,14 +41,11 @@ class Objects:
         """
         path = Reconstruction(folder).objects
         entries = read_objects(path) if path.exists() else []
-        return cls({entry.id: entry for entry in entries}, merged(entries))
+        return cls({entry.id: entry for entry in entries}, shown_as(entries))
 
     def shown_as(self, object_id: int) -> int | None:
         """Return the ID of the object whose collection shows `object_id`, or None if the object is left out."""
-        target = self.target.get(object_id, object_id)
-        if any(at in self.entries and self.entries[at].left_out for at in (object_id, target)):
-            return None
-        return target
+        return self.shown.get(object_id, object_id)
 
     def name(self, object_id: int) -> str:
         """Return the object's name, or a default name if the ID is not in objects.json."""
@@ -73,5 +70,4 @@ class Objects:
 
     def grouping(self) -> dict[str, int | None]:
         """Map the IDs (as strings) of merged and left-out objects to the result of `shown_as`."""
-        shown = {object_id: self.shown_as(object_id) for object_id in self.entries}
-        return {str(object_id): target for object_id, target in shown.items() if target != object_id}
+        return {str(object_id): target for object_id, target in self.shown.items() if target != object_id}

@@ -5,17 +5,18 @@ from __future__ import annotations
 import argparse
 import hashlib
 
-from ...capture import Capture
-from ...labels import vote as vote_points
-from ...labels.points import read_points, write_points
-from ...shared.color.palette import object_colors
-from ...shared.errors import InputError
-from ...shared.events import Reporter
-from ...shared.reconstruction.folder import Reconstruction
-from ...shared.reconstruction.objects import default_name, write_objects
-from ...shared.reconstruction.record import VotesRecord, read_record, update_record
-from ..folder import digest
-from ..stages import stage
+from ..capture import Capture
+from ..labels import vote as vote_points
+from ..labels.points import write_points
+from ..shared.color.palette import object_colors
+from ..shared.errors import InputError
+from ..shared.events import Reporter
+from ..shared.formats.points_ply import read_points
+from ..shared.reconstruction.folder import Reconstruction
+from ..shared.reconstruction.objects import default_name, write_objects
+from ..shared.reconstruction.record import VotesRecord, read_record, update_record
+from .folder import digest
+from .stages import stage
 
 
 def cast_votes(folder: Reconstruction, capture: Capture, options: argparse.Namespace, reporter: Reporter) -> None:
@@ -36,7 +37,21 @@ def cast_votes(folder: Reconstruction, capture: Capture, options: argparse.Names
 
 
 def votes_are_current(folder: Reconstruction, capture: Capture, max_size: int, strategy: str, seed: int) -> bool:
-    """Return whether points.ply is complete and contains the result of the same vote."""
+    """Return whether points.ply is complete and contains the result of the same vote.
+
+    Args:
+        folder: The reconstruction.
+        capture: Its capture, whose masks may have been modified since.
+        max_size: Longest side of the images that voted, in pixels.
+        strategy: As in `labels.vote`.
+        seed: For the strategy probability; others do not depend on it.
+
+    Returns:
+        Whether a vote with these inputs would give the points in points.ply; False if the file is damaged.
+
+    Raises:
+        InputError: objectgs.json is invalid.
+    """
     if not folder.points.exists() or not folder.objects.exists():
         return False
     if read_record(folder).votes != votes_key(capture, max_size, strategy, seed):

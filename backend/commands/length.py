@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from ...capture import Capture
-from ...shared.errors import InputError
-from ...shared.expectation import DEFAULT_SECONDS, expectation
-from ...training.budget import PRESETS, Budget, TrainingProgress
+from ..capture import Capture
+from ..shared.errors import InputError
+from ..shared.expectation import DEFAULT_SECONDS, expectation
+from ..training.budget import PRESETS, Budget, TrainingProgress
 
 
 def budget_of(options: argparse.Namespace) -> Budget:

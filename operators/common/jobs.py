@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Jobs that operators submit, and the folders of new reconstructions."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import bpy
+
+from ...backend.shared.reconstruction.folder import Reconstruction
+from ...objectgs_addon import scene
+from ...objectgs_addon.environment import locations
+from ...objectgs_addon.running import background
+from ...objectgs_addon.state.folder_state import folder_state
+from . import need
+
+
+def submit_for_capture(
+    operator: bpy.types.Operator, context: bpy.types.Context, title: str, command: str, *arguments: str
+) -> set[str]:
+    """Submit a command of the backend on the capture of the active reconstruction.
+
+    Args:
+        operator: The operator, which reports to the user.
+        context: Its context.
+        title: Title of the job, to which the name of the reconstruction is added.
+        command: The command, which is also the kind of the job; its first options are the capture and --out.
+        arguments: Further options.
+
+    Returns:
+        The result of the operator.
+    """
+    root = need.active_root(context)
+    folder = scene.folder_of(root)
+    capture = str(folder_state(folder).capture)
+    job = locations.backend_job(
+        f"{title} {root.name}", command, folder, command, capture, "--out", str(folder), *arguments
+    )
+    return background.submit(job, context.scene, operator.report)
+
+
+def folder_to_import_to(chosen: str, default: Callable[[], Path]) -> Path:
+    """Return the folder that an import writes to: the one that the user has chosen, or else `default()`.
+
+    Raises:
+        InputError: A job uses the folder, or it contains files that are not of a reconstruction.
+    """
+    folder = Path(bpy.path.abspath(chosen)).resolve() if chosen else default()
+    need.require_unused(folder)
+    Reconstruction(folder).require_own()
+    return folder
