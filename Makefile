@@ -28,6 +28,8 @@ export NUMBA_CACHE_DIR ?= $(abspath .venv/kernels)
 
 # Where `make gpu` looks for a torch that sees a GPU: in PYTHON where it is given, else in these.
 GPU_PYTHONS = $(if $(filter command environment,$(firstword $(origin PYTHON))),$(PYTHON),$(BACKEND) python3)
+# How long `make fuzz` tries random cases.
+MINUTES ?= 10
 # The capture that benchmarks/gpu.py trains on, where there is one.
 CAPTURE ?= $(wildcard build/demo/capture)
 
@@ -43,6 +45,7 @@ help:
 	@echo "make venv           the backend's environment, .venv, alone"
 	@echo "make lock           requirements/locked/ anew, after a change of the backend's packages"
 	@echo "make benchmarks     speed of the rasterizer and of training"
+	@echo "make fuzz           hostile inputs, kills and races for MINUTES=10; writes docs/reliability.md"
 	@echo "make gpu            tests and benchmarks on an NVIDIA GPU; CAPTURE may name what to train on"
 	@echo "make clean          remove environments and build/"
 
@@ -80,7 +83,7 @@ zip: .venv-bpy/ready
 	$(BLENDER_EXT) validate build/objectgs-*.zip
 
 test: .venv/ready .venv-bpy/ready
-	$(BACKEND) -m pytest -n 2 tests/backend
+	$(BACKEND) -m pytest -n 2 tests/backend tests/fuzz
 	$(BLENDER) -m pytest -n 2 tests/blender
 
 test-window: .venv/ready .venv-bpy/ready
@@ -94,6 +97,9 @@ test-blenders: .venv/ready .venv-bpy-4.2/ready
 		echo "There is no Python 3.13 here, so Blender 5.2 was left out; PYTHON313 may name one."; \
 	fi
 	$(BACKEND) -m pytest tests/window --all-blenders
+
+fuzz: .venv/ready
+	$(BACKEND) -m tests.fuzz --minutes $(MINUTES) --write
 
 lint: .venv/ready
 	$(BACKEND) -m ruff check .

@@ -17,7 +17,7 @@ from ..planning.decisions import planned_capture
 from ..raster import devices
 from ..shared.errors import InputError
 from ..shared.events import Reporter
-from ..shared.formats.atomic import recorded
+from ..shared.formats.atomic import recorded, remove_abandoned
 from ..shared.reconstruction.folder import Reconstruction
 from ..shared.reconstruction.lock import locked
 from ..shared.reconstruction.objects import read_objects
@@ -80,6 +80,7 @@ def open_output(options: argparse.Namespace) -> Iterator[Output]:
             output.folder.create()
             with locked(output.folder.folder):
                 try:
+                    remove_abandoned(output.folder.folder)
                     update_record(output.folder)
                     yield output
                 except (InputError, OSError) as error:

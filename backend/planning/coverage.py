@@ -13,6 +13,9 @@ SAME_PIXELS = 0.5
 SAME_COLOR = 1.5
 """Their images are the same if they differ by at most this on average, of 255, as after another JPEG compression."""
 
+_BLOCKS = 8
+"""Number of blocks along each side of an image whose means are compared first."""
+
 MARGIN = 0.1
 """Fraction of its size that a view is enlarged by on each side, since splats extend beyond their points."""
 
@@ -32,12 +35,16 @@ def duplicate_views(capture: Capture) -> list[int]:
     if len(train) < 2:
         return []
     poses = _compute_pose_vectors(capture, train)
+    tree, images = cKDTree(poses), _Images(capture)
     found: set[int] = set()
-    # Pairs in the order of the earlier view, so that the first of several equal views is kept.
-    for first, second in sorted(cKDTree(poses).query_pairs(SAME_PIXELS, p=np.inf)):
-        a, b = train[first], train[second]
-        if a not in found and b not in found and _same_camera(capture, a, b) and _same_image(capture, a, b):
-            found.add(b)
+    # In the order of the earlier view, so that the first of several equal views is kept. The views near each one are
+    # looked up one by one, since all pairs of a fixed camera's thousands of views would not fit into memory.
+    for first, a in enumerate(train):
+        if a not in found:
+            near = (second for second in tree.query_ball_point(poses[first], SAME_PIXELS, p=np.inf) if second > first)
+            for b in sorted(train[second] for second in near):
+                if b not in found and _same_camera(capture, a, b) and images.same(a, b):
+                    found.add(b)
     return sorted(found)
 
 
@@ -65,11 +72,31 @@ def _same_camera(capture: Capture, a: int, b: int) -> bool:
     return same_size and np.allclose(first.K, second.K, rtol=0, atol=SAME_PIXELS)
 
 
-def _same_image(capture: Capture, a: int, b: int) -> bool:
-    if capture.ids_in(a) != capture.ids_in(b):
-        return False
-    difference = capture.image(a).astype(np.int16) - capture.image(b)
-    return float(np.abs(difference).mean()) <= SAME_COLOR
+class _Images:
+    """Comparison of a capture's images, which are read only if the means of their blocks are alike."""
+
+    def __init__(self, capture: Capture) -> None:
+        self._capture = capture
+        self._means: dict[int, np.ndarray] = {}
+
+    def same(self, a: int, b: int) -> bool:
+        """Return whether two views of the same size have the same image and the same objects in their masks."""
+        if self._capture.ids_in(a) != self._capture.ids_in(b):
+            return False
+        # The difference of two means is at most the mean of the differences, so this rejects no equal images.
+        if float(np.abs(self._block_means(a) - self._block_means(b)).sum(axis=(0, 1)).mean()) > SAME_COLOR:
+            return False
+        difference = self._capture.image(a).astype(np.int16) - self._capture.image(b)
+        return float(np.abs(difference).mean()) <= SAME_COLOR
+
+    def _block_means(self, index: int) -> np.ndarray:
+        """Return the sums of an image's blocks over its number of pixels, (up to _BLOCKS, up to _BLOCKS, 3)."""
+        if index not in self._means:
+            image = self._capture.image(index)
+            rows, columns = (np.unique(np.linspace(0, n, _BLOCKS, endpoint=False).astype(int)) for n in image.shape[:2])
+            sums = np.add.reduceat(np.add.reduceat(image.astype(np.float64), rows, axis=0), columns, axis=1)
+            self._means[index] = sums / (image.shape[0] * image.shape[1])
+        return self._means[index]
 
 
 def blind_views(capture: Capture) -> list[int]:

@@ -175,3 +175,13 @@ def test_export_per_object_handles_conflicting_names(run_command, trained):  # n
         len({path.name.casefold() for path in files}) == len(files) and not (out.parent / "each" / "CON.ply").exists()
     )
     assert sum(len(read_splats(path)[0]) for path in files) == result.events[-1]["splats"]
+
+
+def test_old_temporary_files_are_removed(run_command, tmp_path, capture):
+    assert run_command("vote", capture, "--out", tmp_path / "out").code == EXIT_DONE
+    old, new = (tmp_path / "out" / "cache" / f".objectgs-{name}-a.ply.part" for name in ("0a", "0b"))
+    for path in (old, new):
+        path.write_bytes(b"left by a killed process")
+    os.utime(old, (0, 0))
+    assert run_command("vote", capture, "--out", tmp_path / "out").code == EXIT_DONE
+    assert new.exists() and not old.exists()

@@ -1,4 +1,7 @@
-"""`python -m tests.fuzz`: hostile inputs for minutes; see --help."""
+"""Hostile inputs, kills, races, full disks and lost output; prints what went wrong, and exits with 1 if anything did.
+
+`make fuzz MINUTES=10` runs all of it; --write also writes docs/reliability.md.
+"""
 
 from __future__ import annotations
 
@@ -8,51 +11,138 @@ import sys
 import tempfile
 import threading
 import time
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from .running import Runner
+from .kills import run_deletions, run_full_disks, run_kills
+from .races import edit_at_once, race_for_lock
+from .running import MEMORY_MB, ROOT, Runner
 from .session import Tally, run_cases
-from .templates import make_templates
+from .streams import run_signals, run_streams
+from .templates import Templates, make_templates
+
+DOCUMENT = ROOT / "docs" / "reliability.md"
+KILLS, DISKS, DELETIONS, SIGNALS, ROUNDS, EDITS = 100, 52, 30, 30, 1000, 300
+
+
+@dataclass
+class Results:
+    """What was run and found: the random cases, and for each other test its number of runs and the faults."""
+
+    tally: Tally = field(default_factory=Tally)
+    others: dict[str, tuple[int, list[str]]] = field(default_factory=dict)
+
+    @property
+    def faults(self) -> list[str]:
+        """A text for each fault."""
+        return [*map(str, self.tally.failures), *(fault for _, found in self.others.values() for fault in found)]
 
 
 def main() -> int:
-    """Run the cases and print what was found; return 1 if anything was."""
+    """Run everything and print what was found; return 1 if anything was."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
-    parser.add_argument("--minutes", type=float, default=10, help="time to run for (10)")
+    parser.add_argument("--minutes", type=float, default=10, help="time for the random cases (10)")
     parser.add_argument("--seed", type=int, default=0, help="number of the first case (0)")
-    parser.add_argument("--only", type=int, nargs="+", help="run only the cases with these numbers")
-    parser.add_argument("--jobs", type=int, default=2, help="number of processes (2)")
+    parser.add_argument("--only", type=int, nargs="+", help="run only the random cases with these numbers")
+    parser.add_argument("--cases", action="store_true", help="run only random cases")
+    parser.add_argument("--write", action="store_true", help="write docs/reliability.md")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="objectgs-fuzz-") as name:
-        tally = _run(Path(name), options)
-    for failure in tally.failures:
-        print(failure, end="\n\n")
-    print(f"{sum(tally.cases.values())} cases: {dict(tally.cases)}")
-    print(f"exits {dict(tally.exits)}, largest {tally.largest_mb:.0f} MB, longest {tally.longest_seconds:.1f} s")
-    print(f"{len(tally.failures)} failures")
-    return bool(tally.failures)
+        results = _run(Path(name), options)
+    for fault in results.faults:
+        print(fault, end="\n\n")
+    print(document(results))
+    if options.write:
+        DOCUMENT.write_text(document(results), encoding="utf-8")
+    return bool(results.faults)
 
 
-def _run(folder: Path, options: argparse.Namespace) -> Tally:
-    runners = [Runner() for _ in range(1 if options.only else options.jobs)]
+def _run(folder: Path, options: argparse.Namespace) -> Results:
+    results = Results()
+    runners = [Runner() for _ in range(1 if options.only else 2)]
     templates = make_templates(folder / "templates", runners[0])
     until = None if options.only else time.monotonic() + 60 * options.minutes
-    tally, lock = Tally(), threading.Lock()
+    lock = threading.Lock()
 
     def work(number: int) -> None:
         seeds = options.only or itertools.count(options.seed + number, len(runners))
         found = run_cases(seeds, folder / f"worker-{number}", templates, runners[number], until)
         with lock:
-            tally.add(found)
+            results.tally.add(found)
 
     threads = [threading.Thread(target=work, args=(number,)) for number in range(len(runners))]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
+    if not (options.only or options.cases):
+        _run_others(folder, options.seed, templates, runners, results)
     for runner in runners:
         runner.close()
-    return tally
+    return results
+
+
+def _run_others(folder: Path, seed: int, templates: Templates, runners: list[Runner], results: Results) -> None:
+    halves: dict[str, list[str]] = {"kills": [], "disks": [], "deletions": []}
+
+    def work(number: int) -> None:
+        place, runner = folder / f"others-{number}", runners[number]
+        share = len(runners)
+        halves["kills"] += run_kills(KILLS // share, seed + number, place, templates, runner)
+        halves["disks"] += run_full_disks(DISKS // share, seed + number, place, templates, runner)
+        halves["deletions"] += run_deletions(DELETIONS // share, seed + number, place, templates, runner)
+
+    threads = [threading.Thread(target=work, args=(number,)) for number in range(len(runners))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    twice, nobody = race_for_lock(ROUNDS, folder / "lock")
+    refused, found = edit_at_once(EDITS, folder, templates)
+    runs, lost = run_streams(templates, folder)
+    race = [f"the lock of a folder had two holders in {twice} rounds"] * bool(twice)
+    results.others = {
+        "commands killed at random moments (kill -9)": (KILLS, halves["kills"]),
+        "commands on a full disk": (DISKS, halves["disks"]),
+        "folders deleted while a command uses them": (DELETIONS, halves["deletions"]),
+        f"rounds in which three processes lock a folder at once (in {nobody} of them all gave way)": (ROUNDS, race),
+        f"concurrent edits of objects.json ({refused} refused by one sentence, the others applied)": (EDITS, found),
+        "commands whose output is closed, full, a broken pipe, or not UTF-8": (runs, lost),
+        "signals at random moments, during imports too": (SIGNALS, run_signals(SIGNALS, seed, templates)),
+    }
+
+
+def document(results: Results) -> str:
+    """Return docs/reliability.md."""
+    tally = results.tally
+    kinds = {
+        "tracebacks": "traceback", "wrong exit codes": "wrong exit", "hangs (over 40 s)": "hang",
+        f"memory over {MEMORY_MB} MB": "memory", "files of others changed": "foreign files",
+        "half-written or left-behind output": ("half-written", "left behind"),
+        "refusals that are not one sentence, or do not name the file": ("no sentence", "file not named"),
+    }  # fmt: skip
+    lines = [
+        "# Reliability", "",
+        "Written by `make fuzz`, which damages inputs at random, kills commands and lets them compete. A case is a",
+        "capture, a reconstruction, splats, a shot or a command line with something wrong, given to a command in a",
+        "process of its own, among files that belong to others. A command may succeed, or refuse the input with exit",
+        "code 2 and one sentence that says what is wrong.", "",
+        "| random cases | |", "|---|---:|",
+        *(f"| {kind} | {count:,} |" for kind, count in sorted(tally.cases.items())),
+        f"| **all** | **{sum(tally.cases.values()):,}** |", "",
+        "| found in them | |", "|---|---:|",
+        *(f"| {what} | {_count(tally, starts)} |" for what, starts in kinds.items()),
+        f"| largest memory | {tally.largest_mb:,.0f} MB |", f"| longest case | {tally.longest_seconds:.0f} s |", "",
+        "| other tests | runs | faults |", "|---|---:|---:|",
+        *(f"| {what} | {runs:,} | {len(found)} |" for what, (runs, found) in results.others.items()), "",
+        "After a kill, a full disk or a race everything that was complete before can be read, and the same command",
+        "finishes.", "",
+    ]  # fmt: skip
+    return "\n".join(lines)
+
+
+def _count(tally: Tally, starts: str | tuple[str, ...]) -> int:
+    return sum(any(fault.startswith(starts) for fault in failure.faults) for failure in tally.failures)
 
 
 if __name__ == "__main__":

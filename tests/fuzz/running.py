@@ -43,11 +43,17 @@ class Runner:
             cwd=ROOT, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1,
         )  # fmt: skip
 
-    def run(self, arguments: list[Any], cwd: Path, seconds: float = SECONDS) -> Outcome:
-        """Run `python -m backend ARGUMENTS` in the folder `cwd`."""
+    def run(
+        self, arguments: list[Any], cwd: Path, seconds: float = SECONDS, largest_file: int | None = None
+    ) -> Outcome:
+        """Run `python -m backend ARGUMENTS` in the folder `cwd`.
+
+        It is killed after `seconds`. Writing files of more than `largest_file` bytes fails, as on a full disk.
+        """
         assert self._server.stdin is not None
         assert self._server.stdout is not None
-        request = {"arguments": [str(word) for word in arguments], "cwd": str(cwd), "seconds": seconds}
+        request = {"arguments": [str(word) for word in arguments], "cwd": str(cwd), "seconds": seconds,
+                   "largest_file": largest_file}  # fmt: skip
         self._server.stdin.write(json.dumps(request) + "\n")
         return Outcome(**json.loads(self._server.stdout.readline()))
 

@@ -2,7 +2,8 @@
 
     python -m tests.fuzz.server
 
-Reads one JSON object a line from stdin, {"arguments": [...], "cwd": "...", "seconds": 60}, and answers each with
+Reads one JSON object a line from stdin, {"arguments": [...], "cwd": "...", "seconds": 60, "largest_file": null}, and
+answers each with
 {"code": 2, "out": "...", "err": "...", "seconds": 0.1, "peak_mb": 310.0, "ended": "exit" | "timeout" | "memory"}.
 The code is negative if a signal ended the command.
 """
@@ -13,6 +14,7 @@ import importlib
 import json
 import os
 import pkgutil
+import resource
 import signal
 import sys
 import tempfile
@@ -41,11 +43,15 @@ def main() -> None:
         answers.flush()
 
 
-def _run(arguments: list[str], cwd: str, seconds: float) -> dict[str, Any]:
+def _run(arguments: list[str], cwd: str, seconds: float, largest_file: int | None = None) -> dict[str, Any]:
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         began = time.monotonic()
         child = os.fork()
         if child == 0:
+            if largest_file is not None:
+                # Like a full disk, for which no privilege is needed: writing beyond this size fails.
+                signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+                resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
             _command(arguments, cwd, out.fileno(), err.fileno())
         status, peak_mb, ended = _wait(child, began + seconds)
         return {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,6 +15,8 @@ PART_PREFIX, PART_SUFFIX = ".objectgs-", ".part"
 
 _LONGEST = 100
 """Number of bytes of the file's name in that of its temporary file; file systems allow 255 in all."""
+
+_ABANDONED_SECONDS = 24 * 3600
 
 _records: list[Created] = []
 
@@ -77,6 +80,15 @@ def make_folder(path: Path) -> None:
             continue  # Another process was faster.
         for record in _records:
             record.add_folder(folder)
+
+
+def remove_abandoned(folder: Path) -> None:
+    """Delete temporary files below `folder` that killed processes have left there, as their age shows."""
+    latest = time.time() - _ABANDONED_SECONDS
+    for path in folder.rglob(f"{PART_PREFIX}*{PART_SUFFIX}"):
+        with suppress(OSError):
+            if path.lstat().st_mtime < latest:
+                path.unlink()
 
 
 @contextmanager

@@ -6,7 +6,6 @@ properties are this program's own: `object_id` as uint32 and, if any splat is un
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -80,7 +79,6 @@ def read_splat_table(path: Path) -> np.ndarray:
             f"{path} is a PLY file but not one of Gaussian splats: it has no property {', '.join(missing)}."
         )
     rest = sum(name.startswith(_REST) for name in names)
-    coefficients = rest // 3 + 1
     if rest not in (0, 9, 24, 45):
         raise InputError(f"{path} has {rest} properties f_rest_*; 0, 9, 24 or 45 were expected.")
     if any(f"{_REST}{i}" not in names for i in range(rest)):
