@@ -167,8 +167,8 @@ def _resample(source: Source, survey: Survey, cache: Path, stem: str, made_from:
     camera, target = source.camera, source.target
     stamp: dict[str, Any] = {"made_from": made_from, "ids": []}
     files: dict[str, str | None] = {"image_file": None, "mask_file": None}
+    check_size(source, image_size(source.image_path), survey.model.file("cameras"))
     pixels = read_image(source.image_path)
-    check_size(source, pixels.size, survey.model.file("cameras"))
     in_place = needs_no_resampling(camera, target.width, target.height)
     if not in_place:
         files["image_file"] = f"{stem}.png"

@@ -147,7 +147,7 @@ def _describe_error(error: Exception) -> str | None:
     if isinstance(error, ModuleNotFoundError):
         return describe_missing_package(error)
     if isinstance(error, OSError) and error.filename:
-        full = error.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", None))
+        full = error.errno in (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", None))
         problem = "could not be written" if full else "cannot be used"
         advice = "free some space and run the same command again" if full else "check it and its permissions"
         return f"{error.filename} {problem} ({error.strerror}); {advice}."

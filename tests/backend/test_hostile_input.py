@@ -143,7 +143,7 @@ def test_spherical_harmonics_beyond_degree_3_are_rejected(trained, tmp_path):  #
     data = (trained[1] / "splats.ply").read_bytes()
     extra = b"".join(b"property float f_rest_%d\n" % i for i in range(9, 3 * (32**2 - 1)))
     (tmp_path / "many.ply").write_bytes(
-        data.replace(b"property float opacity", extra + b"property float opacity", 1) + bytes(1 << 22)
+        data.replace(b"property float opacity", extra + b"property float opacity", 1) + bytes(1 << 23)
     )
     with pytest.raises(InputError, match="3069 properties"):
         read_splats(tmp_path / "many.ply")

@@ -74,7 +74,7 @@ def run_full_disks(count: int, seed: int, folder: Path, templates: Templates, ru
     found = []
     for number in range(count):
         name = list(COMMANDS)[number % len(COMMANDS)]
-        size = rng.choice((0, 100, 2_000, 20_000, 60_000))
+        size = rng.choice((50, 100, 2_000, 20_000, 60_000))
         place = folder / f"disk-{seed}-{number}"
         with _prepared(place, name, templates) as arguments:
             outcome: list[Outcome] = []

@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def _run(arguments: list[str], cwd: str, seconds: float, largest_file: int | None = None) -> dict[str, Any]:
-    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+    with _Output(largest_file is not None) as out, _Output(largest_file is not None) as err:
         began = time.monotonic()
         child = os.fork()
         if child == 0:
@@ -52,16 +52,50 @@ def _run(arguments: list[str], cwd: str, seconds: float, largest_file: int | Non
                 # Like a full disk, for which no privilege is needed: writing beyond this size fails.
                 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
                 resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
-            _command(arguments, cwd, out.fileno(), err.fileno())
+            _command(arguments, cwd, out.descriptor, err.descriptor)
         status, peak_mb, ended = _wait(child, began + seconds)
         return {
             "code": os.waitstatus_to_exitcode(status),
-            "out": _text(out),
-            "err": _text(err),
+            "out": out.text(),
+            "err": err.text(),
             "seconds": round(time.monotonic() - began, 2),
             "peak_mb": round(peak_mb, 1),
             "ended": ended,
         }
+
+
+class _Output:
+    """Receives the output of a command: a file, or a pipe, which has no limit of file sizes but holds little."""
+
+    def __init__(self, is_pipe: bool) -> None:
+        if is_pipe:
+            self._source, self.descriptor = os.pipe()
+        else:
+            self._source = self.descriptor = os.memfd_create("output") if hasattr(os, "memfd_create") else _nameless()
+
+    def text(self) -> str:
+        """Return what was written; call this once the command has ended."""
+        if self._source == self.descriptor:
+            os.lseek(self._source, 0, os.SEEK_SET)
+        else:
+            os.set_blocking(self._source, False)
+        try:
+            return os.read(self._source, _LONGEST).decode("utf-8", "backslashreplace")
+        except BlockingIOError:
+            return ""
+
+    def __enter__(self) -> _Output:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for descriptor in {self._source, self.descriptor}:
+            os.close(descriptor)
+
+
+def _nameless() -> int:
+    descriptor, name = tempfile.mkstemp()
+    Path(name).unlink()
+    return descriptor
 
 
 def _command(arguments: list[str], cwd: str, out: int, err: int) -> None:
@@ -111,11 +145,6 @@ def _memory_mb(pid: int) -> float:
         return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * _PAGE / 1e6
     except (OSError, ValueError, IndexError):
         return 0.0  # Not Linux, or the process has ended.
-
-
-def _text(file: Any) -> str:
-    file.seek(0)
-    return file.read(_LONGEST).decode("utf-8", "backslashreplace")
 
 
 if __name__ == "__main__":
