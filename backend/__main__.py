@@ -11,7 +11,10 @@ if __name__ == "__main__":
     try:
         from .cli.main import main
 
-        sys.exit(main())
+        code = main()
+        # The result is complete, so that signals no longer matter.
+        block_signals()
+        sys.exit(code)
     except ModuleNotFoundError as error:
         # A package that the command line itself needs is missing.
         if "--json" in sys.argv:

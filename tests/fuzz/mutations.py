@@ -77,7 +77,10 @@ def mutate_json(data: bytes, rng: random.Random) -> bytes:
     """Replace, remove, rename or add a value of a JSON file, or damage its text."""
     if rng.random() < 0.15:
         return mutate_bytes(data, rng)
-    value = json.loads(data)
+    try:
+        value = json.loads(data)
+    except (ValueError, RecursionError):  # It was damaged before.
+        return mutate_bytes(data, rng)
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
         value = _changed(value, rng)
     raw = [rng.choice(_RAW), "@raw@"]
@@ -128,6 +131,10 @@ def _changed(value: Any, rng: random.Random) -> Any:
 
 def mutate_arrays(data: bytes, rng: random.Random) -> bytes:
     """Change a tensor or the state of a safetensors file, which stays a valid file, or damage its bytes."""
+    try:
+        load(data)
+    except Exception:  # It was damaged before.
+        return mutate_bytes(data, rng)
     kind = rng.random()
     if kind < 0.3:
         (size,) = struct.unpack("<Q", data[:8])
@@ -199,8 +206,12 @@ def mutate_image(data: bytes, rng: random.Random) -> bytes:
         return png_bomb(*rng.choice(((30_000, 30_000), (1, 4_000_000), (60_000, 1_000))))
     if kind == 3:
         return rng.choice((npz_bomb(1 << 28), b"\x93NUMPY" + rng.randbytes(60), b"GIF89a", b"\xff\xd8\xff\xe0"))
-    with Image.open(io.BytesIO(data)) as image:
-        image.load()
+    try:
+        opened = Image.open(io.BytesIO(data))
+        opened.load()
+    except Exception:  # It was damaged before.
+        return mutate_bytes(data, rng)
+    with opened as image:
         if kind in (4, 5):
             size = rng.choice(((1, 1), (1, image.height), (image.width, image.height + 1), (image.height, image.width)))
             image = image.resize(size)

@@ -181,7 +181,8 @@ def _check_camera(camera: Camera, path: Path) -> None:
 def _compute_viewmat(image: RawImage, path: Path) -> np.ndarray:
     q = np.array(image.quaternion, np.float64)
     t = np.array(image.translation, np.float64)
-    norm = float(np.linalg.norm(q)) if np.isfinite(q).all() else math.nan
+    with np.errstate(over="ignore"):
+        norm = float(np.linalg.norm(q)) if np.isfinite(q).all() else math.nan
     if not (np.isfinite(t).all() and 1e-6 < norm < 1e6):
         raise InputError(
             f"{path} gives image {image.name} a pose that is not a number (NaN, infinite or zero); {EXPORT_AGAIN}."

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,30 @@ def edit(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     for name in ("floaters", "fill"):
         if getattr(options, name) and not options.remove:
             raise InputError(f"--{name} requires --remove, which selects the objects to remove.")
-    wanted = _Edits(folder)
+    edited = 0
+
+    def changes(objects: list[SceneObject]) -> dict[int, dict[str, Any]]:
+        nonlocal edited
+        found = _changes(options, _Edits(folder, objects, splats))
+        edited = len(found)
+        return found
+
+    # Read before objects.json is locked, since it can take long.
+    needs_splats = options.recolor or options.move or options.duplicate
+    splats = read_splats(folder.splats)[0] if needs_splats else None
+    edit_objects(folder.objects, changes)
+    new_splats = fill_holes(folder, reporter)
+    # As one message, since a status display shows only the latest one.
+    lines = [
+        f"{e.id} {e.name}: {', '.join(_described(e, new_splats.get(e.id))) or 'as captured'}"
+        for e in read_objects(folder.objects)
+    ]
+    reporter.status("\n".join(lines) or "There are no objects.")
+    reporter.done(objects=str(folder.objects), edited=edited, new_splats=sum(new_splats.values()))
+
+
+def _changes(options: argparse.Namespace, wanted: _Edits) -> dict[int, dict[str, Any]]:
+    """Return the changes that the options make, for `edit_objects`."""
     everything = [word for word in options.reset if word.casefold() == "all"]
     for entry in wanted.objects if everything else wanted.find(options.reset):
         wanted.change(entry, **_NONE)
@@ -47,24 +69,16 @@ def edit(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     for word, values in options.duplicate:
         (entry,) = wanted.find([word])
         wanted.change(entry, copies=[*wanted.copies(entry), wanted.transform(entry, Placement(**values))])
-    if wanted.changes:
-        edit_objects(folder.objects, wanted.changes)
-    new_splats = fill_holes(folder, reporter)
-    # As one message, since a status display shows only the latest one.
-    lines = [
-        f"{e.id} {e.name}: {', '.join(_described(e, new_splats.get(e.id))) or 'as captured'}"
-        for e in read_objects(folder.objects)
-    ]
-    reporter.status("\n".join(lines) or "There are no objects.")
-    reporter.done(objects=str(folder.objects), edited=len(wanted.changes), new_splats=sum(new_splats.values()))
+    return wanted.changes
 
 
 class _Edits:
     """The changes of one command to the objects of a folder."""
 
-    def __init__(self, folder: Reconstruction) -> None:
+    def __init__(self, folder: Reconstruction, objects: list[SceneObject], splats: Splats | None) -> None:
         self.folder = folder
-        self.objects = read_objects(folder.objects)
+        self.objects = objects
+        self._splats = splats
         self.changes: dict[int, dict[str, Any]] = {}
 
     def find(self, words: Iterable[str]) -> Sequence[SceneObject]:
@@ -79,6 +93,7 @@ class _Edits:
 
     def splats_of(self, entry: SceneObject) -> Splats:
         """Return the captured splats of an object, including those merged into it; InputError if there are none."""
+        assert self._splats is not None
         own = self._splats.select(np.isin(self._splats.object_ids, members_of(self.objects, entry.id)))
         if len(own) == 0:
             raise InputError(f"{self.folder.splats} has no splats of {entry.name}, so it cannot be edited.")
@@ -86,10 +101,6 @@ class _Edits:
 
     def transform(self, entry: SceneObject, placement: Placement) -> Matrix:
         return placement.matrix(middle_of(self.splats_of(entry)), read_upright(self.folder).rotation)
-
-    @cached_property
-    def _splats(self) -> Splats:
-        return read_splats(self.folder.splats)[0]
 
 
 def _described(entry: SceneObject, new_splats: int | None) -> list[str]:

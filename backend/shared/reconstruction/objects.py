@@ -10,7 +10,7 @@ A new vote replaces "objects" and keeps "edits".
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,22 +94,31 @@ def write_objects(path: Path, objects: Sequence[Mapping[str, Any]]) -> None:
         write_json(path, {"objects": list(objects), "edits": edits})
 
 
-def edit_objects(path: Path, changes: Mapping[int, Mapping[str, Any]]) -> None:
+Changes = Mapping[int, Mapping[str, Any]]
+"""Object ID -> new values of fields in `EDITABLE`; None reverts an edit."""
+
+
+def edit_objects(path: Path, changes: Changes | Callable[[list[SceneObject]], Changes]) -> None:
     """Store edits of objects.
 
     Args:
         path: objects.json.
-        changes: Object ID -> new values of fields in `EDITABLE`; None reverts an edit.
+        changes: The changes, or a function that computes them from the present objects while no other process can
+            change the file.
 
     Raises:
         InputError: The file is missing or invalid, or another process keeps changing it.
         ValueError: A field is not editable.
     """
-    unknown = {key for change in changes.values() for key in change} - set(EDITABLE)
-    if unknown:
-        raise ValueError(f"{', '.join(sorted(unknown))} cannot be edited")
-    read_objects(path)  # Fail before writing if the file is invalid.
+    read_objects(path)  # Fail before the lock is created if the file is missing.
     with _locked(path):
+        if callable(changes):
+            changes = changes(read_objects(path))
+        unknown = {key for change in changes.values() for key in change} - set(EDITABLE)
+        if unknown:
+            raise ValueError(f"{', '.join(sorted(unknown))} cannot be edited")
+        if not changes:
+            return
         content = read_json(path)
         edits = _edits(content, path)
         for object_id, change in changes.items():
