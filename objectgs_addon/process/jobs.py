@@ -22,6 +22,8 @@ GRACE_SECONDS = 10.0
 """Time in seconds that a job has to save after the first request to stop, before a second request kills it."""
 
 _WARNINGS = 50
+_LARGEST_NUMBER = 1e15
+"""Largest number of an event that is taken as one; integers in JSON can be too large to convert or to show."""
 _ESTIMATE_FROM = 0.02
 _ESTIMATE_AFTER = 1.0
 _ENDING_SECONDS = 3.0
@@ -281,7 +283,7 @@ class Job:
 
 def _number(value: Any) -> float | int | None:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return value if is_number and abs(value) < float("inf") else None
+    return value if is_number and abs(value) <= _LARGEST_NUMBER else None
 
 
 def _how_it_ended(code: int) -> str:

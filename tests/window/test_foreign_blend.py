@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 from .harness import PACKAGE
-from .test_faults import draws, soon, trained, window  # noqa: F401
+from .test_faults import assert_draws, trained, wait_briefly, window  # noqa: F401
 from .test_workflow import script
 
 FORGET = f"""
@@ -39,7 +39,7 @@ def test_the_panel_asks_before_the_folder_is_used(window, trained):  # noqa: F81
             if region.type == "UI":
                 region.active_panel_category = "ObjectGS"
     """)
-    draws(window)
+    assert_draws(window)
     window.shot("foreign-asked")
     window.run(
         script("""
@@ -52,11 +52,11 @@ def test_the_panel_asks_before_the_folder_is_used(window, trained):  # noqa: F81
     )
     window.move(400, 500)
     window.key("ctrl+z")
-    soon(window, "root.objectgs.objects[0].hue == 0")
+    wait_briefly(window, "root.objectgs.objects[0].hue == 0")
     window.key("ctrl+shift+z")
-    soon(window, "root.objectgs.objects[1].name == 'cup'")
+    wait_briefly(window, "root.objectgs.objects[1].name == 'cup'")
     window.run("bpy.ops.wm.save_mainfile()")
-    draws(window)
+    assert_draws(window)
     window.shot("foreign-edited")
     assert snapshot(folder) == before
     assert not window.run(script("result = bpy.ops.objectgs.show_result.poll()"))
@@ -66,11 +66,11 @@ def test_the_panel_asks_before_the_folder_is_used(window, trained):  # noqa: F81
             bpy.ops.objectgs.use_folder("INVOKE_DEFAULT", True)
     """)
     )
-    draws(window)
+    assert_draws(window)
     window.shot("foreign-accepted")
     edits = json.loads((folder / "objects.json").read_text())["edits"]
     assert sorted(map(sorted, edits.values())) == [["name"], ["recolor"]]
     assert window.run(script("result = bpy.ops.objectgs.show_result.poll()"))
     window.run(f"bpy.ops.wm.open_mainfile(filepath={str(window.folder / 'theirs.blend')!r})")
-    draws(window)
+    assert_draws(window)
     assert window.run(script("result = bpy.ops.objectgs.show_result.poll()")), "it is asked once"
