@@ -175,7 +175,7 @@ def _objects(
     ids = ({*anchors_of, *capture.object_ids.tolist()} - {0}) | set(measured)
     return [
         {
-            "iou": None, **measured.get(i, {}), "id": i, "name": object_name(capture, i),
+            "iou": None, "iou_all": None, **measured.get(i, {}), "id": i, "name": object_name(capture, i),
             "anchors": anchors_of.get(i, 0), "mesh": own.get(i),
         }
         for i in sorted(ids)

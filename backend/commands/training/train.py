@@ -85,7 +85,8 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     latest = progress.curve[-1] if progress.curve else {}
     reporter.done(
         steps=progress.step, seconds=round(progress.seconds, 1), anchors=len(trainer.model.anchors),
-        splats=str(folder.splats), psnr=latest.get("psnr"), miou=latest.get("miou"),
+        splats=str(folder.splats), psnr=latest.get("psnr"), miou=latest.get("miou"), miou_all=latest.get("miou_all"),
+        zero_is_background=trainer.scene.supervise_background,
         psnr_of_export=export.psnr_of_export,
     )  # fmt: skip
 
@@ -210,8 +211,9 @@ def _measure_held_out(folder: Reconstruction, reporter: StoppingReporter) -> Eva
                     ids.add(rendered.ids, truth)
         scores = ids.result()
         figures = {
-            "psnr": float(np.mean(found)) if found else None, "miou": scores["miou"], "mbiou": scores["mbiou"],
-        }  # fmt: skip
+            "psnr": float(np.mean(found)) if found else None,
+            **{name: scores[name] for name in ("miou", "miou_all", "mbiou")},
+        }
         curve = curve_image([*progress.curve, {"seconds": progress.seconds, **figures}])
         if curve is not None:
             save_image(curve, folder.previews / "curve.png", quick=True)
