@@ -32,12 +32,13 @@ def build_context(
     objects: list[SceneObject],
     point_ids: np.ndarray | None = None,
     thorough: bool = False,
+    resumed: Plan | None = None,
 ) -> PlanningContext:
     """Collect the facts for the decisions; arguments are as in `PlanningContext`, but `capture` is unedited."""
     left_out = [entry.id for entry in objects if entry.left_out]
     capture = capture.edited({entry.id: entry.name for entry in objects}, left_out)
     point_ids = None if point_ids is None else capture.without_left_out(point_ids)
-    return PlanningContext(capture, requested, objects, point_ids, thorough)
+    return PlanningContext(capture, requested, objects, point_ids, thorough, resumed=resumed)
 
 
 def choices(options: argparse.Namespace) -> Choices:

@@ -17,7 +17,7 @@ from ..shared.reconstruction.objects import SceneObject, default_name, merged
 from ..shared.reconstruction.plan import KEYS, Decision, Plan
 from ..training.exposure import VARIES_FROM, differences, measure_gains
 from ..training.settings import Settings, background_is_masked, downscale_at
-from .coverage import blind_views, duplicate_views, unseen_points, views_without_objects
+from .coverage import blind_views, duplicate_views, unseen_points, views_like_held_out, views_without_objects
 
 PIXELS_TO_READ = 3e8
 """Largest total number of pixels of photos that are read for a plan, in a few seconds; larger captures are only read
@@ -48,7 +48,8 @@ class PlanningContext:
 
     capture: with the user's names and without the objects left out. objects: of objects.json, or before a vote those
     of the masks. point_ids: (M,) int64, the points' objects; None before a vote. thorough: whether to read all photos,
-    however many. plan: the decisions so far, with the user's overrides.
+    however many. plan: the decisions so far, with the user's overrides. resumed: the plan of the training that is
+    resumed, which keeps the views that it was begun with; None for a new one.
     """
 
     capture: Capture
@@ -57,6 +58,7 @@ class PlanningContext:
     point_ids: np.ndarray | None = None
     thorough: bool = False
     plan: Plan = field(default_factory=Plan)
+    resumed: Plan | None = None
 
     @cached_property
     def gains(self) -> np.ndarray:
@@ -192,10 +194,26 @@ def _undistortion(context: PlanningContext) -> Decision:
 
 
 def _duplicate_views(context: PlanningContext) -> Decision | None:
-    found = duplicate_views(context.capture) if context.capture.prepared else []
+    capture = context.capture
+    if context.resumed is not None:
+        return context.resumed.planned("duplicate-views")
+    if not capture.prepared:
+        return None
+    repeated, flattering = duplicate_views(capture), views_like_held_out(capture)
+    if len({*repeated, *flattering}) == len(capture.train_indices):
+        flattering = []  # Nothing would be left to train on.
+    repeated = [i for i in repeated if i not in flattering]
+    found, reasons = sorted([*repeated, *flattering]), []
     if not found:
         return None
-    why = f"each shows the same image from the same position as an earlier view: {_listed(context.names(found))}"
+    for views, other in (
+        (repeated, "an earlier view"),
+        (flattering, "a held-out view, whose figures would be too good if they were trained on"),
+    ):
+        if views:
+            each = f"each shows the same image from the same position as {other}"
+            reasons.append(f"{each}: {_listed(context.names(views))}")
+    why = "; ".join(reasons)
     return Decision("duplicate-views", f"training on {_views(len(found))}", False, why, views=context.names(found))
 
 

@@ -12,7 +12,8 @@ from PIL import Image
 
 from backend.capture import load_capture
 from backend.labels import read_points
-from backend.planning.coverage import blind_views, duplicate_views, unseen_points
+from backend.planning import decisions
+from backend.planning.coverage import blind_views, duplicate_views, unseen_points, views_like_held_out
 from backend.planning.decisions import DECISIONS, Choices, PlanningContext, decide, planned_settings
 from backend.shared.errors import EXIT_DONE, InputError
 from backend.shared.grouping import changed, chosen, grouped, read_groups
@@ -127,11 +128,15 @@ def test_duplicate_views_are_found(write_capture, tmp_path):
 
     for at, of, shift in ((3, 1, 0.0), (4, 1, 1e-4), (6, 5, 0.5)):
         repeat(at, of, shift)
-    repeat(2, 0)  # View 0 is held out and not trained on, so view 2 is kept.
+    repeat(2, 0)  # View 0 is held out.
     write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
     assert duplicate_views(loaded(scene, tmp_path)) == [3, 4], "view 6 has a different pose"
+    assert views_like_held_out(loaded(scene, tmp_path)) == [2]
     plan = planned(loaded(scene, tmp_path))
-    assert plan.views_left_out == {"view_003.png", "view_004.png"} and "view_003.png" in plan["duplicate-views"].why
+    assert plan.views_left_out == {"view_002.png", "view_003.png", "view_004.png"}
+    repeated, flattering = plan["duplicate-views"].why.split("; ")
+    assert "an earlier view: view_003.png, view_004.png" in repeated
+    assert "a held-out view" in flattering and flattering.endswith(": view_002.png")
     assert not planned(loaded(scene, tmp_path), keep=["duplicate-views"]).views_left_out
 
     pixels = np.asarray(Image.open(scene.folder / "images/view_003.png")).astype(int)
@@ -139,6 +144,22 @@ def test_duplicate_views_are_found(write_capture, tmp_path):
     other = scene.folder / "masks/view_004.png"
     Image.fromarray(np.full((48, 64), 1, np.uint16)).save(other)
     assert duplicate_views(loaded(scene, tmp_path)) == [], "exposure and mask differ"
+    Image.fromarray(np.full((48, 64), 1, np.uint16)).save(scene.folder / "masks/view_002.png")
+    assert views_like_held_out(loaded(scene, tmp_path)) == [2], "another mask does not make the photo unseen"
+    photo = np.asarray(Image.open(scene.folder / "images/view_002.png")).astype(int)
+    Image.fromarray(np.clip(photo + 4, 0, 255).astype(np.uint8)).save(scene.folder / "images/view_002.png")
+    assert views_like_held_out(loaded(scene, tmp_path)) == []
+
+
+def test_capture_of_one_photo_keeps_a_training_view(write_capture, tmp_path):
+    scene = write_capture(views=4, size=(64, 48))
+    for view in (1, 2, 3):
+        for part in (scene.quaternions, scene.viewmats, scene.seen, scene.pixels):
+            part[view] = part[0]
+        for part in ("images", "masks"):
+            shutil.copy(scene.folder / part / scene.names[0], scene.folder / part / scene.names[view])
+    write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
+    assert planned(loaded(scene, tmp_path)).views_left_out == {"view_002.png", "view_003.png"}
 
 
 def test_blind_views_and_unseen_points_are_found(write_capture, tmp_path):
@@ -334,6 +355,27 @@ def test_plan_affects_training_evaluation_and_report(write_capture, tmp_path, ru
     assert run_command(*train, "--steps", 3, "--restart", "--leave-out", "votes").code == EXIT_DONE
     assert set(read_points(out / "points.ply").ids.tolist()) == {0}
     assert run_command("evaluate", out, "--json").events[-1].get("miou") is None
+
+
+def test_begun_training_keeps_its_views(write_capture, tmp_path, run_command, monkeypatch):
+    """A training of an earlier version, which did not look for views like held-out ones, resumes with its views."""
+    scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
+    for part in (scene.quaternions, scene.viewmats, scene.seen, scene.pixels):
+        part[2], part[4] = part[0], part[3]
+    for at, of in ((2, 0), (4, 3)):
+        shutil.copy(scene.folder / "images" / scene.names[of], scene.folder / "images" / scene.names[at])
+        shutil.copy(scene.folder / "masks" / scene.names[of], scene.folder / "masks" / scene.names[at])
+    write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
+    train = ("train", scene.folder, "--out", out, *SMALL, "--steps")
+    with monkeypatch.context() as earlier:
+        earlier.setattr(decisions, "views_like_held_out", lambda capture: [])
+        assert run_command(*train, 2).code == EXIT_DONE
+    assert read_plan(out / "plan.json").views_left_out == {"view_004.png"}
+    assert run_command(*train, 3).code == EXIT_DONE
+    assert read_plan(out / "plan.json").views_left_out == {"view_004.png"}
+    assert_rejected(run_command(*train, 4, "--keep", "duplicate-views"), "another plan (duplicate-views)")
+    assert run_command(*train, 2, "--restart").code == EXIT_DONE
+    assert read_plan(out / "plan.json").views_left_out == {"view_002.png", "view_004.png"}
 
 
 def test_training_without_plan_resumes(write_capture, tmp_path, run_command):

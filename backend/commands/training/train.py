@@ -106,10 +106,11 @@ def _begin(
         cast_votes(folder, voters, options, reporter)
     point_ids = read_points(folder.points).ids if current or not resuming else None
     objects, _ = find_requested_objects(folder, capture, options)
-    context = build_context(capture, choices(options), objects, point_ids, thorough=True)
+    before = plan_of(read_record(folder).training) if resuming else None
+    context = build_context(capture, choices(options), objects, point_ids, thorough=True, resumed=before)
     plan = decide(context)
-    if resuming:
-        plan = plan.settled_by(_plan_before(folder))
+    if before is not None:
+        plan = plan.settled_by(before)
     gains = context.gains if plan.does("exposure") else np.ones_like(context.gains)
     planned, wanted = planned_capture(context.capture, plan), planned_settings(settings(options), plan)
     memory = memory_for_planes(options)
@@ -135,11 +136,6 @@ def _begin(
     write_plan(folder.plan, plan)
     report_plan(plan, reporter)
     return trainer, plan
-
-
-def _plan_before(folder: Reconstruction) -> Plan:
-    """Return the plan of the training in the folder."""
-    return plan_of(read_record(folder).training)
 
 
 def _check_same_training(folder: Reconstruction, capture: Capture, plan: Plan, options: argparse.Namespace) -> None:

@@ -78,6 +78,11 @@ class Plan:
     def __getitem__(self, key: str) -> Decision | None:
         return next((decision for decision in self.decisions if decision.key == key), None)
 
+    def planned(self, key: str) -> Decision | None:
+        """Return a decision without the user's override."""
+        decision = self[key]
+        return None if decision is None else replace(decision, wanted=None)
+
     def does(self, key: str) -> bool:
         """Return whether a step is done; True if there is no decision about it."""
         decision = self[key]
