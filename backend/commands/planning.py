@@ -16,6 +16,7 @@ from ..shared.reconstruction.objects import SceneObject, edit_objects, read_obje
 from ..shared.reconstruction.plan import Plan, write_plan
 from ..shared.reconstruction.record import read_record
 from ..training.settings import Settings
+from .length import budget_of
 from .votes import object_name, votes_are_current
 
 
@@ -43,7 +44,10 @@ def build_context(
 
 def choices(options: argparse.Namespace) -> Choices:
     """Return the choices that the options of `train` make."""
-    return Choices(settings(options), options.max_size, not options.no_meshes, options.keep, options.leave_out)
+    until_converged = budget_of(options).until_converged
+    return Choices(
+        settings(options), options.max_size, not options.no_meshes, options.keep, options.leave_out, until_converged
+    )
 
 
 def settings(options: argparse.Namespace) -> Settings:

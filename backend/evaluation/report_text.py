@@ -71,7 +71,7 @@ def quality_section(report: Report) -> list[str]:
         rows.append((label, f"**{text}**" if value is not None else text, meaning))
     intro = (
         "Measured on the held-out views (every 8th image by file name), which were not used for training. "
-        f"{_of_unlabeled(report)}"
+        f"{_of_validation(report)}{_of_unlabeled(report)}"
     )
     parts = ["## Quality", intro, table(("", "Value", "Meaning"), rows, right=(1,))]
     by_view = sorted((view[lead], view["name"]) for view in report.views if view.get(lead) is not None)
@@ -83,6 +83,15 @@ def quality_section(report: Report) -> list[str]:
             "in `report.json`."
         )
     return parts
+
+
+def _of_validation(report: Report) -> str:
+    """Return the sentence about the views that decided when the training ended; empty if there are none."""
+    count = report.capture.get("validation")
+    if not count:
+        return ""
+    views = "1 other view was" if count == 1 else f"{count} other views were"
+    return f"{views} used for validation instead of training: their PSNR decided when the training ended. "
 
 
 def _of_unlabeled(report: Report) -> str:

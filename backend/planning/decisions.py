@@ -15,6 +15,7 @@ from ..capture import Capture
 from ..shared.defaults import MAX_SIZE
 from ..shared.reconstruction.objects import SceneObject, default_name, merged
 from ..shared.reconstruction.plan import KEYS, Decision, Plan
+from ..training.budget import choose_validation_views
 from ..training.exposure import VARIES_FROM, differences, measure_gains
 from ..training.settings import Settings, background_is_masked, downscale_at
 from .coverage import blind_views, duplicate_views, unseen_points, views_like_held_out, views_without_objects
@@ -32,7 +33,7 @@ class Choices:
     """The user's choices that decisions depend on.
 
     settings: of the training, before the plan changes them. meshes: whether meshes are wanted. keep, leave_out: keys
-    of the decisions to override.
+    of the decisions to override. until_converged: whether the training ends when it has converged.
     """
 
     settings: Settings = field(default_factory=Settings)
@@ -40,6 +41,7 @@ class Choices:
     meshes: bool = True
     keep: Collection[str] = ()
     leave_out: Collection[str] = ()
+    until_converged: bool = False
 
 
 @dataclass
@@ -95,9 +97,10 @@ def decide(context: PlanningContext) -> Plan:
 
 
 def planned_capture(capture: Capture, plan: Plan) -> Capture:
-    """Return the capture that a plan trains on: without unused masks, and with unused views excluded from training."""
+    """Return the capture that a plan trains on: without unused masks, with unused and validation views excluded from
+    training."""
     capture = capture if plan.does("votes") else capture.without_masks()
-    return capture.excluding_from_training(plan.views_left_out)
+    return capture.excluding_from_training(plan.views_left_out).validating_on(plan.validation_views)
 
 
 def planned_settings(settings: Settings, plan: Plan) -> Settings:
@@ -236,6 +239,21 @@ def _other_views(context: PlanningContext) -> Decision | None:
     return Decision("other-views", what, True, "they show the rest of the scene", views=context.names(found))
 
 
+def _validation_views(context: PlanningContext) -> Decision | None:
+    if context.resumed is not None:
+        return context.resumed.planned("validation-views")
+    if not context.choices.until_converged:
+        return None
+    training = planned_capture(context.capture, context.plan).train_indices
+    found = choose_validation_views(training)
+    if not found:
+        why = "they are too few to spare any for validation, so their loss decides when the training ends"
+        what = f"training on all {_views(len(training))}"
+        return Decision("validation-views", what, True, why, can_override=False)
+    why = f"the training ends when their PSNR has converged: {_listed(context.names(found))}"
+    return Decision("validation-views", f"training on {_views(len(found))}", False, why, views=context.names(found))
+
+
 def _unseen_points(context: PlanningContext) -> Decision | None:
     unseen = unseen_points(planned_capture(context.capture, context.plan))
     if not unseen.any():
@@ -282,7 +300,7 @@ def _surface(context: PlanningContext) -> Decision | None:
 
 DECISIONS: tuple[Callable[[PlanningContext], Decision | None], ...] = (
     _votes, _objects, _groups, _rest, _labels, _undistortion, _duplicate_views, _blind_views, _other_views,
-    _unseen_points, _exposure, _pyramid, _meshes, _surface,
+    _validation_views, _unseen_points, _exposure, _pyramid, _meshes, _surface,
 )  # fmt: skip
 """In the order of `KEYS`; a decision may depend on earlier ones. None if a decision does not apply to the capture."""
 

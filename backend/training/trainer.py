@@ -238,7 +238,7 @@ class Trainer:
             budget: total length of the training.
             checkpoints: folder for checkpoints, which are written at the end, before a pause, and at intervals.
             reporter: receives progress, quality and warnings.
-            evaluate: function that measures the model on held-out views.
+            evaluate: function that measures the model on held-out and validation views.
             stop: stop and pause request, checked before each step.
             checkpoint_seconds: interval between checkpoints.
 

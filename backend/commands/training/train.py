@@ -175,7 +175,7 @@ def _run(
     begun = f"Resuming after step {step} with" if step else "Training"
     where = "" if trainer.model.device.type == "cpu" else f", on {devices.name_of(trainer.model.device)}"
     reporter.status(f"{begun} {len(trainer.model.anchors):,} anchors{where}")
-    measure = _measure_held_out(folder, reporter)
+    measure = _measure(folder, reporter)
     try:
         trainer.run(budget, folder.checkpoint, reporter.reporter, measure, reporter.stop, checkpoint_seconds)
     except Cancelled:
@@ -184,8 +184,11 @@ def _run(
     finish_stage(folder, "train", trainer.progress.seconds)
 
 
-def _measure_held_out(folder: Reconstruction, reporter: StoppingReporter) -> Evaluate:
-    """Return a function that measures held-out views, and writes previews of the first one and of the curve."""
+def _measure(folder: Reconstruction, reporter: StoppingReporter) -> Evaluate:
+    """Return a function that measures held-out views, and writes previews of the first one and of the curve.
+
+    It also measures the validation views, if any. Held-out views are for the user; they do not decide anything.
+    """
 
     def measure(model: ObjectModel, scene: Scene, progress: TrainingProgress) -> dict[str, Any]:
         # Without SSIM, which would take most of the time, since measuring counts as training time.
@@ -210,6 +213,12 @@ def _measure_held_out(folder: Reconstruction, reporter: StoppingReporter) -> Eva
             "psnr": float(np.mean(found)) if found else None,
             **{name: scores[name] for name in ("miou", "miou_all", "mbiou")},
         }
+        if capture.validation_indices:
+            validated = [
+                psnr(draw(model, scene.camera(index), want_ids=False).image, capture.image(index))
+                for index in capture.validation_indices
+            ]
+            figures["validation_psnr"] = float(np.mean(validated))
         curve = curve_image([*progress.curve, {"seconds": progress.seconds, **figures}])
         if curve is not None:
             save_image(curve, folder.previews / "curve.png", quick=True)
