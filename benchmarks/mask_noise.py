@@ -145,11 +145,12 @@ class Tally:
         self._unlabeled += int(((found <= 0) & (true > 0)).sum())
 
     def result(self) -> dict[str, float]:
-        """Return miou, mbiou, error (fraction of the labeled pixels with another ID or none), holes per view,
+        """Return miou, miou_all, mbiou, error (fraction of the labeled pixels with another ID or none), holes per view,
         hole_share (fraction of the labeled pixels in holes), and unlabeled (fraction without a label)."""
         scores = self._scores.result()
         return {
             "miou": scores["miou"],
+            "miou_all": scores["miou_all"],
             "mbiou": scores["mbiou"],
             "error": 1 - scores["accuracy"],
             "holes": self._holes / self._views,

@@ -100,6 +100,7 @@ def measured(capture: Path, options: Sequence[str], meshes: bool = False) -> dic
             "mesh_mb": max(stages[name]["peak_rss_mb"] for name in ("train", "mesh") if name in stages),
             "psnr": quality.get("psnr"),
             "miou": quality.get("miou"),
+            "miou_all": quality.get("miou_all"),
             "steps": events[-1]["steps"],
             "splats": memory["export"]["splats"],
             "iou": {str(row["id"]): row["iou"] for row in scores},

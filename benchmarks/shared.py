@@ -169,7 +169,7 @@ def train_and_measure(trainer: Any, capture: Any, budget: Any) -> dict[str, Any]
     quality = evaluate(capture, render, capture.test_indices)["quality"]
     progress = trainer.progress
     return {
-        **{name: quality[name] for name in ("psnr", "ssim", "miou", "mbiou")},
+        **{name: quality[name] for name in ("psnr", "ssim", "miou", "miou_all", "mbiou")},
         "steps": progress.step,
         "steps_per_second": progress.step / progress.seconds,
         "anchors": len(trainer.model.anchors),
@@ -206,6 +206,7 @@ def from_photos_to_report(capture: Path, *options: object, meshes: bool = True) 
         "steps": report["model"]["trained_steps"],
         "psnr": report["quality"]["psnr"],
         "miou": report["quality"]["miou"],
+        "miou_all": report["quality"]["miou_all"],
         "f1": over_objects("f1"),
         "f1_least": over_objects("f1", min),
         "f1_005": over_objects("f1_005"),

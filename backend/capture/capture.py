@@ -80,6 +80,7 @@ class Capture:
         counts: Numbers of images, masks, points and cameras.
         prepared: Whether `image` and `mask` are available; otherwise the files must be resampled first.
         train_indices, test_indices: Training views and held-out views.
+        validation_indices: Views that are neither, on which a training decides when to end.
     """
 
     def __init__(
@@ -113,6 +114,8 @@ class Capture:
         self.test_indices: tuple[int, ...] = tuple(held_out)
         self.train_indices: tuple[int, ...] = tuple(i for i in range(len(views)) if i not in set(held_out))
 
+        self.validation_indices: tuple[int, ...] = ()
+
     def __len__(self) -> int:
         return len(self.views)
 
@@ -134,6 +137,12 @@ class Capture:
         """Return this capture with the named views removed from the training views; held-out views are unchanged."""
         other = copy.copy(self)
         other.train_indices = tuple(i for i in self.train_indices if self.views[i].name not in names)
+        return other
+
+    def validating_on(self, names: Collection[str]) -> Capture:
+        """Return this capture with the named views for validation instead of training."""
+        other = self.excluding_from_training(names)
+        other.validation_indices = tuple(i for i, view in enumerate(self.views) if view.name in names)
         return other
 
     def without_left_out(self, ids: np.ndarray) -> np.ndarray:

@@ -89,7 +89,7 @@ def add_length(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--preset", choices=("preview", "standard", "final"),
         help=f"length by name: preview, {PRESET_STEPS['preview']} steps, to check the scene; standard, "
-        f"{PRESET_STEPS['standard']} steps; final, until it converges on the held-out views",
+        f"{PRESET_STEPS['standard']} steps; final, until it converges on validation views",
     )  # fmt: skip
     command.add_argument("--restart", action="store_true", help="discard an earlier training in DIR")
     command.add_argument(

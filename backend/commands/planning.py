@@ -16,6 +16,7 @@ from ..shared.reconstruction.objects import SceneObject, edit_objects, read_obje
 from ..shared.reconstruction.plan import Plan, write_plan
 from ..shared.reconstruction.record import read_record
 from ..training.settings import Settings
+from .length import budget_of
 from .votes import object_name, votes_are_current
 
 
@@ -32,17 +33,21 @@ def build_context(
     objects: list[SceneObject],
     point_ids: np.ndarray | None = None,
     thorough: bool = False,
+    resumed: Plan | None = None,
 ) -> PlanningContext:
     """Collect the facts for the decisions; arguments are as in `PlanningContext`, but `capture` is unedited."""
     left_out = [entry.id for entry in objects if entry.left_out]
     capture = capture.edited({entry.id: entry.name for entry in objects}, left_out)
     point_ids = None if point_ids is None else capture.without_left_out(point_ids)
-    return PlanningContext(capture, requested, objects, point_ids, thorough)
+    return PlanningContext(capture, requested, objects, point_ids, thorough, resumed=resumed)
 
 
 def choices(options: argparse.Namespace) -> Choices:
     """Return the choices that the options of `train` make."""
-    return Choices(settings(options), options.max_size, not options.no_meshes, options.keep, options.leave_out)
+    until_converged = budget_of(options).until_converged
+    return Choices(
+        settings(options), options.max_size, not options.no_meshes, options.keep, options.leave_out, until_converged
+    )
 
 
 def settings(options: argparse.Namespace) -> Settings:

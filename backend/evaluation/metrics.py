@@ -98,15 +98,22 @@ def boundaries(labels: NDArray, distance: int) -> NDArray[np.bool_]:
 class IdScores:
     """Accumulator of the agreement of predicted and true object IDs over views.
 
-    Pixels with the true ID 0 are unlabeled and are ignored, unless `zero_is_class` makes 0 an object like the others.
-    For each object, intersections and unions are summed over the pixels of all views before the division. miou, mbiou
-    and dice are the means over the objects that occur in the ground truth. A predicted ID that does not occur there has
-    no score of its own, but its pixels count as misses of the true objects. For the boundary IoU, predictions on
-    unlabeled pixels are replaced by "unlabeled" before the bands are computed. accuracy is the fraction of the labeled
-    pixels with the correct ID.
+    For each object, intersections and unions are summed over the pixels of all views before the division; its IoU is
+    |P and T| / |P or T|, with the pixels P that are predicted as the object and its true pixels T. miou, miou_all,
+    mbiou and dice are the means over the objects that occur in the ground truth. A predicted ID that does not occur
+    there has no score of its own, but its pixels count as misses of the true objects.
+
+    Pixels with the true ID 0 are unlabeled. If 0 means background, a prediction of an object there is wrong; if 0 is a
+    gap in the masks, it may be right. `miou_all` takes P over all pixels, so that an object that spreads over unlabeled
+    pixels loses by it; it is the one to compare where 0 means background. `miou` and the other scores ignore unlabeled
+    pixels. With `zero_is_class`, 0 is an object like the others, nothing is ignored, and both are equal. For the
+    boundary IoU, predictions on ignored pixels are replaced by "unlabeled" before the bands are computed. accuracy is
+    the fraction of the labeled pixels with the correct ID.
     """
 
-    _COLUMNS = ("intersection", "predicted", "truth", "band_intersection", "band_predicted", "band_truth")
+    _COLUMNS = (
+        "intersection", "predicted", "truth", "band_intersection", "band_predicted", "band_truth", "predicted_anywhere",
+    )  # fmt: skip
 
     def __init__(self, zero_is_class: bool = False) -> None:
         self.zero_is_class = zero_is_class
@@ -143,6 +150,7 @@ class IdScores:
             count(true, right & found_band & true_band),
             count(found, found_band),
             count(true, true_band),
+            count(compact.reshape(both.shape)[0], np.ones_like(counted)),
         ]
         self._add_sums(ids, np.stack(columns, axis=1))
 
@@ -160,16 +168,17 @@ class IdScores:
         self._ids, self._sums = merged, total
 
     def table(self) -> list[dict[str, Any]]:
-        """Return a row for each true object, by ID: id, iou, biou, dice, pixels (true ones in all views)."""
+        """Return a row for each true object, by ID: id, iou, iou_all, biou, dice, pixels (true ones in all views)."""
         rows = []
         for i, sums in zip(self._ids.tolist(), self._sums.tolist()):
-            same, predicted, truth, band_same, band_predicted, band_truth = sums
+            same, predicted, truth, band_same, band_predicted, band_truth, anywhere = sums
             if truth == 0:
                 continue
             rows.append(
                 {
                     "id": i,
                     "iou": same / (predicted + truth - same),
+                    "iou_all": same / (anywhere + truth - same),
                     "biou": band_same / (band_predicted + band_truth - band_same),
                     "dice": 2 * same / (predicted + truth),
                     "pixels": truth,
@@ -178,7 +187,8 @@ class IdScores:
         return rows
 
     def result(self) -> dict[str, Any]:
-        """Return miou, mbiou, dice and accuracy, 0 .. 1, None if no pixel was labeled, and objects {ID: IoU}."""
+        """Return miou, miou_all, mbiou, dice and accuracy, 0 .. 1, None if no pixel was labeled, and objects {ID: IoU},
+        whose IoUs are those of miou."""
         rows = self.table()
         labeled = sum(row["pixels"] for row in rows)
         right = int(self._sums[:, 0].sum())
@@ -188,6 +198,7 @@ class IdScores:
 
         return {
             "miou": mean("iou"),
+            "miou_all": mean("iou_all"),
             "mbiou": mean("biou"),
             "dice": mean("dice"),
             "accuracy": right / labeled if labeled else None,

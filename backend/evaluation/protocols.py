@@ -39,6 +39,7 @@ def evaluate(
     indices: Sequence[int],
     reporter: Reporter | None = None,
     zero_is_class: bool = False,
+    zero_is_background: bool = False,
 ) -> dict[str, Any]:
     """Compare renders with the images and masks of a capture.
 
@@ -48,10 +49,12 @@ def evaluate(
         indices: The views to measure; for comparable results, the held-out views.
         reporter: Receives the progress, and a warning for each render with NaN or Inf.
         zero_is_class: Count the ID 0 as an object, instead of as unlabeled.
+        zero_is_background: Whether 0 means background, so that `miou_all` is shown as the progress instead of `miou`.
 
     Returns:
-        {"quality": {psnr, ssim, lpips, miou, mbiou, dice, accuracy}, "objects": [{id, name, iou, biou, dice, pixels}],
-        "views": [{name, psnr, ssim, miou}]}. The ID scores are None if no pixel is labeled; lpips is always None.
+        {"quality": {psnr, ssim, lpips, miou, miou_all, mbiou, dice, accuracy}, "objects": [{id, name, iou, iou_all,
+        biou, dice, pixels}], "views": [{name, psnr, ssim, miou, miou_all}]}, see `IdScores`. Scores of a view are those
+        of its pixels and objects alone. The ID scores are None if no pixel is labeled; lpips is always None.
     """
     reporter = reporter or Reporter()
     images = ImageScores()
@@ -64,14 +67,15 @@ def evaluate(
             reporter.warning(f"The render of {name} contains NaN or Inf.")
         psnr, ssim = images.add(image, capture.image(i))
         truth = capture.mask(i)
-        miou = None
+        of_view: dict[str, float | None] = {"miou": None, "miou_all": None}
         if truth is not None:
             view_ids = IdScores(zero_is_class)
             view_ids.add(found, truth)
             ids.merge(view_ids)
-            miou = view_ids.result()["miou"]
-        views.append({"name": name, "psnr": psnr, "ssim": ssim, "miou": miou})
-        reporter.progress(done + 1, len(indices), psnr=psnr, miou=miou)
+            found_scores = view_ids.result()
+            of_view = {key: found_scores[key] for key in of_view}
+        views.append({"name": name, "psnr": psnr, "ssim": ssim, **of_view})
+        reporter.progress(done + 1, len(indices), psnr=psnr, **of_view, zero_is_background=zero_is_background)
 
     quality: dict[str, Any] = {**images.result(), "lpips": None, **ids.result()}
     del quality["objects"]

@@ -57,11 +57,13 @@ def write_report(
     report = complete(report)
     folder = reconstruction.pictures
     folder.mkdir(parents=True, exist_ok=True)
-    shown, rule = choose_objects(report.objects)
+    # The objects' IoU whose mean is the leading mIoU.
+    iou = {"miou_all": "iou_all", "miou": "iou"}[report.lead_miou]
+    shown, rule = choose_objects(report.objects, iou)
     palette = {**object_colors(entry["id"] for entry in shown), **(colors or {})}
-    curve = plot_curve(report.curve)
+    curve = plot_curve(report.curve, report.zero_is_background)
     curve_file = curve and save_image(curve, folder / "error-over-time.png")
-    bars = plot_objects(shown, palette)
+    bars = plot_objects(shown, palette, iou)
     bars_file = bars and save_image(bars, folder / "objects.png")
     files: list[tuple[str, Path]] = []
     for i, (caption, image) in enumerate(images):
@@ -87,7 +89,7 @@ def write_report(
         parts += ["## Objects", *([rule] if rule else [])]
         if bars_file:
             parts.append(f"![IoU of each object]({link(bars_file)})")
-        parts.append(objects_table(shown, {i: link(path) for i, path in swatches.items()}))
+        parts.append(objects_table(shown, {i: link(path) for i, path in swatches.items()}, iou))
     parts += meshes_section(report, None if mesh_sheet is None else link(sheet_file))
     parts += [*stages_section(report), *left_out_section(report)]
     for name, heading in (("model", "Model"), ("capture", "Capture"), ("settings", "Settings"), ("machine", "Machine")):

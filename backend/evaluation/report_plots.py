@@ -8,6 +8,8 @@ from typing import Any
 
 from PIL import Image
 
+from ..shared.reconstruction.report import MIOU_LABELS, lead_miou
+
 _STYLE: dict[Any, Any] = {
     "font.size": 10,
     "axes.edgecolor": "#b9b9bf",
@@ -32,12 +34,16 @@ _STYLE: dict[Any, Any] = {
 }
 
 
-def plot_curve(curve: Sequence[Mapping[str, Any]]) -> Image.Image | None:
-    """Plot PSNR and mIoU on held-out views over the run time, one panel each; None if nothing was measured."""
+def plot_curve(curve: Sequence[Mapping[str, Any]], zero_is_background: bool = False) -> Image.Image | None:
+    """Plot PSNR and mIoU on held-out views over the run time, one panel each; None if nothing was measured.
+
+    The mIoU is `lead_miou` of the latest measurement.
+    """
+    lead = lead_miou(curve[-1] if curve else {}, zero_is_background)
     panels = []
     for key, title, color, how in (
         ("psnr", "PSNR (dB), higher is better", "#3b7dd8", "{:.2f} dB"),
-        ("miou", "mIoU, 1 is perfect", "#d9731a", "{:.3f}"),
+        (lead, f"{MIOU_LABELS[lead]}, 1 is perfect", "#d9731a", "{:.3f}"),
     ):
         points = [(entry["seconds"], entry[key]) for entry in curve if entry.get(key) is not None]
         if points:
@@ -76,9 +82,12 @@ def plot_curve(curve: Sequence[Mapping[str, Any]]) -> Image.Image | None:
         return _render(figure)
 
 
-def plot_objects(objects: Sequence[Mapping[str, Any]], colors: Mapping[int, Sequence[int]]) -> Image.Image | None:
-    """Plot the IoU of each object as a bar in its color, the best on top; None if no object was measured."""
-    measured = sorted((entry for entry in objects if entry["iou"] is not None), key=lambda entry: entry["iou"])
+def plot_objects(
+    objects: Sequence[Mapping[str, Any]], colors: Mapping[int, Sequence[int]], iou: str = "iou"
+) -> Image.Image | None:
+    """Plot the IoU of each object, its entry `iou`, as a bar in its color, the best on top; None if no object was
+    measured."""
+    measured = sorted((entry for entry in objects if entry[iou] is not None), key=lambda entry: entry[iou])
     if not measured:
         return None
     from matplotlib import rc_context
@@ -87,7 +96,7 @@ def plot_objects(objects: Sequence[Mapping[str, Any]], colors: Mapping[int, Sequ
     with rc_context({**_STYLE, "axes.grid.axis": "x", "axes.spines.left": False}):
         figure = Figure(figsize=(7.0, 0.9 + 0.27 * len(measured)), dpi=110, layout="constrained")
         axes = figure.subplots()
-        values = [entry["iou"] for entry in measured]
+        values = [entry[iou] for entry in measured]
         bar_colors = [tuple(channel / 255 for channel in colors[entry["id"]]) for entry in measured]
         axes.barh(range(len(values)), values, color=bar_colors, height=0.68)
         for row, value in enumerate(values):

@@ -9,9 +9,12 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..shared.reconstruction.report import QUALITY, Report
+from ..shared.reconstruction.report import MIOU_LABELS, QUALITY, Report
 
 OBJECTS_SHOWN = 40
+
+IOU_LABELS = {"iou_all": "IoU (all)", "iou": "IoU (labeled)"}
+"""Names of the entries of an object that `MIOU_LABELS` are the means of."""
 
 _MEANINGS = {
     "psnr": (
@@ -21,9 +24,18 @@ _MEANINGS = {
     ),
     "ssim": ("SSIM", "", "similarity of local structure; 1 is identical"),
     "lpips": ("LPIPS", "", "perceptual difference; 0 is identical"),
-    "miou": ("mIoU", "", "overlap of rendered and true masks, mean over the objects; 1 is perfect"),
-    "mbiou": ("mBIoU", "", "the same overlap, but only along the outlines of the objects"),
-    "dice": ("Dice", "", "overlap as the Dice score, mean over the objects"),
+    "miou": (
+        MIOU_LABELS["miou"],
+        "",
+        "overlap of rendered and true masks where pixels have a label, mean over the objects; 1 is perfect",
+    ),
+    "miou_all": (
+        MIOU_LABELS["miou_all"],
+        "",
+        "the same overlap over all pixels: an object that is rendered where no label is counts as an error",
+    ),
+    "mbiou": ("mBIoU", "", "the overlap on labeled pixels, but only along the outlines of the objects"),
+    "dice": ("Dice", "", "overlap on labeled pixels as the Dice score, mean over the objects"),
     "accuracy": ("Pixel accuracy", "", "fraction of the labeled pixels that show the right object"),
 }
 
@@ -39,8 +51,9 @@ def summarize(report: Report) -> str:
         facts.append(f"{model['gaussians']:,.0f} splats")
     if quality["psnr"] is not None:
         facts.append(f"PSNR {quality['psnr']:.2f} dB")
-    if quality["miou"] is not None:
-        facts.append(f"mIoU {quality['miou']:.3f}")
+    lead = report.lead_miou
+    if quality[lead] is not None:
+        facts.append(f"{MIOU_LABELS[lead]} {quality[lead]:.3f}")
     if seconds:
         facts.append(f"{duration(seconds)} of computing time")
     return (", ".join(facts) or "Nothing has been measured yet") + "."
@@ -48,42 +61,79 @@ def summarize(report: Report) -> str:
 
 def quality_section(report: Report) -> list[str]:
     rows = []
-    for key in QUALITY:
+    lead = report.lead_miou
+    order = [key for key in QUALITY if key not in MIOU_LABELS]
+    order[order.index("mbiou") : order.index("mbiou")] = sorted(MIOU_LABELS, key=lambda key: key != lead)
+    for key in order:
         label, unit, meaning = _MEANINGS[key]
         value = report.quality[key]
         text = "—" if value is None else f"{value:.2f} {unit}" if unit else f"{value:.4f}"
         rows.append((label, f"**{text}**" if value is not None else text, meaning))
     intro = (
         "Measured on the held-out views (every 8th image by file name), which were not used for training. "
-        "Pixels without a label in the masks do not count in the object scores."
+        f"{_of_validation(report)}{_of_unlabeled(report)}"
     )
-    return ["## Quality", intro, table(("", "Value", "Meaning"), rows, right=(1,))]
+    parts = ["## Quality", intro, table(("", "Value", "Meaning"), rows, right=(1,))]
+    by_view = sorted((view[lead], view["name"]) for view in report.views if view.get(lead) is not None)
+    if by_view:
+        middle = statistics.median(value for value, _ in by_view)
+        lowest, name = by_view[0]
+        parts.append(
+            f"{MIOU_LABELS[lead]} of single views: median {middle:.3f}, lowest {lowest:.3f} ({escape(name)}); all are "
+            "in `report.json`."
+        )
+    return parts
 
 
-def choose_objects(objects: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], str]:
-    """Return all objects by ID or, if there are many, those with the lowest IoU, and a sentence about the selection."""
+def _of_validation(report: Report) -> str:
+    """Return the sentence about the views that decided when the training ended; empty if there are none."""
+    count = report.capture.get("validation")
+    if not count:
+        return ""
+    views = "1 other view was" if count == 1 else f"{count} other views were"
+    return f"{views} used for validation instead of training: their PSNR decided when the training ended. "
+
+
+def _of_unlabeled(report: Report) -> str:
+    """Return the sentence about what pixels without a label count for."""
+    if report.quality["miou_all"] is None:
+        return "Pixels without a label in the masks do not count in the object scores."
+    if report.zero_is_background:
+        return (
+            "Pixels without a label in the masks show the background: objects that are rendered there count as errors "
+            "in mIoU (all); the other object scores ignore these pixels."
+        )
+    return (
+        "Pixels without a label in the masks are gaps, and objects that are rendered there may be right, although "
+        "mIoU (all) counts them as errors; the other object scores ignore these pixels."
+    )
+
+
+def choose_objects(objects: list[dict[str, Any]], iou: str = "iou") -> tuple[list[dict[str, Any]], str]:
+    """Return all objects by ID or, if there are many, those with the lowest IoU (the entry `iou`), and a sentence about
+    the selection."""
     by_id = sorted(objects, key=lambda entry: entry["id"])
     if len(objects) <= OBJECTS_SHOWN:
         return by_id, ""
-    worst = sorted(by_id, key=lambda entry: math.inf if entry["iou"] is None else entry["iou"])
+    worst = sorted(by_id, key=lambda entry: math.inf if entry[iou] is None else entry[iou])
     return worst[:OBJECTS_SHOWN], (
         f"These are the {OBJECTS_SHOWN} objects with the lowest IoU; "
         f"the other {len(objects) - OBJECTS_SHOWN:,} are in `report.json`."
     )
 
 
-def objects_table(objects: list[dict[str, Any]], swatches: Mapping[int, str]) -> str:
+def objects_table(objects: list[dict[str, Any]], swatches: Mapping[int, str], iou: str = "iou") -> str:
     rows = [
         (
             f"![]({swatches[entry['id']]})",
             str(entry["id"]),
             escape(entry["name"]),
-            _number(entry["iou"], "{:.3f}"),
+            _number(entry[iou], "{:.3f}"),
             _number(entry["anchors"], "{:,.0f}"),
         )
         for entry in objects
     ]
-    return table(("", "ID", "Name", "IoU", "Anchors"), rows, right=(1, 3, 4))
+    return table(("", "ID", "Name", IOU_LABELS[iou], "Anchors"), rows, right=(1, 3, 4))
 
 
 _MESH_COLUMNS = (

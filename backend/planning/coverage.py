@@ -48,6 +48,35 @@ def duplicate_views(capture: Capture) -> list[int]:
     return sorted(found)
 
 
+def views_like_held_out(capture: Capture) -> list[int]:
+    """Find training views that show what a held-out view shows: same position, same camera, same image.
+
+    A training on them has seen the held-out image, whatever the masks.
+
+    Args:
+        capture: The capture; must be prepared.
+
+    Returns:
+        Indices of the training views, ascending.
+    """
+    train, held_out = list(capture.train_indices), list(capture.test_indices)
+    if not train or not held_out:
+        return []
+    poses = _compute_pose_vectors(capture, [*train, *held_out])
+    near = cKDTree(poses[: len(train)]).query_ball_point(poses[len(train) :], SAME_PIXELS, p=np.inf)
+    found: set[int] = set()
+    for index, candidates in zip(held_out, near, strict=True):
+        for i in {train[candidate] for candidate in candidates} - found:
+            if _same_camera(capture, i, index) and _same_photo(capture, i, index):
+                found.add(i)
+    return sorted(found)
+
+
+def _same_photo(capture: Capture, a: int, b: int) -> bool:
+    difference = capture.image(a).astype(np.int16) - capture.image(b)
+    return float(np.abs(difference).mean()) <= SAME_COLOR
+
+
 def _compute_pose_vectors(capture: Capture, views: list[int]) -> np.ndarray:
     """Return positions and rotations of views as vectors (n, 12), scaled to pixels: a distance of 1 moves a view's
     points by at most one pixel, and by about one pixel in the view with the nearest points."""

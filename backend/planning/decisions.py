@@ -15,9 +15,10 @@ from ..capture import Capture
 from ..shared.defaults import MAX_SIZE
 from ..shared.reconstruction.objects import SceneObject, default_name, merged
 from ..shared.reconstruction.plan import KEYS, Decision, Plan
+from ..training.budget import choose_validation_views
 from ..training.exposure import VARIES_FROM, differences, measure_gains
 from ..training.settings import Settings, background_is_masked, downscale_at
-from .coverage import blind_views, duplicate_views, unseen_points, views_without_objects
+from .coverage import blind_views, duplicate_views, unseen_points, views_like_held_out, views_without_objects
 
 PIXELS_TO_READ = 3e8
 """Largest total number of pixels of photos that are read for a plan, in a few seconds; larger captures are only read
@@ -32,7 +33,7 @@ class Choices:
     """The user's choices that decisions depend on.
 
     settings: of the training, before the plan changes them. meshes: whether meshes are wanted. keep, leave_out: keys
-    of the decisions to override.
+    of the decisions to override. until_converged: whether the training ends when it has converged.
     """
 
     settings: Settings = field(default_factory=Settings)
@@ -40,6 +41,7 @@ class Choices:
     meshes: bool = True
     keep: Collection[str] = ()
     leave_out: Collection[str] = ()
+    until_converged: bool = False
 
 
 @dataclass
@@ -48,7 +50,8 @@ class PlanningContext:
 
     capture: with the user's names and without the objects left out. objects: of objects.json, or before a vote those
     of the masks. point_ids: (M,) int64, the points' objects; None before a vote. thorough: whether to read all photos,
-    however many. plan: the decisions so far, with the user's overrides.
+    however many. plan: the decisions so far, with the user's overrides. resumed: the plan of the training that is
+    resumed, which keeps the views that it was begun with; None for a new one.
     """
 
     capture: Capture
@@ -57,6 +60,7 @@ class PlanningContext:
     point_ids: np.ndarray | None = None
     thorough: bool = False
     plan: Plan = field(default_factory=Plan)
+    resumed: Plan | None = None
 
     @cached_property
     def gains(self) -> np.ndarray:
@@ -93,9 +97,10 @@ def decide(context: PlanningContext) -> Plan:
 
 
 def planned_capture(capture: Capture, plan: Plan) -> Capture:
-    """Return the capture that a plan trains on: without unused masks, and with unused views excluded from training."""
+    """Return the capture that a plan trains on: without unused masks, with unused and validation views excluded from
+    training."""
     capture = capture if plan.does("votes") else capture.without_masks()
-    return capture.excluding_from_training(plan.views_left_out)
+    return capture.excluding_from_training(plan.views_left_out).validating_on(plan.validation_views)
 
 
 def planned_settings(settings: Settings, plan: Plan) -> Settings:
@@ -192,10 +197,26 @@ def _undistortion(context: PlanningContext) -> Decision:
 
 
 def _duplicate_views(context: PlanningContext) -> Decision | None:
-    found = duplicate_views(context.capture) if context.capture.prepared else []
+    capture = context.capture
+    if context.resumed is not None:
+        return context.resumed.planned("duplicate-views")
+    if not capture.prepared:
+        return None
+    repeated, flattering = duplicate_views(capture), views_like_held_out(capture)
+    if len({*repeated, *flattering}) == len(capture.train_indices):
+        flattering = []  # Nothing would be left to train on.
+    repeated = [i for i in repeated if i not in flattering]
+    found, reasons = sorted([*repeated, *flattering]), []
     if not found:
         return None
-    why = f"each shows the same image from the same position as an earlier view: {_listed(context.names(found))}"
+    for views, other in (
+        (repeated, "an earlier view"),
+        (flattering, "a held-out view, whose figures would be too good if they were trained on"),
+    ):
+        if views:
+            each = f"each shows the same image from the same position as {other}"
+            reasons.append(f"{each}: {_listed(context.names(views))}")
+    why = "; ".join(reasons)
     return Decision("duplicate-views", f"training on {_views(len(found))}", False, why, views=context.names(found))
 
 
@@ -216,6 +237,21 @@ def _other_views(context: PlanningContext) -> Decision | None:
         return None
     what = f"training on {_views(len(found))} without the selected objects"
     return Decision("other-views", what, True, "they show the rest of the scene", views=context.names(found))
+
+
+def _validation_views(context: PlanningContext) -> Decision | None:
+    if context.resumed is not None:
+        return context.resumed.planned("validation-views")
+    if not context.choices.until_converged:
+        return None
+    training = planned_capture(context.capture, context.plan).train_indices
+    found = choose_validation_views(training)
+    if not found:
+        why = "they are too few to spare any for validation, so their loss decides when the training ends"
+        what = f"training on all {_views(len(training))}"
+        return Decision("validation-views", what, True, why, can_override=False)
+    why = f"the training ends when their PSNR has converged: {_listed(context.names(found))}"
+    return Decision("validation-views", f"training on {_views(len(found))}", False, why, views=context.names(found))
 
 
 def _unseen_points(context: PlanningContext) -> Decision | None:
@@ -264,7 +300,7 @@ def _surface(context: PlanningContext) -> Decision | None:
 
 DECISIONS: tuple[Callable[[PlanningContext], Decision | None], ...] = (
     _votes, _objects, _groups, _rest, _labels, _undistortion, _duplicate_views, _blind_views, _other_views,
-    _unseen_points, _exposure, _pyramid, _meshes, _surface,
+    _validation_views, _unseen_points, _exposure, _pyramid, _meshes, _surface,
 )  # fmt: skip
 """In the order of `KEYS`; a decision may depend on earlier ones. None if a decision does not apply to the capture."""
 

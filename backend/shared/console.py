@@ -10,6 +10,7 @@ from typing import Any, TextIO
 
 from .durations import time_left
 from .events import Reporter
+from .reconstruction.report import MIOU_LABELS, lead_miou
 
 SECONDS_BETWEEN_LINES = 5.0
 SECONDS_BETWEEN_REDRAWS = 0.1
@@ -17,13 +18,14 @@ BAR_COLUMNS = 30
 
 
 def _figures(fields: dict[str, Any]) -> list[str]:
-    """Format the known figures among an event's fields, with units, in a fixed order."""
+    """Format the known figures among an event's fields, with units, in a fixed order; of the mIoUs, the leading one."""
+    lead = lead_miou(fields, fields.get("zero_is_background") is True)
     formats = {
         "loss": "loss {:.4f}",
         "splats": "{:,.0f} splats",
         "psnr": "PSNR {:.1f} dB",
         "ssim": "SSIM {:.3f}",
-        "miou": "mIoU {:.3f}",
+        lead: MIOU_LABELS[lead] + " {:.3f}",
         "mbiou": "mBIoU {:.3f}",
     }
     return [text.format(fields[name]) for name, text in formats.items() if isinstance(fields.get(name), int | float)]

@@ -15,8 +15,9 @@ class Reporter:
     """Receiver of a command's events; this base class discards them (for tests and library use).
 
     status(message): the current activity. progress(done, total, ...): extra fields such as `seconds_left` as keywords.
-    preview(path): an image was written. quality(**figures): metrics on held-out views (psnr, miou, mbiou), with the
-    seconds and the step of the training. warning(message). A command ends with one of done(**fields), stopped(message)
+    preview(path): an image was written. quality(**figures): metrics on held-out views (psnr, miou, miou_all, mbiou),
+    with the seconds and the step of the training, and `zero_is_background`, which decides between miou and miou_all as
+    in `lead_miou`. warning(message). A command ends with one of done(**fields), stopped(message)
     if the user stopped it, and error(message).
     """
 

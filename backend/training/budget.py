@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,6 +37,11 @@ GROWTH_OCTAVES, MIN_GROWTH = 0.5, 1.01
 """Growth ends when the number of anchors has grown by less than this factor over this number of octaves of steps; from
 then on, growth would only move anchors, which takes time and disturbs the others."""
 
+VALIDATE_EVERY, MAX_VALIDATION_VIEWS, MIN_TRAINED_VIEWS = 8, 20, 16
+"""A training until convergence validates on every 8th training view, at most on this number. None is spared if fewer
+than the third number of views would be left to train on: the few that could be would cost the model more than they
+tell about it."""
+
 DECAY_FROM = 0.9
 """Fraction of its steps at which a training until convergence leaves the plateau of the learning rates; later than
 other trainings, since the model on the plateau is as good as after an earlier decay with equally many steps."""
@@ -54,7 +60,8 @@ class TrainingProgress:
             the step of the latest one.
         grown: whether growth has ended.
         converged_at: step at which the training converged and the learning rate decay began; 0 before.
-        curve: for each evaluation, the seconds, step, number of anchors, loss (dB) and measured quality.
+        curve: for each evaluation, the seconds, step, number of anchors, loss (dB) and measured quality, on held-out
+            views and, as `validation_psnr`, on validation views.
     """
 
     step: int = 0
@@ -79,7 +86,8 @@ class TrainingProgress:
 class Budget:
     """Total length of a training, in steps or seconds, which also determines the schedules.
 
-    until_converged: train until further steps would gain little; `seconds` is then a limit, None: no limit.
+    until_converged: train until further steps would gain little on the validation views; `seconds` is then a limit,
+    None: no limit.
     """
 
     steps: int | None = None
@@ -178,6 +186,20 @@ class Budget:
         return p.seconds >= DECAY_FROM * self.seconds
 
 
+def choose_validation_views(training: Sequence[int]) -> list[int]:
+    """Choose the views on which a training until convergence validates, spread evenly over its training views.
+
+    Args:
+        training: Indices of the training views, by file name.
+
+    Returns:
+        Indices of the views not to train on, always the same for the same views; empty if there are too few.
+    """
+    every = max(VALIDATE_EVERY, math.ceil(len(training) / MAX_VALIDATION_VIEWS))
+    chosen = list(training[every // 2 :: every])
+    return chosen if len(training) - len(chosen) >= MIN_TRAINED_VIEWS else []
+
+
 def expected_end(p: TrainingProgress) -> float | None:
     """Estimate the total number of steps of a training until convergence; None as long as there is no estimate."""
     if p.converged_at:
@@ -213,11 +235,13 @@ def _growth_has_ceased(curve: list[dict[str, Any]]) -> bool:
 def _gain_per_octave(curve: list[dict[str, Any]]) -> float | None:
     """Return the quality gain in dB per doubling of the number of steps; None if the curve is too short.
 
-    The quality is the PSNR on held-out views or, if there are none, the loss in dB.
+    The quality is the PSNR on the validation views or, if there are none, the loss in dB. It is never the PSNR on the
+    held-out views: a training that ended where these are best would flatter the figures that are reported of them.
     """
     last = curve[-1]["step"] if curve else 0
     recent = [entry for entry in curve if entry["step"] >= max(WARM_UP, last / 2**OCTAVES)]
-    key = "psnr" if all(entry.get("psnr") is not None for entry in recent) else "loss_db"
+    validated = all(entry.get("validation_psnr") is not None for entry in recent)
+    key = "validation_psnr" if validated else "loss_db"
     found = [(math.log2(entry["step"]), entry[key]) for entry in recent if entry.get(key) is not None]
     if len(found) < 5 or found[-1][0] - found[0][0] < MIN_OCTAVES:
         return None

@@ -238,7 +238,7 @@ class Trainer:
             budget: total length of the training.
             checkpoints: folder for checkpoints, which are written at the end, before a pause, and at intervals.
             reporter: receives progress, quality and warnings.
-            evaluate: function that measures the model on held-out views.
+            evaluate: function that measures the model on held-out and validation views.
             stop: stop and pause request, checked before each step.
             checkpoint_seconds: interval between checkpoints.
 
@@ -318,7 +318,7 @@ class Trainer:
         loss_db = round(-20 * math.log10(loss), 3) if 0 < loss < math.inf else None
         reached = {"seconds": round(p.seconds, 2), "step": p.step, "anchors": len(self.model.anchors)}
         p.curve.append({**reached, "loss_db": loss_db, **quality})
-        reporter.quality(**p.curve[-1])
+        reporter.quality(**p.curve[-1], zero_is_background=self.scene.supervise_background)
 
     def _report(self, budget: Budget, reporter: Reporter, loss: float, pace: float) -> None:
         p = self.progress
@@ -335,6 +335,8 @@ class Trainer:
             splats=self.splats,
             psnr=latest.get("psnr"),
             miou=latest.get("miou"),
+            miou_all=latest.get("miou_all"),
+            zero_is_background=self.scene.supervise_background,
         )
 
     @property

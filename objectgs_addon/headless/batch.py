@@ -13,11 +13,16 @@ from ...backend.shared.errors import Cancelled, InputError
 from ...backend.shared.formats.atomic import write_atomic
 from ...backend.shared.formats.json_file import read_json, write_json
 from ...backend.shared.reconstruction.folder import Reconstruction
-from ...backend.shared.reconstruction.report import read_report
+from ...backend.shared.reconstruction.report import MIOU_LABELS, read_report
 from ...backend.shared.version import __version__
 from .commands import BLEND, PICTURE, StepFailed, absolute, find_backend, reconstruct, sentence
 
 DONE, BAD_INPUT, FAILED, UNFINISHED = "done", "bad input", "failed", "unfinished"
+
+_NOTHING: dict[str, Any] = {
+    "state": UNFINISHED, "psnr": None, "miou": None, "miou_all": None, "zero_is_background": None, "splats": None,
+    "error": None,
+}  # fmt: skip
 
 
 def batch(options: argparse.Namespace) -> None:
@@ -94,7 +99,7 @@ def _run_one(
 ) -> None:
     """Run one capture; its entry in the summary stays valid even if the process is killed."""
     earlier = entry["seconds"] if entry["state"] == UNFINISHED and entry["settings"] == wanted else 0.0
-    entry.update(state=UNFINISHED, settings=wanted, seconds=earlier, psnr=None, miou=None, splats=None, error=None)
+    entry.update(_NOTHING, settings=wanted, seconds=earlier)
     summary.write()
     started = time.monotonic()
     try:
@@ -104,6 +109,8 @@ def _run_one(
             state=DONE,
             psnr=report.quality["psnr"],
             miou=report.quality["miou"],
+            miou_all=report.quality["miou_all"],
+            zero_is_background=report.zero_is_background,
             splats=report.model["gaussians"],
         )
     except (Cancelled, KeyboardInterrupt):
@@ -137,15 +144,7 @@ class _Summary:
                 known = {str(entry["name"]): dict(entry) for entry in content["captures"]}
             except (KeyError, TypeError, ValueError) as error:
                 raise InputError(f"{self.json} was not written by this program; choose another --out.") from error
-        fresh = {
-            "state": UNFINISHED,
-            "seconds": 0.0,
-            "psnr": None,
-            "miou": None,
-            "splats": None,
-            "error": None,
-            "settings": None,
-        }
+        fresh = {**_NOTHING, "seconds": 0.0, "settings": None}
         self.entries = [{"name": capture.name, **fresh, **known.get(capture.name, {})} for capture in captures]
         self.write()
 
@@ -161,13 +160,16 @@ class _Summary:
 
     def write(self) -> None:
         write_json(self.json, {"captures": self.entries})
-        lines = ["| capture | state | seconds | PSNR | mIoU | splats | error |", "|---|---|---:|---:|---:|---:|---|"]
+        heads = ("capture", "state", "seconds", "PSNR", *MIOU_LABELS.values(), "splats", "error")
+        lines = ["| " + " | ".join(heads) + " |", "|---|---|---:|---:|---:|---:|---:|---|"]
         for entry in self.entries:
             cells = (
                 entry["name"],
                 entry["state"],
                 f"{entry['seconds']:.0f}",
                 _figure(entry["psnr"], ".2f"),
+                # Where pixels without a label are gaps in the masks, objects there are no errors.
+                _figure(entry["miou_all"] if entry["zero_is_background"] else None, ".3f"),
                 _figure(entry["miou"], ".3f"),
                 _figure(entry["splats"], "d"),
                 entry["error"] or "",

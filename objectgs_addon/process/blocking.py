@@ -74,8 +74,9 @@ def _watch(job: Job, reporter: Reporter, signals: list[int]) -> None:
         if job.progress != progress:
             progress = job.progress
             reporter.progress(
-                progress, 1.0, seconds_left=job.seconds_left, splats=job.splats, psnr=job.psnr, miou=job.miou
-            )
+                progress, 1.0, seconds_left=job.seconds_left, splats=job.splats, psnr=job.psnr, miou=job.miou,
+                miou_all=job.miou_all, zero_is_background=job.zero_is_background,
+            )  # fmt: skip
         time.sleep(0.02)
     if job.state is not State.FAILED:
         reporter.status(job.message)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ...backend.shared.errors import EXIT_CANCELLED, EXIT_DONE
+from ...backend.shared.reconstruction.report import MIOU_LABELS, lead_miou
 from .backend_process import BackendProcess
 
 GRACE_SECONDS = 10.0
@@ -59,8 +60,9 @@ class Job:
 
     The other attributes change while the job runs: progress from 0 to 1, seconds_left (reported or estimated), message
     (the current step), statuses (all messages so far), warnings and error (sentences), training figures (step, splats,
-    anchors, psnr, miou), preview (path of the newest image), curve (quality events: seconds, step, psnr, miou, mbiou),
-    result (fields of the `done` event), exit_code and log (most recent lines that are not events).
+    anchors, psnr, miou, miou_all, zero_is_background), preview (path of the newest image), curve (quality events:
+    seconds, step, psnr, miou, miou_all, mbiou), result (fields of the `done` event), exit_code and log (most recent
+    lines that are not events).
     """
 
     title: str
@@ -83,6 +85,8 @@ class Job:
     anchors: int | None = None
     psnr: float | None = None
     miou: float | None = None
+    miou_all: float | None = None
+    zero_is_background: bool = False
     preview: Path | None = None
     curve: list[dict[str, Any]] = field(default_factory=list)
     result: dict[str, Any] = field(default_factory=dict)
@@ -115,6 +119,13 @@ class Job:
     def can_pause(self) -> bool:
         """Whether the job can be paused; only a running training job can."""
         return self.kind == "train" and self.state is State.RUNNING
+
+    @property
+    def lead_miou(self) -> tuple[str, float] | None:
+        """Label and value of the metric of the objects to show first, see `lead_miou`; None if it is not measured."""
+        name = lead_miou({"miou_all": self.miou_all}, self.zero_is_background)
+        value = getattr(self, name)
+        return None if value is None else (MIOU_LABELS[name], value)
 
     def pause(self) -> None:
         """Pause a running training job."""
@@ -248,10 +259,12 @@ class Job:
             self.seconds_left = elapsed * (1 - progress) / progress
 
     def _take_figures(self, event: dict[str, Any]) -> None:
-        for name in ("step", "splats", "anchors", "psnr", "miou"):
+        for name in ("step", "splats", "anchors", "psnr", "miou", "miou_all"):
             value = _number(event.get(name))
             if value is not None:
                 setattr(self, name, value)
+        if isinstance(event.get("zero_is_background"), bool):
+            self.zero_is_background = event["zero_is_background"]
 
     def _finish(self, code: int) -> None:
         """Set the final state from the exit code and the last event."""

@@ -53,8 +53,9 @@ def draw_figures(layout: bpy.types.UILayout, job: Job) -> None:
     figures = []
     if job.psnr is not None:
         figures.append(f"PSNR {job.psnr:.1f} dB")
-    if job.miou is not None:
-        figures.append(f"mIoU {job.miou:.3f}")
+    if job.lead_miou is not None:
+        label, value = job.lead_miou
+        figures.append(f"{label} {value:.3f}")
     if job.splats:
         figures.append(f"{job.splats:,} splats")
     if figures:

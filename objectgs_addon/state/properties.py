@@ -131,7 +131,7 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
         items=[
             ("preview", "Preview", f"{PRESET_STEPS['preview']:,} steps, for a quick check"),
             ("standard", "Standard", f"{PRESET_STEPS['standard']:,} steps"),
-            ("final", "Until Converged", "Until the error on held-out photos stops decreasing"),
+            ("final", "Until Converged", "Until the error on photos set aside for validation stops decreasing"),
             ("minutes", "Minutes", "A time limit; a finished training can be extended"),
         ],
     )

@@ -8,19 +8,21 @@ import pytest
 from backend.training.budget import (
     DECAY_FROM,
     LOOKAHEAD,
+    MAX_VALIDATION_VIEWS,
     OCTAVES,
     PRESETS,
     WARM_UP,
     WORTHWHILE_DB,
     Budget,
     TrainingProgress,
+    choose_validation_views,
     convergence_step,
 )
 from backend.training.settings import GROW_UNTIL, PLATEAU_FROM, PLATEAU_UNTIL, rate
 
 
 def curve_of(steps, psnr, **more):
-    return [{"step": step, "psnr": psnr(step), **more} for step in steps]
+    return [{"step": step, "validation_psnr": psnr(step), **more} for step in steps]
 
 
 def walk(budget, psnr, longest=100_000, seconds_a_step=0.05, anchors=lambda step: step):
@@ -31,7 +33,7 @@ def walk(budget, psnr, longest=100_000, seconds_a_step=0.05, anchors=lambda step
     progress, displayed = [], []
     while p.step < longest:
         if budget.evaluation_is_due(p):
-            p.curve.append({"step": p.step, "psnr": psnr(p.step), "loss_db": None, "anchors": anchors(p.step)})
+            p.curve.append({"step": p.step, "validation_psnr": psnr(p.step), "anchors": anchors(p.step)})
             budget.check_convergence(p)
         progress.append(budget.progress(p))
         displayed.append(budget.displayed_progress(p))
@@ -70,10 +72,43 @@ def test_short_curve_has_not_converged():
     assert convergence_step(curve_of([700, 2000], lambda s: 30.0)) is None
 
 
-def test_loss_is_used_without_held_out_views():
+def test_loss_is_used_without_validation_views():
     steps = range(WARM_UP, 3 * WARM_UP, 100)
-    entries = [{"step": s, "psnr": None, "loss_db": 10 + 2 * math.log2(s)} for s in steps]
-    assert convergence_step(entries) == pytest.approx(converged_after(2.0))
+    entries = [{"step": s, "psnr": 30.0, "loss_db": 10 + 2 * math.log2(s)} for s in steps]
+    assert convergence_step(entries) == pytest.approx(converged_after(2.0)), "as in checkpoints of earlier versions"
+    assert convergence_step([{**entry, "loss_db": None} for entry in entries]) is None
+
+
+@pytest.mark.parametrize("held_out", [lambda step: 30.0, lambda step: step, lambda step: None])
+def test_held_out_views_do_not_decide_the_end(held_out):
+    budget, ends = PRESETS["final"], []
+    for measured in (held_out, lambda step: math.log2(step)):
+        p = TrainingProgress()
+        budget.begin(p)
+        while budget.progress(p) < 1 and p.step < 20_000:
+            p.step += 1
+            if budget.evaluation_is_due(p):
+                quality = {"psnr": measured(p.step), "validation_psnr": math.log2(min(p.step, 3000))}
+                p.curve.append({"step": p.step, **quality, "anchors": 5})
+                budget.check_convergence(p)
+        ends.append((p.converged_at, p.step))
+    assert ends[0] == ends[1] and 3000 < ends[0][0] < 20_000
+
+
+@pytest.mark.parametrize(
+    ("count", "chosen"),
+    [(0, []), (1, []), (17, []), (18, [4, 12]), (36, [4, 12, 20, 28]), (160, list(range(4, 160, 8)))],
+)
+def test_validation_views_are_every_8th(count, chosen):
+    views = tuple(range(100, 100 + count))
+    assert choose_validation_views(views) == [100 + i for i in chosen]
+
+
+def test_validation_views_are_limited_and_spread():
+    for count in (161, 500, 999, 5000):
+        chosen = choose_validation_views(range(count))
+        assert 15 <= len(chosen) <= MAX_VALIDATION_VIEWS and len(set(np.diff(chosen))) == 1
+        assert chosen[0] < count / 15 and chosen[-1] > count * 14 / 15
 
 
 def test_training_ends_soon_after_plateau():
@@ -124,7 +159,7 @@ def test_growth_lasts_while_anchor_count_rises():
         while p.step < 20_000:
             p.step += 1
             if budget.evaluation_is_due(p):
-                p.curve.append({"step": p.step, "psnr": math.log2(p.step) ** 2, "anchors": anchors(p.step)})
+                p.curve.append({"step": p.step, "validation_psnr": math.log2(p.step) ** 2, "anchors": anchors(p.step)})
                 assert not budget.check_convergence(p)
                 if budget.progress(p) > GROW_UNTIL:
                     return p.step

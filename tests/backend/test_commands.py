@@ -91,6 +91,7 @@ def test_full_pipeline(write_capture, tmp_path, run_command, masks):
     assert [event["step"] for event in measured] == sorted({event["step"] for event in measured})
     assert measured[-1]["step"] == 20 and all(event["psnr"] > 5 and event["seconds"] >= 0 for event in measured)
     assert all((event["miou"] is not None) is masks and "mbiou" in event for event in measured)
+    assert all((event["miou_all"] is not None) is masks and not event["zero_is_background"] for event in measured)
     previews = [event["path"] for event in ended.events if event["type"] == "preview"]
     assert previews and all(Path(path).exists() for path in previews)
     splats, warnings = read_splats(out / "splats.ply")
@@ -119,9 +120,12 @@ def test_full_pipeline(write_capture, tmp_path, run_command, masks):
     assert list(stages) == ["read", "vote", "train", "export", "evaluate", "render", "report"]
     assert all(stage["seconds"] >= 0 and 50 < stage["peak_rss_mb"] < 5000 for stage in stages.values())
     quality = report["quality"]
-    assert set(quality) == {"psnr", "ssim", "lpips", "miou", "mbiou", "dice", "accuracy"}
+    assert set(quality) == {"psnr", "ssim", "lpips", "miou", "miou_all", "mbiou", "dice", "accuracy"}
     measured = {name for name, value in quality.items() if value is not None}
-    assert measured == ({"psnr", "ssim", "miou", "mbiou", "dice", "accuracy"} if masks else {"psnr", "ssim"})
+    of_objects = {"miou", "miou_all", "mbiou", "dice", "accuracy"}
+    assert measured == ({"psnr", "ssim"} | of_objects if masks else {"psnr", "ssim"})
+    assert [(view["miou"] is None, view["miou_all"] is None) for view in report["views"]] == [(not masks,) * 2] * 2
+    assert all((point["miou_all"] is not None) is masks for point in report["curve"])
     assert report["model"]["gaussians"] == len(splats)
     assert report["model"]["bytes"] == (out / "splats.ply").stat().st_size
     assert [entry["id"] for entry in report["objects"]] == ([1, 2, 5] if masks else [])

@@ -71,7 +71,9 @@ def test_occasional_figures_stay_displayed(now):
     for fields in ({"psnr": 30.04, "miou": 0.9}, {"psnr": None}, {"loss": 0.1}):
         now[0] += 6
         out.progress(1, 10, seconds_left=5, **fields)
-    assert out.stream.getvalue().splitlines()[-1] == "   10%  0:05 left, loss 0.1000, PSNR 30.0 dB, mIoU 0.900"
+    assert (
+        out.stream.getvalue().splitlines()[-1] == "   10%  0:05 left, loss 0.1000, PSNR 30.0 dB, mIoU (labeled) 0.900"
+    )
     out.status("Meshing")
     out.progress(1, 10, seconds_left=5)
     assert out.stream.getvalue().splitlines()[-1] == "   10%  0:05 left"
@@ -89,9 +91,16 @@ def test_done_lists_figures_and_files():
     out = reporter()
     out.done(psnr=31.24, miou=0.97, ssim=None, report=Path("out/report.md"))
     assert out.stream.getvalue().splitlines() == [
-        "Done: PSNR 31.2 dB, mIoU 0.970",
+        "Done: PSNR 31.2 dB, mIoU (labeled) 0.970",
         f"  report: {Path('out/report.md')}",
     ]
+
+
+def test_leading_miou_depends_on_meaning_of_zero():
+    for background, shown in ((True, "mIoU (all) 0.950"), (False, "mIoU (labeled) 0.967")):
+        out = reporter()
+        out.done(miou=0.967, miou_all=0.95, zero_is_background=background)
+        assert out.stream.getvalue() == f"Done: {shown}\n"
 
 
 def test_preview_folder_is_printed_once():

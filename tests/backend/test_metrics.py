@@ -46,27 +46,30 @@ def slow_band(mask, distance):
 def slow_scores(views, zero_is_class=False):
     """Compute the scores with a loop over all IDs and views on full-size masks."""
     ids = sorted({int(i) for _, truth in views for i in np.unique(truth)} - (set() if zero_is_class else {0}))
-    iou, biou, dice = {}, {}, {}
+    iou, iou_all, biou, dice = {}, {}, {}, {}
     right = labeled = 0
     for predicted, truth in views:
         counted = np.ones(truth.shape, bool) if zero_is_class else truth != 0
         right += int(((predicted == truth) & counted).sum())
         labeled += int(counted.sum())
     for i in ids:
-        same = either = both = band_same = band_either = 0
+        same = either = both = band_same = band_either = either_anywhere = 0
         for predicted, truth in views:
             counted = np.ones(truth.shape, bool) if zero_is_class else truth != 0
             p, t = (predicted == i) & counted, (truth == i) & counted
             same += int((p & t).sum())
             either += int((p | t).sum())
+            either_anywhere += int(((predicted == i) | t).sum())
             both += int(p.sum() + t.sum())
             d = boundary_distance(*truth.shape)
             bp, bt = slow_band(p, d), slow_band(t, d)
             band_same += int((bp & bt).sum())
             band_either += int((bp | bt).sum())
         iou[i], biou[i], dice[i] = same / either, band_same / band_either, 2 * same / both
+        iou_all[i] = same / either_anywhere
     return {
         "miou": np.mean(list(iou.values())),
+        "miou_all": np.mean(list(iou_all.values())),
         "mbiou": np.mean(list(biou.values())),
         "dice": np.mean(list(dice.values())),
         "accuracy": right / labeled,
@@ -140,7 +143,7 @@ def test_id_scores_match_definitions(seed, zero_is_class):
         predicted[noisy] = rng.choice([*ids, 12345], int(noisy.sum()))
         views.append((predicted, truth))
     fast, slow = scores(*views, zero_is_class=zero_is_class), slow_scores(views, zero_is_class)
-    for name in ("miou", "mbiou", "dice", "accuracy"):
+    for name in ("miou", "miou_all", "mbiou", "dice", "accuracy"):
         assert fast[name] == pytest.approx(slow[name], abs=1e-12), name
     assert fast["objects"] == pytest.approx(slow["objects"])
 
@@ -149,6 +152,7 @@ def test_equal_ids_score_one():
     truth = blobs(np.random.default_rng(5), 30, 40, [1, 2, 3])
     assert scores((truth, truth)) == {
         "miou": 1.0,
+        "miou_all": 1.0,
         "mbiou": 1.0,
         "dice": 1.0,
         "accuracy": 1.0,
@@ -194,17 +198,79 @@ def test_boundary_distance_is_two_percent_of_the_diagonal():
     assert boundary_distance(1, 1) == 1
 
 
+FOUR_OBJECTS = np.array([
+    [1, 1, 1, 1, 0, 0, 0, 0],
+    [1, 1, 1, 1, 0, 0, 0, 0],
+    [2, 2, 2, 2, 0, 0, 0, 0],
+    [2, 2, 2, 2, 0, 0, 0, 0],
+])  # fmt: skip
+
+
+def test_object_on_unlabeled_pixels_lowers_miou_all():
+    spread = FOUR_OBJECTS.copy()
+    spread[:2, 4:6] = 1  # 4 pixels of object 1 on the background
+    spread[3, 4:] = 9  # an object that the truth does not have
+    result = scores((spread, FOUR_OBJECTS))
+    assert result["miou"] == result["accuracy"] == 1.0 and result["objects"] == {1: 1.0, 2: 1.0}
+    assert result["miou_all"] == pytest.approx((8 / 12 + 8 / 8) / 2)
+
+
+def test_object_predicted_only_on_unlabeled_pixels_has_no_overlap():
+    predicted = np.where(FOUR_OBJECTS == 2, 0, FOUR_OBJECTS)
+    predicted[:, 6] = 2
+    found = IdScores()
+    found.add(predicted, FOUR_OBJECTS)
+    assert [(row["iou"], row["iou_all"]) for row in found.table()] == [(1.0, 1.0), (0.0, 0.0)]
+    assert found.result()["miou_all"] == 0.5
+
+
+def test_false_pixels_in_view_without_the_object_count():
+    empty = np.zeros_like(FOUR_OBJECTS)
+    elsewhere = empty.copy()
+    elsewhere[0, :4] = 2
+    result = scores((FOUR_OBJECTS, FOUR_OBJECTS), (elsewhere, empty))
+    assert result["miou"] == 1.0 and result["miou_all"] == pytest.approx((1 + 8 / 12) / 2)
+
+
+def test_miou_all_equals_miou_if_zero_is_an_object():
+    predicted = FOUR_OBJECTS.copy()
+    predicted[:2, 4:6] = 1
+    result = scores((predicted, FOUR_OBJECTS), zero_is_class=True)
+    assert result["miou_all"] == result["miou"] == pytest.approx((12 / 16 + 8 / 12 + 1) / 3)
+
+
+def test_miou_all_ranks_spreading_objects_last():
+    """miou prefers a map that covers slightly more of each object by spreading over the background."""
+    truth = np.zeros((40, 60), int)
+    truth[10:30, 5:25], truth[10:30, 35:55] = 1, 2
+    tight = truth.copy()
+    tight[10, 5:25] = 0  # one row of 20 is missed
+    spread = np.where(truth == 0, np.where(np.arange(60) < 30, 1, 2), truth)
+    spread[10, 5:10] = 0
+    of_tight, of_spread = scores((tight, truth)), scores((spread, truth))
+    assert of_spread["miou"] > of_tight["miou"], "the ranking of miou is inverted"
+    assert of_spread["miou_all"] < of_tight["miou_all"]
+    assert of_tight["miou_all"] == of_tight["miou"] == pytest.approx((380 / 400 + 1) / 2)
+    assert of_spread["miou_all"] == pytest.approx((395 / 1200 + 400 / 1200) / 2)
+    same = scores((np.where(truth == 0, 1, truth), truth))
+    assert same["miou"] == scores((truth, truth))["miou"] and same["miou_all"] < 1
+
+
 def test_unlabeled_pixels_are_ignored():
     rng = np.random.default_rng(6)
     truth = blobs(rng, 40, 50, [0, 1, 2, 3])
     predicted = np.roll(truth, 2, 1)
-    expected = scores((predicted, truth))
+
+    def on_labeled():
+        return {name: value for name, value in scores((predicted, truth)).items() if name != "miou_all"}
+
+    expected = on_labeled()
     for _ in range(3):
         predicted[truth == 0] = rng.integers(0, 9, int((truth == 0).sum()))
-        assert scores((predicted, truth)) == expected
+        assert on_labeled() == expected
     y, x = np.argwhere((truth == 1) & (predicted == 1))[0]
     predicted[y, x] = 2
-    assert scores((predicted, truth)) != expected
+    assert on_labeled() != expected
 
 
 def test_missing_prediction_on_labeled_pixels_is_an_error():
@@ -236,7 +302,7 @@ def test_ids_equal_in_16_bits_are_distinguished():
 
 def test_scores_without_labels_are_none():
     result = scores((np.ones((5, 5), int), np.zeros((5, 5), int)))
-    assert result == {"miou": None, "mbiou": None, "dice": None, "accuracy": None, "objects": {}}
+    assert result == {"miou": None, "miou_all": None, "mbiou": None, "dice": None, "accuracy": None, "objects": {}}
     assert ImageScores().result() == {"psnr": None, "ssim": None}
 
 
@@ -293,13 +359,26 @@ def test_evaluate_uses_only_chosen_views():
     assert [view["name"] for view in result["views"]] == ["1.png"]
 
 
+def test_evaluate_scores_each_view_by_itself():
+    images = [np.zeros((4, 8, 3), np.uint8)] * 2
+    spread = FOUR_OBJECTS.copy()
+    spread[:2, 4:6] = 1
+    capture = _Capture(images, [FOUR_OBJECTS, FOUR_OBJECTS])
+    found = [FOUR_OBJECTS, spread]
+    result = evaluate(capture, lambda i: (np.full((4, 8, 3), 0.1), found[i]), [0, 1])
+    assert [view["miou"] for view in result["views"]] == [1.0, 1.0]
+    assert [view["miou_all"] for view in result["views"]] == pytest.approx([1.0, (8 / 12 + 1) / 2])
+    assert result["quality"]["miou_all"] == pytest.approx((16 / 20 + 1) / 2), "unions over all views, not their mean"
+    assert [entry["iou_all"] for entry in result["objects"]] == [16 / 20, 1.0]
+
+
 def test_evaluate_without_masks_has_no_id_scores():
     capture = _Capture([np.zeros((12, 16, 3), np.uint8)], [None])
     result = evaluate(capture, lambda i: (np.full((12, 16, 3), 0.1), np.zeros((12, 16), int)), [0])
     assert result["quality"]["psnr"] == pytest.approx(20.0)
-    assert [result["quality"][name] for name in ("miou", "mbiou", "dice", "accuracy")] == [None] * 4
+    assert [result["quality"][name] for name in ("miou", "miou_all", "mbiou", "dice", "accuracy")] == [None] * 5
     assert result["objects"] == []
-    assert result["views"][0]["miou"] is None
+    assert result["views"][0]["miou"] is None and result["views"][0]["miou_all"] is None
 
 
 def test_evaluate_warns_of_nan_in_render():

@@ -12,13 +12,23 @@ from PIL import Image
 
 from backend.capture import load_capture
 from backend.labels import read_points
-from backend.planning.coverage import blind_views, duplicate_views, unseen_points
-from backend.planning.decisions import DECISIONS, Choices, PlanningContext, decide, planned_settings
+from backend.model.checkpoint import load_checkpoint
+from backend.planning import decisions
+from backend.planning.coverage import blind_views, duplicate_views, unseen_points, views_like_held_out
+from backend.planning.decisions import (
+    DECISIONS,
+    Choices,
+    PlanningContext,
+    decide,
+    planned_capture,
+    planned_settings,
+)
 from backend.shared.errors import EXIT_DONE, InputError
 from backend.shared.grouping import changed, chosen, grouped, read_groups
 from backend.shared.reconstruction.objects import edit_objects, merged, read_objects
 from backend.shared.reconstruction.plan import KEYS, Decision, Plan, read_plan, write_plan
 from backend.training.settings import Settings, downscale_at
+from backend.training.step import ViewStep
 from backend.training.trainer import Trainer
 
 from .command_result import assert_rejected
@@ -127,11 +137,15 @@ def test_duplicate_views_are_found(write_capture, tmp_path):
 
     for at, of, shift in ((3, 1, 0.0), (4, 1, 1e-4), (6, 5, 0.5)):
         repeat(at, of, shift)
-    repeat(2, 0)  # View 0 is held out and not trained on, so view 2 is kept.
+    repeat(2, 0)  # View 0 is held out.
     write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
     assert duplicate_views(loaded(scene, tmp_path)) == [3, 4], "view 6 has a different pose"
+    assert views_like_held_out(loaded(scene, tmp_path)) == [2]
     plan = planned(loaded(scene, tmp_path))
-    assert plan.views_left_out == {"view_003.png", "view_004.png"} and "view_003.png" in plan["duplicate-views"].why
+    assert plan.views_left_out == {"view_002.png", "view_003.png", "view_004.png"}
+    repeated, flattering = plan["duplicate-views"].why.split("; ")
+    assert "an earlier view: view_003.png, view_004.png" in repeated
+    assert "a held-out view" in flattering and flattering.endswith(": view_002.png")
     assert not planned(loaded(scene, tmp_path), keep=["duplicate-views"]).views_left_out
 
     pixels = np.asarray(Image.open(scene.folder / "images/view_003.png")).astype(int)
@@ -139,6 +153,22 @@ def test_duplicate_views_are_found(write_capture, tmp_path):
     other = scene.folder / "masks/view_004.png"
     Image.fromarray(np.full((48, 64), 1, np.uint16)).save(other)
     assert duplicate_views(loaded(scene, tmp_path)) == [], "exposure and mask differ"
+    Image.fromarray(np.full((48, 64), 1, np.uint16)).save(scene.folder / "masks/view_002.png")
+    assert views_like_held_out(loaded(scene, tmp_path)) == [2], "another mask does not make the photo unseen"
+    photo = np.asarray(Image.open(scene.folder / "images/view_002.png")).astype(int)
+    Image.fromarray(np.clip(photo + 4, 0, 255).astype(np.uint8)).save(scene.folder / "images/view_002.png")
+    assert views_like_held_out(loaded(scene, tmp_path)) == []
+
+
+def test_capture_of_one_photo_keeps_a_training_view(write_capture, tmp_path):
+    scene = write_capture(views=4, size=(64, 48))
+    for view in (1, 2, 3):
+        for part in (scene.quaternions, scene.viewmats, scene.seen, scene.pixels):
+            part[view] = part[0]
+        for part in ("images", "masks"):
+            shutil.copy(scene.folder / part / scene.names[0], scene.folder / part / scene.names[view])
+    write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
+    assert planned(loaded(scene, tmp_path)).views_left_out == {"view_002.png", "view_003.png"}
 
 
 def test_blind_views_and_unseen_points_are_found(write_capture, tmp_path):
@@ -188,6 +218,28 @@ def test_unseen_points_do_not_affect_scene(write_capture, tmp_path):
     assert torch.equal(found.model.anchors.rows, alone.model.anchors.rows)
     assert found.scene.supervise_background == alone.scene.supervise_background
     assert planned(crowded, point_ids=ids)["rest"].done is False, "unseen points do not count as unlabeled"
+
+
+def test_converging_training_sets_validation_views_aside(write_capture, tmp_path):
+    scene = write_capture(views=21, size=(64, 48))
+    capture = loaded(scene, tmp_path)
+    assert capture.test_indices == (0, 8, 16) and planned(capture)["validation-views"] is None
+    plan = planned(capture, until_converged=True)
+    assert plan["validation-views"].views == ("view_005.png", "view_014.png") and not plan.does("validation-views")
+    assert "converged" in plan["validation-views"].why and plan.does("duplicate-views")
+    used = planned_capture(capture, plan)
+    assert used.validation_indices == (5, 14) and used.test_indices == (0, 8, 16)
+    assert used.train_indices == tuple(i for i in range(21) if i not in (0, 5, 8, 14, 16))
+    kept = planned_capture(capture, planned(capture, until_converged=True, keep=["validation-views"]))
+    assert kept.validation_indices == () and kept.train_indices == capture.train_indices
+    # Views that are left out for other reasons do not validate; too few others are left then.
+    fewer = capture.excluding_from_training(["view_005.png"])
+    few = planned(fewer, until_converged=True)
+    assert few["validation-views"].done and "17 views" in few["validation-views"].what and not few.validation_views
+    assert planned(fewer, until_converged=True, keep=["all"])["validation-views"] == few["validation-views"]
+    with pytest.raises(InputError, match="too few to spare any"):
+        planned(fewer, until_converged=True, leave_out=["validation-views"])
+    assert planned_capture(capture, planned(capture)).train_indices == capture.train_indices
 
 
 def test_chosen_objects_limit_labels_and_views(write_capture, tmp_path):
@@ -334,6 +386,88 @@ def test_plan_affects_training_evaluation_and_report(write_capture, tmp_path, ru
     assert run_command(*train, "--steps", 3, "--restart", "--leave-out", "votes").code == EXIT_DONE
     assert set(read_points(out / "points.ply").ids.tolist()) == {0}
     assert run_command("evaluate", out, "--json").events[-1].get("miou") is None
+
+
+def test_begun_training_keeps_its_views(write_capture, tmp_path, run_command, monkeypatch):
+    """A training of an earlier version, which did not look for views like held-out ones, resumes with its views."""
+    scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
+    for part in (scene.quaternions, scene.viewmats, scene.seen, scene.pixels):
+        part[2], part[4] = part[0], part[3]
+    for at, of in ((2, 0), (4, 3)):
+        shutil.copy(scene.folder / "images" / scene.names[of], scene.folder / "images" / scene.names[at])
+        shutil.copy(scene.folder / "masks" / scene.names[of], scene.folder / "masks" / scene.names[at])
+    write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
+    train = ("train", scene.folder, "--out", out, *SMALL, "--steps")
+    with monkeypatch.context() as earlier:
+        earlier.setattr(decisions, "views_like_held_out", lambda capture: [])
+        assert run_command(*train, 2).code == EXIT_DONE
+    assert read_plan(out / "plan.json").views_left_out == {"view_004.png"}
+    assert run_command(*train, 3).code == EXIT_DONE
+    assert read_plan(out / "plan.json").views_left_out == {"view_004.png"}
+    assert_rejected(run_command(*train, 4, "--keep", "duplicate-views"), "another plan (duplicate-views)")
+    assert run_command(*train, 2, "--restart").code == EXIT_DONE
+    assert read_plan(out / "plan.json").views_left_out == {"view_002.png", "view_004.png"}
+
+
+def views_trained_on(capture, monkeypatch) -> set[int]:
+    """The indices of the views that trainings on a capture use from now on."""
+    seen, compute = set(), ViewStep.compute
+
+    def noted(self, index, progress):
+        if self.scene.capture.folder == capture:  # Not a training that compiles kernels.
+            seen.add(index)
+        return compute(self, index, progress)
+
+    monkeypatch.setattr(ViewStep, "compute", noted)
+    return seen
+
+
+def test_validation_views_stay_the_same_after_resuming(write_capture, tmp_path, run_command, monkeypatch):
+    capture, out = write_capture(views=21, size=(64, 48)).folder, tmp_path / "out"
+    seen = views_trained_on(capture, monkeypatch)
+    train = ("train", capture, "--out", out, *SMALL)
+    with monkeypatch.context() as failing:
+        step = Trainer.step
+
+        def fail(trainer, progress):
+            if trainer.scene.capture.folder == capture and trainer.progress.step == 130:
+                raise InputError("an image cannot be read.")
+            return step(trainer, progress)
+
+        failing.setattr(Trainer, "step", fail)
+        assert_rejected(run_command(*train, "--preset", "final"), "an image cannot be read")
+    trained = set(range(21)) - {0, 5, 8, 14, 16}
+    assert seen == trained
+    began = read_plan(out / "plan.json")
+    assert began.validation_views == ("view_005.png", "view_014.png")
+    ended = run_command(*train, "--preset", "final", "--minutes", 0.02, "--json")
+    assert ended.code == EXIT_DONE and any("Resuming after step 130" in text for text in ended.messages("status"))
+    assert any("view_005.png, view_014.png" in text for text in ended.messages("status"))
+    assert read_plan(out / "plan.json") == began and seen == trained
+    curve = load_checkpoint(out / "checkpoint")[1]["progress"]["curve"]
+    assert curve and all(entry["validation_psnr"] > 5 and entry["psnr"] > 5 for entry in curve)
+    assert curve[-1]["validation_psnr"] != curve[-1]["psnr"]
+    steps = ended.events[-1]["steps"]
+    assert run_command(*train, "--steps", steps + 40).code == EXIT_DONE
+    assert read_plan(out / "plan.json") == began and seen == trained, "also for another length"
+
+    assert run_command("evaluate", out).code == EXIT_DONE and run_command("report", out).code == EXIT_DONE
+    report = json.loads((out / "report.json").read_text())
+    assert report["capture"]["validation"] == 2 and report["capture"]["held_out"] == 3
+    assert any("view_014.png" in entry["why"] for entry in report["left_out"])
+    assert "2 other views were used for validation" in (out / "report.md").read_text()
+
+
+def test_final_extends_training_of_known_length(write_capture, tmp_path, run_command, monkeypatch):
+    """As from an earlier version, whose checkpoint and plan have no validation views."""
+    capture, out = write_capture(views=21, size=(64, 48)).folder, tmp_path / "out"
+    train = ("train", capture, "--out", out, *SMALL)
+    assert run_command(*train, "--steps", 3).code == EXIT_DONE
+    seen = views_trained_on(capture, monkeypatch)
+    assert run_command(*train, "--preset", "final", "--minutes", 0.03).code == EXIT_DONE
+    assert {5, 14} & seen and not {0, 8, 16} & seen
+    assert read_plan(out / "plan.json")["validation-views"] is None
+    assert "validation_psnr" not in load_checkpoint(out / "checkpoint")[1]["progress"]["curve"][-1]
 
 
 def test_training_without_plan_resumes(write_capture, tmp_path, run_command):

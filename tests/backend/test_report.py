@@ -63,6 +63,7 @@ def test_report_json_has_all_keys_and_null_if_unmeasured(reconstruction):
         "ssim": 0.93,
         "lpips": None,
         "miou": 0.97,
+        "miou_all": None,
         "mbiou": None,
         "dice": None,
         "accuracy": None,
@@ -72,7 +73,7 @@ def test_report_json_has_all_keys_and_null_if_unmeasured(reconstruction):
     unmeasured = dict.fromkeys(("vertices", "faces", "watertight", "chamfer", "precision", "recall", "f1"))
     assert report["objects"][0]["mesh"] == unmeasured
     assert [point["seconds"] for point in report["curve"]] == [30.0, 60.0]
-    assert report["curve"][0]["miou"] is None
+    assert report["curve"][0]["miou"] is None and report["curve"][1]["miou_all"] is None
     assert report["views"] == [{"name": "a.png", "psnr": 31.0}]
     assert report["capture"]["images"] == 48
 
@@ -84,6 +85,48 @@ def test_report_is_read_as_written(reconstruction):
         reconstruction.report_json.write_text(content)
         with pytest.raises(InputError, match=r"report\.json"):
             read_report(reconstruction.folder)
+
+
+def with_background(zero_is_background):
+    report = a_report()
+    report["capture"]["supervise_background"] = zero_is_background
+    report["quality"]["miou_all"] = 0.95
+    report["objects"][0]["iou_all"] = 0.91
+    report["views"] = [{"name": f"{i}.png", "miou": 0.9 + i / 100, "miou_all": 0.8 + i / 100} for i in (2, 1, 3)]
+    return Report(**report)
+
+
+@pytest.mark.parametrize(
+    ("background", "headline", "per_view", "iou"),
+    [
+        (True, "mIoU (all) 0.950", "mIoU (all) of single views: median 0.820, lowest 0.810 (1.png)", "0.910"),
+        (False, "mIoU (labeled) 0.970", "mIoU (labeled) of single views: median 0.920, lowest 0.910 (1.png)", "0.960"),
+    ],
+)
+def test_report_leads_with_all_pixels_where_zero_is_background(reconstruction, background, headline, per_view, iou):
+    report = write_report(reconstruction, with_background(background))
+    assert (report.quality["miou"], report.quality["miou_all"]) == (0.97, 0.95) and len(report.views) == 3
+    text = reconstruction.report_md.read_text(encoding="utf-8")
+    assert f"PSNR 31.25 dB, {headline}, 2 min" in text and per_view in text
+    rows = [line.split(" | ")[0] for line in text.splitlines() if line.startswith("| mIoU")]
+    assert rows == (["| mIoU (all)", "| mIoU (labeled)"] if background else ["| mIoU (labeled)", "| mIoU (all)"])
+    mug = next(line for line in text.splitlines() if "| mug |" in line)
+    assert f"| {iou} |" in mug and ("| IoU (all) |" in text) is background
+
+
+def test_report_of_earlier_version_has_no_miou_all(reconstruction):
+    """Reports, evaluations and curves without miou_all lead with miou, whatever 0 means."""
+    write_report(reconstruction, with_background(True))
+    content = json.loads(reconstruction.report_json.read_text())
+    for entry in (content["quality"], *content["curve"], *content["views"]):
+        entry.pop("miou_all", None)
+    for entry in content["objects"]:
+        del entry["iou_all"]
+    reconstruction.report_json.write_text(json.dumps(content))
+    report = read_report(reconstruction.folder)
+    assert report.quality["miou_all"] is None and report.lead_miou == "miou" and report.objects[0]["iou_all"] is None
+    text = write_report(reconstruction, report) and reconstruction.report_md.read_text(encoding="utf-8")
+    assert "mIoU (labeled) 0.970" in text and "| mIoU (all) | — |" in text
 
 
 def test_empty_report_has_only_null(reconstruction):

@@ -420,6 +420,7 @@ def test_batch_continues_after_invalid_capture(batch):
     assert str(out.parent / "captures" / "bad") in bad["error"]
     table = (out / "batch.md").read_text()
     assert bad["error"] in table and "| good | done |" in table and "notes" not in table
+    assert "| mIoU (all) | mIoU (labeled) |" in table and good["miou_all"] <= good["miou"]
     assert (out / "good" / "objectgs.blend").is_file() and size_of(out / "good" / "render.png") == (48, 36)
 
 

@@ -106,9 +106,15 @@ say("done", steps=12, splats="splats.ply", anchors=11, psnr=27.0)
     assert job.progress == 1 and job.seconds_left is None
     assert job.warnings == ["3 images have no pose."]
     assert (job.step, job.splats, job.anchors, job.psnr, job.miou) == (9, 100, 11, 27.0, 0.75)
+    assert job.lead_miou == ("mIoU (labeled)", 0.75)
     assert job.preview == Path("latest.png")
     assert job.curve == [{"seconds": 3.0, "step": 9, "psnr": 26.5, "miou": 0.75, "mbiou": 0.5}]
     assert job.result == {"steps": 12, "splats": "splats.ply", "anchors": 11, "psnr": 27.0}
+
+
+def test_job_leads_with_miou_all_where_zero_is_background(make):
+    job = run(make('say("quality", miou=0.97, miou_all=0.95, zero_is_background=True)\nsay("done")'))
+    assert job.lead_miou == ("mIoU (all)", 0.95)
 
 
 def test_jobs_run_in_order_and_changes_are_reported(make):

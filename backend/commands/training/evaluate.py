@@ -32,11 +32,15 @@ def evaluate(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         return rendered.image, rendered.ids
 
     with stage(folder, "evaluate"):
-        found = evaluate_views(capture, drawn, capture.test_indices, reporter, trained.scene.zero_is_object)
+        found = evaluate_views(
+            capture, drawn, capture.test_indices, reporter, trained.scene.zero_is_object,
+            trained.scene.supervise_background,
+        )  # fmt: skip
         meshes = _meshes(trained, reporter)
     write_evaluation(folder.folder, Evaluation(trained.progress.step, **found, meshes=meshes))
     quality = {name: value for name, value in found["quality"].items() if value is not None}
-    reporter.done(**{name: round(float(value), 4) for name, value in quality.items()})
+    figures = {name: round(float(value), 4) for name, value in quality.items()}
+    reporter.done(**figures, zero_is_background=trained.scene.supervise_background)
 
 
 def _meshes(trained: Trained, reporter: StoppingReporter) -> dict[str, dict[str, Any]]:

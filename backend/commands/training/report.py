@@ -46,6 +46,7 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     value = Report(
         capture={
             "folder": capture.folder.name, "views": len(capture.views), "held_out": len(capture.test_indices),
+            "validation": len(capture.validation_indices),
             "objects": len(capture.object_ids), **capture.counts,
             "exposure_varies": trained.scene.exposure_varies,
             "supervise_background": trained.scene.supervise_background,
@@ -175,7 +176,7 @@ def _objects(
     ids = ({*anchors_of, *capture.object_ids.tolist()} - {0}) | set(measured)
     return [
         {
-            "iou": None, **measured.get(i, {}), "id": i, "name": object_name(capture, i),
+            "iou": None, "iou_all": None, **measured.get(i, {}), "id": i, "name": object_name(capture, i),
             "anchors": anchors_of.get(i, 0), "mesh": own.get(i),
         }
         for i in sorted(ids)

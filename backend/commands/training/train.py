@@ -85,7 +85,8 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     latest = progress.curve[-1] if progress.curve else {}
     reporter.done(
         steps=progress.step, seconds=round(progress.seconds, 1), anchors=len(trainer.model.anchors),
-        splats=str(folder.splats), psnr=latest.get("psnr"), miou=latest.get("miou"),
+        splats=str(folder.splats), psnr=latest.get("psnr"), miou=latest.get("miou"), miou_all=latest.get("miou_all"),
+        zero_is_background=trainer.scene.supervise_background,
         psnr_of_export=export.psnr_of_export,
     )  # fmt: skip
 
@@ -105,10 +106,11 @@ def _begin(
         cast_votes(folder, voters, options, reporter)
     point_ids = read_points(folder.points).ids if current or not resuming else None
     objects, _ = find_requested_objects(folder, capture, options)
-    context = build_context(capture, choices(options), objects, point_ids, thorough=True)
+    before = plan_of(read_record(folder).training) if resuming else None
+    context = build_context(capture, choices(options), objects, point_ids, thorough=True, resumed=before)
     plan = decide(context)
-    if resuming:
-        plan = plan.settled_by(_plan_before(folder))
+    if before is not None:
+        plan = plan.settled_by(before)
     gains = context.gains if plan.does("exposure") else np.ones_like(context.gains)
     planned, wanted = planned_capture(context.capture, plan), planned_settings(settings(options), plan)
     memory = memory_for_planes(options)
@@ -134,11 +136,6 @@ def _begin(
     write_plan(folder.plan, plan)
     report_plan(plan, reporter)
     return trainer, plan
-
-
-def _plan_before(folder: Reconstruction) -> Plan:
-    """Return the plan of the training in the folder."""
-    return plan_of(read_record(folder).training)
 
 
 def _check_same_training(folder: Reconstruction, capture: Capture, plan: Plan, options: argparse.Namespace) -> None:
@@ -178,7 +175,7 @@ def _run(
     begun = f"Resuming after step {step} with" if step else "Training"
     where = "" if trainer.model.device.type == "cpu" else f", on {devices.name_of(trainer.model.device)}"
     reporter.status(f"{begun} {len(trainer.model.anchors):,} anchors{where}")
-    measure = _measure_held_out(folder, reporter)
+    measure = _measure(folder, reporter)
     try:
         trainer.run(budget, folder.checkpoint, reporter.reporter, measure, reporter.stop, checkpoint_seconds)
     except Cancelled:
@@ -187,8 +184,11 @@ def _run(
     finish_stage(folder, "train", trainer.progress.seconds)
 
 
-def _measure_held_out(folder: Reconstruction, reporter: StoppingReporter) -> Evaluate:
-    """Return a function that measures held-out views, and writes previews of the first one and of the curve."""
+def _measure(folder: Reconstruction, reporter: StoppingReporter) -> Evaluate:
+    """Return a function that measures held-out views, and writes previews of the first one and of the curve.
+
+    It also measures the validation views, if any. Held-out views are for the user; they do not decide anything.
+    """
 
     def measure(model: ObjectModel, scene: Scene, progress: TrainingProgress) -> dict[str, Any]:
         # Without SSIM, which would take most of the time, since measuring counts as training time.
@@ -210,8 +210,15 @@ def _measure_held_out(folder: Reconstruction, reporter: StoppingReporter) -> Eva
                     ids.add(rendered.ids, truth)
         scores = ids.result()
         figures = {
-            "psnr": float(np.mean(found)) if found else None, "miou": scores["miou"], "mbiou": scores["mbiou"],
-        }  # fmt: skip
+            "psnr": float(np.mean(found)) if found else None,
+            **{name: scores[name] for name in ("miou", "miou_all", "mbiou")},
+        }
+        if capture.validation_indices:
+            validated = [
+                psnr(draw(model, scene.camera(index), want_ids=False).image, capture.image(index))
+                for index in capture.validation_indices
+            ]
+            figures["validation_psnr"] = float(np.mean(validated))
         curve = curve_image([*progress.curve, {"seconds": progress.seconds, **figures}])
         if curve is not None:
             save_image(curve, folder.previews / "curve.png", quick=True)

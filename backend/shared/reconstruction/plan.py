@@ -17,7 +17,7 @@ from ..formats.json_file import read_json, write_json
 
 KEYS = (
     "votes", "objects", "groups", "rest", "labels", "undistortion", "duplicate-views", "blind-views", "other-views",
-    "unseen-points", "exposure", "pyramid", "meshes", "surface",
+    "validation-views", "unseen-points", "exposure", "pyramid", "meshes", "surface",
 )  # fmt: skip
 """Keys of the decisions, in the order in which they are made."""
 
@@ -78,6 +78,11 @@ class Plan:
     def __getitem__(self, key: str) -> Decision | None:
         return next((decision for decision in self.decisions if decision.key == key), None)
 
+    def planned(self, key: str) -> Decision | None:
+        """Return a decision without the user's override."""
+        decision = self[key]
+        return None if decision is None else replace(decision, wanted=None)
+
     def does(self, key: str) -> bool:
         """Return whether a step is done; True if there is no decision about it."""
         decision = self[key]
@@ -92,6 +97,12 @@ class Plan:
     def views_left_out(self) -> frozenset[str]:
         """Names of the views that are excluded from training."""
         return frozenset(name for decision in self.left_out for name in decision.views)
+
+    @property
+    def validation_views(self) -> tuple[str, ...]:
+        """Names of the views that decide when a training until convergence ends."""
+        decision = self["validation-views"]
+        return decision.views if decision is not None and decision.done is False else ()
 
     def overridden(self, keep: Iterable[str], leave_out: Iterable[str]) -> Plan:
         """Return the plan with the user's overrides.

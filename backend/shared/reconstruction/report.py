@@ -17,16 +17,34 @@ from ..formats.json_file import plain, read_json, write_json
 EVALUATION = "evaluation.json"
 REPORT = "report.json"
 
-QUALITY = ("psnr", "ssim", "lpips", "miou", "mbiou", "dice", "accuracy")
-"""Metrics over the held-out views."""
+QUALITY = ("psnr", "ssim", "lpips", "miou", "miou_all", "mbiou", "dice", "accuracy")
+"""Metrics over the held-out views; `backend/evaluation/metrics.py` defines them."""
+
+MIOU_LABELS = {"miou_all": "mIoU (all)", "miou": "mIoU (labeled)"}
+"""Names for the user: over all pixels, and over those with a label in the masks."""
+
+
+def lead_miou(figures: Mapping[str, Any], zero_is_background: bool) -> str:
+    """Return which of `MIOU_LABELS` to show first.
+
+    Args:
+        figures: Metrics by name.
+        zero_is_background: Whether pixels without a label show the background, as the training has decided (`rest`).
+
+    Returns:
+        `miou_all`, which counts objects on the background as errors. `miou`, where pixels without a label are gaps in
+        the masks, or if only it was measured, as by earlier versions.
+    """
+    return "miou_all" if zero_is_background and figures.get("miou_all") is not None else "miou"
+
 
 MESH_FIGURES = ("vertices", "faces", "watertight", "chamfer", "precision", "recall", "f1")
 _MODEL = ("anchors", "gaussians", "bytes")
 _ENTRIES = {
     "left_out": ("what", "why"),
     "stages": ("name", "seconds", "peak_rss_mb"),
-    "curve": ("seconds", "step", "psnr", "miou"),
-    "objects": ("id", "name", "iou", "anchors", "mesh"),
+    "curve": ("seconds", "step", "psnr", "miou", "miou_all"),
+    "objects": ("id", "name", "iou", "iou_all", "anchors", "mesh"),
 }
 _REQUIRED = {"left_out": ("what", "why"), "stages": ("name",), "curve": ("seconds",), "objects": ("id",)}
 _TEXTS = ("what", "why", "name")
@@ -40,7 +58,7 @@ class Evaluation:
         step: training step of the evaluated model.
         quality: means over the held-out views by metric name.
         objects: metrics of each object.
-        views: metrics of each held-out view.
+        views: metrics of each held-out view, with its miou and miou_all.
         meshes: metrics of each mesh by its key in meshes.json.
     """
 
@@ -88,13 +106,13 @@ class Report:
         machine: the computer, and the device that trained.
         left_out: {"what", "why"} of each omitted step.
         stages: {"name", "seconds", "peak_rss_mb"} of each command.
-        curve: {"seconds", "step", "psnr", "miou"} on held-out views over the training.
+        curve: {"seconds", "step", "psnr", "miou", "miou_all"} on held-out views over the training.
         model: numbers of anchors and Gaussians, size in bytes, trained steps.
         quality: means over the held-out views by metric name, with all of `QUALITY`.
-        objects: {"id", "name", "iou", "anchors", "mesh"} and other metrics of each object; "mesh" has all of
+        objects: {"id", "name", "iou", "iou_all", "anchors", "mesh"} and other metrics of each object; "mesh" has all of
             `MESH_FIGURES`.
         plan: the decisions of plan.json.
-        views: metrics of each held-out view.
+        views: metrics of each held-out view, with its miou and miou_all.
         meshes: figures of the meshes that are not of one object.
     """
 
@@ -110,6 +128,16 @@ class Report:
     plan: list[dict[str, Any]] = field(default_factory=list)
     views: list[dict[str, Any]] = field(default_factory=list)
     meshes: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def lead_miou(self) -> str:
+        """The metric of the objects to show first, see `lead_miou`."""
+        return lead_miou(self.quality, self.zero_is_background)
+
+    @property
+    def zero_is_background(self) -> bool:
+        """Whether pixels without a label show the background; False for reports without it."""
+        return self.capture.get("supervise_background") is True
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as they stand in report.json."""
