@@ -43,7 +43,9 @@ def duplicate_views(capture: Capture) -> list[int]:
         if a not in found:
             near = (second for second in tree.query_ball_point(poses[first], SAME_PIXELS, p=np.inf) if second > first)
             for b in sorted(train[second] for second in near):
-                if b not in found and _same_camera(capture, a, b) and images.same(a, b):
+                if b in found or not _same_camera(capture, a, b) or capture.ids_in(a) != capture.ids_in(b):
+                    continue
+                if images.are_same(a, b):
                     found.add(b)
     return sorted(found)
 
@@ -65,16 +67,12 @@ def views_like_held_out(capture: Capture) -> list[int]:
     poses = _compute_pose_vectors(capture, [*train, *held_out])
     near = cKDTree(poses[: len(train)]).query_ball_point(poses[len(train) :], SAME_PIXELS, p=np.inf)
     found: set[int] = set()
+    images = _Images(capture)
     for index, candidates in zip(held_out, near, strict=True):
         for i in {train[candidate] for candidate in candidates} - found:
-            if _same_camera(capture, i, index) and _same_photo(capture, i, index):
+            if _same_camera(capture, i, index) and images.are_same(i, index):
                 found.add(i)
     return sorted(found)
-
-
-def _same_photo(capture: Capture, a: int, b: int) -> bool:
-    difference = capture.image(a).astype(np.int16) - capture.image(b)
-    return float(np.abs(difference).mean()) <= SAME_COLOR
 
 
 def _compute_pose_vectors(capture: Capture, views: list[int]) -> np.ndarray:
@@ -108,10 +106,8 @@ class _Images:
         self._capture = capture
         self._means: dict[int, np.ndarray] = {}
 
-    def same(self, a: int, b: int) -> bool:
-        """Return whether two views of the same size have the same image and the same objects in their masks."""
-        if self._capture.ids_in(a) != self._capture.ids_in(b):
-            return False
+    def are_same(self, a: int, b: int) -> bool:
+        """Return whether two views of the same size have the same image."""
         # The difference of two means is at most the mean of the differences, so this rejects no equal images.
         if float(np.abs(self._block_means(a) - self._block_means(b)).sum(axis=(0, 1)).mean()) > SAME_COLOR:
             return False
