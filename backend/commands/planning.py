@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import argparse
 
-import numpy as np
-
 from ..capture import Capture
 from ..planning.decisions import Choices, PlanningContext, decide
 from ..shared.events import Reporter
-from ..shared.formats.points_ply import read_points
+from ..shared.formats.points_ply import LabeledPoints, read_points
 from ..shared.grouping import Changes, changed, chosen, grouped, read_groups
 from ..shared.reconstruction.folder import Reconstruction
 from ..shared.reconstruction.objects import SceneObject, edit_objects, read_objects
@@ -19,11 +17,14 @@ from ..training.settings import Settings
 from .length import budget_of
 from .votes import object_name, votes_are_current
 
+_CLEARLY = 0.8
+"""Margin from which on a point without an object counts as background: 9 of 10 masks leave it unlabeled."""
+
 
 def write_default_plan(folder: Reconstruction, capture: Capture, max_size: int) -> None:
     """Write plan.json for a training with the default settings, from the facts known so far."""
     objects, _ = find_requested_objects(folder, capture)
-    context = build_context(capture, Choices(max_size=max_size), objects, voted_ids(folder, capture))
+    context = build_context(capture, Choices(max_size=max_size), objects, voted_points(folder, capture))
     write_plan(folder.plan, decide(context))
 
 
@@ -31,15 +32,28 @@ def build_context(
     capture: Capture,
     requested: Choices,
     objects: list[SceneObject],
-    point_ids: np.ndarray | None = None,
+    points: LabeledPoints | None = None,
     thorough: bool = False,
     resumed: Plan | None = None,
 ) -> PlanningContext:
-    """Collect the facts for the decisions; arguments are as in `PlanningContext`, but `capture` is unedited."""
+    """Collect the facts for the decisions.
+
+    Args:
+        capture: The capture, unedited.
+        requested, objects, thorough, resumed: As in `PlanningContext`.
+        points: The result of a vote on the capture's points; None before.
+
+    Returns:
+        The context, with the user's edits of the objects.
+    """
     left_out = [entry.id for entry in objects if entry.left_out]
     capture = capture.edited({entry.id: entry.name for entry in objects}, left_out)
-    point_ids = None if point_ids is None else capture.without_left_out(point_ids)
-    return PlanningContext(capture, requested, objects, point_ids, thorough, resumed=resumed)
+    if points is None:
+        return PlanningContext(capture, requested, objects, thorough=thorough, resumed=resumed)
+    ids = capture.without_left_out(points.ids)
+    # Points at the borders of objects, which some masks show on them, are not evidence of a background.
+    in_background = (ids == 0) & ((points.margins >= _CLEARLY) | (points.ids != 0))
+    return PlanningContext(capture, requested, objects, ids, in_background, thorough, resumed=resumed)
 
 
 def choices(options: argparse.Namespace) -> Choices:
@@ -100,12 +114,12 @@ def change_objects(folder: Reconstruction, capture: Capture, options: argparse.N
     return objects
 
 
-def voted_ids(folder: Reconstruction, capture: Capture) -> np.ndarray | None:
-    """Return the points' object IDs from the latest vote with any strategy; None if it is not current."""
+def voted_points(folder: Reconstruction, capture: Capture) -> LabeledPoints | None:
+    """Return the points from the latest vote with any strategy; None if it is not current."""
     voted = read_record(folder).votes
     if not voted or not votes_are_current(folder, capture, voted.max_size, voted.strategy, voted.seed or 0):
         return None
-    return read_points(folder.points).ids
+    return read_points(folder.points)
 
 
 def report_plan(found: Plan, reporter: Reporter) -> None:

@@ -1,8 +1,8 @@
 """Assigns each point an object ID by votes of the views' masks, as in ObjectGS, with three strategies.
 
-Two differences from the published code: views in which a point is behind the camera or outside the image do not vote
-on it, and label 0 (unlabeled) counts only if no view voted for an object. Held-out views do not vote, so that their
-masks are used only to measure quality.
+As in the paper's algorithm 1, an unlabeled pixel is a vote for ID 0. Unlike in the published code, views in which a
+point is behind the camera or outside the image do not vote on it. Held-out views do not vote, so that their masks are
+used only to measure quality. Neither do masks without any label, since they are more often missing than complete.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ _MERGE_AT = 1 << 23
 class Votes:
     """The result of a vote on M points.
 
-    ids: (M,) int64, object of each point; 0 if no view voted for an object.
-    margins: (M,) float32 in [0, 1], the chosen ID's fraction of the votes other than 0, minus the next best ID's.
+    ids: (M,) int64, object of each point; 0 if no view voted on it, or more for 0 than for any object.
+    margins: (M,) float32 in [0, 1], the chosen ID's fraction of all votes, 0 included, minus the next best ID's.
     counts: number of points of each object.
     visible: (M,) int32, number of views that voted on the point, for 0 or an object.
     """
@@ -78,7 +78,7 @@ def vote(
     classes = ClassTable(capture.object_ids)
     voters = capture.points.xyz if positions is None else positions
     ballots = _Ballots(len(voters), len(classes))
-    indices = [i for i in capture.train_indices if capture.views[i].mask_file is not None]
+    indices = [i for i in capture.train_indices if set(capture.ids_in(i)) - {0}]
 
     def cast(index: int, points: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
         mask = capture.mask(index)
@@ -224,17 +224,24 @@ class _Ballots:
         self._overflow, self._waiting = [], 0
 
     def count(self, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
-        """Return the chosen class index (M,), -1 without votes, and its margin (M,); drawn if `rng` is given."""
+        """Return the chosen class index (M,), -1 for 0 or without votes, and its margin (M,); drawn if `rng` is given.
+
+        Of equals an object wins over 0, since masks more often miss a part of an object than add one.
+        """
         self._merge()
         slot, point = np.nonzero(self._ids >= 0)
         points = np.concatenate([point, self._merged[0] // self.objects])
         ids = np.concatenate([self._ids[slot, point].astype(np.int64), self._merged[0] % self.objects])
         counts = np.concatenate([self._counts[slot, point].astype(np.int64), self._merged[1]])
+        unlabeled = self.visible - np.bincount(points, counts, self.points).astype(np.int64)
+        some = np.flatnonzero(unlabeled)
+        points, ids = np.concatenate([points, some]), np.concatenate([ids, np.full(len(some), -1)])
+        counts = np.concatenate([counts, unlabeled[some]])
         chosen, margins = np.full(self.points, -1, np.int64), np.zeros(self.points, np.float32)
         if len(points) == 0:
             return chosen, margins
-        # Sorted by point, then by descending frequency, then by ID.
-        order = np.lexsort((ids, -counts, points))
+        # Sorted by point, then by descending frequency, then by ID, with 0 last.
+        order = np.lexsort((ids, ids < 0, -counts, points))
         points, ids, counts = points[order], ids[order], counts[order]
         voted, first, length = np.unique(points, return_index=True, return_counts=True)
         below = np.concatenate([[0], np.cumsum(counts)])

@@ -49,7 +49,8 @@ class PlanningContext:
     """The facts that decisions are based on.
 
     capture: with the user's names and without the objects left out. objects: of objects.json, or before a vote those
-    of the masks. point_ids: (M,) int64, the points' objects; None before a vote. thorough: whether to read all photos,
+    of the masks. point_ids: (M,) int64, the points' objects; None before a vote. in_background: (M,) bool, the points
+    that no mask, or hardly any, shows on an object; None: those without an object. thorough: whether to read all photos,
     however many. plan: the decisions so far, with the user's overrides. resumed: the plan of the training that is
     resumed, which keeps the views that it was begun with; None for a new one.
     """
@@ -58,6 +59,7 @@ class PlanningContext:
     choices: Choices
     objects: Sequence[SceneObject] = ()
     point_ids: np.ndarray | None = None
+    in_background: np.ndarray | None = None
     thorough: bool = False
     plan: Plan = field(default_factory=Plan)
     resumed: Plan | None = None
@@ -158,10 +160,13 @@ def _rest(context: PlanningContext) -> Decision | None:
     if context.point_ids is None:
         return Decision("rest", what, None, "the votes determine how many points have no object")
     # Points outside all views are ignored: no mask votes on them.
-    ids = context.point_ids[~unseen_points(context.capture)]
-    fraction, supervised = float(np.mean(ids == 0)), background_is_masked(ids)
+    background = context.point_ids == 0 if context.in_background is None else context.in_background
+    background = background[~unseen_points(context.capture)]
+    fraction, supervised = float(np.mean(background)), background_is_masked(background)
     meaning = "unlabeled pixels are background" if supervised else "unlabeled pixels count as gaps in the masks"
-    return Decision("rest", what, supervised, f"{fraction:.1%} of the visible points have no object, so {meaning}")
+    return Decision(
+        "rest", what, supervised, f"{fraction:.1%} of the visible points are on no object in the masks, so {meaning}"
+    )
 
 
 def _labels(context: PlanningContext) -> Decision | None:

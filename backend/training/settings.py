@@ -62,20 +62,20 @@ class Settings:
 
 
 BACKGROUND_FROM = 0.05
-"""Fraction of the points without an object from which on unlabeled pixels are considered background instead of gaps in
+"""Fraction of the points in the background from which on unlabeled pixels are considered background instead of gaps in
 the masks. Without supervision there, objects would spread over the background."""
 
 
-def background_is_masked(point_ids: np.ndarray) -> bool:
+def background_is_masked(in_background: np.ndarray) -> bool:
     """Decide whether unlabeled pixels show the background.
 
     Args:
-        point_ids: (M,) object ID of each point, 0 if it belongs to none.
+        in_background: (M,) bool, the points that no mask, or hardly any, shows on an object.
 
     Returns:
         Whether unlabeled pixels should be supervised to show no object.
     """
-    return bool((np.asarray(point_ids) == 0).mean() >= BACKGROUND_FROM)
+    return bool(np.mean(in_background) >= BACKGROUND_FROM)
 
 
 GROW_FROM, GROW_UNTIL = 0.1, 0.6

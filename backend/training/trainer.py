@@ -109,7 +109,7 @@ class Trainer:
             device: device to train on.
             seeds: (M,) bool, the points that are used for the initial anchors and to measure the scene's extent and
                 density; None: all.
-            supervise_background: as in `Scene`; None: decided by `background_is_masked`.
+            supervise_background: as in `Scene`; None: decided by `background_is_masked` for the points without object.
             gains: as in `Scene`.
 
         Raises:
@@ -131,7 +131,7 @@ class Trainer:
         background = torch.from_numpy(shade[settings.background].astype(np.float32))
         model = ObjectModel(anchors, heads, background, classes, normalization, settings.primitive)
         if supervise_background is None:
-            supervise_background = capture.has_masks and background_is_masked(point_ids[seeds])
+            supervise_background = capture.has_masks and background_is_masked(point_ids[seeds] == 0)
         scene = Scene(
             capture, classes, normalization, settings.zero_is_object, memory_mb, supervise_background, device, gains
         )

@@ -37,7 +37,7 @@ SMALL = ("--offsets", "2")
 
 
 def planned(capture, objects=(), point_ids=None, thorough=False, **choices) -> Plan:
-    return decide(PlanningContext(capture, Choices(**choices), objects, point_ids, thorough))
+    return decide(PlanningContext(capture, Choices(**choices), objects, point_ids, thorough=thorough))
 
 
 def loaded(scene, tmp_path, **options):

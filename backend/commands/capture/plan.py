@@ -13,7 +13,7 @@ from ...shared.reconstruction.plan import write_plan
 from ...shared.stopping import StoppingReporter
 from ..folder import memory_for_files, open_output
 from ..length import budget_of, expected_of
-from ..planning import build_context, choices, find_requested_objects, voted_ids
+from ..planning import build_context, choices, find_requested_objects, voted_points
 
 
 def plan(options: argparse.Namespace, reporter: StoppingReporter) -> None:
@@ -27,8 +27,8 @@ def plan(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         cache = folder.cache if folder is not None and folder.cameras.exists() else None
         capture = load_capture(options.capture, cache, memory_for_files(options), options.max_size, reporter)
         objects, _ = find_requested_objects(folder, capture, options)
-        point_ids = voted_ids(folder, capture) if folder is not None else None
-        found = decide(build_context(capture, choices(options), objects, point_ids))
+        points = voted_points(folder, capture) if folder is not None else None
+        found = decide(build_context(capture, choices(options), objects, points))
         if folder is not None:
             write_plan(folder.plan, found)
     for decision in found.decisions:

@@ -104,10 +104,10 @@ def _begin(
     current = votes_are_current(folder, voters, options.max_size, options.strategy, options.seed)
     if not (current or resuming):
         cast_votes(folder, voters, options, reporter)
-    point_ids = read_points(folder.points).ids if current or not resuming else None
+    points = read_points(folder.points) if current or not resuming else None
     objects, _ = find_requested_objects(folder, capture, options)
     before = plan_of(read_record(folder).training) if resuming else None
-    context = build_context(capture, choices(options), objects, point_ids, thorough=True, resumed=before)
+    context = build_context(capture, choices(options), objects, points, thorough=True, resumed=before)
     plan = decide(context)
     if before is not None:
         plan = plan.settled_by(before)
