@@ -4,7 +4,7 @@ import json
 import sys
 
 from .shared.errors import describe_missing_package
-from .shared.signals import block_signals
+from .shared.signals import block_signals, ignore_signals
 
 if __name__ == "__main__":
     block_signals()
@@ -13,7 +13,7 @@ if __name__ == "__main__":
 
         code = main()
         # The result is complete, so that signals no longer matter.
-        block_signals()
+        ignore_signals()
         sys.exit(code)
     except ModuleNotFoundError as error:
         # A package that the command line itself needs is missing.

@@ -248,8 +248,10 @@ def _legend_lines(legend: _Legend, font: Any, width: int, size: int) -> list[lis
 
 def shorten(text: str, font: Any, width: float) -> str:
     """Truncate `text` with an ellipsis to at most `width` pixels."""
-    text = "".join(c if c.isprintable() else " " for c in text)
-    if font.getlength(text) <= width:
+    whole = len(text)
+    # Fonts refuse to measure long texts, and a character is at least a pixel wide.
+    text = "".join(c if c.isprintable() else " " for c in text[: int(width) + 1])
+    if len(text) == whole and font.getlength(text) <= width:
         return text
     while text and font.getlength(text + "...") > width:
         text = text[:-1]

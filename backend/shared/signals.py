@@ -15,6 +15,12 @@ def block_signals() -> None:
         signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
 
 
+def ignore_signals() -> None:
+    """Ignore the stopping signals from now on. Blocking them would not do, since other threads receive them too."""
+    for number in STOPPING:
+        signal.signal(number, signal.SIG_IGN)
+
+
 @contextmanager
 def held_signals() -> Iterator[None]:
     """Hold the stopping signals back; at the end, those that have arrived are delivered to the handlers of then.

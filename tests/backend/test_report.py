@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from backend.evaluation import comparison, contact_sheet, id_image, save_image, write_report
+from backend.evaluation.images import load_font, shorten
 from backend.evaluation.report_plots import plot_curve, plot_objects
 from backend.evaluation.report_text import duration
 from backend.shared.color.palette import UNLABELED, colors_of, object_colors, to_linear
@@ -371,3 +372,11 @@ def test_saved_images_are_small(tmp_path):
     saved = save_image(Image.fromarray(np.clip(photo, 0, 255).astype(np.uint8)), tmp_path / "photo.png")
     assert saved.suffix == ".jpg" and saved.stat().st_size < 300_000
     assert sorted(path.name for path in tmp_path.iterdir()) == ["flat.png", "photo.jpg"]
+
+
+def test_long_names_are_shortened_in_images():
+    font = load_font(12)
+    assert shorten("mug", font, 100) == "mug"
+    for name in ("a" * 2_000_000, "\n" * 500, "mug " * 50):
+        shown = shorten(name, font, 100)
+        assert shown.endswith("...") and font.getlength(shown) <= 100
