@@ -50,9 +50,9 @@ class PlanningContext:
 
     capture: with the user's names and without the objects left out. objects: of objects.json, or before a vote those
     of the masks. point_ids: (M,) int64, the points' objects; None before a vote. in_background: (M,) bool, the points
-    that no mask, or hardly any, shows on an object; None: those without an object. thorough: whether to read all photos,
-    however many. plan: the decisions so far, with the user's overrides. resumed: the plan of the training that is
-    resumed, which keeps the views that it was begun with; None for a new one.
+    that no mask, or hardly any, shows on an object; None: those without an object. thorough: whether to read all
+    photos, however many. plan: the decisions so far, with the user's overrides. resumed: the plan of the training that
+    is resumed, which keeps the views that it was begun with; None for a new one.
     """
 
     capture: Capture
