@@ -114,7 +114,7 @@ def test_one_bad_mask_labels_no_point(write_capture, tmp_path):
     for strategy in ("majority", "correspondence"):
         votes = vote(capture, strategy)
         assert (votes.ids[scene.point_objects != 1] == 1).sum() <= 5
-        assert (votes.ids[scene.point_objects == 1] == 1).mean() > 0.95
+        assert (votes.ids[scene.point_objects == 1] == 1).mean() > 0.9
 
 
 def test_incomplete_masks_lose_few_points(write_capture, tmp_path):
