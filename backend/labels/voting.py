@@ -1,6 +1,7 @@
 """Assigns each point an object ID by votes of the views' masks, as in ObjectGS, with three strategies.
 
-As in the paper's algorithm 1, an unlabeled pixel is a vote for ID 0. Unlike in the published code, views in which a
+As in the paper's algorithm 1, an unlabeled pixel is a vote for ID 0. Unlike there, 0 needs more than half of all votes
+to win, since masks that give an object several IDs split its votes, but not those for 0. Unlike in the published code, views in which a
 point is behind the camera or outside the image do not vote on it. Held-out views do not vote, so that their masks are
 used only to measure quality. Neither do masks without any label, since they are more often missing than complete.
 """
@@ -30,7 +31,7 @@ _MERGE_AT = 1 << 23
 class Votes:
     """The result of a vote on M points.
 
-    ids: (M,) int64, object of each point; 0 if no view voted on it, or more for 0 than for any object.
+    ids: (M,) int64, object of each point; 0 if no view voted on it, or more than half of them for 0.
     margins: (M,) float32 in [0, 1], the chosen ID's fraction of all votes, 0 included, minus the next best ID's.
     counts: number of points of each object.
     visible: (M,) int32, number of views that voted on the point, for 0 or an object.
@@ -226,7 +227,7 @@ class _Ballots:
     def count(self, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
         """Return the chosen class index (M,), -1 for 0 or without votes, and its margin (M,); drawn if `rng` is given.
 
-        Of equals an object wins over 0, since masks more often miss a part of an object than add one.
+        If not drawn, 0 wins with more than half of all votes; otherwise the objects are compared with each other.
         """
         self._merge()
         slot, point = np.nonzero(self._ids >= 0)
@@ -240,8 +241,9 @@ class _Ballots:
         chosen, margins = np.full(self.points, -1, np.int64), np.zeros(self.points, np.float32)
         if len(points) == 0:
             return chosen, margins
-        # Sorted by point, then by descending frequency, then by ID, with 0 last.
-        order = np.lexsort((ids, ids < 0, -counts, points))
+        # Sorted by point, then by descending frequency, then by ID; 0 is last where it has not more than half.
+        is_minority = (ids < 0) & (2 * counts <= self.visible[points])
+        order = np.lexsort((ids, ids < 0, -counts, points) if rng is not None else (ids, -counts, is_minority, points))
         points, ids, counts = points[order], ids[order], counts[order]
         voted, first, length = np.unique(points, return_index=True, return_counts=True)
         below = np.concatenate([[0], np.cumsum(counts)])

@@ -93,7 +93,9 @@ def test_unlabeled_is_a_candidate():
     votes = vote(given(elsewhere(0, 0, 0, 7), [[0, 0, 1.0]]))
     assert votes.ids.tolist() == [0] and votes.margins.tolist() == [0.5] and votes.counts == {7: 0}
     votes = vote(given(elsewhere(0, 0, 7, 7), [[0, 0, 1.0]]))
-    assert votes.ids.tolist() == [7] and votes.margins.tolist() == [0.0], "of equals, the object wins"
+    assert votes.ids.tolist() == [7] and votes.margins.tolist() == [0.0], "half is not enough"
+    votes = vote(given(elsewhere(0, 0, 7, 5), [[0, 0, 1.0]]))
+    assert votes.ids.tolist() == [5] and votes.margins.tolist() == [0.0], "differing IDs are still objects"
     votes = vote(given(elsewhere(0, 0, 0), [[0, 0, 1.0]]))
     assert votes.ids.tolist() == [0] and votes.margins.tolist() == [1.0] and votes.visible.tolist() == [3]
 
@@ -262,8 +264,9 @@ def test_ballots_stay_exact_beyond_their_slots(monkeypatch):
             expected[point][int(i)] += 1
     chosen, margins = ballots.count(None)
     for point, counter in enumerate(expected):
-        best = min(counter, key=lambda i: (-counter[i], i < 0, i))
-        others = max(count for i, count in counter.items() if i != best)
+        objects = {i: count for i, count in counter.items() if i >= 0}
+        best = min(objects, key=lambda i: (-counter[i], i))
+        others = max(count for i, count in objects.items() if i != best)
         assert chosen[point] == best
         assert margins[point] == pytest.approx((counter[best] - others) / counter.total(), abs=1e-6)
 

@@ -61,7 +61,7 @@ class Runner:
         """End the server."""
         assert self._server.stdin is not None
         self._server.stdin.close()
-        self._server.wait(10)
+        self._server.wait(60)
 
 
 def faults(outcome: Outcome, named: str | None = None) -> list[str]:
