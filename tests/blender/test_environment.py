@@ -16,7 +16,7 @@ from objectgs.objectgs_addon.environment.worker import checks, choice, events, l
 from objectgs.objectgs_addon.process import backend_process
 from objectgs.objectgs_addon.process.jobs import JobQueue, State
 
-WAIT = 60.0
+WAIT = 180.0
 
 BACKEND = """
 import json, sys
