@@ -28,6 +28,8 @@ export NUMBA_CACHE_DIR ?= $(abspath .venv/kernels)
 
 # Where `make gpu` looks for a torch that sees a GPU: in PYTHON where it is given, else in these.
 GPU_PYTHONS = $(if $(filter command environment,$(firstword $(origin PYTHON))),$(PYTHON),$(BACKEND) python3)
+# Two processes of the tests; one that has nothing left to do takes tests from the other.
+WORKERS = -n 2 --dist worksteal
 # How long `make fuzz` tries random cases.
 MINUTES ?= 10
 # The capture that benchmarks/gpu.py trains on, where there is one.
@@ -83,16 +85,16 @@ zip: .venv-bpy/ready
 	$(BLENDER_EXT) validate build/objectgs-*.zip
 
 test: .venv/ready .venv-bpy/ready
-	$(BACKEND) -m pytest -n 2 tests/backend tests/fuzz
-	$(BLENDER) -m pytest -n 2 tests/blender
+	$(BACKEND) -m pytest $(WORKERS) tests/backend tests/fuzz
+	$(BLENDER) -m pytest $(WORKERS) tests/blender
 
 test-window: .venv/ready .venv-bpy/ready
 	$(BACKEND) -m pytest tests/window
 
 test-blenders: .venv/ready .venv-bpy-4.2/ready
-	.venv-bpy-4.2/$(BIN)/python -m pytest -n 2 tests/blender
+	.venv-bpy-4.2/$(BIN)/python -m pytest $(WORKERS) tests/blender
 	@if [ -n "$(PYTHON313)" ]; then \
-		$(MAKE) .venv-bpy-5.2/ready && .venv-bpy-5.2/$(BIN)/python -m pytest -n 2 tests/blender; \
+		$(MAKE) .venv-bpy-5.2/ready && .venv-bpy-5.2/$(BIN)/python -m pytest $(WORKERS) tests/blender; \
 	else \
 		echo "There is no Python 3.13 here, so Blender 5.2 was left out; PYTHON313 may name one."; \
 	fi

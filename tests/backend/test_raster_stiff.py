@@ -11,14 +11,13 @@ from backend.raster import Camera
 from backend.raster.cpu import renderer as cpu
 from backend.raster.reference import rasterize_reference
 from backend.raster.settings import ALPHA_MIN, NEAR
+from tests.backend import test_raster
 from tests.backend.test_raster import (
     FOCAL,
     HEIGHT,
     NAMES,
     SIMULATED,
-    WIDTH,
     as_float32,
-    camera,
     compare,
     fewer,
     mapped,
@@ -26,6 +25,13 @@ from tests.backend.test_raster import (
     ranked,
     rasterize,
 )
+
+# In the simulator, which takes a thread for each pixel, images have one tile: the scenes are stiff in their projection.
+WIDTH = 15 if SIMULATED else test_raster.WIDTH
+
+
+def camera(width=WIDTH, height=HEIGHT):
+    return test_raster.camera(width, height)
 
 
 def straight(width=WIDTH, height=HEIGHT, focal=FOCAL, **kwargs):
@@ -594,10 +600,11 @@ def test_screen_gradient_matches_moving_footprint():
     """Growth uses this gradient, so it must include the plane's part, not only the spot's."""
     scene = as_float32(tilted(0.7, scale=(6 / FOCAL, 8 / FOCAL, 1)))
     leaves = {k: v.requires_grad_(k != "ids") for k, v in scene.items()}
-    rendered = rasterize(**leaves, camera=straight(), primitive="2d")
-    pattern = torch.sin(torch.arange(WIDTH) / 5.0)[None, :].expand(HEIGHT, WIDTH)
+    width = test_raster.WIDTH
+    rendered = rasterize(**leaves, camera=straight(width), primitive="2d")
+    pattern = torch.sin(torch.arange(width) / 5.0)[None, :].expand(HEIGHT, width)
     (rendered.alpha * pattern).sum().backward()
-    columns = torch.arange(WIDTH) + 0.5
+    columns = torch.arange(width) + 0.5
     # d/du of sum alpha(x - u) pattern(x) is sum alpha pattern'.
     wanted = (rendered.alpha * (torch.cos((columns - 0.5) / 5.0) / 5.0)[None, :]).sum()
     assert float(rendered.frame.screen_gradient[0, 0]) == pytest.approx(wanted.item(), rel=0.03)
