@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
-from benchmarks import raster_variants, shared, training_variants
+from benchmarks import documents, raster_variants, shared, training_variants
 
 WORK = ROOT / "build" / "approximations"
 TURNS, SETS = 40, 5
@@ -888,24 +888,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--demo", type=Path, default=ROOT / "build/demo", help="a reconstruction of the demo capture")
     parser.add_argument("--steps", type=int, default=750, help="steps of the training of a variant")
-    parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="folder of the document and the plots")
     parser.add_argument("--restart", action="store_true", help="discard earlier results")
     parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
     options = parser.parse_args()
     if options.restart:
         shared.forget(WORK)
     found, choices, scene, failures = run(options.demo.resolve(), options.steps)
-    options.docs.mkdir(parents=True, exist_ok=True)
     with shared.plot_style():
         for name, figure in (
             ("raster", raster_plot(choices["raster"], found.raster)),
             ("training", training_plot(choices["training"], found)),
             ("meshes", mesh_plot(choices["meshes"], found.meshes)),
         ):
-            shared.save_figure(figure, options.docs / f"error-against-time-{name}.png")
-    path = options.docs / "error-against-time.md"
-    path.write_text(document(found, choices, scene))
-    print(f"\nWrote {path} and three plots beside it.")
+            shared.save_figure(figure, documents.DOCS / f"error-against-time-{name}.png")
+    documents.save_text("error-against-time", document(found, choices, scene))
     for verdict in found.verdicts:
         what = f"off the front: {_exception(verdict, found)}" if verdict.better else "on the front"
         print(f"{verdict.choice.title:26s} {verdict.choice.default:22s} {what}")

@@ -4,20 +4,21 @@
 
 --capture is the demo capture, with exact masks in truth/masks. They get errors of four kinds, from none to about half
 of the labels, and the demo is trained with each for --steps. Masks and rendered IDs are compared on the training views,
-and rendered IDs also on the held-out views. Writes docs/mask-noise.md and its plot; results are kept in
-build/mask-noise.
+and rendered IDs also on the held-out views. Writes docs/figures/mask-noise.json,
+docs/mask-noise.md and its plot; results are kept in build/mask-noise.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib.util
+import itertools
 import json
 import shutil
 import sys
 import tempfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,10 +31,14 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
-from benchmarks import shared
+from benchmarks import documents, shared
 
 WORK = ROOT / "build" / "mask-noise"
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5)
+FEW = 3
+"""Number of labeled objects where the rest of the demo counts as background."""
+CLEAR = 0.001
+"""Fraction of the pixels by which the wrong pixels of two cases differ clearly."""
 SPECK = 3
 """Minimum size of a hole in pixels; smaller ones count as rough edges, in masks and renders alike."""
 
@@ -77,6 +82,12 @@ def holes(ids: np.ndarray, level: float, rng: np.random.Generator) -> np.ndarray
     return np.where(gone, 0, ids)
 
 
+def flooded(ids: np.ndarray, level: float, rng: np.random.Generator) -> np.ndarray:
+    """Give the background the ID of one of the view's objects, with probability `level`."""
+    present = np.unique(ids[ids > 0])
+    return np.where(ids == 0, rng.choice(present), ids) if len(present) and rng.random() < level else ids
+
+
 Disturbance = Callable[[np.ndarray, float, np.random.Generator], "np.ndarray | None"]
 KINDS: dict[str, tuple[Disturbance, str]] = {
     "segmenter": (
@@ -86,7 +97,17 @@ KINDS: dict[str, tuple[Disturbance, str]] = {
     "wrong IDs": (wrong_ids, "part of the objects in a view have the ID of another object"),
     "holes": (holes, "part of each mask is replaced by unlabeled discs"),
     "missing masks": (missing, "part of the views have no mask"),
+    "flooded background": (
+        flooded,
+        f"only {FEW} objects are labeled, the rest is background; part of the masks give it the ID of an object",
+    ),
 }
+
+
+def exact_mask(source: Path, name: str, kind: str) -> np.ndarray:
+    """Return the exact IDs (h, w) of a view; for `flooded background`, those of the first FEW objects only."""
+    true = np.asarray(Image.open((source / "truth" / "masks" / name).with_suffix(".png")))
+    return np.where(true <= FEW, true, 0) if kind == "flooded background" else true
 
 
 def disturbed_capture(source: Path, kind: str, level: float, folder: Path) -> None:
@@ -97,7 +118,7 @@ def disturbed_capture(source: Path, kind: str, level: float, folder: Path) -> No
     disturb = KINDS[kind][0]
     for path in sorted((source / "truth" / "masks").rglob("*.png")):
         rng = np.random.default_rng([zlib.crc32(f"{kind} {path.name}".encode()), round(1000 * level)])
-        true = np.asarray(Image.open(path))
+        true = exact_mask(source, path.relative_to(source / "truth" / "masks").as_posix(), kind)
         given = disturb(true, level, rng) if level else true
         if given is not None:
             target = folder / "masks" / path.relative_to(source / "truth" / "masks")
@@ -132,6 +153,7 @@ class Tally:
 
         self._scores = IdScores()
         self._views = self._holes = self._hole_pixels = self._labeled = self._unlabeled = 0
+        self._wrong = self._pixels = 0
 
     def add(self, found: np.ndarray | None, true: np.ndarray) -> None:
         """Add a view; `found` None: all pixels are unlabeled."""
@@ -142,17 +164,19 @@ class Tally:
         self._holes += count
         self._hole_pixels += pixels
         self._labeled += int((true > 0).sum())
+        self._wrong += int((np.maximum(found, 0) != true).sum())
+        self._pixels += true.size
         self._unlabeled += int(((found <= 0) & (true > 0)).sum())
 
     def result(self) -> dict[str, float]:
-        """Return miou, miou_all, mbiou, error (fraction of the labeled pixels with another ID or none), holes per view,
-        hole_share (fraction of the labeled pixels in holes), and unlabeled (fraction without a label)."""
+        """Return miou, miou_all, mbiou, error (fraction of all pixels with a wrong ID), holes per view, hole_share
+        (fraction of the labeled pixels in holes), and unlabeled (fraction of the labeled pixels without a label)."""
         scores = self._scores.result()
         return {
             "miou": scores["miou"],
             "miou_all": scores["miou_all"],
             "mbiou": scores["mbiou"],
-            "error": 1 - scores["accuracy"],
+            "error": self._wrong / self._pixels,
             "holes": self._holes / self._views,
             "hole_share": self._hole_pixels / self._labeled,
             "unlabeled": self._unlabeled / self._labeled,
@@ -184,7 +208,7 @@ def measured(capture: str, kind: str, level: float, steps: int) -> dict[str, Any
         trainer.run(Budget(steps=steps), Path(scratch) / "checkpoint", Reporter())
         given, rendered, held_out = Tally(), Tally(), Tally()
         for index, view in enumerate(loaded.views):
-            true = np.asarray(Image.open((source / "truth" / "masks" / view.name).with_suffix(".png"))).astype(np.int64)
+            true = exact_mask(source, view.name, kind).astype(np.int64)
             found = draw(trainer.shown, trainer.scene.camera(index)).ids
             if index in loaded.test_indices:
                 held_out.add(found, true)
@@ -197,16 +221,16 @@ def measured(capture: str, kind: str, level: float, steps: int) -> dict[str, Any
 # --- results ------------------------------------------------------------------------------------------------
 
 
-def plot(found: dict[str, dict[float, dict[str, Any]]]) -> Any:
+def plot(found: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Any:
     """Plot mIoU and holes of masks and renders over the level of errors, one column per kind."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(2.65 * len(found), 5.2), layout="constrained")
     axes = figure.subplots(2, len(found), squeeze=False, sharex=True, sharey="row")
     for column, (kind, levels) in enumerate(found.items()):
-        x = [100 * level for level in levels]
+        x = [100 * float(level) for level in levels]
         for row, (name, text, factor) in enumerate(
-            (("miou", "mIoU against the truth", 1), ("hole_share", "pixels in holes (%)", 100))
+            (("miou_all", "mIoU against the truth", 1), ("hole_share", "pixels in holes (%)", 100))
         ):
             ax = axes[row, column]
             for who, label, color, style in (
@@ -228,39 +252,45 @@ def plot(found: dict[str, dict[float, dict[str, Any]]]) -> Any:
     return figure
 
 
-def document(found: dict[str, dict[float, dict[str, Any]]], steps: int, views: tuple[int, int]) -> str:
+def document(figures: Mapping[str, Any]) -> str:
     """Return the text of docs/mask-noise.md."""
-    entries = [(kind, level, entry) for kind, levels in found.items() for level, entry in levels.items() if level]
-    closer = [e for e in entries if e[2]["rendered"]["miou"] > e[2]["masks"]["miou"]]
+    found, views = figures["cases"], figures["views"]
+    entries = [
+        (kind, level, entry) for kind, levels in found.items() for level, entry in levels.items() if float(level)
+    ]
+    closer = [e for e in entries if e[2]["rendered"]["miou_all"] > e[2]["masks"]["miou_all"]]
     with_holes = [e for e in entries if e[2]["masks"]["holes"] > 0]
     fewer = [e for e in with_holes if e[2]["rendered"]["holes"] < e[2]["masks"]["holes"]]
     lines = [
         "# Errors in masks",
         "",
         "Made by `python benchmarks/mask_noise.py`; all figures here are its output. The demo's exact masks get",
-        f"errors before each training of {steps} steps; then masks and rendered IDs are compared with the exact masks",
-        f"on the {views[0]} training views, and rendered IDs also on the {views[1]} held-out views.",
+        f"errors before each training of {figures['steps']} steps; then masks and rendered IDs are compared with the",
+        f"exact masks on the {views['training']} training views, and rendered IDs also on the {views['held_out']}"
+        " held-out views.",
         "",
         f"- The rendered IDs are closer to the truth than the masks (mIoU) in {len(closer)} of {len(entries)} cases"
         f"{_named(entries, closer)}.",
         f"- The paper states that its results have fewer holes than the masks. This holds in {len(fewer)} of"
         f" {len(with_holes)} cases whose masks have holes{_named(with_holes, fewer)}.",
         "",
+        *_ranking(found),
+        "",
         "![mIoU and holes of masks and rendered IDs over the level of errors](mask-noise.png)",
         "",
         f"A hole is a region of {SPECK} pixels or more that an object's region encloses on all sides, and that belongs"
-        " to the object in the exact masks; the number is per view. *Wrong*: fraction of the labeled pixels with"
-        " another ID or none.",
+        " to the object in the exact masks; the number is per view. *Wrong*: fraction of the pixels whose ID is not"
+        " that of the exact masks. mIoU is over all pixels.",
         "",
     ]
     head = ("level", "masks: mIoU", "wrong", "holes", "rendered: mIoU", "wrong", "holes", "held out: mIoU", "wrong")
     for kind, levels in found.items():
         rows = []
         for level, entry in levels.items():
-            cells = [f"{level:.0%}"]
+            cells = [f"{float(level):.0%}"]
             for who in ("masks", "rendered", "held_out"):
                 of = entry[who]
-                cells += [f"{of['miou']:.4f}", f"{of['error']:.1%}"] + [f"{of['holes']:.1f}"] * (who != "held_out")
+                cells += [f"{of['miou_all']:.4f}", f"{of['error']:.1%}"] + [f"{of['holes']:.1f}"] * (who != "held_out")
             rows.append(cells)
         text = KINDS[kind][1]
         lines += [f"## {kind[0].upper()}{kind[1:]}", "", f"{text[0].upper()}{text[1:]}.", "", *shared.table(head, rows)]
@@ -268,9 +298,27 @@ def document(found: dict[str, dict[float, dict[str, Any]]], steps: int, views: t
     return "\n".join(lines).rstrip() + "\n"
 
 
-def _named(all_of: Sequence[tuple[str, float, Any]], good: Sequence[tuple[str, float, Any]]) -> str:
+def _ranking(found: Mapping[str, Any]) -> list[str]:
+    """Say how often mIoU, with and without unlabeled pixels, orders two cases as the fraction of wrong pixels does."""
+    right = {"miou_all": 0, "miou": 0}
+    pairs = 0
+    for levels in found.values():
+        for who in ("masks", "rendered", "held_out"):
+            for one, other in itertools.combinations([entry[who] for entry in levels.values()], 2):
+                if abs(one["error"] - other["error"]) >= CLEAR:
+                    pairs += 1
+                    for name in right:
+                        right[name] += (one[name] > other[name]) == (one["error"] < other["error"])
+    return [
+        f"- Of {pairs} pairs of levels whose wrong pixels differ by at least {CLEAR:.1%} of the pixels, mIoU over all"
+        f" pixels orders {right['miou_all']} as the wrong pixels do; mIoU over the labeled pixels alone orders"
+        f" {right['miou']}.",
+    ]
+
+
+def _named(all_of: Sequence[tuple[str, str, Any]], good: Sequence[tuple[str, str, Any]]) -> str:
     """Return the exceptions as text."""
-    bad = [f"{kind} {level:.0%}" for kind, level, entry in all_of if (kind, level, entry) not in good]
+    bad = [f"{kind} {float(level):.0%}" for kind, level, entry in all_of if (kind, level, entry) not in good]
     return f"; exceptions: {', '.join(bad)}" if bad else ""
 
 
@@ -279,7 +327,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--capture", type=Path, default=ROOT / "build/demo/capture", help="the demo capture")
     parser.add_argument("--steps", type=int, default=200, help="number of training steps with each kind of masks")
-    parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="folder for document and plot")
     parser.add_argument("--restart", action="store_true", help="discard the results of earlier runs")
     parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
     options = parser.parse_args()
@@ -291,24 +338,24 @@ def main() -> None:
         shared.forget(WORK)
     shared.compile_everything()
     code = [*shared.sources(), Path(__file__), ROOT / "objectgs_addon" / "demo" / "mask_noise.py"]
-    results = shared.Results(WORK, shared.digest([*code, *truths], options.steps), len(KINDS) * len(LEVELS) + 1)
+    results = shared.Results(WORK, shared.digest([*code, *truths], options.steps), len(KINDS) * len(LEVELS) + 2)
 
     def case(kind: str, level: float) -> dict[str, Any]:
         return results.get(
-            f"{kind} {level:.0%}" if level else "no errors",
+            f"{kind} {level:.0%}",
             partial(
                 shared.in_child, "benchmarks.mask_noise:measured",
                 capture=str(capture), kind=kind, level=level, steps=options.steps,
             ),
             lambda row: "mIoU of masks {:.4f}, rendered {:.4f}; holes {:.1f}, rendered {:.1f}".format(
-                *(row[who][name] for name in ("miou", "holes") for who in ("masks", "rendered"))
+                *(row[who][name] for name in ("miou_all", "holes") for who in ("masks", "rendered"))
             ),
         )  # fmt: skip
 
-    clean = case(next(iter(KINDS)), 0.0)
     found = {}
     for kind in KINDS:
-        entries = {0.0: clean, **{level: case(kind, level) for level in LEVELS}}
+        alike = kind if kind == "flooded background" else next(iter(KINDS))
+        entries = {0.0: case(alike, 0.0), **{level: case(kind, level) for level in LEVELS}}
         found[kind] = {level: entry for level, entry in entries.items() if entry}
     if results.failures:
         raise SystemExit("Not measured: " + "; ".join(results.failures))
@@ -316,12 +363,10 @@ def main() -> None:
 
     with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as cache:
         loaded = load_capture(capture, Path(cache))
-    options.docs.mkdir(parents=True, exist_ok=True)
     with shared.plot_style():
-        shared.save_figure(plot(found), options.docs / "mask-noise.png")
-    path = options.docs / "mask-noise.md"
-    path.write_text(document(found, options.steps, (len(loaded.train_indices), len(loaded.test_indices))))
-    print(f"\nWrote {path} and its plot.")
+        shared.save_figure(plot(found), documents.DOCS / "mask-noise.png")
+    views = {"training": len(loaded.train_indices), "held_out": len(loaded.test_indices)}
+    documents.save("mask-noise", {"steps": options.steps, "views": views, "cases": found})
     if options.json:
         print(json.dumps(found))
 

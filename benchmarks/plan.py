@@ -30,7 +30,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks import plan_captures, shared
+from benchmarks import documents, plan_captures, shared
 
 DEMO = ROOT / "build/demo/capture"
 SAME_PSNR = 0.1
@@ -416,7 +416,7 @@ def main() -> None:
         found[capture.name] = {key: value for figures, _ in sections for key, value in figures.items()}
         lines += [line for _, text in sections for line in text]
     if options.write:
-        (ROOT / "docs" / "plan.md").write_text("\n".join(lines).rstrip() + "\n")
+        documents.save_text("plan", "\n".join(lines).rstrip() + "\n")
     print(json.dumps(found) if options.json else "\n".join(lines))
 
 

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -207,6 +207,9 @@ def from_photos_to_report(capture: Path, *options: object, meshes: bool = True) 
         "psnr": report["quality"]["psnr"],
         "miou": report["quality"]["miou"],
         "miou_all": report["quality"]["miou_all"],
+        "mbiou": report["quality"]["mbiou"],
+        "seconds": sum(seconds_of.values()),
+        "mesh_mb": max((stage["peak_rss_mb"] for stage in report["stages"] if stage["name"] == "mesh"), default=None),
         "f1": over_objects("f1"),
         "f1_least": over_objects("f1", min),
         "f1_005": over_objects("f1_005"),
@@ -236,6 +239,15 @@ def save_figure(figure: Any, path: Path) -> None:
     figure.savefig(buffer, format="png", dpi=130)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_sheet(Image.open(buffer).convert("RGB"), path)
+
+
+def spread(values: Sequence[float | None], form: str) -> str:
+    """Return the mean as text, with the standard deviation if there are several values; empty if a value is None."""
+    known = [value for value in values if value is not None]
+    if len(known) < len(values):
+        return ""
+    mean = form.format(statistics.fmean(known))
+    return mean if len(known) < 2 else f"{mean} ± {form.format(statistics.stdev(known))}"
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:

@@ -17,9 +17,9 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -36,9 +36,9 @@ from backend.shared.events import Reporter
 from backend.training.budget import Budget
 from backend.training.settings import Settings
 from backend.training.trainer import Trainer
+from benchmarks import documents
 from tests.backend.conftest import Scene, rays_of, write_model, write_scene
 
-DOCUMENT = ROOT / "docs" / "stability.md"
 SIZE = (96, 72)
 VIEWS = 24
 STEPS = 300
@@ -389,11 +389,24 @@ def table(rows: list[Row]) -> str:
     return "\n".join(lines)
 
 
+def document(found: Mapping[str, Any]) -> str:
+    """Return the text of docs/stability.md."""
+    return (
+        "# Stability tests\n\n"
+        f"Made by `python benchmarks/stability.py --write`, with {found['processors']} processors. Every case is a "
+        "complete training on a capture of spheres with known ground truth; it fails if a loss, a gradient or a "
+        "value of the model is NaN or infinite. PSNR is that of held-out views if there are any; mIoU compares the "
+        "rendered IDs of the training views with the truth. Seconds are the mean over the cases of a group.\n\n"
+        + table([Row(**row) for row in found["rows"]])
+        + "\n"
+    )
+
+
 def main() -> int:
     """Print the table, or one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", action="store_true")
-    parser.add_argument("--write", action="store_true", help=f"put the table into {DOCUMENT.relative_to(ROOT)}")
+    parser.add_argument("--write", action="store_true", help="write docs/stability.md")
     parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES), metavar="CASE")
     options = parser.parse_args()
     rows: list[Row] = []
@@ -407,14 +420,7 @@ def main() -> int:
     if options.json:
         print(json.dumps([r._asdict() for r in rows], indent=1))
     if options.write:
-        text = (
-            "# Stability tests\n\n"
-            f"Made by `python benchmarks/stability.py --write`, with {os.cpu_count()} processors. Every case is a "
-            "complete training on a capture of spheres with known ground truth; it fails if a loss, a gradient or a "
-            "value of the model is NaN or infinite. PSNR is that of held-out views if there are any; mIoU compares the "
-            "rendered IDs of the training views with the truth. Seconds are the mean over the cases of a group.\n\n"
-        )
-        DOCUMENT.write_text(text + table(rows) + "\n", encoding="utf-8")
+        documents.save("stability", {"processors": os.cpu_count(), "rows": [r._asdict() for r in rows]})
     return 0 if all(r.held for r in rows) else 1
 
 

@@ -101,9 +101,9 @@ def add_length(command: argparse.ArgumentParser) -> None:
 def add_splats(command: argparse.ArgumentParser) -> None:
     group = command.add_argument_group("splats; the defaults suit most captures")
     group.add_argument(
-        "--mode", choices=("explicit", "view"), default="explicit",
-        help="explicit: splats.ply is exactly the model; view: splats depend on the camera, as in the paper, and "
-        "splats.ply is an approximation (explicit)",
+        "--mode", choices=("explicit", "view", "paper"), default="explicit",
+        help="explicit: splats.ply is exactly the model; view: splats depend on the camera, and splats.ply is an "
+        "approximation; paper: as view, but heads alone determine the splats, as in the paper (explicit)",
     )  # fmt: skip
     group.add_argument(
         "--primitive", choices=("3d", "2d"), default="3d",

@@ -212,6 +212,10 @@ def _add_export(commands: _Commands) -> None:
     export.add_argument(
         "--no-ids", action="store_true", help="omit object_id from PLY, for programs that cannot read it"
     )
+    export.add_argument(
+        "--bake-background", action="store_true",
+        help="add a sphere of splats in the color behind the scene, for programs that draw splats on black",
+    )  # fmt: skip
 
 
 def _add_import_splats(commands: _Commands) -> None:

@@ -69,13 +69,16 @@ def fit_splats(
     return concatenate(parts) if parts else Splats.empty(SH_DEGREE), np.concatenate(sources)
 
 
-def agreement(model: ObjectModel, splats: Splats, cameras: Sequence[Camera]) -> float | None:
+def agreement(
+    model: ObjectModel, splats: Splats, cameras: Sequence[Camera], background: Sequence[float] | None = None
+) -> float | None:
     """Measure how well plain splats reproduce a model.
 
     Args:
         model: The model.
         splats: The fitted splats in world units.
         cameras: The cameras in scene units.
+        background: Red, green and blue behind the splats, 0 .. 1; None: the model's.
 
     Returns:
         The mean PSNR in dB of renders of `splats` against those of `model`; None if there are no cameras.
@@ -88,11 +91,12 @@ def agreement(model: ObjectModel, splats: Splats, cameras: Sequence[Camera]) -> 
     scales = tensor(splats.scales * model.normalization.scale)
     quats, opacities, sh = tensor(splats.quats), tensor(splats.opacities), tensor(splats.sh)
     ids = torch.zeros(len(splats), dtype=torch.int32, device=model.device)
+    behind = model.background.detach() if background is None else tensor(np.asarray(background))
     found = []
     for camera in cameras:
         with torch.no_grad():
             drawn = rasterize(means, quats, scales, opacities, sh, ids, camera)
-            image = drawn.color + (1 - drawn.alpha) * model.background.detach()[:, None, None]
+            image = drawn.color + (1 - drawn.alpha) * behind[:, None, None]
             image = image * torch.tensor(camera.gain).to(image.device)[:, None, None]
         shown = devices.host(image.clamp(0, 1).permute(1, 2, 0))
         found.append(psnr(shown, draw(model, camera, want_ids=False).image))

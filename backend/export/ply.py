@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from ..shared.formats.splat_ply import (
     SCALES,
     SMALLEST_QUAT,
     UNOBSERVED,
+    background_comment,
     coefficients_of,
     property_names,
     read_splat_table,
@@ -36,7 +38,9 @@ FLOAT32_RELATIVE_ERROR = 2.0**-24
 ROWS_AT_ONCE = 1 << 16
 
 
-def write_splats(path: Path, splats: Splats, with_ids: bool = True) -> list[str]:
+def write_splats(
+    path: Path, splats: Splats, with_ids: bool = True, background: Sequence[float] | None = None
+) -> list[str]:
     """Write splats as PLY, atomically.
 
     The layout is that of `shared/formats/splat_ply.py`. Positions are double if float32 would change them by more than
@@ -46,6 +50,7 @@ def write_splats(path: Path, splats: Splats, with_ids: bool = True) -> list[str]
         path: The file to write.
         splats: The splats. Those with NaN, Inf or a zero quaternion are left out.
         with_ids: Whether to write `object_id` and `unobserved`, which some programs do not accept.
+        background: Red, green and blue, 0 .. 1, of what is behind the splats, for a comment in the header.
 
     Returns:
         Warnings about splats that were left out.
@@ -71,7 +76,7 @@ def write_splats(path: Path, splats: Splats, with_ids: bool = True) -> list[str]
     dtype = splat_dtype(names, position_kind(splats))
 
     with atomic_file(path) as file:
-        file.write(vertex_header(dtype, len(splats)))
+        file.write(vertex_header(dtype, len(splats), [background_comment(background)] if background else []))
         for start in range(0, len(splats), ROWS_AT_ONCE):
             file.write(_rows(splats, slice(start, start + ROWS_AT_ONCE), dtype).tobytes())
     return warnings

@@ -102,7 +102,7 @@ class Views:
         return self.scene.camera(index, self.downscale)
 
     def splats(self, classes: Sequence[int]) -> Generated:
-        """Return the Gaussians of the objects `classes` in scene units; in view mode, generated for the origin."""
+        """Return the Gaussians of the objects `classes` in scene units; if view-dependent, generated for the origin."""
         self._turn_to(classes)
         return self._own_splats(None)
 

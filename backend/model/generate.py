@@ -1,7 +1,9 @@
 """Differentiable generation of Gaussians from anchors and heads (ObjectGS equations 2 and 3).
 
 For offset j of an anchor at x with extents l, l': mean = x + o_j l, opacity = tanh(.), scale = l' sigmoid(.), rotation
-as a quaternion, color as SH coefficients. Splats that are too transparent to be drawn are not generated.
+as a quaternion, color as SH coefficients. The arguments are the output of the heads, the paper's MLP, plus residuals of
+each offset, which the paper does not have; in paper mode, they are 0. Splats that are too transparent to be drawn are
+not generated.
 """
 
 from __future__ import annotations
@@ -103,13 +105,13 @@ def generate(
         rows: (n, columns) float32.
         ids: (n,) int32 class index.
         heads: the heads of the model.
-        camera_center: (3,), the camera's center in scene units; required only in view mode.
+        camera_center: (3,), the camera's center in scene units; required only if the heads depend on the view.
         present: (n,) bool, only on the GPU: anchors for which it is False generate no Gaussians.
     """
     seen_from = None
-    if heads.mode == "view":
+    if heads.view_dependent:
         if camera_center is None:
-            raise ValueError("view mode needs the camera's center")
+            raise ValueError("a view-dependent model needs the camera's center")
         to_anchor = positions - devices.upload(np.asarray(camera_center, np.float32), positions)
         distance = torch.linalg.vector_norm(to_anchor, dim=1, keepdim=True).clamp(min=1e-6)
         seen_from = torch.cat([distance, to_anchor / distance], 1)

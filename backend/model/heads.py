@@ -14,15 +14,15 @@ class Heads(nn.Module):
     """Opacity, shape and color heads, 32 hidden units each.
 
     In `explicit` mode the only input is the anchor's feature, and colors are spherical harmonics of degree `sh_degree`,
-    so the model can be exported as plain splats without loss. In `view` mode (that of the paper), the distance and
+    so the model can be exported as plain splats without loss. In the modes `view` and `paper`, the distance and
     direction from the camera are additional inputs, and each splat has a single color.
     """
 
     def __init__(self, layout: Layout, mode: str, sh_degree: int, generator: torch.Generator) -> None:
         super().__init__()
-        self.mode = mode
-        self.coefficients = (sh_degree + 1) ** 2 if mode == "explicit" else 1
-        self.inputs = layout.features + (4 if mode == "view" else 0)
+        self.view_dependent = mode != "explicit"
+        self.coefficients = 1 if self.view_dependent else (sh_degree + 1) ** 2
+        self.inputs = layout.features + (4 if self.view_dependent else 0)
         k = layout.offsets
         self.hidden = nn.Linear(self.inputs, 3 * HIDDEN)
         self.opacity = nn.Linear(HIDDEN, k)

@@ -92,14 +92,14 @@ class ObjectModel:
     @property
     def explicit(self) -> bool:
         """Whether the model can be exported as plain splats without loss."""
-        return self.heads.mode == "explicit"
+        return not self.heads.view_dependent
 
     def generate(self, seen: torch.Tensor | None = None, camera_center: np.ndarray | None = None) -> Generated:
         """Generate Gaussians without gradients.
 
         Args:
             seen: (n,) int64, the anchors; None: all.
-            camera_center: (3,), the camera's center in scene units; required only in view mode.
+            camera_center: (3,), the camera's center in scene units; required only if the model is view-dependent.
 
         Returns:
             The Gaussians in scene units; discs have the third scale of the thin 3D Gaussians used for them in files.
@@ -116,7 +116,7 @@ class ObjectModel:
         """Convert the model to plain splats.
 
         Args:
-            camera_center: (3,), the camera's center in scene units; required only in view mode.
+            camera_center: (3,), the camera's center in scene units; required only if the model is view-dependent.
 
         Returns:
             Splats in world units, and source (N,) int64: anchor * offsets + offset of each splat.

@@ -17,7 +17,7 @@ maximum over the measured captures, which are those of the demo in docs/length.m
 NANOSECONDS_A_PIXEL = (300.0, 1200.0)
 """Minimum and maximum time of a step on a CPU per pixel of a view, used until a training has been measured."""
 
-_FINAL = "a training until it stops improving"
+_FINAL = "a training until it stops improving (measured on the demo)"
 
 
 def expectation(

@@ -9,13 +9,17 @@ import numpy as np
 
 from ..model.anchors import Layout
 
+MODES = ("explicit", "view", "paper")
+
 
 @dataclass(frozen=True)
 class Settings:
     """Settings that affect the model; a training can be resumed only with the same ones.
 
     Attributes:
-        mode: `explicit` or `view`, see `Heads`.
+        mode: one of MODES. `explicit` and `view`: see `Heads`; each offset also has residuals of its own, which are
+            added to the output of the heads. `paper`: as `view`, without residuals, so that a splat's appearance comes
+            from the heads alone, as in ObjectGS section 3.2.
         sh_degree: degree of the colors' spherical harmonics in explicit mode.
         offsets: number of splats per anchor.
         voxel: edge length of an anchor's cell in world units; None: the median spacing of the points.
@@ -54,6 +58,11 @@ class Settings:
         """Return the settings that have an effect; for 3D Gaussians, without normal_weight and distortion_weight."""
         surface = () if self.primitive == "2d" else ("normal_weight", "distortion_weight")
         return {name: value for name, value in asdict(self).items() if name not in surface}
+
+    @property
+    def view_dependent(self) -> bool:
+        """Whether the splats depend on the camera, so that plain splats are only a fit of the model."""
+        return self.mode != "explicit"
 
     @property
     def layout(self) -> Layout:
@@ -110,6 +119,9 @@ _ROW_RATES = {
     "shape_columns": (4e-2, 4e-3),
     "color_columns": (2e-2, 2e-3),
 }
+RESIDUALS = ("opacity_columns", "shape_columns", "color_columns")
+"""Columns of the values that are added to the output of the heads."""
+
 HEAD_RATES = {
     "hidden": (4e-3, 1e-4),
     "opacity": (2e-3, 2e-5),
@@ -128,11 +140,15 @@ def rate(ends: tuple[float, float], progress: float) -> float:
     return float(ends[0] * (ends[1] / ends[0]) ** decay)
 
 
-def row_rates(layout: Layout, progress: float) -> np.ndarray:
-    """Return the learning rate of each column of the anchors' rows: (columns,) float32."""
-    rates = np.zeros(layout.columns, np.float32)
+def row_rates(settings: Settings, progress: float) -> np.ndarray:
+    """Return the learning rate of each column of the anchors' rows: (columns,) float32.
+
+    It is 0 for residuals in paper mode.
+    """
+    rates = np.zeros(settings.layout.columns, np.float32)
     for name, ends in _ROW_RATES.items():
-        rates[getattr(layout, name)] = rate(ends, progress)
+        if settings.mode != "paper" or name not in RESIDUALS:
+            rates[getattr(settings.layout, name)] = rate(ends, progress)
     return rates
 
 

@@ -23,7 +23,7 @@ from ..shared.formats.typed import typed
 from ..shared.reconstruction.objects import LARGEST_ID
 from .average import Average
 from .budget import TrainingProgress
-from .settings import HEAD_RATES, Settings
+from .settings import HEAD_RATES, MODES, Settings
 
 _GROWTH = ("gradient", "visits", "opacity", "views")
 _HEAD_ADAM = ("step", "exp_avg", "exp_avg_sq")
@@ -212,7 +212,7 @@ def _check_state(settings: Settings, state: dict[str, Any]) -> None:
         raise ValueError("the normalization is invalid")
     if not (math.isfinite(state["voxel"]) and state["voxel"] > 0):
         raise ValueError("the voxel size is invalid")
-    choices = {"mode": ("explicit", "view"), "primitive": ("3d", "2d"), "background": ("learned", "black", "white")}
+    choices = {"mode": MODES, "primitive": ("3d", "2d"), "background": ("learned", "black", "white")}
     if any(getattr(settings, name) not in values for name, values in choices.items()):
         raise ValueError("a setting is unknown")
     if not (0 <= settings.sh_degree <= 3 and 1 <= settings.offsets <= 1000 and settings.max_anchors >= 1):

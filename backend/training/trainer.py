@@ -125,6 +125,8 @@ class Trainer:
         voxel = settings.voxel * normalization.scale if settings.voxel else median_spacing(scene_xyz)
         point_classes = classes.classes_of(point_ids[seeds])
         anchors = seed_anchors(scene_xyz, rgb / 255.0, point_classes, voxel, settings.layout, rng)
+        if settings.mode == "paper":
+            anchors.rows[:, settings.layout.color_columns] = 0
         generator = torch.Generator().manual_seed(settings.seed)
         heads = Heads(settings.layout, settings.mode, settings.sh_degree, generator)
         shade = {"learned": rgb.mean(axis=0) / 255.0, "black": np.zeros(3), "white": np.ones(3)}
@@ -417,7 +419,7 @@ class Trainer:
         assert gradients.rows.grad is not None
         skipped = ~finite + step_rows(
             self.model.anchors.rows, self._exp_avg, self._exp_avg_sq, gradients.seen, gradients.rows.grad,
-            row_rates(self.settings.layout, progress), 1 - BETA1**step, 1 - BETA2**step, gradients.usable,
+            row_rates(self.settings, progress), 1 - BETA1**step, 1 - BETA2**step, gradients.usable,
         )  # fmt: skip
         self._check.skipped += skipped
         if self._check.at_once and skipped:

@@ -149,7 +149,8 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
         default="explicit",
         items=[
             ("explicit", "Plain Splats", "The trained model is exactly what Blender shows and the PLY file contains"),
-            ("view", "View-Dependent", "As in the paper, splats depend on the view; the PLY file is an approximation"),
+            ("view", "View-Dependent", "Splats depend on the view; the PLY file is an approximation"),
+            ("paper", "Paper", "View-dependent, and with heads alone, as in the paper; for comparisons"),
         ],
     )
     sh_degree: IntProperty(

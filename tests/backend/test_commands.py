@@ -148,7 +148,7 @@ def test_terminal_output_has_no_duplicate_lines(write_capture, tmp_path, run_com
     assert result.err.count("have no mask") == 1
 
 
-@pytest.mark.parametrize(("mode", "far"), [("explicit", 0), ("explicit", 1e6), ("view", 0)])
+@pytest.mark.parametrize(("mode", "far"), [("explicit", 0), ("explicit", 1e6), ("view", 0), ("paper", 0)])
 def test_anchors_file_matches_splats(write_capture, tmp_path, run_command, mode, far):
     scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
     for viewmat in scene.viewmats:

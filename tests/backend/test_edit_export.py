@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import torch
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
@@ -17,6 +18,7 @@ from backend.editing import apply_edits, transformed
 from backend.editing.placement import middle_of
 from backend.export import read_splats, write_splat, write_splats, write_spz
 from backend.model.splats import Splats
+from backend.raster import Camera, rasterize
 from backend.shared.errors import EXIT_DONE, InputError
 from backend.shared.formats.json_file import write_json
 from backend.shared.formats.ply import read_vertices
@@ -428,3 +430,36 @@ def test_splats_without_cameras_are_oriented_to_ground(tmp_path):
     rotation, translation = np.array(upright["rotation"]), np.array(upright["translation"])
     assert (above @ rotation.T + translation)[:, 2].min() > 0.2
     assert np.abs((ground @ rotation.T + translation)[:, 2]).max() < 0.05
+
+
+def test_baked_background_looks_like_background(tmp_path, folder, run_command):
+    color = [0.2, 0.55, 0.9]
+    update_record(folder, export=ExportRecord(splats=60, anchors=6, background=color))
+    plain, baked = tmp_path / "plain.ply", tmp_path / "baked.ply"
+    assert run_command("export", folder.folder, "--out", plain).code == EXIT_DONE
+    assert run_command("export", folder.folder, "--out", baked, "--bake-background").code == EXIT_DONE
+    assert b"comment background 0.2000 0.5500 0.9000\n" in plain.read_bytes()[:400]
+    assert b"background" not in baked.read_bytes()[:400]
+    inside, everything = read_splats(plain)[0], read_splats(baked)[0]
+    assert len(everything) > len(inside) and (everything.object_ids[len(inside) :] == 0).all()
+    # In every direction, from a camera in front of the scene and from one within it.
+    for distance in (6.0, 0.0):
+        for turn in Rotation.random(8, random_state=1).as_matrix():
+            viewmat = np.eye(4)
+            viewmat[:3, :3], viewmat[:3, 3] = turn, -turn @ [1, 2, 3] + [0, 0, distance]
+            camera = Camera(viewmat, np.array([[30, 0, 24], [0, 30, 16], [0, 0, 1.0]]), 48, 32)
+            shown, alone = _drawn(everything, camera), _drawn(inside, camera)
+            wanted = alone.color + (1 - alone.alpha) * torch.tensor(color)[:, None, None]
+            assert float((shown.color - wanted).abs().max()) < 0.03
+
+
+def _drawn(splats, camera):
+    values = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
+    tensors = [torch.from_numpy(np.ascontiguousarray(value, np.float32)) for value in values]
+    return rasterize(*tensors, torch.zeros(len(splats), dtype=torch.int32), camera)
+
+
+def test_background_that_is_not_known_is_not_baked(tmp_path, folder, run_command):
+    result = run_command("export", folder.folder, "--out", tmp_path / "out.ply", "--bake-background")
+    assert_rejected(result, "objectgs.json", "background")
+    assert not (tmp_path / "out.ply").exists()

@@ -689,3 +689,17 @@ def test_killed_training_resumes_to_same_model(write_capture, tmp_path):
     resumed, state, _ = load_checkpoint(current.parent)
     assert state["progress"]["step"] == 260
     assert np.array_equal(whole["anchors.rows"], resumed["anchors.rows"])
+
+
+def test_paper_mode_has_no_residuals(tiny, tmp_path):
+    capture, ids = tiny()
+    trainer = Trainer.start(capture, ids, Settings(mode="paper", offsets=4))
+    assert not trainer.model.explicit
+    first = [float(trainer.step(0.2)) for _ in range(10)]
+    losses = [float(trainer.step(0.2 + i / 200)) for i in range(120)]
+    for columns in ("opacity_columns", "shape_columns", "color_columns"):
+        assert not trainer.model.anchors.rows[:, getattr(trainer.settings.layout, columns)].any(), columns
+    assert np.mean(losses[-10:]) < 0.7 * np.mean(first)
+    trainer.save(tmp_path / "checkpoint")
+    again, _ = Trainer.resume(capture, tmp_path / "checkpoint")
+    assert again.settings.mode == "paper" and torch.equal(again.model.anchors.rows, trainer.model.anchors.rows)

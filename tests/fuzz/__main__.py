@@ -13,15 +13,18 @@ import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+from benchmarks import documents
 
 from .kills import run_deletions, run_full_disks, run_kills
 from .races import edit_at_once, race_for_lock
-from .running import MEMORY_MB, ROOT, Runner
+from .report import document
+from .running import Runner
 from .session import Tally, run_cases
 from .streams import run_signals, run_streams
 from .templates import Templates, make_templates
 
-DOCUMENT = ROOT / "docs" / "reliability.md"
 KILLS, DISKS, DELETIONS, SIGNALS, ROUNDS, EDITS = 100, 52, 30, 30, 1000, 300
 
 
@@ -37,6 +40,17 @@ class Results:
         """A text for each fault."""
         return [*map(str, self.tally.failures), *(fault for _, found in self.others.values() for fault in found)]
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figures of docs/reliability.md."""
+        tally = self.tally
+        return {
+            "cases": dict(sorted(tally.cases.items())),
+            "faults": [failure.faults for failure in tally.failures],
+            "largest_mb": tally.largest_mb,
+            "longest_seconds": tally.longest_seconds,
+            "others": {what: {"runs": runs, "faults": len(found)} for what, (runs, found) in self.others.items()},
+        }
+
 
 def main() -> int:
     """Run everything and print what was found; return 1 if anything was."""
@@ -51,9 +65,9 @@ def main() -> int:
         results = _run(Path(name), options)
     for fault in results.faults:
         print(fault, end="\n\n")
-    print(document(results))
+    print(document(results.as_dict()))
     if options.write:
-        DOCUMENT.write_text(document(results), encoding="utf-8")
+        documents.save("reliability", results.as_dict())
     return bool(results.faults)
 
 
@@ -110,39 +124,6 @@ def _run_others(folder: Path, seed: int, templates: Templates, runners: list[Run
         "commands whose output is closed, full, a broken pipe, or not UTF-8": (runs, lost),
         "signals at random moments, during imports too": (SIGNALS, run_signals(SIGNALS, seed, templates)),
     }
-
-
-def document(results: Results) -> str:
-    """Return docs/reliability.md."""
-    tally = results.tally
-    kinds = {
-        "tracebacks": "traceback", "wrong exit codes": "wrong exit", "hangs (over 40 s)": "hang",
-        f"memory over {MEMORY_MB} MB": "memory", "files of others changed": "foreign files",
-        "half-written or left-behind output": ("half-written", "left behind"),
-        "refusals that are not one sentence, or do not name the file": ("no sentence", "file not named"),
-    }  # fmt: skip
-    lines = [
-        "# Reliability", "",
-        "Written by `make fuzz`, which damages inputs at random, kills commands and lets them compete. A case is a",
-        "capture, a reconstruction, splats, a shot or a command line with something wrong, given to a command in a",
-        "process of its own, among files that belong to others. A command may succeed, or refuse the input with exit",
-        "code 2 and one sentence that says what is wrong.", "",
-        "| random cases | |", "|---|---:|",
-        *(f"| {kind} | {count:,} |" for kind, count in sorted(tally.cases.items())),
-        f"| **all** | **{sum(tally.cases.values()):,}** |", "",
-        "| found in them | |", "|---|---:|",
-        *(f"| {what} | {_count(tally, starts)} |" for what, starts in kinds.items()),
-        f"| largest memory | {tally.largest_mb:,.0f} MB |", f"| longest case | {tally.longest_seconds:.0f} s |", "",
-        "| other tests | runs | faults |", "|---|---:|---:|",
-        *(f"| {what} | {runs:,} | {len(found)} |" for what, (runs, found) in results.others.items()), "",
-        "After a kill, a full disk or a race everything that was complete before can be read, and the same command",
-        "finishes.", "",
-    ]  # fmt: skip
-    return "\n".join(lines)
-
-
-def _count(tally: Tally, starts: str | tuple[str, ...]) -> int:
-    return sum(any(fault.startswith(starts) for fault in failure.faults) for failure in tally.failures)
 
 
 if __name__ == "__main__":

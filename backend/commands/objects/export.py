@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,13 +11,13 @@ import numpy as np
 
 from ...capture import Upright
 from ...editing import apply_edits, transformed
-from ...export import read_splats, write_splat, write_splats, write_spz
-from ...model.splats import Splats
+from ...export import background_sphere, read_splats, write_splat, write_splats, write_spz
+from ...model.splats import Splats, concatenate
 from ...shared.errors import InputError
 from ...shared.formats.file_names import distinct_stems
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.objects import SceneObject, default_name, find_object, read_objects
-from ...shared.reconstruction.record import read_record
+from ...shared.reconstruction.record import Record, read_record
 from ...shared.stopping import StoppingReporter
 from ..cameras import read_upright
 
@@ -29,14 +29,18 @@ _Z_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]
 def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Write one file, or one for each object."""
     folder = Reconstruction(options.folder)
-    kind, write = _format(options)
+    record = read_record(folder)
+    background = record.export.background if record.export else None
+    if options.bake_background and not background:
+        raise InputError(f"{folder.settings} names no background to bake; train on, or leave out --bake-background.")
+    kind, write = _format(options, background)
     objects = read_objects(folder.objects) if folder.objects.exists() else []
     chosen = [find_object(objects, word, folder.objects).id for word in options.objects or ()]
     reporter.status(f"Reading {folder.splats.name}")
     captured, warnings = read_splats(folder.splats)
     for sentence in warnings:
         reporter.warning(sentence)
-    _warn_about_fit(folder, reporter)
+    _warn_about_fit(folder, record, reporter)
     splats = apply_edits(captured, objects)
     if chosen:
         splats = splats.select(np.isin(splats.object_ids, chosen))
@@ -48,6 +52,8 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         reporter.status(f"{splats.unobserved.sum():,} splats fill the holes of removed objects")
     if options.sh_degree is not None:
         splats = splats.with_degree(options.sh_degree)
+    if options.bake_background and background:
+        splats = concatenate([splats, background_sphere(splats, background)])
     splats = _in_coordinates(splats, options.coordinates, read_upright(folder), y_up=kind == "spz")
     files = _files(options, splats, objects, kind)
     for path in files:
@@ -61,10 +67,14 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     reporter.done(exported=str(options.out), files=len(files), splats=len(splats))
 
 
-def _format(options: argparse.Namespace) -> tuple[str, Callable[[Path, Splats], list[str]]]:
+def _format(
+    options: argparse.Namespace, background: Sequence[float] | None
+) -> tuple[str, Callable[[Path, Splats], list[str]]]:
     """Return the name of the format, which is also the suffix of its files, and its writer."""
     writers: dict[str, Callable[[Path, Splats], list[str]]] = {
-        "ply": lambda path, splats: write_splats(path, splats, with_ids=not options.no_ids),
+        "ply": lambda path, splats: write_splats(
+            path, splats, not options.no_ids, None if options.bake_background else background
+        ),
         "spz": write_spz,
         "splat": write_splat,
     }
@@ -73,11 +83,10 @@ def _format(options: argparse.Namespace) -> tuple[str, Callable[[Path, Splats], 
     return kind, writers[kind]
 
 
-def _warn_about_fit(folder: Reconstruction, reporter: StoppingReporter) -> None:
+def _warn_about_fit(folder: Reconstruction, record: Record, reporter: StoppingReporter) -> None:
     """Warn if the splats are only a fit of the trained model, with its PSNR."""
-    record = read_record(folder)
     psnr = record.export.psnr_of_export if record.export else None
-    if psnr is not None and record.training and record.training.settings.get("mode") == "view":
+    if psnr is not None and record.training and record.training.settings.get("mode") != "explicit":
         reporter.warning(
             f"{folder.splats.name} is a fit of a model whose splats change with the camera; its PSNR to renders of "
             f"that model is {psnr:.1f} dB."

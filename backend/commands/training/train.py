@@ -42,6 +42,9 @@ CURVE_VIEWS = 20
 _COMPARED_VIEWS = 20
 """Largest number of views on which the exported splats are compared with the model."""
 
+_CLEAR_ON_BLACK = 40.0
+"""PSNR in dB above which a missing background makes no visible difference."""
+
 
 def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Begin, resume or extend a training, and write a checkpoint, previews, splats.ply and anchors.ply."""
@@ -79,7 +82,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             except Cancelled:
                 # Also export the result of a stopped training if this takes no time.
                 if trainer.model.explicit and progress.step:
-                    _export(trainer.shown, trainer.scene, folder, reporter)
+                    _export(trainer.shown, trainer.scene, folder, reporter, compare=False)
                 raise
         export = _export(trainer.shown, trainer.scene, folder, reporter)
     latest = progress.curve[-1] if progress.curve else {}
@@ -227,28 +230,49 @@ def _measure(folder: Reconstruction, reporter: StoppingReporter) -> Evaluate:
     return measure
 
 
-def _export(model: ObjectModel, scene: Scene, folder: Reconstruction, reporter: Reporter) -> ExportRecord:
-    """Write splats.ply and anchors.ply; return and record their sizes and, if the splats are only a fit, their PSNR to
-    the model."""
+def _export(
+    model: ObjectModel, scene: Scene, folder: Reconstruction, reporter: Reporter, compare: bool = True
+) -> ExportRecord:
+    """Write splats.ply and anchors.ply; return and record their sizes and, with `compare`, their PSNR to the model."""
     with stage(folder, "export"):
-        export = _write_export(model, scene, folder, reporter)
+        export = _write_export(model, scene, folder, reporter, compare)
     update_record(folder, export=export)
     return export
 
 
-def _write_export(model: ObjectModel, scene: Scene, folder: Reconstruction, reporter: Reporter) -> ExportRecord:
+def _write_export(
+    model: ObjectModel, scene: Scene, folder: Reconstruction, reporter: Reporter, compare: bool
+) -> ExportRecord:
     reporter.status(f"Writing {folder.splats.name}")
-    psnr = None
     capture = scene.capture
     if model.explicit:
         splats, source = model.splats()
     else:
         splats, source = fit_splats(model, [scene.camera(i) for i in capture.train_indices], reporter)
+    background = [round(float(value), 4) for value in model.background.detach().cpu()]
+    psnr = on_black = None
+    if compare:
+        cameras = [scene.camera(i) for i in (capture.test_indices or capture.train_indices)[:_COMPARED_VIEWS]]
+        psnr = plain(agreement(model, splats, cameras))
+        on_black = plain(agreement(model, splats, cameras, (0.0, 0.0, 0.0))) if any(background) else psnr
+        _say_how_well(model, folder, capture, psnr, on_black, reporter)
+    for sentence in write_splats(folder.splats, splats, background=background):
+        reporter.warning(sentence)
+    write_anchors(folder.anchors, model, splats, source)
+    return ExportRecord(len(splats), len(model.anchors), _rounded(psnr), _rounded(on_black), background)
+
+
+def _say_how_well(
+    model: ObjectModel,
+    folder: Reconstruction,
+    capture: Capture,
+    psnr: float | None,
+    on_black: float | None,
+    reporter: Reporter,
+) -> None:
+    """Report how well splats.ply shows a model that it is not, and what is lost without the background."""
+    where = "held-out" if capture.test_indices else "training"
     if not model.explicit or model.primitive == "2d":
-        views = (capture.test_indices or capture.train_indices)[:_COMPARED_VIEWS]
-        psnr = plain(agreement(model, splats, [scene.camera(i) for i in views]))
-        where = "held-out" if capture.test_indices else "training"
-        how_well = "cannot be measured" if psnr is None else f"is {psnr:.1f} dB"
         what, has = (
             ("A view-dependent model has no exact splats", "a fit")
             if not model.explicit
@@ -257,9 +281,14 @@ def _write_export(model: ObjectModel, scene: Scene, folder: Reconstruction, repo
         report = reporter.status if model.explicit else reporter.warning
         report(
             f"{what}: {folder.splats.name} contains {has}, whose PSNR to renders of the model in the {where} views "
-            f"{how_well}."
+            f"{'cannot be measured' if psnr is None else f'is {psnr:.1f} dB'}."
         )
-    for sentence in write_splats(folder.splats, splats):
-        reporter.warning(sentence)
-    write_anchors(folder.anchors, model, splats, source)
-    return ExportRecord(len(splats), len(model.anchors), None if psnr is None else round(psnr, 2))
+    if on_black is not None and on_black < _CLEAR_ON_BLACK and (psnr is None or on_black < psnr - 1):
+        reporter.status(
+            f"Programs that draw {folder.splats.name} on black show it with a PSNR of {on_black:.1f} dB to the model "
+            f"in the {where} views, since the model has a background; `export --bake-background` adds it as splats."
+        )
+
+
+def _rounded(psnr: float | None) -> float | None:
+    return None if psnr is None else round(psnr, 2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -27,9 +28,10 @@ _WORDS = {
 _KINDS = {word: kind for kind, words in _WORDS.items() for word in words}
 
 
-def vertex_header(dtype: np.dtype, count: int) -> bytes:
+def vertex_header(dtype: np.dtype, count: int, comments: Sequence[str] = ()) -> bytes:
     """Return the header of a little-endian file of `count` vertices; the fields of `dtype` are scalars of PLY types."""
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
+    lines.append(f"element vertex {count}")
     for name in dtype.names or ():
         field = dtype[name]
         if f"{field.kind}{field.itemsize}" not in _WORDS:

@@ -1,7 +1,8 @@
 """Splats as PLY in the layout of 3D Gaussian splatting: names, order, types and limits of the properties.
 
 Opacities are logits and scales are logarithms. `f_rest` has all red coefficients first, then green, then blue. Two
-properties are this program's own: `object_id` as uint32 and, if any splat is unobserved, `unobserved` as uchar.
+properties are this program's own: `object_id` as uint32 and, if any splat is unobserved, `unobserved` as uchar. A
+comment `background R G B` in the header has the color behind the splats, in display space from 0 to 1.
 """
 
 from __future__ import annotations
@@ -50,6 +51,11 @@ def sh_names(coefficients: int) -> list[tuple[str, str, str]]:
     """Return the properties of each spherical-harmonics coefficient for red, green and blue."""
     rest = coefficients - 1
     return [_DC, *((f"{_REST}{k}", f"{_REST}{rest + k}", f"{_REST}{2 * rest + k}") for k in range(rest))]
+
+
+def background_comment(color: Sequence[float]) -> str:
+    """Return the comment of the header with the color behind the splats."""
+    return "background " + " ".join(f"{value:.4f}" for value in color)
 
 
 def splat_dtype(names: Iterable[str], position: str = "f4") -> np.dtype:

@@ -78,15 +78,18 @@ class TrainingRecord:
 
 @dataclass(frozen=True)
 class ExportRecord:
-    """Sizes of splats.ply and anchors.ply.
+    """Sizes of splats.ply and anchors.ply, and how well splats.ply shows the model.
 
-    psnr_of_export: PSNR in dB of the exported splats to renders of the model; None if they are identical or it was not
-    measured.
+    psnr_of_export: PSNR in dB of renders of the exported splats, on the model's background, to renders of the model;
+    None if they are identical or it was not measured. psnr_on_black: the same with the splats on black, as programs
+    show them that do not know the background. background: red, green and blue in display space, 0 .. 1.
     """
 
     splats: int
     anchors: int
     psnr_of_export: float | None = None
+    psnr_on_black: float | None = None
+    background: list[float] | None = None
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
 """The loss of a view with hand-written gradients: L1, SSIM and the probability of the labels.
 
-L = (1 - lambda_ssim) L1 + lambda_ssim (1 - SSIM) - lambda_semantic mean log P_label, for the composed image
-color + (1 - alpha) background (ObjectGS equation 8; SSIM of Wang et al. 2004 with an 11 x 11 Gaussian of sigma 1.5 and
-zero padding).
+L = (1 - lambda_ssim) L1 + lambda_ssim (1 - SSIM) - lambda_semantic mean log((P_label + f) / (1 + f)), for the composed
+image color + (1 - alpha) background, with f = PROBABILITY_FLOOR. It follows ObjectGS equations 7 and 8, where L1 is not
+weighted, the logarithm is summed over the pixels, and f is 0. SSIM is that of Wang et al. 2004 with an 11 x 11 Gaussian
+of sigma 1.5 and zero padding.
 """
 
 from __future__ import annotations
