@@ -126,7 +126,9 @@ def _describe_problems(capture: Capture, counts: dict[int, int], unlabeled: int,
     few = [i for i, count in counts.items() if 0 < count < FEW_POINTS]
     warnings = []
     if none:
-        warnings.append(f"No point was labeled as object {listed(none)}, so training starts without it.")
+        warnings.append(
+            f"No point was labeled as object {listed(none)}; training places points where the masks of two views agree."
+        )
     if few:
         warnings.append(f"Fewer than {FEW_POINTS} points were labeled as object {listed(few)}.")
     if 2 * unlabeled > points:

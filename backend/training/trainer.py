@@ -98,6 +98,7 @@ class Trainer:
         seeds: np.ndarray | None = None,
         supervise_background: bool | None = None,
         gains: np.ndarray | None = None,
+        more: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     ) -> Trainer:
         """Start a training with anchors at the capture's points.
 
@@ -111,6 +112,7 @@ class Trainer:
                 density; None: all.
             supervise_background: as in `Scene`; None: decided by `background_is_masked` for the points without object.
             gains: as in `Scene`.
+            more: xyz (n, 3), rgb (n, 3) uint8 and IDs (n,) of additional points, of objects that have none.
 
         Raises:
             InputError: an image cannot be read.
@@ -120,11 +122,14 @@ class Trainer:
         xyz, rgb = capture.points.xyz[seeds], capture.points.rgb[seeds]
         camera_centers = np.array([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in capture.views])
         normalization = Normalization.of(camera_centers, xyz)
-        classes = ClassTable(np.concatenate([[0], point_ids]))
-        scene_xyz = normalization.to_scene(xyz)
-        voxel = settings.voxel * normalization.scale if settings.voxel else median_spacing(scene_xyz)
-        point_classes = classes.classes_of(point_ids[seeds])
-        anchors = seed_anchors(scene_xyz, rgb / 255.0, point_classes, voxel, settings.layout, rng)
+        classes = ClassTable(np.concatenate([[0], point_ids, *([] if more is None else [more[2]])]))
+        voxel = settings.voxel * normalization.scale if settings.voxel else median_spacing(normalization.to_scene(xyz))
+        ids = point_ids[seeds]
+        if more is not None:
+            xyz, rgb, ids = (np.concatenate(pair) for pair in zip((xyz, rgb, ids), more, strict=True))
+        anchors = seed_anchors(
+            normalization.to_scene(xyz), rgb / 255.0, classes.classes_of(ids), voxel, settings.layout, rng
+        )
         if settings.mode == "paper":
             anchors.rows[:, settings.layout.color_columns] = 0
         generator = torch.Generator().manual_seed(settings.seed)

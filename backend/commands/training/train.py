@@ -11,6 +11,7 @@ import torch
 from ...capture import Capture
 from ...evaluation import IdScores, comparison, curve_image, psnr, save_image, thumbnail
 from ...export import agreement, fit_splats, write_anchors, write_splats
+from ...labels.mask_points import MaskPoints, place_points
 from ...model.checkpoint import has_checkpoint
 from ...model.draw import draw
 from ...model.object_model import ObjectModel
@@ -34,7 +35,7 @@ from ..length import budget_of, expected_of
 from ..planning import build_context, change_objects, choices, find_requested_objects, report_plan, settings
 from ..setup.kernels import ensure_kernels
 from ..stages import finish_stage, stage
-from ..votes import cast_votes, votes_are_current, votes_key
+from ..votes import cast_votes, object_name, votes_are_current, votes_key
 
 CURVE_VIEWS = 20
 """Largest number of held-out views that are measured during training; `evaluate` measures all."""
@@ -130,6 +131,7 @@ def _begin(
         trainer = Trainer.start(
             planned, context.point_ids, wanted, memory, device,
             seeds=seeds, supervise_background=planned.has_masks and plan.does("rest"), gains=gains,
+            more=_place_missing_objects(planned, context.point_ids, options.seed, reporter),
         )  # fmt: skip
     if options.restart:
         # The new training's first checkpoint replaces that of the old one before anything refers to it.
@@ -139,6 +141,23 @@ def _begin(
     write_plan(folder.plan, plan)
     report_plan(plan, reporter)
     return trainer, plan
+
+
+def _place_missing_objects(capture: Capture, point_ids: np.ndarray, seed: int, reporter: Reporter) -> MaskPoints | None:
+    """Place points for the objects in the masks that have none; report how many, and the objects that stay without."""
+    missing = sorted(set(capture.object_ids.tolist()) - set(point_ids.tolist()))
+    if not missing:
+        return None
+    placed = place_points(capture, missing, seed)
+    for object_id in missing:
+        count, named = int((placed.ids == object_id).sum()), object_name(capture, object_id)
+        if count:
+            reporter.status(
+                f"object {object_id} {named}: {count:,} points where its masks agree, since COLMAP has none"
+            )
+        else:
+            reporter.warning(f"The masks of object {object_id} ({named}) agree nowhere, so training starts without it.")
+    return placed if len(placed.ids) else None
 
 
 def _check_same_training(folder: Reconstruction, capture: Capture, plan: Plan, options: argparse.Namespace) -> None:
