@@ -144,6 +144,16 @@ def comparison(longest: Sequence[Mapping[str, Any]], ends: Sequence[Mapping[str,
     )
 
 
+def mean_psnr(rows: Sequence[Mapping[str, Any]]) -> float:
+    """Return the mean PSNR over seeds, in dB."""
+    return statistics.fmean(row["psnr"] for row in rows)
+
+
+def mean_steps(rows: Sequence[Mapping[str, Any]]) -> float:
+    """Return the mean number of steps over seeds."""
+    return statistics.fmean(row["steps"] for row in rows)
+
+
 def _without_curve(row: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in row.items() if key != "curve"}
 

@@ -8,7 +8,18 @@ from backend.shared.formats import json_file
 from backend.shared.formats.json_file import parse_json, read_json, write_json
 
 DEEP = "[" * 100_000
-BAD = [DEEP, '{"a": ' * 100_000, "1" * 5000, "[NaN]", "[Infinity]", "{", "", "\xff"]
+BAD = [
+    DEEP,
+    '{"a": "\\ud800"}',
+    '["\\uDC00\\uD83D"]',
+    '{"a": ' * 100_000,
+    "1" * 5000,
+    "[NaN]",
+    "[Infinity]",
+    "{",
+    "",
+    "\xff",
+]
 
 
 @pytest.mark.parametrize("text", BAD, ids=range(len(BAD)))
@@ -31,4 +42,6 @@ def test_oversized_json_is_rejected(tmp_path, monkeypatch):
 
 
 def test_valid_json_is_parsed():
-    assert parse_json(b'{"a": [1, 2.5, null, "\\u00e4"]}') == {"a": [1, 2.5, None, "\u00e4"]}
+    assert parse_json(b'{"a": [1, 2.5, null, "\\u00e4", "\\ud83d\\ude00"]}') == {
+        "a": [1, 2.5, None, "\u00e4", "\U0001f600"]
+    }

@@ -41,15 +41,21 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse JSON; raise ValueError if it is invalid, contains NaN or infinity, or is nested too deeply."""
+    """Parse JSON; raise ValueError if it is invalid, contains NaN, infinity or half of a surrogate pair, which UTF-8
+    cannot write, or is nested too deeply."""
 
     def refuse(constant: str) -> None:
         raise ValueError(f"{constant} is not valid in JSON")
 
     try:
-        return json.loads(text, parse_constant=refuse)
+        value = json.loads(text, parse_constant=refuse)
+        if "\\ud" in (text if isinstance(text, str) else text.decode("latin-1")).lower():
+            json.dumps(value, ensure_ascii=False).encode()
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
+    except UnicodeEncodeError as error:
+        raise ValueError("it contains half of a surrogate pair") from error
+    return value
 
 
 def read_json(path: Path) -> Any:
