@@ -30,6 +30,7 @@ MADE_FROM_FIGURES = {
     "ablations": "benchmarks.ablations:document",
     "length": "benchmarks.length:document",
     "mask-noise": "benchmarks.mask_noise:document",
+    "objects": "benchmarks.objects:document",
     "reliability": "tests.fuzz.report:document",
     "stability": "benchmarks.stability:document",
 }

@@ -74,7 +74,7 @@ def open_output(options: argparse.Namespace) -> Iterator[Output]:
     """
     output = Output(Reconstruction(options.out))
     if not options.overwrite:
-        output.folder.require_own()
+        output.folder.require_own(getattr(options, "capture", None))
     with recorded() as created:
         try:
             output.folder.create()

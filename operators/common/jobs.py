@@ -38,13 +38,18 @@ def submit_for_capture(
     return background.submit(job, context.scene, operator.report)
 
 
-def folder_to_import_to(chosen: str, default: Callable[[], Path]) -> Path:
+def folder_to_import_to(chosen: str, default: Callable[[], Path], capture: Path | None = None) -> Path:
     """Return the folder that an import writes to: the one that the user has chosen, or else `default()`.
+
+    Args:
+        chosen: The folder that the user has chosen, or empty.
+        default: Called if it is empty.
+        capture: The capture's folder, which may be in the chosen one.
 
     Raises:
         InputError: A job uses the folder, or it contains files that are not of a reconstruction.
     """
     folder = Path(bpy.path.abspath(chosen)).resolve() if chosen else default()
     need.require_unused(folder)
-    Reconstruction(folder).require_own()
+    Reconstruction(folder).require_own(capture)
     return folder

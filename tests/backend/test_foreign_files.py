@@ -1,6 +1,7 @@
 """Commands neither delete nor overwrite files of others."""
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -72,6 +73,23 @@ def test_folder_with_foreign_files_is_rejected(run_command, tmp_path, capture, t
     options = ["--restart", *LENGTH] if command == "train" else []
     assert_rejected(run_command(command, source, "--out", out, *options), str(out), "choose an")
     assert contents(out) == before
+
+
+def test_capture_may_be_in_the_folder(run_command, tmp_path, capture):
+    """As in `make demo`: the capture is in the folder of the reconstruction."""
+    out = tmp_path / "scene"
+    inside = shutil.copytree(capture, out / "footage" / "capture")
+    assert run_command("vote", inside, "--out", out).code == EXIT_DONE
+    assert (out / "points.ply").exists() and contents(inside) == contents(capture)
+
+
+def test_capture_in_place_of_own_files_is_rejected(run_command, tmp_path, capture):
+    out = tmp_path / "scene"
+    inside = shutil.copytree(capture, out / "cache")
+    assert_rejected(run_command("vote", inside, "--out", out), str(out), "choose an")
+    (out / "cache").rename(out / "capture")
+    (out / "thesis.odt").write_text("not yours")
+    assert_rejected(run_command("vote", out / "capture", "--out", out), "thesis.odt")
 
 
 def test_overwrite_allows_folder_with_foreign_files(run_command, tmp_path, capture):

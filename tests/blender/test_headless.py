@@ -271,6 +271,16 @@ def test_run_makes_meshes_before_evaluation(capture, trained, meshed, backend_py
     assert "mesh" not in calls.read_text().split() and not (folder / "pulled-apart.png").exists()
 
 
+def test_make_demo_reconstructs_around_its_capture(capture, backend_python, tmp_path):
+    recipe = (headless.ROOT / "Makefile").read_text(encoding="utf-8")
+    assert "run $(DEMO)/capture --out $(DEMO) " in recipe
+    folder = tmp_path / "demo"
+    shutil.copytree(capture, folder / "capture")
+    ran = run("run", folder / "capture", "--out", folder, "--steps", "5", *SIZE, "--no-meshes")
+    assert ran.returncode == 0, ran.output + ran.errors
+    assert (folder / "report.md").exists() and (folder / "objectgs.blend").exists()
+
+
 def test_run_succeeds_without_meshes(capture, trained, backend_python, tmp_path):
     folder = shutil.copytree(trained, tmp_path / "out")
     python, _ = fake_python(

@@ -43,8 +43,11 @@ class Reconstruction:
             if is_same or target == own.resolve() or own.resolve() in target.parents:
                 raise InputError(f"{path} belongs to the reconstruction itself; choose another file or folder.")
 
-    def foreign_file(self) -> str | None:
+    def foreign_file(self, capture: Path | None = None) -> str | None:
         """Return the name of a file in a folder that is not a reconstruction; None if commands may use the folder.
+
+        Args:
+            capture: The capture's folder, which may be in the reconstruction's.
 
         Raises:
             InputError: The folder cannot be read.
@@ -55,11 +58,16 @@ class Reconstruction:
             names = sorted(entry.name for entry in os.scandir(self.folder))
         except OSError as error:
             raise InputError(f"The folder {self.folder} cannot be read ({error.strerror}).") from error
-        return next((name for name in names if name not in _IGNORED and not name.startswith(PART_PREFIX)), None)
+        ignored = set(_IGNORED)
+        if capture is not None and capture.resolve().is_relative_to(self.folder.resolve()):
+            parts = capture.resolve().relative_to(self.folder.resolve()).parts
+            own = {path.name for path in vars(self).values() if path != self.folder}
+            ignored.update(set(parts[:1]) - own)
+        return next((name for name in names if name not in ignored and not name.startswith(PART_PREFIX)), None)
 
-    def require_own(self) -> None:
-        """Raise InputError if the folder contains files, but no reconstruction."""
-        foreign = self.foreign_file()
+    def require_own(self, capture: Path | None = None) -> None:
+        """Raise InputError if the folder contains files, apart from those of `capture`, but no reconstruction."""
+        foreign = self.foreign_file(capture)
         if foreign is not None:
             raise InputError(
                 f"The folder {self.folder} contains files (such as {foreign}), but no reconstruction; choose an "
