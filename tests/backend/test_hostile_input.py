@@ -139,6 +139,18 @@ def test_far_points_are_left_out(write_capture, run_command, tmp_path, value):
     assert result.code == EXIT_DONE and "1 points whose coordinates are not finite or exceed 1e+12" in result.err
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [1e308, -1e308])
+def test_huge_errors_of_points_give_no_warning(write_capture, run_command, value):
+    capture = write_capture(views=4, suffix=".txt").folder
+    path = capture / "sparse" / "0" / "points3D.txt"
+    lines = path.read_text().split("\n")
+    words = lines[3].split(" ")
+    lines[3] = " ".join([*words[:7], repr(value), *words[8:]])
+    path.write_text("\n".join(lines))
+    assert run_command("check", capture).code == EXIT_DONE
+
+
 def test_spherical_harmonics_beyond_degree_3_are_rejected(trained, tmp_path):  # noqa: F811
     data = (trained[1] / "splats.ply").read_bytes()
     extra = b"".join(b"property float f_rest_%d\n" % i for i in range(9, 3 * (32**2 - 1)))

@@ -166,7 +166,8 @@ def _validate(model: Model, raw: list[RawImage]) -> Model:
         known = (sorted_ids[at] == image.point_ids) & np.isfinite(image.xy).all(1)
         viewmat = _compute_viewmat(image, images_file)
         images.append(Image(image.name, image.camera_id, viewmat, image.xy[known], order[at[known]]))
-    error = model.error[finite].astype(np.float32)
+    largest = np.finfo(np.float32).max
+    error = np.clip(model.error[finite], -largest, largest).astype(np.float32)
     return Model(model.folder, model.suffix, model.cameras, images, xyz, model.rgb[finite], error, ids, model.warnings)
 
 
