@@ -10,6 +10,7 @@ directly, 32.6 dB with degree 1, and 29.2 dB for splats generated from the cente
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -69,19 +70,23 @@ def fit_splats(
     return concatenate(parts) if parts else Splats.empty(SH_DEGREE), np.concatenate(sources)
 
 
-def agreement(
-    model: ObjectModel, splats: Splats, cameras: Sequence[Camera], background: Sequence[float] | None = None
-) -> float | None:
-    """Measure how well plain splats reproduce a model.
+class Agreement(NamedTuple):
+    """Mean PSNR in dB of renders of plain splats to those of a model: on the model's background, and on black."""
+
+    psnr: float
+    on_black: float
+
+
+def agreement(model: ObjectModel, splats: Splats, cameras: Sequence[Camera]) -> Agreement | None:
+    """Measure how well plain splats reproduce a model, whose renders have its background.
 
     Args:
         model: The model.
-        splats: The fitted splats in world units.
+        splats: The exported splats in world units.
         cameras: The cameras in scene units.
-        background: Red, green and blue behind the splats, 0 .. 1; None: the model's.
 
     Returns:
-        The mean PSNR in dB of renders of `splats` against those of `model`; None if there are no cameras.
+        The agreement; None if there are no cameras.
     """
 
     def tensor(values: NDArray) -> torch.Tensor:
@@ -91,16 +96,19 @@ def agreement(
     scales = tensor(splats.scales * model.normalization.scale)
     quats, opacities, sh = tensor(splats.quats), tensor(splats.opacities), tensor(splats.sh)
     ids = torch.zeros(len(splats), dtype=torch.int32, device=model.device)
-    behind = model.background.detach() if background is None else tensor(np.asarray(background))
+    background = model.background.detach()
     found = []
     for camera in cameras:
         with torch.no_grad():
             drawn = rasterize(means, quats, scales, opacities, sh, ids, camera)
-            image = drawn.color + (1 - drawn.alpha) * behind[:, None, None]
-            image = image * torch.tensor(camera.gain).to(image.device)[:, None, None]
-        shown = devices.host(image.clamp(0, 1).permute(1, 2, 0))
-        found.append(psnr(shown, draw(model, camera, want_ids=False).image))
-    return float(np.mean(found)) if found else None
+        wanted = draw(model, camera, want_ids=False).image
+        gain = torch.tensor(camera.gain).to(drawn.color.device)[:, None, None]
+        both = []
+        for behind in (background, torch.zeros_like(background)):
+            image = (drawn.color + (1 - drawn.alpha) * behind[:, None, None]) * gain
+            both.append(psnr(devices.host(image.clamp(0, 1).permute(1, 2, 0)), wanted))
+        found.append(both)
+    return Agreement(*np.mean(found, axis=0).tolist()) if found else None
 
 
 class _Sums:

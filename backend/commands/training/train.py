@@ -41,7 +41,10 @@ CURVE_VIEWS = 20
 """Largest number of held-out views that are measured during training; `evaluate` measures all."""
 
 _COMPARED_VIEWS = 20
-"""Largest number of views on which the exported splats are compared with the model."""
+"""Largest number of views on which exported splats that are not exactly the model are compared with it."""
+
+_CHECKED_VIEWS = 5
+"""Largest number of views on which others are compared, to check them and the background."""
 
 _CLEAR_ON_BLACK = 40.0
 """PSNR in dB above which a missing background makes no visible difference."""
@@ -271,14 +274,20 @@ def _write_export(
     background = [round(float(value), 4) for value in model.background.detach().cpu()]
     psnr = on_black = None
     if compare:
-        cameras = [scene.camera(i) for i in (capture.test_indices or capture.train_indices)[:_COMPARED_VIEWS]]
-        psnr = plain(agreement(model, splats, cameras))
-        on_black = plain(agreement(model, splats, cameras, (0.0, 0.0, 0.0))) if any(background) else psnr
+        most = _COMPARED_VIEWS if _is_approximate(model) else _CHECKED_VIEWS
+        views = (capture.test_indices or capture.train_indices)[:most]
+        found = agreement(model, splats, [scene.camera(i) for i in views])
+        psnr, on_black = plain(found) or (None, None)
         _say_how_well(model, folder, capture, psnr, on_black, reporter)
     for sentence in write_splats(folder.splats, splats, background=background):
         reporter.warning(sentence)
     write_anchors(folder.anchors, model, splats, source)
     return ExportRecord(len(splats), len(model.anchors), _rounded(psnr), _rounded(on_black), background)
+
+
+def _is_approximate(model: ObjectModel) -> bool:
+    """Return whether plain splats are not exactly the model."""
+    return not model.explicit or model.primitive == "2d"
 
 
 def _say_how_well(
@@ -291,7 +300,7 @@ def _say_how_well(
 ) -> None:
     """Report how well splats.ply shows a model that it is not, and what is lost without the background."""
     where = "held-out" if capture.test_indices else "training"
-    if not model.explicit or model.primitive == "2d":
+    if _is_approximate(model):
         what, has = (
             ("A view-dependent model has no exact splats", "a fit")
             if not model.explicit
