@@ -40,9 +40,9 @@ SEEDS = {DEMO: 3, "300 s": 2, CONVERGED: 2}
 and more apart."""
 
 _COLUMNS = (
-    ("train_seconds", "seconds", "{:.0f}"), ("steps", "steps", "{:,.0f}"), ("psnr", "PSNR", "{:.2f} dB"),
+    ("train_seconds", "seconds", "{:.0f}"), ("steps", "steps", "{:,.0f}"), ("psnr", "PSNR, dB", "{:.2f}"),
     ("miou", "mIoU", "{:.4f}"), ("mbiou", "mBIoU", "{:.4f}"), ("f1_005", "F1 at 5 mm", "{:.3f}"),
-    ("f1", "F1 at 2 cm", "{:.3f}"), ("texture_psnr", "texture", "{:.1f} dB"),
+    ("f1", "F1 at 2 cm", "{:.3f}"), ("texture_psnr", "texture, dB", "{:.1f}"),
 )  # fmt: skip
 
 

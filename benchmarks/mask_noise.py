@@ -273,7 +273,6 @@ def document(figures: Mapping[str, Any]) -> str:
         f"{_named(entries, closer)}.",
         f"- The paper states that its results have fewer holes than the masks. This holds in {len(fewer)} of"
         f" {len(with_holes)} cases whose masks have holes{_named(with_holes, fewer)}.",
-        "",
         *_ranking(found),
         "",
         "![mIoU and holes of masks and rendered IDs over the level of errors](mask-noise.png)",
