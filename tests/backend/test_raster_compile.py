@@ -117,10 +117,7 @@ print(tangent_limits(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 2.0, 2.0)[1], sum(tangent_lim
     assert [limit(), limit()] == [[2.5, 0], [2.5, 1]]
 
 
-@pytest.mark.parametrize(
-    ("changed", "renewed"), [("raster/camera.py", True), ("model/heads.py", True), ("training/settings.py", False)]
-)
-def test_model_kernels_depend_only_on_lower_layers(tmp_path, changed, renewed):
+def test_model_kernels_depend_only_on_lower_layers(tmp_path):
     copy_backend(tmp_path)
     script = """
 import numpy as np
@@ -136,9 +133,10 @@ print(sum(_head_output.stats.cache_hits.values()))
         return int(done.stdout)
 
     assert [hits(), hits()] == [0, 1]
-    path = tmp_path / "backend" / changed
-    path.write_text(path.read_text() + "CHANGED = 1\n")
-    assert hits() == (0 if renewed else 1)
+    for changed, expected in (("training/settings.py", 1), ("raster/camera.py", 0), ("model/heads.py", 0)):
+        path = tmp_path / "backend" / changed
+        path.write_text(path.read_text() + "CHANGED = 1\n")
+        assert hits() == expected, changed
 
 
 @pytest.mark.parametrize(
