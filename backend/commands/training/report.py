@@ -213,7 +213,7 @@ def _left_out(trained: Trained) -> list[dict[str, str]]:
             settings["background"] != "learned", "a learned background",
             f"--background {settings['background']} was given",
         ),
-        (not capture.test_indices, "quality on held-out views", "there are too few views for held-out ones"),
+        (not capture.test_indices, "quality on held-out views", "the capture holds out no view, or has too few"),
         (bool(capture.test_indices), "LPIPS", "it needs a trained network, which is not part of this program"),
     ]  # fmt: skip
     planned = [{"what": decision.what, "why": decision.reason} for decision in trained.plan.left_out]
