@@ -1,9 +1,9 @@
-"""One scene of the paper's datasets: converted, trained, measured by its protocol, and compared with the paper.
+"""Scenes of the paper's datasets: converted, trained, measured by their protocol, and compared with the paper.
 
-    python benchmarks/reproduce.py DATASET SCENE --out DIR [--steps N | --minutes M] [--json]
+    python benchmarks/reproduce.py DATASET SCENE [SCENE ...] --out DIR [--steps N | --minutes M] [--json]
 
-SCENE is the folder of a scene; docs/reproduce.md says where it comes from and which files it has. The capture is
-written to DIR/capture, the reconstruction to DIR/reconstruction, and the figures to DIR/figures.json. The same command
+SCENE is the folder of a scene; docs/reproduce.md says where it comes from and which files it has. In DIR, each scene
+has a folder of its name with its capture, its reconstruction, and its figures in figures.json. The same command
 continues a run that was stopped.
 """
 
@@ -25,7 +25,7 @@ if str(ROOT) not in sys.path:
 import numpy as np
 
 from backend.model.checkpoint import load_checkpoint
-from backend.shared.errors import EXIT_BAD_INPUT, InputError
+from backend.shared.errors import EXIT_BAD_INPUT, EXIT_DONE, InputError
 from backend.shared.formats.anchors_ply import read_anchor_table
 from backend.shared.formats.json_file import plain, read_json, write_json
 from backend.shared.formats.splat_ply import ids_of, read_splat_table, unobserved_of
@@ -33,7 +33,7 @@ from backend.shared.reconstruction.folder import Reconstruction
 from benchmarks import shared
 from benchmarks.protocols import lerf_mask, replica, scannetpp, three_d_ovs
 from benchmarks.protocols.captures import read_pixels
-from benchmarks.protocols.metrics import Results
+from benchmarks.protocols.metrics import Results, mean
 
 DATASETS = {"lerf-mask": lerf_mask, "3d-ovs": three_d_ovs, "replica": replica, "scannetpp": scannetpp}
 
@@ -41,7 +41,7 @@ PAPER_STEPS = 30_000
 
 
 def converted(dataset: str, scene: Path, out: Path, every: int | None = None) -> Path:
-    """Return the capture of a scene in OUT/capture, converted unless it is there.
+    """Return the capture of a scene in OUT/capture; it is converted unless it is there.
 
     Raises:
         InputError: The scene cannot be used, or OUT has the capture of another scene.
@@ -63,10 +63,19 @@ def converted(dataset: str, scene: Path, out: Path, every: int | None = None) ->
     return capture
 
 
-def run(*words: object) -> int:
-    """Run a command of the program, with its messages on the error output; return its exit code."""
+class CommandFailed(Exception):
+    """A command of the program failed, and has said why; code is its exit code."""
+
+    def __init__(self, code: int) -> None:
+        self.code = code
+
+
+def run(*words: object) -> None:
+    """Run a command of the program, with its messages on the error output; raise CommandFailed if it fails."""
     command = [sys.executable, "-m", "backend", *map(str, words)]
-    return subprocess.run(command, cwd=ROOT, stdout=2, check=False).returncode
+    code = subprocess.run(command, cwd=ROOT, stdout=2, check=False).returncode
+    if code:
+        raise CommandFailed(code)
 
 
 def read_results(folder: Path) -> Results:
@@ -93,87 +102,125 @@ def _by_object(table: np.ndarray) -> dict[int, np.ndarray]:
     return {int(i): xyz[ids == i] for i in np.unique(ids) if i > 0}
 
 
-def text(dataset: str, scene: str, figures: Mapping[str, Any], training: Mapping[str, Any]) -> str:
-    """Return the figures of a scene as tables, beside the paper's.
+def table(dataset: str, theirs: Mapping[str, float], figures: Mapping[str, Any]) -> list[str]:
+    """Return the lines of a table of figures beside the paper's.
 
     Args:
         dataset: Key of `DATASETS`.
-        scene: Name of the scene, as in the paper.
+        theirs: The paper's figures.
         figures: As from the dataset's `measure`.
-        training: steps and seconds of the training.
     """
-    module = DATASETS[dataset]
-    theirs = module.paper(scene)
+    labels = DATASETS[dataset].FIGURES
 
     def form(key: str, value: float | None) -> str:
-        return "" if value is None else module.FIGURES[key][1].format(value)
+        return "" if value is None else labels[key][1].format(value)
 
-    rows = [[label, form(key, theirs.get(key)), form(key, figures[key])] for key, (label, _) in module.FIGURES.items()]
+    rows = [[label, form(key, theirs.get(key)), form(key, figures[key])] for key, (label, _) in labels.items()]
+    return shared.table(["", "paper", "ours"], rows)
+
+
+def text(found: Mapping[str, Any]) -> str:
+    """Return the result of a scene, as from `reproduce`, with the figures beside the paper's."""
+    training, figures = found["training"], found["figures"]
     length = f"{training['steps']:,} steps in {training['seconds'] / 60:.1f} minutes; the paper trains {PAPER_STEPS:,}"
-    lines = [f"{dataset}, {scene}: {length}.", "", *shared.table(["", "paper", "ours"], rows), ""]
+    lines = [
+        f"{found['dataset']}, {found['scene']}: {length}.", "",
+        *table(found["dataset"], found["paper"], figures), "",
+    ]  # fmt: skip
     if prompts := figures.get("prompts"):
-        found = [
+        rows = [
             [
                 row["prompt"], "none" if row["id"] is None else str(row["id"]), str(row["views"]),
                 f"{100 * row['iou']:.1f}", f"{100 * row['biou']:.1f}",
             ]
             for row in prompts
         ]  # fmt: skip
-        lines += [*shared.table(["prompt", "object ID", "views", "IoU (%)", "BIoU (%)"], found), ""]
-    return "\n".join([*lines, *module.NOTES])
+        lines += [*shared.table(["prompt", "object ID", "views", "IoU (%)", "BIoU (%)"], rows), ""]
+    return "\n".join(lines)
 
 
-def reproduce(options: argparse.Namespace) -> int:
-    """Convert, train, measure and print; return the exit code.
+def means(dataset: str, found: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
+    """Return the mean of each figure over the scenes that have it."""
+    return {
+        key: mean(result["figures"][key] for result in found if result["figures"][key] is not None)
+        for key in DATASETS[dataset].FIGURES
+    }
+
+
+def reproduce(dataset: str, scene: Path, out: Path, length: Sequence[object], every: int | None) -> dict[str, Any]:
+    """Convert, train and measure a scene.
+
+    Args:
+        dataset: Key of `DATASETS`.
+        scene: Folder of the scene.
+        out: Folder for its capture, reconstruction and figures.
+        length: Options of `train` for the length of the training.
+        every: For Replica, one of this many frames is a view.
+
+    Returns:
+        dataset, scene (its name), training (steps and seconds), figures, as from `measure`, and the paper's figures.
 
     Raises:
-        InputError: The scene or the folder of --out cannot be used.
+        InputError: The scene or the output folder cannot be used.
+        CommandFailed: A command of the program failed.
     """
-    module = DATASETS[options.dataset]
-    out = options.out.resolve()
-    capture = converted(options.dataset, options.scene, out, options.every)
+    module = DATASETS[dataset]
+    capture = converted(dataset, scene, out, every)
     folder = out / "reconstruction"
-    length = ("--steps", options.steps) if options.minutes is None else ("--minutes", options.minutes)
+    run("train", capture, "--out", folder, *length, *module.TRAINING)
     name, *arguments = module.AFTER_TRAINING
-    for words in (("train", capture, "--out", folder, *length, *module.TRAINING), (name, folder, *arguments)):
-        if code := run(*words):
-            return code
-    figures = module.measure(options.scene, capture, read_results(folder))
+    run(name, folder, *arguments)
+    figures = module.measure(scene, capture, read_results(folder))
     progress = load_checkpoint(Reconstruction(folder).checkpoint)[1]["progress"]
-    training = {"steps": progress["step"], "seconds": progress["seconds"]}
-    scene = options.scene.resolve().name
-    written = plain({
-        "dataset": options.dataset, "scene": scene, "training": training, "figures": figures,
-        "paper": module.paper(scene),
+    found = plain({
+        "dataset": dataset, "scene": scene.name,
+        "training": {"steps": progress["step"], "seconds": progress["seconds"]},
+        "figures": figures, "paper": module.paper(scene.name),
     })  # fmt: skip
-    write_json(out / "figures.json", written)
-    print(json.dumps(written) if options.json else text(options.dataset, scene, figures, training))
-    return 0
+    write_json(out / "figures.json", found)
+    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse the arguments, and reproduce a scene."""
+    """Parse the arguments, reproduce the scenes and print their figures."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
     parser.add_argument("dataset", choices=DATASETS)
-    parser.add_argument("scene", type=Path)
+    parser.add_argument("scene", type=Path, nargs="+")
     parser.add_argument("--out", type=Path, required=True)
     length = parser.add_mutually_exclusive_group()
     length.add_argument(
         "--steps", type=int, default=PAPER_STEPS, help=f"training steps ({PAPER_STEPS:,}, as in the paper)"
     )
-    length.add_argument("--minutes", type=float, help="training time instead of steps")
+    length.add_argument("--minutes", type=float, help="training time of a scene instead of steps")
     parser.add_argument("--every", type=int, help=f"replica: one of this many frames is a view ({replica.EVERY})")
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
     options = parser.parse_args(arguments)
     if options.every is not None and (options.dataset != "replica" or options.every < 1):
         parser.error("--every is a number of frames, of replica alone")
+    words = ("--steps", options.steps) if options.minutes is None else ("--minutes", options.minutes)
+    found = []
     try:
-        return reproduce(options)
+        for scene in (path.resolve() for path in options.scene):
+            out = options.out.resolve() / scene.name
+            found.append(reproduce(options.dataset, scene, out, words, options.every))
+            if not options.json:
+                print(text(found[-1]), flush=True)
     except InputError as error:
         print(error, file=sys.stderr)
         return EXIT_BAD_INPUT
+    except CommandFailed as error:
+        return error.code
+    module, mean_of_all = DATASETS[options.dataset], means(options.dataset, found)
+    if options.json:
+        print(json.dumps({"scenes": found, "mean": mean_of_all}))
+        return EXIT_DONE
+    if len(found) > 1:
+        rows = table(options.dataset, module.paper("mean"), mean_of_all)
+        print("\n".join([f"Mean of {len(found)} scenes:", "", *rows, ""]))
+    print("\n".join(module.NOTES))
+    return EXIT_DONE
 
 
 if __name__ == "__main__":

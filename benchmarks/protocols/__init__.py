@@ -7,6 +7,6 @@ A module of a dataset has
     TRAINING                   options of `train`, as in the paper
     AFTER_TRAINING             the command that makes what `measure` needs
     FIGURES                    key -> (label, form) of the figures, in the order of the table
-    paper(scene)               the paper's figures, by key
+    paper(scene)               the paper's figures of a scene, or of "mean", by key
     NOTES                      sentences below the table: what its figures are
 """

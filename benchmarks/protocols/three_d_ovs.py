@@ -34,11 +34,11 @@ NOTES = (
     "mIoU is the mean over all classes in all test views, over the full frame.",
 )
 
-_PAPER = {"bed": 98.0, "bench": 96.4, "room": 95.1, "lawn": 97.2, "sofa": 95.4}
+_PAPER = {"bed": 98.0, "bench": 96.4, "room": 95.1, "lawn": 97.2, "sofa": 95.4, "mean": 96.4}
 
 
 def paper(scene: str) -> dict[str, float]:
-    """Return the paper's figures of a scene; {} if it has none."""
+    """Return the paper's figures of a scene or their mean; {} if it has none."""
     return {"miou": _PAPER[scene]} if scene in _PAPER else {}
 
 

@@ -428,9 +428,9 @@ def test_scannetpp_scores_points_of_objects(scan, tmp_path):
     assert figures["psnr"] == 30 and figures["lpips"] is None and figures["accuracy"] == 99
     assert figures["anchors_chamfer"] == 0 and figures["anchors_f1"] == 100 and figures["anchors_missing"] == 0
     assert figures["splats_missing"] == 1 and figures["splats_f1"] < 30 and figures["splats_chamfer"] > 0.05
-    text = reproduce.text("scannetpp", "0a1b2c", figures, {"steps": 400, "seconds": 90})
+    text = "\n".join(reproduce.table("scannetpp", scannetpp.paper("0a1b2c"), figures))
     assert "| LPIPS | 0.1488 |  |" in text and "| anchors: Chamfer distance (m) | 0.1132 | 0.0000 |" in text
-    assert "| splats: objects without points |  | 1 |" in text and "means over all its scenes" in text
+    assert "| splats: objects without points |  | 1 |" in text
 
 
 def test_scannetpp_with_segments_of_another_mesh_is_refused(scan):
@@ -448,13 +448,23 @@ def test_table_has_the_papers_figures_beside_ours():
         "miou": 50.0, "mbiou": 40.0, "miou_others": None, "mbiou_others": None,
         "prompts": [{"prompt": "cup", "id": None, "views": 2, "iou": 0.0, "biou": 0.0}],
     }  # fmt: skip
-    training = {"steps": 12_000, "seconds": 600}
-    text = reproduce.text("lerf-mask", "figurines", figures, training)
+    found = {
+        "dataset": "lerf-mask", "scene": "figurines", "training": {"steps": 12_000, "seconds": 600},
+        "figures": figures, "paper": lerf_mask.paper("figurines"),
+    }  # fmt: skip
+    text = reproduce.text(found)
     assert text.startswith("lerf-mask, figurines: 12,000 steps in 10.0 minutes; the paper trains 30,000.\n")
     assert "|  | paper | ours |" in text and "| mIoU (%) | 88.2 | 50.0 |" in text
     assert "| mBIoU (%), without the views of the association |  |  |" in text
-    assert "| cup | none | 2 | 0.0 | 0.0 |" in text and "first test view" in text
-    assert "| mIoU (%) |  | 50.0 |" in reproduce.text("lerf-mask", "garden", figures, training), "not in the paper"
+    assert "| cup | none | 2 | 0.0 | 0.0 |" in text
+    assert "| mIoU (%) |  | 50.0 |" in reproduce.text({**found, "paper": lerf_mask.paper("garden")}), "not in the paper"
+
+
+def test_means_are_over_the_scenes_that_have_a_figure():
+    figures = [{"miou": 50.0, "miou_others": None}, {"miou": 60.0, "miou_others": 30.0}]
+    mean = reproduce.means("3d-ovs", [{"figures": row} for row in figures])
+    assert mean == {"miou": 55.0, "miou_others": 30.0}
+    assert "| mIoU (%) | 96.4 | 55.0 |" in reproduce.table("3d-ovs", three_d_ovs.paper("mean"), mean)
 
 
 def test_every_module_has_what_the_command_needs():
@@ -483,20 +493,29 @@ def test_unusable_scene_is_reported_in_a_sentence(tmp_path, capsys):
 
 
 def test_scene_is_trained_and_measured(lerf, tmp_path, capfd):
-    words = ["lerf-mask", str(lerf.folder), "--out", str(tmp_path / "out"), "--steps", "60"]
+    words = ["lerf-mask", str(lerf.folder), "--out", str(tmp_path / "all"), "--steps", "60"]
     assert reproduce.main(words) == EXIT_DONE
+    out = tmp_path / "all" / "figurines"
     printed = capfd.readouterr().out
     assert printed.startswith("lerf-mask, figurines: 60 steps in ") and "| mIoU (%) | 88.2 | " in printed
-    written = json.loads((tmp_path / "out" / "figures.json").read_text())
+    assert "first test view" in printed and "Mean of" not in printed
+    written = json.loads((out / "figures.json").read_text())
     assert written["training"]["steps"] == 60 and written["paper"] == {"miou": 88.2, "mbiou": 85.2}
     assert 0 < written["figures"]["miou"] <= 100 and len(written["figures"]["prompts"]) == 3
-    settings = json.loads((tmp_path / "out" / "reconstruction" / "objectgs.json").read_text())["training"]["settings"]
+    settings = json.loads((out / "reconstruction" / "objectgs.json").read_text())["training"]["settings"]
     assert settings["semantic_weight"] == 0.01, "as in the paper"
-    results = reproduce.read_results(tmp_path / "out" / "reconstruction")
+    results = reproduce.read_results(out / "reconstruction")
     assert set(results.points["anchors"]) == set(results.points["splats"]) == {1, 2, 5}
-    assert (
-        json.loads(json.dumps(lerf_mask.measure(lerf.folder, tmp_path / "out" / "capture", results)))
-        == (written["figures"])
-    )
+    again = lerf_mask.measure(lerf.folder, out / "capture", results)
+    assert json.loads(json.dumps(again)) == written["figures"]
     assert reproduce.main([*words, "--json"]) == EXIT_DONE
-    assert json.loads(capfd.readouterr().out) == written
+    assert json.loads(capfd.readouterr().out)["scenes"] == [written]
+
+
+def test_failed_command_ends_the_run_with_its_code(ovs, tmp_path, monkeypatch, capsys):
+    def fail(*words):
+        raise reproduce.CommandFailed(130)
+
+    monkeypatch.setattr(reproduce, "run", fail)
+    assert reproduce.main(["3d-ovs", str(ovs.folder), "--out", str(tmp_path / "out")]) == 130
+    assert (tmp_path / "out" / "bed" / "capture" / "test.txt").exists() and capsys.readouterr().out == ""
