@@ -60,7 +60,8 @@ def convert(scene: Path, folder: Path) -> None:
 def _test_views(scene: Path, model: Model) -> list[str]:
     """Return the names of the test views, sorted."""
     trained = {path.stem for path in need(scene / "images_train", "the photos to train on").iterdir()}
-    views = sorted(image.name for image in model.images if Path(image.name).stem not in trained)
+    present = [image.name for image in model.images if (scene / "images" / image.name).exists()]
+    views = sorted(name for name in present if Path(name).stem not in trained)
     if not views:
         raise InputError(f"{scene / 'images_train'} contains all photos, so there is no test view; remove those.")
     return views

@@ -204,6 +204,12 @@ def test_lerf_mask_masks_follow_distorted_photos(write_capture, tmp_path):
     assert figures["miou"] > 90 and figures["miou_others"] is None, "there is one test view"
 
 
+def test_lerf_mask_photos_that_are_absent_are_no_test_views(lerf):
+    (lerf.folder / "images" / "view_002.png").unlink()
+    shutil.rmtree(lerf.folder / "test_mask" / "41")
+    assert list(lerf_mask.true_masks(lerf.folder)) == ["view_007.png"]
+
+
 def test_incomplete_lerf_mask_is_refused(lerf, tmp_path):
     (lerf.folder / "test_mask" / "7").mkdir()
     with pytest.raises(InputError, match="3 folders for 2 test views"):
