@@ -323,7 +323,8 @@ def read_held_out(folder: Path) -> list[str] | None:
     try:
         lines = read_regular(path, LARGEST).decode("utf-8-sig").splitlines()
     except (OSError, ValueError) as error:
-        why = getattr(error, "strerror", None) or "it is not text in UTF-8"
+        not_text = isinstance(error, UnicodeDecodeError)
+        why = "it is not text in UTF-8" if not_text else getattr(error, "strerror", None) or str(error)
         raise InputError(f"{path} cannot be read ({why}); write one view name a line, or remove it.") from error
     return [name for line in lines if (name := line.strip())]
 
