@@ -1,8 +1,18 @@
 """Captures: images, ID masks and COLMAP models, loaded as undistorted pinhole views."""
 
-from .capture import Capture, Keypoints, Points, View
+from .capture import Capture, Keypoints, Points, View, default_split
 from .prepare import load_capture
 from .survey import check_capture
 from .upright import Upright, compute_upright
 
-__all__ = ["Capture", "Keypoints", "Points", "Upright", "View", "check_capture", "compute_upright", "load_capture"]
+__all__ = [
+    "Capture",
+    "Keypoints",
+    "Points",
+    "Upright",
+    "View",
+    "check_capture",
+    "compute_upright",
+    "default_split",
+    "load_capture",
+]

@@ -18,7 +18,8 @@ from .files import read_image, read_mask
 from .undistort import is_pinhole, to_pycolmap, undistort
 
 HOLDOUT_EVERY = 8
-"""Every 8th view by file name is held out of training; quality is measured on these views only."""
+"""Every 8th view by file name is held out of training, unless test.txt names others; quality is measured on these views
+only."""
 
 MIN_VIEWS_TO_HOLD_OUT = 3
 _KEYPOINT_TOLERANCE = 0.5
@@ -96,6 +97,7 @@ class Capture:
         color_masks: bool,
         memory_mb: float,
         prepared: bool = True,
+        held_out: Collection[str] | None = None,
     ) -> None:
         self.folder = folder
         self.views = views
@@ -109,11 +111,11 @@ class Capture:
         self._cache = _ArrayCache(memory_mb * 1e6)
         self.prepared = prepared
         self.left_out = np.zeros(0, np.int64)
-        enough = len(views) >= MIN_VIEWS_TO_HOLD_OUT
-        held_out = [i for i in range(len(views)) if enough and i % HOLDOUT_EVERY == 0]
-        self.test_indices: tuple[int, ...] = tuple(held_out)
-        self.train_indices: tuple[int, ...] = tuple(i for i in range(len(views)) if i not in set(held_out))
-
+        test = default_split(len(views))
+        if held_out is not None:
+            test = tuple(i for i, view in enumerate(views) if view.name in held_out)
+        self.test_indices: tuple[int, ...] = test
+        self.train_indices: tuple[int, ...] = tuple(i for i in range(len(views)) if i not in set(test))
         self.validation_indices: tuple[int, ...] = ()
 
     def __len__(self) -> int:
@@ -260,6 +262,11 @@ class Capture:
         if downscale < 1 or width < 1 or height < 1:
             raise ValueError(f"a view of {view.width}x{view.height} cannot be reduced by {downscale}")
         return width, height
+
+
+def default_split(views: int) -> tuple[int, ...]:
+    """Return the indices of the views that are held out of this many if the capture does not name them."""
+    return tuple(range(0, views, HOLDOUT_EVERY)) if views >= MIN_VIEWS_TO_HOLD_OUT else ()
 
 
 def needs_no_resampling(camera: Camera, width: int, height: int) -> bool:

@@ -1,4 +1,4 @@
-"""The files of a capture: images, ID masks in all accepted formats, and label names."""
+"""The files of a capture: images, ID masks in all accepted formats, label names, and names of held-out views."""
 
 from __future__ import annotations
 
@@ -300,6 +300,33 @@ def write_image(path: Path, image: PilImage.Image) -> None:
 
 
 # Names
+
+HELD_OUT = "test.txt"
+"""File in a capture's folder with the names of the held-out views."""
+
+
+def read_held_out(folder: Path) -> list[str] | None:
+    """Read the names of the held-out views of a capture.
+
+    Args:
+        folder: The capture, with a file test.txt that has one view name a line.
+
+    Returns:
+        The names, in the file's order; None if there is no such file.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
+    path = folder / HELD_OUT
+    if not path.exists():
+        return None
+    try:
+        lines = read_regular(path, LARGEST).decode("utf-8-sig").splitlines()
+    except (OSError, ValueError) as error:
+        not_text = isinstance(error, UnicodeDecodeError)
+        why = "it is not text in UTF-8" if not_text else getattr(error, "strerror", None) or str(error)
+        raise InputError(f"{path} cannot be read ({why}); write one view name a line, or remove it.") from error
+    return [name for line in lines if (name := line.strip())]
 
 
 def read_names(folder: Path) -> dict[int, str]:

@@ -30,9 +30,9 @@ def load_capture(
 ) -> Capture:
     """Load a capture.
 
-    A capture has images/, a COLMAP model (sparse/0, sparse/ or beside images/), and optionally masks/ and labels.json
-    or labels.txt. Images that are distorted or too large are resampled into the cache, and again only if their source
-    files change. An interrupted run leaves no incomplete files.
+    A capture has images/, a COLMAP model (sparse/0, sparse/ or beside images/), and optionally masks/, labels.json or
+    labels.txt, and test.txt with the names of the held-out views. Images that are distorted or too large are resampled
+    into the cache, and again only if their source files change. An interrupted run leaves no incomplete files.
 
     Args:
         folder: The capture.
@@ -87,6 +87,7 @@ def load_capture(
         or all(
             needs_no_resampling(source.camera, source.target.width, source.target.height) for source in survey.sources
         ),
+        held_out=survey.held_out,
     )
 
 

@@ -22,6 +22,7 @@ from ..shared.reconstruction.objects import default_name
 from .capture import MIN_VIEWS_TO_HOLD_OUT
 from .colmap import Camera, Image, Model, find_model, read_model
 from .files import (
+    HELD_OUT,
     IMAGE_SUFFIXES,
     Files,
     image_size,
@@ -29,6 +30,7 @@ from .files import (
     is_three_channel,
     mask_names,
     mask_size,
+    read_held_out,
     read_image,
     read_mask,
     read_names,
@@ -62,7 +64,7 @@ class Source:
 
 @dataclass
 class Survey:
-    """The contents of a capture before its images are read."""
+    """The contents of a capture before its images are read; held_out are the views that test.txt names, if any."""
 
     folder: Path
     model: Model
@@ -71,6 +73,7 @@ class Survey:
     warnings: list[str]
     counts: dict[str, Any]
     color_masks: bool
+    held_out: frozenset[str] | None
 
 
 def refuse(sentence: str) -> NoReturn:
@@ -169,7 +172,8 @@ def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Repo
             )
         else:
             warnings.append(f"{len(unmasked)} of {present} images have no mask, for instance {first} is missing.")
-    if present < MIN_VIEWS_TO_HOLD_OUT:
+    held_out = _tolerate(problem, partial(_held_out, folder, model, sources), None)
+    if held_out is None and present < MIN_VIEWS_TO_HOLD_OUT:
         warnings.append(f"Only {present} images can be used, so none is held out and quality cannot be measured.")
     centers = np.array([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in model.images])
     extent = float(np.abs(model.xyz - np.median(model.xyz, 0)).max())
@@ -185,7 +189,24 @@ def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Repo
         "points": len(model.xyz),
         "cameras": dict(Counter(model.cameras[i].model for i in sorted(targets))),
     }
-    return Survey(folder, model, sources, names, warnings, counts, _is_color_coded(sources, problem))
+    return Survey(folder, model, sources, names, warnings, counts, _is_color_coded(sources, problem), held_out)
+
+
+def _held_out(folder: Path, model: Model, sources: list[Source]) -> frozenset[str] | None:
+    """Return the views that test.txt holds out; None without the file. Raises InputError if it cannot be followed."""
+    names = read_held_out(folder)
+    if names is None:
+        return None
+    path, known = folder / HELD_OUT, {image.name for image in model.images}
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise InputError(
+            f"{path} names {unknown[0][:200]}, which {model.file('images')} does not have; correct the name or remove "
+            "its line."
+        )
+    if sources and all(source.image.name in names for source in sources):
+        raise InputError(f"{path} names all {len(sources)} views, so none is left to train on; remove some lines.")
+    return frozenset(names)
 
 
 def _tolerate(problem: Problem, make: Callable[[], _T], otherwise: _T) -> _T:

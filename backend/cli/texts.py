@@ -56,13 +56,13 @@ Render the splats from the capture's cameras to DIR/renders, with the images' na
 """
 
 EVALUATE = """\
-Compare renderings with the photos held out of training (every 8th). PSNR and SSIM
-measure the images; mIoU, mBIoU, Dice and accuracy measure how well the objects agree
-with the masks. mIoU (all) also counts objects rendered on unlabeled pixels as errors,
-and is shown where these pixels are background; the others ignore them. Meshes are
-measured too: whether they are closed, how their textures look in those photos and, if
-CAPTURE/truth contains the true surfaces, how far they are from these. `report` shows
-the figures.
+Compare renderings with the photos held out of training (every 8th, or those in the
+capture's test.txt). PSNR and SSIM measure the images; mIoU, mBIoU, Dice and accuracy
+measure how well the objects agree with the masks. mIoU (all) also counts objects
+rendered on unlabeled pixels as errors, and is shown where these pixels are background;
+the others ignore them. Meshes are measured too: whether they are closed, how their
+textures look in those photos and, if CAPTURE/truth contains the true surfaces, how far
+they are from these. `report` shows the figures.
 """
 
 MESH = """\

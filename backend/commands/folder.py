@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..capture import Capture, load_capture
+from ..capture import Capture, default_split, load_capture
 from ..model.object_model import ObjectModel
 from ..planning.decisions import planned_capture
 from ..raster import devices
@@ -214,11 +214,17 @@ def edited(capture: Capture, folder: Reconstruction, left_out: Iterable[int]) ->
 
 
 def digest(capture: Capture) -> str:
-    """Return a hash of a capture's view names, poses and points; it does not depend on the capture's folder."""
+    """Return a hash of a capture's view names, poses and points, and of its held-out views if it names them.
+
+    It does not depend on the capture's folder.
+    """
     sha = hashlib.sha256()
     for view in capture.views:
         sha.update(view.name.encode() + b"\0" + np.ascontiguousarray(view.viewmat).tobytes())
     sha.update(np.ascontiguousarray(capture.points.xyz).tobytes())
+    # Without the default choice, which folders of earlier versions have.
+    if capture.test_indices != default_split(len(capture)):
+        sha.update(b"held out" + np.array(capture.test_indices, "<i8").tobytes())
     return sha.hexdigest()[:16]
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..shared.events import Reporter
+from .lpips import load_lpips
 from .metrics import IdScores, ImageScores
 
 
@@ -54,10 +55,12 @@ def evaluate(
     Returns:
         {"quality": {psnr, ssim, lpips, miou, miou_all, mbiou, dice, accuracy}, "objects": [{id, name, iou, iou_all,
         biou, dice, pixels}], "views": [{name, psnr, ssim, miou, miou_all}]}, see `IdScores`. Scores of a view are those
-        of its pixels and objects alone. The ID scores are None if no pixel is labeled; lpips is always None.
+        of its pixels and objects alone. The ID scores are None if no pixel is labeled, and lpips, the mean over the
+        views, is None if it cannot be computed, see `load_lpips`.
     """
     reporter = reporter or Reporter()
     images = ImageScores()
+    lpips, distances = load_lpips(), []
     ids = IdScores(zero_is_class)
     views = []
     for done, i in enumerate(indices):
@@ -65,7 +68,10 @@ def evaluate(
         name = capture.views[i].name
         if not np.isfinite(image).all():
             reporter.warning(f"The render of {name} contains NaN or Inf.")
-        psnr, ssim = images.add(image, capture.image(i))
+        photo = capture.image(i)
+        psnr, ssim = images.add(image, photo)
+        if lpips is not None:
+            distances.append(lpips(image, photo))
         truth = capture.mask(i)
         of_view: dict[str, float | None] = {"miou": None, "miou_all": None}
         if truth is not None:
@@ -77,7 +83,8 @@ def evaluate(
         views.append({"name": name, "psnr": psnr, "ssim": ssim, **of_view})
         reporter.progress(done + 1, len(indices), psnr=psnr, **of_view, zero_is_background=zero_is_background)
 
-    quality: dict[str, Any] = {**images.result(), "lpips": None, **ids.result()}
+    perceptual = float(np.mean(distances)) if distances else None
+    quality: dict[str, Any] = {**images.result(), "lpips": perceptual, **ids.result()}
     del quality["objects"]
     objects = [{"id": row["id"], "name": capture.names.get(row["id"], str(row["id"])), **row} for row in ids.table()]
     return {"quality": quality, "objects": objects, "views": views}

@@ -70,8 +70,8 @@ def quality_section(report: Report) -> list[str]:
         text = "—" if value is None else f"{value:.2f} {unit}" if unit else f"{value:.4f}"
         rows.append((label, f"**{text}**" if value is not None else text, meaning))
     intro = (
-        "Measured on the held-out views (every 8th image by file name), which were not used for training. "
-        f"{_of_validation(report)}{_of_unlabeled(report)}"
+        "Measured on the held-out views (every 8th image by file name, or those in test.txt), which were not used for "
+        f"training. {_of_validation(report)}{_of_unlabeled(report)}"
     )
     parts = ["## Quality", intro, table(("", "Value", "Meaning"), rows, right=(1,))]
     by_view = sorted((view[lead], view["name"]) for view in report.views if view.get(lead) is not None)

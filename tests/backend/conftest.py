@@ -186,6 +186,14 @@ def write_scene(
     return scene
 
 
+@pytest.fixture(scope="session", autouse=True)
+def no_trained_networks(tmp_path_factory):
+    """Give torch an empty cache of networks, so that no result depends on what is installed on this computer."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TORCH_HOME", str(tmp_path_factory.mktemp("torch")))
+        yield
+
+
 @pytest.fixture
 def write_capture(tmp_path):
     """Function that runs `write_scene` in the test's own folder `name`."""

@@ -18,6 +18,7 @@ from backend.capture.capture import HOLDOUT_EVERY
 from backend.capture.colmap import CAMERA_MODELS, Camera, read_model
 from backend.capture.files import read_mask
 from backend.capture.undistort import distort, pinhole_for, source_pixels, to_pycolmap
+from backend.commands.folder import digest
 from backend.shared.errors import InputError
 from backend.shared.events import Reporter
 
@@ -134,6 +135,68 @@ def test_few_views_have_no_held_out_views(write_capture, tmp_path):
     capture = load_capture(write_capture(views=2).folder, tmp_path / "cache")
     assert capture.test_indices == () and capture.train_indices == (0, 1)
     assert any("held out" in warning for warning in capture.warnings)
+
+
+def test_test_file_names_held_out_views(write_capture, tmp_path):
+    scene = write_capture(views=9)
+    (scene.folder / "test.txt").write_text("\ufeffview_003.png\r\n\n  view_005.png  \n", encoding="utf-8")
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    assert capture.test_indices == (3, 5) and capture.train_indices == (0, 1, 2, 4, 6, 7, 8)
+    assert check_capture(scene.folder)["problems"] == []
+
+
+@pytest.mark.parametrize("views", [2, 9])
+def test_empty_test_file_holds_out_none(write_capture, tmp_path, views):
+    scene = write_capture(views=views)
+    (scene.folder / "test.txt").write_text("\n")
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    assert capture.test_indices == () and capture.train_indices == tuple(range(views))
+    assert not any("held out" in warning for warning in capture.warnings), "this is what the file asks for"
+
+
+def test_test_file_may_hold_out_one_of_two_views(write_capture, tmp_path):
+    scene = write_capture(views=2)
+    (scene.folder / "test.txt").write_text("view_001.png")
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    assert capture.test_indices == (1,) and capture.train_indices == (0,)
+
+
+def test_views_without_photos_may_be_held_out(write_capture, tmp_path):
+    scene = write_capture(views=9)
+    (scene.folder / "test.txt").write_text("view_003.png\nview_005.png")
+    (scene.folder / "images" / "view_003.png").unlink()
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    assert [capture.views[i].name for i in capture.test_indices] == ["view_005.png"]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"view_001.png\nphoto 7.png\n", ("photo 7.png", "images.bin", "remove")),
+        (b"view_000.png\nview_001.png\nview_002.png", ("all 3 views", "remove")),
+        (b"\xff\xfe\x00view", ("UTF-8",)),
+    ],
+)
+def test_unusable_test_files_are_rejected(write_capture, tmp_path, content, words):
+    scene = write_capture(views=3)
+    (scene.folder / "test.txt").write_bytes(content)
+    assert_load_rejected(scene.folder, tmp_path, str(scene.folder / "test.txt"), *words)
+
+
+def test_test_file_that_is_a_folder_is_rejected(write_capture, tmp_path):
+    scene = write_capture(views=3)
+    (scene.folder / "test.txt").mkdir()
+    assert_load_rejected(scene.folder, tmp_path, str(scene.folder / "test.txt"))
+
+
+def test_digest_depends_on_held_out_views(write_capture, tmp_path):
+    scene, listed = write_capture(views=9), "view_000.png\nview_008.png"
+    found = {}
+    for name, content in (("default", None), ("same", listed), ("one", "view_003.png"), ("none", "")):
+        if content is not None:
+            (scene.folder / "test.txt").write_text(content)
+        found[name] = digest(load_capture(scene.folder, tmp_path / "cache"))
+    assert found["default"] == found["same"] and len(set(found.values())) == 3
 
 
 def test_image_cache_limits_memory_across_threads(write_capture, tmp_path):

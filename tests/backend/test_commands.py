@@ -365,6 +365,13 @@ def test_training_does_not_resume_with_another_capture(trained, write_capture, r
     assert_rejected(run_command("render", out, "--capture", other), str(other), "not the one")
 
 
+def test_training_does_not_resume_with_other_held_out_views(trained, tmp_path, run_command):
+    shared, out = trained
+    capture = shutil.copytree(shared, tmp_path / "capture")
+    (capture / "test.txt").write_text("view_003.png\n")
+    assert_rejected(run_command("train", capture, "--out", out, "--steps", 40, *SMALL), "held-out", "--restart")
+
+
 def test_votes_are_reused_until_inputs_change(write_capture, tmp_path, run_command, monkeypatch):
     scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
     cast = []

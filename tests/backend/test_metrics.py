@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 
 import numpy as np
 import pytest
+import torch
 
 from backend.evaluation import IdScores, ImageScores, evaluate, psnr, ssim
+from backend.evaluation.lpips import PACKAGE, WEIGHTS, load_lpips
 from backend.evaluation.metrics import boundaries, boundary_distance
 from backend.shared.events import Reporter
 
@@ -392,3 +395,49 @@ def test_evaluate_warns_of_nan_in_render():
     capture = _Capture([np.zeros((12, 16, 3), np.uint8)], [None])
     evaluate(capture, lambda i: (np.full((12, 16, 3), np.nan), np.zeros((12, 16), int)), [0], reporter)
     assert reporter.warnings == ["The render of 0.png contains NaN or Inf."]
+
+
+FAKE_LPIPS = """
+import torch
+
+class LPIPS:
+    def __init__(self, net, verbose):
+        assert net == "vgg" and not verbose
+
+    def __call__(self, a, b):
+        assert a.shape == b.shape == (1, 3, 12, 16) and a.dtype == torch.float32
+        assert not torch.is_grad_enabled() and min(a.min(), b.min()) >= -1 and max(a.max(), b.max()) <= 1
+        return (a - b).abs().mean().reshape(1, 1, 1, 1)
+"""
+
+
+@pytest.fixture
+def fake_lpips(tmp_path, monkeypatch):
+    """A package lpips whose distance is the mean difference, without weights; returns the folder of these."""
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "lpips.py").write_text(FAKE_LPIPS)
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
+    monkeypatch.delitem(sys.modules, PACKAGE, raising=False)
+    yield tmp_path / "hub" / "checkpoints"
+    sys.modules.pop(PACKAGE, None)
+
+
+def test_lpips_is_the_mean_over_the_views(fake_lpips):
+    fake_lpips.mkdir(parents=True)
+    (fake_lpips / WEIGHTS).write_bytes(b"")
+    images = [np.full((12, 16, 3), value, np.uint8) for value in (0, 255)]
+    capture = _Capture(images, [None, None])
+    quality = evaluate(capture, lambda i: (np.full((12, 16, 3), (0.25, 1.5)[i]), np.zeros((12, 16), int)), [0, 1])[
+        "quality"
+    ]
+    assert quality["lpips"] == pytest.approx((0.5 + 0.0) / 2), "from -1 to 1, and clipped"
+
+
+def test_lpips_without_weights_is_none_and_loads_nothing(fake_lpips):
+    assert load_lpips() is None and PACKAGE not in sys.modules
+
+
+def test_lpips_without_its_package_is_none(monkeypatch):
+    monkeypatch.setitem(sys.modules, PACKAGE, None)
+    assert load_lpips() is None

@@ -106,7 +106,7 @@ def damaged_masks(folder: Path, templates: Templates, rng: random.Random) -> Cas
     shutil.copytree(templates.captures[0], capture)
     path = rng.choice(sorted((capture / rng.choice(("masks", "images"))).iterdir()))
     path.unlink()
-    kind = rng.choice(("png", "npz", "npy", "pipe", "folder", "loop", "absent", "zero", "deep", "labels"))
+    kind = rng.choice(("png", "npz", "npy", "pipe", "folder", "loop", "absent", "zero", "deep", "labels", "split"))
     if kind == "png":
         path.write_bytes(png_bomb(*rng.choice(((40_000, 40_000), (65_535, 1), (3, 500_000), (13_000, 13_000)))))
     elif kind == "npz":
@@ -127,6 +127,10 @@ def damaged_masks(folder: Path, templates: Templates, rng: random.Random) -> Cas
     elif kind == "labels":
         shutil.copyfile(templates.captures[0] / "images" / path.name, path)
         (capture / "labels.json").write_bytes(mutation_for("a.json")(b'{"1": "mug", "2": "box"}', rng))
+    elif kind == "split":
+        shutil.copyfile(templates.captures[0] / "images" / path.name, path)
+        names = b"".join(b"view_%03d.png\n" % i for i in rng.sample(range(9), rng.randrange(10)))
+        (capture / "test.txt").write_bytes(mutation_for("a.txt")(names, rng) if rng.random() < 0.7 else names)
     arguments = [rng.choice(("check", "import", "train")), capture]
     if arguments[0] != "check":
         arguments += ["--out", folder / "out"]

@@ -23,7 +23,7 @@ def evaluate(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     trained = open_trained(options, reporter)
     folder, capture = trained.folder, trained.capture
     if not capture.test_indices:
-        raise InputError(f"{capture.folder} has too few views to hold any out, so nothing can be measured.")
+        raise InputError(f"{capture.folder} holds out no view or has too few views for it, so nothing can be measured.")
     reporter.status(f"Measuring on the {len(capture.test_indices)} held-out views")
 
     def drawn(index: int) -> tuple[np.ndarray, np.ndarray]:

@@ -58,7 +58,7 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             **training.settings,
         },
         machine={**machine_facts(model.device), "device": trained.trained_on},
-        left_out=_left_out(trained),
+        left_out=_left_out(trained, evaluation),
         plan=trained.plan.as_list(),
         stages=[asdict(stage) for stage in record.stages],
         curve=progress.curve,
@@ -183,7 +183,7 @@ def _objects(
     ]  # fmt: skip
 
 
-def _left_out(trained: Trained) -> list[dict[str, str]]:
+def _left_out(trained: Trained, evaluation: Evaluation) -> list[dict[str, str]]:
     """Return the steps that were left out by the plan or in the training, with the reasons."""
     capture, progress = trained.capture, trained.progress
     settings = trained.training.settings
@@ -213,8 +213,11 @@ def _left_out(trained: Trained) -> list[dict[str, str]]:
             settings["background"] != "learned", "a learned background",
             f"--background {settings['background']} was given",
         ),
-        (not capture.test_indices, "quality on held-out views", "there are too few views for held-out ones"),
-        (bool(capture.test_indices), "LPIPS", "it needs a trained network, which is not part of this program"),
+        (not capture.test_indices, "quality on held-out views", "the capture holds out no view, or has too few"),
+        (
+            bool(capture.test_indices) and evaluation.quality.get("lpips") is None, "LPIPS",
+            "its network, the package lpips and the weights of VGG-16, is not on this computer",
+        ),
     ]  # fmt: skip
     planned = [{"what": decision.what, "why": decision.reason} for decision in trained.plan.left_out]
     return planned + [{"what": what, "why": why} for applies, what, why in cases if applies]

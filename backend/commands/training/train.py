@@ -171,7 +171,10 @@ def _check_same_training(folder: Reconstruction, capture: Capture, plan: Plan, o
         raise InputError(f"{folder.settings} has no record of the training in {folder.checkpoint}; {otherwise}")
     votes = training.votes
     if votes.capture != digest(capture):
-        raise InputError(f"{folder.checkpoint} was trained on another capture than {capture.folder}; {otherwise}")
+        raise InputError(
+            f"{folder.checkpoint} was trained on another capture than {capture.folder}, or with other held-out views; "
+            f"{otherwise}"
+        )
     if votes.max_size != options.max_size:
         raise InputError(f"{folder.checkpoint} was trained with --max-size {votes.max_size}; {otherwise}")
     if votes.strategy != options.strategy:
