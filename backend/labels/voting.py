@@ -1,10 +1,10 @@
 """Assigns each point an object ID by votes of the views' masks, as in ObjectGS, with three strategies.
 
 As in the paper's algorithm 1, an unlabeled pixel is a vote for ID 0. Unlike there, 0 needs more than half of all votes
-to win, since masks that give an object several IDs split its votes, but not those for 0. Unlike in the published code,
-views in which a point is behind the camera or outside the image do not vote on it. Held-out views do not vote, so that
-their masks are used only to measure quality. Neither do masks without any label, since they are more often missing than
-complete.
+to win, since masks that give an object several IDs split its votes, but not those for 0; where masks have gaps, it needs
+more votes than these explain (`needed_to_be_unlabeled`). Unlike in the published code, views in which a point is behind
+the camera or outside the image do not vote on it. Held-out views do not vote, so that their masks are used only to
+measure quality. Neither do masks without any label, since they are more often missing than complete.
 """
 
 from __future__ import annotations
@@ -23,6 +23,13 @@ Strategy = Literal["majority", "probability", "correspondence"]
 
 FEW_POINTS = 20
 """An object with fewer points causes a warning."""
+
+MOSTLY_UNLABELED = 0.8
+"""Fraction of unlabeled votes from which on a point says nothing about the gaps in the masks of objects."""
+
+_GAP_QUANTILE, _BELOW_RATE, _ABOVE_RATE = 0.1, 1.28, 3.0
+"""The rate of gaps is estimated by a quantile, of points that are on objects even where many masks show objects on the
+background, and by its standard deviations below the mean. Unlabeled votes have to exceed the rate by more of them."""
 
 _SLOTS = 6
 _MERGE_AT = 1 << 23
@@ -115,6 +122,29 @@ def vote(
     for sentence in warnings:
         reporter.warning(sentence)
     return Votes(ids, margins, counts, ballots.visible, warnings)
+
+
+def needed_to_be_unlabeled(unlabeled: np.ndarray, votes: np.ndarray) -> np.ndarray:
+    """Compute the fraction of votes for 0 above which a point belongs to no object.
+
+    Masks with gaps leave a point of an object unlabeled in some views, at random, at a rate g. The fraction among n
+    votes then has the standard deviation sqrt(g (1 - g) / n), which puts its 10 % quantile 1.28 deviations below g.
+
+    Args:
+        unlabeled, votes: (M,) int, the votes for 0 and all votes of each point.
+
+    Returns:
+        (M,) float64: g + 3 sqrt(g (1 - g) / n), at least one half and less than 1.
+    """
+    fractions = unlabeled / np.maximum(votes, 1)
+    on_objects = (votes > 0) & (fractions < MOSTLY_UNLABELED)
+    gaps = 0.0
+    if on_objects.any():
+        low = float(np.quantile(fractions[on_objects], _GAP_QUANTILE))
+        gaps = min(low + _BELOW_RATE * float(np.sqrt(low * (1 - low) / np.median(votes[on_objects]))), 1.0)
+    needed = gaps + _ABOVE_RATE * np.sqrt(gaps * (1 - gaps) / np.maximum(votes, 1))
+    # A point that all masks leave unlabeled belongs to no object in any case.
+    return np.clip(needed, 0.5, 1 - 1 / np.maximum(2 * votes, 2))
 
 
 def _describe_problems(capture: Capture, counts: dict[int, int], unlabeled: int, points: int) -> list[str]:
@@ -230,7 +260,7 @@ class _Ballots:
     def count(self, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
         """Return the chosen class index (M,), -1 for 0 or without votes, and its margin (M,); drawn if `rng` is given.
 
-        If not drawn, 0 wins with more than half of all votes; otherwise the objects are compared with each other.
+        If not drawn, 0 wins by more than `needed_to_be_unlabeled`; otherwise the objects are compared with each other.
         """
         self._merge()
         slot, point = np.nonzero(self._ids >= 0)
@@ -244,8 +274,9 @@ class _Ballots:
         chosen, margins = np.full(self.points, -1, np.int64), np.zeros(self.points, np.float32)
         if len(points) == 0:
             return chosen, margins
-        # Sorted by point, then by descending frequency, then by ID; 0 is last where it has not more than half.
-        is_minority = (ids < 0) & (2 * counts <= self.visible[points])
+        # Sorted by point, then by descending frequency, then by ID; 0 is last where it has too few votes to win.
+        needed = needed_to_be_unlabeled(unlabeled, self.visible)
+        is_minority = (ids < 0) & (counts <= needed[points] * self.visible[points])
         order = np.lexsort((ids, ids < 0, -counts, points) if rng is not None else (ids, -counts, is_minority, points))
         points, ids, counts = points[order], ids[order], counts[order]
         voted, first, length = np.unique(points, return_index=True, return_counts=True)

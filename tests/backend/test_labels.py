@@ -12,7 +12,7 @@ import pytest
 
 from backend.capture import Keypoints, Points, View, load_capture
 from backend.labels import read_points, vote, write_points
-from backend.labels.voting import _Ballots
+from backend.labels.voting import _Ballots, needed_to_be_unlabeled
 from backend.shared.errors import InputError
 from backend.shared.events import Reporter
 
@@ -350,3 +350,26 @@ def test_points_file_is_readable_from_header(tmp_path):
     fields = [line.split()[1:] for line in head.decode().splitlines() if line.startswith("property")]
     row = np.frombuffer(body, np.dtype([(name, kinds[kind]) for kind, name in fields]))[0]
     assert [row[name] for name in ("x", "y", "z", "red", "green", "blue", "object_id")] == [1, 2, 3, 4, 5, 6, 7]
+
+
+def test_gaps_in_masks_do_not_make_background():
+    """Points of objects, unlabeled in 40 % of the views at random, and points of the background, in nearly all."""
+    rng = np.random.default_rng(0)
+    votes = rng.integers(8, 30, 2000).astype(np.int32)
+    on_object = np.arange(2000) < 800
+    unlabeled = np.where(on_object, rng.binomial(votes, 0.4), rng.binomial(votes, 0.98))
+    background = unlabeled > needed_to_be_unlabeled(unlabeled, votes) * votes
+    assert background[on_object].mean() < 0.02 and background[~on_object].mean() > 0.95
+    # Half of the votes would take a tenth of the objects' points.
+    assert (unlabeled > votes / 2)[on_object].mean() > 0.1
+
+
+def test_bad_masks_do_not_make_objects():
+    """A tenth of the masks show an object everywhere, where others show a background around objects without gaps."""
+    rng = np.random.default_rng(0)
+    votes = rng.integers(8, 30, 2000).astype(np.int32)
+    on_object = np.arange(2000) < 300
+    unlabeled = np.where(on_object, 0, rng.binomial(votes, 0.9))
+    background = unlabeled > needed_to_be_unlabeled(unlabeled, votes) * votes
+    assert not background[on_object].any() and background[~on_object].mean() > 0.99
+    assert (needed_to_be_unlabeled(np.array([0, 1, 3]), np.array([0, 1, 3])) >= 0.5).all()
