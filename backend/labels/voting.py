@@ -1,7 +1,7 @@
 """Assigns each point an object ID by votes of the views' masks, as in ObjectGS, with three strategies.
 
 As in the paper's algorithm 1, an unlabeled pixel is a vote for ID 0. Unlike there, 0 needs more than half of all votes
-to win, since masks that give an object several IDs split its votes, but not those for 0; where masks have gaps, it needs
+to win, since masks that give an object several IDs split its votes, but not those for 0; where masks have gaps, 0 needs
 more votes than these explain (`needed_to_be_unlabeled`). Unlike in the published code, views in which a point is behind
 the camera or outside the image do not vote on it. Held-out views do not vote, so that their masks are used only to
 measure quality. Neither do masks without any label, since they are more often missing than complete.
