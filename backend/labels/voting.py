@@ -31,6 +31,9 @@ _GAP_QUANTILE, _BELOW_RATE, _ABOVE_RATE = 0.1, 1.28, 3.0
 """The rate of gaps is estimated by a quantile, of points that are on objects even where many masks show objects on the
 background, and by its standard deviations below the mean. Unlabeled votes have to exceed the rate by more of them."""
 
+_ENOUGH_POINTS = 20
+"""Points from which on the rate of gaps is estimated; with fewer, masks are taken to have none."""
+
 _SLOTS = 6
 _MERGE_AT = 1 << 23
 
@@ -139,7 +142,7 @@ def needed_to_be_unlabeled(unlabeled: np.ndarray, votes: np.ndarray) -> np.ndarr
     fractions = unlabeled / np.maximum(votes, 1)
     on_objects = (votes > 0) & (fractions < MOSTLY_UNLABELED)
     gaps = 0.0
-    if on_objects.any():
+    if on_objects.sum() >= _ENOUGH_POINTS:
         low = float(np.quantile(fractions[on_objects], _GAP_QUANTILE))
         gaps = min(low + _BELOW_RATE * float(np.sqrt(low * (1 - low) / np.median(votes[on_objects]))), 1.0)
     needed = gaps + _ABOVE_RATE * np.sqrt(gaps * (1 - gaps) / np.maximum(votes, 1))
