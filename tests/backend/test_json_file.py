@@ -8,18 +8,7 @@ from backend.shared.formats import json_file
 from backend.shared.formats.json_file import parse_json, read_json, write_json
 
 DEEP = "[" * 100_000
-BAD = [
-    DEEP,
-    '{"a": "\\ud800"}',
-    '["\\uDC00\\uD83D"]',
-    '{"a": ' * 100_000,
-    "1" * 5000,
-    "[NaN]",
-    "[Infinity]",
-    "{",
-    "",
-    "\xff",
-]
+BAD = [DEEP, '{"a": ' * 100_000, "1" * 5000, "[NaN]", "[Infinity]", "{", "", "\xff"]
 
 
 @pytest.mark.parametrize("text", BAD, ids=range(len(BAD)))
@@ -45,3 +34,11 @@ def test_valid_json_is_parsed():
     assert parse_json(b'{"a": [1, 2.5, null, "\\u00e4", "\\ud83d\\ude00"]}') == {
         "a": [1, 2.5, None, "\u00e4", "\U0001f600"]
     }
+
+
+def test_halves_of_surrogate_pairs_can_be_written_again(tmp_path):
+    path = tmp_path / "objects.json"
+    path.write_text('{"\\ud800": "a\\uDC00b \\ud83d\\ude00"}')
+    assert read_json(path) == {"?": "a?b \U0001f600"}
+    write_json(path, read_json(path))
+    assert read_json(path) == {"?": "a?b \U0001f600"}

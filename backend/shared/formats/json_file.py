@@ -41,8 +41,10 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse JSON; raise ValueError if it is invalid, contains NaN, infinity or half of a surrogate pair, which UTF-8
-    cannot write, or is nested too deeply."""
+    """Parse JSON; raise ValueError if it is invalid, contains NaN or infinity, or is nested too deeply.
+
+    Halves of surrogate pairs, which UTF-8 cannot write, become question marks.
+    """
 
     def refuse(constant: str) -> None:
         raise ValueError(f"{constant} is not valid in JSON")
@@ -50,11 +52,9 @@ def parse_json(text: str | bytes) -> Any:
     try:
         value = json.loads(text, parse_constant=refuse)
         if "\\ud" in (text if isinstance(text, str) else text.decode("latin-1")).lower():
-            json.dumps(value, ensure_ascii=False).encode()
+            value = json.loads(json.dumps(value, ensure_ascii=False).encode(errors="replace"))
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
-    except UnicodeEncodeError as error:
-        raise ValueError("it contains half of a surrogate pair") from error
     return value
 
 
