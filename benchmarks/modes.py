@@ -1,4 +1,4 @@
-"""Compare plain splats with both modes of the heads on one capture, in equal time or equal steps.
+"""Compare plain splats with the modes of the heads on one capture, in equal time or equal steps.
 
     python benchmarks/modes.py [--json] [--capture build/demo/capture] [--seconds 150 | --steps 600]
 
@@ -27,12 +27,12 @@ from backend.training.settings import Settings
 from backend.training.trainer import Trainer
 from benchmarks.shared import train_and_measure
 
-VARIANTS = ("plain", "explicit", "view")
+VARIANTS = ("plain", "explicit", "view", "paper")
 
 
 def train(capture, ids: np.ndarray, variant: str, budget: Budget) -> dict:
     """Train one variant and measure it."""
-    mode = "view" if variant == "view" else "explicit"
+    mode = "explicit" if variant == "plain" else variant
     trainer = Trainer.start(capture, ids, Settings(mode=mode))
     if variant == "plain":
         silence(trainer)
