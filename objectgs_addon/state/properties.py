@@ -86,7 +86,7 @@ class ObjectItem(bpy.types.PropertyGroup):
         name="Reconstruct",
         default=True,
         update=object_edits.chosen_changed,
-        description="Train this object; otherwise it stays part of the unlabeled rest",
+        description="Train this object; otherwise it stays part of the background",
     )
     object_id: IntProperty(name="ID", description="Pixel value of the object in the masks")
     points: IntProperty(name="Points", description="Points of the capture that are assigned to this object")
@@ -95,7 +95,7 @@ class ObjectItem(bpy.types.PropertyGroup):
     is_merged: BoolProperty(name="Merged", description="Merged into another object")
     merged_into: IntProperty(name="Merged Into", description="ID of the object that this one is merged into")
     removed: BoolProperty(name="Removed", description="Hidden until it is restored")
-    floaters: BoolProperty(name="With Floaters", description="Removed with the unlabeled splats inside it")
+    floaters: BoolProperty(name="With Floaters", description="Removed with the background's splats inside it")
     fill: BoolProperty(
         name="Fill Hole", description="The hole in the ground or wall behind it is filled from its surroundings"
     )

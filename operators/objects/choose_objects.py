@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Choose which objects to reconstruct; the others stay part of the unlabeled rest."""
+"""Choose which objects to reconstruct; the others stay part of the background."""
 
 import bpy
 from bpy.props import EnumProperty

@@ -33,7 +33,7 @@ class DuplicateObject(bpy.types.Operator):
         ]
         wanted = [collection for collection in wanted if scene.object_id_of(collection) in known]
         if not wanted:
-            raise InputError("The unlabeled rest cannot be duplicated; choose an object")
+            raise InputError("The background cannot be duplicated; choose an object")
         duplicates = [scene.duplicate(root, collection) for collection in wanted]
         try:
             object_edits.store_edits(root)

@@ -21,7 +21,7 @@ class RemoveObject(bpy.types.Operator):
     )
     bl_options = {"REGISTER", "UNDO"}
 
-    floaters: BoolProperty(name="With Floaters", description="Also remove unlabeled splats inside the removed objects")
+    floaters: BoolProperty(name="With Floaters", description="Also remove the background's splats inside the removed objects")
     fill: BoolProperty(
         name="Fill Hole", description="Fill the hole in the ground or wall behind the object from its surroundings"
     )
@@ -38,7 +38,7 @@ class RemoveObject(bpy.types.Operator):
         ids = ids if selected else object_list.chosen_ids(context, root)
         ids = [object_id for object_id in ids if object_list.item_of(root, object_id)]
         if not ids and not duplicates:
-            self.report({"ERROR"}, "The unlabeled rest cannot be removed; hide it, or choose an object")
+            self.report({"ERROR"}, "The background cannot be removed; hide it, or choose an object")
             return {"CANCELLED"}
         try:
             for duplicate in duplicates:

@@ -32,7 +32,7 @@ from .command_result import assert_rejected
 HUGE = 3_000_000_001
 IDS = (0, 1, 2, 7, HUGE)
 NAMES = {1: "mug", 2: "can", 7: "mug", HUGE: "große Kiste"}
-SHOWN_NAMES = ["Unlabeled", "mug (1)", "can", "mug (7)", "große Kiste"]
+SHOWN_NAMES = ["Background", "mug (1)", "can", "mug (7)", "große Kiste"]
 WIDTH, HEIGHT = 45, 33
 K = np.array([[40.0, 0, 24.3], [0, 44.0, 15.1], [0, 0, 1]])
 
@@ -185,7 +185,7 @@ def test_edits_and_shot_transforms_are_applied(folder, film):
     ])  # fmt: skip
     named = shot_of([sample(objects=objects)], only_named=True)
     frames = film(shot_of([sample(objects=objects)], [sample()], [sample(0.1, {2: Placed(maps=np.zeros((0, 4, 4)))})]))
-    names = ["Unlabeled", "can", "mug", "große Kiste"]
+    names = ["Background", "can", "mug", "große Kiste"]
     assert list(manifest(folder.folder.parent / "film")) == names, "mug is unique once the other mug is removed"
     np.testing.assert_allclose(rgba_of(frames[0]), reference(expected, sample())[0], atol=2e-3, rtol=2e-3)
     static = concatenate([part[0], transformed(can, moved(0.2)), transformed(part[7], place),

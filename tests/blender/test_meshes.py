@@ -330,7 +330,7 @@ def test_show_kinds_switches_meshes_and_splats(root):
     expected = {
         "splats": ({True}, {False}, {False}, {False}),
         "both": ({False}, {False}, {False}, {False}),
-        "meshes": ({False}, {True}, {False}, {True}),
+        "meshes": ({False}, {True}, {False}, {False}),
     }
     for which, (meshes, splats, without, rest) in expected.items():
         blender_scene.show_kinds(root, which)
@@ -339,7 +339,7 @@ def test_show_kinds_switches_meshes_and_splats(root):
             assert hidden(parts(root, object_id, "mesh")) == meshes
             assert hidden(parts(root, object_id, "splats")) == splats
         assert hidden(parts(root, HUGE, "splats")) == without, "an object without a mesh shows its splats"
-        assert hidden(parts(root, 0, "splats")) == rest
+        assert hidden(parts(root, 0, "splats")) == rest, "the background has no mesh"
         assert hidden(parts(root, 1, "anchors")) == {True}
     with pytest.raises(ValueError):
         blender_scene.show_kinds(root, "points")

@@ -185,7 +185,7 @@ def test_new_vote_and_edits_update_points_and_names(root, folder):
 
 def test_object_collections_have_splats_and_anchors(root, folder):
     collections = blender_scene.object_collections(root)
-    assert {object_id: collection.name for object_id, collection in collections.items()} == {**OBJECTS, 0: "Unlabeled"}
+    assert {object_id: collection.name for object_id, collection in collections.items()} == {**OBJECTS, 0: "Background"}
     for object_id, collection in collections.items():
         assert collection.name in root.children
         assert blender_scene.kind_of(collection) == "object"

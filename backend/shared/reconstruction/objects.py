@@ -210,7 +210,7 @@ def find_object(objects: Sequence[SceneObject], word: str, path: Path) -> SceneO
 
 def default_name(object_id: int) -> str:
     """Return the name of an object without one; ID 0 stands for everything without an object."""
-    return f"object {object_id}" if object_id else "Unlabeled"
+    return f"object {object_id}" if object_id else "Background"
 
 
 def _object(entry: Mapping[str, Any]) -> SceneObject:

@@ -70,7 +70,7 @@ def update_meshes(root: bpy.types.Collection, folder: Path) -> ShownMeshes:
     if not listed and not existing:
         return ShownMeshes()
     carrier.require_object_mode(existing.values())
-    had_meshes = bool(existing)
+    before = _has_meshes(root)
     assigned, warnings = assign_to_collections(listed, objects)
     shown = ShownMeshes(warnings=warnings)
     importer = MeshImporter(root, objects, collections)
@@ -90,7 +90,7 @@ def update_meshes(root: bpy.types.Collection, folder: Path) -> ShownMeshes:
         show_kinds(root, "meshes")
     elif importer.changed:
         # The first mesh added and the last mesh removed change whether the splats of the unlabeled rest are shown.
-        apply_shown(root, {*importer.changed, 0} if had_meshes != bool(shown.meshes) else importer.changed)
+        apply_shown(root, {*importer.changed, 0} if before != _has_meshes(root) else importer.changed)
     for object_id in importer.changed:
         if object_id is not None and object_id not in importer.new:
             remove_if_empty(collections[object_id])
@@ -134,8 +134,8 @@ def apply_shown(root: bpy.types.Collection, changed: Iterable[int | None]) -> No
     for object_id, collection in collections.items():
         if object_id not in wanted:
             continue
-        # The splats of the unlabeled rest would float between the meshes of the objects.
-        replaced = object_id in meshes or (object_id == 0 and bool(meshes or whole))
+        # Without meshes of objects, a mesh of the whole scene replaces the unlabeled rest.
+        replaced = object_id in meshes or (object_id == 0 and bool(whole) and not meshes)
         both = (collection, *copies.get(object_id, ()))
         for obj in [obj for each in both for obj in parts_of(each)]:
             if kind_of(obj) == SPLATS:
@@ -157,6 +157,11 @@ def object_meshes(root: bpy.types.Collection) -> dict[int, list[bpy.types.Object
         for object_id, collection in object_collections(root).items()
     }
     return {object_id: meshes for object_id, meshes in found.items() if meshes}
+
+
+def _has_meshes(root: bpy.types.Collection) -> tuple[bool, bool]:
+    """Return whether there are meshes of single objects, and of the whole scene or of sets of objects."""
+    return bool(object_meshes(root)), bool(scene_meshes(root))
 
 
 def _hide(hidden: dict[bpy.types.Object, bool]) -> None:
