@@ -190,7 +190,7 @@ def measured(capture: str, kind: str, level: float, steps: int) -> dict[str, Any
     held-out views.
     """
     from backend.capture import load_capture
-    from backend.labels import vote
+    from backend.labels import correct_masks, vote
     from backend.model.draw import draw
     from backend.raster import compile_kernels
     from backend.shared.events import Reporter
@@ -204,7 +204,8 @@ def measured(capture: str, kind: str, level: float, steps: int) -> dict[str, Any
         folder = Path(scratch) / "capture"
         disturbed_capture(source, kind, level, folder)
         loaded = load_capture(folder, Path(scratch) / "cache")
-        trainer = Trainer.start(loaded, vote(loaded).ids, Settings())
+        ids = vote(loaded).ids
+        trainer = Trainer.start(correct_masks(loaded, ids)[0], ids, Settings())
         trainer.run(Budget(steps=steps), Path(scratch) / "checkpoint", Reporter())
         given, rendered, held_out = Tally(), Tally(), Tally()
         for index, view in enumerate(loaded.views):

@@ -117,6 +117,8 @@ class Capture:
         self.test_indices: tuple[int, ...] = test
         self.train_indices: tuple[int, ...] = tuple(i for i in range(len(views)) if i not in set(test))
         self.validation_indices: tuple[int, ...] = ()
+        self._corrected: Collection[int] = ()
+        self._correct: Callable[[int, np.ndarray], np.ndarray] | None = None
 
     def __len__(self) -> int:
         return len(self.views)
@@ -133,6 +135,20 @@ class Capture:
         other = copy.copy(self)
         other.views = tuple(replace(view, mask_file=None) for view in self.views)
         other._ids_of_views = [()] * len(self.views)
+        return other
+
+    def with_corrected_masks(
+        self, indices: Collection[int], correct: Callable[[int, np.ndarray], np.ndarray]
+    ) -> Capture:
+        """Return this capture with the masks of some views corrected; the cache is shared.
+
+        Args:
+            indices: The views.
+            correct: Returns the corrected mask (H, W) int64 for a view's index and its mask; negative IDs are of no
+                known object.
+        """
+        other = copy.copy(self)
+        other._corrected, other._correct = indices, correct
         return other
 
     def excluding_from_training(self, names: Collection[str]) -> Capture:
@@ -207,6 +223,14 @@ class Capture:
         Raises:
             InputError: The file cannot be read, or its size has changed.
         """
+        if self._correct is None or index not in self._corrected:
+            return self.uncorrected_mask(index, downscale)
+        # The cache is shared with captures that have other corrections, or none.
+        ids = self._cache.get((self._correct, index, downscale), lambda: self._corrected_mask(index, downscale))
+        return self.without_left_out(ids)
+
+    def uncorrected_mask(self, index: int, downscale: int = 1) -> np.ndarray | None:
+        """Return a view's ID map as in its file, in the form of `mask`."""
         if self.views[index].mask_file is None:
             return None
         ids = self._cache.get(("mask", index, downscale), lambda: self._read_mask(index, downscale))
@@ -245,6 +269,15 @@ class Capture:
         assert path is not None
         ids = read_mask(path, self._color_masks)
         self._check_unchanged(index, path, (ids.shape[1], ids.shape[0]))
+        return self._reduced(ids, index, downscale)
+
+    def _corrected_mask(self, index: int, downscale: int) -> np.ndarray:
+        mask = self.uncorrected_mask(index)
+        assert mask is not None and self._correct is not None
+        return self._reduced(self._correct(index, mask), index, downscale)
+
+    def _reduced(self, ids: np.ndarray, index: int, downscale: int) -> np.ndarray:
+        """Return the IDs at the centers of blocks of downscale x downscale pixels."""
         width, height = self._reduced_size(index, downscale)
         first = downscale // 2
         return np.ascontiguousarray(ids[first::downscale, first::downscale][:height, :width])

@@ -103,7 +103,7 @@ def vote(
     for done, index in enumerate(indices, 1):
         observed = None
         if strategy == "correspondence" or occlusion:
-            observed = _observed(capture, index) if positions is None else nothing
+            observed = find_observed_points(capture, index) if positions is None else nothing
         if strategy == "correspondence":
             assert observed is not None
             cast(index, *observed)
@@ -206,8 +206,8 @@ def _find_unhidden(x: np.ndarray, y: np.ndarray, z: np.ndarray, width: int, heig
     return z <= nearest[at] * (1 + 2 * cell / focal)
 
 
-def _observed(capture: Capture, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the points that COLMAP observed inside a view, in the form of `_project`."""
+def find_observed_points(capture: Capture, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the points that COLMAP observed inside a view: their indices and pixels' columns and rows, all (n,)."""
     view, keypoints = capture.views[index], capture.keypoints(index)
     x, y = keypoints.xy[:, 0], keypoints.xy[:, 1]
     inside = (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height)

@@ -21,7 +21,9 @@ class RemoveObject(bpy.types.Operator):
     )
     bl_options = {"REGISTER", "UNDO"}
 
-    floaters: BoolProperty(name="With Floaters", description="Also remove the background's splats inside the removed objects")
+    floaters: BoolProperty(
+        name="With Floaters", description="Also remove the background's splats inside the removed objects"
+    )
     fill: BoolProperty(
         name="Fill Hole", description="Fill the hole in the ground or wall behind the object from its surroundings"
     )

@@ -11,6 +11,7 @@ import torch
 from ...capture import Capture
 from ...evaluation import IdScores, comparison, curve_image, psnr, save_image, thumbnail
 from ...export import agreement, fit_splats, write_anchors, write_splats
+from ...labels import correct_masks
 from ...labels.mask_points import MaskPoints, place_points
 from ...model.checkpoint import has_checkpoint
 from ...model.draw import draw
@@ -120,6 +121,10 @@ def _begin(
         plan = plan.settled_by(before)
     gains = context.gains if plan.does("exposure") else np.ones_like(context.gains)
     planned, wanted = planned_capture(context.capture, plan), planned_settings(settings(options), plan)
+    if points is not None and planned.has_masks:
+        planned, regions = correct_masks(planned, points.ids)
+        if regions:
+            reporter.status(f"{regions} regions of masks contradict those of other views and are corrected")
     memory = memory_for_planes(options)
     if resuming:
         resumed = Trainer.resume(planned, folder.checkpoint, wanted, memory, device, gains)

@@ -1,0 +1,132 @@
+"""Corrections of masks by the votes: regions whose ID contradicts the objects of the points observed in them.
+
+The ID loss of ObjectGS (section 3.3) takes every mask as true. Since splats keep their IDs, a mask that gives an object
+a wrong ID can only be followed by making the object transparent. The votes of all views tell such masks apart.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from ..capture import Capture
+from .voting import find_observed_points
+
+IGNORED = -1
+"""ID of the pixels of a corrected mask that show no known object and are not supervised."""
+
+_ENOUGH_POINTS = 10
+"""Points from which on a region is judged."""
+
+_OTHER, _OWN = 0.7, 0.1
+"""A region is wrong if at least the first fraction of its points belongs to one other object, or to none, or at most
+the second one to the object of its ID. An object of few points, at whose borders others show, is neither."""
+
+_MOSTLY_WRONG = 0.6
+"""An ID is not corrected if it seems wrong in more than this fraction of the views: its object has hardly any points,
+so that those behind it show through."""
+
+_NEIGHBORS, _AGREEING = 5, 4
+"""A pixel of a wrong region gets the object that this many of its nearest points in the region belong to; without one,
+it is ignored."""
+
+
+class Region(NamedTuple):
+    """A connected region of one ID in a mask.
+
+    object_id: its ID. window: the rows and columns that contain it. inside: (h, w) bool, its pixels in the window.
+    x, y: (n,) int64, pixels of the points in it, relative to the window. ids: (n,) int64, the points' objects.
+    """
+
+    object_id: int
+    window: tuple[slice, slice]
+    inside: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    ids: np.ndarray
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether its points contradict its ID."""
+        found, counts = np.unique(self.ids, return_counts=True)
+        most = counts.max() >= _OTHER * len(self.ids) and found[counts.argmax()] != self.object_id
+        return bool(most or (self.ids == self.object_id).mean() <= _OWN)
+
+    def corrected(self) -> np.ndarray:
+        """Return the IDs of its pixels by the points that are nearest in the image: (pixels,) int64, or IGNORED."""
+        pixels = np.stack(np.nonzero(self.inside), 1)
+        count = min(_NEIGHBORS, len(self.ids))
+        nearest = cKDTree(np.stack([self.y, self.x], 1)).query(pixels, count)[1].reshape(len(pixels), count)
+        near = np.sort(self.ids[nearest], axis=1)
+        middle = near[:, count // 2]
+        agreeing = (near == middle[:, None]).sum(1)
+        return np.where((agreeing >= _AGREEING) & (middle > 0), middle, IGNORED)
+
+
+def correct_masks(capture: Capture, point_ids: np.ndarray) -> tuple[Capture, int]:
+    """Correct the masks of training views where they contradict the votes.
+
+    Args:
+        capture: the capture; must be prepared. Without the objects that are left out, it is corrected all the same.
+        point_ids: (M,) int64, the objects of the capture's points by the votes of all objects.
+
+    Returns:
+        The capture whose `mask` returns the corrected IDs of training views, IGNORED where none is known, and the
+        number of regions that are corrected. Held-out and validation views are unchanged.
+    """
+    wrong = {
+        index: [region.object_id for region in _regions(capture, index, point_ids) if region.is_wrong]
+        for index in capture.train_indices
+    }
+    shown_in = Counter(object_id for index in capture.train_indices for object_id in capture.ids_in(index))
+    wrong_in = Counter(object_id for ids in wrong.values() for object_id in set(ids))
+    kept = {object_id for object_id, views in wrong_in.items() if views > _MOSTLY_WRONG * shown_in[object_id]}
+    wrong = {index: left for index, ids in wrong.items() if (left := [i for i in ids if i not in kept])}
+
+    def correct(index: int, mask: np.ndarray) -> np.ndarray:
+        result = mask.astype(np.int64)
+        for region in _regions(capture, index, point_ids):
+            if region.object_id in wrong[index] and region.is_wrong:
+                result[region.window][region.inside] = region.corrected()
+        return result
+
+    regions = sum(map(len, wrong.values()))
+    return (capture.with_corrected_masks(frozenset(wrong), correct) if wrong else capture), regions
+
+
+def _regions(capture: Capture, index: int, point_ids: np.ndarray) -> Iterator[Region]:
+    """Yield the regions of a view's mask that have enough points, of IDs that some points in them contradict."""
+    mask = capture.uncorrected_mask(index)
+    if mask is None:
+        return
+    points, x, y = find_observed_points(capture, index)
+    at, ids = mask[y, x], point_ids[points]
+    found, doubts = np.unique(at[(at > 0) & (at != ids)], return_counts=True)
+    # With fewer, no region of enough points is wrong.
+    for object_id in found[doubts >= _ENOUGH_POINTS * _OTHER].tolist():
+        shown = mask == object_id
+        own = ndimage.find_objects(shown.view(np.uint8))[0]
+        numbers, _ = ndimage.label(shown[own])
+        mine = at == object_id
+        rows, columns, its = y[mine] - own[0].start, x[mine] - own[1].start, ids[mine]
+        number = numbers[rows, columns]
+        for each, window in enumerate(ndimage.find_objects(numbers), 1):
+            inside = number == each
+            if window is not None and inside.sum() >= _ENOUGH_POINTS:
+                top, left = window[0].start, window[1].start
+                yield Region(
+                    object_id,
+                    (
+                        slice(own[0].start + top, own[0].start + window[0].stop),
+                        slice(own[1].start + left, own[1].start + window[1].stop),
+                    ),
+                    numbers[window] == each,
+                    columns[inside] - left,
+                    rows[inside] - top,
+                    its[inside],
+                )

@@ -1,0 +1,123 @@
+"""Correction of masks that contradict the votes of the other views."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from backend.capture import load_capture
+from backend.labels import correct_masks, vote
+from backend.labels.corrections import IGNORED
+from backend.shared.errors import EXIT_DONE
+
+from .conftest import SPHERES
+
+FIRST, SECOND, THIRD = (sphere[0] for sphere in SPHERES)
+
+
+@pytest.fixture
+def scene(write_capture):
+    """24 views of three spheres with many points."""
+    return write_capture(views=24, size=(96, 72))
+
+
+def mask_path(scene, index):
+    view = sorted(scene.folder.rglob("masks/*.png"))[index]
+    assert view.is_file()
+    return view
+
+
+def rewrite(path, change):
+    mask = np.asarray(Image.open(path)).copy()
+    exact = mask.copy()
+    change(mask)
+    Image.fromarray(mask).save(path)
+    return exact
+
+
+def exchange(mask):
+    first, second = mask == FIRST, mask == SECOND
+    mask[first], mask[second] = SECOND, FIRST
+
+
+def loaded(scene, tmp_path, name="cache"):
+    capture = load_capture(scene.folder, tmp_path / name)
+    return capture, vote(capture).ids
+
+
+def test_exact_masks_are_unchanged(scene, tmp_path):
+    capture, ids = loaded(scene, tmp_path)
+    same, regions = correct_masks(capture, ids)
+    assert same is capture and regions == 0
+
+
+def test_exchanged_ids_are_exchanged_back(scene, tmp_path):
+    index = load_capture(scene.folder, tmp_path / "cache").train_indices[3]
+    exact = rewrite(mask_path(scene, index), exchange)
+    capture, ids = loaded(scene, tmp_path, "again")
+    corrected, regions = correct_masks(capture, ids)
+    assert regions == 2
+    found = corrected.mask(index)
+    assert (capture.mask(index) != exact).sum() > 100, "the capture itself keeps the mask of the file"
+    assert ((found != exact) & (found != IGNORED)).sum() <= 0.02 * (exact > 0).sum()
+    assert (found == IGNORED).sum() <= 0.1 * (exact > 0).sum()
+    half = corrected.mask(index, 2)
+    assert np.array_equal(half, found[1::2, 1::2])
+    for other in capture.train_indices:
+        if other != index:
+            assert np.array_equal(corrected.mask(other), capture.mask(other))
+
+
+def test_flooded_background_is_ignored(scene, tmp_path):
+    """The second sphere is background; in one mask it has, with the rest, the ID of the third."""
+    index = load_capture(scene.folder, tmp_path / "cache").train_indices[2]
+
+    def flood(mask):
+        third, background = mask == THIRD, (mask == 0) | (mask == SECOND)
+        mask[background], mask[third] = THIRD, 0
+
+    for each in range(24):
+        rewrite(mask_path(scene, each), flood if each == index else lambda mask: mask.__setitem__(mask == SECOND, 0))
+    capture, ids = loaded(scene, tmp_path, "again")
+    corrected, regions = correct_masks(capture, ids)
+    flooded = capture.mask(index) == THIRD
+    assert regions >= 1 and (corrected.mask(index)[flooded] == IGNORED).mean() > 0.9
+
+
+def test_held_out_views_are_not_corrected(scene, tmp_path):
+    index = load_capture(scene.folder, tmp_path / "cache").test_indices[0]
+    rewrite(mask_path(scene, index), lambda mask: mask.__setitem__(mask == FIRST, SECOND))
+    capture, ids = loaded(scene, tmp_path, "again")
+    assert correct_masks(capture, ids)[1] == 0
+
+
+def test_object_without_points_keeps_its_masks(scene, tmp_path, write_capture):
+    """Points behind an object that has none of its own must not take over its pixels."""
+    keep = scene.point_objects != FIRST
+    kept = np.cumsum(keep) - 1
+    behind = int(np.flatnonzero(keep)[0])
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    for i, seen in enumerate(scene.seen):
+        mine = keep[seen]
+        scene.seen[i], scene.pixels[i] = kept[seen[mine]], scene.pixels[i][mine]
+        rows, columns = np.nonzero(capture.mask(i) == FIRST)
+        count = min(30, len(rows))
+        # Wrong observations of another object's point all over the object.
+        scene.seen[i] = np.concatenate([scene.seen[i], np.full(count, kept[behind])])
+        scene.pixels[i] = np.concatenate([scene.pixels[i], np.stack([columns, rows], 1)[:count] + 0.5])
+    scene.xyz, scene.rgb, scene.point_objects = scene.xyz[keep], scene.rgb[keep], scene.point_objects[keep]
+    write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
+    capture, ids = loaded(scene, tmp_path, "again")
+    corrected, _ = correct_masks(capture, ids)
+    for index in capture.train_indices:
+        own = capture.mask(index) == FIRST
+        assert (corrected.mask(index)[own] == FIRST).all()
+
+
+def test_training_reports_corrections_and_resumes_the_same(scene, tmp_path, run_command):
+    rewrite(mask_path(scene, 7), exchange)
+    out = tmp_path / "out"
+    words = ("train", scene.folder, "--out", out, "--json")
+    first = run_command(*words, "--steps", 20)
+    assert first.code == EXIT_DONE and any("contradict" in event.get("message", "") for event in first.events)
+    again = run_command(*words, "--steps", 30)
+    assert again.code == EXIT_DONE and any("contradict" in event.get("message", "") for event in again.events)
