@@ -35,7 +35,16 @@ def _classes() -> list[type]:
     from .selection import pick_object, select_by_name, select_object, solo_object
     from .setup import set_up_backend
     from .splats import export_splats, import_splats
-    from .training import pause_job, remove_finished_jobs, show_preview, show_result, stop_job, train
+    from .training import (
+        dismiss_message,
+        pause_job,
+        remove_finished_jobs,
+        retry_job,
+        show_preview,
+        show_result,
+        stop_job,
+        train,
+    )
 
     modules = (
         import_capture,
@@ -49,6 +58,8 @@ def _classes() -> list[type]:
         pause_job,
         stop_job,
         remove_finished_jobs,
+        dismiss_message,
+        retry_job,
         show_result,
         show_preview,
         open_reconstruction,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
+from typing import NamedTuple
 
 DEFAULT_SECONDS = 300.0
 
@@ -17,7 +18,19 @@ maximum over the measured captures, which are those of the demo in docs/length.m
 NANOSECONDS_A_PIXEL = (300.0, 1200.0)
 """Minimum and maximum time of a step on a CPU per pixel of a view, used until a training has been measured."""
 
+_SHARPNESS = ((0.15, "as sharp as it gets"), (0.6, "sharp"), (1.5, "good"), (3.0, "soft"), (math.inf, "rough"))
+"""Largest deficits in dB and what a training with them looks like."""
+
 _FINAL = "a training until it stops improving (measured on the demo)"
+
+
+class _Outlook(NamedTuple):
+    """Bounds of a training: fewest and most steps, seconds of the fastest and the slowest (0 if unknown)."""
+
+    fewest: float
+    most: float
+    fastest: float
+    slowest: float
 
 
 def expectation(
@@ -35,28 +48,57 @@ def expectation(
     Returns:
         A sentence, or None if there is no basis for an estimate.
     """
-    where = ""
+    outlook = _outlook(steps, seconds, pixels, trained)
+    if outlook is None:
+        return None
+    where = "" if all(trained) or not outlook.slowest else " on a CPU"
+    length = ""
+    if steps is None:
+        length = f" of {_range(f'{_rounded(outlook.fewest):,}', f'{_rounded(outlook.most):,}')} steps{where}"
+    elif outlook.slowest:
+        length = f" in {_range(_duration(outlook.fastest), _duration(outlook.slowest))}{where}"
+    if outlook.most < min(SHORT_OF_FINAL):
+        return f"Expected{length}: more than {shortfall(outlook.most)[0]:.1f} dB below {_FINAL}"
+    best, worst = (f"{short:.1f}" for short in (shortfall(outlook.most)[0], shortfall(outlook.fewest)[1]))
+    if worst == "0.0":
+        return f"Expected{length}: as good as {_FINAL}"
+    return f"Expected{length}: {f'up to {worst}' if best == '0.0' else _range(best, worst)} dB below {_FINAL}"
+
+
+def expectation_in_words(
+    steps: int | None, seconds: float | None, pixels: float | None, trained: tuple[int, float] = (0, 0.0)
+) -> str | None:
+    """Describe the expected duration and sharpness of a training in a few words, such as "about 2 to 8 min: soft".
+
+    The arguments are those of `expectation`; None if there is no basis for an estimate.
+    """
+    outlook = _outlook(steps, seconds, pixels, trained)
+    if outlook is None:
+        return None
+    sharpness = _range(*(_in_words(shortfall(count)[end]) for count, end in ((outlook.fewest, 1), (outlook.most, 0))))
+    if steps is None or not outlook.slowest:
+        return sharpness
+    return f"about {_range(_duration(outlook.fastest), _duration(outlook.slowest))}: {sharpness}"
+
+
+def _outlook(
+    steps: int | None, seconds: float | None, pixels: float | None, trained: tuple[int, float]
+) -> _Outlook | None:
+    """Return the bounds of a training with the arguments of `expectation`; None if there is no basis for them."""
+    fastest = slowest = 0.0
     if all(trained):
         fastest = slowest = trained[1] / trained[0]
     elif pixels:
         fastest, slowest = (1e-9 * each * pixels for each in NANOSECONDS_A_PIXEL)
-        where = " on a CPU"
-    else:
-        fastest = slowest = 0.0
     if steps is not None:
-        fewest = most = float(steps)
-        length = f" in {_range(_duration(steps * fastest), _duration(steps * slowest))}{where}" if slowest else ""
-    elif seconds is not None and slowest:
-        fewest, most = seconds / slowest, seconds / fastest
-        length = f" of {_range(f'{_rounded(fewest):,}', f'{_rounded(most):,}')} steps{where}"
-    else:
-        return None
-    if most < min(SHORT_OF_FINAL):
-        return f"Expected{length}: more than {shortfall(most)[0]:.1f} dB below {_FINAL}"
-    best, worst = (f"{short:.1f}" for short in (shortfall(most)[0], shortfall(fewest)[1]))
-    if worst == "0.0":
-        return f"Expected{length}: as good as {_FINAL}"
-    return f"Expected{length}: {f'up to {worst}' if best == '0.0' else _range(best, worst)} dB below {_FINAL}"
+        return _Outlook(steps, steps, steps * fastest, steps * slowest)
+    if seconds is not None and slowest:
+        return _Outlook(seconds / slowest, seconds / fastest, seconds, seconds)
+    return None
+
+
+def _in_words(short: float) -> str:
+    return next(word for most, word in _SHARPNESS if short <= most)
 
 
 def shortfall(steps: float) -> tuple[float, float]:

@@ -1,13 +1,41 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""User messages from timers, handlers and properties, which cannot report through an operator."""
+"""Messages from timers, handlers and properties, which cannot report through an operator.
+
+The ObjectGS tab and the status bar show the latest one until the user dismisses it.
+"""
 
 from __future__ import annotations
 
 import errno
-import textwrap
+from dataclasses import dataclass, field
 from typing import Any
 
 import bpy
+
+_MOST = 20
+"""Number of messages that are kept; older ones are only in the console."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """A message to the user.
+
+    Attributes:
+        text: one or more sentences.
+        kind: INFO or ERROR.
+        operator: operator of the button that helps, or None.
+        label: text of the button.
+        options: properties of the operator.
+    """
+
+    text: str
+    kind: str = "INFO"
+    operator: str | None = None
+    label: str = ""
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+_messages: list[Message] = []
 
 
 def sentence(error: Exception) -> str:
@@ -20,16 +48,34 @@ def sentence(error: Exception) -> str:
     return f"{what} cannot be read or written ({error.strerror or error}); {advice}."
 
 
-def show(text: str, kind: str = "INFO") -> None:
-    """Print a message to the console and, unless in background mode, show a pop-up; kind: INFO or ERROR."""
+def show(text: str, kind: str = "INFO", operator: str | None = None, label: str = "", **options: Any) -> None:
+    """Print a message to the console and, unless in background mode, show it until it is dismissed.
+
+    The arguments are those of `Message`. A message that is already there moves to the front.
+    """
     print(f"ObjectGS: {text}", flush=True)
-    manager = bpy.context.window_manager
-    if bpy.app.background or manager is None or not manager.windows:
+    if bpy.app.background:
         return
+    _messages[:] = [message for message in _messages if message.text != text][1 - _MOST :]
+    _messages.append(Message(text, kind, operator, label, options))
 
-    def draw(menu: Any, _context: bpy.types.Context) -> None:
-        for line in textwrap.wrap(text, 80):
-            menu.layout.label(text=line)
 
-    with bpy.context.temp_override(window=manager.windows[0]):
-        manager.popup_menu(draw, title="ObjectGS", icon=kind)
+def latest() -> Message | None:
+    """Return the latest message that is not dismissed, or None."""
+    return _messages[-1] if _messages else None
+
+
+def count() -> int:
+    """Return the number of messages that are not dismissed."""
+    return len(_messages)
+
+
+def dismiss() -> None:
+    """Remove the latest message."""
+    if _messages:
+        _messages.pop()
+
+
+def clear() -> None:
+    """Remove all messages."""
+    _messages.clear()

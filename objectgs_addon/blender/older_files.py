@@ -25,7 +25,7 @@ CUSTOM_PROPERTIES = {
 KINDS = {"texture_recolour": "texture_recolor"}
 """Values of the custom property KIND."""
 
-GROUPS = {"colour": "color", "colour_by": "color_by", "splat_colours": "splat_colors"}
+GROUPS = {"colour": "color", "splat_colors": "colors", "splat_colours": "colors"}
 """Properties of the property groups `Collection.objectgs` and `Scene.objectgs`, and of the items of their lists."""
 
 ATTRIBUTES = {"closes": "fills", "invented": "unobserved"}

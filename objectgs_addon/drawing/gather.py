@@ -15,8 +15,6 @@ from .splat_arrays import arrays_of
 
 NO_RECOLOR = np.hstack([np.eye(3), np.zeros((3, 1))])
 NONE = (0.0, 0.0, 0.0, 0.0)
-SELECTED = (1.0, 0.55, 0.1, 0.25)
-POINTED_AT = (1.0, 1.0, 1.0, 0.3)
 
 _HIDES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "VOLUME", "POINTCLOUD", "CURVES", "GREASEPENCIL"}
 
@@ -52,7 +50,7 @@ def gather(parts: Any, colors: str = "photo", pointed_at: int | None = None, mar
         parts: mesh carriers of splats.
         colors: "photo", or "object" for the objects' own colors.
         pointed_at: session UID of the collection under the mouse, or None.
-        marks: highlight selected objects.
+        marks: outline selected objects.
     """
     found = []
     collections = collections_by_part()
@@ -61,14 +59,30 @@ def gather(parts: Any, colors: str = "photo", pointed_at: int | None = None, mar
         if arrays is None:
             continue
         collection = collections.get(part)
-        highlight = NONE
-        if pointed_at is not None and collection is not None and collection.session_uid == pointed_at:
-            highlight = POINTED_AT
-        elif marks and part.select_get():
-            highlight = SELECTED
+        is_pointed_at = pointed_at is not None and collection is not None and collection.session_uid == pointed_at
         color = (*to_encoded(part.color[:3]), 1.0) if colors == "object" else NONE
-        found.append(DrawnObject(arrays, np.array(part.matrix_world), color_map(collection), color, highlight))
+        found.append(
+            DrawnObject(
+                arrays,
+                np.array(part.matrix_world),
+                color_map(collection),
+                color,
+                marks and part.select_get(),
+                is_pointed_at,
+            )
+        )
     return found
+
+
+def meshes_of(uid: int | None, view_layer: bpy.types.ViewLayer, space: bpy.types.SpaceView3D) -> list[bpy.types.Object]:
+    """Return the visible meshes in the collection with a session UID; none for None."""
+    if uid is None:
+        return []
+    return [
+        part
+        for part, collection in collections_by_part().items()
+        if collection.session_uid == uid and scenes.kind_of(part) == "mesh" and shown(part, view_layer, space)
+    ]
 
 
 def color_map(collection: bpy.types.Collection) -> np.ndarray:

@@ -11,6 +11,7 @@ import bpy
 import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
+from mathutils import Matrix
 
 from ...backend.shared.splats.picking import View
 from . import shaders
@@ -27,14 +28,16 @@ class DrawnObject:
         matrix: (4, 4) local to world.
         recolor: (3, 4) affine map of colors.
         color: sRGB-encoded RGB that replaces the splats' colors but keeps their brightness, and its opacity.
-        highlight: sRGB-encoded RGB blended over the splats' colors, and its opacity.
+        is_selected: outline it in the color of the selection.
+        is_pointed_at: outline it in white.
     """
 
     splats: SplatArrays
     matrix: np.ndarray
     recolor: np.ndarray
     color: tuple[float, float, float, float]
-    highlight: tuple[float, float, float, float]
+    is_selected: bool = False
+    is_pointed_at: bool = False
 
 
 class Renderer:
@@ -43,10 +46,11 @@ class Renderer:
     def __init__(self) -> None:
         self._splat = shaders.splat_shader()
         self._over = shaders.over_shader()
+        self._mark = shaders.mark_shader()
         square = {"corner": [(-1, -1), (1, -1), (-1, 1), (1, 1)]}
         self._quads = {shader: batch_for_shader(shader, "TRI_STRIP", square) for shader in (self._splat, self._over)}
         self._nothing = gpu.types.GPUTexture((1, 1), format="R32F", data=_buffer(np.ones(1)))
-        self._target: gpu.types.GPUOffScreen | None = None
+        self._target: _Target | None = None
         self._pool: _Pool | None = None
         self._sorted: _Sorted | None = None
 
@@ -73,40 +77,69 @@ class Renderer:
         self._sorted.sort(objs, view)
         if self._sorted.count == 0:
             return False
-        with _KeptState(), self._target_of(view.width, view.height).bind():
-            target = gpu.state.active_framebuffer_get()
-            target.clear(color=(0.0, 0.0, 0.0, 0.0))
+        with _KeptState(), self._target_of(view.width, view.height).buffer.bind():
+            gpu.state.active_framebuffer_get().clear(color=(0.0, 0.0, 0.0, 0.0))
             self._write(objs, view, projection, depth)
         return True
 
-    def composite(self) -> None:
-        """Blend the image over the active framebuffer."""
+    def mark(self, meshes: Iterable[bpy.types.Object], view: View, to_clip: np.ndarray, clear: bool) -> None:
+        """Mark evaluated mesh objects as pointed at, whether or not something hides them.
+
+        Args:
+            meshes: the mesh objects.
+            view: camera and image size.
+            to_clip: (4, 4) world to clip space.
+            clear: empty the image first, since no splats were drawn.
+        """
+        with _KeptState(), self._target_of(view.width, view.height).buffer.bind():
+            if clear:
+                gpu.state.active_framebuffer_get().clear(color=(0.0, 0.0, 0.0, 0.0))
+            gpu.state.blend_set("ALPHA_PREMULT")
+            gpu.state.depth_test_set("NONE")
+            self._mark.bind()
+            for obj in meshes:
+                corners = np.empty((len(obj.data.vertices), 3), np.float32)
+                obj.data.vertices.foreach_get("co", corners.reshape(-1))
+                triangles = np.empty((len(obj.data.loop_triangles), 3), np.int32)
+                obj.data.loop_triangles.foreach_get("vertices", triangles.reshape(-1))
+                if len(triangles):
+                    batch = batch_for_shader(self._mark, "TRIS", {"pos": corners}, indices=triangles)
+                    self._mark.uniform_float("to_clip", Matrix((to_clip @ np.array(obj.matrix_world)).tolist()))
+                    batch.draw(self._mark)
+
+    def composite(self, selected: tuple[float, float, float], width: float) -> None:
+        """Blend the image over the active framebuffer, with outlines of marked objects.
+
+        Args:
+            selected: linear color of the selection's outlines.
+            width: width of the outlines in pixels.
+        """
+        target = self._target
         with _KeptState():
             gpu.state.depth_test_set("NONE")
             gpu.state.blend_set("ALPHA_PREMULT")
             self._over.bind()
-            self._over.uniform_sampler("picture", self._target.texture_color)
+            self._over.uniform_float("width", (width / target.picture.width, width / target.picture.height))
+            self._over.uniform_float("selected", selected)
+            self._over.uniform_sampler("picture", target.picture)
+            self._over.uniform_sampler("marks", target.marks)
             self._quads[self._over].draw(self._over)
 
     def pixels(self) -> np.ndarray:
         """Return the image as (height, width, 4) float32, premultiplied, top row first."""
-        width, height = self._target.width, self._target.height
-        with self._target.bind():
+        width, height = self._target.picture.width, self._target.picture.height
+        with self._target.buffer.bind():
             read = gpu.state.active_framebuffer_get().read_color(0, 0, width, height, 4, 0, "FLOAT")
         read.dimensions = width * height * 4
         return np.array(read, np.float32).reshape(height, width, 4)[::-1]
 
     def free(self) -> None:
         """Free GPU memory."""
-        if self._target is not None:
-            self._target.free()
         self._target = self._pool = self._sorted = None
 
-    def _target_of(self, width: int, height: int) -> gpu.types.GPUOffScreen:
-        if self._target is None or (self._target.width, self._target.height) != (width, height):
-            if self._target is not None:
-                self._target.free()
-            self._target = gpu.types.GPUOffScreen(width, height, format="RGBA16F")
+    def _target_of(self, width: int, height: int) -> _Target:
+        if self._target is None or (self._target.picture.width, self._target.picture.height) != (width, height):
+            self._target = _Target(width, height)
         return self._target
 
     def _write(
@@ -133,6 +166,14 @@ class Renderer:
         shader.uniform_sampler("objects", objects_table)
         shader.uniform_sampler("depth", hiding)
         self._quads[shader].draw_instanced(shader, instance_count=self._sorted.count)
+
+
+class _Target:
+    """The textures that the splat shader writes to, and their framebuffer."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.picture, self.marks = (gpu.types.GPUTexture((width, height), format="RGBA16F") for _ in range(2))
+        self.buffer = gpu.types.GPUFrameBuffer(color_slots=(self.picture, self.marks))
 
 
 class _Pool:
@@ -220,7 +261,8 @@ def _objects(objs: Sequence[DrawnObject], view: View) -> np.ndarray:
         table[:, 3:6, :3] = back @ matrices[:, :3, :3]
         table[:, 3:6, 3] = np.einsum("nij,nj->ni", back, matrices[:, :3, 3] - camera_to_world[:, 3])
     table[:, 6:9] = [obj.recolor for obj in objs]
-    table[:, 9], table[:, 10] = [obj.color for obj in objs], [obj.highlight for obj in objs]
+    table[:, 9] = [obj.color for obj in objs]
+    table[:, 10, :2] = [(obj.is_selected, obj.is_pointed_at) for obj in objs]
     return table
 
 

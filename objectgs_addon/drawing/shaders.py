@@ -4,6 +4,8 @@
 They use GPUShaderCreateInfo, which works with OpenGL, Metal and Vulkan.
 """
 
+import math
+
 import gpu
 
 from ...backend.shared.color import srgb
@@ -19,7 +21,11 @@ SPLAT_TEXELS = 3
 
 OBJECT_TEXELS = 12
 """Texels per object: three rows each of the map to camera space, the map to view directions and the affine map of
-colors; the color and the highlight, each with its opacity; one unused texel."""
+colors; the color with its opacity; the marks, 1 where the object is selected and where it is pointed at; one unused
+texel."""
+
+OUTLINE_SAMPLES = 12
+"""Number of pixels around one that are searched for an object to outline."""
 
 _CONSTANTS = f"""
 #define TABLE_WIDTH {TABLE_WIDTH}
@@ -78,6 +84,7 @@ void main() {
     beside = vec2(0.0);
     shape = vec4(0.0);
     tint = vec4(0.0);
+    mark = vec2(0.0);
     vec2 entry = at(order, gl_InstanceID).xy;
     int splat = int(entry.x + 0.5);
     int object = int(entry.y + 0.5) * OBJECT_TEXELS;
@@ -133,8 +140,7 @@ void main() {
     // Keeps the brightness, so that shapes remain visible.
     float shade = 0.5 + dot(color, LUMA);
     color = mix(color, own.rgb * shade, own.a);
-    vec4 mark = at(objects, object + 10);
-    color = mix(color, mark.rgb, mark.a);
+    mark = at(objects, object + 10).xy;
 
     beside = corner * extent;
     shape = vec4(b / c, 0.5 / across2, 0.5 / c, opacity);
@@ -160,6 +166,7 @@ void main() {
     }
     alpha = min(alpha, ALPHA_MAX);
     result = vec4(alpha * tint.rgb, alpha);
+    marks = vec4(alpha * mark, 0.0, alpha);
 }
 """
 )
@@ -171,7 +178,7 @@ void main() {
 }
 """
 
-# The viewport blends linear colors.
+# The viewport blends linear colors. An object is outlined where its part of a pixel falls below one half.
 _OVER_FRAGMENT = f"""
 void main() {{
     vec4 drawn = texture(picture, uv);
@@ -180,16 +187,30 @@ void main() {{
     vec3 line = color / {srgb.LINEAR_SLOPE};
     vec3 on_line = vec3(lessThanEqual(color, vec3({srgb.ENCODED_CUTOFF})));
     result = vec4(mix(curve, line, on_line) * drawn.a, drawn.a);
+    vec2 own = texture(marks, uv).rg;
+    vec2 most = own;
+    for (int turn = 0; turn < {OUTLINE_SAMPLES}; turn++) {{
+        float angle = {2.0 * math.pi / OUTLINE_SAMPLES} * float(turn);
+        most = max(most, texture(marks, uv + width * vec2(cos(angle), sin(angle))).rg);
+    }}
+    vec2 outside = smoothstep(vec2(0.3), vec2(0.6), most) * (1.0 - smoothstep(vec2(0.4), vec2(0.6), own));
+    result = mix(result, vec4(selected, 1.0), outside.r);
+    result = mix(result, vec4(1.0), outside.g);
 }}
 """
 
 
 def splat_shader() -> gpu.types.GPUShader:
-    """Create the shader that draws a quad for each entry of `order`; the output is premultiplied and sRGB-encoded."""
+    """Create the shader that draws a quad for each entry of `order`.
+
+    Its outputs are premultiplied: the sRGB-encoded picture, and the marks, whose red and green are the parts of a pixel
+    that show a selected object and one that is pointed at.
+    """
     between = gpu.types.GPUStageInterfaceInfo("objectgs_splat")
     between.smooth("VEC2", "beside")
     between.flat("VEC4", "shape")
     between.flat("VEC4", "tint")
+    between.flat("VEC2", "mark")
     info = gpu.types.GPUShaderCreateInfo()
     info.push_constant("VEC4", "lens")
     info.push_constant("VEC4", "size")
@@ -202,20 +223,39 @@ def splat_shader() -> gpu.types.GPUShader:
     info.vertex_in(0, "VEC2", "corner")
     info.vertex_out(between)
     info.fragment_out(0, "VEC4", "result")
+    info.fragment_out(1, "VEC4", "marks")
     info.vertex_source(_SPLAT_VERTEX)
     info.fragment_source(_SPLAT_FRAGMENT)
     return gpu.shader.create_from_info(info)
 
 
 def over_shader() -> gpu.types.GPUShader:
-    """Create the shader that blends a premultiplied, sRGB-encoded image over the framebuffer."""
+    """Create the shader that blends a premultiplied, sRGB-encoded image with outlines over the framebuffer.
+
+    `width` is that of the outlines relative to the image, and `selected` the linear color of the selection's.
+    """
     between = gpu.types.GPUStageInterfaceInfo("objectgs_over")
     between.smooth("VEC2", "uv")
     info = gpu.types.GPUShaderCreateInfo()
+    info.push_constant("VEC2", "width")
+    info.push_constant("VEC3", "selected")
     info.sampler(0, "FLOAT_2D", "picture")
+    info.sampler(1, "FLOAT_2D", "marks")
     info.vertex_in(0, "VEC2", "corner")
     info.vertex_out(between)
     info.fragment_out(0, "VEC4", "result")
     info.vertex_source(_OVER_VERTEX)
     info.fragment_source(_OVER_FRAGMENT)
+    return gpu.shader.create_from_info(info)
+
+
+def mark_shader() -> gpu.types.GPUShader:
+    """Create the shader that marks the pixels of triangles as pointed at."""
+    info = gpu.types.GPUShaderCreateInfo()
+    info.push_constant("MAT4", "to_clip")
+    info.vertex_in(0, "VEC3", "pos")
+    info.fragment_out(0, "VEC4", "result")
+    info.fragment_out(1, "VEC4", "marks")
+    info.vertex_source("void main() { gl_Position = to_clip * vec4(pos, 1.0); }")
+    info.fragment_source("void main() { result = vec4(0.0); marks = vec4(0.0, 1.0, 0.0, 1.0); }")
     return gpu.shader.create_from_info(info)

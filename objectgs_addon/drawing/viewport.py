@@ -9,6 +9,7 @@ import bpy
 import gpu
 import numpy as np
 
+from ...backend.shared.color import srgb
 from ...backend.shared.splats.picking import View
 from ..blender import writing
 from ..scene import kind_of
@@ -16,11 +17,14 @@ from ..scene.shading.modifiers import show_preview
 from . import gather
 from .renderer import Renderer
 
+OUTLINE = 1.5
+"""Width of outlines in pixels at a UI scale of 1."""
+
 _renderer: Renderer | None = None
 _failure: str | None = None
 _handler = None
 _pointed_at: int | None = None
-"""Session UID of the collection that a tool highlights."""
+"""Session UID of the collection that a tool outlines."""
 
 
 def renderer() -> Renderer:
@@ -49,7 +53,7 @@ def picture(context_scene: Any, view_layer: bpy.types.ViewLayer, view: View, pro
         (height, width, 4) float32, premultiplied, sRGB-encoded.
     """
     parts = gather.splat_parts(view_layer)
-    objs = gather.gather(parts, context_scene.objectgs.splat_colors, marks=False)
+    objs = gather.gather(parts, context_scene.objectgs.colors, marks=False)
     if not renderer().draw(objs, view, projection, None):
         return np.zeros((view.height, view.width, 4), np.float32)
     return renderer().pixels()
@@ -67,26 +71,34 @@ def _draw() -> None:
     except Exception as error:  # Driver failures raise various exceptions.
         _failure = f"The graphics driver cannot draw splats: {error}"
         print(f"ObjectGS: {_failure}", flush=True)
+        bpy.app.timers.register(_show_previews, first_interval=0.0)  # Data cannot be changed while drawing.
         return
     parts = gather.splat_parts(context.view_layer, space)
-    objs = gather.gather(parts, properties.splat_colors, _pointed_at, space.overlay.show_overlays)
-    if not objs:
+    objs = gather.gather(parts, properties.colors, _pointed_at, space.overlay.show_overlays)
+    meshes = gather.meshes_of(_pointed_at, context.view_layer, space)
+    if not objs and not meshes:
         return
     target = gpu.state.active_framebuffer_get()
     x, y, width, height = target.viewport_get()
     projection = np.array(region.window_matrix)
     view = View.of_matrices(np.array(region.view_matrix), projection, width, height)
     depth = None
-    if gather.may_hide_splats(context.view_layer, space):
+    if objs and gather.may_hide_splats(context.view_layer, space):
         read = target.read_depth(x, y, width, height)
         read.dimensions = width * height
         depth = np.array(read, np.float32).reshape(height, width)
-    if renderer().draw(objs, view, projection, depth):
-        renderer().composite()
+    is_drawn = renderer().draw(objs, view, projection, depth)
+    if meshes:
+        depsgraph = context.evaluated_depsgraph_get()
+        shapes = [part.evaluated_get(depsgraph) for part in meshes]
+        renderer().mark(shapes, view, np.array(region.perspective_matrix), clear=not is_drawn)
+    if is_drawn or meshes:
+        theme, scale = context.preferences.themes[0].view_3d, context.preferences.system.ui_scale
+        renderer().composite(tuple(srgb.decode(theme.object_active[:3]).tolist()), OUTLINE * scale)
 
 
 def point_at(collection: bpy.types.Collection) -> None:
-    """Highlight the object of a collection in all viewports; None removes the highlight."""
+    """Outline the object of a collection in all viewports; None removes the outline."""
     global _pointed_at
     uid = None if collection is None else collection.session_uid
     if uid != _pointed_at:
@@ -94,11 +106,21 @@ def point_at(collection: bpy.types.Collection) -> None:
         redraw()
 
 
+def _is_drawn(properties: Any) -> bool:
+    return properties.draw_splats and _failure is None
+
+
+@writing.allowed
+def _show_previews() -> None:
+    for scene in bpy.data.scenes:
+        show(scene.objectgs)
+
+
 def show(properties: Any, _context: bpy.types.Context = None) -> None:
     """Switch a scene's splats between the geometry nodes preview and this drawing."""
     for part in properties.id_data.objects:
         if kind_of(part) == "splats":
-            show_preview(part, not properties.draw_splats)
+            show_preview(part, not _is_drawn(properties))
     redraw()
 
 
@@ -114,7 +136,7 @@ def redraw(_properties: Any = None, _context: bpy.types.Context = None) -> None:
 @writing.allowed
 def _changed(scene: bpy.types.Scene, _depsgraph: Any) -> None:
     """Switch off the preview of new splats."""
-    if scene.objectgs.draw_splats:
+    if _is_drawn(scene.objectgs):
         for part in scene.objects:
             if kind_of(part) == "splats":
                 show_preview(part, False)

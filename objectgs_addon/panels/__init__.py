@@ -3,30 +3,34 @@
 
 import bpy
 
-from .capture import CapturePanel
-from .display import DisplayPanel, DrawingPanel
+from .capture import AddMenu, CapturePanel
 from .edits import EditPanel
+from .export import ExportPanel
 from .film import FilmPanel
 from .jobs import JobsPanel, status_bar
 from .meshes import MeshesPanel
 from .objects import ObjectList, ObjectsPanel
-from .plan import PlanPanel
-from .train import SettingsPanel, TrainPanel
+from .placement import PlacementPanel
+from .training.plan import PlanPanel
+from .training.train import DetailsPanel, SettingsPanel, TrainPanel
 
 CLASSES = (
+    AddMenu,
     ObjectList,
     CapturePanel,
+    ObjectsPanel,
     TrainPanel,
+    DetailsPanel,
     PlanPanel,
     SettingsPanel,
-    ObjectsPanel,
     EditPanel,
     MeshesPanel,
-    DrawingPanel,
     FilmPanel,
-    DisplayPanel,
+    ExportPanel,
+    PlacementPanel,
     JobsPanel,
 )
+"""In the order from the capture to the result."""
 
 
 def register() -> None:

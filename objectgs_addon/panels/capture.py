@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Import of captures, and the folder of the reconstruction."""
+"""The first panel: the latest message, the next step, the reconstruction's folder and how it is displayed."""
 
 from __future__ import annotations
 
@@ -7,14 +7,23 @@ from pathlib import Path
 
 import bpy
 
-from .. import scene
+from .. import drawing, scene
+from ..blender import messages
 from ..environment import locations
-from ..process import jobs
 from ..running import background
 from ..running.job_display import write
 from ..state import folder_trust
 from ..state.folder_state import folder_state
+from ..state.next_step import next_step
 from .tab import Tab, draw_job
+
+
+class AddMenu(bpy.types.Menu):
+    bl_idname = "OBJECTGS_MT_add"
+    bl_label = "Add Reconstruction"
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        _draw_add(self.layout)
 
 
 class CapturePanel(Tab, bpy.types.Panel):
@@ -23,22 +32,79 @@ class CapturePanel(Tab, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
-        if locations.backend_python() is None:
-            box = layout.box()
-            write(box, "The compute backend is not set up yet.", "INFO")
-            opens = box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES")
-            opens.module = locations.PACKAGE
-        column = layout.column(align=True)
-        column.operator("objectgs.import_capture", icon="IMPORT")
-        column.operator("objectgs.open_reconstruction", icon="FILE_FOLDER")
-        column.operator("objectgs.make_demo", icon="MESH_MONKEY")
-        for index, job in enumerate(background.queue.jobs):
-            if job.kind in ("import", "demo") and (not job.is_finished or job.state is jobs.State.FAILED):
-                draw_job(layout, job, index)
+        draw_message(layout)
         active = context.scene.objectgs.active
+        jobs = [
+            (index, job)
+            for index, job in enumerate(background.queue.jobs)
+            if job.kind in ("import", "import-splats", "demo", "setup") and not job.is_finished
+        ]
         if active is not None:
-            layout.prop(context.scene.objectgs, "active", text="")
+            row = layout.row(align=True)
+            row.prop(context.scene.objectgs, "active", text="")
+            row.menu("OBJECTGS_MT_add", text="", icon="ADD")
             _draw_folder(layout, active)
+        for index, job in jobs:
+            draw_job(layout, job, index)
+        if not jobs and (active is None or not background.busy(scene.folder_of(active))):
+            _draw_next_step(layout, active)
+        if active is None:
+            column = layout.column(align=True)
+            column.operator("objectgs.open_reconstruction", icon="FILE_FOLDER")
+            column.operator("objectgs.make_demo", icon="MESH_MONKEY")
+        else:
+            _draw_display(layout, context.scene.objectgs)
+
+
+def draw_message(layout: bpy.types.UILayout) -> None:
+    """Draw the latest message, with buttons to act on it and to dismiss it."""
+    message = messages.latest()
+    if message is None:
+        return
+    box = layout.box()
+    row = box.row()
+    write(row.column(), message.text, message.kind)
+    row.operator("objectgs.dismiss_message", text="", icon="X", emboss=False)
+    if message.operator is not None:
+        button = box.operator(message.operator, text=message.label)
+        for name, value in message.options.items():
+            setattr(button, name, value)
+    if messages.count() > 1:
+        box.label(text=f"{messages.count() - 1} more")
+
+
+def _draw_add(layout: bpy.types.UILayout) -> None:
+    layout.operator("objectgs.import_capture", icon="IMPORT")
+    layout.operator("objectgs.open_reconstruction", icon="FILE_FOLDER")
+    layout.operator("objectgs.make_demo", icon="MESH_MONKEY")
+
+
+def _draw_next_step(layout: bpy.types.UILayout, root: bpy.types.Collection | None) -> None:
+    """Draw the button of the next step with its purpose."""
+    step = next_step(root)
+    if step is None:
+        return
+    column = layout.column()
+    button = column.row()
+    button.scale_y = 1.5
+    button.operator(step.operator, text=step.label, icon=step.icon)
+    purpose = column.column()
+    purpose.active = False
+    write(purpose, step.purpose)
+    if step.operator == "objectgs.set_up_backend":
+        opens = column.operator("preferences.addon_show", text="Preferences", icon="PREFERENCES")
+        opens.module = locations.PACKAGE
+
+
+def _draw_display(layout: bpy.types.UILayout, properties: bpy.types.PropertyGroup) -> None:
+    """Draw how points and splats are displayed."""
+    failure = drawing.failure()
+    if failure is not None:
+        write(layout, failure, "ERROR")
+    row = layout.row(align=True)
+    row.prop(properties, "colors", expand=True)
+    row.separator()
+    row.prop(properties, "draw_splats", text="", icon="SHADING_RENDERED")
 
 
 def _draw_folder(layout: bpy.types.UILayout, root: bpy.types.Collection) -> None:

@@ -3,13 +3,18 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import Any
 
 import bpy
 
+from ..blender import messages
 from ..running import background
 from ..running.job_display import summary
 from .tab import Tab, draw_job
+
+_LONGEST = 80
+"""Number of characters of a message in the status bar; the ObjectGS tab shows all of it."""
 
 
 class JobsPanel(Tab, bpy.types.Panel):
@@ -29,7 +34,12 @@ class JobsPanel(Tab, bpy.types.Panel):
 
 
 def status_bar(bar: Any, _context: bpy.types.Context) -> None:
-    """Draw the running job with its time left and a button to stop it."""
+    """Draw the latest message, and the running job with its time left and a button to stop it."""
+    message = messages.latest()
+    if message is not None:
+        row = bar.layout.row(align=True)
+        row.label(text=textwrap.shorten(message.text, _LONGEST, placeholder="..."), icon=message.kind)
+        row.operator("objectgs.dismiss_message", text="", icon="X", emboss=False)
     job = background.queue.running
     if job is not None:
         row = bar.layout.row(align=True)

@@ -50,4 +50,3 @@ class MeshesPanel(WithReconstruction, bpy.types.Panel):
             row.label(text=mesh.name, icon="OUTLINER_OB_MESH")
             row.prop(mesh, "hide_viewport", text="", emboss=False)
             row.prop(mesh, "hide_render", text="", emboss=False)
-        layout.operator("objectgs.mark_assets", icon="ASSET_MANAGER")

@@ -8,9 +8,11 @@ from typing import Any
 import bpy
 
 from .. import scene
+from ..running import background
 from ..running.job_display import write
-from ..state import visibility
-from .tab import WithReconstruction, draw_without_objects
+from ..state import folder_trust, visibility
+from ..state.next_step import has_masks
+from .tab import WithReconstruction, draw_job_of, draw_without_objects
 
 
 class ObjectList(bpy.types.UIList):
@@ -76,8 +78,14 @@ class ObjectsPanel(WithReconstruction, bpy.types.Panel):
         layout = self.layout
         root = context.scene.objectgs.active
         properties = root.objectgs
+        job = background.job_of(root)
+        if job is not None and job.kind == "vote" and not (properties.objects and job.is_finished):
+            draw_job_of(layout, job)
         if not properties.objects:
             draw_without_objects(layout, root)
+        if has_masks(folder_trust.state_of(root)):
+            layout.operator("objectgs.assign_objects", icon="GROUP_VERTEX")
+        if not properties.objects:
             return
         row = layout.row()
         row.template_list("OBJECTGS_UL_objects", "", properties, "objects", properties, "active_object", rows=8)

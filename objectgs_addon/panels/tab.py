@@ -5,10 +5,11 @@ from __future__ import annotations
 
 import bpy
 
-from ..process.jobs import Job
+from ..process.jobs import Job, State
 from ..running import background
 from ..running.job_display import draw_over, draw_running, write
 from ..state import folder_trust
+from ..state.next_step import has_masks
 
 
 class Tab:
@@ -25,16 +26,23 @@ class WithReconstruction(Tab):
 
 def draw_without_objects(layout: bpy.types.UILayout, root: bpy.types.Collection) -> None:
     """Say how an empty list of objects is filled."""
-    accepted = folder_trust.is_accepted(root)
-    text = "Use Assign Objects to find the objects." if accepted else "Objects are listed once the folder is used."
+    if not folder_trust.is_accepted(root):
+        text = "Objects are listed once the folder is used."
+    elif has_masks(folder_trust.state_of(root)):
+        text = "Assign Objects finds the objects by the masks."
+    else:
+        text = (
+            "The capture has no masks, so it trains as one scene. Masks of the objects, one for each photo, belong in "
+            "its folder masks."
+        )
     write(layout, text, "INFO")
 
 
 def draw_job_of(layout: bpy.types.UILayout, job: Job) -> None:
-    """Draw a reconstruction's job in the panel of its operator."""
-    if job.is_finished:
+    """Draw a reconstruction's job in the panel of its operator; that a job has failed is a message of its own."""
+    if job.is_finished and job.state is not State.FAILED:
         draw_over(layout, job)
-    else:
+    elif not job.is_finished:
         draw_job(layout, job, background.queue.jobs.index(job))
 
 

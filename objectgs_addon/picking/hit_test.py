@@ -57,6 +57,19 @@ def object_at(context: bpy.types.Context, x: float, y: float) -> Hit | None:
     return None if seen is None else Hit(collections[seen.object_id], None)
 
 
+def is_in_viewport(window: bpy.types.Window, x: int, y: int) -> bool:
+    """Return whether a pixel of a window, from the lower left, is in a 3D viewport and in no region over it."""
+    for area in window.screen.areas:
+        over = [
+            region.type
+            for region in area.regions
+            if region.x <= x < region.x + region.width and region.y <= y < region.y + region.height
+        ]
+        if over and area.type == "VIEW_3D":
+            return over == ["WINDOW"]
+    return False
+
+
 def objects_in(
     context: bpy.types.Context, left: float, bottom: float, right: float, top: float
 ) -> list[bpy.types.Collection]:

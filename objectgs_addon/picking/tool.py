@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The Pick Object tool, which also labels and highlights the object under the mouse."""
+"""The Pick Object tool, which also labels and outlines the object under the mouse."""
 
 from __future__ import annotations
 
@@ -7,16 +7,14 @@ from typing import Any
 
 import blf
 import bpy
-import gpu
-from gpu_extras.batch import batch_for_shader
-from mathutils import Vector
 
 from .. import drawing, scene
 
 TOOL = "objectgs.pick"
-_EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 
 _handler = None
+_keymap: Any = None
+_items: list[Any] = []
 _name = ""
 _pointed_at: int | None = None
 """Session UID of the collection under the mouse; `_name` is the label of the object."""
@@ -75,34 +73,34 @@ def is_active(context: bpy.types.Context) -> bool:
 
 
 def point_at(hit: Any) -> None:
-    """Label and highlight the hit under the mouse; None removes label and highlight."""
+    """Label and outline the hit under the mouse; None removes label and outline, and so does the background."""
     global _name, _pointed_at
+    if hit is not None and hit.collection is not None and scene.object_id_of(hit.collection) == 0:
+        hit = None
     collection = None if hit is None else hit.collection
     _name = "" if hit is None else hit.name
     _pointed_at = None if collection is None else collection.session_uid
     drawing.point_at(collection)
 
 
-def _draw() -> None:
-    """Draw boxes around the parts under the mouse that the splat renderer does not highlight."""
+def is_pointing() -> bool:
+    """Return whether an object is labeled and outlined."""
+    return bool(_name)
+
+
+def _leave() -> None:
+    """Remove label and outline once another tool is active, or the object is hidden or removed."""
+    if not _name:
+        return
     context = bpy.context
-    if _pointed_at is None:
-        return
-    if not is_active(context):
+    collection = next((each for each in bpy.data.collections if each.session_uid == _pointed_at), None)
+    parts = () if collection is None else collection.objects
+    is_shown = _pointed_at is None or any(
+        scene.kind_of(part) in ("splats", "mesh") and drawing.shown(part, context.view_layer, context.space_data)
+        for part in parts
+    )
+    if not is_active(context) or not is_shown:
         point_at(None)
-        return
-    kinds = ("mesh",) if context.scene.objectgs.draw_splats else ("mesh", "splats")
-    lines = []
-    for collection in bpy.data.collections:
-        if collection.session_uid == _pointed_at:
-            for part in collection.objects:
-                if scene.kind_of(part) in kinds and drawing.shown(part, context.view_layer, context.space_data):
-                    corners = [part.matrix_world @ Vector(corner) for corner in part.bound_box]
-                    lines += [corners[end] for edge in _EDGES for end in edge]
-    if lines:
-        shader = gpu.shader.from_builtin("UNIFORM_COLOR")
-        shader.uniform_float("color", (1.0, 1.0, 1.0, 1.0))
-        batch_for_shader(shader, "LINES", {"pos": lines}).draw(shader)
 
 
 @bpy.app.handlers.persistent
@@ -111,16 +109,23 @@ def _file_loads(*_: Any) -> None:
 
 
 def register() -> None:
-    global _handler
+    global _handler, _keymap
     if not bpy.app.background:
         bpy.utils.register_tool(PickTool, after={"builtin.select_lasso"})
-        _handler = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
+        _handler = bpy.types.SpaceView3D.draw_handler_add(_leave, (), "WINDOW", "PRE_VIEW")
         bpy.app.handlers.load_pre.append(_file_loads)
+        keymaps = bpy.context.window_manager.keyconfigs.addon.keymaps
+        # Outside of the viewport, the tool's own keymap gets no events.
+        _keymap = keymaps.new(name="Window", space_type="EMPTY", region_type="WINDOW")
+        _items.append(_keymap.keymap_items.new("objectgs.point_away", "MOUSEMOVE", "ANY", any=True))
 
 
 def unregister() -> None:
     global _handler
     if _handler is not None:
+        for item in _items:
+            _keymap.keymap_items.remove(item)
+        _items.clear()
         bpy.app.handlers.load_pre.remove(_file_loads)
         bpy.types.SpaceView3D.draw_handler_remove(_handler, "WINDOW")
         bpy.utils.unregister_tool(PickTool)

@@ -6,6 +6,7 @@ With a window, a timer calls `JobQueue.poll`; without a window, `blocking.run_bl
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import sys
@@ -62,7 +63,7 @@ class Job:
     (the current step), statuses (all messages so far), warnings and error (sentences), training figures (step, splats,
     anchors, psnr, miou, miou_all, zero_is_background), preview (path of the newest image), curve (quality events:
     seconds, step, psnr, miou, miou_all, mbiou), result (fields of the `done` event), exit_code and log (most recent
-    lines that are not events).
+    lines that are not events). number identifies the job in this process.
     """
 
     title: str
@@ -92,6 +93,7 @@ class Job:
     result: dict[str, Any] = field(default_factory=dict)
     exit_code: int | None = None
     log: list[str] = field(default_factory=list)
+    number: int = field(default_factory=itertools.count(1).__next__)
 
     _process: BackendProcess | None = field(default=None, repr=False)
     _changed: bool = field(default=False, repr=False)
@@ -103,6 +105,10 @@ class Job:
     _paused_at: float | None = field(default=None, repr=False)
     _stop_asked: float | None = field(default=None, repr=False)
     _kill_at: float | None = field(default=None, repr=False)
+
+    def again(self) -> Job:
+        """Return a new job of the same program."""
+        return Job(self.title, self.kind, self.folder, self.command, self.cwd, self.environment, self.if_silent)
 
     @property
     def _child(self) -> BackendProcess:

@@ -30,6 +30,13 @@ INTERVAL = 0.1
 DRAW_EVERY = 1.0
 """Minimum time in seconds between two redraws for new figures."""
 
+_REMEDIES: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "import": ("objectgs.import_capture", "Choose Another Folder...", {}),
+    "import-splats": ("objectgs.import_splats", "Choose Another File...", {}),
+    "setup": ("objectgs.set_up_backend", "Try Again", {}),
+}
+"""Kind of a failed job -> operator that helps, label of its button and options; other jobs can be tried again."""
+
 queue = JobQueue()
 _drawn = 0.0
 _stale = False
@@ -103,6 +110,11 @@ def job_of(root: bpy.types.Collection) -> Job | None:
     return queue.of_folder(scene.folder_of(root))
 
 
+def failed_job(number: int) -> Job | None:
+    """Return the failed job with a number, or None."""
+    return next((job for job in queue.jobs if job.number == number and job.state is State.FAILED), None)
+
+
 def busy(folder: Path) -> bool:
     """Return whether the queue contains an unfinished job for `folder`."""
     job = queue.of_folder(folder)
@@ -148,7 +160,8 @@ def redraw() -> None:
 
 def _handle_end(job: Job) -> None:
     if job.state is State.FAILED:
-        messages.show(f"{job.title}: {job.error}", "ERROR")
+        operator, label, options = _REMEDIES.get(job.kind, ("objectgs.retry_job", "Try Again", {"number": job.number}))
+        messages.show(f"{job.title}: {job.error}", "ERROR", operator, label, **options)
     elif job.state is State.DONE or (job.state is State.STOPPED and job.kind in ("train", "mesh")):
         _results.append(job)
         return
@@ -236,3 +249,4 @@ def stop() -> None:
     for known in (_results, _announced, _submitted_in, _requested_fills):
         known.clear()
     previews.clear()
+    messages.clear()

@@ -45,11 +45,10 @@ def draw_running(layout: bpy.types.UILayout, job: Job, index: int) -> None:
         row.operator("objectgs.stop_job", text="", icon="X").index = index
     if job.message and job.state is not State.WAITING:
         write(layout, f"{job.title}: {job.message}")
-    draw_figures(layout, job)
 
 
 def draw_figures(layout: bpy.types.UILayout, job: Job) -> None:
-    """Draw the quality on held-out views and the number of splats."""
+    """Draw the quality on held-out views and the number of splats of a training."""
     figures = []
     if job.psnr is not None:
         figures.append(f"PSNR {job.psnr:.1f} dB")
@@ -70,7 +69,6 @@ def draw_over(layout: bpy.types.UILayout, job: Job) -> None:
         write(layout, f"{job.title}: stopped. {job.message}", "INFO")
     else:
         write(layout, f"{job.title}: done", "CHECKMARK")
-        draw_figures(layout, job)
     for sentence in job.warnings[:3]:
         write(layout, sentence, "ERROR")
 

@@ -78,8 +78,14 @@ def _show_votes(job: Job, owner: bpy.types.Scene | None) -> bool:
     for root in roots:
         scene.show_objects(root, _folder_of(job))
         object_edits.fill(root)
-        root.objectgs.color_by = "object"
+        _set_colors(root, "object")
     return bool(roots) or _announce_hidden(job)
+
+
+def _set_colors(root: bpy.types.Collection, colors: str) -> None:
+    """Show the colors of the photos or the objects in all scenes of a reconstruction."""
+    for owner in object_list.scenes_of(root):
+        owner.objectgs.colors = colors
 
 
 def _show_result(job: Job, owner: bpy.types.Scene | None) -> bool:
@@ -89,6 +95,7 @@ def _show_result(job: Job, owner: bpy.types.Scene | None) -> bool:
     for root in roots:
         if not scene.object_collections(root):
             view.hide_points(root)
+            _set_colors(root, "photo")
         shown = scene.show_result(root, _folder_of(job))
         job.warnings.extend(shown.warnings)
         object_edits.fill(root)

@@ -23,8 +23,8 @@ from ...backend.shared.defaults import MAX_SIZE
 from ...backend.shared.expectation import PRESET_STEPS
 from ...backend.shared.formats.splat_ply import UNOBSERVED
 from .. import drawing
-from ..scene import SHOWS, color_points_by, kind_of, show_kinds, shown_kinds
-from . import object_edits
+from ..scene import SHOWS, kind_of, show_kinds, shown_kinds
+from . import object_edits, viewports
 
 
 def _slider(name: str, default: float, least: float, most: float, description: str) -> Any:
@@ -125,14 +125,14 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
     plan_choices: CollectionProperty(type=PlanChoice)
     active_object: IntProperty(name="Active Object", default=0, update=object_edits.active_changed, options=set())
     length: EnumProperty(
-        name="Length",
-        default="minutes",
-        description="Total length of the training",
+        name="Quality",
+        default="standard",
+        description="Total length of the training; a finished one can be extended",
         items=[
-            ("preview", "Preview", f"{PRESET_STEPS['preview']:,} steps, for a quick check"),
-            ("standard", "Standard", f"{PRESET_STEPS['standard']:,} steps"),
-            ("final", "Until Converged", "Until the error on photos set aside for validation stops decreasing"),
-            ("minutes", "Minutes", "A time limit; a finished training can be extended"),
+            ("preview", "Preview", f"For a quick check, soft ({PRESET_STEPS['preview']:,} steps)"),
+            ("standard", "Standard", f"For most work ({PRESET_STEPS['standard']:,} steps)"),
+            ("final", "Best", "Until photos that are set aside for it are shown no sharper"),
+            ("minutes", "Time Limit", "As good as the given time allows"),
         ],
     )
     minutes: FloatProperty(
@@ -179,12 +179,6 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
         ],
     )
     max_size: image_size()
-    color_by: EnumProperty(
-        name="Color Points By",
-        default="photo",
-        items=[("photo", "Photo", "Colors of the photos"), ("object", "Object", "Color of the assigned object")],
-        update=lambda self, _context: color_points_by(self.id_data, self.color_by),
-    )
     # Stored in a custom property outside this property group, as in files made without the extension.
     shown: EnumProperty(
         name="Show",
@@ -255,15 +249,19 @@ class SceneProperties(bpy.types.PropertyGroup):
     )
     draw_splats: BoolProperty(
         name="Draw Splats",
-        default=False,
+        default=True,
         update=drawing.show,
         description="Draw splats in the 3D viewports as in the final image, instead of a preview by points",
     )
-    splat_colors: EnumProperty(
-        name="Splat Colors",
+    colors: EnumProperty(
+        name="Colors",
         default="photo",
-        items=[("photo", "Photo", "Colors of the photos"), ("object", "Object", "Colors that represent the objects")],
-        update=drawing.redraw,
+        description="Colors of points and splats in the 3D viewports",
+        items=[
+            ("photo", "Photo", "Colors of the photos"),
+            ("object", "Objects", "Colors that represent the objects"),
+        ],
+        update=viewports.colors_changed,
     )
 
 

@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import contextlib
+from typing import Any
 
 import bpy
 
-from .. import scene
+from .. import drawing, scene
 from . import object_list
 
 
@@ -32,6 +33,25 @@ def hide_points(root: bpy.types.Collection) -> None:
             # No lookup in the layer, which does not list newly linked objects yet.
             with contextlib.suppress(RuntimeError):  # The layer does not contain the points.
                 part.hide_set(True, view_layer=layer)
+
+
+def colors_changed(properties: Any, _context: bpy.types.Context = None) -> None:
+    """Show points and splats of a scene in the colors of its setting.
+
+    Without Draw Splats, the viewport's shading chooses the colors of the preview: that of the objects in Solid mode.
+    """
+    owner = properties.id_data
+    for root in owner.collection.children_recursive:
+        if scene.kind_of(root) == "reconstruction":
+            scene.color_points_by(root, properties.colors)
+    shading = {"photo": "MATERIAL", "object": "SOLID"}
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D" and window.scene == owner and not properties.draw_splats:
+                space = area.spaces.active
+                if space.shading.type in shading.values():
+                    space.shading.type = shading[properties.colors]
+    drawing.redraw()
 
 
 def _frame(root: bpy.types.Collection) -> None:

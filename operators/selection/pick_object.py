@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Select visible objects in a viewport by a click or a box, and highlight the one under the mouse."""
+"""Select visible objects in a viewport by a click or a box, and outline the one under the mouse."""
 
 import time
 from typing import Any
@@ -137,7 +137,7 @@ class PickBox(_InViewport, bpy.types.Operator):
 class PointAt(_InViewport, bpy.types.Operator):
     bl_idname = "objectgs.point_at"
     bl_label = "Point at Object"
-    bl_description = "Show the name of the object under the mouse and highlight it"
+    bl_description = "Show the name of the object under the mouse and outline it"
     bl_options = {"INTERNAL"}
 
     _next = 0.0
@@ -152,4 +152,20 @@ class PointAt(_InViewport, bpy.types.Operator):
         return {"PASS_THROUGH"}
 
 
-CLASSES = (PickObject, PickBox, PointAt)
+class PointAway(bpy.types.Operator):
+    bl_idname = "objectgs.point_away"
+    bl_label = "Point away from Object"
+    bl_description = "Remove the outline of the object that was under the mouse before it left the viewport"
+    bl_options = {"INTERNAL"}
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        return pick_tool.is_pointing()
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if not hit_test.is_in_viewport(context.window, event.mouse_x, event.mouse_y):
+            pick_tool.point_at(None)
+        return {"PASS_THROUGH"}
+
+
+CLASSES = (PickObject, PickBox, PointAt, PointAway)

@@ -53,3 +53,12 @@ def test_unknown_device_gives_no_duration():
 def test_negligible_loss_is_reported(monkeypatch):
     monkeypatch.setattr(expectation, "SHORT_OF_FINAL", {400: (1.0, 2.0), 1600: (0.0, 0.04)})
     assert expected(1600, None, None) == f"Expected: as good as {FINAL}"
+
+
+def test_words_tell_duration_and_sharpness():
+    words = expectation.expectation_in_words
+    assert words(400, None, 100_000) == "about 20 s to 80 s: soft to good"
+    assert words(1600, None, None) == "good to as sharp as it gets"
+    assert words(None, 100.0, 100_000, (200, 50.0)) == "soft to good"
+    assert words(None, 60.0, None) is None
+    assert words(10, None, None) == "rough to soft"

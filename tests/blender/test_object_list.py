@@ -136,11 +136,11 @@ def test_set_distance_and_ground(root):
         bpy.ops.objectgs.set_distance(points=(1, 1, 1, 1, 1, 1), distance=2.0)
 
 
-def test_color_by_selects_point_colors(root):
+def test_colors_of_the_scene_select_point_colors(root):
     points = next(part for part in root.all_objects if scene.kind_of(part) == "points")
-    root.objectgs.color_by = "object"
+    bpy.context.scene.objectgs.colors = "object"
     assert points.data.color_attributes.active_color_name == "object"
-    root.objectgs.color_by = "photo"
+    bpy.context.scene.objectgs.colors = "photo"
     assert points.data.color_attributes.active_color_name == "photo"
 
 

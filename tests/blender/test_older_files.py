@@ -47,15 +47,14 @@ def older_file(extension, tmp_path):
     object_edits.fill(root)
     with object_edits.without_callbacks():
         root.objectgs.objects[1].color = RED
-    root.objectgs.color_by = "object"
-    scene.objectgs.splat_colors = "object"
+    scene.objectgs.colors = "object"
     blender_scene.recolor(root, 1, Recolor(hue=0.3))
     mesh = splats_of(root).data
     carrier.write(mesh, fills.FILLS, "INT", np.arange(len(mesh.vertices)))
     carrier.write(mesh, UNOBSERVED, "BOOLEAN", np.ones(len(mesh.vertices), bool))
     blender_scene.object_collections(root)[1][fills.UNOBSERVED_COUNT] = 7
     give_former_names()
-    assert set(former_names()) >= {*older_files.CUSTOM_PROPERTIES, "colour_by", "splat_colours"}
+    assert set(former_names()) >= {*older_files.CUSTOM_PROPERTIES, "splat_colours"}
     assert color_attributes() == {"colour"}
     path = tmp_path / "older.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
@@ -110,7 +109,7 @@ def test_older_file_keeps_all_values(older_file):
     root = scene.objectgs.active
     check(root)
     assert tuple(root.objectgs.objects[1].color) == RED and len(root.objectgs.objects) == 3
-    assert root.objectgs.color_by == "object" and scene.objectgs.splat_colors == "object"
+    assert scene.objectgs.colors == "object"
     older_files.rename_all()
     check(root)
     assert not former_names()

@@ -330,6 +330,81 @@ def test_clicks_select_visible_objects(window):
     wait(window, "bpy.context.workspace.tools.from_space_view3d_mode('OBJECT').idname == 'builtin.select_box'")
 
 
+def picture_of(window, name: str) -> np.ndarray:
+    """Return a screenshot (H, W, 3) as float."""
+    from PIL import Image
+
+    time.sleep(1.5)
+    return np.asarray(Image.open(window.shot(name)).convert("RGB"), float)
+
+
+def around(shot: np.ndarray, place, reach: int = 110) -> np.ndarray:
+    x, y = (round(value) for value in place)
+    return shot[y - reach : y + reach, x - reach : x + reach]
+
+
+def test_selection_is_outlined_and_keeps_its_colors(window):
+    left = placement_of(window, (-0.5, 0.0, 0.2))
+    select = """
+        for thing in bpy.context.view_layer.objects:
+            thing.select_set(False)
+        bpy.context.view_layer.objects.active = None
+        bpy.data.objects["left splats"].select_set({})
+    """
+    window.move(left[0], left[1] + 250)
+    window.run(script(select.format(False)))
+    before = around(picture_of(window, "15-not-selected"), left)
+    window.run(script(select.format(True)))
+    after = around(picture_of(window, "16-selected"), left)
+    changed = np.abs(after - before).max(2) > 12
+    assert 0.005 < changed.mean() < 0.25
+    assert not changed[105:116, 105:116].any(), "the middle of the object keeps its colors"
+    orange = after[changed]
+    assert (orange[:, 0] > orange[:, 2] + 40).mean() > 0.4
+    window.run(script(select.format(False)))
+
+
+def test_pointing_outlines_until_the_mouse_leaves(window):
+    window.run(
+        script("""
+        with bpy.context.temp_override(**window_context()):
+            bpy.ops.wm.tool_set_by_id(name="objectgs.pick")
+    """)
+    )
+    left = placement_of(window, (-0.5, 0.0, 0.2))
+    is_pointing = "importlib.import_module(scene.__name__.replace('.scene', '.picking.tool')).is_pointing()"
+    window.move(left[0] + 3, left[1])
+    window.move(*left)
+    wait(window, is_pointing)
+    window.shot("17-pointed-at")
+    outside = window.run(
+        script("""
+        area = next(area for area in bpy.context.window_manager.windows[0].screen.areas if area.type == "OUTLINER")
+        result = [area.x + area.width / 2, bpy.context.window_manager.windows[0].height - area.y - area.height / 2]
+    """)
+    )
+    window.move(*outside)
+    wait(window, f"not {is_pointing}")
+    window.move(left[0] + 3, left[1])
+    window.move(*left)
+    wait(window, is_pointing)
+    window.run(
+        script("""
+        for part in scene.object_collections(root)[1].objects:
+            part.hide_set(True)
+    """)
+    )
+    wait(window, f"not {is_pointing}")
+    window.run(
+        script("""
+        for part in scene.object_collections(root)[1].objects:
+            part.hide_set(False)
+        with bpy.context.temp_override(**window_context()):
+            bpy.ops.wm.tool_set_by_id(name="builtin.select_box")
+    """)
+    )
+
+
 def wait(window, expression: str) -> None:
     """Wait until an expression that can use the prelude's names is true."""
     deadline = time.monotonic() + 20

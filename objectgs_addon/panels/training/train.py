@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Assignment of objects and training, with their settings."""
+"""Training, its settings and its measured quality."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from typing import Any
 
 import bpy
 
-from ...backend.shared.durations import clock
-from ...backend.shared.expectation import PRESET_STEPS, expectation
-from ...backend.shared.reconstruction.lock import lock_holder
-from .. import scene
-from ..process.jobs import Job
-from ..running import background, previews
-from ..running.job_display import write
-from ..state import folder_trust
-from ..state.folder_state import FolderState
-from .tab import WithReconstruction, draw_job_of
+from ....backend.shared.durations import clock
+from ....backend.shared.expectation import PRESET_STEPS, expectation, expectation_in_words
+from ....backend.shared.reconstruction.lock import lock_holder
+from ... import scene
+from ...process.jobs import Job
+from ...running import background, previews
+from ...running.job_display import draw_figures, write
+from ...state import folder_trust
+from ...state.folder_state import FolderState
+from ...state.next_step import has_masks
+from ..tab import WithReconstruction, draw_job_of
 
 
 class TrainPanel(WithReconstruction, bpy.types.Panel):
@@ -26,37 +27,76 @@ class TrainPanel(WithReconstruction, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
         root = context.scene.objectgs.active
         properties = root.objectgs
         folder = scene.folder_of(root)
-        job = background.job_of(root)
-        if job is not None and job.kind in ("mesh", "film", "fill"):
-            job = None  # Other panels show these.
+        job = _training_job(root)
         active = background.busy(folder)
+        state = folder_trust.state_of(root)
         column = layout.column()
         column.enabled = not active
-        column.operator("objectgs.assign_objects", icon="GROUP_VERTEX")
-        row = column.row(align=True)
-        state = folder_trust.state_of(root)
-        row.operator("objectgs.train", icon="PLAY", text="Resume" if _can_resume(state, properties) else "Train")
-        row.prop(properties, "length", text="")
+        column.operator("objectgs.train", icon="PLAY", text="Resume" if _can_resume(state, properties) else "Train")
+        column.prop(properties, "length")
         if properties.length == "minutes":
             column.prop(properties, "minutes")
         is_accepted = folder_trust.is_accepted(root)
         if not active and is_accepted:
             _draw_expectation(column, state, properties)
+            if not state.trained and state.imported and not has_masks(state):
+                _draw_faint(column, "There are no masks, so it trains as one scene without objects.")
         if job is not None:
             draw_job_of(layout, job)
         if not is_accepted:
             return
         if not active:
             _draw_folder_state(layout, root, job)
-        icons = [icon for name in (previews.RENDER, previews.CURVE) if (icon := previews.icon_of(folder, name))]
-        if icons:
-            row = layout.row()
-            for icon in icons:
-                row.template_icon(icon, scale=8.0)
+        icon = previews.icon_of(folder, previews.RENDER)
+        if icon:
+            layout.template_icon(icon, scale=12.0)
             layout.operator("objectgs.show_preview", icon="IMAGE_DATA")
+
+
+class DetailsPanel(WithReconstruction, bpy.types.Panel):
+    bl_idname = "OBJECTGS_PT_details"
+    bl_label = "Details"
+    bl_parent_id = "OBJECTGS_PT_train"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        root = context.scene.objectgs.active
+        if not folder_trust.is_accepted(root):
+            return
+        properties, state = root.objectgs, folder_trust.state_of(root)
+        job = _training_job(root)
+        if job is not None:
+            draw_figures(layout, job)
+        expected = expectation(*_length_of(state, properties))
+        if expected is not None:
+            write(layout, f"{expected}.")
+        icon = previews.icon_of(scene.folder_of(root), previews.CURVE)
+        if icon:
+            layout.template_icon(icon, scale=10.0)
+
+
+def _training_job(root: bpy.types.Collection) -> Job | None:
+    """Return the latest job of a reconstruction, unless another panel shows it."""
+    job = background.job_of(root)
+    return None if job is not None and job.kind in ("mesh", "film", "fill", "vote", "import") else job
+
+
+def _length_of(state: FolderState, properties: Any) -> tuple[int | None, float | None, float, tuple[int, float]]:
+    """Return the arguments of `expectation` for the chosen length."""
+    seconds = 60 * properties.minutes if properties.length == "minutes" else None
+    return PRESET_STEPS.get(properties.length), seconds, state.pixels, (state.steps, state.seconds)
+
+
+def _draw_faint(layout: bpy.types.UILayout, text: str) -> None:
+    column = layout.column()
+    column.active = False
+    write(column, text)
 
 
 def _can_resume(state: FolderState, properties: Any) -> bool:
@@ -88,16 +128,13 @@ def _draw_folder_state(layout: bpy.types.UILayout, root: bpy.types.Collection, j
 
 
 def _draw_expectation(layout: bpy.types.UILayout, state: FolderState, properties: Any) -> None:
-    """Draw the expected quality of a training that is not finished."""
-    steps = PRESET_STEPS.get(properties.length)
-    seconds = 60 * properties.minutes if properties.length == "minutes" else None
+    """Draw the expected duration and sharpness of a training that is not finished."""
+    steps, seconds, pixels, trained = _length_of(state, properties)
     if state.steps >= (steps or math.inf) or state.seconds >= (seconds or math.inf) - 0.5:
         return
-    expected = expectation(steps, seconds, state.pixels, (state.steps, state.seconds))
+    expected = expectation_in_words(steps, seconds, pixels, trained)
     if expected is not None:
-        column = layout.column()
-        column.active = False
-        write(column, expected)
+        _draw_faint(layout, f"Expected on this computer: {expected}.")
 
 
 class SettingsPanel(WithReconstruction, bpy.types.Panel):

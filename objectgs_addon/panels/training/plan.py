@@ -7,13 +7,13 @@ from typing import Any
 
 import bpy
 
-from ...backend.shared.reconstruction.plan import Decision
-from .. import scene
-from ..running import background
-from ..running.job_display import write
-from ..state import planning
-from ..state.planning import sentence_case
-from .tab import WithReconstruction
+from ....backend.shared.reconstruction.plan import Decision
+from ... import scene
+from ...running import background
+from ...running.job_display import write
+from ...state import planning
+from ...state.planning import sentence_case
+from ..tab import WithReconstruction
 
 
 class PlanPanel(WithReconstruction, bpy.types.Panel):

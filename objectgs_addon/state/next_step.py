@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The step that comes next on the way from a capture to objects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import bpy
+
+from ..environment import known_folders, locations
+from . import folder_trust
+from .folder_state import FolderState
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step: its operator, the text and icon of the button, and what it is for."""
+
+    operator: str
+    label: str
+    icon: str
+    purpose: str
+
+
+SET_UP = Step(
+    "objectgs.set_up_backend",
+    "Set Up Backend",
+    "IMPORT",
+    "Training runs in a program of its own, which is downloaded once.",
+)
+IMPORT = Step(
+    "objectgs.import_capture",
+    "Import Capture",
+    "IMPORT",
+    "A capture is a folder of photos whose cameras COLMAP has computed, with masks of the objects if there are any.",
+)
+ASSIGN = Step(
+    "objectgs.assign_objects", "Assign Objects", "GROUP_VERTEX", "The masks decide which object each point belongs to."
+)
+TRAIN = Step("objectgs.train", "Train", "PLAY", "Training turns the photos into splats.")
+MESHES = Step(
+    "objectgs.extract_meshes", "Extract Meshes", "MESH_DATA", "Meshes are for physics, shadows and other programs."
+)
+FILM = Step("objectgs.film_frames", "Film Frames", "RENDER_ANIMATION", "Film frames are rendered from the splats.")
+
+
+def next_step(root: bpy.types.Collection | None) -> Step | None:
+    """Return the step that comes next, or None if the folder of the reconstruction cannot be used.
+
+    root: the active reconstruction's collection, or None.
+    """
+    if locations.backend_python() is None:
+        return SET_UP
+    if root is None:
+        return IMPORT
+    state = folder_trust.state_of(root)
+    if folder_trust.is_in_question(root) or not state.imported:
+        return None
+    if not state.trained:
+        return TRAIN if state.voted or not has_masks(state) else ASSIGN
+    return FILM if state.meshes or not state.steps else MESHES
+
+
+def has_masks(state: FolderState) -> bool:
+    """Return whether the capture of a reconstruction has masks; a capture on another computer is not looked at."""
+    capture = state.capture
+    if capture is None or (known_folders.is_remote(capture) and not known_folders.is_known(capture)):
+        return False
+    return (capture / "masks").is_dir()
