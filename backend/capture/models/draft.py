@@ -147,7 +147,8 @@ class Draft:
             if best is None or hits > most[1] * (1 + 1e-9):
                 best, most = model, (seen, hits)
         assert best is not None
-        if most[0] < _LEAST_SEEN:
+        # Photos that are missing may have seen the rest.
+        if most[0] < _LEAST_SEEN * len(self._images) / (len(self._images) + len(self._absent)):
             raise InputError(
                 f"Only {most[0]:.0%} of the points of {cloud} lie in the views of {self.file}; export both from "
                 f"{self.program} in the same coordinates."

@@ -80,7 +80,8 @@ def read(file: Path) -> Model:
             lenses[sensor_id] = _lens(draft, sensors[sensor_id])
         size, lens = lenses[sensor_id]
         pose = _numbers(draft, camera.find("transform"), 16, f"the transform of {shorten(label)}").reshape(4, 4)
-        draft.add(label, partial(_same, lens), placement @ pose, size)
+        with np.errstate(over="ignore", invalid="ignore"):
+            draft.add(label, partial(_same, lens), placement @ pose, size)
     return draft.finish_with_point_cloud(
         placements=[np.eye(4), placement], export="the tie points or the point cloud, in local coordinates,"
     )

@@ -31,9 +31,9 @@ def none_found(folder: Path, names: Sequence[str], file: Path) -> InputError:
 class Photos:
     """The photos of a capture.
 
-    Programs refer to photos by a path on another computer, by a path from their own folder, or by a name without
-    suffix. Of such a reference, the longest part from the right that belongs to a photo is used, so that no reference
-    leads out of the folder.
+    Programs refer to photos by a path on another computer, by a path from their own folder, or by a name, with or
+    without suffix. Of a path, the longest part from the right that belongs to a photo is used, so that no reference
+    leads out of the folder. A name alone may be that of a photo in any subfolder.
     """
 
     def __init__(self, capture: Path) -> None:
@@ -58,7 +58,7 @@ class Photos:
                 return found.relative_to(self.folder).as_posix()
             if name := _only(self._by_stem.get(end.casefold())):
                 return name
-        if not parts:
+        if len(parts) != 1:
             return None
         last = parts[-1].casefold()
         return _only(self._by_name.get(last)) or _only(self._by_name.get(_split(last)[0]))
