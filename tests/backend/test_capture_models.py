@@ -12,11 +12,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from PIL import Image
 
 from backend.capture import check_capture, load_capture
 from backend.capture.models import read_capture_model
 from backend.capture.models.lens import brown
 from backend.shared.errors import EXIT_DONE, InputError
+from backend.training.exposure import measure_gains, varies
 
 from .command_result import assert_rejected
 from .other_models import (
@@ -295,6 +297,44 @@ def test_photos_may_lie_beside_the_cameras(write_capture, tmp_path):
     assert [view.name for view in found.views] == [scene.names[i] for i in (0, 2, 3)]
     assert found.counts["missing"] == 1 and found.counts["registered"] == 4
     assert any("1 of 4 images in the model are not in" in w and scene.names[1] in w for w in found.warnings)
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV"])
+def test_images_observe_points_that_are_not_hidden(write_capture, tmp_path, model):
+    scene = write_capture(views=6, points=400, model=model, params=None if model == "PINHOLE" else OPENCV)
+    drop_colmap(scene)
+    write_transforms(scene)
+    found = loaded(scene, tmp_path, "cache")
+    for index in range(6):
+        keypoints, seen = found.keypoints(index), scene.seen[index]
+        right = np.isin(keypoints.point_index, seen)
+        assert right.mean() > 0.9 and right.sum() > 0.5 * len(seen)
+        where = dict(zip(seen.tolist(), scene.pixels[index]))
+        raw = found._raw[index][1]
+        np.testing.assert_allclose(raw.xy[right], [where[i] for i in raw.point_index[right].tolist()], atol=1e-6)
+
+
+def test_lens_that_folds_over_observes_only_its_view(write_capture):
+    scene = write_capture(views=3)
+    drop_colmap(scene)
+    write_transforms(scene, changed("k1", -0.8))
+    model = read_capture_model(scene.folder)
+    for image in model.images:
+        local = model.xyz[image.point_index] @ image.viewmat[:3, :3].T + image.viewmat[:3, 3]
+        assert len(local) > 10 and (np.linalg.norm(local[:, :2] / local[:, 2:], axis=1) < (1 / 2.4) ** 0.5).all()
+
+
+def test_exposure_is_measured_on_point_clouds(write_capture, tmp_path):
+    scene = write_capture(views=9, points=150)
+    drop_colmap(scene)
+    write_transforms(scene)
+    before = measure_gains(loaded(scene, tmp_path, "same"))
+    for name in scene.names[2::2]:
+        path = scene.folder / "images" / name
+        Image.fromarray((np.asarray(Image.open(path)) * 0.6).astype(np.uint8)).save(path)
+    change = measure_gains(loaded(scene, tmp_path, "other")) / before
+    assert varies(change)
+    assert np.median(change[[2, 4, 6]]) / np.median(change[[1, 3, 5, 7]]) == pytest.approx(0.6, abs=0.05)
 
 
 def test_colmap_is_preferred(write_capture, tmp_path):

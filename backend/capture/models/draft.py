@@ -15,6 +15,7 @@ from ..colmap import Camera, Model, RawImage, RawPoints, export_again, validate
 from .lens import Lens
 from .photos import Photos, none_found
 from .point_cloud import find_point_cloud, read_point_cloud, seen_in
+from .visibility import with_observations
 
 UNNAMED = "the program that wrote it"
 """The program, in messages, of formats that several programs write."""
@@ -129,7 +130,7 @@ class Draft:
             export: What to export if there is no point cloud.
 
         Returns:
-            The model.
+            The model, in which an image observes the points that are not hidden in it.
 
         Raises:
             InputError: There is no point cloud, it cannot be read, or most of it is outside all views.
@@ -153,7 +154,7 @@ class Draft:
                 f"Only {most[0]:.0%} of the points of {cloud} lie in the views of {self.file}; export both from "
                 f"{self.program} in the same coordinates."
             )
-        return best
+        return with_observations(best)
 
     def _require_photos(self) -> None:
         if self._absent and not self._images:
