@@ -11,9 +11,9 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 
 from ..colmap import Camera, Image, Model
-from ..undistort import to_pycolmap, undistort
+from ..undistort import is_pinhole, to_pycolmap, undistort
 
-_MOST_HIDING = 100_000
+_MOST_HIDING = 20_000
 _MOST_OBSERVED = 5_000
 """Numbers of points, spread over the cloud, that may hide others and that may be observed; more would cost much time
 for each image."""
@@ -48,8 +48,9 @@ def _visible(xyz: np.ndarray, is_candidate: np.ndarray, image: Image, camera: Ca
         rays = local[ahead, :2] / local[ahead, 2:]
         pixels = np.asarray(lens.img_from_cam(np.column_stack([rays, np.ones(len(rays))])), np.float64).reshape(-1, 2)
         inside = np.flatnonzero(((pixels >= 0) & (pixels < [camera.width, camera.height])).all(1))
-        off = np.abs(undistort(lens, pixels[inside]) - rays[inside]).max(1, initial=0.0)
-        inside = inside[off < _RAY_WITHIN]
+        if not is_pinhole(camera):
+            off = np.abs(undistort(lens, pixels[inside]) - rays[inside]).max(1, initial=0.0)
+            inside = inside[off < _RAY_WITHIN]
     points, pixels = ahead[inside], pixels[inside]
     if not len(points):
         return points, pixels
