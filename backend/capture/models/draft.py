@@ -135,7 +135,11 @@ class Draft:
         Raises:
             InputError: There is no point cloud, it cannot be read, or most of it is outside all views.
         """
-        self._require_photos()
+        if not self._images:
+            # The first thing that is wrong, whether or not there are points.
+            return self.finish(
+                RawPoints(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0))
+            )
         cloud = find_point_cloud(self.file, named, self.program, export)
         points = read_point_cloud(cloud, self.warnings)
         best: Model | None = None
@@ -156,12 +160,9 @@ class Draft:
             )
         return with_observations(best)
 
-    def _require_photos(self) -> None:
+    def _model(self, points: RawPoints, points_file: Path) -> Model:
         if self._absent and not self._images:
             raise none_found(self.photos.folder, self._absent, self.file)
-
-    def _model(self, points: RawPoints, points_file: Path) -> Model:
-        self._require_photos()
         return validate(
             Model(
                 self.file.parent,

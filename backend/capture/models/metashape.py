@@ -82,9 +82,7 @@ def read(file: Path) -> Model:
         pose = _numbers(draft, camera.find("transform"), 16, f"the transform of {shorten(label)}").reshape(4, 4)
         with np.errstate(over="ignore", invalid="ignore"):
             draft.add(label, partial(_same, lens), placement @ pose, size)
-    return draft.finish_with_point_cloud(
-        placements=[np.eye(4), placement], export="the tie points or the point cloud, in local coordinates,"
-    )
+    return draft.finish_with_point_cloud(placements=[np.eye(4), placement], export="the tie points or the point cloud")
 
 
 def _same(lens: Lens, _width: int, _height: int) -> Lens:

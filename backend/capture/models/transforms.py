@@ -140,7 +140,7 @@ def _matrix(draft: Draft, value: Any, what: str) -> np.ndarray:
         raise draft.refusal(f"has no 4 x 4 numbers as {what}") from error
     whole = np.eye(4)
     whole[: len(matrix)] = matrix
-    if not (whole[3] == [0, 0, 0, 1]).all():
+    if not np.allclose(whole[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
         raise draft.refusal(f"has a last row other than 0, 0, 0, 1 in {what}")
     return whole
 
