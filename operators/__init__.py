@@ -87,8 +87,8 @@ def _classes() -> list[type]:
 
 
 def _import_menu(menu: Any, _context: Any) -> None:
-    menu.layout.operator("objectgs.import_capture", text="ObjectGS Capture (COLMAP)")
-    menu.layout.operator("objectgs.import_splats", text="3D Gaussian Splats (.ply)")
+    menu.layout.operator("objectgs.import_capture", text="ObjectGS Capture (COLMAP and others)")
+    menu.layout.operator("objectgs.import_splats", text="3D Gaussian Splats (.ply, .spz, .splat)")
 
 
 def _export_menu(menu: Any, _context: Any) -> None:

@@ -1,4 +1,4 @@
-"""Captures: images, ID masks and COLMAP models, loaded as undistorted pinhole views."""
+"""Captures: images, ID masks and models of cameras and points, loaded as undistorted pinhole views."""
 
 from .capture import Capture, Keypoints, Points, View, default_split
 from .prepare import load_capture

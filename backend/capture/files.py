@@ -8,7 +8,7 @@ import re
 import unicodedata
 import warnings
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -29,17 +29,18 @@ _OPENING_ERRORS = (OSError, ValueError, SyntaxError, EOFError, MemoryError, PilI
 
 
 class Files:
-    """The files below a folder, looked up by the names in a COLMAP model.
+    """The files below a folder, looked up by the names in a model.
 
     A name is matched exactly, then in composed Unicode (macOS writes decomposed names), then with backslashes as
     separators (models made on Windows), then case-insensitively. An ambiguous match counts as no match.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, without: Collection[str] = ()) -> None:
+        """List the files of `folder`, without those in its subfolders `without`."""
         self.folder = folder
         self.paths: list[str] = []
         for parent, folders, names in os.walk(folder):
-            folders.sort()
+            folders[:] = sorted(name for name in folders if name not in without or parent != str(folder))
             within = Path(parent).relative_to(folder)
             self.paths += [(within / name).as_posix() for name in sorted(names) if not name.startswith(".")]
         self._levels: list[dict[str, list[str]]] = []

@@ -30,9 +30,10 @@ def load_capture(
 ) -> Capture:
     """Load a capture.
 
-    A capture has images/, a COLMAP model (sparse/0, sparse/ or beside images/), and optionally masks/, labels.json or
-    labels.txt, and test.txt with the names of the held-out views. Images that are distorted or too large are resampled
-    into the cache, and again only if their source files change. An interrupted run leaves no incomplete files.
+    A capture has images/, a COLMAP model (sparse/0, sparse/ or beside images/) or a file with the cameras of another
+    program (see `models.read_capture_model`), and optionally masks/, labels.json or labels.txt, and test.txt with the
+    names of the held-out views. Images that are distorted or too large are resampled into the cache, and again only if
+    their source files change. An interrupted run leaves no incomplete files.
 
     Args:
         folder: The capture.

@@ -20,7 +20,7 @@ from ..shared.errors import InputError
 from ..shared.events import Reporter
 from ..shared.reconstruction.objects import default_name
 from .capture import MIN_VIEWS_TO_HOLD_OUT
-from .colmap import Camera, Image, Model, find_model, read_model
+from .colmap import COLMAP, Camera, Image, Model
 from .files import (
     HELD_OUT,
     IMAGE_SUFFIXES,
@@ -35,6 +35,7 @@ from .files import (
     read_mask,
     read_names,
 )
+from .models import none_found, photos_folder, read_capture_model
 from .undistort import Pinhole, is_pinhole, pinhole_for
 
 Problem = Callable[[str], None]
@@ -99,13 +100,9 @@ def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Repo
     if not folder.is_dir():
         what = "is a file, not a folder" if folder.exists() else "does not exist"
         raise InputError(f"The capture {folder} {what}; expected a folder with images/ and sparse/0/.")
-    reporter.status("Reading the COLMAP model")
-    try:
-        model_folder, warnings = find_model(folder)
-    except OSError as error:
-        raise InputError(f"{error.filename or folder} cannot be read ({error.strerror}); check it.") from error
-    model = read_model(model_folder)
-    warnings += model.warnings
+    reporter.status("Reading the cameras and points")
+    model = read_capture_model(folder)
+    warnings = list(model.warnings)
     no_names: dict[int, str] = {}
     names = _tolerate(problem, lambda: read_names(folder), no_names)
 
@@ -115,14 +112,17 @@ def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Repo
             problem, partial(pinhole_for, model.cameras[camera_id], model.file("cameras"), max_size), None
         )
     if not any(targets.values()):
-        raise InputError(f"{model.file('cameras')} contains no usable camera; run COLMAP again.")
+        raise InputError(f"{model.file('cameras')} contains no usable camera; run {model.program} again.")
 
     images_folder, masks_folder = folder / "images", folder / "masks"
-    if not images_folder.is_dir():
+    if model.program != COLMAP:
+        images_folder = photos_folder(folder)
+    elif not images_folder.is_dir():
         raise InputError(f"{images_folder} does not exist; put the images that the COLMAP model names there.")
-    files = Files(images_folder)
+    files = Files(images_folder, without=(masks_folder.name,) if images_folder == folder else ())
     masks = Files(masks_folder) if masks_folder.is_dir() else None
-    sources, absent, unmasked = [], [], []
+    total, absent = len(model.images) + len(model.absent), list(model.absent)
+    sources, unmasked = [], []
     for image in sorted(model.images, key=lambda image: image.name):
         if re.match(r"[/\\]|[A-Za-z]:", image.name) or ".." in re.split(r"[/\\]", image.name):
             problem(
@@ -144,15 +144,12 @@ def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Repo
         target = targets[image.camera_id]
         if target is not None:
             sources.append(Source(image, model.cameras[image.camera_id], target, path, mask_path))
-    present = len(model.images) - len(absent)
+    present = total - len(absent)
     if absent and not present:
-        raise InputError(
-            f"{images_folder} contains none of the {len(absent)} images that {model.file('images')} names, for "
-            f"instance {absent[0]}; put them there."
-        )
+        raise none_found(images_folder, absent, model.file("images"))
     if absent:
         warnings.append(
-            f"{len(absent)} of {len(model.images)} images in the model are not in {images_folder} and are left out, "
+            f"{len(absent)} of {total} images in the model are not in {images_folder} and are left out, "
             f"for instance {absent[0]}."
         )
     registered = {source.image_path for source in sources}
@@ -161,7 +158,7 @@ def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Repo
     if unregistered and len(registered) == present:
         warnings.append(
             f"{len(unregistered)} of {len(on_disk)} images in {images_folder} are not in the model, for instance "
-            f"{unregistered[0]}; COLMAP could not register them, and they are not used."
+            f"{unregistered[0]}; {model.program} could not register them, and they are not used."
         )
     if unmasked:
         first = masks_folder / Path(unmasked[0]).with_suffix(".png")
@@ -181,7 +178,7 @@ def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Repo
         warnings.append(f"All cameras in {model.file('images')} have the same position, so depth cannot be determined.")
 
     counts = {
-        "registered": len(model.images),
+        "registered": total,
         "used": present,
         "missing": len(absent),
         "unregistered": len(unregistered),
@@ -197,7 +194,7 @@ def _held_out(folder: Path, model: Model, sources: list[Source]) -> frozenset[st
     names = read_held_out(folder)
     if names is None:
         return None
-    path, known = folder / HELD_OUT, {image.name for image in model.images}
+    path, known = folder / HELD_OUT, {*(image.name for image in model.images), *model.absent}
     unknown = [name for name in names if name not in known]
     if unknown:
         raise InputError(
@@ -236,7 +233,7 @@ def check_size(source: Source, size: tuple[int, int], cameras_file: Path) -> Non
     if size != (camera.width, camera.height):
         raise InputError(
             f"{source.image_path} is {size[0]}x{size[1]} pixels, but {cameras_file} gives its camera {camera.id} "
-            f"{camera.width}x{camera.height}; use the images that COLMAP was run on."
+            f"{camera.width}x{camera.height}; use the images that the cameras were computed from."
         )
 
 

@@ -91,7 +91,7 @@ def pinhole_for(camera: Camera, file: Path, max_size: int) -> Pinhole:
     lens = to_pycolmap(camera)
     fx, fy, cx, cy = lens.focal_length_x, lens.focal_length_y, lens.principal_point_x, lens.principal_point_y
     longest = max(camera.width, camera.height)
-    degenerate = "the model is degenerate: run COLMAP again with more images or a simpler camera model"
+    degenerate = "the model is degenerate: align the photos again with more images or a simpler camera model"
     if not (0.02 * longest < min(fx, fy) and max(fx, fy) < 1000 * longest):
         raise InputError(
             f"{who} a focal length of {fx:.4g} pixels for an image of {camera.width}x{camera.height}; {degenerate}."

@@ -10,6 +10,9 @@ from ..shared.expectation import PRESET_STEPS
 from ..shared.reconstruction.plan import EVERYTHING, KEYS
 from . import types
 
+CAPTURE = "folder with images/, cameras (sparse/0/ or another program's file) and masks/"
+"""Help of an argument that is a capture."""
+
 
 def add_memory(command: argparse.ArgumentParser) -> None:
     command.add_argument(
@@ -33,7 +36,7 @@ def add_max_size(command: argparse.ArgumentParser) -> None:
 
 
 def add_capture(command: argparse.ArgumentParser) -> None:
-    command.add_argument("capture", type=Path, metavar="CAPTURE", help="folder with images/, sparse/0/ and masks/")
+    command.add_argument("capture", type=Path, metavar="CAPTURE", help=CAPTURE)
     add_max_size(command)
 
 

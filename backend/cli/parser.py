@@ -223,11 +223,12 @@ def _add_import_splats(commands: _Commands) -> None:
         "import-splats", "Make a reconstruction from splats of another program", texts.IMPORT_SPLATS,
         "point_cloud.ply --out garden-splats --capture garden",
     )  # fmt: skip
-    import_splats.add_argument("ply", type=Path, metavar="PLY", help="splats in the format of 3D Gaussian splatting")
-    options.add_output(import_splats)
     import_splats.add_argument(
-        "--capture", type=Path, metavar="CAPTURE", help="folder with images/, sparse/0/ and masks/"
-    )
+        "splats", type=Path, metavar="SPLATS",
+        help="file in the format of 3D Gaussian splatting (.ply), or .spz or .splat",
+    )  # fmt: skip
+    options.add_output(import_splats)
+    import_splats.add_argument("--capture", type=Path, metavar="CAPTURE", help=options.CAPTURE)
     options.add_max_size(import_splats)
     options.add_memory(import_splats)
 

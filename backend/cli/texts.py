@@ -2,7 +2,8 @@
 
 INTRODUCTION = """\
 Turn photos into labeled splats and meshes. A capture is a folder with images/, the
-COLMAP model of their cameras in sparse/0 and, for objects, an object ID mask of each
+COLMAP model of their cameras in sparse/0 (or transforms.json, or the cameras that
+Metashape, RealityScan or Bundler exported) and, for objects, an object ID mask of each
 image in masks/. The result is written to a reconstruction folder.
 
   python -m backend check    garden                      check the capture
@@ -100,9 +101,9 @@ SPZ (a fifth of the size) or .splat (one color per splat).
 """
 
 IMPORT_SPLATS = """\
-Make a reconstruction from splats that another program trained. Their objects are taken
-from object_id in the file or, with --capture, from a vote by that capture's masks; the
-splats must be in its coordinates.
+Make a reconstruction from splats that another program trained: PLY, SPZ or .splat.
+Their objects are taken from object_id in the PLY or, with --capture, from a vote by
+that capture's masks; the splats must be in its coordinates.
 """
 
 DOCTOR = """\

@@ -162,20 +162,41 @@ def read_splats(path: Path) -> tuple[Splats, list[str]]:
     unobserved = unobserved_of(table)
 
     keep = _usable(means, quats, scales, opacities, sh)
-    keep &= (scales < math.log(np.finfo(np.float32).max)).all(axis=1)
+    with np.errstate(over="ignore"):
+        scales = np.exp(np.maximum(scales, math.log(SMALLEST_SCALE)))
+    opacities = 1.0 / (1.0 + np.exp(-np.clip(opacities, -80, 80)))
+    splats, dropped = cleaned(path, Splats(means, quats, scales, opacities, sh, object_ids, unobserved), keep)
+    return splats, warnings + dropped
+
+
+def cleaned(path: Path, splats: Splats, keep: NDArray | None = None) -> tuple[Splats, list[str]]:
+    """Drop splats of a file that cannot be used, and bring the others into the limits of `Splats`.
+
+    Args:
+        path: The file, for the warning.
+        splats: The splats, with any values; changed in place.
+        keep: (N,) bool, which splats to keep if they can be used; all if not given.
+
+    Returns:
+        The splats that are finite, with unit quaternions, and a warning about the others.
+    """
+    usable = _usable(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
+    usable &= (splats.scales < np.finfo(np.float32).max).all(axis=1)
+    keep = usable if keep is None else usable & keep
+    warnings = []
     if not keep.all():
         warnings.append(
-            f"{int((~keep).sum())} of {n} splats in {path.name} were dropped: they hold NaN, Inf or a zero quaternion."
+            f"{int((~keep).sum())} of {len(keep)} splats in {path.name} were dropped: they hold NaN, Inf or a zero "
+            "quaternion."
         )
-        means, quats, scales, opacities, sh = means[keep], quats[keep], scales[keep], opacities[keep], sh[keep]
-        object_ids, unobserved = object_ids[keep], unobserved[keep]
-
+        splats = splats.select(keep)
+    quats = splats.quats
     lengths = np.linalg.norm(quats.astype(np.float64), axis=1)
     off = np.abs(lengths - 1.0) > 1e-6
     quats[off] = quats[off] / lengths[off, None]
-    scales = np.maximum(np.exp(np.maximum(scales, math.log(SMALLEST_SCALE))), SMALLEST_SCALE)
-    opacities = np.clip(1.0 / (1.0 + np.exp(-np.clip(opacities, -80, 80))), OPACITY_MARGIN, 1.0 - OPACITY_MARGIN)
-    return Splats(means, quats, scales, opacities, sh, object_ids, unobserved), warnings
+    splats.scales = np.maximum(splats.scales, SMALLEST_SCALE)
+    splats.opacities = np.clip(splats.opacities, OPACITY_MARGIN, 1.0 - OPACITY_MARGIN)
+    return splats, warnings
 
 
 def _columns(table: NDArray, names: tuple[str, ...]) -> NDArray:

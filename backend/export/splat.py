@@ -1,4 +1,4 @@
-"""Export of splats as .splat for web viewers: 32 bytes per splat, one color, no object IDs."""
+"""Export and import of splats as .splat, for web viewers: 32 bytes per splat, one color, no object IDs."""
 
 from __future__ import annotations
 
@@ -7,8 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from ..model.splats import Splats
+from ..shared.errors import InputError
 from ..shared.formats.atomic import write_atomic
+from ..shared.formats.regular_file import read_regular
 from ..shared.splats.spherical_harmonics import C0
+from .ply import cleaned
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
@@ -34,3 +37,33 @@ def write_splat(path: Path, splats: Splats) -> list[str]:
     if splats.degree:
         return [f"{path.name} stores one color for each splat; its change with the view direction is lost."]
     return []
+
+
+def read_splat(path: Path) -> tuple[Splats, list[str]]:
+    """Read splats from a .splat file, written by this or another program.
+
+    Args:
+        path: The file to read.
+
+    Returns:
+        The splats, without objects, except those with NaN, Inf or a zero quaternion, and warnings about these.
+
+    Raises:
+        InputError: The file cannot be read, or its size is not a multiple of 32 bytes.
+    """
+    try:
+        data = read_regular(path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}); check the file.") from error
+    if len(data) % _ROW.itemsize:
+        raise InputError(
+            f"{path} is truncated or not a .splat file: its {len(data)} bytes are not a multiple of {_ROW.itemsize}; "
+            "export it again."
+        )
+    rows = np.frombuffer(data, _ROW)
+    color = rows["rgba"].astype(np.float64) / 255.0
+    sh = ((color[:, :3] - 0.5) / C0).astype(np.float32)[:, None]
+    quats = (rows["quat"].astype(np.float32) - 128.0) / 128.0
+    ids = np.zeros(len(rows), np.int64)
+    splats = Splats(rows["mean"].copy(), quats, rows["scale"].astype(np.float64), color[:, 3], sh, ids)
+    return cleaned(path, splats)

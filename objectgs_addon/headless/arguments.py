@@ -72,8 +72,8 @@ OPTIONS are those of `python -m backend export`, whose --help explains them:
 }
 
 _IMPORT_SPLATS = """\
-Make a reconstruction of splats that were trained by another program: PLY is a file of
-3D Gaussian splats. With --capture, the masks of the capture assign each splat to an object.
+Make a reconstruction of splats that were trained by another program: SPLATS is a PLY,
+SPZ or .splat file. With --capture, the masks of the capture assign each splat to an object.
 """
 
 _FILM = """\
@@ -191,10 +191,10 @@ def _parser() -> argparse.ArgumentParser:
         "import-splats",
         "make a reconstruction of splats of another program",
         _IMPORT_SPLATS,
-        takes="PLY",
-        usage="headless.py import-splats PLY --out DIR [--capture CAPTURE]",
+        takes="SPLATS",
+        usage="headless.py import-splats SPLATS --out DIR [--capture CAPTURE]",
     )
-    imported.add_argument("--capture", type=Path, metavar="CAPTURE", help="folder with images/, sparse/ and masks/")
+    imported.add_argument("--capture", type=Path, metavar="CAPTURE", help="folder with images/, cameras and masks/")
     _backend(imported)
     build = command(
         "build",

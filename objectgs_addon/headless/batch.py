@@ -19,6 +19,9 @@ from .commands import BLEND, PICTURE, StepFailed, absolute, find_backend, recons
 
 DONE, BAD_INPUT, FAILED, UNFINISHED = "done", "bad input", "failed", "unfinished"
 
+_CAPTURE_FILES = {".json", ".txt", ".out", ".xml", ".csv", ".ply", ".obj"}
+"""Suffixes of files beside images/ that a capture may consist of: labels, held-out views, cameras and points."""
+
 _NOTHING: dict[str, Any] = {
     "state": UNFINISHED, "psnr": None, "miou": None, "miou_all": None, "zero_is_background": None, "splats": None,
     "error": None,
@@ -75,12 +78,9 @@ def _captures(source: Path) -> list[Path]:
 
 def fingerprint(capture: Path) -> list[int]:
     """Return the number, total size in bytes and latest modification time (ns) of a capture's files."""
-    states = [
-        path.stat()
-        for part in ("images", "masks", "sparse", "labels.json")
-        for path in ([capture / part] if (capture / part).is_file() else (capture / part).rglob("*"))
-        if path.is_file()
-    ]
+    paths = [path for part in ("images", "masks", "sparse") for path in (capture / part).rglob("*")]
+    paths += [path for path in capture.iterdir() if path.suffix.lower() in _CAPTURE_FILES]
+    states = [path.stat() for path in paths if path.is_file()]
     return [len(states), sum(state.st_size for state in states), max((s.st_mtime_ns for s in states), default=0)]
 
 

@@ -21,11 +21,12 @@ class ImportCapture(bpy.types.Operator):
     bl_idname = "objectgs.import_capture"
     bl_label = "Import Capture"
     bl_description = (
-        "Import the cameras, photos and points of a folder with images/, a COLMAP model in sparse/0, and masks/"
+        "Import the cameras, photos and points of a folder with images/, masks/ and a COLMAP model in sparse/0, or a "
+        "file with the cameras: transforms.json, or an export of Metashape, RealityScan or Bundler"
     )
     bl_options = {"REGISTER"}
 
-    directory: StringProperty(name="Capture", subtype="DIR_PATH", description="Folder with images/ and sparse/0")
+    directory: StringProperty(name="Capture", subtype="DIR_PATH", description="Folder with images/ and cameras")
     filter_folder: BoolProperty(default=True, options={"HIDDEN"})
     # A plain string: the button of a DIR_PATH cannot open a second file browser.
     folder: StringProperty(

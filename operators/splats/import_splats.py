@@ -24,12 +24,12 @@ class ImportSplats(bpy.types.Operator):
     bl_options = {"REGISTER"}
 
     filepath: StringProperty(name="File", subtype="FILE_PATH", options={"SKIP_SAVE"})
-    filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
+    filter_glob: StringProperty(default="*.ply;*.spz;*.splat", options={"HIDDEN"})
     # Plain strings: the button of a DIR_PATH cannot open a second file browser.
     capture: StringProperty(
         name="Capture",
         description=(
-            "Path of the folder with images/, sparse/0 and masks/ that the splats were trained on. If empty, the "
+            "Path of the folder with images/, cameras and masks/ that the splats were trained on. If empty, the "
             "objects of the file are used"
         ),
     )
@@ -56,20 +56,20 @@ class ImportSplats(bpy.types.Operator):
 
     @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
-        ply = Path(bpy.path.abspath(self.filepath)).resolve()
-        if not self.filepath or not ply.is_file():
+        path = Path(bpy.path.abspath(self.filepath)).resolve()
+        if not self.filepath or not path.is_file():
             raise InputError(f"The file {self.filepath} does not exist; choose another")
-        folder = folder_to_import_to(self.folder, lambda: _folder_for(ply))
-        arguments = ["import-splats", str(ply), "--out", str(folder)]
+        folder = folder_to_import_to(self.folder, lambda: _folder_for(path))
+        arguments = ["import-splats", str(path), "--out", str(folder)]
         if self.capture:
             arguments += ["--capture", str(Path(bpy.path.abspath(self.capture)).resolve())]
-        job = locations.backend_job(f"Import {ply.name}", "import-splats", folder, *arguments)
+        job = locations.backend_job(f"Import {path.name}", "import-splats", folder, *arguments)
         return background.submit(job, context.scene, self.report)
 
 
-def _folder_for(ply: Path) -> Path:
+def _folder_for(path: Path) -> Path:
     """Return a new reconstruction folder named after the file, or after its parent if the file has a generic name."""
-    name = ply.parent.name if ply.stem.lower() in ("point_cloud", "splats", "splat") else ply.stem
+    name = path.parent.name if path.stem.lower() in ("point_cloud", "splats", "splat") else path.stem
     return locations.new_reconstruction(name, lambda folder: not folder.exists())
 
 

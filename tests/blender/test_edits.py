@@ -655,6 +655,18 @@ def test_exported_splats_have_edits_and_can_be_imported(root, folder, backend_py
     assert other != root and set(blender_scene.object_collections(other)) == {0, 2, HUGE}
 
 
+@pytest.mark.parametrize("kind", ["spz", "splat"])
+def test_splats_of_other_formats_can_be_imported(root, folder, backend_python, tmp_path, kind):
+    assert bpy.ops.objectgs.export_splats(filepath=str(tmp_path / "all"), format=kind) == {"FINISHED"}
+    path = tmp_path / f"all.{kind}"
+    assert bpy.ops.objectgs.import_splats(filepath=str(path), folder=str(tmp_path / "again")) == {"FINISHED"}
+    other = active()
+    assert other != root and set(blender_scene.object_collections(other)) == {0}
+    found, wanted = (read_vertices(made / "splats.ply") for made in (tmp_path / "again", folder))
+    for axis in "xyz":
+        np.testing.assert_allclose(np.sort(found[axis]), np.sort(wanted[axis]), atol=1e-4)
+
+
 @pytest.mark.parametrize("suffix", ["glb", "usdc", "obj"])
 def test_exported_meshes_have_edits(root, tmp_path, suffix):
     blender_scene.show_kinds(root, "splats")

@@ -205,7 +205,7 @@ def odd_arguments(folder: Path, templates: Templates, rng: random.Random) -> Cas
     arguments: list[Any] = [name]
     for action in parsers[name]._actions:
         if not action.option_strings:
-            inputs = {"folder": out if out.exists() else templates.trained, "ply": templates.splats}
+            inputs = {"folder": out if out.exists() else templates.trained, "splats": templates.splats}
             arguments.append(inputs.get(action.dest, templates.captures[0]))
     chosen = [action for action in parsers[name]._actions if action.option_strings and action.dest != "help"]
     for action in chosen:

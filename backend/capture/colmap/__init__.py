@@ -1,6 +1,10 @@
-"""COLMAP models: cameras, posed images and points, read from text or binary files and validated."""
+"""COLMAP models: cameras, posed images and points, read from text or binary files; validation of all models."""
 
-from .model import CAMERA_MODELS, Camera, Image, Model
-from .reader import find_model, read_model
+from .model import CAMERA_MODELS, COLMAP, Camera, Image, Model, RawImage, RawPoints, export_again
+from .reader import find_model, has_model, read_model
+from .validate import validate
 
-__all__ = ["CAMERA_MODELS", "Camera", "Image", "Model", "find_model", "read_model"]
+__all__ = [
+    "CAMERA_MODELS", "COLMAP", "Camera", "Image", "Model", "RawImage", "RawPoints", "export_again", "find_model",
+    "has_model", "read_model", "validate",
+]  # fmt: skip

@@ -1,7 +1,8 @@
-"""Data types of a COLMAP model, before and after validation."""
+"""Data types of a model of cameras and points, before and after validation; names and conventions are COLMAP's."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -34,8 +35,15 @@ CAMERA_MODELS: dict[int, tuple[str, int]] = {
 FILE_STEMS = ("cameras", "images", "points3D")
 """The names of a model's files, without suffix."""
 
-EXPORT_AGAIN = "copy the model again, or export it again from COLMAP"
-"""The advice at the end of error messages about damaged files."""
+COLMAP = "COLMAP"
+
+
+def export_again(program: str) -> str:
+    """Return the advice at the end of error messages about damaged files of a program."""
+    return f"copy the model again, or export it again from {program}"
+
+
+EXPORT_AGAIN = export_again(COLMAP)
 
 
 @dataclass(frozen=True)
@@ -62,10 +70,24 @@ class Image:
 
 @dataclass(frozen=True)
 class Model:
-    """A whole model: images in the file's order, points as arrays of length M."""
+    """A whole model: images in the file's order, points as arrays of length M.
+
+    Attributes:
+        folder: The folder of the model's files.
+        files: The files with the cameras, images and points, by the stems in FILE_STEMS.
+        cameras: Cameras by ID.
+        images: Images with a pose.
+        xyz: (M, 3) float64, world.
+        rgb: (M, 3) uint8.
+        error: (M,) float32, reprojection error in pixels, negative where unknown.
+        ids: (M,) int64, distinct.
+        warnings: Warnings for the user.
+        program: The program that made the model, for messages.
+        absent: Names of images that were left out because their photos are missing.
+    """
 
     folder: Path
-    suffix: str
+    files: Mapping[str, Path]
     cameras: dict[int, Camera]
     images: list[Image]
     xyz: np.ndarray
@@ -73,10 +95,12 @@ class Model:
     error: np.ndarray
     ids: np.ndarray
     warnings: list[str] = field(default_factory=list)
+    program: str = COLMAP
+    absent: tuple[str, ...] = ()
 
     def file(self, stem: str) -> Path:
-        """Return the path of cameras, images or points3D, with the model's suffix."""
-        return self.folder / f"{stem}{self.suffix}"
+        """Return the path of the file with the cameras, images or points3D."""
+        return self.files[stem]
 
 
 @dataclass

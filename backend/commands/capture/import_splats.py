@@ -7,7 +7,8 @@ import argparse
 import numpy as np
 
 from ...capture import Capture, Points
-from ...export import read_splats, write_splats
+from ...editing import transformed
+from ...export import DOWN_TO_UP, read_foreign_splats, write_splats
 from ...labels import Votes
 from ...labels import vote as vote_points
 from ...labels.points import write_points
@@ -28,14 +29,16 @@ _LEAST_VISIBLE = 0.5
 
 
 def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> None:
-    """Write splats.ply, objects.json, cameras.json and points.ply from the PLY."""
+    """Write splats.ply, objects.json, cameras.json and points.ply from a file of splats."""
     folder = Reconstruction(options.out)
     if folder.checkpoint.exists():
         raise InputError(f"{folder.folder} already contains a training; choose another --out.")
-    reporter.status(f"Reading {options.ply.name}")
-    splats, warnings = read_splats(options.ply)
+    reporter.status(f"Reading {options.splats.name}")
+    splats, warnings = read_foreign_splats(options.splats)
     if len(splats) == 0:
-        raise InputError(f"{options.ply} contains no splats.")
+        raise InputError(f"{options.splats} contains no splats.")
+    if options.splats.suffix.lower() == ".spz":
+        splats = transformed(splats, DOWN_TO_UP)
     for sentence in warnings:
         reporter.warning(sentence)
     names: dict[int, str] = {}
@@ -63,7 +66,7 @@ def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> No
             for i, n in zip(found.tolist(), counts.tolist())
         ]
         write_objects(folder.objects, objects)
-        update_record(folder, imported=ImportRecord(str(options.ply.resolve()), len(splats)))
+        update_record(folder, imported=ImportRecord(str(options.splats.resolve()), len(splats)))
     reporter.done(splats=len(splats), objects=len(objects), reconstruction=str(folder.folder))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...capture import Upright
 from ...editing import apply_edits, transformed
-from ...export import background_sphere, read_splats, write_splat, write_splats, write_spz
+from ...export import DOWN_TO_UP, background_sphere, read_splats, write_splat, write_splats, write_spz
 from ...model.splats import Splats, concatenate
 from ...shared.errors import InputError
 from ...shared.formats.file_names import distinct_stems
@@ -21,8 +21,6 @@ from ...shared.reconstruction.record import Record, read_record
 from ...shared.stopping import StoppingReporter
 from ..cameras import read_upright
 
-_DOWN_TO_UP = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From the axes of COLMAP (x right, y down, z forward) to those of SPZ (x right, y up, z back)."""
 _Z_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
@@ -100,7 +98,7 @@ def _in_coordinates(splats: Splats, coordinates: str, upright: Upright, y_up: bo
         stand = np.eye(4)
         stand[:3, :3], stand[:3, 3] = upright.rotation, upright.translation
         return transformed(splats, (_Z_TO_Y_UP if y_up else np.eye(4)) @ stand)
-    return transformed(splats, _DOWN_TO_UP) if y_up else splats
+    return transformed(splats, DOWN_TO_UP) if y_up else splats
 
 
 def _files(

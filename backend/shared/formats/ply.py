@@ -1,4 +1,4 @@
-"""Vertices of binary PLY files as structured NumPy arrays with one field per property."""
+"""Vertices of PLY files as structured NumPy arrays with one field per property."""
 
 from __future__ import annotations
 
@@ -48,26 +48,67 @@ def write_vertices(path: Path, table: np.ndarray) -> None:
         file.write(np.ascontiguousarray(table.astype(packed, copy=False)).data)
 
 
-def read_vertices(path: Path) -> np.ndarray:
-    """Read the vertices of a binary PLY file; later elements are ignored.
+def read_vertices(path: Path, text: bool = False) -> np.ndarray:
+    """Read the vertices of a PLY file; later elements are ignored.
 
     Args:
         path: The file to read.
+        text: Whether ASCII files are read, too; else they are refused, since they round numbers.
 
     Returns:
         A structured array (N,) with the file's property names, order and types.
 
     Raises:
-        InputError: The file is missing, truncated or ASCII, or has no vertices with scalar properties.
+        InputError: The file is missing or truncated, is ASCII without `text`, or has no vertices with scalar
+            properties.
     """
     try:
         with open_regular(path) as file:
-            return _read(file, path)
+            order, dtype, count = _read_header(file, path, text)
+            available = os.fstat(file.fileno()).st_size - file.tell()
+            if order:
+                _check_size(path, count, available, dtype.itemsize)
+                return np.fromfile(file, dtype, count)
+            # A digit and a separator for each value at least, which limits what a wrong count can allocate.
+            _check_size(path, count, available + 1, 2 * len(dtype.names or ()))
+            return _read_text(file, path, dtype, count)
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror or error}).") from error
 
 
-def _read(file: BinaryIO, path: Path) -> np.ndarray:
+def _check_size(path: Path, count: int, available: int, size: int) -> None:
+    if available < count * size:
+        raise InputError(
+            f"{path} is truncated: its header specifies {count} vertices, but only {available // size} are there."
+        )
+
+
+def _read_text(file: BinaryIO, path: Path, dtype: np.dtype, count: int) -> np.ndarray:
+    """Read the vertices of an ASCII file from the end of its header on."""
+    names, table = dtype.names or (), np.zeros(count, dtype)
+    if not count:
+        return table
+    try:
+        values = np.loadtxt(file, np.float64, comments=None, ndmin=2, max_rows=count, encoding="latin-1")
+    except ValueError as error:
+        raise InputError(f"{path} has a vertex that is not {len(names)} numbers; save it as binary PLY.") from error
+    if len(values) < count:
+        raise InputError(
+            f"{path} is truncated: its header specifies {count} vertices, but only {len(values)} are there."
+        )
+    if values.shape[1] != len(names):
+        raise InputError(f"{path} has a vertex that is not {len(names)} numbers; save it as binary PLY.")
+    for column, name in zip(values.T, names):
+        if dtype[name].kind != "f":
+            limits = np.iinfo(dtype[name])
+            column = np.clip(np.nan_to_num(column), limits.min, limits.max)
+        with np.errstate(over="ignore"):
+            table[name] = column
+    return table
+
+
+def _read_header(file: BinaryIO, path: Path, text: bool) -> tuple[str, np.dtype, int]:
+    """Read a header, up to the first vertex; returns the byte order ("" for ASCII) and the vertices' type and count."""
     head = file.read(LONGEST_HEADER)
     if not head.startswith(b"ply"):
         raise InputError(f"{path} is not a PLY file.")
@@ -75,7 +116,7 @@ def _read(file: BinaryIO, path: Path) -> np.ndarray:
     newline = head.find(b"\n", end)
     if end < 0 or newline < 0:
         raise InputError(f"{path} has no complete PLY header; it may be truncated.")
-    order = ""
+    order: str | None = None
     count = -1
     fields: list[tuple[str, str]] = []
     element = ""
@@ -84,9 +125,9 @@ def _read(file: BinaryIO, path: Path) -> np.ndarray:
         if not words or words[0] in ("ply", "comment", "obj_info"):
             continue
         if words[0] == "format" and len(words) >= 2:
-            if words[1] == "ascii":
+            if words[1] == "ascii" and not text:
                 raise InputError(f"{path} is an ASCII PLY file; only binary ones are read. Save it as binary PLY.")
-            order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(words[1], "")
+            order = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}.get(words[1])
         elif words[0] == "element" and len(words) == 3 and words[2].isdigit():
             if count >= 0:
                 break
@@ -102,17 +143,11 @@ def _read(file: BinaryIO, path: Path) -> np.ndarray:
             fields.append((words[2], _KINDS[words[1]]))
         elif words[0] != "property":
             raise InputError(f"{path} has an invalid PLY header line: {line.strip()!r}.")
-    if not order or count < 0 or not fields:
+    if order is None or count < 0 or not fields:
         raise InputError(f"{path} has no format or no vertices in its PLY header.")
     try:
         dtype = np.dtype([(name, order + kind) for name, kind in fields])
     except ValueError as error:
         raise InputError(f"{path} names a vertex property twice.") from error
-    available = os.fstat(file.fileno()).st_size - newline - 1
-    if available < count * dtype.itemsize:
-        raise InputError(
-            f"{path} is truncated: its header specifies {count} vertices, "
-            f"but only {available // dtype.itemsize} are there."
-        )
     file.seek(newline + 1)
-    return np.fromfile(file, dtype, count)
+    return order, dtype, count

@@ -1,0 +1,78 @@
+"""The photos of a capture, looked up by the names and paths with which other programs refer to them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from ...shared.errors import InputError
+from ..files import IMAGE_SUFFIXES, Files, image_size
+
+
+def photos_folder(folder: Path) -> Path:
+    """Return the folder of a capture's photos: images/ or, where there is none, the capture itself."""
+    return folder / "images" if (folder / "images").is_dir() else folder
+
+
+def none_found(folder: Path, names: Sequence[str], file: Path) -> InputError:
+    """Return the error for a model of which no photo exists.
+
+    Args:
+        folder: The folder of the photos.
+        names: The photos that the model names.
+        file: The file of the model that names them.
+    """
+    return InputError(
+        f"{folder} contains none of the {len(names)} images that {file} names, for instance {names[0]}; put them there."
+    )
+
+
+class Photos:
+    """The photos of a capture.
+
+    Programs refer to photos by a path on another computer, by a path from their own folder, or by a name, with or
+    without suffix. Of a path, the longest part from the right that belongs to a photo is used, so that no reference
+    leads out of the folder. A name alone may be that of a photo in any subfolder.
+    """
+
+    def __init__(self, capture: Path) -> None:
+        self.folder = photos_folder(capture)
+        self._files = Files(self.folder, without=("masks",) if self.folder == capture else ())
+        self._by_stem: dict[str, list[str]] = {}
+        self._by_name: dict[str, list[str]] = {}
+        for path in self._files.paths:
+            stem, suffix = _split(path)
+            if suffix.lower() in IMAGE_SUFFIXES:
+                self._by_stem.setdefault(stem.casefold(), []).append(path)
+                for key in {path.rpartition("/")[2], stem.rpartition("/")[2]}:
+                    self._by_name.setdefault(key.casefold(), []).append(path)
+
+    def find(self, reference: str) -> str | None:
+        """Return the name of a photo, relative to the folder, or None; of several that fit equally, none does."""
+        parts = [part for part in re.split(r"[/\\]+", reference) if part not in ("", ".", "..")]
+        for start in range(len(parts)):
+            end = "/".join(parts[start:])
+            found = self._files.find(end)
+            if found is not None and found.suffix.lower() in IMAGE_SUFFIXES:
+                return found.relative_to(self.folder).as_posix()
+            if name := _only(self._by_stem.get(end.casefold())):
+                return name
+        if len(parts) != 1:
+            return None
+        last = parts[-1].casefold()
+        return _only(self._by_name.get(last)) or _only(self._by_name.get(_split(last)[0]))
+
+    def size(self, name: str) -> tuple[int, int]:
+        """Read the width and height of a photo; raises InputError with its path."""
+        return image_size(self.folder / name)
+
+
+def _split(path: str) -> tuple[str, str]:
+    """Split a path into the part before the suffix of a photo, and that suffix, which may be empty."""
+    stem, dot, suffix = path.rpartition(".")
+    return (stem, dot + suffix) if stem and dot + suffix.lower() in IMAGE_SUFFIXES else (path, "")
+
+
+def _only(paths: list[str] | None) -> str | None:
+    return paths[0] if paths and len(paths) == 1 else None

@@ -1,0 +1,72 @@
+"""Search of a capture for the model of its cameras, COLMAP's first, and reading of it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+from ...shared.errors import InputError
+from ...shared.formats.regular_file import open_regular
+from ..colmap import Model, find_model, has_model, read_model
+from . import bundler, metashape, realityscan, transforms
+
+_FORMATS: tuple[tuple[str, str, Callable[[bytes], bool], Callable[[Path], Model]], ...] = (
+    ("a transforms.json", r"transforms\.json", transforms.recognizes, transforms.read),
+    ("a Bundler file", r".*\.out", bundler.recognizes, bundler.read),
+    ("a Metashape XML file", r".*\.xml", metashape.recognizes, metashape.read),
+    ("a RealityScan CSV file", r".*\.csv", realityscan.recognizes, realityscan.read),
+)
+"""What is looked for if there is no COLMAP model, in this order: name, file name, test of a file's start, reader."""
+
+_HEAD = 4096
+
+
+def read_capture_model(folder: Path) -> Model:
+    """Find and read the model of a capture.
+
+    Args:
+        folder: The capture, with a COLMAP model as for `find_model`, or a file of another program beside the photos:
+            transforms.json, a Bundler file (.out), Metashape's cameras (.xml) or RealityScan's (.csv).
+
+    Returns:
+        The model, whose warnings include those about the choice of the model.
+
+    Raises:
+        InputError: There is no model, or it cannot be used; the message names the file.
+    """
+    try:
+        if has_model(folder):
+            chosen, warnings = find_model(folder)
+            model = read_model(chosen)
+            model.warnings[:0] = warnings
+            return model
+        files = sorted(path for path in folder.iterdir() if not path.is_dir())
+    except OSError as error:
+        raise InputError(f"{error.filename or folder} cannot be read ({error.strerror}); check it.") from error
+    unreadable = []
+    for what, pattern, recognizes, read in _FORMATS:
+        found = []
+        for path in files:
+            if not re.fullmatch(pattern, path.name, re.IGNORECASE):
+                continue
+            try:
+                with open_regular(path) as file:
+                    head = file.read(_HEAD)
+            except OSError as error:
+                unreadable.append(f"{path} cannot be read ({error.strerror}); check the file.")
+                continue
+            if recognizes(head):
+                found.append(path)
+        if len(found) > 1:
+            names = " and ".join(path.name for path in found[:2])
+            raise InputError(f"{folder} contains {names}, each {what} with cameras; leave only one of them there.")
+        if found:
+            return read(found[0])
+    if unreadable:
+        raise InputError(unreadable[0])
+    raise InputError(
+        f"{folder} contains no COLMAP model: expected cameras, images and points3D (.bin or .txt) in "
+        f"{folder / 'sparse' / '0'}, or the cameras as transforms.json, Bundler's .out, Metashape's .xml or "
+        "RealityScan's .csv."
+    )
