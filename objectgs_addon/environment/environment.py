@@ -91,8 +91,8 @@ def _wanted(device: str, system: str) -> str:
 
 
 def cache_folder(folder: str | Path) -> Path:
-    """Return the folder for compiled kernels, next to the environment, so that it survives a new setup."""
-    return Path(folder).parent / "cache"
+    """Return the folder for compiled kernels: NUMBA_CACHE_DIR, else beside the environment, to survive a new setup."""
+    return Path(os.environ.get("NUMBA_CACHE_DIR") or Path(folder).parent / "cache")
 
 
 def set_up_job(base_python: str | Path, folder: str | Path, device: str) -> Job:

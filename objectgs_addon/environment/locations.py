@@ -94,14 +94,13 @@ def backend_job(title: str, kind: str, folder: Path | None, *arguments: str) -> 
     python = backend_python()
     assert python is not None
     silent = f"{python} cannot run the backend; choose a Python {VERSIONS} that has its packages, or set it up again."
-    cache = os.environ.get("NUMBA_CACHE_DIR") or user_folder() / "cache"
     return Job(
         title=title,
         kind=kind,
         folder=folder,
         command=backend_command(python, *arguments),
         cwd=ROOT,
-        environment=backend_environment(cache),
+        environment=backend_environment(environment.cache_folder(environment_folder())),
         if_silent=silent,
     )
 
