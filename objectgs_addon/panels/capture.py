@@ -14,6 +14,7 @@ from ..running import background
 from ..running.job_display import write
 from ..state import folder_trust
 from ..state.folder_state import folder_state
+from .preferences import draw_online_access
 from .tab import Tab, draw_job
 
 
@@ -26,6 +27,7 @@ class CapturePanel(Tab, bpy.types.Panel):
         if locations.backend_python() is None:
             box = layout.box()
             write(box, "The compute backend is not set up yet.", "INFO")
+            draw_online_access(box)
             opens = box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES")
             opens.module = locations.PACKAGE
         column = layout.column(align=True)

@@ -43,8 +43,8 @@ def folders(tmp_path_factory):
     """A capture, and a reconstruction of it that the tests fill in the order of `STAGES`, with a shot for the film."""
     place = tmp_path_factory.mktemp("progress")
     write_scene(place / "capture", views=9, size=(64, 48))
-    camera = Sample(np.eye(4), np.array([[64.0, 0, 32], [0, 64, 24], [0, 0, 1]]), (0.01, 100.0), {1: Placed()})
-    write_shot(place / "shot.json", Shot(64, 48, [Frame(number, None, [camera]) for number in (1, 2, 3)]))
+    camera = Sample(1.0, np.eye(4), np.array([[64.0, 0, 32], [0, 64, 24], [0, 0, 1]]), (0.01, 100.0), {1: Placed()})
+    write_shot(place / "shot.json", Shot(64, 48, [Frame(number, (number, number), [camera]) for number in (1, 2, 3)]))
     return place
 
 
@@ -160,6 +160,7 @@ def test_time_left_follows_the_pace_and_expects_later_parts(monkeypatch):
     staged.begin("b", "Working")
     assert recorder.events[-1]["seconds_left"] == 60.0
     staged.progress(1, 2, seconds_left=7.0)
+    clock[0] = 30.0
     staged.progress(5, 2)
     assert [event["seconds_left"] for event in recorder.events[-2:]] == [7.0, 0.0]
     assert recorder.events[-1]["done"] == 0.99
