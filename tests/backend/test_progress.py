@@ -83,7 +83,7 @@ def check_events(found: list[dict]) -> None:
     """Check that progress never decreases, starts near 0 and is complete only when the command is."""
     shares = [event["done"] / event["total"] for event in found if event["type"] == "progress"]
     assert shares and shares == sorted(shares)
-    assert shares[0] == 0 and 0.5 < shares[-1] < 1
+    assert shares[0] == 0 and 0.2 < shares[-1] < 1
     left = [event["seconds_left"] for event in found if event["type"] == "progress"]
     assert all(seconds >= 0 for seconds in left)
 
@@ -107,9 +107,10 @@ def test_compilation_is_a_part_of_its_own(folders, run_command, monkeypatch):
     said = [event for event in result.events if event["type"] == "status"]
     compiling = next(event for event in said if event["message"].startswith("Compiling kernels"))
     assert (compiling["stage"], compiling["number"], compiling["of"]) == ("Preparing", 1, 3)
-    before = [event["done"] for event in result.events if event["type"] == "progress" and "step" not in event]
-    trained = [event["done"] for event in result.events if event["type"] == "progress" and "step" in event]
-    assert len({share for share in before if share < min(trained)}) > 8, "the compilation has progress of its own"
+    later = result.events[result.events.index(compiling) :]
+    training = next(place for place, event in enumerate(later) if event.get("stage") == "Training")
+    shares = {event["done"] for event in later[:training] if event["type"] == "progress"}
+    assert len(shares) > 8 and max(shares) - min(shares) > 0.3, "the compilation has progress of its own"
 
 
 def test_set_up_compiles_what_jobs_need(folders, run_command):

@@ -65,6 +65,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     )  # fmt: skip
     with open_reconstruction(options, reporter) as (output, capture):
         folder = output.folder
+        _expect_training(budget, capture, device, TrainingProgress(), reporter)
         trainer, plan = _begin(folder, capture, options, reporter, device)
         output.accept()
         progress = trainer.progress
@@ -88,8 +89,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
                     plan=plan.as_list(),
                 ),
             )
-            seconds = training_seconds(budget, trainer.scene.capture, device, progress)
-            reporter.expect({"train": ("Training", seconds)})
+            _expect_training(budget, trainer.scene.capture, device, progress, reporter)
             if expected := expected_of(budget, trainer.scene.capture, device, progress):
                 reporter.status(expected)
             try:
@@ -107,6 +107,13 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         zero_is_background=trainer.scene.supervise_background,
         psnr_of_export=export.psnr_of_export,
     )  # fmt: skip
+
+
+def _expect_training(
+    budget: Budget, capture: Capture, device: torch.device, done: TrainingProgress, reporter: Reporter
+) -> None:
+    """Tell the reporter how long the training takes, of which `done` is done."""
+    reporter.expect({"train": ("Training", training_seconds(budget, capture, device, done))})
 
 
 def _begin(
