@@ -21,7 +21,7 @@ from ..shared.errors import (
     InputError,
     describe_missing_package,
 )
-from ..shared.events import JsonReporter, Reporter
+from ..shared.events import JsonReporter, Reporter, StagedReporter
 from ..shared.signals import held_signals
 from ..shared.stopping import StoppingReporter, StopRequest
 from .kernel_cache import use_private_cache
@@ -99,7 +99,7 @@ def _run(arguments: list[str], reporter: Reporter) -> int:
 
                 stack.enter_context(stop.listening(read_stdin=options.json))
             set_threads(options.threads)
-            COMMANDS[options.command](options, StoppingReporter(reporter, stop))
+            COMMANDS[options.command](options, StoppingReporter(StagedReporter(reporter), stop))
         return EXIT_DONE
     except (InputError, UsageError) as error:
         _tell(reporter.error, _shortened(str(error)))

@@ -30,6 +30,9 @@ from ..training.state import load_model, progress_of
 from .cameras import write_capture_cameras
 from .stages import stage
 
+READ = "read"
+"""Name of the opening of a capture or reconstruction among the parts of a command."""
+
 
 def memory_for_files(options: argparse.Namespace) -> float:
     """Return the part of --memory-mb, in MB, for decoded uint8 images; their float32 planes take four times as much."""
@@ -120,6 +123,7 @@ def read_capture(folder: Reconstruction, options: argparse.Namespace, reporter: 
     Raises:
         InputError: The capture cannot be used.
     """
+    reporter.begin(READ, "Reading the capture")
     with stage(folder, "read"):
         capture = load_capture(options.capture, folder.cache, memory_for_files(options), options.max_size, reporter)
         write_capture_cameras(folder, capture)
@@ -156,6 +160,7 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
     Raises:
         InputError: The folder, its model or its capture is missing, or the capture is not that of the training.
     """
+    reporter.begin(READ, "Reading the reconstruction")
     device = devices.pick(options.device)
     folder = Reconstruction(options.folder)
     if not folder.folder.is_dir():

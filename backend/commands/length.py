@@ -10,8 +10,11 @@ import torch
 
 from ..capture import Capture
 from ..shared.errors import InputError
-from ..shared.expectation import DEFAULT_SECONDS, expectation
-from ..training.budget import PRESETS, Budget, TrainingProgress
+from ..shared.expectation import DEFAULT_SECONDS, NANOSECONDS_A_PIXEL, expectation
+from ..training.budget import LOOKAHEAD, PRESETS, WARM_UP, Budget, TrainingProgress
+
+_SECONDS_A_STEP = 0.02
+"""Of a GPU."""
 
 
 def budget_of(options: argparse.Namespace) -> Budget:
@@ -47,6 +50,25 @@ def expected_of(
     """
     if budget.until_converged:
         return None
-    pixels = float(np.mean([view.width * view.height for view in capture.views])) if device.type == "cpu" else None
+    pixels = _pixels(capture) if device.type == "cpu" else None
     trained = (0, 0.0) if done is None else (done.step, done.seconds)
     return expectation(budget.steps, budget.seconds, pixels, trained)
+
+
+def training_seconds(budget: Budget, capture: Capture, device: torch.device, done: TrainingProgress) -> float:
+    """Return about how long the rest of a training takes, for the progress of the whole command."""
+    if budget.seconds is not None and not budget.until_converged:
+        return max(budget.seconds - done.seconds, 0.0)
+    if done.step:
+        pace = done.seconds / done.step
+    else:
+        pace = (
+            1e-9 * float(np.mean(NANOSECONDS_A_PIXEL)) * _pixels(capture) if device.type == "cpu" else _SECONDS_A_STEP
+        )
+    steps = budget.steps or done.step + WARM_UP + LOOKAHEAD
+    return max(steps - done.step, 0) * pace
+
+
+def _pixels(capture: Capture) -> float:
+    """Return the mean number of pixels of a view."""
+    return float(np.mean([view.width * view.height for view in capture.views]))

@@ -18,9 +18,13 @@ from ..shared.reconstruction.record import VotesRecord, read_record, update_reco
 from .folder import digest
 from .stages import stage
 
+VOTE = "vote"
+"""Name of a vote among the parts of a command."""
+
 
 def cast_votes(folder: Reconstruction, capture: Capture, options: argparse.Namespace, reporter: Reporter) -> None:
     """Vote on the objects of the capture's points; writes points.ply and objects.json."""
+    reporter.begin(VOTE, "Voting on the objects of the points")
     with stage(folder, "vote"):
         votes = vote_points(capture, options.strategy, options.seed, reporter=reporter)
         colors = object_colors(votes.counts)

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ..model.splats import Splats, concatenate
 from ..shared.color.recolor import Recolor
+from ..shared.events import Reporter
 from ..shared.reconstruction.objects import SceneObject, members_of, shown_as
 from ..shared.splats import spherical_harmonics
 from .fill import fill_hole
@@ -69,9 +70,12 @@ class Fill:
     fills: NDArray[np.int64]
 
 
-def compute_fill(splats: Splats, objects: Sequence[SceneObject]) -> Fill:
-    """Return the filling of the holes of removed objects, as `apply_edits` uses it."""
-    return _remove_and_fill(splats, objects)[1]
+def compute_fill(splats: Splats, objects: Sequence[SceneObject], reporter: Reporter | None = None) -> Fill:
+    """Return the filling of the holes of removed objects, as `apply_edits` uses it.
+
+    reporter: receives the progress.
+    """
+    return _remove_and_fill(splats, objects, reporter)[1]
 
 
 def transformed(splats: Splats, matrix: ArrayLike) -> Splats:
@@ -115,7 +119,9 @@ def recolored(splats: Splats, recolor: Recolor) -> Splats:
     return replace(splats, sh=sh.astype(splats.sh.dtype))
 
 
-def _remove_and_fill(splats: Splats, objects: Sequence[SceneObject]) -> tuple[Splats, Fill]:
+def _remove_and_fill(
+    splats: Splats, objects: Sequence[SceneObject], reporter: Reporter | None = None
+) -> tuple[Splats, Fill]:
     """Return the visible splats, with the IDs that they are shown as and with filled holes, and the filling itself."""
     known, slots = np.unique(splats.object_ids, return_inverse=True)
     shown = _visible_as(known, objects)[slots]
@@ -126,10 +132,15 @@ def _remove_and_fill(splats: Splats, objects: Sequence[SceneObject]) -> tuple[Sp
     edited = replace(splats.select(keep), object_ids=shown[keep])
     fills = np.zeros(len(edited), np.int64)
     taken: list[tuple[Splats, int]] = []
-    for entry in objects:
-        if not (entry.removed and entry.fill):
-            continue
-        gone, put = fill_hole(edited, splats.select(_with_id(splats, entry.id, objects)))
+    reporter = reporter or Reporter()
+    filled = [entry for entry in objects if entry.removed and entry.fill]
+    for done, entry in enumerate(filled):
+
+        def report(fraction: float, done: int = done) -> None:
+            reporter.progress(done + fraction, len(filled), what="holes")
+
+        gone, put = fill_hole(edited, splats.select(_with_id(splats, entry.id, objects)), report)
+        report(1.0)
         if len(put) == 0:
             continue
         taken.append((edited.select(gone & (fills == 0)), entry.id))

@@ -10,6 +10,7 @@ A hole is filled only where the surface surrounds it, since the object may stand
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -74,12 +75,15 @@ _REACH = 3.0
 _WIDEST = 16
 
 
-def fill_hole(splats: Splats, removed: Splats) -> tuple[NDArray[np.bool_], Splats]:
+def fill_hole(
+    splats: Splats, removed: Splats, progress: Callable[[float], object] = lambda _: None
+) -> tuple[NDArray[np.bool_], Splats]:
     """Fill the holes that a removed object leaves.
 
     Args:
         splats: The N splats of the scene without the object.
         removed: The splats of the object.
+        progress: Called with the fraction that is done.
 
     Returns:
         (N,) bool: the splats at the rims of the holes that the filling replaces, and the filling splats, which are
@@ -92,11 +96,12 @@ def fill_hole(splats: Splats, removed: Splats) -> tuple[NDArray[np.bool_], Splat
     size = float(np.linalg.norm(np.percentile(solid, 95, axis=0) - np.percentile(solid, 5, axis=0)))
     middle = np.median(solid, axis=0)
     around = _Around(splats, solid - middle, middle, size)
-    for within in FLAT_WITHIN:
+    for tries, within in enumerate(FLAT_WITHIN):
         # Labels of a rough surface are rough, too: more of the object's lowest splats may belong to it.
         rough = within / FLAT_WITHIN[0]
         planes = around.planes(within * size)
-        for plane, flat in planes:
+        for number, (plane, flat) in enumerate(planes, 1):
+            progress((tries + number / (len(planes) + 1)) / len(FLAT_WITHIN))
             surface = _Surface(plane, splats.select(flat), around.centered[flat], solid - middle, size, rough)
             replaced, patches = surface.fill_hole(surface.beyond([other for other, _ in planes if other is not plane]))
             gone[flat[replaced]] = True

@@ -57,7 +57,7 @@ class ConsoleReporter(Reporter):
         self._kept: dict[str, Any] = {}
         self._preview_folder: Path | None = None
 
-    def status(self, message: str) -> None:
+    def status(self, message: str, **_stage: Any) -> None:
         """Print the current activity, to which the following progress belongs."""
         self.close()
         self._print(message, self.stream)

@@ -5,10 +5,17 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TextIO
 
 from .formats.json_file import plain
+
+_MOST = 0.99
+"""Progress of a command whose parts are all complete, but which has not ended."""
+_PACED_FROM = 0.05
+_PACED_AFTER = 2.0
+"""Fraction and time in seconds of a part from which on its pace tells the time left."""
 
 
 class Reporter:
@@ -19,9 +26,17 @@ class Reporter:
     with the seconds and the step of the training, and `zero_is_background`, which decides between miou and miou_all as
     in `lead_miou`. warning(message). A command ends with one of done(**fields), stopped(message)
     if the user stopped it, and error(message).
+
+    expect(parts): the parts of the command, as in `StagedReporter`. begin(part, message): a part begins, with its first
+    status. Receivers that do not combine the progress of parts ignore the parts.
     """
 
-    def status(self, message: str) -> None: ...
+    def expect(self, parts: Mapping[str, tuple[str, float]]) -> None: ...
+
+    def begin(self, part: str, message: str) -> None:  # noqa: ARG002
+        self.status(message)
+
+    def status(self, message: str, **stage: Any) -> None: ...
 
     def progress(self, done: float, total: float, **fields: Any) -> None: ...
 
@@ -40,6 +55,90 @@ class Reporter:
     def close(self) -> None: ...
 
 
+class StagedReporter(Reporter):
+    """Combines the progress of a command's parts to that of the whole command, and forwards all events.
+
+    The user sees stages, each of one or more parts. A command calls `expect` with part -> (stage, expected seconds), in
+    the order in which they run, and `begin` for each part that takes place; the seconds of parts that have not begun
+    may be corrected by another `expect`. A part that begins gets its share of the remaining progress in proportion to
+    the expected seconds, so the progress of the command never decreases, and it stays below 1 until the command ends.
+
+    Each status has the fields `stage`, `number` and `of`, if there are several stages. `seconds_left` of progress is
+    the rest of the part, as reported, from its pace or as expected, and the expected seconds of the later parts.
+    """
+
+    def __init__(self, reporter: Reporter) -> None:
+        self._reporter = reporter
+        self._parts: dict[str, tuple[str, float]] = {}
+        self._part = ""
+        self._shown = self._before = self._share = self._began = 0.0
+
+    def expect(self, parts: Mapping[str, tuple[str, float]]) -> None:
+        self._parts.update(parts)
+
+    def begin(self, part: str, message: str) -> None:
+        if part in self._parts:
+            # The part before is complete, whether or not it reported so.
+            self._shown = max(self._shown, self._before + self._share)
+            self._part, self._before, self._began = part, self._shown, time.monotonic()
+            seconds = self._parts[part][1]
+            self._share = (_MOST - self._shown) * seconds / max(seconds + self._later(), 1e-9)
+        self.status(message)
+        if part in self._parts:
+            self.progress(0, 1)
+
+    def status(self, message: str, **stage: Any) -> None:
+        names = list(dict.fromkeys(name for name, _ in self._parts.values()))
+        if self._part and len(names) > 1 and not stage:
+            name = self._parts[self._part][0]
+            stage = {"stage": name, "number": names.index(name) + 1, "of": len(names)}
+        self._reporter.status(message, **stage)
+
+    def progress(self, done: float, total: float, **fields: Any) -> None:
+        if not self._part:
+            self._reporter.progress(done, total, **fields)
+            return
+        fraction = min(max(done / total, 0.0), 1.0) if total > 0 else 0.0
+        self._shown = max(self._shown, self._before + self._share * fraction)
+        fields["seconds_left"] = round(self._left(fraction, fields.get("seconds_left")) + self._later(), 1)
+        self._reporter.progress(round(self._shown, 5), 1.0, **fields)
+
+    def _left(self, fraction: float, reported: float | None) -> float:
+        """Estimate the remaining seconds of the part."""
+        if reported is not None:
+            return reported
+        expected, spent = self._parts[self._part][1], time.monotonic() - self._began
+        if fraction >= _PACED_FROM and spent >= _PACED_AFTER:
+            return spent * (1 - fraction) / fraction
+        return max(expected - spent, 0.0)
+
+    def _later(self) -> float:
+        """Return the expected seconds of the parts after the current one."""
+        names = list(self._parts)
+        return sum(self._parts[name][1] for name in names[names.index(self._part) + 1 :])
+
+    def preview(self, path: Path, **fields: Any) -> None:
+        self._reporter.preview(path, **fields)
+
+    def quality(self, **figures: Any) -> None:
+        self._reporter.quality(**figures)
+
+    def warning(self, message: str) -> None:
+        self._reporter.warning(message)
+
+    def error(self, message: str) -> None:
+        self._reporter.error(message)
+
+    def stopped(self, message: str) -> None:
+        self._reporter.stopped(message)
+
+    def done(self, **fields: Any) -> None:
+        self._reporter.done(**fields)
+
+    def close(self) -> None:
+        self._reporter.close()
+
+
 class JsonReporter(Reporter):
     """Writes each event as one JSON object per line."""
 
@@ -52,8 +151,8 @@ class JsonReporter(Reporter):
         self.stream.write(json.dumps(plain(event), allow_nan=False) + "\n")
         self.stream.flush()
 
-    def status(self, message: str) -> None:
-        self._emit("status", message=message)
+    def status(self, message: str, **stage: Any) -> None:
+        self._emit("status", message=message, **stage)
 
     def progress(self, done: float, total: float, **fields: Any) -> None:
         self._emit("progress", done=done, total=total, **fields)

@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -102,8 +102,14 @@ class StoppingReporter(Reporter):
         self.reporter = reporter
         self.stop = stop
 
-    def status(self, message: str) -> None:
-        self.reporter.status(message)
+    def expect(self, parts: Mapping[str, tuple[str, float]]) -> None:
+        self.reporter.expect(parts)
+
+    def begin(self, part: str, message: str) -> None:
+        self.reporter.begin(part, message)
+
+    def status(self, message: str, **stage: Any) -> None:
+        self.reporter.status(message, **stage)
 
     def progress(self, done: float, total: float, **fields: Any) -> None:
         self.reporter.progress(done, total, **fields)

@@ -26,7 +26,7 @@ import bpy
 import numpy as np
 
 from ...backend.shared.errors import Cancelled, InputError
-from ...backend.shared.events import Reporter
+from ...backend.shared.events import Reporter, StagedReporter
 from ...backend.shared.formats.atomic import make_folder, recorded
 from . import files, mask_noise, points, scene
 from .render import Renderer
@@ -98,7 +98,7 @@ def make(
         InputError: A setting is out of range, or the folder cannot be used.
         Cancelled: `stopped()` returned True, or the render was cancelled.
     """
-    settings, reporter = settings or Settings(), reporter or Reporter()
+    settings, reporter = settings or Settings(), StagedReporter(reporter or Reporter())
     settings.check()
     out = Path(out).expanduser().absolute()
     if _is_there(out, settings, overwrite):
@@ -183,6 +183,14 @@ def _json(path: Path, value: Any) -> None:
 
 def _fill(part: Path, settings: Settings, reporter: Any, stopped: Any) -> None:
     start = time.monotonic()
+    reporter.expect(
+        {
+            "truth": ("Rendering", 0.2 * settings.views),
+            "pictures": ("Rendering", 1.0 * settings.views),
+            "write": ("Saving", 0.1 * settings.views),
+        }
+    )
+    reporter.begin("truth", "Building the scene")
     for name in ("images", "masks", "sparse/0", "truth/masks", "truth/depth", "truth/meshes"):
         (part / name).mkdir(parents=True)
     built, objs = scene.build(settings.objects, settings.seed)
@@ -192,12 +200,15 @@ def _fill(part: Path, settings: Settings, reporter: Any, stopped: Any) -> None:
         _write_truth(part, objs)
     finally:
         scene.remove(built)
+    reporter.begin("write", "Writing the photos and masks")
     for view, image, depth, labels, i in zip(views, images, depths, ids, range(len(views))):
         files.write_png(part / "images" / view.name, image)
         files.write_png(part / "truth" / "masks" / view.name, labels)
         noisy = mask_noise.disturb(labels, settings.mask_noise, scene.rng_for(settings.seed, 6, i))
         files.write_png(part / "masks" / view.name, noisy)
         np.save(part / "truth" / "depth" / (view.name[:-4] + ".npy"), depth)
+        reporter.progress(i + 1, len(views) + 1)
+    reporter.status("Finding points")
     intrinsics = scene.intrinsics(settings.width, settings.height)
     cloud = points.make(views, intrinsics, images, depths, ids, scene.rng_for(settings.seed, 5))
     files.write_colmap(
@@ -223,7 +234,6 @@ def _render(built: Any, views: Any, settings: Settings, part: Path, reporter: An
     """Return images, depths and ID maps of all views; each kind is rendered in one pass, since switching is slow."""
     renderer = Renderer(built, settings.width, settings.height, settings.samples, settings.seed, part)
     images, truth = [], []
-    total = 2 * len(views)
     try:
         reporter.status("Rendering IDs and depth")
         renderer.for_truth()
@@ -231,16 +241,14 @@ def _render(built: Any, views: Any, settings: Settings, part: Path, reporter: An
             if stopped():
                 raise Cancelled
             truth.append(renderer.truth(view))
-            reporter.progress(i, total)
-        reporter.status("Rendering pictures")
+            reporter.progress(i, len(views))
+        reporter.begin("pictures", "Rendering pictures")
         renderer.for_pictures()
-        begin = time.monotonic()
         for i, view in enumerate(views, 1):
             if stopped():
                 raise Cancelled
             images.append(renderer.picture(view))
-            left = (time.monotonic() - begin) / i * (len(views) - i)
-            reporter.progress(len(views) + i, total, seconds_left=round(left, 1))
+            reporter.progress(i, len(views))
     finally:
         renderer.close()
     return images, [depth for _, depth in truth], [labels for labels, _ in truth]

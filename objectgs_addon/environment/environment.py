@@ -23,7 +23,6 @@ REQUIREMENTS = ROOT / "requirements"
 WORKER = Path(layout.__file__).resolve().parent
 """Program that creates environments: a folder with `__main__.py`."""
 
-_AGAIN = "press Set Up Backend"
 _removed = itertools.count()
 
 
@@ -42,8 +41,13 @@ class EnvironmentState:
     sentence: str
 
 
-def inspect(folder: str | Path) -> EnvironmentState:
-    """Return the state of the environment in `folder`; reads few files, so panels can call this while drawing."""
+def inspect(folder: str | Path, remedy: str = "press Set Up Backend") -> EnvironmentState:
+    """Return the state of the environment in `folder`; reads few files, so panels can call this while drawing.
+
+    Args:
+        folder: folder of the environment.
+        remedy: what the user can do if it is not ready.
+    """
     folder = Path(folder)
     python = layout.environment_python(folder)
     try:
@@ -53,21 +57,21 @@ def inspect(folder: str | Path) -> EnvironmentState:
     if not ours:
         return EnvironmentState("broken", None, f"{folder} contains files that are not ObjectGS's; move them away.")
     if not (folder / layout.STAMP).is_file():
-        return EnvironmentState("absent", None, f"The compute backend is not set up; {_AGAIN}.")
+        return EnvironmentState("absent", None, f"The compute backend is not set up; {remedy}.")
     try:
         ready = _ready(folder / layout.MARKER, (folder / layout.MARKER).stat().st_mtime_ns)
     except OSError:
-        return EnvironmentState("incomplete", None, f"The set-up of the compute backend is not complete; {_AGAIN}.")
+        return EnvironmentState("incomplete", None, f"The set-up of the compute backend is not complete; {remedy}.")
     if ready is None:
-        return EnvironmentState("broken", None, f"{folder / layout.MARKER} cannot be read; {_AGAIN} again.")
+        return EnvironmentState("broken", None, f"{folder / layout.MARKER} cannot be read; {remedy} again.")
     # The environment's Python is a link to the base Python or, on Windows, a small program that starts it.
     if not python.exists() or not Path(ready["base"]).exists():
         gone = ready["base"] if python.is_symlink() or python.exists() else python
-        return EnvironmentState("broken", None, f"The backend's Python {gone} is missing; {_AGAIN} again.")
+        return EnvironmentState("broken", None, f"The backend's Python {gone} is missing; {remedy} again.")
     # The environment's Python can be for another processor than Blender's.
     if ready["requirements"] != _wanted(ready["device"], ready.get("system") or layout.system()):
         return EnvironmentState(
-            "outdated", None, f"The compute backend was set up for another version of ObjectGS; {_AGAIN} again."
+            "outdated", None, f"The compute backend was set up for another version of ObjectGS; {remedy} again."
         )
     found = f"Python {ready['python']}, PyTorch {ready['packages'].get('torch', '?')}"
     return EnvironmentState("ready", python, f"The compute backend is ready: {found}.")
@@ -91,8 +95,8 @@ def _wanted(device: str, system: str) -> str:
 
 
 def cache_folder(folder: str | Path) -> Path:
-    """Return the folder for compiled kernels, next to the environment, so that it survives a new setup."""
-    return Path(folder).parent / "cache"
+    """Return the folder for compiled kernels: NUMBA_CACHE_DIR, else beside the environment, to survive a new setup."""
+    return Path(os.environ.get("NUMBA_CACHE_DIR") or Path(folder).parent / "cache")
 
 
 def set_up_job(base_python: str | Path, folder: str | Path, device: str) -> Job:

@@ -15,7 +15,7 @@ import bpy
 from ...backend.shared.formats.file_names import file_stem
 from ..process.backend_process import backend_command, backend_environment
 from ..process.jobs import Job
-from . import environment
+from . import environment, online_access
 from .extension import PACKAGE, ROOT
 from .worker.layout import VERSIONS
 
@@ -64,7 +64,7 @@ def backend_sentence() -> str:
     """Describe the backend in a sentence: its location, or why it cannot run and what to do."""
     chosen = _chosen_python()
     if chosen is None:
-        return environment.inspect(environment_folder()).sentence
+        return environment.inspect(environment_folder(), online_access.remedy()).sentence
     if chosen.is_file():
         return f"The backend is at {chosen}."
     return f"The backend's Python {chosen} does not exist; choose another, or clear the field."
@@ -94,14 +94,13 @@ def backend_job(title: str, kind: str, folder: Path | None, *arguments: str) -> 
     python = backend_python()
     assert python is not None
     silent = f"{python} cannot run the backend; choose a Python {VERSIONS} that has its packages, or set it up again."
-    cache = os.environ.get("NUMBA_CACHE_DIR") or user_folder() / "cache"
     return Job(
         title=title,
         kind=kind,
         folder=folder,
         command=backend_command(python, *arguments),
         cwd=ROOT,
-        environment=backend_environment(cache),
+        environment=backend_environment(environment.cache_folder(environment_folder())),
         if_silent=silent,
     )
 

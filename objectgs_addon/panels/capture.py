@@ -15,6 +15,7 @@ from ..running.job_display import write
 from ..state import folder_trust
 from ..state.folder_state import folder_state
 from ..state.next_step import next_step
+from .preferences import draw_online_access
 from .tab import Tab, draw_job
 
 
@@ -85,6 +86,8 @@ def _draw_next_step(layout: bpy.types.UILayout, root: bpy.types.Collection | Non
     if step is None:
         return
     column = layout.column()
+    if step.operator == "objectgs.set_up_backend":
+        draw_online_access(column)
     button = column.row()
     button.scale_y = 1.5
     button.operator(step.operator, text=step.label, icon=step.icon)

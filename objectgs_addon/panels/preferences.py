@@ -4,7 +4,7 @@
 import bpy
 from bpy.props import EnumProperty, StringProperty
 
-from ..environment import locations
+from ..environment import locations, online_access
 from ..running import background, job_display
 
 
@@ -44,8 +44,7 @@ class Preferences(bpy.types.AddonPreferences):
         _draw_state(box)
         row = box.row()
         row.prop(self, "device", expand=True)
-        if not bpy.app.online_access:
-            box.label(text="Downloads need Preferences > System > Network > Allow Online Access", icon="INFO")
+        draw_online_access(box)
         row = box.row()
         row.operator("objectgs.set_up_backend", icon="IMPORT")
         row.operator("objectgs.check_backend", icon="CHECKMARK")
@@ -57,6 +56,17 @@ class Preferences(bpy.types.AddonPreferences):
         column = layout.column()
         column.use_property_split = True
         column.prop(self, "reconstructions")
+
+
+def draw_online_access(layout: bpy.types.UILayout) -> None:
+    """Draw a button that allows the downloads of the set-up, or why they cannot be allowed; nothing if they are."""
+    if bpy.app.online_access:
+        return
+    if online_access.can_be_allowed():
+        job_display.write(layout, "The set-up downloads packages, and online access is off.", "INFO")
+        layout.operator("objectgs.allow_online_access", icon="URL")
+    else:
+        job_display.write(layout, "The set-up downloads packages, and Blender was started with --offline-mode.", "INFO")
 
 
 def _draw_state(layout: bpy.types.UILayout) -> None:

@@ -26,6 +26,8 @@ GRACE_SECONDS = 10.0
 _WARNINGS = 50
 _LARGEST_NUMBER = 1e15
 """Largest number of an event that is taken as one; integers in JSON can be too large to convert or to show."""
+_MOST = 0.99
+"""Progress of a job that has not ended."""
 _ESTIMATE_FROM = 0.02
 _ESTIMATE_AFTER = 1.0
 _ENDING_SECONDS = 3.0
@@ -59,11 +61,12 @@ class Job:
         environment: additional environment variables.
         if_silent: error message if the program ends without any event, because it is not the expected program.
 
-    The other attributes change while the job runs: progress from 0 to 1, seconds_left (reported or estimated), message
-    (the current step), statuses (all messages so far), warnings and error (sentences), training figures (step, splats,
-    anchors, psnr, miou, miou_all, zero_is_background), preview (path of the newest image), curve (quality events:
-    seconds, step, psnr, miou, miou_all, mbiou), result (fields of the `done` event), exit_code and log (most recent
-    lines that are not events). number identifies the job in this process.
+    The other attributes change while the job runs: progress from 0 to 1, which never decreases, seconds_left
+    (reported or estimated), stage (such as "Preparing (1 of 3)", or empty), message (the current step), statuses
+    (all messages so far), warnings and error (sentences), training figures (step, splats, anchors, psnr, miou,
+    miou_all, zero_is_background), preview (path of the newest image), curve (quality events: seconds, step, psnr,
+    miou, miou_all, mbiou), result (fields of the `done` event), exit_code and log (most recent lines that are not
+    events). number identifies the job in this process.
     """
 
     title: str
@@ -77,6 +80,7 @@ class Job:
     state: State = State.WAITING
     progress: float = 0.0
     seconds_left: float | None = None
+    stage: str = ""
     message: str = ""
     statuses: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -101,7 +105,7 @@ class Job:
     _answered: bool = field(default=False, repr=False)
     _done: bool = field(default=False, repr=False)
     _killed: bool = field(default=False, repr=False)
-    _phase_began: float = field(default=0.0, repr=False)
+    _began: float = field(default=0.0, repr=False)
     _paused_at: float | None = field(default=None, repr=False)
     _stop_asked: float | None = field(default=None, repr=False)
     _kill_at: float | None = field(default=None, repr=False)
@@ -185,8 +189,8 @@ class Job:
                 self.error = f"The folder {self.cwd} is missing; install the extension again."
             self._set(State.FAILED, self.error)
             return
-        self._phase_began = time.monotonic()
-        self._set(State.RUNNING)
+        self._began = time.monotonic()
+        self._set(State.RUNNING, "Starting")
 
     def poll(self) -> bool:
         """Process the events since the last call without blocking; return whether anything changed."""
@@ -215,7 +219,7 @@ class Job:
     def _shift_clock(self) -> None:
         """Exclude the pause from the elapsed time of the estimate."""
         if self._paused_at is not None:
-            self._phase_began += time.monotonic() - self._paused_at
+            self._began += time.monotonic() - self._paused_at
             self._paused_at = None
 
     def _take(self, event: dict[str, Any]) -> None:
@@ -223,12 +227,8 @@ class Job:
         self._answered = self._changed = True
         kind, message = event["type"], str(event.get("message", ""))
         if kind == "status":
-            if self.state is State.RUNNING:
-                self._phase_began = time.monotonic()
-                self.seconds_left = None
-                if self.progress == 1.0:  # Only the previous phase is complete.
-                    self.progress = 0.0
             if self.state is not State.STOPPING:
+                self.stage = _stage_of(event)
                 self.message = message
                 self.statuses.append(message)
         elif kind == "progress":
@@ -254,15 +254,11 @@ class Job:
         self._take_figures(event)
         if done is None or not total or total < 0:
             return
-        now = time.monotonic()
-        progress = min(max(done / total, 0.0), 1.0)
-        if progress < self.progress:
-            self._phase_began = now
-        self.progress = progress
+        self.progress = max(self.progress, min(max(done / total, 0.0), _MOST))
         self.seconds_left = _number(event.get("seconds_left"))
-        elapsed = now - self._phase_began
-        if self.seconds_left is None and progress >= _ESTIMATE_FROM and elapsed >= _ESTIMATE_AFTER:
-            self.seconds_left = elapsed * (1 - progress) / progress
+        elapsed = time.monotonic() - self._began
+        if self.seconds_left is None and self.progress >= _ESTIMATE_FROM and elapsed >= _ESTIMATE_AFTER:
+            self.seconds_left = elapsed * (1 - self.progress) / self.progress
 
     def _take_figures(self, event: dict[str, Any]) -> None:
         for name in ("step", "splats", "anchors", "psnr", "miou", "miou_all"):
@@ -275,6 +271,7 @@ class Job:
     def _finish(self, code: int) -> None:
         """Set the final state from the exit code and the last event."""
         self.exit_code = code
+        self.stage = ""
         self.log = self._child.log
         self.seconds_left = None
         if self._done and not self.result.get("stopped"):
@@ -298,6 +295,14 @@ class Job:
         text = _last_message(self.log)
         how = "ended without a result" if code == EXIT_DONE else _how_it_ended(code)
         return f"The backend {how}" + (f"; its last message: {text}" if text else ".")
+
+
+def _stage_of(event: dict[str, Any]) -> str:
+    """Return the stage of a status: its name, with its place if there are several."""
+    name, number, of = event.get("stage"), _number(event.get("number")), _number(event.get("of"))
+    if not isinstance(name, str):
+        return ""
+    return f"{name} ({number} of {of})" if number and of else name
 
 
 def _number(value: Any) -> float | int | None:

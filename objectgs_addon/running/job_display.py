@@ -25,7 +25,7 @@ def summary(job: Job) -> str:
     if job.state is State.STOPPING:
         return f"{job.title}: saving and stopping"
     left = f", {time_left(job.seconds_left)}" if job.seconds_left is not None else ""
-    return f"{job.title}: {100 * job.progress:.0f} %{left}"
+    return f"{job.title}: {job.stage or job.message}, {100 * job.progress:.0f} %{left}"
 
 
 def draw_running(layout: bpy.types.UILayout, job: Job, index: int) -> None:
@@ -44,7 +44,16 @@ def draw_running(layout: bpy.types.UILayout, job: Job, index: int) -> None:
     if job.state is not State.STOPPING:
         row.operator("objectgs.stop_job", text="", icon="X").index = index
     if job.message and job.state is not State.WAITING:
-        write(layout, f"{job.title}: {job.message}")
+        write(layout, f"{job.title}: {activity(job)}")
+
+
+def activity(job: Job) -> str:
+    """Return the current stage and step of a job, such as "Preparing (1 of 3): reading the splats"."""
+    if not job.stage:
+        return job.message
+    # The message begins a sentence of its own, but not where it follows a stage.
+    first, rest = job.message[:1], job.message[1:]
+    return f"{job.stage}: {first.lower() if rest[:1].islower() else first}{rest}"
 
 
 def draw_figures(layout: bpy.types.UILayout, job: Job) -> None:

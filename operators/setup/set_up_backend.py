@@ -6,7 +6,7 @@ from typing import Any
 import bpy
 
 from ...backend.shared.errors import InputError
-from ...objectgs_addon.environment import environment, locations
+from ...objectgs_addon.environment import environment, locations, online_access
 from ...objectgs_addon.running import background
 from ..common.reporting import reports_errors
 
@@ -16,6 +16,28 @@ def _idle(cls: Any) -> bool:
         cls.poll_message_set("The backend is being set up or checked")
         return False
     return True
+
+
+class AllowOnlineAccess(bpy.types.Operator):
+    bl_idname = "objectgs.allow_online_access"
+    bl_label = "Allow Online Access"
+    bl_description = (
+        "Enable Preferences > System > Network > Allow Online Access, so that the packages of the backend can be "
+        "downloaded. Other extensions may then use the network, too"
+    )
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        if online_access.can_be_allowed():
+            return True
+        is_on = bpy.app.online_access
+        cls.poll_message_set("Online access is allowed" if is_on else "Blender was started with --offline-mode")
+        return False
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        online_access.allow()
+        background.redraw()
+        return {"FINISHED"}
 
 
 class SetUpBackend(bpy.types.Operator):
@@ -29,9 +51,8 @@ class SetUpBackend(bpy.types.Operator):
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
         if not bpy.app.online_access:
-            cls.poll_message_set(
-                "Enable Preferences > System > Network > Allow Online Access first; packages are downloaded"
-            )
+            how = "Allow online access" if online_access.can_be_allowed() else "Start Blender without --offline-mode"
+            cls.poll_message_set(f"{how} first; packages are downloaded")
             return False
         return _idle(cls)
 
@@ -85,4 +106,4 @@ class RemoveBackend(bpy.types.Operator):
             ) from error
 
 
-CLASSES = (SetUpBackend, CheckBackend, RemoveBackend)
+CLASSES = (AllowOnlineAccess, SetUpBackend, CheckBackend, RemoveBackend)

@@ -26,7 +26,7 @@ def say(kind, **fields):
     print(json.dumps({"type": kind, **fields}), flush=True)
 say("status", message="Trying it")
 for i in range(4):
-    say("progress", done=i % 2, total=2)
+    say("progress", done=i, total=4)
 mode = open("mode").read()
 if mode == "crash":
     print("OSError: libsomething.so is missing", file=sys.stderr)

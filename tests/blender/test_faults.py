@@ -139,7 +139,7 @@ def blocks() -> dict[str, list[str]]:
 def test_missing_backend_is_reported(extension, shown, capture):
     for operator in (bpy.ops.objectgs.assign_objects, bpy.ops.objectgs.train, bpy.ops.objectgs.check_backend):
         assert not operator.poll()
-    assert "is not set up; press Set Up Backend" in error_report(bpy.ops.objectgs.train)
+    assert "is not set up; allow online access, then press Set Up Backend" in error_report(bpy.ops.objectgs.train)
     assert "is not set up" in error_report(bpy.ops.objectgs.import_capture, directory=str(capture))
 
 

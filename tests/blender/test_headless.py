@@ -379,7 +379,9 @@ def test_demo_prints_json_events(tmp_path):
     events = [json.loads(line) for line in ran.output.splitlines() if line.startswith("{")]
     assert events[-1]["type"] == "done"
     shares = [event["done"] / event["total"] for event in events if event["type"] == "progress"]
-    assert shares == sorted(shares) and shares[-1] == 1
+    assert shares == sorted(shares) and 0.9 < shares[-1] < 1
+    stages = [event["stage"] for event in events if event["type"] == "status" and "stage" in event]
+    assert list(dict.fromkeys(stages)) == ["Rendering", "Saving"]
     refused = run("demo", tmp_path / "demo", "--json", "--objects", "0")
     assert refused.returncode == 2
     assert json.loads(refused.output.splitlines()[-1])["type"] == "error"

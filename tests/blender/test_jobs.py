@@ -84,7 +84,7 @@ def started(job, queue=None):
     """Start a job and return the queue once the job has sent a message."""
     queue = queue or JobQueue()
     queue.add(job)
-    until(lambda: job.message, queue.poll)
+    until(lambda: job.statuses or job.is_finished, queue.poll)
     return queue
 
 
@@ -375,18 +375,30 @@ def test_missing_time_left_is_estimated(make, monkeypatch):
     clock = [100.0]
     monkeypatch.setattr(jobs.time, "monotonic", lambda: clock[0])
     job = Job(title="", kind="train", folder=None, command=[], cwd=Path())
-    job.state, job._phase_began = State.RUNNING, 0.0
+    job.state, job._began = State.RUNNING, 100.0
     job._take({"type": "status", "message": "Undistorting"})
     clock[0] += 10
     job._take({"type": "progress", "done": 1, "total": 4})
     assert job.seconds_left == pytest.approx(30)
     job._take({"type": "progress", "done": 2, "total": 4, "seconds_left": 7})
     assert job.seconds_left == 7
-    job._take({"type": "status", "message": "Voting"})
-    assert job.seconds_left is None
     clock[0] += 5
-    job._take({"type": "progress", "done": 5, "total": 10})
-    assert job.seconds_left == pytest.approx(5)
+    job._take({"type": "progress", "done": 6, "total": 10})
+    assert job.seconds_left == pytest.approx(10)
+
+
+def test_stages_are_named_and_progress_only_rises():
+    job = Job(title="", kind="train", folder=None, command=[], cwd=Path(), state=State.RUNNING)
+    job._take({"type": "status", "message": "Reading the COLMAP model", "stage": "Preparing", "number": 1, "of": 3})
+    assert job.stage == "Preparing (1 of 3)" and job.message == "Reading the COLMAP model"
+    job._take({"type": "progress", "done": 4, "total": 4})
+    assert job.progress == 0.99, "a job that works is not complete"
+    job._take({"type": "progress", "done": 1, "total": 4})
+    assert job.progress == 0.99
+    job._take({"type": "status", "message": "Paused"})
+    assert job.stage == ""
+    job._take({"type": "status", "message": "Odd", "stage": 7, "number": "a", "of": None})
+    assert job.stage == ""
 
 
 def test_job_of_folder_is_found_by_equivalent_paths(make, tmp_path):

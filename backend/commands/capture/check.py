@@ -7,10 +7,13 @@ import argparse
 from ...capture import check_capture
 from ...shared.errors import InputError
 from ...shared.stopping import StoppingReporter
+from ..folder import READ
 
 
 def check(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Report a capture's contents; raise InputError with the first problem if it cannot be used."""
+    reporter.expect({READ: ("Checking", 5.0)})
+    reporter.begin(READ, "Checking the capture")
     found = check_capture(options.capture, options.max_size, reporter)
     for sentence in found["warnings"] + found["problems"][1:]:
         reporter.warning(sentence)

@@ -11,7 +11,7 @@ from ...labels.points import write_points
 from ...shared.reconstruction.objects import write_objects
 from ...shared.reconstruction.record import read_record, update_record
 from ...shared.stopping import StoppingReporter
-from ..folder import capture_record, open_reconstruction
+from ..folder import READ, capture_record, open_reconstruction
 from ..planning import write_default_plan
 from ..votes import votes_are_current
 
@@ -21,8 +21,10 @@ def import_capture(options: argparse.Namespace, reporter: StoppingReporter) -> N
 
     Points keep the objects of an earlier vote on this capture; without a vote they belong to no object.
     """
+    reporter.expect({READ: ("Preparing", 10.0), "plan": ("Planning", 5.0)})
     with open_reconstruction(options, reporter) as (output, capture):
         folder = output.folder
+        reporter.begin("plan", "Planning the training")
         output.accept()
         update_record(folder, capture=capture_record(capture, options.max_size))
         voted = read_record(folder).votes

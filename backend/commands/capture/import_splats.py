@@ -21,8 +21,8 @@ from ...shared.reconstruction.objects import default_name, write_objects
 from ...shared.reconstruction.record import ImportRecord, update_record
 from ...shared.stopping import StoppingReporter
 from ..cameras import write_splat_cameras
-from ..folder import capture_record, open_output, read_capture
-from ..votes import object_name
+from ..folder import READ, capture_record, open_output, read_capture
+from ..votes import VOTE, object_name
 
 _LEAST_VISIBLE = 0.5
 """Least fraction of the splats inside a view; with fewer, they are probably not in the capture's coordinates."""
@@ -33,7 +33,11 @@ def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> No
     folder = Reconstruction(options.out)
     if folder.checkpoint.exists():
         raise InputError(f"{folder.folder} already contains a training; choose another --out.")
-    reporter.status(f"Reading {options.splats.name}")
+    parts = {"splats": ("Reading", 5.0), READ: ("Preparing", 5.0), VOTE: ("Voting", 5.0), "write": ("Saving", 5.0)}
+    if options.capture is None:
+        parts = {"splats": parts["splats"], "write": parts["write"]}
+    reporter.expect(parts)
+    reporter.begin("splats", f"Reading {options.splats.name}")
     splats, warnings = read_foreign_splats(options.splats)
     if len(splats) == 0:
         raise InputError(f"{options.splats} contains no splats.")
@@ -57,6 +61,7 @@ def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> No
                 reporter.warning(f"{capture.folder / 'masks'} does not exist, so splats keep the objects of the file.")
             write_points(folder.points, capture.points, votes)
             update_record(folder, capture=capture_record(capture, options.max_size))
+        reporter.begin("write", f"Writing {folder.splats.name}")
         for sentence in write_splats(folder.splats, splats):
             reporter.warning(sentence)
         found, counts = np.unique(splats.object_ids[splats.object_ids > 0], return_counts=True)
@@ -72,6 +77,7 @@ def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> No
 
 def _vote_on_splats(capture: Capture, splats: Splats, reporter: Reporter) -> np.ndarray:
     """Return the voted object ID of each splat (N,); raise InputError if too few splats are in the capture's views."""
+    reporter.begin(VOTE, "Voting on the objects of the splats")
     votes = vote_points(capture, reporter=reporter, positions=splats.means)
     seen = float((votes.visible > 0).mean())
     if seen < _LEAST_VISIBLE:

@@ -11,13 +11,15 @@ from ...raster import devices
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.plan import write_plan
 from ...shared.stopping import StoppingReporter
-from ..folder import memory_for_files, open_output
+from ..folder import READ, memory_for_files, open_output
 from ..length import budget_of, expected_of
 from ..planning import build_context, choices, find_requested_objects, voted_points
 
 
 def plan(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Report the steps that training would do and omit; with --out, use and write the files of that folder."""
+    reporter.expect({READ: ("Preparing", 5.0), "plan": ("Planning", 5.0)})
+    reporter.begin(READ, "Reading the capture")
     device, budget = devices.pick(options.device), budget_of(options)
     folder = Reconstruction(options.out) if options.out else None
     with ExitStack() as held:
@@ -26,6 +28,7 @@ def plan(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         # A plan reads images that are already prepared, but does not prepare any.
         cache = folder.cache if folder is not None and folder.cameras.exists() else None
         capture = load_capture(options.capture, cache, memory_for_files(options), options.max_size, reporter)
+        reporter.begin("plan", "Planning the training")
         objects, _ = find_requested_objects(folder, capture, options)
         points = voted_points(folder, capture) if folder is not None else None
         found = decide(build_context(capture, choices(options), objects, points))

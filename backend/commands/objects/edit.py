@@ -17,7 +17,8 @@ from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.objects import Matrix, SceneObject, edit_objects, find_object, members_of, read_objects
 from ...shared.stopping import StoppingReporter
 from ..cameras import read_upright
-from .fill import fill_holes
+from ..folder import READ
+from .fill import FILL, fill_holes
 
 _NONE: dict[str, Any] = dict.fromkeys(("removed", "floaters", "fill", "recolor", "transform", "copies"))
 """Resets every edit of an object that this command makes."""
@@ -29,6 +30,8 @@ def edit(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     for name in ("floaters", "fill"):
         if getattr(options, name) and not options.remove:
             raise InputError(f"--{name} requires --remove, which selects the objects to remove.")
+    reporter.expect({READ: ("Reading", 3.0), FILL: ("Filling", 20.0)})
+    reporter.begin(READ, "Reading the objects")
     edited = 0
 
     def changes(objects: list[SceneObject]) -> dict[int, dict[str, Any]]:

@@ -20,6 +20,7 @@ from ...shared.reconstruction.objects import SceneObject, default_name, find_obj
 from ...shared.reconstruction.record import Record, read_record
 from ...shared.stopping import StoppingReporter
 from ..cameras import read_upright
+from ..folder import READ
 
 _Z_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
@@ -34,11 +35,13 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     kind, write = _format(options, background)
     objects = read_objects(folder.objects) if folder.objects.exists() else []
     chosen = [find_object(objects, word, folder.objects).id for word in options.objects or ()]
-    reporter.status(f"Reading {folder.splats.name}")
+    reporter.expect({READ: ("Reading", 3.0), "edit": ("Editing", 3.0), "write": ("Saving", 3.0)})
+    reporter.begin(READ, f"Reading {folder.splats.name}")
     captured, warnings = read_splats(folder.splats)
     for sentence in warnings:
         reporter.warning(sentence)
     _warn_about_fit(folder, record, reporter)
+    reporter.begin("edit", "Applying the edits")
     splats = apply_edits(captured, objects)
     if chosen:
         splats = splats.select(np.isin(splats.object_ids, chosen))
@@ -56,6 +59,7 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     files = _files(options, splats, objects, kind)
     for path in files:
         folder.require_foreign(path)
+    reporter.begin("write", f"Writing {len(files)} file{'' if len(files) == 1 else 's'}")
     for done, (path, ids) in enumerate(files.items(), 1):
         path.parent.mkdir(parents=True, exist_ok=True)
         part = splats if ids is None else splats.select(np.isin(splats.object_ids, ids))

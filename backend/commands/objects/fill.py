@@ -9,6 +9,9 @@ from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.objects import read_objects
 from ...shared.stopping import StoppingReporter
 
+FILL = "fill"
+"""Name of the filling among the parts of a command."""
+
 
 def fill_holes(folder: Reconstruction, reporter: StoppingReporter) -> dict[int, int]:
     """Fill the holes of removed objects where their edits ask for it, in the file that `fill_path` names.
@@ -23,9 +26,9 @@ def fill_holes(folder: Reconstruction, reporter: StoppingReporter) -> dict[int, 
     if path is None:
         return {}
     if not path.is_file():
-        reporter.status("Filling the holes of removed objects")
+        reporter.begin(FILL, "Filling the holes of removed objects")
         path.parent.mkdir(parents=True, exist_ok=True)
-        fill = compute_fill(read_splats(folder.splats)[0], objects)
+        fill = compute_fill(read_splats(folder.splats)[0], objects, reporter)
         write_fill(path, FillRows(splat_table(fill.splats), fill.put, fill.fills))
     rows = read_fill(path)
     return {entry.id: rows.count_new(entry.id) for entry in objects if entry.removed and entry.fill}

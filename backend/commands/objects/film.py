@@ -20,11 +20,15 @@ from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.record import read_record
 from ...shared.reconstruction.shot import Frame, Shot, chosen_frames, read_shot
 from ...shared.stopping import StoppingReporter
-from ..setup.kernels import ensure_kernels
+from ..folder import READ
+from ..setup.kernels import PART as KERNELS
+from ..setup.kernels import ensure_kernels, kernel_seconds
 
 MATTES = "CryptoObject"
 REC709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 """Chromaticities of sRGB: red, green, blue and white, x and y each."""
+
+_SECONDS_A_FRAME = 3.0
 
 
 def film(options: argparse.Namespace, reporter: StoppingReporter) -> None:
@@ -35,7 +39,13 @@ def film(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         raise InputError(f"{folder.folder} has no {folder.splats.name}; give the --out folder of a training.")
     shot = read_shot(options.shot)
     frames = chosen_frames(options.frames, shot)
-    reporter.status("Reading the splats")
+    reporter.expect(
+        {
+            READ: ("Preparing", 3.0), KERNELS: ("Preparing", kernel_seconds(device)),
+            "frames": ("Rendering", _SECONDS_A_FRAME * len(frames)),
+        }
+    )  # fmt: skip
+    reporter.begin(READ, "Reading the splats")
     primitive = training.settings.get("primitive", "3d") if (training := read_record(folder).training) else "3d"
     stage = Stage(folder, primitive, device, reporter)
     wanted = [(frame, stage.digest(shot, frame)) for frame in frames]
@@ -43,7 +53,8 @@ def film(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     _create_folder(options.out)
     if missing:
         ensure_kernels(reporter, device)
-    reporter.status(_progress_text(len(missing), len(frames)))
+    reporter.expect({"frames": ("Rendering", _SECONDS_A_FRAME * len(missing))})
+    reporter.begin("frames", _progress_text(len(missing), len(frames)))
     started = time.monotonic()
     for done, (frame, digest) in enumerate(missing):
 

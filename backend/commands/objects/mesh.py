@@ -20,6 +20,7 @@ from ...mesh.texture.bake import bake_texture, texture_size
 from ...mesh.texture.unwrap import unwrap
 from ...mesh.views import Views
 from ...model.object_model import ObjectModel
+from ...raster import devices
 from ...shared.errors import InputError
 from ...shared.events import Reporter
 from ...shared.formats.atomic import write_atomic
@@ -30,8 +31,9 @@ from ...shared.reconstruction.lock import locked
 from ...shared.reconstruction.meshes import MeshEntry, read_meshes, write_meshes
 from ...shared.reconstruction.objects import find_object, members_of, read_objects, shown_as
 from ...shared.stopping import StoppingReporter
-from ..folder import Trained, open_trained
-from ..setup.kernels import ensure_kernels
+from ..folder import READ, Trained, open_trained
+from ..setup.kernels import PART as KERNELS
+from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import finish_stage
 
 SCENE = "scene"
@@ -40,6 +42,7 @@ SCENE_BUDGET = 5
 
 _PROGRESS_FRACTIONS = {"fuse": 0.4, "extract": 0.1, "refine": 0.2, "unwrap": 0.1, "bake": 0.2}
 """Fractions of the time of one mesh, for the progress."""
+_SECONDS_A_MESH = 15.0
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,10 @@ class Target:
 
 def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Make the selected meshes that do not exist yet; each is written as soon as it is complete."""
+    device = devices.pick(options.device)
+    reporter.expect(
+        {READ: ("Preparing", 5.0), KERNELS: ("Preparing", kernel_seconds(device)), "meshes": ("Meshing", 30.0)}
+    )
     trained = open_trained(options, reporter)
     folder = trained.folder
     ensure_kernels(reporter, trained.model.device)
@@ -61,6 +68,8 @@ def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         folder.meshes.mkdir(exist_ok=True)
         known = {} if options.restart else _known_meshes(folder)
         wanted = [target for target in targets if not _is_current(known.get(target.key), target, options, trained)]
+        reporter.expect({"meshes": ("Meshing", _SECONDS_A_MESH * len(wanted))})
+        reporter.begin("meshes", "Reading the photos")
         if len(wanted) < len(targets):
             reporter.status(f"{len(targets) - len(wanted)} of {len(targets)} meshes exist already")
         started = time.monotonic()
@@ -87,7 +96,7 @@ class _Part(Reporter):
         self._reporter, self._done, self._total, self._started = reporter, done, total, started
         self._before, self._fraction, self._shown = 0.0, 0.0, float(done)
 
-    def begin(self, step: str) -> _Part:
+    def step(self, step: str) -> _Part:
         """Begin a step of the mesh and return self."""
         self._before += self._fraction
         self._fraction = _PROGRESS_FRACTIONS[step]
@@ -119,17 +128,17 @@ def _make(target: Target, options: argparse.Namespace, trained: Trained, views: 
     try:
         if not np.isin(model.anchors.ids, classes).any():
             raise NoSurface(f"{target.name} has no splats, so it has no mesh; was it left out of the training?")
-        field = fuse(views, classes.tolist(), reporter=part.begin("fuse"))
-        surface = extract(field, closed=not options.open, faces=budget, reporter=part.begin("extract"))
+        field = fuse(views, classes.tolist(), reporter=part.step("fuse"))
+        surface = extract(field, closed=not options.open, faces=budget, reporter=part.step("extract"))
     except NoSurface as reason:
         for suffix in (".ply", ".png"):
             (folder / f"{_stem(target.key)}{suffix}").unlink(missing_ok=True)
         return replace(entry, why=str(reason))
-    surface = refine(surface, views, classes.tolist(), part.begin("refine"))
-    part.begin("unwrap")
+    surface = refine(surface, views, classes.tolist(), part.step("refine"))
+    part.step("unwrap")
     size = options.texture_size or texture_size(surface, views)
     uvs = unwrap(surface, size)
-    texture, colors = bake_texture(surface, uvs, size, views, classes.tolist(), reporter=part.begin("bake"))
+    texture, colors = bake_texture(surface, uvs, size, views, classes.tolist(), reporter=part.step("bake"))
     stem = _stem(target.key)
     _write_image(folder / f"{stem}.png", texture)
     write_mesh(folder / f"{stem}.ply", _in_world(surface, colors, uvs, f"{stem}.png", model))

@@ -7,13 +7,17 @@ import time
 
 from ...raster import devices
 from ...shared.stopping import StoppingReporter
-from .kernels import try_kernels
+from .kernels import PART, kernel_seconds, try_kernels
 from .machine import machine_facts
+
+_SECONDS = 10.0
+"""Typical time of the test where the kernels are compiled already."""
 
 
 def doctor(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Report versions and devices, compile the kernels and run a short training."""
     device = devices.pick(options.device)
+    reporter.expect({PART: ("Compiling kernels", kernel_seconds(device) or _SECONDS)})
     found = machine_facts(device)
     for key, value in found.items():
         reporter.status(f"{key}: {value}")

@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import llvmlite.binding
 import numba
@@ -34,6 +35,18 @@ from ...training.trainer import Trainer
 
 STEPS = 220
 """Takes a second or two, and includes growth, which occurs every 50 steps in the first half of the training."""
+PART = "kernels"
+"""Name of the compilation among the parts of a command."""
+
+_SECONDS = 90.0
+"""Typical time of a compilation."""
+_PROGRESS_FRACTIONS = {"render": 0.35, "step": 0.35, "train": 0.15, "fuse": 0.04, "refine": 0.01, "bake": 0.1}
+"""Fractions of its time, for the progress."""
+
+
+def kernel_seconds(device: torch.device) -> float:
+    """Return how long `ensure_kernels` is expected to take."""
+    return 0.0 if _are_ready(device) else _SECONDS
 
 
 def ensure_kernels(reporter: StoppingReporter, device: torch.device) -> None:
@@ -46,22 +59,44 @@ def ensure_kernels(reporter: StoppingReporter, device: torch.device) -> None:
     Raises:
         Cancelled: The user stopped the command.
     """
-    if not devices.simulated() and not _mark(device).exists():
+    if not _are_ready(device):
         try_kernels(reporter, device)
 
 
 def try_kernels(reporter: StoppingReporter, device: torch.device) -> None:
     """Compile all kernels of a device and run them in a training of a few splats."""
-    reporter.status("Compiling the renderer's kernels (once per machine)")
-    compile_kernels(device, lambda done, total: reporter.progress(done, total))
-    reporter.status("Testing them on a few splats")
+    reporter.begin(PART, "Compiling kernels, which later jobs use, too")
+    steps = _Steps(reporter)
+    compile_kernels(device, steps.step("render").progress)
     with tempfile.TemporaryDirectory(prefix="objectgs-kernels-") as folder:
-        _train_a_little(Path(folder), reporter, device)
+        _train_a_little(Path(folder), reporter, device, steps)
     # Without a writable cache the mark is not needed.
     with contextlib.suppress(OSError):
         mark = _mark(device)
         mark.parent.mkdir(parents=True, exist_ok=True)
         mark.touch()
+
+
+class _Steps(Reporter):
+    """Converts the progress of a step of the compilation to that of all."""
+
+    def __init__(self, reporter: Reporter) -> None:
+        self._reporter, self._before, self._fraction = reporter, 0.0, 0.0
+
+    def step(self, step: str) -> _Steps:
+        """Begin a step and return self."""
+        self._before += self._fraction
+        self._fraction = _PROGRESS_FRACTIONS[step]
+        self.progress(0, 1)
+        return self
+
+    def progress(self, done: float, total: float, **_: Any) -> None:
+        self._reporter.progress(self._before + self._fraction * done / max(total, 1e-9), 1.0)
+
+
+def _are_ready(device: torch.device) -> bool:
+    """Return whether an earlier run compiled the kernels; the simulator needs no compilation."""
+    return devices.simulated() or _mark(device).exists()
 
 
 def _mark(device: torch.device) -> Path:
@@ -76,33 +111,34 @@ def _mark(device: torch.device) -> Path:
     return folder / f"objectgs-{hashlib.sha256(kernels.encode()).hexdigest()[:16]}.ready"
 
 
-def _train_a_little(scratch: Path, reporter: StoppingReporter, device: torch.device) -> None:
+def _train_a_little(scratch: Path, reporter: StoppingReporter, device: torch.device, steps: _Steps) -> None:
     """Train on a synthetic capture, draw and mesh it, so that each kernel is compiled, cached and run."""
     capture_folder, folder = scratch / "capture", Reconstruction(scratch / "out").create()
     _write_small_capture(capture_folder)
     quiet = Reporter()
     capture = load_capture(capture_folder, folder.cache, reporter=quiet)
     ids = vote_points(capture, reporter=quiet).ids
+    steps.step("step")
     discs = Trainer.start(capture, ids, Settings(offsets=2, primitive="2d"), device=device)
     for progress in (0.0, 1.0):
         discs.step(progress)
     trainer = Trainer.start(capture, ids, Settings(offsets=2), device=device)
-    trainer.run(Budget(steps=STEPS), folder.checkpoint, quiet, stop=reporter.stop)
-    _mesh_a_little(trainer)
+    trainer.run(Budget(steps=STEPS), folder.checkpoint, steps.step("train"), stop=reporter.stop)
+    _mesh_a_little(trainer, steps)
     rendering = draw(trainer.model, trainer.scene.camera(0), want_depth=True)
     if not np.isfinite(rendering.image).all():
         raise RuntimeError("a short training rendered an image that is not finite")
 
 
-def _mesh_a_little(trainer: Trainer) -> None:
+def _mesh_a_little(trainer: Trainer, steps: _Steps) -> None:
     """Extract a mesh of the first object, if it has a surface, and bake the texture of a tetrahedron."""
     views = Views(trainer.model, trainer.scene, trainer.scene.capture.train_indices)
     with contextlib.suppress(NoSurface):
-        extract(fuse(views, [1]), faces=500)
+        extract(fuse(views, [1], reporter=steps.step("fuse")), faces=500)
     corners = np.array([[0.3, 0, 0], [-0.3, 0.3, 0], [-0.3, -0.3, 0], [0, 0, 0.4]])
     faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], np.int32)
-    shape = refine(Surface(corners, faces, np.zeros(4, bool)), views, [1])
-    bake_texture(shape, unwrap(shape, 64), 64, views, [1])
+    shape = refine(Surface(corners, faces, np.zeros(4, bool)), views, [1], steps.step("refine"))
+    bake_texture(shape, unwrap(shape, 64), 64, views, [1], reporter=steps.step("bake"))
 
 
 def _write_small_capture(folder: Path) -> None:

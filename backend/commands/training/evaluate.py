@@ -14,17 +14,19 @@ from ...model.draw import draw
 from ...shared.errors import InputError
 from ...shared.reconstruction.report import Evaluation, write_evaluation
 from ...shared.stopping import StoppingReporter
-from ..folder import Trained, open_trained
+from ..folder import READ, Trained, open_trained
 from ..stages import stage
 
 
 def evaluate(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Measure splats and meshes on the held-out views, and write evaluation.json, which `report` reads."""
+    parts = {READ: ("Preparing", 5.0), "views": ("Measuring the views", 20.0), "meshes": ("Measuring the meshes", 20.0)}
+    reporter.expect(parts)
     trained = open_trained(options, reporter)
     folder, capture = trained.folder, trained.capture
     if not capture.test_indices:
         raise InputError(f"{capture.folder} holds out no view or has too few views for it, so nothing can be measured.")
-    reporter.status(f"Measuring on the {len(capture.test_indices)} held-out views")
+    reporter.begin("views", f"Measuring on the {len(capture.test_indices)} held-out views")
 
     def drawn(index: int) -> tuple[np.ndarray, np.ndarray]:
         rendered = draw(trained.model, trained.scene.camera(index))
@@ -49,7 +51,7 @@ def _meshes(trained: Trained, reporter: StoppingReporter) -> dict[str, dict[str,
     entries = mesh_entries(folder, trained.progress.step, reporter)
     if not entries:
         return {}
-    reporter.status(f"Measuring {len(entries)} meshes")
+    reporter.begin("meshes", f"Measuring {len(entries)} meshes")
     truth = load_truth(capture, capture.train_indices)
     found = {}
     for done, (key, entry) in enumerate(entries.items()):

@@ -14,18 +14,19 @@ from ...evaluation.images import as_bytes
 from ...model.draw import draw
 from ...shared.formats.atomic import write_atomic
 from ...shared.stopping import StoppingReporter
-from ..folder import open_trained
+from ..folder import READ, open_trained
 from ..stages import stage
 
 
 def render(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Render views into DIR/renders, under the names of the images."""
+    reporter.expect({READ: ("Preparing", 5.0), "views": ("Rendering", 20.0)})
     trained = open_trained(options, reporter)
     folder, capture = trained.folder, trained.capture
     indices = list(capture.test_indices)
     if options.views == "all" or not indices:
         indices = list(range(len(capture.views)))
-    reporter.status(f"Rendering {len(indices)} views")
+    reporter.begin("views", f"Rendering {len(indices)} views")
     paths = _render_paths(folder.renders, [view.name for view in capture.views])
     with stage(folder, "render"):
         for done, index in enumerate(indices, 1):

@@ -24,7 +24,7 @@ from ...shared.reconstruction.record import read_record
 from ...shared.reconstruction.report import Evaluation, Report, read_evaluation
 from ...shared.stopping import StoppingReporter
 from ...training.budget import TrainingProgress
-from ..folder import Trained, open_trained
+from ..folder import READ, Trained, open_trained
 from ..setup.machine import machine_facts
 from ..stages import stage
 from ..votes import object_name
@@ -34,6 +34,13 @@ IMAGES_IN_REPORT = 3
 
 def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Write report.json, report.md and their images from the results of the other commands."""
+    parts = {
+        READ: ("Preparing", 5.0),
+        "images": ("Drawing", 10.0),
+        "meshes": ("Drawing", 10.0),
+        "write": ("Saving", 2.0),
+    }
+    reporter.expect(parts)
     trained = open_trained(options, reporter)
     folder, capture, model, progress = trained.folder, trained.capture, trained.model, trained.progress
     evaluation = _evaluation(folder, progress, reporter)
@@ -41,6 +48,7 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         images = _sample_images(trained, reporter)
         meshes = _meshes(trained, evaluation.meshes, reporter)
         sheet = _mesh_sheet(trained, meshes, reporter)
+    reporter.begin("write", f"Writing {folder.report_md.name}")
     record = read_record(folder)
     training, export = trained.training, record.export
     value = Report(
@@ -145,7 +153,7 @@ def _mesh_sheet(trained: Trained, meshes: dict[str, dict[str, Any]], reporter: R
         cards.append(card)
     if not cards:
         return None
-    reporter.status("Drawing the meshes")
+    reporter.begin("meshes", "Drawing the meshes")
     return mesh_sheet(cards, reporter)
 
 
@@ -153,7 +161,7 @@ def _sample_images(trained: Trained, reporter: Reporter) -> list[tuple[str, Imag
     capture = trained.capture
     views = capture.test_indices or tuple(range(len(capture.views)))
     views = views[:: max(len(views) // IMAGES_IN_REPORT, 1)][:IMAGES_IN_REPORT]
-    reporter.status("Rendering the images of the report")
+    reporter.begin("images", "Rendering the images of the report")
     images = []
     for done, index in enumerate(views, 1):
         drawn = draw(trained.model, trained.scene.camera(index))

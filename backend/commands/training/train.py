@@ -21,6 +21,7 @@ from ...planning.decisions import OF_TRAINING, decide, planned_capture, planned_
 from ...raster import devices
 from ...shared.errors import Cancelled, InputError
 from ...shared.events import Reporter
+from ...shared.expectation import DEFAULT_SECONDS
 from ...shared.formats.json_file import plain
 from ...shared.formats.points_ply import read_points
 from ...shared.reconstruction.checkpoint import PREVIOUS
@@ -31,12 +32,13 @@ from ...shared.stopping import StoppingReporter
 from ...training.budget import Budget, TrainingProgress
 from ...training.scene import Scene
 from ...training.trainer import Evaluate, Trainer
-from ..folder import capture_record, digest, memory_for_planes, open_reconstruction, plan_of
-from ..length import budget_of, expected_of
+from ..folder import READ, capture_record, digest, memory_for_planes, open_reconstruction, plan_of
+from ..length import budget_of, expected_of, training_seconds
 from ..planning import build_context, change_objects, choices, find_requested_objects, report_plan, settings
-from ..setup.kernels import ensure_kernels
+from ..setup.kernels import PART as KERNELS
+from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import finish_stage, stage
-from ..votes import cast_votes, object_name, votes_are_current, votes_key
+from ..votes import VOTE, cast_votes, object_name, votes_are_current, votes_key
 
 CURVE_VIEWS = 20
 """Largest number of held-out views that are measured during training; `evaluate` measures all."""
@@ -55,8 +57,16 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Begin, resume or extend a training, and write a checkpoint, previews, splats.ply and anchors.ply."""
     device = devices.pick(options.device)
     budget = budget_of(options)
+    reporter.expect(
+        {
+            READ: ("Preparing", 5.0), VOTE: ("Preparing", 5.0), "plan": ("Preparing", 5.0),
+            KERNELS: ("Preparing", kernel_seconds(device)),
+            "train": ("Training", budget.seconds or DEFAULT_SECONDS), "export": ("Saving", 5.0),
+        }
+    )  # fmt: skip
     with open_reconstruction(options, reporter) as (output, capture):
         folder = output.folder
+        _expect_training(budget, capture, device, TrainingProgress(), reporter)
         trainer, plan = _begin(folder, capture, options, reporter, device)
         output.accept()
         progress = trainer.progress
@@ -80,6 +90,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
                     plan=plan.as_list(),
                 ),
             )
+            _expect_training(budget, trainer.scene.capture, device, progress, reporter)
             if expected := expected_of(budget, trainer.scene.capture, device, progress):
                 reporter.status(expected)
             try:
@@ -99,6 +110,13 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     )  # fmt: skip
 
 
+def _expect_training(
+    budget: Budget, capture: Capture, device: torch.device, done: TrainingProgress, reporter: Reporter
+) -> None:
+    """Tell the reporter how long the training takes, of which `done` is done."""
+    reporter.expect({"train": ("Training", training_seconds(budget, capture, device, done))})
+
+
 def _begin(
     folder: Reconstruction,
     capture: Capture,
@@ -112,6 +130,7 @@ def _begin(
     current = votes_are_current(folder, voters, options.max_size, options.strategy, options.seed)
     if not (current or resuming):
         cast_votes(folder, voters, options, reporter)
+    reporter.begin("plan", "Planning the training")
     points = read_points(folder.points) if current or not resuming else None
     objects, _ = find_requested_objects(folder, capture, options)
     before = plan_of(read_record(folder).training) if resuming else None
@@ -207,7 +226,7 @@ def _run(
     step = trainer.progress.step
     begun = f"Resuming after step {step} with" if step else "Training"
     where = "" if trainer.model.device.type == "cpu" else f", on {devices.name_of(trainer.model.device)}"
-    reporter.status(f"{begun} {len(trainer.model.anchors):,} anchors{where}")
+    reporter.begin("train", f"{begun} {len(trainer.model.anchors):,} anchors{where}")
     measure = _measure(folder, reporter)
     try:
         trainer.run(budget, folder.checkpoint, reporter.reporter, measure, reporter.stop, checkpoint_seconds)
@@ -273,7 +292,7 @@ def _export(
 def _write_export(
     model: ObjectModel, scene: Scene, folder: Reconstruction, reporter: Reporter, compare: bool
 ) -> ExportRecord:
-    reporter.status(f"Writing {folder.splats.name}")
+    reporter.begin("export", f"Writing {folder.splats.name}")
     capture = scene.capture
     if model.explicit:
         splats, source = model.splats()

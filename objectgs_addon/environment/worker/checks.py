@@ -20,6 +20,8 @@ from .programs import run
 
 GIGABYTES = {"cpu": 2.5, "cuda": 9.0}
 """Free disk space in GB that the setup requires for the packages and their wheels."""
+KERNEL_SECONDS = 90.0
+"""Typical time of the compilation of the backend's kernels."""
 
 
 def check_python() -> None:
@@ -82,8 +84,6 @@ class _DoctorOutput:
         self.progress = progress
         self.result: dict[str, Any] = {}
         self.last_message = "it said nothing"
-        self._is_compiled = False
-        self._fraction = 0.0
 
     def take(self, line: str) -> None:
         """Process a line of output."""
@@ -99,11 +99,7 @@ class _DoctorOutput:
         if kind == "status":
             self.progress.status(message)
         elif kind == "progress" and event.get("total"):
-            fraction = event["done"] / event["total"]
-            # Compilation takes most of the time; training then restarts the progress at 0.
-            self._is_compiled = self._is_compiled or fraction < self._fraction
-            self._fraction = fraction
-            self.progress.at(0.8 + 0.2 * fraction if self._is_compiled else 0.8 * fraction)
+            self.progress.at(event["done"] / event["total"])
         elif kind == "warning":
             emit("warning", message=message)
         elif kind == "error":
@@ -134,7 +130,7 @@ def probe(options: argparse.Namespace, stop: Callable[[], bool]) -> None:
         )
     for warning in warnings:
         emit("warning", message=warning)
-    progress = Progress({"check": 60})
-    progress.begin("check", "Checking the backend")
+    progress = Progress({"kernels": ("Compiling kernels", KERNEL_SECONDS)})
+    progress.begin("kernels", "Starting the backend")
     checked = check_backend(Path(sys.executable), progress, stop)
     emit("done", message=checked.get("message", "The backend works."), machine=checked.get("machine", {}))

@@ -32,36 +32,38 @@ def print_error(line: str) -> None:
 
 
 class Progress:
-    """Progress over stages; `stages` maps their names to typical durations in seconds."""
+    """Progress over parts: `parts` maps their names to the stage that the user sees and a typical duration in s."""
 
-    def __init__(self, stages: dict[str, float]) -> None:
-        self.stages = stages
-        self._stage = next(iter(stages))
+    def __init__(self, parts: dict[str, tuple[str, float]]) -> None:
+        self._parts = parts
+        self._part = next(iter(parts))
         self._began = self._emitted = time.monotonic()
         self._fraction = 0.0
 
-    def begin(self, stage: str, message: str) -> None:
-        """Begin a stage, described by `message`; the earlier stages are complete."""
-        self._stage, self._began, self._fraction = stage, time.monotonic(), 0.0
+    def begin(self, part: str, message: str) -> None:
+        """Begin a part, described by `message`; the earlier parts are complete."""
+        self._part, self._began, self._fraction = part, time.monotonic(), 0.0
         self.status(message)
 
     def status(self, message: str) -> None:
-        """Report a new step of the stage."""
-        emit("status", message=message)
+        """Report a new step of the part."""
+        names, stage = list(dict.fromkeys(name for name, _ in self._parts.values())), self._parts[self._part][0]
+        place = {"stage": stage, "number": names.index(stage) + 1, "of": len(names)} if len(names) > 1 else {}
+        emit("status", message=message, **place)
         self._emit()
 
     def at(self, fraction: float) -> None:
-        """Set the completed fraction of the stage, from 0 to 1; it never decreases. Emit at most twice per second."""
+        """Set the completed fraction of the part, from 0 to 1; it never decreases. Emit at most twice per second."""
         self._fraction = max(self._fraction, min(fraction, 1.0))
         if time.monotonic() - self._emitted >= 0.5:
             self._emit()
 
     def _emit(self) -> None:
         now = self._emitted = time.monotonic()
-        names = list(self.stages)
-        before = sum(self.stages[name] for name in names[: names.index(self._stage)])
-        usual, total, elapsed = self.stages[self._stage], sum(self.stages.values()), now - self._began
-        # Estimate from the typical duration until the pace of the stage is known.
+        names, seconds = list(self._parts), [usual for _, usual in self._parts.values()]
+        place = names.index(self._part)
+        before, usual, total, elapsed = sum(seconds[:place]), seconds[place], sum(seconds), now - self._began
+        # Estimate from the typical duration until the pace of the part is known.
         fraction = self._fraction
         paced = elapsed * (1 - fraction) / fraction if fraction > 0.05 and elapsed > 3 else None
         left = usual * (1 - fraction) if paced is None else paced

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from . import layout
-from .checks import GIGABYTES, check_backend, check_can_make_environments, check_python, check_space
+from .checks import GIGABYTES, KERNEL_SECONDS, check_backend, check_can_make_environments, check_python, check_space
 from .choice import check_system, choose
 from .events import Progress, Refused, Stopped, emit, print_error
 from .pip import Pip
@@ -40,7 +40,14 @@ def set_up(options: argparse.Namespace, stop: Callable[[], bool]) -> None:
     check_can_make_environments()
     check_space(folder, device)
     check_system(options.requirements, device)
-    progress = Progress({"venv": 5, "packages": 60 if device == "cpu" else 300, "torch": 60, "check": 60})
+    progress = Progress(
+        {
+            "venv": ("Preparing", 5.0),
+            "packages": ("Installing", 60.0 if device == "cpu" else 300.0),
+            "torch": ("Installing", 60.0),
+            "kernels": ("Compiling kernels", KERNEL_SECONDS),
+        }
+    )
     with claimed(folder), layout.short_path(folder) as short:
         progress.begin("venv", "Making an environment")
         if run(guarded(Path(sys.executable), "venv", str(short / layout.VENV)), stop, print_error) != 0:
@@ -57,7 +64,7 @@ def set_up(options: argparse.Namespace, stop: Callable[[], bool]) -> None:
             # Without dependencies, so that no other package can come from the index of this build.
             progress.begin("torch", "Resolving PyTorch")
             pip.install(["--no-deps", *chosen.torch], megabytes=500)
-        progress.begin("check", "Checking the backend")
+        progress.begin("kernels", "Starting the backend")
         checked = check_backend(layout.environment_python(folder), progress, stop)
         shutil.rmtree(pip.temporary)
         ready = {
