@@ -17,7 +17,7 @@ from PIL import Image
 from backend.capture import check_capture, load_capture
 from backend.capture.models import read_capture_model
 from backend.capture.models.lens import brown
-from backend.shared.errors import EXIT_DONE, InputError
+from backend.shared.errors import EXIT_BAD_INPUT, EXIT_DONE, InputError
 from backend.training.exposure import measure_gains, varies
 
 from .command_result import assert_rejected
@@ -780,3 +780,15 @@ def test_damaged_files_raise_only_input_errors(write_capture, name):
     assert refusals > 50
     path.write_bytes(whole)
     read_capture_model(scene.folder)
+
+
+@pytest.mark.parametrize("within", ["", "images"])
+def test_photos_alone_are_told_what_they_lack(write_capture, tmp_path, run_command, within):
+    scene = write_capture()
+    photos = tmp_path / "photos"
+    (photos / within).mkdir(parents=True)
+    for path in (scene.folder / "images").iterdir():
+        (photos / within / path.name).write_bytes(path.read_bytes())
+    result = run_command("import", photos, "--out", tmp_path / "out")
+    assert result.code == EXIT_BAD_INPUT and "6 photos, but not where they were taken" in result.err
+    assert not (tmp_path / "out").exists()

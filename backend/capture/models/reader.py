@@ -9,6 +9,7 @@ from pathlib import Path
 from ...shared.errors import InputError
 from ...shared.formats.regular_file import open_regular
 from ..colmap import Model, find_model, has_model, read_model
+from ..files import IMAGE_SUFFIXES
 from . import bundler, metashape, realityscan, transforms
 
 _FORMATS: tuple[tuple[str, str, Callable[[bytes], bool], Callable[[Path], Model]], ...] = (
@@ -41,7 +42,8 @@ def read_capture_model(folder: Path) -> Model:
             model = read_model(chosen)
             model.warnings[:0] = warnings
             return model
-        files = sorted(path for path in folder.iterdir() if not path.is_dir())
+        files = _files_in(folder)
+        photos = [path for path in (*files, *_files_in(folder / "images")) if path.suffix.lower() in IMAGE_SUFFIXES]
     except OSError as error:
         raise InputError(f"{error.filename or folder} cannot be read ({error.strerror}); check it.") from error
     unreadable = []
@@ -65,8 +67,17 @@ def read_capture_model(folder: Path) -> Model:
             return read(found[0])
     if unreadable:
         raise InputError(unreadable[0])
+    if photos:
+        raise InputError(
+            f"{folder} contains {len(photos)} photos, but not where they were taken; compute that with COLMAP, "
+            f"RealityScan or Metashape, and save it there, for instance COLMAP's model in {folder / 'sparse' / '0'}."
+        )
     raise InputError(
         f"{folder} contains no COLMAP model: expected cameras, images and points3D (.bin or .txt) in "
         f"{folder / 'sparse' / '0'}, or the cameras as transforms.json, Bundler's .out, Metashape's .xml or "
         "RealityScan's .csv."
     )
+
+
+def _files_in(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if not path.is_dir()) if folder.is_dir() else []
