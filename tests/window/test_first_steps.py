@@ -179,3 +179,52 @@ def test_saving_does_not_render_splats(window, tmp_path):
     )
     window.run("window_context()['area'].spaces.active.shading.type = 'SOLID'")
     assert seconds < 4 and kind == "AUTO", "the user's preference is restored"
+
+
+MESSAGES = """
+    messages = sys.modules[f"{addon.__name__}.blender.messages"]
+    latest = messages.latest()
+    result = None if latest is None else [latest.text, latest.operator, latest.label, messages.count()]
+"""
+
+
+def test_failed_import_is_one_message_until_it_is_dismissed(window, tmp_path):
+    """Photos without cameras are refused by a message with a button, which the panel shows instead of a pop-up."""
+    scene = write_scene(tmp_path / "capture", masks=False)
+    photos = tmp_path / "photos"
+    (scene.folder / "images").rename(photos)
+    for _ in range(2):
+        window.run(
+            script(f"""
+            bpy.ops.objectgs.import_capture("EXEC_DEFAULT", directory={str(photos)!r})
+        """)
+        )
+        wait(window, IDLE)
+        time.sleep(1)
+    text, operator, label, count = window.run(script(MESSAGES))
+    assert "6 photos, but not where they were taken" in text and count == 1
+    assert (operator, label) == ("objectgs.import_capture", "Choose Another Folder...")
+    time.sleep(1)
+    window.shot("message")
+    window.run("bpy.ops.objectgs.dismiss_message()")
+    assert window.run(script(MESSAGES)) is None
+
+
+def test_capture_without_masks_trains_as_one_scene(window, tmp_path):
+    scene = write_scene(tmp_path / "plain", masks=False, views=9)
+    folder = tmp_path / "reconstruction"
+    window.run(
+        script(f"""
+        bpy.ops.objectgs.import_capture("EXEC_DEFAULT", directory={str(scene.folder)!r}, folder={str(folder)!r})
+    """)
+    )
+    wait(window, f"{IDLE} and owner.objectgs.active is not None")
+    time.sleep(1)
+    window.shot("without-masks")
+    assert window.run(
+        script("""
+        steps = sys.modules[f"{addon.__name__}.state.next_step"]
+        trust = sys.modules[f"{addon.__name__}.state.folder_trust"]
+        result = [steps.next_step(root).operator, steps.has_masks(trust.state_of(root))]
+    """)
+    ) == ["objectgs.train", False]

@@ -86,6 +86,16 @@ def wait(blender, expression: str, timeout: float = 120.0):
     )
 
 
+def next_step(window) -> str:
+    """Return the operator of the button that the first panel shows."""
+    return window.run(
+        script("""
+        from bl_ext.user_default.objectgs.objectgs_addon.state import next_step
+        result = next_step.next_step(root).operator
+    """)
+    )
+
+
 def test_import_shows_cameras_photos_and_points(window):
     kinds = window.run(
         script("""
@@ -97,6 +107,7 @@ def test_import_shows_cameras_photos_and_points(window):
     """)
     )
     assert kinds[:2] == [12, 12] and kinds[2] > 100
+    assert next_step(window) == "objectgs.assign_objects"
     window.shot("1-imported")
 
 
@@ -105,13 +116,14 @@ def test_vote_fills_object_list(window):
     wait(window, f"len(root.objectgs.objects) and {IDLE}")
     names = window.run(script("result = [item.name for item in root.objectgs.objects]"))
     assert {"mug", "table"} <= set(names) or len(names) >= 8
+    assert window.run(script("result = owner.objectgs.colors")) == "object" and next_step(window) == "objectgs.train"
     window.shot("2-voted")
 
 
 def test_training_shows_objects(window):
     window.run(
         script("""
-        root.objectgs.minutes = 0.3
+        root.objectgs.length, root.objectgs.minutes = "minutes", 0.3
         call(bpy.ops.objectgs.train)
     """)
     )
@@ -120,6 +132,15 @@ def test_training_shows_objects(window):
     wait(window, f"{IDLE} and len(scene.object_collections(root)) > 1", 400)
     counts = window.run(script("result = object_list.splat_counts(root)"))
     assert sum(counts.values()) > 500
+    drawn = window.run(
+        script("""
+        parts = [part for part in root.all_objects if scene.kind_of(part) == "splats"]
+        result = [owner.objectgs.draw_splats, owner.objectgs.colors,
+                  any(part.modifiers["ObjectGS Splats"].show_viewport for part in parts)]
+    """)
+    )
+    assert drawn == [True, "photo", False], "splats are drawn in the colors of the photos, not as a preview"
+    assert next_step(window) == "objectgs.extract_meshes"
     window.shot("4-trained")
 
 
