@@ -24,6 +24,7 @@ def _classes() -> list[type]:
     from .meshes import export_meshes, extract_meshes
     from .objects import (
         choose_objects,
+        clean_floaters,
         duplicate_object,
         fill_hole,
         mark_assets,
@@ -63,6 +64,7 @@ def _classes() -> list[type]:
         remove_object,
         restore_object,
         fill_hole,
+        clean_floaters,
         duplicate_object,
         reset_object,
         export_splats,

@@ -6,7 +6,7 @@ from .capture import show_capture, warnings_of
 from .carrier import require_object_mode
 from .edits.duplicates import duplicate, remove_duplicate
 from .edits.fills import UNOBSERVED_COUNT, missing_fill, show_fills, unobserved_splats
-from .edits.floaters import hidden_splats
+from .edits.floaters import floater_counts, floating_splats, hidden_splats
 from .edits.placement import distance_moved, matrix_to_capture, matrix_to_world, placement_of
 from .edits.recolor import luma_of, recolor_of, with_own_textures
 from .edits.show import is_removed, recolor, reset_placement, show_edits, store_placements
@@ -52,6 +52,8 @@ __all__ = [
     "distance_moved",
     "duplicate",
     "duplicates_of",
+    "floater_counts",
+    "floating_splats",
     "folder_of",
     "from_stored",
     "has_shown_meshes",

@@ -18,6 +18,7 @@ from ...backend.shared.formats.splat_ply import ids_of
 from ...backend.shared.reconstruction.folder import Reconstruction
 from . import carrier
 from .capture import origin_of
+from .edits.floaters import mark_floaters
 from .edits.show import show_edits
 from .kinds import (
     ANCHORS,
@@ -109,11 +110,9 @@ def show_result(root: bpy.types.Collection, folder: Path) -> Shown:
             new.append(collection)
         positions = positions_of(own_splats, origin)
         pivot = ensure_pivot(collection, parent, object_id, positions)
-        carrier.fill(
-            makers.part(collection, SPLATS, object_id, pivot).data,
-            positions - center_of(pivot),
-            splat_attributes(own_splats),
-        )
+        obj = makers.part(collection, SPLATS, object_id, pivot)
+        carrier.fill(obj.data, positions - center_of(pivot), splat_attributes(own_splats))
+        mark_floaters(obj, positions)
         shown.splats += len(own_splats)
         if own_anchors is not None:
             carrier.fill(

@@ -99,6 +99,7 @@ class ObjectItem(bpy.types.PropertyGroup):
     fill: BoolProperty(
         name="Fill Hole", description="The hole in the ground or wall behind it is filled from its surroundings"
     )
+    cleaned: BoolProperty(name="Floaters Hidden", description="Its splats apart from the rest of it are hidden")
     replace: _color_edit("New Color", 0.5, "Replaces the object's color and keeps its shading")
     amount: _slider("Amount", 0.0, 0.0, 1.0, "Amount of the new color")
     hue: _slider("Hue", 0.0, -0.5, 0.5, "Rotation of the hue in turns of the color wheel; brightness is kept")
