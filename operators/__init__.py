@@ -20,7 +20,7 @@ def _classes() -> list[type]:
         orient,
         override_decision,
     )
-    from .film import film_frames, set_up_compositor
+    from .film import film_frames, set_up_compositor, set_up_render
     from .meshes import export_meshes, extract_meshes
     from .objects import (
         choose_objects,
@@ -72,6 +72,7 @@ def _classes() -> list[type]:
         export_meshes,
         film_frames,
         set_up_compositor,
+        set_up_render,
         set_up_backend,
     )
     return [cls for module in modules for cls in module.CLASSES]

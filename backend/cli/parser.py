@@ -172,7 +172,7 @@ def _add_edit(commands: _Commands) -> None:
     edit.add_argument("--restore", nargs="+", default=[], metavar="OBJECT", help="restore removed objects")
     edit.add_argument(
         "--clean-floaters", nargs="+", default=[], metavar="OBJECT",
-        help="hide the floaters of objects, or of `all`: their splats far from the rest, and small groups apart from it",
+        help="hide the floaters of objects, or of `all`: splats far from the rest, and small groups apart from it",
     )  # fmt: skip
     edit.add_argument(
         "--restore-floaters", nargs="+", default=[], metavar="OBJECT", help="show the floaters of objects, or of `all`"

@@ -6,11 +6,11 @@ import bpy
 from .capture import CapturePanel
 from .display import DisplayPanel, DrawingPanel
 from .edits import EditPanel
-from .film import FilmPanel
 from .jobs import JobsPanel, status_bar
 from .meshes import MeshesPanel
 from .objects import ObjectList, ObjectsPanel
 from .plan import PlanPanel
+from .render import FilmPanel, RenderPanel
 from .train import SettingsPanel, TrainPanel
 
 CLASSES = (
@@ -23,6 +23,7 @@ CLASSES = (
     EditPanel,
     MeshesPanel,
     DrawingPanel,
+    RenderPanel,
     FilmPanel,
     DisplayPanel,
     JobsPanel,

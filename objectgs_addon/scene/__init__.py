@@ -24,6 +24,7 @@ from .kinds import (
     to_stored,
 )
 from .meshes.assets import bounds, mark_asset
+from .meshes.shading import shade_meshes, shading_of
 from .meshes.show import (
     SHOWS,
     ShownMeshes,
@@ -38,9 +39,11 @@ from .object_display import Objects
 from .orientation import orient_to_ground, scale_to_distance
 from .points import color_points_by
 from .result import Shown, result_is_newer, show_label, show_objects, show_result
-from .shading.render_settings import prepare_render
+from .shading.materials import SHADINGS
+from .shading.render_settings import is_untouched, prepare_render, render_problem, set_up_render
 
 __all__ = [
+    "SHADINGS",
     "SHOWS",
     "UNOBSERVED_COUNT",
     "Objects",
@@ -59,6 +62,7 @@ __all__ = [
     "has_shown_meshes",
     "hidden_splats",
     "is_removed",
+    "is_untouched",
     "kind_of",
     "link_folder",
     "luma_of",
@@ -76,12 +80,16 @@ __all__ = [
     "recolor",
     "recolor_of",
     "remove_duplicate",
+    "render_problem",
     "require_object_mode",
     "reset_placement",
     "result_is_newer",
     "root_of",
     "scale_to_distance",
     "scene_meshes",
+    "set_up_render",
+    "shade_meshes",
+    "shading_of",
     "show_capture",
     "show_edits",
     "show_fills",

@@ -48,7 +48,7 @@ def ensure_pivot(
         center, size = np.zeros(3), 1.0
         if len(positions):
             center = np.median(positions, axis=0)
-            size = 0.5 * float(np.median(np.linalg.norm(positions - center, axis=1))) or 1.0
+            size = 0.2 * float(np.median(np.linalg.norm(positions - center, axis=1))) or 1.0
         pivot.empty_display_size = size
         pivot[CENTER] = center.tolist()
         pivot.location = center

@@ -23,7 +23,7 @@ from ...backend.shared.defaults import MAX_SIZE
 from ...backend.shared.expectation import PRESET_STEPS
 from ...backend.shared.formats.splat_ply import UNOBSERVED
 from .. import drawing
-from ..scene import SHOWS, color_points_by, kind_of, show_kinds, shown_kinds
+from ..scene import SHADINGS, SHOWS, color_points_by, kind_of, shade_meshes, shading_of, show_kinds, shown_kinds
 from . import object_edits
 
 
@@ -196,6 +196,15 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
         ],
         get=lambda self: SHOWS.index(shown_kinds(self.id_data)),
         set=lambda self, value: show_kinds(self.id_data, SHOWS[value]),
+    )
+    mesh_shading: EnumProperty(
+        name="Mesh Shading",
+        items=[
+            ("captured", "As Captured", "Meshes show the colors of the photos without any light, like splats", 0),
+            ("lit", "Lit", "The scene's lights and world light the meshes; without them, meshes are black", 1),
+        ],
+        get=lambda self: SHADINGS.index(shading_of(self.id_data)),
+        set=lambda self, value: shade_meshes(self.id_data, SHADINGS[value]),
     )
     mesh_objects: EnumProperty(
         name="Objects",

@@ -15,7 +15,6 @@ import bpy
 
 from ....backend.shared.splats import spherical_harmonics as sh
 from ....backend.shared.splats.blending import ALPHA_MIN
-from ..kinds import kind_of
 from .color_nodes import linear_channel, recolor_inputs, recolored
 from .graph import Graph, find_or_make
 from .materials import COLOR, ellipsoids_material
@@ -28,7 +27,7 @@ HIDE_GROUP = "splats_drawn"
 HIDDEN = "objectgs_hidden"
 """Boolean attribute of a carrier's vertices: splats that are hidden individually."""
 FLOATING = "objectgs_floating"
-"""Boolean attribute of a carrier's vertices: floaters, which the preview leaves out, since Blender frames what it shows."""
+"""Boolean attribute of a carrier's vertices: floaters. Previews leave them out, since Blender frames what it shows."""
 
 MINIMUM_FLATNESS = 1e-3
 """Lower limit of a splat's smallest scale relative to its largest, since rays miss flatter ellipsoids."""
