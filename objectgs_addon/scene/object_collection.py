@@ -49,7 +49,7 @@ def ensure_pivot(
         if len(positions):
             center = np.median(positions, axis=0)
             size = 0.2 * float(np.median(np.linalg.norm(positions - center, axis=1))) or 1.0
-        pivot.empty_display_size = size
+        pivot.empty_display_size = min(size, parent.empty_display_size)
         pivot[CENTER] = center.tolist()
         pivot.location = center
         pivot.parent = parent
