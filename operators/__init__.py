@@ -20,10 +20,11 @@ def _classes() -> list[type]:
         orient,
         override_decision,
     )
-    from .film import film_frames, set_up_compositor
+    from .film import film_frames, set_up_compositor, set_up_render
     from .meshes import export_meshes, extract_meshes
     from .objects import (
         choose_objects,
+        clean_floaters,
         duplicate_object,
         fill_hole,
         mark_assets,
@@ -74,6 +75,7 @@ def _classes() -> list[type]:
         remove_object,
         restore_object,
         fill_hole,
+        clean_floaters,
         duplicate_object,
         reset_object,
         export_splats,
@@ -81,6 +83,7 @@ def _classes() -> list[type]:
         export_meshes,
         film_frames,
         set_up_compositor,
+        set_up_render,
         set_up_backend,
     )
     return [cls for module in modules for cls in module.CLASSES]

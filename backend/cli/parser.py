@@ -171,6 +171,13 @@ def _add_edit(commands: _Commands) -> None:
     )  # fmt: skip
     edit.add_argument("--restore", nargs="+", default=[], metavar="OBJECT", help="restore removed objects")
     edit.add_argument(
+        "--clean-floaters", nargs="+", default=[], metavar="OBJECT",
+        help="hide the floaters of objects, or of `all`: splats far from the rest, and small groups apart from it",
+    )  # fmt: skip
+    edit.add_argument(
+        "--restore-floaters", nargs="+", default=[], metavar="OBJECT", help="show the floaters of objects, or of `all`"
+    )
+    edit.add_argument(
         "--recolor", nargs="+", default=[], type=types.recolor, metavar="OBJECT:KEY=VALUE",
         help="hue (-0.5 to 0.5, in turns of the color wheel), saturation, value and contrast (factors; 1: unchanged), "
         "tint=#RRGGBB, replace=#RRGGBB and amount (0 to 1, how much of replace)",

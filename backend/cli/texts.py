@@ -75,7 +75,7 @@ remaining meshes. `evaluate` then measures the meshes too.
 FILM = """\
 Render film frames of the splats, with the edits in DIR/objects.json, from a shot file:
 multilayer EXR with color (linear, premultiplied), depth, object IDs and Cryptomatte.
-Blender's Film panel writes shot files; their format is described in
+Blender's Render panel writes shot files; their format is described in
 backend/shared/reconstruction/shot.py. Existing frames are skipped, so several machines
 can share a folder, each with its own --frames.
 """

@@ -17,6 +17,7 @@ from ..shared.color.recolor import Recolor
 from ..shared.events import Reporter
 from ..shared.reconstruction.objects import SceneObject, members_of, shown_as
 from ..shared.splats import spherical_harmonics
+from ..shared.splats.floaters import floating
 from .fill import fill_hole
 from .floaters import inside_hull
 
@@ -28,7 +29,7 @@ _SMALLEST_SCALE = float(np.finfo(np.float32).tiny)
 
 
 def apply_edits(splats: Splats, objects: Sequence[SceneObject]) -> Splats:
-    """Apply the user's edits: remove, fill holes, recolor, transform and duplicate.
+    """Apply the user's edits: remove, fill holes, clean floaters, recolor, transform and duplicate.
 
     Args:
         splats: The captured splats.
@@ -129,6 +130,9 @@ def _remove_and_fill(
     for entry in objects:
         if entry.removed and entry.floaters:
             keep &= ~_floaters(splats, _with_id(splats, entry.id, objects))
+        if entry.cleaned:
+            mine = np.flatnonzero(shown == entry.id)
+            keep[mine[floating(splats.means[mine])]] = False
     edited = replace(splats.select(keep), object_ids=shown[keep])
     fills = np.zeros(len(edited), np.int64)
     taken: list[tuple[Splats, int]] = []

@@ -6,11 +6,11 @@ import bpy
 from .capture import AddMenu, CapturePanel
 from .edits import EditPanel
 from .export import ExportPanel
-from .film import FilmPanel
 from .jobs import JobsPanel, status_bar
 from .meshes import MeshesPanel
 from .objects import ObjectList, ObjectsPanel
 from .placement import PlacementPanel
+from .render import FilmPanel, RenderPanel
 from .training.plan import PlanPanel
 from .training.train import DetailsPanel, SettingsPanel, TrainPanel
 
@@ -25,6 +25,7 @@ CLASSES = (
     SettingsPanel,
     EditPanel,
     MeshesPanel,
+    RenderPanel,
     FilmPanel,
     ExportPanel,
     PlacementPanel,

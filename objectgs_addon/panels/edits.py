@@ -47,6 +47,12 @@ class EditPanel(WithReconstruction, bpy.types.Panel):
             ):
                 operator = column.operator("objectgs.remove_object", text=text)
                 operator.floaters, operator.fill = floaters, fill
+        row = layout.row(align=True)
+        clean = row.operator(
+            "objectgs.clean_floaters", text="Restore Floaters" if item.cleaned else "Clean Floaters", icon="BRUSH_DATA"
+        )
+        clean.restore, clean.everything = item.cleaned, False
+        row.operator("objectgs.clean_floaters", text="All").everything = True
         layout.operator("objectgs.duplicate_object", icon="DUPLICATE")
         if collection is None:
             write(layout, "This object has no splats and no mesh yet; train first.", "INFO")

@@ -45,6 +45,8 @@ class MeshesPanel(WithReconstruction, bpy.types.Panel):
             return
         layout.label(text="Show")
         layout.row().prop(properties, "shown", expand=True)
+        layout.label(text="Shading")
+        layout.row().prop(properties, "mesh_shading", expand=True)
         for mesh in scene.scene_meshes(root):
             row = layout.row(align=True)
             row.label(text=mesh.name, icon="OUTLINER_OB_MESH")

@@ -10,9 +10,9 @@ import bpy
 import numpy as np
 from bpy_extras.view3d_utils import region_2d_to_origin_3d, region_2d_to_vector_3d
 
-from ...backend.shared.splats.picking import PickObject, View, ids_in, pick
+from ...backend.shared.splats.picking import Cloud, PickObject, View, ids_in, pick
 from .. import drawing, scene
-from ..drawing.splat_arrays import arrays_of
+from ..drawing.splat_arrays import SplatArrays, arrays_of
 
 MIN_PROBABILITY = 0.1
 """Minimum contribution of an object's splats to a pixel for the object to count as visible there."""
@@ -73,9 +73,12 @@ def is_in_viewport(window: bpy.types.Window, x: int, y: int) -> bool:
 def objects_in(
     context: bpy.types.Context, left: float, bottom: float, right: float, top: float
 ) -> list[bpy.types.Collection]:
-    """Return the collections of objects visible in a rectangle, given in region pixels from the lower left."""
+    """Return the collections of objects visible in a rectangle, given in region pixels from the lower left.
+
+    Floaters do not count, which may be anywhere in the view.
+    """
     view = view_of(context)
-    collections, placed = _splats(context)
+    collections, placed = _splats(context, with_floaters=False)
     found = [collections[key] for key in ids_in(placed, view, (left, view.height - top, right, view.height - bottom))]
     collections_by_part = drawing.collections_by_part()
     meshes = _meshes(context)
@@ -96,7 +99,9 @@ def view_of(context: bpy.types.Context) -> View:
     )
 
 
-def _splats(context: bpy.types.Context) -> tuple[dict[int, bpy.types.Collection], list[PickObject]]:
+def _splats(
+    context: bpy.types.Context, with_floaters: bool = True
+) -> tuple[dict[int, bpy.types.Collection], list[PickObject]]:
     """Return the collections of objects with visible splats by session UID, and these splats."""
     collections, placed = {}, []
     collections_by_part = drawing.collections_by_part()
@@ -104,8 +109,20 @@ def _splats(context: bpy.types.Context) -> tuple[dict[int, bpy.types.Collection]
         collection, arrays = collections_by_part.get(part), arrays_of(part.data)
         if collection is not None and arrays is not None and not part.hide_select:
             collections[collection.session_uid] = collection
-            placed.append(PickObject(collection.session_uid, arrays.cloud, np.array(part.matrix_world)))
+            cloud = arrays.cloud if with_floaters else _without_floaters(part.data, arrays)
+            placed.append(PickObject(collection.session_uid, cloud, np.array(part.matrix_world)))
     return collections, placed
+
+
+def _without_floaters(mesh: bpy.types.Mesh, arrays: SplatArrays) -> Cloud:
+    """Return the visible splats of a carrier except its floaters."""
+    floating, hidden = scene.floating_splats(mesh), scene.hidden_splats(mesh)
+    if hidden is not None:
+        floating = floating[~hidden]
+    if not floating.any():
+        return arrays.cloud
+    kept = (values[~floating] for values in (arrays.means, arrays.quats, arrays.scales, arrays.opacities))
+    return Cloud(*kept)
 
 
 def _meshes(context: bpy.types.Context) -> list[bpy.types.Object]:

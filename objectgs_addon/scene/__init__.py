@@ -6,7 +6,7 @@ from .capture import show_capture, warnings_of
 from .carrier import require_object_mode
 from .edits.duplicates import duplicate, remove_duplicate
 from .edits.fills import UNOBSERVED_COUNT, missing_fill, show_fills, unobserved_splats
-from .edits.floaters import hidden_splats
+from .edits.floaters import floater_counts, floating_splats, hidden_splats
 from .edits.placement import distance_moved, matrix_to_capture, matrix_to_world, placement_of
 from .edits.recolor import luma_of, recolor_of, with_own_textures
 from .edits.show import is_removed, recolor, reset_placement, show_edits, store_placements
@@ -24,6 +24,7 @@ from .kinds import (
     to_stored,
 )
 from .meshes.assets import bounds, mark_asset
+from .meshes.shading import shade_meshes, shading_of
 from .meshes.show import (
     SHOWS,
     ShownMeshes,
@@ -38,9 +39,11 @@ from .object_display import Objects
 from .orientation import orient_to_ground, scale_to_distance
 from .points import color_points_by
 from .result import Shown, result_is_newer, show_label, show_objects, show_result
-from .shading.render_settings import prepare_render
+from .shading.materials import SHADINGS
+from .shading.render_settings import is_untouched, prepare_render, render_problem, set_up_render
 
 __all__ = [
+    "SHADINGS",
     "SHOWS",
     "UNOBSERVED_COUNT",
     "Objects",
@@ -52,11 +55,14 @@ __all__ = [
     "distance_moved",
     "duplicate",
     "duplicates_of",
+    "floater_counts",
+    "floating_splats",
     "folder_of",
     "from_stored",
     "has_shown_meshes",
     "hidden_splats",
     "is_removed",
+    "is_untouched",
     "kind_of",
     "link_folder",
     "luma_of",
@@ -74,12 +80,16 @@ __all__ = [
     "recolor",
     "recolor_of",
     "remove_duplicate",
+    "render_problem",
     "require_object_mode",
     "reset_placement",
     "result_is_newer",
     "root_of",
     "scale_to_distance",
     "scene_meshes",
+    "set_up_render",
+    "shade_meshes",
+    "shading_of",
     "show_capture",
     "show_edits",
     "show_fills",

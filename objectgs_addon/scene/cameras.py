@@ -13,7 +13,7 @@ from .kinds import CAMERA, KIND, kind_of, mark
 
 SENSOR_WIDTH = 36.0
 LARGEST_ASPECT_ERROR = 0.01
-DISPLAY_SIZE = 0.4
+DISPLAY_SIZE = 0.25
 """Display size of a camera relative to the median distance between nearest cameras."""
 
 
@@ -54,6 +54,11 @@ def use_camera(scene: bpy.types.Scene, camera: bpy.types.Object) -> None:
     scene.camera = camera
     if kind_of(camera) != CAMERA:
         return
+    use_size(scene, camera)
+
+
+def use_size(scene: bpy.types.Scene, camera: bpy.types.Object) -> None:
+    """Set the render size and pixel aspect to those of a capture camera's photo."""
     aspect = float(camera["pixel_aspect"])
     scene.render.resolution_x, scene.render.resolution_y = int(camera["width"]), int(camera["height"])
     scene.render.resolution_percentage = 100

@@ -40,6 +40,8 @@ ORIGIN = "objectgs_origin"
 UPRIGHT = "objectgs_upright"
 WARNINGS = "objectgs_warnings"
 
+_LAYER_FLAGS = ("exclude", "hide_viewport", "holdout", "indirect_only")
+
 
 def show_capture(
     scene: bpy.types.Scene, folder: Path, root: bpy.types.Collection | None = None, name: str | None = None
@@ -103,6 +105,41 @@ def show_capture(
     return root
 
 
+def put_capture_last(root: bpy.types.Collection) -> None:
+    """Move the capture behind the other collections in the outliner; visibility and selection are kept."""
+    capture = capture_of(root)
+    if capture is None or capture not in root.children[:-1]:
+        return
+    owners = [scene for scene in bpy.data.scenes if root in scene.collection.children_recursive]
+    before = [[getattr(layer, name) for name in _LAYER_FLAGS] for layer in _layer_collections(owners, capture)]
+    # While another collection contains the objects, view layers keep what is selected and hidden.
+    holder = bpy.data.collections.new(capture.name)
+    holder.children.link(capture)
+    for scene in owners:
+        scene.collection.children.link(holder)
+    root.children.unlink(capture)
+    root.children.link(capture)
+    bpy.data.collections.remove(holder)
+    for layer, flags in zip(_layer_collections(owners, capture), before):
+        for name, value in zip(_LAYER_FLAGS, flags):
+            if getattr(layer, name) != value:
+                setattr(layer, name, value)
+
+
+def _layer_collections(
+    scenes: list[bpy.types.Scene], collection: bpy.types.Collection
+) -> list[bpy.types.LayerCollection]:
+    """Return the layer collections of a collection in all view layers of scenes."""
+    above = [layer.layer_collection for scene in scenes for layer in scene.view_layers]
+    found = []
+    while above:
+        layer = above.pop()
+        if layer.collection == collection:
+            found.append(layer)
+        above.extend(reversed(layer.children))
+    return found
+
+
 def warnings_of(root: bpy.types.Collection) -> list[str]:
     """Return the camera warnings of the last `show_capture`."""
     text = root.get(WARNINGS, "")
@@ -123,7 +160,7 @@ def _stand_up(root: bpy.types.Collection, upright: np.ndarray, views: Any) -> bp
         mark(parent, PARENT)
         parent.empty_display_type = "ARROWS"
         centers = np.array([-view.viewmat[:3, :3].T @ view.viewmat[:3, 3] for view in views]).reshape(-1, 3)
-        parent.empty_display_size = 0.15 * float(np.linalg.norm(np.ptp(centers, axis=0))) if len(centers) > 1 else 1.0
+        parent.empty_display_size = 0.05 * float(np.linalg.norm(np.ptp(centers, axis=0))) if len(centers) > 1 else 1.0
         root.objects.link(parent)
         for obj in root.all_objects:
             of_all = kind_of(obj) == MESH and object_id_of(obj) is None

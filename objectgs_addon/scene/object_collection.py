@@ -37,7 +37,7 @@ def new_collection(object_id: int, objects: Objects) -> bpy.types.Collection:
 
 
 def ensure_pivot(
-    collection: bpy.types.Collection, parent: bpy.types.Object, object_id: int, positions: np.ndarray
+    collection: bpy.types.Collection, parent: bpy.types.Object | None, object_id: int, positions: np.ndarray
 ) -> bpy.types.Object:
     """Return the object's pivot (its own parent empty), created at the median of `positions` (n, 3) if missing."""
     pivot = part_of(collection, OBJECT_PARENT)
@@ -48,8 +48,8 @@ def ensure_pivot(
         center, size = np.zeros(3), 1.0
         if len(positions):
             center = np.median(positions, axis=0)
-            size = 0.5 * float(np.median(np.linalg.norm(positions - center, axis=1))) or 1.0
-        pivot.empty_display_size = size
+            size = 0.2 * float(np.median(np.linalg.norm(positions - center, axis=1))) or 1.0
+        pivot.empty_display_size = size if parent is None else min(size, parent.empty_display_size)
         pivot[CENTER] = center.tolist()
         pivot.location = center
         pivot.parent = parent

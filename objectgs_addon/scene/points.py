@@ -9,12 +9,13 @@ import numpy as np
 from ...backend.shared.errors import InputError
 from ...backend.shared.formats.points_ply import LabeledPoints, read_shown_points
 from ...backend.shared.reconstruction.folder import Reconstruction
+from ...backend.shared.splats.floaters import far
 from . import carrier
 from .kinds import POINTS, mark, part_of, points_of
 from .object_display import Objects, linear_colors
 from .shading.materials import points_material
 from .shading.modifiers import modifier_of, set_input
-from .shading.node_groups import POINTS_GROUP, points_group
+from .shading.node_groups import FLOATING, POINTS_GROUP, points_group
 
 SIZE = 0.004
 """Radius of a point relative to the diagonal of the box around the 5th to 95th percentiles of the points."""
@@ -66,6 +67,7 @@ def show_points(
             "object": ("FLOAT_COLOR", objects.colors(points.ids)),
             "object_id": ("INT", carrier.stored_ids(points.ids)),
             "margin": ("FLOAT", points.margins),
+            FLOATING: ("BOOLEAN", far(positions)),
         },
     )
     _activate(obj, active if active in COLORINGS else "photo")

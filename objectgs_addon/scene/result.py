@@ -17,7 +17,8 @@ from ...backend.shared.errors import InputError
 from ...backend.shared.formats.splat_ply import ids_of
 from ...backend.shared.reconstruction.folder import Reconstruction
 from . import carrier
-from .capture import origin_of
+from .capture import origin_of, put_capture_last
+from .edits.floaters import mark_floaters
 from .edits.show import show_edits
 from .kinds import (
     ANCHORS,
@@ -90,6 +91,7 @@ def show_result(root: bpy.types.Collection, folder: Path) -> Shown:
     anchors, more = read_anchors(folder)
     objects = Objects.read(folder)
     collections = object_collections(root)
+    is_first = not collections
     carrier.require_object_mode(part for collection in collections.values() for part in parts_of(collection))
 
     origin = origin_of(root)
@@ -109,11 +111,9 @@ def show_result(root: bpy.types.Collection, folder: Path) -> Shown:
             new.append(collection)
         positions = positions_of(own_splats, origin)
         pivot = ensure_pivot(collection, parent, object_id, positions)
-        carrier.fill(
-            makers.part(collection, SPLATS, object_id, pivot).data,
-            positions - center_of(pivot),
-            splat_attributes(own_splats),
-        )
+        obj = makers.part(collection, SPLATS, object_id, pivot)
+        carrier.fill(obj.data, positions - center_of(pivot), splat_attributes(own_splats))
+        mark_floaters(obj, positions)
         shown.splats += len(own_splats)
         if own_anchors is not None:
             carrier.fill(
@@ -140,6 +140,8 @@ def show_result(root: bpy.types.Collection, folder: Path) -> Shown:
         remove_if_empty(still_there[object_id])
     for collection in new:
         root.children.link(collection)
+    if is_first:
+        put_capture_last(root)
     show_edits(root, objects)
     root[GROUPING] = json.dumps(objects.grouping())
     root[SHOWN] = _written(folder)

@@ -72,6 +72,7 @@ def fill(root: bpy.types.Collection) -> None:
             item.is_merged = entry.merged_into is not None
             item.merged_into = to_stored(entry.merged_into or 0)
             item.removed, item.floaters, item.fill = entry.removed, entry.floaters, entry.fill
+            item.cleaned = entry.cleaned
             _set_sliders(item, entry.recolor)
             _remember(item)
             if item.object_id == active_id:
@@ -100,6 +101,7 @@ def store(root: bpy.types.Collection) -> None:
             "removed": item.removed or None,
             "floaters": item.floaters or None,
             "fill": item.fill or None,
+            "cleaned": item.cleaned or None,
             "recolor": object_list.recolor_of(item).stored(),
         }
         there = {
@@ -110,6 +112,7 @@ def store(root: bpy.types.Collection) -> None:
             "removed": entry.removed or None,
             "floaters": entry.floaters or None,
             "fill": entry.fill or None,
+            "cleaned": entry.cleaned or None,
             "recolor": object_list.rounded(entry.recolor).stored(),
         }
         changed = {key: value for key, value in wanted.items() if value != there[key]}
@@ -246,6 +249,11 @@ def restore(root: bpy.types.Collection, object_ids: Iterable[int]) -> None:
 def fill_hole(root: bpy.types.Collection, object_id: int, is_filled: bool) -> None:
     """Fill the hole behind a removed object, or remove the fill."""
     _show_edit(root, {object_id: {"fill": is_filled or None}})
+
+
+def clean_floaters(root: bpy.types.Collection, object_ids: Iterable[int], are_hidden: bool) -> None:
+    """Hide the floaters of objects, or show them again."""
+    _show_edit(root, {object_id: {"cleaned": are_hidden or None} for object_id in object_ids})
 
 
 def reset_colors(root: bpy.types.Collection, object_ids: Iterable[int]) -> None:

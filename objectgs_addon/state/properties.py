@@ -23,7 +23,7 @@ from ...backend.shared.defaults import MAX_SIZE
 from ...backend.shared.expectation import PRESET_STEPS
 from ...backend.shared.formats.splat_ply import UNOBSERVED
 from .. import drawing
-from ..scene import SHOWS, kind_of, show_kinds, shown_kinds
+from ..scene import SHADINGS, SHOWS, kind_of, shade_meshes, shading_of, show_kinds, shown_kinds
 from . import object_edits, viewports
 
 
@@ -99,6 +99,7 @@ class ObjectItem(bpy.types.PropertyGroup):
     fill: BoolProperty(
         name="Fill Hole", description="The hole in the ground or wall behind it is filled from its surroundings"
     )
+    cleaned: BoolProperty(name="Floaters Hidden", description="Its splats apart from the rest of it are hidden")
     replace: _color_edit("New Color", 0.5, "Replaces the object's color and keeps its shading")
     amount: _slider("Amount", 0.0, 0.0, 1.0, "Amount of the new color")
     hue: _slider("Hue", 0.0, -0.5, 0.5, "Rotation of the hue in turns of the color wheel; brightness is kept")
@@ -189,6 +190,15 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
         ],
         get=lambda self: SHOWS.index(shown_kinds(self.id_data)),
         set=lambda self, value: show_kinds(self.id_data, SHOWS[value]),
+    )
+    mesh_shading: EnumProperty(
+        name="Mesh Shading",
+        items=[
+            ("captured", "As Captured", "Meshes show the colors of the photos without any light, like splats", 0),
+            ("lit", "Lit", "The scene's lights and world light the meshes; without them, meshes are black", 1),
+        ],
+        get=lambda self: SHADINGS.index(shading_of(self.id_data)),
+        set=lambda self, value: shade_meshes(self.id_data, SHADINGS[value]),
     )
     mesh_objects: EnumProperty(
         name="Objects",

@@ -20,7 +20,7 @@ from ..cameras import read_upright
 from ..folder import READ
 from .fill import FILL, fill_holes
 
-_NONE: dict[str, Any] = dict.fromkeys(("removed", "floaters", "fill", "recolor", "transform", "copies"))
+_NONE: dict[str, Any] = dict.fromkeys(("removed", "floaters", "fill", "cleaned", "recolor", "transform", "copies"))
 """Resets every edit of an object that this command makes."""
 
 
@@ -56,13 +56,16 @@ def edit(options: argparse.Namespace, reporter: StoppingReporter) -> None:
 
 def _changes(options: argparse.Namespace, wanted: _Edits) -> dict[int, dict[str, Any]]:
     """Return the changes that the options make, for `edit_objects`."""
-    everything = [word for word in options.reset if word.casefold() == "all"]
-    for entry in wanted.objects if everything else wanted.find(options.reset):
+    for entry in wanted.find_or_all(options.reset):
         wanted.change(entry, **_NONE)
     for entry in wanted.find(options.restore):
         wanted.change(entry, removed=None, floaters=None, fill=None)
     for entry in wanted.find(options.remove):
         wanted.change(entry, removed=True, floaters=options.floaters or None, fill=options.fill or None)
+    for entry in wanted.find_or_all(options.restore_floaters):
+        wanted.change(entry, cleaned=None)
+    for entry in wanted.find_or_all(options.clean_floaters):
+        wanted.change(entry, cleaned=True)
     for word, recolor in options.recolor:
         (entry,) = wanted.find([word])
         wanted.change(entry, recolor=replace(recolor, middle=luma_of(wanted.splats_of(entry))).stored())
@@ -86,6 +89,11 @@ class _Edits:
 
     def find(self, words: Iterable[str]) -> Sequence[SceneObject]:
         return [find_object(self.objects, word, self.folder.objects) for word in words]
+
+    def find_or_all(self, words: Sequence[str]) -> Sequence[SceneObject]:
+        """Find the objects that are named; the word `all` stands for every object."""
+        everything = any(word.casefold() == "all" for word in words)
+        return self.objects if everything else self.find(words)
 
     def change(self, entry: SceneObject, **values: Any) -> None:
         self.changes.setdefault(entry.id, {}).update(values)
@@ -116,6 +124,7 @@ def _described(entry: SceneObject, new_splats: int | None) -> list[str]:
             words.append("its hole not filled, since there is no flat surface around it")
         elif entry.fill:
             words.append("its hole filled" + f" with {new_splats:,} new splats" * bool(new_splats))
+    words += ["floaters hidden"] if entry.cleaned else []
     if entry.recolor:
         stored = entry.recolor.stored() or {}
         words.append("recolored " + " ".join(f"{key}={_short(value)}" for key, value in stored.items()))

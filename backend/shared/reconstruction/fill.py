@@ -95,8 +95,9 @@ def fill_path(folder: Reconstruction, objects: Sequence[SceneObject]) -> Path | 
         return None
     edits = [
         (entry.id, entry.merged_into, entry.left_out, entry.removed, entry.floaters, entry.fill)
+        + ("cleaned",) * entry.cleaned
         for entry in objects
-        if entry.merged_into is not None or entry.left_out or entry.removed
+        if entry.merged_into is not None or entry.left_out or entry.removed or entry.cleaned
     ]
     made_of = f"{_FORMAT} {_digest(folder.splats)} {edits}"
     return folder.cache / f"fill-{hashlib.sha256(made_of.encode()).hexdigest()[:24]}.ply"

@@ -3,7 +3,8 @@
     {"objects": [{"id": 1, "name": "mug", "color": [59, 125, 216], "points": 812}, ...],
      "edits": {"1": {"name": "cup", "color": [255, 0, 0], "merged_into": 2, "left_out": true},
                "4": {"removed": true, "floaters": true, "fill": true},
-               "5": {"recolor": {"hue": 0.3}, "transform": [[1, 0, 0, 2], ...], "copies": [[[1, 0, 0, 5], ...]]}, ...}}
+               "5": {"recolor": {"hue": 0.3}, "transform": [[1, 0, 0, 2], ...], "copies": [[[1, 0, 0, 5], ...]]},
+               "6": {"cleaned": true}, ...}}
 
 A new vote replaces "objects" and keeps "edits".
 """
@@ -25,7 +26,8 @@ from ..formats.json_file import read_json, write_json
 from .lock import FolderInUse, locked
 
 EDITABLE = (
-    "name", "color", "merged_into", "left_out", "removed", "floaters", "fill", "recolor", "transform", "copies",
+    "name", "color", "merged_into", "left_out", "removed", "floaters", "fill", "cleaned", "recolor", "transform",
+    "copies",
 )  # fmt: skip
 
 _LOCK = ".objects.lock"
@@ -55,6 +57,7 @@ class SceneObject:
         removed: hide the reconstructed object and its duplicates.
         floaters: if removed, also hide unlabeled splats inside its convex hull.
         fill: if removed, fill the hole that it leaves in the ground or wall.
+        cleaned: hide its floaters, as `shared/splats/floaters.py` finds them.
         recolor: color change of its splats and textures, or None.
         transform: affine map that moves it from its captured place, or None.
         copies: affine maps from its captured place to those of its duplicates.
@@ -69,6 +72,7 @@ class SceneObject:
     removed: bool = False
     floaters: bool = False
     fill: bool = False
+    cleaned: bool = False
     recolor: Recolor | None = None
     transform: Matrix | None = None
     copies: tuple[Matrix, ...] = ()
@@ -226,6 +230,7 @@ def _object(entry: Mapping[str, Any]) -> SceneObject:
         removed=bool(entry.get("removed", False)),
         floaters=bool(entry.get("floaters", False)),
         fill=bool(entry.get("fill", False)),
+        cleaned=bool(entry.get("cleaned", False)),
         recolor=None if (recolor := entry.get("recolor")) is None else Recolor.of(recolor),
         transform=None if (transform := entry.get("transform")) is None else affine_map(transform),
         copies=tuple(affine_map(copy) for copy in entry.get("copies") or ()),

@@ -1,19 +1,23 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Floaters: unlabeled splats inside removed objects, hidden by a carrier attribute.
+"""Floaters, hidden by a carrier attribute: those of cleaned objects, and unlabeled splats inside removed objects.
 
-The rule is the same as in the backend's export.
+The rules are the same as in the backend's export.
 """
+
+from collections.abc import Mapping
 
 import bmesh
 import bpy
 import numpy as np
 
+from ....backend.shared.reconstruction.objects import SceneObject
 from ....backend.shared.splats.convex_hull import points_inside, reliable_centers
+from ....backend.shared.splats.floaters import floating
 from .. import carrier
 from ..kinds import OBJECT_ID, SPLATS, object_collections, part_of
 from ..object_collection import center_of
 from ..shading.modifiers import update_groups
-from ..shading.node_groups import HIDDEN
+from ..shading.node_groups import FLOATING, HIDDEN
 from .fills import given_way, unobserved_splats
 
 FLATTEST = 1e-5
@@ -22,31 +26,92 @@ TOLERANCE = 1e-5
 """Largest distance of a hull's corner outside one of its faces, relative to the hull's size."""
 
 
-def hide_floaters(root: bpy.types.Collection, removed: list[int]) -> None:
-    """Hide the unlabeled splats inside the removed objects with these IDs, and show all other unlabeled splats."""
-    collections = object_collections(root)
-    carriers = {object_id: part_of(collection, SPLATS) for object_id, collection in collections.items()}
-    unlabeled = carriers.pop(0, None)
-    if unlabeled is None or "radiance:base" not in unlabeled.data.attributes:
-        return
-    before = hidden_splats(unlabeled.data)
-    if not removed and before is None:
-        return
+def hide_floaters(root: bpy.types.Collection, entries: Mapping[int, SceneObject]) -> None:
+    """Hide the floaters of cleaned objects and the unlabeled splats inside removed ones, and show all other splats.
+
+    Args:
+        root: the reconstruction's collection.
+        entries: object ID -> object with the user's edits.
+
+    Raises:
+        InputError: Splats that would change are in Edit Mode.
+    """
+    changes = _changes(root, entries)
+    carrier.require_object_mode(obj for obj, _ in changes)
+    for obj, hidden in changes:
+        update_groups(obj)
+        carrier.write(obj.data, HIDDEN, "BOOLEAN", hidden)
+        obj.data.update()
+
+
+def mark_floaters(obj: bpy.types.Object, positions: np.ndarray) -> None:
+    """Store which splats of a newly filled carrier are floaters.
+
+    Args:
+        obj: the carrier.
+        positions: (n, 3) float64 positions of its splats, in any coordinates.
+    """
+    found = floating(positions)
+    if found.any():
+        update_groups(obj)
+    carrier.write(obj.data, FLOATING, "BOOLEAN", found)
+
+
+def floating_splats(mesh: bpy.types.Mesh) -> np.ndarray:
+    """Return an (n,) bool mask of a carrier's floaters, hidden or not."""
+    if FLOATING in mesh.attributes:
+        return carrier.read(mesh, FLOATING)
+    # The carrier is of an older version.
+    captured = np.flatnonzero(~unobserved_splats(mesh))
+    found = np.zeros(len(mesh.vertices), bool)
+    found[captured] = floating(carrier.read(mesh, "position")[captured].astype(np.float64))
+    return found
+
+
+def floater_counts(root: bpy.types.Collection) -> dict[int, int]:
+    """Map object IDs to the numbers of their floaters, hidden or not."""
+    carriers = {object_id: part_of(collection, SPLATS) for object_id, collection in object_collections(root).items()}
+    return {object_id: int(floating_splats(obj.data).sum()) for object_id, obj in carriers.items() if obj is not None}
+
+
+def _changes(
+    root: bpy.types.Collection, entries: Mapping[int, SceneObject]
+) -> list[tuple[bpy.types.Object, np.ndarray]]:
+    """Return the carriers whose hidden splats change, and which of their splats are hidden then."""
+    carriers = {
+        object_id: obj
+        for object_id, collection in object_collections(root).items()
+        if (obj := part_of(collection, SPLATS)) is not None
+        and obj.data.library is None
+        and "radiance:base" in obj.data.attributes
+    }
+    removed = [
+        carriers[entry.id] for entry in entries.values() if entry.removed and entry.floaters and entry.id in carriers
+    ]
+    found = []
+    for object_id, obj in carriers.items():
+        cleaned = object_id in entries and entries[object_id].cleaned
+        before = hidden_splats(obj.data)
+        if before is None and not cleaned and not (object_id == 0 and removed):
+            continue
+        hidden = given_way(obj.data)
+        if cleaned:
+            hidden |= floating_splats(obj.data)
+        if object_id == 0:
+            hidden |= _inside(obj, removed)
+        if not np.array_equal(hidden, np.zeros(len(hidden), bool) if before is None else before):
+            found.append((obj, hidden))
+    return found
+
+
+def _inside(unlabeled: bpy.types.Object, removed: list[bpy.types.Object]) -> np.ndarray:
+    """Return which splats of the unlabeled rest are of no object and inside one of the removed carriers, (n,) bool."""
     places = _places(unlabeled)
-    hidden = np.zeros(len(places), bool)
-    for object_id in removed:
-        obj = carriers.get(object_id)
-        if obj is not None and "radiance:base" in obj.data.attributes:
-            hidden |= inside_hull(places, _places(obj), carrier.read(obj.data, "radiance:base")[:, 3])
+    found = np.zeros(len(places), bool)
+    for obj in removed:
+        found |= inside_hull(places, _places(obj), carrier.read(obj.data, "radiance:base")[:, 3])
     # Objects merged into the unlabeled rest keep their own IDs and are not floaters.
-    hidden &= (carrier.read(unlabeled.data, OBJECT_ID) == 0) & ~unobserved_splats(unlabeled.data)
-    hidden |= given_way(unlabeled.data)
-    if np.array_equal(hidden, np.zeros(len(places), bool) if before is None else before):
-        return
-    carrier.require_object_mode([unlabeled])
-    update_groups(unlabeled)
-    carrier.write(unlabeled.data, HIDDEN, "BOOLEAN", hidden)
-    unlabeled.data.update()
+    return found & (carrier.read(unlabeled.data, OBJECT_ID) == 0) & ~unobserved_splats(unlabeled.data)
 
 
 def hidden_splats(mesh: bpy.types.Mesh) -> np.ndarray | None:

@@ -42,9 +42,10 @@ def show_edits(root: bpy.types.Collection, objects: Objects) -> None:
         InputError: Splats that would change are in Edit Mode.
     """
     collections = object_collections(root)
-    hulls = [entry.id for entry in objects.entries.values() if entry.removed and entry.floaters]
-    if hulls and 0 in collections:
-        carrier.require_object_mode([part_of(collections[0], SPLATS)])
+    entries = objects.entries.values()
+    hiding = {entry.id for entry in entries if entry.cleaned}
+    hiding |= {0 for entry in entries if entry.removed and entry.floaters}
+    carrier.require_object_mode(part_of(collections[object_id], SPLATS) for object_id in hiding & collections.keys())
     show_fills(root, objects)
     adopt_blender_duplicates(root)
     bring_up_to_date(root)
@@ -59,7 +60,7 @@ def show_edits(root: bpy.types.Collection, objects: Objects) -> None:
             _set_removed(each, entry.removed)
             if entry.recolor is not None or recolor_of(each) is not None:
                 set_recolor(each, entry.recolor)
-    hide_floaters(root, hulls)
+    hide_floaters(root, objects.entries)
 
 
 def recolor(root: bpy.types.Collection, object_id: int, wanted: Recolor | None) -> bool:

@@ -16,6 +16,7 @@ from ....backend.shared.formats.file_names import distinct_stems
 from ....backend.shared.reconstruction.folder import Reconstruction
 from ... import scene
 from ...blender.quiet import quiet
+from .shading import lit
 
 
 def export(
@@ -66,7 +67,7 @@ def export(
             for mesh in scene.parts_of(collection)
             if scene.kind_of(mesh) == "mesh"
         ]
-        with _stage(root, parts, in_capture):
+        with lit(mesh for _, mesh in parts), _stage(root, parts, in_capture):
             _write(path, suffix, in_capture)
     return list(files)
 

@@ -17,6 +17,7 @@ from ..object_collection import NAME, center_of, ensure_pivot, new_collection, t
 from ..object_display import Objects
 from ..shading.materials import mesh_material
 from .listed import ListedMesh
+from .shading import shading_of
 from .textures import load_texture, reload_texture
 
 WRITTEN = "objectgs_written"
@@ -118,7 +119,7 @@ class MeshImporter:
         slots = [slot.material for slot in obj.material_slots]
         if not slots:
             image = load_texture(listed.texture, obj.name, listed.key)
-            self._material = material = mesh_material(obj.name, image, self._material)
+            self._material = material = mesh_material(obj.name, image, self._material, shading_of(self.root))
             material.diffuse_color = obj.color
             obj.data.materials.append(material)
             return

@@ -22,6 +22,7 @@ from ..object_collection import remove, remove_if_empty
 from ..object_display import Objects
 from .importing import MeshImporter
 from .listed import assign_to_collections, read_listed
+from .shading import SHADING, shading_of
 
 SHOW = "objectgs_show"
 """Custom property of the root collection: the chosen entry of SHOWS."""
@@ -71,6 +72,7 @@ def update_meshes(root: bpy.types.Collection, folder: Path) -> ShownMeshes:
         return ShownMeshes()
     carrier.require_object_mode(existing.values())
     before = _has_meshes(root)
+    root[SHADING] = shading_of(root)
     assigned, warnings = assign_to_collections(listed, objects)
     shown = ShownMeshes(warnings=warnings)
     importer = MeshImporter(root, objects, collections)

@@ -16,6 +16,9 @@ SPLAT_SHADER = "splat_shader"
 POINTS_MATERIAL = "points_material"
 ELLIPSOIDS_MATERIAL = "ellipsoids_material"
 
+CAPTURED, LIT = SHADINGS = ("captured", "lit")
+"""How meshes are shaded: by the colors of their textures alone, like splats, or by the scene's lights."""
+
 MESH_ROUGHNESS = 0.8
 MESH_SPECULAR = 0.2
 """Low specular level, since the texture already contains the highlights of the photos."""
@@ -125,8 +128,17 @@ def _falloff(
     graph.arrange()
 
 
-def mesh_material(name: str, image: bpy.types.Image, like: bpy.types.Material | None) -> bpy.types.Material:
-    """Create a material with a mesh's texture; copying the material `like`, if given, is faster."""
+def mesh_material(
+    name: str, image: bpy.types.Image, like: bpy.types.Material | None, shading: str = CAPTURED
+) -> bpy.types.Material:
+    """Create a material with a mesh's texture.
+
+    Args:
+        name: the material's name.
+        image: the texture.
+        like: a material made with the same `shading` to copy, which is faster, or None.
+        shading: an entry of SHADINGS.
+    """
     if like is not None:
         material = like.copy()
         material.name = name
@@ -142,7 +154,33 @@ def mesh_material(name: str, image: bpy.types.Image, like: bpy.types.Material | 
         {"Base Color": texture.outputs["Color"], "Roughness": MESH_ROUGHNESS, "Specular IOR Level": MESH_SPECULAR},
     )
     graph.node("ShaderNodeOutputMaterial", {"Surface": shader.outputs[0]}, location=(320.0, 0.0))
+    if hasattr(material, "cycles"):
+        material.cycles.emission_sampling = "NONE"  # As for splats.
+    shade_mesh_material(material, shading)
     return material
+
+
+def shade_mesh_material(material: bpy.types.Material, shading: str) -> bool:
+    """Switch a material of `mesh_material` to an entry of SHADINGS, unless the user has linked another surface.
+
+    Returns:
+        Whether the material has changed.
+    """
+    tree = material.node_tree
+    output = next((node for node in tree.nodes if node.type == "OUTPUT_MATERIAL" and node.is_active_output), None)
+    if output is None or not output.inputs["Surface"].is_linked:
+        return False
+    surface = output.inputs["Surface"]
+    now = surface.links[0].from_socket
+    for shader in [node for node in tree.nodes if node.type == "BSDF_PRINCIPLED"]:
+        color = shader.inputs["Base Color"]
+        if color.is_linked and now in (shader.outputs[0], color.links[0].from_socket):
+            # A color that is linked to a surface is emitted.
+            wanted = color.links[0].from_socket if shading == CAPTURED else shader.outputs[0]
+            if now != wanted:
+                tree.links.new(wanted, surface)
+            return now != wanted
+    return False
 
 
 def _empty_material(name: str) -> tuple[bpy.types.Material, Graph]:

@@ -77,10 +77,11 @@ def show_preview(part: bpy.types.Object, is_on: bool) -> None:
         preview.show_viewport = is_on
     if is_on and hiding is not None:
         part.modifiers.remove(hiding)
-    elif not is_on and hiding is None:
-        hiding = part.modifiers.new("ObjectGS Drawn", "NODES")
-        hiding.node_group = hide_group()
+    elif not is_on:
+        hiding = hiding or part.modifiers.new("ObjectGS Drawn", "NODES")
         hiding.show_render = False
+        if hiding.node_group != (newest := hide_group()):
+            hiding.node_group = newest
 
 
 def set_input(modifier: bpy.types.NodesModifier, name: str, value: Any) -> None:

@@ -15,7 +15,6 @@ import bpy
 
 from ....backend.shared.splats import spherical_harmonics as sh
 from ....backend.shared.splats.blending import ALPHA_MIN
-from ..kinds import kind_of, mark
 from .color_nodes import linear_channel, recolor_inputs, recolored
 from .graph import Graph, find_or_make
 from .materials import COLOR, ellipsoids_material
@@ -27,6 +26,8 @@ HIDE_GROUP = "splats_drawn"
 
 HIDDEN = "objectgs_hidden"
 """Boolean attribute of a carrier's vertices: splats that are hidden individually."""
+FLOATING = "objectgs_floating"
+"""Boolean attribute of a carrier's vertices: floaters. Previews leave them out, since Blender frames what it shows."""
 
 MINIMUM_FLATNESS = 1e-3
 """Lower limit of a splat's smallest scale relative to its largest, since rays miss flatter ellipsoids."""
@@ -40,7 +41,7 @@ ICOSPHERE_INRADIUS = 0.9341
 
 def points_group() -> bpy.types.NodeTree:
     """Return the group that shows a carrier's vertices as small octahedra in one of two colorings."""
-    return find_or_make(bpy.data.node_groups, POINTS_GROUP, 2, "ObjectGS Points", _make_points_group)
+    return find_or_make(bpy.data.node_groups, POINTS_GROUP, 3, "ObjectGS Points", _make_points_group)
 
 
 def _make_points_group(name: str) -> bpy.types.NodeTree:
@@ -63,7 +64,11 @@ def _make_points_group(name: str) -> bpy.types.NodeTree:
         },
         input_type="RGBA",
     ).outputs[0]
-    colored = graph.store(group_input.outputs["Geometry"], COLOR, "FLOAT_COLOR", color)
+    near = graph.node(
+        "GeometryNodeDeleteGeometry",
+        {"Geometry": group_input.outputs["Geometry"], "Selection": graph.attribute(FLOATING, "BOOLEAN")},
+    ).outputs[0]
+    colored = graph.store(near, COLOR, "FLOAT_COLOR", color)
     shape = graph.node(
         "GeometryNodeMeshUVSphere", {"Segments": 4, "Rings": 2, "Radius": group_input.outputs["Size"]}
     ).outputs["Mesh"]
@@ -86,21 +91,33 @@ def _make_points_group(name: str) -> bpy.types.NodeTree:
 def splats_group(kind: str) -> bpy.types.NodeTree:
     """Return the newest group that shows splats in viewports (kind: SPLATS_GROUP) or renders (RENDER_GROUP)."""
     if kind == SPLATS_GROUP:
-        return find_or_make(bpy.data.node_groups, kind, 3, "ObjectGS Splats", _make_splats_group)
-    return find_or_make(bpy.data.node_groups, kind, 3, "ObjectGS Render", _make_render_group)
+        return find_or_make(bpy.data.node_groups, kind, 4, "ObjectGS Splats", _make_splats_group)
+    return find_or_make(bpy.data.node_groups, kind, 4, "ObjectGS Render", _make_render_group)
 
 
 def hide_group() -> bpy.types.NodeTree:
-    """Return a group with empty output; without it, Blender draws dots for the loose vertices of a mesh."""
-    for tree in bpy.data.node_groups:
-        if kind_of(tree) == HIDE_GROUP and tree.library is None:
-            return tree
-    tree = bpy.data.node_groups.new("ObjectGS Drawn", "GeometryNodeTree")
-    mark(tree, HIDE_GROUP)
-    tree.is_modifier = True
-    for side in ("INPUT", "OUTPUT"):
-        tree.interface.new_socket("Geometry", in_out=side, socket_type="NodeSocketGeometry")
-    tree.nodes.new("NodeGroupOutput")
+    """Return the newest group that shows nothing; without it, Blender draws dots for the loose vertices of a mesh.
+
+    Its output is the corners of the box around the splats, as points of radius 0, by which Blender frames the object.
+    """
+    return find_or_make(bpy.data.node_groups, HIDE_GROUP, 1, "ObjectGS Drawn", _make_hide_group)
+
+
+def _make_hide_group(name: str) -> bpy.types.NodeTree:
+    tree = _geometry_group(name, [])
+    graph = Graph(tree)
+    either = graph.node(
+        "FunctionNodeBooleanMath",
+        {0: graph.attribute(HIDDEN, "BOOLEAN"), 1: graph.attribute(FLOATING, "BOOLEAN")},
+        operation="OR",
+    ).outputs[0]
+    kept = graph.node(
+        "GeometryNodeDeleteGeometry", {"Geometry": graph.node("NodeGroupInput").outputs[0], "Selection": either}
+    ).outputs[0]
+    box = graph.node("GeometryNodeBoundBox", {"Geometry": kept}).outputs[0]
+    corners = graph.node("GeometryNodeMeshToPoints", {"Mesh": box, "Radius": 0.0}).outputs[0]
+    graph.node("NodeGroupOutput", {0: corners})
+    graph.arrange()
     return tree
 
 
@@ -138,6 +155,9 @@ def _make_splats_group(name: str) -> bpy.types.NodeTree:
     splat = _Splat(graph)
     raw = recolored(graph, graph.vector("MULTIPLY_ADD", splat.base, (sh.C0,) * 3, (0.5,) * 3), group_input)
     points = graph.node("GeometryNodeMeshToPoints", {"Mesh": group_input.outputs["Geometry"]}).outputs[0]
+    points = graph.node(
+        "GeometryNodeDeleteGeometry", {"Geometry": points, "Selection": graph.attribute(FLOATING, "BOOLEAN")}
+    ).outputs[0]
 
     first, second, third = splat.sides
     middle = graph.math(
@@ -248,7 +268,7 @@ def _make_render_group(name: str) -> bpy.types.NodeTree:
         "FLOAT_VECTOR",
         graph.node("ShaderNodeCombineXYZ", {0: widened, 1: widened, 2: nearness}).outputs[0],
     )
-    for pattern in ("radiance:*", "rotation", "scale", "object_id", HIDDEN):
+    for pattern in ("radiance:*", "rotation", "scale", "object_id", HIDDEN, FLOATING):
         points = graph.removed(points, pattern)
 
     square = graph.node(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Film frames of the splats through the scene's camera, and the compositor that combines them with renders."""
+"""Renders: settings for splats, film frames, and the compositor that combines the frames with Blender's renders."""
 
 from __future__ import annotations
 
@@ -11,9 +11,27 @@ from ..running.job_display import write
 from .tab import WithReconstruction, draw_job_of
 
 
+class RenderPanel(WithReconstruction, bpy.types.Panel):
+    bl_idname = "OBJECTGS_PT_render"
+    bl_label = "Render"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        owner = context.scene
+        root = owner.objectgs.active
+        problem = scene.render_problem(owner, root)
+        if problem is not None:
+            write(layout, problem, "ERROR")
+        layout.operator("objectgs.set_up_render", icon="SCENE")
+        layout.prop(root, "hide_render", text="Disable in Renders", icon="NONE")
+        if root.hide_render:
+            write(layout, "Blender does not render this reconstruction; film frames show it.", "INFO")
+
+
 class FilmPanel(WithReconstruction, bpy.types.Panel):
     bl_idname = "OBJECTGS_PT_film"
     bl_label = "Film"
+    bl_parent_id = "OBJECTGS_PT_render"
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -40,6 +58,3 @@ class FilmPanel(WithReconstruction, bpy.types.Panel):
         if job is not None and job.kind == "film":
             draw_job_of(layout, job)
         layout.operator("objectgs.set_up_compositor", icon="NODE_COMPOSITING")
-        layout.prop(root, "hide_render", text="Disable in Renders", icon="NONE")
-        if root.hide_render:
-            write(layout, "Blender does not render this reconstruction; film frames show it.", "INFO")
