@@ -11,7 +11,7 @@ import numpy as np
 from ...backend.shared.color.palette import to_encoded
 from .. import scene as scenes
 from .renderer import DrawnObject
-from .splat_arrays import arrays_of
+from .splat_arrays import arrays_of, selected_of
 
 NO_RECOLOR = np.hstack([np.eye(3), np.zeros((3, 1))])
 NONE = (0.0, 0.0, 0.0, 0.0)
@@ -52,7 +52,7 @@ def gather(parts: Any, colors: str = "photo", pointed_at: int | None = None, mar
         parts: mesh carriers of splats.
         colors: "photo", or "object" for the objects' own colors.
         pointed_at: session UID of the collection under the mouse, or None.
-        marks: highlight selected objects.
+        marks: highlight selected objects and splats.
     """
     found = []
     collections = collections_by_part()
@@ -67,7 +67,9 @@ def gather(parts: Any, colors: str = "photo", pointed_at: int | None = None, mar
         elif marks and part.select_get():
             highlight = SELECTED
         color = (*to_encoded(part.color[:3]), 1.0) if colors == "object" else NONE
-        found.append(DrawnObject(arrays, np.array(part.matrix_world), color_map(collection), color, highlight))
+        selected = selected_of(part.data) if marks else None
+        matrix, recolor = np.array(part.matrix_world), color_map(collection)
+        found.append(DrawnObject(arrays, matrix, recolor, color, highlight, selected))
     return found
 
 

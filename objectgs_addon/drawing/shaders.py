@@ -21,6 +21,13 @@ OBJECT_TEXELS = 12
 """Texels per object: three rows each of the map to camera space, the map to view directions and the affine map of
 colors; the color and the highlight, each with its opacity; one unused texel."""
 
+SELECTED = 0.25
+"""Fraction added to the slot of a splat's object in `order` if the splat is selected."""
+
+SELECTED_COLOR = (1.0, 0.85, 0.1)
+SELECTED_AMOUNT = 0.6
+"""sRGB-encoded color blended over a selected splat's color, and its opacity."""
+
 _CONSTANTS = f"""
 #define TABLE_WIDTH {TABLE_WIDTH}
 #define SPLAT_TEXELS {SPLAT_TEXELS}
@@ -29,6 +36,8 @@ _CONSTANTS = f"""
 #define ALPHA_MIN {ALPHA_MIN!r}
 #define EPS_2D {EPS_2D!r}
 #define MAX_EXTENT {MAX_EXTENT!r}
+#define SELECTED_COLOR vec3{SELECTED_COLOR!r}
+#define SELECTED_AMOUNT {SELECTED_AMOUNT!r}
 #define LUMA vec3({", ".join(repr(float(weight)) for weight in LUMA)})
 #define SH_C0 {sh.C0!r}
 #define SH_C1 {sh.C1!r}
@@ -135,6 +144,7 @@ void main() {
     color = mix(color, own.rgb * shade, own.a);
     vec4 mark = at(objects, object + 10);
     color = mix(color, mark.rgb, mark.a);
+    color = mix(color, SELECTED_COLOR, fract(entry.y) > 0.1 ? SELECTED_AMOUNT : 0.0);
 
     beside = corner * extent;
     shape = vec4(b / c, 0.5 / across2, 0.5 / c, opacity);

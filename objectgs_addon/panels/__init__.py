@@ -11,6 +11,7 @@ from .jobs import JobsPanel, status_bar
 from .meshes import MeshesPanel
 from .objects import ObjectList, ObjectsPanel
 from .plan import PlanPanel
+from .splats import AssignMenu, SplatsPanel
 from .train import SettingsPanel, TrainPanel
 
 CLASSES = (
@@ -21,6 +22,8 @@ CLASSES = (
     SettingsPanel,
     ObjectsPanel,
     EditPanel,
+    AssignMenu,
+    SplatsPanel,
     MeshesPanel,
     DrawingPanel,
     FilmPanel,

@@ -15,6 +15,7 @@ from ..object_collection import center_of
 from ..shading.modifiers import update_groups
 from ..shading.node_groups import HIDDEN
 from .fills import given_way, unobserved_splats
+from .single_splats import deleted_splats
 
 FLATTEST = 1e-5
 """A hull that is thinner than this, relative to its length, counts as flat and has no interior."""
@@ -37,10 +38,11 @@ def hide_floaters(root: bpy.types.Collection, removed: list[int]) -> None:
     for object_id in removed:
         obj = carriers.get(object_id)
         if obj is not None and "radiance:base" in obj.data.attributes:
-            hidden |= inside_hull(places, _places(obj), carrier.read(obj.data, "radiance:base")[:, 3])
+            own = ~deleted_splats(obj.data)
+            hidden |= inside_hull(places, _places(obj)[own], carrier.read(obj.data, "radiance:base")[own, 3])
     # Objects merged into the unlabeled rest keep their own IDs and are not floaters.
     hidden &= (carrier.read(unlabeled.data, OBJECT_ID) == 0) & ~unobserved_splats(unlabeled.data)
-    hidden |= given_way(unlabeled.data)
+    hidden |= given_way(unlabeled.data) | deleted_splats(unlabeled.data)
     if np.array_equal(hidden, np.zeros(len(places), bool) if before is None else before):
         return
     carrier.require_object_mode([unlabeled])
