@@ -113,6 +113,17 @@ def test_drags_select_splats_by_each_shape(tool):
     wait(tool, f"{PICKED}[1] > 0")
 
 
+def test_the_key_f_changes_the_radius_of_the_brush(tool):
+    left = placement_of(tool, LEFT)
+    tool.move(*left)
+    tool.key("f")
+    tool.move(left[0] + 40, left[1])
+    tool.run("")
+    tool.click(left[0] + 60, left[1])
+    wait(tool, "owner.objectgs.splat_radius != 25")
+    tool.run(script("owner.objectgs.splat_radius = 25"))
+
+
 def test_selected_splats_are_highlighted_deleted_and_restored_by_undo(tool, folder):  # noqa: F811
     left = placement_of(tool, LEFT)
     aside = (left[0], left[1] + 220)
