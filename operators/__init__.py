@@ -35,7 +35,7 @@ def _classes() -> list[type]:
     )
     from .selection import pick_object, select_by_name, select_object, solo_object
     from .setup import set_up_backend
-    from .splats import export_splats, import_splats
+    from .splats import crop_scene, edit_splats, export_splats, import_splats, select_more, select_splats
     from .training import (
         dismiss_message,
         pause_job,
@@ -78,6 +78,10 @@ def _classes() -> list[type]:
         clean_floaters,
         duplicate_object,
         reset_object,
+        select_splats,
+        select_more,
+        edit_splats,
+        crop_scene,
         export_splats,
         import_splats,
         export_meshes,
@@ -102,20 +106,24 @@ def _export_menu(menu: Any, _context: Any) -> None:
 def register() -> None:
     import bpy
 
+    from ..objectgs_addon.picking import splats_tool
     from ..objectgs_addon.picking import tool as pick_tool
 
     for cls in _classes():
         bpy.utils.register_class(cls)
     bpy.types.TOPBAR_MT_file_import.append(_import_menu)
     bpy.types.TOPBAR_MT_file_export.append(_export_menu)
-    pick_tool.register()  # Its keymap needs registered operators.
+    pick_tool.register()  # The keymaps of tools need registered operators.
+    splats_tool.register()
 
 
 def unregister() -> None:
     import bpy
 
+    from ..objectgs_addon.picking import splats_tool
     from ..objectgs_addon.picking import tool as pick_tool
 
+    splats_tool.unregister()
     pick_tool.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_export_menu)
     bpy.types.TOPBAR_MT_file_import.remove(_import_menu)

@@ -5,20 +5,20 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..editing.apply import apply_edits, transformed
+from ..editing import apply_edits, apply_splat_edits, transformed
 from ..export.ply import read_splats
 from ..model.splats import Splats, concatenate
 from ..raster import devices
 from ..shared.class_table import ClassTable
 from ..shared.events import Reporter
 from ..shared.formats.regular_file import open_regular
+from ..shared.reconstruction.edits.splat_edits import digest_of, read_splat_edits
 from ..shared.reconstruction.folder import Reconstruction
 from ..shared.reconstruction.objects import SceneObject, default_name, read_objects
 from ..shared.reconstruction.shot import Frame, Placed, Sample, Shot
@@ -37,12 +37,13 @@ class Stage:
 
     def __init__(self, folder: Reconstruction, primitive: str, device: torch.device, reporter: Reporter) -> None:
         splats, warnings = read_splats(folder.splats)
-        for warning in warnings:
+        splats, more = apply_splat_edits(splats, folder)
+        for warning in warnings + more:
             reporter.warning(warning)
         objects = read_objects(folder.objects) if folder.objects.exists() else []
         self.primitive = primitive
         self._device = device
-        self._digest = _digest_of(folder.splats, objects, primitive)
+        self._digest = _digest_of(folder, objects, primitive)
         self._entries = {entry.id: entry for entry in objects}
         edited = apply_edits(splats, [replace(entry, transform=None, copies=()) for entry in objects])
         self.classes = ClassTable(edited.object_ids)
@@ -127,11 +128,11 @@ class Stage:
         return {"means": devices.upload(means, self._device), **tensors, "ids": devices.upload(ids, self._device)}
 
 
-def _digest_of(path: Path, objects: list[SceneObject], primitive: str) -> str:
-    with open_regular(path) as file:
+def _digest_of(folder: Reconstruction, objects: list[SceneObject], primitive: str) -> str:
+    with open_regular(folder.splats) as file:
         content = hashlib.file_digest(file, "sha256").hexdigest()
     drawn = [replace(entry, color=(0, 0, 0), points=0) for entry in objects]
-    return f"{_FORMAT} {content} {drawn!r} {primitive}"
+    return f"{_FORMAT} {content} {drawn!r} {primitive} {digest_of(read_splat_edits(folder))}"
 
 
 def _names(ids: list[int], entries: dict[int, SceneObject]) -> list[str]:

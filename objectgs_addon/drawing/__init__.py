@@ -6,6 +6,7 @@ them with the shaders in `shaders`, and `viewport` composites the result over th
 """
 
 from .gather import collections_by_part, shown, splat_parts
+from .splat_arrays import selected_of, selection_changed, splats_changed
 from .viewport import failure, picture, point_at, redraw, register, show, unregister
 
 __all__ = [
@@ -15,8 +16,11 @@ __all__ = [
     "point_at",
     "redraw",
     "register",
+    "selected_of",
+    "selection_changed",
     "show",
     "shown",
     "splat_parts",
+    "splats_changed",
     "unregister",
 ]

@@ -11,7 +11,7 @@ import numpy as np
 from ...backend.shared.color.palette import to_encoded
 from .. import scene as scenes
 from .renderer import DrawnObject
-from .splat_arrays import arrays_of
+from .splat_arrays import arrays_of, selected_of
 
 NO_RECOLOR = np.hstack([np.eye(3), np.zeros((3, 1))])
 NONE = (0.0, 0.0, 0.0, 0.0)
@@ -50,7 +50,7 @@ def gather(parts: Any, colors: str = "photo", pointed_at: int | None = None, mar
         parts: mesh carriers of splats.
         colors: "photo", or "object" for the objects' own colors.
         pointed_at: session UID of the collection under the mouse, or None.
-        marks: outline selected objects.
+        marks: outline selected objects, and highlight selected splats.
     """
     found = []
     collections = collections_by_part()
@@ -69,6 +69,7 @@ def gather(parts: Any, colors: str = "photo", pointed_at: int | None = None, mar
                 color,
                 marks and part.select_get(),
                 is_pointed_at,
+                selected_of(part.data) if marks else None,
             )
         )
     return found

@@ -30,6 +30,7 @@ class DrawnObject:
         color: sRGB-encoded RGB that replaces the splats' colors but keeps their brightness, and its opacity.
         is_selected: outline it in the color of the selection.
         is_pointed_at: outline it in white.
+        selected: (N,) bool, the splats that are drawn as selected; None if there are none.
     """
 
     splats: SplatArrays
@@ -38,6 +39,7 @@ class DrawnObject:
     color: tuple[float, float, float, float]
     is_selected: bool = False
     is_pointed_at: bool = False
+    selected: np.ndarray | None = None
 
 
 class Renderer:
@@ -225,6 +227,8 @@ class _Sorted:
             self._parts.append(own)
             first += count
         self._rows: np.ndarray | None = None
+        self._selected: list[np.ndarray | None] = [None] * len(self._splats)
+        self._order = np.zeros(0, np.int64)
         self.count = 0
         self.texture: gpu.types.GPUTexture | None = None
 
@@ -233,17 +237,32 @@ class _Sorted:
         return len(objs) == len(self._splats) and all(obj.splats is splats for obj, splats in zip(objs, self._splats))
 
     def sort(self, objs: Sequence[DrawnObject], view: View) -> None:
-        """Update the order if the view or an object has moved."""
+        """Update the order if the view or an object has moved, and mark the selected splats."""
         rows = view.viewmat[2] @ np.array([obj.matrix for obj in objs])
-        if self._rows is not None and np.array_equal(rows, self._rows):
+        moved = self._rows is None or not np.array_equal(rows, self._rows)
+        if not self._mark([obj.selected for obj in objs]) and not moved:
             return
-        self._rows = rows
+        if moved:
+            self._rows = rows
+            self._sort(rows, view)
+        self.texture = _table(self._entries.take(self._order, axis=0), "RG32F") if self.count else None
+
+    def _mark(self, selected: list[np.ndarray | None]) -> bool:
+        """Write which splats are selected into the entries; return False if the selection has not changed."""
+        if all(now is before for now, before in zip(selected, self._selected)):
+            return False
+        for slot, (own, marked) in enumerate(zip(self._parts, selected)):
+            self._entries[own, 1] = slot if marked is None else slot + shaders.SELECTED * marked
+        self._selected = selected
+        return True
+
+    def _sort(self, rows: np.ndarray, view: View) -> None:
+        """Sort the splats by depth; rows (n, 4): the maps from each object's coordinates to the depth."""
         for splats, row, own in zip(self._splats, rows.astype(np.float32), self._parts):
             np.matmul(splats.means, row[:3], out=self._depths[own])
             self._depths[own] += row[3]
-        order = back_to_front(self._depths, view.near, view.orthographic)
-        self.count = len(order)
-        self.texture = _table(self._entries.take(order, axis=0), "RG32F") if self.count else None
+        self._order = back_to_front(self._depths, view.near, view.orthographic)
+        self.count = len(self._order)
 
 
 def _objects(objs: Sequence[DrawnObject], view: View) -> np.ndarray:

@@ -27,6 +27,13 @@ texel."""
 OUTLINE_SAMPLES = 12
 """Number of pixels around one that are searched for an object to outline."""
 
+SELECTED = 0.25
+"""Fraction added to the slot of a splat's object in `order` if the splat is selected."""
+
+SELECTED_COLOR = (1.0, 0.85, 0.1)
+SELECTED_AMOUNT = 0.6
+"""sRGB-encoded color blended over a selected splat's color, and its opacity."""
+
 _CONSTANTS = f"""
 #define TABLE_WIDTH {TABLE_WIDTH}
 #define SPLAT_TEXELS {SPLAT_TEXELS}
@@ -35,6 +42,8 @@ _CONSTANTS = f"""
 #define ALPHA_MIN {ALPHA_MIN!r}
 #define EPS_2D {EPS_2D!r}
 #define MAX_EXTENT {MAX_EXTENT!r}
+#define SELECTED_COLOR vec3{SELECTED_COLOR!r}
+#define SELECTED_AMOUNT {SELECTED_AMOUNT!r}
 #define LUMA vec3({", ".join(repr(float(weight)) for weight in LUMA)})
 #define SH_C0 {sh.C0!r}
 #define SH_C1 {sh.C1!r}
@@ -141,6 +150,7 @@ void main() {
     float shade = 0.5 + dot(color, LUMA);
     color = mix(color, own.rgb * shade, own.a);
     mark = at(objects, object + 10).xy;
+    color = mix(color, SELECTED_COLOR, fract(entry.y) > 0.1 ? SELECTED_AMOUNT : 0.0);
 
     beside = corner * extent;
     shape = vec4(b / c, 0.5 / across2, 0.5 / c, opacity);

@@ -29,6 +29,7 @@ class SplatArrays:
         scales: (N, 3).
         opacities: (N,).
         harmonics: (N, K, 3) spherical harmonics coefficients for red, green and blue.
+        vertices: (N,) indices of the splats among the vertices of the carrier; None if all are visible.
     """
 
     means: np.ndarray
@@ -36,6 +37,7 @@ class SplatArrays:
     scales: np.ndarray
     opacities: np.ndarray
     harmonics: np.ndarray
+    vertices: np.ndarray | None = None
 
     @cached_property
     def cloud(self) -> Cloud:
@@ -44,6 +46,7 @@ class SplatArrays:
 
 
 _held: dict[int, SplatArrays] = {}
+_selected: dict[int, np.ndarray | None] = {}
 
 
 def arrays_of(mesh: bpy.types.Mesh) -> SplatArrays | None:
@@ -52,6 +55,27 @@ def arrays_of(mesh: bpy.types.Mesh) -> SplatArrays | None:
     if found is None and all(name in mesh.attributes for name in ("radiance:base", "scale", "rotation")):
         found = _held[mesh.session_uid] = _read(mesh)
     return found
+
+
+def selected_of(mesh: bpy.types.Mesh) -> np.ndarray | None:
+    """Return which of a carrier's visible splats are selected, (N,) bool; None if there are none."""
+    if mesh.session_uid not in _selected:
+        arrays, selected = arrays_of(mesh), scene.selected_splats(mesh)
+        if arrays is not None and arrays.vertices is not None:
+            selected = selected[arrays.vertices]
+        _selected[mesh.session_uid] = selected if selected.any() else None
+    return _selected[mesh.session_uid]
+
+
+def selection_changed(mesh: bpy.types.Mesh) -> None:
+    """Drop the cached selection of a mesh."""
+    _selected.pop(mesh.session_uid, None)
+
+
+def splats_changed(mesh: bpy.types.Mesh) -> None:
+    """Drop the cached splats and the selection of a mesh."""
+    _held.pop(mesh.session_uid, None)
+    _selected.pop(mesh.session_uid, None)
 
 
 def _read(mesh: bpy.types.Mesh) -> SplatArrays:
@@ -67,18 +91,21 @@ def _read(mesh: bpy.types.Mesh) -> SplatArrays:
         np.stack(coefficients, axis=1),
     )
     hidden = scene.hidden_splats(mesh)
-    return SplatArrays(*arrays) if hidden is None else SplatArrays(*(values[~hidden] for values in arrays))
+    if hidden is None:
+        return SplatArrays(*arrays)
+    return SplatArrays(*(values[~hidden] for values in arrays), vertices=np.flatnonzero(~hidden))
 
 
 def _forget(*_: Any) -> None:
     _held.clear()
+    _selected.clear()
 
 
 def _changed(_scene: Any, depsgraph: Any) -> None:
     # Only mesh updates count: objects also get geometry updates when moved, since modifiers may depend on transforms.
     for update in depsgraph.updates:
         if update.is_updated_geometry and isinstance(update.id, bpy.types.Mesh):
-            _held.pop(update.id.original.session_uid, None)
+            splats_changed(update.id.original)
 
 
 _forget, _changed = bpy.app.handlers.persistent(_forget), bpy.app.handlers.persistent(_changed)

@@ -11,6 +11,7 @@ from .meshes import MeshesPanel
 from .objects import ObjectList, ObjectsPanel
 from .placement import PlacementPanel
 from .render import FilmPanel, RenderPanel
+from .splats import AssignMenu, SplatsPanel
 from .training.plan import PlanPanel
 from .training.train import DetailsPanel, SettingsPanel, TrainPanel
 
@@ -24,6 +25,8 @@ CLASSES = (
     PlanPanel,
     SettingsPanel,
     EditPanel,
+    AssignMenu,
+    SplatsPanel,
     MeshesPanel,
     RenderPanel,
     FilmPanel,

@@ -13,16 +13,17 @@ import bpy
 from ...backend.shared.errors import InputError
 from .. import scene
 from ..blender import messages, writing
-from ..state import folder_trust, object_edits
+from ..state import folder_trust, object_edits, splat_edits
 from . import background, results
 
 
 @bpy.app.handlers.persistent
 @writing.allowed
 def _undone(*_: Any) -> None:
-    """Update objects.json and the fills after undo or redo."""
+    """Update the folder's edits and the fills after undo or redo."""
     for root in _accepted_roots():
-        for action in (object_edits.store, results.show_fill, partial(background.fill_holes, again=False)):
+        fill_holes = partial(background.fill_holes, again=False)
+        for action in (object_edits.store, splat_edits.follow, results.show_fill, fill_holes):
             _try(action, root)
 
 
@@ -59,6 +60,7 @@ def _file_loaded(*_: Any) -> None:
 
     The lists are filled only from accepted folders, and no other folder is read.
     """
+    splat_edits.forget()
     for owner in bpy.data.scenes:
         roots = [root for root in owner.collection.children_recursive if scene.kind_of(root) == "reconstruction"]
         for root in roots:

@@ -4,12 +4,23 @@
 from .cameras import use_camera
 from .capture import show_capture, warnings_of
 from .carrier import require_object_mode
+from .edits.crop_box import add_crop_box, box_of, crop_box_of
 from .edits.duplicates import duplicate, remove_duplicate
 from .edits.fills import UNOBSERVED_COUNT, missing_fill, show_fills, unobserved_splats
 from .edits.floaters import floater_counts, floating_splats, hidden_splats
 from .edits.placement import distance_moved, matrix_to_capture, matrix_to_world, placement_of
 from .edits.recolor import luma_of, recolor_of, with_own_textures
 from .edits.show import is_removed, recolor, reset_placement, show_edits, store_placements
+from .edits.single_splats import (
+    ShownEdits,
+    delete_splats,
+    deleted_splats,
+    keys_of,
+    remember_edits,
+    select_splats,
+    selected_splats,
+    shown_edits,
+)
 from .kinds import (
     collection_of,
     duplicates_of,
@@ -48,10 +59,16 @@ __all__ = [
     "UNOBSERVED_COUNT",
     "Objects",
     "Shown",
+    "ShownEdits",
     "ShownMeshes",
+    "add_crop_box",
     "bounds",
+    "box_of",
     "collection_of",
     "color_points_by",
+    "crop_box_of",
+    "delete_splats",
+    "deleted_splats",
     "distance_moved",
     "duplicate",
     "duplicates_of",
@@ -63,6 +80,7 @@ __all__ = [
     "hidden_splats",
     "is_removed",
     "is_untouched",
+    "keys_of",
     "kind_of",
     "link_folder",
     "luma_of",
@@ -79,6 +97,7 @@ __all__ = [
     "prepare_render",
     "recolor",
     "recolor_of",
+    "remember_edits",
     "remove_duplicate",
     "render_problem",
     "require_object_mode",
@@ -87,6 +106,8 @@ __all__ = [
     "root_of",
     "scale_to_distance",
     "scene_meshes",
+    "select_splats",
+    "selected_splats",
     "set_up_render",
     "shade_meshes",
     "shading_of",
@@ -98,6 +119,7 @@ __all__ = [
     "show_meshes",
     "show_objects",
     "show_result",
+    "shown_edits",
     "shown_kinds",
     "store_placements",
     "to_stored",

@@ -15,6 +15,7 @@ from ...backend.shared.errors import InputError
 _FIELDS = {
     "FLOAT": ("value", np.float32, 1),
     "INT": ("value", np.int32, 1),
+    "INT32_2D": ("value", np.int32, 2),
     "FLOAT_VECTOR": ("vector", np.float32, 3),
     "FLOAT_COLOR": ("color", np.float32, 4),
     "QUATERNION": ("value", np.float32, 4),

@@ -31,6 +31,7 @@ OBJECT_PARENT = "object_parent"
 SPLATS = "splats"
 ANCHORS = "anchors"
 MESH = "mesh"
+CROP_BOX = "crop_box"
 
 SPLATS_MATERIAL = "splats_material"
 MESH_MATERIAL = "mesh_material"

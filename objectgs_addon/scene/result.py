@@ -15,11 +15,21 @@ import numpy as np
 from ...backend.shared.color.palette import to_linear
 from ...backend.shared.errors import InputError
 from ...backend.shared.formats.splat_ply import ids_of
+from ...backend.shared.reconstruction.edits.splat_edits import missing_sentence, read_splat_edits
 from ...backend.shared.reconstruction.folder import Reconstruction
 from . import carrier
 from .capture import origin_of, put_capture_last
 from .edits.floaters import mark_floaters
 from .edits.show import show_edits
+from .edits.single_splats import (
+    captured_positions,
+    edited_attributes,
+    keys_of,
+    remember_edits,
+    select_splats,
+    selected_splats,
+    table_keys,
+)
 from .kinds import (
     ANCHORS,
     MESH,
@@ -41,7 +51,8 @@ from .object_collection import NAME, center_of, ensure_pivot, new_collection, pa
 from .object_display import Objects
 from .points import read_points, show_points
 from .shading.materials import splats_material
-from .shading.modifiers import add_splats_modifiers, use_material
+from .shading.modifiers import add_splats_modifiers, update_groups, use_material
+from .shading.node_groups import HIDDEN
 from .splats import (
     anchor_attributes,
     median_scale,
@@ -90,13 +101,16 @@ def show_result(root: bpy.types.Collection, folder: Path) -> Shown:
     splats, warnings = read_splats(folder)
     anchors, more = read_anchors(folder)
     objects = Objects.read(folder)
+    edits = read_splat_edits(Reconstruction(folder))
     collections = object_collections(root)
     is_first = not collections
     carrier.require_object_mode(part for collection in collections.values() for part in parts_of(collection))
 
     origin = origin_of(root)
-    splat_groups = _groups(splats, objects)
-    anchor_groups = {} if anchors is None else _groups(anchors, objects)
+    applied = edits.apply(table_keys(splats) if edits else np.zeros(0), ids_of(splats), captured_positions(splats))
+    splat_groups = _groups(splats, applied.object_ids, objects)
+    anchor_groups = {} if anchors is None else _groups(anchors, ids_of(anchors), objects)
+    selected = _selected_keys(collections)
     parent = parent_of(root)
     makers = _Makers(objects, LARGEST_POINT * median_scale(splats))
     shown = Shown(warnings=warnings + more)
@@ -112,7 +126,11 @@ def show_result(root: bpy.types.Collection, folder: Path) -> Shown:
         positions = positions_of(own_splats, origin)
         pivot = ensure_pivot(collection, parent, object_id, positions)
         obj = makers.part(collection, SPLATS, object_id, pivot)
-        carrier.fill(obj.data, positions - center_of(pivot), splat_attributes(own_splats))
+        attributes = splat_attributes(own_splats) | edited_attributes(own_splats, edits)
+        if HIDDEN in attributes:
+            update_groups(obj)
+        carrier.fill(obj.data, positions - center_of(pivot), attributes)
+        select_splats(obj.data, np.isin(keys_of(obj.data), selected))
         mark_floaters(obj, positions)
         shown.splats += len(own_splats)
         if own_anchors is not None:
@@ -145,7 +163,16 @@ def show_result(root: bpy.types.Collection, folder: Path) -> Shown:
     show_edits(root, objects)
     root[GROUPING] = json.dumps(objects.grouping())
     root[SHOWN] = _written(folder)
+    remember_edits(root, edits, applied.missing)
+    if applied.missing:
+        shown.warnings.append(missing_sentence(applied.missing, edits, Reconstruction(folder).splat_edits))
     return shown
+
+
+def _selected_keys(collections: dict[int, bpy.types.Collection]) -> np.ndarray:
+    """Return the keys of the selected splats of objects, which remain selected while the splats are the same."""
+    meshes = [part.data for each in collections.values() if (part := part_of(each, SPLATS)) is not None]
+    return np.concatenate([np.zeros(0, np.uint64), *(keys_of(mesh)[selected_splats(mesh)] for mesh in meshes)])
 
 
 def result_is_newer(root: bpy.types.Collection) -> bool:
@@ -196,9 +223,15 @@ def show_label(root: bpy.types.Collection, object_id: int, name: str, rgb: tuple
         paint(each, rgb)
 
 
-def _groups(table: np.ndarray, objects: Objects) -> dict[int, np.ndarray]:
-    """Map the IDs of collections to their rows of the table, in file order, without rows of left-out objects."""
-    ids, inverse = unique_ids(ids_of(table))
+def _groups(table: np.ndarray, object_ids: np.ndarray, objects: Objects) -> dict[int, np.ndarray]:
+    """Map the IDs of collections to their rows of the table, in file order, without rows of left-out objects.
+
+    Args:
+        table: (n,) splats or anchors.
+        object_ids: (n,) their IDs.
+        objects: the objects with the user's edits.
+    """
+    ids, inverse = unique_ids(object_ids)
     shown = [objects.shown_as(int(object_id)) for object_id in ids]
     targets = sorted({target for target in shown if target is not None})
     place = {target: index for index, target in enumerate(targets)}

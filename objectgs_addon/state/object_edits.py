@@ -19,7 +19,7 @@ from ...backend.shared.color.recolor import Recolor
 from ...backend.shared.errors import InputError
 from ...backend.shared.grouping import grouped, read_groups
 from ...backend.shared.reconstruction.folder import Reconstruction
-from ...backend.shared.reconstruction.objects import edit_objects, read_objects
+from ...backend.shared.reconstruction.objects import EDITABLE, SceneObject, edit_objects, read_objects
 from .. import scene
 from ..blender import messages, writing
 from ..environment import known_folders
@@ -73,6 +73,7 @@ def fill(root: bpy.types.Collection) -> None:
             item.merged_into = to_stored(entry.merged_into or 0)
             item.removed, item.floaters, item.fill = entry.removed, entry.floaters, entry.fill
             item.cleaned = entry.cleaned
+            item.separated = entry.separated
             _set_sliders(item, entry.recolor)
             _remember(item)
             if item.object_id == active_id:
@@ -88,11 +89,11 @@ def store(root: bpy.types.Collection) -> None:
         return
     entries = {entry.id: entry for entry in read_objects(path)}
     items = {from_stored(item.object_id): item for item in root.objectgs.objects}
-    if set(items) != set(entries):
+    if {i for i, item in items.items() if not item.separated} != {i for i in entries if not entries[i].separated}:
         return
-    changes = {}
+    changes: dict[int, dict] = {i: dict.fromkeys(EDITABLE) for i in entries.keys() - items.keys()}
     for object_id, item in items.items():
-        entry = entries[object_id]
+        entry = entries.get(object_id, SceneObject(object_id, "", (0, 0, 0), 0))
         wanted = {
             "name": item.name,
             "color": _rgb(item),
@@ -103,6 +104,7 @@ def store(root: bpy.types.Collection) -> None:
             "fill": item.fill or None,
             "cleaned": item.cleaned or None,
             "recolor": object_list.recolor_of(item).stored(),
+            "separated": item.separated or None,
         }
         there = {
             "name": entry.name,
@@ -114,6 +116,7 @@ def store(root: bpy.types.Collection) -> None:
             "fill": entry.fill or None,
             "cleaned": entry.cleaned or None,
             "recolor": object_list.rounded(entry.recolor).stored(),
+            "separated": entry.separated or None,
         }
         changed = {key: value for key, value in wanted.items() if value != there[key]}
         if changed:
@@ -216,7 +219,7 @@ def _edit(root: bpy.types.Collection, changes: dict[int, dict]) -> None:
             show(root)
     finally:
         fill(root)
-    _notify(root)
+    notify(root)
 
 
 def show(root: bpy.types.Collection) -> None:
@@ -272,10 +275,11 @@ def _show_edit(root: bpy.types.Collection, changes: dict[int, dict]) -> None:
         scene.show_edits(root, scene.Objects.read(folder))
     finally:
         fill(root)
-    _notify(root)
+    notify(root)
 
 
-def _notify(root: bpy.types.Collection) -> None:
+def notify(root: bpy.types.Collection) -> None:
+    """Call the callbacks `after_edits`."""
     for call in after_edits:
         call(root)
 
@@ -391,7 +395,7 @@ def _row_changed(item: Any, **changes: Any) -> None:
     try:
         if object_list.scenes_of(root):
             scene.show_objects(root, folder)
-        _notify(root)
+        notify(root)
     except (InputError, OSError) as error:
         messages.show(messages.sentence(error), "ERROR")
 

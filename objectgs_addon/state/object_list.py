@@ -70,10 +70,13 @@ def scenes_of(root: bpy.types.Collection) -> list[bpy.types.Scene]:
 
 
 def splat_counts(root: bpy.types.Collection) -> dict[int, int]:
-    """Map object IDs to the numbers of observed splats in their collections, including those of merged objects."""
+    """Map object IDs to the numbers of splats in their collections, including those of merged objects.
+
+    Splats that are unobserved, deleted or outside of the crop do not count.
+    """
     return {
         object_id: sum(
-            len(part.data.vertices) - int(scene.unobserved_splats(part.data).sum())
+            int((~scene.unobserved_splats(part.data) & ~scene.deleted_splats(part.data)).sum())
             for part in scene.parts_of(collection)
             if scene.kind_of(part) == "splats"
         )

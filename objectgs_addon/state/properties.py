@@ -100,6 +100,7 @@ class ObjectItem(bpy.types.PropertyGroup):
         name="Fill Hole", description="The hole in the ground or wall behind it is filled from its surroundings"
     )
     cleaned: BoolProperty(name="Floaters Hidden", description="Its splats apart from the rest of it are hidden")
+    separated: BoolProperty(name="Separated", description="Consists of single splats taken from other objects")
     replace: _color_edit("New Color", 0.5, "Replaces the object's color and keeps its shading")
     amount: _slider("Amount", 0.0, 0.0, 1.0, "Amount of the new color")
     hue: _slider("Hue", 0.0, -0.5, 0.5, "Rotation of the hue in turns of the color wheel; brightness is kept")
@@ -272,6 +273,30 @@ class SceneProperties(bpy.types.PropertyGroup):
             ("object", "Objects", "Colors that represent the objects"),
         ],
         update=viewports.colors_changed,
+    )
+
+    splat_shape: EnumProperty(
+        name="Shape",
+        description="How the tool Select Splats selects",
+        default="BRUSH",
+        items=[
+            ("BRUSH", "Brush", "Splats under a brush", "MESH_CIRCLE", 0),
+            ("LASSO", "Lasso", "Splats in an outline", "GP_SELECT_POINTS", 1),
+            ("BOX", "Box", "Splats in a rectangle", "SELECT_SET", 2),
+            ("SPHERE", "Sphere", "Splats in a sphere around the surface under the mouse", "SPHERE", 3),
+        ],
+    )
+    splat_radius: IntProperty(
+        name="Radius", description="Radius of the brush", default=30, min=1, soft_max=300, max=2000, subtype="PIXEL"
+    )
+    splat_depth: EnumProperty(
+        name="Depth",
+        description="Whether splats that others hide are selected, too",
+        default="THROUGH",
+        items=[
+            ("THROUGH", "Through", "Select all splats, whether or not others hide them"),
+            ("VISIBLE", "Visible Only", "Select only splats that are not hidden by others in front of them"),
+        ],
     )
 
 

@@ -180,6 +180,7 @@ OWNERS = {
     "cameras.json": "cameras",
     "points.ply": "folder",
     "splats.ply": "folder",
+    "splat-edits.ply": "folder",
     "anchors.ply": "folder",
     "meshes.json": "meshes",
     "report.json": "report",

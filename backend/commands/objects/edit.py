@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from ...editing import apply_splat_edits
 from ...editing.placement import Placement, luma_of, middle_of
 from ...export import read_splats
 from ...model.splats import Splats
 from ...shared.errors import InputError
+from ...shared.reconstruction.edits.splat_edits import SplatEdits, read_splat_edits
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.objects import Matrix, SceneObject, edit_objects, find_object, members_of, read_objects
 from ...shared.stopping import StoppingReporter
@@ -42,7 +44,7 @@ def edit(options: argparse.Namespace, reporter: StoppingReporter) -> None:
 
     # Read before objects.json is locked, since it can take long.
     needs_splats = options.recolor or options.move or options.duplicate
-    splats = read_splats(folder.splats)[0] if needs_splats else None
+    splats = apply_splat_edits(read_splats(folder.splats)[0], folder)[0] if needs_splats else None
     edit_objects(folder.objects, changes)
     new_splats = fill_holes(folder, reporter)
     # As one message, since a status display shows only the latest one.
@@ -50,6 +52,7 @@ def edit(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         f"{e.id} {e.name}: {', '.join(_described(e, new_splats.get(e.id))) or 'as captured'}"
         for e in read_objects(folder.objects)
     ]
+    lines += _splat_edits(read_splat_edits(folder))
     reporter.status("\n".join(lines) or "There are no objects.")
     reporter.done(objects=str(folder.objects), edited=edited, new_splats=sum(new_splats.values()))
 
@@ -134,6 +137,13 @@ def _described(entry: SceneObject, new_splats: int | None) -> list[str]:
     if entry.copies:
         words.append(f"{len(entry.copies)} cop{'y' if len(entry.copies) == 1 else 'ies'}")
     return words
+
+
+def _splat_edits(edits: SplatEdits) -> list[str]:
+    """Describe the edits of single splats on at most one line."""
+    words = [f"{count:,} {what}" for count, what in ((edits.deleted, "deleted"), (edits.assigned, "assigned")) if count]
+    words += ["cropped to a box"] if edits.crop is not None else []
+    return [f"single splats: {', '.join(words)}"] if words else []
 
 
 def _short(value: Any) -> str:

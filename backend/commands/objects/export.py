@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ...capture import Upright
-from ...editing import apply_edits, transformed
+from ...editing import apply_edits, apply_splat_edits, transformed
 from ...export import DOWN_TO_UP, background_sphere, read_splats, write_splat, write_splats, write_spz
 from ...model.splats import Splats, concatenate
 from ...shared.errors import InputError
@@ -38,7 +38,8 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     reporter.expect({READ: ("Reading", 3.0), "edit": ("Editing", 3.0), "write": ("Saving", 3.0)})
     reporter.begin(READ, f"Reading {folder.splats.name}")
     captured, warnings = read_splats(folder.splats)
-    for sentence in warnings:
+    captured, more = apply_splat_edits(captured, folder)
+    for sentence in warnings + more:
         reporter.warning(sentence)
     _warn_about_fit(folder, record, reporter)
     reporter.begin("edit", "Applying the edits")
@@ -47,7 +48,8 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         splats = splats.select(np.isin(splats.object_ids, chosen))
     if len(splats) == 0:
         raise InputError(
-            f"No splats of {folder.splats} are left to export, since removed and left-out objects are skipped."
+            f"No splats of {folder.splats} are left to export, since those that are deleted, cropped, or of removed or "
+            "left-out objects are skipped."
         )
     if splats.unobserved.any():
         reporter.status(f"{splats.unobserved.sum():,} splats fill the holes of removed objects")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ...editing import compute_fill
+from ...editing import apply_splat_edits, compute_fill
 from ...export import read_splats, splat_table
 from ...shared.reconstruction.fill import FillRows, fill_path, read_fill, write_fill
 from ...shared.reconstruction.folder import Reconstruction
@@ -28,7 +28,7 @@ def fill_holes(folder: Reconstruction, reporter: StoppingReporter) -> dict[int, 
     if not path.is_file():
         reporter.begin(FILL, "Filling the holes of removed objects")
         path.parent.mkdir(parents=True, exist_ok=True)
-        fill = compute_fill(read_splats(folder.splats)[0], objects, reporter)
+        fill = compute_fill(apply_splat_edits(read_splats(folder.splats)[0], folder)[0], objects, reporter)
         write_fill(path, FillRows(splat_table(fill.splats), fill.put, fill.fills))
     rows = read_fill(path)
     return {entry.id: rows.count_new(entry.id) for entry in objects if entry.removed and entry.fill}

@@ -127,7 +127,9 @@ def _make(target: Target, options: argparse.Namespace, trained: Trained, views: 
     budget = options.faces * (SCENE_BUDGET if target.key == SCENE else 1)
     try:
         if not np.isin(model.anchors.ids, classes).any():
-            raise NoSurface(f"{target.name} has no splats, so it has no mesh; was it left out of the training?")
+            raise NoSurface(
+                f"{target.name} has no splats, so it has no mesh; was it left out of training or separated?"
+            )
         field = fuse(views, classes.tolist(), reporter=part.step("fuse"))
         surface = extract(field, closed=not options.open, faces=budget, reporter=part.step("extract"))
     except NoSurface as reason:
@@ -168,7 +170,8 @@ def _targets(options: argparse.Namespace, folder: Reconstruction) -> list[Target
     """Return the meshes that the options select; without a selection, those of all objects, merged ones as one."""
     objects = [entry for entry in read_objects(folder.objects) if entry.id] if folder.objects.exists() else []
     groups = {entry.id: Target(str(entry.id), entry.name, tuple(members_of(objects, entry.id))) for entry in objects}
-    shown = [object_id for object_id, target in shown_as(objects).items() if target == object_id]
+    separated = {entry.id for entry in objects if entry.separated}
+    shown = [i for i, target in shown_as(objects).items() if target == i and i not in separated]
 
     def find(word: str) -> int:
         return find_object(objects, word, folder.objects).id

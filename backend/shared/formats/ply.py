@@ -40,11 +40,11 @@ def vertex_header(dtype: np.dtype, count: int, comments: Sequence[str] = ()) -> 
     return "\n".join([*lines, "end_header", ""]).encode("ascii")
 
 
-def write_vertices(path: Path, table: np.ndarray) -> None:
+def write_vertices(path: Path, table: np.ndarray, comments: Sequence[str] = ()) -> None:
     """Write a structured array (N,) of scalar fields as binary little-endian PLY, atomically."""
     packed = np.dtype([(name, table.dtype[name].newbyteorder("<")) for name in table.dtype.names or ()])
     with atomic_file(path) as file:
-        file.write(vertex_header(packed, len(table)))
+        file.write(vertex_header(packed, len(table), comments))
         file.write(np.ascontiguousarray(table.astype(packed, copy=False)).data)
 
 
@@ -74,6 +74,21 @@ def read_vertices(path: Path, text: bool = False) -> np.ndarray:
             return _read_text(file, path, dtype, count)
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror or error}).") from error
+
+
+def read_comments(path: Path) -> list[str]:
+    """Return the comments in the header of a PLY file that `read_vertices` has read.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
+    try:
+        with open_regular(path) as file:
+            head = file.read(LONGEST_HEADER)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror or error}).") from error
+    lines = head[: max(head.find(b"end_header"), 0)].decode("ascii", "replace").splitlines()
+    return [line[len("comment ") :] for line in lines if line.startswith("comment ")]
 
 
 def _check_size(path: Path, count: int, available: int, size: int) -> None:

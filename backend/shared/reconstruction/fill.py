@@ -89,7 +89,7 @@ def fill_path(folder: Reconstruction, objects: Sequence[SceneObject]) -> Path | 
         The path, whether or not the file exists; None if no hole is to be filled or splats.ply does not exist.
 
     Raises:
-        InputError: splats.ply cannot be read.
+        InputError: splats.ply or splat-edits.ply cannot be read.
     """
     if not any(entry.removed and entry.fill for entry in objects) or not folder.splats.is_file():
         return None
@@ -100,6 +100,8 @@ def fill_path(folder: Reconstruction, objects: Sequence[SceneObject]) -> Path | 
         if entry.merged_into is not None or entry.left_out or entry.removed or entry.cleaned
     ]
     made_of = f"{_FORMAT} {_digest(folder.splats)} {edits}"
+    if folder.splat_edits.is_file():
+        made_of += f" {_digest(folder.splat_edits)}"
     return folder.cache / f"fill-{hashlib.sha256(made_of.encode()).hexdigest()[:24]}.ply"
 
 

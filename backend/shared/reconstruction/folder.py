@@ -25,6 +25,7 @@ class Reconstruction:
         self.points = self.folder / "points.ply"
         self.checkpoint = self.folder / "checkpoint"
         self.splats = self.folder / "splats.ply"
+        self.splat_edits = self.folder / "splat-edits.ply"
         self.anchors = self.folder / "anchors.ply"
         self.meshes = self.folder / "meshes"
         self.previews = self.folder / "previews"

@@ -4,9 +4,10 @@
      "edits": {"1": {"name": "cup", "color": [255, 0, 0], "merged_into": 2, "left_out": true},
                "4": {"removed": true, "floaters": true, "fill": true},
                "5": {"recolor": {"hue": 0.3}, "transform": [[1, 0, 0, 2], ...], "copies": [[[1, 0, 0, 5], ...]]},
-               "6": {"cleaned": true}, ...}}
+               "6": {"cleaned": true}, "7": {"separated": true, "name": "handle", "color": [0, 99, 0]}, ...}}
 
-A new vote replaces "objects" and keeps "edits".
+A new vote replaces "objects" and keeps "edits". An object with "separated" is in "edits" alone: the user has made it of
+single splats of other objects.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from .lock import FolderInUse, locked
 
 EDITABLE = (
     "name", "color", "merged_into", "left_out", "removed", "floaters", "fill", "cleaned", "recolor", "transform",
-    "copies",
+    "copies", "separated",
 )  # fmt: skip
 
 _LOCK = ".objects.lock"
@@ -61,6 +62,7 @@ class SceneObject:
         recolor: color change of its splats and textures, or None.
         transform: affine map that moves it from its captured place, or None.
         copies: affine maps from its captured place to those of its duplicates.
+        separated: it consists of single splats that the user took from other objects, so no mask and no model has it.
     """
 
     id: int
@@ -76,6 +78,7 @@ class SceneObject:
     recolor: Recolor | None = None
     transform: Matrix | None = None
     copies: tuple[Matrix, ...] = ()
+    separated: bool = False
 
 
 def read_objects(path: Path) -> list[SceneObject]:
@@ -83,9 +86,15 @@ def read_objects(path: Path) -> list[SceneObject]:
     content = read_json(path)
     edits = _edits(content, path)
     try:
+        voted = {entry["id"]: {**_renamed(entry), "separated": False} for entry in content["objects"]}
+        made = {
+            int(key): {"id": int(key), "name": "", "color": (0, 0, 0), "points": 0, "separated": True}
+            for key, edit in edits.items()
+            if edit.get("separated")
+        }
         return [
-            _object({**_renamed(entry), **_known(edits.get(str(entry["id"]), {}))})
-            for entry in sorted(content["objects"], key=lambda entry: entry["id"])
+            _object({**entry, **_known(edits.get(str(object_id), {})), "separated": entry["separated"]})
+            for object_id, entry in sorted({**made, **voted}.items())
         ]
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path} is not a valid list of objects ({error!r}); delete it and vote again.") from error
@@ -234,6 +243,7 @@ def _object(entry: Mapping[str, Any]) -> SceneObject:
         recolor=None if (recolor := entry.get("recolor")) is None else Recolor.of(recolor),
         transform=None if (transform := entry.get("transform")) is None else affine_map(transform),
         copies=tuple(affine_map(copy) for copy in entry.get("copies") or ()),
+        separated=bool(entry["separated"]),
     )
 
 

@@ -23,6 +23,7 @@ from ..object_display import Objects
 from ..shading.modifiers import update_groups
 from ..shading.node_groups import HIDDEN
 from ..splats import positions_of, splat_attributes
+from .single_splats import deleted_splats
 
 SHOWN_FILL = "objectgs_fill"
 """Custom property of a carrier's mesh: the name of the fill file that it shows."""
@@ -161,7 +162,7 @@ def _fill(obj: bpy.types.Object, positions: np.ndarray, attributes: dict[str, tu
 def _hidden_otherwise(mesh: bpy.types.Mesh) -> np.ndarray:
     """Return an (n,) bool mask of the splats that are hidden for reasons other than a fill."""
     hidden = carrier.read(mesh, HIDDEN) if HIDDEN in mesh.attributes else np.zeros(len(mesh.vertices), bool)
-    return hidden & ~given_way(mesh)
+    return (hidden & ~given_way(mesh)) | deleted_splats(mesh)
 
 
 def _attributes(mesh: bpy.types.Mesh) -> dict[str, tuple[str, np.ndarray]]:

@@ -19,6 +19,7 @@ from ..object_collection import center_of
 from ..shading.modifiers import update_groups
 from ..shading.node_groups import FLOATING, HIDDEN
 from .fills import given_way, unobserved_splats
+from .single_splats import deleted_splats
 
 FLATTEST = 1e-5
 """A hull that is thinner than this, relative to its length, counts as flat and has no interior."""
@@ -94,7 +95,7 @@ def _changes(
         before = hidden_splats(obj.data)
         if before is None and not cleaned and not (object_id == 0 and removed):
             continue
-        hidden = given_way(obj.data)
+        hidden = given_way(obj.data) | deleted_splats(obj.data)
         if cleaned:
             hidden |= floating_splats(obj.data)
         if object_id == 0:
@@ -109,7 +110,8 @@ def _inside(unlabeled: bpy.types.Object, removed: list[bpy.types.Object]) -> np.
     places = _places(unlabeled)
     found = np.zeros(len(places), bool)
     for obj in removed:
-        found |= inside_hull(places, _places(obj), carrier.read(obj.data, "radiance:base")[:, 3])
+        own = ~deleted_splats(obj.data)
+        found |= inside_hull(places, _places(obj)[own], carrier.read(obj.data, "radiance:base")[own, 3])
     # Objects merged into the unlabeled rest keep their own IDs and are not floaters.
     return found & (carrier.read(unlabeled.data, OBJECT_ID) == 0) & ~unobserved_splats(unlabeled.data)
 

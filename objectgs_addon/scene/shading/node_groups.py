@@ -91,8 +91,8 @@ def _make_points_group(name: str) -> bpy.types.NodeTree:
 def splats_group(kind: str) -> bpy.types.NodeTree:
     """Return the newest group that shows splats in viewports (kind: SPLATS_GROUP) or renders (RENDER_GROUP)."""
     if kind == SPLATS_GROUP:
-        return find_or_make(bpy.data.node_groups, kind, 4, "ObjectGS Splats", _make_splats_group)
-    return find_or_make(bpy.data.node_groups, kind, 4, "ObjectGS Render", _make_render_group)
+        return find_or_make(bpy.data.node_groups, kind, 5, "ObjectGS Splats", _make_splats_group)
+    return find_or_make(bpy.data.node_groups, kind, 5, "ObjectGS Render", _make_render_group)
 
 
 def hide_group() -> bpy.types.NodeTree:
@@ -268,7 +268,7 @@ def _make_render_group(name: str) -> bpy.types.NodeTree:
         "FLOAT_VECTOR",
         graph.node("ShaderNodeCombineXYZ", {0: widened, 1: widened, 2: nearness}).outputs[0],
     )
-    for pattern in ("radiance:*", "rotation", "scale", "object_id", HIDDEN, FLOATING):
+    for pattern in ("radiance:*", "rotation", "scale", "object_id", "objectgs_*"):
         points = graph.removed(points, pattern)
 
     square = graph.node(

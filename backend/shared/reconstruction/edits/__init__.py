@@ -1,0 +1,1 @@
+"""Edits that are stored apart from objects.json."""
