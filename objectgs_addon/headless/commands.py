@@ -20,7 +20,7 @@ from ..blender.quiet import quiet
 from ..demo import capture as demo_capture
 from ..environment import locations
 from ..process.blocking import run_blocking
-from ..state import first_show, folder_trust
+from ..state import folder_trust
 from ..state import viewports as view
 from . import apart
 from .picture import render_picture
@@ -249,7 +249,7 @@ def build_blend(folder: Path, blend: Path, reporter: Reporter) -> bool:
             warnings += scene.show_result(root, folder).warnings
             view.hide_points(root)
         scene.set_up_render(target, root)
-        first_show.hide_relationship_lines()
+        view.hide_relationship_lines()
         has_meshes = bool(scene.object_meshes(root))
         if has_meshes or scene.scene_meshes(root):
             apart.add_even_light(target)

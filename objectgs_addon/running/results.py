@@ -15,7 +15,7 @@ from .. import film, scene
 from ..blender import messages
 from ..environment import known_folders
 from ..process.jobs import Job
-from ..state import first_show, object_edits, object_list
+from ..state import object_edits, object_list
 from ..state import viewports as view
 from ..state.folder_state import folder_state
 
@@ -58,7 +58,7 @@ def _show_capture(job: Job, owner: bpy.types.Scene | None) -> bool:
     if owner is not None:
         root = next((root for root in roots if owner in object_list.scenes_of(root)), None)
         if root is None:
-            root = first_show.show_first(owner, _folder_of(job))
+            root = view.show_first(owner, _folder_of(job))
             object_edits.fill(root)
             roots.append(root)
         owner.objectgs.active = root

@@ -12,7 +12,7 @@ from ...objectgs_addon import scene
 from ...objectgs_addon.blender import messages
 from ...objectgs_addon.environment import known_folders
 from ...objectgs_addon.running import background
-from ...objectgs_addon.state import first_show, object_edits
+from ...objectgs_addon.state import object_edits
 from ...objectgs_addon.state import viewports as view
 
 
@@ -23,10 +23,7 @@ def show_folder(operator: bpy.types.Operator, context: bpy.types.Context, folder
 
     Raises InputError for unusable cameras; what is wrong with splats and meshes is reported.
     """
-    if root is None:
-        root = first_show.show_first(context.scene, folder)
-    else:
-        root = scene.show_capture(context.scene, folder, root)
+    root = view.show_first(context.scene, folder) if root is None else scene.show_capture(context.scene, folder, root)
     known_folders.remember(folder)
     object_edits.fill(root)
     context.scene.objectgs.active = root

@@ -224,7 +224,7 @@ def test_export_per_object_writes_one_file_each(run_command, folder, tmp_path):
     edit_objects(folder.objects, {3: {"name": "../BLUE box"}, 1: {"merged_into": 7}})
     run_command("export", folder.folder, "--out", tmp_path / "parts", "--per-object")
     assert {path.name for path in (tmp_path / "parts").iterdir()} == {
-        "unlabeled.ply", "Blue_box.ply", "BLUE_box_3.ply", "can.ply",
+        "background.ply", "Blue_box.ply", "BLUE_box_3.ply", "can.ply",
     }  # fmt: skip
     assert len(read_splats(tmp_path / "parts" / "can.ply")[0]) == 24
     run_command(

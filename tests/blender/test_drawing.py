@@ -70,7 +70,7 @@ def test_hidden_objects_are_not_drawn(root):
     assert ids() == [0, HUGE]
 
 
-def test_transforms_highlights_and_colors_are_current(root, monkeypatch):
+def test_transforms_marks_and_colors_are_current(root, monkeypatch):
     """Moving, selecting and recoloring reuse the arrays."""
     obj = part(root, 1)
     before = gather.gather([obj])[0]
@@ -82,11 +82,11 @@ def test_transforms_highlights_and_colors_are_current(root, monkeypatch):
     assert after.splats is before.splats
     assert np.allclose((after.matrix - before.matrix)[:, 3], (2.0, 0, 0, 0), atol=1e-6)
     assert np.allclose(after.recolor, np.hstack([0.5 * np.eye(3), np.zeros((3, 1))]))
-    assert before.highlight == gather.NONE and after.highlight == gather.SELECTED
+    assert not before.is_selected and after.is_selected
     assert before.color == gather.NONE and np.allclose(np.multiply(after.color, 255), (10, 20, 30, 255), atol=0.1)
     collection = scene.object_collections(root)[1]
-    assert gather.gather([obj], pointed_at=collection.session_uid)[0].highlight == gather.POINTED_AT
-    assert gather.gather([obj], marks=False)[0].highlight == gather.NONE
+    assert gather.gather([obj], pointed_at=collection.session_uid)[0].is_pointed_at
+    assert not gather.gather([obj], marks=False)[0].is_selected
 
 
 def test_preview_is_hidden_while_drawing(root):

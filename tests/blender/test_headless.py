@@ -276,7 +276,9 @@ def test_make_demo_reconstructs_around_its_capture(capture, backend_python, tmp_
     assert "run $(DEMO)/capture --out $(DEMO) " in recipe
     folder = tmp_path / "demo"
     shutil.copytree(capture, folder / "capture")
-    ran = run("run", folder / "capture", "--out", folder, "--steps", "5", *SIZE, "--no-meshes")
+    ran = run(
+        "run", folder / "capture", "--out", folder, "--steps", "5", *SIZE, "--no-meshes", OBJECTGS_PYTHON=backend_python
+    )
     assert ran.returncode == 0, ran.output + ran.errors
     assert (folder / "report.md").exists() and (folder / "objectgs.blend").exists()
 

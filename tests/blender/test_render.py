@@ -11,7 +11,7 @@ from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.scene import kinds
 from objectgs.objectgs_addon.scene.meshes import export
 from objectgs.objectgs_addon.scene.shading import materials
-from objectgs.objectgs_addon.state import first_show
+from objectgs.objectgs_addon.state import viewports
 
 import headless
 
@@ -219,7 +219,7 @@ def test_startup_scene_alone_is_set_up_by_itself(folder, tmp_path, change):
         scene.cycles.transparent_max_bounces = 9
     elif change == "saved":
         bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "own.blend"))
-    root = first_show.show_first(scene, folder)
+    root = viewports.show_first(scene, folder)
     if change == "nothing":
         assert blender_scene.render_problem(scene, root) is None
         assert scene.camera.name == "000.png" and (scene.render.resolution_x, scene.render.resolution_y) == SIZE
@@ -236,11 +236,11 @@ def test_lines_to_parents_are_hidden_unless_the_user_has_some(fresh, folder):
         return {area.spaces.active.overlay.show_relationship_lines for area in areas}
 
     bpy.data.objects["Cube"].parent = bpy.data.objects["Light"]
-    root = first_show.show_first(bpy.context.scene, folder)
+    root = viewports.show_first(bpy.context.scene, folder)
     assert True in lines()
     bpy.data.objects["Cube"].parent = None
     bpy.data.collections.remove(root)
     for obj in [obj for obj in bpy.data.objects if kinds.kind_of(obj)]:
         bpy.data.objects.remove(obj)
-    first_show.show_first(bpy.context.scene, folder)
+    viewports.show_first(bpy.context.scene, folder)
     assert lines() == {False}
