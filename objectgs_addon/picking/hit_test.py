@@ -57,6 +57,19 @@ def object_at(context: bpy.types.Context, x: float, y: float) -> Hit | None:
     return None if seen is None else Hit(collections[seen.object_id], None)
 
 
+def draws_splats(context: bpy.types.Context) -> bool:
+    """Return whether the context's viewport draws splats itself, so that Blender's own tools do not see them."""
+    return context.scene.objectgs.draw_splats and drawing.failure() is None
+
+
+def is_drawn(context: bpy.types.Context, hit: Hit) -> bool:
+    """Return whether the context's viewport shows the splats of what was hit."""
+    return hit.collection is not None and any(
+        scene.kind_of(part) == "splats" and drawing.shown(part, context.view_layer, context.space_data)
+        for part in hit.collection.objects
+    )
+
+
 def is_in_viewport(window: bpy.types.Window, x: int, y: int) -> bool:
     """Return whether a pixel of a window, from the lower left, is in a 3D viewport and in no region over it."""
     for area in window.screen.areas:

@@ -13,8 +13,8 @@ from .. import drawing, scene
 TOOL = "objectgs.pick"
 
 _handler = None
-_keymap: Any = None
-_items: list[Any] = []
+_items: list[tuple[Any, Any]] = []
+"""Keymaps and their items outside of the tool."""
 _name = ""
 _pointed_at: int | None = None
 """Session UID of the collection under the mouse; `_name` is the label of the object."""
@@ -109,22 +109,28 @@ def _file_loads(*_: Any) -> None:
 
 
 def register() -> None:
-    global _handler, _keymap
+    global _handler
     if not bpy.app.background:
         bpy.utils.register_tool(PickTool, after={"builtin.select_lasso"})
         _handler = bpy.types.SpaceView3D.draw_handler_add(_leave, (), "WINDOW", "PRE_VIEW")
         bpy.app.handlers.load_pre.append(_file_loads)
         keymaps = bpy.context.window_manager.keyconfigs.addon.keymaps
         # Outside of the viewport, the tool's own keymap gets no events.
-        _keymap = keymaps.new(name="Window", space_type="EMPTY", region_type="WINDOW")
-        _items.append(_keymap.keymap_items.new("objectgs.point_away", "MOUSEMOVE", "ANY", any=True))
+        everywhere = keymaps.new(name="Window", space_type="EMPTY", region_type="WINDOW")
+        _items.append((everywhere, everywhere.keymap_items.new("objectgs.point_away", "MOUSEMOVE", "ANY", any=True)))
+        # The same clicks as Blender's own selection, which goes on where no splats are hit.
+        viewport = keymaps.new(name="3D View", space_type="VIEW_3D", region_type="WINDOW")
+        for shift in (False, True):
+            item = viewport.keymap_items.new("objectgs.click_object", "LEFTMOUSE", "CLICK", shift=shift)
+            item.properties.toggle = shift
+            _items.append((viewport, item))
 
 
 def unregister() -> None:
     global _handler
     if _handler is not None:
-        for item in _items:
-            _keymap.keymap_items.remove(item)
+        for keymap, item in _items:
+            keymap.keymap_items.remove(item)
         _items.clear()
         bpy.app.handlers.load_pre.remove(_file_loads)
         bpy.types.SpaceView3D.draw_handler_remove(_handler, "WINDOW")

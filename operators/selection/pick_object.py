@@ -49,21 +49,45 @@ class PickObject(_InViewport, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         hit = hit_test.object_at(context, self.x, self.y)
-        if hit is None:
-            if not self.toggle:
-                selection.select_nothing(context)
-            return {"FINISHED"}
-        parts = [hit.obj] if hit.collection is None else selection.parts_to_select(hit.collection)
-        if self.toggle and parts and all(part.select_get() for part in parts):
-            for part in parts:
-                part.select_set(False)
-        elif hit.collection is not None:
-            selection.select_collections(context, [hit.collection], self.toggle)
-        else:
-            if not self.toggle:
-                selection.select_nothing(context)
-            hit.obj.select_set(True)
-            context.view_layer.objects.active = hit.obj
+        if hit is not None:
+            _select(context, hit, self.toggle)
+        elif not self.toggle:
+            selection.select_nothing(context)
+        return {"FINISHED"}
+
+
+def _select(context: bpy.types.Context, hit: hit_test.Hit, toggle: bool) -> None:
+    """Select what was hit; with `toggle`, add it to the selection, or remove it."""
+    parts = [hit.obj] if hit.collection is None else selection.parts_to_select(hit.collection)
+    if toggle and parts and all(part.select_get() for part in parts):
+        for part in parts:
+            part.select_set(False)
+    elif hit.collection is not None:
+        selection.select_collections(context, [hit.collection], toggle)
+    else:
+        if not toggle:
+            selection.select_nothing(context)
+        hit.obj.select_set(True)
+        context.view_layer.objects.active = hit.obj
+
+
+class ClickObject(_InViewport, bpy.types.Operator):
+    bl_idname = "objectgs.click_object"
+    bl_label = "Select Drawn Splats"
+    bl_description = "Select the object whose drawn splats are under the mouse, which Blender's own tools do not see"
+    bl_options = {"INTERNAL", "UNDO"}
+
+    toggle: BoolProperty(name="Toggle", options={"SKIP_SAVE"})
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return context.region_data is not None and context.mode == "OBJECT" and hit_test.draws_splats(context)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        hit = hit_test.object_at(context, event.mouse_region_x, event.mouse_region_y)
+        if hit is None or not hit_test.is_drawn(context, hit):
+            return {"PASS_THROUGH"}
+        _select(context, hit, self.toggle)
         return {"FINISHED"}
 
 
@@ -168,4 +192,4 @@ class PointAway(bpy.types.Operator):
         return {"PASS_THROUGH"}
 
 
-CLASSES = (PickObject, PickBox, PointAt, PointAway)
+CLASSES = (PickObject, ClickObject, PickBox, PointAt, PointAway)
