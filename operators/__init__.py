@@ -20,7 +20,7 @@ def _classes() -> list[type]:
         orient,
         override_decision,
     )
-    from .film import film_frames, set_up_compositor, set_up_render
+    from .film import cameras, film_frames, set_up_compositor, set_up_render
     from .meshes import export_meshes, extract_meshes
     from .objects import (
         choose_objects,
@@ -85,6 +85,7 @@ def _classes() -> list[type]:
         export_splats,
         import_splats,
         export_meshes,
+        cameras,
         film_frames,
         set_up_compositor,
         set_up_render,

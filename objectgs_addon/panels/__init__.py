@@ -3,6 +3,7 @@
 
 import bpy
 
+from . import context_menu
 from .capture import AddMenu, CapturePanel
 from .edits import EditPanel
 from .export import ExportPanel
@@ -41,9 +42,11 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.STATUSBAR_HT_header.append(status_bar)
+    bpy.types.VIEW3D_MT_object_context_menu.prepend(context_menu.draw)
 
 
 def unregister() -> None:
+    bpy.types.VIEW3D_MT_object_context_menu.remove(context_menu.draw)
     bpy.types.STATUSBAR_HT_header.remove(status_bar)
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

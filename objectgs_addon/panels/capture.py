@@ -14,7 +14,7 @@ from ..running import background
 from ..running.job_display import write
 from ..state import folder_trust
 from ..state.folder_state import folder_state
-from ..state.next_step import next_step
+from ..state.next_step import Step, next_step
 from .preferences import draw_online_access
 from .tab import Tab, draw_job
 
@@ -48,7 +48,7 @@ class CapturePanel(Tab, bpy.types.Panel):
         for index, job in jobs:
             draw_job(layout, job, index)
         if not jobs and (active is None or not background.busy(scene.folder_of(active))):
-            _draw_next_step(layout, active)
+            _draw_next_step(layout, next_step(active, context.scene))
         if active is None:
             column = layout.column(align=True)
             column.operator("objectgs.open_reconstruction", icon="FILE_FOLDER")
@@ -80,9 +80,8 @@ def _draw_add(layout: bpy.types.UILayout) -> None:
     layout.operator("objectgs.make_demo", icon="MESH_MONKEY")
 
 
-def _draw_next_step(layout: bpy.types.UILayout, root: bpy.types.Collection | None) -> None:
-    """Draw the button of the next step with its purpose."""
-    step = next_step(root)
+def _draw_next_step(layout: bpy.types.UILayout, step: Step | None) -> None:
+    """Draw the button of the next step with its purpose; nothing for None."""
     if step is None:
         return
     column = layout.column()
@@ -90,7 +89,9 @@ def _draw_next_step(layout: bpy.types.UILayout, root: bpy.types.Collection | Non
         draw_online_access(column)
     button = column.row()
     button.scale_y = 1.5
-    button.operator(step.operator, text=step.label, icon=step.icon)
+    operator = button.operator(step.operator, text=step.label, icon=step.icon)
+    for name, value in step.options:
+        setattr(operator, name, value)
     purpose = column.column()
     purpose.active = False
     write(purpose, step.purpose)

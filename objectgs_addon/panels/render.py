@@ -23,6 +23,10 @@ class RenderPanel(WithReconstruction, bpy.types.Panel):
         if problem is not None:
             write(layout, problem, "ERROR")
         layout.operator("objectgs.set_up_render", icon="SCENE")
+        column = layout.column(align=True)
+        column.operator_context = "INVOKE_REGION_WIN"
+        column.operator("objectgs.camera_from_view", icon="CAMERA_DATA")
+        column.operator("objectgs.camera_path", icon="CON_FOLLOWPATH")
         layout.prop(root, "hide_render", text="Disable in Renders", icon="NONE")
         if root.hide_render:
             write(layout, "Blender does not render this reconstruction; film frames show it.", "INFO")

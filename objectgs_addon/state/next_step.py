@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import bpy
 
+from .. import scene
 from ..environment import known_folders, locations
 from . import folder_trust
 from .folder_state import FolderState
@@ -14,12 +15,13 @@ from .folder_state import FolderState
 
 @dataclass(frozen=True)
 class Step:
-    """A step: its operator, the text and icon of the button, and what it is for."""
+    """A step: its operator, the text and icon of the button, what it is for, and the operator's properties."""
 
     operator: str
     label: str
     icon: str
     purpose: str
+    options: tuple[tuple[str, object], ...] = ()
 
 
 SET_UP = Step(
@@ -41,13 +43,23 @@ TRAIN = Step("objectgs.train", "Train", "PLAY", "Training turns the photos into 
 MESHES = Step(
     "objectgs.extract_meshes", "Extract Meshes", "MESH_DATA", "Meshes are for physics, shadows and other programs."
 )
+CLEAN = Step(
+    "objectgs.clean_floaters",
+    "Clean Up",
+    "BRUSH_DATA",
+    "Hides stray splats far from their objects; they can be restored.",
+    (("everything", True),),
+)
+SET_UP_RENDER = Step(
+    "objectgs.set_up_render", "Set Up Render", "SCENE", "Splats need other render settings than Blender's defaults."
+)
 FILM = Step("objectgs.film_frames", "Film Frames", "RENDER_ANIMATION", "Film frames are rendered from the splats.")
 
 
-def next_step(root: bpy.types.Collection | None) -> Step | None:
+def next_step(root: bpy.types.Collection | None, owner: bpy.types.Scene) -> Step | None:
     """Return the step that comes next, or None if the folder of the reconstruction cannot be used.
 
-    root: the active reconstruction's collection, or None.
+    root: the active reconstruction's collection, or None. owner: the scene that shows it.
     """
     if locations.backend_python() is None:
         return SET_UP
@@ -58,7 +70,12 @@ def next_step(root: bpy.types.Collection | None) -> Step | None:
         return None
     if not state.trained:
         return TRAIN if state.voted or not has_masks(state) else ASSIGN
-    return FILM if state.meshes or not state.steps else MESHES
+    items = root.objectgs.objects
+    if items and not state.meshes and not any(item.cleaned for item in items):
+        return CLEAN
+    if state.steps and not state.meshes:
+        return MESHES
+    return FILM if scene.render_problem(owner, root) is None else SET_UP_RENDER
 
 
 def has_masks(state: FolderState) -> bool:

@@ -225,6 +225,6 @@ def test_capture_without_masks_trains_as_one_scene(window, tmp_path):
         script("""
         steps = sys.modules[f"{addon.__name__}.state.next_step"]
         trust = sys.modules[f"{addon.__name__}.state.folder_trust"]
-        result = [steps.next_step(root).operator, steps.has_masks(trust.state_of(root))]
+        result = [steps.next_step(root, owner).operator, steps.has_masks(trust.state_of(root))]
     """)
     ) == ["objectgs.train", False]

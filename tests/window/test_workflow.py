@@ -91,7 +91,7 @@ def next_step(window) -> str:
     return window.run(
         script("""
         from bl_ext.user_default.objectgs.objectgs_addon.state import next_step
-        result = next_step.next_step(root).operator
+        result = next_step.next_step(root, owner).operator
     """)
     )
 
@@ -140,7 +140,7 @@ def test_training_shows_objects(window):
     """)
     )
     assert drawn == [True, "photo", False], "splats are drawn in the colors of the photos, not as a preview"
-    assert next_step(window) == "objectgs.extract_meshes"
+    assert next_step(window) == "objectgs.clean_floaters"
     window.shot("4-trained")
 
 

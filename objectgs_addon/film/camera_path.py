@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A camera that moves along the cameras of a capture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import bpy
+import numpy as np
+
+MOST_KEYS = 12
+"""Number of cameras that the path passes through; more would repeat the shaking of a hand."""
+
+_JUMP = 3.0
+"""Mean step from one camera to the next, relative to the distance of nearest cameras, from which on they count as
+unordered."""
+
+
+def path_order(centers: np.ndarray) -> np.ndarray:
+    """Return an order in which the cameras at `centers` (n, 3) form a path, as indices (n,).
+
+    Cameras that were taken along a path keep their order; otherwise each is followed by the nearest of the rest.
+    """
+    count = len(centers)
+    if count < 3:
+        return np.arange(count)
+    apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
+    nearest = (apart + np.diag(np.full(count, np.inf))).min(1)
+    if np.linalg.norm(np.diff(centers, axis=0), axis=1).mean() <= _JUMP * nearest.mean():
+        return np.arange(count)
+    order, left = [0], set(range(1, count))
+    while left:
+        order.append(min(left, key=lambda index: apart[order[-1], index]))
+        left.remove(order[-1])
+    return np.array(order)
+
+
+def make_path(scene: bpy.types.Scene, cameras: Sequence[bpy.types.Object], first: int, last: int) -> bpy.types.Object:
+    """Create a camera with keyframes along cameras, and make it the scene's.
+
+    Args:
+        scene: the scene.
+        cameras: at least two cameras, in the order of their names.
+        first: frame at the first of them.
+        last: frame at the last of them.
+
+    Returns:
+        The camera, which has the lens of the first of them.
+    """
+    order = path_order(np.array([camera.matrix_world.translation for camera in cameras]))
+    chosen = order[np.unique(np.linspace(0, len(order) - 1, min(len(order), MOST_KEYS)).round().astype(int))]
+    moving = new_camera(scene, "Camera Path", cameras[chosen[0]].data)
+    before = None
+    for frame, index in zip(np.linspace(first, last, len(chosen)), chosen.tolist()):
+        location, rotation, _scale = cameras[index].matrix_world.decompose()
+        if before is not None and before.dot(rotation) < 0:
+            rotation.negate()  # The shorter of two rotations.
+        before = rotation
+        moving.location, moving.rotation_quaternion = location, rotation
+        for name in ("location", "rotation_quaternion"):
+            moving.keyframe_insert(name, frame=float(frame))
+    return moving
+
+
+def new_camera(scene: bpy.types.Scene, name: str, like: bpy.types.Camera | None) -> bpy.types.Object:
+    """Create a camera in a scene, make it the scene's, and give it the lens of the camera `like`, if there is one."""
+    data = bpy.data.cameras.new(name)
+    if like is not None:
+        for setting in ("sensor_fit", "sensor_width", "sensor_height", "lens", "shift_x", "shift_y"):
+            setattr(data, setting, getattr(like, setting))
+    camera = bpy.data.objects.new(name, data)
+    camera.rotation_mode = "QUATERNION"
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    return camera

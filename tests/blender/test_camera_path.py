@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The camera that moves along the captured views, and the step that the first panel offers."""
+
+import itertools
+import sys
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from objectgs.objectgs_addon import scene
+from objectgs.objectgs_addon.film.camera_path import path_order
+from objectgs.objectgs_addon.state.next_step import next_step
+
+import headless
+
+from .building import look_at, write_cameras, write_folder
+
+
+@pytest.fixture
+def root(fresh, tmp_path):
+    """A reconstruction with 30 cameras on a part of a circle, in a registered extension."""
+    extension = headless.extension()
+    extension.register()
+    folder = write_folder(tmp_path / "table")
+    write_cameras(folder, [look_at(3 * center + (0, 0, 1)) for center in circle(30)])
+    bpy.ops.objectgs.open_reconstruction(directory=str(folder))
+    yield bpy.context.scene.objectgs.active
+    extension.unregister()
+
+
+def circle(count: int) -> np.ndarray:
+    angles = np.linspace(0, 1.5 * np.pi, count)
+    return np.stack([np.cos(angles), np.sin(angles), np.zeros(count)], 1)
+
+
+def test_ordered_cameras_keep_their_order():
+    assert path_order(circle(20)).tolist() == list(range(20))
+    assert path_order(circle(2)).tolist() == [0, 1] and path_order(np.zeros((1, 3))).tolist() == [0]
+
+
+def test_unordered_cameras_are_put_in_order():
+    shuffle = np.random.default_rng(0).permutation(20)
+    shuffle[[0, int(np.flatnonzero(shuffle == 0)[0])]] = 0, shuffle[0]
+    centers = circle(20)[shuffle]
+    found = shuffle[path_order(centers)]
+    assert found.tolist() == list(range(20))
+
+
+def test_path_passes_through_captured_views(root):
+    owner = bpy.context.scene
+    owner.frame_start, owner.frame_end = 1, 100
+    assert bpy.ops.objectgs.camera_path() == {"FINISHED"}
+    camera = owner.camera
+    captured = sorted(
+        (part for part in root.all_objects if scene.kind_of(part) == "camera"), key=lambda part: part["objectgs_image"]
+    )
+    assert scene.kind_of(camera) is None and camera.data.lens == pytest.approx(captured[0].data.lens)
+    for frame, view in ((1, captured[0]), (100, captured[-1])):
+        owner.frame_set(frame)
+        assert np.allclose(np.array(camera.matrix_world), np.array(view.matrix_world), atol=1e-4)
+    turns = []
+    for frame in range(1, 101):
+        owner.frame_set(frame)
+        turns.append(camera.matrix_world.to_quaternion())
+    steps = [first.rotation_difference(second).angle for first, second in itertools.pairwise(turns)]
+    assert max(min(step, 2 * np.pi - step) for step in steps) < 0.2
+
+
+def test_next_step_follows_the_state(root, monkeypatch):
+    owner = bpy.context.scene
+    monkeypatch.setenv("OBJECTGS_PYTHON", "/no/such/python")
+    assert next_step(root, owner).operator == "objectgs.set_up_backend"
+    monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
+    assert next_step(None, owner).operator == "objectgs.import_capture"
+    step = next_step(root, owner)
+    assert (step.operator, step.options) == ("objectgs.clean_floaters", (("everything", True),))
+    bpy.ops.objectgs.clean_floaters(everything=True)
+    # The splats are not of a training, so there is nothing to extract meshes from.
+    owner.view_settings.view_transform = "Raw"
+    assert next_step(root, owner).operator == "objectgs.set_up_render"
+    bpy.ops.objectgs.set_up_render()
+    assert next_step(root, owner).operator == "objectgs.film_frames"
