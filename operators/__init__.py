@@ -37,6 +37,7 @@ def _classes() -> list[type]:
     from .setup import set_up_backend
     from .splats import crop_scene, edit_splats, export_splats, import_splats, select_more, select_splats
     from .training import (
+        add_preset,
         dismiss_message,
         pause_job,
         remove_finished_jobs,
@@ -55,6 +56,7 @@ def _classes() -> list[type]:
         override_decision,
         group_objects,
         train,
+        add_preset,
         extract_meshes,
         pause_job,
         stop_job,

@@ -14,6 +14,7 @@ from .placement import PlacementPanel
 from .render import FilmPanel, RenderPanel
 from .splats import AssignMenu, SplatsPanel
 from .training.plan import PlanPanel
+from .training.presets import TrainingPresets
 from .training.train import DetailsPanel, SettingsPanel, TrainPanel
 
 CLASSES = (
@@ -24,6 +25,7 @@ CLASSES = (
     TrainPanel,
     DetailsPanel,
     PlanPanel,
+    TrainingPresets,
     SettingsPanel,
     EditPanel,
     AssignMenu,

@@ -34,7 +34,7 @@ from .kinds import (
     root_of,
     to_stored,
 )
-from .meshes.assets import bounds, mark_asset
+from .meshes.assets import bounds, mark_asset, write_catalog
 from .meshes.shading import shade_meshes, shading_of
 from .meshes.show import (
     SHOWS,
@@ -127,4 +127,5 @@ __all__ = [
     "use_camera",
     "warnings_of",
     "with_own_textures",
+    "write_catalog",
 ]

@@ -162,7 +162,7 @@ def test_mesh_asset_can_be_used_in_another_file(root, folder, tmp_path):
     bpy.context.view_layer.update()
     before = coordinates(mesh_of(root, 1))
     collection = blender_scene.object_collections(root)[1]
-    blender_scene.mark_asset(collection, parts(root, 1, "mesh"))
+    blender_scene.mark_asset(collection, parts(root, 1, "mesh"), "name")
     assert collection.asset_data is not None and [tag.name for tag in collection.asset_data.tags] == ["ObjectGS"]
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
@@ -610,3 +610,32 @@ def test_mark_assets_sets_origin_at_base(active):
 
 def test_points_are_hidden_when_result_is_opened(active):
     assert kinds.points_of(active).hide_get()
+
+
+def test_marked_objects_have_a_catalog(active, tmp_path):
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "set.blend"))
+    catalogs = tmp_path / "blender_assets.cats.txt"
+    catalogs.write_text("VERSION 1\n11111111-1111-1111-1111-111111111111:Mine:Mine\n")
+    for _ in range(2):
+        assert bpy.ops.objectgs.mark_assets() == {"FINISHED"}
+    lines = catalogs.read_text().splitlines()
+    assert len(lines) == 3 and lines[1].endswith("Mine:Mine")
+    uuid, path, _ = lines[2].split(":")
+    marked = [each for each in bpy.data.collections if each.asset_data is not None]
+    assert marked and {each.asset_data.catalog_id for each in marked} == {uuid}
+    assert path == f"ObjectGS/{active.name}"
+
+
+def test_training_presets_store_and_restore_settings(active):
+    properties = active.objectgs
+    properties.length, properties.primitive, properties.max_size = "preview", "2d", 900
+    assert bpy.ops.objectgs.add_training_preset(name="Discs") == {"FINISHED"}
+    properties.length, properties.primitive, properties.max_size = "standard", "3d", 1600
+    (path,) = (
+        path / "objectgs" / "training" / "Discs.py"
+        for path in map(Path, bpy.utils.preset_paths(""))
+        if (path / "objectgs" / "training" / "Discs.py").exists()
+    )
+    exec(path.read_text(), {"bpy": bpy})
+    path.unlink()
+    assert (properties.length, properties.primitive, properties.max_size) == ("preview", "2d", 900)

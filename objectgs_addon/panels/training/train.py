@@ -19,6 +19,7 @@ from ...state import folder_trust
 from ...state.folder_state import FolderState
 from ...state.next_step import has_masks
 from ..tab import WithReconstruction, draw_job_of
+from .presets import TrainingPresets
 
 
 class TrainPanel(WithReconstruction, bpy.types.Panel):
@@ -142,6 +143,9 @@ class SettingsPanel(WithReconstruction, bpy.types.Panel):
     bl_label = "Settings"
     bl_parent_id = "OBJECTGS_PT_train"
     bl_options = {"DEFAULT_CLOSED"}
+
+    def draw_header_preset(self, _context: bpy.types.Context) -> None:
+        TrainingPresets.draw_panel_header(self.layout)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
