@@ -23,6 +23,7 @@ from ..environment import locations
 from ..process.blocking import run_blocking
 from ..process.jobs import Job, JobQueue, State
 from ..state import folder_trust, object_edits, object_list
+from ..state.next_step import has_masks
 from . import previews, results
 
 INTERVAL = 0.1
@@ -215,6 +216,8 @@ def finish(job: Job) -> None:
     show = _import_demo if job.kind == "demo" else results.SHOW_BY_KIND.get(job.kind)
     if show is not None and show(job, owner):
         _push_undo(job.title)
+    if job.kind == "import" and owner is not None and not bpy.app.background:
+        _assign_objects(job, owner)
     for root in results.roots_of(job.folder):
         fill_holes(root, again=False)
 
@@ -231,6 +234,23 @@ def _import_demo(job: Job, owner: bpy.types.Scene | None) -> bool:
         lambda _kind, text: messages.show(text, "ERROR"),
     )
     return False
+
+
+def _assign_objects(job: Job, owner: bpy.types.Scene) -> None:
+    """Let the masks of a newly imported capture vote on its objects, which takes seconds."""
+    root = next(iter(results.roots_of(job.folder)), None)
+    state = None if root is None else folder_trust.state_of(root)
+    if state is None or state.voted or not has_masks(state) or locations.backend_python() is None:
+        return
+    options = ("--strategy", root.objectgs.strategy, "--max-size", str(root.objectgs.max_size))
+    submit(
+        locations.backend_job(
+            f"Assign objects of {root.name}", "vote", job.folder, "vote", str(state.capture), "--out", str(job.folder),
+            *options,
+        ),
+        owner,
+        lambda _kind, text: messages.show(text, "ERROR"),
+    )  # fmt: skip
 
 
 def _push_undo(title: str) -> None:

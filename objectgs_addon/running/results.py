@@ -11,6 +11,7 @@ from pathlib import Path
 import bpy
 
 from ...backend.shared.reconstruction.folder import Reconstruction
+from ...backend.shared.reconstruction.record import read_record
 from .. import film, scene
 from ..blender import messages
 from ..environment import known_folders
@@ -62,6 +63,9 @@ def _show_capture(job: Job, owner: bpy.types.Scene | None) -> bool:
             object_edits.fill(root)
             roots.append(root)
         owner.objectgs.active = root
+        imported = read_record(Reconstruction(_folder_of(job))).capture
+        if imported is not None:
+            root.objectgs.max_size = imported.max_size
         view.show(root)
     if roots:
         job.warnings.extend(scene.warnings_of(roots[0]))

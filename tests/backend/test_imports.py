@@ -11,7 +11,19 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("backend", "objectgs_addon", "operators")
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
-BLENDER = {"bpy", "bpy_extras", "bl_ui", "blf", "bmesh", "gpu", "gpu_extras", "mathutils", "addon_utils", "imbuf"}
+BLENDER = {
+    "bpy",
+    "bpy_extras",
+    "bl_operators",
+    "bl_ui",
+    "blf",
+    "bmesh",
+    "gpu",
+    "gpu_extras",
+    "mathutils",
+    "addon_utils",
+    "imbuf",
+}
 MOST_MODULES = 12
 MOST_LINES = 450
 

@@ -107,11 +107,13 @@ def test_import_shows_cameras_photos_and_points(window):
     """)
     )
     assert kinds[:2] == [12, 12] and kinds[2] > 100
-    assert next_step(window) == "objectgs.assign_objects"
     window.shot("1-imported")
 
 
-def test_vote_fills_object_list(window):
+def test_objects_are_assigned_after_import(window):
+    """The masks vote by themselves, and once more when asked."""
+    wait(window, f"len(root.objectgs.objects) and {IDLE}")
+    assert next_step(window) == "objectgs.train"
     window.run(script("call(bpy.ops.objectgs.assign_objects)"))
     wait(window, f"len(root.objectgs.objects) and {IDLE}")
     names = window.run(script("result = [item.name for item in root.objectgs.objects]"))
