@@ -50,9 +50,9 @@ _selected: dict[int, np.ndarray | None] = {}
 
 
 def arrays_of(mesh: bpy.types.Mesh) -> SplatArrays | None:
-    """Return the splats of a carrier's mesh, or None if attributes are missing."""
+    """Return the splats of a carrier's mesh, or None if attributes are missing or, in Edit Mode, cannot be read."""
     found = _held.get(mesh.session_uid)
-    if found is None and all(name in mesh.attributes for name in ("radiance:base", "scale", "rotation")):
+    if found is None and not mesh.is_editmode and all(name in mesh.attributes for name in ("radiance:base", "scale", "rotation")):
         found = _held[mesh.session_uid] = _read(mesh)
     return found
 
@@ -60,6 +60,8 @@ def arrays_of(mesh: bpy.types.Mesh) -> SplatArrays | None:
 def selected_of(mesh: bpy.types.Mesh) -> np.ndarray | None:
     """Return which of a carrier's visible splats are selected, (N,) bool; None if there are none."""
     if mesh.session_uid not in _selected:
+        if mesh.is_editmode:
+            return None
         arrays, selected = arrays_of(mesh), scene.selected_splats(mesh)
         if arrays is not None and arrays.vertices is not None:
             selected = selected[arrays.vertices]

@@ -9,7 +9,7 @@ from .test_workflow import script
 
 MOUSE = (600, 450)
 """Where the mouse is when the panel pops up under it."""
-HUE = 114
+HUE = 141
 """How far below it the slider is."""
 
 
