@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Take the pictures of the manual, docs/manual/images/, in the first Blender that `harness.blenders` finds.
 
-.venv/bin/python -m tests.window.manual_pictures [--demo FOLDER] [--only NAME ...]
+.venv/bin/python -m tests.window.manual_pictures [--demo FOLDER] [--only PART ...]
 
-FOLDER is the result of `make demo`, by default build/demo; it is copied, not changed.
+FOLDER is the result of `make demo`, by default build/demo; it is copied, not changed. PART is a key of `PARTS`.
 """
 
 import argparse
@@ -36,15 +36,13 @@ def view(blender: harness.Blender, distance: float, tilt: float = 68.0) -> None:
 
 
 class Window:
-    """Blender's window, and the pictures to take of it (none: all)."""
+    """Blender's window with the demo, whose result is the folder `demo`, and a folder for a new reconstruction."""
 
-    def __init__(self, blender: harness.Blender, only: list[str]) -> None:
-        self.blender, self.only = blender, only
+    def __init__(self, blender: harness.Blender, demo: Path, folder: Path) -> None:
+        self.blender, self.demo, self.folder = blender, demo, folder
 
     def save(self, name: str, box: tuple[int, int, int, int] | None = None, mouse: bool = False) -> None:
         """Write a picture of a part of the window, by default the 3D viewport; `mouse` leaves the mouse where it is."""
-        if self.only and name not in self.only:
-            return
         if not mouse:
             self.blender.move(*AWAY)
         time.sleep(3.0)
@@ -272,9 +270,8 @@ def rendering(window: Window) -> None:
         result = [str(path) for path in sorted((Path(scene.folder_of(root)) / "film").rglob("*.png"))]
     """)
     )
-    if not window.only or "film-frame" in window.only:
-        with Image.open(frames[0]) as image:
-            image.convert("RGBA").save(IMAGES / "film-frame.png", optimize=True)
+    with Image.open(frames[0]) as image:
+        image.convert("RGB").save(IMAGES / "film-frame.jpg", quality=QUALITY, optimize=True)
 
 
 def exporting(window: Window) -> None:
@@ -290,14 +287,14 @@ def exporting(window: Window) -> None:
     time.sleep(2.0)
 
 
-def from_capture(window: Window, capture: Path, folder: Path) -> None:
+def from_capture(window: Window) -> None:
     """Save an imported capture, its objects, and its training."""
-    blender = window.blender
+    blender, capture, folder = window.blender, str(window.demo / "capture"), str(window.folder)
     window.panels()
     window.do(f"""
     with bpy.context.temp_override(**window_context()):
         bpy.ops.wm.read_homefile(use_empty=True, app_template="")
-        bpy.ops.objectgs.import_capture("EXEC_DEFAULT", directory={str(capture)!r}, folder={str(folder)!r})
+        bpy.ops.objectgs.import_capture("EXEC_DEFAULT", directory={capture!r}, folder={folder!r})
     """)
     wait(blender, f"{IDLE} and root is not None")
     screenshots.show_sidebar(blender)
@@ -310,7 +307,7 @@ def from_capture(window: Window, capture: Path, folder: Path) -> None:
     window.save("objects")
     window.panels("TrainPanel", "PlanPanel")
     window.do("call(bpy.ops.objectgs.analyze_capture)")
-    window.sidebar("plan", 560)
+    window.sidebar("plan", 800)
     window.panels("TrainPanel")
     blender.run(script("root.objectgs.length = 'standard'; call(bpy.ops.objectgs.train)"))
     wait(blender, "(job := background.queue.running) is not None and job.step and job.progress > 0.6", 600)
@@ -318,11 +315,22 @@ def from_capture(window: Window, capture: Path, folder: Path) -> None:
     window.do("call(bpy.ops.objectgs.stop_job)")
 
 
+PARTS = {
+    "view": viewing,
+    "meshes": meshes,
+    "edit": editing,
+    "splats": splats,
+    "render": rendering,
+    "export": exporting,
+    "capture": from_capture,
+}
+
+
 def main() -> None:
     """Take the pictures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--demo", type=Path, default=harness.ROOT / "build" / "demo")
-    parser.add_argument("--only", nargs="*", default=[], help="names of pictures, without suffix")
+    parser.add_argument("--only", nargs="*", choices=PARTS, default=list(PARTS))
     options = parser.parse_args()
     subprocess.run(["make", "zip"], cwd=harness.ROOT, check=True, stdout=subprocess.DEVNULL)
     archive = max((harness.ROOT / "build").glob("objectgs-*.zip"), key=lambda path: path.stat().st_mtime)
@@ -335,7 +343,7 @@ def main() -> None:
         blender = harness.Blender(
             command, variables, folder / "blender", harness.ROOT / "build" / "window" / name, SIZE
         )
-        window = Window(blender, options.only)
+        window = Window(blender, options.demo.resolve(), folder / "new" / "tabletop")
         try:
             blender.wait_for("True", timeout=180)
             blender.install(archive, Path(sys.executable))
@@ -345,9 +353,8 @@ def main() -> None:
             help_popover(window)
             screenshots.open_demo(blender, folder / "tabletop")
             window.do(SHOW_SPLATS)
-            for part in (viewing, meshes, editing, splats, rendering, exporting):
-                part(window)
-            from_capture(window, options.demo / "capture", folder / "new" / "tabletop")
+            for part in options.only:
+                PARTS[part](window)
         finally:
             blender.close()
 
