@@ -7,6 +7,7 @@ from . import context_menu
 from .capture import AddMenu, CapturePanel
 from .edits import EditPanel
 from .export import ExportPanel
+from .help import HelpPanel
 from .jobs import JobsPanel, status_bar
 from .meshes import MeshesPanel
 from .objects import ObjectList, ObjectsPanel
@@ -19,6 +20,7 @@ from .training.train import DetailsPanel, SettingsPanel, TrainPanel
 
 CLASSES = (
     AddMenu,
+    HelpPanel,
     ObjectList,
     CapturePanel,
     ObjectsPanel,

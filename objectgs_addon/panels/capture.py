@@ -31,6 +31,11 @@ class CapturePanel(Tab, bpy.types.Panel):
     bl_idname = "OBJECTGS_PT_capture"
     bl_label = "ObjectGS"
 
+    def draw_header_preset(self, _context: bpy.types.Context) -> None:
+        row = self.layout.row()
+        row.emboss = "NONE"
+        row.popover("OBJECTGS_PT_help", text="", icon="QUESTION")
+
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         draw_message(layout)

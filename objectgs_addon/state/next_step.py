@@ -34,7 +34,7 @@ IMPORT = Step(
     "objectgs.import_capture",
     "Import Capture",
     "IMPORT",
-    "A capture is a folder of photos whose cameras COLMAP has computed, with masks of the objects if there are any.",
+    "A capture is a folder of photos with their cameras, as COLMAP and others compute them, and masks of the objects.",
 )
 ASSIGN = Step(
     "objectgs.assign_objects", "Assign Objects", "GROUP_VERTEX", "The masks decide which object each point belongs to."

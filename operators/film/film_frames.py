@@ -19,7 +19,7 @@ class FilmFrames(UsesOutputFolder, bpy.types.Operator):
     bl_label = "Render Film Frames"
     bl_description = (
         "Render the splats with all edits through the scene's camera over its frame range, in the "
-        "background: color, depth and object mattes as EXR. Existing frames are skipped"
+        "background: color, depth and object mattes as EXR. Frames that would not change are skipped"
     )
     bl_options = {"REGISTER"}
 

@@ -47,6 +47,8 @@ def test_zip_has_expected_files_only(package):
         "LICENSE",
         "README.md",
         "backend/__main__.py",
+        "docs/guide.md",
+        "docs/manual/index.md",
         "objectgs_addon/headless/commands.py",
         "operators/__init__.py",
         "requirements/backend.txt",
@@ -65,9 +67,15 @@ def test_zip_has_expected_files_only(package):
         "LICENSE",
         "README.md",
         "backend",
+        "docs",
         "objectgs_addon",
         "operators",
         "requirements",
+    }
+    manual = {path.name for path in (ROOT / "docs" / "manual").glob("*.md")} - {"store.md"}
+    assert {name for name in names if name.startswith("docs/")} == {
+        "docs/guide.md",
+        *(f"docs/manual/{name}" for name in manual),
     }
     assert {name for name in names if name.startswith("requirements/")} == {
         "requirements/backend.txt",
