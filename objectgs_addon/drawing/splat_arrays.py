@@ -52,7 +52,11 @@ _selected: dict[int, np.ndarray | None] = {}
 def arrays_of(mesh: bpy.types.Mesh) -> SplatArrays | None:
     """Return the splats of a carrier's mesh, or None if attributes are missing or, in Edit Mode, cannot be read."""
     found = _held.get(mesh.session_uid)
-    if found is None and not mesh.is_editmode and all(name in mesh.attributes for name in ("radiance:base", "scale", "rotation")):
+    if (
+        found is None
+        and not mesh.is_editmode
+        and all(name in mesh.attributes for name in ("radiance:base", "scale", "rotation"))
+    ):
         found = _held[mesh.session_uid] = _read(mesh)
     return found
 

@@ -3,9 +3,8 @@
 
 import bpy
 
-from . import context_menu
 from .capture import AddMenu, CapturePanel
-from .edits import EditPanel
+from .edits import EditPanel, draw_context_menu
 from .export import ExportPanel
 from .help import HelpPanel
 from .jobs import JobsPanel, status_bar
@@ -46,11 +45,11 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.STATUSBAR_HT_header.append(status_bar)
-    bpy.types.VIEW3D_MT_object_context_menu.prepend(context_menu.draw)
+    bpy.types.VIEW3D_MT_object_context_menu.prepend(draw_context_menu)
 
 
 def unregister() -> None:
-    bpy.types.VIEW3D_MT_object_context_menu.remove(context_menu.draw)
+    bpy.types.VIEW3D_MT_object_context_menu.remove(draw_context_menu)
     bpy.types.STATUSBAR_HT_header.remove(status_bar)
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -117,3 +117,21 @@ def _describe_transform(root: bpy.types.Collection, collection: bpy.types.Collec
     if abs(factor - 1.0) > 1e-4:
         words.append(f"scaled by {factor:.3g}")
     return ", ".join(words)
+
+
+def draw_context_menu(menu: Any, context: bpy.types.Context) -> None:
+    """Draw, in the context menu of objects, the edits of the reconstruction's object that the active one belongs to."""
+    part = context.active_object
+    object_id = scene.object_id_of(part) if part is not None else None
+    if not object_id or scene.root_of(part, context.scene) is None:
+        return
+    layout = menu.layout
+    layout.label(text="ObjectGS")
+    for text, floaters, fill in (("Remove", False, False), ("Remove and Fill", False, True)):
+        operator = layout.operator("objectgs.remove_object", text=text)
+        operator.floaters, operator.fill = floaters, fill
+    layout.operator("objectgs.clean_floaters").everything = False
+    layout.operator("objectgs.duplicate_object")
+    layout.operator("objectgs.solo_object")
+    layout.operator("objectgs.extract_meshes")
+    layout.separator()
