@@ -307,7 +307,7 @@ def from_capture(window: Window) -> None:
     window.save("objects")
     window.panels("TrainPanel", "PlanPanel")
     window.do("call(bpy.ops.objectgs.analyze_capture)")
-    window.sidebar("plan", 800)
+    window.sidebar("plan", 700)
     window.panels("TrainPanel")
     blender.run(script("root.objectgs.length = 'standard'; call(bpy.ops.objectgs.train)"))
     wait(blender, "(job := background.queue.running) is not None and job.step and job.progress > 0.6", 600)
