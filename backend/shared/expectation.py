@@ -18,7 +18,7 @@ maximum over the measured captures, which are those of the demo in docs/length.m
 NANOSECONDS_A_PIXEL = (300.0, 1200.0)
 """Minimum and maximum time of a step on a CPU per pixel of a view, used until a training has been measured."""
 
-_SHARPNESS = ((0.15, "as sharp as it gets"), (0.6, "sharp"), (1.5, "good"), (3.0, "soft"), (math.inf, "rough"))
+_SHARPNESS = ((0.15, "very sharp"), (0.6, "sharp"), (1.5, "good"), (3.0, "soft"), (math.inf, "rough"))
 """Largest deficits in dB and what a training with them looks like."""
 
 _FINAL = "a training until it stops improving (measured on the demo)"

@@ -14,7 +14,7 @@ from .. import scene
 from ..running import background
 from ..running.job_display import write
 from ..state import object_list
-from .tab import WithReconstruction, draw_job_of, draw_without_objects
+from .tab import WithReconstruction, draw_job_of
 
 
 class EditPanel(WithReconstruction, bpy.types.Panel):
@@ -26,7 +26,7 @@ class EditPanel(WithReconstruction, bpy.types.Panel):
         root = context.scene.objectgs.active
         item = object_list.shown_item(root)
         if item is None:
-            draw_without_objects(layout, root)
+            write(layout, "There are no objects yet.", "INFO")
             return
         collection = scene.object_collections(root).get(scene.from_stored(item.object_id))
         row = layout.row()

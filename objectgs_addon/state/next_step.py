@@ -53,7 +53,9 @@ CLEAN = Step(
 SET_UP_RENDER = Step(
     "objectgs.set_up_render", "Set Up Render", "SCENE", "Splats need other render settings than Blender's defaults."
 )
-FILM = Step("objectgs.film_frames", "Film Frames", "RENDER_ANIMATION", "Film frames are rendered from the splats.")
+FILM = Step(
+    "objectgs.film_frames", "Render Film Frames", "RENDER_ANIMATION", "Film frames are rendered from the splats."
+)
 
 
 def next_step(root: bpy.types.Collection | None, owner: bpy.types.Scene) -> Step | None:

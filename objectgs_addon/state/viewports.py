@@ -75,16 +75,23 @@ def _frame(root: bpy.types.Collection) -> None:
 def show_first(owner: bpy.types.Scene, folder: Path) -> bpy.types.Collection:
     """Show the cameras and points of a folder in a scene that does not show them yet, and return the collection.
 
-    Blender's startup scene is set up for renders through the capture's first camera. The settings of any other scene
-    are the user's.
+    Blender's startup scene is set up for renders through the capture's first camera, its cube, camera and light are
+    hidden, since they would stand in the captured room, and Solid mode shows colors without shading. Any other scene
+    is the user's.
 
     Raises:
         InputError: The folder's files cannot be used; nothing is changed.
     """
     untouched, related = scene.is_untouched(owner), any(obj.parent is not None for obj in owner.objects)
+    startup = list(owner.objects) if untouched else []
     root = scene.show_capture(owner, folder)
     if untouched:
         scene.set_up_render(owner, root, replace=True)
+        for obj in startup:
+            obj.hide_set(True, view_layer=owner.view_layers[0])
+            obj.hide_render = True
+        for space in _spaces():
+            space.shading.color_type, space.shading.light = "VERTEX", "FLAT"
     if not related:
         hide_relationship_lines()
     return root
@@ -92,8 +99,16 @@ def show_first(owner: bpy.types.Scene, folder: Path) -> bpy.types.Collection:
 
 def hide_relationship_lines() -> None:
     """Hide the lines from objects to their parents in all 3D viewports, since every camera has one."""
-    for screen in bpy.data.screens:
-        for area in screen.areas:
-            for space in area.spaces:
-                if space.type == "VIEW_3D":
-                    space.overlay.show_relationship_lines = False
+    for space in _spaces():
+        space.overlay.show_relationship_lines = False
+
+
+def _spaces() -> list[bpy.types.SpaceView3D]:
+    """Return all 3D viewports of all workspaces."""
+    return [
+        space
+        for screen in bpy.data.screens
+        for area in screen.areas
+        for space in area.spaces
+        if space.type == "VIEW_3D"
+    ]

@@ -58,7 +58,7 @@ def test_negligible_loss_is_reported(monkeypatch):
 def test_words_tell_duration_and_sharpness():
     words = expectation.expectation_in_words
     assert words(400, None, 100_000) == "about 20 s to 80 s: soft to good"
-    assert words(1600, None, None) == "good to as sharp as it gets"
+    assert words(1600, None, None) == "good to very sharp"
     assert words(None, 100.0, 100_000, (200, 50.0)) == "soft to good"
     assert words(None, 60.0, None) is None
     assert words(10, None, None) == "rough to soft"

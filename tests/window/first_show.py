@@ -103,7 +103,7 @@ def viewmat(center: np.ndarray) -> np.ndarray:
 
 
 def open_startup_scene(blender) -> None:
-    """Open Blender's startup file, without its cube, and show the sidebar."""
+    """Open Blender's startup file, and show the sidebar."""
     blender.run("""
         with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
             bpy.ops.wm.read_homefile(app_template="")
@@ -111,7 +111,6 @@ def open_startup_scene(blender) -> None:
     time.sleep(1.0)
     blender.key("Escape")
     blender.run("""
-        bpy.data.objects.remove(bpy.data.objects["Cube"])
         window_context()["area"].spaces.active.show_region_ui = True
     """)
     time.sleep(0.5)

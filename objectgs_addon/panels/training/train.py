@@ -37,11 +37,11 @@ class TrainPanel(WithReconstruction, bpy.types.Panel):
         active = background.busy(folder)
         state = folder_trust.state_of(root)
         column = layout.column()
-        column.enabled = not active
-        column.operator("objectgs.train", icon="PLAY", text="Resume" if _can_resume(state, properties) else "Train")
-        column.prop(properties, "length")
-        if properties.length == "minutes":
-            column.prop(properties, "minutes")
+        if not active:
+            column.operator("objectgs.train", icon="PLAY", text="Resume" if _can_resume(state, properties) else "Train")
+            column.prop(properties, "length")
+            if properties.length == "minutes":
+                column.prop(properties, "minutes")
         is_accepted = folder_trust.is_accepted(root)
         if not active and is_accepted:
             _draw_expectation(column, state, properties)
@@ -83,9 +83,9 @@ class DetailsPanel(WithReconstruction, bpy.types.Panel):
 
 
 def _training_job(root: bpy.types.Collection) -> Job | None:
-    """Return the latest job of a reconstruction, unless another panel shows it."""
+    """Return the training that is the latest job of a reconstruction, or None."""
     job = background.job_of(root)
-    return None if job is not None and job.kind in ("mesh", "film", "fill", "vote", "import") else job
+    return job if job is not None and job.kind == "train" else None
 
 
 def _length_of(state: FolderState, properties: Any) -> tuple[int | None, float | None, float, tuple[int, float]]:
