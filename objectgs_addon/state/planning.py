@@ -14,6 +14,9 @@ from ...backend.shared.reconstruction.plan import Decision, Plan, read_plan
 from .. import scene
 from . import folder_trust
 
+PRESETS = "objectgs/training"
+"""Folder of the presets of training settings, below Blender's folders of presets."""
+
 _known: dict[Path, tuple[int, Plan]] = {}
 """Folder -> modification time and content of its plan, cached for panels."""
 

@@ -2,36 +2,22 @@
 """Select visible objects in a viewport by a click or a box, and outline the one under the mouse."""
 
 import time
-from typing import Any
 
 import bpy
 import gpu
-from bpy.props import BoolProperty, EnumProperty, IntProperty
+from bpy.props import BoolProperty, IntProperty
 from gpu_extras.batch import batch_for_shader
 
 from ...objectgs_addon.picking import hit_test, selection
 from ...objectgs_addon.picking import tool as pick_tool
+from ..common.viewport import InViewport, selection_mode
 
 _HIDDEN = {"HIDDEN", "SKIP_SAVE"}
 _PAUSE = 1.0
 """Pause after a lookup under the mouse, relative to its duration, so that redraws keep up."""
 
 
-class _InViewport:
-    poll_message_set: Any
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if context.region_data is None:
-            cls.poll_message_set("This needs a 3D viewport")
-            return False
-        if context.mode != "OBJECT":
-            cls.poll_message_set("Switch to Object Mode first")
-            return False
-        return True
-
-
-class PickObject(_InViewport, bpy.types.Operator):
+class PickObject(InViewport, bpy.types.Operator):
     bl_idname = "objectgs.pick_object"
     bl_label = "Pick Object"
     bl_description = "Select the object under the mouse, whether it shows splats or a mesh"
@@ -71,7 +57,7 @@ def _select(context: bpy.types.Context, hit: hit_test.Hit, toggle: bool) -> None
         context.view_layer.objects.active = hit.obj
 
 
-class ClickObject(_InViewport, bpy.types.Operator):
+class ClickObject(InViewport, bpy.types.Operator):
     bl_idname = "objectgs.click_object"
     bl_label = "Select Drawn Splats"
     bl_description = "Select the object whose drawn splats are under the mouse, which Blender's own tools do not see"
@@ -91,21 +77,13 @@ class ClickObject(_InViewport, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PickBox(_InViewport, bpy.types.Operator):
+class PickBox(InViewport, bpy.types.Operator):
     bl_idname = "objectgs.pick_box"
     bl_label = "Pick Objects in Box"
     bl_description = "Select the objects that are visible in a box"
     bl_options = {"REGISTER", "UNDO"}
 
-    mode: EnumProperty(
-        name="Mode",
-        options={"SKIP_SAVE"},
-        items=[
-            ("SET", "Set", "Set a new selection"),
-            ("ADD", "Add", "Extend the existing selection"),
-            ("SUBTRACT", "Subtract", "Subtract from the existing selection"),
-        ],
-    )
+    mode: selection_mode()
     left: IntProperty(options=_HIDDEN)
     bottom: IntProperty(options=_HIDDEN)
     right: IntProperty(options=_HIDDEN)
@@ -158,7 +136,7 @@ class PickBox(_InViewport, bpy.types.Operator):
         batch_for_shader(shader, "LINE_STRIP", {"pos": corners}).draw(shader)
 
 
-class PointAt(_InViewport, bpy.types.Operator):
+class PointAt(InViewport, bpy.types.Operator):
     bl_idname = "objectgs.point_at"
     bl_label = "Point at Object"
     bl_description = "Show the name of the object under the mouse and outline it"

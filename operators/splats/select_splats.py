@@ -7,7 +7,7 @@ from typing import Any
 import bpy
 import gpu
 import numpy as np
-from bpy.props import CollectionProperty, EnumProperty
+from bpy.props import CollectionProperty
 from gpu_extras.batch import batch_for_shader
 
 from ...backend.shared.splats.picking import View
@@ -15,37 +15,24 @@ from ...backend.shared.splats.regions import box_region, brush_region, lasso_reg
 from ...objectgs_addon.picking import hit_test, splat_selection, splats_tool
 from ..common import need
 from ..common.reporting import reports_errors
+from ..common.viewport import InViewport, selection_mode
 
 _SPACING = 2.0
 """Smallest distance in pixels of the positions of a path."""
 
 
-class SelectSplats(bpy.types.Operator):
+class SelectSplats(InViewport, bpy.types.Operator):
     bl_idname = "objectgs.select_splats"
     bl_label = "Select Splats"
     bl_description = "Select single splats of the active reconstruction with the shape set in the tool"
     bl_options = {"REGISTER", "UNDO"}
 
-    mode: EnumProperty(
-        name="Mode",
-        options={"SKIP_SAVE"},
-        items=[
-            ("SET", "Set", "Set a new selection"),
-            ("ADD", "Add", "Extend the existing selection"),
-            ("SUBTRACT", "Subtract", "Subtract from the existing selection"),
-        ],
-    )
+    mode: selection_mode()
     path: CollectionProperty(type=bpy.types.OperatorMousePath, options={"HIDDEN", "SKIP_SAVE"})
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if context.region_data is None:
-            cls.poll_message_set("This needs a 3D viewport")
-            return False
-        if context.mode != "OBJECT":
-            cls.poll_message_set("Switch to Object Mode first")
-            return False
-        return need.shown(cls, context)
+        return super().poll(context) and need.shown(cls, context)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         self.path.clear()

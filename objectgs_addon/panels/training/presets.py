@@ -4,13 +4,12 @@
 import bpy
 from bl_ui.utils import PresetPanel
 
-FOLDER = "objectgs/training"
-"""Folder of the presets below Blender's folders of presets."""
+from ...state import planning
 
 
 class TrainingPresets(PresetPanel, bpy.types.Panel):
     bl_idname = "OBJECTGS_PT_training_presets"
     bl_label = "Training Presets"
-    preset_subdir = FOLDER
+    preset_subdir = planning.PRESETS
     preset_operator = "script.execute_preset"
     preset_add_operator = "objectgs.add_training_preset"
