@@ -240,7 +240,7 @@ def _assign_objects(job: Job, owner: bpy.types.Scene) -> None:
     """Let the masks of a newly imported capture vote on its objects, which takes seconds."""
     root = next(iter(results.roots_of(job.folder)), None)
     state = None if root is None else folder_trust.state_of(root)
-    if state is None or state.voted or not has_masks(state) or locations.backend_python() is None:
+    if state is None or root.objectgs.objects or not has_masks(state) or locations.backend_python() is None:
         return
     options = ("--strategy", root.objectgs.strategy, "--max-size", str(root.objectgs.max_size))
     submit(

@@ -70,9 +70,9 @@ def next_step(root: bpy.types.Collection | None, owner: bpy.types.Scene) -> Step
     state = folder_trust.state_of(root)
     if folder_trust.is_in_question(root) or not state.imported:
         return None
-    if not state.trained:
-        return TRAIN if state.voted or not has_masks(state) else ASSIGN
     items = root.objectgs.objects
+    if not state.trained:
+        return TRAIN if items or not has_masks(state) else ASSIGN
     if items and not state.meshes and not any(item.cleaned for item in items):
         return CLEAN
     if state.steps and not state.meshes:
