@@ -54,7 +54,8 @@ class Blender:
         )
         _wait(lambda: Path(f"/tmp/.X11-unix/X{self.display[1:]}").exists(), 10, "the virtual screen does not start")
         environment = {
-            **os.environ,
+            # The Python in the preferences counts: OBJECTGS_PYTHON, which the Makefile exports, would win over it.
+            **{name: value for name, value in os.environ.items() if name != "OBJECTGS_PYTHON"},
             **variables,
             "DISPLAY": self.display,
             "LIBGL_ALWAYS_SOFTWARE": "1",
