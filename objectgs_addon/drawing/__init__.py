@@ -5,7 +5,7 @@
 them with the shaders in `shaders`, and `viewport` composites the result over the viewports.
 """
 
-from .gather import collections_by_part, shown, splat_parts
+from .gather import collections_by_part, placed_parts, shown, splat_parts
 from .splat_arrays import selected_of, selection_changed, splats_changed
 from .viewport import failure, picture, point_at, redraw, register, show, unregister
 
@@ -13,6 +13,7 @@ __all__ = [
     "collections_by_part",
     "failure",
     "picture",
+    "placed_parts",
     "point_at",
     "redraw",
     "register",

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 
 from ...backend.shared.color.palette import to_encoded
 from .. import scene as scenes
@@ -17,6 +19,73 @@ NO_RECOLOR = np.hstack([np.eye(3), np.zeros((3, 1))])
 NONE = (0.0, 0.0, 0.0, 0.0)
 
 _HIDES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "VOLUME", "POINTCLOUD", "CURVES", "GREASEPENCIL"}
+
+
+class Placed(NamedTuple):
+    """A splat carrier in the scene or in an instance of its collection.
+
+    Attributes:
+        part: the mesh carrier.
+        matrix: map from its local to world coordinates.
+        instancer: empty of the scene that instances its collection, or None.
+    """
+
+    part: bpy.types.Object
+    matrix: Matrix
+    instancer: bpy.types.Object | None = None
+
+
+def placed(part: bpy.types.Object) -> Placed:
+    """Return a carrier at its own place."""
+    return Placed(part, part.matrix_world)
+
+
+def placed_parts(view_layer: bpy.types.ViewLayer, space: bpy.types.SpaceView3D | None = None) -> list[Placed]:
+    """Return the splat carriers that a view layer or one of its viewports shows, also those in collection instances.
+
+    *File > Link* adds a collection as an instance.
+    """
+    return [
+        *(placed(part) for part in splat_parts(view_layer, space)),
+        *(
+            each
+            for obj in view_layer.objects
+            if _instances_collection(obj) and shown(obj, view_layer, space)
+            for each in _instanced(obj, obj.matrix_world, obj)
+        ),
+    ]
+
+
+def carriers(owner: bpy.types.Scene) -> list[bpy.types.Object]:
+    """Return all splat carriers of a scene and of the collections that it instances, shown or not."""
+    found = [part for part in owner.objects if scenes.kind_of(part) == "splats"]
+    for obj in owner.objects:
+        if _instances_collection(obj):
+            inside = obj.instance_collection.all_objects
+            found.extend(part for part in inside if scenes.kind_of(part) == "splats")
+    return list(dict.fromkeys(found))
+
+
+def _instances_collection(obj: bpy.types.Object) -> bool:
+    return obj.instance_type == "COLLECTION" and obj.instance_collection is not None
+
+
+def _instanced(obj: bpy.types.Object, world: Matrix, instancer: bpy.types.Object) -> Iterator[Placed]:
+    """Return the visible carriers in the collection that `obj` instances with the matrix `world`."""
+    world = world @ Matrix.Translation(-obj.instance_collection.instance_offset)
+    left = [obj.instance_collection]
+    while left:
+        collection = left.pop()
+        if collection.hide_viewport:
+            continue
+        left.extend(collection.children)
+        for part in collection.objects:
+            if part.hide_viewport:
+                continue
+            if scenes.kind_of(part) == "splats":
+                yield Placed(part, world @ part.matrix_world, instancer)
+            elif _instances_collection(part):
+                yield from _instanced(part, world @ part.matrix_world, instancer)
 
 
 def splat_parts(view_layer: bpy.types.ViewLayer, space: bpy.types.SpaceView3D | None = None) -> list[bpy.types.Object]:
@@ -43,18 +112,20 @@ def collections_by_part() -> dict[bpy.types.Object, bpy.types.Collection]:
     }
 
 
-def gather(parts: Any, colors: str = "photo", pointed_at: int | None = None, marks: bool = True) -> list[DrawnObject]:
+def gather(
+    parts: list[Placed], colors: str = "photo", pointed_at: int | None = None, marks: bool = True
+) -> list[DrawnObject]:
     """Convert carriers to objects for the renderer; carriers without the required attributes are left out.
 
     Args:
-        parts: mesh carriers of splats.
+        parts: mesh carriers of splats with their places.
         colors: "photo", or "object" for the objects' own colors.
         pointed_at: session UID of the collection under the mouse, or None.
         marks: outline selected objects, and highlight selected splats.
     """
     found = []
     collections = collections_by_part()
-    for part in parts:
+    for part, matrix, instancer in parts:
         arrays = arrays_of(part.data)
         if arrays is None:
             continue
@@ -64,10 +135,10 @@ def gather(parts: Any, colors: str = "photo", pointed_at: int | None = None, mar
         found.append(
             DrawnObject(
                 arrays,
-                np.array(part.matrix_world),
+                np.array(matrix),
                 color_map(collection),
                 color,
-                marks and part.select_get(),
+                marks and (instancer or part).select_get(),
                 is_pointed_at,
                 selected_of(part.data) if marks else None,
             )
@@ -98,6 +169,8 @@ def color_map(collection: bpy.types.Collection) -> np.ndarray:
 def may_hide_splats(view_layer: bpy.types.ViewLayer, space: bpy.types.SpaceView3D) -> bool:
     """Return whether a viewport shows anything that may occlude splats."""
     return space.overlay.show_overlays or any(
-        obj.type in _HIDES and scenes.kind_of(obj) != "splats" and shown(obj, view_layer, space)
+        (obj.type in _HIDES or _instances_collection(obj))
+        and scenes.kind_of(obj) != "splats"
+        and shown(obj, view_layer, space)
         for obj in view_layer.objects
     )

@@ -12,7 +12,6 @@ import numpy as np
 from ...backend.shared.color import srgb
 from ...backend.shared.splats.picking import View
 from ..blender import writing
-from ..scene import kind_of
 from ..scene.shading.modifiers import show_preview
 from . import gather
 from .renderer import Renderer
@@ -52,7 +51,7 @@ def picture(context_scene: Any, view_layer: bpy.types.ViewLayer, view: View, pro
     Returns:
         (height, width, 4) float32, premultiplied, sRGB-encoded.
     """
-    parts = gather.splat_parts(view_layer)
+    parts = gather.placed_parts(view_layer)
     objs = gather.gather(parts, context_scene.objectgs.colors, marks=False)
     if not renderer().draw(objs, view, projection, None):
         return np.zeros((view.height, view.width, 4), np.float32)
@@ -73,7 +72,7 @@ def _draw() -> None:
         print(f"ObjectGS: {_failure}", flush=True)
         bpy.app.timers.register(_show_previews, first_interval=0.0)  # Data cannot be changed while drawing.
         return
-    parts = gather.splat_parts(context.view_layer, space)
+    parts = gather.placed_parts(context.view_layer, space)
     objs = gather.gather(parts, properties.colors, _pointed_at, space.overlay.show_overlays)
     meshes = gather.meshes_of(_pointed_at, context.view_layer, space)
     if not objs and not meshes:
@@ -118,9 +117,8 @@ def _show_previews() -> None:
 
 def show(properties: Any, _context: bpy.types.Context = None) -> None:
     """Switch a scene's splats between the geometry nodes preview and this drawing."""
-    for part in properties.id_data.objects:
-        if kind_of(part) == "splats":
-            show_preview(part, not _is_drawn(properties))
+    for part in gather.carriers(properties.id_data):
+        show_preview(part, not _is_drawn(properties))
     redraw()
 
 
@@ -137,9 +135,8 @@ def redraw(_properties: Any = None, _context: bpy.types.Context = None) -> None:
 def _changed(scene: bpy.types.Scene, _depsgraph: Any) -> None:
     """Switch off the preview of new splats."""
     if _is_drawn(scene.objectgs):
-        for part in scene.objects:
-            if kind_of(part) == "splats":
-                show_preview(part, False)
+        for part in gather.carriers(scene):
+            show_preview(part, False)
 
 
 def register() -> None:
@@ -156,9 +153,8 @@ def unregister() -> None:
         bpy.types.SpaceView3D.draw_handler_remove(_handler, "WINDOW")
         _handler = None
         for scene in bpy.data.scenes:
-            for part in scene.objects:
-                if kind_of(part) == "splats":
-                    show_preview(part, True)
+            for part in gather.carriers(scene):
+                show_preview(part, True)
     if _renderer is not None:
         _renderer.free()
         _renderer = None

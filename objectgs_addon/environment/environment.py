@@ -9,6 +9,9 @@ import functools
 import itertools
 import json
 import os
+import shutil
+import subprocess
+import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,6 +100,28 @@ def _wanted(device: str, system: str) -> str:
 def cache_folder(folder: str | Path) -> Path:
     """Return the folder for compiled kernels: NUMBA_CACHE_DIR, else beside the environment, to survive a new setup."""
     return Path(os.environ.get("NUMBA_CACHE_DIR") or Path(folder).parent / "cache")
+
+
+def find_python() -> Path:
+    """Return a Python that the setup supports: Blender's own, else the newest in the PATH, else Blender's own.
+
+    Linux distributions build Blender with the Python of their system, which may be newer than the supported ones.
+    """
+    if layout.OLDEST <= sys.version_info[:2] <= layout.NEWEST:
+        return Path(sys.executable)
+    for minor in range(layout.NEWEST[1], layout.OLDEST[1] - 1, -1):
+        found = shutil.which(f"python3.{minor}")
+        if found is not None and _runs(found):
+            return Path(found)
+    return Path(sys.executable)
+
+
+def _runs(python: str) -> bool:
+    """Return whether a program starts; a version manager's link may belong to a version that is not installed."""
+    try:
+        return subprocess.run([python, "-c", ""], capture_output=True, timeout=10).returncode == 0
+    except (OSError, subprocess.TimeoutExpired):
+        return False
 
 
 def set_up_job(base_python: str | Path, folder: str | Path, device: str) -> Job:

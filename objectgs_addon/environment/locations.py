@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -77,9 +76,9 @@ def _chosen_python() -> Path | None:
 
 
 def base_python() -> Path:
-    """Return the Python for new environments: the user's choice, or else Blender's own."""
+    """Return the Python for new environments: the user's choice, or else one that `find_python` finds."""
     chosen = preferences().base_python if preferences() else ""
-    return Path(bpy.path.abspath(chosen)) if chosen else Path(sys.executable)
+    return Path(bpy.path.abspath(chosen)) if chosen else environment.find_python()
 
 
 def backend_job(title: str, kind: str, folder: Path | None, *arguments: str) -> Job:

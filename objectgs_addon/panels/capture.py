@@ -18,6 +18,9 @@ from ..state.next_step import Step, next_step
 from .preferences import draw_online_access
 from .tab import Tab, draw_job
 
+_BOX = 45.0
+"""Width in pixels of a box's borders and a button beside its text, at a UI scale of 1."""
+
 
 class AddMenu(bpy.types.Menu):
     bl_idname = "OBJECTGS_MT_add"
@@ -55,6 +58,7 @@ class CapturePanel(Tab, bpy.types.Panel):
         if not jobs and (active is None or not background.busy(scene.folder_of(active))):
             _draw_next_step(layout, next_step(active, context.scene))
         if active is None:
+            _draw_linked(layout, context.scene)
             column = layout.column(align=True)
             column.operator("objectgs.open_reconstruction", icon="FILE_FOLDER")
             column.operator("objectgs.make_demo", icon="MESH_MONKEY")
@@ -69,7 +73,7 @@ def draw_message(layout: bpy.types.UILayout) -> None:
         return
     box = layout.box()
     row = box.row()
-    write(row.column(), message.text, message.kind)
+    write(row.column(), message.text, message.kind, inset=_BOX)
     row.operator("objectgs.dismiss_message", text="", icon="X", emboss=False)
     if message.operator is not None:
         button = box.operator(message.operator, text=message.label)
@@ -83,6 +87,14 @@ def _draw_add(layout: bpy.types.UILayout) -> None:
     layout.operator("objectgs.import_capture", icon="IMPORT")
     layout.operator("objectgs.open_reconstruction", icon="FILE_FOLDER")
     layout.operator("objectgs.make_demo", icon="MESH_MONKEY")
+
+
+def _draw_linked(layout: bpy.types.UILayout, owner: bpy.types.Scene) -> None:
+    """Say where a linked reconstruction of the scene is edited."""
+    for root in owner.collection.children_recursive:
+        if scene.kind_of(root) == "reconstruction" and scene.is_linked(root):
+            library = (root.library or root.override_library.reference.library).filepath
+            write(layout, f"{root.name} is linked; edit it in {bpy.path.basename(library)}.", "LINKED")
 
 
 def _draw_next_step(layout: bpy.types.UILayout, step: Step | None) -> None:

@@ -29,7 +29,7 @@ class Preferences(bpy.types.AddonPreferences):
     base_python: StringProperty(
         name="Base Python",
         subtype="FILE_PATH",
-        description="Python 3.11 to 3.13 for new environments. If empty, Blender's own is used",
+        description="Python 3.11 to 3.13 for new environments. If empty, Blender's own, or one that is installed",
     )
     reconstructions: StringProperty(
         name="Reconstructions",

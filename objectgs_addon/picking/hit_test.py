@@ -24,7 +24,7 @@ _GRID = 12
 
 @dataclass(frozen=True)
 class Hit:
-    """A visible object: its collection, or a Blender object outside such collections."""
+    """A visible object: its collection, or a Blender object outside such collections, or one that instances them."""
 
     collection: bpy.types.Collection | None
     obj: bpy.types.Object | None
@@ -46,7 +46,7 @@ def object_at(context: bpy.types.Context, x: float, y: float) -> Hit | None:
         The nearest splats or mesh, or None.
     """
     view = view_of(context)
-    collections, placed = _splats(context)
+    hits, placed = _splats(context)
     seen = pick(placed, view, x + 0.5, view.height - y - 0.5)
     if seen is not None and seen.probability < MIN_PROBABILITY:
         seen = None
@@ -54,7 +54,7 @@ def object_at(context: bpy.types.Context, x: float, y: float) -> Hit | None:
     if obj is not None and (seen is None or depth < seen.depth):
         collection = drawing.collections_by_part().get(obj)
         return Hit(collection, None if collection else obj)
-    return None if seen is None else Hit(collections[seen.object_id], None)
+    return None if seen is None else hits[seen.object_id]
 
 
 def draws_splats(context: bpy.types.Context) -> bool:
@@ -64,7 +64,9 @@ def draws_splats(context: bpy.types.Context) -> bool:
 
 def is_drawn(context: bpy.types.Context, hit: Hit) -> bool:
     """Return whether the context's viewport shows the splats of what was hit."""
-    return hit.collection is not None and any(
+    if hit.collection is None:
+        return hit.obj.instance_type == "COLLECTION"
+    return any(
         scene.kind_of(part) == "splats" and drawing.shown(part, context.view_layer, context.space_data)
         for part in hit.collection.objects
     )
@@ -91,8 +93,9 @@ def objects_in(
     Floaters do not count, which may be anywhere in the view.
     """
     view = view_of(context)
-    collections, placed = _splats(context, with_floaters=False)
-    found = [collections[key] for key in ids_in(placed, view, (left, view.height - top, right, view.height - bottom))]
+    hits, placed = _splats(context, with_floaters=False)
+    keys = ids_in(placed, view, (left, view.height - top, right, view.height - bottom))
+    found = [collection for key in keys if (collection := hits[key].collection) is not None]
     collections_by_part = drawing.collections_by_part()
     meshes = _meshes(context)
     if any(obj in collections_by_part for obj in meshes):
@@ -112,19 +115,18 @@ def view_of(context: bpy.types.Context) -> View:
     )
 
 
-def _splats(
-    context: bpy.types.Context, with_floaters: bool = True
-) -> tuple[dict[int, bpy.types.Collection], list[PickObject]]:
-    """Return the collections of objects with visible splats by session UID, and these splats."""
-    collections, placed = {}, []
+def _splats(context: bpy.types.Context, with_floaters: bool = True) -> tuple[dict[int, Hit], list[PickObject]]:
+    """Return what a click on visible splats selects, by the session UID of what it selects, and these splats."""
+    hits, found = {}, []
     collections_by_part = drawing.collections_by_part()
-    for part in drawing.splat_parts(context.view_layer, context.space_data):
+    for part, matrix, instancer in drawing.placed_parts(context.view_layer, context.space_data):
         collection, arrays = collections_by_part.get(part), arrays_of(part.data)
-        if collection is not None and arrays is not None and not part.hide_select:
-            collections[collection.session_uid] = collection
+        if collection is not None and arrays is not None and not (instancer or part).hide_select:
+            key = (instancer or collection).session_uid
+            hits[key] = Hit(collection, None) if instancer is None else Hit(None, instancer)
             cloud = arrays.cloud if with_floaters else _without_floaters(part.data, arrays)
-            placed.append(PickObject(collection.session_uid, cloud, np.array(part.matrix_world)))
-    return collections, placed
+            found.append(PickObject(key, cloud, np.array(matrix)))
+    return hits, found
 
 
 def _without_floaters(mesh: bpy.types.Mesh, arrays: SplatArrays) -> Cloud:

@@ -63,6 +63,7 @@ def _file_loaded(*_: Any) -> None:
     splat_edits.forget()
     for owner in bpy.data.scenes:
         roots = [root for root in owner.collection.children_recursive if scene.kind_of(root) == "reconstruction"]
+        roots = [root for root in roots if not scene.is_linked(root)]
         for root in roots:
             if not root.objectgs.objects and folder_trust.is_accepted(root):
                 # The panel already reports a missing or invalid folder.

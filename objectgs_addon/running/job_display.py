@@ -82,10 +82,10 @@ def draw_over(layout: bpy.types.UILayout, job: Job) -> None:
         write(layout, sentence, "ERROR")
 
 
-def write(layout: bpy.types.UILayout, text: str, icon: str = "NONE") -> None:
-    """Draw `text`, wrapped to the width of the current region."""
+def write(layout: bpy.types.UILayout, text: str, icon: str = "NONE", inset: float = 0.0) -> None:
+    """Draw `text`, wrapped to the width of the current region less `inset` pixels at a UI scale of 1."""
     scale = bpy.context.preferences.system.ui_scale
-    width = max(20, int((bpy.context.region.width / scale - AROUND) / CHARACTER))
+    width = max(20, int((bpy.context.region.width / scale - AROUND - inset) / CHARACTER))
     column = layout.column(align=True)
     for line in textwrap.wrap(text, width):
         column.label(text=line, icon=icon)

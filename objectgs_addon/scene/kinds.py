@@ -44,6 +44,11 @@ def kind_of(block: bpy.types.ID) -> str | None:
     return kind if isinstance(kind, str) else None
 
 
+def is_linked(block: bpy.types.ID) -> bool:
+    """Return whether another .blend holds a data-block, linked or overridden, so that changes are not saved."""
+    return block.library is not None or block.override_library is not None
+
+
 def object_id_of(block: bpy.types.ID) -> int | None:
     """Return the object ID (0 .. 2^32 - 1) of a collection or Blender object, or None."""
     value = block.get(OBJECT_ID) if kind_of(block) is not None else None

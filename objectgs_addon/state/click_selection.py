@@ -24,7 +24,7 @@ def _active_changed() -> None:
         return
     object_id = scene.object_id_of(part)
     root = scene.root_of(part, context.scene) if object_id is not None else None
-    if root is None:
+    if root is None or scene.is_linked(root):
         return
     context.scene.objectgs.active = root
     for index, item in enumerate(root.objectgs.objects):

@@ -23,7 +23,7 @@ from ...backend.shared.defaults import MAX_SIZE
 from ...backend.shared.expectation import PRESET_STEPS
 from ...backend.shared.formats.splat_ply import UNOBSERVED
 from .. import drawing
-from ..scene import SHADINGS, SHOWS, kind_of, shade_meshes, shading_of, show_kinds, shown_kinds
+from ..scene import SHADINGS, SHOWS, is_linked, kind_of, shade_meshes, shading_of, show_kinds, shown_kinds
 from . import object_edits, viewports
 
 
@@ -241,7 +241,7 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
 
 
 def _is_reconstruction(_scene: Any, collection: bpy.types.Collection) -> bool:
-    return kind_of(collection) == "reconstruction"
+    return kind_of(collection) == "reconstruction" and not is_linked(collection)
 
 
 class SceneProperties(bpy.types.PropertyGroup):

@@ -8,22 +8,26 @@ from pathlib import Path
 from typing import Any
 
 import bpy
+import numpy as np
 
 from .. import drawing, scene
 from . import object_list
 
 
 def show(root: bpy.types.Collection) -> None:
-    """Frame the cameras in every 3D viewport of a reconstruction's scene, and show color attributes in Solid mode."""
+    """Show the scene as its first camera sees it in all 3D viewports, and color attributes in Solid mode."""
     for window in bpy.context.window_manager.windows:
         if root not in window.scene.collection.children_recursive:
             continue
+        window.view_layer.update()
+        cameras = sorted(
+            (part for part in root.all_objects if scene.kind_of(part) == "camera"), key=lambda camera: camera.name
+        )
         for area in window.screen.areas:
             if area.type == "VIEW_3D":
                 area.spaces.active.shading.color_type = "VERTEX"
-                region = next(region for region in area.regions if region.type == "WINDOW")
-                with bpy.context.temp_override(window=window, area=area, region=region):
-                    _frame(root)
+                if cameras and area.spaces.active.region_3d is not None:
+                    _look_as(area.spaces.active, cameras)
 
 
 def hide_points(root: bpy.types.Collection) -> None:
@@ -55,21 +59,39 @@ def colors_changed(properties: Any, _context: bpy.types.Context = None) -> None:
     drawing.redraw()
 
 
-def _frame(root: bpy.types.Collection) -> None:
-    """Frame the cameras in the context's viewport and keep the selection."""
-    context = bpy.context
-    selected = list(context.selected_objects)
-    for obj in selected:
-        obj.select_set(False)
-    wanted = [part for part in root.all_objects if scene.kind_of(part) == "camera" and part.visible_get()]
-    for part in wanted:
-        part.select_set(True)
-    if wanted:
-        bpy.ops.view3d.view_selected()
-    for part in wanted:
-        part.select_set(False)
-    for obj in selected:
-        obj.select_set(True)
+def subject_of(centers: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Return the point that cameras look at: the nearest one to their optical axes in the least-squares sense.
+
+    Args:
+        centers: (n, 3) positions.
+        axes: (n, 3) unit vectors along which they look.
+
+    Returns:
+        (3,), which may lie behind cameras that look apart.
+    """
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    # Parallel axes leave the distance along them open; a weak pull to the cameras closes it.
+    pull = 1e-3 * np.eye(3)
+    return np.linalg.solve((across + pull).sum(0), ((across + pull) @ centers[:, :, None]).sum(0))[:, 0]
+
+
+def _look_as(space: bpy.types.SpaceView3D, cameras: list[bpy.types.Object]) -> None:
+    """Look from where the first camera is, and turn around what the cameras look at.
+
+    From outside, the walls of a captured room would hide it.
+    """
+    poses = np.array([camera.matrix_world for camera in cameras])
+    centers, axes = poses[:, :3, 3], -poses[:, :3, 2]
+    axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    far = float((subject_of(centers, axes) - centers[0]) @ axes[0])
+    spread = float(np.linalg.norm(np.ptp(centers, axis=0)))
+    if not 0.1 * spread < far < 2.0 * spread:  # Cameras that look outward, or in parallel.
+        far = spread or 1.0
+    region = space.region_3d
+    region.view_perspective = "PERSP"
+    region.view_rotation = cameras[0].matrix_world.to_quaternion()
+    region.view_location = centers[0] + far * axes[0]
+    region.view_distance = far
 
 
 def show_first(owner: bpy.types.Scene, folder: Path) -> bpy.types.Collection:

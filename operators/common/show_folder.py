@@ -23,10 +23,13 @@ def show_folder(operator: bpy.types.Operator, context: bpy.types.Context, folder
 
     Raises InputError for unusable cameras; what is wrong with splats and meshes is reported.
     """
-    root = view.show_first(context.scene, folder) if root is None else scene.show_capture(context.scene, folder, root)
+    is_new = root is None
+    root = view.show_first(context.scene, folder) if is_new else scene.show_capture(context.scene, folder, root)
     known_folders.remember(folder)
     object_edits.fill(root)
     context.scene.objectgs.active = root
+    if is_new:
+        view.show(root)
     try:
         if Reconstruction(folder).splats.exists():
             if not scene.object_collections(root):

@@ -12,6 +12,7 @@ from objectgs.objectgs_addon.drawing import gather, splat_arrays
 from objectgs.objectgs_addon.drawing.order import back_to_front
 from objectgs.objectgs_addon.scene import carrier
 from objectgs.objectgs_addon.scene.shading.modifiers import show_preview
+from objectgs.objectgs_addon.state import viewports
 
 from .building import HUGE, write_folder
 
@@ -73,20 +74,20 @@ def test_hidden_objects_are_not_drawn(root):
 def test_transforms_marks_and_colors_are_current(root, monkeypatch):
     """Moving, selecting and recoloring reuse the arrays."""
     obj = part(root, 1)
-    before = gather.gather([obj])[0]
+    before = gather.gather([gather.placed(obj)])[0]
     obj.parent.location.x += 2.0
     obj.select_set(True)
     bpy.context.view_layer.update()
     monkeypatch.setattr(gather.scenes, "recolor_of", lambda _collection: Recolor(value=0.5))
-    after = gather.gather([obj], "object")[0]
+    after = gather.gather([gather.placed(obj)], "object")[0]
     assert after.splats is before.splats
     assert np.allclose((after.matrix - before.matrix)[:, 3], (2.0, 0, 0, 0), atol=1e-6)
     assert np.allclose(after.recolor, np.hstack([0.5 * np.eye(3), np.zeros((3, 1))]))
     assert not before.is_selected and after.is_selected
     assert before.color == gather.NONE and np.allclose(np.multiply(after.color, 255), (10, 20, 30, 255), atol=0.1)
     collection = scene.object_collections(root)[1]
-    assert gather.gather([obj], pointed_at=collection.session_uid)[0].is_pointed_at
-    assert not gather.gather([obj], marks=False)[0].is_selected
+    assert gather.gather([gather.placed(obj)], pointed_at=collection.session_uid)[0].is_pointed_at
+    assert not gather.gather([gather.placed(obj)], marks=False)[0].is_selected
 
 
 def test_preview_is_hidden_while_drawing(root):
@@ -120,3 +121,39 @@ def test_splats_of_equal_depth_keep_order():
     assert back_to_front(np.full(5, 2.0, np.float32), 0.1, False).tolist() == [0, 1, 2, 3, 4]
     assert back_to_front(np.full(5, 2.0, np.float32), 0.1, True).tolist() == [0, 1, 2, 3, 4]
     assert len(back_to_front(np.full(5, -2.0, np.float32), 0.1, False)) == 0
+
+
+def test_instances_of_collections_are_drawn(root):
+    """File > Link adds a collection as an instance; what is hidden inside is not drawn there."""
+    collection = bpy.data.collections.new("prop")
+    obj = part(root, 1)
+    collection.objects.link(obj)
+    collection.instance_offset = (0.0, 0.0, 1.0)
+    outer = bpy.data.collections.new("set")
+    for name, place, inside, of in (("inner", (0, 3, 0), collection, outer), ("outer", (5, 0, 0), outer, None)):
+        empty = bpy.data.objects.new(name, None)
+        empty.instance_type, empty.instance_collection, empty.location = "COLLECTION", inside, place
+        (of or bpy.context.scene.collection).objects.link(empty)
+    layer = bpy.context.view_layer
+    layer.update()
+    direct = {placed.part: placed for placed in gather.placed_parts(layer) if placed.instancer is None}
+    (instance,) = (placed for placed in gather.placed_parts(layer) if placed.instancer is not None)
+    assert instance.part == obj and instance.instancer == bpy.data.objects["outer"]
+    moved = np.array(instance.matrix) - np.array(direct[obj].matrix)
+    assert np.allclose(moved[:, 3], (5.0, 3.0, -1.0, 0.0), atol=1e-6) and np.allclose(moved[:, :3], 0.0)
+    bpy.data.objects["outer"].select_set(True)
+    assert gather.gather([instance])[0].is_selected and not gather.gather([direct[obj]])[0].is_selected
+    assert obj in gather.carriers(bpy.context.scene)
+    collection.hide_viewport = True
+    assert all(placed.instancer is None for placed in gather.placed_parts(layer))
+
+
+def test_view_looks_at_subject_of_cameras():
+    rng = np.random.default_rng(0)
+    centers = rng.normal(size=(20, 3))
+    centers *= 3.0 / np.linalg.norm(centers, axis=1, keepdims=True)
+    subject = np.array([0.2, -0.1, 0.4])
+    axes = subject - centers
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    assert np.allclose(viewports.subject_of(centers, axes), subject, atol=5e-3)
+    assert np.isfinite(viewports.subject_of(centers, np.tile([0.0, 1.0, 0.0], (20, 1)))).all()

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 import zipfile
+from pathlib import Path
 
 import pytest
 from objectgs.objectgs_addon.environment import environment
@@ -374,6 +375,21 @@ def test_unsuitable_pythons_are_rejected(root, monkeypatch):
         assert "ensurepip is missing" in error()
     monkeypatch.setitem(checks.GIGABYTES, "cpu", 1e9)
     assert "free; make room" in error()
+
+
+def test_supported_python_is_found_beside_newer_blender(root, monkeypatch):
+    """A Debian or Arch Blender has the system's Python; a version manager's link may start nothing."""
+    assert environment.find_python() == Path(sys.executable)
+    names = root / "names"
+    names.mkdir()
+    monkeypatch.setattr(environment.layout, "NEWEST", (3, 10))
+    monkeypatch.setattr(environment.layout, "OLDEST", (3, 8))
+    monkeypatch.setenv("PATH", str(names))
+    assert environment.find_python() == Path(sys.executable)
+    for name, code in (("python3.10", 1), ("python3.9", 0)):
+        (names / name).write_text(f"#!/bin/sh\nexit {code}\n")
+        (names / name).chmod(0o755)
+    assert environment.find_python() == names / "python3.9"
 
 
 def test_probe_checks_packages_and_backend(root, monkeypatch):

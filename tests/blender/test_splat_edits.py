@@ -265,13 +265,13 @@ def test_visible_only_leaves_out_what_others_hide(root):
 def test_drawing_gets_the_selection_and_keeps_the_splats(root):
     arrays = arrays_of(part(1).data)
     select(1, [3, 5])
-    (drawn,) = drawing.gather.gather([part(1)])
+    (drawn,) = drawing.gather.gather([drawing.gather.placed(part(1))])
     assert np.flatnonzero(drawn.selected).tolist() == [3, 5] and drawn.splats is arrays
-    (again,) = drawing.gather.gather([part(1)])
+    (again,) = drawing.gather.gather([drawing.gather.placed(part(1))])
     assert again.selected is drawn.selected, "an unchanged selection is not drawn anew"
-    assert drawing.gather.gather([part(1)], marks=False)[0].selected is None
+    assert drawing.gather.gather([drawing.gather.placed(part(1))], marks=False)[0].selected is None
     select(1, [])
-    assert drawing.gather.gather([part(1)])[0].selected is None
+    assert drawing.gather.gather([drawing.gather.placed(part(1))])[0].selected is None
 
 
 def test_duplicates_share_the_selection(root):
