@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ import bpy
 import numpy as np
 
 from .. import drawing, scene
-from . import object_list
 
 
 def show(root: bpy.types.Collection) -> None:
@@ -31,13 +29,10 @@ def show(root: bpy.types.Collection) -> None:
 
 
 def hide_points(root: bpy.types.Collection) -> None:
-    """Hide the point cloud when splats or meshes replace it."""
-    points = [part for part in root.all_objects if scene.kind_of(part) == "points"]
-    for layer in (layer for owner in object_list.scenes_of(root) for layer in owner.view_layers):
-        for part in points:
-            # No lookup in the layer, which does not list newly linked objects yet.
-            with contextlib.suppress(RuntimeError):  # The layer does not contain the points.
-                part.hide_set(True, view_layer=layer)
+    """Hide the point cloud when splats or meshes replace it, in every view layer and in instances."""
+    for part in root.all_objects:
+        if scene.kind_of(part) == "points":
+            part.hide_viewport = True
 
 
 def colors_changed(properties: Any, _context: bpy.types.Context = None) -> None:

@@ -97,7 +97,7 @@ def test_far_points_of_the_capture_are_left_out(root):
     write_points(folder, np.concatenate([rng.uniform(-1, 1, (200, 3)), STRAYS]), np.zeros(203, int))
     blender_scene.show_objects(root, folder)
     points = kinds.points_of(root)
-    points.hide_set(False)
+    points.hide_viewport = False
     assert len(points.data.vertices) == 203
     assert size_of(points).max() < 2.5
 
@@ -150,7 +150,7 @@ def test_carriers_of_older_versions_can_be_cleaned(root):
 def test_capture_comes_after_objects(root):
     capture = kinds.capture_of(root)
     assert root.children[-1] == capture and len(root.children) == 3
-    assert kinds.points_of(root).hide_get(), "what is hidden stays hidden"
+    assert kinds.points_of(root).hide_viewport, "what is hidden stays hidden"
     assert capture.name not in bpy.context.scene.collection.children and len(bpy.data.collections) == 4
     blender_scene.show_result(root, blender_scene.folder_of(root))
     assert json.loads(root["objectgs_grouping"]) == {} and root.children[-1] == capture

@@ -609,7 +609,7 @@ def test_mark_assets_sets_origin_at_base(active):
 
 
 def test_points_are_hidden_when_result_is_opened(active):
-    assert kinds.points_of(active).hide_get()
+    assert kinds.points_of(active).hide_viewport
 
 
 def test_marked_objects_have_a_catalog(active, tmp_path):
