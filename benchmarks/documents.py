@@ -33,6 +33,7 @@ MADE_FROM_FIGURES = {
     "objects": "benchmarks.objects:document",
     "reliability": "tests.fuzz.report:document",
     "stability": "benchmarks.stability:document",
+    "suite": "benchmarks.suite:document",
 }
 """Name of figures and document -> the function that returns the document's text for the figures."""
 

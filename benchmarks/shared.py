@@ -53,9 +53,9 @@ def digest(paths: Iterable[Path], *words: object) -> str:
     return sha.hexdigest()[:16]
 
 
-def sources() -> list[Path]:
-    """Return the files that determine the backend's results: all except the module with earlier measurements."""
-    return sorted(path for path in (ROOT / "backend").rglob("*.py") if path.name != "expectation.py")
+def sources(code: Path = ROOT) -> list[Path]:
+    """Return the files that determine the results of a checkout's backend: all except that of earlier measurements."""
+    return sorted(path for path in (code / "backend").rglob("*.py") if path.name != "expectation.py")
 
 
 class Results:

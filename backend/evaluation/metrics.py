@@ -42,6 +42,28 @@ def psnr(a: NDArray, b: NDArray) -> float:
     return math.inf if error == 0.0 else -10.0 * math.log10(error)
 
 
+def color_corrected(render: NDArray, photo: NDArray) -> NDArray[np.float64]:
+    """Fit the colors of a render to a photo, as exposure and white balance of an unseen photo are unknown.
+
+    The affine map of colors c' = A c + b with the least squared error over all pixels.
+
+    Args:
+        render, photo: Images of the same shape (h, w, 3), float in [0, 1] or uint8.
+
+    Returns:
+        The mapped render (h, w, 3), clipped to [0, 1].
+
+    Raises:
+        ValueError: If the shapes differ.
+    """
+    render, photo = _pair(render, photo)
+    colors = render.reshape(-1, 3)
+    terms = np.column_stack([colors, np.ones(len(colors))])
+    # The normal equations suffice: four terms of order 1. lstsq gives the smallest map where a render has one color.
+    fitted = np.linalg.lstsq(terms.T @ terms, terms.T @ photo.reshape(-1, 3), rcond=1e-10)[0]
+    return np.clip((terms @ fitted).reshape(render.shape), 0.0, 1.0)
+
+
 def ssim(a: NDArray, b: NDArray) -> float:
     """Compute the structural similarity of two images (Wang et al. 2004), as in papers on Gaussian splatting.
 
@@ -207,21 +229,27 @@ class IdScores:
 
 
 class ImageScores:
-    """Accumulator of the mean PSNR and SSIM over views."""
+    """Accumulator of the mean scores over views: psnr, psnr_corrected (both in dB) and ssim."""
 
     def __init__(self) -> None:
-        self._psnr: list[float] = []
-        self._ssim: list[float] = []
+        self._views: list[dict[str, float]] = []
 
-    def add(self, render: NDArray, truth: NDArray) -> tuple[float, float]:
-        """Add one view (h, w, 3) and return its PSNR in dB and SSIM; the render is clipped to [0, 1]."""
+    def add(self, render: NDArray, truth: NDArray) -> dict[str, float]:
+        """Add one view (h, w, 3) and return its scores; the render is clipped to [0, 1].
+
+        psnr_corrected is the PSNR after `color_corrected`.
+        """
         render = np.clip(_as_float(render), 0.0, 1.0)
-        self._psnr.append(psnr(render, truth))
-        self._ssim.append(ssim(render, truth))
-        return self._psnr[-1], self._ssim[-1]
+        corrected = color_corrected(np.nan_to_num(render), truth)
+        scores = {
+            "psnr": psnr(render, truth),
+            "psnr_corrected": psnr(corrected, truth),
+            "ssim": ssim(render, truth),
+        }
+        self._views.append(scores)
+        return scores
 
     def result(self) -> dict[str, float | None]:
-        """Return the mean psnr in dB and ssim; None if there was no view."""
-        if not self._psnr:
-            return {"psnr": None, "ssim": None}
-        return {"psnr": float(np.mean(self._psnr)), "ssim": float(np.mean(self._ssim))}
+        """Return the means; None if there was no view."""
+        names = ("psnr", "psnr_corrected", "ssim")
+        return {name: float(np.mean([v[name] for v in self._views])) if self._views else None for name in names}

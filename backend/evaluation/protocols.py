@@ -53,10 +53,11 @@ def evaluate(
         zero_is_background: Whether 0 means background, so that `miou_all` is shown as the progress instead of `miou`.
 
     Returns:
-        {"quality": {psnr, ssim, lpips, miou, miou_all, mbiou, dice, accuracy}, "objects": [{id, name, iou, iou_all,
-        biou, dice, pixels}], "views": [{name, psnr, ssim, miou, miou_all}]}, see `IdScores`. Scores of a view are those
-        of its pixels and objects alone. The ID scores are None if no pixel is labeled, and lpips, the mean over the
-        views, is None if it cannot be computed, see `load_lpips`.
+        {"quality": {psnr, psnr_corrected, ssim, lpips, miou, miou_all, mbiou, dice, accuracy}, "objects": [{id, name,
+        iou, iou_all, biou, dice, pixels}], "views": [{name, psnr, psnr_corrected, ssim, miou, miou_all}]}, see
+        `ImageScores` and `IdScores`. Scores of a view are those of its pixels and objects alone. The ID
+        scores are None if no pixel is labeled, and lpips, the mean over the views, is None if it cannot be computed,
+        see `load_lpips`.
     """
     reporter = reporter or Reporter()
     images = ImageScores()
@@ -69,7 +70,7 @@ def evaluate(
         if not np.isfinite(image).all():
             reporter.warning(f"The render of {name} contains NaN or Inf.")
         photo = capture.image(i)
-        psnr, ssim = images.add(image, photo)
+        of_image = images.add(image, photo)
         if lpips is not None:
             distances.append(lpips(image, photo))
         truth = capture.mask(i)
@@ -80,8 +81,10 @@ def evaluate(
             ids.merge(view_ids)
             found_scores = view_ids.result()
             of_view = {key: found_scores[key] for key in of_view}
-        views.append({"name": name, "psnr": psnr, "ssim": ssim, **of_view})
-        reporter.progress(done + 1, len(indices), psnr=psnr, **of_view, zero_is_background=zero_is_background)
+        views.append({"name": name, **of_image, **of_view})
+        reporter.progress(
+            done + 1, len(indices), psnr=of_image["psnr"], **of_view, zero_is_background=zero_is_background
+        )
 
     perceptual = float(np.mean(distances)) if distances else None
     quality: dict[str, Any] = {**images.result(), "lpips": perceptual, **ids.result()}

@@ -22,6 +22,11 @@ _MEANINGS = {
         "dB",
         "difference of the rendered pixels from the photos; 30 dB is good, 6 dB more halve the error",
     ),
+    "psnr_corrected": (
+        "PSNR, corrected",
+        "dB",
+        "the same with the colors of each render fitted to its photo, as if exposure and white balance were known",
+    ),
     "ssim": ("SSIM", "", "similarity of local structure; 1 is identical"),
     "lpips": ("LPIPS", "", "perceptual difference; 0 is identical"),
     "miou": (

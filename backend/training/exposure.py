@@ -25,15 +25,15 @@ _LIMIT = 4.0
 def measure_gains(capture: Capture) -> np.ndarray:
     """Estimate the gains of all views from the training views alone.
 
-    The gain of a held-out view is interpolated between the preceding and the following training view of the same
-    camera, in the order of their names.
+    The gains of held-out views are unknown: nothing of them is used, and the names of photos say nothing of their
+    exposure. `evaluation.metrics.color_corrected` measures renders of such views without it.
 
     Args:
         capture: A prepared capture with V views, whose points COLMAP observed.
 
     Returns:
-        (V, 3) float64 in display space, with a geometric mean of 1 over the training views; 1 for views with too few
-        points or without such neighbors.
+        (V, 3) float64 in display space, with a geometric mean of 1 over the training views; 1 for held-out views, and
+        for views with too few points.
 
     Raises:
         InputError: an image cannot be read.
@@ -59,12 +59,6 @@ def measure_gains(capture: Capture) -> np.ndarray:
             if shared.sum() >= _MIN_OBSERVATIONS and (model.sum(0) > 0).all():
                 gains[i] = np.clip(_ratio(colors[shared], model), 1 / _LIMIT, _LIMIT)
         gains[known] /= np.exp(np.log(gains[known]).mean(0))
-    for i in set(range(len(capture.views))) - set(known):
-        camera = capture.views[i].camera_id
-        same = [j for j in known if capture.views[j].camera_id == camera]
-        if same:
-            for c in range(3):
-                gains[i, c] = np.exp(np.interp(i, same, np.log(gains[same, c])))
     return gains
 
 

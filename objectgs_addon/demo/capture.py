@@ -40,7 +40,7 @@ _FILES = (
 )
 """Patterns of the files in a demo capture."""
 
-__all__ = ["Settings", "make"]
+__all__ = ["Settings", "make", "write"]
 
 
 @dataclass(frozen=True)
@@ -191,15 +191,50 @@ def _fill(part: Path, settings: Settings, reporter: Any, stopped: Any) -> None:
         }
     )
     reporter.begin("truth", "Building the scene")
-    for name in ("images", "masks", "sparse/0", "truth/masks", "truth/depth", "truth/meshes"):
-        (part / name).mkdir(parents=True)
     built, objs = scene.build(settings.objects, settings.seed)
     try:
         views = scene.cameras(settings.views, settings.seed)
-        images, depths, ids = _render(built, views, settings, part, reporter, stopped)
-        _write_truth(part, objs)
+        found = write(part, built, objs, views, settings, reporter, stopped)
     finally:
         scene.remove(built)
+    _json(part / "truth" / "settings.json", _record(settings))
+    reporter.status(f"{len(views)} views, {len(objs)} objects, {found} points in {time.monotonic() - start:.0f} s.")
+
+
+def write(
+    part: Path,
+    built: bpy.types.Scene,
+    objs: list[scene.DemoObject],
+    views: list[scene.View],
+    settings: Settings,
+    reporter: Any,
+    stopped: Callable[[], bool] = lambda: False,
+    develop: Callable[[np.ndarray, int], np.ndarray] = lambda image, _index: image,
+    prepare: Callable[[bpy.types.Scene], None] = lambda _scene: None,
+    target: int = points.TARGET,
+) -> int:
+    """Render a scene, write all files of a capture except the record of its settings, and return the number of points.
+
+    Args:
+        part: existing folder.
+        built: the scene.
+        objs: objects whose meshes are the truth; pixels of others have the ID 0 and no points.
+        views: cameras, in the order of the COLMAP model.
+        settings: image size, samples, seed and mask noise.
+        reporter: a StagedReporter with the stages truth, pictures and write.
+        stopped: called before each view; True cancels.
+        develop: changes the picture (H, W, 3) uint8 of a view, given its index, as a camera might.
+        prepare: called with the scene before pictures are rendered, for other settings of Cycles.
+        target: wanted number of points.
+
+    Raises:
+        Cancelled: `stopped()` returned True, or the render was cancelled.
+    """
+    for name in ("images", "masks", "sparse/0", "truth/masks", "truth/depth", "truth/meshes"):
+        (part / name).mkdir(parents=True)
+    images, depths, ids = _render(built, views, settings, part, reporter, stopped, prepare)
+    _write_truth(part, objs)
+    images = [develop(image, i) for i, image in enumerate(images)]
     reporter.begin("write", "Writing the photos and masks")
     for view, image, depth, labels, i in zip(views, images, depths, ids, range(len(views))):
         files.write_png(part / "images" / view.name, image)
@@ -210,7 +245,7 @@ def _fill(part: Path, settings: Settings, reporter: Any, stopped: Any) -> None:
         reporter.progress(i + 1, len(views) + 1)
     reporter.status("Finding points")
     intrinsics = scene.intrinsics(settings.width, settings.height)
-    cloud = points.make(views, intrinsics, images, depths, ids, scene.rng_for(settings.seed, 5))
+    cloud = points.make(views, intrinsics, images, depths, ids, scene.rng_for(settings.seed, 5), target)
     files.write_colmap(
         part / "sparse" / "0",
         intrinsics,
@@ -223,14 +258,10 @@ def _fill(part: Path, settings: Settings, reporter: Any, stopped: Any) -> None:
     )
     np.savez(part / "truth" / "points.npz", object_id=cloud.object_id.astype(np.int32), outlier=cloud.outlier)
     _json(part / "labels.json", {str(obj.id): obj.name for obj in objs})
-    _json(part / "truth" / "settings.json", _record(settings))
-    reporter.status(
-        f"{len(views)} views, {len(objs)} objects, {len(cloud.points['xyz'])} points "
-        f"in {time.monotonic() - start:.0f} s."
-    )
+    return len(cloud.points["xyz"])
 
 
-def _render(built: Any, views: Any, settings: Settings, part: Path, reporter: Any, stopped: Any) -> Any:
+def _render(built: Any, views: Any, settings: Settings, part: Path, reporter: Any, stopped: Any, prepare: Any) -> Any:
     """Return images, depths and ID maps of all views; each kind is rendered in one pass, since switching is slow."""
     renderer = Renderer(built, settings.width, settings.height, settings.samples, settings.seed, part)
     images, truth = [], []
@@ -244,6 +275,7 @@ def _render(built: Any, views: Any, settings: Settings, part: Path, reporter: An
             reporter.progress(i, len(views))
         reporter.begin("pictures", "Rendering pictures")
         renderer.for_pictures()
+        prepare(built)
         for i, view in enumerate(views, 1):
             if stopped():
                 raise Cancelled
@@ -254,7 +286,7 @@ def _render(built: Any, views: Any, settings: Settings, part: Path, reporter: An
     return images, [depth for _, depth in truth], [labels for labels, _ in truth]
 
 
-def _write_truth(part: Path, objs: Iterable[bpy.types.Object]) -> None:
+def _write_truth(part: Path, objs: Iterable[scene.DemoObject]) -> None:
     rows = []
     for obj in objs:
         vertices, triangles = scene.triangles(obj)

@@ -14,7 +14,7 @@ import numpy as np
 from ...backend.shared.color.srgb import decode
 
 
-class _Nodes:
+class Nodes:
     """A material's node tree with shorthand methods for the patterns."""
 
     def __init__(self, name: str) -> None:
@@ -186,7 +186,7 @@ def material(kind: str, rng: Any) -> bpy.types.Material:
     """Create the material of a kind of object; `rng` varies the hue and the position of the pattern."""
     pattern, size, around, codes, roughness, specular = LOOKS[kind]
     turn = float(rng.uniform(-0.03, 0.03))
-    n = _Nodes(kind)
+    n = Nodes(kind)
     raw, place = n.place(tuple(map(float, rng.uniform(-5, 5, 3))))
     color = pattern(n, raw, place, [_linear(code, turn) for code in codes], size, around)
     return n.finish(n.vary(color, place), roughness, specular)
@@ -194,7 +194,7 @@ def material(kind: str, rng: Any) -> bpy.types.Material:
 
 def table(rng: Any) -> bpy.types.Material:
     """Create the table's material: planks of warm wood with grain."""
-    n = _Nodes("table")
+    n = Nodes("table")
     raw, place = n.place(tuple(map(float, rng.uniform(-5, 5, 3))))
     planks = n.add(
         "TexBrick",
@@ -223,7 +223,7 @@ def table(rng: Any) -> bpy.types.Material:
 
 def floor(rng: Any) -> bpy.types.Material:
     """Create the floor's material: tiles, darker under the table."""
-    n = _Nodes("floor")
+    n = Nodes("floor")
     raw, place = n.place(tuple(map(float, rng.uniform(-5, 5, 3))))
     color = n.add(
         "TexChecker", {"Vector": place, "Scale": 4.5, "Color1": _linear("8d857c"), "Color2": _linear("a69c90")}
@@ -236,7 +236,7 @@ def floor(rng: Any) -> bpy.types.Material:
 
 def wall(rng: Any) -> bpy.types.Material:
     """Create the wall's material: large cells with light joints; details are at least 6 cm for the larger distance."""
-    n = _Nodes("wall")
+    n = Nodes("wall")
     _, place = n.place(tuple(map(float, rng.uniform(-5, 5, 3))))
     choice = n.add("SeparateColor", {0: n.cells(place, 3.2)["Color"]}).outputs[0]
     color = n.ramp(choice, [_linear(code) for code in ("8fb0b8", "a9c3c2", "7f9fb0", "b9c6b8", "98b3a6")])

@@ -17,6 +17,7 @@ NOISE = 0.5  # Standard deviation of an observation in pixels.
 TOLERANCE = 0.008  # Largest depth difference in meters at which a spot counts as visible.
 ANGLE = 38.0  # Largest angle in degrees between two views of a spot at which it is matched.
 OUTLIERS = 0.03  # Fraction of points that are wrong matches.
+TARGET = 13_500  # Wanted number of points.
 
 
 @dataclass
@@ -52,12 +53,12 @@ def _lift(xy: Any, depth: Any, view: Any, intrinsics: Any) -> np.ndarray:
 
 
 def _seeds(image: Any, depth: Any, count: Any, rng: Any) -> np.ndarray:
-    """Sample (count, 2) pixel rows and columns in textured areas away from depth discontinuities."""
+    """Sample (count, 2) pixel rows and columns in textured areas away from depth discontinuities and the sky."""
     gray = image.astype(np.float32).mean(2)
     gy, gx = np.gradient(gray)
     weight = np.hypot(gx, gy) + 1.0
     step = np.maximum(*[np.abs(g) for g in np.gradient(depth)])
-    weight[step > 0.03] = 0
+    weight[(step > 0.03) | (depth <= 0)] = 0
     weight[:2], weight[-2:], weight[:, :2], weight[:, -2:] = 0, 0, 0, 0
     weight = np.minimum(weight, 40.0).ravel()
     # The Gumbel trick: weighted sampling without replacement.
@@ -68,7 +69,7 @@ def _seeds(image: Any, depth: Any, count: Any, rng: Any) -> np.ndarray:
     return np.stack(np.unravel_index(keep, gray.shape), 1)
 
 
-def make(views: Any, intrinsics: Any, images: Any, depths: Any, ids: Any, rng: Any, target: int = 13_500) -> Cloud:
+def make(views: Any, intrinsics: Any, images: Any, depths: Any, ids: Any, rng: Any, target: int = TARGET) -> Cloud:
     """Return about `target` points, fewer for few or small views.
 
     Args:

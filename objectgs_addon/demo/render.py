@@ -46,7 +46,7 @@ class Renderer:
         self.camera = bpy.data.objects.new("demo camera", data)
         scene.collection.objects.link(self.camera)
         scene.camera = self.camera
-        self.override = _id_and_depth()
+        self.override, self.world = _id_and_depth(), scene.world
         meshes = {o.data for o in scene.collection.all_objects if isinstance(o.data, bpy.types.Mesh)}
         self.looks = {mesh: list(mesh.materials) for mesh in meshes}
 
@@ -57,13 +57,15 @@ class Renderer:
                 mesh.materials[slot] = material
 
     def close(self) -> None:
-        """Restore the materials and remove the override material."""
+        """Restore materials and world, and remove the override material."""
         self._assign_materials(self.looks)
+        self.scene.world = self.world
         bpy.data.materials.remove(self.override)
 
     def for_pictures(self) -> None:
         """Set up the scene for `picture`."""
         self._assign_materials(self.looks)
+        self.scene.world = self.world
         cycles = self.scene.cycles
         cycles.samples, cycles.seed = self.samples, self.seed
         # Texture edges cause half of the noise (42 dB between two seeds), so adaptive sampling concentrates there.
@@ -79,6 +81,7 @@ class Renderer:
     def for_truth(self) -> None:
         """Set up the scene for `truth`: one ray per pixel center (Cycles ignores the width of the box filter)."""
         self._assign_materials({mesh: [self.override] * len(looks) for mesh, looks in self.looks.items()})
+        self.scene.world = None  # The sky has the ID 0 and the depth 0.
         cycles = self.scene.cycles
         cycles.samples, cycles.seed, cycles.use_adaptive_sampling = 1, 0, False
         cycles.pixel_filter_type, cycles.filter_width = "GAUSSIAN", 0.01

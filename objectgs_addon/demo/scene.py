@@ -80,7 +80,7 @@ def build(objects: int, seed: int) -> tuple[bpy.types.Scene, list[DemoObject]]:
         obj.object.pass_index = obj.id
     room = objs[-1].object  # World lighting passes through the room.
     room.visible_diffuse = room.visible_glossy = room.visible_shadow = False
-    _light(scene)
+    light(scene)
     return scene, objs
 
 
@@ -134,7 +134,7 @@ def _scatter(radius: Any, height: Any, limit: Any, rng: Any) -> Any:
     return placed
 
 
-def _light(scene: bpy.types.Scene) -> None:
+def light(scene: bpy.types.Scene) -> None:
     world = bpy.data.worlds.new("demo")
     if world.node_tree is None:
         world.use_nodes = True

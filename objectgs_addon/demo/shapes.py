@@ -22,14 +22,14 @@ def _rounded(points: Any, times: int = 3) -> np.ndarray:
     return line
 
 
-def _mesh(name: str, vertices: Any, faces: Any) -> bpy.types.Mesh:
+def from_faces(name: str, vertices: Any, faces: Any) -> bpy.types.Mesh:
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata([tuple(map(float, v)) for v in vertices], [], faces)
     mesh.update()
     return mesh
 
 
-def _finish(mesh: bpy.types.Mesh, sharp_degrees: float = 40.0) -> bpy.types.Mesh:
+def finish(mesh: bpy.types.Mesh, sharp_degrees: float = 40.0) -> bpy.types.Mesh:
     """Set smooth shading with sharp edges above an angle, and outward normals."""
     bm = bmesh.new()
     bm.from_mesh(mesh)
@@ -71,7 +71,7 @@ def lathe(name: str, profile: Any, segments: int = 64, lobes: int = 0, depth: fl
             (i * segments + j, i * segments + k, (i + 1) * segments + k, (i + 1) * segments + j)
             for i in range(rows - 1)
         ]
-    return _mesh(name, vertices, faces)
+    return from_faces(name, vertices, faces)
 
 
 def tube(name: str, path: Any, radii: Any, segments: int = 20) -> Any:
@@ -97,12 +97,12 @@ def tube(name: str, path: Any, radii: Any, segments: int = 20) -> Any:
         for j in range(segments)
     ]
     faces += [tuple(range(segments))[::-1], tuple((n - 1) * segments + j for j in range(segments))]
-    return _mesh(name, body, faces)
+    return from_faces(name, body, faces)
 
 
 def _union(meshes: Any, scene: bpy.types.Scene) -> bpy.types.Mesh:
     """Join overlapping closed meshes into one closed surface (exact boolean)."""
-    objects = [bpy.data.objects.new("part", _finish(m)) for m in meshes]
+    objects = [bpy.data.objects.new("part", finish(m)) for m in meshes]
     layer = scene.view_layers[0]
     for part in objects:
         scene.collection.objects.link(part)
@@ -210,7 +210,7 @@ def ring(scene: bpy.types.Scene) -> bpy.types.Object:
         for i in range(64)
         for j in range(28)
     ]
-    return _mesh("ring", points, faces)
+    return from_faces("ring", points, faces)
 
 
 def bowl(scene: bpy.types.Scene) -> bpy.types.Object:
@@ -397,7 +397,7 @@ MAKERS = {
 
 def make(kind: str, scene: bpy.types.Scene) -> bpy.types.Mesh:
     """Create the mesh of a kind of object (a key of `MAKERS`); `scene` temporarily holds parts for modifiers."""
-    return _finish(MAKERS[kind](scene))
+    return finish(MAKERS[kind](scene))
 
 
 def table(radius: float) -> bpy.types.Mesh:
@@ -407,7 +407,7 @@ def table(radius: float) -> bpy.types.Mesh:
     )
     foot = _rounded([(0.30, -0.70), (0.30, -0.68), (0.10, -0.62), (0.06, -0.5), (0.06, -0.15), (0.16, -0.05)], 2)
     rings = [(r, 0.0) for r in np.linspace(radius - 0.02, 0.02, 24)]
-    return _finish(lathe("table", [(0, -0.70), *foot, *top, *rings, (0, 0)], segments=96), 30)
+    return finish(lathe("table", [(0, -0.70), *foot, *top, *rings, (0, 0)], segments=96), 30)
 
 
 def backdrop(radius: float) -> bpy.types.Mesh:
@@ -429,7 +429,7 @@ def backdrop(radius: float) -> bpy.types.Mesh:
         3,
     )
     floor = [(r, z) for r in np.linspace(0.1, radius - 0.6, 20)]
-    mesh = _finish(lathe("backdrop", [(0, z), *floor, *line, (0, top)], segments=128))
+    mesh = finish(lathe("backdrop", [(0, z), *floor, *line, (0, top)], segments=128))
     mesh.flip_normals()
     for face in mesh.polygons:
         face.material_index = int(face.center.z > z + 0.02)

@@ -12,7 +12,7 @@ import torch
 
 from backend.evaluation import IdScores, ImageScores, evaluate, psnr, ssim
 from backend.evaluation.lpips import PACKAGE, WEIGHTS, load_lpips
-from backend.evaluation.metrics import boundaries, boundary_distance
+from backend.evaluation.metrics import boundaries, boundary_distance, color_corrected
 from backend.shared.events import Reporter
 
 
@@ -306,7 +306,21 @@ def test_ids_equal_in_16_bits_are_distinguished():
 def test_scores_without_labels_are_none():
     result = scores((np.ones((5, 5), int), np.zeros((5, 5), int)))
     assert result == {"miou": None, "miou_all": None, "mbiou": None, "dice": None, "accuracy": None, "objects": {}}
-    assert ImageScores().result() == {"psnr": None, "ssim": None}
+    assert ImageScores().result() == {"psnr": None, "psnr_corrected": None, "ssim": None}
+
+
+def test_color_correction_removes_exposure_and_white_balance_only():
+    rng = np.random.default_rng(0)
+    photo = rng.uniform(0.1, 0.6, (24, 32, 3))
+    darker = photo * [0.6, 0.7, 0.8] + 0.02
+    assert psnr(darker, photo) < 20 < 100 < psnr(color_corrected(darker, photo), photo)
+    noise = rng.normal(0, 0.05, photo.shape)
+    before = psnr(np.clip(photo + noise, 0, 1), photo)
+    assert before - 0.1 < psnr(color_corrected(np.clip(photo + noise, 0, 1), photo), photo) < before + 1
+    flat = np.full_like(photo, 0.5)
+    np.testing.assert_allclose(color_corrected(flat, photo), np.broadcast_to(photo.mean((0, 1)), photo.shape))
+    scores = ImageScores().add(darker, photo)
+    assert scores["psnr_corrected"] > 100 and scores["psnr"] == psnr(darker, photo)
 
 
 def test_many_objects_are_scored_quickly():
@@ -328,7 +342,7 @@ def test_many_objects_are_scored_quickly():
 
 def test_renders_are_clipped_before_comparison():
     truth = np.full((12, 12, 3), 255, np.uint8)
-    assert ImageScores().add(np.full((12, 12, 3), 1.5), truth)[0] == math.inf
+    assert ImageScores().add(np.full((12, 12, 3), 1.5), truth)["psnr"] == math.inf
 
 
 class _View:

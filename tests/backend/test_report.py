@@ -61,6 +61,7 @@ def test_report_json_has_all_keys_and_null_if_unmeasured(reconstruction):
     assert report == returned
     assert report["quality"] == {
         "psnr": 31.25,
+        "psnr_corrected": None,
         "ssim": 0.93,
         "lpips": None,
         "miou": 0.97,

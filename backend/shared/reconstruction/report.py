@@ -17,7 +17,7 @@ from ..formats.json_file import plain, read_json, write_json
 EVALUATION = "evaluation.json"
 REPORT = "report.json"
 
-QUALITY = ("psnr", "ssim", "lpips", "miou", "miou_all", "mbiou", "dice", "accuracy")
+QUALITY = ("psnr", "psnr_corrected", "ssim", "lpips", "miou", "miou_all", "mbiou", "dice", "accuracy")
 """Metrics over the held-out views; `backend/evaluation/metrics.py` defines them."""
 
 MIOU_LABELS = {"miou_all": "mIoU (all)", "miou": "mIoU (labeled)"}

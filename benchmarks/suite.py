@@ -1,0 +1,272 @@
+"""Quality of default trainings on many captures, each of them difficult in its own way.
+
+    python benchmarks/suite.py [--part develop|check|all] [--minutes 1 2 5] [--capture NAME ...] [--seed 0]
+    python benchmarks/suite.py --compare OTHER        a checkout of another version, measured in the same run
+    python benchmarks/suite.py --write
+
+The synthetic captures are made by `suite_scenes.py` in build/suite, with exact truth; the others are those of
+../shared/data that are there. Changes are developed on the captures `DEVELOP`; the others are looked at only when a
+change is done. Each length is a training of its own through the user's commands. --write saves the figures to
+docs/figures/suite.json, the table to docs/suite.md and the plot to docs/suite.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from benchmarks import documents, shared
+
+SYNTHETIC = {
+    "room": "a room from inside, objects against its walls",
+    "yard": "objects before an open sky",
+    "few": "12 views only",
+    "plain": "walls, floor and table without texture",
+    "thin": "a chair, a plant and a fence",
+    "gloss": "polish, metal and glass",
+    "many": "60 small objects",
+    "exposure": "exposure and white balance at random, photos unordered",
+    "blur": "shaken and noisy photos",
+}
+"""Scenes of `suite_scenes.py`, and what is difficult about them."""
+
+REAL = {
+    "tabletop": "a real table with objects, 640 x 480",
+    "banana": "14 real photos of one object",
+    "mouse": "56 real photos of a small glossy object, few points",
+}
+"""Captures of ../shared/data."""
+
+DEVELOP = ("room", "yard", "few", "exposure", "tabletop")
+"""Captures that changes are developed on."""
+
+MINUTES = (1.0, 2.0, 5.0)
+
+_COLUMNS = (
+    ("psnr", "PSNR, dB", "{:.2f}"),
+    ("psnr_worst", "worst view", "{:.2f}"),
+    ("psnr_corrected", "colors corrected", "{:.2f}"),
+    ("ssim", "SSIM", "{:.4f}"),
+    ("miou", "mIoU", "{:.4f}"),
+    ("miou_all", "with unlabeled", "{:.4f}"),
+    ("f1", "F1 at 2 cm", "{:.3f}"),
+    ("f1_005", "at 5 mm", "{:.3f}"),
+    ("f1_005_all", "whole objects", "{:.3f}"),
+    ("texture_psnr", "texture, dB", "{:.1f}"),
+    ("splats", "splats", "{:,.0f}"),
+)
+_TITLES = {"psnr": "PSNR, median view, dB", "miou_all": "mIoU with unlabeled", "f1_005": "F1 of meshes at 5 mm"}
+
+
+def captures(names: Sequence[str]) -> dict[str, Path]:
+    """Return the folders of the named captures; synthetic ones are made if needed, and real ones may be absent."""
+    made = [name for name in names if name in SYNTHETIC]
+    if made:
+        python = next(
+            path
+            for path in (ROOT / ".venv-bpy" / part for part in ("bin/python", "Scripts/python.exe"))
+            if path.exists()
+        )
+        subprocess.run([python, "benchmarks/suite_scenes.py", "build/suite", *made], cwd=ROOT, check=True)
+    found = {}
+    for name in names:
+        folder = ROOT / "build" / "suite" / name if name in SYNTHETIC else ROOT.parent / "shared" / "data" / name
+        if folder.is_dir():
+            found[name] = folder
+        else:
+            print(f"{name} is left out: {folder} does not exist")
+    return found
+
+
+def measured(code: Path, capture: Path, minutes: float, seed: int) -> dict[str, Any]:
+    """Train, mesh and evaluate with the commands of the checkout `code`, and return the figures of a row.
+
+    PSNR values are medians over the held-out views except `psnr_worst`; those of meshes are medians over the objects.
+    """
+    has_masks = (capture / "masks").is_dir()
+    with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as scratch:
+        out = Path(scratch) / "out"
+        for words in (
+            ("train", capture, "--out", out, "--minutes", minutes, "--seed", seed),
+            *([("mesh", out)] if has_masks else []),
+            ("evaluate", out),
+            ("report", out),
+        ):
+            done = subprocess.run(
+                [sys.executable, "-m", "backend", *map(str, words)],
+                cwd=code, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+            )  # fmt: skip
+            if done.returncode:
+                raise RuntimeError(f"{words[0]}: {done.stderr.strip().splitlines()[-1:]}")
+        report = json.loads((out / "report.json").read_text())
+    views, quality = report["views"], report["quality"]
+
+    def over(rows: Sequence[Mapping[str, Any]], key: str) -> float | None:
+        known = [row[key] for row in rows if row.get(key) is not None]
+        return statistics.median(known) if known else None
+
+    meshes = [entry["mesh"] for entry in report["objects"] if entry["mesh"]]
+    return {
+        "steps": report["model"]["trained_steps"],
+        "splats": report["model"]["gaussians"],
+        "psnr": over(views, "psnr"),
+        "psnr_worst": min(view["psnr"] for view in views),
+        "psnr_corrected": over(views, "psnr_corrected"),
+        "ssim": quality["ssim"],
+        "miou": quality["miou"],
+        "miou_all": quality["miou_all"],
+        **{key: over(meshes, key) for key in ("f1", "f1_005", "f1_005_all", "texture_psnr")},
+    }
+
+
+def document(found: Mapping[str, Any]) -> str:
+    """Return the text of docs/suite.md."""
+    described = {**SYNTHETIC, **REAL}
+    lines = [
+        "# Many captures",
+        "",
+        "Made by `python benchmarks/suite.py --write`: default trainings on two cores of a server CPU, measured on "
+        "held-out views. *PSNR* is of the median view; *colors corrected* after the colors of each render are fitted "
+        "to its photo. F1 of the meshes is the median over the objects, where training views see the true surface, and "
+        "at 5 mm also over whole objects. Changes are developed on "
+        + ", ".join(f"*{name}*" for name in DEVELOP)
+        + " and the demo alone.",
+        "",
+        *shared.table(
+            ("capture", "what is difficult"), ((name, text) for name, text in described.items() if name in found)
+        ),
+        "",
+    ]
+    for minutes in sorted({float(length) for of in found.values() for length in of}):
+        lines += [f"## {minutes:g} min", ""]
+        rows = [
+            (name, *(_cell(of[str(minutes)].get(key), form) for key, _, form in _COLUMNS))
+            for name, of in found.items()
+            if str(minutes) in of
+        ]
+        median = [
+            _cell(_median([of[str(minutes)].get(key) for of in found.values() if str(minutes) in of]), form)
+            for key, _, form in _COLUMNS
+        ]
+        lines += [
+            *shared.table(("capture", *(title for _, title, _ in _COLUMNS)), [*rows, ("**median**", *median)]),
+            "",
+        ]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def comparison(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
+    """Return a table of the differences between two versions, `after` less `before`."""
+    lines = []
+    for minutes in sorted({float(length) for of in after.values() for length in of}):
+        rows = []
+        for name, of in after.items():
+            new, old = of.get(str(minutes)), before.get(name, {}).get(str(minutes))
+            if new and old:
+                rows.append(
+                    (
+                        name,
+                        *(_cell(_difference(new.get(key), old.get(key)), _signed(form)) for key, _, form in _COLUMNS),
+                    )
+                )
+        lines += [f"{minutes:g} min, difference to the other version:", ""]
+        lines += [*shared.table(("capture", *(title for _, title, _ in _COLUMNS)), rows), ""]
+    return "\n".join(lines)
+
+
+def _difference(new: float | None, old: float | None) -> float | None:
+    return None if new is None or old is None else new - old
+
+
+def _signed(form: str) -> str:
+    return form.replace("{:", "{:+")
+
+
+def _median(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return statistics.median(known) if known else None
+
+
+def _cell(value: float | None, form: str) -> str:
+    return "" if value is None else form.format(value)
+
+
+def plot(found: Mapping[str, Any]) -> Any:
+    """Plot PSNR, mIoU and F1 of each capture over the minutes of training."""
+    from matplotlib.figure import Figure
+
+    with shared.plot_style():
+        figure = Figure(figsize=(10, 3.6), layout="constrained")
+        axes_of = figure.subplots(1, len(_TITLES))
+        for axes, (key, title) in zip(axes_of, _TITLES.items(), strict=True):
+            for number, (name, of) in enumerate(found.items()):
+                points = sorted((float(m), row[key]) for m, row in of.items() if row.get(key) is not None)
+                if points:
+                    style = "-" if name in DEVELOP else "--"
+                    color = shared.COLORS[number % len(shared.COLORS)]
+                    axes.plot(*zip(*points, strict=True), style, color=color, marker="o", markersize=3, label=name)
+            axes.set_title(title)
+            axes.set_xlabel("minutes of training")
+        axes_of[0].legend(fontsize=7, ncols=2)
+    return figure
+
+
+def main() -> None:
+    """Measure, and print or write the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--part", choices=("develop", "check", "all"), default="develop")
+    parser.add_argument("--capture", nargs="+", choices=(*SYNTHETIC, *REAL), help="these captures instead of a part")
+    parser.add_argument("--minutes", type=float, nargs="+", default=MINUTES)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--compare", type=Path, metavar="OTHER")
+    parser.add_argument("--write", action="store_true", help="all captures and lengths, for the document")
+    options = parser.parse_args()
+    everything = (*SYNTHETIC, *REAL)
+    parts = {"develop": DEVELOP, "check": [name for name in everything if name not in DEVELOP], "all": everything}
+    names = everything if options.write else options.capture or parts[options.part]
+    lengths = MINUTES if options.write else options.minutes
+    folders = captures(names)
+    shared.compile_everything()
+    versions = {"this": ROOT, **({"other": options.compare.resolve()} if options.compare else {})}
+    found: dict[str, dict[str, dict[str, Any]]] = {version: {} for version in versions}
+    results = {
+        version: shared.Results(
+            ROOT / "build" / "suite-results" / version,
+            shared.digest(shared.sources(code), version), len(folders) * len(lengths),
+        )
+        for version, code in versions.items()
+    }  # fmt: skip
+    # The versions take turns, since a machine's speed varies over hours.
+    for minutes in lengths:
+        for name, folder in folders.items():
+            for version, code in versions.items():
+                row = results[version].get(
+                    f"{name} {minutes} min seed {options.seed}",
+                    lambda code=code, folder=folder, minutes=minutes: measured(code, folder, minutes, options.seed),
+                    lambda row: f"{row['psnr']:.2f} dB, worst {row['psnr_worst']:.2f}, mIoU {row['miou_all']}",
+                )
+                if row:
+                    found[version].setdefault(name, {})[str(float(minutes))] = row
+    failed = {name: why for each in results.values() for name, why in each.failures.items()}
+    if failed:
+        sys.exit("\n".join(f"{name}: {why}" for name, why in failed.items()))
+    if options.write:
+        shared.save_figure(plot(found["this"]), documents.DOCS / "suite.png")
+        documents.save("suite", found["this"])
+    print(document(found["this"]))
+    if options.compare:
+        print(comparison(found["other"], found["this"]))
+
+
+if __name__ == "__main__":
+    main()
