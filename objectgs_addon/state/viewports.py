@@ -30,9 +30,9 @@ def show(root: bpy.types.Collection) -> None:
 
 def hide_points(root: bpy.types.Collection) -> None:
     """Hide the point cloud when splats or meshes replace it, in every view layer and in instances."""
-    for part in root.all_objects:
-        if scene.kind_of(part) == "points":
-            part.hide_viewport = True
+    points = [part for part in root.all_objects if scene.kind_of(part) == "points"]
+    for part in points:  # Hiding frees the list of the collection's objects.
+        part.hide_viewport = True
 
 
 def colors_changed(properties: Any, _context: bpy.types.Context = None) -> None:
