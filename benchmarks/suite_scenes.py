@@ -31,8 +31,8 @@ import headless
 
 headless.extension()
 _DEMO = "objectgs.objectgs_addon.demo"
-capture, files, materials, scene, shapes = (
-    importlib.import_module(f"{_DEMO}.{name}") for name in ("capture", "files", "materials", "scene", "shapes")
+capture, materials, points, scene, shapes = (
+    importlib.import_module(f"{_DEMO}.{name}") for name in ("capture", "materials", "points", "scene", "shapes")
 )
 events = importlib.import_module("objectgs.backend.shared.events")
 srgb = importlib.import_module("objectgs.backend.shared.color.srgb")
@@ -57,7 +57,7 @@ class Stage(NamedTuple):
     views: list[Any]
     develop: Callable[[np.ndarray, int], np.ndarray] = lambda image, _index: image
     prepare: Callable[[bpy.types.Scene], None] = lambda _scene: None
-    target: int = 13_500
+    target: int = points.TARGET
 
 
 def room(seed: int) -> Stage:
@@ -69,14 +69,14 @@ def room(seed: int) -> Stage:
     for obj, (x, y) in zip(objs, around, strict=True):
         _place(obj, (x, y, -0.7), float(rng.uniform(0, 2 * math.pi)), 2.2)
     _add(built, objs, "room", _box(half, -0.7, 1.3), [materials.floor, materials.wall], seed)
-    _pass_through(objs[-1])
+    scene.pass_light(objs[-1])
     views = []
     for i in range(60):
         angle = 2 * math.pi * i / 30 + rng.normal(0, 0.05)
         away = 0.55 + 0.1 * rng.random()
         center = np.array([-away * math.cos(angle) * 1.2, -away * math.sin(angle), (0.15, 0.55)[i // 30]])
         target = np.array([1.7 * math.cos(angle), 1.4 * math.sin(angle), -0.35 + rng.normal(0, 0.05)])
-        views.append(_view(i, center, target))
+        views.append(scene.look_at(i, center, target))
     return Stage(built, objs, views)
 
 
@@ -96,7 +96,7 @@ def yard(seed: int) -> Stage:
         angle = 2 * math.pi * i / 24 + rng.normal(0, 0.03)
         radius, height = ((1.6, 0.35), (1.9, 0.8))[i // 24]
         center = np.array([radius * math.cos(angle), radius * math.sin(angle), height])
-        views.append(_view(i, center, np.array([0, 0, 0.28]) + rng.normal(0, 0.02, 3)))
+        views.append(scene.look_at(i, center, np.array([0, 0, 0.28]) + rng.normal(0, 0.02, 3)))
     return Stage(built, objs, views)
 
 
@@ -131,7 +131,7 @@ def thin(seed: int) -> Stage:
         objs[-1].object.location = place
     _add(built, objs, "table", shapes.table(0.66), [materials.table], seed)
     _add(built, objs, "backdrop", shapes.backdrop(2.6), [materials.floor, materials.wall], seed)
-    _pass_through(objs[-1])
+    scene.pass_light(objs[-1])
     return Stage(built, objs, scene.cameras(48, seed))
 
 
@@ -222,24 +222,10 @@ def _place(obj: Any, place: tuple[float, float, float], turn: float, scale: floa
     obj.object.matrix_world = Matrix.Translation(place) @ Matrix.Rotation(turn, 4, "Z") @ Matrix.Scale(scale, 4)
 
 
-def _pass_through(obj: Any) -> None:
-    """Let the light of the world pass through a closed room."""
-    obj.object.visible_diffuse = obj.object.visible_glossy = obj.object.visible_shadow = False
-
-
 def _ring(count: int, radius: float, rng: np.random.Generator) -> list[tuple[float, float]]:
     """Return places on a circle and one in its middle."""
     angles = [2 * math.pi * i / (count - 1) + float(rng.normal(0, 0.1)) for i in range(count - 1)]
     return [(0.0, 0.0), *((radius * math.cos(angle), radius * math.sin(angle)) for angle in angles)]
-
-
-def _view(index: int, center: np.ndarray, target: np.ndarray) -> Any:
-    """Return a camera at `center` (3,) that looks at `target` (3,), upright."""
-    forward = (target - center) / np.linalg.norm(target - center)
-    right = np.cross(forward, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return scene.View(f"{index:04d}.png", rotation, -rotation @ center)
 
 
 def _box(half: np.ndarray, low: float, high: float, cells: int = 16) -> bpy.types.Mesh:
@@ -377,17 +363,13 @@ def make(name: str, out: Path, samples: int) -> Path:
     stage.built.view_layers[0].update()
     folder.mkdir(parents=True)
     reporter = events.StagedReporter(events.Reporter())
-    count = len(stage.views)
-    reporter.expect(
-        {"truth": ("Rendering", 0.2 * count), "pictures": ("Rendering", count), "write": ("Saving", 0.1 * count)}
-    )
-    reporter.begin("truth", "Building the scene")
+    capture.begin(reporter, len(stage.views))
     found = capture.write(
         folder, stage.built, stage.objects, stage.views, settings, reporter,
         develop=stage.develop, prepare=stage.prepare, target=stage.target,
     )  # fmt: skip
     stored.write_text(json.dumps(record), encoding="utf-8")
-    print(f"{folder}: {count} views, {len(stage.objects)} objects, {found} points", flush=True)
+    print(f"{folder}: {len(stage.views)} views, {len(stage.objects)} objects, {found} points", flush=True)
     return folder
 
 

@@ -40,7 +40,7 @@ _FILES = (
 )
 """Patterns of the files in a demo capture."""
 
-__all__ = ["Settings", "make", "write"]
+__all__ = ["Settings", "begin", "make", "write"]
 
 
 @dataclass(frozen=True)
@@ -183,14 +183,7 @@ def _json(path: Path, value: Any) -> None:
 
 def _fill(part: Path, settings: Settings, reporter: Any, stopped: Any) -> None:
     start = time.monotonic()
-    reporter.expect(
-        {
-            "truth": ("Rendering", 0.2 * settings.views),
-            "pictures": ("Rendering", 1.0 * settings.views),
-            "write": ("Saving", 0.1 * settings.views),
-        }
-    )
-    reporter.begin("truth", "Building the scene")
+    begin(reporter, settings.views)
     built, objs = scene.build(settings.objects, settings.seed)
     try:
         views = scene.cameras(settings.views, settings.seed)
@@ -199,6 +192,14 @@ def _fill(part: Path, settings: Settings, reporter: Any, stopped: Any) -> None:
         scene.remove(built)
     _json(part / "truth" / "settings.json", _record(settings))
     reporter.status(f"{len(views)} views, {len(objs)} objects, {found} points in {time.monotonic() - start:.0f} s.")
+
+
+def begin(reporter: StagedReporter, views: int) -> None:
+    """Announce the stages of `write` for a number of views, and that the scene is being built."""
+    reporter.expect(
+        {"truth": ("Rendering", 0.2 * views), "pictures": ("Rendering", 1.0 * views), "write": ("Saving", 0.1 * views)}
+    )
+    reporter.begin("truth", "Building the scene")
 
 
 def write(
@@ -221,7 +222,7 @@ def write(
         objs: objects whose meshes are the truth; pixels of others have the ID 0 and no points.
         views: cameras, in the order of the COLMAP model.
         settings: image size, samples, seed and mask noise.
-        reporter: a StagedReporter with the stages truth, pictures and write.
+        reporter: a StagedReporter after `begin`.
         stopped: called before each view; True cancels.
         develop: changes the picture (H, W, 3) uint8 of a view, given its index, as a camera might.
         prepare: called with the scene before pictures are rendered, for other settings of Cycles.

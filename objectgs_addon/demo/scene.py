@@ -78,10 +78,15 @@ def build(objects: int, seed: int) -> tuple[bpy.types.Scene, list[DemoObject]]:
         objs.append(obj)
     for obj in objs:
         obj.object.pass_index = obj.id
-    room = objs[-1].object  # World lighting passes through the room.
-    room.visible_diffuse = room.visible_glossy = room.visible_shadow = False
+    pass_light(objs[-1])
     light(scene)
     return scene, objs
+
+
+def pass_light(room: DemoObject) -> None:
+    """Let the light of the world pass through a closed room."""
+    obj = room.object
+    obj.visible_diffuse = obj.visible_glossy = obj.visible_shadow = False
 
 
 def _size(mesh: bpy.types.Mesh) -> tuple[float, float]:
@@ -169,16 +174,20 @@ def cameras(views: int, seed: int) -> list[View]:
         radius, height = radius * (1 + rng.normal(0, 0.02)), height + rng.normal(0, 0.015)
         center = np.array([radius * math.cos(angle), radius * math.sin(angle), height])
         target = LOOK_AT + rng.normal(0, 0.012, 3)
-        forward = target - center
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0, 0, 1])
-        right /= np.linalg.norm(right)
-        roll = rng.normal(0, 0.01)
-        down = np.cross(forward, right)
-        right, down = (math.cos(roll) * right + math.sin(roll) * down, math.cos(roll) * down - math.sin(roll) * right)
-        rotation = np.stack([right, down, forward])
-        result.append(View(f"{i:04d}.png", rotation, -rotation @ center))
+        result.append(look_at(i, center, target, rng.normal(0, 0.01)))
     return result
+
+
+def look_at(index: int, center: np.ndarray, target: np.ndarray, roll: float = 0.0) -> View:
+    """Return the camera number `index` at `center` (3,) that looks at `target` (3,), rolled by radians."""
+    forward = target - center
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    right, down = (math.cos(roll) * right + math.sin(roll) * down, math.cos(roll) * down - math.sin(roll) * right)
+    rotation = np.stack([right, down, forward])
+    return View(f"{index:04d}.png", rotation, -rotation @ center)
 
 
 def intrinsics(width: int, height: int) -> tuple[float, float, float, float]:

@@ -58,12 +58,16 @@ def placed_parts(view_layer: bpy.types.ViewLayer, space: bpy.types.SpaceView3D |
 
 def carriers(owner: bpy.types.Scene) -> list[bpy.types.Object]:
     """Return all splat carriers of a scene and of the collections that it instances, shown or not."""
-    found = [part for part in owner.objects if scenes.kind_of(part) == "splats"]
-    for obj in owner.objects:
-        if _instances_collection(obj):
-            inside = obj.instance_collection.all_objects
-            found.extend(part for part in inside if scenes.kind_of(part) == "splats")
-    return list(dict.fromkeys(found))
+    found: dict[bpy.types.Object, None] = {}
+    left, known = list(owner.objects), set()
+    while left:
+        obj = left.pop()
+        if scenes.kind_of(obj) == "splats":
+            found[obj] = None
+        elif _instances_collection(obj) and obj.instance_collection not in known:
+            known.add(obj.instance_collection)
+            left.extend(obj.instance_collection.all_objects)
+    return list(found)
 
 
 def _instances_collection(obj: bpy.types.Object) -> bool:
