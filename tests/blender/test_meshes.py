@@ -4,6 +4,7 @@
 import json
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -12,6 +13,7 @@ from mathutils import Matrix
 from objectgs.backend.shared.errors import InputError
 from objectgs.backend.shared.formats.ply import write_vertices
 from objectgs.backend.shared.reconstruction.objects import edit_objects
+from objectgs.objectgs_addon import panels
 from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.environment import locations
 from objectgs.objectgs_addon.running import background
@@ -639,3 +641,12 @@ def test_training_presets_store_and_restore_settings(active):
     exec(path.read_text(), {"bpy": bpy})
     path.unlink()
     assert (properties.length, properties.primitive, properties.max_size) == ("preview", "2d", 900)
+
+
+def test_training_presets_open_from_the_header_of_settings():
+    """A popover shows nothing, and reports an error at each redraw, if there is no panel of its name."""
+    shown = []
+    row = SimpleNamespace(popover=lambda panel, **_: shown.append(panel), emboss="NORMAL")
+    header = SimpleNamespace(layout=SimpleNamespace(row=lambda: row, popover=row.popover))
+    panels.training.train.SettingsPanel.draw_header_preset(header, bpy.context)
+    assert len(shown) == 1 and shown[0] in {cls.bl_idname for cls in panels.CLASSES}

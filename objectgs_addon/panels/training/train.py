@@ -145,7 +145,9 @@ class SettingsPanel(WithReconstruction, bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw_header_preset(self, _context: bpy.types.Context) -> None:
-        TrainingPresets.draw_panel_header(self.layout)
+        row = self.layout.row()
+        row.emboss = "NONE"
+        row.popover(TrainingPresets.bl_idname, text="", icon="PRESET")
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
