@@ -774,6 +774,7 @@ def surface(root) -> dict:
 
 def test_hole_is_filled_and_reopened(ground, filled_ground, root):
     """Drawing and picking show exactly what the backend exports, also after the splats are reloaded."""
+    blender_scene.show_kinds(root, "splats")
     captured, count = surface(root), item(root, 2).splats
     luma = blender_scene.luma_of(collection_of(root, 2))
     activate(root, 1)
@@ -837,3 +838,41 @@ def test_fills_of_earlier_version_are_updated_and_restored(ground, root):
     assert surface(root) == filled
     object_edits.restore(root, [1])
     assert surface(root) == captured
+
+
+def test_fill_stays_beside_meshes(ground, root):
+    """A mesh that replaces the splats of an object leaves those that fill a hole in it."""
+    blender_scene.show_kinds(root, "splats")
+    captured, obj = surface(root), part(root, "splats", 2)
+    object_edits.remove(root, [1], False, True)
+    filled = surface(root)
+    blender_scene.show_kinds(root, "meshes")
+    new = blender_scene.unobserved_splats(obj.data)
+    assert not obj.hide_viewport and not obj.hide_render
+    assert np.array_equal(blender_scene.hidden_splats(obj.data), ~new)
+    assert np.array_equal(arrays_of(obj.data).vertices, np.flatnonzero(new))
+    show_faint(obj)
+    assert len(evaluated_colors(obj)) == new.sum()
+    show_again(root)
+    assert np.array_equal(blender_scene.hidden_splats(obj.data), ~new)
+    object_edits.restore(root, [1])
+    assert obj.hide_viewport and obj.hide_render and blender_scene.hidden_splats(obj.data) is None
+    object_edits.remove(root, [1], False, True)
+    assert not obj.hide_viewport and np.array_equal(blender_scene.hidden_splats(obj.data), ~new)
+    blender_scene.show_kinds(root, "splats")
+    assert surface(root) == filled
+    object_edits.restore(root, [1])
+    assert surface(root) == captured
+
+
+def test_fill_stays_until_recomputed_after_other_edits(ground, root, monkeypatch):
+    """Cleaning objects, and splats that are shown anew, leave a fill in place until the newer one exists."""
+    blender_scene.show_kinds(root, "splats")
+    object_edits.remove(root, [1], False, True)
+    mesh, filled = part(root, "splats", 2).data, surface(root)
+    monkeypatch.setenv("OBJECTGS_PYTHON", str(ground / "no-python"))
+    object_edits.clean_floaters(root, [2, HUGE], True)
+    assert blender_scene.missing_fill(root, blender_scene.Objects.read(ground)) is not None
+    assert (fills.filled_objects(mesh) == 1).any() and surface(root)["position"] == filled["position"]
+    blender_scene.show_result(root, ground)
+    assert (fills.filled_objects(mesh) == 1).any() and surface(root)["position"] == filled["position"]

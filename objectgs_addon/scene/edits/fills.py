@@ -17,11 +17,11 @@ from ....backend.shared.reconstruction.fill import FILLS, FillRows, fill_path, r
 from ....backend.shared.reconstruction.folder import Reconstruction
 from .. import carrier
 from ..capture import origin_of
-from ..kinds import OBJECT_PARENT, SPLATS, folder_of, object_collections, part_of
+from ..kinds import OBJECT_PARENT, SPLATS, duplicates_of, folder_of, object_collections, part_of
 from ..object_collection import center_of
 from ..object_display import Objects
 from ..shading.modifiers import update_groups
-from ..shading.node_groups import HIDDEN
+from ..shading.node_groups import COVERED, HIDDEN
 from ..splats import positions_of, splat_attributes
 from .single_splats import deleted_splats
 
@@ -29,6 +29,8 @@ SHOWN_FILL = "objectgs_fill"
 """Custom property of a carrier's mesh: the name of the fill file that it shows."""
 UNOBSERVED_COUNT = "objectgs_unobserved"
 """Custom property of a removed object's collection: the number of splats that fill its hole, if known."""
+REPLACED = "objectgs_replaced"
+"""Custom property of a carrier: a mesh is shown in its place. Only its splats that fill holes are shown then."""
 
 
 def missing_fill(root: bpy.types.Collection, objects: Objects) -> Path | None:
@@ -40,7 +42,8 @@ def missing_fill(root: bpy.types.Collection, objects: Objects) -> Path | None:
 def show_fills(root: bpy.types.Collection, objects: Objects) -> None:
     """Show the fills of removed objects that the edits require.
 
-    While the file for these edits is missing, objects that still require a fill keep the splats shown so far.
+    While the file for these edits is missing, objects that still require a fill keep the splats shown so far, also if
+    the carriers have been filled anew.
 
     Raises:
         InputError: A file cannot be read, or a carrier is in Edit Mode; nothing is changed.
@@ -54,6 +57,10 @@ def show_fills(root: bpy.types.Collection, objects: Objects) -> None:
         if obj is None or obj.data.library is not None or "radiance:base" not in obj.data.attributes:
             continue
         fills = filled_objects(obj.data)
+        if rows is None and not fills.any() and obj.data.get(SHOWN_FILL):
+            own = _shown_before(root, obj, object_id, filled)
+            changes.append((collection, obj, fills, own, obj.data[SHOWN_FILL] if own is not None else ""))
+            continue
         if rows is None:
             if not np.isin(fills, [0, *filled]).all():
                 changes.append((collection, obj, np.where(np.isin(fills, filled), fills, 0), None, ""))
@@ -69,11 +76,54 @@ def show_fills(root: bpy.types.Collection, objects: Objects) -> None:
             pivot = part_of(collection, OBJECT_PARENT)
             _put(obj, own, origin_of(root), np.zeros(3) if pivot is None else center_of(pivot))
         obj.data[SHOWN_FILL] = shows
+    for each in _in_place_of(root, [obj for _, obj, *_ in changes]):
+        each.hide_viewport = each.hide_render = replace_by_mesh(each, True)
     for object_id, collection in object_collections(root).items():
         if rows is not None and object_id in filled:
             collection[UNOBSERVED_COUNT] = rows.count_new(object_id)
         elif UNOBSERVED_COUNT in collection:
             del collection[UNOBSERVED_COUNT]
+
+
+def replace_by_mesh(obj: bpy.types.Object, replaced: bool) -> bool:
+    """Show only the splats of a carrier that fill a hole, or all of them again.
+
+    Returns:
+        Whether the carrier must be hidden, since none of its splats is shown.
+    """
+    fills = unobserved_splats(obj.data)
+    if replaced:
+        obj[REPLACED] = True
+    elif REPLACED in obj:
+        del obj[REPLACED]
+    if replaced and fills.any():
+        update_groups(obj)
+        carrier.write(obj.data, COVERED, "BOOLEAN", ~fills)
+        obj.data.update()
+    elif COVERED in obj.data.attributes:
+        obj.data.attributes.remove(obj.data.attributes[COVERED])
+        obj.data.update()
+    return replaced and not fills.any()
+
+
+def _shown_before(
+    root: bpy.types.Collection, obj: bpy.types.Object, object_id: int, filled: list[int]
+) -> FillRows | None:
+    """Return the splats of the fill file that a carrier has shown, for the objects in `filled`; None without any."""
+    path = Reconstruction(folder_of(root)).cache / obj.data[SHOWN_FILL]
+    if not filled or not path.is_file():
+        return None
+    rows = read_fill(path)
+    own = rows.select((ids_of(rows.splats) == object_id) & np.isin(rows.fills, filled))
+    return own if len(own.new) else None
+
+
+def _in_place_of(root: bpy.types.Collection, carriers: list[bpy.types.Object]) -> list[bpy.types.Object]:
+    """Return those of some carriers and of their duplicates that a mesh replaces."""
+    meshes = {obj.data for obj in carriers}
+    copies = (part_of(copy, SPLATS) for copies in duplicates_of(root).values() for copy in copies)
+    duplicates = [obj for obj in copies if obj is not None and obj.data in meshes]
+    return [obj for obj in (*carriers, *duplicates) if REPLACED in obj]
 
 
 def filled_objects(mesh: bpy.types.Mesh) -> np.ndarray:

@@ -17,7 +17,7 @@ from .. import carrier
 from ..kinds import OBJECT_ID, SPLATS, object_collections, part_of
 from ..object_collection import center_of
 from ..shading.modifiers import update_groups
-from ..shading.node_groups import FLOATING, HIDDEN
+from ..shading.node_groups import COVERED, FLOATING, HIDDEN
 from .fills import given_way, unobserved_splats
 from .single_splats import deleted_splats
 
@@ -92,7 +92,7 @@ def _changes(
     found = []
     for object_id, obj in carriers.items():
         cleaned = object_id in entries and entries[object_id].cleaned
-        before = hidden_splats(obj.data)
+        before = carrier.read(obj.data, HIDDEN) if HIDDEN in obj.data.attributes else None
         if before is None and not cleaned and not (object_id == 0 and removed):
             continue
         hidden = given_way(obj.data) | deleted_splats(obj.data)
@@ -118,10 +118,9 @@ def _inside(unlabeled: bpy.types.Object, removed: list[bpy.types.Object]) -> np.
 
 def hidden_splats(mesh: bpy.types.Mesh) -> np.ndarray | None:
     """Return an (n,) bool mask of a carrier's individually hidden splats, or None if there are none."""
-    if HIDDEN not in mesh.attributes:
-        return None
-    hidden = carrier.read(mesh, HIDDEN)
-    return hidden if hidden.any() else None
+    reasons = [carrier.read(mesh, name) for name in (HIDDEN, COVERED) if name in mesh.attributes]
+    hidden = np.logical_or.reduce(reasons) if reasons else None
+    return hidden if hidden is not None and hidden.any() else None
 
 
 def inside_hull(points: np.ndarray, means: np.ndarray, opacities: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ import numpy as np
 
 from ....backend.shared.errors import InputError
 from .. import carrier
+from ..edits.fills import replace_by_mesh
 from ..edits.show import show_edits
 from ..kinds import MESH, MESH_KEY, SPLATS, duplicates_of, kind_of, object_collections, object_id_of, parts_of
 from ..object_collection import remove, remove_if_empty
@@ -113,7 +114,9 @@ def shown_kinds(root: bpy.types.Collection) -> str:
 
 
 def show_kinds(root: bpy.types.Collection, which: str) -> None:
-    """Show splats, meshes or both in viewports and renders; an object without a mesh always shows its splats.
+    """Show splats, meshes or both in viewports and renders.
+
+    An object without a mesh, and what fills the hole of a removed object, always show their splats.
 
     In addition, users can hide single objects by their collection or with the eye icon.
 
@@ -141,7 +144,7 @@ def apply_shown(root: bpy.types.Collection, changed: Iterable[int | None]) -> No
         both = (collection, *copies.get(object_id, ()))
         for obj in [obj for each in both for obj in parts_of(each)]:
             if kind_of(obj) == SPLATS:
-                hidden[obj] = which == "meshes" and replaced
+                hidden[obj] = replace_by_mesh(obj, which == "meshes" and replaced)
             elif kind_of(obj) == MESH:
                 hidden[obj] = which == "splats"
     _hide(hidden)

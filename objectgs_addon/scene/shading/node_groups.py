@@ -26,6 +26,8 @@ HIDE_GROUP = "splats_drawn"
 
 HIDDEN = "objectgs_hidden"
 """Boolean attribute of a carrier's vertices: splats that are hidden individually."""
+COVERED = "objectgs_covered"
+"""Boolean attribute of a carrier's vertices: splats that a mesh replaces, while splats that fill a hole stay shown."""
 FLOATING = "objectgs_floating"
 """Boolean attribute of a carrier's vertices: floaters. Previews leave them out, since Blender frames what it shows."""
 
@@ -91,8 +93,8 @@ def _make_points_group(name: str) -> bpy.types.NodeTree:
 def splats_group(kind: str) -> bpy.types.NodeTree:
     """Return the newest group that shows splats in viewports (kind: SPLATS_GROUP) or renders (RENDER_GROUP)."""
     if kind == SPLATS_GROUP:
-        return find_or_make(bpy.data.node_groups, kind, 5, "ObjectGS Splats", _make_splats_group)
-    return find_or_make(bpy.data.node_groups, kind, 5, "ObjectGS Render", _make_render_group)
+        return find_or_make(bpy.data.node_groups, kind, 6, "ObjectGS Splats", _make_splats_group)
+    return find_or_make(bpy.data.node_groups, kind, 6, "ObjectGS Render", _make_render_group)
 
 
 def hide_group() -> bpy.types.NodeTree:
@@ -100,7 +102,7 @@ def hide_group() -> bpy.types.NodeTree:
 
     Its output is the corners of the box around the splats, as points of radius 0, by which Blender frames the object.
     """
-    return find_or_make(bpy.data.node_groups, HIDE_GROUP, 1, "ObjectGS Drawn", _make_hide_group)
+    return find_or_make(bpy.data.node_groups, HIDE_GROUP, 2, "ObjectGS Drawn", _make_hide_group)
 
 
 def _make_hide_group(name: str) -> bpy.types.NodeTree:
@@ -108,7 +110,7 @@ def _make_hide_group(name: str) -> bpy.types.NodeTree:
     graph = Graph(tree)
     either = graph.node(
         "FunctionNodeBooleanMath",
-        {0: graph.attribute(HIDDEN, "BOOLEAN"), 1: graph.attribute(FLOATING, "BOOLEAN")},
+        {0: _hidden(graph), 1: graph.attribute(FLOATING, "BOOLEAN")},
         operation="OR",
     ).outputs[0]
     kept = graph.node(
@@ -317,13 +319,19 @@ class _Splat:
         # Distance from the center in sigmas at which alpha falls to 1/255.
         ratio = graph.math("MAXIMUM", graph.math("MULTIPLY", self.opacity, 1.0 / ALPHA_MIN), 1.0)
         self.reach = graph.math("SQRT", graph.math("MULTIPLY", graph.math("LOGARITHM", ratio, math.e), 2.0))
-        self.hidden = graph.attribute(HIDDEN, "BOOLEAN")
+        self.hidden = _hidden(graph)
         shown = graph.node("FunctionNodeBooleanMath", {0: self.hidden}, operation="NOT").outputs[0]
         self.is_seen = graph.node(
             "FunctionNodeBooleanMath",
             {0: graph.math("GREATER_THAN", self.opacity, 1.01 * ALPHA_MIN), 1: shown},
             operation="AND",
         ).outputs[0]
+
+
+def _hidden(graph: Graph) -> bpy.types.NodeSocket:
+    """Return whether a splat is hidden for any reason."""
+    reasons = {index: graph.attribute(name, "BOOLEAN") for index, name in enumerate((HIDDEN, COVERED))}
+    return graph.node("FunctionNodeBooleanMath", reasons, operation="OR").outputs[0]
 
 
 def _linear_color(graph: Graph, raw: bpy.types.NodeSocket, alpha: Any) -> bpy.types.NodeSocket:
