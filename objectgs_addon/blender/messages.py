@@ -76,6 +76,20 @@ def dismiss() -> None:
         _messages.pop()
 
 
+def settle(title: str, operator: str | None) -> None:
+    """Remove the messages about failures that a later success has settled.
+
+    Args:
+        title: title of the job that succeeded.
+        operator: operator that the failures of such jobs offer, or None.
+    """
+    _messages[:] = [
+        message
+        for message in _messages
+        if message.operator is None or not (message.text.startswith(f"{title}: ") or message.operator == operator)
+    ]
+
+
 def clear() -> None:
     """Remove all messages."""
     _messages.clear()

@@ -10,11 +10,12 @@ import bpy
 from .. import drawing, scene
 from ..blender import messages
 from ..environment import locations
+from ..process.jobs import Job, State
 from ..running import background
 from ..running.job_display import write
 from ..state import folder_trust
 from ..state.folder_state import folder_state
-from ..state.next_step import Step, next_step
+from ..state.next_step import RESUME, Step, next_step
 from .preferences import draw_online_access
 from .tab import Tab, draw_job
 
@@ -53,10 +54,10 @@ class CapturePanel(Tab, bpy.types.Panel):
             row.prop(context.scene.objectgs, "active", text="")
             row.menu("OBJECTGS_MT_add", text="", icon="ADD")
             _draw_folder(layout, active)
-        for index, job in jobs:
-            draw_job(layout, job, index)
-        if not jobs and (active is None or not background.busy(scene.folder_of(active))):
-            _draw_next_step(layout, next_step(active, context.scene))
+        if step := _step(active, context.scene):
+            _draw_next_step(layout, step, jobs, active is not None and background.busy(scene.folder_of(active)))
+        else:
+            _draw_jobs(layout, jobs)
         if active is None:
             _draw_linked(layout, context.scene)
             column = layout.column(align=True)
@@ -97,21 +98,40 @@ def _draw_linked(layout: bpy.types.UILayout, owner: bpy.types.Scene) -> None:
             write(layout, f"{root.name} is linked; edit it in {bpy.path.basename(library)}.", "LINKED")
 
 
-def _draw_next_step(layout: bpy.types.UILayout, step: Step | None) -> None:
-    """Draw the button of the next step with its purpose; nothing for None."""
-    if step is None:
-        return
+def _step(root: bpy.types.Collection | None, owner: bpy.types.Scene) -> Step | None:
+    """Return the next step, which after a stopped training is to resume it."""
+    step = next_step(root, owner)
+    job = background.job_of(root) if root is not None and step is not None else None
+    if job is not None and job.kind == "train" and job.state is State.STOPPED and folder_trust.state_of(root).steps:
+        return RESUME
+    return step
+
+
+def _draw_jobs(layout: bpy.types.UILayout, jobs: list[tuple[int, Job]]) -> None:
+    for index, job in jobs:
+        draw_job(layout, job, index)
+
+
+def _draw_next_step(layout: bpy.types.UILayout, step: Step, jobs: list[tuple[int, Job]], is_busy: bool) -> None:
+    """Draw the button of the next step with its purpose, or with the jobs that must end before.
+
+    The button stays in its place meanwhile, so that what is below it does not move under the mouse.
+    """
     column = layout.column()
     if step.operator == "objectgs.set_up_backend":
         draw_online_access(column)
     button = column.row()
+    button.enabled = not (jobs or is_busy)
     button.scale_y = 1.5
     operator = button.operator(step.operator, text=step.label, icon=step.icon)
     for name, value in step.options:
         setattr(operator, name, value)
-    purpose = column.column()
-    purpose.active = False
-    write(purpose, step.purpose)
+    if jobs:
+        _draw_jobs(column, jobs)
+    else:
+        purpose = column.column()
+        purpose.active = False
+        write(purpose, step.purpose)
     if step.operator == "objectgs.set_up_backend":
         opens = column.operator("preferences.addon_show", text="Preferences", icon="PREFERENCES")
         opens.module = locations.PACKAGE

@@ -58,7 +58,9 @@ class EditPanel(WithReconstruction, bpy.types.Panel):
             write(layout, "This object has no splats and no mesh yet; train first.", "INFO")
             return
         self._draw_colors(layout, item)
-        self._draw_transform(layout, root, collection)
+        copies = scene.duplicates_of(root).get(scene.from_stored(item.object_id), [])
+        active = context.active_object
+        self._draw_transform(layout, root, collection, copies, active if active in context.selected_objects else None)
 
     def _draw_fill(
         self, layout: bpy.types.UILayout, root: bpy.types.Collection, collection: bpy.types.Collection | None
@@ -85,18 +87,24 @@ class EditPanel(WithReconstruction, bpy.types.Panel):
         row.operator("objectgs.reset_object", text="Reset Colors", icon="LOOP_BACK").what = "COLORS"
 
     def _draw_transform(
-        self, layout: bpy.types.UILayout, root: bpy.types.Collection, collection: bpy.types.Collection
+        self,
+        layout: bpy.types.UILayout,
+        root: bpy.types.Collection,
+        collection: bpy.types.Collection,
+        copies: list[bpy.types.Collection],
+        active: bpy.types.Object | None,
     ) -> None:
-        place = scene.placement_of(root, collection)
-        copies = len(scene.duplicates_of(root).get(scene.object_id_of(collection) or 0, ()))
+        """Draw where an object is, or the one of its duplicates to which the active object belongs."""
+        chosen = next((copy for copy in copies if active is not None and active in set(copy.objects)), collection)
+        place = scene.placement_of(root, chosen)
         column = layout.column(align=True)
         moved = place is not None and not _is_identity(place)
-        where = _describe_transform(root, collection, place) if place is not None and moved else "Not moved"
-        column.label(text=where, icon="OBJECT_ORIGIN")
+        where = _describe_transform(root, chosen, place) if place is not None and moved else "Not moved"
+        column.label(text=where if chosen == collection else f"Duplicate: {where.lower()}", icon="OBJECT_ORIGIN")
         if copies:
-            column.label(text=f"{copies} duplicate{'s' if copies > 1 else ''}", icon="DUPLICATE")
+            column.label(text=f"{len(copies)} duplicate{'s' if len(copies) > 1 else ''}", icon="DUPLICATE")
         row = column.row()
-        row.enabled = moved
+        row.enabled = moved and chosen == collection
         row.operator("objectgs.reset_object", text="Reset Transform", icon="LOOP_BACK").what = "TRANSFORM"
 
 

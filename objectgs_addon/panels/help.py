@@ -11,8 +11,8 @@ MANUAL = ROOT / "docs" / "manual"
 """The pages of the manual, which the extension contains without their pictures."""
 STEPS = (
     ("Import Capture", "IMPORT", "reads photos and their cameras"),
-    ("Assign Objects", "GROUP_VERTEX", "finds objects by the masks"),
     ("Train", "PLAY", "turns the photos into splats; stop at any time"),
+    ("Clean Up", "BRUSH_DATA", "hides stray splats"),
     ("Edit", "OUTLINER_COLLECTION", "changes the object that you click"),
     ("Extract Meshes", "MESH_DATA", "for shadows, physics, other programs"),
     ("Set Up Render", "SCENE", "before F12, to keep the photos' colors"),

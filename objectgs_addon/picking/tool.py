@@ -27,7 +27,7 @@ class PickTool(bpy.types.WorkSpaceTool):
     bl_label = "Pick Object"
     bl_description = (
         "Select the visible objects of a reconstruction.\n"
-        "Shift toggles, dragging selects all objects in a box, Esc leaves the tool"
+        "Shift adds or removes, dragging selects all objects in a box, Esc leaves the tool"
     )
     bl_icon = "ops.generic.select"
     bl_keymap = (
@@ -111,7 +111,7 @@ def _file_loads(*_: Any) -> None:
 def register() -> None:
     global _handler
     if not bpy.app.background:
-        bpy.utils.register_tool(PickTool, after={"builtin.select_lasso"})
+        bpy.utils.register_tool(PickTool, after={"builtin.cursor"})
         _handler = bpy.types.SpaceView3D.draw_handler_add(_leave, (), "WINDOW", "PRE_VIEW")
         bpy.app.handlers.load_pre.append(_file_loads)
         keymaps = bpy.context.window_manager.keyconfigs.addon.keymaps

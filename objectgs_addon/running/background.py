@@ -160,13 +160,15 @@ def redraw() -> None:
 
 
 def _handle_end(job: Job) -> None:
+    operator, label, options = _REMEDIES.get(job.kind, ("objectgs.retry_job", "Try Again", {"number": job.number}))
     if job.state is State.FAILED:
-        operator, label, options = _REMEDIES.get(job.kind, ("objectgs.retry_job", "Try Again", {"number": job.number}))
         messages.show(f"{job.title}: {job.error}", "ERROR", operator, label, **options)
-    elif job.state is State.DONE or (job.state is State.STOPPED and job.kind in ("train", "mesh")):
+    elif job.state is State.DONE:
+        messages.settle(job.title, operator if job.kind in _REMEDIES else None)
+    if job.state is State.DONE or (job.state is State.STOPPED and job.kind in ("train", "mesh")):
         _results.append(job)
-        return
-    _submitted_in.pop(job, None)
+    else:
+        _submitted_in.pop(job, None)
 
 
 def _show_results() -> None:

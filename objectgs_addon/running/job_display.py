@@ -15,6 +15,13 @@ CHARACTER = 6.6
 AROUND = 60.0
 """Width of borders and icon in pixels at a UI scale of 1."""
 
+_AFTER_STOP = {
+    "train": " Resume continues it.",
+    "mesh": " Extract Meshes continues it.",
+    "film": " Render Film Frames continues it.",
+}
+"""Kind of a stopped job -> what to do next; others start anew."""
+
 
 def summary(job: Job) -> str:
     """Return the state of a job in a few words."""
@@ -75,7 +82,7 @@ def draw_over(layout: bpy.types.UILayout, job: Job) -> None:
     if job.state is State.FAILED:
         write(layout, f"{job.title} failed. {job.error}", "ERROR")
     elif job.state is State.STOPPED:
-        write(layout, f"{job.title}: stopped. {job.message}", "INFO")
+        write(layout, f"{job.title}: stopped.{_AFTER_STOP.get(job.kind, '')}", "INFO")
     else:
         write(layout, f"{job.title}: done", "CHECKMARK")
     for sentence in job.warnings[:3]:

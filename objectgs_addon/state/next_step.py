@@ -40,6 +40,7 @@ ASSIGN = Step(
     "objectgs.assign_objects", "Assign Objects", "GROUP_VERTEX", "The masks decide which object each point belongs to."
 )
 TRAIN = Step("objectgs.train", "Train", "PLAY", "Training turns the photos into splats.")
+RESUME = Step("objectgs.train", "Resume", "PLAY", "The training was stopped, and goes on from there.")
 MESHES = Step(
     "objectgs.extract_meshes", "Extract Meshes", "MESH_DATA", "Meshes are for physics, shadows and other programs."
 )

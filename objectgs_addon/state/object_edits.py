@@ -66,7 +66,7 @@ def fill(root: bpy.types.Collection) -> None:
             item.object_id = to_stored(entry.id)
             item.color = [channel / 255.0 for channel in entry.color]
             item.chosen = not entry.left_out
-            item.points = entry.points
+            item.points = entry.points + sum(other.points for other in entries if other.merged_into == entry.id)
             item.splats = shown.get(entry.id, 0)
             item.faces = faces.get(entry.id, 0)
             item.is_merged = entry.merged_into is not None

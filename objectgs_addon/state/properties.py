@@ -22,7 +22,6 @@ from bpy.props import (
 from ...backend.shared.defaults import MAX_SIZE
 from ...backend.shared.expectation import PRESET_STEPS
 from ...backend.shared.formats.splat_ply import UNOBSERVED
-from .. import drawing
 from ..scene import SHADINGS, SHOWS, is_linked, kind_of, shade_meshes, shading_of, show_kinds, shown_kinds
 from . import object_edits, viewports
 
@@ -89,7 +88,9 @@ class ObjectItem(bpy.types.PropertyGroup):
         description="Train this object; otherwise it stays part of the background",
     )
     object_id: IntProperty(name="ID", description="Pixel value of the object in the masks")
-    points: IntProperty(name="Points", description="Points of the capture that are assigned to this object")
+    points: IntProperty(
+        name="Points", description="Points of the capture that are assigned to this object, and to those merged into it"
+    )
     splats: IntProperty(name="Splats", description="Number of Gaussian splats of this object")
     faces: IntProperty(name="Faces", description="Number of faces of this object's mesh; 0 without a mesh")
     is_merged: BoolProperty(name="Merged", description="Merged into another object")
@@ -261,7 +262,7 @@ class SceneProperties(bpy.types.PropertyGroup):
     draw_splats: BoolProperty(
         name="Draw Splats",
         default=True,
-        update=drawing.show,
+        update=viewports.draw_splats_changed,
         description="Draw splats in the 3D viewports as in the final image, instead of a preview by points",
     )
     colors: EnumProperty(

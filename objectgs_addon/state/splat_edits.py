@@ -87,7 +87,7 @@ def assign(root: bpy.types.Collection, parts: Sequence[bpy.types.Object], object
 
 
 def separate(root: bpy.types.Collection, parts: Sequence[bpy.types.Object], name: str) -> int:
-    """Move the selected splats of carriers to a new object, and return its ID."""
+    """Move the selected splats of carriers to a new object, deselect them, and return the object's ID."""
     edits = _up_to_date(root)
     keys = _selected_keys(parts)
     path = Reconstruction(scene.folder_of(root)).objects
@@ -99,6 +99,10 @@ def separate(root: bpy.types.Collection, parts: Sequence[bpy.types.Object], name
     except (InputError, OSError):
         edit_objects(path, {object_id: dict.fromkeys(entry)})
         raise
+    for part in scene.parts_of(scene.object_collections(root)[object_id]):
+        if scene.kind_of(part) == "splats":
+            scene.select_splats(part.data, np.zeros(len(part.data.vertices), bool))
+            drawing.selection_changed(part.data)
     return object_id
 
 

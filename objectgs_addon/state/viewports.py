@@ -54,6 +54,12 @@ def colors_changed(properties: Any, _context: bpy.types.Context = None) -> None:
     drawing.redraw()
 
 
+def draw_splats_changed(properties: Any, context: bpy.types.Context) -> None:
+    """Switch drawing on or off; the preview that replaces it takes the colors of the scene's setting."""
+    drawing.show(properties, context)
+    colors_changed(properties)
+
+
 def subject_of(centers: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """Return the point that cameras look at: the nearest one to their optical axes in the least-squares sense.
 

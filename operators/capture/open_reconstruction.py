@@ -7,6 +7,7 @@ import bpy
 from bpy.props import BoolProperty, StringProperty
 
 from ...objectgs_addon import scene
+from ...objectgs_addon.environment import locations
 from ...objectgs_addon.state import folder_trust, object_edits
 from ..common import need
 from ..common.reporting import reports_errors
@@ -28,6 +29,8 @@ class OpenReconstruction(bpy.types.Operator):
     )
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        if not self.directory and locations.reconstructions_folder().is_dir():
+            self.directory = str(locations.reconstructions_folder() / "")
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 

@@ -56,6 +56,7 @@ class CameraPath(bpy.types.Operator):
             raise InputError("A path needs at least two captured views; import the capture again")
         cameras.sort(key=lambda camera: camera["objectgs_image"])
         film.make_path(owner, cameras, owner.frame_start, owner.frame_end)
+        owner.frame_set(owner.frame_current)  # Otherwise the camera stays at its last key.
 
 
 CLASSES = (CameraFromView, CameraPath)

@@ -21,7 +21,10 @@ def _targets(_operator: Any, context: bpy.types.Context) -> list[tuple[str, str,
     global _choices
     root = need.active_root(context)
     items = root.objectgs.objects if root else ()
-    _choices = [(str(scene.from_stored(item.object_id)), item.name, "") for item in items if not item.is_merged]
+    ids = [(scene.from_stored(item.object_id), item.name) for item in items if not item.is_merged]
+    sources = _sources(context) if ids else []
+    # One object is merged into another; of several, each may take the others.
+    _choices = [(str(object_id), name, "") for object_id, name in ids if [object_id] != sources]
     return _choices
 
 
@@ -55,7 +58,7 @@ class MergeObjects(bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         sources = _sources(context)
         targets = [choice[0] for choice in _targets(self, context)]
-        wanted = sources[-1:] if len(sources) > 1 else [int(t) for t in targets if int(t) != sources[0]]
+        wanted = sources[-1:] if len(sources) > 1 else [int(target) for target in targets]
         if wanted and str(wanted[0]) in targets:
             self.into = str(wanted[0])
         return context.window_manager.invoke_props_dialog(self)

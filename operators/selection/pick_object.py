@@ -8,6 +8,7 @@ import gpu
 from bpy.props import BoolProperty, IntProperty
 from gpu_extras.batch import batch_for_shader
 
+from ...objectgs_addon import scene
 from ...objectgs_addon.picking import hit_test, selection
 from ...objectgs_addon.picking import tool as pick_tool
 from ..common.viewport import InViewport, selection_mode
@@ -116,7 +117,9 @@ class PickBox(InViewport, bpy.types.Operator):
         self._end(context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        collections = hit_test.objects_in(context, self.left, self.bottom, self.right + 1, self.top + 1)
+        found = hit_test.objects_in(context, self.left, self.bottom, self.right + 1, self.top + 1)
+        # The background is in nearly every box.
+        collections = [collection for collection in found if scene.object_id_of(collection) != 0]
         if self.mode == "SUBTRACT":
             for part in (part for collection in collections for part in selection.parts_to_select(collection)):
                 part.select_set(False)

@@ -22,7 +22,7 @@ class AddCropBox(_OnSplats, bpy.types.Operator):
     bl_idname = "objectgs.add_crop_box"
     bl_label = "Crop Box"
     bl_description = (
-        "Add a box around the selected splats or, if there are none, around all of them, or show that of the present "
+        "Add a box around the selected splats or, if there are none, around all objects, or show that of the present "
         "crop. Move, rotate and scale it, then apply the crop"
     )
 

@@ -5,6 +5,7 @@ import bpy
 from bpy.props import StringProperty
 
 from ...backend.shared.errors import InputError
+from ...objectgs_addon import scene
 from ...objectgs_addon.picking import selection
 from ...objectgs_addon.state import object_list, splat_edits
 from ..common import need
@@ -68,7 +69,7 @@ class SeparateSplats(bpy.types.Operator):
     bl_description = "Move the selected splats to a new object"
     bl_options = {"REGISTER", "UNDO"}
 
-    name: StringProperty(name="Name", description="Name of the new object", default="Separated")
+    name: StringProperty(name="Name", description="Name of the new object; if empty, that of its source")
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -77,10 +78,9 @@ class SeparateSplats(bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:
         root = need.active_root(context)
-        name = " ".join(self.name.split())
-        if not name:
-            raise InputError("The new object has no name; enter one")
-        object_id = splat_edits.separate(root, splat_edits.shown_parts(context, root), name)
+        parts = splat_edits.shown_parts(context, root)
+        name = " ".join(self.name.split()) or f"{_source(parts)} part"
+        object_id = splat_edits.separate(root, parts, name)
         context.view_layer.update()
         selection.select_object(context, root, object_id)
 
@@ -109,6 +109,13 @@ class AssignSplats(bpy.types.Operator):
         count = splat_edits.assign(root, splat_edits.shown_parts(context, root), target)
         name = item.name if item else "no object"
         self.report({"INFO"}, f"{_counted(count)} assigned to {name}")
+
+
+def _source(parts: list[bpy.types.Object]) -> str:
+    """Return the name of the object that has most of the selected splats."""
+    most = max(parts, key=lambda part: scene.selected_splats(part.data).sum(), default=None)
+    collection = None if most is None else scene.collection_of(most)
+    return "Background" if collection is None else collection.name
 
 
 def _counted(count: int) -> str:

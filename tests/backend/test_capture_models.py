@@ -791,4 +791,13 @@ def test_photos_alone_are_told_what_they_lack(write_capture, tmp_path, run_comma
         (photos / within / path.name).write_bytes(path.read_bytes())
     result = run_command("import", photos, "--out", tmp_path / "out")
     assert result.code == EXIT_BAD_INPUT and "6 photos, but not where they were taken" in result.err
+
+
+@pytest.mark.parametrize("name", ["images", "masks"])
+def test_folder_of_photos_names_the_capture_above(write_capture, tmp_path, run_command, name):
+    scene = write_capture()
+    folder = scene.folder / name
+    (folder / "left").mkdir(parents=True, exist_ok=True)
+    result = run_command("import", folder, "--out", tmp_path / "out")
+    assert result.code == EXIT_BAD_INPUT and f"choose the folder above, {scene.folder}." in result.err
     assert not (tmp_path / "out").exists()

@@ -53,6 +53,8 @@ def test_path_passes_through_captured_views(root):
     owner.frame_start, owner.frame_end = 1, 100
     assert bpy.ops.objectgs.camera_path() == {"FINISHED"}
     camera = owner.camera
+    bpy.context.view_layer.update()
+    start = np.array(camera.matrix_world)
     captured = sorted(
         (part for part in root.all_objects if scene.kind_of(part) == "camera"), key=lambda part: part["objectgs_image"]
     )
@@ -60,6 +62,7 @@ def test_path_passes_through_captured_views(root):
     for frame, view in ((1, captured[0]), (100, captured[-1])):
         owner.frame_set(frame)
         assert np.allclose(np.array(camera.matrix_world), np.array(view.matrix_world), atol=1e-4)
+    assert np.allclose(start, np.array(captured[0].matrix_world), atol=1e-4), "the frame is shown without a change"
     turns = []
     for frame in range(1, 101):
         owner.frame_set(frame)

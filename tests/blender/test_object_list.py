@@ -100,6 +100,7 @@ def test_active_row_selects_object(root):
 def test_selected_objects_are_merged_and_split(root):
     first, second = first_ids(root)[:2]
     before = object_list.splat_counts(root)
+    points_before = {scene.from_stored(item.object_id): item.points for item in root.objectgs.objects}
     selection.select_object(bpy.context, root, first)
     selection.select_object(bpy.context, root, second, extend=True)
     bpy.ops.objectgs.merge_objects(into=str(second))
@@ -107,9 +108,23 @@ def test_selected_objects_are_merged_and_split(root):
     after = object_list.splat_counts(root)
     assert after[second] == before[first] + before[second] and first not in after
     assert object_list.merge_target(root, first) == second
+    points = {scene.from_stored(item.object_id): item.points for item in root.objectgs.objects}
+    assert points[second] == points_before[first] + points_before[second]
     activate(root, second)
     bpy.ops.objectgs.split_objects()
     assert object_list.splat_counts(root) == before and entry(root, first).merged_into is None
+
+
+def test_one_object_is_not_merged_into_itself(root):
+    first, second = first_ids(root)[:2]
+    selection.select_nothing(bpy.context)
+    activate(root, first)
+    with pytest.raises(TypeError):
+        bpy.ops.objectgs.merge_objects(into=str(first))
+    selection.select_object(bpy.context, root, first)
+    selection.select_object(bpy.context, root, second, extend=True)
+    bpy.ops.objectgs.merge_objects(into=str(first))
+    assert entry(root, second).merged_into == first
 
 
 def test_choose_objects_leaves_out_others(root):

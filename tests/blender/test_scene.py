@@ -407,7 +407,7 @@ def test_reconstructions_in_one_file_are_separate(root, folder, tmp_path):
 @pytest.mark.parametrize(
     ("name", "corrupt", "sentence"),
     [
-        ("cameras.json", None, "has no cameras.json; run Import again"),
+        ("cameras.json", None, "is no reconstruction, since it has no cameras.json"),
         ("cameras.json", b"{}", "is not a valid list of cameras"),
         ("cameras.json", b"{", "cannot be read as JSON"),
         ("points.ply", None, "has no points.ply; run Import again"),
@@ -465,7 +465,7 @@ def test_blend_file_without_folder_opens(root, folder, tmp_path):
     shown = next(child for child in owner.collection.children if blender_scene.kind_of(child) == "reconstruction")
     assert set(blender_scene.object_collections(shown)) == {0, *OBJECTS}
     blender_scene.color_points_by(shown, "object")
-    with pytest.raises(InputError, match="run Import again"):
+    with pytest.raises(InputError, match="no cameras.json"):
         blender_scene.show_capture(owner, blender_scene.folder_of(shown), shown)
     with pytest.raises(InputError, match="train first"):
         again(shown, folder)

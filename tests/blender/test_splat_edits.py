@@ -405,11 +405,27 @@ def test_separated_splats_become_an_object(root, folder, backend_python, tmp_pat
     assert entry(folder, new).removed
     assert_agrees(folder, backend_python, tmp_path)
     bpy.ops.objectgs.restore_object(object=str(new))
-    assert blender_scene.selected_splats(part(new).data).all(), "they remain selected"
-    bpy.ops.objectgs.select_all_splats(action="DESELECT")
+    assert not blender_scene.selected_splats(part(new).data).any()
     with pytest.raises(RuntimeError, match="No splats are selected"):
         bpy.ops.objectgs.separate_splats(name="nothing")
     assert set(counts()) == {1, 2, HUGE, new} and entry(folder, new + 1) is None
+
+
+def test_separated_splats_are_named_after_their_source(root, folder):
+    select(1, range(3))
+    select(2, range(7), "ADD")
+    assert bpy.ops.objectgs.separate_splats() == {"FINISHED"}
+    (new,) = set(counts()) - {1, 2, HUGE}
+    assert entry(folder, new).name == f"{entry(folder, 2).name} part"
+
+
+def test_crop_box_is_around_the_objects(root, folder):
+    splats = read_vertices(folder / "splats.ply")
+    splats["x"][splats["object_id"] == 0] += 1000.0
+    write_vertices(folder / "splats.ply", splats)
+    bpy.ops.objectgs.show_result()
+    bpy.ops.objectgs.add_crop_box()
+    assert max(blender_scene.crop_box_of(active()).scale) < 50.0
 
 
 def test_crop_keeps_the_inside_of_the_box_and_survives_new_splats(root, folder, backend_python, tmp_path):

@@ -67,6 +67,8 @@ def read_capture_model(folder: Path) -> Model:
             return read(found[0])
     if unreadable:
         raise InputError(unreadable[0])
+    if _is_inside_capture(folder):
+        raise InputError(f"{folder} is a part of a capture; choose the folder above, {folder.parent}.")
     if photos:
         raise InputError(
             f"{folder} contains {len(photos)} photos, but not where they were taken; compute that with COLMAP, "
@@ -77,6 +79,19 @@ def read_capture_model(folder: Path) -> Model:
         f"{folder / 'sparse' / '0'}, or the cameras as transforms.json, Bundler's .out, Metashape's .xml or "
         "RealityScan's .csv."
     )
+
+
+def _is_inside_capture(folder: Path) -> bool:
+    """Return whether a folder without a model is images/ or masks/ of a capture with one."""
+    above = folder.parent
+    if folder.name.lower() not in ("images", "masks"):
+        return False
+    try:
+        return has_model(above) or any(
+            re.fullmatch(pattern, path.name, re.IGNORECASE) for path in _files_in(above) for _, pattern, *_ in _FORMATS
+        )
+    except OSError:
+        return False
 
 
 def _files_in(folder: Path) -> list[Path]:

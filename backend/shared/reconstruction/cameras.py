@@ -105,7 +105,9 @@ def read_cameras(folder: Path) -> Cameras:
     """
     path = folder / NAME
     if not path.is_file():
-        raise InputError(f"{folder} has no {NAME}; run Import again.")
+        raise InputError(
+            f"{folder} is no reconstruction, since it has no {NAME}; choose one that an import has written."
+        )
     content = read_json(path)
     try:
         upright = np.eye(4)

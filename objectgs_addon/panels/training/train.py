@@ -37,11 +37,11 @@ class TrainPanel(WithReconstruction, bpy.types.Panel):
         active = background.busy(folder)
         state = folder_trust.state_of(root)
         column = layout.column()
-        if not active:
-            column.operator("objectgs.train", icon="PLAY", text="Resume" if _can_resume(state, properties) else "Train")
-            column.prop(properties, "length")
-            if properties.length == "minutes":
-                column.prop(properties, "minutes")
+        column.enabled = not active
+        column.operator("objectgs.train", icon="PLAY", text="Resume" if _can_resume(state, properties) else "Train")
+        column.prop(properties, "length")
+        if properties.length == "minutes":
+            column.prop(properties, "minutes")
         is_accepted = folder_trust.is_accepted(root)
         if not active and is_accepted:
             _draw_expectation(column, state, properties)

@@ -31,8 +31,9 @@ def add_crop_box(root: bpy.types.Collection, box: Rows | None) -> bpy.types.Obje
 
     Args:
         root: the reconstruction's collection.
-        box: its map (4, 4) from the cube of -1 to 1 to capture coordinates; None for one around the selected splats
-            or, if there are none, around all splats without outliers, in the axes of the world.
+        box: its map (4, 4) from the cube of -1 to 1 to capture coordinates; None for one in the axes of the world,
+            around the selected splats or, if there are none, around those of all objects without outliers. Without
+            objects it is around the background.
 
     Raises:
         InputError: The user deleted the reconstruction's parent empty, or there are no splats.
@@ -74,18 +75,20 @@ def box_of(root: bpy.types.Collection, obj: bpy.types.Object) -> Rows:
 
 def _around(root: bpy.types.Collection, to_world: np.ndarray) -> np.ndarray:
     """Return the map (4, 4) from the cube of -1 to 1 to a box of the world around captured splats."""
-    places, selected = [np.zeros((0, 3))], [np.zeros(0, bool)]
-    for collection in object_collections(root).values():
+    places, selected, is_object = [np.zeros((0, 3))], [np.zeros(0, bool)], [np.zeros(0, bool)]
+    for object_id, collection in object_collections(root).items():
         part = part_of(collection, SPLATS)
         if part is not None:
             shown = ~deleted_splats(part.data)
             center = center_of(part.parent) if part.parent is not None else np.zeros(3)
             places.append(carrier.read(part.data, "position")[shown] + center)
             selected.append(selected_splats(part.data)[shown])
-    points, chosen = np.concatenate(places), np.concatenate(selected)
+            is_object.append(np.full(int(shown.sum()), object_id != 0))
+    points, chosen, of_objects = (np.concatenate(each) for each in (places, selected, is_object))
     if not len(points):
         raise InputError("There are no splats to crop")
-    points = (points[chosen] if chosen.any() else points) @ to_world[:3, :3].T + to_world[:3, 3]
+    around = chosen if chosen.any() else of_objects if of_objects.any() else ~of_objects
+    points = points[around] @ to_world[:3, :3].T + to_world[:3, 3]
     low, high = (points.min(0), points.max(0)) if chosen.any() else np.percentile(points, COVERS, axis=0)
     size = np.maximum(0.5 * (high - low), 1e-3 * max(float((high - low).max()), 1e-3))
     box = np.diag([*size, 1.0])
