@@ -76,6 +76,13 @@ class _Commands:
 
 
 def _add_capture_commands(commands: _Commands) -> None:
+    poses = commands.add("sfm", "Make a capture of photos alone", texts.SFM, "photos --out garden")
+    poses.add_argument("photos", type=Path, metavar="PHOTOS", help="folder with photos, also in subfolders")
+    poses.add_argument("--out", type=Path, required=True, metavar="CAPTURE", help="folder for the new capture")
+    poses.add_argument(
+        "--cameras", choices=("auto", "one", "each"), default="auto",
+        help="which photos share a camera and its focal length: auto, by size and EXIF; one, all; each, none (auto)",
+    )  # fmt: skip
     check = commands.add("check", "Check a capture and list its contents", texts.CHECK, "garden")
     options.add_capture(check)
     prepare = commands.add(

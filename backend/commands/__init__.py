@@ -9,12 +9,13 @@ import argparse
 from collections.abc import Callable
 
 from ..shared.stopping import StoppingReporter
-from .capture import check, import_capture, import_splats, plan, vote
+from .capture import check, import_capture, import_splats, plan, sfm, vote
 from .objects import edit, export, film, mesh
 from .setup import doctor
 from .training import evaluate, render, report, train
 
 COMMANDS: dict[str, Callable[[argparse.Namespace, StoppingReporter], None]] = {
+    "sfm": sfm.sfm,
     "check": check.check,
     "import": import_capture.import_capture,
     "plan": plan.plan,

@@ -1,0 +1,199 @@
+"""`sfm`: makes a capture of photos alone, with poses and points computed by COLMAP."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import pycolmap
+from PIL import Image as PilImage
+
+from ...capture.models import read_capture_model
+from ...sfm import database, model
+from ...sfm.pairs import choose_pairs
+from ...sfm.photos import IMAGES, Photo, take_photos
+from ...sfm.stages import run_stage
+from ...shared.errors import InputError
+from ...shared.formats.atomic import make_folder, recorded, write_atomic
+from ...shared.formats.json_file import write_json
+from ...shared.reconstruction.lock import locked
+from ...shared.stopping import StoppingReporter
+
+WORK = "sfm"
+"""Folder in the capture with the database, which lets a stopped command go on, and sfm.json."""
+REPORT = "sfm.json"
+
+_EXTRACT, _MATCH, _MAP = 0.5, 0.03, 0.3
+"""Expected seconds of the stages for each photo, pair and photo on two cores, until the pace is known."""
+_ENOUGH = 0.95
+"""Fraction of photos with trusted poses from which on the result of the first mapper is kept."""
+_WORST = 10
+
+
+def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
+    """Find features, match the photos, compute poses and points, and write CAPTURE/sparse/0 and sfm/sfm.json."""
+    source, capture = options.photos, options.out
+    if not source.is_dir():
+        raise InputError(f"{source} is no folder; choose the folder that contains the photos.")
+    _require_own(source, capture)
+    with recorded() as created:
+        try:
+            make_folder(capture / WORK)
+            with locked(capture / WORK):
+                _run(source, capture, options, reporter)
+        except InputError:
+            if not (capture / WORK / database.NAME).exists():
+                created.remove_files()
+                created.remove_folders()
+            raise
+
+
+def _require_own(source: Path, capture: Path) -> None:
+    """Raise InputError if the capture's folder has files of others, or a model that this command has not made."""
+    if not capture.exists() or (capture / WORK).is_dir():
+        return
+    if not capture.is_dir():
+        raise InputError(f"{capture} is a file; choose another --out.")
+    is_source = source.resolve() in (capture.resolve(), (capture / IMAGES).resolve())
+    if (capture / "sparse").exists():
+        raise InputError(f"{capture} has a COLMAP model already, {capture / 'sparse'}; choose another --out.")
+    if is_source and (capture / IMAGES).is_dir():
+        return
+    if any(capture.iterdir()):
+        raise InputError(f"{capture} contains other files; choose a new folder as --out.")
+
+
+def _run(source: Path, capture: Path, options: argparse.Namespace, reporter: StoppingReporter) -> None:
+    started = time.monotonic()
+    work = capture / WORK
+    images, path, log = capture / IMAGES, work / database.NAME, work / "colmap.log"
+    reporter.expect({
+        "photos": ("Photos", 2.0), "extract": ("Features", 30.0), "pairs": ("Pairs", 0.1), "match": ("Matching", 30.0),
+        "global": ("Poses", 10.0), "incremental": ("Poses", 5.0),
+    })  # fmt: skip
+    reporter.begin("photos", "Reading the photos")
+    photos, unreadable = take_photos(source, capture, reporter)
+    names = [photo.name for photo in photos]
+    count = len(photos)
+    pairs_expected = count * (count - 1) / 2
+    reporter.expect({
+        "extract": ("Features", _EXTRACT * count), "match": ("Matching", _MATCH * pairs_expected),
+        "global": ("Poses", _MAP * count), "incremental": ("Poses", 0.1 * _MAP * count),
+    })  # fmt: skip
+
+    groups = work / "groups.json"
+    write_json(groups, _groups(photos, images, options.cameras))
+    reporter.begin("extract", f"Finding features in {count} photos")
+    if not run_stage(
+        reporter, log, ["extract", str(path), str(images), str(groups)], lambda _: database.count_features(path), count
+    ):
+        raise InputError(f"COLMAP could not find features in the photos; see {log}.")
+    reporter.begin("pairs", "Comparing the photos")
+    pairs = choose_pairs(path, names, reporter.progress)
+    listed = work / "pairs.txt"
+    if pairs is not None:
+        write_atomic(listed, "".join(f"{first} {second}\n" for first, second in pairs).encode())
+    total = count * (count - 1) // 2 if pairs is None else len(pairs)
+    arguments = ["match", str(path), *([] if pairs is None else [str(listed)])]
+    reporter.begin("match", f"Matching {total:,} pairs of photos")
+    if not run_stage(reporter, log, arguments, lambda _: database.count_pairs(path), total):
+        raise InputError(f"COLMAP could not match the photos; see {log}.")
+    _require_matches(path, source)
+
+    candidates: list[model.Candidate] = []
+    for mapper in ("global", "incremental"):
+        best = model.best_of(candidates)
+        if best is not None and len(best.agreement.trusted) >= _ENOUGH * count:
+            break
+        reporter.begin(mapper, f"Computing poses ({mapper})")
+        out = work / mapper
+        make_folder(out)
+        run_stage(reporter, log, [mapper, str(path), str(images), str(out)], lambda lines: lines, count)
+        candidate = model.read_candidate(mapper, out, path)
+        if candidate is not None:
+            candidates.append(candidate)
+    best = model.best_of(candidates)
+    if best is None or len(best.agreement.trusted) < 2:
+        raise InputError(
+            f"The photos in {source} do not fit together: no two of them show the same scene from different places "
+            "with enough detail; take more photos, each overlapping the one before by two thirds."
+        )
+    wrong = model.drop_untrusted(best)
+    model.require_parallax(best.model, source)
+    model.to_common_size(best.model)
+    model.write_model(best.model, capture)
+    read_capture_model(capture)
+    _report(best, capture, names, unreadable, wrong, time.monotonic() - started, reporter)
+
+
+def _groups(photos: list[Photo], images: Path, cameras: str) -> list[dict]:
+    """Return the photos of each camera with the longest side of a photo."""
+    groups: dict[str, list[str]] = {}
+    for photo in photos:
+        groups.setdefault({"one": "", "each": photo.name}.get(cameras, photo.camera), []).append(photo.name)
+    found = []
+    for names in groups.values():
+        with PilImage.open(images / names[0]) as image:
+            found.append({"names": names, "longest": max(image.size)})
+    return found
+
+
+def _require_matches(path: Path, source: Path) -> None:
+    """Raise InputError if no photos match, or all that do were taken from one spot."""
+    pairs = database.verified_pairs(path)
+    if not pairs:
+        raise InputError(
+            f"No two photos in {source} show the same: they are of different scenes, blurred, or without texture; take "
+            "sharp photos that overlap by two thirds."
+        )
+    still = {
+        int(pycolmap.TwoViewGeometryConfiguration.PANORAMIC),
+        int(pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC),
+    }
+    if all(config in still for _, _, config, _ in pairs):
+        raise InputError(model.one_spot(source))
+
+
+def _report(
+    best: model.Candidate,
+    capture: Path,
+    names: list[str],
+    unreadable: dict[str, str],
+    wrong: list[str],
+    seconds: float,
+    reporter: StoppingReporter,
+) -> None:
+    """Write sfm.json, and report what was found and which photos have no pose and why."""
+    found = best.model
+    posed = sorted(found.image(number).name for number in found.reg_image_ids())
+    left_out = {**unreadable, **model.reasons(capture / WORK / database.NAME, names, posed, wrong)}
+    error = found.compute_mean_reprojection_error()
+    report = {
+        "photos": len(names) + len(unreadable),
+        "registered": len(posed),
+        "points": found.num_points3D(),
+        "reprojection_error": round(float(error), 4),
+        "mapper": best.mapper,
+        "cameras": found.num_cameras(),
+        "separate_sets": best.others,
+        "support": {name: round(best.agreement.support[name], 4) for name in posed},
+        "left_out": left_out,
+        "seconds": round(seconds, 1),
+    }
+    write_json(capture / WORK / REPORT, report)
+    for name, why in list(left_out.items())[:_WORST]:
+        reporter.warning(f"{name} has no pose: {why}.")
+    if len(left_out) > _WORST:
+        reporter.warning(f"{len(left_out) - _WORST} more photos have no pose; {capture / WORK / REPORT} lists them.")
+    if best.others and max(best.others) > 2:
+        reporter.warning(
+            f"The photos form separate sets, of {len(posed)} and {', '.join(map(str, best.others))} photos; the "
+            "largest is used. Photos that show both sets would connect them."
+        )
+    reporter.done(
+        message=f"{len(posed)} of {report['photos']} photos have a pose, with {report['points']:,} points and a mean "
+        f"reprojection error of {error:.2f} pixels.",
+        capture=str(capture),
+        **{key: report[key] for key in ("photos", "registered", "points", "reprojection_error")},
+    )

@@ -1,0 +1,91 @@
+"""COLMAP's database of features and matches: what it holds so far, read while another process writes it."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from ..shared.errors import InputError
+
+NAME = "database.db"
+FEWEST_INLIERS = 15
+"""Number of matches in agreement from which on COLMAP takes two photos to show the same."""
+
+_MOST_IMAGES = 2**31 - 1
+"""COLMAP's pair ID is this times the smaller image ID, plus the larger one."""
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[sqlite3.Connection]:
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=30.0)) as connection:
+            yield connection
+    except sqlite3.Error as error:
+        raise InputError(
+            f"{path} cannot be read ({error}); delete its folder and run the same command again."
+        ) from error
+
+
+def count_features(path: Path) -> int:
+    """Return the number of photos whose features are known; 0 if the database does not exist yet."""
+    return _count(path, "SELECT COUNT(*) FROM descriptors")
+
+
+def count_pairs(path: Path) -> int:
+    """Return the number of pairs of photos that were matched and verified; 0 if the database does not exist yet."""
+    return _count(path, "SELECT COUNT(*) FROM two_view_geometries")
+
+
+def _count(path: Path, query: str) -> int:
+    if not path.exists():
+        return 0
+    try:
+        with _reading(path) as database:
+            return int(database.execute(query).fetchone()[0])
+    except InputError:
+        return 0  # The tables are being made.
+
+
+def image_ids(path: Path) -> dict[str, int]:
+    """Map the names of the photos in the database to their IDs."""
+    with _reading(path) as database:
+        return {name: int(number) for number, name in database.execute("SELECT image_id, name FROM images")}
+
+
+def feature_counts(path: Path) -> dict[int, int]:
+    """Map the IDs of photos to their numbers of features."""
+    with _reading(path) as database:
+        return {int(number): int(rows) for number, rows in database.execute("SELECT image_id, rows FROM keypoints")}
+
+
+def largest_features(path: Path, image_id: int, most: int) -> np.ndarray:
+    """Return the descriptors (n, 128) uint8 of the photo's features with the largest scales, n <= `most`.
+
+    Large features are seen from afar and nearby, so a few of them tell whether two photos show the same.
+    """
+    with _reading(path) as database:
+        points = database.execute("SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (image_id,)).fetchone()
+        found = database.execute("SELECT rows, cols, data FROM descriptors WHERE image_id = ?", (image_id,)).fetchone()
+    if not points or not found or not found[0]:
+        return np.zeros((0, 128), np.uint8)
+    shapes = np.frombuffer(points[2], np.float32).reshape(points[0], points[1])
+    # An affine shape (a11, a12, a21, a22), or scale and orientation.
+    if points[1] >= 6:
+        size = np.abs(shapes[:, 2] * shapes[:, 5] - shapes[:, 3] * shapes[:, 4])
+    else:
+        size = shapes[:, 2] if points[1] > 2 else np.zeros(len(shapes))
+    rows = np.frombuffer(found[2], np.uint8).reshape(found[0], found[1])
+    return rows[np.argsort(-size, kind="stable")[:most]]
+
+
+def verified_pairs(path: Path) -> list[tuple[int, int, int, int]]:
+    """Return (first image ID, second image ID, COLMAP's configuration, number of inliers) of the verified pairs."""
+    with _reading(path) as database:
+        rows = database.execute(
+            "SELECT pair_id, config, rows FROM two_view_geometries WHERE rows >= ?", (FEWEST_INLIERS,)
+        ).fetchall()
+    return [(*divmod(int(pair), _MOST_IMAGES), int(config), int(count)) for pair, config, count in rows]

@@ -1,0 +1,152 @@
+"""The models that mappers made of a set of photos: choice of the best, removal of wrong poses, size, and reasons."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pycolmap
+
+from ..shared.errors import InputError
+from . import database
+from .agreement import Agreement, measure_agreement
+
+SPARSE = Path("sparse") / "0"
+DISTANCE = 2.0
+"""Median distance of points from the cameras that see them in a finished model, in units that are meters on average."""
+FEWEST_FEATURES = 100
+_LEAST_ANGLE = 1.5
+"""Median angle in degrees between the rays of a point, below which photos show no parallax."""
+
+
+class Candidate(NamedTuple):
+    """A model of a mapper.
+
+    Attributes:
+        mapper: "global" or "incremental".
+        model: the cameras, poses and points.
+        agreement: how it agrees with the matches.
+        others: numbers of photos of the mapper's other, separate models.
+    """
+
+    mapper: str
+    model: pycolmap.Reconstruction
+    agreement: Agreement
+    others: list[int]
+
+
+def read_candidate(mapper: str, folder: Path, path: Path) -> Candidate | None:
+    """Return the largest model that a mapper wrote to the subfolders of `folder`, or None without any."""
+    models = []
+    for each in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if (each / "images.bin").exists():
+            models.append(pycolmap.Reconstruction(each))
+    measured = [(model, measure_agreement(model, path)) for model in models if model.num_reg_images() > 1]
+    if not measured:
+        return None
+    measured.sort(key=lambda found: (len(found[1].trusted), found[0].num_points3D()), reverse=True)
+    return Candidate(mapper, *measured[0], [len(agreement.trusted) for _, agreement in measured[1:]])
+
+
+def best_of(candidates: Iterable[Candidate]) -> Candidate | None:
+    """Return the candidate with most photos whose poses are trusted; of equals, the one with more observations."""
+    return max(
+        candidates,
+        key=lambda each: (len(each.agreement.trusted), each.model.compute_num_observations()),
+        default=None,
+    )
+
+
+def drop_untrusted(candidate: Candidate) -> list[str]:
+    """Remove the poses of a model that are not trusted, and return the names of their photos."""
+    model = candidate.model
+    images = {number: model.image(number) for number in model.reg_image_ids()}
+    dropped = {number: image for number, image in images.items() if image.name not in candidate.agreement.trusted}
+    names = sorted(image.name for image in dropped.values())
+    for frame in {image.frame_id for image in dropped.values()}:
+        model.deregister_frame(frame)
+    return names
+
+
+def require_parallax(model: pycolmap.Reconstruction, photos: Path) -> None:
+    """Raise InputError if the photos of a model were taken from one spot."""
+    centers = {number: model.image(number).projection_center() for number in model.reg_image_ids()}
+    angles = []
+    for point in model.points3D.values():
+        rays = np.array([centers[each.image_id] for each in point.track.elements if each.image_id in centers])
+        rays = point.xyz - rays
+        rays = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+        angles.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0))) if len(rays) else 0.0)
+    if not angles or float(np.median(angles)) < _LEAST_ANGLE:
+        raise InputError(one_spot(photos))
+
+
+def one_spot(photos: Path) -> str:
+    """Return the sentence about photos without parallax."""
+    return (
+        f"The photos in {photos} were taken from one spot, so they show no depth; take them from different places, a "
+        "step apart."
+    )
+
+
+def to_common_size(model: pycolmap.Reconstruction) -> None:
+    """Scale a model, which has no size of its own, so that points are `DISTANCE` from their cameras in the median."""
+    distances = [
+        np.linalg.norm(model.points3D[point.point3D_id].xyz - image.projection_center())
+        for image in (model.image(number) for number in model.reg_image_ids())
+        for point in image.get_observation_points2D()
+    ]
+    middle = float(np.median(distances)) if distances else 1.0
+    if middle > 0:
+        scaled = np.column_stack([np.eye(3) * (DISTANCE / middle), np.zeros(3)])
+        model.transform(pycolmap.Sim3d(scaled))
+
+
+def write_model(model: pycolmap.Reconstruction, capture: Path) -> None:
+    """Write a model as the sparse/0 of a capture, replacing the one there at the end."""
+    target = capture / SPARSE
+    target.parent.mkdir(parents=True, exist_ok=True)
+    part, old = target.with_name("new"), target.with_name("old")
+    for folder in (part, old):
+        shutil.rmtree(folder, ignore_errors=True)
+    part.mkdir()
+    model.write(part)
+    if target.exists():
+        target.rename(old)
+    part.rename(target)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def reasons(path: Path, names: Sequence[str], posed: Iterable[str], wrong: Iterable[str]) -> Mapping[str, str]:
+    """Return why photos have no pose: name -> a few words.
+
+    Args:
+        path: the database.
+        names: all photos.
+        posed: those with a pose.
+        wrong: those whose pose was removed.
+    """
+    ids = database.image_ids(path)
+    features = database.feature_counts(path)
+    partners: dict[int, int] = {}
+    for first, second, _, _ in database.verified_pairs(path):
+        for number in (first, second):
+            partners[number] = partners.get(number, 0) + 1
+    found = {}
+    has_pose, is_wrong = set(posed), set(wrong)
+    for name in names:
+        identity = ids.get(name)
+        if name in has_pose:
+            continue
+        if name in is_wrong:
+            found[name] = "its matches contradict each other"
+        elif identity is None or features.get(identity, 0) < FEWEST_FEATURES:
+            found[name] = "it shows too few details, as when it is blurred or plain"
+        elif not partners.get(identity):
+            found[name] = "it shows nothing that another photo shows"
+        else:
+            found[name] = f"it matches {partners[identity]} other photos, but not well enough to place it"
+    return found

@@ -1,0 +1,92 @@
+"""One stage of COLMAP in a process of its own, since it cannot be stopped otherwise: `python -m backend.sfm.worker`.
+
+    worker extract DATABASE IMAGES GROUPS.json     features of the photos in each group, which share a camera
+    worker match DATABASE [PAIRS.txt]              matches of the pairs, or of all
+    worker incremental|global DATABASE IMAGES OUT  camera poses and points
+
+Photos and pairs whose results are in the database are skipped. Each line on standard output is one more photo with a
+pose.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pycolmap
+
+SEED = 0
+LONGEST_SIDE = 1600
+"""Side in pixels to which larger photos are scaled for the search of features."""
+MOST_FEATURES = 4096
+FEWEST_POSES = 3
+_BLOCK = 64
+"""Number of pairs after which matches are written to the database."""
+_ERRORS = 2
+"""Level of COLMAP's messages from which on they are kept."""
+_LOW_RESOLUTION = 640
+_FAINT = 0.004
+"""Threshold of features in photos below `_LOW_RESOLUTION` pixels, which have too few otherwise."""
+
+
+def extract(database: str, images: str, groups: str) -> None:
+    """Find the features of photos; each group of names shares a camera, whose focal length EXIF may tell."""
+    for group in json.loads(Path(groups).read_text(encoding="utf-8")):
+        options = pycolmap.FeatureExtractionOptions()
+        options.use_gpu = False
+        options.max_image_size = LONGEST_SIDE
+        options.sift.max_num_features = MOST_FEATURES
+        if group["longest"] < _LOW_RESOLUTION:
+            options.sift.peak_threshold = _FAINT
+        pycolmap.extract_features(
+            database, images, image_names=group["names"], camera_mode=pycolmap.CameraMode.SINGLE,
+            extraction_options=options,
+        )  # fmt: skip
+
+
+def match(database: str, pairs: str = "") -> None:
+    """Match and verify pairs of photos, those in a file or all."""
+    options = pycolmap.FeatureMatchingOptions()
+    options.use_gpu = False
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    if pairs:
+        listed = pycolmap.ImportedPairingOptions()
+        listed.match_list_path, listed.block_size = pairs, _BLOCK
+        pycolmap.match_image_pairs(database, options, listed, verification)
+    else:
+        every = pycolmap.ExhaustivePairingOptions()
+        every.block_size = int(_BLOCK**0.5)
+        pycolmap.match_exhaustive(database, options, every, verification)
+
+
+def map_incrementally(database: str, images: str, out: str) -> None:
+    """Add one photo after another to the model."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed, options.min_model_size = SEED, FEWEST_POSES
+
+    def tell() -> None:
+        print("pose", flush=True)
+
+    pycolmap.incremental_mapping(database, images, out, options=options, next_image_callback=tell)
+
+
+def map_globally(database: str, images: str, out: str) -> None:
+    """Solve for all rotations, then all positions at once (GLOMAP)."""
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed, options.min_model_size = SEED, FEWEST_POSES
+    pycolmap.global_mapping(database, images, out, options=options)
+
+
+STAGES: dict[str, Callable[..., None]] = {
+    "extract": extract,
+    "match": match,
+    "incremental": map_incrementally,
+    "global": map_globally,
+}
+
+if __name__ == "__main__":
+    pycolmap.logging.minloglevel = _ERRORS
+    STAGES[sys.argv[1]](*sys.argv[2:])
