@@ -114,7 +114,7 @@ def _require_space(paths: Sequence[Path], capture: Path) -> None:
 
 
 def _described(path: Path, relative: Path) -> Photo:
-    """Return a photo with its camera: size and, where EXIF tells them, maker, model and focal length."""
+    """Return a photo with its camera: folder, size and, where EXIF tells them, maker, model and focal length."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -127,7 +127,7 @@ def _described(path: Path, relative: Path) -> Photo:
     details = exif.get_ifd(ExifTags.IFD.Exif)
     maker = [str(exif.get(tag, "")).strip("\0 ") for tag in (ExifTags.Base.Make, ExifTags.Base.Model)]
     focal = details.get(ExifTags.Base.FocalLength, "")
-    return Photo(relative.as_posix(), " ".join([f"{size[0]}x{size[1]}", *maker, str(focal)]).strip())
+    return Photo(relative.as_posix(), " ".join([str(relative.parent), f"{size[0]}x{size[1]}", *maker, str(focal)]))
 
 
 def _copied(path: Path, relative: Path, images: Path) -> Path:

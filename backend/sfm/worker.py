@@ -3,6 +3,7 @@
     worker extract DATABASE IMAGES GROUPS.json     features of the photos in each group, which share a camera
     worker match DATABASE [PAIRS.txt]              matches of the pairs, or of all
     worker incremental|global DATABASE IMAGES OUT  camera poses and points
+    worker lens MODEL OUT                          the same with a second term of distortion, where photos show one
 
 Photos and pairs whose results are in the database are skipped. Each line on standard output is one more photo with a
 pose.
@@ -22,13 +23,15 @@ LONGEST_SIDE = 1600
 """Side in pixels to which larger photos are scaled for the search of features."""
 MOST_FEATURES = 4096
 FEWEST_POSES = 3
+_WORTH = 0.98
+"""Reprojection error with a second term of distortion, relative to that with one, below which it is used."""
 _BLOCK = 64
 """Number of pairs after which matches are written to the database."""
 _ERRORS = 2
 """Level of COLMAP's messages from which on they are kept."""
-_LOW_RESOLUTION = 640
-_FAINT = 0.004
-"""Threshold of features in photos below `_LOW_RESOLUTION` pixels, which have too few otherwise."""
+_FAINT = 0.003
+"""Least contrast of a feature, below COLMAP's 0.0067: plain or small photos have too few otherwise, and others reach
+`MOST_FEATURES` anyway."""
 
 
 def extract(database: str, images: str, groups: str) -> None:
@@ -38,10 +41,9 @@ def extract(database: str, images: str, groups: str) -> None:
         options.use_gpu = False
         options.max_image_size = LONGEST_SIDE
         options.sift.max_num_features = MOST_FEATURES
-        if group["longest"] < _LOW_RESOLUTION:
-            options.sift.peak_threshold = _FAINT
+        options.sift.peak_threshold = _FAINT
         pycolmap.extract_features(
-            database, images, image_names=group["names"], camera_mode=pycolmap.CameraMode.SINGLE,
+            database, images, image_names=group, camera_mode=pycolmap.CameraMode.SINGLE,
             extraction_options=options,
         )  # fmt: skip
 
@@ -80,11 +82,31 @@ def map_globally(database: str, images: str, out: str) -> None:
     pycolmap.global_mapping(database, images, out, options=options)
 
 
+def refine_lens(model: str, out: str) -> None:
+    """Refine a model with one and with two terms of radial distortion, and write the second if it is worth it.
+
+    One term is safer where the photos do not determine the second, which then bends the whole scene a little.
+    """
+    refined = {}
+    for kind in ("SIMPLE_RADIAL", "RADIAL"):
+        found = refined[kind] = pycolmap.Reconstruction(model)
+        for camera in found.cameras.values():
+            if kind == "RADIAL":
+                camera.model, camera.params = pycolmap.CameraModelId.RADIAL, [*camera.params, 0.0]
+        options = pycolmap.BundleAdjustmentOptions()
+        options.refine_principal_point = options.ceres.use_gpu = options.print_summary = False
+        pycolmap.bundle_adjustment(found, options)
+        found.update_point_3d_errors()
+    one, two = (found.compute_mean_reprojection_error() for found in refined.values())
+    refined["RADIAL" if two < _WORTH * one else "SIMPLE_RADIAL"].write(out)
+
+
 STAGES: dict[str, Callable[..., None]] = {
     "extract": extract,
     "match": match,
     "incremental": map_incrementally,
     "global": map_globally,
+    "lens": refine_lens,
 }
 
 if __name__ == "__main__":

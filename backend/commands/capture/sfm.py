@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import time
 from pathlib import Path
 
 import pycolmap
-from PIL import Image as PilImage
 
 from ...capture.models import read_capture_model
 from ...sfm import database, model
@@ -70,7 +70,7 @@ def _run(source: Path, capture: Path, options: argparse.Namespace, reporter: Sto
     images, path, log = capture / IMAGES, work / database.NAME, work / "colmap.log"
     reporter.expect({
         "photos": ("Photos", 2.0), "extract": ("Features", 30.0), "pairs": ("Pairs", 0.1), "match": ("Matching", 30.0),
-        "global": ("Poses", 10.0), "incremental": ("Poses", 5.0),
+        "global": ("Poses", 10.0), "incremental": ("Poses", 5.0), "lens": ("Poses", 2.0),
     })  # fmt: skip
     reporter.begin("photos", "Reading the photos")
     photos, unreadable = take_photos(source, capture, reporter)
@@ -80,10 +80,11 @@ def _run(source: Path, capture: Path, options: argparse.Namespace, reporter: Sto
     reporter.expect({
         "extract": ("Features", _EXTRACT * count), "match": ("Matching", _MATCH * pairs_expected),
         "global": ("Poses", _MAP * count), "incremental": ("Poses", 0.1 * _MAP * count),
+        "lens": ("Poses", 0.2 * _MAP * count),
     })  # fmt: skip
 
     groups = work / "groups.json"
-    write_json(groups, _groups(photos, images, options.cameras))
+    write_json(groups, _groups(photos, options.cameras))
     reporter.begin("extract", f"Finding features in {count} photos")
     if not run_stage(
         reporter, log, ["extract", str(path), str(images), str(groups)], lambda _: database.count_features(path), count
@@ -121,22 +122,34 @@ def _run(source: Path, capture: Path, options: argparse.Namespace, reporter: Sto
         )
     wrong = model.drop_untrusted(best)
     model.require_parallax(best.model, source)
+    best = best._replace(model=_with_best_lens(best.model, work, log, reporter))
     model.to_common_size(best.model)
     model.write_model(best.model, capture)
     read_capture_model(capture)
     _report(best, capture, names, unreadable, wrong, time.monotonic() - started, reporter)
 
 
-def _groups(photos: list[Photo], images: Path, cameras: str) -> list[dict]:
-    """Return the photos of each camera with the longest side of a photo."""
+def _with_best_lens(
+    found: pycolmap.Reconstruction, work: Path, log: Path, reporter: StoppingReporter
+) -> pycolmap.Reconstruction:
+    """Return a model after a last adjustment, or the model itself if that fails."""
+    reporter.begin("lens", "Refining lenses and poses")
+    before, after = work / "chosen", work / "refined"
+    for folder in (before, after):
+        shutil.rmtree(folder, ignore_errors=True)
+        make_folder(folder)
+    found.write(before)
+    if run_stage(reporter, log, ["lens", str(before), str(after)], lambda lines: lines, 1):
+        return pycolmap.Reconstruction(after)
+    return found
+
+
+def _groups(photos: list[Photo], cameras: str) -> list[list[str]]:
+    """Return the names of the photos of each camera."""
     groups: dict[str, list[str]] = {}
     for photo in photos:
         groups.setdefault({"one": "", "each": photo.name}.get(cameras, photo.camera), []).append(photo.name)
-    found = []
-    for names in groups.values():
-        with PilImage.open(images / names[0]) as image:
-            found.append({"names": names, "longest": max(image.size)})
-    return found
+    return list(groups.values())
 
 
 def _require_matches(path: Path, source: Path) -> None:
