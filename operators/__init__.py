@@ -15,6 +15,7 @@ def _classes() -> list[type]:
         assign_objects,
         group_objects,
         import_capture,
+        import_photos,
         make_demo,
         open_reconstruction,
         orient,
@@ -50,6 +51,7 @@ def _classes() -> list[type]:
 
     modules = (
         import_capture,
+        import_photos,
         make_demo,
         assign_objects,
         analyze_capture,
@@ -97,6 +99,7 @@ def _classes() -> list[type]:
 
 
 def _import_menu(menu: Any, _context: Any) -> None:
+    menu.layout.operator("objectgs.import_photos", text="ObjectGS Photos")
     menu.layout.operator("objectgs.import_capture", text="ObjectGS Capture (COLMAP and others)")
     menu.layout.operator("objectgs.import_splats", text="3D Gaussian Splats (.ply, .spz, .splat)")
 

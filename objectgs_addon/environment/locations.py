@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,15 @@ def new_reconstruction(name: str, is_free: Callable[[Path], bool]) -> Path:
     name = file_stem(name, "capture")
     numbered = (name if number == 1 else f"{name}-{number}" for number in itertools.count(1))
     return next(folder for each in numbered if is_free(folder := reconstructions_folder() / each))
+
+
+def new_capture(photos: Path) -> Path:
+    """Return the folder for the capture of a folder of photos, where its computation may have begun before."""
+    generic = photos.name.lower() in ("images", "photos", "dcim")
+    name = file_stem(photos.parent.name if generic else photos.name, "photos")
+    mark = f"{zlib.crc32(str(photos).encode()):08x}"
+    chosen = preferences().reconstructions if preferences() else ""
+    return (Path(bpy.path.abspath(chosen)) if chosen else user_folder()) / "captures" / f"{name}-{mark}"
 
 
 def backend_python() -> Path | None:

@@ -15,7 +15,7 @@ from ..running import background
 from ..running.job_display import write
 from ..state import folder_trust
 from ..state.folder_state import folder_state
-from ..state.next_step import RESUME, Step, next_step
+from ..state.next_step import IMPORT, RESUME, Step, next_step
 from .preferences import draw_online_access
 from .tab import Tab, draw_job
 
@@ -47,7 +47,7 @@ class CapturePanel(Tab, bpy.types.Panel):
         jobs = [
             (index, job)
             for index, job in enumerate(background.queue.jobs)
-            if job.kind in ("import", "import-splats", "demo", "setup") and not job.is_finished
+            if job.kind in ("sfm", "import", "import-splats", "demo", "setup") and not job.is_finished
         ]
         if active is not None:
             row = layout.row(align=True)
@@ -85,6 +85,7 @@ def draw_message(layout: bpy.types.UILayout) -> None:
 
 
 def _draw_add(layout: bpy.types.UILayout) -> None:
+    layout.operator("objectgs.import_photos", icon="IMAGE_DATA")
     layout.operator("objectgs.import_capture", icon="IMPORT")
     layout.operator("objectgs.open_reconstruction", icon="FILE_FOLDER")
     layout.operator("objectgs.make_demo", icon="MESH_MONKEY")
@@ -123,6 +124,9 @@ def _draw_next_step(layout: bpy.types.UILayout, step: Step, jobs: list[tuple[int
     button = column.row()
     button.enabled = not (jobs or is_busy)
     button.scale_y = 1.5
+    if step == IMPORT:
+        button = button.column(align=True)
+        button.operator("objectgs.import_photos", icon="IMAGE_DATA")
     operator = button.operator(step.operator, text=step.label, icon=step.icon)
     for name, value in step.options:
         setattr(operator, name, value)

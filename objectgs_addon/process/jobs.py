@@ -54,7 +54,7 @@ class Job:
 
     Attributes:
         title: name shown to the user.
-        kind: import, import-splats, plan, vote, train, mesh, export, film, fill, demo, setup or doctor.
+        kind: sfm, import, import-splats, plan, vote, train, mesh, export, film, fill, demo, setup or doctor.
         folder: the reconstruction folder, or None.
         command: program and arguments.
         cwd: working directory.
@@ -127,8 +127,8 @@ class Job:
 
     @property
     def can_pause(self) -> bool:
-        """Whether the job can be paused; only a running training job can."""
-        return self.kind == "train" and self.state is State.RUNNING
+        """Whether the job can be paused: a running training, or a computation of poses."""
+        return self.kind in ("train", "sfm") and self.state is State.RUNNING
 
     @property
     def lead_miou(self) -> tuple[str, float] | None:
@@ -138,13 +138,13 @@ class Job:
         return None if value is None else (MIOU_LABELS[name], value)
 
     def pause(self) -> None:
-        """Pause a running training job."""
+        """Pause a running job that can be paused."""
         if self.can_pause and self._child.send("pause"):
             self._paused_at = time.monotonic()
             self._set(State.PAUSED)
 
     def resume(self) -> None:
-        """Resume a paused training job."""
+        """Resume a paused job."""
         if self.state is State.PAUSED and self._child.send("resume"):
             self._shift_clock()
             self._set(State.RUNNING)

@@ -30,9 +30,11 @@ INTERVAL = 0.1
 """Time in seconds between two polls of the queue."""
 DRAW_EVERY = 1.0
 """Minimum time in seconds between two redraws for new figures."""
+_SHOWN_WARNINGS = 3
 
 _REMEDIES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "import": ("objectgs.import_capture", "Choose Another Folder...", {}),
+    "sfm": ("objectgs.import_photos", "Choose Another Folder...", {}),
     "import-splats": ("objectgs.import_splats", "Choose Another File...", {}),
     "setup": ("objectgs.set_up_backend", "Try Again", {}),
 }
@@ -215,7 +217,7 @@ def finish(job: Job) -> None:
     object_edits.flush()
     submitted_in = _submitted_in.pop(job, None)
     owner = next((owner for owner in bpy.data.scenes if owner.session_uid == submitted_in), None)
-    show = _import_demo if job.kind == "demo" else results.SHOW_BY_KIND.get(job.kind)
+    show = _import_made if job.kind in ("demo", "sfm") else results.SHOW_BY_KIND.get(job.kind)
     if show is not None and show(job, owner):
         _push_undo(job.title)
     if job.kind == "import" and owner is not None and not bpy.app.background:
@@ -224,14 +226,18 @@ def finish(job: Job) -> None:
         fill_holes(root, again=False)
 
 
-def _import_demo(job: Job, owner: bpy.types.Scene | None) -> bool:
-    """Import the new demo capture if the backend is set up; return False."""
+def _import_made(job: Job, owner: bpy.types.Scene | None) -> bool:
+    """Import the capture that a job has made if the backend is set up; return False."""
+    assert job.folder is not None
+    if job.kind == "sfm":
+        messages.show(" ".join([f"{job.title}: {job.message}", *job.warnings[:_SHOWN_WARNINGS]]))
     if owner is None or locations.backend_python() is None:
-        messages.show(f"The demo capture is in {job.folder}; set up the backend, then import it")
+        messages.show(f"The new capture is in {job.folder}; set up the backend, then import it")
         return False
-    folder = locations.reconstructions_folder() / "demo"
+    name = "demo" if job.kind == "demo" else job.folder.name
+    folder = locations.reconstructions_folder() / name
     submit(
-        locations.backend_job("Import demo", "import", folder, "import", str(job.folder), "--out", str(folder)),
+        locations.backend_job(f"Import {name}", "import", folder, "import", str(job.folder), "--out", str(folder)),
         owner,
         lambda _kind, text: messages.show(text, "ERROR"),
     )

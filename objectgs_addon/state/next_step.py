@@ -34,7 +34,8 @@ IMPORT = Step(
     "objectgs.import_capture",
     "Import Capture",
     "IMPORT",
-    "A capture is a folder of photos with their cameras, as COLMAP and others compute them, and masks of the objects.",
+    "Photos: a folder of photos; where they were taken is computed, which takes minutes. Capture: photos with their "
+    "cameras, as COLMAP and others compute them, and masks of the objects.",
 )
 ASSIGN = Step(
     "objectgs.assign_objects", "Assign Objects", "GROUP_VERTEX", "The masks decide which object each point belongs to."

@@ -465,7 +465,7 @@ def test_blend_file_without_folder_opens(root, folder, tmp_path):
     shown = next(child for child in owner.collection.children if blender_scene.kind_of(child) == "reconstruction")
     assert set(blender_scene.object_collections(shown)) == {0, *OBJECTS}
     blender_scene.color_points_by(shown, "object")
-    with pytest.raises(InputError, match="no cameras.json"):
+    with pytest.raises(InputError, match=r"no cameras\.json"):
         blender_scene.show_capture(owner, blender_scene.folder_of(shown), shown)
     with pytest.raises(InputError, match="train first"):
         again(shown, folder)

@@ -1,0 +1,275 @@
+"""Poses of photos alone: against the exact poses of rendered photos, after stops, and with photos that do not fit."""
+
+import functools
+import json
+import shutil
+import threading
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from backend.cli import main as command_line
+from backend.sfm import agreement, database, pairs, stages
+from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE
+
+WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
+VIEWS = 7
+
+
+@functools.cache
+def texture(seed: int, size: int = 512) -> np.ndarray:
+    """Return a random texture (size, size, 3) with details of many sizes."""
+    rng = np.random.default_rng(seed)
+    values = np.zeros((size, size, 3))
+    for cells in (8, 16, 32, 64, 128):
+        small = Image.fromarray(rng.integers(0, 256, (cells, cells, 3), np.uint8))
+        values += np.asarray(small.resize((size, size), Image.Resampling.BICUBIC), float)
+    values -= values.min()
+    return 255 * values / values.max()
+
+
+def pose(center, target) -> np.ndarray:
+    """Return the world-to-camera matrix (3, 4) of a camera at `center` that looks at `target`, with y down."""
+    forward = np.asarray(target, float) - center
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return np.column_stack([rotation, -rotation @ center])
+
+
+def photo(matrix: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Render a textured floor, two walls and two boxes as (HEIGHT, WIDTH, 3) uint8."""
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    rays = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL, np.ones_like(x)], -1) @ matrix[:, :3]
+    center = -matrix[:, :3].T @ matrix[:, 3]
+    nearest, image = np.full(x.shape, np.inf), np.zeros((*x.shape, 3))
+    planes = [(2, 0.0, None), (1, 2.5, None), (0, -2.5, None)]
+    for low, high in (((-0.6, -0.3, 0.0), (0.0, 0.4, 0.7)), ((0.4, -0.7, 0.0), (0.9, 0.0, 0.4))):
+        planes += [(axis, side, (low, high)) for axis in range(3) for side in (low[axis], high[axis])]
+    for number, (axis, at, box) in enumerate(planes):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = (at - center[axis]) / rays[..., axis]
+            place = center + distance[..., None] * rays
+        hit = (distance > 0) & (distance < nearest)
+        for other in range(3):
+            if box is not None and other != axis:
+                hit &= (place[..., other] >= box[0][other]) & (place[..., other] <= box[1][other])
+        across = np.nan_to_num(place[..., [other for other in range(3) if other != axis]], posinf=0, neginf=0)
+        cells = (np.clip(across, -50, 50) * 160).astype(int) % 512
+        nearest = np.where(hit, distance, nearest)
+        image = np.where(hit[..., None], texture(seed + number)[cells[..., 0], cells[..., 1]], image)
+    return image.astype(np.uint8)
+
+
+def write_photos(folder, matrices, seed: int = 0, names=None) -> None:
+    folder.mkdir(parents=True)
+    for number, matrix in enumerate(matrices):
+        name = names[number] if names else f"photo {number + 1}.png"  # A space, and 10 after 9.
+        Image.fromarray(photo(matrix, seed)).save(folder / name)
+
+
+def ring(count: int = VIEWS, turn: float = 0.0) -> list[np.ndarray]:
+    angles = turn + np.linspace(-1.0, 0.2, count)
+    centers = np.stack([2.2 * np.cos(angles), 2.2 * np.sin(angles), 1.2 + 0.1 * np.sin(5 * angles)], 1)
+    return [pose(center, (0.1, 0.0, 0.3)) for center in centers]
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    """A folder with images/ of the ring, masks/ and names, and the exact poses."""
+    folder = tmp_path_factory.mktemp("photos") / "room"
+    write_photos(folder / "images", ring())
+    (folder / "masks").mkdir()
+    for number in range(VIEWS):
+        Image.fromarray(np.ones((HEIGHT, WIDTH), np.uint8)).save(folder / "masks" / f"photo {number + 1}.png")
+    (folder / "labels.json").write_text('{"1": "box"}')
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made(photos, tmp_path_factory):
+    """The capture that `sfm` makes of them."""
+    capture = tmp_path_factory.mktemp("made") / "room"
+    assert command_line.main(["sfm", str(photos), "--out", str(capture)]) == EXIT_DONE
+    return capture
+
+
+def pose_errors(capture, matrices) -> tuple[np.ndarray, np.ndarray]:
+    """Return the errors of rotations in degrees, and of positions relative to the size of the ring, after a fit."""
+    model = pycolmap.Reconstruction(capture / "sparse" / "0")
+    found = {model.image(i).name: model.image(i).cam_from_world().matrix() for i in model.reg_image_ids()}
+    names = [f"photo {number + 1}.png" for number in range(len(matrices))]
+    true = {name: matrix for name, matrix in zip(names, matrices) if name in found}
+    here = np.array([-found[name][:, :3].T @ found[name][:, 3] for name in true])
+    there = np.array([-matrix[:, :3].T @ matrix[:, 3] for matrix in true.values()])
+    a, b = here - here.mean(0), there - there.mean(0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    flip = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    rotation = u @ flip @ vt
+    moved = (s * np.diag(flip)).sum() / (a**2).sum() * a @ rotation.T
+    turns = [found[name][:, :3] @ rotation.T @ true[name][:, :3].T for name in true]
+    degrees = np.degrees([np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)) for turn in turns])
+    return degrees, np.linalg.norm(moved - b, axis=1) / np.linalg.norm(np.ptp(there, axis=0))
+
+
+def test_poses_are_those_of_the_photos(made, photos):
+    report = json.loads((made / "sfm" / "sfm.json").read_text())
+    assert report["registered"] == report["photos"] == VIEWS and not report["left_out"]
+    assert report["points"] > 300 and report["reprojection_error"] < 0.6
+    degrees, positions = pose_errors(made, ring())
+    assert len(degrees) == VIEWS and np.median(degrees) < 0.3 and np.median(positions) < 0.01
+    assert (made / "masks" / "photo 1.png").exists() and (made / "labels.json").exists()
+    for path in (photos / "images").iterdir():
+        assert (made / "images" / path.name).read_bytes() == path.read_bytes()
+
+
+def test_capture_can_be_imported_and_is_kept_by_a_second_run(made, run_command, tmp_path):
+    assert run_command("import", made, "--out", tmp_path / "out").code == EXIT_DONE
+    before = pycolmap.Reconstruction(made / "sparse" / "0").num_reg_images()
+    result = run_command("sfm", made, "--out", made)
+    assert result.code == EXIT_DONE and pycolmap.Reconstruction(made / "sparse" / "0").num_reg_images() == before
+
+
+def test_stopped_command_goes_on(photos, tmp_path, run_command, monkeypatch):
+    """Features and matches are kept; the pairs that are known are not matched again."""
+    capture = tmp_path / "capture"
+    real = stages.run_stage
+
+    def stop_after_matching(reporter, log, arguments, count, total):
+        if arguments[0] == "global":
+            reporter.stop._stopped = True
+        return real(reporter, log, arguments, count, total)
+
+    monkeypatch.setattr("backend.commands.capture.sfm.run_stage", stop_after_matching)
+    assert run_command("sfm", photos, "--out", capture).code == EXIT_CANCELLED
+    path = capture / "sfm" / database.NAME
+    assert not (capture / "sparse").exists()
+    assert database.count_features(path) == VIEWS and database.count_pairs(path) == VIEWS * (VIEWS - 1) // 2
+    monkeypatch.undo()
+    assert run_command("sfm", photos, "--out", capture).code == EXIT_DONE
+    assert (capture / "sparse" / "0" / "images.bin").exists()
+
+
+def test_killed_mapper_leaves_the_earlier_model(made, photos, tmp_path, monkeypatch, run_command):
+    capture = shutil.copytree(made, tmp_path / "capture")
+    before = (capture / "sparse" / "0" / "images.bin").read_bytes()
+    monkeypatch.setattr(stages, "_KILLED", (0,))
+    result = run_command("sfm", photos, "--out", capture)
+    assert result.code == EXIT_BAD_INPUT and "The system ended COLMAP" in result.err
+    assert (capture / "sparse" / "0" / "images.bin").read_bytes() == before
+
+
+def test_photos_that_do_not_fit_are_named_with_the_reason(photos, tmp_path, run_command):
+    folder = shutil.copytree(photos / "images", tmp_path / "mixed")
+    Image.fromarray(photo(ring()[0], seed=900)).save(folder / "zz other room.png")
+    Image.fromarray(np.full((HEIGHT, WIDTH, 3), 128, np.uint8)).save(folder / "zz plain.png")
+    (folder / "zz broken.jpg").write_bytes(b"\xff\xd8\xff")
+    result = run_command("sfm", folder, "--out", tmp_path / "capture")
+    assert result.code == EXIT_DONE
+    left_out = json.loads((tmp_path / "capture" / "sfm" / "sfm.json").read_text())["left_out"]
+    assert set(left_out) == {"zz other room.png", "zz plain.png", "zz broken.jpg"}
+    assert "nothing that another photo shows" in left_out["zz other room.png"]
+    assert "too few details" in left_out["zz plain.png"] and "damaged" in left_out["zz broken.jpg"]
+
+
+def test_photos_from_one_spot_are_refused(tmp_path, run_command):
+    targets = [(0.1 + 0.12 * step, 0.05 * step, 0.3) for step in range(6)]
+    write_photos(tmp_path / "spot", [pose((2.0, -0.8, 1.2), target) for target in targets])
+    result = run_command("sfm", tmp_path / "spot", "--out", tmp_path / "capture")
+    assert result.code == EXIT_BAD_INPUT and "were taken from one spot" in result.err
+    assert not (tmp_path / "capture" / "sparse").exists()
+
+
+@pytest.mark.parametrize(
+    ("count", "sentence"), [(0, "contains no photos"), (1, "contains only one photo"), (2, "No two photos in")]
+)
+def test_photos_that_cannot_work_are_refused(tmp_path, run_command, count, sentence):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for number in range(count):
+        Image.fromarray(photo(ring()[0], seed=100 * number)).save(folder / f"{number}.png")
+    result = run_command("sfm", folder, "--out", tmp_path / "capture")
+    assert result.code == EXIT_BAD_INPUT and sentence in result.err
+    assert count == 2 or not (tmp_path / "capture").exists(), "nothing is left of what could not begin"
+
+
+def test_folders_of_others_are_kept(photos, tmp_path, run_command, made):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("Dear")
+    result = run_command("sfm", photos, "--out", tmp_path / "mine")
+    assert result.code == EXIT_BAD_INPUT and "contains other files" in result.err
+    other = shutil.copytree(made, tmp_path / "model")
+    shutil.rmtree(other / "sfm")
+    result = run_command("sfm", other, "--out", other)
+    assert result.code == EXIT_BAD_INPUT and "has a COLMAP model already" in result.err
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["letter.txt"]
+
+
+def test_pause_suspends_the_process(monkeypatch):
+    """The child is suspended until the pause ends."""
+    calls = []
+
+    class Child:
+        def __init__(self, _pid): ...
+
+        def suspend(self):
+            calls.append("suspend")
+
+        def resume(self):
+            calls.append("resume")
+
+    monkeypatch.setattr(stages.psutil, "Process", Child)
+
+    class Request:
+        paused = True
+
+        def __call__(self):
+            threading.Event().wait(0.01)
+            calls.append("waited")
+            return False
+
+    stages._wait_while_paused(type("P", (), {"pid": 1}), type("R", (), {"stop": Request()})())
+    assert calls == ["suspend", "waited", "resume"]
+
+
+def test_wrong_pose_is_not_trusted(made, tmp_path):
+    """A photo at another place has few matches near their epipolar lines, whatever its reprojection error is."""
+    path = made / "sfm" / database.NAME
+    model = pycolmap.Reconstruction(made / "sparse" / "0")
+    assert len(agreement.measure_agreement(model, path).trusted) == VIEWS
+    image = model.find_image_with_name("photo 3.png")
+    moved = pycolmap.Rigid3d(np.column_stack([pose((-2.0, 1.5, 1.0), (0.3, 0.0, 0.2))]))
+    model.frame(image.frame_id).set_cam_from_world(image.camera_id, moved)
+    found = agreement.measure_agreement(model, path)
+    assert found.support["photo 3.png"] < 0.3 and "photo 3.png" not in found.trusted
+    assert len(found.trusted) == VIEWS - 1
+
+
+def test_epipolar_errors_are_zero_for_exact_matches():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.5, (50, 3))
+    first, second = ring()[0], ring()[3]
+
+    def seen(matrix):
+        local = points @ matrix[:, :3].T + matrix[:, 3]
+        return local[:, :2] / local[:, 2:]
+
+    assert agreement.epipolar_errors(first, second, seen(first), seen(second)).max() < 1e-9
+    assert np.median(agreement.epipolar_errors(first, ring()[5], seen(first), seen(second))) > 0.005
+    assert np.isinf(agreement.epipolar_errors(first, second, seen(first)[:1] * np.nan, seen(second)[:1])).all()
+
+
+def test_pairs_of_large_sets_are_those_that_show_the_same(made, monkeypatch):
+    path = made / "sfm" / database.NAME
+    names = sorted(database.image_ids(path))
+    assert pairs.choose_pairs(path, names) is None, "all pairs of a small set"
+    monkeypatch.setattr(pairs, "ALL_UP_TO", 2)
+    assert pairs.choose_pairs(path, names) is None, "COLMAP's lists have no names with spaces"
+    monkeypatch.setattr(pairs, "NEIGHBORS", 1)
+    monkeypatch.setattr(pairs.database, "image_ids", lambda _: {f"{i}": i for i in database.feature_counts(path)})
+    chosen = pairs.choose_pairs(path, [str(number) for number in range(1, VIEWS + 1)])
+    assert len(chosen) < VIEWS and {name for pair in chosen for name in pair} == {str(i) for i in range(1, VIEWS + 1)}
+    assert all(abs(int(first) - int(second)) <= 2 for first, second in chosen), "neighbors of the ring"
