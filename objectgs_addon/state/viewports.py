@@ -11,7 +11,6 @@ import numpy as np
 
 from .. import drawing, scene
 
-
 _switched: set[int] = set()
 """Viewports in Solid mode that show the preview in Material Preview while drawing is switched off."""
 
