@@ -1,10 +1,11 @@
 """The paper's ablations: semantics, voting, weight of the ID loss, splats per anchor, primitives and models.
 
-    python benchmarks/ablations.py [--capture FOLDER ...] [--steps 400] [--seeds 3] [--write]
+    python benchmarks/ablations.py [--capture FOLDER ...] [--steps 400] [--seeds 3] [--add] [--write]
 
 Every variant is trained with the same number of steps from the same points, and measured on the held-out views; figures
 are means over the seeds with their standard deviation. --write writes docs/figures/ablations.json and
-docs/ablations.md, with the paper's figures beside ours. Results are kept in build/ablations, so a stopped run goes on.
+docs/ablations.md, with the paper's figures beside ours. Results are kept in build/ablations, so a stopped run goes on;
+--add measures only the seeds that docs/figures/ablations.json lacks, and keeps the others.
 """
 
 from __future__ import annotations
@@ -268,6 +269,11 @@ def _reading(captures: Mapping[str, Any]) -> str:
     )
 
 
+def _name(capture: Path) -> str:
+    """Return the name of a capture in the tables."""
+    return capture.parent.name if capture.name == "capture" else capture.name
+
+
 def _key(variant: Variant) -> str:
     """Return what tells trainings apart; the default is in every table and trained once."""
     return str(sorted(variant.change.items()))
@@ -279,19 +285,26 @@ def main() -> None:
     parser.add_argument("--capture", type=Path, nargs="+", default=[ROOT / "build/demo/capture"])
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--add", action="store_true")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     shared.compile_everything()
+    names = [_name(capture) for capture in options.capture]
+    earlier = documents.load("ablations") if options.add else {"seeds": 0, "steps": options.steps, "captures": {}}
+    if options.add and (earlier["steps"], list(earlier["captures"])) != (options.steps, names):
+        raise SystemExit(
+            f"docs/figures/ablations.json has {earlier['steps']} steps of {', '.join(earlier['captures'])}"
+        )
     runs = {_key(variant): variant for table in TABLES.values() for variant in table.variants}
     code = [*shared.sources(), Path(__file__), Path(__file__).with_name("semantics.py")]
     results = shared.Results(
         ROOT / "build" / "ablations", shared.digest(code, options.steps),
-        len(options.capture) * len(runs) * options.seeds,
+        len(options.capture) * len(runs) * (options.seeds - earlier["seeds"]),
     )  # fmt: skip
     found: dict[str, Any] = {"steps": options.steps, "seeds": options.seeds, "captures": {}}
     # Seed by seed, so that a stopped run has a seed of everything.
     rows: dict[str, dict[str, list[dict[str, Any]]]] = {str(capture): {} for capture in options.capture}
-    for seed in range(options.seeds):
+    for seed in range(earlier["seeds"], options.seeds):
         for capture in options.capture:
             for key, variant in runs.items():
                 row = results.get(
@@ -306,13 +319,19 @@ def main() -> None:
     if results.failures:
         raise SystemExit("Not measured: " + "; ".join(f"{name}: {why}" for name, why in results.failures.items()))
     for capture in options.capture:
-        of = rows[str(capture)]
-        name = capture.parent.name if capture.name == "capture" else capture.name
+        of, name = rows[str(capture)], _name(capture)
+        before = earlier["captures"].get(name, {"objects": 0, "figures": {}})
         found["captures"][name] = {
-            "objects": next(iter(of.values()))[0]["objects"],
+            "objects": before["objects"] or next(iter(of.values()))[0]["objects"],
             "figures": {
                 key: {
-                    variant.name: {figure: [row[figure] for row in of[_key(variant)]] for figure in FIGURES}
+                    variant.name: {
+                        figure: [
+                            *before["figures"].get(key, {}).get(variant.name, {}).get(figure, ()),
+                            *(row[figure] for row in of.get(_key(variant), ())),
+                        ]
+                        for figure in FIGURES
+                    }
                     for variant in table.variants
                 }
                 for key, table in TABLES.items()

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import bpy
 
 from ...backend.shared.formats.file_names import file_stem
+from ...backend.shared.source_of_photos import photos_of
 from ..process.backend_process import backend_command, backend_environment
 from ..process.jobs import Job
 from . import environment, online_access
@@ -51,13 +51,20 @@ def new_reconstruction(name: str, is_free: Callable[[Path], bool]) -> Path:
     return next(folder for each in numbered if is_free(folder := reconstructions_folder() / each))
 
 
+def name_of_photos(photos: Path) -> str:
+    """Return a name for a folder of photos: that of the folder above if its own says nothing."""
+    named = photos.parent if photos.name.lower() in ("images", "photos", "dcim") else photos
+    named = named.parent if named.name.lower() == "capture" else named
+    return file_stem(named.name, "photos")
+
+
 def new_capture(photos: Path) -> Path:
-    """Return the folder for the capture of a folder of photos, where its computation may have begun before."""
-    generic = photos.name.lower() in ("images", "photos", "dcim")
-    name = file_stem(photos.parent.name if generic else photos.name, "photos")
-    mark = f"{zlib.crc32(str(photos).encode()):08x}"
+    """Return the folder for the capture of a folder of photos: a new one, or that where its computation has begun."""
     chosen = preferences().reconstructions if preferences() else ""
-    return (Path(bpy.path.abspath(chosen)) if chosen else user_folder()) / "captures" / f"{name}-{mark}"
+    captures = (Path(bpy.path.abspath(chosen)) if chosen else user_folder()) / "captures"
+    name = name_of_photos(photos)
+    numbered = (captures / (name if number == 1 else f"{name}-{number}") for number in itertools.count(1))
+    return next(folder for folder in numbered if not folder.exists() or photos_of(folder) == photos)
 
 
 def backend_python() -> Path | None:

@@ -107,7 +107,7 @@ def _draw() -> None:
 def register() -> None:
     global _handler
     if not bpy.app.background:
-        bpy.utils.register_tool(SelectSplatsTool, after={pick_tool.TOOL})
+        bpy.utils.register_tool(SelectSplatsTool, after={pick_tool.TOOL}, group=True)
         _handler = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
 
 

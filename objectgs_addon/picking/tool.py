@@ -111,7 +111,7 @@ def _file_loads(*_: Any) -> None:
 def register() -> None:
     global _handler
     if not bpy.app.background:
-        bpy.utils.register_tool(PickTool, after={"builtin.cursor"})
+        bpy.utils.register_tool(PickTool, after={"builtin.select_lasso"}, group=True)
         _handler = bpy.types.SpaceView3D.draw_handler_add(_leave, (), "WINDOW", "PRE_VIEW")
         bpy.app.handlers.load_pre.append(_file_loads)
         keymaps = bpy.context.window_manager.keyconfigs.addon.keymaps

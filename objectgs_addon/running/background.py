@@ -23,6 +23,7 @@ from ..environment import locations
 from ..process.blocking import run_blocking
 from ..process.jobs import Job, JobQueue, State
 from ..state import folder_trust, object_edits, object_list
+from ..state.folder_state import reconstruction_for
 from ..state.next_step import has_masks
 from . import previews, results
 
@@ -234,8 +235,8 @@ def _import_made(job: Job, owner: bpy.types.Scene | None) -> bool:
     if owner is None or locations.backend_python() is None:
         messages.show(f"The new capture is in {job.folder}; set up the backend, then import it")
         return False
-    name = "demo" if job.kind == "demo" else job.folder.name
-    folder = locations.reconstructions_folder() / name
+    folder = reconstruction_for(job.folder) if job.kind == "sfm" else locations.reconstructions_folder() / "demo"
+    name = folder.name
     submit(
         locations.backend_job(f"Import {name}", "import", folder, "import", str(job.folder), "--out", str(folder)),
         owner,

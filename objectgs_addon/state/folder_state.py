@@ -10,6 +10,7 @@ from ...backend.shared.reconstruction.checkpoint import CURRENT, CheckpointHeade
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.meshes import NAME as MESHES
 from ...backend.shared.reconstruction.meshes import read_meshes
+from ..environment import locations
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,19 @@ UNKNOWN = FolderState(
 """What is known of a folder that is not read."""
 
 _known: dict[Path, tuple[tuple, FolderState]] = {}
+
+
+def reconstruction_for(capture: Path) -> Path:
+    """Return a reconstruction folder named after a capture, or after its parent if the capture has a generic name.
+
+    A number is appended if that name belongs to another capture or to something else.
+    """
+    name = capture.name if capture.name.lower() not in ("capture", "colmap", "data") else capture.parent.name
+
+    def is_free(folder: Path) -> bool:
+        return folder_state(folder).capture in (None, capture) and Reconstruction(folder).foreign_file() is None
+
+    return locations.new_reconstruction(name, is_free)
 
 
 def folder_state(folder: Path) -> FolderState:

@@ -7,10 +7,9 @@ import bpy
 from bpy.props import BoolProperty, StringProperty
 
 from ...backend.shared.errors import InputError
-from ...backend.shared.reconstruction.folder import Reconstruction
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
-from ...objectgs_addon.state.folder_state import folder_state
+from ...objectgs_addon.state.folder_state import reconstruction_for
 from ...objectgs_addon.state.properties import image_size
 from ..common import need
 from ..common.jobs import folder_to_import_to
@@ -54,7 +53,7 @@ class ImportCapture(bpy.types.Operator):
         capture = Path(bpy.path.abspath(self.directory)).resolve() if self.directory else None
         if capture is None or not capture.is_dir():
             raise InputError(f"The folder {capture or 'of the capture'} does not exist; choose another")
-        folder = folder_to_import_to(self.folder, lambda: _folder_for(capture), capture)
+        folder = folder_to_import_to(self.folder, lambda: reconstruction_for(capture), capture)
         job = locations.backend_job(
             f"Import {capture.name}",
             "import",
@@ -67,19 +66,6 @@ class ImportCapture(bpy.types.Operator):
             str(self.max_size),
         )
         return background.submit(job, context.scene, self.report)
-
-
-def _folder_for(capture: Path) -> Path:
-    """Return a reconstruction folder named after the capture, or after its parent if the capture has a generic name.
-
-    A number is appended if that name belongs to another capture or to something else.
-    """
-    name = capture.name if capture.name.lower() not in ("capture", "colmap", "data") else capture.parent.name
-
-    def is_free(folder: Path) -> bool:
-        return folder_state(folder).capture in (None, capture) and Reconstruction(folder).foreign_file() is None
-
-    return locations.new_reconstruction(name, is_free)
 
 
 CLASSES = (ImportCapture,)

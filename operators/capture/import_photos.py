@@ -62,7 +62,7 @@ class ImportPhotos(bpy.types.Operator):
         capture = Path(bpy.path.abspath(self.folder)).resolve() if self.folder else locations.new_capture(photos)
         need.require_unused(capture)
         job = locations.backend_job(
-            f"Import photos of {photos.name}",
+            f"Photos of {locations.name_of_photos(photos)}",
             "sfm",
             capture,
             "sfm",

@@ -228,16 +228,16 @@ def test_folder_without_capture_is_rejected(extension, backend_python, monkeypat
 
 
 def test_captures_of_equal_name_get_separate_folders(extension, tmp_path):
-    from objectgs.operators.capture.import_capture import _folder_for
+    from objectgs.objectgs_addon.state.folder_state import reconstruction_for
 
     first, second = tmp_path / "a" / "mug", tmp_path / "b" / "mug"
-    taken = _folder_for(first)
+    taken = reconstruction_for(first)
     taken.mkdir(parents=True)
     upright = {"rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}
     cameras = {"capture": str(first), "origin": [0.0, 0.0, 0.0], "upright": upright, "cameras": []}
     (taken / "cameras.json").write_text(json.dumps(cameras))
     (taken / "objectgs.json").write_text("{}")
-    assert _folder_for(first) == taken and _folder_for(second) == taken.with_name("mug-2")
+    assert reconstruction_for(first) == taken and reconstruction_for(second) == taken.with_name("mug-2")
 
 
 def test_import_into_folder_in_use_is_rejected(extension, shown, folder, capture, tmp_path, monkeypatch):

@@ -18,10 +18,9 @@ from ...shared.errors import InputError
 from ...shared.formats.atomic import make_folder, recorded, write_atomic
 from ...shared.formats.json_file import write_json
 from ...shared.reconstruction.lock import locked
+from ...shared.source_of_photos import WORK, remember_photos
 from ...shared.stopping import StoppingReporter
 
-WORK = "sfm"
-"""Folder in the capture with the database, which lets a stopped command go on, and sfm.json."""
 REPORT = "sfm.json"
 
 _EXTRACT, _MATCH, _MAP = 0.5, 0.03, 0.3
@@ -41,6 +40,7 @@ def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         try:
             make_folder(capture / WORK)
             with locked(capture / WORK):
+                remember_photos(capture, source)
                 _run(source, capture, options, reporter)
         except InputError:
             if not (capture / WORK / database.NAME).exists():
