@@ -12,7 +12,7 @@ from typing import Any
 import bpy
 
 from ...backend.shared.formats.file_names import file_stem
-from ...backend.shared.source_of_photos import photos_of
+from ...backend.shared.formats.photos_source import photos_of
 from ..process.backend_process import backend_command, backend_environment
 from ..process.jobs import Job
 from . import environment, online_access

@@ -17,8 +17,8 @@ from ...sfm.stages import run_stage
 from ...shared.errors import InputError
 from ...shared.formats.atomic import make_folder, recorded, write_atomic
 from ...shared.formats.json_file import write_json
+from ...shared.formats.photos_source import WORK, remember_photos
 from ...shared.reconstruction.lock import locked
-from ...shared.source_of_photos import WORK, remember_photos
 from ...shared.stopping import StoppingReporter
 
 REPORT = "sfm.json"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .errors import InputError
-from .formats.json_file import read_json, write_json
+from ..errors import InputError
+from .json_file import read_json, write_json
 
 WORK = "sfm"
 """Folder in the capture for what the computation of poses keeps."""
