@@ -35,10 +35,11 @@ MINUTES ?= 10
 # The capture that benchmarks/gpu.py trains on, where there is one.
 CAPTURE ?= $(wildcard build/demo/capture)
 
-.PHONY: help venv lock demo zip test test-window test-blenders lint benchmarks gpu gpu-with clean
+.PHONY: help venv lock demo demo-photos zip test test-window test-blenders lint benchmarks gpu gpu-with clean
 
 help:
 	@echo "make demo           a capture made by Blender becomes objects in a .blend, with a report, in $(DEMO)"
+	@echo "make demo-photos    the same from the photos alone, in $(DEMO)-photos"
 	@echo "make zip            the extension to install in Blender, in build/"
 	@echo "make test           the tests"
 	@echo "make test-window    the tests that drive a Blender with a window, where there is one"
@@ -78,6 +79,12 @@ demo: .venv/ready .venv-bpy/ready
 	$(BACKEND) -m backend check $(DEMO)/capture
 	$(HEADLESS) run $(DEMO)/capture --out $(DEMO) --minutes $(DEMO_MINUTES)
 	@echo "Done: see $(DEMO)/report.md and $(DEMO)/objectgs.blend"
+
+demo-photos: .venv/ready .venv-bpy/ready
+	$(HEADLESS) demo $(DEMO)/capture
+	$(BACKEND) -m backend sfm $(DEMO)/capture --out $(DEMO)-photos/capture
+	$(HEADLESS) run $(DEMO)-photos/capture --out $(DEMO)-photos --minutes $(DEMO_MINUTES)
+	@echo "Done: see $(DEMO)-photos/report.md and $(DEMO)-photos/objectgs.blend"
 
 zip: .venv-bpy/ready
 	@mkdir -p build
