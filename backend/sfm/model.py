@@ -105,6 +105,12 @@ def to_common_size(model: pycolmap.Reconstruction) -> None:
         model.transform(pycolmap.Sim3d(scaled))
 
 
+def add_points(model: pycolmap.Reconstruction, xyz: np.ndarray, rgb: np.ndarray) -> None:
+    """Add points (n, 3) with colors (n, 3) uint8 that no feature belongs to."""
+    for position, color in zip(xyz, rgb, strict=True):
+        model.add_point3D(position, pycolmap.Track(), color)
+
+
 def write_model(model: pycolmap.Reconstruction, capture: Path) -> None:
     """Write a model as the sparse/0 of a capture, replacing the one there at the end."""
     target = capture / SPARSE

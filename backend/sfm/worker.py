@@ -3,7 +3,7 @@
     worker extract DATABASE IMAGES GROUPS.json     features of the photos in each group, which share a camera
     worker match DATABASE [PAIRS.txt]              matches of the pairs, or of all
     worker incremental|global DATABASE IMAGES OUT  camera poses and points
-    worker lens MODEL OUT                          the same with a second term of distortion, where photos show one
+    worker refine MODEL OUT                        the same without wrong matches, and with the lens that photos show
 
 Photos and pairs whose results are in the database are skipped. Each line on standard output is one more photo with a
 pose.
@@ -16,6 +16,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
 SEED = 0
@@ -24,7 +25,11 @@ LONGEST_SIDE = 1600
 MOST_FEATURES = 4096
 FEWEST_POSES = 3
 _WORTH = 0.98
-"""Reprojection error with a second term of distortion, relative to that with one, below which it is used."""
+"""Median residual with a further term of distortion, relative to that without, below which it is used."""
+_FARTHEST = (10.0, 6.0, 5.0)
+"""Distances of observations, relative to the median, above which they are removed, one adjustment after another."""
+_TYPICAL, _FINEST = 2.0, 0.05
+"""Scale of the loss relative to the median distance, and its least value in pixels."""
 _BLOCK = 64
 """Number of pairs after which matches are written to the database."""
 _ERRORS = 2
@@ -82,23 +87,69 @@ def map_globally(database: str, images: str, out: str) -> None:
     pycolmap.global_mapping(database, images, out, options=options)
 
 
-def refine_lens(model: str, out: str) -> None:
-    """Refine a model with one and with two terms of radial distortion, and write the second if it is worth it.
+def refine(model: str, out: str) -> None:
+    """Refine poses and points without wrong matches, with as many terms of radial distortion as the photos show.
 
-    One term is safer where the photos do not determine the second, which then bends the whole scene a little.
+    A term that the photos do not determine bends the whole scene a little, and without any, photos are used unchanged.
     """
-    refined = {}
-    for kind in ("SIMPLE_RADIAL", "RADIAL"):
-        found = refined[kind] = pycolmap.Reconstruction(model)
+    chosen, error = None, float("inf")
+    for kind in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
+        found = pycolmap.Reconstruction(model)
         for camera in found.cameras.values():
-            if kind == "RADIAL":
-                camera.model, camera.params = pycolmap.CameraModelId.RADIAL, [*camera.params, 0.0]
+            values = [*camera.params[:3], *([camera.params[3], 0.0] if len(camera.params) == 4 else [0.0, 0.0])]
+            camera.model = getattr(pycolmap.CameraModelId, kind)
+            camera.params = values[: {"SIMPLE_PINHOLE": 3, "SIMPLE_RADIAL": 4, "RADIAL": 5}[kind]]
+        reached = adjust(found)
+        if chosen is None or reached < _WORTH * error:
+            chosen, error = found, reached
+    assert chosen is not None
+    chosen.write(out)
+
+
+def adjust(model: pycolmap.Reconstruction) -> float:
+    """Adjust a model and remove observations that are far from where it expects them, in turns.
+
+    Matches that are wrong by a few pixels, at edges of objects or on repeated textures, pass COLMAP's filter of 4
+    pixels and move poses by several times the error of the others. The loss is Cauchy's, which hardly counts them.
+
+    Returns:
+        The median distance in pixels of the observations that were there at first.
+    """
+    observed = _residuals(model)
+    for most in (None, *_FARTHEST):
+        typical = float(np.median([distance for distance, _, _ in observed]))
+        if most is not None:
+            for distance, image, index in observed:
+                # Of a point with two observations, the first that goes takes the other with it.
+                if distance > most * typical and model.image(image).points2D[index].has_point3D():
+                    model.delete_observation(image, index)
         options = pycolmap.BundleAdjustmentOptions()
         options.refine_principal_point = options.ceres.use_gpu = options.print_summary = False
-        pycolmap.bundle_adjustment(found, options)
-        found.update_point_3d_errors()
-    one, two = (found.compute_mean_reprojection_error() for found in refined.values())
-    refined["RADIAL" if two < _WORTH * one else "SIMPLE_RADIAL"].write(out)
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        options.ceres.loss_function_scale = max(_TYPICAL * typical, _FINEST)
+        pycolmap.bundle_adjustment(model, options)
+        observed = _residuals(model)
+        if most is None:
+            first = float(np.median([distance for distance, _, _ in observed]))
+    model.update_point_3d_errors()
+    return first
+
+
+def _residuals(model: pycolmap.Reconstruction) -> list[tuple[float, int, int]]:
+    """Return the distance in pixels, the image ID and the index of each observation of a point."""
+    found = []
+    for number in model.reg_image_ids():
+        image = model.image(number)
+        camera, matrix = model.camera(image.camera_id), image.cam_from_world().matrix()
+        seen = [(index, point) for index, point in enumerate(image.points2D) if point.has_point3D()]
+        if not seen:
+            continue
+        world = np.array([model.points3D[point.point3D_id].xyz for _, point in seen])
+        expected = np.asarray(camera.img_from_cam(world @ matrix[:, :3].T + matrix[:, 3]))
+        distances = np.linalg.norm(expected - np.array([point.xy for _, point in seen]), axis=1)
+        distances = np.where(np.isfinite(distances), distances, np.inf)
+        found += [(float(d), number, index) for d, (index, _) in zip(distances, seen, strict=True)]
+    return found
 
 
 STAGES: dict[str, Callable[..., None]] = {
@@ -106,7 +157,7 @@ STAGES: dict[str, Callable[..., None]] = {
     "match": match,
     "incremental": map_incrementally,
     "global": map_globally,
-    "lens": refine_lens,
+    "refine": refine,
 }
 
 if __name__ == "__main__":

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pycolmap
 
-from ...capture.models import read_capture_model
+from ...capture import load_capture
 from ...sfm import database, model
+from ...sfm.dense import dense_points, spacing, thinned
 from ...sfm.pairs import choose_pairs
 from ...sfm.photos import IMAGES, Photo, take_photos
 from ...sfm.stages import run_stage
@@ -23,8 +24,8 @@ from ...shared.stopping import StoppingReporter
 
 REPORT = "sfm.json"
 
-_EXTRACT, _MATCH, _MAP = 0.5, 0.03, 0.3
-"""Expected seconds of the stages for each photo, pair and photo on two cores, until the pace is known."""
+_EXTRACT, _MATCH, _MAP, _DENSE = 0.5, 0.03, 0.3, 0.3
+"""Expected seconds of the stages for each photo, pair, photo and photo on two cores, until the pace is known."""
 _ENOUGH = 0.95
 """Fraction of photos with trusted poses from which on the result of the first mapper is kept."""
 _WORST = 10
@@ -70,7 +71,7 @@ def _run(source: Path, capture: Path, options: argparse.Namespace, reporter: Sto
     images, path, log = capture / IMAGES, work / database.NAME, work / "colmap.log"
     reporter.expect({
         "photos": ("Photos", 2.0), "extract": ("Features", 30.0), "pairs": ("Pairs", 0.1), "match": ("Matching", 30.0),
-        "global": ("Poses", 10.0), "incremental": ("Poses", 5.0), "lens": ("Poses", 2.0),
+        "global": ("Poses", 10.0), "incremental": ("Poses", 5.0), "refine": ("Poses", 2.0), "dense": ("Points", 10.0),
     })  # fmt: skip
     reporter.begin("photos", "Reading the photos")
     photos, unreadable = take_photos(source, capture, reporter)
@@ -80,7 +81,7 @@ def _run(source: Path, capture: Path, options: argparse.Namespace, reporter: Sto
     reporter.expect({
         "extract": ("Features", _EXTRACT * count), "match": ("Matching", _MATCH * pairs_expected),
         "global": ("Poses", _MAP * count), "incremental": ("Poses", 0.1 * _MAP * count),
-        "lens": ("Poses", 0.2 * _MAP * count),
+        "refine": ("Poses", 0.2 * _MAP * count), "dense": ("Points", _DENSE * count),
     })  # fmt: skip
 
     groups = work / "groups.json"
@@ -122,26 +123,41 @@ def _run(source: Path, capture: Path, options: argparse.Namespace, reporter: Sto
         )
     wrong = model.drop_untrusted(best)
     model.require_parallax(best.model, source)
-    best = best._replace(model=_with_best_lens(best.model, work, log, reporter))
+    best = best._replace(model=_refined(best.model, work, log, reporter))
     model.to_common_size(best.model)
     model.write_model(best.model, capture)
-    read_capture_model(capture)
+    _densify(best.model, capture, reporter)
     _report(best, capture, names, unreadable, wrong, time.monotonic() - started, reporter)
 
 
-def _with_best_lens(
+def _refined(
     found: pycolmap.Reconstruction, work: Path, log: Path, reporter: StoppingReporter
 ) -> pycolmap.Reconstruction:
     """Return a model after a last adjustment, or the model itself if that fails."""
-    reporter.begin("lens", "Refining lenses and poses")
+    reporter.begin("refine", "Refining lenses and poses")
     before, after = work / "chosen", work / "refined"
     for folder in (before, after):
         shutil.rmtree(folder, ignore_errors=True)
         make_folder(folder)
     found.write(before)
-    if run_stage(reporter, log, ["lens", str(before), str(after)], lambda lines: lines, 1):
+    if run_stage(reporter, log, ["refine", str(before), str(after)], lambda lines: lines, 1):
         return pycolmap.Reconstruction(after)
     return found
+
+
+def _densify(found: pycolmap.Reconstruction, capture: Path, reporter: StoppingReporter) -> None:
+    """Add points where features are few, from patches of the photos."""
+    reporter.begin("dense", "Finding points on plain surfaces")
+    scratch = capture / WORK / "undistorted"
+    shutil.rmtree(scratch, ignore_errors=True)
+    try:
+        photos = load_capture(capture, scratch)
+        xyz, rgb = dense_points(photos, reporter.progress)
+        new = thinned(xyz, photos.points.xyz, spacing(photos))
+        model.add_points(found, xyz[new], rgb[new])
+        model.write_model(found, capture)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
 
 
 def _groups(photos: list[Photo], cameras: str) -> list[list[str]]:
