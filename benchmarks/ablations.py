@@ -215,13 +215,14 @@ def measured(
 
 def document(found: Mapping[str, Any]) -> str:
     """Return the text of docs/ablations.md."""
-    captures = found["captures"]
+    captures, seeds = found["captures"], found["seeds"]
+    spread = "figures of one seed" if seeds == 1 else f"means over {seeds} seeds ± standard deviation"
     lines = [
         "# The paper's ablations",
         "",
         f"Made by `python benchmarks/ablations.py --write`. Trainings of {found['steps']} steps on a laptop's CPU, on "
         + " and ".join(f"{name} ({own['objects']} objects)" for name, own in captures.items())
-        + f", measured on held-out views: means over {found['seeds']} seeds ± standard deviation. The paper's figures "
+        + f", measured on held-out views: {spread}. The paper's figures "
         "are of other scenes, 30,000 steps and masks from a segmentation network; compare the order of the rows.",
         "",
     ]

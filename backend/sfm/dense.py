@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from PIL import Image as PilImage
 
-from ..capture import Capture
+from ..capture import Capture, View
 
 GRID = 6000
 """Number of pixels of each photo that are tried."""
@@ -97,7 +97,7 @@ def dense_points(
 
 def spacing(capture: Capture) -> float:
     """Return the typical distance between the points of neighboring pixels of the grid."""
-    sizes = []
+    sizes: list[float] = []
     for view in capture.views:
         depths = capture.points.xyz @ view.viewmat[2, :3] + view.viewmat[2, 3]
         if (depths > 0).any():
@@ -142,7 +142,7 @@ def _neighbors(capture: Capture) -> list[list[int]]:
 def _sweep(capture: Capture, scaled: list, index: int, neighbors: list[int]) -> _Sweep | None:
     """Find the depths of the grid's pixels in a view; None without neighbors or points."""
     image = scaled[index][0]
-    view, height, width = capture.views[index], *image.shape
+    view, (height, width) = capture.views[index], image.shape
     matrix, K = view.viewmat, _scaled_intrinsics(view, image)
     known = capture.points.xyz @ matrix[2, :3] + matrix[2, 3]
     if not neighbors or not (known > 0).any():
@@ -262,6 +262,6 @@ def _agrees(capture: Capture, sweep: _Sweep | None, other: int, world: np.ndarra
     return ((there > 0) & (np.abs(there - depth) < AGREES * depth)).astype(int)
 
 
-def _scaled_intrinsics(view, image: np.ndarray) -> np.ndarray:
+def _scaled_intrinsics(view: View, image: np.ndarray) -> np.ndarray:
     height, width = image.shape
     return np.diag([width / view.width, height / view.height, 1.0]) @ view.K

@@ -126,6 +126,54 @@ def test_poses_are_those_of_the_photos(made, photos):
         assert (made / "images" / path.name).read_bytes() == path.read_bytes()
 
 
+def to_world(capture, xyz: np.ndarray, matrices) -> np.ndarray:
+    """Return points of a capture (n, 3) in the world of the rendered photos."""
+    model = pycolmap.Reconstruction(capture / "sparse" / "0")
+    images = [model.find_image_with_name(f"photo {number + 1}.png") for number in range(len(matrices))]
+    here = np.array([image.projection_center() for image in images])
+    there = np.array([-matrix[:, :3].T @ matrix[:, 3] for matrix in matrices])
+    a, b = here - here.mean(0), there - there.mean(0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    flip = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    scale = (s * np.diag(flip)).sum() / (a**2).sum()
+    return scale * (xyz - here.mean(0)) @ (u @ flip @ vt).T + there.mean(0)
+
+
+def test_points_of_patches_lie_on_the_surfaces(made):
+    model = pycolmap.Reconstruction(made / "sparse" / "0")
+    added = np.array([point.xyz for point in model.points3D.values() if not point.track.elements])
+    assert len(added) > 300
+    x, y, z = to_world(made, added, ring()).T
+    distances = [np.abs(z), np.abs(y - 2.5), np.abs(x + 2.5)]
+    for low, high in (((-0.6, -0.3, 0.0), (0.0, 0.4, 0.7)), ((0.4, -0.7, 0.0), (0.9, 0.0, 0.4))):
+        outside = np.maximum(np.maximum(np.array(low) - np.array([x, y, z]).T, np.array([x, y, z]).T - high), 0)
+        inside = np.minimum(np.array([x, y, z]).T - low, high - np.array([x, y, z]).T).min(1)
+        distances.append(np.where((outside > 0).any(1), np.linalg.norm(outside, axis=1), inside))
+    assert np.percentile(np.min(distances, 0), 90) < 0.04, "of a room 5 wide"
+
+
+def test_wrong_matches_do_not_move_poses(made, tmp_path):
+    from backend.sfm import worker
+
+    rng = np.random.default_rng(1)
+    model = pycolmap.Reconstruction(made / "sparse" / "0")
+    for number in model.reg_image_ids():
+        for point in model.image(number).points2D:
+            if point.has_point3D() and rng.random() < 0.1:
+                point.xy = np.array(point.xy) + rng.choice([-1, 1], 2) * rng.uniform(1.0, 4.0, 2)
+    plain = pycolmap.Reconstruction(model)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.ceres.use_gpu = options.print_summary = options.refine_principal_point = False
+    pycolmap.bundle_adjustment(plain, options)
+    worker.adjust(model)
+    errors = []
+    for number, each in enumerate((plain, model)):
+        (tmp_path / str(number) / "sparse" / "0").mkdir(parents=True)
+        each.write(tmp_path / str(number) / "sparse" / "0")
+        errors.append(np.median(pose_errors(tmp_path / str(number), ring())[0]))
+    assert errors[1] < 0.12 and errors[0] > 2 * errors[1]
+
+
 def test_capture_can_be_imported_and_is_kept_by_a_second_run(made, run_command, tmp_path):
     assert run_command("import", made, "--out", tmp_path / "out").code == EXIT_DONE
     before = pycolmap.Reconstruction(made / "sparse" / "0").num_reg_images()
