@@ -235,7 +235,10 @@ def _import_made(job: Job, owner: bpy.types.Scene | None) -> bool:
     if owner is None or locations.backend_python() is None:
         messages.show(f"The new capture is in {job.folder}; set up the backend, then import it")
         return False
-    folder = reconstruction_for(job.folder) if job.kind == "sfm" else locations.reconstructions_folder() / "demo"
+    if job.kind == "sfm":
+        folder = reconstruction_for(job.folder, locations.new_reconstruction)
+    else:
+        folder = locations.reconstructions_folder() / "demo"
     name = folder.name
     submit(
         locations.backend_job(f"Import {name}", "import", folder, "import", str(job.folder), "--out", str(folder)),

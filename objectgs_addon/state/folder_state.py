@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Progress of a reconstruction folder, read from its files."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +11,6 @@ from ...backend.shared.reconstruction.checkpoint import CURRENT, CheckpointHeade
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.meshes import NAME as MESHES
 from ...backend.shared.reconstruction.meshes import read_meshes
-from ..environment import locations
 
 
 @dataclass(frozen=True)
@@ -59,17 +59,22 @@ UNKNOWN = FolderState(
 _known: dict[Path, tuple[tuple, FolderState]] = {}
 
 
-def reconstruction_for(capture: Path) -> Path:
+def reconstruction_for(capture: Path, new: Callable[[str, Callable[[Path], bool]], Path]) -> Path:
     """Return a reconstruction folder named after a capture, or after its parent if the capture has a generic name.
 
-    A number is appended if that name belongs to another capture or to something else.
+    Args:
+        capture: the capture's folder.
+        new: returns a folder of a name, with a number if it is needed for a condition; `locations.new_reconstruction`.
+
+    Returns:
+        The folder, which does not belong to another capture or to something else.
     """
     name = capture.name if capture.name.lower() not in ("capture", "colmap", "data") else capture.parent.name
 
     def is_free(folder: Path) -> bool:
         return folder_state(folder).capture in (None, capture) and Reconstruction(folder).foreign_file() is None
 
-    return locations.new_reconstruction(name, is_free)
+    return new(name, is_free)
 
 
 def folder_state(folder: Path) -> FolderState:

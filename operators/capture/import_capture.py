@@ -53,7 +53,9 @@ class ImportCapture(bpy.types.Operator):
         capture = Path(bpy.path.abspath(self.directory)).resolve() if self.directory else None
         if capture is None or not capture.is_dir():
             raise InputError(f"The folder {capture or 'of the capture'} does not exist; choose another")
-        folder = folder_to_import_to(self.folder, lambda: reconstruction_for(capture), capture)
+        folder = folder_to_import_to(
+            self.folder, lambda: reconstruction_for(capture, locations.new_reconstruction), capture
+        )
         job = locations.backend_job(
             f"Import {capture.name}",
             "import",

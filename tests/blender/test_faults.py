@@ -231,13 +231,15 @@ def test_captures_of_equal_name_get_separate_folders(extension, tmp_path):
     from objectgs.objectgs_addon.state.folder_state import reconstruction_for
 
     first, second = tmp_path / "a" / "mug", tmp_path / "b" / "mug"
-    taken = reconstruction_for(first)
+    taken = reconstruction_for(first, locations.new_reconstruction)
     taken.mkdir(parents=True)
     upright = {"rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}
     cameras = {"capture": str(first), "origin": [0.0, 0.0, 0.0], "upright": upright, "cameras": []}
     (taken / "cameras.json").write_text(json.dumps(cameras))
     (taken / "objectgs.json").write_text("{}")
-    assert reconstruction_for(first) == taken and reconstruction_for(second) == taken.with_name("mug-2")
+    assert reconstruction_for(first, locations.new_reconstruction) == taken and reconstruction_for(
+        second, locations.new_reconstruction
+    ) == taken.with_name("mug-2")
 
 
 def test_import_into_folder_in_use_is_rejected(extension, shown, folder, capture, tmp_path, monkeypatch):
