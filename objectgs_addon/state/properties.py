@@ -22,6 +22,7 @@ from bpy.props import (
 from ...backend.shared.defaults import MAX_SIZE
 from ...backend.shared.expectation import PRESET_STEPS
 from ...backend.shared.formats.splat_ply import UNOBSERVED
+from .. import drawing
 from ..scene import SHADINGS, SHOWS, is_linked, kind_of, shade_meshes, shading_of, show_kinds, shown_kinds
 from . import object_edits, viewports
 
@@ -262,7 +263,7 @@ class SceneProperties(bpy.types.PropertyGroup):
     draw_splats: BoolProperty(
         name="Draw Splats",
         default=True,
-        update=viewports.draw_splats_changed,
+        update=drawing.show,
         description="Draw splats in the 3D viewports as in the final image, instead of a preview by points",
     )
     colors: EnumProperty(

@@ -11,9 +11,6 @@ import numpy as np
 
 from .. import drawing, scene
 
-_switched: set[int] = set()
-"""Viewports in Solid mode that show the preview in Material Preview while drawing is switched off."""
-
 
 def show(root: bpy.types.Collection) -> None:
     """Show the scene as its first camera sees it in all 3D viewports, and color attributes in Solid mode."""
@@ -55,22 +52,6 @@ def colors_changed(properties: Any, _context: bpy.types.Context = None) -> None:
                 if space.shading.type in shading.values():
                     space.shading.type = shading[properties.colors]
     drawing.redraw()
-
-
-def draw_splats_changed(properties: Any, context: bpy.types.Context) -> None:
-    """Switch drawing on or off; meanwhile, the preview that replaces it has the colors of the scene's setting."""
-    drawing.show(properties, context)
-    before = {space.as_pointer(): space.shading.type for space in _spaces()}
-    if not properties.draw_splats:
-        colors_changed(properties)
-        _switched.update(
-            place for space in _spaces() if before[place := space.as_pointer()] == "SOLID" != space.shading.type
-        )
-        return
-    for space in _spaces():
-        if space.as_pointer() in _switched and space.shading.type == "MATERIAL":
-            space.shading.type = "SOLID"
-    _switched.clear()
 
 
 def subject_of(centers: np.ndarray, axes: np.ndarray) -> np.ndarray:
