@@ -11,12 +11,12 @@ from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
 from ...objectgs_addon.state.folder_state import reconstruction_for
 from ...objectgs_addon.state.properties import image_size
-from ..common import need
+from ..common.import_dialog import ImportDialog
 from ..common.jobs import folder_to_import_to
 from ..common.reporting import reports_errors
 
 
-class ImportCapture(bpy.types.Operator):
+class ImportCapture(ImportDialog, bpy.types.Operator):
     bl_idname = "objectgs.import_capture"
     bl_label = "Import Capture"
     bl_description = (
@@ -34,14 +34,6 @@ class ImportCapture(bpy.types.Operator):
         "capture, in the folder set in the preferences",
     )
     max_size: image_size()
-
-    @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
-        return need.backend(cls)
-
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
 
     def draw(self, _context: bpy.types.Context) -> None:
         self.layout.use_property_split = True

@@ -10,10 +10,11 @@ from ...backend.shared.errors import InputError
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
 from ..common import need
+from ..common.import_dialog import ImportDialog
 from ..common.reporting import reports_errors
 
 
-class ImportPhotos(bpy.types.Operator):
+class ImportPhotos(ImportDialog, bpy.types.Operator):
     bl_idname = "objectgs.import_photos"
     bl_label = "Import Photos"
     bl_description = (
@@ -40,14 +41,6 @@ class ImportPhotos(bpy.types.Operator):
             ("each", "One per Photo", "None, as for photos by many people or a zoom lens"),
         ],
     )
-
-    @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
-        return need.backend(cls)
-
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
 
     def draw(self, _context: bpy.types.Context) -> None:
         self.layout.use_property_split = True

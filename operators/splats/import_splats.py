@@ -9,12 +9,12 @@ from bpy.props import StringProperty
 from ...backend.shared.errors import InputError
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
-from ..common import need
+from ..common.import_dialog import ImportDialog
 from ..common.jobs import folder_to_import_to
 from ..common.reporting import reports_errors
 
 
-class ImportSplats(bpy.types.Operator):
+class ImportSplats(ImportDialog, bpy.types.Operator):
     bl_idname = "objectgs.import_splats"
     bl_label = "Import Splats"
     bl_description = (
@@ -40,14 +40,6 @@ class ImportSplats(bpy.types.Operator):
             "preferences"
         ),
     )
-
-    @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
-        return need.backend(cls)
-
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
 
     def draw(self, _context: bpy.types.Context) -> None:
         self.layout.use_property_split = True
