@@ -107,8 +107,8 @@ class ObjectsPanel(WithReconstruction, bpy.types.Panel):
 
 
 def describe(item: Any, properties: Any) -> str:
-    """Return the ID, counts and state of a row as text."""
-    words = [f"ID {scene.from_stored(item.object_id)}", f"{item.points:,} points"]
+    """Return the name, which the row may cut off, the ID, counts and state of a row as text."""
+    words = [item.name, f"ID {scene.from_stored(item.object_id)}", f"{item.points:,} points"]
     if item.splats:
         words.append(f"{item.splats:,} splats")
     if item.faces:

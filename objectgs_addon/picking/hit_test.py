@@ -85,17 +85,15 @@ def is_in_viewport(window: bpy.types.Window, x: int, y: int) -> bool:
     return False
 
 
-def objects_in(
-    context: bpy.types.Context, left: float, bottom: float, right: float, top: float
-) -> list[bpy.types.Collection]:
-    """Return the collections of objects visible in a rectangle, given in region pixels from the lower left.
+def objects_in(context: bpy.types.Context, left: float, bottom: float, right: float, top: float) -> list[Hit]:
+    """Return the objects visible in a rectangle, given in region pixels from the lower left.
 
     Floaters do not count, which may be anywhere in the view.
     """
     view = view_of(context)
     hits, placed = _splats(context, with_floaters=False)
     keys = ids_in(placed, view, (left, view.height - top, right, view.height - bottom))
-    found = [collection for key in keys if (collection := hits[key].collection) is not None]
+    found = [hits[key] for key in keys]
     collections_by_part = drawing.collections_by_part()
     meshes = _meshes(context)
     if any(obj in collections_by_part for obj in meshes):
@@ -103,7 +101,7 @@ def objects_in(
             for y in np.linspace(bottom, top, _GRID):
                 obj, _ = _mesh_at(context, meshes, view, x, y)
                 if obj in collections_by_part:
-                    found.append(collections_by_part[obj])
+                    found.append(Hit(collections_by_part[obj], None))
     return list(dict.fromkeys(found))
 
 

@@ -34,9 +34,14 @@ def select_collections(context: bpy.types.Context, collections: Any, extend: boo
         select_nothing(context)
     for part in (part for own in parts for part in own):
         part.select_set(True)
-    last = next(own for own in reversed(parts) if own)
-    context.view_layer.objects.active = next((part for part in last if scene.kind_of(part) == "object_parent"), last[0])
+    activate(context, next(own for own in reversed(parts) if own))
     return True
+
+
+def activate(context: bpy.types.Context, parts: list) -> None:
+    """Make the parent of an object's parts the active Blender object, or else the first part."""
+    parent = (part for part in parts if scene.kind_of(part) == "object_parent")
+    context.view_layer.objects.active = next(parent, parts[0])
 
 
 def parts_to_select(collection: bpy.types.Collection) -> list:

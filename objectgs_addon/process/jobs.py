@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from ...backend.shared.errors import EXIT_CANCELLED, EXIT_DONE
-from ...backend.shared.reconstruction.report import MIOU_LABELS, lead_miou
 from .backend_process import BackendProcess
 
 GRACE_SECONDS = 10.0
@@ -131,11 +130,10 @@ class Job:
         return self.kind in ("train", "sfm") and self.state is State.RUNNING
 
     @property
-    def lead_miou(self) -> tuple[str, float] | None:
-        """Label and value of the metric of the objects to show first, see `lead_miou`; None if it is not measured."""
-        name = lead_miou({"miou_all": self.miou_all}, self.zero_is_background)
-        value = getattr(self, name)
-        return None if value is None else (MIOU_LABELS[name], value)
+    def quality(self) -> dict[str, float]:
+        """The metrics on held-out views that were measured: psnr, miou and miou_all."""
+        found = {"psnr": self.psnr, "miou": self.miou, "miou_all": self.miou_all}
+        return {name: value for name, value in found.items() if value is not None}
 
     def pause(self) -> None:
         """Pause a running job that can be paused."""

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Mapping
 
 import bpy
 
 from ...backend.shared.durations import time_left
+from ...backend.shared.reconstruction.report import MIOU_LABELS, lead_miou
 from ..process.jobs import Job, State
 
 CHARACTER = 6.6
@@ -63,16 +65,25 @@ def activity(job: Job) -> str:
     return f"{job.stage}: {first.lower() if rest[:1].islower() else first}{rest}"
 
 
-def draw_figures(layout: bpy.types.UILayout, job: Job) -> None:
-    """Draw the quality on held-out views and the number of splats of a training."""
+def draw_figures(
+    layout: bpy.types.UILayout, quality: Mapping[str, float], zero_is_background: bool, splats: int | None = None
+) -> None:
+    """Draw the quality of a training on held-out views, and the number of its splats where it is given.
+
+    Args:
+        layout: where to draw.
+        quality: those of psnr, miou and miou_all that were measured.
+        zero_is_background: see `lead_miou`.
+        splats: number of splats.
+    """
     figures = []
-    if job.psnr is not None:
-        figures.append(f"PSNR {job.psnr:.1f} dB")
-    if job.lead_miou is not None:
-        label, value = job.lead_miou
-        figures.append(f"{label} {value:.3f}")
-    if job.splats:
-        figures.append(f"{job.splats:,} splats")
+    if "psnr" in quality:
+        figures.append(f"PSNR {quality['psnr']:.1f} dB")
+    lead = lead_miou(quality, zero_is_background)
+    if lead in quality:
+        figures.append(f"{MIOU_LABELS[lead]} {quality[lead]:.3f}")
+    if splats:
+        figures.append(f"{splats:,} splats")
     if figures:
         write(layout, "   ".join(figures))
 

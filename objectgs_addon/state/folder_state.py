@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Progress of a reconstruction folder, read from its files."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from ...backend.shared.errors import InputError
@@ -28,6 +28,7 @@ class FolderState:
         pixels: average number of pixels per view.
         meshes: number of meshes.
         stale_meshes: number of meshes made at another training step than the checkpoint's.
+        quality, zero_is_background: of the checkpoint's header.
     """
 
     exists: bool
@@ -40,6 +41,8 @@ class FolderState:
     pixels: float
     meshes: int
     stale_meshes: int
+    quality: Mapping[str, float] = field(default_factory=dict)
+    zero_is_background: bool = False
 
 
 UNKNOWN = FolderState(
@@ -102,6 +105,8 @@ def folder_state(folder: Path) -> FolderState:
         pixels=pixels,
         meshes=len(made),
         stale_meshes=sum(at != header.steps for at in made),
+        quality=header.quality,
+        zero_is_background=header.zero_is_background,
     )
     _known[paths.folder] = (stamp, state)
     return state

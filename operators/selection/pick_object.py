@@ -43,9 +43,14 @@ class PickObject(InViewport, bpy.types.Operator):
         return {"FINISHED"}
 
 
+def _parts(hit: hit_test.Hit) -> list[bpy.types.Object]:
+    """Return the Blender objects to select of what was hit."""
+    return [hit.obj] if hit.collection is None else selection.parts_to_select(hit.collection)
+
+
 def _select(context: bpy.types.Context, hit: hit_test.Hit, toggle: bool) -> None:
     """Select what was hit; with `toggle`, add it to the selection, or remove it."""
-    parts = [hit.obj] if hit.collection is None else selection.parts_to_select(hit.collection)
+    parts = _parts(hit)
     if toggle and parts and all(part.select_get() for part in parts):
         for part in parts:
             part.select_set(False)
@@ -119,12 +124,14 @@ class PickBox(InViewport, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         found = hit_test.objects_in(context, self.left, self.bottom, self.right + 1, self.top + 1)
         # The background is in nearly every box.
-        collections = [collection for collection in found if scene.object_id_of(collection) != 0]
-        if self.mode == "SUBTRACT":
-            for part in (part for collection in collections for part in selection.parts_to_select(collection)):
-                part.select_set(False)
-        elif not selection.select_collections(context, collections, self.mode == "ADD") and self.mode == "SET":
+        hits = [hit for hit in found if hit.collection is None or scene.object_id_of(hit.collection) != 0]
+        if self.mode == "SET":
             selection.select_nothing(context)
+        found_parts = [parts for hit in hits if (parts := _parts(hit))]
+        for part in (part for parts in found_parts for part in parts):
+            part.select_set(self.mode != "SUBTRACT")
+        if found_parts and self.mode != "SUBTRACT":
+            selection.activate(context, found_parts[-1])
         return {"FINISHED"}
 
     def _end(self, context: bpy.types.Context) -> None:

@@ -14,9 +14,10 @@ from objectgs.backend.shared.reconstruction.cameras import Cameras, CameraView, 
 from objectgs.objectgs_addon.state.folder_state import folder_state
 
 
-def write_checkpoint(folder, step, seconds):
+def write_checkpoint(folder, step, seconds, curve=()):
     """Write a safetensors file with the backend's header and no tensors."""
-    state = json.dumps({"format": 1, "progress": {"step": step, "seconds": seconds}})
+    progress = {"step": step, "seconds": seconds, "curve": list(curve)}
+    state = json.dumps({"format": 1, "supervise_background": True, "progress": progress})
     header = json.dumps({"__metadata__": {"state": state}}).encode()
     (folder / "checkpoint").mkdir(exist_ok=True)
     (folder / "checkpoint" / "model.safetensors").write_bytes(struct.pack("<Q", len(header)) + header)
@@ -46,6 +47,14 @@ def test_folder_state_follows_each_step(tmp_path):
     assert state.voted and (state.steps, state.seconds) == (700, 12.5) and not state.trained
     (folder / "splats.ply").write_bytes(b"ply")
     assert folder_state(folder).trained
+
+
+def test_quality_is_that_of_the_last_entry_of_the_curve(tmp_path):
+    write_checkpoint(tmp_path, 500, 9.0)
+    assert folder_state(tmp_path).quality == {}
+    write_checkpoint(tmp_path, 700, 12.5, [{"psnr": 20.0, "miou": 0.5}, {"psnr": 30.5, "miou": None, "miou_all": 0.75}])
+    state = folder_state(tmp_path)
+    assert state.quality == {"psnr": 30.5, "miou_all": 0.75} and state.zero_is_background
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff" * 8, b'\x05\0\0\0\0\0\0\0{"a":', struct.pack("<Q", 2) + b"{}"])

@@ -52,5 +52,5 @@ def test_any_event_is_taken_or_ignored(tmp_path, monkeypatch, seed):
             job._take(event)
             assert 0 <= job.progress <= 1
             assert job_display.summary(job).startswith("Train: ")
-            job_display.draw_figures(None, job)
+            job_display.draw_figures(None, job.quality, job.zero_is_background, job.splats)
     assert all(isinstance(text, str) for text in [job.message, *job.statuses, *job.warnings])

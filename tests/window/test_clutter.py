@@ -81,10 +81,43 @@ def test_box_picking_ignores_strays(window):
             x, y = location_3d_to_region_2d(context["region"], view, Vector(place))
             with bpy.context.temp_override(**context):
                 found = hit_test.objects_in(bpy.context, x - 6, y - 6, x + 6, y + 6)
-            result.append([collection.name for collection in found])
+            result.append([hit.name for hit in found])
     """)
     )
     assert "ball" not in result[0] and "ball" in result[1]
+
+
+def test_box_picking_selects_instances(window):
+    """A collection instance, as File > Link adds it, is picked with what it is drawn from, or alone."""
+    result = window.run(
+        script("""
+        from bpy_extras.view3d_utils import location_3d_to_region_2d
+        from mathutils import Vector
+        view.view_perspective, view.view_location, view.view_distance = "PERSP", (0, 0, 0), 30.0
+        view.view_rotation = Vector((0, -1, 0)).to_track_quat("Z", "Y")
+        empty = bpy.data.objects.new("instance", None)
+        empty.instance_type, empty.instance_collection = "COLLECTION", part(1).users_collection[0]
+        empty.location = 4, 0, 0
+        owner.collection.objects.link(empty)
+        bpy.context.view_layer.update()
+        view.update()
+        context = window_context()
+        x, y = location_3d_to_region_2d(context["region"], view, Vector((4, 0, 0)))
+        result = []
+        for box in ((x - 6, y - 6, x + 6, y + 6), (0, 0, context["region"].width, context["region"].height)):
+            left, bottom, right, top = map(int, box)
+            with bpy.context.temp_override(**context):
+                bpy.ops.objectgs.pick_box(left=left, bottom=bottom, right=right, top=top)
+            result.append(sorted(obj.name for obj in bpy.context.selected_objects))
+        with bpy.context.temp_override(**context):
+            bpy.ops.objectgs.pick_box(mode="SUBTRACT", left=left, bottom=bottom, right=right, top=top)
+        result.append([obj.name for obj in bpy.context.selected_objects])
+        bpy.data.objects.remove(empty)
+    """)
+    )
+    assert result[0] == ["instance"]
+    assert "instance" in result[1] and len(result[1]) > 2
+    assert result[2] == []
 
 
 def test_clean_floaters_changes_exports_and_is_undone(window, folder):

@@ -7,9 +7,12 @@ contains the training state as a JSON string with `format`, `progress`, `setting
 
 from __future__ import annotations
 
+import math
 import struct
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from ..formats.json_file import parse_json
 from ..formats.regular_file import open_regular
@@ -24,10 +27,18 @@ LONGEST_HEADER = 1 << 26
 
 @dataclass(frozen=True)
 class CheckpointHeader:
-    """Progress of a training in steps and seconds."""
+    """Progress of a training in steps and seconds, and its latest metrics on held-out views.
+
+    Attributes:
+        steps, seconds: progress.
+        quality: those of psnr, miou and miou_all that were measured.
+        zero_is_background: whether pixels without a label show the background, see `report.lead_miou`.
+    """
 
     steps: int
     seconds: float
+    quality: Mapping[str, float] = field(default_factory=dict)
+    zero_is_background: bool = False
 
 
 def read_header(folder: Path) -> CheckpointHeader | None:
@@ -43,7 +54,17 @@ def read_header(folder: Path) -> CheckpointHeader | None:
         with open_regular(folder / CURRENT) as file:
             (length,) = struct.unpack("<Q", file.read(8))
             header = parse_json(file.read(min(length, LONGEST_HEADER)))
-        progress = parse_json(header["__metadata__"]["state"])["progress"]
-        return CheckpointHeader(int(progress["step"]), float(progress["seconds"]))
+        state = parse_json(header["__metadata__"]["state"])
+        progress = state["progress"]
+        steps, seconds = int(progress["step"]), float(progress["seconds"])
+        return CheckpointHeader(steps, seconds, _latest(progress), state.get("supervise_background") is True)
     except (OSError, ValueError, KeyError, TypeError, struct.error):
         return None
+
+
+def _latest(progress: Mapping[str, Any]) -> dict[str, float]:
+    """Return the finite metrics of the last entry of the training curve."""
+    curve = progress.get("curve")
+    last = curve[-1] if isinstance(curve, list) and curve and isinstance(curve[-1], dict) else {}
+    found = {name: last.get(name) for name in ("psnr", "miou", "miou_all")}
+    return {name: value for name, value in found.items() if isinstance(value, float) and math.isfinite(value)}

@@ -72,8 +72,10 @@ class DetailsPanel(WithReconstruction, bpy.types.Panel):
             return
         properties, state = root.objectgs, folder_trust.state_of(root)
         job = _training_job(root)
-        if job is not None:
-            draw_figures(layout, job)
+        if job is not None and job.quality:
+            draw_figures(layout, job.quality, job.zero_is_background, job.splats)
+        else:
+            draw_figures(layout, state.quality, state.zero_is_background)
         expected = expectation(*_length_of(state, properties))
         if expected is not None:
             write(layout, f"{expected}.")
