@@ -16,6 +16,7 @@ def _classes() -> list[type]:
         group_objects,
         import_capture,
         import_photos,
+        leave_out_photos,
         make_demo,
         open_reconstruction,
         orient,
@@ -52,6 +53,7 @@ def _classes() -> list[type]:
     modules = (
         import_capture,
         import_photos,
+        leave_out_photos,
         make_demo,
         assign_objects,
         analyze_capture,
@@ -99,7 +101,7 @@ def _classes() -> list[type]:
 
 
 def _import_menu(menu: Any, _context: Any) -> None:
-    menu.layout.operator("objectgs.import_photos", text="ObjectGS Photos")
+    menu.layout.operator("objectgs.import_photos", text="ObjectGS Photos or Video")
     menu.layout.operator("objectgs.import_capture", text="ObjectGS Capture (COLMAP and others)")
     menu.layout.operator("objectgs.import_splats", text="3D Gaussian Splats (.ply, .spz, .splat)")
 

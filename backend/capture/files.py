@@ -22,7 +22,6 @@ from ..shared.formats.atomic import write_atomic
 from ..shared.formats.json_file import LARGEST, parse_json
 from ..shared.formats.regular_file import open_regular, read_regular, require_regular
 
-IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm", ".pgm"}
 MASK_SUFFIXES = (".png", ".npy", ".npz", ".tif", ".tiff", ".bmp")
 LOSSY_SUFFIXES = (".jpg", ".jpeg")
 _OPENING_ERRORS = (OSError, ValueError, SyntaxError, EOFError, MemoryError, PilImage.DecompressionBombError)

@@ -18,12 +18,12 @@ from PIL import Image as PilImage
 from ..shared.defaults import MAX_SIZE
 from ..shared.errors import InputError
 from ..shared.events import Reporter
+from ..shared.formats.suffixes import IMAGES
 from ..shared.reconstruction.objects import default_name
 from .capture import MIN_VIEWS_TO_HOLD_OUT
 from .colmap import COLMAP, Camera, Image, Model
 from .files import (
     HELD_OUT,
-    IMAGE_SUFFIXES,
     Files,
     image_size,
     is_color_mask,
@@ -153,7 +153,7 @@ def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Repo
             f"for instance {absent[0]}."
         )
     registered = {source.image_path for source in sources}
-    on_disk = [path for path in files.paths if Path(path).suffix.lower() in IMAGE_SUFFIXES]
+    on_disk = [path for path in files.paths if Path(path).suffix.lower() in IMAGES]
     unregistered = [path for path in on_disk if images_folder / path not in registered]
     if unregistered and len(registered) == present:
         warnings.append(

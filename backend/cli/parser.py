@@ -76,13 +76,25 @@ class _Commands:
 
 
 def _add_capture_commands(commands: _Commands) -> None:
-    poses = commands.add("sfm", "Make a capture of photos alone", texts.SFM, "photos --out garden")
-    poses.add_argument("photos", type=Path, metavar="PHOTOS", help="folder with photos, also in subfolders")
+    poses = commands.add("sfm", "Make a capture of photos or a video alone", texts.SFM, "photos --out garden")
+    poses.add_argument(
+        "photos",
+        type=Path,
+        nargs="+",
+        metavar="PHOTOS",
+        help="folder with photos and videos, also in subfolders; or a video; or files",
+    )
     poses.add_argument("--out", type=Path, required=True, metavar="CAPTURE", help="folder for the new capture")
     poses.add_argument(
         "--cameras", choices=("auto", "one", "each"), default="auto",
         help="which photos share a camera and its focal length: auto, by size and EXIF; one, all; each, none (auto)",
     )  # fmt: skip
+    poses.add_argument(
+        "--frames", type=types.count, metavar="N", help="number of frames of each video (by how far the picture moves)"
+    )
+    poses.add_argument(
+        "--leave-out", nargs="+", default=[], metavar="NAME", help="photos to leave out, named as in images/"
+    )
     check = commands.add("check", "Check a capture and list its contents", texts.CHECK, "garden")
     options.add_capture(check)
     prepare = commands.add(

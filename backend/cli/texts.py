@@ -6,7 +6,7 @@ COLMAP model of their cameras in sparse/0 (or transforms.json, or the cameras th
 Metashape, RealityScan or Bundler exported) and, for objects, an object ID mask of each
 image in masks/. The result is written to a reconstruction folder.
 
-  python -m backend sfm      photos --out garden         make a capture of photos alone
+  python -m backend sfm      photos --out garden         make a capture of photos or a video
   python -m backend check    garden                      check the capture
   python -m backend plan     garden                      show what training would do
   python -m backend train    garden --out garden-splats  train the splats (5 minutes)
@@ -24,9 +24,10 @@ used (the message says why), 130 stopped, 1 any other error.
 """
 
 SFM = """\
-Make a capture of photos alone: compute by COLMAP where they were taken, and points of
-the scene. Photos are copied to CAPTURE/images, unless PHOTOS is that folder; the
-cameras are written to CAPTURE/sparse/0, and what was found to CAPTURE/sfm/sfm.json.
+Make a capture of photos or a video alone: compute by COLMAP where they were taken, and
+points of the scene. Photos are copied to CAPTURE/images, unless PHOTOS is that folder;
+HEIC becomes JPEG. Of a video, sharp frames are taken, evenly in how far the picture
+moves. The cameras are written to CAPTURE/sparse/0, and what was found to CAPTURE/sfm/sfm.json.
 Photos that do not fit are named with the reason. If PHOTOS has folders images/ and
 masks/, both are copied. After a stop, the same command goes on.
 """

@@ -14,6 +14,8 @@ ALL_UP_TO = 150
 """Number of photos up to which all pairs are matched."""
 NEIGHBORS = 30
 """Number of most similar photos that each photo of a larger set is matched with."""
+ALONG = 10
+"""Number of next frames of a video that each frame is matched with."""
 FEATURES = 384
 """Number of features of a photo in the cheap comparison."""
 _RATIO = 0.8
@@ -21,13 +23,17 @@ _RATIO = 0.8
 
 
 def choose_pairs(
-    path: Path, names: Sequence[str], progress: Callable[[int, int], None] = lambda _done, _total: None
+    path: Path,
+    names: Sequence[str],
+    in_order: bool = False,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> list[tuple[str, str]] | None:
     """Return the pairs of photos to match; None for all of them.
 
     Args:
         path: the database with the features.
         names: the photos.
+        in_order: whether they are frames of videos, so that neighbors show the same.
         progress: called with the number of compared photos, and of all.
 
     Returns:
@@ -48,6 +54,8 @@ def choose_pairs(
         for second in np.argsort(-row, kind="stable")[:NEIGHBORS].tolist():
             if row[second]:
                 chosen.add((min(first, second), max(first, second)))
+        if in_order:
+            chosen.update((first, second) for second in range(first + 1, min(first + 1 + ALONG, len(names))))
     return [(names[first], names[second]) for first, second in sorted(chosen)]
 
 

@@ -1,25 +1,25 @@
-"""Photos of a folder as the images/ of a new capture, grouped by the camera that took them."""
+"""Photos and videos as the images/ of a new capture, grouped by the camera that took them."""
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from PIL import ExifTags
-from PIL import Image as PilImage
-
-from ..capture.files import IMAGE_SUFFIXES, read_image, write_image
 from ..shared.errors import InputError
 from ..shared.formats.atomic import atomic_path, make_folder
+from ..shared.formats.json_file import read_json, write_json
+from ..shared.formats.photos_source import WORK
+from ..shared.formats.suffixes import PHOTOS, RAW, VIDEOS
 from ..shared.stopping import StoppingReporter
+from . import photo_files, video
 
 IMAGES, MASKS = "images", "masks"
-COPIED = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"}
-"""Suffixes of files that COLMAP reads; images of other formats are converted to PNG."""
+FRAMES = "frames.json"
+"""File in sfm/ with the frames that were taken of each video."""
 _OTHER_FILES = re.compile(r"(labels?|classes|names|test)[\w.-]*\.(json|txt|csv)", re.IGNORECASE)
 _LEAST_FREE = 1.2
 """Free space on the disk, relative to the size of the photos, below which they are not copied."""
@@ -37,63 +37,111 @@ class Photo(NamedTuple):
     camera: str
 
 
-def take_photos(source: Path, capture: Path, reporter: StoppingReporter) -> tuple[list[Photo], dict[str, str]]:
-    """Copy the photos of a folder to the images/ of a capture, unless they are there.
+class Taken(NamedTuple):
+    """The photos of a capture.
+
+    Attributes:
+        photos: in natural order of their names.
+        unreadable: name -> reason for files that cannot be read.
+        in_order: whether all are frames of videos, so that neighbors show the same.
+    """
+
+    photos: list[Photo]
+    unreadable: dict[str, str]
+    in_order: bool
+
+
+def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, reporter: StoppingReporter) -> Taken:
+    """Copy photos and frames of videos to the images/ of a capture, unless they are there.
 
     Args:
-        source: a folder with photos, also in subfolders, or with a folder images/ and, optionally, masks/ and files
-            with names, which are copied, too.
+        sources: a folder with photos and videos, also in subfolders, or with a folder images/ and, optionally, masks/
+            and files with names, which are copied, too; or files of photos and videos.
         capture: the capture's folder.
-        reporter: receives progress.
-
-    Returns:
-        The photos in natural order of their names, and name -> reason for files that cannot be read.
+        frames: wanted number of frames of each video; None: by its motion.
+        reporter: receives progress and warnings.
 
     Raises:
         InputError: There are fewer than two photos, or too little space on the disk.
     """
-    base = source / IMAGES if (source / IMAGES).is_dir() else source
-    found = _listed(base, capture)
-    if len(found) < 2:
-        count = "only one photo" if found else "no photos"
+    source = sources[0] if len(sources) == 1 else Path(os.path.commonpath([path.parent for path in sources]))
+    base = source / IMAGES if (source / IMAGES).is_dir() else source if source.is_dir() else source.parent
+    found = _listed(base, capture) if sources[0].is_dir() else sorted(sources, key=_natural)
+    in_place = base.resolve() == (capture / IMAGES).resolve()
+    videos = [] if in_place else [path for path in found if path.suffix.lower() in VIDEOS]
+    files = [path for path in found if path.suffix.lower() in PHOTOS]
+    if len(files) < 2 and not videos:
+        count = "only one photo" if files else "no photos"
         raise InputError(f"{base} contains {count}; poses need at least two photos of the same scene.")
-    images = capture / IMAGES
-    in_place = base.resolve() == images.resolve()
     if not in_place:
-        _require_space(found, capture)
+        _require_space(files, capture)
+    # Masks fit the pixels as they are stored.
+    turn = not in_place and not (source / MASKS).is_dir()
     photos, unreadable = [], {}
-    for number, path in enumerate(found):
-        reporter.progress(number, len(found))
+    for number, path in enumerate(files):
+        reporter.progress(number, len(files))
         relative = path.relative_to(base)
         try:
-            photo = _described(path, relative)
+            camera = f"{relative.parent} {photo_files.camera_of(path, turn)}"
             if not in_place:
-                relative = _copied(path, relative, images)
-            photos.append(photo._replace(name=relative.as_posix()))
+                copied = photo_files.copy_photo(path, capture / IMAGES / relative, turn)
+                relative = copied.relative_to(capture / IMAGES)
+            photos.append(Photo(relative.as_posix(), camera))
         except InputError as error:
             unreadable[relative.as_posix()] = str(error)
+    for path in videos:
+        # COLMAP's lists of pairs have no names with spaces.
+        folder = "" if videos == [source] else re.sub(r"\s+", "_", path.relative_to(base).with_suffix("").as_posix())
+        try:
+            names = _frames_of(path, capture, folder, frames, reporter)
+            photos += [Photo((Path(folder) / name).as_posix(), f"video {folder}") for name in names]
+        except InputError as error:
+            if videos == [source]:
+                raise
+            unreadable[path.relative_to(base).as_posix()] = str(error)
     if len(photos) < 2:
-        raise InputError(f"Of the photos in {base}, {len(photos)} can be read; {next(iter(unreadable.values()))}")
-    if not in_place and base != source:
+        why = next(iter(unreadable.values()), "a single photo has no pose.")
+        raise InputError(f"Of the photos in {base}, {len(photos)} can be read; {why}")
+    if not in_place and base != source and source.is_dir():
         _copy_rest(source, capture)
-    return photos, unreadable
+    return Taken(photos, unreadable, not files)
+
+
+def _frames_of(path: Path, capture: Path, folder: str, count: int | None, reporter: StoppingReporter) -> list[str]:
+    """Take the frames of a video, unless that was done, and return their names in a folder of images/."""
+    listed = capture / WORK / FRAMES
+    known = read_json(listed) if listed.exists() else {}
+    status = path.stat()
+    asked = {"file": str(path.resolve()), "bytes": status.st_size, "modified": status.st_mtime_ns, "frames": count}
+    entry = known.get(folder, {})
+    names = entry.get("names") if all(entry.get(key) == value for key, value in asked.items()) else None
+    if names is None or not all((capture / IMAGES / folder / name).is_file() for name in names):
+        reporter.status(f"Choosing frames of {path.name}")
+        names = video.write_frames(path, capture / IMAGES / folder, count, reporter)
+        write_json(listed, {**known, folder: {**asked, "names": names}})
+    return names
 
 
 def _listed(base: Path, capture: Path) -> list[Path]:
-    """Return the photos below a folder in natural order, without those of the capture, if it is in the folder."""
+    """Return the photos and videos below a folder in natural order, without those of the capture, if it is in there.
+
+    Of a raw photo beside its JPEG, the latter is taken.
+    """
     try:
         inside = capture.resolve()
         paths = [
             path
             for path in base.rglob("*")
-            if path.suffix.lower() in IMAGE_SUFFIXES
+            if path.suffix.lower() in PHOTOS | VIDEOS
             and not path.name.startswith(".")
             and path.is_file()
             and (base.resolve().is_relative_to(inside) or not path.resolve().is_relative_to(inside))
         ]
     except OSError as error:
         raise InputError(f"{error.filename or base} cannot be read ({error.strerror}); check it.") from error
-    return sorted(paths, key=_natural)
+    developed = {path.with_suffix("") for path in paths if path.suffix.lower() in photo_files.COPIED}
+    kept = [path for path in paths if path.suffix.lower() not in RAW or path.with_suffix("") not in developed]
+    return sorted(kept, key=_natural)
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -111,38 +159,6 @@ def _require_space(paths: Sequence[Path], capture: Path) -> None:
             f"The photos need {needed / 1e9:.1f} GB and the disk of {existing} has {free / 1e9:.1f} GB free; make "
             "room, or choose another --out."
         )
-
-
-def _described(path: Path, relative: Path) -> Photo:
-    """Return a photo with its camera: folder, size and, where EXIF tells them, maker, model and focal length."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with PilImage.open(path) as image:
-                size, exif = image.size, image.getexif()
-                image.draft("L", (64, 64))  # Decodes a JPEG at an eighth of its size.
-                image.load()
-    except Exception as error:
-        raise InputError(f"{path.name} cannot be read as an image: it is damaged or its format is unknown.") from error
-    details = exif.get_ifd(ExifTags.IFD.Exif)
-    maker = [str(exif.get(tag, "")).strip("\0 ") for tag in (ExifTags.Base.Make, ExifTags.Base.Model)]
-    focal = details.get(ExifTags.Base.FocalLength, "")
-    return Photo(relative.as_posix(), " ".join([str(relative.parent), f"{size[0]}x{size[1]}", *maker, str(focal)]))
-
-
-def _copied(path: Path, relative: Path, images: Path) -> Path:
-    """Copy or convert a photo, unless that was done, and return its path within images/."""
-    relative = relative if path.suffix.lower() in COPIED else relative.with_suffix(".png")
-    target = images / relative
-    if target.exists():
-        return relative
-    make_folder(target.parent)
-    if path.suffix.lower() in COPIED:
-        with atomic_path(target) as part:
-            shutil.copyfile(path, part)
-    else:
-        write_image(target, read_image(path))
-    return relative
 
 
 def _copy_rest(source: Path, capture: Path) -> None:

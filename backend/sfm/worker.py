@@ -2,7 +2,7 @@
 
     worker extract DATABASE IMAGES GROUPS.json     features of the photos in each group, which share a camera
     worker match DATABASE [PAIRS.txt]              matches of the pairs, or of all
-    worker incremental|global DATABASE IMAGES OUT  camera poses and points
+    worker incremental|global DATABASE IMAGES OUT NAMES.json   camera poses of the named photos, and points
     worker refine MODEL OUT                        the same without wrong matches, and with the lens that photos show
 
 Photos and pairs whose results are in the database are skipped. Each line on standard output is one more photo with a
@@ -69,9 +69,10 @@ def match(database: str, pairs: str = "") -> None:
         pycolmap.match_exhaustive(database, options, every, verification)
 
 
-def map_incrementally(database: str, images: str, out: str) -> None:
+def map_incrementally(database: str, images: str, out: str, names: str) -> None:
     """Add one photo after another to the model."""
     options = pycolmap.IncrementalPipelineOptions()
+    options.image_names = json.loads(Path(names).read_text(encoding="utf-8"))
     options.random_seed, options.min_model_size = SEED, FEWEST_POSES
 
     def tell() -> None:
@@ -80,9 +81,10 @@ def map_incrementally(database: str, images: str, out: str) -> None:
     pycolmap.incremental_mapping(database, images, out, options=options, next_image_callback=tell)
 
 
-def map_globally(database: str, images: str, out: str) -> None:
+def map_globally(database: str, images: str, out: str, names: str) -> None:
     """Solve for all rotations, then all positions at once (GLOMAP)."""
     options = pycolmap.GlobalPipelineOptions()
+    options.image_names = json.loads(Path(names).read_text(encoding="utf-8"))
     options.random_seed, options.min_model_size = SEED, FEWEST_POSES
     pycolmap.global_mapping(database, images, out, options=options)
 
@@ -115,7 +117,7 @@ def adjust(model: pycolmap.Reconstruction) -> float:
     Returns:
         The median distance in pixels of the observations that were there at first.
     """
-    observed = _residuals(model)
+    observed = residuals(model)
     for most in (None, *_FARTHEST):
         typical = float(np.median([distance for distance, _, _ in observed]))
         if most is not None:
@@ -128,14 +130,14 @@ def adjust(model: pycolmap.Reconstruction) -> float:
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.loss_function_scale = max(_TYPICAL * typical, _FINEST)
         pycolmap.bundle_adjustment(model, options)
-        observed = _residuals(model)
+        observed = residuals(model)
         if most is None:
             first = float(np.median([distance for distance, _, _ in observed]))
     model.update_point_3d_errors()
     return first
 
 
-def _residuals(model: pycolmap.Reconstruction) -> list[tuple[float, int, int]]:
+def residuals(model: pycolmap.Reconstruction) -> list[tuple[float, int, int]]:
     """Return the distance in pixels, the image ID and the index of each observation of a point."""
     found = []
     for number in model.reg_image_ids():

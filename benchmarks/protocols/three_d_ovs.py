@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from backend.capture.files import IMAGE_SUFFIXES
 from backend.shared.errors import InputError
+from backend.shared.formats.suffixes import IMAGES
 
 from .captures import as_seen, copy_capture, need, read_binary_mask, read_colmap
 from .metrics import Results, mean, percent, prompt_rows, score_prompts
@@ -64,7 +64,7 @@ def convert(scene: Path, folder: Path) -> None:
 def _folders(scene: Path) -> dict[str, Path]:
     """Return test view -> its folder in segmentations, sorted by view."""
     photos = sorted(
-        path.name for path in need(scene / "images", "the photos").iterdir() if path.suffix.lower() in IMAGE_SUFFIXES
+        path.name for path in need(scene / "images", "the photos").iterdir() if path.suffix.lower() in IMAGES
     )
     parent = need(scene / "segmentations", "a folder for each test view")
     folders = sorted((path for path in parent.iterdir() if path.name.isdecimal()), key=lambda path: int(path.name))

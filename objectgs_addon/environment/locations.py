@@ -5,14 +5,14 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import bpy
 
 from ...backend.shared.formats.file_names import file_stem
-from ...backend.shared.formats.photos_source import photos_of
+from ...backend.shared.formats.photos_source import PhotosSource, read_source
 from ..process.backend_process import backend_command, backend_environment
 from ..process.jobs import Job
 from . import environment, online_access
@@ -51,20 +51,31 @@ def new_reconstruction(name: str, is_free: Callable[[Path], bool]) -> Path:
     return next(folder for each in numbered if is_free(folder := reconstructions_folder() / each))
 
 
-def name_of_photos(photos: Path) -> str:
-    """Return a name for a folder of photos: that of the folder above if its own says nothing."""
+def name_of_photos(sources: Sequence[Path]) -> str:
+    """Return a name for a folder of photos, a video or files of a folder.
+
+    Where the folder's name says nothing, it is that of the folder above.
+    """
+    if len(sources) == 1 and sources[0].is_file():
+        return file_stem(sources[0].stem, "video")
+    photos = sources[0] if len(sources) == 1 else sources[0].parent
     named = photos.parent if photos.name.lower() in ("images", "photos", "dcim") else photos
     named = named.parent if named.name.lower() == "capture" else named
     return file_stem(named.name, "photos")
 
 
-def new_capture(photos: Path) -> Path:
-    """Return the folder for the capture of a folder of photos: a new one, or that where its computation has begun."""
+def new_capture(sources: Sequence[Path]) -> Path:
+    """Return the folder for the capture of photos or a video: a new one, or that where its computation has begun."""
     chosen = preferences().reconstructions if preferences() else ""
     captures = (Path(bpy.path.abspath(chosen)) if chosen else user_folder()) / "captures"
-    name = name_of_photos(photos)
+    name = name_of_photos(sources)
     numbered = (captures / (name if number == 1 else f"{name}-{number}") for number in itertools.count(1))
-    return next(folder for folder in numbered if not folder.exists() or photos_of(folder) == photos)
+
+    def is_of_sources(folder: Path) -> bool:
+        stored = read_source(folder)
+        return stored is not None and stored.photos == list(sources)
+
+    return next(folder for folder in numbered if not folder.exists() or is_of_sources(folder))
 
 
 def backend_python() -> Path | None:
@@ -118,6 +129,23 @@ def backend_job(title: str, kind: str, folder: Path | None, *arguments: str) -> 
         cwd=ROOT,
         environment=backend_environment(environment.cache_folder(environment_folder())),
         if_silent=silent,
+    )
+
+
+def sfm_job(capture: Path, source: PhotosSource, leave_out: Sequence[str] = ()) -> Job:
+    """Return a job that computes the poses of photos, without those to leave out, and writes a capture."""
+    return backend_job(
+        f"Photos of {name_of_photos(source.photos)}",
+        "sfm",
+        capture,
+        "sfm",
+        *map(str, source.photos),
+        "--out",
+        str(capture),
+        "--cameras",
+        source.cameras,
+        *(["--frames", str(source.frames)] if source.frames else []),
+        *(["--leave-out", *leave_out] if leave_out else []),
     )
 
 

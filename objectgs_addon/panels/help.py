@@ -10,7 +10,7 @@ from ..environment.extension import ROOT
 MANUAL = ROOT / "docs" / "manual"
 """The pages of the manual, which the extension contains without their pictures."""
 STEPS = (
-    ("Import Photos", "IMAGE_DATA", "computes where they were taken"),
+    ("Import Photos or Video", "IMAGE_DATA", "computes where they were taken"),
     ("Import Capture", "IMPORT", "reads photos and their cameras"),
     ("Train", "PLAY", "turns the photos into splats; stop at any time"),
     ("Clean Up", "BRUSH_DATA", "hides stray splats"),

@@ -7,6 +7,7 @@ and reconstructions are matched by folder.
 
 from __future__ import annotations
 
+import json
 import time
 import traceback
 from collections.abc import Callable
@@ -231,7 +232,7 @@ def _import_made(job: Job, owner: bpy.types.Scene | None) -> bool:
     """Import the capture that a job has made if the backend is set up; return False."""
     assert job.folder is not None
     if job.kind == "sfm":
-        messages.show(" ".join([f"{job.title}: {job.message}", *job.warnings[:_SHOWN_WARNINGS]]))
+        _show_poses(job)
     if owner is None or locations.backend_python() is None:
         messages.show(f"The new capture is in {job.folder}; set up the backend, then import it")
         return False
@@ -246,6 +247,22 @@ def _import_made(job: Job, owner: bpy.types.Scene | None) -> bool:
         lambda _kind, text: messages.show(text, "ERROR"),
     )
     return False
+
+
+def _show_poses(job: Job) -> None:
+    """Show how many photos have a pose, with a button to leave out those whose poses are weak."""
+    text = " ".join([f"{job.title}: {job.message}", *job.warnings[:_SHOWN_WARNINGS]])
+    weak = job.result.get("weak")
+    if not (isinstance(weak, list) and weak):
+        messages.show(text)
+        return
+    messages.show(
+        text,
+        operator="objectgs.leave_out_photos",
+        label=f"Leave Out {len(weak)} Weak Photo{'s' if len(weak) > 1 else ''}",
+        capture=str(job.folder),
+        names=json.dumps(weak),
+    )
 
 
 def _assign_objects(job: Job, owner: bpy.types.Scene) -> None:

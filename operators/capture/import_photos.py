@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Import photos alone: where they were taken is computed in the background, and the capture is imported then."""
+"""Import photos or a video alone: where they were taken is computed in the background, and the capture is imported."""
 
 from pathlib import Path
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, StringProperty
+from bpy.props import CollectionProperty, EnumProperty, IntProperty, StringProperty
 
 from ...backend.shared.errors import InputError
+from ...backend.shared.formats.photos_source import PhotosSource
+from ...backend.shared.formats.suffixes import PHOTOS, VIDEOS
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
 from ..common import need
@@ -16,16 +18,20 @@ from ..common.reporting import reports_errors
 
 class ImportPhotos(ImportDialog, bpy.types.Operator):
     bl_idname = "objectgs.import_photos"
-    bl_label = "Import Photos"
+    bl_label = "Import Photos or Video"
     bl_description = (
-        "Compute where the photos of a folder were taken, in the background, and import them. This takes minutes, and "
-        "hours for hundreds of photos"
+        "Compute where the photos of a folder, the selected photos or the frames of a video were taken, in the "
+        "background, and import them. This takes minutes, and hours for hundreds of photos"
     )
     bl_options = {"REGISTER"}
 
     directory: StringProperty(name="Photos", subtype="DIR_PATH", description="Folder with the photos")
-    filter_folder: BoolProperty(default=True, options={"HIDDEN"})
-    filter_image: BoolProperty(default=True, options={"HIDDEN"})
+    files: CollectionProperty(
+        name="Files", type=bpy.types.OperatorFileListElement, description="Photos or a video; if empty, all photos"
+    )
+    filter_glob: StringProperty(
+        default=";".join(f"*{suffix}" for suffix in sorted(PHOTOS | VIDEOS)), options={"HIDDEN"}
+    )
     # A plain string: the button of a DIR_PATH cannot open a second file browser.
     folder: StringProperty(
         name="Save To",
@@ -41,31 +47,35 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
             ("each", "One per Photo", "None, as for photos by many people or a zoom lens"),
         ],
     )
+    frames: IntProperty(
+        name="Video Frames",
+        description="Number of frames that are used of each video, the sharpest ones. 0: by how far the picture moves",
+        min=0,
+        soft_max=300,
+    )
 
     def draw(self, _context: bpy.types.Context) -> None:
         self.layout.use_property_split = True
         self.layout.prop(self, "folder", placeholder="Automatic")
         self.layout.prop(self, "cameras")
+        self.layout.prop(self, "frames")
+        names = [file.name for file in self.files if file.name]
+        self.layout.label(text=f"{len(names)} files" if len(names) > 1 else names[0] if names else "All in the folder")
 
     @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
-        photos = Path(bpy.path.abspath(self.directory)).resolve() if self.directory else None
-        if photos is None or not photos.is_dir():
-            raise InputError(f"The folder {photos or 'of the photos'} does not exist; choose another")
-        capture = Path(bpy.path.abspath(self.folder)).resolve() if self.folder else locations.new_capture(photos)
+        sources = self._sources()
+        capture = Path(bpy.path.abspath(self.folder)).resolve() if self.folder else locations.new_capture(sources)
         need.require_unused(capture)
-        job = locations.backend_job(
-            f"Photos of {locations.name_of_photos(photos)}",
-            "sfm",
-            capture,
-            "sfm",
-            str(photos),
-            "--out",
-            str(capture),
-            "--cameras",
-            self.cameras,
-        )
+        job = locations.sfm_job(capture, PhotosSource(sources, self.cameras, self.frames or None))
         return background.submit(job, context.scene, self.report)
+
+    def _sources(self) -> list[Path]:
+        """Return the folder, or the files selected in it."""
+        folder = Path(bpy.path.abspath(self.directory)).resolve() if self.directory else None
+        if folder is None or not folder.is_dir():
+            raise InputError(f"The folder {folder or 'of the photos'} does not exist; choose another")
+        return sorted(folder / file.name for file in self.files if file.name) or [folder]
 
 
 CLASSES = (ImportPhotos,)

@@ -8,10 +8,10 @@ import threading
 import numpy as np
 import pycolmap
 import pytest
-from PIL import Image
+from PIL import Image, ImageFilter
 
 from backend.cli import main as command_line
-from backend.sfm import agreement, database, pairs, stages
+from backend.sfm import agreement, check, database, pairs, stages
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
@@ -221,6 +221,40 @@ def test_photos_that_do_not_fit_are_named_with_the_reason(photos, tmp_path, run_
     assert set(left_out) == {"zz other room.png", "zz plain.png", "zz broken.jpg"}
     assert "nothing that another photo shows" in left_out["zz other room.png"]
     assert "too few details" in left_out["zz plain.png"] and "damaged" in left_out["zz broken.jpg"]
+
+
+def test_weak_photos_are_named_and_left_out_by_request(photos, tmp_path, run_command):
+    folder = shutil.copytree(photos / "images", tmp_path / "mixed")
+    blurred = Image.fromarray(photo(ring(count=13)[5])).filter(ImageFilter.GaussianBlur(3.0))
+    blurred.save(folder / "photo 3b.png")
+    capture = tmp_path / "capture"
+    assert run_command("sfm", folder, "--out", capture).code == EXIT_DONE
+    report = json.loads((capture / "sfm" / "sfm.json").read_text())
+    unsure = {**report["weak"], **report["left_out"]}
+    assert list(unsure) == ["photo 3b.png"]
+    assert set(report["figures"]["photo 1.png"]) == {"support", "error", "points"}
+    with Image.open(capture / "sfm" / "sfm.png") as picture:
+        assert picture.width > 1000
+    result = run_command("sfm", folder, "--out", capture, "--leave-out", "photo 3b.png")
+    assert result.code == EXIT_DONE
+    report = json.loads((capture / "sfm" / "sfm.json").read_text())
+    assert report["left_out"] == {"photo 3b.png": "it was left out by request"} and not report["weak"]
+    assert report["registered"] == VIEWS and report["photos"] == VIEWS + 1
+
+
+def test_weak_photos_are_those_unlike_the_others():
+    figures = {f"{number}.jpg": check.PhotoFigures(0.98, 0.5 + 0.01 * number, 400) for number in range(9)}
+    assert check.weak_photos(figures) == {}
+    figures |= {
+        "few.jpg": check.PhotoFigures(0.95, 0.5, 20),
+        "far.jpg": check.PhotoFigures(0.95, 2.0, 400),
+        "wrong.jpg": check.PhotoFigures(0.7, 0.5, 400),
+    }
+    weak = check.weak_photos(figures)
+    assert list(weak) == ["wrong.jpg", "far.jpg", "few.jpg"]
+    assert "30% of its matches" in weak["wrong.jpg"] and "20 points" in weak["few.jpg"]
+    small = {name: each._replace(error=each.error / 100) for name, each in figures.items()}
+    assert "far.jpg" not in check.weak_photos(small), "a fiftieth of a pixel is no error"
 
 
 def test_photos_from_one_spot_are_refused(tmp_path, run_command):

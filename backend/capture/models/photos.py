@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ...shared.errors import InputError
-from ..files import IMAGE_SUFFIXES, Files, image_size
+from ...shared.formats.suffixes import IMAGES
+from ..files import Files, image_size
 
 
 def photos_folder(folder: Path) -> Path:
@@ -43,7 +44,7 @@ class Photos:
         self._by_name: dict[str, list[str]] = {}
         for path in self._files.paths:
             stem, suffix = _split(path)
-            if suffix.lower() in IMAGE_SUFFIXES:
+            if suffix.lower() in IMAGES:
                 self._by_stem.setdefault(stem.casefold(), []).append(path)
                 for key in {path.rpartition("/")[2], stem.rpartition("/")[2]}:
                     self._by_name.setdefault(key.casefold(), []).append(path)
@@ -54,7 +55,7 @@ class Photos:
         for start in range(len(parts)):
             end = "/".join(parts[start:])
             found = self._files.find(end)
-            if found is not None and found.suffix.lower() in IMAGE_SUFFIXES:
+            if found is not None and found.suffix.lower() in IMAGES:
                 return found.relative_to(self.folder).as_posix()
             if name := _only(self._by_stem.get(end.casefold())):
                 return name
@@ -71,7 +72,7 @@ class Photos:
 def _split(path: str) -> tuple[str, str]:
     """Split a path into the part before the suffix of a photo, and that suffix, which may be empty."""
     stem, dot, suffix = path.rpartition(".")
-    return (stem, dot + suffix) if stem and dot + suffix.lower() in IMAGE_SUFFIXES else (path, "")
+    return (stem, dot + suffix) if stem and dot + suffix.lower() in IMAGES else (path, "")
 
 
 def _only(paths: list[str] | None) -> str | None:

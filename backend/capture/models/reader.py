@@ -8,8 +8,8 @@ from pathlib import Path
 
 from ...shared.errors import InputError
 from ...shared.formats.regular_file import open_regular
+from ...shared.formats.suffixes import IMAGES
 from ..colmap import Model, find_model, has_model, read_model
-from ..files import IMAGE_SUFFIXES
 from . import bundler, metashape, realityscan, transforms
 
 _FORMATS: tuple[tuple[str, str, Callable[[bytes], bool], Callable[[Path], Model]], ...] = (
@@ -43,7 +43,7 @@ def read_capture_model(folder: Path) -> Model:
             model.warnings[:0] = warnings
             return model
         files = _files_in(folder)
-        photos = [path for path in (*files, *_files_in(folder / "images")) if path.suffix.lower() in IMAGE_SUFFIXES]
+        photos = [path for path in (*files, *_files_in(folder / "images")) if path.suffix.lower() in IMAGES]
     except OSError as error:
         raise InputError(f"{error.filename or folder} cannot be read ({error.strerror}); check it.") from error
     unreadable = []

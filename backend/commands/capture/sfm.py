@@ -6,11 +6,14 @@ import argparse
 import shutil
 import time
 from pathlib import Path
+from typing import Any
 
 import pycolmap
 
 from ...capture import load_capture
 from ...sfm import database, model
+from ...sfm.agreement import measure_agreement
+from ...sfm.check import figures_of, weak_photos, write_picture
 from ...sfm.dense import dense_points, spacing, thinned
 from ...sfm.pairs import choose_pairs
 from ...sfm.photos import IMAGES, Photo, take_photos
@@ -18,11 +21,12 @@ from ...sfm.stages import run_stage
 from ...shared.errors import InputError
 from ...shared.formats.atomic import make_folder, recorded, write_atomic
 from ...shared.formats.json_file import write_json
-from ...shared.formats.photos_source import WORK, remember_photos
+from ...shared.formats.photos_source import WORK, PhotosSource, write_source
+from ...shared.formats.suffixes import PHOTOS, VIDEOS
 from ...shared.reconstruction.lock import locked
 from ...shared.stopping import StoppingReporter
 
-REPORT = "sfm.json"
+REPORT, PICTURE = "sfm.json", "sfm.png"
 
 _EXTRACT, _MATCH, _MAP, _DENSE = 0.5, 0.03, 0.3, 0.3
 """Expected seconds of the stages for each photo, pair, photo and photo on two cores, until the pace is known."""
@@ -33,21 +37,31 @@ _WORST = 10
 
 def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Find features, match the photos, compute poses and points, and write CAPTURE/sparse/0 and sfm/sfm.json."""
-    source, capture = options.photos, options.out
-    if not source.is_dir():
-        raise InputError(f"{source} is no folder; choose the folder that contains the photos.")
-    _require_own(source, capture)
+    sources, capture = options.photos, options.out
+    _require_sources(sources)
+    _require_own(sources[0], capture)
     with recorded() as created:
         try:
             make_folder(capture / WORK)
             with locked(capture / WORK):
-                remember_photos(capture, source)
-                _run(source, capture, options, reporter)
+                write_source(capture, PhotosSource(sources, options.cameras, options.frames, options.leave_out))
+                _run(sources, capture, options, reporter)
         except InputError:
             if not (capture / WORK / database.NAME).exists():
                 created.remove_files()
                 created.remove_folders()
             raise
+
+
+def _require_sources(sources: list[Path]) -> None:
+    """Raise InputError unless the sources are a folder, or files of photos and videos."""
+    for path in sources:
+        if not path.exists():
+            raise InputError(f"{path} does not exist; choose a folder of photos, or a video.")
+        if path.is_dir() and len(sources) > 1:
+            raise InputError(f"{path} is a folder beside other photos; choose one folder, or files.")
+        if path.is_file() and path.suffix.lower() not in PHOTOS | VIDEOS:
+            raise InputError(f"{path} is neither a photo nor a video that can be read; choose another file.")
 
 
 def _require_own(source: Path, capture: Path) -> None:
@@ -65,7 +79,7 @@ def _require_own(source: Path, capture: Path) -> None:
         raise InputError(f"{capture} contains other files; choose a new folder as --out.")
 
 
-def _run(source: Path, capture: Path, options: argparse.Namespace, reporter: StoppingReporter) -> None:
+def _run(sources: list[Path], capture: Path, options: argparse.Namespace, reporter: StoppingReporter) -> None:
     started = time.monotonic()
     work = capture / WORK
     images, path, log = capture / IMAGES, work / database.NAME, work / "colmap.log"
@@ -74,9 +88,14 @@ def _run(source: Path, capture: Path, options: argparse.Namespace, reporter: Sto
         "global": ("Poses", 10.0), "incremental": ("Poses", 5.0), "refine": ("Poses", 2.0), "dense": ("Points", 10.0),
     })  # fmt: skip
     reporter.begin("photos", "Reading the photos")
-    photos, unreadable = take_photos(source, capture, reporter)
+    photos, unreadable, in_order = take_photos(sources, capture, options.frames, reporter)
+    source = sources[0] if len(sources) == 1 else sources[0].parent
+    unwanted = {name: "it was left out by request" for name in options.leave_out}
+    photos = [photo for photo in photos if photo.name not in unwanted]
     names = [photo.name for photo in photos]
     count = len(photos)
+    if count < 2:
+        raise InputError(f"Too few photos are left in {source}; leave out fewer.")
     pairs_expected = count * (count - 1) / 2
     reporter.expect({
         "extract": ("Features", _EXTRACT * count), "match": ("Matching", _MATCH * pairs_expected),
@@ -84,15 +103,16 @@ def _run(source: Path, capture: Path, options: argparse.Namespace, reporter: Sto
         "refine": ("Poses", 0.2 * _MAP * count), "dense": ("Points", _DENSE * count),
     })  # fmt: skip
 
-    groups = work / "groups.json"
+    groups, listed_names = work / "groups.json", work / "names.json"
     write_json(groups, _groups(photos, options.cameras))
+    write_json(listed_names, names)
     reporter.begin("extract", f"Finding features in {count} photos")
     if not run_stage(
         reporter, log, ["extract", str(path), str(images), str(groups)], lambda _: database.count_features(path), count
     ):
         raise InputError(f"COLMAP could not find features in the photos; see {log}.")
     reporter.begin("pairs", "Comparing the photos")
-    pairs = choose_pairs(path, names, reporter.progress)
+    pairs = choose_pairs(path, names, in_order, reporter.progress)
     listed = work / "pairs.txt"
     if pairs is not None:
         write_atomic(listed, "".join(f"{first} {second}\n" for first, second in pairs).encode())
@@ -111,7 +131,8 @@ def _run(source: Path, capture: Path, options: argparse.Namespace, reporter: Sto
         reporter.begin(mapper, f"Computing poses ({mapper})")
         out = work / mapper
         make_folder(out)
-        run_stage(reporter, log, [mapper, str(path), str(images), str(out)], lambda lines: lines, count)
+        arguments = [mapper, str(path), str(images), str(out), str(listed_names)]
+        run_stage(reporter, log, arguments, lambda lines: lines, count)
         candidate = model.read_candidate(mapper, out, path)
         if candidate is not None:
             candidates.append(candidate)
@@ -124,10 +145,30 @@ def _run(source: Path, capture: Path, options: argparse.Namespace, reporter: Sto
     wrong = model.drop_untrusted(best)
     model.require_parallax(best.model, source)
     best = best._replace(model=_refined(best.model, work, log, reporter))
+    best = best._replace(agreement=measure_agreement(best.model, path))
+    figures = figures_of(best.model, best.agreement)
+    weak = weak_photos(figures)
     model.to_common_size(best.model)
     model.write_model(best.model, capture)
     _densify(best.model, capture, reporter)
-    _report(best, capture, names, unreadable, wrong, time.monotonic() - started, reporter)
+    write_picture(work / PICTURE, best.model, figures, path, list(weak))
+    posed = list(figures)
+    left_out = {**unreadable, **unwanted, **model.reasons(path, names, posed, wrong)}
+    report = {
+        "photos": len(names) + len(unreadable) + len(unwanted),
+        "registered": len(posed),
+        "points": best.model.num_points3D(),
+        "reprojection_error": round(float(best.model.compute_mean_reprojection_error()), 4),
+        "mapper": best.mapper,
+        "cameras": best.model.num_cameras(),
+        "separate_sets": best.others,
+        "figures": {name: own._asdict() for name, own in figures.items()},
+        "weak": weak,
+        "left_out": left_out,
+        "seconds": round(time.monotonic() - started, 1),
+    }
+    write_json(work / REPORT, report)
+    _tell(report, capture, reporter)
 
 
 def _refined(
@@ -184,45 +225,28 @@ def _require_matches(path: Path, source: Path) -> None:
         raise InputError(model.one_spot(source))
 
 
-def _report(
-    best: model.Candidate,
-    capture: Path,
-    names: list[str],
-    unreadable: dict[str, str],
-    wrong: list[str],
-    seconds: float,
-    reporter: StoppingReporter,
-) -> None:
-    """Write sfm.json, and report what was found and which photos have no pose and why."""
-    found = best.model
-    posed = sorted(found.image(number).name for number in found.reg_image_ids())
-    left_out = {**unreadable, **model.reasons(capture / WORK / database.NAME, names, posed, wrong)}
-    error = found.compute_mean_reprojection_error()
-    report = {
-        "photos": len(names) + len(unreadable),
-        "registered": len(posed),
-        "points": found.num_points3D(),
-        "reprojection_error": round(float(error), 4),
-        "mapper": best.mapper,
-        "cameras": found.num_cameras(),
-        "separate_sets": best.others,
-        "support": {name: round(best.agreement.support[name], 4) for name in posed},
-        "left_out": left_out,
-        "seconds": round(seconds, 1),
-    }
-    write_json(capture / WORK / REPORT, report)
+def _tell(report: dict[str, Any], capture: Path, reporter: StoppingReporter) -> None:
+    """Report what was found, which photos have no pose and why, and which are weak."""
+    path, left_out, weak = capture / WORK / REPORT, report["left_out"], report["weak"]
     for name, why in list(left_out.items())[:_WORST]:
         reporter.warning(f"{name} has no pose: {why}.")
     if len(left_out) > _WORST:
-        reporter.warning(f"{len(left_out) - _WORST} more photos have no pose; {capture / WORK / REPORT} lists them.")
-    if best.others and max(best.others) > 2:
+        reporter.warning(f"{len(left_out) - _WORST} more photos have no pose; {path} lists them.")
+    for name, why in list(weak.items())[:_WORST]:
+        reporter.warning(f"{name} is weak: {why}; --leave-out {name} computes the poses without it.")
+    if len(weak) > _WORST:
+        reporter.warning(f"{len(weak) - _WORST} more photos are weak; {path} lists them.")
+    others = report["separate_sets"]
+    if others and max(others) > 2:
         reporter.warning(
-            f"The photos form separate sets, of {len(posed)} and {', '.join(map(str, best.others))} photos; the "
+            f"The photos form separate sets, of {report['registered']} and {', '.join(map(str, others))} photos; the "
             "largest is used. Photos that show both sets would connect them."
         )
     reporter.done(
-        message=f"{len(posed)} of {report['photos']} photos have a pose, with {report['points']:,} points and a mean "
-        f"reprojection error of {error:.2f} pixels.",
+        message="{registered} of {photos} photos have a pose, with {points:,} points and a mean reprojection error of "
+        "{reprojection_error:.2f} pixels.".format(**report),
         capture=str(capture),
+        picture=str(capture / WORK / PICTURE),
+        weak=list(weak),
         **{key: report[key] for key in ("photos", "registered", "points", "reprojection_error")},
     )

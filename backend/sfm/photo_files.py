@@ -1,0 +1,138 @@
+"""Files of photos in all accepted formats: which camera took them, and copies that COLMAP and other programs read."""
+
+from __future__ import annotations
+
+import importlib
+import io
+import shutil
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pillow_heif
+from PIL import ExifTags, ImageCms, ImageOps
+from PIL import Image as PilImage
+
+from ..capture.files import read_image, write_image
+from ..shared.errors import InputError
+from ..shared.formats.atomic import atomic_path, make_folder, write_atomic
+from ..shared.formats.suffixes import HEIC, RAW
+
+COPIED = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"}
+"""Suffixes of files that COLMAP reads. HEIC becomes JPEG with its EXIF data, which may tell the focal length; other
+formats become PNG."""
+_QUALITY = 97
+"""JPEG quality of photos that are converted or turned."""
+
+pillow_heif.register_heif_opener()
+
+
+def camera_of(path: Path, turned: bool) -> str:
+    """Return what photos of one camera with one focal length have in common: size and, by EXIF, model and focal length.
+
+    Args:
+        path: the photo.
+        turned: whether it is turned as its EXIF orientation says.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    if path.suffix.lower() in RAW:
+        return path.suffix.lower()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with PilImage.open(path) as image:
+                size, exif = image.size, image.getexif()
+                image.draft("L", (64, 64))  # Decodes a JPEG at an eighth of its size.
+                image.load()
+    except Exception as error:
+        raise InputError(f"{path.name} cannot be read as an image: it is damaged or its format is unknown.") from error
+    if turned and _orientation(exif) > 4:
+        size = size[::-1]
+    details = exif.get_ifd(ExifTags.IFD.Exif)
+    maker = [str(exif.get(tag, "")).strip("\0 ") for tag in (ExifTags.Base.Make, ExifTags.Base.Model)]
+    return " ".join([f"{size[0]}x{size[1]}", *maker, str(details.get(ExifTags.Base.FocalLength, ""))])
+
+
+def copy_photo(path: Path, target: Path, turn: bool) -> Path:
+    """Copy a photo, or convert it to JPEG or PNG, unless that was done.
+
+    Args:
+        path: the photo.
+        target: the copy, whose suffix may change.
+        turn: whether to turn it as its EXIF orientation says, so that it stands upright; the pixels of others are kept.
+
+    Returns:
+        The copy.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    suffix = path.suffix.lower()
+    target = target if suffix in COPIED else target.with_suffix(".jpg" if suffix in HEIC else ".png")
+    if target.exists():
+        return target
+    make_folder(target.parent)
+    if suffix in RAW:
+        write_image(target, _developed(path))
+    elif suffix in HEIC:
+        _save(target, _with_colors(PilImage.open(path)))
+    elif suffix not in COPIED:
+        write_image(target, read_image(path))
+    elif turn and suffix in (".jpg", ".jpeg") and _is_turned(path):
+        _save(target, ImageOps.exif_transpose(PilImage.open(path)))
+    else:
+        with atomic_path(target) as part:
+            shutil.copyfile(path, part)
+    return target
+
+
+def _save(target: Path, image: PilImage.Image) -> None:
+    """Write a JPEG atomically, with the image's EXIF data."""
+    buffer = io.BytesIO()
+    image.convert("RGB").save(buffer, "JPEG", quality=_QUALITY, subsampling=0, exif=image.getexif())
+    write_atomic(target, buffer.getvalue())
+
+
+def _orientation(exif: PilImage.Exif) -> int:
+    value = exif.get(ExifTags.Base.Orientation, 1)
+    return value if isinstance(value, int) and 1 <= value <= 8 else 1
+
+
+def _is_turned(path: Path) -> bool:
+    with PilImage.open(path) as image:
+        return _orientation(image.getexif()) > 1
+
+
+def _with_colors(image: PilImage.Image) -> PilImage.Image:
+    """Return an image in sRGB, which phones store with the colors of their displays (Display P3)."""
+    profile = image.info.get("icc_profile")
+    if not profile:
+        return image
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        shown = ImageCms.profileToProfile(image.convert("RGB"), source, ImageCms.createProfile("sRGB"))
+    except ImageCms.PyCMSError:
+        return image
+    assert shown is not None
+    shown.getexif().update(image.getexif())
+    return shown
+
+
+def _developed(path: Path) -> PilImage.Image:
+    """Develop a raw photo with the camera's white balance and the same brightness for all."""
+    try:
+        rawpy: Any = importlib.import_module("rawpy")
+    except ImportError as error:
+        raise InputError(
+            f"{path.name} is a raw photo, which needs the package rawpy; install it in the backend's Python, or save "
+            "the photo as JPEG."
+        ) from error
+    try:
+        with rawpy.imread(str(path)) as raw:
+            return PilImage.fromarray(raw.postprocess(use_camera_wb=True, no_auto_bright=True))
+    except Exception as error:
+        raise InputError(
+            f"{path.name} cannot be read as a raw photo: it is damaged or of an unknown camera."
+        ) from error

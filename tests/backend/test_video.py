@@ -1,0 +1,296 @@
+"""Frames of videos: choice by motion and sharpness, turned, interlaced, HDR and damaged videos, and poses of a walk."""
+
+import json
+
+import av
+import numpy as np
+import pytest
+from PIL import Image, ImageFilter
+
+from backend.sfm import motion, photo_files, video
+from backend.shared.color import hdr
+from backend.shared.errors import EXIT_BAD_INPUT, EXIT_DONE, InputError
+from backend.shared.events import Reporter
+from backend.shared.stopping import StoppingReporter, StopRequest
+
+from .test_sfm import HEIGHT, WIDTH, photo, pose, texture
+
+PAN = 4
+"""Pixels by which the picture of `pan` moves from frame to frame."""
+
+
+def reporter() -> StoppingReporter:
+    return StoppingReporter(Reporter(), StopRequest())
+
+
+def write_video(path, images, codec="libx264", form="yuv420p", rate=25, times=None, matrix=None, **tags):
+    """Write images (h, w, 3) uint8 or uint16 as a video; times: in frames; matrix: of the colors, tagged or not."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=rate, options={"crf": "12"})
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt = form
+        for name, value in tags.items():
+            setattr(stream.codec_context, name, value)
+        for number, image in enumerate(images):
+            frame = av.VideoFrame.from_ndarray(image, "rgb48le" if image.dtype == np.uint16 else "rgb24")
+            if matrix is not None:
+                frame = frame.reformat(format=form, dst_colorspace=matrix)
+                frame.colorspace = tags.get("colorspace", 2)
+            frame.pts = number if times is None else times[number]
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+
+def pan(count: int, step: int = PAN, size=(144, 192)) -> list[np.ndarray]:
+    """Return pictures of a texture that moves to the left."""
+    wide = texture(3).astype(np.uint8)
+    wide = np.concatenate([wide, wide], 1)
+    return [wide[: size[0], step * number : step * number + size[1]] for number in range(count)]
+
+
+def blurred(image: np.ndarray, radius: float = 2.0) -> np.ndarray:
+    return np.asarray(Image.fromarray(image).filter(ImageFilter.GaussianBlur(radius)))
+
+
+@pytest.mark.parametrize("step", [0, 1, 4, 12])
+def test_motion_is_that_of_the_picture(step):
+    tracker = motion.MotionTracker()
+    positions = [tracker.add(image.mean(2)) for image in pan(16, step)]
+    assert positions[-1] == pytest.approx(15 * step / 192, rel=0.1, abs=1e-9)
+    assert (np.diff(positions) >= -1e-9).all()
+
+
+def test_motion_beyond_measure_counts_as_far():
+    tracker = motion.MotionTracker()
+    tracker.add(texture(3)[:144, :192].mean(2))
+    assert tracker.add(texture(4)[:144, :192].mean(2)) == pytest.approx(24 / 192)
+
+
+def test_an_object_that_turns_before_a_still_wall_is_motion():
+    tracker = motion.MotionTracker()
+    wall = texture(5)[:144, :192].mean(2)
+    positions = []
+    for image in pan(10):
+        wall[:, 48:144] = image[:, 48:144].mean(2)
+        positions.append(tracker.add(wall))
+    assert positions[-1] > 0.6 * 9 * PAN / 192
+
+
+def test_choice_is_even_in_motion_and_takes_sharp_frames():
+    positions = np.concatenate([np.linspace(0, 0.2, 80), np.linspace(0.21, 1.0, 20)])
+    sharp = np.ones(100)
+    sharp[::3] = 2.0
+    chosen = motion.choose_frames(positions, sharp, 10)
+    assert len(chosen) == 10 and np.diff(positions[chosen]).max() < 0.2
+    assert (sharp[chosen] == 2.0).mean() >= 0.7
+    assert (chosen < 80).sum() <= 3, "of the 80 frames where it hardly moves"
+
+
+def test_number_of_frames_follows_the_motion():
+    sharp = np.ones(1000)
+    counts = [len(motion.choose_frames(np.linspace(0, length, 1000), sharp)) for length in (0.5, 8.0, 100.0)]
+    assert counts == [motion.FEWEST, 100, motion.MOST]
+    assert len(motion.choose_frames(np.linspace(0, 8.0, 12), sharp[:12])) == 12
+    assert len(motion.choose_frames(np.zeros(500), sharp[:500])) == motion.FEWEST, "a camera at rest"
+
+
+def test_frames_are_the_sharp_ones(tmp_path):
+    images = [blurred(image) if number % 5 else image for number, image in enumerate(pan(60))]
+    write_video(tmp_path / "a.mp4", images)
+    names = video.write_frames(tmp_path / "a.mp4", tmp_path / "frames", 11, reporter())
+    numbers = [int(name[6:12]) for name in names]
+    assert len(names) >= 10 and numbers == sorted(numbers)
+    assert np.mean([number % 5 == 0 for number in numbers]) >= 0.8
+    for name, number in zip(names, numbers):
+        shown = np.asarray(Image.open(tmp_path / "frames" / name), float)
+        assert np.abs(shown - images[number]).mean() < 6
+
+
+def test_variable_rates_and_repeated_frames_do_not_matter(tmp_path):
+    images = pan(40)
+    held = images[:10] + [images[10]] * 60 + images[10:]
+    write_video(tmp_path / "a.mp4", held, times=np.cumsum(np.arange(len(held)) % 7 + 1).tolist())
+    found = video.analyze(tmp_path / "a.mp4", reporter())
+    assert len(found.positions) == len(held)
+    chosen = motion.choose_frames(found.positions, found.sharp, 10)
+    assert ((chosen >= 10) & (chosen < 70)).sum() <= 2
+
+
+def test_video_is_turned_as_it_says(tmp_path):
+    path = tmp_path / "a.mp4"
+    images = pan(3, size=(96, 192))
+    write_video(path, images)
+    content = bytearray(path.read_bytes())
+    header = content.index(b"tkhd")
+    matrix = header + 4 + 4 + 4 + 4 + 4 + 4 + 4 + 8 + 2 + 2 + 2 + 2
+    one = 0x10000
+    assert int.from_bytes(content[matrix : matrix + 4], "big") == one
+    clockwise = (0, one, 0, -one, 0, 0, 0, 0, 0x40000000)
+    content[matrix : matrix + 36] = b"".join(value.to_bytes(4, "big", signed=True) for value in clockwise)
+    path.write_bytes(content)
+    (name, *_) = video.write_frames(path, tmp_path / "frames", None, reporter())
+    shown = np.asarray(Image.open(tmp_path / "frames" / name), float)
+    assert shown.shape[:2] == (192, 96)
+    assert np.abs(shown - np.rot90(images[0], -1)).mean() < 6
+
+
+def test_half_pictures_become_whole(tmp_path):
+    """Each frame shows two times, in its even and odd rows; the result has rows of one time only."""
+    images = [blurred(image, 1.5) for image in pan(24, 3)]
+    woven = []
+    for first, second in zip(images[::2], images[1::2]):
+        frame = first.copy()
+        frame[1::2] = second[1::2]
+        woven.append(frame)
+    from av.codec.context import Flags
+
+    flags = Flags.interlaced_dct | Flags.interlaced_me
+    write_video(tmp_path / "a.mpg", woven, "mpeg2video", flags=flags, bit_rate=20_000_000)
+    assert video.analyze(tmp_path / "a.mpg", reporter()).interlaced
+    names = video.write_frames(tmp_path / "a.mpg", tmp_path / "frames", None, reporter())
+    assert len(names) == len(woven)
+
+    def combing(image):
+        rows = image.astype(float)
+        return np.abs(2 * rows[1:-1] - rows[:-2] - rows[2:]).mean()
+
+    before = combing(woven[5])
+    after = combing(np.asarray(Image.open(tmp_path / "frames" / names[5])))
+    assert after < 0.5 * before
+
+
+@pytest.mark.parametrize(("number", "signal", "white"), [(16, 0.5807, 1.0), (18, 0.75, 1.0)])
+def test_hdr_video_has_its_white_near_that_of_photos(tmp_path, number, signal, white):
+    curve = {16: hdr.pq_to_linear, 18: hdr.hlg_to_linear}[number]
+    assert curve(np.array(signal)) == pytest.approx(white, rel=0.01)
+    ramp = np.linspace(0, signal, 192)
+    image = np.repeat(np.repeat((65535 * ramp).astype(np.uint16)[None], 144, 0)[..., None], 3, 2)
+    write_video(
+        tmp_path / "a.mp4", [image] * 3, "libx265", "yuv420p10le", color_trc=number, color_primaries=9, colorspace=9
+    )
+    (name, *_) = video.write_frames(tmp_path / "a.mp4", tmp_path / "frames", None, reporter())
+    shown = np.asarray(Image.open(tmp_path / "frames" / name), float).mean((0, 2))
+    expected = 255 * hdr.to_srgb(curve(ramp)[:, None].repeat(3, 1)).mean(1)
+    assert np.abs(shown - expected).max() < 8
+    assert shown[-1] > 235 and shown[0] < 4
+
+
+def test_colors_of_high_definition_video_without_a_matrix(tmp_path):
+    image = np.zeros((720, 1280, 3), np.uint8)
+    image[:] = 200, 40, 60
+    write_video(tmp_path / "a.mp4", [image] * 2, matrix=1)
+    (name, *_) = video.write_frames(tmp_path / "a.mp4", tmp_path / "frames", None, reporter())
+    shown = np.asarray(Image.open(tmp_path / "frames" / name)).reshape(-1, 3)
+    assert np.abs(np.median(shown, 0) - (200, 40, 60)).max() <= 4
+
+
+def test_damaged_video_gives_the_frames_that_are_whole(tmp_path):
+    images = pan(80)
+    write_video(tmp_path / "a.mkv", images)
+    content = bytearray((tmp_path / "a.mkv").read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 2000] = np.random.default_rng(0).integers(0, 256, 2000, np.uint8).tobytes()
+    (tmp_path / "b.mkv").write_bytes(content)
+    names = video.write_frames(tmp_path / "b.mkv", tmp_path / "frames", 20, reporter())
+    assert len(names) >= 8
+    (tmp_path / "c.mkv").write_bytes(content[: len(content) // 2])
+    assert len(video.write_frames(tmp_path / "c.mkv", tmp_path / "more", 20, reporter())) >= 8
+
+
+@pytest.mark.parametrize("content", [b"", b"no video at all" * 100])
+def test_what_is_no_video_is_refused(tmp_path, content):
+    (tmp_path / "a.mp4").write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.mp4 cannot be read as a video"):
+        video.write_frames(tmp_path / "a.mp4", tmp_path / "frames", None, reporter())
+    assert not (tmp_path / "frames").exists()
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    """A video of the room of `test_sfm`, along an arc; every fourth frame is sharp."""
+    path = tmp_path_factory.mktemp("walk") / "my walk.mp4"
+    angles = np.linspace(-1.0, 0.1, 48)
+    images = []
+    for number, angle in enumerate(angles):
+        center = np.array([2.2 * np.cos(angle), 2.2 * np.sin(angle), 1.2 + 0.1 * np.sin(5 * angle)])
+        image = photo(pose(center, (0.1, 0.0, 0.3)))
+        images.append(image if number % 4 == 2 else blurred(image, 1.5))
+    write_video(path, images)
+    return path
+
+
+def test_poses_of_a_video(walk, tmp_path, run_command):
+    result = run_command("sfm", walk, "--out", tmp_path / "capture", "--frames", 12)
+    assert result.code == EXIT_DONE
+    report = json.loads((tmp_path / "capture" / "sfm" / "sfm.json").read_text())
+    assert report["registered"] == report["photos"] >= 11 and report["cameras"] == 1
+    names = sorted(path.name for path in (tmp_path / "capture" / "images").iterdir())
+    assert np.mean([int(name[6:12]) % 4 == 2 for name in names]) > 0.7
+    stamps = [(tmp_path / "capture" / "images" / name).stat().st_mtime_ns for name in names]
+    assert run_command("sfm", walk, "--out", tmp_path / "capture", "--frames", 12).code == EXIT_DONE
+    assert stamps == [(tmp_path / "capture" / "images" / name).stat().st_mtime_ns for name in names], "taken once"
+
+
+def test_videos_beside_photos(walk, tmp_path, run_command):
+    """A folder with a video and photos: both are used, and each has a camera of its own."""
+    folder = tmp_path / "both"
+    folder.mkdir()
+    (folder / walk.name).write_bytes(walk.read_bytes())
+    for number, angle in enumerate((-0.9, -0.6, -0.3)):
+        center = (2.1 * np.cos(angle), 2.1 * np.sin(angle), 1.0)
+        Image.fromarray(photo(pose(np.array(center), (0.1, 0.0, 0.3)))).save(folder / f"{number}.png")
+    (folder / "broken.mov").write_bytes(b"nothing")
+    result = run_command("sfm", folder, "--out", tmp_path / "capture", "--frames", 6)
+    assert result.code == EXIT_DONE
+    report = json.loads((tmp_path / "capture" / "sfm" / "sfm.json").read_text())
+    assert report["registered"] >= 8 and report["cameras"] == 2 and set(report["left_out"]) >= {"broken.mov"}
+    assert (tmp_path / "capture" / "images" / "my_walk").is_dir() and (
+        tmp_path / "capture" / "images" / "0.png"
+    ).exists()
+
+
+def test_video_that_cannot_work_is_refused(tmp_path, run_command):
+    write_video(tmp_path / "still.mp4", [texture(9)[:HEIGHT, :WIDTH].astype(np.uint8)] * 25)
+    result = run_command("sfm", tmp_path / "still.mp4", "--out", tmp_path / "capture")
+    assert result.code == EXIT_BAD_INPUT and "\n" not in result.err.strip()
+    result = run_command("sfm", tmp_path / "gone.mp4", "--out", tmp_path / "other")
+    assert result.code == EXIT_BAD_INPUT and "gone.mp4 does not exist" in result.err
+    assert not (tmp_path / "other").exists()
+
+
+def heic(path, orientation=1) -> np.ndarray:
+    image = Image.fromarray(texture(2)[:120, :160].astype(np.uint8))
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0112] = "Maker", orientation
+    exif.get_ifd(0x8769)[0x920A] = 4.25
+    image.save(path, quality=95, exif=exif)
+    return np.asarray(image, float)
+
+
+def test_heic_becomes_jpeg_with_its_data(tmp_path):
+    pixels = heic(tmp_path / "a.heic")
+    made = photo_files.copy_photo(tmp_path / "a.heic", tmp_path / "images" / "a.heic", True)
+    assert made.name == "a.jpg"
+    with Image.open(made) as image:
+        assert np.abs(np.asarray(image, float) - pixels).mean() < 4
+        assert image.getexif()[0x010F] == "Maker" and image.getexif().get_ifd(0x8769)[0x920A] == pytest.approx(4.25)
+    assert "Maker" in photo_files.camera_of(tmp_path / "a.heic", True) and "4.25" in photo_files.camera_of(made, True)
+
+
+def test_photos_are_turned_as_exif_says(tmp_path):
+    pixels = heic(tmp_path / "a.jpg", orientation=6)
+    kept = photo_files.copy_photo(tmp_path / "a.jpg", tmp_path / "kept.jpg", False)
+    assert kept.read_bytes() == (tmp_path / "a.jpg").read_bytes()
+    made = photo_files.copy_photo(tmp_path / "a.jpg", tmp_path / "made.jpg", True)
+    with Image.open(made) as image:
+        assert np.abs(np.asarray(image, float) - np.rot90(pixels, -1)).mean() < 5
+        assert image.getexif().get(0x0112, 1) == 1 and image.getexif()[0x010F] == "Maker"
+    assert photo_files.camera_of(tmp_path / "a.jpg", True) == photo_files.camera_of(made, True) != ""
+    assert photo_files.camera_of(tmp_path / "a.jpg", False).startswith("160x120")
+
+
+def test_raw_photos_need_their_package(tmp_path, monkeypatch):
+    (tmp_path / "a.cr2").write_bytes(b"II*\0")
+    monkeypatch.setitem(__import__("sys").modules, "rawpy", None)
+    with pytest.raises(InputError, match="needs the package rawpy"):
+        photo_files.copy_photo(tmp_path / "a.cr2", tmp_path / "b.cr2", True)

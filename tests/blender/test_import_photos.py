@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Import Photos or Video: what the backend is asked for, of a folder, chosen photos and a video."""
+
+from pathlib import Path
+
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+import objectgs as extension
+from objectgs.backend.shared.formats.photos_source import PhotosSource, write_source
+from objectgs.objectgs_addon.environment import locations
+from objectgs.objectgs_addon.running import background
+from objectgs.operators.capture import import_photos
+
+
+@pytest.fixture
+def submitted(fresh, tmp_path, monkeypatch):
+    """The jobs that were submitted; captures are made in a folder of the test."""
+    jobs = []
+    extension.register()
+    monkeypatch.setattr(locations, "user_folder", lambda: tmp_path / "user")
+    monkeypatch.setattr(locations, "backend_python", lambda: Path("/python"))
+    monkeypatch.setattr(import_photos.background, "submit", lambda job, *_: jobs.append(job) or {"FINISHED"})
+    for name in ("b.jpg", "a.heic", "walk.mov", "notes.txt"):
+        (tmp_path / "trip").mkdir(exist_ok=True)
+        (tmp_path / "trip" / name).write_bytes(b"")
+    yield jobs
+    extension.unregister()
+
+
+@pytest.mark.parametrize(
+    ("chosen", "sources", "name"),
+    [
+        ([], [""], "trip"),
+        ([""], [""], "trip"),
+        (["b.jpg", "a.heic"], ["a.heic", "b.jpg"], "trip"),
+        (["walk.mov"], ["walk.mov"], "walk"),
+    ],
+)
+def test_job_has_the_chosen_sources(submitted, tmp_path, chosen, sources, name):
+    folder = tmp_path / "trip"
+    files = [{"name": file} for file in chosen]
+    bpy.ops.objectgs.import_photos("EXEC_DEFAULT", directory=str(folder), files=files, frames=30)
+    (job,) = submitted
+    at = job.command.index("sfm")
+    out = job.command.index("--out")
+    assert job.command[at + 1 : out] == [str(folder / part if part else folder) for part in sources]
+    assert job.command[job.command.index("--frames") + 1] == "30"
+    assert job.folder == tmp_path / "user" / "captures" / name and job.kind == "sfm"
+
+
+def test_same_sources_continue_in_their_capture(submitted, tmp_path):
+    folder, first = tmp_path / "trip", tmp_path / "user" / "captures" / "trip"
+    (first / "sfm").mkdir(parents=True)
+    write_source(first, PhotosSource([folder], leave_out=["1.jpg"]))
+    assert locations.new_capture([folder]) == first
+    assert locations.new_capture([folder / "a.heic", folder / "b.jpg"]).name == "trip-2"
+    bpy.ops.objectgs.import_photos("EXEC_DEFAULT", directory=str(folder))
+    assert submitted[0].folder == first and "--frames" not in submitted[0].command
+
+
+def test_weak_photos_are_left_out(submitted, tmp_path):
+    """The button of the message computes the poses again, also without those that were left out before."""
+    capture = tmp_path / "capture"
+    (capture / "sfm").mkdir(parents=True)
+    write_source(capture, PhotosSource([tmp_path / "trip"], "one", 12, ["1.jpg"]))
+    job = locations.sfm_job(capture, PhotosSource([tmp_path / "trip"]))
+    job.result = {"weak": ["a b.jpg", "2.jpg"]}
+    shown = []
+    background.messages.show, before = lambda text, **options: shown.append(options), background.messages.show
+    background._show_poses(job)
+    background.messages.show = before
+    (options,) = shown
+    assert options.pop("label") == "Leave Out 2 Weak Photos" and options.pop("operator") == "objectgs.leave_out_photos"
+    bpy.ops.objectgs.leave_out_photos("EXEC_DEFAULT", **options)
+    command = submitted[0].command
+    assert command[command.index("--leave-out") + 1 :][:3] == ["1.jpg", "a b.jpg", "2.jpg"]
+    assert command[command.index("--cameras") + 1] == "one" and command[command.index("--frames") + 1] == "12"
+    with pytest.raises(RuntimeError, match="was not made by Import Photos"):
+        bpy.ops.objectgs.leave_out_photos("EXEC_DEFAULT", capture=str(tmp_path), names="[]")
+
+
+def test_missing_folder_is_refused(submitted, tmp_path):
+    with pytest.raises(RuntimeError, match="does not exist; choose another"):
+        bpy.ops.objectgs.import_photos("EXEC_DEFAULT", directory=str(tmp_path / "gone"))
+    assert not submitted
