@@ -18,7 +18,7 @@ from PIL import Image as PilImage
 from ..shared.defaults import MAX_SIZE
 from ..shared.errors import InputError
 from ..shared.events import Reporter
-from ..shared.formats.suffixes import IMAGES
+from ..shared.formats.photos_source import IMAGES
 from ..shared.reconstruction.objects import default_name
 from .capture import MIN_VIEWS_TO_HOLD_OUT
 from .colmap import COLMAP, Camera, Image, Model

@@ -9,11 +9,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+from PIL import Image
+
+from ..capture.files import Files, image_size, mask_names, read_mask, write_image
 from ..shared.errors import InputError
 from ..shared.formats.atomic import atomic_path, make_folder
 from ..shared.formats.json_file import read_json, write_json
-from ..shared.formats.photos_source import WORK
-from ..shared.formats.suffixes import PHOTOS, RAW, VIDEOS
+from ..shared.formats.photos_source import PHOTOS, RAW, VIDEOS, WORK
 from ..shared.stopping import StoppingReporter
 from . import photo_files, video
 
@@ -159,6 +162,29 @@ def _require_space(paths: Sequence[Path], capture: Path) -> None:
             f"The photos need {needed / 1e9:.1f} GB and the disk of {existing} has {free / 1e9:.1f} GB free; make "
             "room, or choose another --out."
         )
+
+
+def write_object_masks(capture: Path, names: Sequence[str], folder: Path) -> None:
+    """Write for each photo of a capture where features may be: on objects, or everywhere without a mask.
+
+    Args:
+        capture: the capture, with masks/.
+        names: the photos.
+        folder: receives NAME.png, black where there is no object.
+
+    Raises:
+        InputError: No photo has a mask, or one cannot be read.
+    """
+    masks = Files(capture / MASKS)
+    found = {name: path for name in names if (path := masks.first(mask_names(name)[0])) is not None}
+    if not found:
+        raise InputError(f"{capture / MASKS} has no mask of any photo; add masks, or use features everywhere.")
+    shutil.rmtree(folder, ignore_errors=True)
+    for name in names:
+        ids = read_mask(found[name]) if name in found else np.ones(image_size(capture / IMAGES / name)[::-1], np.uint8)
+        target = folder / f"{name}.png"
+        make_folder(target.parent)
+        write_image(target, Image.fromarray((ids > 0).astype(np.uint8) * 255))
 
 
 def _copy_rest(source: Path, capture: Path) -> None:

@@ -1,9 +1,9 @@
 """One stage of COLMAP in a process of its own, since it cannot be stopped otherwise: `python -m backend.sfm.worker`.
 
-    worker extract DATABASE IMAGES GROUPS.json     features of the photos in each group, which share a camera
-    worker match DATABASE [PAIRS.txt]              matches of the pairs, or of all
+    worker extract DATABASE IMAGES GROUPS.json [MASKS]   features of the photos in each group, which share a camera
+    worker match DATABASE [PAIRS.txt]   matches of the pairs, or of all
     worker incremental|global DATABASE IMAGES OUT NAMES.json   camera poses of the named photos, and points
-    worker refine MODEL OUT                        the same without wrong matches, and with the lens that photos show
+    worker refine MODEL OUT   the same without wrong matches, and with the lens that photos show
 
 Photos and pairs whose results are in the database are skipped. Each line on standard output is one more photo with a
 pose.
@@ -39,8 +39,14 @@ _FAINT = 0.003
 `MOST_FEATURES` anyway."""
 
 
-def extract(database: str, images: str, groups: str) -> None:
-    """Find the features of photos; each group of names shares a camera, whose focal length EXIF may tell."""
+def extract(database: str, images: str, groups: str, masks: str = "") -> None:
+    """Find the features of photos; each group of names shares a camera, whose focal length EXIF may tell.
+
+    With masks, features are where MASKS/NAME.png is not black.
+    """
+    reader = pycolmap.ImageReaderOptions()
+    if masks:
+        reader.mask_path = masks
     for group in json.loads(Path(groups).read_text(encoding="utf-8")):
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu = False
@@ -49,7 +55,7 @@ def extract(database: str, images: str, groups: str) -> None:
         options.sift.peak_threshold = _FAINT
         pycolmap.extract_features(
             database, images, image_names=group, camera_mode=pycolmap.CameraMode.SINGLE,
-            extraction_options=options,
+            reader_options=reader, extraction_options=options,
         )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from backend.shared.errors import InputError
-from backend.shared.formats.suffixes import IMAGES
+from backend.shared.formats.photos_source import IMAGES
 
 from .captures import as_seen, copy_capture, need, read_binary_mask, read_colmap
 from .metrics import Results, mean, percent, prompt_rows, score_prompts

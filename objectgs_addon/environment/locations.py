@@ -144,6 +144,8 @@ def sfm_job(capture: Path, source: PhotosSource, leave_out: Sequence[str] = ()) 
         str(capture),
         "--cameras",
         source.cameras,
+        "--features",
+        source.features,
         *(["--frames", str(source.frames)] if source.frames else []),
         *(["--leave-out", *leave_out] if leave_out else []),
     )

@@ -7,8 +7,7 @@ import bpy
 from bpy.props import CollectionProperty, EnumProperty, IntProperty, StringProperty
 
 from ...backend.shared.errors import InputError
-from ...backend.shared.formats.photos_source import PhotosSource
-from ...backend.shared.formats.suffixes import PHOTOS, VIDEOS
+from ...backend.shared.formats.photos_source import PHOTOS, VIDEOS, PhotosSource
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
 from ..common import need
@@ -47,6 +46,14 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
             ("each", "One per Photo", "None, as for photos by many people or a zoom lens"),
         ],
     )
+    features: EnumProperty(
+        name="Features",
+        description="Where the photos are compared",
+        items=[
+            ("all", "Everywhere", "In the whole photos"),
+            ("objects", "On Objects", "On the objects of the masks alone, which turn before a background at rest"),
+        ],
+    )
     frames: IntProperty(
         name="Video Frames",
         description="Number of frames that are used of each video, the sharpest ones. 0: by how far the picture moves",
@@ -58,6 +65,7 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
         self.layout.use_property_split = True
         self.layout.prop(self, "folder", placeholder="Automatic")
         self.layout.prop(self, "cameras")
+        self.layout.prop(self, "features")
         self.layout.prop(self, "frames")
         names = [file.name for file in self.files if file.name]
         self.layout.label(text=f"{len(names)} files" if len(names) > 1 else names[0] if names else "All in the folder")
@@ -67,7 +75,9 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
         sources = self._sources()
         capture = Path(bpy.path.abspath(self.folder)).resolve() if self.folder else locations.new_capture(sources)
         need.require_unused(capture)
-        job = locations.sfm_job(capture, PhotosSource(sources, self.cameras, self.frames or None))
+        job = locations.sfm_job(
+            capture, PhotosSource(sources, self.cameras, self.frames or None, features=self.features)
+        )
         return background.submit(job, context.scene, self.report)
 
     def _sources(self) -> list[Path]:

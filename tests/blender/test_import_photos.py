@@ -64,7 +64,7 @@ def test_weak_photos_are_left_out(submitted, tmp_path):
     """The button of the message computes the poses again, also without those that were left out before."""
     capture = tmp_path / "capture"
     (capture / "sfm").mkdir(parents=True)
-    write_source(capture, PhotosSource([tmp_path / "trip"], "one", 12, ["1.jpg"]))
+    write_source(capture, PhotosSource([tmp_path / "trip"], "one", 12, ["1.jpg"], "objects"))
     job = locations.sfm_job(capture, PhotosSource([tmp_path / "trip"]))
     job.result = {"weak": ["a b.jpg", "2.jpg"]}
     shown = []
@@ -77,6 +77,7 @@ def test_weak_photos_are_left_out(submitted, tmp_path):
     command = submitted[0].command
     assert command[command.index("--leave-out") + 1 :][:3] == ["1.jpg", "a b.jpg", "2.jpg"]
     assert command[command.index("--cameras") + 1] == "one" and command[command.index("--frames") + 1] == "12"
+    assert command[command.index("--features") + 1] == "objects"
     with pytest.raises(RuntimeError, match="was not made by Import Photos"):
         bpy.ops.objectgs.leave_out_photos("EXEC_DEFAULT", capture=str(tmp_path), names="[]")
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ...shared.errors import InputError
-from ...shared.formats.suffixes import IMAGES
+from ...shared.formats.photos_source import IMAGES
 from ..files import Files, image_size
 
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ...shared.errors import InputError
+from ...shared.formats.photos_source import IMAGES
 from ...shared.formats.regular_file import open_regular
-from ...shared.formats.suffixes import IMAGES
 from ..colmap import Model, find_model, has_model, read_model
 from . import bundler, metashape, realityscan, transforms
 

@@ -16,17 +16,18 @@ from ...sfm.agreement import measure_agreement
 from ...sfm.check import figures_of, weak_photos, write_picture
 from ...sfm.dense import dense_points, spacing, thinned
 from ...sfm.pairs import choose_pairs
-from ...sfm.photos import IMAGES, Photo, take_photos
+from ...sfm.photos import IMAGES, MASKS, Photo, take_photos, write_object_masks
 from ...sfm.stages import run_stage
 from ...shared.errors import InputError
 from ...shared.formats.atomic import make_folder, recorded, write_atomic
 from ...shared.formats.json_file import write_json
-from ...shared.formats.photos_source import WORK, PhotosSource, write_source
-from ...shared.formats.suffixes import PHOTOS, VIDEOS
+from ...shared.formats.photos_source import PHOTOS, VIDEOS, WORK, PhotosSource, write_source
 from ...shared.reconstruction.lock import locked
 from ...shared.stopping import StoppingReporter
 
 REPORT, PICTURE = "sfm.json", "sfm.png"
+OBJECTS_DATABASE = "objects.db"
+"""Database in sfm/ with the features on objects alone."""
 
 _EXTRACT, _MATCH, _MAP, _DENSE = 0.5, 0.03, 0.3, 0.3
 """Expected seconds of the stages for each photo, pair, photo and photo on two cores, until the pace is known."""
@@ -44,10 +45,12 @@ def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         try:
             make_folder(capture / WORK)
             with locked(capture / WORK):
-                write_source(capture, PhotosSource(sources, options.cameras, options.frames, options.leave_out))
+                write_source(
+                    capture, PhotosSource(sources, options.cameras, options.frames, options.leave_out, options.features)
+                )
                 _run(sources, capture, options, reporter)
         except InputError:
-            if not (capture / WORK / database.NAME).exists():
+            if not any((capture / WORK / name).exists() for name in (database.NAME, OBJECTS_DATABASE)):
                 created.remove_files()
                 created.remove_folders()
             raise
@@ -82,7 +85,9 @@ def _require_own(source: Path, capture: Path) -> None:
 def _run(sources: list[Path], capture: Path, options: argparse.Namespace, reporter: StoppingReporter) -> None:
     started = time.monotonic()
     work = capture / WORK
-    images, path, log = capture / IMAGES, work / database.NAME, work / "colmap.log"
+    images, log = capture / IMAGES, work / "colmap.log"
+    on_objects = options.features == "objects"
+    path = work / (OBJECTS_DATABASE if on_objects else database.NAME)
     reporter.expect({
         "photos": ("Photos", 2.0), "extract": ("Features", 30.0), "pairs": ("Pairs", 0.1), "match": ("Matching", 30.0),
         "global": ("Poses", 10.0), "incremental": ("Poses", 5.0), "refine": ("Poses", 2.0), "dense": ("Points", 10.0),
@@ -107,9 +112,11 @@ def _run(sources: list[Path], capture: Path, options: argparse.Namespace, report
     write_json(groups, _groups(photos, options.cameras))
     write_json(listed_names, names)
     reporter.begin("extract", f"Finding features in {count} photos")
-    if not run_stage(
-        reporter, log, ["extract", str(path), str(images), str(groups)], lambda _: database.count_features(path), count
-    ):
+    arguments = ["extract", str(path), str(images), str(groups)]
+    if on_objects:
+        write_object_masks(capture, names, work / "masks")
+        arguments.append(str(work / "masks"))
+    if not run_stage(reporter, log, arguments, lambda _: database.count_features(path), count):
         raise InputError(f"COLMAP could not find features in the photos; see {log}.")
     reporter.begin("pairs", "Comparing the photos")
     pairs = choose_pairs(path, names, in_order, reporter.progress)
@@ -121,7 +128,7 @@ def _run(sources: list[Path], capture: Path, options: argparse.Namespace, report
     reporter.begin("match", f"Matching {total:,} pairs of photos")
     if not run_stage(reporter, log, arguments, lambda _: database.count_pairs(path), total):
         raise InputError(f"COLMAP could not match the photos; see {log}.")
-    _require_matches(path, source)
+    _require_matches(path, source, capture)
 
     candidates: list[model.Candidate] = []
     for mapper in ("global", "incremental"):
@@ -143,7 +150,7 @@ def _run(sources: list[Path], capture: Path, options: argparse.Namespace, report
             "with enough detail; take more photos, each overlapping the one before by two thirds."
         )
     wrong = model.drop_untrusted(best)
-    model.require_parallax(best.model, source)
+    model.require_parallax(best.model, source, capture / MASKS)
     best = best._replace(model=_refined(best.model, work, log, reporter))
     best = best._replace(agreement=measure_agreement(best.model, path))
     figures = figures_of(best.model, best.agreement)
@@ -209,7 +216,7 @@ def _groups(photos: list[Photo], cameras: str) -> list[list[str]]:
     return list(groups.values())
 
 
-def _require_matches(path: Path, source: Path) -> None:
+def _require_matches(path: Path, source: Path, capture: Path) -> None:
     """Raise InputError if no photos match, or all that do were taken from one spot."""
     pairs = database.verified_pairs(path)
     if not pairs:
@@ -222,7 +229,7 @@ def _require_matches(path: Path, source: Path) -> None:
         int(pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC),
     }
     if all(config in still for _, _, config, _ in pairs):
-        raise InputError(model.one_spot(source))
+        raise InputError(model.one_spot(source, capture / MASKS))
 
 
 def _tell(report: dict[str, Any], capture: Path, reporter: StoppingReporter) -> None:

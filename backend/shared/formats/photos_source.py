@@ -1,4 +1,4 @@
-"""What a capture was computed from, and how, in sfm/source.json of the capture."""
+"""Photos and videos: suffixes of their files, and what a capture was computed from, in its sfm/source.json."""
 
 from __future__ import annotations
 
@@ -12,6 +12,17 @@ WORK = "sfm"
 """Folder in the capture for what the computation of poses keeps."""
 _SOURCE = "source.json"
 
+# Suffixes in lower case
+
+IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm", ".pgm"}
+"""Images that a capture may contain."""
+HEIC = {".heic", ".heif", ".hif", ".avif"}
+"""Photos of phones."""
+RAW = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
+"""Unprocessed photos of cameras, which need the package rawpy."""
+PHOTOS = IMAGES | HEIC | RAW
+VIDEOS = {".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv", ".3gp"}
+
 
 @dataclass(frozen=True)
 class PhotosSource:
@@ -22,12 +33,14 @@ class PhotosSource:
         cameras: which photos share a camera.
         frames: wanted number of frames of each video, or None.
         leave_out: names of photos that are not used.
+        features: where features are found, "all" or "objects".
     """
 
     photos: list[Path]
     cameras: str = "auto"
     frames: int | None = None
     leave_out: list[str] = field(default_factory=list)
+    features: str = "all"
 
 
 def write_source(capture: Path, source: PhotosSource) -> None:
@@ -39,6 +52,7 @@ def write_source(capture: Path, source: PhotosSource) -> None:
             "cameras": source.cameras,
             "frames": source.frames,
             "leave_out": source.leave_out,
+            "features": source.features,
         },
     )
 
@@ -53,6 +67,7 @@ def read_source(capture: Path) -> PhotosSource | None:
             str(stored.get("cameras", "auto")),
             None if frames is None else int(frames),
             [str(name) for name in stored.get("leave_out", [])],
+            str(stored.get("features", "all")),
         )
     except (InputError, AttributeError, KeyError, TypeError, ValueError):
         return None
