@@ -62,13 +62,13 @@ class Stage(NamedTuple):
 
 def room(seed: int) -> Stage:
     """A rectangular room from inside; the objects stand against its walls."""
-    built, objs = _things(("mug", "bottle", "books", "monkey", "teapot", "vase", "pumpkin", "gear"), seed)
+    built, objs = things(("mug", "bottle", "books", "monkey", "teapot", "vase", "pumpkin", "gear"), seed)
     half = np.array([1.9, 1.5])
     around = [(-1.2, 1.22), (0.1, 1.25), (1.3, 1.2), (1.6, 0.2), (1.35, -1.2), (0.0, -1.22), (-1.3, -1.2), (-1.62, 0.1)]
     rng = scene.rng_for(seed, 11)
     for obj, (x, y) in zip(objs, around, strict=True):
-        _place(obj, (x, y, -0.7), float(rng.uniform(0, 2 * math.pi)), 2.2)
-    _add(built, objs, "room", _box(half, -0.7, 1.3), [materials.floor, materials.wall], seed)
+        place(obj, (x, y, -0.7), float(rng.uniform(0, 2 * math.pi)), 2.2)
+    add(built, objs, "room", _box(half, -0.7, 1.3), [materials.floor, materials.wall], seed)
     scene.pass_light(objs[-1])
     views = []
     for i in range(60):
@@ -82,14 +82,14 @@ def room(seed: int) -> Stage:
 
 def yard(seed: int) -> Stage:
     """Objects on the ground before an open sky, which is in no mask and has no points."""
-    built, objs = _things(("bottle", "vase", "ball", "pumpkin", "cone", "die", "mushroom"), seed)
+    built, objs = things(("bottle", "vase", "ball", "pumpkin", "cone", "die", "mushroom"), seed)
     rng = scene.rng_for(seed, 11)
-    for obj, (x, y) in zip(objs, _ring(len(objs), 0.5, rng), strict=True):
-        _place(obj, (x, y, 0.0), float(rng.uniform(0, 2 * math.pi)), 1.4)
+    for obj, (x, y) in zip(objs, ring(len(objs), 0.5, rng), strict=True):
+        place(obj, (x, y, 0.0), float(rng.uniform(0, 2 * math.pi)), 1.4)
     ground = shapes.lathe(
         "ground", [(0, -0.02), (4.0, -0.02), (4.0, 0.0), *((r, 0.0) for r in (3.0, 2, 1, 0.4)), (0, 0)]
     )
-    _add(built, objs, "ground", shapes.finish(ground), [materials.table], seed)
+    add(built, objs, "ground", shapes.finish(ground), [materials.table], seed)
     _sky(built)
     views = []
     for i in range(48):
@@ -118,19 +118,19 @@ def plain(seed: int) -> Stage:
 
 def thin(seed: int) -> Stage:
     """A chair, a plant and a fence on the table."""
-    built, objs = _things(("mug", "ball"), seed)
+    built, objs = things(("mug", "ball"), seed)
     rng = scene.rng_for(seed, 11)
-    _place(objs[0], (0.33, -0.18, 0.0), 0.4, 1.0)
-    _place(objs[1], (-0.30, -0.28, 0.0), 1.0, 0.8)
-    for name, mesh, place, kind in (
+    place(objs[0], (0.33, -0.18, 0.0), 0.4, 1.0)
+    place(objs[1], (-0.30, -0.28, 0.0), 1.0, 0.8)
+    for name, mesh, where, kind in (
         ("chair", _chair(), (-0.12, 0.1, 0.0), "die"),
         ("plant", _plant(rng), (0.28, 0.2, 0.0), "bottle"),
         ("fence", _fence(), (0.0, -0.42, 0.0), "cone"),
     ):
-        _add(built, objs, name, mesh, [lambda rng, kind=kind: materials.material(kind, rng)], seed)
-        objs[-1].object.location = place
-    _add(built, objs, "table", shapes.table(0.66), [materials.table], seed)
-    _add(built, objs, "backdrop", shapes.backdrop(2.6), [materials.floor, materials.wall], seed)
+        add(built, objs, name, mesh, [lambda rng, kind=kind: materials.material(kind, rng)], seed)
+        objs[-1].object.location = where
+    add(built, objs, "table", shapes.table(0.66), [materials.table], seed)
+    add(built, objs, "backdrop", shapes.backdrop(2.6), [materials.floor, materials.wall], seed)
     scene.pass_light(objs[-1])
     return Stage(built, objs, scene.cameras(48, seed))
 
@@ -198,17 +198,17 @@ def blur(seed: int) -> Stage:
 SCENES = {make.__name__: make for make in (room, yard, few, plain, thin, gloss, many, exposure, blur)}
 
 
-def _things(kinds: tuple[str, ...], seed: int) -> tuple[bpy.types.Scene, list[Any]]:
+def things(kinds: tuple[str, ...], seed: int) -> tuple[bpy.types.Scene, list[Any]]:
     """Return a new lit scene with an object of each kind at its origin."""
     built = bpy.data.scenes.new("suite")
     objs: list[Any] = []
     for kind in kinds:
-        _add(built, objs, kind, shapes.make(kind, built), [lambda rng, kind=kind: materials.material(kind, rng)], seed)
+        add(built, objs, kind, shapes.make(kind, built), [lambda rng, kind=kind: materials.material(kind, rng)], seed)
     scene.light(built)
     return built, objs
 
 
-def _add(built: bpy.types.Scene, objs: list[Any], name: str, mesh: bpy.types.Mesh, looks: list[Any], seed: int) -> None:
+def add(built: bpy.types.Scene, objs: list[Any], name: str, mesh: bpy.types.Mesh, looks: list[Any], seed: int) -> None:
     """Add an object with the next ID, with materials made by `looks`."""
     for i, look in enumerate(looks):
         mesh.materials.append(look(scene.rng_for(seed, 10, len(objs), i)))
@@ -218,11 +218,11 @@ def _add(built: bpy.types.Scene, objs: list[Any], name: str, mesh: bpy.types.Mes
     objs.append(obj)
 
 
-def _place(obj: Any, place: tuple[float, float, float], turn: float, scale: float) -> None:
-    obj.object.matrix_world = Matrix.Translation(place) @ Matrix.Rotation(turn, 4, "Z") @ Matrix.Scale(scale, 4)
+def place(obj: Any, where: tuple[float, float, float], turn: float, scale: float) -> None:
+    obj.object.matrix_world = Matrix.Translation(where) @ Matrix.Rotation(turn, 4, "Z") @ Matrix.Scale(scale, 4)
 
 
-def _ring(count: int, radius: float, rng: np.random.Generator) -> list[tuple[float, float]]:
+def ring(count: int, radius: float, rng: np.random.Generator) -> list[tuple[float, float]]:
     """Return places on a circle and one in its middle."""
     angles = [2 * math.pi * i / (count - 1) + float(rng.normal(0, 0.1)) for i in range(count - 1)]
     return [(0.0, 0.0), *((radius * math.cos(angle), radius * math.sin(angle)) for angle in angles)]
@@ -350,16 +350,22 @@ def _shifted(image: np.ndarray, right: float, down: float) -> np.ndarray:
 
 
 def make(name: str, out: Path, samples: int) -> Path:
-    """Make one capture, or keep it if it is of this version; an unfinished one is made again."""
-    folder, seed = out / name, 100 + list(SCENES).index(name)
-    settings = capture.Settings(seed=seed, samples=samples)
-    record = {"suite": VERSION, "scene": name, "samples": samples}
+    """Make one capture of the suite."""
+    return make_stage(SCENES[name], out / name, 100 + list(SCENES).index(name), samples)
+
+
+def make_stage(
+    build: Callable[[int], Stage], folder: Path, seed: int, samples: int, size: tuple[int, int] = (320, 240)
+) -> Path:
+    """Make a capture of a stage, or keep it if it is of this version; an unfinished one is made again."""
+    settings = capture.Settings(seed=seed, samples=samples, width=size[0], height=size[1])
+    record = {"suite": VERSION, "scene": build.__name__, "samples": samples}
     stored = folder / "truth" / "settings.json"
     if stored.is_file() and json.loads(stored.read_text(encoding="utf-8")) == record:
         return folder
     shutil.rmtree(folder, ignore_errors=True)
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    stage = SCENES[name](seed)
+    stage = build(seed)
     stage.built.view_layers[0].update()
     folder.mkdir(parents=True)
     reporter = events.StagedReporter(events.Reporter())

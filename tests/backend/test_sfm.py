@@ -257,11 +257,32 @@ def test_weak_photos_are_those_unlike_the_others():
     assert "far.jpg" not in check.weak_photos(small), "a fiftieth of a pixel is no error"
 
 
+def test_features_can_be_on_objects_alone(photos, tmp_path, run_command):
+    """Half of each mask is an object, and one photo has no mask; another set of photos has none at all."""
+    folder = shutil.copytree(photos, tmp_path / "turntable")
+    for path in (folder / "masks").iterdir():
+        ids = np.zeros((HEIGHT, WIDTH), np.uint8)
+        ids[:, : WIDTH // 2] = 3
+        Image.fromarray(ids).save(path)
+    (folder / "masks" / "photo 2.png").unlink()
+    capture = tmp_path / "capture"
+    run_command("sfm", folder, "--out", capture, "--features", "objects")
+    path = capture / "sfm" / "objects.db"
+    assert database.count_features(path) == VIEWS and not (capture / "sfm" / database.NAME).exists()
+    with pycolmap.Database.open(path) as stored:
+        for name, number in database.image_ids(path).items():
+            columns = np.asarray(stored.read_keypoints(number))[:, 0]
+            assert (columns.max() < WIDTH / 2 + 2) == (name != "photo 2.png") and len(columns) > 50
+    result = run_command("sfm", folder / "images", "--out", tmp_path / "bare", "--features", "objects")
+    assert result.code == EXIT_BAD_INPUT and "has no mask of any photo" in result.err
+
+
 def test_photos_from_one_spot_are_refused(tmp_path, run_command):
     targets = [(0.1 + 0.12 * step, 0.05 * step, 0.3) for step in range(6)]
     write_photos(tmp_path / "spot", [pose((2.0, -0.8, 1.2), target) for target in targets])
     result = run_command("sfm", tmp_path / "spot", "--out", tmp_path / "capture")
     assert result.code == EXIT_BAD_INPUT and "were taken from one spot" in result.err
+    assert "--features objects" in result.err
     assert not (tmp_path / "capture" / "sparse").exists()
 
 

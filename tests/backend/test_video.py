@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
-from backend.sfm import motion, photo_files, video
+from backend.sfm.sources import motion, photo_files, video
 from backend.shared.color import hdr
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_DONE, InputError
 from backend.shared.events import Reporter

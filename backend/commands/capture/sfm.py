@@ -16,7 +16,7 @@ from ...sfm.agreement import measure_agreement
 from ...sfm.check import figures_of, weak_photos, write_picture
 from ...sfm.dense import dense_points, spacing, thinned
 from ...sfm.pairs import choose_pairs
-from ...sfm.photos import IMAGES, MASKS, Photo, take_photos, write_object_masks
+from ...sfm.sources.photos import IMAGES, MASKS, Photo, take_photos, write_object_masks
 from ...sfm.stages import run_stage
 from ...shared.errors import InputError
 from ...shared.formats.atomic import make_folder, recorded, write_atomic

@@ -12,10 +12,10 @@ import av
 import numpy as np
 from PIL import Image as PilImage
 
-from ..shared.color import hdr
-from ..shared.errors import InputError
-from ..shared.formats.atomic import atomic_path, make_folder
-from ..shared.stopping import StoppingReporter
+from ...shared.color import hdr
+from ...shared.errors import InputError
+from ...shared.formats.atomic import atomic_path, make_folder
+from ...shared.stopping import StoppingReporter
 from .motion import ANALYZED, MotionTracker, choose_frames, sharpness
 
 _SHARPNESS_SIDE = 640

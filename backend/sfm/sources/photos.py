@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from ..capture.files import Files, image_size, mask_names, read_mask, write_image
-from ..shared.errors import InputError
-from ..shared.formats.atomic import atomic_path, make_folder
-from ..shared.formats.json_file import read_json, write_json
-from ..shared.formats.photos_source import PHOTOS, RAW, VIDEOS, WORK
-from ..shared.stopping import StoppingReporter
+from ...capture.files import Files, image_size, mask_names, read_mask, write_image
+from ...shared.errors import InputError
+from ...shared.formats.atomic import atomic_path, make_folder
+from ...shared.formats.json_file import read_json, write_json
+from ...shared.formats.photos_source import PHOTOS, RAW, VIDEOS, WORK
+from ...shared.stopping import StoppingReporter
 from . import photo_files, video
 
 IMAGES, MASKS = "images", "masks"

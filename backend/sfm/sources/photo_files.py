@@ -13,10 +13,10 @@ import pillow_heif
 from PIL import ExifTags, ImageCms, ImageOps
 from PIL import Image as PilImage
 
-from ..capture.files import read_image, write_image
-from ..shared.errors import InputError
-from ..shared.formats.atomic import atomic_path, make_folder, write_atomic
-from ..shared.formats.photos_source import HEIC, RAW
+from ...capture.files import read_image, write_image
+from ...shared.errors import InputError
+from ...shared.formats.atomic import atomic_path, make_folder, write_atomic
+from ...shared.formats.photos_source import HEIC, RAW
 
 COPIED = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"}
 """Suffixes of files that COLMAP reads. HEIC becomes JPEG with its EXIF data, which may tell the focal length; other
