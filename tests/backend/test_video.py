@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
-from backend.sfm.sources import motion, photo_files, video
+from backend.sfm.sources import motion, photo_files, photos, video
 from backend.shared.color import hdr
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_DONE, InputError
 from backend.shared.events import Reporter
@@ -287,6 +287,37 @@ def test_photos_are_turned_as_exif_says(tmp_path):
         assert image.getexif().get(0x0112, 1) == 1 and image.getexif()[0x010F] == "Maker"
     assert photo_files.camera_of(tmp_path / "a.jpg", True) == photo_files.camera_of(made, True) != ""
     assert photo_files.camera_of(tmp_path / "a.jpg", False).startswith("160x120")
+
+
+def test_doubles_and_live_photos_are_taken_once(tmp_path):
+    folder = tmp_path / "phone"
+    folder.mkdir()
+    for name in ("a.jpg", "a.heic", "b.heic", "c.jpg"):
+        heic(folder / name)
+    (folder / "a.cr2").write_bytes(b"II*\0")
+    write_video(folder / "b.mov", pan(3))
+    taken = photos.take_photos([folder], tmp_path / "capture", None, reporter())
+    assert [photo.name for photo in taken.photos] == ["a.jpg", "b.jpg", "c.jpg"] and not taken.unreadable
+    assert sorted(path.name for path in (tmp_path / "capture" / "images").iterdir()) == ["a.jpg", "b.jpg", "c.jpg"]
+
+
+def test_chosen_files_are_those_chosen(tmp_path):
+    (tmp_path / "trip" / "images").mkdir(parents=True)
+    for name in ("1.jpg", "2.jpg", "3.jpg", "images/4.jpg"):
+        heic(tmp_path / "trip" / name)
+    chosen = [tmp_path / "trip" / name for name in ("3.jpg", "1.jpg")]
+    taken = photos.take_photos(chosen, tmp_path / "capture", None, reporter())
+    assert [photo.name for photo in taken.photos] == ["1.jpg", "3.jpg"]
+
+
+def test_other_number_of_frames_replaces_them(tmp_path):
+    write_video(tmp_path / "a.mp4", pan(40))
+    (tmp_path / "capture" / "sfm").mkdir(parents=True)
+    for count in (12, 5):
+        taken = photos.take_photos([tmp_path / "a.mp4"], tmp_path / "capture", count, reporter())
+        assert len(taken.photos) == count and taken.in_order
+        kept = sorted(path.name for path in (tmp_path / "capture" / "images").iterdir())
+        assert kept == [photo.name for photo in taken.photos]
 
 
 def test_raw_photos_need_their_package(tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ from ...capture.files import Files, image_size, mask_names, read_mask, write_ima
 from ...shared.errors import InputError
 from ...shared.formats.atomic import atomic_path, make_folder
 from ...shared.formats.json_file import read_json, write_json
-from ...shared.formats.photos_source import PHOTOS, RAW, VIDEOS, WORK
+from ...shared.formats.photos_source import PHOTOS, VIDEOS, WORK
 from ...shared.stopping import StoppingReporter
 from . import photo_files, video
 
@@ -67,9 +67,13 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
     Raises:
         InputError: There are fewer than two photos, or too little space on the disk.
     """
-    source = sources[0] if len(sources) == 1 else Path(os.path.commonpath([path.parent for path in sources]))
-    base = source / IMAGES if (source / IMAGES).is_dir() else source if source.is_dir() else source.parent
-    found = _listed(base, capture) if sources[0].is_dir() else sorted(sources, key=_natural)
+    source = sources[0]
+    if source.is_dir():
+        base = source / IMAGES if (source / IMAGES).is_dir() else source
+        found = _listed(base, capture)
+    else:
+        base = Path(os.path.commonpath([path.parent for path in sources]))
+        found = sorted(sources, key=_natural)
     in_place = base.resolve() == (capture / IMAGES).resolve()
     videos = [] if in_place else [path for path in found if path.suffix.lower() in VIDEOS]
     files = [path for path in found if path.suffix.lower() in PHOTOS]
@@ -94,12 +98,12 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
             unreadable[relative.as_posix()] = str(error)
     for path in videos:
         # COLMAP's lists of pairs have no names with spaces.
-        folder = "" if videos == [source] else re.sub(r"\s+", "_", path.relative_to(base).with_suffix("").as_posix())
+        folder = "" if found == [source] else re.sub(r"\s+", "_", path.relative_to(base).with_suffix("").as_posix())
         try:
             names = _frames_of(path, capture, folder, frames, reporter)
             photos += [Photo((Path(folder) / name).as_posix(), f"video {folder}") for name in names]
         except InputError as error:
-            if videos == [source]:
+            if found == [source]:
                 raise
             unreadable[path.relative_to(base).as_posix()] = str(error)
     if len(photos) < 2:
@@ -118,9 +122,13 @@ def _frames_of(path: Path, capture: Path, folder: str, count: int | None, report
     asked = {"file": str(path.resolve()), "bytes": status.st_size, "modified": status.st_mtime_ns, "frames": count}
     entry = known.get(folder, {})
     names = entry.get("names") if all(entry.get(key) == value for key, value in asked.items()) else None
+    before = [capture / IMAGES / folder / name for name in entry.get("names", [])]
     if names is None or not all((capture / IMAGES / folder / name).is_file() for name in names):
         reporter.status(f"Choosing frames of {path.name}")
         names = video.write_frames(path, capture / IMAGES / folder, count, reporter)
+        for old in before:
+            if old.name not in names:
+                old.unlink(missing_ok=True)
         write_json(listed, {**known, folder: {**asked, "names": names}})
     return names
 
@@ -128,7 +136,7 @@ def _frames_of(path: Path, capture: Path, folder: str, count: int | None, report
 def _listed(base: Path, capture: Path) -> list[Path]:
     """Return the photos and videos below a folder in natural order, without those of the capture, if it is in there.
 
-    Of a raw photo beside its JPEG, the latter is taken.
+    Of a raw or HEIC photo beside its JPEG, the latter is taken, and of a Live Photo the photo alone.
     """
     try:
         inside = capture.resolve()
@@ -142,9 +150,14 @@ def _listed(base: Path, capture: Path) -> list[Path]:
         ]
     except OSError as error:
         raise InputError(f"{error.filename or base} cannot be read ({error.strerror}); check it.") from error
-    developed = {path.with_suffix("") for path in paths if path.suffix.lower() in photo_files.COPIED}
-    kept = [path for path in paths if path.suffix.lower() not in RAW or path.with_suffix("") not in developed]
-    return sorted(kept, key=_natural)
+    copied = {path.with_suffix("") for path in paths if path.suffix.lower() in photo_files.COPIED}
+    photos = {path.with_suffix("") for path in paths if path.suffix.lower() in PHOTOS}
+
+    def is_double(path: Path) -> bool:
+        suffix = path.suffix.lower()
+        return suffix not in photo_files.COPIED and path.with_suffix("") in (photos if suffix in VIDEOS else copied)
+
+    return sorted((path for path in paths if not is_double(path)), key=_natural)
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
