@@ -76,7 +76,7 @@ class _Commands:
 
 
 def _add_capture_commands(commands: _Commands) -> None:
-    poses = commands.add("sfm", "Make a capture of photos or a video alone", texts.SFM, "photos --out garden")
+    poses = commands.add("sfm", "Make a capture of photos or a video", texts.SFM, "photos --out garden")
     poses.add_argument(
         "photos",
         type=Path,

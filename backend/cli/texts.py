@@ -6,7 +6,7 @@ COLMAP model of their cameras in sparse/0 (or transforms.json, or the cameras th
 Metashape, RealityScan or Bundler exported) and, for objects, an object ID mask of each
 image in masks/. The result is written to a reconstruction folder.
 
-  python -m backend sfm      photos --out garden         make a capture of photos or a video
+  python -m backend sfm      photos --out garden         make a capture of photos
   python -m backend check    garden                      check the capture
   python -m backend plan     garden                      show what training would do
   python -m backend train    garden --out garden-splats  train the splats (5 minutes)
