@@ -15,6 +15,7 @@ from objectgs.objectgs_addon.process import jobs
 from objectgs.objectgs_addon.process.backend_process import BackendProcess, backend_command, backend_environment
 from objectgs.objectgs_addon.process.blocking import run_blocking
 from objectgs.objectgs_addon.process.jobs import Job, JobQueue, State
+from objectgs.objectgs_addon.running import job_display
 
 posix = pytest.mark.skipif(os.name != "posix", reason="signals and niceness are POSIX's")
 WAIT = 30.0
@@ -106,15 +107,20 @@ say("done", steps=12, splats="splats.ply", anchors=11, psnr=27.0)
     assert job.progress == 1 and job.seconds_left is None
     assert job.warnings == ["3 images have no pose."]
     assert (job.step, job.splats, job.anchors, job.psnr, job.miou) == (9, 100, 11, 27.0, 0.75)
-    assert job.lead_miou == ("mIoU (labeled)", 0.75)
+    assert job.quality == {"psnr": 27.0, "miou": 0.75}
     assert job.preview == Path("latest.png")
     assert job.curve == [{"seconds": 3.0, "step": 9, "psnr": 26.5, "miou": 0.75, "mbiou": 0.5}]
     assert job.result == {"steps": 12, "splats": "splats.ply", "anchors": 11, "psnr": 27.0}
 
 
-def test_job_leads_with_miou_all_where_zero_is_background(make):
-    job = run(make('say("quality", miou=0.97, miou_all=0.95, zero_is_background=True)\nsay("done")'))
-    assert job.lead_miou == ("mIoU (all)", 0.95)
+@pytest.mark.parametrize(("is_background", "shown"), [(True, "mIoU (all) 0.950"), (False, "mIoU (labeled) 0.970")])
+def test_figures_lead_with_miou_all_where_zero_is_background(make, monkeypatch, is_background, shown):
+    figures = f"psnr=30.0, miou=0.97, miou_all=0.95, zero_is_background={is_background}"
+    job = run(make(f'say("quality", {figures})\nsay("done")'))
+    written = []
+    monkeypatch.setattr(job_display, "write", lambda _layout, text: written.append(text))
+    job_display.draw_figures(None, job.quality, job.zero_is_background, 1200)
+    assert written == [f"PSNR 30.0 dB   {shown}   1,200 splats"]
 
 
 def test_jobs_run_in_order_and_changes_are_reported(make):
