@@ -24,7 +24,7 @@ from ..shared.reconstruction.objects import read_objects
 from ..shared.reconstruction.plan import Plan
 from ..shared.reconstruction.record import CaptureRecord, TrainingRecord, read_record, update_record
 from ..training.budget import TrainingProgress
-from ..training.exposure import measure_gains
+from ..training.exposure.gains import measure_gains
 from ..training.scene import Scene
 from ..training.state import load_model, progress_of
 from .cameras import write_capture_cameras

@@ -16,7 +16,7 @@ from ..shared.defaults import MAX_SIZE
 from ..shared.reconstruction.objects import SceneObject, default_name, merged
 from ..shared.reconstruction.plan import KEYS, Decision, Plan
 from ..training.budget import choose_validation_views
-from ..training.exposure import VARIES_FROM, differences, measure_gains
+from ..training.exposure.gains import VARIES_FROM, differences, measure_gains
 from ..training.settings import Settings, background_is_masked, downscale_at
 from .coverage import blind_views, duplicate_views, unseen_points, views_like_held_out, views_without_objects
 
@@ -113,8 +113,10 @@ def planned_settings(settings: Settings, plan: Plan) -> Settings:
         plan: The plan, with the user's overrides.
 
     Returns:
-        The settings without the weights of losses that the plan leaves out, and with an overridden image pyramid.
+        The settings without the weights of losses that the plan leaves out, with colors that are fitted if the plan
+        compensates the exposure, and with an overridden image pyramid.
     """
+    settings = replace(settings, fit_colors=plan.does("exposure"))
     if not plan.does("labels"):
         settings = replace(settings, semantic_weight=0.0)
     if not plan.does("surface"):
@@ -274,7 +276,7 @@ def _exposure(context: PlanningContext) -> Decision:
         return Decision("exposure", what, None, "it requires reading all photos, which training does first")
     off = differences(context.gains)
     if off == 0:
-        return Decision("exposure", what, False, "the photos share too few points to be compared")
+        return Decision("exposure", what, True, "the photos share too few points to be compared before training")
     why = f"the photos show the same points with a difference in brightness or color of {off:.1%}"
     return Decision("exposure", what, off > VARIES_FROM, f"{why}; the threshold is {VARIES_FROM:.0%}")
 

@@ -12,7 +12,7 @@ import torch
 from ..model.object_model import Normalization
 from ..raster import Camera, devices
 from ..shared.class_table import ClassTable
-from .exposure import measure_gains, varies
+from .exposure.gains import measure_gains, varies
 
 if TYPE_CHECKING:
     from ..capture import Capture

@@ -32,6 +32,7 @@ class Settings:
         normal_weight: weight of the loss that aligns the normals of discs with the depth.
         distortion_weight: weight of the loss that concentrates the discs along a ray at one depth.
         pyramid: whether images are downscaled at the start of the training; None: only large ones.
+        fit_colors: whether a correction of each photo's colors is fitted (see `PhotoColors`).
     """
 
     seed: int = 0
@@ -49,15 +50,20 @@ class Settings:
     normal_weight: float = 0.05
     distortion_weight: float = 10.0
     pyramid: bool | None = None
+    fit_colors: bool = False
 
     def as_dict(self) -> dict[str, Any]:
         """Return the settings as a JSON-compatible dict."""
         return asdict(self)
 
     def in_effect(self) -> dict[str, Any]:
-        """Return the settings that have an effect; for 3D Gaussians, without normal_weight and distortion_weight."""
-        surface = () if self.primitive == "2d" else ("normal_weight", "distortion_weight")
-        return {name: value for name, value in asdict(self).items() if name not in surface}
+        """Return the settings that a training has to be resumed with.
+
+        For 3D Gaussians, these are without normal_weight and distortion_weight. fit_colors follows from the plan, and
+        trainings of older versions continue without it.
+        """
+        without = ("fit_colors",) if self.primitive == "2d" else ("fit_colors", "normal_weight", "distortion_weight")
+        return {name: value for name, value in asdict(self).items() if name not in without}
 
     @property
     def view_dependent(self) -> bool:
@@ -152,12 +158,18 @@ def row_rates(settings: Settings, progress: float) -> np.ndarray:
     return rates
 
 
-_MIN_PIXELS, _MIN_PIXELS_OF_SMALL = 300, 50
-"""Smallest longer side of downscaled images, in pixels; the second value applies if `pyramid` is True."""
+_MIN_PIXELS, _MIN_PIXELS_OF_SMALL, _MIN_PIXELS_LATER = 300, 50, 600
+"""Smallest longer side of downscaled images, in pixels; the second value applies if `pyramid` is True, the third after
+SMALL_UNTIL."""
+
+SMALL_UNTIL, HALF_UNTIL = 0.25, 0.7
+"""Progress until which images are downscaled to about `_MIN_PIXELS`, and to about `_MIN_PIXELS_LATER`."""
 
 
 def downscale_at(progress: float, longest: int, pyramid: bool | None = None) -> int:
     """Return the factor by which images are downscaled, coarse to fine.
+
+    A step on a large image takes as long as several on a small one, which teach more while the splats are still few.
 
     Args:
         progress: progress of the training, 0 .. 1.
@@ -167,8 +179,9 @@ def downscale_at(progress: float, longest: int, pyramid: bool | None = None) -> 
     Returns:
         4, 2 or 1.
     """
-    factor = 4 if progress < 0.08 else 2 if progress < 0.25 else 1
+    if pyramid is False or progress >= HALF_UNTIL:
+        return 1
     least = _MIN_PIXELS_OF_SMALL if pyramid else _MIN_PIXELS
-    while factor > 1 and (pyramid is False or longest // factor < least):
-        factor //= 2
-    return factor
+    if progress >= SMALL_UNTIL:
+        least = _MIN_PIXELS_LATER
+    return next((factor for factor in (4, 2) if longest // factor >= least), 1)

@@ -23,6 +23,7 @@ from ..shared.formats.typed import typed
 from ..shared.reconstruction.objects import LARGEST_ID
 from .average import Average
 from .budget import TrainingProgress
+from .exposure.photo_colors import PhotoColors
 from .settings import HEAD_RATES, MODES, Settings
 
 _GROWTH = ("gradient", "visits", "opacity", "views")
@@ -68,6 +69,7 @@ def training_tensors(
     statistics: GrowthStatistics,
     average: Average,
     head_optimizer: torch.optim.Optimizer,
+    colors: PhotoColors | None,
 ) -> dict[str, np.ndarray]:
     """Return all tensors that the next step depends on, by their names in a checkpoint.
 
@@ -84,6 +86,7 @@ def training_tensors(
         "object_ids": model.classes.ids,
         "background": model.background,
         **average.tensors(),
+        **({} if colors is None else colors.tensors()),
         **{f"heads.{name}": value for name, value in model.heads.state_dict().items()},
     }
     for i, state in head_optimizer.state_dict()["state"].items():
@@ -194,6 +197,10 @@ def _check_training(tensors: dict[str, np.ndarray], state: dict[str, Any]) -> No
     if any(name.startswith("mean.") for name in tensors):
         shapes |= {f"mean.{name}": shape for name, shape in shapes.items()}
         shapes |= {"mean.rows": (f4, (count, columns)), "mean.background": (f4, (3,))}
+    if "colors.steps" in tensors:
+        photos = len(tensors["colors.steps"])
+        shapes |= {name: (f4, (photos, 2, 3)) for name in ("colors.values", "colors.exp_avg", "colors.exp_avg_sq")}
+        shapes |= {"colors.steps": (f4, (photos,))}
     _check_tensors(tensors, shapes)
     ordered = [value for name in HEAD_RATES if name != "background" for value in getattr(heads, name).parameters()]
     _check_head_moments(tensors, [*(tuple(value.shape) for value in ordered), (3,)])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from ..shared.errors import InputError
 from . import check_finite
 from .adam import take_rows
 from .check_finite import FiniteCheck
+from .exposure.photo_colors import PhotoColors, corrected
 from .growth_strategy import GrowthStrategy, ViewStatistics
 from .losses.on_cpu import image_loss, normal_loss, volume_loss
 from .scene import Scene
@@ -29,6 +30,12 @@ from .settings import SURFACE_FROM, Settings, downscale_at
 
 MOST_PARTS = 16
 """Largest number of parts in which an image is rendered if it does not fit into the GPU's memory."""
+
+IN_PARTS = (
+    "The GPU's memory is full, so each image is rendered in {parts} parts from here on, and fewer images are kept "
+    "there; a smaller --max-size or --max-anchors would be faster."
+)
+"""Warning when the parts become smaller."""
 
 _NO_ROOM = (
     "The GPU's memory is too small, even for a sixteenth of an image at a time; close programs that use it, or try a "
@@ -142,6 +149,9 @@ class ViewStep:
         self._head_optimizer = head_optimizer
         self._growth = growth
         self._check = check
+        self.colors = (
+            PhotoColors(len(scene.capture), scene.capture.train_indices, model.device) if settings.fit_colors else None
+        )
         self._limits = _Limits()
         self._splats: int | torch.Tensor = 0
 
@@ -149,6 +159,11 @@ class ViewStep:
     def splats(self) -> int:
         """Number of splats generated in the latest step; synchronizes with the GPU."""
         return int(self._splats)
+
+    def restore(self, tensors: Mapping[str, np.ndarray]) -> None:
+        """Restore the corrections of the photos' colors from a checkpoint's tensors."""
+        if self.colors is not None:
+            self.colors.restore(tensors)
 
     def compute(self, index: int, progress: float) -> ViewGradients | None:
         """Compute the loss and gradients of a view.
@@ -206,16 +221,17 @@ class ViewStep:
             return None
         self._head_optimizer.zero_grad(set_to_none=True)
         rows = take_rows(anchors.rows, seen).requires_grad_()
+        correction = None if self.colors is None else self.colors.of(index)
         loss = torch.zeros((), device=rows.device)
         self._splats = 0
         statistics = []
         for part in self._parts_of(camera, image, labels):
             chosen = self._anchors_of(part, seen, rows)
-            terms, g, drawn = self._terms(part, *chosen, present, progress)
+            terms, g, drawn = self._terms(part, *chosen, present, correction, progress)
             of_part = self._total(terms, part)
             if self._check.at_once and not math.isfinite(float(of_part.detach())):
                 self._check.skipped += 1
-                named = self._split_image_loss(terms, part, drawn)
+                named = self._split_image_loss(terms, part, drawn, correction)
                 self._check.fault = check_finite.find_fault_of_loss(named, g, chosen[0], anchors.layout.offsets)
                 return None
             of_part.backward()
@@ -227,6 +243,8 @@ class ViewStep:
                         chosen[0], g.source, g.opacities.detach(), drawn.frame.seen, drawn.frame.screen_gradient
                     )
                 )
+        if self.colors is not None and correction is not None and correction.grad is not None:
+            self.colors.step(index, correction.grad, progress)
         finite = usable = None
         if on_gpu:
             finite = loss.isfinite() if present is None else loss.isfinite() & present.any()
@@ -256,7 +274,13 @@ class ViewStep:
         return seen[here], rows.index_select(0, here)
 
     def _terms(
-        self, part: _Part, seen: torch.Tensor, rows: torch.Tensor, present: torch.Tensor | None, progress: float
+        self,
+        part: _Part,
+        seen: torch.Tensor,
+        rows: torch.Tensor,
+        present: torch.Tensor | None,
+        correction: torch.Tensor | None,
+        progress: float,
     ) -> tuple[dict[str, torch.Tensor], Generated, Rendered]:
         """Render a part from the anchors' rows; returns the weighted loss terms (), the Gaussians and the render."""
         anchors, settings = self.model.anchors, self.settings
@@ -274,7 +298,7 @@ class ViewStep:
             primitive=settings.primitive, want_depth=normal_weight > 0, want_normals=normal_weight > 0,
             want_distortion=distortion_weight > 0,
         )  # fmt: skip
-        terms = {_IMAGE: self._image_loss(part, drawn, drawn.label_probability)}
+        terms = {_IMAGE: self._image_loss(part, drawn, drawn.label_probability, correction)}
         if settings.volume_weight and len(g.scales):
             terms["the volume loss"] = (
                 settings.volume_weight * (0.5 if flat else 1.0) * volume_loss(g.scales, flat, g.valid)
@@ -286,10 +310,15 @@ class ViewStep:
             terms["the distortion loss"] = distortion_weight * drawn.distortion.mean()
         return terms, g, drawn
 
-    def _image_loss(self, part: _Part, drawn: Rendered, label_probability: torch.Tensor | None) -> torch.Tensor:
+    def _image_loss(
+        self, part: _Part, drawn: Rendered, label_probability: torch.Tensor | None, correction: torch.Tensor | None
+    ) -> torch.Tensor:
         """Return the loss () of the image, including the label loss if the labels' probability (h, w) is given."""
+        color, background = drawn.color, self.model.background
+        if correction is not None:
+            color, background = corrected(color, background, correction)
         return image_loss(
-            drawn.color, drawn.alpha, label_probability, self.model.background, part.image, part.labels,
+            color, drawn.alpha, label_probability, background, part.image, part.labels,
             self.settings.ssim_weight, self.settings.semantic_weight * part.more_labels,
         )  # fmt: skip
 
@@ -300,11 +329,11 @@ class ViewStep:
         return part.fraction * loss if self.parts > 1 else loss
 
     def _split_image_loss(
-        self, terms: dict[str, torch.Tensor], part: _Part, drawn: Rendered
+        self, terms: dict[str, torch.Tensor], part: _Part, drawn: Rendered, correction: torch.Tensor | None
     ) -> dict[str, torch.Tensor]:
         """Return the terms with the image loss and the label loss separated."""
         with torch.no_grad():
-            image = self._image_loss(part, drawn, None)
+            image = self._image_loss(part, drawn, None, correction)
         labels = torch.where(image.isfinite(), terms[_IMAGE].detach(), 0.0)
         return {**terms, _IMAGE: image, "the label loss": labels}
 

@@ -42,7 +42,7 @@ from .state import (
     restore_tensor,
     training_tensors,
 )
-from .step import ViewGradients, ViewStep
+from .step import IN_PARTS, ViewGradients, ViewStep
 
 if TYPE_CHECKING:
     from ..capture import Capture
@@ -50,10 +50,6 @@ if TYPE_CHECKING:
 CHECKPOINT_SECONDS = 30.0
 _REPORT_SECONDS = 0.5
 
-_IN_PARTS = (
-    "The GPU's memory is full, so each image is rendered in {parts} parts from here on, and fewer images are kept "
-    "there; a smaller --max-size or --max-anchors would be faster."
-)
 _CONVERGED = "The training has converged; its learning rates fall from step {steps:,} on"
 
 Evaluate = Callable[[ObjectModel, Scene, TrainingProgress], dict[str, Any]]
@@ -160,7 +156,13 @@ class Trainer:
         save_checkpoint(
             folder,
             training_tensors(
-                model, self._exp_avg, self._exp_avg_sq, self._growth.statistics, self._average, self._head_optimizer
+                model,
+                self._exp_avg,
+                self._exp_avg_sq,
+                self._growth.statistics,
+                self._average,
+                self._head_optimizer,
+                self._view_step.colors,
             ),
             {
                 "settings": self.settings.as_dict(),
@@ -219,12 +221,12 @@ class Trainer:
         rng.bit_generator.state = state["rng"]
         trainer = cls(scene, stored, model.to(device), rng)
         trainer._keeps_current = warning is None
-        device = trainer.model.device
         trainer._exp_avg = restore_tensor(tensors, "adam.exp_avg", device)
         trainer._exp_avg_sq = restore_tensor(tensors, "adam.exp_avg_sq", device)
         trainer._growth.statistics = restore_statistics(tensors, device)
         restore_head_optimizer(trainer._head_optimizer, tensors, device)
         trainer._average = Average.from_checkpoint(tensors, trainer.model)
+        trainer._view_step.restore(tensors)
         trainer.progress = TrainingProgress(**state["progress"])
         return trainer, warning
 
@@ -303,7 +305,7 @@ class Trainer:
                 reporter.warning(self._warnings.pop(0))
             smooth = torch.where(smooth.isnan(), loss, smooth.lerp(loss, 0.05))
             if parts == 1 < self.parts:
-                reporter.warning(_IN_PARTS.format(parts=self.parts))
+                reporter.warning(IN_PARTS.format(parts=self.parts))
                 parts = self.parts
             now = time.monotonic()
             if now - last_report >= _REPORT_SECONDS:
@@ -328,8 +330,7 @@ class Trainer:
         reporter.quality(**p.curve[-1], zero_is_background=self.scene.supervise_background)
 
     def _report(self, budget: Budget, reporter: Reporter, loss: float, pace: float) -> None:
-        p = self.progress
-        left = budget.remaining(p, pace)
+        p, left = self.progress, budget.remaining(self.progress, pace)
         latest = p.curve[-1] if p.curve else {}
         reporter.progress(
             round(budget.displayed_progress(p), 5),

@@ -18,7 +18,7 @@ from backend.capture import check_capture, load_capture
 from backend.capture.models import read_capture_model
 from backend.capture.models.lens import brown
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_DONE, InputError
-from backend.training.exposure import measure_gains, varies
+from backend.training.exposure.gains import measure_gains, varies
 
 from .command_result import assert_rejected
 from .other_models import (

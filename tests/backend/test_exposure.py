@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from backend.training.exposure import measure_gains, varies
+from backend.training.exposure.gains import measure_gains, varies
 
 
 def photos(gains, cameras, held_out=(), points=200, noise=0.0, hidden=0.0):

@@ -94,7 +94,7 @@ def test_plan_of_capture_with_objects(write_capture, tmp_path):
         "votes": True, "rest": False, "labels": True, "undistortion": False, "exposure": True, "pyramid": False,
     }  # fmt: skip
     assert len(DECISIONS) == len(KEYS) and list(done) == [key for key in KEYS if key in done]
-    assert planned_settings(Settings(), plan) == Settings()
+    assert planned_settings(Settings(), plan) == Settings(fit_colors=True)
 
 
 def test_plan_without_masks_has_no_object_steps(write_capture, tmp_path):
@@ -263,12 +263,22 @@ def test_undistortion_exposure_and_pyramid_are_planned(write_capture, tmp_path):
     assert plan["undistortion"].done and "SIMPLE_RADIAL" in plan["undistortion"].why
     assert plan["exposure"].done is None and plan["pyramid"].done
     assert planned_settings(Settings(), planned(unprepared, leave_out=["pyramid"])).pyramid is False
-    assert planned(loaded(bent, tmp_path))["exposure"].done is False
+    few_points = planned(loaded(bent, tmp_path))
+    assert few_points["exposure"].done and "too few points" in few_points["exposure"].why
+    assert planned_settings(Settings(), few_points).fit_colors
+    assert not planned_settings(Settings(), planned(loaded(bent, tmp_path), leave_out=["exposure"])).fit_colors
     with pytest.raises(InputError, match="--leave-out undistortion is not possible"):
         planned(unprepared, leave_out=["undistortion"])
     assert [downscale_at(0.0, 640, pyramid) for pyramid in (None, True, False)] == [2, 4, 1]
     assert [downscale_at(0.0, 320, pyramid) for pyramid in (None, True, False)] == [1, 4, 1]
     assert downscale_at(1.0, 640, True) == 1
+
+
+def test_large_images_stay_small_for_longer():
+    progress = (0.0, 0.2, 0.3, 0.65, 0.75)
+    assert [downscale_at(done, 1600) for done in progress] == [4, 4, 2, 2, 1]
+    assert [downscale_at(done, 1000) for done in progress] == [2, 2, 1, 1, 1]
+    assert [downscale_at(done, 4000) for done in progress] == [4, 4, 4, 4, 1]
 
 
 def test_surface_losses_need_meshes(write_capture, tmp_path):
@@ -278,7 +288,7 @@ def test_surface_losses_need_meshes(write_capture, tmp_path):
     plan = planned(capture, settings=flat, meshes=False)
     assert not plan.does("meshes") and planned_settings(flat, plan).normal_weight == 0
     assert planned_settings(flat, plan).distortion_weight == 0
-    kept = planned(capture, settings=flat, meshes=False, keep=["surface"])
+    kept = planned(capture, settings=flat, meshes=False, keep=["surface"], leave_out=["exposure"])
     assert planned_settings(flat, kept) == flat
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from ..capture import Capture
+    from ...capture import Capture
 
 VARIES_FROM = 0.02
 """Standard deviation of the log gains above which the exposure is considered to vary."""

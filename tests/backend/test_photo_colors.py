@@ -1,0 +1,57 @@
+"""Color corrections of photos: recovery of known ones, their mean, and their checkpoints."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from backend.raster import devices
+from backend.training.exposure.photo_colors import PhotoColors, corrected
+
+
+def test_correction_applies_to_render_and_background() -> None:
+    generator = torch.Generator().manual_seed(0)
+    color, alpha = torch.rand((3, 4, 5), generator=generator), torch.rand((4, 5), generator=generator)
+    background, correction = torch.rand(3, generator=generator), torch.randn((2, 3), generator=generator)
+    shown, behind = corrected(color, background, correction)
+    found = shown + (1 - alpha) * behind[:, None, None]
+    composed = color + (1 - alpha) * background[:, None, None]
+    torch.testing.assert_close(found, correction[0].exp()[:, None, None] * composed + correction[1][:, None, None])
+
+
+def test_known_corrections_are_recovered() -> None:
+    generator = torch.Generator().manual_seed(1)
+    render, nothing = torch.rand((3, 24, 24), generator=generator), torch.zeros(3)
+    true = torch.randn((5, 2, 3), generator=generator) * torch.tensor([0.3, 0.05])[:, None]
+    true[:4] -= true[:4].mean(0)
+    photos = [corrected(render, nothing, correction)[0] for correction in true]
+    colors = PhotoColors(5, range(4), devices.CPU)
+    rng = np.random.default_rng(0)
+    for step in range(2000):
+        index = int(rng.integers(4))
+        correction = colors.of(index)
+        (corrected(render, nothing, correction)[0] - photos[index]).abs().mean().backward()
+        assert correction.grad is not None
+        colors.step(index, correction.grad, step / 2000)
+    assert (colors.values[:4] - true[:4]).abs().max() < 0.02
+    assert true[:4].abs().max() > 0.3
+    assert not colors.values[4].any(), "a photo that is held out has no correction"
+    assert colors.values[:4].mean(0).abs().max() < 1e-6
+
+
+def test_unusable_gradient_changes_nothing() -> None:
+    colors = PhotoColors(2, (0, 1), devices.CPU)
+    colors.step(0, torch.ones((2, 3)), 0.0)
+    before = {name: tensor.clone() for name, tensor in colors.tensors().items()}
+    colors.step(1, torch.full((2, 3), torch.nan), 0.0)
+    assert all(torch.equal(before[name], tensor) for name, tensor in colors.tensors().items())
+
+
+@pytest.mark.parametrize("photos", [2, 3])
+def test_corrections_are_restored_from_checkpoints_of_the_same_photos(photos: int) -> None:
+    colors, other = PhotoColors(2, (0, 1), devices.CPU), PhotoColors(photos, (0, 1), devices.CPU)
+    colors.step(0, torch.ones((2, 3)), 0.0)
+    other.restore({name: tensor.numpy() for name, tensor in colors.tensors().items()})
+    assert other.values.any() == (photos == 2)
+    other.restore({})
