@@ -88,11 +88,13 @@ class Budget:
 
     until_converged: train until further steps would gain little on the validation views; `seconds` is then a limit,
     None: no limit.
+    first: progress at the first of `steps`, for a model that was trained before.
     """
 
     steps: int | None = None
     seconds: float | None = None
     until_converged: bool = False
+    first: float = 0.0
 
     def progress(self, p: TrainingProgress) -> float:
         """Return the progress that determines learning rates, growth and resolution.
@@ -109,7 +111,7 @@ class Budget:
             decay = (p.step - p.converged_at) / (p.converged_at / DECAY_FROM - p.converged_at)
             return min(PLATEAU_UNTIL + (1 - PLATEAU_UNTIL) * decay, 1.0)
         if self.steps is not None:
-            return min(p.step / self.steps, 1.0)
+            return min(self.first + (1.0 - self.first) * (p.step / self.steps), 1.0)
         assert self.seconds is not None
         return min(p.seconds / self.seconds, 1.0)
 
@@ -141,7 +143,7 @@ class Budget:
         """
         progress = self.progress(p)
         if not self.until_converged or progress >= 1.0:
-            return progress
+            return (progress - self.first) / (1.0 - self.first)
         end = expected_end(p)
         steps = p.step / (p.step + LOOKAHEAD if end is None else max(end, p.step + 1))
         return steps if self.seconds is None else min(max(steps, p.seconds / self.seconds), 1.0)

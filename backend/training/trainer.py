@@ -80,7 +80,7 @@ class Trainer:
         self._head_optimizer = torch.optim.Adam(groups, betas=(BETA1, BETA2), eps=1e-15, fused=True)
         self._check = FiniteCheck(model.device)
         self._growth = GrowthStrategy(settings, model)
-        self._view_step = ViewStep(scene, settings, model, self._head_optimizer, self._growth, self._check)
+        self.view_step = ViewStep(scene, settings, model, self._head_optimizer, self._growth, self._check)
 
     @classmethod
     def start(
@@ -162,7 +162,7 @@ class Trainer:
                 self._growth.statistics,
                 self._average,
                 self._head_optimizer,
-                self._view_step.colors,
+                self.view_step.colors,
             ),
             {
                 "settings": self.settings.as_dict(),
@@ -226,7 +226,7 @@ class Trainer:
         trainer._growth.statistics = restore_statistics(tensors, device)
         restore_head_optimizer(trainer._head_optimizer, tensors, device)
         trainer._average = Average.from_checkpoint(tensors, trainer.model)
-        trainer._view_step.restore(tensors)
+        trainer.view_step.restore(tensors)
         trainer.progress = TrainingProgress(**state["progress"])
         return trainer, warning
 
@@ -350,12 +350,12 @@ class Trainer:
     @property
     def parts(self) -> int:
         """The number of parts in which an image is rendered."""
-        return self._view_step.parts
+        return self.view_step.parts
 
     @property
     def splats(self) -> int:
         """Number of splats generated in the latest step; synchronizes with the GPU."""
-        return self._view_step.splats
+        return self.view_step.splats
 
     def step(self, progress: float) -> torch.Tensor:
         """Train on one view: forward, backward and update.
@@ -369,7 +369,7 @@ class Trainer:
         p = self.progress
         if not p.queue:
             p.queue = self.rng.permutation(self.scene.capture.train_indices).tolist()
-        gradients = self._view_step.compute(p.queue[-1], progress)
+        gradients = self.view_step.compute(p.queue[-1], progress)
         # Remove the view only now, so that it remains the next one if its image cannot be read.
         index = p.queue.pop()
         p.step += 1

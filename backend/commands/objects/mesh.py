@@ -35,6 +35,7 @@ from ..folder import READ, Trained, open_trained
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import finish_stage
+from .discs import DISCS, model_of_discs, seconds_of_discs
 
 SCENE = "scene"
 SCENE_BUDGET = 5
@@ -58,8 +59,11 @@ def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Make the selected meshes that do not exist yet; each is written as soon as it is complete."""
     device = devices.pick(options.device)
     reporter.expect(
-        {READ: ("Preparing", 5.0), KERNELS: ("Preparing", kernel_seconds(device)), "meshes": ("Meshing", 30.0)}
-    )
+        {
+            READ: ("Preparing", 5.0), KERNELS: ("Preparing", kernel_seconds(device)),
+            DISCS: ("Fitting discs", 30.0), "meshes": ("Meshing", 30.0),
+        }
+    )  # fmt: skip
     trained = open_trained(options, reporter)
     folder = trained.folder
     ensure_kernels(reporter, trained.model.device)
@@ -68,12 +72,14 @@ def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         folder.meshes.mkdir(exist_ok=True)
         known = {} if options.restart else _known_meshes(folder)
         wanted = [target for target in targets if not _is_current(known.get(target.key), target, options, trained)]
-        reporter.expect({"meshes": ("Meshing", _SECONDS_A_MESH * len(wanted))})
+        discs = seconds_of_discs(trained) if wanted else 0.0
+        reporter.expect({DISCS: ("Fitting discs", discs), "meshes": ("Meshing", _SECONDS_A_MESH * len(wanted))})
+        model = model_of_discs(trained, options, reporter) if wanted else trained.model
         reporter.begin("meshes", "Reading the photos")
         if len(wanted) < len(targets):
             reporter.status(f"{len(targets) - len(wanted)} of {len(targets)} meshes exist already")
         started = time.monotonic()
-        views = Views(trained.model, trained.scene, trained.capture.train_indices)
+        views = Views(model, trained.scene, trained.capture.train_indices)
         for done, target in enumerate(wanted):
             reporter.status(f"Making the mesh of {target.name} ({done + 1} of {len(wanted)})")
             entry = _make(target, options, trained, views, _Part(reporter, done, len(wanted), started))
