@@ -192,7 +192,7 @@ def measured(
             modes.silence(trainer)
         trainer.run(Budget(steps=steps), Path(scratch) / "checkpoint", Reporter())
         alone: dict[int, np.ndarray] = {}
-        view_step = trainer._view_step
+        view_step = trainer.view_step
 
         def render(index: int) -> tuple[Any, Any]:
             camera = trainer.scene.camera(index)

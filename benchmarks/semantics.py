@@ -33,8 +33,8 @@ OPAQUE = 0.5
 class _WithoutLabels(step.ViewStep):
     """A training step whose label loss is replaced by `_semantic_loss`."""
 
-    def _terms(self, part: Any, seen: Any, rows: Any, present: Any, progress: float) -> Any:
-        terms, g, drawn = super()._terms(part._replace(labels=None), seen, rows, present, progress)
+    def _terms(self, part: Any, seen: Any, rows: Any, *others: Any) -> Any:
+        terms, g, drawn = super()._terms(part._replace(labels=None), seen, rows, *others)
         if part.labels is not None and bool((part.labels >= 0).any()):
             loss = self._semantic_loss(g, rows, part.camera, part.labels)
             terms["the semantic loss"] = self.settings.semantic_weight * loss

@@ -30,7 +30,7 @@ def test_learnable_features_learn_the_masks(capture, monkeypatch):
     # The cameras are far apart, so a training view is checked.
     index = capture.train_indices[0]
     mask = capture.mask(index)
-    found = trainer._view_step.ids(trainer.model, trainer.scene.camera(index))
+    found = trainer.view_step.ids(trainer.model, trainer.scene.camera(index))
     assert (found == mask)[mask > 0].mean() > 0.9
 
 
@@ -38,10 +38,10 @@ def test_objects_rendered_alone_follow_their_masks(capture, monkeypatch):
     """With object-independent constraints, an object behind another one has a hole where it is hidden."""
     trainer = started(capture, "independent", monkeypatch)
     index = capture.train_indices[0]
-    before = trainer._view_step.compute(index, 0.5).loss
+    before = trainer.view_step.compute(index, 0.5).loss
     for i in range(60):
         trainer.step(0.1 + 0.5 * i / 60)
-    assert trainer._view_step.compute(index, 0.5).loss < before
+    assert trainer.view_step.compute(index, 0.5).loss < before
     for inside, union in semantics.iou_alone(trainer.model, trainer.scene.camera(index), capture.mask(index)).values():
         assert 0 < inside <= union
 
@@ -50,7 +50,7 @@ def test_objects_rendered_alone_follow_their_masks(capture, monkeypatch):
 def test_without_weight_the_semantics_change_nothing(capture, monkeypatch, name):
     index = capture.train_indices[0]
     losses = [
-        started(capture, kind, monkeypatch, semantic_weight=0.0)._view_step.compute(index, 0.5).loss
+        started(capture, kind, monkeypatch, semantic_weight=0.0).view_step.compute(index, 0.5).loss
         for kind in ("one-hot", name)
     ]
     assert torch.equal(*losses)

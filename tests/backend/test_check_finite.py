@@ -147,7 +147,7 @@ def test_nonfinite_gradient_affects_only_its_anchor(trainer, monkeypatch, value)
         index = trained.scene.capture.train_indices[0]
         before, trained.progress.step = trained.model.anchors.rows.clone(), 1
         monkeypatch.setattr(step, "rasterize", corrupted(step.rasterize, 41, given))
-        learned = trained._view_step.compute(index, 0.6)
+        learned = trained.view_step.compute(index, 0.6)
         monkeypatch.undo()
         trained._update(learned, 0.6)
         results.append((trained, before))
@@ -182,7 +182,7 @@ def test_heads_learn_from_finite_anchors(trainer, monkeypatch, value):
 
     monkeypatch.setattr(step, "rasterize", call)
     before = [p.detach().clone() for p in trained.model.heads.parameters()]
-    learned = trained._view_step.compute(index, 0.6)
+    learned = trained.view_step.compute(index, 0.6)
     trained._update(learned, 0.6)
     assert all(p.isfinite().all() for p in trained.model.heads.parameters())
     assert all(not torch.equal(a, b) for a, b in zip(before, trained.model.heads.parameters(), strict=True))

@@ -457,8 +457,8 @@ def test_strips_give_same_gradients(tiny, as_on_gpu):
     found = []
     for parts in (1, 2, 4):
         trainer = Trainer.start(capture, ids, settings)
-        trainer._view_step.parts = parts
-        learned = trainer._view_step.compute(capture.train_indices[0], 0.09)
+        trainer.view_step.parts = parts
+        learned = trainer.view_step.compute(capture.train_indices[0], 0.09)
         full = torch.zeros_like(trainer.model.anchors.rows)
         usable = learned.usable[:, None]
         full.index_add_(0, learned.seen, torch.where(usable, learned.rows.grad, 0.0))

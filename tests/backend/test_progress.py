@@ -28,7 +28,7 @@ STAGES = {
     "train": ["Preparing (1 of 3)", "Training (2 of 3)", "Saving (3 of 3)"],
     "evaluate": ["Preparing (1 of 3)", "Measuring the views (2 of 3)"],
     "render": ["Preparing (1 of 2)", "Rendering (2 of 2)"],
-    "mesh": ["Preparing (1 of 2)", "Meshing (2 of 2)"],
+    "mesh": ["Preparing (1 of 3)", "Fitting discs (2 of 3)", "Meshing (3 of 3)"],
     "report": ["Preparing (1 of 3)", "Drawing (2 of 3)", "Saving (3 of 3)"],
     "film": ["Preparing (1 of 2)", "Rendering (2 of 2)"],
     "fill": ["Reading (1 of 2)", "Filling (2 of 2)"],
