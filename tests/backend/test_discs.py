@@ -111,6 +111,9 @@ def test_meshes_are_made_of_discs_that_are_fitted_once(write_capture, run_comman
     (kept,) = (out / "cache").glob("discs-*")
     assert run_command(*mesh, "--restart").code == EXIT_DONE and len(taken) == 10, "the fit is kept"
     assert (out / "splats.ply").read_bytes() == splats, "the model that is displayed remains"
+    for file in kept.iterdir():
+        file.write_bytes(b"damaged")
+    assert run_command(*mesh, "--restart").code == EXIT_DONE and len(taken) == 20, "a damaged fit is made anew"
     assert run_command(*train, "--steps", 60).code == EXIT_DONE
     taken.clear()
     assert run_command(*mesh).code == EXIT_DONE and len(taken) == 12

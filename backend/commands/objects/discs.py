@@ -9,6 +9,7 @@ from typing import Any
 
 from ...labels import correct_masks
 from ...model.object_model import ObjectModel
+from ...shared.errors import InputError
 from ...shared.events import Reporter
 from ...shared.formats.points_ply import read_points
 from ...shared.stopping import StoppingReporter
@@ -55,7 +56,12 @@ def model_of_discs(trained: Trained, options: argparse.Namespace, reporter: Stop
     if capture.has_masks and trained.folder.points.is_file():
         capture, _ = correct_masks(capture, read_points(trained.folder.points).ids)
     memory, gains = memory_for_planes(options), trained.scene.gains
-    resumed = Trainer.resume(capture, folder, None, memory, model.device, gains)
+    try:
+        resumed = Trainer.resume(capture, folder, None, memory, model.device, gains)
+    except InputError:
+        # A damaged fit is made anew, as it can be computed again.
+        shutil.rmtree(folder, ignore_errors=True)
+        resumed = None
     trainer = resumed[0] if resumed else begin_discs(model, capture, trained.folder.checkpoint, memory, gains)
     budget = budget_of_discs(trained.progress.step)
     if budget.progress(trainer.progress) < 1.0:
