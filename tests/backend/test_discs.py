@@ -21,7 +21,7 @@ DRAWN = ("--offsets", 4, "--background", "black")
 
 
 def model_of(mode: str = "explicit", primitive: str = "3d") -> ObjectModel:
-    """A model with splats of all shapes, whose extents exceed the limit in one anchor."""
+    """A model with splats of all shapes."""
     rng, generator, layout = np.random.default_rng(0), torch.Generator().manual_seed(0), Layout(4)
     xyz = rng.uniform(-1, 1, (40, 3))
     anchors = seed_anchors(xyz, rng.uniform(0, 1, (40, 3)), np.zeros(40, np.int64), 0.05, layout, rng)

@@ -27,7 +27,7 @@ _PREFIX = "discs-"
 def seconds_of_discs(trained: Trained) -> float:
     """Return the expected duration of the fit in seconds, 0 if the model is meshed as it is."""
     progress = trained.progress
-    if not _is_converted(trained.model) or not progress.step:
+    if not _needs_discs(trained):
         return 0.0
     return (budget_of_discs(progress.step).steps or 0) * progress.seconds / progress.step
 
@@ -46,7 +46,7 @@ def model_of_discs(trained: Trained, options: argparse.Namespace, reporter: Stop
         Cancelled: A stop was requested; the fit so far is kept and continued next time.
     """
     model, cache = trained.model, trained.folder.cache
-    if not _is_converted(model) or not trained.progress.step:
+    if not _needs_discs(trained):
         return model
     folder = cache / f"{_PREFIX}{digest_of_model(model)}"
     for other in cache.glob(f"{_PREFIX}*"):
@@ -72,8 +72,8 @@ def model_of_discs(trained: Trained, options: argparse.Namespace, reporter: Stop
     return trainer.shown
 
 
-def _is_converted(model: ObjectModel) -> bool:
-    return model.explicit and model.primitive == "3d"
+def _needs_discs(trained: Trained) -> bool:
+    return trained.model.explicit and trained.model.primitive == "3d" and trained.progress.step > 0
 
 
 class _Fit(Reporter):
