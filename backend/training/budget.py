@@ -61,7 +61,9 @@ class TrainingProgress:
         grown: whether growth has ended.
         converged_at: step at which the training converged and the learning rate decay began; 0 before.
         curve: for each evaluation, the seconds, step, number of anchors, loss (dB) and measured quality, on held-out
-            views and, as `validation_psnr`, on validation views.
+            views, as `validation_psnr` on validation views, and as `watched_psnr` on those of `watched`.
+        watched: training views that are spared, as `overfitting` describes.
+        dropped: fraction of the splats that each step leaves out.
     """
 
     step: int = 0
@@ -74,6 +76,8 @@ class TrainingProgress:
     grown: bool = False
     converged_at: int = 0
     curve: list[dict[str, Any]] = field(default_factory=list)
+    watched: list[int] = field(default_factory=list)
+    dropped: float = 0.0
 
     @property
     def causes(self) -> str:

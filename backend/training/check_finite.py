@@ -10,7 +10,7 @@ import torch
 from ..model.anchors import Layout
 from ..model.generate import Generated
 from ..raster import devices
-from .adam import LARGEST_GRADIENT
+from .optimizer.adam import LARGEST_GRADIENT
 
 BRIGHTEST = 1e9
 """Larger colors are reported as faults, since their squares overflow in SSIM."""

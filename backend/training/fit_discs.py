@@ -76,4 +76,5 @@ def begin_discs(model: ObjectModel, capture: Capture, checkpoint: Path, memory_m
     discs.heads.requires_grad_()
     trainer = Trainer(scene, settings, discs, np.random.default_rng(settings.seed))
     trainer.view_step.restore(tensors)
+    trainer.progress.dropped = state["progress"].get("dropped", 0.0)
     return trainer

@@ -21,9 +21,9 @@ from ..shared.class_table import ClassTable
 from ..shared.errors import InputError
 from ..shared.formats.typed import typed
 from ..shared.reconstruction.objects import LARGEST_ID
-from .average import Average
 from .budget import TrainingProgress
 from .exposure.photo_colors import PhotoColors
+from .optimizer.average import Average
 from .settings import HEAD_RATES, MODES, Settings
 
 _GROWTH = ("gradient", "visits", "opacity", "views")

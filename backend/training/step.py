@@ -20,11 +20,12 @@ from ..model.object_model import ObjectModel, anchors_in_view, first_anchors_in_
 from ..raster import Camera, Rendered, devices, rasterize
 from ..shared.errors import InputError
 from . import check_finite
-from .adam import take_rows
 from .check_finite import FiniteCheck
 from .exposure.photo_colors import PhotoColors, corrected
 from .growth_strategy import GrowthStrategy, ViewStatistics
 from .losses.on_cpu import image_loss, normal_loss, volume_loss
+from .optimizer.adam import take_rows
+from .overfitting import Dropout
 from .scene import Scene
 from .settings import SURFACE_FROM, Settings, downscale_at
 
@@ -153,6 +154,7 @@ class ViewStep:
             PhotoColors(len(scene.capture), scene.capture.train_indices, model.device) if settings.fit_colors else None
         )
         self._limits = _Limits()
+        self._dropout: Dropout | None = None
         self._splats: int | torch.Tensor = 0
 
     @property
@@ -165,12 +167,13 @@ class ViewStep:
         if self.colors is not None:
             self.colors.restore(tensors)
 
-    def compute(self, index: int, progress: float) -> ViewGradients | None:
+    def compute(self, index: int, progress: float, dropout: Dropout | None = None) -> ViewGradients | None:
         """Compute the loss and gradients of a view.
 
         Args:
             index: index of the view in the capture.
             progress: progress of the training, 0 .. 1.
+            dropout: leaves out some of the splats.
 
         Returns:
             The loss and gradients; None if no anchor is in view or the loss is not finite.
@@ -178,6 +181,7 @@ class ViewStep:
         Raises:
             InputError: the GPU's memory is too small for the smallest parts, or the view's image cannot be read.
         """
+        self._dropout = dropout
         gradients, full = self._compute_if_it_fits(index, progress)
         while full:
             self._make_room()
@@ -288,6 +292,8 @@ class ViewStep:
             anchors.layout, anchors.positions[seen], rows, anchors.ids[seen], self.model.heads, part.camera.center,
             present,
         )  # fmt: skip
+        if self._dropout is not None:
+            g = self._dropout(g)
         flat = settings.primitive == "2d"
         normal_weight, distortion_weight = (
             weight if flat and progress >= SURFACE_FROM else 0.0

@@ -26,12 +26,12 @@ from ..shared.errors import Cancelled, InputError
 from ..shared.events import Reporter
 from ..shared.reconstruction.objects import default_name
 from ..shared.stopping import StopRequest
-from . import check_finite
-from .adam import BETA1, BETA2, step_rows
-from .average import Average
+from . import check_finite, overfitting
 from .budget import Budget, TrainingProgress
 from .check_finite import FiniteCheck
 from .growth_strategy import GrowthStrategy
+from .optimizer.adam import BETA1, BETA2, step_rows
+from .optimizer.average import Average
 from .scene import Scene
 from .settings import HEAD_RATES, Settings, background_is_masked, rate, row_rates
 from .state import (
@@ -153,27 +153,19 @@ class Trainer:
         """
         model = self.model
         self.progress.skipped += self._check.take_skipped()
-        save_checkpoint(
-            folder,
-            training_tensors(
-                model,
-                self._exp_avg,
-                self._exp_avg_sq,
-                self._growth.statistics,
-                self._average,
-                self._head_optimizer,
-                self.view_step.colors,
-            ),
-            {
-                "settings": self.settings.as_dict(),
-                "voxel": model.anchors.voxel,
-                "supervise_background": self.scene.supervise_background,
-                "normalization": {"center": model.normalization.center, "scale": model.normalization.scale},
-                "rng": self.rng.bit_generator.state,
-                "progress": {**self.progress.__dict__},
-            },
-            keep_current=self._keeps_current,
-        )
+        tensors = training_tensors(
+            model, self._exp_avg, self._exp_avg_sq, self._growth.statistics, self._average, self._head_optimizer,
+            self.view_step.colors,
+        )  # fmt: skip
+        state = {
+            "settings": self.settings.as_dict(),
+            "voxel": model.anchors.voxel,
+            "supervise_background": self.scene.supervise_background,
+            "normalization": {"center": model.normalization.center, "scale": model.normalization.scale},
+            "rng": self.rng.bit_generator.state,
+            "progress": {**self.progress.__dict__},
+        }
+        save_checkpoint(folder, tensors, state, keep_current=self._keeps_current)
         self._keeps_current = True
 
     @classmethod
@@ -279,6 +271,9 @@ class Trainer:
         before = p.seconds
         first_step = p.step
         budget.begin(p)
+        capture = self.scene.capture
+        if evaluate is not None and not p.step and not capture.validation_indices:
+            p.watched = overfitting.choose_watched_views(capture.train_indices, len(capture.points.xyz))
         smooth = torch.full((), math.nan, device=self.model.device)
         parts = self.parts
         while True:
@@ -287,6 +282,8 @@ class Trainer:
                 self._evaluate(evaluate, reporter, float(smooth))
                 if budget.check_convergence(p):
                     reporter.status(_CONVERGED.format(steps=p.step))
+                if overfitting.watch(p, budget):
+                    reporter.status(overfitting.OVERFITS)
             progress = budget.progress(p)
             if progress >= 1.0:
                 break
@@ -368,8 +365,9 @@ class Trainer:
         """
         p = self.progress
         if not p.queue:
-            p.queue = self.rng.permutation(self.scene.capture.train_indices).tolist()
-        gradients = self.view_step.compute(p.queue[-1], progress)
+            views = [index for index in self.scene.capture.train_indices if index not in p.watched]
+            p.queue = self.rng.permutation(views).tolist()
+        gradients = self.view_step.compute(p.queue[-1], progress, overfitting.dropout_at(p, progress))
         # Remove the view only now, so that it remains the next one if its image cannot be read.
         index = p.queue.pop()
         p.step += 1

@@ -11,8 +11,8 @@ from backend.raster import devices
 from backend.shared.events import Reporter
 from backend.training import check_finite, step
 from backend.training import trainer as trainer_module
-from backend.training.adam import LARGEST_GRADIENT, step_rows
 from backend.training.budget import Budget
+from backend.training.optimizer.adam import LARGEST_GRADIENT, step_rows
 from backend.training.settings import Settings
 from backend.training.trainer import Trainer
 

@@ -27,9 +27,9 @@ from backend.raster import Camera, devices, rasterize
 from backend.shared.errors import InputError
 from backend.shared.events import Reporter
 from backend.training import step
-from backend.training.adam import step_rows, take_rows
 from backend.training.budget import Budget
 from backend.training.losses.on_cpu import image_loss, normal_loss, volume_loss
+from backend.training.optimizer.adam import step_rows, take_rows
 from backend.training.settings import Settings
 from backend.training.step import strips
 from backend.training.trainer import Trainer
@@ -210,7 +210,7 @@ def test_normal_loss_matches(both):
 
 
 def test_adam_updates_seen_usable_finite_rows(both, monkeypatch):
-    monkeypatch.setattr("backend.training.adam._ROWS_AT_ONCE", 4)
+    monkeypatch.setattr("backend.training.optimizer.adam._ROWS_AT_ONCE", 4)
     rng = np.random.default_rng(0)
     base = torch.tensor(rng.normal(size=(20, 7)), dtype=torch.float32)
     seen = torch.tensor([1, 4, 7, 9, 12, 19])

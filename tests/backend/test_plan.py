@@ -423,10 +423,10 @@ def views_trained_on(capture, monkeypatch) -> set[int]:
     """The indices of the views that trainings on a capture use from now on."""
     seen, compute = set(), ViewStep.compute
 
-    def noted(self, index, progress):
+    def noted(self, index, progress, dropout=None):
         if self.scene.capture.folder == capture:  # Not a training that compiles kernels.
             seen.add(index)
-        return compute(self, index, progress)
+        return compute(self, index, progress, dropout)
 
     monkeypatch.setattr(ViewStep, "compute", noted)
     return seen

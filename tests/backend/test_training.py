@@ -23,10 +23,10 @@ from backend.raster import Camera, rasterize
 from backend.shared.errors import Cancelled, InputError
 from backend.shared.events import Reporter
 from backend.shared.stopping import StopRequest
-from backend.training.adam import BETA1, BETA2, step_rows
-from backend.training.average import EVERY, FRACTION, MAX_STEPS, Average
 from backend.training.budget import Budget
 from backend.training.losses.on_cpu import PROBABILITY_FLOOR, image_loss, normal_loss, volume_loss
+from backend.training.optimizer.adam import BETA1, BETA2, step_rows
+from backend.training.optimizer.average import EVERY, FRACTION, MAX_STEPS, Average
 from backend.training.settings import Settings
 from backend.training.state import load_model
 from backend.training.trainer import Trainer

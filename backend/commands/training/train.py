@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ...capture import Capture
-from ...evaluation import IdScores, comparison, curve_image, psnr, save_image, thumbnail
+from ...evaluation import IdScores, color_corrected, comparison, curve_image, psnr, save_image, thumbnail
 from ...export import agreement, fit_splats, write_anchors, write_splats
 from ...labels import correct_masks
 from ...labels.mask_points import MaskPoints, place_points
@@ -239,7 +239,8 @@ def _run(
 def _measure(folder: Reconstruction, reporter: StoppingReporter) -> Evaluate:
     """Return a function that measures held-out views, and writes previews of the first one and of the curve.
 
-    It also measures the validation views, if any. Held-out views are for the user; they do not decide anything.
+    It also measures the validation views and the spared views, if any. Held-out views are for the user; they do not
+    decide anything.
     """
 
     def measure(model: ObjectModel, scene: Scene, progress: TrainingProgress) -> dict[str, Any]:
@@ -271,6 +272,12 @@ def _measure(folder: Reconstruction, reporter: StoppingReporter) -> Evaluate:
                 for index in capture.validation_indices
             ]
             figures["validation_psnr"] = float(np.mean(validated))
+        if progress.watched:
+            watched = []
+            for index in progress.watched:
+                photo, drawn = capture.image(index), draw(model, scene.camera(index), want_ids=False).image
+                watched.append(psnr(color_corrected(drawn, photo), photo))
+            figures["watched_psnr"] = float(np.mean(watched))
         curve = curve_image([*progress.curve, {"seconds": progress.seconds, **figures}])
         if curve is not None:
             save_image(curve, folder.previews / "curve.png", quick=True)

@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
-from ..adam import BETA1, BETA2
+from ..optimizer.adam import BETA1, BETA2
 from ..settings import rate
 
 RATES = (5e-3, 5e-4)

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 if TYPE_CHECKING:
-    from ..model.object_model import ObjectModel
+    from ...model.object_model import ObjectModel
 
 EVERY = 4
 """Number of steps between updates of the mean, since an update of all rows takes time."""

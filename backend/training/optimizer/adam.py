@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from numba import prange
 
-from ..raster import devices
-from ..raster.kernel import kernel
+from ...raster import devices
+from ...raster.kernel import kernel
 
 BETA1 = 0.9
 BETA2 = 0.999
