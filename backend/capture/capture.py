@@ -256,6 +256,33 @@ class Capture:
         pixels = xy[found] * [K[0, 0], K[1, 1]] + K[:2, 2]
         return Keypoints(pixels, image.point_index[found].astype(np.int64))
 
+    def photo_mask(self, index: int, ids: np.ndarray) -> np.ndarray:
+        """Return the mask of a view's photo, before its undistortion.
+
+        Args:
+            index: The view.
+            ids: (h, w) IDs of the undistorted view's pixels.
+
+        Returns:
+            (H, W), of the photo's size and the type of `ids`; 0 where the undistorted view does not reach.
+        """
+        camera, view = self._raw[index][0], self.views[index]
+        lens = to_pycolmap(camera)
+        x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        pixels = np.stack([x.ravel(), y.ravel()], 1)
+        if is_pinhole(camera):
+            center = np.array([lens.principal_point_x, lens.principal_point_y])
+            xy = (pixels - center) / np.array([lens.focal_length_x, lens.focal_length_y])
+        else:
+            xy = undistort(lens, pixels)
+        # A pixel's center on the border of two may be rounded to either.
+        at = np.nan_to_num(xy, nan=-1e9) * [view.K[0, 0], view.K[1, 1]] + view.K[:2, 2]
+        inside = (at >= 0).all(1) & (at < [view.width, view.height]).all(1)
+        found = np.zeros(len(pixels), ids.dtype)
+        column, row = at[inside].astype(np.int64).T
+        found[inside] = ids[row, column]
+        return found.reshape(camera.height, camera.width)
+
     def _read_image(self, index: int, downscale: int) -> np.ndarray:
         image = read_image(self.views[index].image_file)
         self._check_unchanged(index, self.views[index].image_file, image.size)

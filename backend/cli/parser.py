@@ -37,6 +37,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = _Commands(parser)
     _add_capture_commands(commands)
     _add_training_commands(commands)
+    _add_label(commands)
     _add_render(commands)
     _add_mesh(commands)
     _add_film(commands)
@@ -124,6 +125,16 @@ def _add_training_commands(commands: _Commands) -> None:
         options.add_length(command)
         options.add_splats(command)
         options.add_plan_overrides(command)
+
+
+def _add_label(commands: _Commands) -> None:
+    label = commands.add_for_result(
+        "label", "Make masks of strokes on the objects in a few photos", texts.LABEL,
+        "garden-splats --strokes strokes.json",
+    )  # fmt: skip
+    label.add_argument(
+        "--strokes", type=Path, required=True, metavar="FILE", help="strokes on the objects, as JSON; see above"
+    )
 
 
 def _add_render(commands: _Commands) -> None:

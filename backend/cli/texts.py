@@ -62,6 +62,17 @@ keeps the mean of its latest steps. To train longer, run the command again with 
 --minutes or --steps.
 """
 
+LABEL = """\
+Make masks of the capture from strokes on its objects in one or more photos, after a
+training without masks. Writes masks/, for the training views, and labels.json to the
+capture's folder; train the capture again to separate the objects. Repeat the command
+with more strokes to correct the masks. FILE is JSON:
+  {"objects": {"1": "mug"},
+   "strokes": [{"object": 1, "view": "photo.jpg", "points": [[0.42, 0.5], [0.48, 0.5]]}]}
+Points are fractions of the undistorted photo's width and height, from its top left
+corner. Object 0 is what belongs to no object.
+"""
+
 RENDER = """\
 Render the splats from the capture's cameras to DIR/renders, with the images' names.
 """

@@ -1,0 +1,226 @@
+"""Splats as a graph: neighbors, and how likely two of them belong to one object.
+
+Two neighbors rather belong to different objects if their colors differ, if their surfaces meet in a concave edge as
+where an object stands on a table, if they are far apart for where they are, or if a photo has an edge between them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from scipy import sparse
+from scipy.spatial import cKDTree
+from skimage.color import rgb2lab
+
+from ..raster import Camera, devices, rasterize
+from ..shared.splats.spherical_harmonics import C0
+from .random_walker import random_walker
+
+if TYPE_CHECKING:
+    from ..model.generate import Generated
+
+NEIGHBORS, SURFACE_NEIGHBORS = 10, 17
+"""Number of neighbors of a splat in the graph, and of those that its normal is measured on, itself included."""
+
+SEEN = 1.0
+"""Splats that cover less than this number of pixels in all photos together get the object of the nearest other."""
+
+COLOR, CONCAVE, GAP, PHOTO_EDGE, LEAST = 0.7, 8.0, 1 / 3, 0.25, 1e-4
+"""Weights of a tenth of the CIELAB distance of two splats, of the concavity (the change of the normals along the edge),
+of the distance in units of the local spacing, and of a tenth of the largest CIELAB step in the photos. The weight of an
+edge is exp(-sum of the squares), but at least the last value."""
+
+PRIOR, SIMILAR = 1e-3, 4.0
+"""Weight of the colors of the strokes, and the CIELAB distance at which a color hardly counts as one of these."""
+
+SEEDED = 0.8
+"""The splats that make up this part of what a stroke shows are its seeds; the rest shines through from behind."""
+
+_PHOTOS, _SAMPLES, _VISIBLE = 16, 5, 0.3
+
+
+def contributions(splats: Generated, camera: Camera, planes: np.ndarray, primitive: str) -> np.ndarray:
+    """Sum the blending weights of each splat over pixels.
+
+    Args:
+        splats: N splats of the model.
+        camera: the view.
+        planes: (3, H, W) float32, three weights of the pixels.
+        primitive: "3d" or "2d".
+
+    Returns:
+        (N, 3) float64: for each plane, the sum of weight times blending weight over the pixels.
+    """
+    # The gradient of a pixel's color with respect to that of a splat is the splat's blending weight there.
+    sh = torch.zeros((len(splats.means), 1, 3), device=splats.means.device, requires_grad=True)
+    drawn = rasterize(*splats[:4], sh, splats.ids, camera, primitive=primitive)
+    drawn.color.backward(devices.upload(np.ascontiguousarray(planes, np.float32), sh))
+    assert sh.grad is not None
+    return devices.host(sh.grad[:, 0]).astype(np.float64) / C0
+
+
+@dataclass(frozen=True)
+class SplatGraph:
+    """The graph of N splats.
+
+    Attributes:
+        splats: the splats.
+        primitive: "3d" or "2d".
+        nodes: (n,) int64, the splats that are seen.
+        nearest: (N,) int64, the node of each splat, or the nearest one.
+        lab: (n, 3) CIELAB color of each node, the mean over its neighborhood.
+        weights: (n, n) weights of the edges.
+    """
+
+    splats: Generated
+    primitive: str
+    nodes: np.ndarray
+    nearest: np.ndarray
+    lab: np.ndarray
+    weights: sparse.csr_array
+
+    def solve(self, seeds: dict[int, np.ndarray]) -> np.ndarray:
+        """Find the object of each splat.
+
+        Args:
+            seeds: for each object, 0 included, the (N,) contributions of the splats to its strokes, as from
+                `contributions`.
+
+        Returns:
+            (N,) int64 object IDs.
+        """
+        objects = np.array(sorted(seeds))
+        shown = np.stack([seeds[object_id][self.nodes] for object_id in objects.tolist()])
+        labels = _seed_labels(shown)
+        found = random_walker(self.weights, labels, len(objects), self._prior(labels, len(objects)), PRIOR)
+        return objects[found.argmax(1)][self.nearest]
+
+    def _prior(self, labels: np.ndarray, count: int) -> np.ndarray:
+        """Return (n, count) how similar each node's color is to that of each label's seeds."""
+        fit = np.zeros((len(self.lab), count))
+        for label in range(count):
+            seeds = self.lab[labels == label]
+            if len(seeds):
+                distance, _ = cKDTree(seeds).query(self.lab, workers=-1)
+                fit[:, label] = np.exp(-0.5 * (distance / SIMILAR) ** 2)
+        return fit / (fit.sum(1, keepdims=True) + 0.05)
+
+
+def _seed_labels(shown: np.ndarray) -> np.ndarray:
+    """Return the label of each node (n,), -1 for those that are no seeds, from the contributions (labels, n)."""
+    most, labels = shown.argmax(0), np.full(shown.shape[1], -1)
+    for label, part in enumerate(shown):
+        order = np.argsort(-part, kind="stable")
+        enough = np.searchsorted(np.cumsum(part[order]), SEEDED * part.sum()) + 1
+        seeds = order[:enough]
+        labels[seeds[(most[seeds] == label) & (part[seeds] > 0)]] = label
+    return labels
+
+
+def build_graph(
+    splats: Generated,
+    primitive: str,
+    cameras: Sequence[Camera],
+    photo: Callable[[int], np.ndarray],
+    progress: Callable[[int, int], object],
+) -> SplatGraph:
+    """Build the graph of a model's splats.
+
+    Args:
+        splats: the splats, in scene units.
+        primitive: "3d" or "2d".
+        cameras: the cameras of the training views, in scene units.
+        photo: returns the photo (H, W, 3) uint8 of the camera with an index.
+        progress: receives the number of finished cameras, and of all.
+
+    Returns:
+        The graph.
+    """
+    means = devices.host(splats.means).astype(np.float64)
+    seen, facing = np.zeros(len(means)), np.zeros((len(means), 3))
+    in_photos = {}
+    chosen = set(np.unique(np.linspace(0, len(cameras) - 1, _PHOTOS).round().astype(int)).tolist())
+    for number, camera in enumerate(cameras):
+        ones = np.ones((3, camera.height, camera.width), np.float32)
+        weight = contributions(splats, camera, ones, primitive)[:, 0]
+        to_camera = camera.center - means
+        facing += weight[:, None] * to_camera / np.maximum(np.linalg.norm(to_camera, axis=1, keepdims=True), 1e-12)
+        seen += weight
+        if number in chosen:
+            in_photos[number] = weight.astype(np.float32)
+        progress(number + 1, len(cameras))
+    nodes = np.flatnonzero(seen > SEEN)
+    if len(nodes) <= SURFACE_NEIGHBORS:
+        nodes = np.arange(len(means))
+    xyz = means[nodes]
+    tree = cKDTree(xyz)
+    nearest = np.empty(len(means), np.int64)
+    nearest[nodes] = np.arange(len(nodes))
+    hidden = np.setdiff1d(np.arange(len(means)), nodes)
+    nearest[hidden] = tree.query(means[hidden], workers=-1)[1] if len(hidden) else 0
+
+    distance, neighbor = tree.query(xyz, k=min(SURFACE_NEIGHBORS, len(nodes)), workers=-1)
+    normal = _normals(xyz[neighbor], facing[nodes])
+    rgb = np.clip(0.5 + C0 * devices.host(splats.sh[:, 0])[nodes].astype(np.float64), 0, 1)
+    lab = rgb2lab(rgb[None])[0][neighbor[:, :6]].mean(1)
+    second, length = neighbor[:, 1 : NEIGHBORS + 1].ravel(), distance[:, 1 : NEIGHBORS + 1].ravel()
+    first = np.repeat(np.arange(len(nodes)), len(second) // len(nodes))
+    other = first != second
+    first, second, length = first[other], second[other], length[other]
+    spacing = distance[:, 1:6].mean(1)
+    along = (xyz[second] - xyz[first]) / np.maximum(length, 1e-12)[:, None]
+    concavity = np.maximum(0.0, -((normal[second] - normal[first]) * along).sum(1))
+    gap = length / np.maximum(np.minimum(spacing[first], spacing[second]), 1e-12)
+    color = np.linalg.norm(lab[first] - lab[second], axis=1) / 10
+    steps = _steps_in_photos(xyz, (first, second), {n: w[nodes] for n, w in in_photos.items()}, cameras, photo) / 10
+    weight = LEAST + np.exp(
+        -((COLOR * color) ** 2) - (CONCAVE * concavity) ** 2 - (GAP * gap) ** 2 - (PHOTO_EDGE * steps) ** 2
+    )
+    weights = sparse.coo_array((weight, (first, second)), shape=(len(nodes), len(nodes))).tocsr()
+    return SplatGraph(splats, primitive, nodes, nearest, lab, weights.maximum(weights.T).tocsr())
+
+
+def _normals(neighborhoods: np.ndarray, facing: np.ndarray) -> np.ndarray:
+    """Return the normals (n, 3) of neighborhoods (n, k, 3), on the side of `facing` (n, 3)."""
+    centered = neighborhoods - neighborhoods.mean(1, keepdims=True)
+    _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", centered, centered))
+    normal = axes[:, :, 0]
+    return np.where((normal * facing).sum(1, keepdims=True) < 0, -normal, normal)
+
+
+def _steps_in_photos(
+    xyz: np.ndarray,
+    edges: tuple[np.ndarray, np.ndarray],
+    visible: dict[int, np.ndarray],
+    cameras: Sequence[Camera],
+    photo: Callable[[int], np.ndarray],
+) -> np.ndarray:
+    """Return the largest CIELAB step between the ends of each edge, the mean over the photos that show both."""
+    first, second = edges
+    total, count = np.zeros(len(first)), np.zeros(len(first))
+    for number, weight in visible.items():
+        camera = cameras[number]
+        viewmat, (fx, fy, cx, cy) = camera.arrays()
+        in_camera = xyz @ np.asarray(viewmat[:3, :3], np.float64).T + viewmat[:3, 3]
+        depth = np.maximum(in_camera[:, 2], 1e-9)
+        pixels = np.stack([fx * in_camera[:, 0] / depth + cx, fy * in_camera[:, 1] / depth + cy], 1)
+        size = np.array([camera.width, camera.height])
+        shown = (weight > _VISIBLE) & (in_camera[:, 2] > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
+        both = np.flatnonzero(shown[first] & shown[second])
+        lab = rgb2lab(photo(number))
+        before, step = None, np.zeros(len(both))
+        for t in np.linspace(0, 1, _SAMPLES):
+            at = ((1 - t) * pixels[first[both]] + t * pixels[second[both]]).astype(np.int64)
+            here = lab[at[:, 1], at[:, 0]]
+            if before is not None:
+                step = np.maximum(step, np.linalg.norm(here - before, axis=1))
+            before = here
+        total[both] += step
+        count[both] += 1
+    known = count > 0
+    usual = float(np.median(total[known] / count[known])) if known.any() else 0.0
+    return np.where(known, total / np.maximum(count, 1), usual)
