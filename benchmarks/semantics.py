@@ -18,7 +18,7 @@ from backend.model.generate import Generated
 from backend.model.object_model import ObjectModel, anchors_in_view
 from backend.raster import Camera, rasterize
 from backend.shared.splats.spherical_harmonics import C0
-from backend.training import step, trainer
+from backend.training import overfitting, step, trainer
 from backend.training.losses.on_cpu import PROBABILITY_FLOOR
 from benchmarks import shared
 
@@ -58,10 +58,12 @@ class LearnableStep(_WithoutLabels):
                 layer.bias.zero_()
         self._optimizer = torch.optim.Adam([*self.encoder.parameters(), *self.decoder.parameters()], RATE)
 
-    def compute(self, index: int, progress: float) -> step.ViewGradients | None:
+    def compute(
+        self, index: int, progress: float, dropout: overfitting.Dropout | None = None
+    ) -> step.ViewGradients | None:
         """Compute the gradients of a view, and update encoder and decoder."""
         self._optimizer.zero_grad()
-        found = super().compute(index, progress)
+        found = super().compute(index, progress, dropout)
         if found is not None:
             self._optimizer.step()
         return found

@@ -60,8 +60,7 @@ def trained(write_capture, tmp_path, tmp_path_factory, run_command):
 
 def assert_no_temporary_files(folder: Path) -> None:
     """Check that no temporary file of a command is left."""
-    hidden = [path for path in folder.rglob(".*") if path.name == LOCK or path.name.startswith(".write-test")]
-    assert not [*folder.rglob("*.part"), *hidden]
+    assert not [*folder.rglob("*.part"), *folder.rglob(LOCK)]
 
 
 def step_of(out: Path) -> int:

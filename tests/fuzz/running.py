@@ -118,5 +118,5 @@ def unfinished(folder: Path) -> list[str]:
     return sorted(
         str(path.relative_to(folder))
         for path in folder.rglob(".*")
-        if path.name.startswith((PART_PREFIX, ".write-test")) or path.name == ".lock"
+        if path.name.startswith(PART_PREFIX) or path.name == ".lock"
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from ...pointing.splat_graph import SplatGraph, build_graph, contributions
 from ...pointing.strokes import Strokes, read_strokes
 from ...raster import devices, object_map, rasterize
 from ...shared.errors import InputError
-from ...shared.formats.atomic import PART_PREFIX
+from ...shared.formats.atomic import PART_PREFIX, PART_SUFFIX
 from ...shared.formats.json_file import write_json
 from ...shared.reconstruction.objects import default_name
 from ...shared.stopping import StoppingReporter
@@ -89,7 +88,9 @@ def _write_masks(
     objects, classes = np.unique(ids, return_inverse=True)
     labeled = splats._replace(ids=torch.from_numpy(classes.astype(np.int32)).to(splats.means.device))
     folder = capture.folder / "masks"
-    part = Path(tempfile.mkdtemp(prefix=PART_PREFIX, dir=capture.folder))
+    part = capture.folder / f"{PART_PREFIX}masks{PART_SUFFIX}"
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir()
     try:
         for done, index in enumerate(capture.train_indices, 1):
             with torch.no_grad():

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from ..errors import InputError
-from ..formats.atomic import PART_PREFIX, make_folder
+from ..formats.atomic import PART_PREFIX, PART_SUFFIX, make_folder
 from . import cameras, lock, report
 
 _IGNORED = (lock.NAME, ".DS_Store", "Thumbs.db", "desktop.ini")
@@ -79,7 +79,7 @@ class Reconstruction:
         """Create the folder and return self; raise InputError if it is not writable."""
         try:
             make_folder(self.folder)
-            probe = self.folder / f".write-test-{os.getpid()}"
+            probe = self.folder / f"{PART_PREFIX}write-test-{os.getpid()}{PART_SUFFIX}"
             probe.write_bytes(b"")
             probe.unlink()
         except OSError as error:
