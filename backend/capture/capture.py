@@ -22,7 +22,7 @@ HOLDOUT_EVERY = 8
 only."""
 
 MIN_VIEWS_TO_HOLD_OUT = 3
-_KEYPOINT_TOLERANCE = 0.5
+_PIXEL_TOLERANCE = 0.5
 
 
 @dataclass(frozen=True)
@@ -244,17 +244,10 @@ class Capture:
 
     def keypoints(self, index: int) -> Keypoints:
         """Return COLMAP's observations in a view, except those whose undistortion does not converge."""
-        camera, image = self._raw[index]
-        K = self.views[index].K
-        if is_pinhole(camera):
-            lens = to_pycolmap(camera)
-            center = np.array([lens.principal_point_x, lens.principal_point_y])
-            xy = (image.xy - center) / np.array([lens.focal_length_x, lens.focal_length_y])
-        else:
-            xy = undistort(to_pycolmap(camera), image.xy, _KEYPOINT_TOLERANCE)
-        found = np.isfinite(xy).all(1)
-        pixels = xy[found] * [K[0, 0], K[1, 1]] + K[:2, 2]
-        return Keypoints(pixels, image.point_index[found].astype(np.int64))
+        image = self._raw[index][1]
+        pixels = self._undistorted(index, image.xy)
+        found = np.isfinite(pixels).all(1)
+        return Keypoints(pixels[found], image.point_index[found].astype(np.int64))
 
     def photo_mask(self, index: int, ids: np.ndarray) -> np.ndarray:
         """Return the mask of a view's photo, before its undistortion.
@@ -267,21 +260,25 @@ class Capture:
             (H, W), of the photo's size and the type of `ids`; 0 where the undistorted view does not reach.
         """
         camera, view = self._raw[index][0], self.views[index]
-        lens = to_pycolmap(camera)
         x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        pixels = np.stack([x.ravel(), y.ravel()], 1)
+        # Comparisons with NaN are false.
+        at = self._undistorted(index, np.stack([x.ravel(), y.ravel()], 1))
+        inside = (at >= 0).all(1) & (at < [view.width, view.height]).all(1)
+        found = np.zeros(len(at), ids.dtype)
+        column, row = at[inside].astype(np.int64).T
+        found[inside] = ids[row, column]
+        return found.reshape(camera.height, camera.width)
+
+    def _undistorted(self, index: int, pixels: np.ndarray) -> np.ndarray:
+        """Convert pixels (n, 2) of a view's photo to those of the view; NaN where undistortion does not converge."""
+        camera, K = self._raw[index][0], self.views[index].K
+        lens = to_pycolmap(camera)
         if is_pinhole(camera):
             center = np.array([lens.principal_point_x, lens.principal_point_y])
             xy = (pixels - center) / np.array([lens.focal_length_x, lens.focal_length_y])
         else:
-            xy = undistort(lens, pixels)
-        # A pixel's center on the border of two may be rounded to either.
-        at = np.nan_to_num(xy, nan=-1e9) * [view.K[0, 0], view.K[1, 1]] + view.K[:2, 2]
-        inside = (at >= 0).all(1) & (at < [view.width, view.height]).all(1)
-        found = np.zeros(len(pixels), ids.dtype)
-        column, row = at[inside].astype(np.int64).T
-        found[inside] = ids[row, column]
-        return found.reshape(camera.height, camera.width)
+            xy = undistort(lens, pixels, _PIXEL_TOLERANCE)
+        return xy * [K[0, 0], K[1, 1]] + K[:2, 2]
 
     def _read_image(self, index: int, downscale: int) -> np.ndarray:
         image = read_image(self.views[index].image_file)

@@ -68,16 +68,12 @@ class SplatGraph:
     """The graph of N splats.
 
     Attributes:
-        splats: the splats.
-        primitive: "3d" or "2d".
         nodes: (n,) int64, the splats that are seen.
         nearest: (N,) int64, the node of each splat, or the nearest one.
         lab: (n, 3) CIELAB color of each node, the mean over its neighborhood.
         weights: (n, n) weights of the edges.
     """
 
-    splats: Generated
-    primitive: str
     nodes: np.ndarray
     nearest: np.ndarray
     lab: np.ndarray
@@ -181,7 +177,7 @@ def build_graph(
         -((COLOR * color) ** 2) - (CONCAVE * concavity) ** 2 - (GAP * gap) ** 2 - (PHOTO_EDGE * steps) ** 2
     )
     weights = sparse.coo_array((weight, (first, second)), shape=(len(nodes), len(nodes))).tocsr()
-    return SplatGraph(splats, primitive, nodes, nearest, lab, weights.maximum(weights.T).tocsr())
+    return SplatGraph(nodes, nearest, lab, weights.maximum(weights.T).tocsr())
 
 
 def _normals(neighborhoods: np.ndarray, facing: np.ndarray) -> np.ndarray:

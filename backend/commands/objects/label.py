@@ -12,7 +12,7 @@ import torch
 from ...capture.files import encode_mask
 from ...evaluation.images import as_bytes
 from ...model.generate import Generated
-from ...pointing.splat_graph import SplatGraph, build_graph, contributions
+from ...pointing.splat_graph import build_graph, contributions
 from ...pointing.strokes import Strokes, read_strokes
 from ...raster import devices, object_map, rasterize
 from ...shared.errors import InputError
@@ -36,22 +36,24 @@ def label(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         raise InputError(f"{options.folder} has a view-dependent model; train it with --mode explicit to label it.")
     folder = capture.folder / "masks"
     own = (folder / STROKES).is_file()
-    if folder.exists() and not own:
-        raise InputError(
-            f"{folder} has masks that were not made of strokes; move the folder elsewhere to make masks of strokes."
-        )
+    for path in (folder, capture.folder / "labels.json"):
+        if path.exists() and not own:
+            raise InputError(f"{path} was not made of strokes; move it elsewhere to make masks of strokes.")
     strokes = read_strokes(options.strokes, [view.name for view in capture.views])
     reporter.begin("graph", "Comparing the splats with their neighbors")
     with stage(trained.folder, "label"):
         splats = model.generate()
+        seeds = _seeds(trained, splats, strokes)
         indices = list(capture.train_indices)
         graph = build_graph(
             splats, model.primitive, [trained.scene.camera(index) for index in indices],
             lambda number: as_bytes(capture.image(indices[number])), lambda done, of: reporter.progress(done, of),
         )  # fmt: skip
-        ids = graph.solve(_seeds(trained, splats, strokes))
+        ids = graph.solve(seeds)
         reporter.begin("masks", f"Writing masks of {len(indices)} photos")
-        _write_masks(trained, graph, ids, strokes, options.strokes, own, reporter)
+        _write_masks(trained, splats, ids, options.strokes, reporter)
+        names = {str(i): strokes.names.get(i) or default_name(i) for i in np.unique(ids).tolist() if i}
+        write_json(capture.folder / "labels.json", names)
     objects = sorted({stroke.object for stroke in strokes.strokes} - {0})
     reporter.status(f"{len(objects)} objects in {folder}; train the capture again to separate them.")
     reporter.done(masks=str(folder), objects=len(objects), views=len(indices))
@@ -80,11 +82,10 @@ def _seeds(trained: Trained, splats: Generated, strokes: Strokes) -> dict[int, n
 
 
 def _write_masks(
-    trained: Trained, graph: SplatGraph, ids: np.ndarray, strokes: Strokes, source: Path, own: bool,
-    reporter: StoppingReporter,
-) -> None:  # fmt: skip
+    trained: Trained, splats: Generated, ids: np.ndarray, strokes: Path, reporter: StoppingReporter
+) -> None:
     """Render the objects into masks of the training photos, which replace those of earlier strokes when complete."""
-    capture, splats = trained.capture, graph.splats
+    capture = trained.capture
     objects, classes = np.unique(ids, return_inverse=True)
     labeled = splats._replace(ids=torch.from_numpy(classes.astype(np.int32)).to(splats.means.device))
     folder = capture.folder / "masks"
@@ -94,7 +95,7 @@ def _write_masks(
     try:
         for done, index in enumerate(capture.train_indices, 1):
             with torch.no_grad():
-                drawn = rasterize(*labeled[:6], trained.scene.camera(index), primitive=graph.primitive)
+                drawn = rasterize(*labeled[:6], trained.scene.camera(index), primitive=trained.model.primitive)
             found, _ = object_map(drawn)
             found = devices.host(found)
             shown = np.where(found >= 0, objects[np.maximum(found, 0)], 0)
@@ -103,13 +104,9 @@ def _write_masks(
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
             reporter.progress(done, len(capture.train_indices), what="photos")
-        shutil.copyfile(source, part / STROKES)
-        if own:
+        shutil.copyfile(strokes, part / STROKES)
+        if folder.exists():
             shutil.rmtree(folder)
         part.rename(folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)
-    names = {str(i): strokes.names.get(int(i)) or default_name(int(i)) for i in objects.tolist() if i}
-    labels = capture.folder / "labels.json"
-    if own or not labels.exists():
-        write_json(labels, names)
