@@ -26,7 +26,7 @@ def reporter() -> StoppingReporter:
 def write_video(path, images, codec="libx264", form="yuv420p", rate=25, times=None, matrix=None, **tags):
     """Write images (h, w, 3) uint8 or uint16 as a video; times: in frames; matrix: of the colors, tagged or not."""
     with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=rate, options={"crf": "12"})
+        stream = container.add_stream(codec, rate=rate, options={"crf": "12", "threads": "1"})
         stream.height, stream.width = images[0].shape[:2]
         stream.pix_fmt = form
         for name, value in tags.items():

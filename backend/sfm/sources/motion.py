@@ -24,8 +24,8 @@ _CERTAIN = 0.12
 """Least height of the peak of a correlation; pictures that have nothing in common reach 0.1."""
 _QUANTILE = 75
 """Percentile of the blocks' motion that counts, since an object may turn before a background at rest."""
-_CENTER = 0.6
-"""Part of each slot, around its middle, within which the sharpest frame is chosen if there is one."""
+_AT_EDGE = 0.5
+"""What sharpness counts at the edges of a slot, compared to its middle, so that frames are also evenly spaced."""
 
 
 class MotionTracker:
@@ -100,14 +100,9 @@ def choose_frames(positions: np.ndarray, sharp: np.ndarray, count: int | None = 
         return np.unique(np.linspace(0, len(positions) - 1, count).round().astype(int))
     place = positions / total * count
     slots = np.minimum(place.astype(int), count - 1)
-    is_central = np.abs(place - slots - 0.5) <= _CENTER / 2
-    chosen = []
-    for slot in np.unique(slots):
-        members = np.flatnonzero(slots == slot)
-        central = members[is_central[members]]
-        members = central if len(central) else members
-        chosen.append(members[sharp[members].argmax()])
-    return np.array(chosen)
+    value = sharp * (1 - 2 * (1 - _AT_EDGE) * np.abs(place - slots - 0.5))
+    members = (np.flatnonzero(slots == slot) for slot in np.unique(slots))
+    return np.array([frames[value[frames].argmax()] for frames in members])
 
 
 def _spectra(gray: np.ndarray) -> np.ndarray:
