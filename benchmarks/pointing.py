@@ -1,11 +1,11 @@
 """Objects from strokes: held-out mIoU over the number of photos with strokes, with the true masks as the user.
 
-    python benchmarks/pointing.py [--photos 1 2 3] [--minutes 1.5] [--capture build/demo/capture]
+    python benchmarks/pointing.py [--photos 1 2 3] [--minutes 2.4] [--capture build/demo/capture]
 
 The capture is trained without its masks. In each of the photos, one stroke then marks each object that shows there:
-along the row through the middle of the object's largest inscribed circle, without a fifth at both ends. `label` makes
-masks of the strokes, and a second training learns them. The IDs of its renders are compared with the true masks of the
-held-out views.
+along the row through the middle of the object's largest inscribed circle, without a fifth at both ends. If the masks
+leave pixels unlabeled, one such stroke in one photo marks them, too. `label` separates the objects, and the IDs of its
+renders are compared with the true masks of the held-out views.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from backend.capture import Capture, load_capture
-from backend.evaluation.metrics import IdScores
+from backend.evaluation.metrics import IdScores, psnr
 from backend.model.draw import draw
 from backend.training.scene import Scene
 from backend.training.state import load_model
@@ -61,19 +61,24 @@ def strokes_of(truth: Capture, photos: int) -> dict[str, Any]:
             if mask is not None and (mask == object_id).sum() > SMALLEST:
                 points = widest_row(mask == object_id)
                 strokes.append({"object": object_id, "view": truth.views[index].name, "points": points})
-    return {"strokes": strokes}
+    mask = truth.mask(chosen[0])
+    everything = mask is not None and bool((mask > 0).all())
+    if mask is not None and not everything:
+        strokes.append({"object": 0, "view": truth.views[chosen[0]].name, "points": widest_row(mask == 0)})
+    return {"strokes": strokes, "everything": everything}
 
 
 def scores(checkpoint: Path, truth: Capture) -> dict[str, float]:
-    """Return the scores of a trained model's IDs in the held-out views."""
+    """Return the scores of a trained model's IDs and images in the held-out views."""
     model, _, _ = load_model(checkpoint)
     scene = Scene(truth, model.classes, model.normalization)
-    found = IdScores(False)
+    found, images = IdScores(False), []
     for index in truth.test_indices:
-        ids, mask = draw(model, scene.camera(index)).ids, truth.mask(index)
-        assert ids is not None and mask is not None
-        found.add(ids, mask)
-    return found.result()
+        drawn, mask = draw(model, scene.camera(index)), truth.mask(index)
+        assert drawn.ids is not None and mask is not None
+        found.add(drawn.ids, mask)
+        images.append(psnr(drawn.image, truth.image(index)))
+    return {**found.result(), "psnr": float(np.mean(images))}
 
 
 def run(*words: object) -> float:
@@ -91,24 +96,26 @@ def main() -> None:
     """Print a row for each number of photos."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--photos", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--minutes", type=float, default=1.5)
+    parser.add_argument("--minutes", type=float, default=2.4)
     parser.add_argument("--capture", type=Path, default=ROOT / "build/demo/capture")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as scratch:
         truth = load_capture(options.capture.resolve(), Path(scratch) / "cache")
         capture = Path(scratch) / "capture"
         shutil.copytree(options.capture, capture, ignore=shutil.ignore_patterns("masks", "labels.json", "objects.json"))
-        run("train", capture, "--out", Path(scratch) / "unlabeled", "--minutes", options.minutes)
+        unlabeled = Path(scratch) / "unlabeled"
+        run("train", capture, "--out", unlabeled, "--minutes", options.minutes)
         for photos in options.photos:
-            file = Path(scratch) / "strokes.json"
+            file, out = Path(scratch) / "strokes.json", Path(scratch) / f"labeled-{photos}"
             file.write_text(json.dumps(strokes_of(truth, photos)))
-            seconds = run("label", Path(scratch) / "unlabeled", "--strokes", file)
-            out = Path(scratch) / f"labeled-{photos}"
-            run("train", capture, "--out", out, "--minutes", options.minutes)
+            shutil.rmtree(capture / "masks", ignore_errors=True)
+            (capture / "labels.json").unlink(missing_ok=True)
+            shutil.copytree(unlabeled, out)
+            seconds = run("label", out, "--strokes", file)
             found = scores(out / "checkpoint", truth)
             print(
-                f"{photos} photos: mIoU {found['miou']:.4f}, with unlabeled {found['miou_all']:.4f}; "
-                f"masks in {seconds:.0f} s",
+                f"{photos} photos: mIoU {found['miou']:.4f}, with unlabeled {found['miou_all']:.4f}, "
+                f"PSNR {found['psnr']:.2f} dB; {seconds:.0f} s",
                 flush=True,
             )
 

@@ -24,6 +24,7 @@ from .capture import MIN_VIEWS_TO_HOLD_OUT
 from .colmap import COLMAP, Camera, Image, Model
 from .files import (
     HELD_OUT,
+    STROKES,
     Files,
     image_size,
     is_color_mask,
@@ -167,7 +168,7 @@ def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Repo
                 f"The mask {first} is missing, as are those of {len(unmasked)} of {present} images: add them, or "
                 f"remove {masks_folder} to work without objects."
             )
-        else:
+        elif not (masks_folder / STROKES).is_file():
             warnings.append(f"{len(unmasked)} of {present} images have no mask, for instance {first} is missing.")
     held_out = _tolerate(problem, partial(_held_out, folder, model, sources), None)
     if held_out is None and present < MIN_VIEWS_TO_HOLD_OUT:

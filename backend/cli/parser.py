@@ -129,12 +129,13 @@ def _add_training_commands(commands: _Commands) -> None:
 
 def _add_label(commands: _Commands) -> None:
     label = commands.add_for_result(
-        "label", "Make masks of strokes on the objects in a few photos", texts.LABEL,
+        "label", "Separate objects by strokes on them in a few photos", texts.LABEL,
         "garden-splats --strokes strokes.json",
     )  # fmt: skip
     label.add_argument(
         "--strokes", type=Path, required=True, metavar="FILE", help="strokes on the objects, as JSON; see above"
     )
+    commands.add_for_result("point", "Answer the strokes of another program", texts.POINT, "garden-splats --json")
 
 
 def _add_render(commands: _Commands) -> None:

@@ -63,14 +63,22 @@ keeps the mean of its latest steps. To train longer, run the command again with 
 """
 
 LABEL = """\
-Make masks of the capture from strokes on its objects in one or more photos, after a
-training without masks. Writes masks/, for the training views, and labels.json to the
-capture's folder; train the capture again to separate the objects. Repeat the command
-with more strokes to correct the masks. FILE is JSON:
+Separate the objects of a training without masks, by strokes on them in one or more
+photos. Writes masks/, for the training views, and labels.json to the capture's folder,
+gives the splats the IDs of their objects, and trains their borders for a short time.
+Repeat the command with more strokes to correct the result. FILE is JSON:
   {"objects": {"1": "mug"},
    "strokes": [{"object": 1, "view": "photo.jpg", "points": [[0.42, 0.5], [0.48, 0.5]]}]}
 Points are fractions of the undistorted photo's width and height, from its top left
-corner. Object 0 is what belongs to no object.
+corner. With "area": true, the line encloses an area. Instead of "view", a "camera" may
+have "viewmat" (4 x 4, world to camera), "intrinsics" (fx, fy, cx, cy), "width" and
+"height". Object 0 is what belongs to no object, like all that is far from the strokes,
+unless the file has "everything": true.
+"""
+
+POINT = """\
+Answer strokes with the object of each splat, for programs such as Blender. Each line of
+standard input is a JSON object as for `label`, with a number `request` for the answer.
 """
 
 RENDER = """\

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from skimage.color import rgb2lab
 
@@ -34,8 +35,9 @@ COLOR, CONCAVE, GAP, PHOTO_EDGE, LEAST = 0.7, 8.0, 1 / 3, 0.25, 1e-4
 of the distance in units of the local spacing, and of a tenth of the largest CIELAB step in the photos. The weight of an
 edge is exp(-sum of the squares), but at least the last value."""
 
-PRIOR, SIMILAR = 1e-3, 4.0
-"""Weight of the colors of the strokes, and the CIELAB distance at which a color hardly counts as one of these."""
+PRIOR, SIMILAR, NOTHING = 1e-3, 4.0, 1e-3
+"""Weight of the colors of the strokes, the CIELAB distance at which a color hardly counts as one of these, and the
+weight of belonging to no object, unless everything belongs to one."""
 
 SEEDED = 0.8
 """The splats that make up this part of what a stroke shows are its seeds; the rest shines through from behind."""
@@ -64,6 +66,21 @@ def contributions(splats: Generated, camera: Camera, planes: np.ndarray, primiti
 
 
 @dataclass(frozen=True)
+class Solution:
+    """The objects of N splats.
+
+    Attributes:
+        objects: (C,) int64, ascending: the object IDs that were to be found, and 0.
+        probabilities: (n, C) float32, for each node of the graph.
+        ids: (N,) int64, the object ID of each splat.
+    """
+
+    objects: np.ndarray
+    probabilities: np.ndarray
+    ids: np.ndarray
+
+
+@dataclass(frozen=True)
 class SplatGraph:
     """The graph of N splats.
 
@@ -79,21 +96,50 @@ class SplatGraph:
     lab: np.ndarray
     weights: sparse.csr_array
 
-    def solve(self, seeds: dict[int, np.ndarray]) -> np.ndarray:
+    def solve(self, seeds: dict[int, np.ndarray], everything: bool = False, before: Solution | None = None) -> Solution:
         """Find the object of each splat.
 
         Args:
-            seeds: for each object, 0 included, the (N,) contributions of the splats to its strokes, as from
-                `contributions`.
-
-        Returns:
-            (N,) int64 object IDs.
+            seeds: for each object, the (N,) contributions of the splats to its strokes, as from `contributions`; those
+                of 0 belong to no object.
+            everything: whether every splat belongs to an object; otherwise, splats far from the strokes have none.
+            before: an earlier solution for similar strokes, from which this one begins.
         """
-        objects = np.array(sorted(seeds))
-        shown = np.stack([seeds[object_id][self.nodes] for object_id in objects.tolist()])
-        labels = _seed_labels(shown)
-        found = random_walker(self.weights, labels, len(objects), self._prior(labels, len(objects)), PRIOR)
-        return objects[found.argmax(1)][self.nearest]
+        objects = np.array(sorted({0, *seeds}))
+        nothing = np.zeros(len(self.nearest))
+        labels = _seed_labels(np.stack([seeds.get(object_id, nothing)[self.nodes] for object_id in objects.tolist()]))
+        prior = PRIOR * self._prior(labels, len(objects))
+        if not everything:
+            prior[:, 0] += NOTHING
+        start = None
+        if before is not None:
+            start = np.zeros_like(prior)
+            _, now, then = np.intersect1d(objects, before.objects, return_indices=True)
+            start[:, now] = before.probabilities[:, then]
+        probabilities = random_walker(self.weights, labels, prior, 1.0, start)
+        found = self._joined(probabilities.argmax(1), labels, everything)
+        return Solution(objects, probabilities, objects[found][self.nearest])
+
+    def _joined(self, found: np.ndarray, seeds: np.ndarray, everything: bool) -> np.ndarray:
+        """Give the parts of an object that are not connected to any of its seeds to the objects around them.
+
+        Such a part only has a similar color. found, seeds: (n,) labels; seeds are -1 where there is none.
+        """
+        edges = self.weights.tocoo()
+        same = found[edges.row] == found[edges.col]
+        inside = sparse.coo_array((same[same], (edges.row[same], edges.col[same])), shape=self.weights.shape)
+        parts, part_of = connected_components(inside, directed=False)
+        is_seeded = np.zeros(parts, bool)
+        is_seeded[part_of[(seeds >= 0) & (seeds == found)]] = True
+        loose = ~is_seeded[part_of]
+        if not everything:
+            loose &= found > 0
+        if not loose.any() or loose.all():
+            return found
+        known = np.where(loose, -1, found)
+        around = random_walker(self.weights, known, np.zeros((len(found), found.max() + 1)), 0.0)
+        # Parts that are connected to nothing keep their labels.
+        return np.where(loose & (around.max(1) > 0), around.argmax(1), found)
 
     def _prior(self, labels: np.ndarray, count: int) -> np.ndarray:
         """Return (n, count) how similar each node's color is to that of each label's seeds."""

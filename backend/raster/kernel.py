@@ -16,7 +16,7 @@ from typing import Any, cast
 
 from numba import njit
 
-_LAYERS = ("raster", "model", "training", "mesh")
+_LAYERS = ("raster", "model", "training", "mesh", "pointing")
 """The packages that contain kernels; each one may depend on itself and on those before it."""
 _SHARED = ("blending.py", "spherical_harmonics.py")
 """The files of `backend.shared.splats` whose constants are compiled into kernels."""

@@ -44,6 +44,8 @@ class Reporter:
 
     def quality(self, **figures: Any) -> None: ...
 
+    def answer(self, **fields: Any) -> None: ...
+
     def warning(self, message: str) -> None: ...
 
     def error(self, message: str) -> None: ...
@@ -123,6 +125,9 @@ class StagedReporter(Reporter):
     def quality(self, **figures: Any) -> None:
         self._reporter.quality(**figures)
 
+    def answer(self, **fields: Any) -> None:
+        self._reporter.answer(**fields)
+
     def warning(self, message: str) -> None:
         self._reporter.warning(message)
 
@@ -162,6 +167,9 @@ class JsonReporter(Reporter):
 
     def quality(self, **figures: Any) -> None:
         self._emit("quality", **figures)
+
+    def answer(self, **fields: Any) -> None:
+        self._emit("answer", **fields)
 
     def warning(self, message: str) -> None:
         self._emit("warning", message=message)

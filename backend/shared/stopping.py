@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from queue import SimpleQueue
 from types import FrameType
 from typing import Any
 
@@ -28,6 +29,9 @@ class StopRequest:
 
     Args:
         announce: Called with a message when a pause begins and ends.
+
+    Attributes:
+        requests: Other lines of standard input that begin with `{`, for commands that answer requests.
     """
 
     def __init__(self, announce: Callable[[str], None] = lambda _: None) -> None:
@@ -35,6 +39,7 @@ class StopRequest:
         # Plain flags, since a signal handler that interrupts the main thread would deadlock on a lock that it holds.
         self._stopped = False
         self._paused = False
+        self.requests: SimpleQueue[str] = SimpleQueue()
 
     def __call__(self) -> bool:
         if self.paused:
@@ -85,6 +90,8 @@ class StopRequest:
                     self._paused = word == "pause"
                 elif word == "attached":
                     attached = True
+                elif word.startswith("{"):
+                    self.requests.put(word)
         except (OSError, ValueError):
             pass  # Standard input is closed or unreadable.
         if attached:
@@ -121,6 +128,9 @@ class StoppingReporter(Reporter):
 
     def quality(self, **figures: Any) -> None:
         self.reporter.quality(**figures)
+
+    def answer(self, **fields: Any) -> None:
+        self.reporter.answer(**fields)
 
     def warning(self, message: str) -> None:
         self.reporter.warning(message)

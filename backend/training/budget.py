@@ -92,13 +92,15 @@ class Budget:
 
     until_converged: train until further steps would gain little on the validation views; `seconds` is then a limit,
     None: no limit.
-    first: progress at the first of `steps`, for a model that was trained before.
+    first, first_step: progress at the first of `steps`, for a model that was trained before, and the number of that
+        step.
     """
 
     steps: int | None = None
     seconds: float | None = None
     until_converged: bool = False
     first: float = 0.0
+    first_step: int = 0
 
     def progress(self, p: TrainingProgress) -> float:
         """Return the progress that determines learning rates, growth and resolution.
@@ -115,7 +117,8 @@ class Budget:
             decay = (p.step - p.converged_at) / (p.converged_at / DECAY_FROM - p.converged_at)
             return min(PLATEAU_UNTIL + (1 - PLATEAU_UNTIL) * decay, 1.0)
         if self.steps is not None:
-            return min(self.first + (1.0 - self.first) * (p.step / self.steps), 1.0)
+            done = (p.step - self.first_step) / max(self.steps - self.first_step, 1)
+            return min(self.first + (1.0 - self.first) * done, 1.0)
         assert self.seconds is not None
         return min(p.seconds / self.seconds, 1.0)
 

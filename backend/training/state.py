@@ -94,6 +94,31 @@ def training_tensors(
     return {name: devices.host(value) for name, value in tensors.items()}
 
 
+def training_state(
+    settings: Settings, model: ObjectModel, supervise_background: bool, rng: np.random.Generator, p: TrainingProgress
+) -> dict[str, Any]:
+    """Return what a checkpoint contains beside its tensors, as JSON."""
+    return {
+        "settings": settings.as_dict(),
+        "voxel": model.anchors.voxel,
+        "supervise_background": supervise_background,
+        "normalization": {"center": model.normalization.center, "scale": model.normalization.scale},
+        "rng": rng.bit_generator.state,
+        "progress": {**p.__dict__},
+    }
+
+
+def require_settings(wanted: Settings, state: dict[str, Any], folder: Path) -> None:
+    """Raise InputError if the training of a checkpoint in `folder` has other settings than `wanted`."""
+    stored = Settings(**state["settings"])
+    if wanted.in_effect() != stored.in_effect():
+        changed = [k for k, v in wanted.as_dict().items() if stored.as_dict()[k] != v]
+        raise InputError(
+            f"The checkpoint in {folder} was trained with other settings ({', '.join(changed)}); use the same, "
+            "another --out, or --restart to start over."
+        )
+
+
 def restore_statistics(tensors: dict[str, np.ndarray], device: torch.device) -> GrowthStatistics:
     """Return the growth statistics in a checkpoint's tensors."""
     return GrowthStatistics(*(restore_tensor(tensors, f"growth.{name}", device) for name in _GROWTH))

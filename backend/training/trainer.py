@@ -37,9 +37,11 @@ from .settings import HEAD_RATES, Settings, background_is_masked, rate, row_rate
 from .state import (
     model_from_checkpoint,
     read_checkpoint,
+    require_settings,
     restore_head_optimizer,
     restore_statistics,
     restore_tensor,
+    training_state,
     training_tensors,
 )
 from .step import IN_PARTS, ViewGradients, ViewStep
@@ -49,7 +51,6 @@ if TYPE_CHECKING:
 
 CHECKPOINT_SECONDS = 30.0
 _REPORT_SECONDS = 0.5
-
 _CONVERGED = "The training has converged; its learning rates fall from step {steps:,} on"
 
 Evaluate = Callable[[ObjectModel, Scene, TrainingProgress], dict[str, Any]]
@@ -108,7 +109,7 @@ class Trainer:
                 density; None: all.
             supervise_background: as in `Scene`; None: decided by `background_is_masked` for the points without object.
             gains: as in `Scene`.
-            more: xyz (n, 3), rgb (n, 3) uint8 and IDs (n,) of additional points, of objects that have none.
+            more: xyz (n, 3), rgb (n, 3) uint8 and IDs (n,) of points of objects that have none.
 
         Raises:
             InputError: an image cannot be read.
@@ -157,14 +158,7 @@ class Trainer:
             model, self._exp_avg, self._exp_avg_sq, self._growth.statistics, self._average, self._head_optimizer,
             self.view_step.colors,
         )  # fmt: skip
-        state = {
-            "settings": self.settings.as_dict(),
-            "voxel": model.anchors.voxel,
-            "supervise_background": self.scene.supervise_background,
-            "normalization": {"center": model.normalization.center, "scale": model.normalization.scale},
-            "rng": self.rng.bit_generator.state,
-            "progress": {**self.progress.__dict__},
-        }
+        state = training_state(self.settings, model, self.scene.supervise_background, self.rng, self.progress)
         save_checkpoint(folder, tensors, state, keep_current=self._keeps_current)
         self._keeps_current = True
 
@@ -184,8 +178,7 @@ class Trainer:
             capture: the capture that the checkpoint was trained on.
             folder: folder of the checkpoints.
             settings: the requested settings; None: those of the checkpoint.
-            memory_mb, gains: as in `start`.
-            device: device to train on; may differ from that of the checkpoint.
+            memory_mb, gains, device: as in `start`; the device may be another one.
 
         Returns:
             The trainer, and a warning or None; None if there is no checkpoint.
@@ -197,22 +190,32 @@ class Trainer:
         if found is None:
             return None
         tensors, state, warning = found
-        stored = Settings(**state["settings"])
-        if settings is not None and settings.in_effect() != stored.in_effect():
-            changed = [k for k, v in settings.as_dict().items() if stored.as_dict()[k] != v]
-            raise InputError(
-                f"The checkpoint in {folder} was trained with other settings ({', '.join(changed)}); use the same, "
-                "another --out, or --restart to start over."
-            )
+        if settings is not None:
+            require_settings(settings, state, folder)
+        trainer = cls.restore(capture, tensors, state, memory_mb, device, gains)
+        trainer._keeps_current = warning is None
+        return trainer, warning
+
+    @classmethod
+    def restore(
+        cls,
+        capture: Capture,
+        tensors: dict[str, np.ndarray],
+        state: dict[str, Any],
+        memory_mb: float,
+        device: torch.device,
+        gains: np.ndarray | None,
+    ) -> Trainer:
+        """Return the trainer of a checkpoint's tensors and state; other arguments as in `resume`."""
         model = model_from_checkpoint(tensors, state)
+        settings = Settings(**state["settings"])
         scene = Scene(
-            capture, model.classes, model.normalization, stored.zero_is_object, memory_mb,
+            capture, model.classes, model.normalization, settings.zero_is_object, memory_mb,
             state["supervise_background"], device, gains,
         )  # fmt: skip
         rng = np.random.default_rng()
         rng.bit_generator.state = state["rng"]
-        trainer = cls(scene, stored, model.to(device), rng)
-        trainer._keeps_current = warning is None
+        trainer = cls(scene, settings, model.to(device), rng)
         trainer._exp_avg = restore_tensor(tensors, "adam.exp_avg", device)
         trainer._exp_avg_sq = restore_tensor(tensors, "adam.exp_avg_sq", device)
         trainer._growth.statistics = restore_statistics(tensors, device)
@@ -220,7 +223,7 @@ class Trainer:
         trainer._average = Average.from_checkpoint(tensors, trainer.model)
         trainer.view_step.restore(tensors)
         trainer.progress = TrainingProgress(**state["progress"])
-        return trainer, warning
+        return trainer
 
     def run(
         self,
@@ -315,8 +318,7 @@ class Trainer:
                 last_saved = time.monotonic()
         self.save(checkpoints)
         if p.skipped:
-            because = f": {p.causes}" if p.faults else ""
-            reporter.warning(f"{p.skipped} updates were not finite and were skipped{because}.")
+            reporter.warning(f"{p.skipped} updates were not finite and were skipped{p.causes and f': {p.causes}'}.")
 
     def _evaluate(self, evaluate: Evaluate, reporter: Reporter, loss: float) -> None:
         p = self.progress

@@ -1,112 +1,157 @@
-"""`label`: strokes on objects in a few photos become masks of the capture."""
+"""`label`: strokes on objects become masks of the capture, and the trained splats get the objects' IDs."""
 
 from __future__ import annotations
 
 import argparse
 import shutil
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
-import torch
 
-from ...capture.files import encode_mask
-from ...evaluation.images import as_bytes
-from ...model.generate import Generated
-from ...pointing.splat_graph import build_graph, contributions
+from ...capture import Capture, load_capture
+from ...capture.files import STROKES, encode_mask
+from ...planning.decisions import Choices, decide, planned_capture
+from ...pointing.pointer import Pointer
 from ...pointing.strokes import Strokes, read_strokes
-from ...raster import devices, object_map, rasterize
-from ...shared.errors import InputError
+from ...shared.errors import Cancelled, InputError
 from ...shared.formats.atomic import PART_PREFIX, PART_SUFFIX
 from ...shared.formats.json_file import write_json
+from ...shared.formats.points_ply import read_points
+from ...shared.reconstruction.checkpoint import PREVIOUS
+from ...shared.reconstruction.lock import locked
 from ...shared.reconstruction.objects import default_name
+from ...shared.reconstruction.plan import write_plan
+from ...shared.reconstruction.record import update_record
 from ...shared.stopping import StoppingReporter
-from ..folder import READ, Trained, open_trained
-from ..stages import stage
+from ...training.relabel import begin_with_labels, budget_of_labels
+from ...training.settings import Settings
+from ...training.trainer import Trainer
+from ..exported import EXPORT, export_model
+from ..folder import READ, Trained, memory_for_files, memory_for_planes, open_trained, plan_of
+from ..planning import build_context, find_requested_objects
+from ..setup.kernels import PART as KERNELS
+from ..setup.kernels import kernel_seconds
+from ..stages import finish_stage, stage
+from ..votes import VOTE, cast_votes, votes_key
+from .point import GRAPH, require_explicit
 
-STROKES = "strokes.json"
-"""The strokes that masks were made of, in the folder of the masks."""
+_MASKS, _TRAIN = "masks", "train"
 
 
 def label(options: argparse.Namespace, reporter: StoppingReporter) -> None:
-    """Find the object of each splat from the strokes, and write masks/ and labels.json of the capture."""
-    reporter.expect({READ: ("Preparing", 5.0), "graph": ("Comparing splats", 10.0), "masks": ("Writing masks", 10.0)})
+    """Find the objects from the strokes, write masks/ and labels.json of the capture, and train their IDs."""
+    reporter.expect(
+        {
+            READ: ("Preparing", 5.0), KERNELS: ("Preparing", 0.0), GRAPH: ("Preparing", 5.0),
+            _MASKS: ("Making masks", 5.0), VOTE: ("Making masks", 5.0), _TRAIN: ("Training", 25.0),
+            EXPORT: ("Saving", 5.0),
+        }
+    )  # fmt: skip
     trained = open_trained(options, reporter)
-    capture, model = trained.capture, trained.model
-    if not model.explicit:
-        raise InputError(f"{options.folder} has a view-dependent model; train it with --mode explicit to label it.")
+    capture = trained.capture
+    require_explicit(trained)
+    _require_own_masks(capture)
+    strokes = read_strokes(options.strokes, [view.name for view in capture.views])
+    with locked(trained.folder.folder):
+        reporter.expect(
+            {KERNELS: ("Preparing", kernel_seconds(trained.model.device)), _TRAIN: ("Training", _seconds(trained))}
+        )
+        reporter.begin(GRAPH, "Comparing the splats with their neighbors")
+        with stage(trained.folder, "label"):
+            pointer = Pointer(trained.model, trained.scene, reporter.progress)
+            ids = pointer.solve(strokes)
+            reporter.begin(_MASKS, f"Making masks of {len(capture.train_indices)} photos")
+            _write_masks(capture, pointer, ids, strokes, options, reporter)
+        trainer = _begin(trained, pointer.splats.source.cpu().numpy(), ids, options, reporter)
+        _train(trained, trainer, reporter)
+    objects = sorted({stroke.object for stroke in strokes.strokes} - {0})
+    reporter.done(
+        masks=str(capture.folder / "masks"), objects=len(objects), views=len(capture.train_indices),
+        splats=str(trained.folder.splats), steps=trainer.progress.step,
+    )  # fmt: skip
+
+
+def _require_own_masks(capture: Capture) -> None:
+    """Raise InputError if the capture has masks or names that no strokes were made to."""
     folder = capture.folder / "masks"
     own = (folder / STROKES).is_file()
     for path in (folder, capture.folder / "labels.json"):
         if path.exists() and not own:
             raise InputError(f"{path} was not made of strokes; move it elsewhere to make masks of strokes.")
-    strokes = read_strokes(options.strokes, [view.name for view in capture.views])
-    reporter.begin("graph", "Comparing the splats with their neighbors")
-    with stage(trained.folder, "label"):
-        splats = model.generate()
-        seeds = _seeds(trained, splats, strokes)
-        indices = list(capture.train_indices)
-        graph = build_graph(
-            splats, model.primitive, [trained.scene.camera(index) for index in indices],
-            lambda number: as_bytes(capture.image(indices[number])), lambda done, of: reporter.progress(done, of),
-        )  # fmt: skip
-        ids = graph.solve(seeds)
-        reporter.begin("masks", f"Writing masks of {len(indices)} photos")
-        _write_masks(trained, splats, ids, options.strokes, reporter)
-        names = {str(i): strokes.names.get(i) or default_name(i) for i in np.unique(ids).tolist() if i}
-        write_json(capture.folder / "labels.json", names)
-    objects = sorted({stroke.object for stroke in strokes.strokes} - {0})
-    reporter.status(f"{len(objects)} objects in {folder}; train the capture again to separate them.")
-    reporter.done(masks=str(folder), objects=len(objects), views=len(indices))
-
-
-def _seeds(trained: Trained, splats: Generated, strokes: Strokes) -> dict[int, np.ndarray]:
-    """Return the (N,) contributions of the splats to the strokes of each object.
-
-    Raises:
-        InputError: a stroke shows no splat.
-    """
-    index_of = {view.name: index for index, view in enumerate(trained.capture.views)}
-    seeds: dict[int, np.ndarray] = {}
-    for number, stroke in enumerate(strokes.strokes, 1):
-        camera = trained.scene.camera(index_of[stroke.view])
-        pixels = stroke.pixels(camera.width, camera.height)
-        found = contributions(splats, camera, np.stack([pixels] * 3), trained.model.primitive)[:, 0]
-        if not found.sum() > 0.5:
-            raise InputError(
-                f"Stroke {number} shows no splats, since nothing was reconstructed there in {stroke.view}; draw it "
-                "elsewhere on the object."
-            )
-        # So that each stroke counts as much, however long it is.
-        seeds[stroke.object] = seeds.get(stroke.object, 0.0) + found / found.sum()
-    return seeds
 
 
 def _write_masks(
-    trained: Trained, splats: Generated, ids: np.ndarray, strokes: Path, reporter: StoppingReporter
+    capture: Capture,
+    pointer: Pointer,
+    ids: np.ndarray,
+    strokes: Strokes,
+    options: argparse.Namespace,
+    reporter: StoppingReporter,
 ) -> None:
-    """Render the objects into masks of the training photos, which replace those of earlier strokes when complete."""
-    capture = trained.capture
-    objects, classes = np.unique(ids, return_inverse=True)
-    labeled = splats._replace(ids=torch.from_numpy(classes.astype(np.int32)).to(splats.means.device))
+    """Write masks of the training photos, which replace those of earlier strokes when complete, and labels.json."""
     folder = capture.folder / "masks"
     part = capture.folder / f"{PART_PREFIX}masks{PART_SUFFIX}"
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
     try:
-        for done, index in enumerate(capture.train_indices, 1):
-            with torch.no_grad():
-                drawn = rasterize(*labeled[:6], trained.scene.camera(index), primitive=trained.model.primitive)
-            found, _ = object_map(drawn)
-            found = devices.host(found)
-            shown = np.where(found >= 0, objects[np.maximum(found, 0)], 0)
-            suffix, data = encode_mask(capture.photo_mask(index, shown))
+        for done, (index, mask) in enumerate(pointer.masks(ids), 1):
+            suffix, data = encode_mask(capture.photo_mask(index, mask))
             path = part / (capture.views[index].name + suffix)
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
             reporter.progress(done, len(capture.train_indices), what="photos")
-        shutil.copyfile(strokes, part / STROKES)
+        shutil.copyfile(options.strokes, part / STROKES)
         if folder.exists():
             shutil.rmtree(folder)
         part.rename(folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)
+    names = {str(i): strokes.names.get(i) or default_name(i) for i in np.unique(ids).tolist() if i}
+    write_json(capture.folder / "labels.json", names)
+
+
+def _begin(
+    trained: Trained, source: np.ndarray, ids: np.ndarray, options: argparse.Namespace, reporter: StoppingReporter
+) -> Trainer:
+    """Vote with the masks, plan anew, give the splats their IDs, and save that as the folder's training."""
+    folder, before = trained.folder, trained.training
+    settings, votes = Settings(**before.settings), before.votes
+    capture = load_capture(trained.capture.folder, folder.cache, memory_for_files(options), votes.max_size, reporter)
+    voting = argparse.Namespace(strategy=votes.strategy, seed=settings.seed, max_size=votes.max_size)
+    cast_votes(folder, capture, voting, reporter)
+    objects, _ = find_requested_objects(folder, capture)
+    wanted = Choices(settings, votes.max_size, until_converged=before.preset == "final")
+    points = read_points(folder.points)
+    context = build_context(capture, wanted, objects, points, thorough=True, resumed=plan_of(before))
+    plan = decide(context).settled_by(plan_of(before))
+    planned = planned_capture(context.capture, plan)
+    trainer = begin_with_labels(
+        source, ids, planned, folder.checkpoint, memory_for_planes(options), trained.model.device,
+        trained.scene.gains, planned.has_masks and plan.does("rest"),
+    )  # fmt: skip
+    trainer.save(folder.checkpoint)
+    (folder.checkpoint / PREVIOUS).unlink(missing_ok=True)
+    write_plan(folder.plan, plan)
+    key = votes_key(planned, votes.max_size, votes.strategy, settings.seed)
+    update_record(folder, training=replace(before, left_out=[], votes=key, plan=plan.as_list()))
+    return trainer
+
+
+def _train(trained: Trained, trainer: Trainer, reporter: StoppingReporter) -> None:
+    """Train with the masks, and export the model; also if the training is stopped."""
+    folder, before = trained.folder, trainer.progress.seconds
+    budget = budget_of_labels(trainer.progress.step)
+    reporter.begin(_TRAIN, "Training the objects' borders")
+    try:
+        trainer.run(budget, folder.checkpoint, reporter.reporter, stop=reporter.stop)
+    except Cancelled:
+        export_model(trainer.shown, trainer.scene, folder, reporter, compare=False)
+        raise
+    finish_stage(folder, "label training", trainer.progress.seconds - before)
+    export_model(trainer.shown, trainer.scene, folder, reporter)
+
+
+def _seconds(trained: Trained) -> float:
+    """Return the expected duration of the training in seconds."""
+    done = trained.progress
+    return ((budget_of_labels(done.step).steps or 0) - done.step) * done.seconds / max(done.step, 1)

@@ -13,6 +13,7 @@ import numba
 import numpy as np
 import torch
 from PIL import Image
+from scipy import sparse
 
 from ...capture import load_capture
 from ...labels import vote as vote_points
@@ -24,6 +25,7 @@ from ...mesh.texture.bake import bake_texture
 from ...mesh.texture.unwrap import unwrap
 from ...mesh.views import Views
 from ...model.draw import draw
+from ...pointing.random_walker import random_walker
 from ...raster import compile_kernels, devices
 from ...raster.kernel import digest_up_to
 from ...shared.events import Reporter
@@ -106,13 +108,13 @@ def _mark(device: torch.device) -> Path:
     """
     sources = Path(__file__).resolve().parents[2]
     processor = f"{llvmlite.binding.get_host_cpu_name()} {devices.name_of(device)}"
-    kernels = f"{sources} {digest_up_to('mesh')} {numba.__version__} {processor}"
+    kernels = f"{sources} {digest_up_to('pointing')} {numba.__version__} {processor}"
     folder = Path(numba.config.CACHE_DIR or sources / "raster" / "__pycache__")
     return folder / f"objectgs-{hashlib.sha256(kernels.encode()).hexdigest()[:16]}.ready"
 
 
 def _train_a_little(scratch: Path, reporter: StoppingReporter, device: torch.device, steps: _Steps) -> None:
-    """Train on a synthetic capture, draw and mesh it, so that each kernel is compiled, cached and run."""
+    """Train on a synthetic capture, draw, mesh and label it, so that each kernel is compiled, cached and run."""
     capture_folder, folder = scratch / "capture", Reconstruction(scratch / "out").create()
     _write_small_capture(capture_folder)
     quiet = Reporter()
@@ -125,6 +127,7 @@ def _train_a_little(scratch: Path, reporter: StoppingReporter, device: torch.dev
     trainer = Trainer.start(capture, ids, Settings(offsets=2), device=device)
     trainer.run(Budget(steps=STEPS), folder.checkpoint, steps.step("train"), stop=reporter.stop)
     _mesh_a_little(trainer, steps)
+    random_walker(sparse.csr_array(np.eye(2)[::-1]), np.array([0, -1]), np.zeros((2, 2)), 0.0)
     rendering = draw(trainer.model, trainer.scene.camera(0), want_depth=True)
     if not np.isfinite(rendering.image).all():
         raise RuntimeError("a short training rendered an image that is not finite")

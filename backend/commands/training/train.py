@@ -10,7 +10,6 @@ import torch
 
 from ...capture import Capture
 from ...evaluation import IdScores, color_corrected, comparison, curve_image, psnr, save_image, thumbnail
-from ...export import agreement, fit_splats, write_anchors, write_splats
 from ...labels import correct_masks
 from ...labels.mask_points import MaskPoints, place_points
 from ...model.checkpoint import has_checkpoint
@@ -22,35 +21,26 @@ from ...raster import devices
 from ...shared.errors import Cancelled, InputError
 from ...shared.events import Reporter
 from ...shared.expectation import DEFAULT_SECONDS
-from ...shared.formats.json_file import plain
 from ...shared.formats.points_ply import read_points
 from ...shared.reconstruction.checkpoint import PREVIOUS
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.plan import Plan, write_plan
-from ...shared.reconstruction.record import ExportRecord, TrainingRecord, read_record, update_record
+from ...shared.reconstruction.record import TrainingRecord, read_record, update_record
 from ...shared.stopping import StoppingReporter
 from ...training.budget import Budget, TrainingProgress
 from ...training.scene import Scene
 from ...training.trainer import Evaluate, Trainer
+from ..exported import EXPORT, export_model
 from ..folder import READ, capture_record, digest, memory_for_planes, open_reconstruction, plan_of
 from ..length import budget_of, expected_of, training_seconds
 from ..planning import build_context, change_objects, choices, find_requested_objects, report_plan, settings
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
-from ..stages import finish_stage, stage
+from ..stages import finish_stage
 from ..votes import VOTE, cast_votes, object_name, votes_are_current, votes_key
 
 CURVE_VIEWS = 20
 """Largest number of held-out views that are measured during training; `evaluate` measures all."""
-
-_COMPARED_VIEWS = 20
-"""Largest number of views on which exported splats that are not exactly the model are compared with it."""
-
-_CHECKED_VIEWS = 5
-"""Largest number of views on which others are compared, to check them and the background."""
-
-_CLEAR_ON_BLACK = 40.0
-"""PSNR in dB above which a missing background makes no visible difference."""
 
 
 def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
@@ -61,7 +51,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         {
             READ: ("Preparing", 5.0), VOTE: ("Preparing", 5.0), "plan": ("Preparing", 5.0),
             KERNELS: ("Preparing", kernel_seconds(device)),
-            "train": ("Training", budget.seconds or DEFAULT_SECONDS), "export": ("Saving", 5.0),
+            "train": ("Training", budget.seconds or DEFAULT_SECONDS), EXPORT: ("Saving", 5.0),
         }
     )  # fmt: skip
     with open_reconstruction(options, reporter) as (output, capture):
@@ -98,9 +88,9 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             except Cancelled:
                 # Also export the result of a stopped training if this takes no time.
                 if trainer.model.explicit and progress.step:
-                    _export(trainer.shown, trainer.scene, folder, reporter, compare=False)
+                    export_model(trainer.shown, trainer.scene, folder, reporter, compare=False)
                 raise
-        export = _export(trainer.shown, trainer.scene, folder, reporter)
+        export = export_model(trainer.shown, trainer.scene, folder, reporter)
     latest = progress.curve[-1] if progress.curve else {}
     reporter.done(
         steps=progress.step, seconds=round(progress.seconds, 1), anchors=len(trainer.model.anchors),
@@ -284,73 +274,3 @@ def _measure(folder: Reconstruction, reporter: StoppingReporter) -> Evaluate:
         return figures
 
     return measure
-
-
-def _export(
-    model: ObjectModel, scene: Scene, folder: Reconstruction, reporter: Reporter, compare: bool = True
-) -> ExportRecord:
-    """Write splats.ply and anchors.ply; return and record their sizes and, with `compare`, their PSNR to the model."""
-    with stage(folder, "export"):
-        export = _write_export(model, scene, folder, reporter, compare)
-    update_record(folder, export=export)
-    return export
-
-
-def _write_export(
-    model: ObjectModel, scene: Scene, folder: Reconstruction, reporter: Reporter, compare: bool
-) -> ExportRecord:
-    reporter.begin("export", f"Writing {folder.splats.name}")
-    capture = scene.capture
-    if model.explicit:
-        splats, source = model.splats()
-    else:
-        splats, source = fit_splats(model, [scene.camera(i) for i in capture.train_indices], reporter)
-    background = [round(float(value), 4) for value in model.background.detach().cpu()]
-    psnr = on_black = None
-    if compare:
-        most = _COMPARED_VIEWS if _is_approximate(model) else _CHECKED_VIEWS
-        views = (capture.test_indices or capture.train_indices)[:most]
-        found = agreement(model, splats, [scene.camera(i) for i in views])
-        psnr, on_black = plain(found) or (None, None)
-        _say_how_well(model, folder, capture, psnr, on_black, reporter)
-    for sentence in write_splats(folder.splats, splats, background=background):
-        reporter.warning(sentence)
-    write_anchors(folder.anchors, model, splats, source)
-    return ExportRecord(len(splats), len(model.anchors), _rounded(psnr), _rounded(on_black), background)
-
-
-def _is_approximate(model: ObjectModel) -> bool:
-    """Return whether plain splats are not exactly the model."""
-    return not model.explicit or model.primitive == "2d"
-
-
-def _say_how_well(
-    model: ObjectModel,
-    folder: Reconstruction,
-    capture: Capture,
-    psnr: float | None,
-    on_black: float | None,
-    reporter: Reporter,
-) -> None:
-    """Report how well splats.ply shows a model that it is not, and what is lost without the background."""
-    where = "held-out" if capture.test_indices else "training"
-    if _is_approximate(model):
-        what, has = (
-            ("A view-dependent model has no exact splats", "a fit")
-            if not model.explicit
-            else ("Most programs do not support flat splats", "thin Gaussians instead")
-        )
-        report = reporter.status if model.explicit else reporter.warning
-        report(
-            f"{what}: {folder.splats.name} contains {has}, whose PSNR to renders of the model in the {where} views "
-            f"{'cannot be measured' if psnr is None else f'is {psnr:.1f} dB'}."
-        )
-    if on_black is not None and on_black < _CLEAR_ON_BLACK and (psnr is None or on_black < psnr - 1):
-        reporter.status(
-            f"Programs that draw {folder.splats.name} on black show it with a PSNR of {on_black:.1f} dB to the model "
-            f"in the {where} views, since the model has a background; `export --bake-background` adds it as splats."
-        )
-
-
-def _rounded(psnr: float | None) -> float | None:
-    return None if psnr is None else round(psnr, 2)

@@ -1,0 +1,81 @@
+"""`point`: answers the strokes of a controlling program, such as Blender, with the object of each splat."""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import json
+import zlib
+from queue import Empty
+from typing import Any
+
+import numpy as np
+
+from ...pointing.pointer import Pointer
+from ...pointing.strokes import strokes_of
+from ...shared.errors import InputError
+from ...shared.stopping import StoppingReporter
+from ..folder import READ, Trained, open_trained
+
+GRAPH = "graph"
+"""Name of the preparation among the parts of a command."""
+
+_WAIT = 0.2
+"""Interval in seconds at which a stop is noticed."""
+
+_AT_ONCE = 500_000
+"""Number of splats in an answer, whose lines are limited."""
+
+
+def point(options: argparse.Namespace, reporter: StoppingReporter) -> None:
+    """Answer each request with the objects of the splats, until the controlling program ends or stops the command."""
+    if not options.json:
+        raise InputError("`point` answers another program; run it with --json, or use `label` with a file of strokes.")
+    reporter.expect({READ: ("Preparing", 3.0), GRAPH: ("Preparing", 3.0)})
+    trained = open_trained(options, reporter)
+    require_explicit(trained)
+    views = [view.name for view in trained.capture.views]
+    reporter.begin(GRAPH, "Comparing the splats with their neighbors")
+    pointer = Pointer(trained.model, trained.scene, reporter.progress)
+    # Splats that cannot be drawn are not in splats.ply.
+    in_file = np.isin(pointer.splats.source.cpu().numpy(), trained.model.splats()[1])
+    reporter.answer(ready=True, splats=int(in_file.sum()))
+    while not reporter.stop():
+        content = _latest(reporter)
+        if content is None:
+            continue
+        request: Any = content.get("request")
+        try:
+            ids = pointer.solve(strokes_of(content, "the request", views))[in_file]
+        except InputError as error:
+            reporter.answer(request=request, problem=str(error))
+            continue
+        objects, classes = np.unique(ids, return_inverse=True)
+        kind = "u1" if len(objects) <= 256 else "<u4"
+        for first in range(0, max(len(ids), 1), _AT_ONCE):
+            part = np.ascontiguousarray(classes[first : first + _AT_ONCE], kind).tobytes()
+            reporter.answer(
+                request=request, objects=objects.tolist(), kind=kind, first=first, splats=len(ids),
+                classes=base64.b64encode(zlib.compress(part, 1)).decode(),
+            )  # fmt: skip
+    reporter.done()
+
+
+def require_explicit(trained: Trained) -> None:
+    """Raise InputError if the model's splats depend on the view."""
+    if not trained.model.explicit:
+        raise InputError(
+            f"{trained.folder.folder} has a view-dependent model; train it with --mode explicit to label it."
+        )
+
+
+def _latest(reporter: StoppingReporter) -> dict[str, Any] | None:
+    """Return the latest request, or None; earlier ones that wait are outdated."""
+    try:
+        line = reporter.stop.requests.get(timeout=_WAIT)
+        while not reporter.stop.requests.empty():
+            line = reporter.stop.requests.get()
+        content = json.loads(line)
+    except (Empty, ValueError):
+        return None
+    return content if isinstance(content, dict) else None
