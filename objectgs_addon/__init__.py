@@ -15,7 +15,7 @@ def _modules() -> tuple[ModuleType, ...]:
     from .drawing import splat_arrays
     from .film import properties as film
     from .panels import preferences
-    from .running import file_preview, handlers
+    from .running import file_preview, handlers, pointing
     from .state import click_selection, properties
 
     return (
@@ -25,6 +25,7 @@ def _modules() -> tuple[ModuleType, ...]:
         film,
         preferences,
         handlers,
+        pointing,
         file_preview,
         click_selection,
         splat_arrays,

@@ -23,6 +23,7 @@ def _classes() -> list[type]:
         override_decision,
     )
     from .film import cameras, film_frames, set_up_compositor, set_up_render
+    from .marking import mark_object, marked_objects
     from .meshes import export_meshes, extract_meshes
     from .objects import (
         choose_objects,
@@ -61,6 +62,8 @@ def _classes() -> list[type]:
         group_objects,
         train,
         add_preset,
+        mark_object,
+        marked_objects,
         extract_meshes,
         pause_job,
         stop_job,
@@ -114,7 +117,7 @@ def _export_menu(menu: Any, _context: Any) -> None:
 def register() -> None:
     import bpy
 
-    from ..objectgs_addon.picking import splats_tool
+    from ..objectgs_addon.picking import marking_tool, splats_tool
     from ..objectgs_addon.picking import tool as pick_tool
 
     for cls in _classes():
@@ -123,14 +126,16 @@ def register() -> None:
     bpy.types.TOPBAR_MT_file_export.append(_export_menu)
     pick_tool.register()  # The keymaps of tools need registered operators.
     splats_tool.register()
+    marking_tool.register()
 
 
 def unregister() -> None:
     import bpy
 
-    from ..objectgs_addon.picking import splats_tool
+    from ..objectgs_addon.picking import marking_tool, splats_tool
     from ..objectgs_addon.picking import tool as pick_tool
 
+    marking_tool.unregister()
     splats_tool.unregister()
     pick_tool.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_export_menu)

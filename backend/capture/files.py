@@ -281,10 +281,6 @@ def _not_ids(path: Path, why: str) -> InputError:
     return InputError(f"{path} is not an ID map: {why}; expected one integer per pixel, 0 for unlabeled.")
 
 
-STROKES = "strokes.json"
-"""The strokes that masks were made of, in the folder of the masks; such masks are those of training views alone."""
-
-
 def encode_mask(ids: np.ndarray) -> tuple[str, bytes]:
     """Encode an ID map for `read_mask`; returns the suffix and bytes of a file: PNG up to 16 bits, otherwise .npz."""
     ids = compact(ids)

@@ -19,12 +19,12 @@ from ..shared.defaults import MAX_SIZE
 from ..shared.errors import InputError
 from ..shared.events import Reporter
 from ..shared.formats.photos_source import IMAGES
+from ..shared.reconstruction.folder import STROKES
 from ..shared.reconstruction.objects import default_name
 from .capture import MIN_VIEWS_TO_HOLD_OUT
 from .colmap import COLMAP, Camera, Image, Model
 from .files import (
     HELD_OUT,
-    STROKES,
     Files,
     image_size,
     is_color_mask,

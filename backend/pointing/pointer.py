@@ -26,6 +26,17 @@ _RANKS = 4
 """Number of objects of a pixel that its mask is decided between."""
 
 
+class StrokeOnNothing(InputError):
+    """A stroke shows no splats; number: its number, from 1."""
+
+    def __init__(self, number: int, where: str) -> None:
+        super().__init__(
+            f"Stroke {number} shows no splats, since nothing was reconstructed there in {where}; draw it elsewhere on "
+            "the object."
+        )
+        self.number = number
+
+
 class Pointer:
     """Finds the objects of a model's splats.
 
@@ -54,7 +65,7 @@ class Pointer:
             (N,) int64 object IDs, 0 for none.
 
         Raises:
-            InputError: a stroke shows no splats.
+            StrokeOnNothing: a stroke shows no splats.
         """
         self._shown = {stroke: self._contributions(n, stroke) for n, stroke in enumerate(strokes.strokes, 1)}
         seeds: dict[int, np.ndarray] = {}
@@ -88,11 +99,7 @@ class Pointer:
         pixels = stroke.pixels(camera.width, camera.height)
         found = contributions(self.splats, camera, np.stack([pixels] * 3), self._primitive)[:, 0]
         if not found.sum() > 0.5:
-            where = stroke.view if isinstance(stroke.view, str) else "the viewport"
-            raise InputError(
-                f"Stroke {number} shows no splats, since nothing was reconstructed there in {where}; draw it elsewhere "
-                "on the object."
-            )
+            raise StrokeOnNothing(number, stroke.view if isinstance(stroke.view, str) else "the viewport")
         return found
 
     def _camera(self, stroke: Stroke) -> Camera:

@@ -27,8 +27,9 @@ if TYPE_CHECKING:
 NEIGHBORS, SURFACE_NEIGHBORS = 10, 17
 """Number of neighbors of a splat in the graph, and of those that its normal is measured on, itself included."""
 
-SEEN = 1.0
-"""Splats that cover less than this number of pixels in all photos together get the object of the nearest other."""
+SEEN, ALONE = 1.0, 4.0
+"""Splats that cover less than the first number of pixels in all photos together get the object of the nearest other, or
+none, if that is farther away than the second number times the local spacing."""
 
 COLOR, CONCAVE, GAP, PHOTO_EDGE, LEAST = 0.7, 8.0, 1 / 3, 0.25, 1e-4
 """Weights of a tenth of the CIELAB distance of two splats, of the concavity (the change of the normals along the edge),
@@ -87,12 +88,14 @@ class SplatGraph:
     Attributes:
         nodes: (n,) int64, the splats that are seen.
         nearest: (N,) int64, the node of each splat, or the nearest one.
+        is_alone: (N,) bool, splats that are no nodes and far from all of them.
         lab: (n, 3) CIELAB color of each node, the mean over its neighborhood.
         weights: (n, n) weights of the edges.
     """
 
     nodes: np.ndarray
     nearest: np.ndarray
+    is_alone: np.ndarray
     lab: np.ndarray
     weights: sparse.csr_array
 
@@ -118,7 +121,8 @@ class SplatGraph:
             start[:, now] = before.probabilities[:, then]
         probabilities = random_walker(self.weights, labels, prior, 1.0, start)
         found = self._joined(probabilities.argmax(1), labels, everything)
-        return Solution(objects, probabilities, objects[found][self.nearest])
+        ids = objects[found][self.nearest]
+        return Solution(objects, probabilities, ids if everything else np.where(self.is_alone, 0, ids))
 
     def _joined(self, found: np.ndarray, seeds: np.ndarray, everything: bool) -> np.ndarray:
         """Give the parts of an object that are not connected to any of its seeds to the objects around them.
@@ -203,7 +207,7 @@ def build_graph(
     nearest = np.empty(len(means), np.int64)
     nearest[nodes] = np.arange(len(nodes))
     hidden = np.setdiff1d(np.arange(len(means)), nodes)
-    nearest[hidden] = tree.query(means[hidden], workers=-1)[1] if len(hidden) else 0
+    away, nearest[hidden] = tree.query(means[hidden], workers=-1)
 
     distance, neighbor = tree.query(xyz, k=min(SURFACE_NEIGHBORS, len(nodes)), workers=-1)
     normal = _normals(xyz[neighbor], facing[nodes])
@@ -214,6 +218,8 @@ def build_graph(
     other = first != second
     first, second, length = first[other], second[other], length[other]
     spacing = distance[:, 1:6].mean(1)
+    is_alone = np.zeros(len(means), bool)
+    is_alone[hidden] = away > ALONE * spacing[nearest[hidden]]
     along = (xyz[second] - xyz[first]) / np.maximum(length, 1e-12)[:, None]
     concavity = np.maximum(0.0, -((normal[second] - normal[first]) * along).sum(1))
     gap = length / np.maximum(np.minimum(spacing[first], spacing[second]), 1e-12)
@@ -223,7 +229,7 @@ def build_graph(
         -((COLOR * color) ** 2) - (CONCAVE * concavity) ** 2 - (GAP * gap) ** 2 - (PHOTO_EDGE * steps) ** 2
     )
     weights = sparse.coo_array((weight, (first, second)), shape=(len(nodes), len(nodes))).tocsr()
-    return SplatGraph(nodes, nearest, lab, weights.maximum(weights.T).tocsr())
+    return SplatGraph(nodes, nearest, is_alone, lab, weights.maximum(weights.T).tocsr())
 
 
 def _normals(neighborhoods: np.ndarray, facing: np.ndarray) -> np.ndarray:

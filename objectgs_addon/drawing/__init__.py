@@ -6,7 +6,7 @@ them with the shaders in `shaders`, and `viewport` composites the result over th
 """
 
 from .gather import collections_by_part, placed_parts, shown, splat_parts
-from .splat_arrays import selected_of, selection_changed, splats_changed
+from .splat_arrays import selected_of, selection_changed, show_labels, splats_changed
 from .viewport import failure, picture, point_at, redraw, register, show, unregister
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "selected_of",
     "selection_changed",
     "show",
+    "show_labels",
     "shown",
     "splat_parts",
     "splats_changed",

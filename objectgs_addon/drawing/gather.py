@@ -13,7 +13,7 @@ from mathutils import Matrix
 from ...backend.shared.color.palette import to_encoded
 from .. import scene as scenes
 from .renderer import DrawnObject
-from .splat_arrays import arrays_of, selected_of
+from .splat_arrays import arrays_of, labels_of, selected_of
 
 NO_RECOLOR = np.hstack([np.eye(3), np.zeros((3, 1))])
 NONE = (0.0, 0.0, 0.0, 0.0)
@@ -125,7 +125,7 @@ def gather(
         parts: mesh carriers of splats with their places.
         colors: "photo", or "object" for the objects' own colors.
         pointed_at: session UID of the collection under the mouse, or None.
-        marks: outline selected objects, and highlight selected splats.
+        marks: outline selected objects, highlight selected splats, and show labels.
     """
     found = []
     collections = collections_by_part()
@@ -145,6 +145,7 @@ def gather(
                 marks and (instancer or part).select_get(),
                 is_pointed_at,
                 selected_of(part.data) if marks else None,
+                labels_of(part.data) if marks else None,
             )
         )
     return found

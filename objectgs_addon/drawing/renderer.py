@@ -16,7 +16,10 @@ from mathutils import Matrix
 from ...backend.shared.splats.picking import View
 from . import shaders
 from .order import back_to_front
-from .splat_arrays import SplatArrays
+from .splat_arrays import Labels, SplatArrays
+
+LABEL_AMOUNT = 0.75
+"""Opacity of the color of a label over a splat's own."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,7 @@ class DrawnObject:
         is_selected: outline it in the color of the selection.
         is_pointed_at: outline it in white.
         selected: (N,) bool, the splats that are drawn as selected; None if there are none.
+        labels: colors of single splats; None if there are none.
     """
 
     splats: SplatArrays
@@ -40,6 +44,12 @@ class DrawnObject:
     is_selected: bool = False
     is_pointed_at: bool = False
     selected: np.ndarray | None = None
+    labels: Labels | None = None
+
+    @property
+    def slots(self) -> int:
+        """Number of rows in the shader's table of objects: one for the object, and one for each color of labels."""
+        return 1 if self.labels is None else 1 + len(self.labels.colors)
 
 
 class Renderer:
@@ -214,51 +224,56 @@ class _Sorted:
     """Drawing order of splats for one view and one set of object transforms."""
 
     def __init__(self, pool: _Pool, objs: Sequence[DrawnObject]) -> None:
-        self._splats = [obj.splats for obj in objs]
+        self._splats, self._slots = [obj.splats for obj in objs], [obj.slots for obj in objs]
         counts = [len(splats.means) for splats in self._splats]
         self._entries = np.empty((sum(counts), 2), np.float32)
         self._depths = np.empty(len(self._entries), np.float32)
         self._parts = []
-        first = 0
-        for slot, (splats, count) in enumerate(zip(self._splats, counts)):
+        first = slot = 0
+        for splats, count, slots in zip(self._splats, counts, self._slots):
             start, own = pool.starts[id(splats)], slice(first, first + count)
             self._entries[own, 0] = np.arange(start, start + count)
             self._entries[own, 1] = slot
-            self._parts.append(own)
+            self._parts.append((own, slot))
             first += count
+            slot += slots
         self._rows: np.ndarray | None = None
-        self._selected: list[np.ndarray | None] = [None] * len(self._splats)
+        self._marked: list[tuple[np.ndarray | None, Labels | None]] = [(None, None)] * len(self._splats)
         self._order = np.zeros(0, np.int64)
         self.count = 0
         self.texture: gpu.types.GPUTexture | None = None
 
     def holds(self, objs: Sequence[DrawnObject]) -> bool:
         """Return whether this order is for these objects."""
-        return len(objs) == len(self._splats) and all(obj.splats is splats for obj, splats in zip(objs, self._splats))
+        return self._slots == [obj.slots for obj in objs] and all(
+            obj.splats is splats for obj, splats in zip(objs, self._splats)
+        )
 
     def sort(self, objs: Sequence[DrawnObject], view: View) -> None:
-        """Update the order if the view or an object has moved, and mark the selected splats."""
+        """Update the order if the view or an object has moved, and mark selected and labeled splats."""
         rows = view.viewmat[2] @ np.array([obj.matrix for obj in objs])
         moved = self._rows is None or not np.array_equal(rows, self._rows)
-        if not self._mark([obj.selected for obj in objs]) and not moved:
+        if not self._mark([(obj.selected, obj.labels) for obj in objs]) and not moved:
             return
         if moved:
             self._rows = rows
             self._sort(rows, view)
         self.texture = _table(self._entries.take(self._order, axis=0), "RG32F") if self.count else None
 
-    def _mark(self, selected: list[np.ndarray | None]) -> bool:
-        """Write which splats are selected into the entries; return False if the selection has not changed."""
-        if all(now is before for now, before in zip(selected, self._selected)):
+    def _mark(self, marked: list[tuple[np.ndarray | None, Labels | None]]) -> bool:
+        """Write which splats are selected, and their labels, into the entries; return False if nothing has changed."""
+        if all(now is before for pair in zip(marked, self._marked) for now, before in zip(*pair)):
             return False
-        for slot, (own, marked) in enumerate(zip(self._parts, selected)):
-            self._entries[own, 1] = slot if marked is None else slot + shaders.SELECTED * marked
-        self._selected = selected
+        for (own, slot), (selected, labels) in zip(self._parts, marked):
+            self._entries[own, 1] = slot if labels is None else slot + labels.of_splats
+            if selected is not None:
+                self._entries[own, 1] += shaders.SELECTED * selected
+        self._marked = marked
         return True
 
     def _sort(self, rows: np.ndarray, view: View) -> None:
         """Sort the splats by depth; rows (n, 4): the maps from each object's coordinates to the depth."""
-        for splats, row, own in zip(self._splats, rows.astype(np.float32), self._parts):
+        for splats, row, (own, _) in zip(self._splats, rows.astype(np.float32), self._parts):
             np.matmul(splats.means, row[:3], out=self._depths[own])
             self._depths[own] += row[3]
         self._order = back_to_front(self._depths, view.near, view.orthographic)
@@ -266,7 +281,7 @@ class _Sorted:
 
 
 def _objects(objs: Sequence[DrawnObject], view: View) -> np.ndarray:
-    """Return the shader's data for each object in this view, (n, OBJECT_TEXELS, 4) float32."""
+    """Return the shader's data for each object and label in this view, (n, OBJECT_TEXELS, 4) float32."""
     table = np.zeros((len(objs), shaders.OBJECT_TEXELS, 4), np.float32)
     matrices = np.array([obj.matrix for obj in objs])
     camera_to_world = np.linalg.inv(view.viewmat)[:3]
@@ -282,6 +297,12 @@ def _objects(objs: Sequence[DrawnObject], view: View) -> np.ndarray:
     table[:, 6:9] = [obj.recolor for obj in objs]
     table[:, 9] = [obj.color for obj in objs]
     table[:, 10, :2] = [(obj.is_selected, obj.is_pointed_at) for obj in objs]
+    slots = [obj.slots for obj in objs]
+    table = np.repeat(table, slots, axis=0)
+    for first, obj in zip(np.cumsum([0, *slots]), objs):
+        if obj.labels is not None:
+            own = slice(first + 1, first + obj.slots)
+            table[own, 9, :3], table[own, 9, 3] = obj.labels.colors, LABEL_AMOUNT
     return table
 
 

@@ -45,7 +45,21 @@ class SplatArrays:
         return Cloud(self.means, self.quats, self.scales, self.opacities)
 
 
+@dataclass(frozen=True)
+class Labels:
+    """Colors in which single splats are drawn instead of their own.
+
+    Attributes:
+        of_splats: (N,) int64, for each visible splat 0, or the number of its color, from 1.
+        colors: (L, 3) sRGB-encoded.
+    """
+
+    of_splats: np.ndarray
+    colors: np.ndarray
+
+
 _held: dict[int, SplatArrays] = {}
+_labels: dict[int, Labels] = {}
 _selected: dict[int, np.ndarray | None] = {}
 
 
@@ -82,6 +96,26 @@ def splats_changed(mesh: bpy.types.Mesh) -> None:
     """Drop the cached splats and the selection of a mesh."""
     _held.pop(mesh.session_uid, None)
     _selected.pop(mesh.session_uid, None)
+
+
+def labels_of(mesh: bpy.types.Mesh) -> Labels | None:
+    """Return the labels that `show_labels` has set for a mesh; None if there are none."""
+    return _labels.get(mesh.session_uid)
+
+
+def show_labels(labels: dict[bpy.types.Mesh, np.ndarray], colors: np.ndarray) -> None:
+    """Draw splats in other colors than their own, until this is called again.
+
+    Args:
+        labels: for each carrier (n,) the number of the color of each of its splats, from 1; 0 for their own color.
+        colors: (L, 3) sRGB-encoded.
+    """
+    _labels.clear()
+    for mesh, of_splats in labels.items():
+        arrays = arrays_of(mesh)
+        if arrays is not None:
+            visible = of_splats if arrays.vertices is None else of_splats[arrays.vertices]
+            _labels[mesh.session_uid] = Labels(visible, colors)
 
 
 def _read(mesh: bpy.types.Mesh) -> SplatArrays:

@@ -8,6 +8,7 @@ from .edits import EditPanel, draw_context_menu
 from .export import ExportPanel
 from .help import HelpPanel
 from .jobs import JobsPanel, status_bar
+from .marking import MarkedList, MarkingPanel
 from .meshes import MeshesPanel
 from .objects import ObjectList, ObjectsPanel
 from .placement import PlacementPanel
@@ -23,6 +24,8 @@ CLASSES = (
     ObjectList,
     CapturePanel,
     ObjectsPanel,
+    MarkedList,
+    MarkingPanel,
     TrainPanel,
     DetailsPanel,
     PlanPanel,

@@ -9,7 +9,7 @@ from ..process.jobs import Job, State
 from ..running import background
 from ..running.job_display import draw_over, draw_running, write
 from ..state import folder_trust
-from ..state.next_step import has_masks
+from ..state.next_step import can_mark, has_masks
 
 
 class Tab:
@@ -30,10 +30,12 @@ def draw_without_objects(layout: bpy.types.UILayout, root: bpy.types.Collection)
         text = "Objects are listed once the folder is used."
     elif has_masks(folder_trust.state_of(root)):
         text = "Assign Objects finds the objects by the masks."
+    elif can_mark(folder_trust.state_of(root)):
+        text = "Objects are listed once they are marked and separated."
     else:
         text = (
-            "The capture has no masks, so it trains as one scene. Masks of the objects, one for each photo, belong in "
-            "its folder masks."
+            "The capture has no masks, so it trains as one scene. Objects are marked by strokes afterwards, or by "
+            "masks, one for each photo, in its folder masks."
         )
     write(layout, text, "INFO")
 

@@ -53,7 +53,7 @@ class Job:
 
     Attributes:
         title: name shown to the user.
-        kind: sfm, import, import-splats, plan, vote, train, mesh, export, film, fill, demo, setup or doctor.
+        kind: sfm, import, import-splats, plan, vote, train, label, mesh, export, film, fill, demo, setup or doctor.
         folder: the reconstruction folder, or None.
         command: program and arguments.
         cwd: working directory.
@@ -126,8 +126,8 @@ class Job:
 
     @property
     def can_pause(self) -> bool:
-        """Whether the job can be paused: a running training, or a computation of poses."""
-        return self.kind in ("train", "sfm") and self.state is State.RUNNING
+        """Whether the job can be paused: a running training, of labels too, or a computation of poses."""
+        return self.kind in ("train", "label", "sfm") and self.state is State.RUNNING
 
     @property
     def quality(self) -> dict[str, float]:

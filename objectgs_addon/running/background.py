@@ -26,7 +26,7 @@ from ..process.jobs import Job, JobQueue, State
 from ..state import folder_trust, object_edits, object_list
 from ..state.folder_state import reconstruction_for
 from ..state.next_step import has_masks
-from . import previews, results
+from . import pointing, previews, results
 
 INTERVAL = 0.1
 """Time in seconds between two polls of the queue."""
@@ -67,6 +67,7 @@ def submit(job: Job, owner: bpy.types.Scene, report: Callable[[set[str], str], A
         The return value for the operator's `execute`.
     """
     _submitted_in[job] = owner.session_uid
+    pointing.release(job.folder)
     if bpy.app.background:
         run_blocking(job, ConsoleReporter())
         if job.state is not State.DONE:
@@ -169,7 +170,7 @@ def _handle_end(job: Job) -> None:
         messages.show(f"{job.title}: {job.error}", "ERROR", operator, label, **options)
     elif job.state is State.DONE:
         messages.settle(job.title, operator if job.kind in _REMEDIES else None)
-    if job.state is State.DONE or (job.state is State.STOPPED and job.kind in ("train", "mesh")):
+    if job.state is State.DONE or (job.state is State.STOPPED and job.kind in ("train", "label", "mesh")):
         _results.append(job)
     else:
         _submitted_in.pop(job, None)

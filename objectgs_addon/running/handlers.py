@@ -14,7 +14,7 @@ from ...backend.shared.errors import InputError
 from .. import scene
 from ..blender import messages, writing
 from ..state import folder_trust, object_edits, splat_edits
-from . import background, results
+from . import background, pointing, results
 
 
 @bpy.app.handlers.persistent
@@ -23,7 +23,7 @@ def _undone(*_: Any) -> None:
     """Update the folder's edits and the fills after undo or redo."""
     for root in _accepted_roots():
         fill_holes = partial(background.fill_holes, again=False)
-        for action in (object_edits.store, splat_edits.follow, results.show_fill, fill_holes):
+        for action in (object_edits.store, splat_edits.follow, results.show_fill, fill_holes, pointing.refresh):
             _try(action, root)
 
 

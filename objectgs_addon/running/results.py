@@ -106,6 +106,13 @@ def _show_result(job: Job, owner: bpy.types.Scene | None) -> bool:
     return bool(roots) or _announce_hidden(job)
 
 
+def _show_labels(job: Job, owner: bpy.types.Scene | None) -> bool:
+    """Show the objects that strokes have separated, each in a collection of its own."""
+    for root in _shown_roots(job, owner):
+        scene.show_objects(root, _folder_of(job))
+    return _show_result(job, owner)
+
+
 def _show_meshes(job: Job, owner: bpy.types.Scene | None) -> bool:
     """Show the meshes of a finished or stopped job."""
     roots = _shown_roots(job, owner)
@@ -149,6 +156,7 @@ SHOW_BY_KIND = {
     "import": _show_capture,
     "vote": _show_votes,
     "train": _show_result,
+    "label": _show_labels,
     "mesh": _show_meshes,
     "film": _show_film,
     "import-splats": _show_imported,

@@ -2,7 +2,7 @@
 """A reconstruction folder shown as collections, cameras, points and splats in Blender; contains no operators."""
 
 from .cameras import use_camera
-from .capture import show_capture, warnings_of
+from .capture import capture_to_world, show_capture, warnings_of
 from .carrier import require_object_mode
 from .edits.crop_box import add_crop_box, box_of, crop_box_of
 from .edits.duplicates import duplicate, remove_duplicate
@@ -53,6 +53,7 @@ from .points import color_points_by
 from .result import Shown, result_is_newer, show_label, show_objects, show_result
 from .shading.materials import SHADINGS
 from .shading.render_settings import is_untouched, prepare_render, render_problem, set_up_render
+from .splats import splat_keys
 
 __all__ = [
     "SHADINGS",
@@ -65,6 +66,7 @@ __all__ = [
     "add_crop_box",
     "bounds",
     "box_of",
+    "capture_to_world",
     "collection_of",
     "color_points_by",
     "crop_box_of",
@@ -123,6 +125,7 @@ __all__ = [
     "show_result",
     "shown_edits",
     "shown_kinds",
+    "splat_keys",
     "store_placements",
     "to_stored",
     "unobserved_splats",

@@ -151,6 +151,14 @@ def origin_of(root: bpy.types.Collection) -> np.ndarray:
     return np.array(root.get(ORIGIN, (0.0, 0.0, 0.0)), np.float64)
 
 
+def capture_to_world(root: bpy.types.Collection) -> np.ndarray:
+    """Return the (4, 4) map from the capture's coordinates to the world, where objects that are not moved are."""
+    parent = parent_of(root)
+    world = np.eye(4) if parent is None else np.array(parent.matrix_world, np.float64)
+    world[:3, 3] -= world[:3, :3] @ origin_of(root)
+    return world
+
+
 def _stand_up(root: bpy.types.Collection, upright: np.ndarray, views: Any) -> bpy.types.Object:
     """Return the parent empty, created if missing and set to `upright` unless the user has moved it."""
     parent = parent_of(root)

@@ -23,6 +23,7 @@ from ...backend.shared.formats.splat_ply import (
 )
 from ...backend.shared.reconstruction.folder import Reconstruction
 from .carrier import stored_ids
+from .edits.single_splats import table_keys
 
 LARGEST_TABLE = 1 << 22
 """IDs below this limit are grouped by counting instead of sorting."""
@@ -38,6 +39,14 @@ def read_splats(folder: Path) -> tuple[np.ndarray, list[str]]:
     if not path.is_file():
         raise InputError(f"{folder} has no splats.ply; train first.")
     return _without_unusable(read_splat_table(path), REQUIRED, path.name, "splats")
+
+
+def splat_keys(folder: Path) -> np.ndarray:
+    """Return the (N,) keys of all splats in splats.ply, in its order; raises as `read_splats`."""
+    path = Reconstruction(folder).splats
+    if not path.is_file():
+        raise InputError(f"{folder} has no splats.ply; train first.")
+    return table_keys(read_splat_table(path))
 
 
 def read_anchors(folder: Path) -> tuple[np.ndarray | None, list[str]]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import bpy
 
+from ...backend.shared.reconstruction.folder import STROKES
 from .. import scene
 from ..environment import known_folders, locations
 from . import folder_trust
@@ -42,6 +43,12 @@ ASSIGN = Step(
 )
 TRAIN = Step("objectgs.train", "Train", "PLAY", "Training turns the photos into splats.")
 RESUME = Step("objectgs.train", "Resume", "PLAY", "The training was stopped, and goes on from there.")
+MARK = Step(
+    "objectgs.start_marking",
+    "Mark Objects",
+    "GREASEPENCIL",
+    "Without masks, a stroke over each object separates it from the scene.",
+)
 MESHES = Step(
     "objectgs.extract_meshes", "Extract Meshes", "MESH_DATA", "Meshes are for physics, shadows and other programs."
 )
@@ -75,11 +82,20 @@ def next_step(root: bpy.types.Collection | None, owner: bpy.types.Scene) -> Step
     items = root.objectgs.objects
     if not state.trained:
         return TRAIN if items or not has_masks(state) else ASSIGN
+    if not items and can_mark(state):
+        return MARK
     if items and not state.meshes and not any(item.cleaned for item in items):
         return CLEAN
     if state.steps and not state.meshes:
         return MESHES
     return FILM if scene.render_problem(owner, root) is None else SET_UP_RENDER
+
+
+def can_mark(state: FolderState) -> bool:
+    """Return whether objects can be marked: there is a training, and the capture has no masks but those of strokes."""
+    if not state.steps or state.capture is None:
+        return False
+    return not has_masks(state) or (state.capture / "masks" / STROKES).is_file()
 
 
 def has_masks(state: FolderState) -> bool:

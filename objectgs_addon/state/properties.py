@@ -24,7 +24,7 @@ from ...backend.shared.expectation import PRESET_STEPS
 from ...backend.shared.formats.splat_ply import UNOBSERVED
 from .. import drawing
 from ..scene import SHADINGS, SHOWS, is_linked, kind_of, shade_meshes, shading_of, show_kinds, shown_kinds
-from . import object_edits, viewports
+from . import marks, object_edits, viewports
 
 
 def _slider(name: str, default: float, least: float, most: float, description: str) -> Any:
@@ -116,6 +116,16 @@ class ObjectItem(bpy.types.PropertyGroup):
     stored: StringProperty(name="Stored", description="State in objects.json, which a failed edit reverts to")
 
 
+class MarkedObject(bpy.types.PropertyGroup):
+    """An object that is marked by strokes; `strokes` of the reconstruction has them."""
+
+    name: StringProperty(name="Name", description="Name of the object")
+    object_id: IntProperty(name="ID")
+    color: FloatVectorProperty(
+        name="Color", description="Color in which the object is shown", subtype="COLOR_GAMMA", size=3, min=0.0, max=1.0
+    )
+
+
 class PlanChoice(bpy.types.PropertyGroup):
     """The user's choice for a decision of the plan; `name` is its key."""
 
@@ -127,6 +137,17 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
 
     objects: CollectionProperty(type=ObjectItem)
     plan_choices: CollectionProperty(type=PlanChoice)
+    marked: CollectionProperty(type=MarkedObject)
+    active_marked: IntProperty(name="Active Object", default=0, options=set())
+    strokes: StringProperty(
+        name="Strokes", description="The strokes on the marked objects, as JSON", update=marks.strokes_changed
+    )
+    everything: BoolProperty(
+        name="Everything Is Marked",
+        description="Every part of the scene belongs to one of the marked objects. Otherwise, what is far from all "
+        "strokes belongs to none",
+        update=marks.strokes_changed,
+    )
     active_object: IntProperty(name="Active Object", default=0, update=object_edits.active_changed, options=set())
     length: EnumProperty(
         name="Quality",
@@ -277,6 +298,16 @@ class SceneProperties(bpy.types.PropertyGroup):
         update=viewports.colors_changed,
     )
 
+    mark_shape: EnumProperty(
+        name="Shape",
+        description="How the tool Mark Object marks",
+        default="STROKE",
+        items=[
+            ("STROKE", "Stroke", "What is under the stroke or click", "GREASEPENCIL", 0),
+            ("LASSO", "Lasso", "What is inside an outline", "GP_SELECT_POINTS", 1),
+            ("BOX", "Box", "What is inside a rectangle", "SELECT_SET", 2),
+        ],
+    )
     splat_shape: EnumProperty(
         name="Shape",
         description="How the tool Select Splats selects",
@@ -302,7 +333,7 @@ class SceneProperties(bpy.types.PropertyGroup):
     )
 
 
-CLASSES = (ObjectItem, PlanChoice, ReconstructionProperties, SceneProperties)
+CLASSES = (ObjectItem, MarkedObject, PlanChoice, ReconstructionProperties, SceneProperties)
 
 
 def register() -> None:

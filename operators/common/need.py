@@ -17,6 +17,7 @@ from ...objectgs_addon.picking import selection
 from ...objectgs_addon.running import background
 from ...objectgs_addon.state import folder_trust, object_list
 from ...objectgs_addon.state.folder_state import folder_state
+from ...objectgs_addon.state.next_step import can_mark
 
 
 def active_root(context: bpy.types.Context) -> Any:
@@ -109,7 +110,17 @@ def training(cls: Any, context: bpy.types.Context) -> bool:
     """Return whether the active reconstruction has a trained model, which imported splats lack."""
     if folder_state(scene.folder_of(active_root(context))).steps:
         return True
-    cls.poll_message_set("Meshes need a trained model; train first")
+    cls.poll_message_set("This needs a trained model; train first")
+    return False
+
+
+def own_masks(cls: Any, context: bpy.types.Context) -> bool:
+    """Return whether the active reconstruction's capture has no masks but those made of strokes."""
+    if can_mark(folder_state(scene.folder_of(active_root(context)))):
+        return True
+    cls.poll_message_set(
+        "The capture has masks of its own, which strokes would replace; move its folder masks elsewhere"
+    )
     return False
 
 

@@ -205,7 +205,7 @@ def test_borders_of_masks_follow_the_photo() -> None:
 def test_far_splats_belong_to_nothing_unless_everything_is_an_object() -> None:
     """Two plates far apart; the stroke is on one of them. A part with a similar color elsewhere is not the object's."""
     graph = SplatGraph(
-        np.arange(9), np.arange(9), np.repeat([[50.0, 0, 0], [80.0, 0, 0], [50.0, 0, 0]], 3, axis=0),
+        np.arange(9), np.arange(9), np.zeros(9, bool), np.repeat([[50.0, 0, 0], [80.0, 0, 0], [50.0, 0, 0]], 3, axis=0),
         chain([1, 1, 1e-4, 1, 1, 1e-4, 1, 1]),
     )  # fmt: skip
     seeds = {7: np.eye(9)[0]}

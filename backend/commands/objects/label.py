@@ -9,15 +9,17 @@ from dataclasses import replace
 import numpy as np
 
 from ...capture import Capture, load_capture
-from ...capture.files import STROKES, encode_mask
+from ...capture.files import encode_mask
 from ...planning.decisions import Choices, decide, planned_capture
 from ...pointing.pointer import Pointer
 from ...pointing.strokes import Strokes, read_strokes
 from ...shared.errors import Cancelled, InputError
+from ...shared.events import Reporter
 from ...shared.formats.atomic import PART_PREFIX, PART_SUFFIX
 from ...shared.formats.json_file import write_json
 from ...shared.formats.points_ply import read_points
 from ...shared.reconstruction.checkpoint import PREVIOUS
+from ...shared.reconstruction.folder import STROKES
 from ...shared.reconstruction.lock import locked
 from ...shared.reconstruction.objects import default_name
 from ...shared.reconstruction.plan import write_plan
@@ -32,7 +34,7 @@ from ..planning import build_context, find_requested_objects
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import kernel_seconds
 from ..stages import finish_stage, stage
-from ..votes import VOTE, cast_votes, votes_key
+from ..votes import cast_votes, votes_key
 from .point import GRAPH, require_explicit
 
 _MASKS, _TRAIN = "masks", "train"
@@ -43,7 +45,7 @@ def label(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     reporter.expect(
         {
             READ: ("Preparing", 5.0), KERNELS: ("Preparing", 0.0), GRAPH: ("Preparing", 5.0),
-            _MASKS: ("Making masks", 5.0), VOTE: ("Making masks", 5.0), _TRAIN: ("Training", 25.0),
+            _MASKS: ("Making masks", 5.0), _TRAIN: ("Training", 25.0),
             EXPORT: ("Saving", 5.0),
         }
     )  # fmt: skip
@@ -118,7 +120,8 @@ def _begin(
     settings, votes = Settings(**before.settings), before.votes
     capture = load_capture(trained.capture.folder, folder.cache, memory_for_files(options), votes.max_size, reporter)
     voting = argparse.Namespace(strategy=votes.strategy, seed=settings.seed, max_size=votes.max_size)
-    cast_votes(folder, capture, voting, reporter)
+    # What is far from all strokes has no object, which is no reason for a warning.
+    cast_votes(folder, capture, voting, Reporter())
     objects, _ = find_requested_objects(folder, capture)
     wanted = Choices(settings, votes.max_size, until_converged=before.preset == "final")
     points = read_points(folder.points)

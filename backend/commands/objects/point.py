@@ -11,11 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from ...pointing.pointer import Pointer
+from ...pointing.pointer import Pointer, StrokeOnNothing
 from ...pointing.strokes import strokes_of
 from ...shared.errors import InputError
 from ...shared.stopping import StoppingReporter
 from ..folder import READ, Trained, open_trained
+from ..setup.kernels import PART as KERNELS
+from ..setup.kernels import ensure_kernels
 
 GRAPH = "graph"
 """Name of the preparation among the parts of a command."""
@@ -31,9 +33,10 @@ def point(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Answer each request with the objects of the splats, until the controlling program ends or stops the command."""
     if not options.json:
         raise InputError("`point` answers another program; run it with --json, or use `label` with a file of strokes.")
-    reporter.expect({READ: ("Preparing", 3.0), GRAPH: ("Preparing", 3.0)})
+    reporter.expect({READ: ("Preparing", 3.0), KERNELS: ("Preparing", 0.0), GRAPH: ("Preparing", 3.0)})
     trained = open_trained(options, reporter)
     require_explicit(trained)
+    ensure_kernels(reporter, trained.model.device)
     views = [view.name for view in trained.capture.views]
     reporter.begin(GRAPH, "Comparing the splats with their neighbors")
     pointer = Pointer(trained.model, trained.scene, reporter.progress)
@@ -48,7 +51,8 @@ def point(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         try:
             ids = pointer.solve(strokes_of(content, "the request", views))[in_file]
         except InputError as error:
-            reporter.answer(request=request, problem=str(error))
+            number = error.number if isinstance(error, StrokeOnNothing) else None
+            reporter.answer(request=request, problem=str(error), stroke=number)
             continue
         objects, classes = np.unique(ids, return_inverse=True)
         kind = "u1" if len(objects) <= 256 else "<u4"

@@ -9,6 +9,10 @@ from ..errors import InputError
 from ..formats.atomic import PART_PREFIX, PART_SUFFIX, make_folder
 from . import cameras, lock, report
 
+STROKES = "strokes.json"
+"""Strokes on objects: of a reconstruction, and in the folder masks of a capture whose masks were made of them. Such
+masks are those of training views alone."""
+
 _IGNORED = (lock.NAME, ".DS_Store", "Thumbs.db", "desktop.ini")
 """Files that a folder without content may contain."""
 
@@ -25,6 +29,7 @@ class Reconstruction:
         self.points = self.folder / "points.ply"
         self.checkpoint = self.folder / "checkpoint"
         self.splats = self.folder / "splats.ply"
+        self.strokes = self.folder / STROKES
         self.splat_edits = self.folder / "splat-edits.ply"
         self.anchors = self.folder / "anchors.ply"
         self.meshes = self.folder / "meshes"

@@ -46,7 +46,7 @@ class TrainPanel(WithReconstruction, bpy.types.Panel):
         if not active and is_accepted:
             _draw_expectation(column, state, properties)
             if not state.trained and state.imported and not has_masks(state):
-                _draw_faint(column, "There are no masks, so it trains as one scene without objects.")
+                _draw_faint(column, "There are no masks, so objects are marked after the training.")
         if job is not None:
             draw_job_of(layout, job)
         if not is_accepted:

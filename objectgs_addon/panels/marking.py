@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Objects that are marked by strokes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from ..running import background, pointing
+from ..running.job_display import write
+from ..state import folder_trust, marks
+from ..state.next_step import can_mark
+from .tab import WithReconstruction, draw_job_of
+
+
+class MarkedList(bpy.types.UIList):
+    """Rows of `MarkedObject`."""
+
+    bl_idname = "OBJECTGS_UL_marked"
+
+    def draw_item(
+        self,
+        _context: bpy.types.Context,
+        layout: bpy.types.UILayout,
+        properties: Any,
+        item: Any,
+        _icon: int,
+        _active: Any,
+        _property: str,
+        _index: int = 0,
+        _flag: int = 0,
+    ) -> None:
+        row = layout.row(align=True)
+        swatch = row.row()
+        swatch.ui_units_x = 0.8
+        swatch.prop(item, "color", text="")
+        row.prop(item, "name", text="", emboss=False)
+        numbers = row.row()
+        numbers.alignment = "RIGHT"
+        numbers.active = False
+        count = marks.count(properties.id_data, item.object_id)
+        numbers.label(text=f"{count} stroke{'s' if count != 1 else ''}" if count else "not marked")
+
+
+class MarkingPanel(WithReconstruction, bpy.types.Panel):
+    bl_idname = "OBJECTGS_PT_marking"
+    bl_label = "Mark Objects"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not super().poll(context):
+            return False
+        root = context.scene.objectgs.active
+        return folder_trust.is_accepted(root) and can_mark(folder_trust.state_of(root))
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, root = self.layout, context.scene.objectgs.active
+        properties = root.objectgs
+        job = background.job_of(root)
+        if job is not None and job.kind == "label":
+            draw_job_of(layout, job)
+        is_active = pointing.is_active(root)
+        if not is_active:
+            layout.operator("objectgs.start_marking", icon="GREASEPENCIL")
+            if not properties.marked:
+                write(layout, "Draw over each object in the viewport to separate it from the scene.")
+                return
+        else:
+            self._draw_state(layout, root)
+        row = layout.row()
+        row.template_list("OBJECTGS_UL_marked", "", properties, "marked", properties, "active_marked", rows=4)
+        column = row.column(align=True)
+        column.operator("objectgs.add_marked_object", text="", icon="ADD")
+        column.operator("objectgs.remove_marked_object", text="", icon="REMOVE")
+        column.separator()
+        column.operator("objectgs.clear_marks", text="", icon="TRASH")
+        layout.prop(properties, "everything")
+        layout.operator("objectgs.separate_marked", icon="CHECKMARK")
+        if is_active:
+            layout.operator("objectgs.stop_marking", icon="X")
+
+    def _draw_state(self, layout: bpy.types.UILayout, root: bpy.types.Collection) -> None:
+        progress, waits = pointing.state()
+        if progress < 1.0:
+            layout.progress(factor=progress, text=f"{100 * progress:.0f} %")
+            write(layout, pointing.message())
+            return
+        item, nothing = marks.active_object(root), marks.count(root, marks.NOTHING)
+        if waits:
+            text = "Finding the objects"
+        elif not marks.strokes_of(root):
+            text = f"Draw over {item.name if item else 'an object'} in the viewport."
+        elif not nothing:
+            text = "Press Tab for the next object. Ctrl and a stroke take away what does not belong to any."
+        else:
+            text = f"Press Tab for the next object. {nothing} stroke{'s' if nothing != 1 else ''} on no object."
+        write(layout, text, "INFO")

@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A backend process that answers strokes on objects with the object of each splat, which is shown at once.
+
+There is at most one, for one reconstruction; it reads the training and ends before a job changes it.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ...backend.shared.errors import InputError
+from .. import drawing, scene
+from ..blender import messages, writing
+from ..environment import locations
+from ..process.backend_process import BackendProcess
+from ..state import marks
+
+INTERVAL = 0.05
+"""Time in seconds between two polls of the process."""
+
+
+class _Session:
+    """The process, and what it has answered."""
+
+    def __init__(self, root: bpy.types.Collection) -> None:
+        self.root, self.folder = root.session_uid, scene.folder_of(root)
+        self.keys = scene.splat_keys(self.folder)
+        job = locations.backend_job("", "point", self.folder, "point", str(self.folder))
+        self.process = BackendProcess(job.command, job.cwd, job.environment, in_background=False)
+        self.ready, self.progress, self.message, self.failure = False, 0.0, "Starting", ""
+        self.asked = self.answered = 0
+        self._parts: list[np.ndarray] = []
+        self.objects: np.ndarray = np.zeros(1, np.int64)
+        self.classes = np.zeros(len(self.keys), np.int64)
+
+    def ask(self, content: dict[str, Any]) -> None:
+        """Send the strokes; what is shown until the answer is that of earlier ones."""
+        if not self.ready:
+            return
+        if not content["strokes"]:
+            self.classes = np.zeros(len(self.keys), np.int64)
+            self.asked = self.answered = self.asked + 1
+            return
+        self.asked += 1
+        self.process.send(json.dumps({"request": self.asked, **content}))
+
+    def take(self, event: dict[str, Any]) -> int | None:
+        """Process an event; return the number of a stroke that shows no splats."""
+        kind = event["type"]
+        if kind == "progress":
+            self.progress = float(event.get("done") or 0.0) / float(event.get("total") or 1.0)
+        elif kind == "status":
+            self.message = str(event.get("message"))
+        elif kind == "error":
+            self.failure = str(event.get("message"))
+        elif kind == "answer" and event.get("ready"):
+            self.ready = event.get("splats") == len(self.keys)
+            if not self.ready:
+                self.failure = "The splats in the folder are not those of its training; train again."
+        elif kind == "answer" and event.get("request") == self.asked:
+            if "problem" in event:
+                self.answered = self.asked
+                messages.show(str(event["problem"]), "ERROR")
+                return event.get("stroke")
+            self._take_classes(event)
+        return None
+
+    def _take_classes(self, event: dict[str, Any]) -> None:
+        if event["first"] == 0:
+            self._parts = []
+        data = zlib.decompress(base64.b64decode(event["classes"]))
+        self._parts.append(np.frombuffer(data, event["kind"]).astype(np.int64))
+        if sum(map(len, self._parts)) == len(self.keys):
+            self.objects = np.array(event["objects"], np.int64)
+            self.classes = np.concatenate(self._parts)
+            self.answered = self.asked
+
+
+_session: _Session | None = None
+
+
+def start(root: bpy.types.Collection) -> None:
+    """Start the process for a reconstruction, unless it runs.
+
+    Raises:
+        InputError: the folder has no splats that can be read.
+        OSError: the process cannot be started.
+    """
+    global _session
+    if is_active(root):
+        return
+    stop()
+    _session = _Session(root)
+    if not bpy.app.timers.is_registered(_tick):
+        bpy.app.timers.register(_tick, first_interval=0.0, persistent=True)
+
+
+def stop() -> None:
+    """End the process, and show the splats in their own colors."""
+    global _session
+    if _session is None:
+        return
+    _session.process.kill()
+    _session = None
+    drawing.show_labels({}, np.zeros((0, 3)))
+    drawing.redraw()
+
+
+def release(folder: Path | None) -> None:
+    """End the process if it reads this folder, which a job is going to change."""
+    if _session is not None and folder is not None and _session.folder == folder:
+        stop()
+
+
+def is_active(root: bpy.types.Collection) -> bool:
+    """Return whether the process runs for a reconstruction."""
+    return _session is not None and _session.root == root.session_uid
+
+
+def state() -> tuple[float, bool]:
+    """Return the progress of the preparation, 1 when it is complete, and whether an answer is awaited."""
+    if _session is None:
+        return 0.0, False
+    return (1.0 if _session.ready else min(_session.progress, 0.99)), _session.asked > _session.answered
+
+
+def message() -> str:
+    """Return what the preparation is doing."""
+    return "" if _session is None else _session.message
+
+
+def share_of_splats() -> dict[int, int]:
+    """Return the number of splats of each marked object."""
+    if _session is None:
+        return {}
+    counts = np.bincount(_session.classes, minlength=len(_session.objects))
+    return dict(zip(_session.objects.tolist(), counts.tolist()))
+
+
+def refresh(root: bpy.types.Collection) -> None:
+    """Ask for the objects of changed strokes."""
+    if _session is not None and _session.root == root.session_uid:
+        _session.ask(marks.content(root))
+        show()
+
+
+@writing.allowed
+def _tick() -> float | None:
+    session = _session
+    if session is None:
+        return None
+    root = next((each for each in bpy.data.collections if each.session_uid == session.root), None)
+    if root is None:
+        stop()
+        return None
+    events = session.process.poll()
+    was_ready, before = session.ready, session.answered
+    for event in events:
+        number = session.take(event)
+        if number is not None:
+            marks.remove_stroke(root, number)
+    if session.ready and not was_ready:
+        session.ask(marks.content(root))
+    if session.answered != before:
+        show()
+    if events:
+        redraw()
+    if session.failure or session.process.exit_code is not None:
+        lines = session.process.log
+        why = session.failure or (lines[-1] if lines else "it gave no reason")
+        messages.show(f"The objects of strokes cannot be found: {why}", "ERROR")
+        stop()
+        redraw()
+        return None
+    return INTERVAL
+
+
+def show() -> None:
+    """Draw the splats of the marked objects in the objects' colors."""
+    session = _session
+    root = next((each for each in bpy.data.collections if session and each.session_uid == session.root), None)
+    if session is None or root is None:
+        return
+    colors = {item.object_id: tuple(item.color) for item in root.objectgs.marked}
+    shown = [object_id for object_id in session.objects.tolist() if object_id in colors]
+    number_of = np.array([shown.index(i) + 1 if i in colors else 0 for i in session.objects.tolist()], np.int64)
+    numbers = number_of[session.classes]
+    order = np.argsort(session.keys)
+    found: dict[bpy.types.Mesh, np.ndarray] = {}
+    for part in root.all_objects:
+        if scene.kind_of(part) == "splats" and not part.data.is_editmode:
+            keys = scene.keys_of(part.data)
+            at = np.minimum(np.searchsorted(session.keys, keys, sorter=order), len(order) - 1)
+            own = order[at]
+            found[part.data] = np.where(session.keys[own] == keys, numbers[own], 0)
+    drawing.show_labels(found, np.array([colors[i] for i in shown]).reshape(-1, 3))
+    drawing.redraw()
+
+
+def redraw() -> None:
+    """Redraw the sidebars and headers of the viewports."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                for region in area.regions:
+                    if region.type in ("UI", "TOOL_HEADER"):
+                        region.tag_redraw()
+
+
+@bpy.app.handlers.persistent
+def _file_loads(*_: Any) -> None:
+    stop()
+
+
+def require_running(root: bpy.types.Collection) -> None:
+    """Start the process if it does not run; raises as `start`."""
+    try:
+        start(root)
+    except OSError as error:
+        raise InputError(f"The backend could not be started ({error.strerror or error}).") from error
+
+
+def register() -> None:
+    marks.after_strokes.append(refresh)
+    bpy.app.handlers.load_pre.append(_file_loads)
+
+
+def unregister() -> None:
+    stop()
+    bpy.app.handlers.load_pre.remove(_file_loads)
+    marks.after_strokes.remove(refresh)

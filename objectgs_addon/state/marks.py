@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Strokes on the objects of a reconstruction that has no masks, and the list of these objects.
+
+They are properties of the reconstruction's collection, so that undo removes a stroke, and the .blend keeps them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ...backend.shared.color.palette import colors_of
+from ...backend.shared.splats.picking import View
+from .. import scene
+
+NOTHING = 0
+"""ID of strokes on what belongs to no object."""
+
+_FAR = 1e4
+"""Distance, relative to the size of the view, from which an orthographic view is drawn in perspective instead."""
+
+after_strokes: list[Callable[[bpy.types.Collection], object]] = []
+"""Called with a reconstruction whose strokes have changed."""
+
+
+def strokes_changed(properties: Any, _context: bpy.types.Context = None) -> None:
+    """Tell of changed strokes; an update of a property."""
+    for action in after_strokes:
+        action(properties.id_data)
+
+
+def strokes_of(root: bpy.types.Collection) -> list[dict[str, Any]]:
+    """Return the strokes in the form of the backend's files of strokes."""
+    try:
+        found = json.loads(root.objectgs.strokes or "[]")
+    except ValueError:
+        return []
+    return found if isinstance(found, list) else []
+
+
+def content(root: bpy.types.Collection) -> dict[str, Any]:
+    """Return the content of a file of strokes for the backend."""
+    properties = root.objectgs
+    names = {str(item.object_id): item.name for item in properties.marked if item.name}
+    return {"objects": names, "everything": properties.everything, "strokes": strokes_of(root)}
+
+
+def count(root: bpy.types.Collection, object_id: int) -> int:
+    """Return the number of strokes on an object."""
+    return sum(stroke["object"] == object_id for stroke in strokes_of(root))
+
+
+def active_object(root: bpy.types.Collection) -> Any:
+    """Return the row of the object that strokes are drawn on, or None."""
+    properties = root.objectgs
+    known = 0 <= properties.active_marked < len(properties.marked)
+    return properties.marked[properties.active_marked] if known else None
+
+
+def add_object(root: bpy.types.Collection) -> Any:
+    """Add an object and make it the active one; return its row. An object without strokes is taken, if there is one."""
+    properties = root.objectgs
+    for index, item in enumerate(properties.marked):
+        if not count(root, item.object_id):
+            properties.active_marked = index
+            return item
+    used = {item.object_id for item in properties.marked} | {item.object_id for item in properties.objects}
+    object_id = next(number for number in range(1, len(used) + 2) if number not in used)
+    item = properties.marked.add()
+    item.object_id, item.name = object_id, f"Object {object_id}"
+    item.color = colors_of([object_id])[0] / 255.0
+    properties.active_marked = len(properties.marked) - 1
+    return item
+
+
+def remove_object(root: bpy.types.Collection, index: int) -> None:
+    """Remove an object of the list with its strokes."""
+    properties = root.objectgs
+    object_id = properties.marked[index].object_id
+    properties.marked.remove(index)
+    properties.active_marked = max(0, min(properties.active_marked, len(properties.marked) - 1))
+    _store(root, [stroke for stroke in strokes_of(root) if stroke["object"] != object_id])
+
+
+def add_stroke(
+    root: bpy.types.Collection, object_id: int, view: View, points: Sequence[tuple[float, float]], area: bool
+) -> None:
+    """Add a stroke.
+
+    Args:
+        root: the reconstruction's collection.
+        object_id: the object, or NOTHING.
+        view: the view in the world that it was drawn in.
+        points: its corners in pixels from the upper left.
+        area: whether it encloses an area.
+    """
+    inside = [
+        [round(min(max(x / view.width, 0.0), 1.0), 5), round(min(max(y / view.height, 0.0), 1.0), 5)] for x, y in points
+    ]
+    stroke = {"object": object_id, "camera": _camera(root, view), "points": inside}
+    _store(root, [*strokes_of(root), {**stroke, "area": True} if area else stroke])
+
+
+def remove_stroke(root: bpy.types.Collection, number: int) -> None:
+    """Remove the stroke with a number, from 1; do nothing if there is none."""
+    kept = strokes_of(root)
+    if 1 <= number <= len(kept):
+        _store(root, [*kept[: number - 1], *kept[number:]])
+
+
+def clear(root: bpy.types.Collection) -> None:
+    """Remove all strokes and objects."""
+    root.objectgs.marked.clear()
+    _store(root, [])
+
+
+def _store(root: bpy.types.Collection, strokes: list[dict[str, Any]]) -> None:
+    root.objectgs.strokes = json.dumps(strokes)
+
+
+def _camera(root: bpy.types.Collection, view: View) -> dict[str, Any]:
+    """Return the camera of a view in capture coordinates."""
+    viewmat = view.viewmat @ scene.capture_to_world(root)
+    scale = float(np.cbrt(abs(np.linalg.det(viewmat[:3, :3])))) or 1.0
+    viewmat[:3] /= scale
+    fx, fy = view.fx, view.fy
+    if view.orthographic:
+        # A camera far behind the view sees nearly the same.
+        far = _FAR * view.width / (fx * scale)
+        viewmat[2, 3] += far
+        fx, fy = fx * scale * far, fy * scale * far
+    return {
+        "viewmat": viewmat.tolist(),
+        "intrinsics": [fx, fy, view.cx, view.cy],
+        "width": view.width,
+        "height": view.height,
+    }

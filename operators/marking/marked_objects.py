@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The list of marked objects, and their separation from the scene."""
+
+from pathlib import Path
+
+import bpy
+
+from ...backend.shared.errors import InputError
+from ...backend.shared.formats.json_file import write_json
+from ...backend.shared.reconstruction.folder import Reconstruction
+from ...objectgs_addon import scene
+from ...objectgs_addon.environment import locations
+from ...objectgs_addon.running import background, pointing
+from ...objectgs_addon.state import marks
+from ..common import need
+from ..common.reporting import reports_errors
+
+
+class _OfMarks:
+    """Base of operators on the list of marked objects."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return need.shown(cls, context)
+
+
+class AddMarkedObject(_OfMarks, bpy.types.Operator):
+    bl_idname = "objectgs.add_marked_object"
+    bl_label = "Next Object"
+    bl_description = "Begin the next object; further strokes mark it"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        marks.add_object(need.active_root(context))
+        pointing.redraw()
+        return {"FINISHED"}
+
+
+class RemoveMarkedObject(_OfMarks, bpy.types.Operator):
+    bl_idname = "objectgs.remove_marked_object"
+    bl_label = "Remove Marked Object"
+    bl_description = "Remove the active object of the list with its strokes"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return super().poll(context) and marks.active_object(need.active_root(context)) is not None
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        root = need.active_root(context)
+        marks.remove_object(root, root.objectgs.active_marked)
+        return {"FINISHED"}
+
+
+class ClearMarks(_OfMarks, bpy.types.Operator):
+    bl_idname = "objectgs.clear_marks"
+    bl_label = "Remove All Marks"
+    bl_description = "Remove all strokes and marked objects"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        marks.clear(need.active_root(context))
+        return {"FINISHED"}
+
+
+class SeparateMarked(_OfMarks, bpy.types.Operator):
+    bl_idname = "objectgs.separate_marked"
+    bl_label = "Separate Objects"
+    bl_description = (
+        "Give each marked object a collection of its own, and train the borders of the objects for half a minute. "
+        "Masks of the photos are made, too"
+    )
+    bl_options = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return need.work_on_capture(cls, context) and need.training(cls, context) and need.own_masks(cls, context)
+
+    @reports_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        root = need.active_root(context)
+        content = marks.content(root)
+        if not any(stroke["object"] for stroke in content["strokes"]):
+            raise InputError("No object is marked; draw over one with the tool Mark Object")
+        folder = scene.folder_of(root)
+        strokes: Path = Reconstruction(folder).strokes
+        write_json(strokes, content)
+        job = locations.backend_job(
+            f"Objects of {root.name}", "label", folder, "label", str(folder), "--strokes", str(strokes)
+        )
+        return background.submit(job, context.scene, self.report)
+
+
+CLASSES = (AddMarkedObject, RemoveMarkedObject, ClearMarks, SeparateMarked)

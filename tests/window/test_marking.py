@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Objects by strokes in a real window: a capture without masks is trained, marked, undone and separated."""
+
+import shutil
+import time
+
+import numpy as np
+import pytest
+
+from backend.capture import load_capture
+from backend.labels import vote
+
+from .test_splat_edits import trace
+from .test_workflow import IDLE, capture, next_step, script, wait  # noqa: F401
+
+MARKING = """
+from bl_ext.user_default.objectgs.objectgs_addon.running import pointing
+from bl_ext.user_default.objectgs.objectgs_addon.state import marks
+"""
+VASE, MONKEY, TABLE = 8, 6, 9
+"""IDs in the demo capture."""
+
+
+@pytest.fixture(scope="module")
+def centers(capture, tmp_path_factory):  # noqa: F811
+    """The centers of the demo's objects in the capture, from the masks that Blender does not get."""
+    labeled = load_capture(capture, tmp_path_factory.mktemp("cache"))
+    ids, xyz = vote(labeled).ids, labeled.points.xyz
+    return {object_id: np.median(xyz[ids == object_id], 0) for object_id in (VASE, MONKEY, TABLE)}
+
+
+@pytest.fixture(scope="module")
+def window(blender, capture):  # noqa: F811
+    """Blender with a short training of the capture without its masks, seen through its first camera."""
+    unlabeled, folder = blender.folder / "unlabeled", blender.folder / "unlabeled-splats"
+    shutil.copytree(capture, unlabeled, ignore=shutil.ignore_patterns("masks", "labels.json", "truth"))
+    blender.run(
+        script(f"""
+        with bpy.context.temp_override(**window_context()):
+            result = list(bpy.ops.objectgs.import_capture(
+                "EXEC_DEFAULT", directory={str(unlabeled)!r}, folder={str(folder)!r}))
+    """)
+    )
+    blender.run("window_context()['area'].spaces.active.show_region_ui = True")
+    wait(blender, f"owner.objectgs.active is not None and {IDLE}")
+    blender.run("""
+        for region in window_context()["area"].regions:
+            if region.type == "UI":
+                region.active_panel_category = "ObjectGS"
+    """)
+    blender.run(
+        script("""
+        root.objectgs.length, root.objectgs.minutes = "minutes", 0.2
+        call(bpy.ops.objectgs.train)
+    """)
+    )
+    wait(blender, f"scene.object_collections(root) and {IDLE}", 240)
+    return blender
+
+
+def asked(window, expression: str):
+    return window.run(script(MARKING + f"result = {expression}"))
+
+
+def settled(window) -> dict[int, int]:
+    """Return the number of splats of each marked object, when the strokes are answered."""
+    deadline = time.monotonic() + 120
+    while asked(window, "pointing.state() != (1.0, False)"):
+        assert time.monotonic() < deadline, "the strokes are not answered"
+        time.sleep(0.3)
+    found = asked(window, "{str(i): n for i, n in pointing.share_of_splats().items()}")
+    return {int(i): n for i, n in found.items()}
+
+
+def at(window, center) -> tuple[float, float]:
+    """Return the pixel of the screen, from the upper left, of a place in the capture."""
+    return tuple(
+        window.run(
+            script(f"""
+        from bpy_extras.view3d_utils import location_3d_to_region_2d
+        context = window_context()
+        place = scene.capture_to_world(root) @ [*{list(map(float, center))}, 1.0]
+        x, y = location_3d_to_region_2d(context["region"], context["area"].spaces.active.region_3d, place[:3])
+        result = [context["region"].x + x, context["window"].height - context["region"].y - y]
+    """)
+        )
+    )
+
+
+def draw_over(window, center) -> None:
+    x, y = at(window, center)
+    trace(window, [(x - 8, y), (x + 8, y)])
+
+
+def test_marking_is_the_step_after_a_training_without_masks(window):
+    assert next_step(window) == "objectgs.start_marking"
+    window.run(script("result = call(bpy.ops.objectgs.start_marking)"))
+    assert settled(window) == {0: asked(window, "len(pointing._session.keys)")}
+    tool = "bpy.context.workspace.tools.from_space_view3d_mode('OBJECT', create=False).idname"
+    assert asked(window, tool) == "objectgs.mark"
+    assert asked(window, "[item.name for item in root.objectgs.marked]") == ["Object 1"]
+
+
+def test_strokes_show_objects_at_once_and_are_undone(window, centers):
+    draw_over(window, centers[VASE])
+    first = settled(window)
+    assert first[1] > 20
+    window.key("Tab")
+    assert asked(window, "[item.name for item in root.objectgs.marked]") == ["Object 1", "Object 2"]
+    assert asked(window, "bpy.context.mode") == "OBJECT"
+    draw_over(window, centers[MONKEY])
+    both = settled(window)
+    assert both[2] > 20 and both[1] > 0.5 * first[1]
+    window.hold("ctrl")
+    draw_over(window, centers[TABLE])
+    window.release("ctrl")
+    settled(window)
+    assert asked(window, "[stroke['object'] for stroke in marks.strokes_of(root)]") == [1, 2, 0]
+    window.shot("marking")
+    window.key("ctrl+z")
+    wait(window, "len(__import__('json').loads(root.objectgs.strokes)) == 2")
+    window.key("ctrl+shift+z")
+    wait(window, "len(__import__('json').loads(root.objectgs.strokes)) == 3")
+
+
+def test_strokes_on_nothing_are_removed(window):
+    """Behind the scene, nothing was reconstructed; the other strokes stay."""
+    far = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -1e6], [0, 0, 0, 1]]
+    asked(
+        window,
+        "marks.add_stroke(root, 1, marks.View("
+        f"__import__('numpy').array({far}), 500.0, 500.0, 100.0, 100.0, 200, 200), [(100, 100)], False)",
+    )
+    settled(window)
+    wait(window, "len(__import__('json').loads(root.objectgs.strokes)) == 3")
+
+
+def test_marked_objects_get_collections_of_their_own(window, centers):
+    window.run(script("root.objectgs.marked[0].name = 'Vase'; call(bpy.ops.objectgs.separate_marked)"))
+    wait(window, f"len(root.objectgs.objects) == 2 and {IDLE}", 240)
+    names = window.run(script("result = [[item.name, item.splats] for item in root.objectgs.objects]"))
+    assert [name for name, _ in names] == ["Vase", "Object 2"] and all(splats > 20 for _, splats in names)
+    assert not asked(window, "pointing.is_active(root)")
+    collections = window.run(script("result = sorted(scene.object_collections(root))"))
+    assert {1, 2} <= set(collections)
+    window.shot("marked-and-separated")
+    # The strokes are kept, and further ones correct the result.
+    window.run(script("result = call(bpy.ops.objectgs.start_marking)"))
+    assert settled(window)[1] > 20
+    window.run(script("result = call(bpy.ops.objectgs.stop_marking)"))
+    assert not asked(window, "pointing.is_active(root)")
