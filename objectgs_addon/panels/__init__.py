@@ -8,9 +8,8 @@ from .edits import EditPanel, draw_context_menu
 from .export import ExportPanel
 from .help import HelpPanel
 from .jobs import JobsPanel, status_bar
-from .marking import MarkedList, MarkingPanel
 from .meshes import MeshesPanel
-from .objects import ObjectList, ObjectsPanel
+from .objects import MarkedList, MarkingPanel, ObjectList, ObjectsPanel
 from .placement import PlacementPanel
 from .render import FilmPanel, RenderPanel
 from .splats import AssignMenu, SplatsPanel

@@ -7,8 +7,7 @@ from typing import Any
 
 import bpy
 
-from ..state import marks
-from . import splats_tool
+from . import marks, splats_tool
 
 TOOL = "objectgs.mark"
 _MARK = "objectgs.mark_object"

@@ -19,8 +19,8 @@ from ...backend.shared.errors import InputError
 from .. import drawing, scene
 from ..blender import messages, writing
 from ..environment import locations
+from ..picking import marks
 from ..process.backend_process import BackendProcess
-from ..state import marks
 
 INTERVAL = 0.05
 """Time in seconds between two polls of the process."""

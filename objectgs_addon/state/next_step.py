@@ -10,6 +10,7 @@ import bpy
 from ...backend.shared.reconstruction.folder import STROKES
 from .. import scene
 from ..environment import known_folders, locations
+from ..picking import marks
 from . import folder_trust
 from .folder_state import FolderState
 
@@ -49,6 +50,12 @@ MARK = Step(
     "GREASEPENCIL",
     "Without masks, a stroke over each object separates it from the scene.",
 )
+SEPARATE = Step(
+    "objectgs.separate_marked",
+    "Separate Objects",
+    "CHECKMARK",
+    "The marked objects get collections of their own; their borders are trained for half a minute.",
+)
 MESHES = Step(
     "objectgs.extract_meshes", "Extract Meshes", "MESH_DATA", "Meshes are for physics, shadows and other programs."
 )
@@ -83,7 +90,7 @@ def next_step(root: bpy.types.Collection | None, owner: bpy.types.Scene) -> Step
     if not state.trained:
         return TRAIN if items or not has_masks(state) else ASSIGN
     if not items and can_mark(state):
-        return MARK
+        return SEPARATE if any(stroke["object"] for stroke in marks.strokes_of(root)) else MARK
     if items and not state.meshes and not any(item.cleaned for item in items):
         return CLEAN
     if state.steps and not state.meshes:

@@ -23,8 +23,9 @@ from ...backend.shared.defaults import MAX_SIZE
 from ...backend.shared.expectation import PRESET_STEPS
 from ...backend.shared.formats.splat_ply import UNOBSERVED
 from .. import drawing
+from ..picking import marks
 from ..scene import SHADINGS, SHOWS, is_linked, kind_of, shade_meshes, shading_of, show_kinds, shown_kinds
-from . import marks, object_edits, viewports
+from . import object_edits, viewports
 
 
 def _slider(name: str, default: float, least: float, most: float, description: str) -> Any:

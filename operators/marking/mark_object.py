@@ -4,9 +4,8 @@
 import bpy
 from bpy.props import BoolProperty
 
-from ...objectgs_addon.picking import hit_test, marking_tool
+from ...objectgs_addon.picking import hit_test, marking_tool, marks
 from ...objectgs_addon.running import pointing
-from ...objectgs_addon.state import marks
 from ..common import need
 from ..common.path import FollowsMouse, Points, rectangle
 from ..common.reporting import reports_errors

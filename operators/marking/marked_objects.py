@@ -10,8 +10,8 @@ from ...backend.shared.formats.json_file import write_json
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...objectgs_addon import scene
 from ...objectgs_addon.environment import locations
+from ...objectgs_addon.picking import marks
 from ...objectgs_addon.running import background, pointing
-from ...objectgs_addon.state import marks
 from ..common import need
 from ..common.reporting import reports_errors
 

@@ -11,7 +11,7 @@ bpy = pytest.importorskip("bpy")
 
 from objectgs.backend.shared.reconstruction.objects import read_objects
 from objectgs.objectgs_addon import scene
-from objectgs.objectgs_addon.panels.objects import describe
+from objectgs.objectgs_addon.panels.objects.panel import describe
 from objectgs.objectgs_addon.picking import selection
 from objectgs.objectgs_addon.state import object_list, visibility
 

@@ -15,7 +15,7 @@ from .test_workflow import IDLE, capture, next_step, script, wait  # noqa: F401
 
 MARKING = """
 from bl_ext.user_default.objectgs.objectgs_addon.running import pointing
-from bl_ext.user_default.objectgs.objectgs_addon.state import marks
+from bl_ext.user_default.objectgs.objectgs_addon.picking import marks
 """
 VASE, MONKEY, TABLE = 8, 6, 9
 """IDs in the demo capture."""

@@ -7,11 +7,12 @@ from typing import Any
 
 import bpy
 
-from ..running import background, pointing
-from ..running.job_display import write
-from ..state import folder_trust, marks
-from ..state.next_step import can_mark
-from .tab import WithReconstruction, draw_job_of
+from ...picking import marks
+from ...running import background, pointing
+from ...running.job_display import write
+from ...state import folder_trust
+from ...state.next_step import can_mark
+from ..tab import WithReconstruction, draw_job_of
 
 
 class MarkedList(bpy.types.UIList):

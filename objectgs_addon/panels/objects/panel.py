@@ -7,12 +7,12 @@ from typing import Any
 
 import bpy
 
-from .. import scene
-from ..running import background
-from ..running.job_display import write
-from ..state import folder_trust, visibility
-from ..state.next_step import has_masks
-from .tab import WithReconstruction, draw_job_of, draw_without_objects
+from ... import scene
+from ...running import background
+from ...running.job_display import write
+from ...state import folder_trust, visibility
+from ...state.next_step import has_masks
+from ..tab import WithReconstruction, draw_job_of, draw_without_objects
 
 
 class ObjectList(bpy.types.UIList):
