@@ -36,9 +36,11 @@ COLOR, CONCAVE, GAP, PHOTO_EDGE, LEAST = 0.7, 8.0, 1 / 3, 0.25, 1e-4
 of the distance in units of the local spacing, and of a tenth of the largest CIELAB step in the photos. The weight of an
 edge is exp(-sum of the squares), but at least the last value."""
 
-PRIOR, SIMILAR, NOTHING = 1e-3, 4.0, 1e-3
-"""Weight of the colors of the strokes, the CIELAB distance at which a color hardly counts as one of these, and the
-weight of belonging to no object, unless everything belongs to one."""
+PRIOR, SIMILAR = 1e-3, 4.0
+"""Weight of the colors of the strokes, and the CIELAB distance at which a color hardly counts as one of these."""
+
+NOTHING = 2e-4
+"""Weight of belonging to no object, relative to all edges of a node, unless everything belongs to one."""
 
 SEEDED = 0.8
 """The splats that make up this part of what a stroke shows are its seeds; the rest shines through from behind."""
@@ -113,7 +115,7 @@ class SplatGraph:
         labels = _seed_labels(np.stack([seeds.get(object_id, nothing)[self.nodes] for object_id in objects.tolist()]))
         prior = PRIOR * self._prior(labels, len(objects))
         if not everything:
-            prior[:, 0] += NOTHING
+            prior[:, 0] += NOTHING * np.asarray(self.weights.sum(axis=1)).ravel()
         start = None
         if before is not None:
             start = np.zeros_like(prior)
