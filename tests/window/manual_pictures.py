@@ -212,6 +212,46 @@ def editing(window: Window) -> None:
     window.do("bpy.ops.object.select_all(action='DESELECT')")
 
 
+def marking(window: Window) -> None:
+    """Save two marked objects of the demo, as if it had no masks, and the stroke on the next one."""
+    blender, spots = window.blender, {}
+    view(blender, 1.1)
+    for name in ("monkey", "vase", "ring"):
+        spots[name] = window.spot(name)
+    folder, capture = window.folder.parent / "marked", window.folder.parent / "unlabeled"
+    shutil.copytree(window.demo / "capture", capture, ignore=shutil.ignore_patterns("masks", "labels.json", "truth"))
+    shutil.copytree(window.demo, folder, ignore=shutil.ignore_patterns("capture", "cache", "meshes", "*.blend", "film"))
+    for name in ("objectgs.json", "cameras.json"):
+        path = folder / name
+        path.write_text(path.read_text().replace(str(window.demo / "capture"), str(capture)))
+    (folder / "objects.json").unlink()
+    before = blender.run(script("result = root.name"))
+    window.do(f"bpy.data.collections[{before!r}].hide_viewport = True")
+    screenshots.open_demo(blender, folder)
+    window.panels("MarkingPanel")
+    view(blender, 1.1)
+    window.do("call(bpy.ops.objectgs.start_marking)")
+    pointing = f"sys.modules['{harness.PACKAGE}.objectgs_addon.running.pointing'].state()"
+    for name in ("monkey", "vase"):
+        wait(blender, f"{pointing} == (1.0, False)")
+        x, y = spots[name]
+        blender.drag((x - 25, y - 30), (x + 25, y + 30))
+        blender.key("Tab")
+    wait(blender, f"{pointing} == (1.0, False)")
+    x, y = spots["ring"]
+    blender.move(x - 30, y - 45)
+    blender._tool("xdotool", "mousedown", "1")
+    blender.move(x + 30, y - 45)
+    window.save("mark", mouse=True)
+    blender._tool("xdotool", "mouseup", "1")
+    window.do(f"""
+    call(bpy.ops.objectgs.stop_marking)
+    bpy.data.collections.remove(root)
+    owner.objectgs.active = bpy.data.collections[{before!r}]
+    owner.objectgs.active.hide_viewport = False
+    """)
+
+
 def splats(window: Window) -> None:
     """Save single splats that are selected with the lasso, and a crop box."""
     blender = window.blender
@@ -318,6 +358,7 @@ def from_capture(window: Window) -> None:
 PARTS = {
     "view": viewing,
     "meshes": meshes,
+    "mark": marking,
     "edit": editing,
     "splats": splats,
     "render": rendering,
