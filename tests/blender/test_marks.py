@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Strokes on objects: their cameras in the capture, the list of marked objects, undo, and the drawn colors."""
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from mathutils import Matrix
+from objectgs.backend.shared.formats.ply import write_vertices
+from objectgs.backend.shared.splats.picking import View
+from objectgs.objectgs_addon import drawing
+from objectgs.objectgs_addon import scene as blender_scene
+from objectgs.objectgs_addon.drawing import splat_arrays
+from objectgs.objectgs_addon.drawing.gather import gather, placed_parts
+from objectgs.objectgs_addon.picking import marks
+from objectgs.objectgs_addon.scene import kinds
+
+import headless
+
+from .building import OBJECTS, look_at, splat_table, write_cameras, write_folder
+
+ORIGIN = np.array([100.0, -200.0, 30.0])
+PLACE = ORIGIN + np.array([0.1, -0.3, 0.2])
+"""A place in the capture."""
+
+
+@pytest.fixture
+def root(fresh, tmp_path, backend_python, monkeypatch):
+    """A turned reconstruction far from the origin with 200 splats, whose parent was moved and scaled."""
+    folder = write_folder(tmp_path / "table top")
+    upright = np.eye(4)
+    upright[:3, :3] = np.array(Matrix.Rotation(0.7, 3, "X")) @ np.array(Matrix.Rotation(0.3, 3, "Z"))
+    write_cameras(folder, [look_at(ORIGIN + np.array([3, 0, 1]), ORIGIN)], origin=ORIGIN, upright=upright)
+    splats = splat_table(np.resize([0, *OBJECTS], 200), degree=1)
+    for axis, name in enumerate("xyz"):
+        splats[name] += ORIGIN[axis]
+    write_vertices(folder / "splats.ply", splats)
+    monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
+    extension = headless.extension()
+    extension.register()
+    bpy.ops.objectgs.open_reconstruction(directory=str(folder))
+    found = bpy.context.scene.objectgs.active
+    parent = kinds.parent_of(found)
+    parent.scale = (2.5, 2.5, 2.5)
+    parent.location = (4.0, 5.0, 6.0)
+    bpy.context.view_layer.update()
+    yield found
+    extension.unregister()
+
+
+def world_of(root) -> np.ndarray:
+    return (blender_scene.capture_to_world(root) @ [*PLACE, 1.0])[:3]
+
+
+def views(root) -> list[View]:
+    """Return a perspective and an orthographic view of the place."""
+    at = world_of(root)
+    viewmat = np.array(look_at(at + np.array([6.0, 2.0, 3.0]), at + np.array([0.4, 0.3, 0.0])))
+    return [
+        View(viewmat, 700.0, 720.0, 410.0, 290.0, 800, 600),
+        View(viewmat, 90.0, 95.0, 410.0, 290.0, 800, 600, orthographic=True),
+    ]
+
+
+def pixel(view: View, place: np.ndarray) -> np.ndarray:
+    x, y, z = (view.viewmat @ [*place, 1.0])[:3]
+    z = 1.0 if view.orthographic else z
+    return np.array([view.fx * x / z + view.cx, view.fy * y / z + view.cy])
+
+
+def test_cameras_of_strokes_see_the_capture_as_the_view_sees_the_world(root):
+    for view in views(root):
+        marks.add_stroke(root, 1, view, [(10.0, 20.0), (400.0, 300.0)], area=False)
+        stroke = marks.strokes_of(root)[-1]
+        assert stroke["points"] == [[10 / 800, round(20 / 600, 5)], [0.5, 0.5]]
+        camera = stroke["camera"]
+        viewmat = np.array(camera["viewmat"])
+        assert np.allclose(viewmat[:3, :3] @ viewmat[:3, :3].T, np.eye(3), atol=1e-5)
+        x, y, z = (viewmat @ [*PLACE, 1.0])[:3]
+        fx, fy, cx, cy = camera["intrinsics"]
+        assert z > 0
+        assert np.allclose([fx * x / z + cx, fy * y / z + cy], pixel(view, world_of(root)), atol=0.1)
+        assert (camera["width"], camera["height"]) == (800, 600)
+
+
+def test_objects_are_added_and_removed_with_their_strokes(root):
+    view = views(root)[0]
+    root.objectgs.objects.clear()
+    first = marks.add_object(root)
+    assert (first.object_id, first.name) == (1, "Object 1")
+    assert marks.add_object(root).object_id == 1, "an object without strokes is used first"
+    marks.add_stroke(root, 1, view, [(1, 1)], area=False)
+    second = marks.add_object(root)
+    assert second.object_id == 2 and root.objectgs.active_marked == 1
+    marks.add_stroke(root, 2, view, [(1, 1), (9, 1), (9, 9)], area=True)
+    marks.add_stroke(root, marks.NOTHING, view, [(900, -5)], area=False)
+    root.objectgs.marked[1].name = "can"
+    content = marks.content(root)
+    assert content["objects"] == {"1": "Object 1", "2": "can"} and content["everything"] is False
+    assert [stroke["object"] for stroke in content["strokes"]] == [1, 2, 0]
+    assert content["strokes"][1]["area"] is True
+    assert content["strokes"][2]["points"] == [[1.0, 0.0]], "outside of the view"
+    marks.remove_object(root, 0)
+    assert [stroke["object"] for stroke in marks.strokes_of(root)] == [2, 0]
+    assert marks.active_object(root).name == "can"
+    marks.remove_stroke(root, 2)
+    marks.remove_stroke(root, 7)
+    assert [stroke["object"] for stroke in marks.strokes_of(root)] == [2]
+    root.objectgs.strokes = "{"
+    assert marks.strokes_of(root) == []
+
+
+def test_ids_of_marked_objects_are_free(root):
+    root.objectgs.objects.clear()
+    for object_id in (1, 2, 4):
+        root.objectgs.objects.add().object_id = object_id
+    assert marks.add_object(root).object_id == 3
+
+
+def test_strokes_are_kept_in_the_file(root, tmp_path):
+    marks.add_object(root)
+    marks.add_stroke(root, 1, views(root)[0], [(1, 1)], area=False)
+    before = marks.content(root)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    marks.clear(root)
+    assert not root.objectgs.marked and not marks.strokes_of(root)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    assert marks.content(bpy.context.scene.objectgs.active) == before
+
+
+def test_labels_color_visible_splats(root):
+    """Labels are numbers of colors; hidden splats have none, and clearing them restores the splats' own colors."""
+    parts = [part for part in root.all_objects if blender_scene.kind_of(part) == "splats"]
+    mesh = max(parts, key=lambda part: len(part.data.vertices)).data
+    labels = np.arange(len(mesh.vertices)) % 3
+    drawing.show_labels({mesh: labels}, np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
+    arrays = splat_arrays.arrays_of(mesh)
+    shown = labels if arrays.vertices is None else labels[arrays.vertices]
+    drawn = gather(placed_parts(bpy.context.view_layer))
+    with_labels = [obj for obj in drawn if obj.labels is not None]
+    assert len(with_labels) == 1 and np.array_equal(with_labels[0].labels.of_splats, shown)
+    assert with_labels[0].slots == 3 and all(obj.slots == 1 for obj in drawn if obj.labels is None)
+    drawing.show_labels({}, np.zeros((0, 3)))
+    assert all(obj.labels is None for obj in gather(placed_parts(bpy.context.view_layer)))
+
+
+def test_marking_needs_a_training(root):
+    folder = Path(blender_scene.folder_of(root))
+    with pytest.raises(RuntimeError, match="train first"):
+        bpy.ops.objectgs.separate_marked()
+    assert not (folder / "strokes.json").exists()
