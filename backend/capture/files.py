@@ -24,6 +24,8 @@ from ..shared.formats.regular_file import open_regular, read_regular, require_re
 
 MASK_SUFFIXES = (".png", ".npy", ".npz", ".tif", ".tiff", ".bmp")
 LOSSY_SUFFIXES = (".jpg", ".jpeg")
+_MASK_WORDS = ("mask", "seg", "id")
+"""Words that the names of masks may have before or after that of the photo, as in `photo_mask.png`."""
 _OPENING_ERRORS = (OSError, ValueError, SyntaxError, EOFError, MemoryError, PilImage.DecompressionBombError)
 
 
@@ -74,9 +76,13 @@ def _folded(name: str, level: int) -> str:
 
 def mask_names(image_name: str) -> tuple[list[str], list[str]]:
     """Return the names that an image's mask may have below masks/: accepted ones, and lossy ones that are refused."""
-    stem = re.sub(r"\.[^./\\]*$", "", image_name)
-    accepted = [image_name + suffix for suffix in MASK_SUFFIXES] + [stem + suffix for suffix in MASK_SUFFIXES]
-    return accepted, [name + suffix for name in (image_name, stem) for suffix in LOSSY_SUFFIXES]
+    place, name = re.fullmatch(r"(.*[/\\])?([^/\\]*)", image_name).groups()  # type: ignore[union-attr]
+    stem = re.sub(r"\.[^.]*$", "", name)
+    found = [name, stem, *(f"{stem}_{word}" for word in _MASK_WORDS), *(f"{word}_{stem}" for word in _MASK_WORDS)]
+    found = [(place or "") + each for each in found]
+    return [each + suffix for each in found for suffix in MASK_SUFFIXES], [
+        each + suffix for each in found for suffix in LOSSY_SUFFIXES
+    ]
 
 
 # Images

@@ -16,7 +16,7 @@ from PIL import Image
 from backend.capture import check_capture, load_capture
 from backend.capture.capture import HOLDOUT_EVERY
 from backend.capture.colmap import CAMERA_MODELS, Camera, read_model
-from backend.capture.files import read_mask
+from backend.capture.files import mask_names, read_mask
 from backend.capture.undistort import distort, pinhole_for, source_pixels, to_pycolmap
 from backend.commands.folder import digest
 from backend.shared.errors import InputError
@@ -1038,3 +1038,12 @@ def test_edited_capture_maps_left_out_ids_to_0(write_capture, tmp_path):
         np.testing.assert_array_equal(edited.mask(index), np.where(ids == 2, 0, ids))
         assert edited.ids_in(index) == tuple(np.unique(edited.mask(index)).tolist())
         assert edited.image(index) is capture.image(index), "decoded once"
+
+
+@pytest.mark.parametrize("form", ["{}.png", "{}.jpg.png", "{}_mask.png", "mask_{}.png", "{}_seg.npy"])
+@pytest.mark.parametrize("folder", ["", "left/"])
+def test_masks_have_one_of_the_usual_names(form, folder):
+    accepted, lossy = mask_names(f"{folder}photo.1.jpg")
+    assert folder + form.format("photo.1") in accepted
+    assert folder + "photo.1_mask.jpg" in lossy and not set(accepted) & set(lossy)
+    assert accepted[0] == f"{folder}photo.1.jpg.png", "the exact name comes first"
