@@ -45,7 +45,7 @@ class _Session:
         if not self.ready:
             return
         if not content["strokes"]:
-            self.classes = np.zeros(len(self.keys), np.int64)
+            self.objects, self.classes = np.zeros(1, np.int64), np.zeros(len(self.keys), np.int64)
             self.asked = self.answered = self.asked + 1
             return
         self.asked += 1
@@ -53,6 +53,13 @@ class _Session:
 
     def take(self, event: dict[str, Any]) -> int | None:
         """Process an event; return the number of a stroke that shows no splats."""
+        try:
+            return self._take(event)
+        except (KeyError, TypeError, ValueError, IndexError, zlib.error) as error:
+            self.failure = f"the backend's answer is not valid ({error!r})"
+            return None
+
+    def _take(self, event: dict[str, Any]) -> int | None:
         kind = event["type"]
         if kind == "progress":
             self.progress = float(event.get("done") or 0.0) / float(event.get("total") or 1.0)
@@ -68,7 +75,8 @@ class _Session:
             if "problem" in event:
                 self.answered = self.asked
                 messages.show(str(event["problem"]), "ERROR")
-                return event.get("stroke")
+                number = event.get("stroke")
+                return number if isinstance(number, int) else None
             self._take_classes(event)
         return None
 
@@ -77,10 +85,11 @@ class _Session:
             self._parts = []
         data = zlib.decompress(base64.b64decode(event["classes"]))
         self._parts.append(np.frombuffer(data, event["kind"]).astype(np.int64))
-        if sum(map(len, self._parts)) == len(self.keys):
-            self.objects = np.array(event["objects"], np.int64)
-            self.classes = np.concatenate(self._parts)
-            self.answered = self.asked
+        if sum(map(len, self._parts)) >= len(self.keys):
+            objects, classes = np.array(event["objects"], np.int64), np.concatenate(self._parts)
+            if len(classes) != len(self.keys) or classes.max(initial=0) >= len(objects):
+                raise ValueError("its objects are not those of the splats")
+            self.objects, self.classes, self.answered = objects, classes, self.asked
 
 
 _session: _Session | None = None

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Strokes on objects: their cameras in the capture, the list of marked objects, undo, and the drawn colors."""
 
+import base64
+import json
+import zlib
 from pathlib import Path
 
 import bpy
@@ -14,6 +17,7 @@ from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.drawing import splat_arrays
 from objectgs.objectgs_addon.drawing.gather import gather, placed_parts
 from objectgs.objectgs_addon.picking import marks
+from objectgs.objectgs_addon.running import pointing
 from objectgs.objectgs_addon.scene import kinds
 
 import headless
@@ -150,3 +154,73 @@ def test_marking_needs_a_training(root):
     with pytest.raises(RuntimeError, match="train first"):
         bpy.ops.objectgs.separate_marked()
     assert not (folder / "strokes.json").exists()
+
+
+class _Process:
+    """Stands in for the backend's process."""
+
+    def __init__(self, *_, **__):
+        self.sent: list[dict] = []
+
+    def send(self, line: str) -> bool:
+        self.sent.append(json.loads(line))
+        return True
+
+    def kill(self) -> None: ...
+
+
+@pytest.fixture
+def session(root, monkeypatch):
+    monkeypatch.setattr(pointing, "BackendProcess", _Process)
+    pointing.start(root)
+    yield pointing._session
+    pointing.stop()
+
+
+def answer(session, objects, classes, /, **other):
+    packed = base64.b64encode(zlib.compress(np.array(classes, "u1").tobytes())).decode()
+    event = {"type": "answer", "request": session.asked, "objects": objects, "kind": "u1", "first": 0}
+    return session.take({**event, "classes": packed, **other})
+
+
+def test_answers_are_shown_and_end_with_the_strokes(root, session):
+    count = len(session.keys)
+    assert session.take({"type": "answer", "ready": True, "splats": count}) is None and session.ready
+    marks.add_object(root)
+    marks.add_stroke(root, 3, views(root)[0], [(1, 1)], area=False)
+    assert session.process.sent[-1]["request"] == session.asked == 1
+    answer(session, [3], [0] * count)
+    assert pointing.share_of_splats() == {3: count} and pointing.state() == (1.0, False)
+    marks.clear(root)
+    assert pointing.share_of_splats() == {0: count} and not pointing.state()[1]
+
+
+def test_answers_to_earlier_strokes_are_ignored(root, session):
+    session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
+    for _ in range(2):
+        marks.add_stroke(root, 3, views(root)[0], [(1, 1)], area=False)
+    answer(session, [3], [0] * len(session.keys), request=1)
+    assert pointing.state()[1] and pointing.share_of_splats() == {0: len(session.keys)}
+    assert session.take({"type": "answer", "request": 2, "problem": "Stroke 2 shows no splats", "stroke": 2}) == 2
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"classes": "?"}, {"classes": base64.b64encode(b"no zlib").decode()}, {"kind": "nonsense"}, {"objects": []},
+        {"objects": "x"}, {"objects": None},
+    ],
+)  # fmt: skip
+def test_invalid_answers_end_the_process_with_a_sentence(root, session, change):
+    session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
+    marks.add_stroke(root, 3, views(root)[0], [(1, 1)], area=False)
+    answer(session, [3], [0] * len(session.keys), **change)
+    assert "not valid" in session.failure
+    session.failure = ""
+    answer(session, [3], [0] * (len(session.keys) + 1))
+    assert "not valid" in session.failure
+
+
+def test_splats_of_another_training_are_refused(session):
+    session.take({"type": "answer", "ready": True, "splats": 7})
+    assert not session.ready and "train again" in session.failure

@@ -26,7 +26,7 @@ _WAIT = 0.2
 """Interval in seconds at which a stop is noticed."""
 
 _AT_ONCE = 500_000
-"""Number of splats in an answer, whose lines are limited."""
+"""Number of bytes for the splats in one line of an answer, since the length of lines is limited."""
 
 
 def point(options: argparse.Namespace, reporter: StoppingReporter) -> None:
@@ -56,8 +56,9 @@ def point(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             continue
         objects, classes = np.unique(ids, return_inverse=True)
         kind = "u1" if len(objects) <= 256 else "<u4"
-        for first in range(0, max(len(ids), 1), _AT_ONCE):
-            part = np.ascontiguousarray(classes[first : first + _AT_ONCE], kind).tobytes()
+        step = _AT_ONCE // np.dtype(kind).itemsize
+        for first in range(0, max(len(ids), 1), step):
+            part = np.ascontiguousarray(classes[first : first + step], kind).tobytes()
             reporter.answer(
                 request=request, objects=objects.tolist(), kind=kind, first=first, splats=len(ids),
                 classes=base64.b64encode(zlib.compress(part, 1)).decode(),
