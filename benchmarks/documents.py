@@ -31,6 +31,7 @@ MADE_FROM_FIGURES = {
     "length": "benchmarks.length:document",
     "mask-noise": "benchmarks.mask_noise:document",
     "objects": "benchmarks.objects:document",
+    "pointing": "benchmarks.pointing:document",
     "reliability": "tests.fuzz.report:document",
     "stability": "benchmarks.stability:document",
     "suite": "benchmarks.suite:document",

@@ -1,11 +1,14 @@
 """Objects from strokes: held-out mIoU over the number of photos with strokes, with the true masks as the user.
 
-    python benchmarks/pointing.py [--photos 1 2 3] [--minutes 2.4] [--capture build/demo/capture]
+    python benchmarks/pointing.py [--photos 1 2 3] [--minutes 2.4] [--seeds 1] [--capture NAME ...]
+    python benchmarks/pointing.py --write
 
-The capture is trained without its masks. In each of the photos, one stroke then marks each object that shows there:
-along the row through the middle of the object's largest inscribed circle, without a fifth at both ends. If the masks
-leave pixels unlabeled, one such stroke in one photo marks them, too. `label` separates the objects, and the IDs of its
-renders are compared with the true masks of the held-out views.
+Captures are the demo (`make demo`), and the real tabletop of ../shared/data if it is there. Each is trained without its
+masks. In each of the photos, one stroke then marks each object that shows there: along the row through the middle of
+the object's largest inscribed circle, without a fifth at both ends. If the masks leave pixels unlabeled, one such
+stroke in one photo marks them, too. `label` separates the objects, and the IDs of its renders are compared with the
+true masks of the held-out views. --write saves the figures of two seeds to docs/figures/pointing.json and the table to
+docs/pointing.md.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +35,12 @@ from backend.evaluation.metrics import IdScores, psnr
 from backend.model.draw import draw
 from backend.training.scene import Scene
 from backend.training.state import load_model
+from benchmarks import documents, shared
 
+CAPTURES = {
+    "demo": ROOT / "build" / "demo" / "capture",
+    "tabletop": ROOT.parent / "shared" / "data" / "tabletop",
+}
 SMALLEST = 30
 """Number of pixels below which an object is not marked in a photo."""
 
@@ -92,32 +101,86 @@ def run(*words: object) -> float:
     return time.monotonic() - started
 
 
-def main() -> None:
-    """Print a row for each number of photos."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--photos", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--minutes", type=float, default=2.4)
-    parser.add_argument("--capture", type=Path, default=ROOT / "build/demo/capture")
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as scratch:
-        truth = load_capture(options.capture.resolve(), Path(scratch) / "cache")
-        capture = Path(scratch) / "capture"
-        shutil.copytree(options.capture, capture, ignore=shutil.ignore_patterns("masks", "labels.json", "objects.json"))
-        unlabeled = Path(scratch) / "unlabeled"
-        run("train", capture, "--out", unlabeled, "--minutes", options.minutes)
-        for photos in options.photos:
-            file, out = Path(scratch) / "strokes.json", Path(scratch) / f"labeled-{photos}"
-            file.write_text(json.dumps(strokes_of(truth, photos)))
+def measured(folder: Path, photos: Sequence[int], minutes: float, seed: int) -> dict[str, Any]:
+    """Train a capture without its masks, and return the scores by the number of photos with strokes."""
+    rows: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as place:
+        scratch = Path(place)
+        truth = load_capture(folder, scratch / "cache")
+        capture, unlabeled = scratch / "capture", scratch / "unlabeled"
+        shutil.copytree(folder, capture, ignore=shutil.ignore_patterns("masks", "labels.json", "objects.json"))
+        run("train", capture, "--out", unlabeled, "--minutes", minutes, "--seed", seed)
+        rows["0"] = {"psnr": scores(unlabeled / "checkpoint", truth)["psnr"]}
+        for count in photos:
+            file, out = scratch / "strokes.json", scratch / f"labeled-{count}"
+            file.write_text(json.dumps(strokes_of(truth, count)))
             shutil.rmtree(capture / "masks", ignore_errors=True)
             (capture / "labels.json").unlink(missing_ok=True)
             shutil.copytree(unlabeled, out)
             seconds = run("label", out, "--strokes", file)
-            found = scores(out / "checkpoint", truth)
-            print(
-                f"{photos} photos: mIoU {found['miou']:.4f}, with unlabeled {found['miou_all']:.4f}, "
-                f"PSNR {found['psnr']:.2f} dB; {seconds:.0f} s",
-                flush=True,
+            rows[str(count)] = {**scores(out / "checkpoint", truth), "seconds": seconds}
+    return rows
+
+
+def document(found: Mapping[str, Any]) -> str:
+    """Return the text of docs/pointing.md."""
+    lines = [
+        "# Objects by strokes",
+        "",
+        "Made by `python benchmarks/pointing.py --write`: captures are trained without their masks, and one stroke "
+        "marks each object that shows in one, two or three photos. If the masks leave pixels unlabeled, one stroke in "
+        "one photo marks what is there. No stroke corrects the result, as a person would. *mIoU* is that of the "
+        "renders' IDs with the true masks of held-out views, over labeled pixels and over all; *PSNR* is that of "
+        "held-out views, before and after. *Seconds* are those of the command `label` on two cores of a server CPU, "
+        f"its training of borders included. Means over {found['seeds']} seeds ± standard deviation.",
+        "",
+    ]
+    rows = []
+    for name, seeds in found["captures"].items():
+        for count in sorted(set(seeds[0]) - {"0"}):
+            cells = [
+                shared.spread([seed[count][key] for seed in seeds], form)
+                for key, form in (("miou", "{:.3f}"), ("miou_all", "{:.3f}"))
+            ]
+            before, after = (shared.spread([seed[of]["psnr"] for seed in seeds], "{:.2f}") for of in ("0", count))
+            seconds = shared.spread([seed[count]["seconds"] for seed in seeds], "{:.0f}")
+            rows.append((name, count, *cells, before, after, seconds))
+    head = ("capture", "photos with strokes", "mIoU", "with unlabeled", "PSNR before, dB", "after, dB", "seconds")
+    return "\n".join([*lines, *shared.table(head, rows)]) + "\n"
+
+
+def main() -> None:
+    """Measure, and print or write the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--photos", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("--minutes", type=float, default=2.4)
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--capture", nargs="+", choices=CAPTURES, default=list(CAPTURES))
+    parser.add_argument("--write", action="store_true", help="all captures and two seeds, for the document")
+    options = parser.parse_args()
+    seeds = 2 if options.write else options.seeds
+    folders = {name: CAPTURES[name] for name in (CAPTURES if options.write else options.capture)}
+    folders = {name: folder for name, folder in folders.items() if folder.is_dir()}
+    shared.compile_everything()
+    results = shared.Results(
+        ROOT / "build" / "pointing-results",
+        shared.digest(shared.sources(), options.photos, options.minutes), len(folders) * seeds,
+    )  # fmt: skip
+    found: dict[str, Any] = {"seeds": seeds, "captures": {}}
+    for name, folder in folders.items():
+        found["captures"][name] = [
+            results.get(
+                f"{name}, seed {seed}",
+                lambda folder=folder, seed=seed: measured(folder, options.photos, options.minutes, seed),
+                lambda rows: ", ".join(f"{n} photos {row['miou']:.4f}" for n, row in rows.items() if n != "0"),
             )
+            for seed in range(seeds)
+        ]
+    if results.failures:
+        sys.exit("\n".join(f"{name}: {why}" for name, why in results.failures.items()))
+    if options.write:
+        documents.save("pointing", found)
+    print(document(found))
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from ..exported import EXPORT, export_model
 from ..folder import READ, Trained, memory_for_files, memory_for_planes, open_trained, plan_of
 from ..planning import build_context, find_requested_objects
 from ..setup.kernels import PART as KERNELS
-from ..setup.kernels import kernel_seconds
+from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import finish_stage, stage
 from ..votes import cast_votes, votes_key
 from .point import GRAPH, require_explicit
@@ -45,8 +45,7 @@ def label(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     reporter.expect(
         {
             READ: ("Preparing", 5.0), KERNELS: ("Preparing", 0.0), GRAPH: ("Preparing", 5.0),
-            _MASKS: ("Making masks", 5.0), _TRAIN: ("Training", 25.0),
-            EXPORT: ("Saving", 5.0),
+            _MASKS: ("Making masks", 5.0), _TRAIN: ("Training", 25.0), EXPORT: ("Saving", 5.0),
         }
     )  # fmt: skip
     trained = open_trained(options, reporter)
@@ -54,10 +53,10 @@ def label(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     require_explicit(trained)
     _require_own_masks(capture)
     strokes = read_strokes(options.strokes, [view.name for view in capture.views])
+    device = trained.model.device
+    reporter.expect({KERNELS: ("Preparing", kernel_seconds(device)), _TRAIN: ("Training", _seconds(trained))})
+    ensure_kernels(reporter, device)
     with locked(trained.folder.folder):
-        reporter.expect(
-            {KERNELS: ("Preparing", kernel_seconds(trained.model.device)), _TRAIN: ("Training", _seconds(trained))}
-        )
         reporter.begin(GRAPH, "Comparing the splats with their neighbors")
         with stage(trained.folder, "label"):
             pointer = Pointer(trained.model, trained.scene, reporter.progress)
@@ -74,7 +73,7 @@ def label(options: argparse.Namespace, reporter: StoppingReporter) -> None:
 
 
 def _require_own_masks(capture: Capture) -> None:
-    """Raise InputError if the capture has masks or names that no strokes were made to."""
+    """Raise InputError if the capture has masks or names that were not made of strokes."""
     folder = capture.folder / "masks"
     own = (folder / STROKES).is_file()
     for path in (folder, capture.folder / "labels.json"):
