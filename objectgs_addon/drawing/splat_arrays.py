@@ -50,7 +50,7 @@ class Labels:
     """Colors in which single splats are drawn instead of their own.
 
     Attributes:
-        of_splats: (N,) int64, for each visible splat 0, or the number of its color, from 1.
+        of_splats: (N,) int64, for each splat 0, or the number of its color, from 1.
         colors: (L, 3) sRGB-encoded.
     """
 
@@ -60,6 +60,9 @@ class Labels:
 
 _held: dict[int, SplatArrays] = {}
 _labels: dict[int, Labels] = {}
+"""Session UID of a mesh -> the labels of all its splats."""
+_visible_labels: dict[int, tuple[SplatArrays, Labels]] = {}
+"""Session UID of a mesh -> its visible splats, and their labels."""
 _selected: dict[int, np.ndarray | None] = {}
 
 
@@ -99,8 +102,17 @@ def splats_changed(mesh: bpy.types.Mesh) -> None:
 
 
 def labels_of(mesh: bpy.types.Mesh) -> Labels | None:
-    """Return the labels that `show_labels` has set for a mesh; None if there are none."""
-    return _labels.get(mesh.session_uid)
+    """Return the labels of a mesh's visible splats, as `show_labels` has set them; None if there are none."""
+    labels, arrays = _labels.get(mesh.session_uid), arrays_of(mesh)
+    if labels is None or arrays is None:
+        return None
+    known = _visible_labels.get(mesh.session_uid)
+    if known is None or known[0] is not arrays:
+        if len(labels.of_splats) != len(mesh.vertices):
+            return None  # The mesh has other splats since.
+        own = labels.of_splats if arrays.vertices is None else labels.of_splats[arrays.vertices]
+        known = _visible_labels[mesh.session_uid] = arrays, Labels(own, labels.colors)
+    return known[1]
 
 
 def show_labels(labels: dict[bpy.types.Mesh, np.ndarray], colors: np.ndarray) -> None:
@@ -111,11 +123,8 @@ def show_labels(labels: dict[bpy.types.Mesh, np.ndarray], colors: np.ndarray) ->
         colors: (L, 3) sRGB-encoded.
     """
     _labels.clear()
-    for mesh, of_splats in labels.items():
-        arrays = arrays_of(mesh)
-        if arrays is not None:
-            visible = of_splats if arrays.vertices is None else of_splats[arrays.vertices]
-            _labels[mesh.session_uid] = Labels(visible, colors)
+    _visible_labels.clear()
+    _labels.update((mesh.session_uid, Labels(of_splats, colors)) for mesh, of_splats in labels.items())
 
 
 def _read(mesh: bpy.types.Mesh) -> SplatArrays:

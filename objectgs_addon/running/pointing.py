@@ -99,14 +99,16 @@ def start(root: bpy.types.Collection) -> None:
     """Start the process for a reconstruction, unless it runs.
 
     Raises:
-        InputError: the folder has no splats that can be read.
-        OSError: the process cannot be started.
+        InputError: the folder has no splats that can be read, or the process cannot be started.
     """
     global _session
     if is_active(root):
         return
     stop()
-    _session = _Session(root)
+    try:
+        _session = _Session(root)
+    except OSError as error:
+        raise InputError(f"The backend could not be started ({error.strerror or error}).") from error
     if not bpy.app.timers.is_registered(_tick):
         bpy.app.timers.register(_tick, first_interval=0.0, persistent=True)
 
@@ -226,14 +228,6 @@ def redraw() -> None:
 @bpy.app.handlers.persistent
 def _file_loads(*_: Any) -> None:
     stop()
-
-
-def require_running(root: bpy.types.Collection) -> None:
-    """Start the process if it does not run; raises as `start`."""
-    try:
-        start(root)
-    except OSError as error:
-        raise InputError(f"The backend could not be started ({error.strerror or error}).") from error
 
 
 def register() -> None:

@@ -24,7 +24,7 @@ class StartMarking(bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:
         root = need.active_root(context)
-        pointing.require_running(root)
+        pointing.start(root)
         if marks.active_object(root) is None:
             marks.add_object(root)
         marking_tool.activate(context)
@@ -70,7 +70,7 @@ class MarkObject(FollowsMouse, bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:
         root, shape = need.active_root(context), context.scene.objectgs.mark_shape
-        pointing.require_running(root)
+        pointing.start(root)
         item = marks.active_object(root) or marks.add_object(root)
         view = hit_test.view_of(context)
         points = self.pixels(view.height)

@@ -145,6 +145,12 @@ def test_labels_color_visible_splats(root):
     with_labels = [obj for obj in drawn if obj.labels is not None]
     assert len(with_labels) == 1 and np.array_equal(with_labels[0].labels.of_splats, shown)
     assert with_labels[0].slots == 3 and all(obj.slots == 1 for obj in drawn if obj.labels is None)
+    hidden = np.zeros(len(mesh.vertices), bool)
+    hidden[:5] = True
+    blender_scene.delete_splats(next(part for part in parts if part.data == mesh), hidden)
+    drawing.splats_changed(mesh)
+    left = next(obj.labels for obj in gather(placed_parts(bpy.context.view_layer)) if obj.labels is not None)
+    assert len(left.of_splats) == len(splat_arrays.arrays_of(mesh).means) < len(labels)
     drawing.show_labels({}, np.zeros((0, 3)))
     assert all(obj.labels is None for obj in gather(placed_parts(bpy.context.view_layer)))
 
