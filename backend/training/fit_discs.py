@@ -17,11 +17,10 @@ import numpy as np
 from ..model.discs import to_discs
 from ..model.object_model import ObjectModel
 from ..raster import devices
-from ..shared.errors import InputError
 from .budget import Budget
 from .scene import Scene
 from .settings import Settings
-from .state import read_checkpoint
+from .state import require_checkpoint
 from .trainer import Trainer
 
 if TYPE_CHECKING:
@@ -63,10 +62,7 @@ def begin_discs(model: ObjectModel, capture: Capture, checkpoint: Path, memory_m
     Raises:
         InputError: the checkpoint cannot be read.
     """
-    found = read_checkpoint(checkpoint)
-    if found is None:
-        raise InputError(f"{checkpoint} contains no checkpoint; train first.")
-    tensors, state, _ = found
+    tensors, state, _ = require_checkpoint(checkpoint)
     settings = replace(Settings(**state["settings"]), primitive="2d")
     scene = Scene(
         capture, model.classes, model.normalization, settings.zero_is_object, memory_mb,

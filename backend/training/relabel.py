@@ -14,10 +14,9 @@ import numpy as np
 import torch
 
 from ..shared.class_table import ClassTable
-from ..shared.errors import InputError
 from .budget import Budget
 from .settings import Settings
-from .state import read_checkpoint
+from .state import require_checkpoint
 from .trainer import Trainer
 
 if TYPE_CHECKING:
@@ -67,10 +66,7 @@ def begin_with_labels(
     Raises:
         InputError: the checkpoint cannot be read.
     """
-    found = read_checkpoint(checkpoint)
-    if found is None:
-        raise InputError(f"{checkpoint} contains no checkpoint; train first.")
-    tensors, state, _ = found
+    tensors, state, _ = require_checkpoint(checkpoint)
     state = {**state, "supervise_background": supervise_background}
     state["progress"] = {**state["progress"], "watched": [], "grown": False, "converged_at": 0}
     return Trainer.restore(capture, relabeled(tensors, state, source, object_ids), state, memory_mb, device, gains)

@@ -162,6 +162,14 @@ def model_from_checkpoint(tensors: dict[str, np.ndarray], state: dict[str, Any])
     )  # fmt: skip
 
 
+def require_checkpoint(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None]:
+    """Return the result of `read_checkpoint`; raise InputError also if there is no checkpoint."""
+    found = read_checkpoint(folder)
+    if found is None:
+        raise InputError(f"{folder} contains no checkpoint; train first.")
+    return found
+
+
 def load_model(folder: Path, device: torch.device = devices.CPU) -> tuple[ObjectModel, dict[str, Any], str | None]:
     """Load the result of a training, the mean of the model over the latest steps.
 
@@ -175,10 +183,7 @@ def load_model(folder: Path, device: torch.device = devices.CPU) -> tuple[Object
     Raises:
         InputError: There is no checkpoint in `folder`, or none can be read.
     """
-    found = read_checkpoint(folder)
-    if found is None:
-        raise InputError(f"{folder} contains no checkpoint; train first.")
-    tensors, state, warning = found
+    tensors, state, warning = require_checkpoint(folder)
     model = model_from_checkpoint(tensors, state)
     return Average.from_checkpoint(tensors, model).of(model).to(device), state, warning
 

@@ -114,8 +114,10 @@ def training(cls: Any, context: bpy.types.Context) -> bool:
     return False
 
 
-def own_masks(cls: Any, context: bpy.types.Context) -> bool:
-    """Return whether the active reconstruction's capture has no masks but those made of strokes."""
+def markable(cls: Any, context: bpy.types.Context) -> bool:
+    """Return whether objects of the active reconstruction can be marked: it is trained, without masks of others."""
+    if not (work_on_capture(cls, context) and training(cls, context)):
+        return False
     if can_mark(folder_state(scene.folder_of(active_root(context)))):
         return True
     cls.poll_message_set(

@@ -19,7 +19,7 @@ class StartMarking(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return _can_mark(cls, context)
+        return need.markable(cls, context)
 
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:
@@ -58,7 +58,7 @@ class MarkObject(FollowsMouse, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return super().poll(context) and _can_mark(cls, context)
+        return super().poll(context) and need.markable(cls, context)
 
     def keeps_path(self, context: bpy.types.Context) -> bool:
         return context.scene.objectgs.mark_shape != "BOX"
@@ -77,11 +77,6 @@ class MarkObject(FollowsMouse, bpy.types.Operator):
         corners = rectangle(points)[:-1] if shape == "BOX" else points
         object_id = marks.NOTHING if self.nothing else item.object_id
         marks.add_stroke(root, object_id, view, corners, area=shape != "STROKE")
-
-
-def _can_mark(cls: type, context: bpy.types.Context) -> bool:
-    """Return whether the strokes of the active reconstruction can be answered."""
-    return need.work_on_capture(cls, context) and need.training(cls, context) and need.own_masks(cls, context)
 
 
 CLASSES = (StartMarking, StopMarking, MarkObject)

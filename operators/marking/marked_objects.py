@@ -74,7 +74,7 @@ class SeparateMarked(_OfMarks, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return need.work_on_capture(cls, context) and need.training(cls, context) and need.own_masks(cls, context)
+        return need.markable(cls, context)
 
     @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
