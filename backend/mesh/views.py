@@ -205,9 +205,10 @@ class Views:
             return self._own
         if self.model.explicit:
             splats = self._scene_splats(self.camera(self.indices[0]))
-            self._own = splats.select(self._are_ours(splats.ids))
+            self._own = splats.select(self._are_ours(splats.ids) & self.scene.before_surroundings(splats.means))
             return self._own
-        anchors = self._are_ours(self.model.anchors.ids).nonzero()[:, 0]
+        ours = self._are_ours(self.model.anchors.ids) & self.scene.before_surroundings(self.model.anchors.positions)
+        anchors = ours.nonzero()[:, 0]
         return self.model.generate(anchors, np.zeros(3) if camera is None else camera.center)
 
     def _are_ours(self, ids: torch.Tensor) -> torch.Tensor:

@@ -164,6 +164,29 @@ def seed_anchors(
     return Anchors(layout, voxel, *(torch.from_numpy(a) for a in (positions, rows, owner)))
 
 
+def with_surroundings(
+    anchors: Anchors, xyz: np.ndarray, rgb: np.ndarray, of_class: int, spacing: float, rng: np.random.Generator
+) -> Anchors:
+    """Return anchors with further ones for distant surroundings, which are much larger than voxels.
+
+    Args:
+        anchors: the anchors, on the CPU.
+        xyz: (n, 3) positions in scene units, which are not rounded to voxels.
+        rgb: (n, 3) in [0, 1].
+        of_class: their class index.
+        spacing: distance between neighboring positions in scene units, which becomes the extent of the anchors.
+        rng: generator of the offsets.
+    """
+    layout = anchors.layout
+    rows = new_rows(len(xyz), layout, rng)
+    rows[:, layout.extent_columns] = np.log(spacing)
+    rows[:, layout.color_columns] = np.tile((rgb - 0.5) / C0, (1, layout.offsets))
+    added = np.asarray(xyz, np.float32), rows, np.full(len(xyz), of_class, np.int32)
+    before = anchors.positions, anchors.rows, anchors.ids
+    joined = (torch.cat([old, torch.from_numpy(new)]) for old, new in zip(before, added, strict=True))
+    return Anchors(layout, anchors.voxel, *joined)
+
+
 def new_rows(count: int, layout: Layout, rng: np.random.Generator) -> np.ndarray:
     """Return rows (count, columns) float32 of new anchors: random offsets, everything else 0."""
     rows = np.zeros((count, layout.columns), np.float32)

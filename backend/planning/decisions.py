@@ -19,6 +19,7 @@ from ..training.budget import choose_validation_views
 from ..training.exposure.gains import VARIES_FROM, differences, measure_gains
 from ..training.settings import Settings, background_is_masked, downscale_at
 from .coverage import blind_views, duplicate_views, unseen_points, views_like_held_out, views_without_objects
+from .surroundings import LEAST, Surroundings, find_surroundings
 
 PIXELS_TO_READ = 3e8
 """Largest total number of pixels of photos that are read for a plan, in a few seconds; larger captures are only read
@@ -68,6 +69,11 @@ class PlanningContext:
     def gains(self) -> np.ndarray:
         """The gains of the photos' color channels, (V, 3), measured on the training views."""
         return measure_gains(planned_capture(self.capture, self.plan))
+
+    @cached_property
+    def surroundings(self) -> Surroundings:
+        """The surroundings without points that the training views show."""
+        return find_surroundings(planned_capture(self.capture, self.plan))
 
     @property
     def labeled(self) -> bool:
@@ -155,6 +161,17 @@ def _groups(context: PlanningContext) -> Decision | None:
     return Decision("groups", f"separate meshes and names for {len(parts)} IDs", False, why, can_override=False)
 
 
+def _surroundings(context: PlanningContext) -> Decision:
+    what = "distant splats where photos show no points, such as in the sky"
+    if not _may_read_photos(context):
+        return Decision("surroundings", what, None, "it requires reading all photos, which training does first")
+    found = context.surroundings
+    needed = found.fraction >= LEAST
+    seen = f"{found.fraction:.1%} of the photos' pixels show neither points nor objects"
+    why = f"{seen}, but a single color" if needed and found.uniform else f"{seen}; the threshold is {LEAST:.0%}"
+    return Decision("surroundings", what, needed and not found.uniform, why, can_override=len(found.xyz) > 0)
+
+
 def _rest(context: PlanningContext) -> Decision | None:
     if not context.labeled or context.choices.settings.zero_is_object:
         return None
@@ -165,10 +182,13 @@ def _rest(context: PlanningContext) -> Decision | None:
     background = context.point_ids == 0 if context.in_background is None else context.in_background
     background = background[~unseen_points(context.capture)]
     fraction, supervised = float(np.mean(background)), background_is_masked(background)
+    beside = context.surroundings.fraction if _may_read_photos(context) else 0.0
+    if beside >= LEAST and not supervised:
+        why = f"{beside:.1%} of the photos' pixels show neither points nor objects, so they are background"
+        return Decision("rest", what, True, why)
     meaning = "unlabeled pixels are background" if supervised else "unlabeled pixels count as gaps in the masks"
-    return Decision(
-        "rest", what, supervised, f"{fraction:.1%} of the visible points are on no object in the masks, so {meaning}"
-    )
+    why = f"{fraction:.1%} of the visible points are on no object in the masks, so {meaning}"
+    return Decision("rest", what, supervised, why)
 
 
 def _labels(context: PlanningContext) -> Decision | None:
@@ -270,9 +290,8 @@ def _unseen_points(context: PlanningContext) -> Decision | None:
 
 
 def _exposure(context: PlanningContext) -> Decision:
-    capture, what = context.capture, "exposure and white balance correction"
-    pixels = sum(capture.views[i].width * capture.views[i].height for i in capture.train_indices)
-    if not context.thorough and not (capture.prepared and pixels <= PIXELS_TO_READ):
+    what = "exposure and white balance correction"
+    if not _may_read_photos(context):
         return Decision("exposure", what, None, "it requires reading all photos, which training does first")
     off = differences(context.gains)
     if off == 0:
@@ -306,13 +325,20 @@ def _surface(context: PlanningContext) -> Decision | None:
 
 
 DECISIONS: tuple[Callable[[PlanningContext], Decision | None], ...] = (
-    _votes, _objects, _groups, _rest, _labels, _undistortion, _duplicate_views, _blind_views, _other_views,
-    _validation_views, _unseen_points, _exposure, _pyramid, _meshes, _surface,
+    _votes, _objects, _groups, _surroundings, _rest, _labels, _undistortion, _duplicate_views, _blind_views,
+    _other_views, _validation_views, _unseen_points, _exposure, _pyramid, _meshes, _surface,
 )  # fmt: skip
 """In the order of `KEYS`; a decision may depend on earlier ones. None if a decision does not apply to the capture."""
 
 OF_TRAINING = tuple(key for key in KEYS if key not in ("objects", "groups", "undistortion", "meshes"))
 """Keys of decisions that cannot be changed once a training has begun."""
+
+
+def _may_read_photos(context: PlanningContext) -> bool:
+    """Return whether all photos may be read for the plan."""
+    capture = context.capture
+    pixels = sum(capture.views[i].width * capture.views[i].height for i in capture.train_indices)
+    return context.thorough or (capture.prepared and pixels <= PIXELS_TO_READ)
 
 
 def _views(count: int) -> str:

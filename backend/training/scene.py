@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
+from ..capture.extent import SURROUNDINGS, Extent, extent_of
 from ..model.object_model import Normalization
 from ..raster import Camera, devices
 from ..shared.class_table import ClassTable
@@ -19,6 +21,9 @@ if TYPE_CHECKING:
 
 _GPU_FRACTION = 0.25
 """Largest fraction of the GPU's free memory for cached targets."""
+
+_HORIZON = 0.5 * SURROUNDINGS
+"""Distance from which on splats belong to surroundings without points, relative to the radius of the capture."""
 
 
 class Scene:
@@ -75,6 +80,16 @@ class Scene:
             view.height // downscale,
             gain=(float(self.gains[index, 0]), float(self.gains[index, 1]), float(self.gains[index, 2])),
         )
+
+    def before_surroundings(self, positions: torch.Tensor) -> torch.Tensor:
+        """Return which of the positions (n, 3) in scene units are nearer than surroundings without points, bool."""
+        center, radius = self._extent
+        offsets = positions - devices.upload(self.normalization.to_scene(center[None])[0].astype(np.float32), positions)
+        return offsets.square().sum(1) < (_HORIZON * radius * self.normalization.scale) ** 2
+
+    @cached_property
+    def _extent(self) -> Extent:
+        return extent_of(self.capture)
 
     def target(self, index: int, downscale: int = 1) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Return the target of a view.

@@ -16,12 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from ..model.anchors import median_spacing, seed_anchors
 from ..model.checkpoint import save_checkpoint
-from ..model.heads import Heads
-from ..model.object_model import Normalization, ObjectModel
+from ..model.object_model import ObjectModel
 from ..raster import devices
-from ..shared.class_table import ClassTable
 from ..shared.errors import Cancelled, InputError
 from ..shared.events import Reporter
 from ..shared.reconstruction.objects import default_name
@@ -30,6 +27,7 @@ from . import check_finite, overfitting
 from .budget import Budget, TrainingProgress
 from .check_finite import FiniteCheck
 from .growth_strategy import GrowthStrategy
+from .initial_model import AddedPoints, DistantPoints, initial_model
 from .optimizer.adam import BETA1, BETA2, step_rows
 from .optimizer.average import Average
 from .scene import Scene
@@ -95,7 +93,8 @@ class Trainer:
         seeds: np.ndarray | None = None,
         supervise_background: bool | None = None,
         gains: np.ndarray | None = None,
-        more: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+        more: AddedPoints | None = None,
+        surroundings: DistantPoints | None = None,
     ) -> Trainer:
         """Start a training with anchors at the capture's points.
 
@@ -105,40 +104,22 @@ class Trainer:
             settings: settings of the training.
             memory_mb: memory limit for cached targets.
             device: device to train on.
-            seeds: (M,) bool, the points that are used for the initial anchors and to measure the scene's extent and
-                density; None: all.
+            seeds, more, surroundings: as in `initial_model`; seeds may be None for all points.
             supervise_background: as in `Scene`; None: decided by `background_is_masked` for the points without object.
             gains: as in `Scene`.
-            more: xyz (n, 3), rgb (n, 3) uint8 and IDs (n,) of points of objects that have none.
 
         Raises:
             InputError: an image cannot be read.
         """
         rng = np.random.default_rng(settings.seed)
         seeds = np.ones(len(capture.points.xyz), np.bool_) if seeds is None else seeds
-        xyz, rgb = capture.points.xyz[seeds], capture.points.rgb[seeds]
-        camera_centers = np.array([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in capture.views])
-        normalization = Normalization.of(camera_centers, xyz)
-        classes = ClassTable(np.concatenate([[0], point_ids, *([] if more is None else [more[2]])]))
-        voxel = settings.voxel * normalization.scale if settings.voxel else median_spacing(normalization.to_scene(xyz))
-        ids = point_ids[seeds]
-        if more is not None:
-            xyz, rgb, ids = (np.concatenate(pair) for pair in zip((xyz, rgb, ids), more, strict=True))
-        anchors = seed_anchors(
-            normalization.to_scene(xyz), rgb / 255.0, classes.classes_of(ids), voxel, settings.layout, rng
-        )
-        if settings.mode == "paper":
-            anchors.rows[:, settings.layout.color_columns] = 0
-        generator = torch.Generator().manual_seed(settings.seed)
-        heads = Heads(settings.layout, settings.mode, settings.sh_degree, generator)
-        shade = {"learned": rgb.mean(axis=0) / 255.0, "black": np.zeros(3), "white": np.ones(3)}
-        background = torch.from_numpy(shade[settings.background].astype(np.float32))
-        model = ObjectModel(anchors, heads, background, classes, normalization, settings.primitive)
+        model = initial_model(capture, point_ids, settings, rng, seeds, more, surroundings)
         if supervise_background is None:
             supervise_background = capture.has_masks and background_is_masked(point_ids[seeds] == 0)
         scene = Scene(
-            capture, classes, normalization, settings.zero_is_object, memory_mb, supervise_background, device, gains
-        )
+            capture, model.classes, model.normalization, settings.zero_is_object, memory_mb, supervise_background,
+            device, gains,
+        )  # fmt: skip
         return cls(scene, settings, model.to(device), rng)
 
     @property

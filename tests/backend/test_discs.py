@@ -13,8 +13,8 @@ from backend.model.object_model import Normalization, ObjectModel
 from backend.shared.class_table import ClassTable
 from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE, Cancelled
 from backend.shared.stopping import StopRequest
-from backend.training import fit_discs
 from backend.training.budget import TrainingProgress
+from backend.training.fine_tuning import fit_discs
 from backend.training.trainer import Trainer
 
 DRAWN = ("--offsets", 4, "--background", "black")

@@ -67,11 +67,14 @@ def views_of(splats, cameras, explicit=True, mask=None, primitive="3d", **option
         assert explicit or camera_center is not None
         return splats if seen is None else splats.select(seen)
 
-    anchors = SimpleNamespace(ids=splats.ids)
+    anchors = SimpleNamespace(ids=splats.ids, positions=splats.means)
     model = SimpleNamespace(generate=generate, explicit=explicit, primitive=primitive, anchors=anchors)
     model.classes = ClassTable([0, 10, 20])
     capture = SimpleNamespace(mask=lambda index, downscale: mask)
-    scene = SimpleNamespace(camera=lambda index, downscale: cameras[index], capture=capture)
+    scene = SimpleNamespace(
+        camera=lambda index, downscale: cameras[index], capture=capture,
+        before_surroundings=lambda positions: torch.ones(len(positions), dtype=torch.bool),
+    )  # fmt: skip
     return Views(model, scene, range(len(cameras)), **options)
 
 

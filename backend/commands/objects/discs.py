@@ -13,7 +13,7 @@ from ...shared.errors import InputError
 from ...shared.events import Reporter
 from ...shared.formats.points_ply import read_points
 from ...shared.stopping import StoppingReporter
-from ...training.fit_discs import begin_discs, budget_of_discs, digest_of_model
+from ...training.fine_tuning.fit_discs import begin_discs, budget_of_discs, digest_of_model
 from ...training.trainer import Trainer
 from ..folder import Trained, memory_for_planes
 from ..stages import finish_stage

@@ -25,7 +25,7 @@ from ...shared.reconstruction.objects import default_name
 from ...shared.reconstruction.plan import write_plan
 from ...shared.reconstruction.record import update_record
 from ...shared.stopping import StoppingReporter
-from ...training.relabel import begin_with_labels, budget_of_labels
+from ...training.fine_tuning.relabel import begin_with_labels, budget_of_labels
 from ...training.settings import Settings
 from ...training.trainer import Trainer
 from ..exported import EXPORT, export_model

@@ -11,7 +11,7 @@ import torch
 from ...capture import Capture
 from ...evaluation import IdScores, color_corrected, comparison, curve_image, psnr, save_image, thumbnail
 from ...labels import correct_masks
-from ...labels.mask_points import MaskPoints, place_points
+from ...labels.mask_points import place_points
 from ...model.checkpoint import has_checkpoint
 from ...model.draw import draw
 from ...model.object_model import ObjectModel
@@ -28,6 +28,7 @@ from ...shared.reconstruction.plan import Plan, write_plan
 from ...shared.reconstruction.record import TrainingRecord, read_record, update_record
 from ...shared.stopping import StoppingReporter
 from ...training.budget import Budget, TrainingProgress
+from ...training.initial_model import AddedPoints, DistantPoints
 from ...training.scene import Scene
 from ...training.trainer import Evaluate, Trainer
 from ..exported import EXPORT, export_model
@@ -144,11 +145,12 @@ def _begin(
         _check_same_training(folder, planned, plan, options)
     else:
         assert context.point_ids is not None
+        far = DistantPoints(*context.surroundings[:3]) if plan.does("surroundings") else None
         seeds = None if plan.does("unseen-points") else ~unseen_points(planned)
         trainer = Trainer.start(
             planned, context.point_ids, wanted, memory, device,
             seeds=seeds, supervise_background=planned.has_masks and plan.does("rest"), gains=gains,
-            more=_place_missing_objects(planned, context.point_ids, options.seed, reporter),
+            more=_place_missing_objects(planned, context.point_ids, options.seed, reporter), surroundings=far,
         )  # fmt: skip
     if options.restart:
         # The new training's first checkpoint replaces that of the old one before anything refers to it.
@@ -160,7 +162,9 @@ def _begin(
     return trainer, plan
 
 
-def _place_missing_objects(capture: Capture, point_ids: np.ndarray, seed: int, reporter: Reporter) -> MaskPoints | None:
+def _place_missing_objects(
+    capture: Capture, point_ids: np.ndarray, seed: int, reporter: Reporter
+) -> AddedPoints | None:
     """Place points for the objects in the masks that have none; report how many, and the objects that stay without."""
     missing = sorted(set(capture.object_ids.tolist()) - set(point_ids.tolist()))
     if not missing:
@@ -174,7 +178,7 @@ def _place_missing_objects(capture: Capture, point_ids: np.ndarray, seed: int, r
             )
         else:
             reporter.warning(f"The masks of object {object_id} ({named}) agree nowhere, so training starts without it.")
-    return placed if len(placed.ids) else None
+    return AddedPoints(*placed) if len(placed.ids) else None
 
 
 def _check_same_training(folder: Reconstruction, capture: Capture, plan: Plan, options: argparse.Namespace) -> None:

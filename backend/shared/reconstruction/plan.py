@@ -16,8 +16,8 @@ from ..errors import InputError
 from ..formats.json_file import read_json, write_json
 
 KEYS = (
-    "votes", "objects", "groups", "rest", "labels", "undistortion", "duplicate-views", "blind-views", "other-views",
-    "validation-views", "unseen-points", "exposure", "pyramid", "meshes", "surface",
+    "votes", "objects", "groups", "surroundings", "rest", "labels", "undistortion", "duplicate-views", "blind-views",
+    "other-views", "validation-views", "unseen-points", "exposure", "pyramid", "meshes", "surface",
 )  # fmt: skip
 """Keys of the decisions, in the order in which they are made."""
 

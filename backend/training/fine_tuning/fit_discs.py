@@ -14,17 +14,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..model.discs import to_discs
-from ..model.object_model import ObjectModel
-from ..raster import devices
-from .budget import Budget
-from .scene import Scene
-from .settings import Settings
-from .state import require_checkpoint
-from .trainer import Trainer
+from ...model.discs import to_discs
+from ...model.object_model import ObjectModel
+from ...raster import devices
+from ..budget import Budget
+from ..scene import Scene
+from ..settings import Settings
+from ..state import require_checkpoint
+from ..trainer import Trainer
 
 if TYPE_CHECKING:
-    from ..capture import Capture
+    from ...capture import Capture
 
 FRACTION = 0.2
 """Number of steps, relative to those of the training."""

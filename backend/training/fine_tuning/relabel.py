@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from ..shared.class_table import ClassTable
-from .budget import Budget
-from .settings import Settings
-from .state import require_checkpoint
-from .trainer import Trainer
+from ...shared.class_table import ClassTable
+from ..budget import Budget
+from ..settings import Settings
+from ..state import require_checkpoint
+from ..trainer import Trainer
 
 if TYPE_CHECKING:
-    from ..capture import Capture
+    from ...capture import Capture
 
 FRACTION, MOST = 0.2, 1000
 """Number of steps, relative to those of the training, and at most."""

@@ -1,0 +1,129 @@
+"""Detection of surroundings without points, such as the sky.
+
+COLMAP finds no points there, and masks leave them unlabeled. Without splats of their own they are explained by splats
+close to the cameras, which other views contradict, and which have the IDs of the objects in front. A direction belongs
+to these surroundings if most views that contain it have no points and no object there. Points at a great distance
+represent them; where the surroundings are in fact nearer, training moves the splats or adds others.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+
+from ..capture import Capture, View
+from ..capture.extent import SURROUNDINGS, extent_of
+
+SPACING = float(np.radians(2.0))
+"""Angle between neighboring directions."""
+
+LEAST = 0.02
+"""Smallest fraction of the photos' pixels that shows surroundings without points, if there are any."""
+
+_CELLS = 40
+"""Number of cells along the longer side of a view in which points are looked for."""
+
+_VIEWS = 60
+"""Largest number of views that are examined."""
+
+_VACANT, _FEWEST = 0.5, 2
+"""Smallest fraction of the views of a direction that have nothing there, and smallest number of them."""
+
+_UNIFORM = 3.0
+"""Largest standard deviation of the colors of uniform surroundings, of 255."""
+
+
+class Surroundings(NamedTuple):
+    """Surroundings without points.
+
+    Attributes:
+        xyz: (n, 3) float64, points in world units, all at the same distance from the center of the cameras.
+        rgb: (n, 3) uint8, their colors.
+        spacing: distance between neighboring points.
+        fraction: fraction of the photos' pixels that shows them.
+        uniform: whether they all have about the same color, so that a background of one color suffices.
+    """
+
+    xyz: np.ndarray
+    rgb: np.ndarray
+    spacing: float
+    fraction: float
+    uniform: bool
+
+
+def find_surroundings(capture: Capture) -> Surroundings:
+    """Find the directions in which the training views of a capture show surroundings without points.
+
+    Args:
+        capture: the capture; must be prepared.
+
+    Returns:
+        The surroundings; xyz is empty if no direction shows any.
+
+    Raises:
+        InputError: an image or a mask cannot be read.
+    """
+    train = list(capture.train_indices)
+    views = [train[i] for i in np.unique(np.linspace(0, len(train) - 1, min(len(train), _VIEWS)).astype(int))]
+    directions = _sphere(SPACING)
+    inside, vacant = np.zeros(len(directions), np.int64), np.zeros(len(directions), np.int64)
+    total = np.zeros((len(directions), 3))
+    shown = []
+    for index in views:
+        view, free = capture.views[index], _vacant_cells(capture, index)
+        seen, x, y = _pixels(view, directions @ view.viewmat[:3, :3].T)
+        here = free[y * free.shape[0] // view.height, x * free.shape[1] // view.width]
+        inside[seen] += 1
+        vacant[seen[here]] += 1
+        total[seen[here]] += capture.image(index)[y[here], x[here]]
+        shown.append((seen, here))
+    chosen = (vacant >= _FEWEST) & (vacant >= _VACANT * inside)
+    fractions = [chosen[seen[here]].sum() / len(seen) for seen, here in shown if len(seen)]
+    extent = extent_of(capture)
+    distance = SURROUNDINGS * extent.radius
+    rgb = total[chosen] / vacant[chosen, None]
+    return Surroundings(
+        extent.center + distance * directions[chosen],
+        rgb.round().astype(np.uint8),
+        distance * SPACING,
+        float(np.mean(fractions)) if fractions else 0.0,
+        not len(rgb) or float(rgb.std(0).mean()) <= _UNIFORM,
+    )
+
+
+def _sphere(spacing: float) -> np.ndarray:
+    """Return directions (n, 3) at about this angle from their neighbors (Fibonacci lattice)."""
+    count = round(4 * np.pi / spacing**2)
+    turns = np.arange(count) + 0.5
+    z = 1 - 2 * turns / count
+    angle = np.pi * (1 + np.sqrt(5)) * turns
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
+
+
+def _pixels(view: View, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Project positions or directions (n, 3) in camera space: indices of those in the image, columns and rows."""
+    x, y, z = xyz.T
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        u = x / z * view.K[0, 0] + view.K[0, 2]
+        v = y / z * view.K[1, 1] + view.K[1, 2]
+        inside = np.flatnonzero((z > 0) & (u >= 0) & (v >= 0) & (u < view.width) & (v < view.height))
+    return inside, u[inside].astype(np.int64), v[inside].astype(np.int64)
+
+
+def _vacant_cells(capture: Capture, index: int) -> np.ndarray:
+    """Return the cells of a view without points in or beside them, and without objects: (rows, columns) bool."""
+    view = capture.views[index]
+    cell = max(view.width, view.height) / _CELLS
+    rows, columns = max(round(view.height / cell), 1), max(round(view.width / cell), 1)
+    occupied = np.zeros((rows, columns), np.bool_)
+    _, x, y = _pixels(view, capture.points.xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3])
+    occupied[y * rows // view.height, x * columns // view.width] = True
+    occupied = ndimage.binary_dilation(occupied, np.ones((3, 3), np.bool_))
+    mask = capture.mask(index)
+    if mask is not None:
+        y, x = np.nonzero(mask)
+        occupied[y * rows // view.height, x * columns // view.width] = True
+    return ~occupied

@@ -1,0 +1,1 @@
+"""Trainings that continue from a trained model: other object IDs, and flat splats for meshes."""

@@ -1,0 +1,82 @@
+"""The model that a training starts with: anchors at the capture's points, and at those that were added to them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+
+from ..model.anchors import median_spacing, seed_anchors, with_surroundings
+from ..model.heads import Heads
+from ..model.object_model import Normalization, ObjectModel
+from ..shared.class_table import ClassTable
+from .settings import Settings
+
+if TYPE_CHECKING:
+    from ..capture import Capture
+
+
+class AddedPoints(NamedTuple):
+    """Points that COLMAP did not find.
+
+    Attributes:
+        xyz: (n, 3) float64 in world units.
+        rgb: (n, 3) uint8.
+        ids: (n,) int64, the objects that they belong to.
+    """
+
+    xyz: np.ndarray
+    rgb: np.ndarray
+    ids: np.ndarray
+
+
+class DistantPoints(NamedTuple):
+    """Points of distant surroundings: xyz (n, 3) in world units, rgb (n, 3) uint8, distance between neighbors."""
+
+    xyz: np.ndarray
+    rgb: np.ndarray
+    spacing: float
+
+
+def initial_model(
+    capture: Capture,
+    point_ids: np.ndarray,
+    settings: Settings,
+    rng: np.random.Generator,
+    seeds: np.ndarray,
+    more: AddedPoints | None = None,
+    surroundings: DistantPoints | None = None,
+) -> ObjectModel:
+    """Return a model with anchors at the capture's points.
+
+    Args:
+        capture: the views and points.
+        point_ids: (M,) int64 object ID of each point, 0 if it belongs to none.
+        settings: settings of the training.
+        rng: generator of the anchors' offsets.
+        seeds: (M,) bool, the points that are used for anchors and to measure the scene's extent and density.
+        more: points of objects that have none.
+        surroundings: points of distant surroundings, which belong to no object.
+    """
+    xyz, rgb, ids = capture.points.xyz[seeds], capture.points.rgb[seeds], point_ids[seeds]
+    camera_centers = np.array([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in capture.views])
+    normalization = Normalization.of(camera_centers, xyz)
+    classes = ClassTable(np.concatenate([[0], point_ids, *([] if more is None else [more.ids])]))
+    voxel = settings.voxel * normalization.scale if settings.voxel else median_spacing(normalization.to_scene(xyz))
+    if more is not None:
+        xyz, rgb, ids = (np.concatenate(pair) for pair in zip((xyz, rgb, ids), more, strict=True))
+    anchors = seed_anchors(
+        normalization.to_scene(xyz), rgb / 255.0, classes.classes_of(ids), voxel, settings.layout, rng
+    )
+    if surroundings is not None:
+        anchors = with_surroundings(
+            anchors, normalization.to_scene(surroundings.xyz), surroundings.rgb / 255.0, int(classes.classes_of(0)),
+            normalization.scale * surroundings.spacing, rng,
+        )  # fmt: skip
+    if settings.mode == "paper":
+        anchors.rows[:, settings.layout.color_columns] = 0
+    heads = Heads(settings.layout, settings.mode, settings.sh_degree, torch.Generator().manual_seed(settings.seed))
+    shade = {"learned": rgb.mean(axis=0) / 255.0, "black": np.zeros(3), "white": np.ones(3)}
+    background = torch.from_numpy(shade[settings.background].astype(np.float32))
+    return ObjectModel(anchors, heads, background, classes, normalization, settings.primitive)
