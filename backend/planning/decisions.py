@@ -182,10 +182,9 @@ def _rest(context: PlanningContext) -> Decision | None:
     background = context.point_ids == 0 if context.in_background is None else context.in_background
     background = background[~unseen_points(context.capture)]
     fraction, supervised = float(np.mean(background)), background_is_masked(background)
-    beside = context.surroundings.fraction if _may_read_photos(context) else 0.0
-    if beside >= LEAST and not supervised:
-        why = f"{beside:.1%} of the photos' pixels show neither points nor objects, so they are background"
-        return Decision("rest", what, True, why)
+    surroundings = context.plan["surroundings"]
+    if surroundings is not None and surroundings.done and not supervised:
+        return Decision("rest", what, True, "distant splats of no object show the surroundings")
     meaning = "unlabeled pixels are background" if supervised else "unlabeled pixels count as gaps in the masks"
     why = f"{fraction:.1%} of the visible points are on no object in the masks, so {meaning}"
     return Decision("rest", what, supervised, why)

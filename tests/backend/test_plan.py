@@ -91,7 +91,7 @@ def test_plan_of_capture_with_objects(write_capture, tmp_path):
     plan = planned(loaded(scene, tmp_path), point_ids=scene.point_objects, thorough=True)
     done = {own.key: own.done for own in plan.decisions}
     assert done == {
-        "votes": True, "surroundings": False, "rest": True, "labels": True, "undistortion": False, "exposure": True,
+        "votes": True, "surroundings": False, "rest": False, "labels": True, "undistortion": False, "exposure": True,
         "pyramid": False,
     }  # fmt: skip
     assert len(DECISIONS) == len(KEYS) and list(done) == [key for key in KEYS if key in done]
@@ -106,8 +106,7 @@ def test_plan_without_masks_has_no_object_steps(write_capture, tmp_path):
         planned(loaded(write_capture(name="again", masks=False), tmp_path), keep=["votes"])
 
 
-def test_labels_of_single_object_need_unlabeled_rest(write_capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(decisions, "LEAST", 1.1)  # So that points alone tell gaps in masks from background.
+def test_labels_of_single_object_need_unlabeled_rest(write_capture, tmp_path):
     scene = write_capture(views=9, size=(64, 48), spheres=[(7, np.zeros(3), 1.0)], points=200)
     beside = loaded(scene, tmp_path)
     assert planned(beside)["labels"].done is None, "undecided before votes: unlabeled pixels may be gaps or background"
@@ -201,11 +200,12 @@ def test_blind_views_and_unseen_points_are_found(write_capture, tmp_path):
     assert blind_views(nothing) == [] and not unseen_points(nothing).any(), "at least one view and point remain"
 
 
-def test_unseen_points_do_not_affect_scene(write_capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(decisions, "LEAST", 1.1)
+def test_unseen_points_do_not_affect_scene(write_capture, tmp_path):
     scene = write_capture(views=9, size=(64, 48))
     ids = scene.point_objects
     alone = Trainer.start(loaded(scene, tmp_path), ids, Settings(offsets=2))
+    assert planned(loaded(scene, tmp_path), point_ids=ids)["rest"].done is False
+
     far = np.random.default_rng(0).uniform((-50, 400, -50), (50, 500, 50), (len(ids), 3))
     scene.xyz, scene.rgb = np.concatenate([scene.xyz, far]), np.concatenate([scene.rgb, scene.rgb])
     ids = np.concatenate([ids, np.zeros_like(ids)])
@@ -363,7 +363,7 @@ def test_plan_command_reports_decisions_and_writes_only_out(write_capture, tmp_p
     assert run_command("import", capture, "--out", out).code == EXIT_DONE
     assert read_plan(out / "plan.json")["rest"].done is None
     assert run_command("vote", capture, "--out", out).code == EXIT_DONE
-    assert read_plan(out / "plan.json")["rest"].done is True
+    assert read_plan(out / "plan.json")["rest"].done is False
 
 
 def test_plan_affects_training_evaluation_and_report(write_capture, tmp_path, run_command):

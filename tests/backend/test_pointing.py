@@ -12,7 +12,6 @@ import zlib
 import numpy as np
 import pytest
 import torch
-from backend.training.relabel import relabeled
 from PIL import Image
 from scipy import sparse
 
@@ -26,6 +25,7 @@ from backend.pointing.splat_graph import SplatGraph, contributions
 from backend.pointing.strokes import Stroke, read_strokes
 from backend.raster import rasterize
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError
+from backend.training.fine_tuning.relabel import relabeled
 from backend.training.scene import Scene
 from backend.training.state import load_model, read_checkpoint
 from backend.training.trainer import Trainer

@@ -63,12 +63,13 @@ def test_surroundings_are_where_no_points_are(outdoors, masks):
 def test_plan_gives_surroundings_splats_unless_they_have_one_color(outdoors):
     capture, scene = outdoors()
     plan = plan_of(capture, scene)
-    assert plan["surroundings"].done and plan["rest"].done and "neither points nor objects" in plan["rest"].why
-    assert not plan_of(capture, scene, leave_out=["surroundings"]).does("surroundings")
+    assert plan["surroundings"].done and plan["rest"].done and "show the surroundings" in plan["rest"].why
+    plan = plan_of(capture, scene, leave_out=["surroundings"])
+    assert not plan.does("surroundings") and not plan.does("rest")
 
     capture, scene = outdoors(color=lambda rays: np.full(rays.shape, 90), name="gray")
     plan = plan_of(capture, scene)
-    assert not plan["surroundings"].done and "a single color" in plan["surroundings"].why and plan["rest"].done
+    assert not plan["surroundings"].done and "a single color" in plan["surroundings"].why and not plan["rest"].done
     assert plan_of(capture, scene, keep=["surroundings"]).does("surroundings")
 
 
