@@ -172,7 +172,7 @@ def measured(
     from backend.raster import compile_kernels
     from backend.shared.events import Reporter
     from backend.training.budget import Budget
-    from backend.training.settings import Settings
+    from backend.training.settings import Settings, background_is_masked
     from backend.training.trainer import Trainer
     from benchmarks import mask_noise, modes
     from benchmarks import semantics as alternatives
@@ -186,7 +186,7 @@ def measured(
             loaded = load_capture(Path(scratch) / "capture", Path(scratch) / "cache of wrong IDs")
         ids = vote(loaded, strategy, seed).ids  # type: ignore[arg-type]
         if corrected:
-            loaded, _ = correct_masks(loaded, ids)
+            loaded, _ = correct_masks(loaded, ids, ignore_gaps=background_is_masked(ids == 0))
         trainer = Trainer.start(loaded, ids, Settings(seed=seed, **(settings or {})))
         if plain:
             modes.silence(trainer)

@@ -195,7 +195,7 @@ def measured(capture: str, kind: str, level: float, steps: int) -> dict[str, Any
     from backend.raster import compile_kernels
     from backend.shared.events import Reporter
     from backend.training.budget import Budget
-    from backend.training.settings import Settings
+    from backend.training.settings import Settings, background_is_masked
     from backend.training.trainer import Trainer
 
     compile_kernels()
@@ -205,7 +205,8 @@ def measured(capture: str, kind: str, level: float, steps: int) -> dict[str, Any
         disturbed_capture(source, kind, level, folder)
         loaded = load_capture(folder, Path(scratch) / "cache")
         ids = vote(loaded).ids
-        trainer = Trainer.start(correct_masks(loaded, ids)[0], ids, Settings())
+        corrected, _ = correct_masks(loaded, ids, ignore_gaps=background_is_masked(ids == 0))
+        trainer = Trainer.start(corrected, ids, Settings())
         trainer.run(Budget(steps=steps), Path(scratch) / "checkpoint", Reporter())
         given, rendered, held_out = Tally(), Tally(), Tally()
         for index, view in enumerate(loaded.views):

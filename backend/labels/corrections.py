@@ -31,6 +31,12 @@ _MOSTLY_WRONG = 0.6
 """An ID is not corrected if it seems wrong in more than this fraction of the views: its object has hardly any points,
 so that those behind it show through."""
 
+_THIN = 0.01
+"""Half the width of unlabeled strips that are gaps between masks, relative to the longer side of a view."""
+
+_NEAR = 2.5
+"""Distance of the pixels of a gap from points of objects, relative to the average distance between observed points."""
+
 _NEIGHBORS, _AGREEING = 5, 4
 """A pixel of a wrong region gets the object that this many of its nearest points in the region belong to; without one,
 it is ignored."""
@@ -68,12 +74,14 @@ class Region(NamedTuple):
         return np.where((agreeing >= _AGREEING) & (middle > 0), middle, IGNORED)
 
 
-def correct_masks(capture: Capture, point_ids: np.ndarray) -> tuple[Capture, int]:
+def correct_masks(capture: Capture, point_ids: np.ndarray, ignore_gaps: bool) -> tuple[Capture, int]:
     """Correct the masks of training views where they contradict the votes.
 
     Args:
         capture: the capture; must be prepared. Without the objects that are left out, it is corrected all the same.
         point_ids: (M,) int64, the objects of the capture's points by the votes of all objects.
+        ignore_gaps: whether unlabeled pixels where objects should be are ignored, since other unlabeled pixels are
+            supervised to show no object.
 
     Returns:
         The capture whose `mask` returns the corrected IDs of training views, IGNORED where none is known, and the
@@ -90,13 +98,44 @@ def correct_masks(capture: Capture, point_ids: np.ndarray) -> tuple[Capture, int
 
     def correct(index: int, mask: np.ndarray) -> np.ndarray:
         result = mask.astype(np.int64)
-        for region in _regions(capture, index, point_ids):
-            if region.object_id in wrong[index] and region.is_wrong:
-                result[region.window][region.inside] = region.corrected()
+        if index in wrong:
+            for region in _regions(capture, index, point_ids):
+                if region.object_id in wrong[index] and region.is_wrong:
+                    result[region.window][region.inside] = region.corrected()
+        if ignore_gaps:
+            result[_gaps(capture, index, mask, point_ids)] = IGNORED
         return result
 
     regions = sum(map(len, wrong.values()))
-    return (capture.with_corrected_masks(frozenset(wrong), correct) if wrong else capture), regions
+    changed = {index for index in capture.train_indices if 0 in capture.ids_in(index)} if ignore_gaps else set()
+    changed |= set(wrong)
+    return (capture.with_corrected_masks(frozenset(changed), correct) if changed else capture), regions
+
+
+def _gaps(capture: Capture, index: int, mask: np.ndarray, point_ids: np.ndarray) -> np.ndarray:
+    """Find the unlabeled pixels of a view's mask that are gaps in it: thin strips, and pixels near points of objects.
+
+    Points within a strip's width of the mask's borders are not considered, since they may be on the other side.
+
+    Returns:
+        (H, W) bool.
+    """
+    unlabeled = mask == 0
+    if not unlabeled.any() or unlabeled.all():
+        return np.zeros_like(unlabeled)
+    radius = max(_THIN * max(mask.shape), 1.0)
+    # What circles of this radius fit into (morphological opening).
+    inside = ndimage.distance_transform_edt(unlabeled) > radius
+    wide = unlabeled & (ndimage.distance_transform_edt(~inside) <= radius)
+    points, x, y = find_observed_points(capture, index)
+    missed = inside[y, x] & (point_ids[points] > 0)
+    gaps = unlabeled & ~wide
+    if missed.any():
+        at = np.ones_like(unlabeled)
+        at[y[missed], x[missed]] = False
+        spacing = np.sqrt(mask.size / len(points))
+        gaps |= unlabeled & (ndimage.distance_transform_edt(at) <= _NEAR * spacing)
+    return gaps
 
 
 def _regions(capture: Capture, index: int, point_ids: np.ndarray) -> Iterator[Region]:

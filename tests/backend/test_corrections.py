@@ -46,7 +46,7 @@ def loaded(scene, tmp_path, name="cache"):
 
 def test_exact_masks_are_unchanged(scene, tmp_path):
     capture, ids = loaded(scene, tmp_path)
-    same, regions = correct_masks(capture, ids)
+    same, regions = correct_masks(capture, ids, ignore_gaps=False)
     assert same is capture and regions == 0
 
 
@@ -54,7 +54,7 @@ def test_exchanged_ids_are_exchanged_back(scene, tmp_path):
     index = load_capture(scene.folder, tmp_path / "cache").train_indices[3]
     exact = rewrite(mask_path(scene, index), exchange)
     capture, ids = loaded(scene, tmp_path, "again")
-    corrected, regions = correct_masks(capture, ids)
+    corrected, regions = correct_masks(capture, ids, ignore_gaps=False)
     assert regions == 2
     found = corrected.mask(index)
     assert (capture.mask(index) != exact).sum() > 100, "the capture itself keeps the mask of the file"
@@ -78,7 +78,7 @@ def test_flooded_background_is_ignored(scene, tmp_path):
     for each in range(24):
         rewrite(mask_path(scene, each), flood if each == index else lambda mask: mask.__setitem__(mask == SECOND, 0))
     capture, ids = loaded(scene, tmp_path, "again")
-    corrected, regions = correct_masks(capture, ids)
+    corrected, regions = correct_masks(capture, ids, ignore_gaps=False)
     flooded = capture.mask(index) == THIRD
     assert regions >= 1 and (corrected.mask(index)[flooded] == IGNORED).mean() > 0.9
 
@@ -87,7 +87,7 @@ def test_held_out_views_are_not_corrected(scene, tmp_path):
     index = load_capture(scene.folder, tmp_path / "cache").test_indices[0]
     rewrite(mask_path(scene, index), lambda mask: mask.__setitem__(mask == FIRST, SECOND))
     capture, ids = loaded(scene, tmp_path, "again")
-    assert correct_masks(capture, ids)[1] == 0
+    assert correct_masks(capture, ids, ignore_gaps=False)[1] == 0
 
 
 def test_object_without_points_keeps_its_masks(scene, tmp_path, write_capture):
@@ -107,7 +107,7 @@ def test_object_without_points_keeps_its_masks(scene, tmp_path, write_capture):
     scene.xyz, scene.rgb, scene.point_objects = scene.xyz[keep], scene.rgb[keep], scene.point_objects[keep]
     write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
     capture, ids = loaded(scene, tmp_path, "again")
-    corrected, _ = correct_masks(capture, ids)
+    corrected, _ = correct_masks(capture, ids, ignore_gaps=False)
     for index in capture.train_indices:
         own = capture.mask(index) == FIRST
         assert (corrected.mask(index)[own] == FIRST).all()
@@ -121,3 +121,23 @@ def test_training_reports_corrections_and_resumes_the_same(scene, tmp_path, run_
     assert first.code == EXIT_DONE and any("contradict" in event.get("message", "") for event in first.events)
     again = run_command(*words, "--steps", 30)
     assert again.code == EXIT_DONE and any("contradict" in event.get("message", "") for event in again.events)
+
+
+def test_gaps_are_ignored_and_background_is_not(write_capture, tmp_path):
+    """One mask lacks a sphere, and a line is cut out of the others; the rest of the photo shows no object."""
+    scene = write_capture(views=24, size=(96, 72), points=600)
+    index = load_capture(scene.folder, tmp_path / "cache").train_indices[3]
+    exact = rewrite(mask_path(scene, index), lambda mask: mask.__setitem__(mask == SECOND, 0))
+    largest = np.unique(exact[exact != SECOND], return_counts=True)
+    kept = largest[0][1:][largest[1][1:].argmax()]
+    rows = np.nonzero(exact == kept)[0]
+    line = (exact == kept) & (np.arange(exact.shape[0]) == int(np.median(rows)))[:, None]
+    rewrite(mask_path(scene, index), lambda mask: mask.__setitem__(line, 0))
+    capture, ids = loaded(scene, tmp_path, "again")
+    corrected, _ = correct_masks(capture, ids, ignore_gaps=True)
+    found = corrected.mask(index)
+    assert line.sum() > 10 and (found[line] == IGNORED).mean() > 0.8
+    background = exact == 0
+    assert (found[background] == 0).mean() > 0.85
+    assert (correct_masks(capture, ids, ignore_gaps=False)[0].mask(index) != IGNORED).all()
+    assert (found[exact == SECOND] == IGNORED).mean() > 0.9

@@ -54,7 +54,9 @@ def model_of_discs(trained: Trained, options: argparse.Namespace, reporter: Stop
             shutil.rmtree(other, ignore_errors=True)
     capture = trained.capture
     if capture.has_masks and trained.folder.points.is_file():
-        capture, _ = correct_masks(capture, read_points(trained.folder.points).ids)
+        capture, _ = correct_masks(
+            capture, read_points(trained.folder.points).ids, ignore_gaps=trained.scene.supervise_background
+        )
     memory, gains = memory_for_planes(options), trained.scene.gains
     try:
         resumed = Trainer.resume(capture, folder, None, memory, model.device, gains)

@@ -132,7 +132,8 @@ def _begin(
     gains = context.gains if plan.does("exposure") else np.ones_like(context.gains)
     planned, wanted = planned_capture(context.capture, plan), planned_settings(settings(options), plan)
     if points is not None and planned.has_masks:
-        planned, regions = correct_masks(planned, points.ids)
+        supervised = plan.does("rest") and not options.unlabeled_is_object
+        planned, regions = correct_masks(planned, points.ids, ignore_gaps=supervised)
         if regions:
             reporter.status(f"{regions} regions of masks contradict those of other views and are corrected")
     memory = memory_for_planes(options)
