@@ -19,7 +19,7 @@ from ...backend.shared.reconstruction.edits.splat_edits import missing_sentence,
 from ...backend.shared.reconstruction.folder import Reconstruction
 from . import carrier
 from .capture import origin_of, put_capture_last
-from .edits.floaters import mark_floaters
+from .edits.floaters import mark_distant, mark_floaters
 from .edits.show import show_edits
 from .edits.single_splats import (
     captured_positions,
@@ -132,6 +132,7 @@ def show_result(root: bpy.types.Collection, folder: Path) -> Shown:
         carrier.fill(obj.data, positions - center_of(pivot), attributes)
         select_splats(obj.data, np.isin(keys_of(obj.data), selected))
         mark_floaters(obj, positions)
+        mark_distant(root, obj, positions)
         shown.splats += len(own_splats)
         if own_anchors is not None:
             carrier.fill(

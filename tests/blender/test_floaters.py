@@ -102,6 +102,27 @@ def test_far_points_of_the_capture_are_left_out(root):
     assert size_of(points).max() < 2.5
 
 
+def test_distant_surroundings_do_not_count_for_the_view(root):
+    """The sky of a capture, ten times as far as its points, is drawn, but Blender frames the rest."""
+    folder = blender_scene.folder_of(root)
+    rng = np.random.default_rng(0)
+    write_points(folder, rng.uniform(-2, 5, (200, 3)), np.ones(200, int))
+    blender_scene.show_objects(root, folder)
+    table = splat_table(np.repeat([1, 0], [300, 400]))
+    places = rng.normal(size=(700, 3))
+    places *= np.repeat([1.0, 60.0], [300, 400])[:, None] / np.linalg.norm(places, axis=1)[:, None]
+    for axis, name in enumerate("xyz"):
+        table[name] = places[:, axis]
+    write_vertices(folder / "splats.ply", table)
+    blender_scene.show_result(root, folder)
+    sky = part(root, 0)
+    assert len(sky.data.vertices) == 400 and len(arrays_of(sky.data).means) == 400
+    evaluated = sky.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    assert np.ptp(np.array(evaluated.bound_box)) == 0 and 1.5 < size_of(part(root)).max() < 3
+    assert bpy.ops.objectgs.clean_floaters(everything=True) == {"FINISHED"}
+    assert hidden(root, 0) == floating(places[300:]).sum(), "as the backend's export does"
+
+
 def test_clean_floaters_is_an_edit_of_the_object(root):
     assert bpy.ops.objectgs.clean_floaters() == {"FINISHED"}
     assert cleaned(root) == [1] and hidden(root) == 3 and hidden(root, 2) == 0

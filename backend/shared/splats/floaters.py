@@ -16,6 +16,9 @@ SPACING = 3.0
 """Smallest side of a cell relative to the average distance of the object's splats on its surface."""
 SMALLEST_PART = 0.02
 """Smallest fraction of the object's splats in a group that is apart from the rest but part of the object."""
+BEYOND, ALMOST_ALL = 5.0, 98.0
+"""Splats farther from the median of the capture's points than BEYOND times this percentile of the points' distances
+show distant surroundings, such as the sky."""
 FEWEST = 32
 """Objects with fewer splats have no floaters, since their extent is uncertain."""
 
@@ -35,6 +38,23 @@ def far(means: NDArray) -> NDArray[np.bool_]:
         return np.zeros(len(means), bool)
     distances = _distances(means)
     return distances > FAR_RATIO * np.percentile(distances, 75)
+
+
+def distant(means: NDArray, points: NDArray) -> NDArray[np.bool_]:
+    """Find the splats that show distant surroundings.
+
+    Args:
+        means: splat centers (n, 3).
+        points: the capture's points (m, 3), in the same coordinates.
+
+    Returns:
+        (n,) bool.
+    """
+    if len(points) < FEWEST:
+        return np.zeros(len(means), bool)
+    middle = np.median(points, axis=0)
+    extent = np.percentile(np.linalg.norm(points.astype(np.float64) - middle, axis=1), ALMOST_ALL)
+    return np.linalg.norm(means.astype(np.float64) - middle, axis=1) > BEYOND * extent
 
 
 def floating(means: NDArray) -> NDArray[np.bool_]:

@@ -12,12 +12,12 @@ import numpy as np
 
 from ....backend.shared.reconstruction.objects import SceneObject
 from ....backend.shared.splats.convex_hull import points_inside, reliable_centers
-from ....backend.shared.splats.floaters import floating
+from ....backend.shared.splats.floaters import distant, floating
 from .. import carrier
-from ..kinds import OBJECT_ID, SPLATS, object_collections, part_of
+from ..kinds import OBJECT_ID, SPLATS, object_collections, part_of, points_of
 from ..object_collection import center_of
 from ..shading.modifiers import update_groups
-from ..shading.node_groups import COVERED, FLOATING, HIDDEN
+from ..shading.node_groups import COVERED, DISTANT, FLOATING, HIDDEN
 from .fills import given_way, unobserved_splats
 from .single_splats import deleted_splats
 
@@ -56,6 +56,23 @@ def mark_floaters(obj: bpy.types.Object, positions: np.ndarray) -> None:
     if found.any():
         update_groups(obj)
     carrier.write(obj.data, FLOATING, "BOOLEAN", found)
+
+
+def mark_distant(root: bpy.types.Collection, obj: bpy.types.Object, positions: np.ndarray) -> None:
+    """Store which splats of a newly filled carrier show distant surroundings, by the capture's points if there are any.
+
+    Args:
+        root: the reconstruction's collection.
+        obj: the carrier.
+        positions: (n, 3) float64 positions of its splats relative to the reconstruction's origin.
+    """
+    points = points_of(root)
+    if points is None:
+        return
+    found = distant(positions, carrier.read(points.data, "position"))
+    if found.any() or DISTANT in obj.data.attributes:
+        update_groups(obj)
+        carrier.write(obj.data, DISTANT, "BOOLEAN", found)
 
 
 def floating_splats(mesh: bpy.types.Mesh) -> np.ndarray:

@@ -30,6 +30,8 @@ COVERED = "objectgs_covered"
 """Boolean attribute of a carrier's vertices: splats that a mesh replaces, while splats that fill a hole stay shown."""
 FLOATING = "objectgs_floating"
 """Boolean attribute of a carrier's vertices: floaters. Previews leave them out, since Blender frames what it shows."""
+DISTANT = "objectgs_distant"
+"""Boolean attribute of a carrier's vertices: splats of distant surroundings, which previews leave out, too."""
 
 MINIMUM_FLATNESS = 1e-3
 """Lower limit of a splat's smallest scale relative to its largest, since rays miss flatter ellipsoids."""
@@ -93,7 +95,7 @@ def _make_points_group(name: str) -> bpy.types.NodeTree:
 def splats_group(kind: str) -> bpy.types.NodeTree:
     """Return the newest group that shows splats in viewports (kind: SPLATS_GROUP) or renders (RENDER_GROUP)."""
     if kind == SPLATS_GROUP:
-        return find_or_make(bpy.data.node_groups, kind, 6, "ObjectGS Splats", _make_splats_group)
+        return find_or_make(bpy.data.node_groups, kind, 7, "ObjectGS Splats", _make_splats_group)
     return find_or_make(bpy.data.node_groups, kind, 6, "ObjectGS Render", _make_render_group)
 
 
@@ -102,7 +104,7 @@ def hide_group() -> bpy.types.NodeTree:
 
     Its output is the corners of the box around the splats, as points of radius 0, by which Blender frames the object.
     """
-    return find_or_make(bpy.data.node_groups, HIDE_GROUP, 2, "ObjectGS Drawn", _make_hide_group)
+    return find_or_make(bpy.data.node_groups, HIDE_GROUP, 3, "ObjectGS Drawn", _make_hide_group)
 
 
 def _make_hide_group(name: str) -> bpy.types.NodeTree:
@@ -110,7 +112,7 @@ def _make_hide_group(name: str) -> bpy.types.NodeTree:
     graph = Graph(tree)
     either = graph.node(
         "FunctionNodeBooleanMath",
-        {0: _hidden(graph), 1: graph.attribute(FLOATING, "BOOLEAN")},
+        {0: _hidden(graph), 1: _outside(graph)},
         operation="OR",
     ).outputs[0]
     kept = graph.node(
@@ -157,9 +159,7 @@ def _make_splats_group(name: str) -> bpy.types.NodeTree:
     splat = _Splat(graph)
     raw = recolored(graph, graph.vector("MULTIPLY_ADD", splat.base, (sh.C0,) * 3, (0.5,) * 3), group_input)
     points = graph.node("GeometryNodeMeshToPoints", {"Mesh": group_input.outputs["Geometry"]}).outputs[0]
-    points = graph.node(
-        "GeometryNodeDeleteGeometry", {"Geometry": points, "Selection": graph.attribute(FLOATING, "BOOLEAN")}
-    ).outputs[0]
+    points = graph.node("GeometryNodeDeleteGeometry", {"Geometry": points, "Selection": _outside(graph)}).outputs[0]
 
     first, second, third = splat.sides
     middle = graph.math(
@@ -330,8 +330,18 @@ class _Splat:
 
 def _hidden(graph: Graph) -> bpy.types.NodeSocket:
     """Return whether a splat is hidden for any reason."""
-    reasons = {index: graph.attribute(name, "BOOLEAN") for index, name in enumerate((HIDDEN, COVERED))}
-    return graph.node("FunctionNodeBooleanMath", reasons, operation="OR").outputs[0]
+    return _either(graph, HIDDEN, COVERED)
+
+
+def _outside(graph: Graph) -> bpy.types.NodeSocket:
+    """Return whether previews leave a splat out, since Blender would frame it."""
+    return _either(graph, FLOATING, DISTANT)
+
+
+def _either(graph: Graph, *names: str) -> bpy.types.NodeSocket:
+    """Return whether one of two Boolean attributes is true."""
+    attributes = {index: graph.attribute(name, "BOOLEAN") for index, name in enumerate(names)}
+    return graph.node("FunctionNodeBooleanMath", attributes, operation="OR").outputs[0]
 
 
 def _linear_color(graph: Graph, raw: bpy.types.NodeSocket, alpha: Any) -> bpy.types.NodeSocket:
