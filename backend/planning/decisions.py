@@ -161,8 +161,11 @@ def _groups(context: PlanningContext) -> Decision | None:
     return Decision("groups", f"separate meshes and names for {len(parts)} IDs", False, why, can_override=False)
 
 
-def _surroundings(context: PlanningContext) -> Decision:
+def _surroundings(context: PlanningContext) -> Decision | None:
     what = "distant splats where photos show no points, such as in the sky"
+    if context.resumed is not None:
+        # The training has begun with or without them.
+        return context.resumed.planned("surroundings")
     if not _may_read_photos(context):
         return Decision("surroundings", what, None, "it requires reading all photos, which training does first")
     found = context.surroundings

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from ..capture import Capture, View
-from ..capture.extent import SURROUNDINGS, extent_of
+from ..training.extent import SURROUNDINGS, extent_of
 
 SPACING = float(np.radians(2.0))
 """Angle between neighboring directions."""

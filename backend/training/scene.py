@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from ..capture.extent import SURROUNDINGS, Extent, extent_of
 from ..model.object_model import Normalization
 from ..raster import Camera, devices
 from ..shared.class_table import ClassTable
 from .exposure.gains import measure_gains, varies
+from .extent import SURROUNDINGS, Extent, extent_of
 
 if TYPE_CHECKING:
     from ..capture import Capture

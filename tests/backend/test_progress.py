@@ -119,7 +119,8 @@ def test_set_up_compiles_what_jobs_need(folders, run_command):
     assert run_command("doctor", "--json").code == 0
 
     def compiled() -> set[Path]:
-        return {path for path in cache.rglob("*.nbc")}
+        # Other tests may compile those of the simulated GPU at the same time.
+        return {path for path in cache.rglob("*.nbc") if not path.parent.name.startswith("cuda")}
 
     before = compiled()
     for words in (

@@ -8,12 +8,12 @@ import torch
 from PIL import Image
 
 from backend.capture import load_capture
-from backend.capture.extent import SURROUNDINGS, extent_of
 from backend.mesh.views import Views
 from backend.model.draw import draw
 from backend.model.object_model import ObjectModel
 from backend.planning.decisions import Choices, PlanningContext, decide
 from backend.planning.surroundings import find_surroundings
+from backend.training.extent import SURROUNDINGS, extent_of
 from backend.training.initial_model import DistantPoints
 from backend.training.settings import Settings
 from backend.training.trainer import Trainer

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from .capture import Capture
+if TYPE_CHECKING:
+    from ..capture import Capture
 
 SURROUNDINGS = 10.0
 """Distance of surroundings without points, such as the sky, relative to the radius; parallax is negligible there."""
