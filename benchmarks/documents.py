@@ -32,6 +32,7 @@ MADE_FROM_FIGURES = {
     "mask-noise": "benchmarks.mask_noise:document",
     "objects": "benchmarks.objects:document",
     "pointing": "benchmarks.pointing:document",
+    "poses": "benchmarks.poses:document",
     "reliability": "tests.fuzz.report:document",
     "stability": "benchmarks.stability:document",
     "suite": "benchmarks.suite:document",

@@ -5,7 +5,8 @@
 Synthetic sets have exact poses; the real ones are compared with the models that come with them, which are estimates
 themselves. Positions are compared after a similarity fit that wrong poses do not influence. --defaults also runs
 COLMAP's feature extraction, exhaustive matching and incremental mapping with their default options, in the same run.
---write saves the figures to docs/figures/poses.json and the table to docs/poses.md.
+--write saves the figures to docs/figures/poses.json, beside those of sets that were measured before, and the table to
+docs/poses.md.
 """
 
 from __future__ import annotations
@@ -314,6 +315,9 @@ def main() -> None:
             found[name]["defaults"] = defaults(case)
         print(name, json.dumps(found[name]), flush=True)
     if options.write:
+        stored = documents.FIGURES / "poses.json"
+        known = json.loads(stored.read_text(encoding="utf-8")) if stored.exists() else {}
+        found = {name: each for name in CASES if (each := found.get(name) or known.get(name))}
         documents.save("poses", found)
     print(document(found))
 

@@ -151,10 +151,12 @@ def _sweep(capture: Capture, scaled: list, index: int, neighbors: list[int]) -> 
     stride = max(int(np.ceil(np.sqrt(height * width / GRID))), 1)
     rows, columns = (np.arange(RADIUS, side - RADIUS, stride) for side in (height, width))
     pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
-    offsets = np.stack(np.meshgrid(*[np.arange(-RADIUS, RADIUS + 1)] * 2), -1).reshape(-1, 2)
-    patches = pixels[:, None] + offsets
+    offsets = np.stack(np.meshgrid(*[np.arange(-RADIUS, RADIUS + 1)] * 2), -1)
+    patches = pixels[:, None, None] + offsets
     values = image[patches[..., 1], patches[..., 0]]
-    rays = np.concatenate([patches + 0.5, np.ones((*patches.shape[:2], 1))], -1) @ np.linalg.inv(K).T
+    textured = np.flatnonzero(values.std((1, 2)) >= _FLATTEST)
+    inverse_K = np.linalg.inv(K)
+    rays = np.column_stack([pixels[textured] + 0.5, np.ones(len(textured))]) @ inverse_K.T
     depths = 1.0 / np.linspace(1.0 / far, 1.0 / near, DEPTHS)
     between = np.array([capture.views[other].viewmat for other in neighbors]) @ np.linalg.inv(matrix)
     theirs = np.array([_scaled_intrinsics(capture.views[other], scaled[other][0]) for other in neighbors])
@@ -163,84 +165,100 @@ def _sweep(capture: Capture, scaled: list, index: int, neighbors: list[int]) -> 
     for number, other in enumerate(neighbors):
         images[number, : sizes[number, 0], : sizes[number, 1]] = scaled[other][0]
     score = _scores(
-        values, rays.astype(np.float32), depths.astype(np.float32), (theirs @ between[:, :3, :3]).astype(np.float32),
+        values[textured], rays.astype(np.float32), inverse_K.T[:2].astype(np.float32), depths.astype(np.float32),
+        (theirs @ between[:, :3, :3]).astype(np.float32),
         np.einsum("nij,nj->ni", theirs, between[:, :3, 3]).astype(np.float32), images, sizes,
     )  # fmt: skip
     best = score.argmax(1)
     top = score[np.arange(len(score)), best]
     aside = np.abs(np.arange(DEPTHS)[None] - best[:, None]) > _BESIDE
     second = np.where(aside, score, -1.0).max(1)
-    good = (top >= CORRELATES) & (top - second >= DISTINCT) & (values.std(1) >= _FLATTEST)
+    good = (top >= CORRELATES) & (top - second >= DISTINCT)
     good &= (best > 0) & (best < DEPTHS - 1)
     inner = np.clip(best, 1, DEPTHS - 2)
     left, middle, right = (score[np.arange(len(score)), inner + step] for step in (-1, 0, 1))
     bend = left - 2 * middle + right
     shift = np.where(bend < -1e-6, 0.5 * (left - right) / np.minimum(bend, -1e-6), 0.0).clip(-0.5, 0.5)
     inverse = np.interp(inner + shift, np.arange(DEPTHS), 1.0 / depths)
-    return _Sweep(pixels, np.where(good, 1.0 / inverse, 0.0), (len(rows), len(columns)), stride, K)
+    found = np.zeros(len(pixels))
+    found[textured[good]] = 1.0 / inverse[good]
+    return _Sweep(pixels, found, (len(rows), len(columns)), stride, K)
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
-def _scores(values, rays, depths, turns, steps, images, sizes):  # type: ignore[no-untyped-def]
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
+def _scores(values, rays, beside, depths, turns, steps, images, sizes):  # type: ignore[no-untyped-def]
     """Return the mean of the two best correlations of each patch with other photos at each depth, (n, d) float32.
 
+    A patch is small, so its projection is taken as affine.
+
     Args:
-        values: (n, p) float32 gray levels of the patches.
-        rays: (n, p, 3) float32 rays of their pixels, with depth 1.
+        values: (n, side, side) float32 gray levels of the patches.
+        rays: (n, 3) float32 rays of the middle pixels, with depth 1.
+        beside: (2, 3) float32, difference of the ray of the next pixel to the right, and of the one below.
         depths: (d,) float32.
         turns: (k, 3, 3) float32, and steps (k, 3): a ray times its depth, to the other photos' pixels times depth.
         images: (k, H, W) float32 gray levels; sizes: (k, 2) heights and widths that are used of them.
     """
-    count, pixels = values.shape
+    count, side = values.shape[:2]
+    radius, pixels, edge = side // 2, side * side, np.float32(0.01)
     scores = np.empty((count, len(depths)), np.float32)
     for n in numba.prange(count):
         mean, square = 0.0, 0.0
-        for p in range(pixels):
-            mean += values[n, p]
-            square += values[n, p] * values[n, p]
+        for i in range(side):
+            for j in range(side):
+                mean += values[n, i, j]
+                square += values[n, i, j] * values[n, i, j]
         mean /= pixels
         own = np.sqrt(max(square / pixels - mean * mean, 1e-6))
-        turned = np.empty((len(turns), pixels, 3), np.float32)
+        middle = np.empty((len(turns), 3), np.float32)
+        right, below = np.empty_like(middle), np.empty_like(middle)
         for k in range(len(turns)):
-            for p in range(pixels):
-                for axis in range(3):
-                    turned[k, p, axis] = (
-                        turns[k, axis, 0] * rays[n, p, 0]
-                        + turns[k, axis, 1] * rays[n, p, 1]
-                        + turns[k, axis, 2] * rays[n, p, 2]
-                    )
+            for axis in range(3):
+                middle[k, axis] = right[k, axis] = below[k, axis] = 0.0
+                for other in range(3):
+                    middle[k, axis] += turns[k, axis, other] * rays[n, other]
+                    right[k, axis] += turns[k, axis, other] * beside[0, other]
+                    below[k, axis] += turns[k, axis, other] * beside[1, other]
         for d in range(len(depths)):
-            first, second = -1.0, -1.0
+            first, second = np.float32(-1.0), np.float32(-1.0)
             for k in range(len(turns)):
+                z = middle[k, 2] * depths[d] + steps[k, 2]
+                if z <= 0.0:
+                    continue
+                u = (middle[k, 0] * depths[d] + steps[k, 0]) / z
+                v = (middle[k, 1] * depths[d] + steps[k, 1]) / z
+                scale = depths[d] / z
+                ux, uy = scale * (right[k, 0] - u * right[k, 2]), scale * (below[k, 0] - u * below[k, 2])
+                vx, vy = scale * (right[k, 1] - v * right[k, 2]), scale * (below[k, 1] - v * below[k, 2])
                 height, width = sizes[k]
-                total, squares, product, inside = 0.0, 0.0, 0.0, True
-                for p in range(pixels):
-                    z = turned[k, p, 2] * depths[d] + steps[k, 2]
-                    if z <= 0.0:
-                        inside = False
-                        break
-                    x = (turned[k, p, 0] * depths[d] + steps[k, 0]) / z - 0.5
-                    y = (turned[k, p, 1] * depths[d] + steps[k, 1]) / z - 0.5
-                    if not (0.0 <= x < width - 1 and 0.0 <= y < height - 1):
-                        inside = False
-                        break
-                    column, row = int(x), int(y)
-                    right, down = x - column, y - row
-                    seen = (1.0 - down) * (
-                        (1.0 - right) * images[k, row, column] + right * images[k, row, column + 1]
-                    ) + down * ((1.0 - right) * images[k, row + 1, column] + right * images[k, row + 1, column + 1])
-                    total += seen
-                    squares += seen * seen
-                    product += seen * (values[n, p] - mean)
-                correlation = -1.0
-                if inside:
-                    other = squares / pixels - (total / pixels) ** 2
-                    if other > 0.25:
-                        correlation = product / pixels / (own * np.sqrt(other))
-                if correlation > first:
-                    first, second = correlation, first
-                elif correlation > second:
-                    second = correlation
+                across, down = radius * (abs(ux) + abs(uy)), radius * (abs(vx) + abs(vy))
+                u, v = u - np.float32(0.5), v - np.float32(0.5)
+                if min(u - across, v - down) < edge or u + across > width - 1 - edge or v + down > height - 1 - edge:
+                    continue
+                total, squares, product = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+                for i in range(side):
+                    x = u - radius * ux + (i - radius) * uy
+                    y = v - radius * vx + (i - radius) * vy
+                    for j in range(side):
+                        column, row = int(x), int(y)
+                        a, b = x - column, y - row
+                        upper = images[k, row, column] + a * (images[k, row, column + 1] - images[k, row, column])
+                        lower = images[k, row + 1, column] + a * (
+                            images[k, row + 1, column + 1] - images[k, row + 1, column]
+                        )
+                        seen = upper + b * (lower - upper)
+                        total += seen
+                        squares += seen * seen
+                        product += seen * (values[n, i, j] - mean)
+                        x += ux
+                        y += vx
+                other_square = squares / pixels - (total / pixels) ** 2
+                if other_square > 0.25:
+                    correlation = np.float32(product / pixels / (own * np.sqrt(other_square)))
+                    if correlation > first:
+                        first, second = correlation, first
+                    elif correlation > second:
+                        second = correlation
             scores[n, d] = 0.5 * (first + second) if len(turns) > 1 else first
     return scores
 
