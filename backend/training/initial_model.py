@@ -17,20 +17,6 @@ if TYPE_CHECKING:
     from ..capture import Capture
 
 
-class AddedPoints(NamedTuple):
-    """Points that COLMAP did not find.
-
-    Attributes:
-        xyz: (n, 3) float64 in world units.
-        rgb: (n, 3) uint8.
-        ids: (n,) int64, the objects that they belong to.
-    """
-
-    xyz: np.ndarray
-    rgb: np.ndarray
-    ids: np.ndarray
-
-
 class DistantPoints(NamedTuple):
     """Points of distant surroundings: xyz (n, 3) in world units, rgb (n, 3) uint8, distance between neighbors."""
 
@@ -45,7 +31,7 @@ def initial_model(
     settings: Settings,
     rng: np.random.Generator,
     seeds: np.ndarray,
-    more: AddedPoints | None = None,
+    more: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     surroundings: DistantPoints | None = None,
 ) -> ObjectModel:
     """Return a model with anchors at the capture's points.
@@ -56,13 +42,13 @@ def initial_model(
         settings: settings of the training.
         rng: generator of the anchors' offsets.
         seeds: (M,) bool, the points that are used for anchors and to measure the scene's extent and density.
-        more: points of objects that have none.
+        more: xyz (n, 3), rgb (n, 3) uint8 and IDs (n,) of points of objects that have none.
         surroundings: points of distant surroundings, which belong to no object.
     """
     xyz, rgb, ids = capture.points.xyz[seeds], capture.points.rgb[seeds], point_ids[seeds]
     camera_centers = np.array([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in capture.views])
     normalization = Normalization.of(camera_centers, xyz)
-    classes = ClassTable(np.concatenate([[0], point_ids, *([] if more is None else [more.ids])]))
+    classes = ClassTable(np.concatenate([[0], point_ids, *([] if more is None else [more[2]])]))
     voxel = settings.voxel * normalization.scale if settings.voxel else median_spacing(normalization.to_scene(xyz))
     if more is not None:
         xyz, rgb, ids = (np.concatenate(pair) for pair in zip((xyz, rgb, ids), more, strict=True))

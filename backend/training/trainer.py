@@ -27,7 +27,7 @@ from . import check_finite, overfitting
 from .budget import Budget, TrainingProgress
 from .check_finite import FiniteCheck
 from .growth_strategy import GrowthStrategy
-from .initial_model import AddedPoints, DistantPoints, initial_model
+from .initial_model import DistantPoints, initial_model
 from .optimizer.adam import BETA1, BETA2, step_rows
 from .optimizer.average import Average
 from .scene import Scene
@@ -93,7 +93,7 @@ class Trainer:
         seeds: np.ndarray | None = None,
         supervise_background: bool | None = None,
         gains: np.ndarray | None = None,
-        more: AddedPoints | None = None,
+        more: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
         surroundings: DistantPoints | None = None,
     ) -> Trainer:
         """Start a training with anchors at the capture's points.

@@ -11,7 +11,7 @@ import torch
 from ...capture import Capture
 from ...evaluation import IdScores, color_corrected, comparison, curve_image, psnr, save_image, thumbnail
 from ...labels import correct_masks
-from ...labels.mask_points import place_points
+from ...labels.mask_points import MaskPoints, place_points
 from ...model.checkpoint import has_checkpoint
 from ...model.draw import draw
 from ...model.object_model import ObjectModel
@@ -28,7 +28,7 @@ from ...shared.reconstruction.plan import Plan, write_plan
 from ...shared.reconstruction.record import TrainingRecord, read_record, update_record
 from ...shared.stopping import StoppingReporter
 from ...training.budget import Budget, TrainingProgress
-from ...training.initial_model import AddedPoints, DistantPoints
+from ...training.initial_model import DistantPoints
 from ...training.scene import Scene
 from ...training.trainer import Evaluate, Trainer
 from ..exported import EXPORT, export_model
@@ -163,9 +163,7 @@ def _begin(
     return trainer, plan
 
 
-def _place_missing_objects(
-    capture: Capture, point_ids: np.ndarray, seed: int, reporter: Reporter
-) -> AddedPoints | None:
+def _place_missing_objects(capture: Capture, point_ids: np.ndarray, seed: int, reporter: Reporter) -> MaskPoints | None:
     """Place points for the objects in the masks that have none; report how many, and the objects that stay without."""
     missing = sorted(set(capture.object_ids.tolist()) - set(point_ids.tolist()))
     if not missing:
@@ -179,7 +177,7 @@ def _place_missing_objects(
             )
         else:
             reporter.warning(f"The masks of object {object_id} ({named}) agree nowhere, so training starts without it.")
-    return AddedPoints(*placed) if len(placed.ids) else None
+    return placed if len(placed.ids) else None
 
 
 def _check_same_training(folder: Reconstruction, capture: Capture, plan: Plan, options: argparse.Namespace) -> None:
