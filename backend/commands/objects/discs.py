@@ -54,9 +54,9 @@ def model_of_discs(trained: Trained, options: argparse.Namespace, reporter: Stop
             shutil.rmtree(other, ignore_errors=True)
     capture = trained.capture
     if capture.has_masks and trained.folder.points.is_file():
-        capture, _ = correct_masks(
-            capture, read_points(trained.folder.points).ids, ignore_gaps=trained.scene.supervise_background
-        )
+        # As in the training itself, where ID 0 may be an object.
+        gaps = trained.scene.supervise_background and not trained.scene.zero_is_object
+        capture, _ = correct_masks(capture, read_points(trained.folder.points).ids, ignore_gaps=gaps)
     memory, gains = memory_for_planes(options), trained.scene.gains
     try:
         resumed = Trainer.resume(capture, folder, None, memory, model.device, gains)
