@@ -19,6 +19,12 @@ _BLOCKS = 8
 MARGIN = 0.1
 """Fraction of its size that a view is enlarged by on each side, since splats extend beyond their points."""
 
+VACANT = 0.35
+"""Fraction of the training views' area without points from which on points are looked for there."""
+
+_CELLS = 40
+"""Number of cells along the longer side of a view in which points are counted."""
+
 
 def duplicate_views(capture: Capture) -> list[int]:
     """Find training views that duplicate an earlier one: same position, same image, same objects in the masks.
@@ -171,6 +177,26 @@ def unseen_points(capture: Capture) -> np.ndarray:
             break
         unseen[left[_inside(capture, index, capture.points.xyz[left])]] = False
     return unseen if not unseen.all() else np.zeros_like(unseen)
+
+
+def vacancy(capture: Capture) -> float:
+    """Return the mean fraction of the training views' area without points.
+
+    Args:
+        capture: The capture.
+    """
+    fractions = []
+    for index in capture.train_indices:
+        view = capture.views[index]
+        cell = max(view.width, view.height) / _CELLS
+        x, y, z = (capture.points.xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]).T
+        ahead = z > 0
+        pixels = view.K[:2, :2] @ np.stack([x[ahead], y[ahead]]) / z[ahead] + view.K[:2, 2:]
+        size = np.array([[view.width], [view.height]])
+        inside = ((pixels >= 0) & (pixels < size)).all(0)
+        cells = np.unique((pixels[:, inside] // cell).astype(np.int64), axis=1).shape[1]
+        fractions.append(1.0 - cells / (np.ceil(size / cell).prod()))
+    return float(np.mean(fractions)) if fractions else 0.0
 
 
 def _inside(capture: Capture, index: int, xyz: np.ndarray) -> np.ndarray:

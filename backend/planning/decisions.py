@@ -18,7 +18,15 @@ from ..shared.reconstruction.plan import KEYS, Decision, Plan
 from ..training.budget import choose_validation_views
 from ..training.exposure.gains import VARIES_FROM, differences, measure_gains
 from ..training.settings import Settings, background_is_masked, downscale_at
-from .coverage import blind_views, duplicate_views, unseen_points, views_like_held_out, views_without_objects
+from .coverage import (
+    VACANT,
+    blind_views,
+    duplicate_views,
+    unseen_points,
+    vacancy,
+    views_like_held_out,
+    views_without_objects,
+)
 from .surroundings import LEAST, Surroundings, find_surroundings
 
 PIXELS_TO_READ = 3e8
@@ -291,6 +299,18 @@ def _unseen_points(context: PlanningContext) -> Decision | None:
     return Decision("unseen-points", "anchors outside every view", False, why)
 
 
+def _dense_points(context: PlanningContext) -> Decision | None:
+    what = "points on surfaces without features, from patches of the photos"
+    if context.resumed is not None:
+        # The training has begun with or without them.
+        return context.resumed.planned("dense-points")
+    if not _may_read_photos(context):
+        return Decision("dense-points", what, None, "it requires reading all photos, which training does first")
+    vacant = max(vacancy(planned_capture(context.capture, context.plan)) - context.surroundings.fraction, 0.0)
+    why = f"{vacant:.0%} of the photos' area is without points, but not of the sky; the threshold is {VACANT:.0%}"
+    return Decision("dense-points", what, vacant >= VACANT, why)
+
+
 def _exposure(context: PlanningContext) -> Decision:
     what = "exposure and white balance correction"
     if not _may_read_photos(context):
@@ -328,7 +348,7 @@ def _surface(context: PlanningContext) -> Decision | None:
 
 DECISIONS: tuple[Callable[[PlanningContext], Decision | None], ...] = (
     _votes, _objects, _groups, _surroundings, _rest, _labels, _undistortion, _duplicate_views, _blind_views,
-    _other_views, _validation_views, _unseen_points, _exposure, _pyramid, _meshes, _surface,
+    _other_views, _validation_views, _unseen_points, _dense_points, _exposure, _pyramid, _meshes, _surface,
 )  # fmt: skip
 """In the order of `KEYS`; a decision may depend on earlier ones. None if a decision does not apply to the capture."""
 

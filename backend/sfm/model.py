@@ -114,6 +114,12 @@ def add_points(model: pycolmap.Reconstruction, xyz: np.ndarray, rgb: np.ndarray)
         model.add_point3D(position, pycolmap.Track(), color)
 
 
+def remove_points(model: pycolmap.Reconstruction, ids: np.ndarray) -> None:
+    """Remove points with these IDs (n,)."""
+    for point_id in ids.tolist():
+        model.delete_point3D(point_id)
+
+
 def write_model(model: pycolmap.Reconstruction, capture: Path) -> None:
     """Write a model as the sparse/0 of a capture, replacing the one there at the end."""
     target = capture / SPARSE

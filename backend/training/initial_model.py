@@ -41,17 +41,17 @@ def initial_model(
         point_ids: (M,) int64 object ID of each point, 0 if it belongs to none.
         settings: settings of the training.
         rng: generator of the anchors' offsets.
-        seeds: (M,) bool, the points that are used for anchors and to measure the scene's extent and density.
-        more: xyz (n, 3), rgb (n, 3) uint8 and IDs (n,) of points of objects that have none.
+        seeds: (M,) bool, the points that are used for anchors and to measure the scene's extent.
+        more: xyz (n, 3), rgb (n, 3) uint8 and IDs (n,) of further points.
         surroundings: points of distant surroundings, which belong to no object.
     """
     xyz, rgb, ids = capture.points.xyz[seeds], capture.points.rgb[seeds], point_ids[seeds]
     camera_centers = np.array([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in capture.views])
     normalization = Normalization.of(camera_centers, xyz)
     classes = ClassTable(np.concatenate([[0], point_ids, *([] if more is None else [more[2]])]))
-    voxel = settings.voxel * normalization.scale if settings.voxel else median_spacing(normalization.to_scene(xyz))
     if more is not None:
         xyz, rgb, ids = (np.concatenate(pair) for pair in zip((xyz, rgb, ids), more, strict=True))
+    voxel = settings.voxel * normalization.scale if settings.voxel else median_spacing(normalization.to_scene(xyz))
     anchors = seed_anchors(
         normalization.to_scene(xyz), rgb / 255.0, classes.classes_of(ids), voxel, settings.layout, rng
     )

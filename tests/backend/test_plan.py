@@ -14,7 +14,7 @@ from backend.capture import load_capture
 from backend.labels import read_points
 from backend.model.checkpoint import load_checkpoint
 from backend.planning import decisions
-from backend.planning.coverage import blind_views, duplicate_views, unseen_points, views_like_held_out
+from backend.planning.coverage import blind_views, duplicate_views, unseen_points, vacancy, views_like_held_out
 from backend.planning.decisions import (
     DECISIONS,
     Choices,
@@ -83,6 +83,19 @@ def test_undecided_steps_are_done_until_settled():
     assert Plan((later,)).settled_by(Plan())["labels"] == later
 
 
+def test_points_are_looked_for_where_photos_have_none(write_capture, tmp_path):
+    capture = loaded(write_capture(views=9, size=(64, 48)), tmp_path)
+    plan = planned(capture)
+    assert plan["dense-points"].done and "without points" in plan["dense-points"].why
+    assert not planned(capture, leave_out=["dense-points"])["dense-points"].done
+    around = {"spheres": [(3, np.zeros(3), 3.0)], "points": 20_000}
+    many = loaded(write_capture(name="many", views=9, size=(64, 48), **around), tmp_path)
+    assert vacancy(many) < 0.05 and not planned(many)["dense-points"].done
+    assert planned(many, keep=["dense-points"])["dense-points"].done
+    begun = Plan((Decision("dense-points", "", True, ""),))
+    assert decide(PlanningContext(many, Choices(), resumed=begun))["dense-points"].done, "as the training began"
+
+
 # --- basis of decisions ----------------------------------------------------------------------------------------------
 
 
@@ -91,8 +104,8 @@ def test_plan_of_capture_with_objects(write_capture, tmp_path):
     plan = planned(loaded(scene, tmp_path), point_ids=scene.point_objects, thorough=True)
     done = {own.key: own.done for own in plan.decisions}
     assert done == {
-        "votes": True, "surroundings": False, "rest": False, "labels": True, "undistortion": False, "exposure": True,
-        "pyramid": False,
+        "votes": True, "surroundings": False, "rest": False, "labels": True, "undistortion": False,
+        "dense-points": True, "exposure": True, "pyramid": False,
     }  # fmt: skip
     assert len(DECISIONS) == len(KEYS) and list(done) == [key for key in KEYS if key in done]
     assert planned_settings(Settings(), plan) == Settings(fit_colors=True)

@@ -14,7 +14,6 @@ from ...capture import load_capture
 from ...sfm import database, model
 from ...sfm.agreement import measure_agreement
 from ...sfm.check import figures_of, weak_photos, write_picture
-from ...sfm.dense import dense_points, spacing, thinned
 from ...sfm.pairs import choose_pairs
 from ...sfm.sources.photos import IMAGES, MASKS, Photo, take_photos, write_object_masks
 from ...sfm.stages import run_stage
@@ -24,6 +23,7 @@ from ...shared.formats.json_file import write_json
 from ...shared.formats.photos_source import PHOTOS, VIDEOS, WORK, PhotosSource, write_source
 from ...shared.reconstruction.lock import locked
 from ...shared.stopping import StoppingReporter
+from ...stereo.dense_points import find_dense_points
 
 REPORT, PICTURE = "sfm.json", "sfm.png"
 OBJECTS_DATABASE = "objects.db"
@@ -194,15 +194,15 @@ def _refined(
 
 
 def _densify(found: pycolmap.Reconstruction, capture: Path, reporter: StoppingReporter) -> None:
-    """Add points where features are few, from patches of the photos."""
+    """Add points where features are few, from patches of the photos, and remove those in front of surfaces."""
     reporter.begin("dense", "Finding points on plain surfaces")
     scratch = capture / WORK / "undistorted"
     shutil.rmtree(scratch, ignore_errors=True)
     try:
         photos = load_capture(capture, scratch)
-        xyz, rgb = dense_points(photos, reporter.progress)
-        new = thinned(xyz, photos.points.xyz, spacing(photos))
-        model.add_points(found, xyz[new], rgb[new])
+        points = find_dense_points(photos, range(len(photos.views)), reporter.progress)
+        model.remove_points(found, photos.points.ids[points.in_front])
+        model.add_points(found, points.xyz, points.rgb)
         model.write_model(found, capture)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)

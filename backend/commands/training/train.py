@@ -11,11 +11,9 @@ import torch
 from ...capture import Capture
 from ...evaluation import IdScores, color_corrected, comparison, curve_image, psnr, save_image, thumbnail
 from ...labels import correct_masks
-from ...labels.mask_points import MaskPoints, place_points
 from ...model.checkpoint import has_checkpoint
 from ...model.draw import draw
 from ...model.object_model import ObjectModel
-from ...planning.coverage import unseen_points
 from ...planning.decisions import OF_TRAINING, decide, planned_capture, planned_settings
 from ...raster import devices
 from ...shared.errors import Cancelled, InputError
@@ -38,7 +36,8 @@ from ..planning import build_context, change_objects, choices, find_requested_ob
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import finish_stage
-from ..votes import VOTE, cast_votes, object_name, votes_are_current, votes_key
+from ..votes import VOTE, cast_votes, votes_are_current, votes_key
+from .points import DENSE, starting_points
 
 CURVE_VIEWS = 20
 """Largest number of held-out views that are measured during training; `evaluate` measures all."""
@@ -51,7 +50,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     reporter.expect(
         {
             READ: ("Preparing", 5.0), VOTE: ("Preparing", 5.0), "plan": ("Preparing", 5.0),
-            KERNELS: ("Preparing", kernel_seconds(device)),
+            DENSE: ("Preparing", 0.0), KERNELS: ("Preparing", kernel_seconds(device)),
             "train": ("Training", budget.seconds or DEFAULT_SECONDS), EXPORT: ("Saving", 5.0),
         }
     )  # fmt: skip
@@ -147,11 +146,10 @@ def _begin(
     else:
         assert context.point_ids is not None
         far = DistantPoints(*context.surroundings[:3]) if plan.does("surroundings") else None
-        seeds = None if plan.does("unseen-points") else ~unseen_points(planned)
+        seeds, more = starting_points(planned, context.point_ids, plan, options.seed, reporter)
         trainer = Trainer.start(
-            planned, context.point_ids, wanted, memory, device,
-            seeds=seeds, supervise_background=planned.has_masks and plan.does("rest"), gains=gains,
-            more=_place_missing_objects(planned, context.point_ids, options.seed, reporter), surroundings=far,
+            planned, context.point_ids, wanted, memory, device, seeds=seeds,
+            supervise_background=planned.has_masks and plan.does("rest"), gains=gains, more=more, surroundings=far,
         )  # fmt: skip
     if options.restart:
         # The new training's first checkpoint replaces that of the old one before anything refers to it.
@@ -161,23 +159,6 @@ def _begin(
     write_plan(folder.plan, plan)
     report_plan(plan, reporter)
     return trainer, plan
-
-
-def _place_missing_objects(capture: Capture, point_ids: np.ndarray, seed: int, reporter: Reporter) -> MaskPoints | None:
-    """Place points for the objects in the masks that have none; report how many, and the objects that stay without."""
-    missing = sorted(set(capture.object_ids.tolist()) - set(point_ids.tolist()))
-    if not missing:
-        return None
-    placed = place_points(capture, missing, seed)
-    for object_id in missing:
-        count, named = int((placed.ids == object_id).sum()), object_name(capture, object_id)
-        if count:
-            reporter.status(
-                f"object {object_id} {named}: {count:,} points where its masks agree, since COLMAP has none"
-            )
-        else:
-            reporter.warning(f"The masks of object {object_id} ({named}) agree nowhere, so training starts without it.")
-    return placed if len(placed.ids) else None
 
 
 def _check_same_training(folder: Reconstruction, capture: Capture, plan: Plan, options: argparse.Namespace) -> None:

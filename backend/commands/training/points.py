@@ -1,0 +1,93 @@
+"""The points that a training begins with: those of the capture that can be right, and more."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ...capture import Capture
+from ...labels import vote
+from ...labels.mask_points import MaskPoints, place_points
+from ...planning.coverage import unseen_points
+from ...shared.events import Reporter
+from ...shared.reconstruction.plan import Plan
+from ...stereo.dense_points import find_dense_points
+from ..votes import object_name
+
+DENSE = "dense"
+"""Name of the search for dense points among the parts of a command."""
+
+_SECONDS = 0.4
+"""Typical time of the search for dense points in a photo."""
+
+
+class StartingPoints(NamedTuple):
+    """Points to begin with.
+
+    Attributes:
+        seeds: (M,) bool, the points of the capture that are used.
+        more: further points with their objects, or None.
+    """
+
+    seeds: np.ndarray
+    more: MaskPoints | None
+
+
+def starting_points(
+    capture: Capture, point_ids: np.ndarray, plan: Plan, seed: int, reporter: Reporter
+) -> StartingPoints:
+    """Choose and complete a capture's points as its plan decides.
+
+    Args:
+        capture: the capture that is trained on.
+        point_ids: (M,) int64 object ID of each of its points, 0 if it belongs to none.
+        plan: the plan.
+        seed: of random numbers.
+        reporter: receives progress, how many points are placed, and the objects that stay without any.
+
+    Raises:
+        InputError: a photo or mask cannot be read.
+    """
+    seeds = np.ones(len(point_ids), np.bool_) if plan.does("unseen-points") else ~unseen_points(capture)
+    parts = []
+    found_ids = set(point_ids.tolist())
+    if plan.does("dense-points"):
+        dense, seeds = _dense(capture, seeds, reporter)
+        parts.append(dense)
+        found_ids |= set(dense.ids.tolist())
+    missing = sorted(set(capture.object_ids.tolist()) - found_ids)
+    if missing:
+        parts.append(_place(capture, missing, seed, reporter))
+    parts = [part for part in parts if len(part.ids)]
+    return StartingPoints(seeds, MaskPoints(*map(np.concatenate, zip(*parts, strict=True))) if parts else None)
+
+
+def _dense(capture: Capture, seeds: np.ndarray, reporter: Reporter) -> tuple[MaskPoints, np.ndarray]:
+    """Return points on surfaces without features, with their objects, and the seeds that do not float."""
+    reporter.expect({DENSE: ("Preparing", _SECONDS * len(capture.train_indices))})
+    reporter.begin(DENSE, "Finding points on surfaces without features")
+    found = find_dense_points(capture, capture.train_indices, reporter.progress)
+    ids = np.zeros(len(found.xyz), np.int64)
+    if capture.has_masks and len(ids):
+        ids = vote(capture, positions=found.xyz).ids
+    reporter.status(
+        f"{len(found.xyz):,} points added on surfaces without features; {int(found.in_front.sum()):,} of the capture's "
+        "left out, which float in front of surfaces"
+    )
+    kept = seeds & ~found.in_front
+    return MaskPoints(found.xyz, found.rgb, ids), kept if kept.any() or len(ids) else seeds
+
+
+def _place(capture: Capture, missing: list[int], seed: int, reporter: Reporter) -> MaskPoints:
+    """Place points for the objects in the masks that have none; report how many, and the objects that stay without."""
+    placed = place_points(capture, missing, seed)
+    for object_id in missing:
+        count, named = int((placed.ids == object_id).sum()), object_name(capture, object_id)
+        if count:
+            reporter.status(
+                f"object {object_id} {named}: {count:,} points where its masks agree, since COLMAP has none"
+            )
+        else:
+            reporter.warning(f"The masks of object {object_id} ({named}) agree nowhere, so training starts without it.")
+    return placed

@@ -1,0 +1,1 @@
+"""Depth of surfaces without features, from photos with known poses."""

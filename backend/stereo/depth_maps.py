@@ -1,0 +1,241 @@
+"""Depth maps of the photos of a capture on coarse grids, and what they say about points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image as PilImage
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from ..capture import Capture, View
+from .patch_match import RADIUS, Others, match
+
+GRID = 6000
+"""Number of pixels of each photo whose depth is looked for."""
+LONGEST_SIDE = 640
+"""Side in pixels to which larger photos are scaled."""
+NEIGHBORS = 8
+"""Largest number of other photos that a photo is matched with."""
+CORRELATES = 0.6
+"""Least correlation of patches that match."""
+AGREES = 0.015
+"""Largest relative difference between the depths that two photos find at a point."""
+IN_FRONT = 0.05
+"""Relative difference from which on a point is in front of the surface that a photo shows."""
+FEWEST = 2
+"""Number of other photos that must find a depth, too."""
+SPECKLE = 8
+"""Fewest pixels of a grid that must form a surface."""
+_SMOOTH = 0.02
+"""Largest relative difference of the depths of neighboring pixels of a surface, along their planes."""
+_NEAREST_FARTHEST = 5, 99
+_NEARER, _FARTHER = 0.6, 1.5
+"""Percentiles of the depths of the capture's points in a view, and the range of depths relative to them."""
+_LEAST_ANGLE, _BEST_ANGLE, _LARGEST_ANGLE = 0.05, 0.2, 1.1
+"""Angles in radians between neighboring photos, as seen from the scene."""
+
+
+class DepthMap(NamedTuple):
+    """Depths found in a view.
+
+    Attributes:
+        pixels: (n, 2) int64 columns and rows of a regular grid in the scaled photo, row by row.
+        planes: (n, 3) float32, see `patch_match.Matches`.
+        depths: (n,) float64, 0 where none was found.
+        shape: rows and columns of the grid.
+        stride: pixels between neighbors in the grid.
+        K: (3, 3) of the scaled photo.
+        scale: size of the scaled photo relative to the photo.
+    """
+
+    pixels: np.ndarray
+    planes: np.ndarray
+    depths: np.ndarray
+    shape: tuple[int, int]
+    stride: int
+    K: np.ndarray
+    scale: float
+
+    def points(self, view: View) -> tuple[np.ndarray, np.ndarray]:
+        """Return the positions (m, 3) of the pixels with a depth, and their columns and rows (m, 2) in the photo."""
+        found = np.flatnonzero(self.depths > 0)
+        rays = np.column_stack([self.pixels[found] + 0.5, np.ones(len(found))]) @ np.linalg.inv(self.K).T
+        local = rays * self.depths[found, None]
+        at = np.floor((self.pixels[found] + 0.5) / self.scale).astype(np.int64)
+        at = np.clip(at, 0, [view.width - 1, view.height - 1])
+        return (local - view.viewmat[:3, 3]) @ view.viewmat[:3, :3], at
+
+    def compare(self, view: View, xyz: np.ndarray) -> np.ndarray:
+        """Return, for points (n, 3), 1 where the view shows a surface there, -1 where it shows one behind, else 0."""
+        local = xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        ahead = local[:, 2] > 0
+        depth = np.where(ahead, local[:, 2], 1.0)
+        at = (local @ self.K.T)[:, :2] / depth[:, None] - 0.5
+        cell = np.round((at - RADIUS) / self.stride)
+        rows, columns = self.shape
+        inside = np.flatnonzero(ahead & (cell >= 0).all(1) & (cell[:, 0] < columns) & (cell[:, 1] < rows))
+        index = (cell[inside, 1] * columns + cell[inside, 0]).astype(np.int64)
+        known = self.depths[index] > 0
+        inside, index = inside[known], index[known]
+        # The inverse depth of the surface in the point's pixel, relative to that of the point.
+        inverse = self.planes[index, 0] + (self.planes[index, 1:] * (at[inside] - self.pixels[index])).sum(1)
+        nearness = inverse * depth[inside]
+        result = np.zeros(len(xyz), np.int64)
+        result[inside[nearness < 1 / (1 + IN_FRONT)]] = -1
+        result[inside[np.abs(nearness - 1) < AGREES]] = 1
+        return result
+
+
+def find_depth_maps(
+    capture: Capture, views: Sequence[int], progress: Callable[[int, int], None] = lambda _done, _total: None
+) -> dict[int, DepthMap]:
+    """Find the depths on which photos agree.
+
+    Args:
+        capture: the capture; must be prepared.
+        views: indices of the views to use.
+        progress: called with the number of photos done, and of all.
+
+    Returns:
+        The depth maps of the views that others overlap. Depths that fewer than FEWEST others find are left out, as are
+        those in front of what more views show than agree, and small islands of depths.
+
+    Raises:
+        InputError: a photo cannot be read.
+    """
+    scaled = {index: _gray(capture, index) for index in views}
+    neighbors = _neighbors(capture, views)
+    raw: dict[int, DepthMap] = {}
+    for number, index in enumerate(views):
+        progress(number, len(views))
+        found = _depth_map(capture, scaled, index, neighbors[index])
+        if found is not None:
+            raw[index] = found
+    agreed: dict[int, DepthMap] = {}
+    for index, found in raw.items():
+        others = {other: raw[other] for other in neighbors[index] if other in raw}
+        agreed[index] = _without_speckles(_filtered(capture, index, found, others, agreeing=FEWEST))
+    return {index: _filtered(capture, index, found, agreed) for index, found in agreed.items()}
+
+
+def balance(capture: Capture, maps: dict[int, DepthMap], xyz: np.ndarray, without: int | None = None) -> np.ndarray:
+    """Count the views with a surface at each point, less those with one behind it.
+
+    Args:
+        capture: the views.
+        maps: their depth maps.
+        xyz: (n, 3) points.
+        without: a view that is not counted.
+
+    Returns:
+        (n,) int64.
+    """
+    total = np.zeros(len(xyz), np.int64)
+    for other, found in maps.items():
+        if other != without:
+            total += found.compare(capture.views[other], xyz)
+    return total
+
+
+def _filtered(
+    capture: Capture, index: int, found: DepthMap, others: dict[int, DepthMap], agreeing: int | None = None
+) -> DepthMap:
+    """Return a map without depths that fewer than `agreeing` others find, or None: whose balance is not positive."""
+    xyz, _ = found.points(capture.views[index])
+    if agreeing is None:
+        good = balance(capture, others, xyz, without=index) > 0
+    else:
+        votes = [each.compare(capture.views[other], xyz) > 0 for other, each in others.items()]
+        good = np.sum(votes, axis=0) >= agreeing if votes else np.zeros(len(xyz), np.bool_)
+    depths = found.depths.copy()
+    depths[np.flatnonzero(depths > 0)[~good]] = 0.0
+    return found._replace(depths=depths)
+
+
+def _without_speckles(found: DepthMap) -> DepthMap:
+    """Return a depth map without surfaces of fewer than SPECKLE pixels."""
+    rows, columns = found.shape
+    number = np.arange(rows * columns).reshape(rows, columns)
+    pairs = []
+    for first, second, slope in (
+        (number[:, :-1].ravel(), number[:, 1:].ravel(), found.planes[:, 1]),
+        (number[:-1].ravel(), number[1:].ravel(), found.planes[:, 2]),
+    ):
+        known = (found.depths[first] > 0) & (found.depths[second] > 0)
+        first, second = first[known], second[known]
+        here, there = found.planes[first, 0], found.planes[second, 0]
+        apart = np.minimum(
+            np.abs(here + found.stride * slope[first] - there), np.abs(there - found.stride * slope[second] - here)
+        )
+        close = apart < _SMOOTH * np.minimum(here, there)
+        pairs.append((first[close], second[close]))
+    i, j = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
+    labels = connected_components(coo_matrix((np.ones(len(i)), (i, j)), (rows * columns,) * 2), directed=False)[1]
+    large = np.bincount(labels)[labels] >= SPECKLE
+    return found._replace(depths=np.where(large, found.depths, 0.0))
+
+
+def _gray(capture: Capture, index: int) -> tuple[np.ndarray, float]:
+    """Return a photo in gray (h, w), scaled down if it is large, and the factor."""
+    image = PilImage.fromarray(capture.image(index)).convert("F")
+    factor = min(1.0, LONGEST_SIDE / max(image.size))
+    if factor < 1.0:
+        image = image.resize([max(round(side * factor), 1) for side in image.size], PilImage.Resampling.BOX)
+    return np.asarray(image, np.float32), factor
+
+
+def _neighbors(capture: Capture, views: Sequence[int]) -> dict[int, list[int]]:
+    """Return, for each view, the others that show the same from a little aside, the best angle first."""
+    matrices = np.array([capture.views[index].viewmat for index in views]).reshape(-1, 4, 4)
+    centers = -np.einsum("nij,ni->nj", matrices[:, :3, :3], matrices[:, :3, 3])
+    axes = matrices[:, 2, :3]
+    found = {}
+    for place, index in enumerate(views):
+        depths = capture.points.xyz @ axes[place] + matrices[place, 2, 3]
+        subject = centers[place] + axes[place] * (np.median(depths[depths > 0]) if (depths > 0).any() else 1.0)
+        rays = centers - subject
+        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+        angles = np.arccos(np.clip(rays @ rays[place], -1.0, 1.0))
+        usable = (angles > _LEAST_ANGLE) & (angles < _LARGEST_ANGLE) & (axes @ axes[place] > 0.5)
+        order = np.argsort(np.where(usable, np.abs(angles - _BEST_ANGLE), np.inf), kind="stable")
+        found[index] = [views[other] for other in order[:NEIGHBORS] if usable[other]]
+    return found
+
+
+def _depth_map(
+    capture: Capture, scaled: dict[int, tuple[np.ndarray, float]], index: int, neighbors: list[int]
+) -> DepthMap | None:
+    """Return the depths of a view, not compared with others; None without neighbors, points, or room for a patch."""
+    image, scale = scaled[index]
+    view, (height, width) = capture.views[index], image.shape
+    known = capture.points.xyz @ view.viewmat[2, :3] + view.viewmat[2, 3]
+    stride = max(int(np.ceil(np.sqrt(height * width / GRID))), 1)
+    rows, columns = (np.arange(RADIUS, side - RADIUS, stride) for side in (height, width))
+    if not neighbors or not (known > 0).any() or min(len(rows), len(columns)) < 2:
+        return None
+    near, far = np.percentile(known[known > 0], _NEAREST_FARTHEST) * (_NEARER, _FARTHER)
+    pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
+    K = _scaled_intrinsics(view, image)
+    theirs = np.array([_scaled_intrinsics(capture.views[other], scaled[other][0]) for other in neighbors])
+    between = np.array([capture.views[other].viewmat for other in neighbors]) @ np.linalg.inv(view.viewmat)
+    sizes = np.array([scaled[other][0].shape for other in neighbors], np.int64)
+    images = np.zeros((len(neighbors), *sizes.max(0)), np.float32)
+    for number, other in enumerate(neighbors):
+        images[number, : sizes[number, 0], : sizes[number, 1]] = scaled[other][0]
+    others = Others(
+        np.ascontiguousarray(theirs @ between[:, :3, :3] @ np.linalg.inv(K), np.float32),
+        np.einsum("nij,nj->ni", theirs, between[:, :3, 3]).astype(np.float32), images, sizes,
+    )  # fmt: skip
+    matches = match(image, pixels, len(columns), others, near, far, K[0, 0])
+    inverse = matches.planes[:, 0].astype(np.float64)
+    good = (matches.scores >= CORRELATES) & (inverse > 1.0 / far) & (inverse < 1.0 / near)
+    depths = np.where(good, 1.0 / np.where(good, inverse, 1.0), 0.0)
+    return DepthMap(pixels, matches.planes, depths, (len(rows), len(columns)), stride, K, scale)
+
+
+def _scaled_intrinsics(view: View, image: np.ndarray) -> np.ndarray:
+    height, width = image.shape
+    return np.diag([width / view.width, height / view.height, 1.0]) @ view.K

@@ -1,0 +1,184 @@
+"""Depth maps of photos with known poses: exact planes, occlusion, what is left out, and points for training."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numba
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from backend.capture.capture import Points, View
+from backend.shared.errors import EXIT_DONE
+from backend.stereo.dense_points import find_dense_points
+from backend.stereo.depth_maps import AGREES, balance, find_depth_maps
+from backend.training.state import model_from_checkpoint, read_checkpoint
+
+SIZE = (160, 120)
+FLOOR, BOX = 0.0, 0.5
+"""Height of the floor, and of the top of the box on it, which spans -0.6 .. 0.6."""
+
+
+def texture(x, y, seed):
+    """Return gray levels of a smooth texture at positions on a plane."""
+    rng = np.random.default_rng(seed)
+    total = np.zeros(np.shape(x))
+    for scale in (3.0, 7.0, 15.0):
+        for _ in range(6):
+            angle, phase = rng.uniform(0, 2 * np.pi, 2)
+            total += np.sin(scale * (np.cos(angle) * x + np.sin(angle) * y) + phase) / np.sqrt(scale)
+    return 128 + 25 * total
+
+
+def shot(viewmat, K):
+    """Return a photo (h, w, 3) uint8 of a box on a floor, its exact depth (h, w), and where the box is."""
+    u, v = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1) @ viewmat[:3, :3]
+    center = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    top = (BOX - center[2]) / rays[..., 2]
+    at = center + top[..., None] * rays
+    on_box = (np.abs(at[..., :2]) <= 0.6).all(-1)
+    depth = np.where(on_box, top, (FLOOR - center[2]) / rays[..., 2])
+    at = center + depth[..., None] * rays
+    gray = np.where(on_box, texture(at[..., 0], at[..., 1], 1), texture(at[..., 0], at[..., 1], 2))
+    return np.repeat(np.clip(gray, 0, 255).round().astype(np.uint8)[..., None], 3, 2), depth, on_box
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A capture of a box on a floor in 9 photos that look down at it aslant, with points on both."""
+    K = np.array([[150.0, 0, SIZE[0] / 2], [0, 150.0, SIZE[1] / 2], [0, 0, 1]])
+    views, photos, depths, masks = [], [], [], []
+    for i in range(9):
+        angle = 2 * np.pi * i / 9
+        center = np.array([1.6 * np.cos(angle), 1.6 * np.sin(angle), 2.6])
+        forward = np.array([0, 0, 0.2]) - center
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0, 0, 1.0])
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        viewmat = np.eye(4)
+        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ center
+        views.append(View(f"{i}.png", None, None, K, viewmat, *SIZE, 1))
+        photo, depth, on_box = shot(viewmat, K)
+        photos.append(photo)
+        depths.append(depth)
+        masks.append(on_box)
+    rng = np.random.default_rng(0)
+    xyz = np.concatenate([
+        np.column_stack([rng.uniform(-0.5, 0.5, (10, 2)), np.full(10, BOX)]),
+        np.column_stack([rng.uniform(0.8, 1.2, (10, 2)), np.full(10, FLOOR)]),
+        [[0.1, 0.1, 1.0], [0.3, -0.9, 1.2]],  # In the air.
+    ])  # fmt: skip
+    count = len(xyz)
+    points = Points(xyz, np.zeros((count, 3), np.uint8), np.zeros(count, np.float32), np.arange(count))
+    return SimpleNamespace(views=views, points=points, image=lambda i: photos[i], depths=depths, on_box=masks)
+
+
+@pytest.fixture(scope="module")
+def maps(scene):
+    return find_depth_maps(scene, range(9))
+
+
+def test_depths_are_exact_on_slanted_planes(scene, maps):
+    known = total = 0
+    errors = []
+    for index, found in maps.items():
+        truth = scene.depths[index][found.pixels[:, 1], found.pixels[:, 0]]
+        good = found.depths > 0
+        errors.append(np.abs(found.depths[good] / truth[good] - 1))
+        known, total = known + good.sum(), total + len(good)
+    errors = np.concatenate(errors)
+    assert known > 0.6 * total
+    assert np.median(errors) < 0.002 and (errors < AGREES).mean() > 0.98
+
+
+def test_planes_follow_the_surface(scene, maps):
+    found = maps[0]
+    truth = 1 / scene.depths[0]
+    x, y = found.pixels.T
+    box = (np.abs(x - SIZE[0] / 2) < 15) & (np.abs(y - SIZE[1] / 2) < 10) & (found.depths > 0)
+    down = truth[y + 1, x] - truth[y, x]
+    assert box.sum() > 20
+    assert np.median(np.abs(found.planes[box, 2] / down[box] - 1)) < 0.1
+
+
+def test_threads_do_not_matter(scene, maps):
+    before = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        alone = find_depth_maps(scene, range(9))
+    finally:
+        numba.set_num_threads(before)
+    assert all(np.array_equal(alone[index].depths, found.depths) for index, found in maps.items())
+
+
+def test_balance_tells_surfaces_from_the_air(scene, maps):
+    score = balance(scene, maps, scene.points.xyz)
+    assert (score[:20] > 0).mean() > 0.8 and (score[20:] < 0).all()
+    below = balance(scene, maps, np.array([[0.0, 0.0, 0.2], [0.0, 0.0, -1.0]]))
+    assert (below == 0).all(), "what is behind a surface is not known"
+
+
+def test_points_are_on_the_surfaces_and_evenly_spread(scene):
+    steps = []
+    found = find_dense_points(scene, range(9), lambda done, total: steps.append((done, total)))
+    assert steps == [(i, 9) for i in range(9)]
+    assert found.in_front.tolist() == [False] * 20 + [True] * 2
+    assert len(found.xyz) == len(found.rgb) > 1000
+    height = found.xyz[:, 2]
+    off = np.minimum(np.abs(height - FLOOR), np.abs(height - BOX))
+    assert (off < 0.03).mean() > 0.97
+    on_box = np.abs(height - BOX) < 0.02
+    assert 0.05 < on_box.mean() < 0.6
+    gray = texture(found.xyz[on_box, 0], found.xyz[on_box, 1], 1)
+    assert np.median(np.abs(found.rgb[on_box, 0] - gray)) < 4
+
+
+def test_views_alone_find_nothing(scene):
+    for views in ([], [3], [0, 5]):
+        assert not any((found.depths > 0).any() for found in find_depth_maps(scene, views).values())
+        found = find_dense_points(scene, views)
+        assert len(found.xyz) == 0 and not found.in_front.any()
+
+
+def write_capture(folder, scene):
+    """Write the scene's photos, masks of the box (ID 4) and a text model of COLMAP."""
+    model = folder / "sparse" / "0"
+    for part in (folder / "images", folder / "masks", model):
+        part.mkdir(parents=True)
+    K = scene.views[0].K
+    (model / "cameras.txt").write_text(f"1 PINHOLE {SIZE[0]} {SIZE[1]} {K[0, 0]} {K[1, 1]} {K[0, 2]} {K[1, 2]}\n")
+    lines = []
+    for number, view in enumerate(scene.views):
+        x, y, z, w = pycolmap.Rotation3d(view.viewmat[:3, :3]).quat
+        lines += [f"{number + 1} {w} {x} {y} {z} {' '.join(map(str, view.viewmat[:3, 3]))} 1 {view.name}", ""]
+        Image.fromarray(scene.image(number)).save(folder / "images" / view.name)
+        Image.fromarray(np.where(scene.on_box[number], 4, 0).astype(np.uint8)).save(folder / "masks" / view.name)
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    points = scene.points
+    (model / "points3D.txt").write_text(
+        "".join(f"{i} {' '.join(map(str, at))} 9 9 9 0.5\n" for i, at in zip(points.ids, points.xyz, strict=True))
+    )
+
+
+def test_training_begins_with_them(scene, tmp_path, run_command):
+    """Through the command: the points that float are left out, and those found on surfaces have their objects."""
+    folder = tmp_path / "capture"
+    write_capture(folder, scene)
+    begun = {}
+    for name, words in (("with", ()), ("without", ("--leave-out", "dense-points"))):
+        out = tmp_path / name
+        result = run_command("train", folder, "--out", out, "--steps", 1, "--offsets", 2, *words)
+        assert result.code == EXIT_DONE
+        begun[name] = model_from_checkpoint(*read_checkpoint(out / "checkpoint")[:2]), result.out + result.err
+    model, said = begun["with"]
+    assert "points added on surfaces without features; 2 of the capture's left out" in said
+    height = model.normalization.to_world(model.anchors.positions.numpy())[:, 2]
+    ids = model.classes.ids_of(model.anchors.ids.numpy())
+    for level, expected in ((BOX, 4), (FLOOR, 0)):
+        assert (ids[np.abs(height - level) < 0.05] == expected).mean() > 0.9
+    few, unsaid = begun["without"]
+    assert len(model.anchors) > 8 * len(few.anchors) and "points added" not in unsaid
