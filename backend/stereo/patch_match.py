@@ -16,7 +16,7 @@ from scipy import ndimage
 
 RADIUS = 4
 """Radius of the patches in pixels."""
-DEPTHS = 64
+DEPTHS = 32
 """Number of fronto-parallel planes that are tried first, at equal steps of the inverse depth."""
 ROUNDS = 8
 """Number of rounds in which planes spread."""
