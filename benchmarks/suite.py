@@ -37,6 +37,8 @@ SYNTHETIC = {
     "many": "60 small objects",
     "exposure": "exposure and white balance at random, photos unordered",
     "blur": "shaken and noisy photos",
+    "sparse": "23 unordered photos from all sides with few points",
+    "ample": "the same scene in 60 photos with many points",
 }
 """Scenes of `suite_scenes.py`, and what is difficult about them."""
 

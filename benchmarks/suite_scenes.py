@@ -164,12 +164,8 @@ def many(seed: int) -> Stage:
 def exposure(seed: int) -> Stage:
     """Exposure and white balance at random in photos without an order."""
     built, objs = scene.build(7, seed)
-    views = scene.cameras(40, seed)
     rng = scene.rng_for(seed, 11)
-    names = [view.name for view in views]
-    views = [
-        dataclasses.replace(view, name=names[i]) for view, i in zip(views, rng.permutation(len(views)), strict=True)
-    ]
+    views = _shuffled(scene.cameras(40, seed), rng)
     gains = 2.0 ** rng.uniform(-0.8, 0.5, (len(views), 1)) * rng.uniform(0.88, 1.12, (len(views), 3))
 
     def develop(image: np.ndarray, index: int) -> np.ndarray:
@@ -195,7 +191,20 @@ def blur(seed: int) -> Stage:
     return Stage(built, objs, views, develop)
 
 
-SCENES = {make.__name__: make for make in (room, yard, few, plain, thin, gloss, many, exposure, blur)}
+def sparse(seed: int) -> Stage:
+    """23 photos from all sides, without an order, with few points."""
+    built, objs = scene.build(8, seed)
+    return Stage(built, objs, _shuffled(scene.cameras(23, seed), scene.rng_for(seed, 11)), target=2_000)
+
+
+def ample(seed: int) -> Stage:
+    """The scene of `sparse`, which is made just before, from 60 photos with many points."""
+    built, objs = scene.build(8, seed - 1)
+    return Stage(built, objs, scene.cameras(60, seed - 1), target=15_000)
+
+
+SCENES = {make.__name__: make for make in (room, yard, few, plain, thin, gloss, many, exposure, blur, sparse, ample)}
+"""In the order of their seeds: new scenes are appended."""
 
 
 def things(kinds: tuple[str, ...], seed: int) -> tuple[bpy.types.Scene, list[Any]]:
@@ -325,6 +334,14 @@ def _leaf(start: np.ndarray, tip: np.ndarray) -> bpy.types.Mesh:
     vertices = [start, middle + across, tip, middle - across, middle + up, middle - up]
     faces = [(0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4), (1, 0, 5), (2, 1, 5), (3, 2, 5), (0, 3, 5)]
     return shapes.from_faces("leaf", vertices, faces)
+
+
+def _shuffled(views: list[Any], rng: np.random.Generator) -> list[Any]:
+    """Return views whose names are in another order than they."""
+    names = [view.name for view in views]
+    return [
+        dataclasses.replace(view, name=names[i]) for view, i in zip(views, rng.permutation(len(views)), strict=True)
+    ]
 
 
 def _fence() -> bpy.types.Mesh:

@@ -307,7 +307,7 @@ def _dense_points(context: PlanningContext) -> Decision | None:
     if not _may_read_photos(context):
         return Decision("dense-points", what, None, "it requires reading all photos, which training does first")
     vacant = max(vacancy(planned_capture(context.capture, context.plan)) - context.surroundings.fraction, 0.0)
-    why = f"{vacant:.0%} of the photos' area is without points, but not of the sky; the threshold is {VACANT:.0%}"
+    why = f"{vacant:.0%} of the photos' area, without the sky, has no points; the threshold is {VACANT:.0%}"
     return Decision("dense-points", what, vacant >= VACANT, why)
 
 

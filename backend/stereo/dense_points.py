@@ -17,6 +17,9 @@ from .depth_maps import GRID, balance, find_depth_maps
 MOST = 40_000
 """Largest number of points that are added; with more, they are farther apart."""
 
+MOST_VIEWS = 400
+"""Largest number of photos that are compared; of more, some at equal distances are."""
+
 
 class DensePoints(NamedTuple):
     """Points of the surfaces that the photos of a capture agree on.
@@ -39,12 +42,13 @@ def find_dense_points(
 
     Args:
         capture: the capture; must be prepared.
-        views: indices of the views to use.
+        views: indices of the views to use, in the order in which they were taken, if known.
         progress: called with the number of photos done, and of all.
 
     Raises:
         InputError: a photo cannot be read.
     """
+    views = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(len(views), MOST_VIEWS)).astype(int))]
     maps = find_depth_maps(capture, views, progress)
     found, colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
     for index, each in maps.items():

@@ -86,7 +86,7 @@ def test_undecided_steps_are_done_until_settled():
 def test_points_are_looked_for_where_photos_have_none(write_capture, tmp_path):
     capture = loaded(write_capture(views=9, size=(64, 48)), tmp_path)
     plan = planned(capture)
-    assert plan["dense-points"].done and "without points" in plan["dense-points"].why
+    assert plan["dense-points"].done and "has no points" in plan["dense-points"].why
     assert not planned(capture, leave_out=["dense-points"])["dense-points"].done
     around = {"spheres": [(3, np.zeros(3), 3.0)], "points": 20_000}
     many = loaded(write_capture(name="many", views=9, size=(64, 48), **around), tmp_path)

@@ -137,6 +137,13 @@ def test_points_are_on_the_surfaces_and_evenly_spread(scene):
     assert np.median(np.abs(found.rgb[on_box, 0] - gray)) < 4
 
 
+def test_many_views_are_thinned(scene, monkeypatch):
+    monkeypatch.setattr("backend.stereo.dense_points.MOST_VIEWS", 5)
+    steps = []
+    found = find_dense_points(scene, range(9), lambda done, total: steps.append((done, total)))
+    assert steps == [(i, 5) for i in range(5)] and len(found.xyz) > 300
+
+
 def test_views_alone_find_nothing(scene):
     for views in ([], [3], [0, 5]):
         assert not any((found.depths > 0).any() for found in find_depth_maps(scene, views).values())

@@ -12,7 +12,7 @@ from ...labels.mask_points import MaskPoints, place_points
 from ...planning.coverage import unseen_points
 from ...shared.events import Reporter
 from ...shared.reconstruction.plan import Plan
-from ...stereo.dense_points import find_dense_points
+from ...stereo.dense_points import MOST_VIEWS, find_dense_points
 from ..votes import object_name
 
 DENSE = "dense"
@@ -51,12 +51,11 @@ def starting_points(
     """
     seeds = np.ones(len(point_ids), np.bool_) if plan.does("unseen-points") else ~unseen_points(capture)
     parts = []
-    found_ids = set(point_ids.tolist())
     if plan.does("dense-points"):
         dense, seeds = _dense(capture, seeds, reporter)
         parts.append(dense)
-        found_ids |= set(dense.ids.tolist())
-    missing = sorted(set(capture.object_ids.tolist()) - found_ids)
+    found_ids = np.concatenate([point_ids[seeds], *(part.ids for part in parts)])
+    missing = np.setdiff1d(capture.object_ids, found_ids).tolist()
     if missing:
         parts.append(_place(capture, missing, seed, reporter))
     parts = [part for part in parts if len(part.ids)]
@@ -65,7 +64,7 @@ def starting_points(
 
 def _dense(capture: Capture, seeds: np.ndarray, reporter: Reporter) -> tuple[MaskPoints, np.ndarray]:
     """Return points on surfaces without features, with their objects, and the seeds that do not float."""
-    reporter.expect({DENSE: ("Preparing", _SECONDS * len(capture.train_indices))})
+    reporter.expect({DENSE: ("Preparing", _SECONDS * min(len(capture.train_indices), MOST_VIEWS))})
     reporter.begin(DENSE, "Finding points on surfaces without features")
     found = find_dense_points(capture, capture.train_indices, reporter.progress)
     ids = np.zeros(len(found.xyz), np.int64)
@@ -76,7 +75,7 @@ def _dense(capture: Capture, seeds: np.ndarray, reporter: Reporter) -> tuple[Mas
         "left out, which float in front of surfaces"
     )
     kept = seeds & ~found.in_front
-    return MaskPoints(found.xyz, found.rgb, ids), kept if kept.any() or len(ids) else seeds
+    return MaskPoints(found.xyz, found.rgb, ids), kept if kept.any() else seeds
 
 
 def _place(capture: Capture, missing: list[int], seed: int, reporter: Reporter) -> MaskPoints:
