@@ -103,10 +103,15 @@ def _deviation(image: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _read_patch(image, column, row, values, weights):  # type: ignore[no-untyped-def]
-    """Fill a patch's values (side, side), less their mean, and weights, which sum to 1; return the deviation."""
-    side = values.shape[0]
-    radius = side // 2
+def _read_patch(image, column, row, turns):  # type: ignore[no-untyped-def]
+    """Return what the correlation of a patch with others needs.
+
+    Returns:
+        Its values (side, side) less their weighted mean, their weights, which sum to 1, their standard deviation, the
+        direction of its middle pixel in the other photos (k, 3), and its change to the right and below (k, 2, 3).
+    """
+    side, radius = 2 * RADIUS + 1, RADIUS
+    values, weights = np.empty((side, side), np.float32), np.empty((side, side), np.float32)
     total, mean, square = np.float32(0.0), np.float32(0.0), np.float32(0.0)
     for i in range(side):
         for j in range(side):
@@ -121,17 +126,14 @@ def _read_patch(image, column, row, values, weights):  # type: ignore[no-untyped
             weights[i, j] /= total
             values[i, j] -= mean
             square += weights[i, j] * values[i, j] * values[i, j]
-    return np.sqrt(max(square, np.float32(1e-6)))
-
-
-@numba.njit(cache=True, nogil=True, fastmath=True)
-def _project(turns, column, row, middle, beside):  # type: ignore[no-untyped-def]
-    """Fill a pixel's direction in the other photos, middle (k, 3), and its change to the right and below (k, 2, 3)."""
+    deviation = np.sqrt(max(square, np.float32(1e-6)))
+    middle, beside = np.empty((len(turns), 3), np.float32), np.empty((len(turns), 2, 3), np.float32)
     u, v = np.float32(column + 0.5), np.float32(row + 0.5)
     for k in range(len(turns)):
         for axis in range(3):
             middle[k, axis] = turns[k, axis, 0] * u + turns[k, axis, 1] * v + turns[k, axis, 2]
             beside[k, 0, axis], beside[k, 1, axis] = turns[k, axis, 0], turns[k, axis, 1]
+    return values, weights, deviation, middle, beside
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
@@ -188,15 +190,11 @@ def _score(values, weights, deviation, middle, beside, steps, images, sizes, w, 
 @numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
 def _sweep(image, pixels, textured, turns, steps, images, sizes, inverse, planes, scores):  # type: ignore[no-untyped-def]
     """Try fronto-parallel planes; fills the best planes (n, 3) and scores (n,)."""
-    side, count = 2 * RADIUS + 1, len(turns)
     flat = np.float32(0.0)
     for n in numba.prange(len(pixels)):
         if not textured[n]:
             continue
-        values, weights = np.empty((side, side), np.float32), np.empty((side, side), np.float32)
-        middle, beside = np.empty((count, 3), np.float32), np.empty((count, 2, 3), np.float32)
-        deviation = _read_patch(image, pixels[n, 0], pixels[n, 1], values, weights)
-        _project(turns, pixels[n, 0], pixels[n, 1], middle, beside)
+        values, weights, deviation, middle, beside = _read_patch(image, pixels[n, 0], pixels[n, 1], turns)
         for w in inverse:
             score = _score(values, weights, deviation, middle, beside, steps, images, sizes, w, flat, flat)
             if score > scores[n]:
@@ -209,17 +207,14 @@ def _spread(  # type: ignore[no-untyped-def]
 ):
     """Try the planes of nearby pixels and random changes, which become smaller each turn; return planes and scores."""
     new, new_scores = planes.copy(), scores.copy()
-    rows, side, count = len(pixels) // columns, 2 * RADIUS + 1, len(turns)
+    rows = len(pixels) // columns
     least, most = inverse[0], inverse[-1]
     step = np.float32(2.0) * (inverse[1] - inverse[0]) * np.float32(0.5) ** turn
     lean = tilt * np.float32(0.5) ** turn
     for n in numba.prange(len(pixels)):
         if not textured[n]:
             continue
-        values, weights = np.empty((side, side), np.float32), np.empty((side, side), np.float32)
-        middle, beside = np.empty((count, 3), np.float32), np.empty((count, 2, 3), np.float32)
-        deviation = _read_patch(image, pixels[n, 0], pixels[n, 1], values, weights)
-        _project(turns, pixels[n, 0], pixels[n, 1], middle, beside)
+        values, weights, deviation, middle, beside = _read_patch(image, pixels[n, 0], pixels[n, 1], turns)
         row, column = n // columns, n % columns
         best, top = planes[n].copy(), scores[n]
         for t in range(len(_AROUND)):
