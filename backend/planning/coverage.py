@@ -1,11 +1,11 @@
-"""Detection of redundant views, and of points outside all views."""
+"""Detection of redundant views, of points outside all views, and of the area of views that has no points."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..capture import Capture
+from ..capture import Capture, View
 
 SAME_PIXELS = 0.5
 """Two views have the same position if the points of one move by at most this many pixels in the other."""
@@ -185,18 +185,29 @@ def vacancy(capture: Capture) -> float:
     Args:
         capture: The capture.
     """
-    fractions = []
-    for index in capture.train_indices:
-        view = capture.views[index]
-        cell = max(view.width, view.height) / _CELLS
-        x, y, z = (capture.points.xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]).T
-        ahead = z > 0
-        pixels = view.K[:2, :2] @ np.stack([x[ahead], y[ahead]]) / z[ahead] + view.K[:2, 2:]
-        size = np.array([[view.width], [view.height]])
-        inside = ((pixels >= 0) & (pixels < size)).all(0)
-        cells = np.unique((pixels[:, inside] // cell).astype(np.int64), axis=1).shape[1]
-        fractions.append(1.0 - cells / (np.ceil(size / cell).prod()))
+    xyz = capture.points.xyz
+    fractions = [1.0 - occupied_cells(capture.views[index], xyz).mean() for index in capture.train_indices]
     return float(np.mean(fractions)) if fractions else 0.0
+
+
+def occupied_cells(view: View, xyz: np.ndarray) -> np.ndarray:
+    """Return the cells of a view with any of the points (n, 3) in them: (rows, columns) bool."""
+    cell = max(view.width, view.height) / _CELLS
+    rows, columns = max(round(view.height / cell), 1), max(round(view.width / cell), 1)
+    occupied = np.zeros((rows, columns), np.bool_)
+    _, x, y = pixels_in_view(view, xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3])
+    occupied[y * rows // view.height, x * columns // view.width] = True
+    return occupied
+
+
+def pixels_in_view(view: View, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Project positions or directions (n, 3) in camera space: indices of those in the image, columns and rows."""
+    x, y, z = xyz.T
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        u = x / z * view.K[0, 0] + view.K[0, 2]
+        v = y / z * view.K[1, 1] + view.K[1, 2]
+        inside = np.flatnonzero((z > 0) & (u >= 0) & (v >= 0) & (u < view.width) & (v < view.height))
+    return inside, u[inside].astype(np.int64), v[inside].astype(np.int64)
 
 
 def _inside(capture: Capture, index: int, xyz: np.ndarray) -> np.ndarray:

@@ -13,17 +13,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from ..capture import Capture, View
+from ..capture import Capture
 from ..training.extent import SURROUNDINGS, extent_of
+from .coverage import occupied_cells, pixels_in_view
 
 SPACING = float(np.radians(2.0))
 """Angle between neighboring directions."""
 
 LEAST = 0.02
 """Smallest fraction of the photos' pixels that shows surroundings without points, if there are any."""
-
-_CELLS = 40
-"""Number of cells along the longer side of a view in which points are looked for."""
 
 _VIEWS = 60
 """Largest number of views that are examined."""
@@ -73,7 +71,7 @@ def find_surroundings(capture: Capture) -> Surroundings:
     shown = []
     for index in views:
         view, free = capture.views[index], _vacant_cells(capture, index)
-        seen, x, y = _pixels(view, directions @ view.viewmat[:3, :3].T)
+        seen, x, y = pixels_in_view(view, directions @ view.viewmat[:3, :3].T)
         here = free[y * free.shape[0] // view.height, x * free.shape[1] // view.width]
         inside[seen] += 1
         vacant[seen[here]] += 1
@@ -103,25 +101,11 @@ def _sphere(spacing: float) -> np.ndarray:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
 
 
-def _pixels(view: View, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Project positions or directions (n, 3) in camera space: indices of those in the image, columns and rows."""
-    x, y, z = xyz.T
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        u = x / z * view.K[0, 0] + view.K[0, 2]
-        v = y / z * view.K[1, 1] + view.K[1, 2]
-        inside = np.flatnonzero((z > 0) & (u >= 0) & (v >= 0) & (u < view.width) & (v < view.height))
-    return inside, u[inside].astype(np.int64), v[inside].astype(np.int64)
-
-
 def _vacant_cells(capture: Capture, index: int) -> np.ndarray:
     """Return the cells of a view without points in or beside them, and without objects: (rows, columns) bool."""
     view = capture.views[index]
-    cell = max(view.width, view.height) / _CELLS
-    rows, columns = max(round(view.height / cell), 1), max(round(view.width / cell), 1)
-    occupied = np.zeros((rows, columns), np.bool_)
-    _, x, y = _pixels(view, capture.points.xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3])
-    occupied[y * rows // view.height, x * columns // view.width] = True
-    occupied = ndimage.binary_dilation(occupied, np.ones((3, 3), np.bool_))
+    occupied = ndimage.binary_dilation(occupied_cells(view, capture.points.xyz), np.ones((3, 3), np.bool_))
+    rows, columns = occupied.shape
     mask = capture.mask(index)
     if mask is not None:
         y, x = np.nonzero(mask)

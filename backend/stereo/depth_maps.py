@@ -117,8 +117,13 @@ def find_depth_maps(
     agreed: dict[int, DepthMap] = {}
     for index, found in raw.items():
         others = {other: raw[other] for other in neighbors[index] if other in raw}
-        agreed[index] = _without_speckles(_filtered(capture, index, found, others, agreeing=FEWEST))
-    return {index: _filtered(capture, index, found, agreed) for index, found in agreed.items()}
+        xyz, _ = found.points(capture.views[index])
+        agreed[index] = _without_speckles(_restricted(found, _agreeing(capture, others, xyz) >= FEWEST))
+    result = {}
+    for index, found in agreed.items():
+        xyz, _ = found.points(capture.views[index])
+        result[index] = _restricted(found, balance(capture, agreed, xyz, without=index) > 0)
+    return result
 
 
 def balance(capture: Capture, maps: dict[int, DepthMap], xyz: np.ndarray, without: int | None = None) -> np.ndarray:
@@ -140,16 +145,16 @@ def balance(capture: Capture, maps: dict[int, DepthMap], xyz: np.ndarray, withou
     return total
 
 
-def _filtered(
-    capture: Capture, index: int, found: DepthMap, others: dict[int, DepthMap], agreeing: int | None = None
-) -> DepthMap:
-    """Return a map without depths that fewer than `agreeing` others find, or None: whose balance is not positive."""
-    xyz, _ = found.points(capture.views[index])
-    if agreeing is None:
-        good = balance(capture, others, xyz, without=index) > 0
-    else:
-        votes = [each.compare(capture.views[other], xyz) > 0 for other, each in others.items()]
-        good = np.sum(votes, axis=0) >= agreeing if votes else np.zeros(len(xyz), np.bool_)
+def _agreeing(capture: Capture, others: dict[int, DepthMap], xyz: np.ndarray) -> np.ndarray:
+    """Count the views with a surface at each point (n, 3), (n,) int64."""
+    total = np.zeros(len(xyz), np.int64)
+    for other, found in others.items():
+        total += found.compare(capture.views[other], xyz) > 0
+    return total
+
+
+def _restricted(found: DepthMap, good: np.ndarray) -> DepthMap:
+    """Return a depth map with the depths that are good, (m,) bool of those that it has."""
     depths = found.depths.copy()
     depths[np.flatnonzero(depths > 0)[~good]] = 0.0
     return found._replace(depths=depths)

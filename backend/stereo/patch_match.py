@@ -58,7 +58,7 @@ class Matches(NamedTuple):
 
     Attributes:
         planes: (n, 3) float32, inverse depth of the pixel, and its difference to the next pixel to the right and below.
-        scores: (n,) float32, the mean of the two best correlations; -1 where the patch has no texture.
+        scores: (n,) float32, the mean of the two best correlations; -1 where none was found.
     """
 
     planes: np.ndarray
