@@ -2,18 +2,20 @@
 
     python benchmarks/suite.py [--part develop|check|all] [--minutes 1 2 5] [--capture NAME ...] [--seed 0]
     python benchmarks/suite.py --compare OTHER        a checkout of another version, measured in the same run
-    python benchmarks/suite.py --write
+    python benchmarks/suite.py --write [--minutes 1 2 5]
 
 The synthetic captures are made by `suite_scenes.py` in build/suite, with exact truth; the others are those of
 ../shared/data that are there. Changes are developed on the captures `DEVELOP`; the others are looked at only when a
-change is done. Each length is a training of its own through the user's commands. --write saves the figures to
-docs/figures/suite.json, the table to docs/suite.md and the plot to docs/suite.png.
+change is done. Each length is a training of its own through the user's commands. --write saves the figures of all
+captures to docs/figures/suite.json, the tables to docs/suite.md and the plot to docs/suite.png, and prints the values
+of `PSNR_FIT` in backend/shared/expectation.py.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import statistics
 import subprocess
 import sys
@@ -22,9 +24,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from backend.shared.expectation import PsnrFit, shortfall
+from backend.shared.reconstruction.cameras import read_cameras
+from backend.shared.reconstruction.folder import Reconstruction
+from backend.shared.reconstruction.record import read_record
 from benchmarks import documents, shared
 
 SYNTHETIC = {
@@ -53,6 +61,9 @@ DEVELOP = ("room", "yard", "few", "exposure", "tabletop")
 """Captures that changes are developed on."""
 
 MINUTES = (1.0, 2.0, 5.0)
+
+_FEWEST_TO_FIT = 8
+"""Smallest number of captures from which the quality of others is expected."""
 
 _COLUMNS = (
     ("psnr", "PSNR, dB", "{:.2f}"),
@@ -111,6 +122,8 @@ def measured(code: Path, capture: Path, minutes: float, seed: int) -> dict[str, 
             if done.returncode:
                 raise RuntimeError(f"{words[0]}: {done.stderr.strip().splitlines()[-1:]}")
         report = json.loads((out / "report.json").read_text())
+        agreement = read_record(Reconstruction(out)).capture.agreement
+        sizes = [view.width * view.height for view in read_cameras(out).views]
     views, quality = report["views"], report["quality"]
 
     def over(rows: Sequence[Mapping[str, Any]], key: str) -> float | None:
@@ -124,6 +137,9 @@ def measured(code: Path, capture: Path, minutes: float, seed: int) -> dict[str, 
         "psnr": over(views, "psnr"),
         "psnr_worst": min(view["psnr"] for view in views),
         "psnr_corrected": over(views, "psnr_corrected"),
+        "psnr_corrected_mean": quality["psnr_corrected"],
+        "agreement": agreement,
+        "pixels": statistics.mean(sizes),
         "ssim": quality["ssim"],
         "miou": quality["miou"],
         "miou_all": quality["miou_all"],
@@ -164,7 +180,64 @@ def document(found: Mapping[str, Any]) -> str:
             *shared.table(("capture", *(title for _, title, _ in _COLUMNS)), [*rows, ("**median**", *median)]),
             "",
         ]
+    if len(found) >= _FEWEST_TO_FIT:
+        lines += _expected_and_found(found)
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _expected_and_found(found: Mapping[str, Any]) -> list[str]:
+    """Return the lines of docs/suite.md about the expectation of each capture from the others."""
+    fit, errors = fit_of_psnr(found)
+    described = {name: of[max(of, key=float)] for name, of in found.items()}
+    inside = sum(abs(error) <= fit.margin for error in errors.values())
+    rows = [
+        (
+            name,
+            f"{row['agreement']:.1f}",
+            f"{row['pixels'] / 1e6:.2f}",
+            f"{row['psnr_corrected_mean'] - errors[name] - fit.margin:.1f} to "
+            f"{row['psnr_corrected_mean'] - errors[name] + fit.margin:.1f}",
+            f"{row['psnr_corrected_mean']:.1f}",
+            f"{errors[name]:+.1f}",
+        )
+        for name, row in described.items()
+    ]
+    return [
+        "## Expected and found",
+        "",
+        "What a training reaches is expected from how well photos agree with what their neighbors show at the depths "
+        "of the points, and from the photos' size. Here, each capture's longest training is predicted by the fit to "
+        "the other captures. PSNR in dB, colors corrected, mean over the held-out views; "
+        f"{inside} of {len(rows)} are within {fit.margin:.1f} dB.",
+        "",
+        *shared.table(("capture", "agreement, dB", "megapixels", "expected", "found", "difference"), rows),
+        "",
+    ]
+
+
+def fit_of_psnr(found: Mapping[str, Any]) -> tuple[PsnrFit, dict[str, float]]:
+    """Fit the PSNR of trainings to the agreement and the size of the photos.
+
+    Args:
+        found: The figures by capture and minutes.
+
+    Returns:
+        The fit to all captures, with the margin within which 80% of captures, each predicted by the fit to the others,
+        would be; and the difference of each capture's longest training to that prediction, in dB.
+    """
+    names = list(found)
+    rows = [of[max(of, key=float)] for of in found.values()]
+    terms = np.array([[1.0, row["agreement"], math.log2(row["pixels"] / 1e6)] for row in rows])
+    final = np.array([row["psnr_corrected_mean"] + statistics.mean(shortfall(row["steps"])) for row in rows])
+
+    def solve(kept: np.ndarray) -> np.ndarray:
+        return np.linalg.lstsq(terms[kept], final[kept], rcond=None)[0]
+
+    errors = {name: float(final[i] - terms[i] @ solve(np.arange(len(names)) != i)) for i, name in enumerate(names)}
+    # The smallest margin that holds for a new capture with a probability of at least 80% (Barber et al. 2021).
+    rank = min(math.ceil(0.8 * (len(names) + 1)), len(names))
+    margin = sorted(map(abs, errors.values()))[rank - 1]
+    return PsnrFit(*(float(value) for value in solve(np.ones(len(names), np.bool_))), margin), errors
 
 
 def comparison(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
@@ -231,12 +304,12 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, nargs="+", default=MINUTES)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--compare", type=Path, metavar="OTHER")
-    parser.add_argument("--write", action="store_true", help="all captures and lengths, for the document")
+    parser.add_argument("--write", action="store_true", help="all captures, for the document")
     options = parser.parse_args()
     everything = (*SYNTHETIC, *REAL)
     parts = {"develop": DEVELOP, "check": [name for name in everything if name not in DEVELOP], "all": everything}
     names = everything if options.write else options.capture or parts[options.part]
-    lengths = MINUTES if options.write else options.minutes
+    lengths = options.minutes
     folders = captures(names)
     shared.compile_everything()
     versions = {"this": ROOT, **({"other": options.compare.resolve()} if options.compare else {})}
@@ -265,6 +338,8 @@ def main() -> None:
     if options.write:
         shared.save_figure(plot(found["this"]), documents.DOCS / "suite.png")
         documents.save("suite", found["this"])
+        if len(found["this"]) >= _FEWEST_TO_FIT:
+            print(fit_of_psnr(found["this"])[0])
     print(document(found["this"]))
     if options.compare:
         print(comparison(found["other"], found["this"]))

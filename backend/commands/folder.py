@@ -192,7 +192,8 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
             "its location with --capture, or train again."
         )
     if options.capture:
-        update_record(folder, capture=capture_record(capture, max_size))
+        agreement = recorded_agreement(folder, capture, max_size)
+        update_record(folder, capture=capture_record(capture, max_size, agreement))
         write_capture_cameras(folder, capture)
     # The objects left out of the training, regardless of later edits.
     plan = plan_of(training)
@@ -233,6 +234,13 @@ def digest(capture: Capture) -> str:
     return sha.hexdigest()[:16]
 
 
-def capture_record(capture: Capture, max_size: int) -> CaptureRecord:
+def capture_record(capture: Capture, max_size: int, agreement: float | None = None) -> CaptureRecord:
     """Return the entry of a capture for objectgs.json."""
-    return CaptureRecord(str(capture.folder.resolve()), max_size, digest(capture))
+    return CaptureRecord(str(capture.folder.resolve()), max_size, digest(capture), agreement)
+
+
+def recorded_agreement(folder: Reconstruction, capture: Capture, max_size: int) -> float | None:
+    """Return the agreement of the capture's photos that is recorded in a folder; None if there is none."""
+    known = read_record(folder).capture
+    is_same = known is not None and (known.max_size, known.digest) == (max_size, digest(capture))
+    return known.agreement if known is not None and is_same else None

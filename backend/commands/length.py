@@ -10,7 +10,7 @@ import torch
 
 from ..capture import Capture
 from ..shared.errors import InputError
-from ..shared.expectation import DEFAULT_SECONDS, NANOSECONDS_A_PIXEL, expectation
+from ..shared.expectation import DEFAULT_SECONDS, NANOSECONDS_A_PIXEL, expectation, expected_psnr, typical_psnr
 from ..training.budget import LOOKAHEAD, PRESETS, WARM_UP, Budget, TrainingProgress
 
 _SECONDS_A_STEP = 0.02
@@ -35,7 +35,11 @@ def budget_of(options: argparse.Namespace) -> Budget:
 
 
 def expected_of(
-    budget: Budget, capture: Capture, device: torch.device, done: TrainingProgress | None = None
+    budget: Budget,
+    capture: Capture,
+    device: torch.device,
+    done: TrainingProgress | None = None,
+    agreement: float | None = None,
 ) -> str | None:
     """Describe the expected result of a training in a sentence.
 
@@ -44,15 +48,32 @@ def expected_of(
         capture: The capture.
         device: The device to train on.
         done: The progress so far, if a training is resumed.
+        agreement: How well the photos agree, in dB; None if it is not known.
 
     Returns:
-        The sentence, or None if the training runs until convergence or there is no basis for an estimate.
+        The sentence, or None if there is no basis for an estimate.
     """
-    if budget.until_converged:
+    typical = None if agreement is None else typical_psnr(agreement, _pixels(capture))
+    return expectation(*_length(budget, capture, device, done), typical)
+
+
+def expected_psnr_of(
+    budget: Budget, capture: Capture, device: torch.device, done: TrainingProgress, agreement: float | None
+) -> list[float] | None:
+    """Return the bounds of the expected PSNR on held-out views, in dB, for objectgs.json; see `expected_of`."""
+    if agreement is None:
         return None
+    bounds = expected_psnr(typical_psnr(agreement, _pixels(capture)), *_length(budget, capture, device, done))
+    return [round(bound, 2) for bound in bounds]
+
+
+def _length(
+    budget: Budget, capture: Capture, device: torch.device, done: TrainingProgress | None
+) -> tuple[int | None, float | None, float | None, tuple[int, float]]:
+    """Return the length of a training as the arguments of `expectation`; that until convergence is not known."""
     pixels = _pixels(capture) if device.type == "cpu" else None
     trained = (0, 0.0) if done is None else (done.step, done.seconds)
-    return expectation(budget.steps, budget.seconds, pixels, trained)
+    return budget.steps, None if budget.until_converged else budget.seconds, pixels, trained
 
 
 def training_seconds(budget: Budget, capture: Capture, device: torch.device, done: TrainingProgress) -> float:

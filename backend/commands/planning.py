@@ -21,11 +21,13 @@ _CLEARLY = 0.8
 """Margin from which on a point without an object counts as background: 9 of 10 masks leave it unlabeled."""
 
 
-def write_default_plan(folder: Reconstruction, capture: Capture, max_size: int) -> None:
-    """Write plan.json for a training with the default settings, from the facts known so far."""
+def write_default_plan(folder: Reconstruction, capture: Capture, max_size: int) -> Plan:
+    """Write plan.json for a training with the default settings, from the facts known so far, and return it."""
     objects, _ = find_requested_objects(folder, capture)
     context = build_context(capture, Choices(max_size=max_size), objects, voted_points(folder, capture))
-    write_plan(folder.plan, decide(context))
+    plan = decide(context)
+    write_plan(folder.plan, plan)
+    return plan
 
 
 def build_context(

@@ -79,6 +79,8 @@ def quality_section(report: Report) -> list[str]:
         f"training. {_of_validation(report)}{_of_unlabeled(report)}"
     )
     parts = ["## Quality", intro, table(("", "Value", "Meaning"), rows, right=(1,))]
+    if expected := _of_expectation(report):
+        parts.append(expected)
     by_view = sorted((view[lead], view["name"]) for view in report.views if view.get(lead) is not None)
     if by_view:
         middle = statistics.median(value for value, _ in by_view)
@@ -88,6 +90,19 @@ def quality_section(report: Report) -> list[str]:
             "in `report.json`."
         )
     return parts
+
+
+def _of_expectation(report: Report) -> str:
+    """Return the sentence that compares the PSNR with what was expected before the training; empty without either."""
+    bounds, found = report.model.get("expected_psnr"), report.quality["psnr_corrected"]
+    if not bounds or found is None:
+        return ""
+    low, high = bounds
+    verdict = "lower than" if found < low else "higher than" if found > high else "as"
+    return (
+        f"Expected before the training, from how well the photos agree: {low:.1f} to {high:.1f} dB with the colors "
+        f"corrected, as on 80% of the captures measured so far. The result is {verdict} expected."
+    )
 
 
 def _of_validation(report: Report) -> str:

@@ -15,11 +15,34 @@ SHORT_OF_FINAL = {414: (1.6, 1.6), 600: (0.7, 0.7), 883: (0.4, 0.4), 1500: (0.0,
 """Steps -> deficit of a training's PSNR on held-out views, in dB, relative to a training until convergence: minimum and
 maximum over the measured captures, which are those of the demo in docs/length.md."""
 
+
+class PsnrFit(NamedTuple):
+    """A fit of the PSNR on held-out views, colors corrected, of trainings until they stop improving.
+
+    Attributes:
+        at_zero: dB where photos agree by 0 dB and have one million pixels.
+        by_agreement: dB for each dB that the photos agree better.
+        by_size: dB for each doubling of the photos' number of pixels.
+        margin: dB to both sides, within which 80% of captures are that were not used for the fit.
+    """
+
+    at_zero: float
+    by_agreement: float
+    by_size: float
+    margin: float
+
+
+PSNR_FIT = PsnrFit(-5.9, 0.96, -2.1, 4.0)
+"""Of the captures in docs/suite.md; printed by `benchmarks/suite.py`."""
+
 NANOSECONDS_A_PIXEL = (300.0, 1200.0)
 """Minimum and maximum time of a step on a CPU per pixel of a view, used until a training has been measured."""
 
 _SHARPNESS = ((0.15, "very sharp"), (0.6, "sharp"), (1.5, "good"), (3.0, "soft"), (math.inf, "rough"))
 """Largest deficits in dB and what a training with them looks like."""
+
+_LOOKS = ((20.0, "rough"), (24.0, "soft"), (28.0, "good"), (33.0, "sharp"), (math.inf, "very sharp"))
+"""PSNR in dB, and what a training below it looks like."""
 
 _FINAL = "a training until it stops improving (measured on the demo)"
 
@@ -33,8 +56,41 @@ class _Outlook(NamedTuple):
     slowest: float
 
 
+def typical_psnr(agreement: float, pixels: float) -> float:
+    """Return the PSNR on held-out views, colors corrected, that a training until it stops improving typically has.
+
+    Args:
+        agreement: How well the photos agree, in dB, see `backend.planning.agreement`.
+        pixels: Mean number of pixels of a photo.
+    """
+    fit = PSNR_FIT
+    return fit.at_zero + fit.by_agreement * agreement + fit.by_size * math.log2(max(pixels, 1.0) / 1e6)
+
+
+def expected_psnr(
+    typical: float,
+    steps: int | None,
+    seconds: float | None,
+    pixels: float | None,
+    trained: tuple[int, float] = (0, 0.0),
+) -> tuple[float, float]:
+    """Return the bounds of the PSNR on held-out views, in dB, within which 80% of captures are after a training.
+
+    Args:
+        typical: The result of `typical_psnr`.
+        steps, seconds, pixels, trained: As for `expectation`; a training of unknown speed is taken to be long enough.
+    """
+    outlook = _outlook(steps, seconds, pixels, trained)
+    short = 0.0 if outlook is None else sum(shortfall(math.sqrt(outlook.fewest * outlook.most))) / 2
+    return typical - short - PSNR_FIT.margin, typical - short + PSNR_FIT.margin
+
+
 def expectation(
-    steps: int | None, seconds: float | None, pixels: float | None, trained: tuple[int, float] = (0, 0.0)
+    steps: int | None,
+    seconds: float | None,
+    pixels: float | None,
+    trained: tuple[int, float] = (0, 0.0),
+    typical: float | None = None,
 ) -> str | None:
     """Describe the expected duration and quality of a training.
 
@@ -44,41 +100,59 @@ def expectation(
         pixels: Pixels of a view, from which the time on a CPU is estimated before the training begins; None on other
             devices.
         trained: Steps of the same training that are done, and the seconds that they took.
+        typical: The result of `typical_psnr` for the capture; None if it is not known.
 
     Returns:
         A sentence, or None if there is no basis for an estimate.
     """
     outlook = _outlook(steps, seconds, pixels, trained)
-    if outlook is None:
-        return None
-    where = "" if all(trained) or not outlook.slowest else " on a CPU"
-    length = ""
-    if steps is None:
-        length = f" of {_range(f'{_rounded(outlook.fewest):,}', f'{_rounded(outlook.most):,}')} steps{where}"
-    elif outlook.slowest:
-        length = f" in {_range(_duration(outlook.fastest), _duration(outlook.slowest))}{where}"
-    if outlook.most < min(SHORT_OF_FINAL):
-        return f"Expected{length}: more than {shortfall(outlook.most)[0]:.1f} dB below {_FINAL}"
-    best, worst = (f"{short:.1f}" for short in (shortfall(outlook.most)[0], shortfall(outlook.fewest)[1]))
-    if worst == "0.0":
-        return f"Expected{length}: as good as {_FINAL}"
-    return f"Expected{length}: {f'up to {worst}' if best == '0.0' else _range(best, worst)} dB below {_FINAL}"
+    length, quality = "", []
+    if typical is not None:
+        bounds = _in_decibels(expected_psnr(typical, steps, seconds, pixels, trained))
+        quality.append(f"PSNR of {bounds} on held-out views, as on 80% of captures")
+    if outlook is not None:
+        where = "" if all(trained) or not outlook.slowest else " on a CPU"
+        if steps is None:
+            length = f" of {_range(f'{_rounded(outlook.fewest):,}', f'{_rounded(outlook.most):,}')} steps{where}"
+        elif outlook.slowest:
+            length = f" in {_range(_duration(outlook.fastest), _duration(outlook.slowest))}{where}"
+        quality.append(f"{_below_final(outlook)} {_FINAL}")
+    return f"Expected{length}: {'; '.join(quality)}" if quality else None
 
 
 def expectation_in_words(
-    steps: int | None, seconds: float | None, pixels: float | None, trained: tuple[int, float] = (0, 0.0)
+    steps: int | None,
+    seconds: float | None,
+    pixels: float | None,
+    trained: tuple[int, float] = (0, 0.0),
+    typical: float | None = None,
 ) -> str | None:
     """Describe the expected duration and sharpness of a training in a few words, such as "about 2 to 8 min: soft".
 
     The arguments are those of `expectation`; None if there is no basis for an estimate.
     """
     outlook = _outlook(steps, seconds, pixels, trained)
-    if outlook is None:
+    if typical is not None:
+        bounds = expected_psnr(typical, steps, seconds, pixels, trained)
+        sharpness = f"{_range(*(_word(_LOOKS, bound) for bound in bounds))} ({_in_decibels(bounds)})"
+    elif outlook is not None:
+        ends = shortfall(outlook.fewest)[1], shortfall(outlook.most)[0]
+        sharpness = _range(*(_word(_SHARPNESS, short) for short in ends))
+    else:
         return None
-    sharpness = _range(*(_in_words(shortfall(count)[end]) for count, end in ((outlook.fewest, 1), (outlook.most, 0))))
-    if steps is None or not outlook.slowest:
+    if outlook is None or steps is None or not outlook.slowest:
         return sharpness
     return f"about {_range(_duration(outlook.fastest), _duration(outlook.slowest))}: {sharpness}"
+
+
+def _below_final(outlook: _Outlook) -> str:
+    """Return how far trainings end below one until it stops improving, as the beginning of a clause."""
+    if outlook.most < min(SHORT_OF_FINAL):
+        return f"more than {shortfall(outlook.most)[0]:.1f} dB below"
+    best, worst = (f"{short:.1f}" for short in (shortfall(outlook.most)[0], shortfall(outlook.fewest)[1]))
+    if worst == "0.0":
+        return "as good as"
+    return f"{f'up to {worst}' if best == '0.0' else _range(best, worst)} dB below"
 
 
 def _outlook(
@@ -97,8 +171,12 @@ def _outlook(
     return None
 
 
-def _in_words(short: float) -> str:
-    return next(word for most, word in _SHARPNESS if short <= most)
+def _word(words: tuple[tuple[float, str], ...], value: float) -> str:
+    return next(word for most, word in words if value <= most)
+
+
+def _in_decibels(bounds: tuple[float, float]) -> str:
+    return f"{_range(*(f'{bound:.0f}' for bound in bounds))} dB"
 
 
 def shortfall(steps: float) -> tuple[float, float]:

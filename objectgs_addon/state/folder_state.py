@@ -11,6 +11,7 @@ from ...backend.shared.reconstruction.checkpoint import CURRENT, CheckpointHeade
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.meshes import NAME as MESHES
 from ...backend.shared.reconstruction.meshes import read_meshes
+from ...backend.shared.reconstruction.record import read_record
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class FolderState:
         trained: splats exist.
         capture: folder of the capture with the photos, or None.
         pixels: average number of pixels per view.
+        agreement: how well the photos agree, in dB, or None.
         meshes: number of meshes.
         stale_meshes: number of meshes made at another training step than the checkpoint's.
         quality, zero_is_background: of the checkpoint's header.
@@ -41,6 +43,7 @@ class FolderState:
     pixels: float
     meshes: int
     stale_meshes: int
+    agreement: float | None = None
     quality: Mapping[str, float] = field(default_factory=dict)
     zero_is_background: bool = False
 
@@ -86,7 +89,8 @@ def folder_state(folder: Path) -> FolderState:
     checkpoint = paths.checkpoint / CURRENT
     listed = paths.meshes / MESHES
     stamp = tuple(
-        _modified(path) for path in (paths.folder, paths.cameras, paths.objects, paths.splats, checkpoint, listed)
+        _modified(path)
+        for path in (paths.folder, paths.cameras, paths.objects, paths.splats, checkpoint, listed, paths.settings)
     )
     before = _known.get(paths.folder)
     if before is not None and before[0] == stamp:
@@ -105,6 +109,7 @@ def folder_state(folder: Path) -> FolderState:
         pixels=pixels,
         meshes=len(made),
         stale_meshes=sum(at != header.steps for at in made),
+        agreement=_agreement(paths),
         quality=header.quality,
         zero_is_background=header.zero_is_background,
     )
@@ -127,6 +132,15 @@ def _views(folder: Path) -> tuple[Path | None, float]:
         return None, 0.0
     sizes = [view.width * view.height for view in cameras.views]
     return cameras.capture, sum(sizes) / max(len(sizes), 1)
+
+
+def _agreement(paths: Reconstruction) -> float | None:
+    """Return how well the photos of the capture agree, in dB; None if it is not recorded."""
+    try:
+        capture = read_record(paths).capture
+    except InputError:
+        return None
+    return None if capture is None else capture.agreement
 
 
 def _mesh_steps(folder: Path) -> list[int | None]:

@@ -62,3 +62,16 @@ def test_words_tell_duration_and_sharpness():
     assert words(None, 100.0, 100_000, (200, 50.0)) == "soft to good"
     assert words(None, 60.0, None) is None
     assert words(10, None, None) == "rough to soft"
+
+
+def test_typical_quality_of_the_capture_gives_an_interval(monkeypatch):
+    monkeypatch.setattr(expectation, "PSNR_FIT", expectation.PsnrFit(-10.0, 1.0, -2.0, 3.0))
+    typical = expectation.typical_psnr(40.0, 2e6)
+    assert typical == pytest.approx(28.0)
+    assert expectation.expected_psnr(typical, 400, None, None) == pytest.approx((23.5, 29.5))
+    assert expectation.expected_psnr(typical, None, 60.0, None) == pytest.approx((25.0, 31.0)), "unknown speed"
+    interval = "PSNR of 24 to 30 dB on held-out views, as on 80% of captures"
+    assert expected(400, None, None, (0, 0.0), typical) == f"Expected: {interval}; 1.0 to 2.0 dB below {FINAL}"
+    assert expected(None, None, None, (0, 0.0), typical).startswith("Expected: PSNR of 25 to 31 dB")
+    words = expectation.expectation_in_words
+    assert words(400, None, 100_000, (0, 0.0), typical) == "about 20 s to 80 s: soft to sharp (24 to 30 dB)"

@@ -8,6 +8,8 @@ import numpy as np
 
 from ...labels import Votes
 from ...labels.points import write_points
+from ...planning.agreement import measure_agreement
+from ...planning.decisions import planned_capture
 from ...shared.reconstruction.objects import write_objects
 from ...shared.reconstruction.record import read_record, update_record
 from ...shared.stopping import StoppingReporter
@@ -37,7 +39,9 @@ def import_capture(options: argparse.Namespace, reporter: StoppingReporter) -> N
             write_points(folder.points, capture.points, none)
             if folder.objects.exists():
                 write_objects(folder.objects, [])
-        write_default_plan(folder, capture, options.max_size)
+        plan = write_default_plan(folder, capture, options.max_size)
+        agreement = measure_agreement(planned_capture(capture, plan))
+        update_record(folder, capture=capture_record(capture, options.max_size, agreement))
     reporter.done(
         cameras=str(folder.cameras), points=str(folder.points), views=len(capture.views), masks=capture.has_masks
     )

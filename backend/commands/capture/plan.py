@@ -6,7 +6,8 @@ import argparse
 from contextlib import ExitStack
 
 from ...capture import load_capture
-from ...planning.decisions import decide
+from ...planning.agreement import measure_agreement
+from ...planning.decisions import decide, planned_capture
 from ...raster import devices
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.plan import write_plan
@@ -32,10 +33,11 @@ def plan(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         objects, _ = find_requested_objects(folder, capture, options)
         points = voted_points(folder, capture) if folder is not None else None
         found = decide(build_context(capture, choices(options), objects, points))
+        agreement = measure_agreement(planned_capture(capture, found)) if capture.prepared else None
         if folder is not None:
             write_plan(folder.plan, found)
     for decision in found.decisions:
         reporter.status(decision.sentence())
-    if expected := expected_of(budget, capture, device):
+    if expected := expected_of(budget, capture, device, agreement=agreement):
         reporter.status(expected)
     reporter.done(plan=found.as_list())

@@ -14,6 +14,7 @@ from ...labels import correct_masks
 from ...model.checkpoint import has_checkpoint
 from ...model.draw import draw
 from ...model.object_model import ObjectModel
+from ...planning.agreement import measure_agreement
 from ...planning.decisions import OF_TRAINING, decide, planned_capture, planned_settings
 from ...raster import devices
 from ...shared.errors import Cancelled, InputError
@@ -30,8 +31,16 @@ from ...training.initial_model import DistantPoints
 from ...training.scene import Scene
 from ...training.trainer import Evaluate, Trainer
 from ..exported import EXPORT, export_model
-from ..folder import READ, capture_record, digest, memory_for_planes, open_reconstruction, plan_of
-from ..length import budget_of, expected_of, training_seconds
+from ..folder import (
+    READ,
+    capture_record,
+    digest,
+    memory_for_planes,
+    open_reconstruction,
+    plan_of,
+    recorded_agreement,
+)
+from ..length import budget_of, expected_of, expected_psnr_of, training_seconds
 from ..planning import build_context, change_objects, choices, find_requested_objects, report_plan, settings
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
@@ -66,9 +75,12 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
                 "--steps to extend it, or --restart to start over."
             )
         else:
+            agreement = recorded_agreement(folder, capture, options.max_size)
+            if agreement is None:
+                agreement = measure_agreement(trainer.scene.capture)
             update_record(
                 folder,
-                capture=capture_record(capture, options.max_size),
+                capture=capture_record(capture, options.max_size, agreement),
                 training=TrainingRecord(
                     settings=trainer.settings.as_dict(),
                     minutes=None if budget.seconds is None else budget.seconds / 60,
@@ -78,10 +90,11 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
                     left_out=trainer.scene.capture.left_out.tolist(),
                     votes=votes_key(trainer.scene.capture, options.max_size, options.strategy, options.seed),
                     plan=plan.as_list(),
+                    expected_psnr=expected_psnr_of(budget, trainer.scene.capture, device, progress, agreement),
                 ),
             )
             _expect_training(budget, trainer.scene.capture, device, progress, reporter)
-            if expected := expected_of(budget, trainer.scene.capture, device, progress):
+            if expected := expected_of(budget, trainer.scene.capture, device, progress, agreement):
                 reporter.status(expected)
             try:
                 _run(trainer, budget, folder, options.checkpoint_seconds, reporter)

@@ -1,10 +1,10 @@
 """objectgs.json: the inputs and settings that the other files of the reconstruction folder were made from.
 
 {"version": "0.1.0",
- "capture": {"folder": "/captures/garden", "max_size": 1600, "digest": "0f..."},
+ "capture": {"folder": "/captures/garden", "max_size": 1600, "digest": "0f...", "agreement": 33.1},
  "votes": {"strategy": "majority", "seed": null, "max_size": 1600, "capture": "0f...", "masks": "a1..."},
  "training": {"settings": {...}, "minutes": 5.0, "steps": null, "preset": null, "device": "cpu", "left_out": [],
-              "votes": {...}, "plan": [...]},
+              "votes": {...}, "plan": [...], "expected_psnr": [24.1, 31.9]},
  "export": {"splats": 81000, "anchors": 21000, "psnr_of_export": null},
  "imported": {"file": "/splats/point_cloud.ply", "splats": 81000},
  "stages": [{"name": "train", "seconds": 300.0, "peak_rss_mb": 900.0}]}
@@ -27,11 +27,19 @@ _Part = TypeVar("_Part")
 
 @dataclass(frozen=True)
 class CaptureRecord:
-    """The capture: its folder, the maximum length of its images' longer side in pixels, and a hash of its content."""
+    """The capture.
+
+    Attributes:
+        folder: its folder.
+        max_size: maximum length of its images' longer side in pixels.
+        digest: hash of its content.
+        agreement: how well its photos agree, in dB, see `backend.planning.agreement`; None if it is not known.
+    """
 
     folder: str
     max_size: int
     digest: str
+    agreement: float | None = None
 
 
 @dataclass(frozen=True)
@@ -64,6 +72,8 @@ class TrainingRecord:
         device: name of the device.
         left_out: IDs of the objects that were left out.
         plan: the decisions, as in plan.json.
+        expected_psnr: bounds in dB of the PSNR on held-out views that was expected before, see `expected_psnr` in
+            `backend.shared.expectation`; None without an expectation.
     """
 
     settings: dict[str, Any]
@@ -74,6 +84,7 @@ class TrainingRecord:
     device: str = "cpu"
     left_out: list[int] = field(default_factory=list)
     plan: list[dict[str, Any]] | None = None
+    expected_psnr: list[float] | None = None
 
 
 @dataclass(frozen=True)

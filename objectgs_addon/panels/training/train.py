@@ -9,7 +9,7 @@ from typing import Any
 import bpy
 
 from ....backend.shared.durations import clock
-from ....backend.shared.expectation import PRESET_STEPS, expectation, expectation_in_words
+from ....backend.shared.expectation import PRESET_STEPS, expectation, expectation_in_words, typical_psnr
 from ....backend.shared.reconstruction.lock import lock_holder
 from ... import scene
 from ...process.jobs import Job
@@ -90,10 +90,13 @@ def _training_job(root: bpy.types.Collection) -> Job | None:
     return job if job is not None and job.kind == "train" else None
 
 
-def _length_of(state: FolderState, properties: Any) -> tuple[int | None, float | None, float, tuple[int, float]]:
+def _length_of(
+    state: FolderState, properties: Any
+) -> tuple[int | None, float | None, float, tuple[int, float], float | None]:
     """Return the arguments of `expectation` for the chosen length."""
     seconds = 60 * properties.minutes if properties.length == "minutes" else None
-    return PRESET_STEPS.get(properties.length), seconds, state.pixels, (state.steps, state.seconds)
+    typical = None if state.agreement is None else typical_psnr(state.agreement, state.pixels)
+    return PRESET_STEPS.get(properties.length), seconds, state.pixels, (state.steps, state.seconds), typical
 
 
 def _draw_faint(layout: bpy.types.UILayout, text: str) -> None:
@@ -132,10 +135,10 @@ def _draw_folder_state(layout: bpy.types.UILayout, root: bpy.types.Collection, j
 
 def _draw_expectation(layout: bpy.types.UILayout, state: FolderState, properties: Any) -> None:
     """Draw the expected duration and sharpness of a training that is not finished."""
-    steps, seconds, pixels, trained = _length_of(state, properties)
+    steps, seconds, *others = _length_of(state, properties)
     if state.steps >= (steps or math.inf) or state.seconds >= (seconds or math.inf) - 0.5:
         return
-    expected = expectation_in_words(steps, seconds, pixels, trained)
+    expected = expectation_in_words(steps, seconds, *others)
     if expected is not None:
         _draw_faint(layout, f"Expected on this computer: {expected}.")
 
