@@ -7,8 +7,8 @@
 The synthetic captures are made by `suite_scenes.py` in build/suite, with exact truth; the others are those of
 ../shared/data that are there. Changes are developed on the captures `DEVELOP`; the others are looked at only when a
 change is done. Each length is a training of its own through the user's commands. --write saves the figures of all
-captures to docs/figures/suite.json, the tables to docs/suite.md and the plot to docs/suite.png, and prints the values
-of `PSNR_FIT` in backend/shared/expectation.py.
+captures to docs/figures/suite.json, the tables to docs/suite.md and the plots beside it, and prints the values of
+`PSNR_FIT` in backend/shared/expectation.py.
 """
 
 from __future__ import annotations
@@ -61,6 +61,9 @@ DEVELOP = ("room", "yard", "few", "exposure", "tabletop")
 """Captures that changes are developed on."""
 
 MINUTES = (1.0, 2.0, 5.0)
+
+OVER_TIME, EXPECTED = "suite-over-time.png", "suite-expected.png"
+"""The plots in docs/."""
 
 _FEWEST_TO_FIT = 8
 """Smallest number of captures from which the quality of others is expected."""
@@ -180,6 +183,8 @@ def document(found: Mapping[str, Any]) -> str:
             *shared.table(("capture", *(title for _, title, _ in _COLUMNS)), [*rows, ("**median**", *median)]),
             "",
         ]
+    if len({length for of in found.values() for length in of}) > 1:
+        lines += [f"![PSNR, mIoU and F1 over the minutes of training]({OVER_TIME})", ""]
     if len(found) >= _FEWEST_TO_FIT:
         lines += _expected_and_found(found)
     return "\n".join(lines).rstrip() + "\n"
@@ -209,6 +214,8 @@ def _expected_and_found(found: Mapping[str, Any]) -> list[str]:
         "of the points, and from the photos' size. Here, each capture's longest training is predicted by the fit to "
         "the other captures. PSNR in dB, colors corrected, mean over the held-out views; "
         f"{inside} of {len(rows)} are within {fit.margin:.1f} dB.",
+        "",
+        f"![Found over expected PSNR of each capture]({EXPECTED})",
         "",
         *shared.table(("capture", "agreement, dB", "megapixels", "expected", "found", "difference"), rows),
         "",
@@ -296,6 +303,29 @@ def plot(found: Mapping[str, Any]) -> Any:
     return figure
 
 
+def plot_expected(found: Mapping[str, Any]) -> Any:
+    """Plot the found PSNR of each capture over the one expected from the others, and the interval."""
+    from matplotlib.figure import Figure
+
+    fit, errors = fit_of_psnr(found)
+    values = {name: of[max(of, key=float)]["psnr_corrected_mean"] for name, of in found.items()}
+    expected = {name: value - errors[name] for name, value in values.items()}
+    with shared.plot_style():
+        figure = Figure(figsize=(5.6, 4.6), layout="constrained")
+        axes = figure.subplots()
+        ends = np.array([min(expected.values()) - 2, max(expected.values()) + 2])
+        axes.fill_between(ends, ends - fit.margin, ends + fit.margin, color=shared.COLORS[0], alpha=0.12, linewidth=0)
+        axes.plot(ends, ends, color=shared.GRAY, linewidth=1)
+        for name, value in values.items():
+            color = shared.COLORS[1] if name in REAL else shared.COLORS[0]
+            axes.plot(expected[name], value, "o", color=color, markersize=5)
+            axes.annotate(name, (expected[name], value), xytext=(5, 3), textcoords="offset points", fontsize=8)
+        axes.set_title("PSNR on held-out views, colors corrected, dB")
+        axes.set_xlabel("expected from the other captures")
+        axes.set_ylabel("found")
+    return figure
+
+
 def main() -> None:
     """Measure, and print or write the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -336,10 +366,12 @@ def main() -> None:
     if failed:
         sys.exit("\n".join(f"{name}: {why}" for name, why in failed.items()))
     if options.write:
-        shared.save_figure(plot(found["this"]), documents.DOCS / "suite.png")
-        documents.save("suite", found["this"])
+        if len(lengths) > 1:
+            shared.save_figure(plot(found["this"]), documents.DOCS / OVER_TIME)
         if len(found["this"]) >= _FEWEST_TO_FIT:
+            shared.save_figure(plot_expected(found["this"]), documents.DOCS / EXPECTED)
             print(fit_of_psnr(found["this"])[0])
+        documents.save("suite", found["this"])
     print(document(found["this"]))
     if options.compare:
         print(comparison(found["other"], found["this"]))

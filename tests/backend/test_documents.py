@@ -4,10 +4,11 @@ import json
 import re
 import shutil
 
+import numpy as np
 import pytest
 
 from backend.shared import expectation
-from benchmarks import documents, length, quoted
+from benchmarks import documents, length, quoted, suite
 
 KNOWN = {path.stem for path in documents.FIGURES.glob("*.json")}
 
@@ -51,6 +52,13 @@ def test_expectations_are_those_measured():
     }
     for steps, (least, most) in expectation.SHORT_OF_FINAL.items():
         assert least == most == measured[steps], steps
+
+
+def test_expected_quality_is_that_of_the_suite():
+    fit, errors = suite.fit_of_psnr(documents.load("suite"))
+    assert np.allclose(expectation.PSNR_FIT, fit, rtol=0.005)
+    inside = [abs(error) <= fit.margin for error in errors.values()]
+    assert np.mean(inside) >= 0.8 and len(inside) >= 10
 
 
 def test_text_without_a_value_is_an_error(tmp_path, monkeypatch):
