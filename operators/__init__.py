@@ -15,6 +15,7 @@ def _classes() -> list[type]:
         assign_objects,
         group_objects,
         import_capture,
+        import_masks,
         import_photos,
         leave_out_photos,
         make_demo,
@@ -54,6 +55,7 @@ def _classes() -> list[type]:
     modules = (
         import_capture,
         import_photos,
+        import_masks,
         leave_out_photos,
         make_demo,
         assign_objects,

@@ -74,11 +74,16 @@ def _folded(name: str, level: int) -> str:
     return name.casefold() if level >= 3 else name
 
 
-def mask_names(image_name: str) -> tuple[list[str], list[str]]:
-    """Return the names that an image's mask may have below masks/: accepted ones, and lossy ones that are refused."""
+def mask_names(image_name: str, beside: bool = False) -> tuple[list[str], list[str]]:
+    """Return the names that an image's mask may have below masks/: accepted ones, and lossy ones that are refused.
+
+    If the masks are beside the images, only names that contain a word for masks.
+    """
     place, name = re.fullmatch(r"(.*[/\\])?([^/\\]*)", image_name).groups()  # type: ignore[union-attr]
     stem = re.sub(r"\.[^.]*$", "", name)
-    found = [name, stem, *(f"{stem}_{word}" for word in _MASK_WORDS), *(f"{word}_{stem}" for word in _MASK_WORDS)]
+    found = [*(f"{stem}_{word}" for word in _MASK_WORDS), *(f"{word}_{stem}" for word in _MASK_WORDS)]
+    if not beside:
+        found = [name, stem, *found]
     found = [(place or "") + each for each in found]
     return [each + suffix for each in found for suffix in MASK_SUFFIXES], [
         each + suffix for each in found for suffix in LOSSY_SUFFIXES
@@ -183,7 +188,7 @@ def read_mask(path: Path, color: bool | None = None) -> np.ndarray:
     """
     suffix = path.suffix.lower()
     if suffix in LOSSY_SUFFIXES:
-        raise InputError(f"{path} is a JPEG, whose compression changes IDs; save the mask as PNG.")
+        raise InputError(f"{path} is a JPEG, whose compression changes IDs; save it as PNG, or use `masks`.")
     ids = _array_mask(path) if suffix in (".npy", ".npz") else _image_mask(path, color)
     return compact(ids)
 
@@ -253,7 +258,7 @@ def _image_mask(path: Path, color: bool | None) -> np.ndarray:
         tile = getattr(image, "tile", None)
         raw_mode = str(tile[0][3]) if tile else ""
         if image.format == "JPEG":
-            raise InputError(f"{path} is a JPEG, whose compression changes IDs; save the mask as PNG.")
+            raise InputError(f"{path} is a JPEG, whose compression changes IDs; save it as PNG, or use `masks`.")
         try:
             values = np.asarray(image)
         except _OPENING_ERRORS as error:

@@ -139,7 +139,7 @@ def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Repo
             accepted, lossy = mask_names(image.name)
             mask_path = masks.first(accepted)
             if mask_path is None and (jpeg := masks.first(lossy)) is not None:
-                problem(f"{jpeg} is a JPEG, whose compression changes IDs; save the mask as PNG.")
+                problem(f"{jpeg} is a JPEG, whose compression changes IDs; save it as PNG, or use `masks`.")
             if mask_path is None:
                 unmasked.append(image.name)
         target = targets[image.camera_id]

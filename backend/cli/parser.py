@@ -101,6 +101,16 @@ def _add_capture_commands(commands: _Commands) -> None:
     poses.add_argument(
         "--leave-out", nargs="+", default=[], metavar="NAME", help="photos to leave out, named as in images/"
     )
+    masks = commands.add(
+        "masks", "Make masks of those of another program", texts.MASKS, "garden segmentation/annotations.json"
+    )
+    masks.add_argument("capture", type=Path, metavar="CAPTURE", help=options.CAPTURE)
+    masks.add_argument("masks", type=Path, metavar="MASKS", help="file or folder of masks; see above")
+    masks.add_argument(
+        "--objects", choices=("auto", "given", "find"), default="auto",
+        help="which segments show the same object: given, as the masks say; find, by the points that they show; auto, "
+        "find if the masks do not say, or contradict the points (auto)",
+    )  # fmt: skip
     check = commands.add("check", "Check a capture and list its contents", texts.CHECK, "garden")
     options.add_capture(check)
     prepare = commands.add(

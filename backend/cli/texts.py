@@ -32,6 +32,18 @@ Photos that do not fit are named with the reason. If PHOTOS has folders images/ 
 masks/, both are copied. After a stop, the same command goes on.
 """
 
+MASKS = """\
+Make masks/ and labels.json of a capture of masks that another program wrote. MASKS is
+  a file of COCO (instances or panoptic), CVAT (for images or videos) or Label Studio;
+  a folder with a file for each photo, named like it: PNG or NumPy with IDs, black and
+  white PNG or JPEG, EXR with Cryptomatte or object indices, or JSON with run lengths;
+  a folder of black and white images for each object, or for each photo.
+Segments that are numbered in each photo on their own, as by Segment Anything, get one
+ID for each object: segments that show the same points are the same object. Segments
+that show several objects are divided. masks/masks.png shows the result. Masks that are
+in masks/ already are kept in masks-given/.
+"""
+
 CHECK = """\
 Check a capture and list its contents and problems: cameras, images without a pose,
 masks, objects. Nothing is written.

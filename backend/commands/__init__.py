@@ -9,13 +9,14 @@ import argparse
 from collections.abc import Callable
 
 from ..shared.stopping import StoppingReporter
-from .capture import check, import_capture, import_splats, plan, sfm, vote
+from .capture import check, import_capture, import_splats, masks, plan, sfm, vote
 from .objects import edit, export, film, label, mesh, point
 from .setup import doctor
 from .training import evaluate, render, report, train
 
 COMMANDS: dict[str, Callable[[argparse.Namespace, StoppingReporter], None]] = {
     "sfm": sfm.sfm,
+    "masks": masks.masks,
     "check": check.check,
     "import": import_capture.import_capture,
     "plan": plan.plan,

@@ -35,7 +35,7 @@ def draw_without_objects(layout: bpy.types.UILayout, root: bpy.types.Collection)
     else:
         text = (
             "The capture has no masks, so it trains as one scene. Objects are marked by strokes afterwards, or by "
-            "masks, one for each photo, in its folder masks."
+            "masks of another program, which Import Masks reads."
         )
     write(layout, text, "INFO")
 

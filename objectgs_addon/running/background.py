@@ -223,7 +223,7 @@ def finish(job: Job) -> None:
     show = _import_made if job.kind in ("demo", "sfm") else results.SHOW_BY_KIND.get(job.kind)
     if show is not None and show(job, owner):
         _push_undo(job.title)
-    if job.kind == "import" and owner is not None and not bpy.app.background:
+    if job.kind in ("import", "masks") and owner is not None and not bpy.app.background:
         _assign_objects(job, owner)
     for root in results.roots_of(job.folder):
         fill_holes(root, again=False)

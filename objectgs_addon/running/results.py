@@ -152,8 +152,19 @@ def _show_film(job: Job, _owner: bpy.types.Scene | None) -> bool:
     return False
 
 
+def _show_masks(job: Job, _owner: bpy.types.Scene | None) -> bool:
+    """Tell what was found in imported masks; return False."""
+    result = job.result.get("result")
+    found = len(result.get("objects", ())) if isinstance(result, dict) else 0
+    messages.show(
+        f"The masks show {found} objects in {job.result.get('photos')} photos; {job.result.get('masks')} has a picture"
+    )
+    return False
+
+
 SHOW_BY_KIND = {
     "import": _show_capture,
+    "masks": _show_masks,
     "vote": _show_votes,
     "train": _show_result,
     "label": _show_labels,

@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections import Counter
 from functools import partial
 from pathlib import Path
-from xml.etree.ElementTree import Element, TreeBuilder
-from xml.parsers import expat
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from ..colmap import Model
+from ..xml_text import parse_xml
 from .draft import Draft, shorten
 from .lens import Lens, brown, fisheye
 
@@ -90,21 +90,11 @@ def _same(lens: Lens, _width: int, _height: int) -> Lens:
 
 
 def _parse(draft: Draft) -> Element:
-    """Parse the file; a DTD is refused, since its entities may expand without bound or name other files."""
-    builder, parser = TreeBuilder(), expat.ParserCreate()
-
-    def refuse(*_: object) -> None:
-        raise draft.refusal("contains a DTD, which Metashape does not write")
-
-    parser.StartDoctypeDeclHandler = refuse
-    parser.StartElementHandler = lambda tag, attributes: builder.start(tag, attributes) and None
-    parser.EndElementHandler = lambda tag: builder.end(tag) and None
-    parser.CharacterDataHandler = builder.data
+    """Parse the file."""
     try:
-        parser.Parse(draft.text(), True)
-    except expat.ExpatError as error:
-        raise draft.refusal(f"is not valid XML ({error})") from error
-    return builder.close()
+        return parse_xml(draft.text())
+    except ValueError as error:
+        raise draft.refusal(str(error)) from error
 
 
 def _numbers(draft: Draft, element: Element | None, count: int, what: str) -> np.ndarray:

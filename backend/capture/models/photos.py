@@ -35,11 +35,16 @@ class Photos:
     Programs refer to photos by a path on another computer, by a path from their own folder, or by a name, with or
     without suffix. Of a path, the longest part from the right that belongs to a photo is used, so that no reference
     leads out of the folder. A name alone may be that of a photo in any subfolder.
+
+    Attributes:
+        folder: their folder.
+        names: their names, relative to it.
     """
 
     def __init__(self, capture: Path) -> None:
         self.folder = photos_folder(capture)
         self._files = Files(self.folder, without=("masks",) if self.folder == capture else ())
+        self.names = [path for path in self._files.paths if _split(path)[1]]
         self._by_stem: dict[str, list[str]] = {}
         self._by_name: dict[str, list[str]] = {}
         for path in self._files.paths:

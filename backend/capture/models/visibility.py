@@ -21,10 +21,10 @@ _RAY_WITHIN = 1e-3
 """Largest difference between a ray and that of its pixel; beyond, the lens folds over there."""
 
 
-def with_observations(model: Model) -> Model:
-    """Return a model without observations with those of points that no other point hides."""
+def with_observations(model: Model, most: int = _MOST_OBSERVED) -> Model:
+    """Return a model with observations of at most this many points, wherever no other point hides them."""
     hiding = _spread(len(model.xyz), _MOST_HIDING)
-    observed = hiding[_spread(len(hiding), _MOST_OBSERVED)]
+    observed = hiding[_spread(len(hiding), most)]
     is_candidate = np.isin(hiding, observed)
     xyz = model.xyz[hiding]
     images = []

@@ -5,18 +5,19 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
 
-from ...capture.files import Files, image_size, mask_names, read_mask, write_image
+from ...capture.files import Files, encode_mask, image_size, mask_names, read_mask, write_image
+from ...capture.mask_sources import MaskFiles, ids_of
 from ...shared.errors import InputError
-from ...shared.formats.atomic import atomic_path, make_folder
+from ...shared.formats.atomic import atomic_path, make_folder, write_atomic
 from ...shared.formats.json_file import read_json, write_json
-from ...shared.formats.photos_source import PHOTOS, VIDEOS, WORK
+from ...shared.formats.photos_source import PHOTOS, VIDEOS, WORK, natural_order
 from ...shared.stopping import StoppingReporter
 from . import photo_files, video
 
@@ -59,7 +60,8 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
 
     Args:
         sources: a folder with photos and videos, also in subfolders, or with a folder images/ and, optionally, masks/
-            and files with names, which are copied, too; or files of photos and videos.
+            and files with names, which are copied, too; or files of photos and videos. Photos named like another one
+            with `_mask` are its masks.
         capture: the capture's folder.
         frames: wanted number of frames of each video; None: by its motion.
         reporter: receives progress and warnings.
@@ -73,7 +75,8 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
         found = _listed(base, capture)
     else:
         base = Path(os.path.commonpath([path.parent for path in sources]))
-        found = sorted(sources, key=_natural)
+        found = sorted(sources, key=lambda path: natural_order(path.as_posix()))
+    found, masked = _without_masks(found)
     in_place = base.resolve() == (capture / IMAGES).resolve()
     videos = [] if in_place else [path for path in found if path.suffix.lower() in VIDEOS]
     files = [path for path in found if path.suffix.lower() in PHOTOS]
@@ -83,8 +86,9 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
     if not in_place:
         _require_space(files, capture)
     # Masks fit the pixels as they are stored.
-    turn = not in_place and not (source / MASKS).is_dir()
+    turn = not in_place and not (source / MASKS).is_dir() and not masked
     photos, unreadable = [], {}
+    names: dict[str, str] = {}
     for number, path in enumerate(files):
         reporter.progress(number, len(files))
         relative = path.relative_to(base)
@@ -94,14 +98,15 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
                 copied = photo_files.copy_photo(path, capture / IMAGES / relative, turn)
                 relative = copied.relative_to(capture / IMAGES)
             photos.append(Photo(relative.as_posix(), camera))
+            names[path.relative_to(base).as_posix()] = relative.as_posix()
         except InputError as error:
             unreadable[relative.as_posix()] = str(error)
     for path in videos:
         # COLMAP's lists of pairs have no names with spaces.
         folder = "" if found == [source] else re.sub(r"\s+", "_", path.relative_to(base).with_suffix("").as_posix())
         try:
-            names = _frames_of(path, capture, folder, frames, reporter)
-            photos += [Photo((Path(folder) / name).as_posix(), f"video {folder}") for name in names]
+            taken = _frames_of(path, capture, folder, frames, reporter)
+            photos += [Photo((Path(folder) / name).as_posix(), f"video {folder}") for name in taken]
         except InputError as error:
             if found == [source]:
                 raise
@@ -111,7 +116,28 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
         raise InputError(f"Of the photos in {base}, {len(photos)} can be read; {why}")
     if not in_place and base != source and source.is_dir():
         _copy_rest(source, capture)
+    if masked:
+        _write_masks(MaskFiles(base, names, base), names, capture)
     return Taken(photos, unreadable, not files)
+
+
+def _without_masks(paths: Sequence[Path]) -> tuple[list[Path], bool]:
+    """Return the photos and videos without those that are masks of others beside them, and whether there are masks."""
+    known = {path.as_posix() for path in paths}
+    masks = {
+        name for path in paths for names in mask_names(path.as_posix(), beside=True) for name in names if name in known
+    }
+    return [path for path in paths if path.as_posix() not in masks], bool(masks)
+
+
+def _write_masks(masks: MaskFiles, names: Mapping[str, str], capture: Path) -> None:
+    """Write the masks of photos to the masks/ of a capture, unless they are there; names: of the photos there."""
+    for photo in masks.photos:
+        suffix, data = encode_mask(ids_of(masks.read(photo)))
+        target = capture / MASKS / (names[photo] + suffix)
+        if not target.exists():
+            make_folder(target.parent)
+            write_atomic(target, data)
 
 
 def _frames_of(path: Path, capture: Path, folder: str, count: int | None, reporter: StoppingReporter) -> list[str]:
@@ -157,13 +183,7 @@ def _listed(base: Path, capture: Path) -> list[Path]:
         suffix = path.suffix.lower()
         return suffix not in photo_files.COPIED and path.with_suffix("") in (photos if suffix in VIDEOS else copied)
 
-    return sorted((path for path in paths if not is_double(path)), key=_natural)
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Return a sort key by which photo 10 follows photo 9."""
-    parts = re.split(r"(\d+)", path.as_posix().lower())
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
+    return sorted((path for path in paths if not is_double(path)), key=lambda path: natural_order(path.as_posix()))
 
 
 def _require_space(paths: Sequence[Path], capture: Path) -> None:

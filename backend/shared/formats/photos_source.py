@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,6 +23,11 @@ RAW = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
 """Unprocessed photos of cameras, which need the package rawpy."""
 PHOTOS = IMAGES | HEIC | RAW
 VIDEOS = {".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv", ".3gp"}
+
+
+def natural_order(name: str) -> list[tuple[int, str]]:
+    """Return a sort key by which photo 10 follows photo 9."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name.lower())]
 
 
 @dataclass(frozen=True)

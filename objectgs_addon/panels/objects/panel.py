@@ -79,12 +79,15 @@ class ObjectsPanel(WithReconstruction, bpy.types.Panel):
         root = context.scene.objectgs.active
         properties = root.objectgs
         job = background.job_of(root)
-        if job is not None and job.kind == "vote" and not (properties.objects and job.is_finished):
+        if job is not None and job.kind in ("vote", "masks") and not (properties.objects and job.is_finished):
             draw_job_of(layout, job)
         if not properties.objects:
             draw_without_objects(layout, root)
-        if has_masks(folder_trust.state_of(root)):
+        state = folder_trust.state_of(root)
+        if has_masks(state):
             layout.operator("objectgs.assign_objects", icon="GROUP_VERTEX")
+        elif state.capture is not None and not properties.objects:
+            layout.operator("objectgs.import_masks", icon="IMAGE_ALPHA")
         if not properties.objects:
             return
         row = layout.row()

@@ -1,0 +1,120 @@
+"""CVAT's XML, for images and for videos: polygons, boxes, ellipses and masks."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Hashable, Sequence
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from ...shared.errors import InputError
+from ...shared.formats.photos_source import natural_order
+from ..models.photos import Photos
+from .segments import Segments, Shape, checked_size, draw_shapes, polygon
+
+_SHAPES = ("polygon", "box", "ellipse", "mask")
+
+
+def recognizes(head: bytes) -> bool:
+    """Return whether a file that starts with these bytes is of CVAT."""
+    return b"<annotations" in head
+
+
+class CvatMasks:
+    """The masks of a file of CVAT.
+
+    Args:
+        root: its XML.
+        file: the file, for messages.
+        photos: the photos of the capture; the frames of a video are theirs in natural order.
+        names: the names of all photos.
+
+    Raises:
+        InputError: the file is not valid.
+    """
+
+    what = "CVAT annotations"
+
+    def __init__(self, root: Element, file: Path, photos: Photos, names: Sequence[str]) -> None:
+        self._file = file
+        self._sizes: dict[str, tuple[int, int]] = {}
+        self._shapes: dict[str, list[tuple[Element, str, Hashable]]] = {}
+        try:
+            self._read_images(root, photos)
+            self._read_tracks(root, names)
+        except (TypeError, ValueError, KeyError) as error:
+            raise self._invalid(error) from error
+        self.photos: Sequence[str] = sorted(self._shapes)
+        self._is_unique = all(
+            count == 1
+            for found in self._shapes.values()
+            for count in Counter(label for _, label, track in found if track is None).values()
+        )
+
+    def _read_images(self, root: Element, photos: Photos) -> None:
+        for image in root.iter("image"):
+            name = photos.find(image.get("name", ""))
+            if name is not None:
+                width, height = int(image.attrib["width"]), int(image.attrib["height"])
+                self._sizes[name] = checked_size(width, height, f"{self._file}: {name}")
+                self._shapes[name] = [(each, each.get("label", ""), None) for each in image if each.tag in _SHAPES]
+
+    def _read_tracks(self, root: Element, names: Sequence[str]) -> None:
+        tracks = list(root.iter("track"))
+        if not tracks:
+            return
+        size = root.find(".//original_size")
+        if size is None:
+            raise ValueError("without original_size")
+        width, height = (int(size.findtext(side, "")) for side in ("width", "height"))
+        ordered = sorted(names, key=natural_order)
+        for track in tracks:
+            key = ("track", track.get("id"))
+            for each in track:
+                frame = int(each.get("frame", "-1"))
+                if each.tag in _SHAPES and each.get("outside") != "1" and 0 <= frame < len(ordered):
+                    name = ordered[frame]
+                    self._sizes[name] = checked_size(width, height, f"{self._file}: {name}")
+                    self._shapes.setdefault(name, []).append((each, track.get("label", ""), key))
+
+    def read(self, photo: str) -> Segments:
+        """Return the segments of a photo; raises InputError."""
+        size, shapes = self._sizes[photo], []
+        for element, label, track in self._shapes[photo]:
+            try:
+                inside = _inside(element, size)
+            except (TypeError, ValueError, KeyError) as error:
+                raise self._invalid(error, photo) from error
+            known = track if track is not None else label if label and self._is_unique else None
+            shapes.append(Shape(inside, known, label))
+        return draw_shapes(shapes, size)
+
+    def _invalid(self, error: Exception, photo: str = "") -> InputError:
+        where = f" for {photo}" if photo else ""
+        return InputError(f"{self._file} is not valid{where} ({error}); export it again from CVAT.")
+
+
+def _inside(element: Element, size: tuple[int, int]) -> np.ndarray:
+    """Return the pixels (h, w) bool of a shape."""
+    width, height = size
+    values = element.attrib
+    if element.tag == "polygon":
+        return polygon([tuple(map(float, pair.split(","))) for pair in values["points"].split(";")], size)  # type: ignore[misc]
+    if element.tag == "box":
+        left, top, right, bottom = (float(values[key]) for key in ("xtl", "ytl", "xbr", "ybr"))
+        return polygon([(left, top), (right, top), (right, bottom), (left, bottom)], size)
+    if element.tag == "ellipse":
+        turns = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+        x = float(values["cx"]) + float(values["rx"]) * np.cos(turns)
+        y = float(values["cy"]) + float(values["ry"]) * np.sin(turns)
+        return polygon(list(zip(x.tolist(), y.tolist(), strict=True)), size)
+    left, top, wide, tall = (int(values[key]) for key in ("left", "top", "width", "height"))
+    runs = [int(run) for run in values["rle"].split(",")]
+    fits = 0 <= left <= left + wide <= width and 0 <= top <= top + tall <= height
+    if min(runs) < 0 or sum(runs) != wide * tall or not fits:
+        raise ValueError(f"a mask of {wide} x {tall} pixels whose run lengths add up to {sum(runs)}")
+    inside = np.zeros((height, width), bool)
+    inside[top : top + tall, left : left + wide] = np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(tall, wide)
+    return inside

@@ -1,0 +1,92 @@
+"""OpenEXR files: Cryptomatte, of any renderer or compositing program, and passes of object indices."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Hashable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+
+from ...shared.errors import InputError
+from .segments import Segments
+
+_INDEX = re.compile(r"(.*\.)?(IndexOB|IndexMA|object_?id|id)(\.[XYRV])?", re.IGNORECASE)
+_COVERED = 0.5
+"""A pixel shows an object that covers more of it than this."""
+
+
+class ExrMasks:
+    """The masks of EXR files.
+
+    Args:
+        files: the file of each photo by its name.
+    """
+
+    what = "EXR masks"
+
+    def __init__(self, files: dict[str, Path]) -> None:
+        self._files = files
+        self.photos: Sequence[str] = sorted(files)
+
+    def read(self, photo: str) -> Segments:
+        """Return the segments of a photo; raises InputError."""
+        path = self._files[photo]
+        try:
+            with OpenEXR.File(str(path), separate_channels=True) as file:
+                header = dict(file.header())
+                channels = {name: np.array(each.pixels) for name, each in file.channels().items()}
+        except (OSError, RuntimeError, ValueError, TypeError) as error:
+            raise InputError(f"{path} cannot be read as OpenEXR ({error}); render it again.") from error
+        found = _cryptomatte(header, channels) or _indices(channels)
+        if found is None:
+            raise InputError(
+                f"{path} contains neither Cryptomatte nor a pass of object indices; its channels are "
+                f"{', '.join(sorted(channels)[:10])}."
+            )
+        return found
+
+
+def _cryptomatte(header: dict[str, Any], channels: dict[str, np.ndarray]) -> Segments | None:
+    """Return the objects that cover most of each pixel; None without Cryptomatte. Objects come before materials."""
+    layers = sorted(
+        (str(name) for key, name in header.items() if re.fullmatch(r"cryptomatte/[^/]+/name", key)),
+        key=lambda name: ("object" not in name.lower(), "asset" not in name.lower(), name),
+    )
+    layer = next((name for name in layers if f"{name}00.R" in channels), None)
+    if layer is None:
+        return None
+    ids = np.ascontiguousarray(channels[f"{layer}00.R"], np.float32).view(np.uint32)
+    covered = channels[f"{layer}00.G"] > _COVERED
+    key = next(key for key, name in header.items() if str(name) == layer and key.endswith("/name"))
+    try:
+        manifest = json.loads(header.get(key.removesuffix("name") + "manifest") or "{}")
+        names = {int(value, 16): str(name) for name, value in manifest.items()}
+    except (AttributeError, TypeError, ValueError):
+        names = {}
+    found, numbers = np.unique(np.where(covered, ids, 0), return_inverse=True)
+    return _numbered(found, numbers.reshape(ids.shape), lambda value: names.get(value, f"{value:08x}"), names)
+
+
+def _indices(channels: dict[str, np.ndarray]) -> Segments | None:
+    """Return the objects of a pass of indices; None without one."""
+    name = next((name for name in sorted(channels) if _INDEX.fullmatch(name)), None)
+    if name is None:
+        return None
+    indices = np.rint(np.nan_to_num(channels[name].astype(np.float64))).astype(np.int64)
+    found, numbers = np.unique(np.maximum(indices, 0), return_inverse=True)
+    return _numbered(found, numbers.reshape(indices.shape), lambda value: value, {})
+
+
+def _numbered(
+    found: np.ndarray, numbers: np.ndarray, object_of: Callable[[int], Hashable], names: dict[int, str]
+) -> Segments:
+    """Return segments from indices (h, w) into the values found, of which 0 is no object."""
+    offset = 0 if len(found) and found[0] == 0 else 1
+    values = found[1 - offset :].tolist()
+    return Segments(
+        (numbers + offset).astype(np.int32), list(map(object_of, values)), [names.get(value, "") for value in values]
+    )

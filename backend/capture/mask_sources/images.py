@@ -1,0 +1,129 @@
+"""Masks as image files: one for each photo, or black and white ones in a folder for each object or for each photo."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from ...shared.errors import InputError
+from ..files import (
+    LOSSY_SUFFIXES,
+    MASK_SUFFIXES,
+    Files,
+    is_color_mask,
+    is_three_channel,
+    mask_names,
+    read_image,
+    read_mask,
+    read_names,
+)
+from ..models.photos import Photos
+from .segments import Segments, Shape, draw_shapes
+
+_GRAY = 0.02
+"""Largest fraction of pixels that are neither black nor white in a JPEG that is black and white."""
+
+
+class MaskFiles:
+    """A file for each photo with its object IDs, or in black and white with one object.
+
+    Args:
+        folder: the folder of the files, which may be that of the photos.
+        names: the names of the capture's photos.
+        photos: the folder of the photos.
+    """
+
+    def __init__(self, folder: Path, names: Iterable[str], photos: Path) -> None:
+        files, beside = Files(folder), folder.resolve() == photos.resolve()
+        self._files: dict[str, Path] = {}
+        for name in names:
+            accepted, lossy = mask_names(name, beside)
+            if (found := files.first(accepted) or files.first(lossy)) is not None:
+                self._files[name] = found
+        self.photos: Sequence[str] = sorted(self._files)
+        self.what = "ID masks"
+        self._labels = {**read_names(folder.parent), **read_names(folder)} if self._files else {}
+        color = [path for path in self._files.values() if path.suffix.lower() not in LOSSY_SUFFIXES]
+        self._is_color = bool(color) and all(map(is_three_channel, color)) and any(map(is_color_mask, color))
+
+    def read(self, photo: str) -> Segments:
+        """Return the segments of a photo; raises InputError."""
+        path = self._files[photo]
+        if path.suffix.lower() in LOSSY_SUFFIXES:
+            ids = read_black_and_white(path).astype(np.int64)
+        else:
+            ids = read_mask(path, self._is_color).astype(np.int64)
+            if set(np.unique(ids).tolist()) <= {0, 255}:
+                ids = np.minimum(ids, 1)
+        found, numbers = np.unique(ids, return_inverse=True)
+        offset = 0 if len(found) and found[0] == 0 else 1
+        values = found[1 - offset :].tolist()
+        named = [self._labels.get(value, "") for value in values]
+        return Segments((numbers.reshape(ids.shape) + offset).astype(np.int32), values, named)
+
+
+class MaskFolders:
+    """Black and white files, of which each shows one segment.
+
+    Args:
+        folder: a folder with a folder for each photo, of its name without suffix, or for each object, of the object's
+            name and with a file for each photo.
+        photos: the photos of the capture.
+    """
+
+    def __init__(self, folder: Path, photos: Photos) -> None:
+        self._shapes: dict[str, list[tuple[Path, str]]] = {}
+        by_photo: dict[str, list[tuple[Path, str]]] = {}
+        by_object: dict[str, list[tuple[Path, str]]] = {}
+        for path in sorted(folder.rglob("*")):
+            if path.suffix.lower() not in (*MASK_SUFFIXES, *LOSSY_SUFFIXES) or path.parent == folder:
+                continue
+            within = PurePosixPath(path.relative_to(folder).as_posix())
+            if (name := photos.find(within.parent.as_posix())) is not None:
+                by_photo.setdefault(name, []).append((path, ""))
+            elif (name := photos.find("/".join(within.parts[1:]))) is not None:
+                by_object.setdefault(name, []).append((path, within.parts[0]))
+        self._has_objects = len(by_object) >= len(by_photo)
+        self._shapes = by_object if self._has_objects else by_photo
+        self.photos: Sequence[str] = sorted(self._shapes)
+        self.what = "a folder of masks for each object" if self._has_objects else "a folder of masks for each photo"
+
+    def read(self, photo: str) -> Segments:
+        """Return the segments of a photo; raises InputError."""
+        shapes, size = [], None
+        for path, name in self._shapes[photo]:
+            inside = read_black_and_white(path)
+            if size is not None and inside.shape != size:
+                raise InputError(f"{path} is not of the size of the other masks of {photo}; make it the photo's size.")
+            size = inside.shape
+            shapes.append(Shape(inside, name or None, name))
+        assert size is not None
+        return draw_shapes(shapes, size[::-1])
+
+
+def read_black_and_white(path: Path) -> np.ndarray:
+    """Read a mask in black and white, also a JPEG: (h, w) bool, True where it is white.
+
+    Raises:
+        InputError: It cannot be read, or is not black and white.
+    """
+    if path.suffix.lower() in (".npy", ".npz"):
+        values = read_mask(path).astype(np.int64) > 0
+        return np.asarray(values)
+    gray = np.asarray(read_image(path).convert("L"))
+    if gray.max(initial=0) <= 1:
+        return gray > 0
+    between = float(((gray > 64) & (gray < 192)).mean())
+    if between > _GRAY:
+        raise InputError(
+            f"{path} is not black and white, since {between:.0%} of its pixels are gray; save masks with several "
+            "objects as PNG with IDs."
+        )
+    return gray > 127
+
+
+def ids_of(segments: Segments) -> np.ndarray:
+    """Return the IDs (h, w) int64 of segments whose objects are IDs."""
+    return np.array([0, *segments.objects], np.int64)[segments.numbers]

@@ -1,0 +1,156 @@
+"""Label Studio's JSON: brushes, polygons, rectangles and ellipses."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...shared.errors import InputError
+from ..models.photos import Photos
+from .segments import Segments, Shape, checked_size, draw_shapes, polygon
+
+_UPLOAD = re.compile(r"^[0-9a-f]{8}-")
+_LABELS = ("brushlabels", "polygonlabels", "rectanglelabels", "ellipselabels", "labels")
+
+
+def recognizes(content: Any) -> bool:
+    """Return whether JSON is of Label Studio: a list of tasks with annotations."""
+    return (
+        isinstance(content, list)
+        and bool(content)
+        and all(isinstance(task, Mapping) and isinstance(task.get("annotations"), list) for task in content)
+    )
+
+
+class LabelStudioMasks:
+    """The masks of an export of Label Studio.
+
+    Args:
+        content: its JSON.
+        file: the file, for messages.
+        photos: the photos of the capture.
+
+    Raises:
+        InputError: the file is not valid.
+    """
+
+    what = "Label Studio annotations"
+
+    def __init__(self, content: Sequence[Mapping[str, Any]], file: Path, photos: Photos) -> None:
+        self._file = file
+        self._results: dict[str, list[Mapping[str, Any]]] = {}
+        try:
+            for task in content:
+                name = _photo_of(task, photos)
+                results = [each for annotation in task["annotations"] for each in annotation["result"]]
+                if name is not None:
+                    self._results[name] = [each for each in results if "original_width" in each]
+        except (AttributeError, KeyError, TypeError) as error:
+            raise self._invalid(error) from error
+        self.photos: Sequence[str] = sorted(self._results)
+        self._is_unique = all(
+            count == 1 for found in self._results.values() for count in Counter(map(_label, found)).values()
+        )
+
+    def read(self, photo: str) -> Segments:
+        """Return the segments of a photo; raises InputError."""
+        results = self._results[photo]
+        if not results:
+            raise InputError(f"{self._file} has no region for {photo}; label it, or remove its task.")
+        shapes = []
+        try:
+            size = checked_size(results[0]["original_width"], results[0]["original_height"], f"{self._file}: {photo}")
+            for each in results:
+                label = _label(each)
+                shapes.append(Shape(_inside(each, size), label if label and self._is_unique else None, label))
+        except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
+            raise self._invalid(error, photo) from error
+        return draw_shapes(shapes, size)
+
+    def _invalid(self, error: Exception, photo: str = "") -> InputError:
+        where = f" for {photo}" if photo else ""
+        return InputError(f"{self._file} is not valid{where} ({error}); export it again from Label Studio as JSON.")
+
+
+def _photo_of(task: Mapping[str, Any], photos: Photos) -> str | None:
+    """Return the photo of a task; an upload's name begins with eight digits that the photo's lacks."""
+    for value in (*task["data"].values(), task.get("file_upload")):
+        if isinstance(value, str):
+            name = value.rpartition("/")[2]
+            found = photos.find(value) or photos.find(name) or photos.find(_UPLOAD.sub("", name))
+            if found is not None:
+                return found
+    return None
+
+
+def _label(result: Mapping[str, Any]) -> str:
+    value = result.get("value", {})
+    return next((str(value[key][0]) for key in _LABELS if value.get(key)), "")
+
+
+def _inside(result: Mapping[str, Any], size: tuple[int, int]) -> np.ndarray:
+    """Return the pixels (h, w) bool of a region."""
+    value, (width, height) = result["value"], size
+    if "rle" in value:
+        return unpack(value["rle"], width * height * 4).reshape(height, width, 4)[..., 3] > 0
+    if "points" in value:
+        return polygon([(x / 100 * width, y / 100 * height) for x, y in value["points"]], size)
+    x, y = value["x"] / 100 * width, value["y"] / 100 * height
+    if "radiusX" in value:
+        turns = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+        across = x + value["radiusX"] / 100 * width * np.cos(turns)
+        down = y + value["radiusY"] / 100 * height * np.sin(turns)
+        return polygon(list(zip(across.tolist(), down.tolist(), strict=True)), size)
+    right, bottom = x + value["width"] / 100 * width, y + value["height"] / 100 * height
+    return polygon([(x, y), (right, y), (right, bottom), (x, bottom)], size)
+
+
+def unpack(data: Sequence[int], count: int) -> np.ndarray:
+    """Decode the run lengths of Label Studio's brushes, those of the package @thi.ng/rle-pack.
+
+    The bits are: the number of values (32), the bits of a value less 1 (5), and four times the bits of a length less 1
+    (4). Then follow runs: whether it repeats one value (1), which size its length has (2), the length less 1, and the
+    value or the values.
+
+    Args:
+        data: bytes.
+        count: expected number of values.
+
+    Returns:
+        (count,) uint8.
+
+    Raises:
+        ValueError: The data is damaged.
+    """
+    bits = np.unpackbits(np.array(data, np.uint8)).tolist()
+    at = 0
+
+    def take(length: int) -> int:
+        nonlocal at
+        if at + length > len(bits):
+            raise ValueError("a brush that ends too early")
+        value = 0
+        for bit in bits[at : at + length]:
+            value = value << 1 | bit
+        at += length
+        return value
+
+    total, word = take(32), take(5) + 1
+    sizes = [take(4) + 1 for _ in range(4)]
+    if total != count or word > 8:
+        raise ValueError(f"a brush of {total} values, expected {count}")
+    values = np.zeros(count, np.uint8)
+    first = 0
+    while first < count:
+        repeats, length = take(1), take(sizes[take(2)]) + 1
+        last = first + length
+        if last > count:
+            raise ValueError("a brush that is too long")
+        values[first:last] = take(word) if repeats else [take(word) for _ in range(length)]
+        first = last
+    return values

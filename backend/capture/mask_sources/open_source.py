@@ -1,0 +1,84 @@
+"""Recognition of the program that wrote masks."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ...shared.errors import InputError
+from ...shared.formats.json_file import parse_json
+from ...shared.formats.regular_file import read_regular
+from ..files import Files
+from ..models.photos import Photos
+from ..xml_text import parse_xml
+from . import coco, cvat, label_studio
+from .exr import ExrMasks
+from .images import MaskFiles, MaskFolders
+from .segments import MaskSource
+
+_LARGEST = 1 << 30
+_ACCEPTED = (
+    "expected a file of COCO, CVAT or Label Studio; or a folder with files named like the photos: PNG or NumPy files "
+    "with IDs, black and white images, EXR with Cryptomatte or object indices, or folders of black and white images"
+)
+
+
+def open_source(path: Path, capture: Path, names: Sequence[str]) -> MaskSource:
+    """Open the masks that a program wrote.
+
+    Args:
+        path: the file or folder.
+        capture: the capture, in whose images/ its photos are.
+        names: the names of the capture's photos.
+
+    Raises:
+        InputError: it is not of a known kind, is damaged, or has masks of none of the photos.
+    """
+    photos = Photos(capture)
+    if not path.exists():
+        raise InputError(f"{path} does not exist; {_ACCEPTED}.")
+    sources = _of_folder(path, photos, names) if path.is_dir() else [_of_file(path, photos, names)]
+    source = max(sources, key=lambda each: len(each.photos))
+    if not source.photos:
+        raise InputError(f"{path} has masks of none of the {len(names)} photos, such as {names[0]}; {_ACCEPTED}.")
+    return source
+
+
+def _of_file(path: Path, photos: Photos, names: Sequence[str]) -> MaskSource:
+    try:
+        data = read_regular(path, _LARGEST)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read ({getattr(error, 'strerror', None) or error}).") from error
+    try:
+        if path.suffix.lower() == ".xml":
+            root = parse_xml(data)
+            if root.tag == "annotations":
+                return cvat.CvatMasks(root, path, photos, names)
+        elif path.suffix.lower() == ".json":
+            content: Any = parse_json(data.decode("utf-8-sig"))
+            if coco.recognizes(content):
+                return coco.CocoMasks(content, path, photos)
+            if label_studio.recognizes(content):
+                return label_studio.LabelStudioMasks(content, path, photos)
+    except ValueError as error:
+        why = str(error) if path.suffix.lower() == ".xml" else f"is not valid JSON ({error})"
+        raise InputError(f"{path} {why}; export it again.") from error
+    raise InputError(f"{path} is not a file of masks that can be read; {_ACCEPTED}.")
+
+
+def _of_folder(path: Path, photos: Photos, names: Sequence[str]) -> list[MaskSource]:
+    files = Files(path)
+    exr = {}
+    for name in files.paths:
+        stem, _, suffix = name.rpartition(".")
+        if suffix.lower() == "exr" and (photo := photos.find(stem)) is not None:
+            exr[photo] = path / name
+    found: list[MaskSource] = [
+        ExrMasks(exr), MaskFiles(path, names, photos.folder), MaskFolders(path, photos), coco.PhotoJson(path, photos)
+    ]  # fmt: skip
+    described = [path / name for name in files.paths if re.fullmatch(r"[^/]+\.(json|xml)", name, re.IGNORECASE)]
+    if len(described) == 1 and described[0].stem not in ("labels", "masks"):
+        found.append(_of_file(described[0], photos, names))
+    return found

@@ -1,0 +1,127 @@
+"""What the mask sources have in common: the segments of a photo, and shapes drawn as segments."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from PIL import Image, ImageDraw
+from pycocotools import mask as coco_masks
+
+from ...shared.errors import InputError
+
+LARGEST_SIDE = 32768
+
+
+class Segments(NamedTuple):
+    """The segments of a photo.
+
+    Attributes:
+        numbers: (h, w) int32, the number of each pixel's segment, from 1; 0: none.
+        objects: for each segment, what has the same value in other photos of the same object; None if the source does
+            not say.
+        names: for each segment, the name that the source gives it, or "".
+    """
+
+    numbers: np.ndarray
+    objects: Sequence[Hashable]
+    names: Sequence[str]
+
+
+class MaskSource(Protocol):
+    """Masks of photos that a program wrote.
+
+    Attributes:
+        what: the kind of masks, such as "COCO annotations".
+        photos: the names of the capture's photos that have masks.
+    """
+
+    what: str
+    photos: Sequence[str]
+
+    def read(self, photo: str) -> Segments:
+        """Return the segments of a photo; raises InputError if they cannot be read."""
+        ...
+
+
+class Shape(NamedTuple):
+    """One segment before it is drawn: its pixels (h, w) bool, and its object and name as in `Segments`."""
+
+    inside: np.ndarray
+    object: Hashable
+    name: str
+
+
+def draw_shapes(shapes: Iterable[Shape], size: tuple[int, int]) -> Segments:
+    """Draw the shapes of a photo of this size (width, height), the smaller ones over the larger ones."""
+    numbers = np.zeros(size[::-1], np.int32)
+    ordered = sorted((shape for shape in shapes if shape.inside.any()), key=lambda shape: -int(shape.inside.sum()))
+    for number, shape in enumerate(ordered, 1):
+        numbers[shape.inside] = number
+    return Segments(numbers, [shape.object for shape in ordered], [shape.name for shape in ordered])
+
+
+def polygon(corners: Sequence[tuple[float, float]], size: tuple[int, int]) -> np.ndarray:
+    """Return the pixels (h, w) bool inside of a polygon with corners (x, y) in pixels."""
+    image = Image.new("1", size)
+    if len(corners) > 2:
+        ImageDraw.Draw(image).polygon([(float(x), float(y)) for x, y in corners], fill=1, outline=1)
+    return np.array(image)
+
+
+def run_lengths(counts: Any, size: tuple[int, int]) -> np.ndarray:
+    """Decode COCO's run lengths by columns: a list, or its compressed text.
+
+    Raises:
+        ValueError: They do not fit the size.
+    """
+    width, height = size
+    if isinstance(counts, list):
+        if any(not isinstance(count, int) or isinstance(count, bool) or count < 0 for count in counts):
+            raise ValueError("run lengths that are not whole numbers")
+        if sum(counts) != width * height:
+            raise ValueError(f"run lengths of {sum(counts)} pixels for {width} x {height}")
+        runs = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
+        return runs.reshape(width, height).T
+    if not isinstance(counts, str | bytes):
+        raise ValueError("run lengths that are neither a list nor text")
+    data = counts.encode("ascii") if isinstance(counts, str) else counts
+    _check_compressed(data, width * height)
+    return coco_masks.decode({"size": [height, width], "counts": data}).astype(bool)
+
+
+def _check_compressed(data: bytes, pixels: int) -> None:
+    """Raise ValueError unless compressed run lengths add up to a number of pixels, as the decoder does not check it."""
+    runs: list[int] = []
+    at = 0
+    while at < len(data):
+        value, shift, more = 0, 0, True
+        while more:
+            if at >= len(data) or not 0 <= data[at] - 48 < 64 or shift > 60:
+                raise ValueError("damaged run lengths")
+            part = data[at] - 48
+            value |= (part & 31) << shift
+            more, at, shift = bool(part & 32), at + 1, shift + 5
+            if not more and part & 16:
+                value -= 1 << shift
+        runs.append(value + runs[-2] if len(runs) > 2 else value)
+    if min(runs, default=0) < 0 or sum(runs) != pixels:
+        raise ValueError(f"run lengths of {sum(runs)} pixels, expected {pixels}")
+
+
+def text_of(values: Mapping[str, Any], keys: Iterable[str]) -> Hashable:
+    """Return the first of the keys' values that identifies something: text or a whole number, or None."""
+    for key in keys:
+        value = values.get(key)
+        if isinstance(value, str | int) and not isinstance(value, bool) and value != "":
+            return value
+    return None
+
+
+def checked_size(width: Any, height: Any, where: str) -> tuple[int, int]:
+    """Return a size (width, height); raise InputError if it is not one."""
+    for side in (width, height):
+        if not isinstance(side, int) or isinstance(side, bool) or not 0 < side <= LARGEST_SIDE:
+            raise InputError(f"{where} has the size {width!r} x {height!r}; expected the photo's width and height.")
+    return width, height

@@ -1,0 +1,282 @@
+"""`masks`: makes the masks of a capture from those of another program, with one ID for each object in all photos."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from collections import Counter
+from collections.abc import Hashable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...capture.colmap import Model
+from ...capture.files import encode_mask, image_size, read_image
+from ...capture.mask_sources import MaskSource, Segments, open_source
+from ...capture.models import Photos, read_capture_model, with_observations
+from ...evaluation import contact_sheet, save_image
+from ...evaluation.images import id_image, thumbnail
+from ...labels.association import Association, Seen, associate, consistency, object_mask
+from ...shared.class_table import LARGEST_ID
+from ...shared.errors import InputError
+from ...shared.formats.atomic import PART_PREFIX, PART_SUFFIX
+from ...shared.formats.json_file import write_json
+from ...shared.reconstruction.objects import default_name
+from ...shared.stopping import StoppingReporter
+from ..folder import READ
+
+RECORD, OVERVIEW = "masks.json", "masks.png"
+"""Files in masks/ with where the masks are from, and how well they agree; and a picture of some."""
+
+_FIND, _WRITE = "find", "write"
+_POINTS = 20_000
+"""Largest number of points that segments are compared on."""
+
+_CONSISTENT = 0.6
+"""IDs that agree on a smaller part of the points are not taken for those of objects."""
+
+_PICTURES = 12
+_ASPECT = 0.01
+
+
+class _Found(NamedTuple):
+    """The objects of all segments: their IDs for each photo, from that of no segment, and the names of the IDs."""
+
+    ids: dict[str, np.ndarray]
+    names: dict[int, str]
+
+
+def masks(options: argparse.Namespace, reporter: StoppingReporter) -> None:
+    """Read the masks of another program, find the objects where IDs differ between photos, and write masks/."""
+    reporter.expect({READ: ("Reading", 5.0), _FIND: ("Comparing", 5.0), _WRITE: ("Writing", 5.0)})
+    capture, given = options.capture, options.masks
+    if not capture.is_dir():
+        raise InputError(f"The capture {capture} does not exist; expected a folder with images/.")
+    reporter.begin(READ, "Reading the masks")
+    model = _model(capture, needed=options.objects == "find")
+    names = sorted(image.name for image in model.images) if model is not None else Photos(capture).names
+    if not names:
+        raise InputError(f"{capture / 'images'} contains no photos; put them there.")
+    source = open_source(given, capture, names)
+    _require_replaceable(capture, given)
+    photos = [name for name in source.photos if name in set(names)]
+    segments = {name: _checked(source, name, capture, given) for name in _counted(photos, reporter)}
+    reporter.begin(_FIND, "Comparing the segments of the photos")
+    found, association, seen = _objects(segments, model, options.objects, reporter)
+    reporter.begin(_WRITE, f"Writing masks of {len(photos)} photos")
+    record = _record(source, given, found, association)
+    _write(capture, given, _drawn(segments, found, association, seen, reporter), found, record)
+    _report(record, reporter)
+    reporter.done(masks=str(capture / "masks"), photos=len(photos), result=record)
+
+
+def _model(capture: Path, needed: bool) -> Model | None:
+    """Return the model of the capture's cameras; None if there is none, unless it is needed."""
+    try:
+        return read_capture_model(capture)
+    except InputError as error:
+        if needed:
+            raise InputError(f"Objects are found by the points of the photos: {error}") from error
+        return None
+
+
+def _require_replaceable(capture: Path, given: Path) -> None:
+    """Raise InputError if the capture has masks that are neither the given ones nor made by this command."""
+    folder = capture / "masks"
+    is_own = (folder / RECORD).is_file()
+    if given.resolve() == folder.resolve():
+        if is_own:
+            raise InputError(f"{folder} was made of other masks, which {folder / RECORD} names; give those.")
+        if _kept(capture).exists():
+            raise InputError(f"{_kept(capture)} exists, where the given masks would be kept; move it elsewhere.")
+    elif folder.exists() and not is_own:
+        raise InputError(f"{folder} exists; move it elsewhere, or give it as the masks.")
+
+
+def _kept(capture: Path) -> Path:
+    """Return the folder in which masks are kept that are replaced by those made of them."""
+    return capture / "masks-given"
+
+
+def _counted(photos: Sequence[str], reporter: StoppingReporter) -> Any:
+    """Yield the photos, and report the progress."""
+    for done, name in enumerate(photos, 1):
+        yield name
+        reporter.progress(done, len(photos), what="photos")
+
+
+def _checked(source: MaskSource, name: str, capture: Path, given: Path) -> Segments:
+    """Read the segments of a photo; raises InputError if their size does not fit it."""
+    found = source.read(name)
+    height, width = found.numbers.shape
+    size = image_size(Photos(capture).folder / name)
+    expected = height * size[0] / size[1]
+    if abs(width - expected) > max(1.0, _ASPECT * expected):
+        raise InputError(
+            f"{given} has a mask of {width}x{height} pixels for {name}, which is {size[0]}x{size[1]}; make masks of "
+            "the capture's photos."
+        )
+    return found
+
+
+# --- objects ---------------------------------------------------------------------------------------------------------
+
+
+def _objects(
+    segments: dict[str, Segments], model: Model | None, how: str, reporter: StoppingReporter
+) -> tuple[_Found, Association | None, dict[str, Seen]]:
+    """Return the objects of the segments: those that the source says, or those found by the model's points."""
+    seen = {} if model is None else _seen(segments, model)
+    given = None if any(None in found.objects for found in segments.values()) else _given(segments)
+    if how == "given" and given is None:
+        raise InputError("The masks do not say which segments show the same object; use --objects find.")
+    if given is None and model is None:
+        raise InputError(
+            "The masks do not say which segments show the same object, and the capture has no cameras and points to "
+            "find out; run `sfm` first."
+        )
+    if given is not None and (how == "given" or model is None):
+        return given, None, seen
+    if given is not None and how == "auto":
+        agrees = consistency([given.ids[name][photo.segments] for name, photo in seen.items()], list(seen.values()))
+        if agrees >= _CONSISTENT:
+            return given, None, seen
+        reporter.warning(
+            f"The IDs agree between photos on {agrees:.0%} of the points only, so objects are found anew; --objects "
+            "given keeps the IDs."
+        )
+    assert model is not None
+    association = associate(list(seen.values()), len(model.xyz))
+    ids = dict(zip(seen, association.objects, strict=True))
+    if not any(part.any() for part in ids.values()):
+        raise InputError("No segments of two photos show the same points, so no object was found; check the masks.")
+    return _Found(ids, _names(segments, ids)), association, seen
+
+
+def _given(segments: dict[str, Segments]) -> _Found:
+    """Return the objects that the source says; whole numbers are IDs, and others are numbered in their order."""
+    known = {key for found in segments.values() for key in found.objects}
+    numbers: dict[Hashable, int] = {key: key for key in known if isinstance(key, int) and 0 < key <= LARGEST_ID}
+    if len(numbers) < len(known):
+        numbers = {key: number for number, key in enumerate(sorted(known, key=str), 1)}
+    ids = {name: np.array([0, *(numbers[key] for key in found.objects)], np.int64) for name, found in segments.items()}
+    texts = {number: key for key, number in numbers.items() if isinstance(key, str)}
+    return _Found(ids, {**_names(segments, ids), **texts})
+
+
+def _names(segments: dict[str, Segments], ids: dict[str, np.ndarray]) -> dict[int, str]:
+    """Return the most frequent name of each object's segments."""
+    named: dict[int, Counter[str]] = {}
+    for photo, of in ids.items():
+        for object_id, name in zip(of[1:].tolist(), segments[photo].names, strict=True):
+            if object_id:
+                named.setdefault(object_id, Counter())[name] += bool(name)
+    common = {object_id: counts.most_common(1)[0] for object_id, counts in sorted(named.items())}
+    return {object_id: name if count else default_name(object_id) for object_id, (name, count) in common.items()}
+
+
+def _seen(segments: dict[str, Segments], model: Model) -> dict[str, Seen]:
+    """Return the points that each photo with masks shows, and their segments."""
+    images = [image for image in model.images if image.name in segments]
+    seen = {}
+    projected = with_observations(replace(model, images=images), _POINTS).images
+    for image, shown in zip(images, projected, strict=True):
+        camera, numbers = model.cameras[image.camera_id], segments[image.name].numbers
+        points = np.concatenate([image.point_index, shown.point_index])
+        xy = np.concatenate([image.xy, shown.xy]) * (numbers.shape[1] / camera.width, numbers.shape[0] / camera.height)
+        inside = ((xy >= 0) & (xy < numbers.shape[::-1])).all(1)
+        points, first = np.unique(points[inside], return_index=True)
+        at = xy[inside][first].astype(np.int64)
+        is_certain = np.flatnonzero(inside)[first] < len(image.point_index)
+        seen[image.name] = Seen(
+            points, at, numbers[at[:, 1], at[:, 0]].astype(np.int64), is_certain, len(segments[image.name].objects)
+        )
+    return seen
+
+
+# --- files -----------------------------------------------------------------------------------------------------------
+
+
+def _drawn(
+    segments: dict[str, Segments],
+    found: _Found,
+    association: Association | None,
+    seen: dict[str, Seen],
+    reporter: StoppingReporter,
+) -> Any:
+    """Yield the name and the mask of each photo."""
+    for done, (name, own) in enumerate(segments.items(), 1):
+        if association is None:
+            yield name, found.ids[name][own.numbers]
+        else:
+            yield name, object_mask(own.numbers, seen[name], found.ids[name], association.points)
+        reporter.progress(done, len(segments), what="photos")
+
+
+def _record(source: MaskSource, given: Path, found: _Found, association: Association | None) -> dict[str, Any]:
+    """Return the content of masks.json."""
+    shown_in = Counter(i for ids in found.ids.values() for i in np.unique(ids).tolist())
+    agreement = (
+        None if association is None else dict(zip(found.ids, association.agreement.round(4).tolist(), strict=True))
+    )
+    return {
+        "source": str(given.resolve()),
+        "kind": source.what,
+        "found": association is not None,
+        "objects": [{"id": i, "name": name, "photos": shown_in[i]} for i, name in found.names.items()],
+        "agreement": agreement,
+    }
+
+
+def _write(capture: Path, given: Path, drawn: Any, found: _Found, record: dict[str, Any]) -> None:
+    """Write the masks, which replace those of an earlier run when they are complete, and labels.json."""
+    folder, part = capture / "masks", capture / f"{PART_PREFIX}masks{PART_SUFFIX}"
+    photos = Photos(capture).folder
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir()
+    try:
+        pictures: list[tuple[str, np.ndarray]] = []
+        every = max(len(found.ids) // _PICTURES, 1)
+        for number, (name, mask) in enumerate(drawn):
+            suffix, data = encode_mask(mask)
+            path = part / (name + suffix)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+            if number % every == 0 and len(pictures) < _PICTURES:
+                pictures.append((name, _overlay(photos / name, mask)))
+        save_image(contact_sheet([image for _, image in pictures], [name for name, _ in pictures]), part / OVERVIEW)
+        if given.resolve() == folder.resolve():
+            folder.rename(_kept(capture))
+            record["source"] = str(_kept(capture).resolve())
+        elif folder.exists():
+            shutil.rmtree(folder)
+        write_json(part / RECORD, record)
+        part.rename(folder)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    write_json(capture / "labels.json", {str(i): name for i, name in found.names.items()})
+
+
+def _overlay(photo: Path, mask: np.ndarray) -> np.ndarray:
+    """Return a photo with the colors of its objects over it."""
+    image = np.asarray(thumbnail(np.asarray(read_image(photo)), 480), np.float64)
+    rows, columns = (np.linspace(0, size - 1, wanted).astype(int) for size, wanted in zip(mask.shape, image.shape))
+    ids = mask[np.ix_(rows, columns)]
+    mixed = np.where((ids > 0)[..., None], 0.45 * image + 0.55 * id_image(ids), image)
+    return mixed.astype(np.uint8)
+
+
+def _report(record: dict[str, Any], reporter: StoppingReporter) -> None:
+    """Tell what was found."""
+    for entry in record["objects"]:
+        reporter.status(f"object {entry['id']} {entry['name']}: in {entry['photos']} photos")
+    agreement = record["agreement"]
+    if agreement:
+        worst = min(agreement, key=agreement.get)
+        mean = sum(agreement.values()) / len(agreement)
+        reporter.status(
+            f"The segments agree with the objects on {mean:.0%} of the points; least in {worst}, on "
+            f"{agreement[worst]:.0%}"
+        )

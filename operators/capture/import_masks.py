@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Import masks of other programs to the capture."""
+
+from pathlib import Path
+
+import bpy
+from bpy.props import EnumProperty, StringProperty
+
+from ...backend.shared.errors import InputError
+from ...objectgs_addon import scene
+from ...objectgs_addon.environment import locations
+from ...objectgs_addon.running import background
+from ...objectgs_addon.state.folder_state import folder_state
+from ..common import need
+from ..common.import_dialog import ImportDialog
+from ..common.reporting import reports_errors
+
+_FILES = "*.json;*.xml"
+
+
+class ImportMasks(ImportDialog, bpy.types.Operator):
+    bl_idname = "objectgs.import_masks"
+    bl_label = "Import Masks"
+    bl_description = (
+        "Import masks of the photos that another program made: a file of COCO, CVAT or Label Studio, or a folder of "
+        "images, EXR with Cryptomatte, or run lengths. Segments of each photo are joined to objects"
+    )
+    bl_options = {"REGISTER"}
+
+    filepath: StringProperty(name="Masks", subtype="FILE_PATH", description="File, or folder, with the masks")
+    filter_glob: StringProperty(default=_FILES, options={"HIDDEN"})
+    objects: EnumProperty(
+        name="Objects",
+        description="Which segments show the same object",
+        items=[
+            ("auto", "Automatic", "As the masks say, unless they do not, or contradict the points"),
+            ("given", "As Given", "As the masks say"),
+            ("find", "Find", "Segments that show the same points show the same object"),
+        ],
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return need.work_on_capture(cls, context)
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        self.layout.use_property_split = True
+        self.layout.prop(self, "objects")
+
+    @reports_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        given = Path(bpy.path.abspath(self.filepath)).resolve() if self.filepath else None
+        if given is not None and not given.exists() and given.parent.is_dir():
+            # The file browser adds a name to the folder that it shows.
+            given = given.parent
+        if given is None or not given.exists():
+            raise InputError(f"{given or 'The file of the masks'} does not exist; choose another")
+        root = need.active_root(context)
+        folder = scene.folder_of(root)
+        capture = folder_state(folder).capture
+        job = locations.backend_job(
+            f"Import masks of {root.name}",
+            "masks",
+            folder,
+            "masks",
+            str(capture),
+            str(given),
+            "--objects",
+            self.objects,
+        )
+        return background.submit(job, context.scene, self.report)
+
+
+CLASSES = (ImportMasks,)

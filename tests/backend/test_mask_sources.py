@@ -1,0 +1,339 @@
+"""Masks of other programs: every format gives the objects that were written, and damaged files are refused."""
+
+import json
+
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+from pycocotools import mask as coco_masks
+
+from backend.capture.files import read_mask
+from backend.capture.mask_sources import open_source
+from backend.capture.mask_sources.label_studio import unpack
+from backend.capture.mask_sources.segments import run_lengths
+from backend.film.cryptomatte import header, name_bits
+from backend.sfm.sources.photos import take_photos
+from backend.shared.errors import EXIT_BAD_INPUT, EXIT_DONE, InputError
+from backend.shared.events import Reporter
+
+from .command_result import assert_rejected
+
+SIZE = (40, 30)
+NAMES = {1: "mug", 2: "box"}
+
+
+def masks_of(number):
+    """The exact IDs in a photo: a mug of the ID 1 and a box of the ID 2, as rectangles."""
+    ids = np.zeros(SIZE[::-1], np.uint8)
+    ids[4 + number : 14 + number, 5:20] = 1
+    ids[18:27, 10 + number : 33] = 2
+    return ids
+
+
+@pytest.fixture
+def photos(tmp_path):
+    """A capture with two photos and without cameras."""
+    folder = tmp_path / "capture" / "images"
+    folder.mkdir(parents=True)
+    for number in (0, 1):
+        Image.new("RGB", SIZE, (90, 90, 90)).save(folder / f"photo {number}.jpg")
+    return tmp_path / "capture"
+
+
+def photo(number):
+    return f"photo {number}.jpg"
+
+
+def corners(inside):
+    rows, columns = np.nonzero(inside)
+    return columns.min(), rows.min(), columns.max(), rows.max()
+
+
+def compressed(inside):
+    return coco_masks.encode(np.asfortranarray(inside.astype(np.uint8)))["counts"].decode()
+
+
+def runs(inside):
+    """Run lengths along the rows of a flattened mask, beginning with those outside."""
+    values = inside.ravel().astype(int)
+    at = np.flatnonzero(np.diff(values, prepend=0, append=1 - values[-1]))
+    return np.diff([0, *at]).tolist()
+
+
+def coco(describe, **more):
+    return {
+        "images": [{"id": n, "file_name": photo(n), "width": SIZE[0], "height": SIZE[1]} for n in (0, 1)],
+        "categories": [{"id": 10 * i, "name": name} for i, name in NAMES.items()],
+        "annotations": [
+            {"image_id": n, "category_id": 10 * i, "segmentation": describe(masks_of(n) == i), **more}
+            for n in (0, 1)
+            for i in NAMES
+        ],
+    }
+
+
+def as_polygon(inside):
+    left, top, right, bottom = map(int, corners(inside))
+    return [[left, top, right, top, right, bottom, left, bottom]]
+
+
+def write_coco(folder, describe):
+    path = folder / "annotations.json"
+    path.write_text(json.dumps(coco(describe)))
+    return path
+
+
+def write_coco_polygons(folder):
+    return write_coco(folder, as_polygon)
+
+
+def write_coco_runs(folder):
+    return write_coco(folder, lambda inside: {"size": list(SIZE[::-1]), "counts": runs(inside.T)})
+
+
+def write_coco_compressed(folder):
+    return write_coco(folder, lambda inside: {"size": list(SIZE[::-1]), "counts": compressed(inside)})
+
+
+def write_panoptic(folder):
+    content = coco(as_polygon)
+    (folder / "panoptic").mkdir()
+    content["annotations"] = []
+    for n in (0, 1):
+        ids = np.choose(masks_of(n), (0, 300 + n, 70_000))
+        channels = np.stack([ids & 255, ids >> 8 & 255, ids >> 16], -1).astype(np.uint8)
+        Image.fromarray(channels).save(folder / "panoptic" / f"photo {n}.png")
+        segments = [{"id": 300 + n, "category_id": 10}, {"id": 70_000, "category_id": 20}]
+        content["annotations"].append({"image_id": n, "file_name": f"photo {n}.png", "segments_info": segments})
+    path = folder / "panoptic.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+def cvat_shapes(n):
+    """A polygon for the mug and a mask for the box."""
+    left, top, right, bottom = corners(masks_of(n) == 1)
+    points = ";".join(f"{x},{y}" for x, y in ((left, top), (right, top), (right, bottom), (left, bottom)))
+    x, y, right, bottom = corners(masks_of(n) == 2)
+    wide, tall = right - x + 1, bottom - y + 1
+    box = f'rle="0, {wide * tall}" left="{x}" top="{y}" width="{wide}" height="{tall}"'
+    return f'<polygon label="mug" points="{points}" {{0}}/>', f'<mask label="box" {box} {{1}}/>'
+
+
+def write_cvat_images(folder):
+    entries = [
+        f'<image id="{n}" name="{photo(n)}" width="{SIZE[0]}" height="{SIZE[1]}">'
+        + "".join(shape.format("", "") for shape in cvat_shapes(n)) + "</image>"
+        for n in (0, 1)
+    ]  # fmt: skip
+    path = folder / "annotations.xml"
+    path.write_text(f'<?xml version="1.0"?><annotations>{"".join(entries)}</annotations>')
+    return path
+
+
+def write_cvat_video(folder):
+    size = f"<original_size><width>{SIZE[0]}</width><height>{SIZE[1]}</height></original_size>"
+    tracks = [
+        f'<track id="{i}" label="{name}">'
+        + "".join(cvat_shapes(n)[i - 1].format(*[f'frame="{n}" outside="0"'] * 2) for n in (0, 1)) + "</track>"
+        for i, name in NAMES.items()
+    ]  # fmt: skip
+    path = folder / "video.xml"
+    path.write_text(f"<annotations><meta><task>{size}</task></meta>{''.join(tracks)}</annotations>")
+    return path
+
+
+def packed(values, word=8):
+    """Encode a brush as @thi.ng/rle-pack does, with runs of one value and with runs of single values."""
+    bits = f"{len(values):032b}{word - 1:05b}" + "".join(f"{size - 1:04b}" for size in (3, 4, 8, 16))
+    at = 0
+    while at < len(values):
+        end = at
+        while end < len(values) and values[end] == values[at] and end - at < 1 << 16:
+            end += 1
+        if end - at > 1:
+            bits += f"111{end - at - 1:016b}{values[at]:08b}"
+        else:
+            bits += f"000{0:03b}{values[at]:08b}"
+            end = at + 1
+        at = end
+    bits += "0" * (-len(bits) % 8)
+    return [int(bits[i : i + 8], 2) for i in range(0, len(bits), 8)]
+
+
+def write_label_studio(folder):
+    tasks = []
+    for n in (0, 1):
+        mug = np.zeros((*SIZE[::-1], 4), np.uint8)
+        mug[masks_of(n) == 1] = 255
+        left, top, right, bottom = corners(masks_of(n) == 2)
+        points = [
+            [100 * x / SIZE[0], 100 * y / SIZE[1]]
+            for x, y in ((left, top), (right, top), (right, bottom), (left, bottom))
+        ]
+        values = [
+            {"format": "rle", "rle": packed(mug.ravel().tolist()), "brushlabels": ["mug"]},
+            {"points": points, "polygonlabels": ["box"]},
+        ]
+        results = [{"original_width": SIZE[0], "original_height": SIZE[1], "value": value} for value in values]
+        image = f"/data/upload/1/0123abcd-{photo(n)}"
+        tasks.append({"data": {"image": image}, "annotations": [{"result": results}]})
+    path = folder / "export.json"
+    path.write_text(json.dumps(tasks))
+    return path
+
+
+def write_cryptomatte(folder):
+    for n in (0, 1):
+        ids = np.choose(masks_of(n), (0, *(name_bits(name) for name in NAMES.values()))).astype(np.uint32)
+        covered = (ids > 0).astype(np.float32)
+        planes = {"R": ids.view(np.float32), "G": covered, "B": 0 * covered, "A": 0 * covered}
+        channels = {f"ViewLayer.CryptoObject00.{channel}": plane for channel, plane in planes.items()}
+        attributes = header("ViewLayer.CryptoObject", list(NAMES.values()))
+        with OpenEXR.File({**attributes, "type": OpenEXR.scanlineimage}, channels) as file:
+            file.write(str(folder / f"photo {n}.exr"))
+    return folder
+
+
+def write_index_pass(folder):
+    for n in (0, 1):
+        channels = {"ViewLayer.IndexOB.X": masks_of(n).astype(np.float32), "R": np.zeros(SIZE[::-1], np.float32)}
+        with OpenEXR.File({"type": OpenEXR.scanlineimage}, channels) as file:
+            file.write(str(folder / f"photo {n}.exr"))
+    return folder
+
+
+def write_ids(folder):
+    for n in (0, 1):
+        Image.fromarray(masks_of(n)).save(folder / f"photo {n}_mask.png")
+    (folder / "labels.json").write_text(json.dumps(NAMES))
+    return folder
+
+
+def write_object_folders(folder):
+    for i, name in NAMES.items():
+        (folder / name).mkdir()
+        for n in (0, 1):
+            Image.fromarray(255 * (masks_of(n) == i).astype(np.uint8)).save(
+                folder / name / f"photo {n}.jpg", quality=95
+            )
+    return folder
+
+
+GIVEN = [
+    write_coco_polygons, write_coco_runs, write_coco_compressed, write_panoptic, write_cvat_images, write_cvat_video,
+    write_label_studio, write_cryptomatte, write_index_pass, write_ids, write_object_folders,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("write", GIVEN)
+def test_objects_of_every_format_are_those_that_were_written(write, photos, tmp_path, run_command):
+    given = tmp_path / "given"
+    given.mkdir()
+    path = write(given)
+    done = run_command("masks", photos, path, "--json")
+    assert done.code == EXIT_DONE, done.err
+    labels = json.loads((photos / "labels.json").read_text())
+    if write is not write_index_pass:
+        assert set(labels.values()) == set(NAMES.values())
+    number = {name: int(i) for i, name in labels.items()} if write is not write_index_pass else {"mug": 1, "box": 2}
+    for n in (0, 1):
+        found, true = read_mask(photos / "masks" / f"{photo(n)}.png"), masks_of(n)
+        for i, name in NAMES.items():
+            assert ((found == number[name]) == (true == i)).all(), (n, name)
+    assert (photos / "masks" / "masks.json").exists() and not list(photos.glob(".objectgs*"))
+
+
+def test_black_and_white_masks_beside_the_photos_become_those_of_the_capture(photos, tmp_path):
+    images = photos / "images"
+    for n in (0, 1):
+        Image.fromarray(255 * (masks_of(n) > 0).astype(np.uint8)).save(images / f"photo {n}_mask.jpg", quality=90)
+    taken = take_photos([images], tmp_path / "new", None, Reporter())
+    assert [each.name for each in taken.photos] == [photo(0), photo(1)]
+    for n in (0, 1):
+        assert (read_mask(tmp_path / "new" / "masks" / f"{photo(n)}.png") == (masks_of(n) > 0)).all()
+
+
+def test_masks_without_identities_need_points(photos, tmp_path, run_command):
+    for n in (0, 1):
+        folder = tmp_path / "given" / f"photo {n}"
+        folder.mkdir(parents=True)
+        for i in NAMES:
+            Image.fromarray(255 * (masks_of(n) == i).astype(np.uint8)).save(folder / f"{i}.png")
+    found = open_source(tmp_path / "given", photos, [photo(0), photo(1)])
+    assert found.read(photo(0)).objects == [None, None] and found.photos == [photo(0), photo(1)]
+    assert_rejected(run_command("masks", photos, tmp_path / "given"), "do not say which segments", "run `sfm`")
+    assert not (photos / "masks").exists()
+
+
+def damaged(content, change):
+    copy = json.loads(json.dumps(content))
+    change(copy)
+    return copy
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda c: c["annotations"][0].update(segmentation={"size": [30, 40], "counts": [5, 6]}),
+        lambda c: c["annotations"][0].update(segmentation={"size": [30, 40], "counts": "00"}),
+        lambda c: c["annotations"][0].update(segmentation={"size": [30, 40], "counts": "\u00ff~~"}),
+        lambda c: c["annotations"][0].update(segmentation={"size": [3, 4], "counts": [12]}),
+        lambda c: c["annotations"][0].update(segmentation=[[1, 2, 3]]),
+        lambda c: c["images"][0].update(width=-1),
+        lambda c: c["images"][0].pop("file_name"),
+        lambda c: c.update(categories=[3]),
+        lambda c: c["images"][0].update(width=20),
+    ],
+)
+def test_damaged_files_are_refused_and_leave_nothing(change, photos, tmp_path, run_command):
+    path = tmp_path / "annotations.json"
+    path.write_text(json.dumps(damaged(coco(as_polygon), change)))
+    done = run_command("masks", photos, path)
+    assert done.code == EXIT_BAD_INPUT and str(path) in done.err, done.err
+    assert sorted(each.name for each in photos.iterdir()) == ["images"]
+
+
+def test_masks_of_other_photos_and_of_no_known_kind_are_refused(photos, tmp_path, run_command):
+    content = coco(as_polygon)
+    for number, image in enumerate(content["images"]):
+        image["file_name"] = f"other{number}.jpg"
+    path = tmp_path / "annotations.json"
+    path.write_text(json.dumps(content))
+    assert_rejected(run_command("masks", photos, path), "has masks of none of the 2 photos")
+    path.write_text("{}")
+    assert_rejected(run_command("masks", photos, path), "is not a file of masks")
+    path.write_text("{")
+    assert_rejected(run_command("masks", photos, path), "is not valid JSON")
+    (tmp_path / "bomb.xml").write_text('<!DOCTYPE a [<!ENTITY b "b">]><annotations/>')
+    assert_rejected(run_command("masks", photos, tmp_path / "bomb.xml"), "DTD")
+    assert_rejected(run_command("masks", photos, tmp_path / "none"), "does not exist")
+
+
+def test_masks_of_somebody_else_are_not_replaced(photos, tmp_path, run_command):
+    given = tmp_path / "given"
+    given.mkdir()
+    write_ids(given)
+    assert run_command("masks", photos, given).code == run_command("masks", photos, given).code == EXIT_DONE
+    (photos / "masks" / "masks.json").unlink()
+    assert_rejected(run_command("masks", photos, given), "exists; move it elsewhere")
+
+
+def test_decoders_refuse_what_does_not_fit():
+    with pytest.raises(ValueError, match="whole numbers"):
+        run_lengths([-1, 13], (4, 3))
+    with pytest.raises(ValueError, match="ends too early"):
+        unpack(packed([7] * 40)[:-4], 40)
+    assert unpack(packed([7] * 40 + [1, 2, 3]), 43).tolist() == [7] * 40 + [1, 2, 3]
+    with pytest.raises(ValueError, match="expected 12"):
+        unpack(packed([7] * 40), 12)
+
+
+def test_gray_jpeg_is_no_mask(photos, tmp_path):
+    given = tmp_path / "given"
+    given.mkdir()
+    rng = np.random.default_rng(0)
+    Image.fromarray(rng.integers(0, 255, SIZE[::-1], np.uint8)).save(given / "photo 0.jpg")
+    with pytest.raises(InputError, match="not black and white"):
+        open_source(given, photos, [photo(0)]).read(photo(0))
