@@ -7,8 +7,8 @@ Captures are the demo (`make demo`), and the real tabletop of ../shared/data if 
 masks. In each of the photos, one stroke then marks each object that shows there: along the row through the middle of
 the object's largest inscribed circle, without a fifth at both ends. If the masks leave pixels unlabeled, one such
 stroke in one photo marks them, too. `label` separates the objects, and the IDs of its renders are compared with the
-true masks of the held-out views. --write saves the figures of two seeds to docs/figures/pointing.json and the table to
-docs/pointing.md.
+true masks of the held-out views. Before, `propose` finds objects without any stroke. --write saves the figures of two
+seeds to docs/figures/pointing.json and the table to docs/pointing.md.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
+from scipy.optimize import linear_sum_assignment
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -33,6 +33,7 @@ sys.path.insert(0, str(ROOT))
 from backend.capture import Capture, load_capture
 from backend.evaluation.metrics import IdScores, psnr
 from backend.model.draw import draw
+from backend.pointing.strokes import stroke_through
 from backend.training.scene import Scene
 from backend.training.state import load_model
 from benchmarks import documents, shared
@@ -41,20 +42,11 @@ CAPTURES = {
     "demo": ROOT / "build" / "demo" / "capture",
     "tabletop": ROOT.parent / "shared" / "data" / "tabletop",
 }
+GOOD = 0.8
+"""IoU from which on a proposed object counts as found."""
+
 SMALLEST = 30
 """Number of pixels below which an object is not marked in a photo."""
-
-
-def widest_row(mask: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the ends (x, y) of a stroke through the widest part of a mask (H, W), as fractions of its size."""
-    inside = distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
-    row, column = np.unravel_index(inside.argmax(), mask.shape)
-    gaps = np.flatnonzero(~np.pad(mask[row], 1, constant_values=False)) - 1
-    first, last = gaps[gaps < column].max() + 1, gaps[gaps > column].min() - 1
-    margin = (last - first) // 5
-    height, width = mask.shape
-    y = (row + 0.5) / height
-    return ((first + margin + 0.5) / width, y), ((last - margin + 0.5) / width, y)
 
 
 def strokes_of(truth: Capture, photos: int) -> dict[str, Any]:
@@ -68,12 +60,12 @@ def strokes_of(truth: Capture, photos: int) -> dict[str, Any]:
         mask = truth.mask(index)
         for object_id in truth.object_ids.tolist():
             if mask is not None and (mask == object_id).sum() > SMALLEST:
-                points = widest_row(mask == object_id)
+                points = stroke_through(mask == object_id)
                 strokes.append({"object": object_id, "view": truth.views[index].name, "points": points})
     mask = truth.mask(chosen[0])
     everything = mask is not None and bool((mask > 0).all())
     if mask is not None and not everything:
-        strokes.append({"object": 0, "view": truth.views[chosen[0]].name, "points": widest_row(mask == 0)})
+        strokes.append({"object": 0, "view": truth.views[chosen[0]].name, "points": stroke_through(mask == 0)})
     return {"strokes": strokes, "everything": everything}
 
 
@@ -88,6 +80,33 @@ def scores(checkpoint: Path, truth: Capture) -> dict[str, float]:
         found.add(drawn.ids, mask)
         images.append(psnr(drawn.image, truth.image(index)))
     return {**found.result(), "psnr": float(np.mean(images))}
+
+
+def matched(checkpoint: Path, truth: Capture) -> dict[str, float]:
+    """Return the scores of a trained model whose objects have other IDs: each true object is compared with the one that
+    fits it, so that the sum of the IoU is largest."""
+    model, _, _ = load_model(checkpoint)
+    scene = Scene(truth, model.classes, model.normalization)
+    rows, columns = int(model.classes.ids.max()) + 1, int(truth.object_ids.max()) + 1
+    shown, images = np.zeros((rows, columns)), []
+    for index in truth.test_indices:
+        drawn, mask = draw(model, scene.camera(index)), truth.mask(index)
+        assert drawn.ids is not None and mask is not None
+        np.add.at(shown, (drawn.ids.astype(np.int64), mask.astype(np.int64)), 1)
+        images.append(psnr(drawn.image, truth.image(index)))
+    # As for strokes, over labeled pixels, and over all.
+    found = {}
+    for key, first in (("miou", 1), ("miou_all", 0)):
+        both = shown[1:, 1:]
+        either = shown[1:, first:].sum(1)[:, None] + shown[:, 1:].sum(0) - both
+        iou = both / np.maximum(either, 1)
+        pairs = linear_sum_assignment(-iou)
+        of_object = np.zeros(columns - 1)
+        of_object[pairs[1]] = iou[pairs]
+        of_object = of_object[shown[:, 1:].sum(0) > 0]
+        found[key] = float(of_object.mean())
+    found |= {"good": float((of_object >= GOOD).sum()), "objects": float(len(of_object)), "proposed": float(rows - 1)}
+    return {**found, "psnr": float(np.mean(images))}
 
 
 def run(*words: object) -> float:
@@ -111,6 +130,10 @@ def measured(folder: Path, photos: Sequence[int], minutes: float, seed: int) -> 
         shutil.copytree(folder, capture, ignore=shutil.ignore_patterns("masks", "labels.json", "objects.json"))
         run("train", capture, "--out", unlabeled, "--minutes", minutes, "--seed", seed)
         rows["0"] = {"psnr": scores(unlabeled / "checkpoint", truth)["psnr"]}
+        file, out = scratch / "proposed.json", scratch / "proposed"
+        shutil.copytree(unlabeled, out)
+        seconds = run("propose", out, "--strokes", file) + run("label", out, "--strokes", file)
+        rows["proposed"] = {**matched(out / "checkpoint", truth), "seconds": seconds}
         for count in photos:
             file, out = scratch / "strokes.json", scratch / f"labeled-{count}"
             file.write_text(json.dumps(strokes_of(truth, count)))
@@ -137,7 +160,7 @@ def document(found: Mapping[str, Any]) -> str:
     ]
     rows = []
     for name, seeds in found["captures"].items():
-        for count in sorted(set(seeds[0]) - {"0"}):
+        for count in sorted(set(seeds[0]) - {"0", "proposed"}):
             cells = [
                 shared.spread([seed[count][key] for seed in seeds], form)
                 for key, form in (("miou", "{:.3f}"), ("miou_all", "{:.3f}"))
@@ -145,8 +168,34 @@ def document(found: Mapping[str, Any]) -> str:
             before, after = (shared.spread([seed[of]["psnr"] for seed in seeds], "{:.2f}") for of in ("0", count))
             seconds = shared.spread([seed[count]["seconds"] for seed in seeds], "{:.0f}")
             rows.append((name, count, *cells, before, after, seconds))
+    proposals = [
+        (
+            name,
+            shared.spread([seed["proposed"]["proposed"] for seed in seeds], "{:.0f}"),
+            shared.spread([seed["proposed"]["good"] for seed in seeds], "{:.1f}")
+            + f" of {seeds[0]['proposed']['objects']:.0f}",
+            *(
+                shared.spread([seed["proposed"][key] for seed in seeds], form)
+                for key, form in (("miou", "{:.3f}"), ("miou_all", "{:.3f}"), ("psnr", "{:.2f}"), ("seconds", "{:.0f}"))
+            ),
+        )
+        for name, seeds in found["captures"].items()
+        if "proposed" in seeds[0]
+    ]
     head = ("capture", "photos with strokes", "mIoU", "with unlabeled", "PSNR before, dB", "after, dB", "seconds")
-    return "\n".join([*lines, *shared.table(head, rows)]) + "\n"
+    lines += shared.table(head, rows)
+    if proposals:
+        lines += [
+            "",
+            "## Without strokes",
+            "",
+            "`propose` finds objects by the shape of the scene, and `label` separates them. Each true object is "
+            f"compared with the proposed one that fits it. *Found* are those of an IoU of {GOOD} or more, over all "
+            "pixels. Flat things that lie on others, such as posters on a table, are not found.",
+            "",
+            *shared.table(("capture", "proposed", "found", "mIoU", "with unlabeled", "PSNR, dB", "seconds"), proposals),
+        ]
+    return "\n".join(lines) + "\n"
 
 
 def main() -> None:
@@ -172,7 +221,7 @@ def main() -> None:
             results.get(
                 f"{name}, seed {seed}",
                 lambda folder=folder, seed=seed: measured(folder, options.photos, options.minutes, seed),
-                lambda rows: ", ".join(f"{n} photos {row['miou']:.4f}" for n, row in rows.items() if n != "0"),
+                lambda rows: ", ".join(f"{n} photos {row['miou']:.4f}" for n, row in rows.items() if "miou" in row),
             )
             for seed in range(seeds)
         ]

@@ -138,6 +138,13 @@ def _add_training_commands(commands: _Commands) -> None:
 
 
 def _add_label(commands: _Commands) -> None:
+    """Add `propose`, `label` and `point`."""
+    propose = commands.add_for_result(
+        "propose", "Find objects without strokes or masks", texts.PROPOSE, "garden-splats"
+    )
+    propose.add_argument(
+        "--strokes", type=Path, metavar="FILE", help="file of strokes to write (default: strokes.json in the folder)"
+    )
     label = commands.add_for_result(
         "label", "Separate objects by strokes on them in a few photos", texts.LABEL,
         "garden-splats --strokes strokes.json",

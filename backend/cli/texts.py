@@ -74,6 +74,13 @@ keeps the mean of its latest steps. To train longer, run the command again with 
 --minutes or --steps.
 """
 
+PROPOSE = """\
+Find the objects of a training without masks: splats with concave borders or gaps around
+them, such as things on a table, the table and the walls. Flat things that lie on others,
+and things that touch smoothly, are not told apart. Writes strokes that mark the objects
+in three photos each, for `label`; they may be changed before.
+"""
+
 LABEL = """\
 Separate the objects of a training without masks, by strokes on them in one or more
 photos. Writes masks/, for the training views, and labels.json to the capture's folder,
@@ -91,6 +98,7 @@ unless the file has "everything": true.
 POINT = """\
 Answer strokes with the object of each splat, for programs such as Blender. Each line of
 standard input is a JSON object as for `label`, with a number `request` for the answer.
+With "propose": true, the answer has strokes on proposed objects, as `propose` finds.
 """
 
 RENDER = """\

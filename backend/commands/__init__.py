@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from ..shared.stopping import StoppingReporter
 from .capture import check, import_capture, import_splats, masks, plan, sfm, vote
-from .objects import edit, export, film, label, mesh, point
+from .objects import edit, export, film, label, mesh, point, propose
 from .setup import doctor
 from .training import evaluate, render, report, train
 
@@ -22,6 +22,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace, StoppingReporter], None]] = {
     "plan": plan.plan,
     "vote": vote.vote,
     "train": train.train,
+    "propose": propose.propose,
     "label": label.label,
     "point": point.point,
     "render": render.render,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,9 +11,11 @@ import torch
 from ..evaluation.images import as_bytes
 from ..raster import Camera, devices, object_ranks, rasterize
 from ..shared.errors import InputError
+from ..shared.reconstruction.objects import default_name
 from .mask_edges import follow_edges
+from .proposals import find_objects
 from .splat_graph import Solution, SplatGraph, build_graph, contributions
-from .strokes import Stroke, Strokes
+from .strokes import Stroke, Strokes, stroke_through
 
 if TYPE_CHECKING:
     from ..model.object_model import ObjectModel
@@ -21,6 +23,12 @@ if TYPE_CHECKING:
 
 LONGEST = 640
 """Longer side in pixels of the images from viewpoints that are not those of photos."""
+
+_PHOTOS, _STROKES, _FEWEST_PIXELS = 16, 3, 30
+"""Number of photos in which proposed objects are looked for, of strokes on each, and of pixels that they must show."""
+
+_EVERYTHING = 0.9
+"""Everything belongs to a proposed object if they cover more than this fraction of the photos' pixels."""
 
 _RANKS = 4
 """Number of objects of a pixel that its mask is decided between."""
@@ -74,6 +82,42 @@ class Pointer:
             seeds[stroke.object] = seeds.get(stroke.object, 0.0) + shown / shown.sum()
         self._latest = self._graph.solve(seeds, strokes.everything, self._latest)
         return self._latest.ids
+
+    def propose(self, progress: Callable[[int, int], object]) -> Strokes:
+        """Find the objects without strokes, and return strokes that mark them, in up to three photos each.
+
+        Args:
+            progress: receives the number of finished trials, and of all.
+        """
+        found = find_objects(self._graph, progress)[self._graph.nearest]
+        found[self._graph.is_alone] = 0
+        train = self._scene.capture.train_indices
+        places = np.unique(np.linspace(0, len(train) - 1, min(len(train), _PHOTOS)).round().astype(int))
+        best: dict[int, list[tuple[int, Stroke]]] = {}
+        for index, shown in self._shown_ids(found, [train[place] for place in places.tolist()]):
+            name = self._scene.capture.views[index].name
+            for object_id, pixels in zip(*np.unique(shown[shown > 0], return_counts=True), strict=True):
+                if pixels >= _FEWEST_PIXELS:
+                    stroke = Stroke(int(object_id), name, stroke_through(shown == object_id))
+                    best.setdefault(int(object_id), []).append((int(pixels), stroke))
+        strokes = tuple(
+            stroke
+            for object_id in sorted(best)
+            for _, stroke in sorted(best[object_id], key=lambda each: -each[0])[:_STROKES]
+        )
+        seen, known = self._graph.seen, np.isin(found[self._graph.nodes], list(best))
+        everything = bool(seen[known].sum() >= _EVERYTHING * seen.sum())
+        return Strokes(strokes, {object_id: default_name(object_id) for object_id in best}, everything)
+
+    def _shown_ids(self, ids: np.ndarray, views: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield each of the views and the object (H, W) that most of a pixel shows, for the splats' objects (N,)."""
+        objects, classes = np.unique(ids, return_inverse=True)
+        labeled = self.splats._replace(ids=torch.from_numpy(classes.astype(np.int32)).to(self.splats.means.device))
+        for index in views:
+            with torch.no_grad():
+                drawn = rasterize(*labeled[:6], self._scene.camera(index), primitive=self._primitive)
+            ranks, parts = (devices.host(plane) for plane in object_ranks(drawn, 1))
+            yield index, np.where((ranks[0] >= 0) & (parts[0] > 0.5), objects[np.maximum(ranks[0], 0)], 0)
 
     def masks(self, ids: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
         """Yield each training view and its mask (H, W) int64, for the objects (N,) of the splats."""

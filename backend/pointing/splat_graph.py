@@ -84,6 +84,24 @@ class Solution:
 
 
 @dataclass(frozen=True)
+class Edges:
+    """The m edges of a graph between nodes, each in both directions or in one.
+
+    Attributes:
+        first, second: (m,) nodes.
+        gap: (m,) distance in units of the local spacing.
+        color: (m,) a tenth of the CIELAB distance.
+        steps: (m,) a tenth of the largest CIELAB step in the photos.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    gap: np.ndarray
+    color: np.ndarray
+    steps: np.ndarray
+
+
+@dataclass(frozen=True)
 class SplatGraph:
     """The graph of N splats.
 
@@ -93,6 +111,10 @@ class SplatGraph:
         is_alone: (N,) bool, splats that are no nodes and far from all of them.
         lab: (n, 3) CIELAB color of each node, the mean over its neighborhood.
         weights: (n, n) weights of the edges.
+        edges: what the weights are made of.
+        xyz: (n, 3) positions of the nodes.
+        seen: (n,) pixels that each node covers in all photos together.
+        facing: (n, 3) sum of the directions to the cameras, each as long as the pixels that the node covers there.
     """
 
     nodes: np.ndarray
@@ -100,6 +122,10 @@ class SplatGraph:
     is_alone: np.ndarray
     lab: np.ndarray
     weights: sparse.csr_array
+    edges: Edges
+    xyz: np.ndarray
+    seen: np.ndarray
+    facing: np.ndarray
 
     def solve(self, seeds: dict[int, np.ndarray], everything: bool = False, before: Solution | None = None) -> Solution:
         """Find the object of each splat.
@@ -212,7 +238,7 @@ def build_graph(
     away, nearest[hidden] = tree.query(means[hidden], workers=-1)
 
     distance, neighbor = tree.query(xyz, k=min(SURFACE_NEIGHBORS, len(nodes)), workers=-1)
-    normal = _normals(xyz[neighbor], facing[nodes])
+    normal = measure_normals(xyz[neighbor], facing[nodes])
     rgb = np.clip(0.5 + C0 * devices.host(splats.sh[:, 0])[nodes].astype(np.float64), 0, 1)
     lab = rgb2lab(rgb[None])[0][neighbor[:, :6]].mean(1)
     second, length = neighbor[:, 1 : NEIGHBORS + 1].ravel(), distance[:, 1 : NEIGHBORS + 1].ravel()
@@ -222,19 +248,33 @@ def build_graph(
     spacing = distance[:, 1:6].mean(1)
     is_alone = np.zeros(len(means), bool)
     is_alone[hidden] = away > ALONE * spacing[nearest[hidden]]
-    along = (xyz[second] - xyz[first]) / np.maximum(length, 1e-12)[:, None]
-    concavity = np.maximum(0.0, -((normal[second] - normal[first]) * along).sum(1))
     gap = length / np.maximum(np.minimum(spacing[first], spacing[second]), 1e-12)
     color = np.linalg.norm(lab[first] - lab[second], axis=1) / 10
     steps = _steps_in_photos(xyz, (first, second), {n: w[nodes] for n, w in in_photos.items()}, cameras, photo) / 10
+    concave = concavity(xyz, normal, first, second)
     weight = LEAST + np.exp(
-        -((COLOR * color) ** 2) - (CONCAVE * concavity) ** 2 - (GAP * gap) ** 2 - (PHOTO_EDGE * steps) ** 2
+        -((COLOR * color) ** 2) - (CONCAVE * concave) ** 2 - (GAP * gap) ** 2 - (PHOTO_EDGE * steps) ** 2
     )
     weights = sparse.coo_array((weight, (first, second)), shape=(len(nodes), len(nodes))).tocsr()
-    return SplatGraph(nodes, nearest, is_alone, lab, weights.maximum(weights.T).tocsr())
+    edges = Edges(first, second, gap, color, steps)
+    weights = weights.maximum(weights.T).tocsr()
+    return SplatGraph(nodes, nearest, is_alone, lab, weights, edges, xyz, seen[nodes], facing[nodes])
 
 
-def _normals(neighborhoods: np.ndarray, facing: np.ndarray) -> np.ndarray:
+def concavity(xyz: np.ndarray, normal: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return how concave the surface is along edges (m,), 0 where it is flat or convex: the change of the normals.
+
+    Args:
+        xyz: (n, 3) positions.
+        normal: (n, 3) normals.
+        first, second: (m,) ends of the edges.
+    """
+    along = xyz[second] - xyz[first]
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    return np.maximum(0.0, -((normal[second] - normal[first]) * along).sum(1))
+
+
+def measure_normals(neighborhoods: np.ndarray, facing: np.ndarray) -> np.ndarray:
     """Return the normals (n, 3) of neighborhoods (n, k, 3), on the side of `facing` (n, 3)."""
     centered = neighborhoods - neighborhoods.mean(1, keepdims=True)
     _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", centered, centered))

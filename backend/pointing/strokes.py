@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw
+from scipy.ndimage import distance_transform_edt
 
 from ..shared.errors import InputError
 from ..shared.formats.json_file import read_json
@@ -76,6 +77,33 @@ class Strokes:
     strokes: tuple[Stroke, ...]
     names: dict[int, str]
     everything: bool = False
+
+
+def stroke_through(mask: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the ends (x, y), as fractions of the size, of a stroke through the widest part of a mask (H, W).
+
+    It is along the row through the middle of the largest inscribed circle, without a fifth at both ends.
+    """
+    inside = distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
+    row, column = np.unravel_index(inside.argmax(), mask.shape)
+    gaps = np.flatnonzero(~np.pad(mask[row], 1, constant_values=False)) - 1
+    first, last = gaps[gaps < column].max() + 1, gaps[gaps > column].min() - 1
+    margin = (last - first) // 5
+    height, width = mask.shape
+    y = float((row + 0.5) / height)
+    return (float((first + margin + 0.5) / width), y), (float((last - margin + 0.5) / width), y)
+
+
+def content_of(strokes: Strokes) -> dict[str, Any]:
+    """Return the content of a file of strokes on photos, as `strokes_of` reads it."""
+    return {
+        "objects": {str(object_id): name for object_id, name in strokes.names.items()},
+        "everything": strokes.everything,
+        "strokes": [
+            {"object": stroke.object, "view": stroke.view, "points": [list(point) for point in stroke.points]}
+            for stroke in strokes.strokes
+        ],
+    }
 
 
 def read_strokes(path: Path, views: Sequence[str]) -> Strokes:

@@ -6,6 +6,7 @@ They are properties of the reconstruction's collection, so that undo removes a s
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -70,11 +71,53 @@ def add_object(root: bpy.types.Collection) -> Any:
             return item
     used = {item.object_id for item in properties.marked} | {item.object_id for item in properties.objects}
     object_id = next(number for number in range(1, len(used) + 2) if number not in used)
-    item = properties.marked.add()
-    item.object_id, item.name = object_id, f"Object {object_id}"
-    item.color = colors_of([object_id])[0] / 255.0
+    item = _add_row(root, object_id)
     properties.active_marked = len(properties.marked) - 1
     return item
+
+
+def _add_row(root: bpy.types.Collection, object_id: int) -> Any:
+    """Add an object to the list and return its row."""
+    item = root.objectgs.marked.add()
+    item.object_id, item.name = object_id, f"Object {object_id}"
+    item.color = colors_of([object_id])[0] / 255.0
+    return item
+
+
+def set_proposed(root: bpy.types.Collection, proposed: dict[str, Any]) -> None:
+    """Replace all strokes and objects by proposed ones.
+
+    Args:
+        root: the reconstruction's collection.
+        proposed: the content of a file of strokes on photos.
+
+    Raises:
+        KeyError, TypeError, ValueError: it is not valid.
+    """
+    properties = root.objectgs
+    strokes = [
+        {"object": int(each["object"]), "view": str(each["view"]), "points": each["points"]}
+        for each in proposed["strokes"]
+    ]
+    taken = {item.object_id for item in properties.objects}
+    free = (number for number in itertools.count(1) if number not in taken)
+    ids = {number: next(free) for number in sorted({stroke["object"] for stroke in strokes})}
+    properties.marked.clear()
+    for object_id in ids.values():
+        _add_row(root, object_id)
+    properties.active_marked = 0
+    properties.everything = bool(proposed["everything"])
+    _store(root, [{**stroke, "object": ids[stroke["object"]]} for stroke in strokes])
+
+
+def merge_object(root: bpy.types.Collection, index: int, into: int) -> None:
+    """Make an object of the list a part of another one; index, into: their rows."""
+    properties = root.objectgs
+    object_id, other = properties.marked[index].object_id, properties.marked[into].object_id
+    strokes = [{**stroke, "object": other} if stroke["object"] == object_id else stroke for stroke in strokes_of(root)]
+    properties.marked.remove(index)
+    properties.active_marked = into - (index < into)
+    _store(root, strokes)
 
 
 def remove_object(root: bpy.types.Collection, index: int) -> None:

@@ -36,6 +36,8 @@ class _Session:
         self.process = BackendProcess(job.command, job.cwd, job.environment, in_background=False)
         self.ready, self.progress, self.message, self.failure = False, 0.0, "Starting", ""
         self.asked = self.answered = 0
+        self.wants_proposals = False
+        self.proposed: dict[str, Any] | None = None
         self._parts: list[np.ndarray] = []
         self.objects: np.ndarray = np.zeros(1, np.int64)
         self.classes = np.zeros(len(self.keys), np.int64)
@@ -50,6 +52,13 @@ class _Session:
             return
         self.asked += 1
         self.process.send(json.dumps({"request": self.asked, **content}))
+
+    def propose(self) -> None:
+        """Ask for objects without strokes, now or as soon as the process is ready."""
+        self.wants_proposals = not self.ready
+        if self.ready:
+            self.asked += 1
+            self.process.send(json.dumps({"request": self.asked, "propose": True}))
 
     def take(self, event: dict[str, Any]) -> int | None:
         """Process an event; return the number of a stroke that shows no splats."""
@@ -72,6 +81,9 @@ class _Session:
             if not self.ready:
                 self.failure = "The splats in the folder are not those of its training; train again."
         elif kind == "answer" and event.get("request") == self.asked:
+            if "proposed" in event:
+                self.answered, self.proposed = self.asked, dict(event["proposed"])
+                return None
             if "problem" in event:
                 self.answered = self.asked
                 messages.show(str(event["problem"]), "ERROR")
@@ -122,6 +134,13 @@ def stop() -> None:
     _session = None
     drawing.show_labels({}, np.zeros((0, 3)))
     drawing.redraw()
+
+
+def propose(root: bpy.types.Collection) -> None:
+    """Ask for objects without strokes, which replace those that are marked; starts the process if it does not run."""
+    start(root)
+    assert _session is not None
+    _session.propose()
 
 
 def release(folder: Path | None) -> None:
@@ -179,6 +198,10 @@ def _tick() -> float | None:
             marks.remove_stroke(root, number)
     if session.ready and not was_ready:
         session.ask(marks.content(root))
+        if session.wants_proposals:
+            session.propose()
+    if session.proposed is not None:
+        _show_proposed(root, session)
     if session.answered != before:
         show()
     if events:
@@ -191,6 +214,28 @@ def _tick() -> float | None:
         redraw()
         return None
     return INTERVAL
+
+
+def _show_proposed(root: bpy.types.Collection, session: _Session) -> None:
+    """Mark the proposed objects, as one undo step."""
+    proposed, session.proposed = session.proposed, None
+    try:
+        marks.set_proposed(root, proposed or {})
+    except (KeyError, TypeError, ValueError) as error:
+        session.failure = f"the backend's answer is not valid ({error!r})"
+        return
+    count = len(root.objectgs.marked)
+    if count:
+        messages.show(
+            f"{count} objects were found. Remove those that are none, merge parts, and draw over what is missing; then "
+            "press Separate Objects"
+        )
+    else:
+        messages.show("No objects were found by their shape; draw over them instead")
+    windows = bpy.context.window_manager.windows
+    if windows and not bpy.app.background:
+        with bpy.context.temp_override(window=windows[0]):
+            bpy.ops.ed.undo_push(message="ObjectGS: Suggest Objects")
 
 
 def show() -> None:

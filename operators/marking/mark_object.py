@@ -30,6 +30,25 @@ class StartMarking(bpy.types.Operator):
         marking_tool.activate(context)
 
 
+class SuggestObjects(bpy.types.Operator):
+    bl_idname = "objectgs.suggest_objects"
+    bl_label = "Suggest Objects"
+    bl_description = (
+        "Find objects by the shape of the scene, such as things on a table, and mark them; this takes seconds and "
+        "replaces all marks"
+    )
+    bl_options = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return need.markable(cls, context)
+
+    @reports_errors
+    def execute(self, context: bpy.types.Context) -> None:
+        pointing.propose(need.active_root(context))
+        marking_tool.activate(context)
+
+
 class StopMarking(bpy.types.Operator):
     bl_idname = "objectgs.stop_marking"
     bl_label = "Stop Marking"
@@ -79,4 +98,4 @@ class MarkObject(FollowsMouse, bpy.types.Operator):
         marks.add_stroke(root, object_id, view, corners, area=shape != "STROKE")
 
 
-CLASSES = (StartMarking, StopMarking, MarkObject)
+CLASSES = (StartMarking, SuggestObjects, StopMarking, MarkObject)

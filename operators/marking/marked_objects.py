@@ -4,6 +4,7 @@
 from pathlib import Path
 
 import bpy
+from bpy.props import EnumProperty
 
 from ...backend.shared.errors import InputError
 from ...backend.shared.formats.json_file import write_json
@@ -52,6 +53,42 @@ class RemoveMarkedObject(_OfMarks, bpy.types.Operator):
         return {"FINISHED"}
 
 
+def _other_objects(_self: bpy.types.Operator, context: bpy.types.Context) -> list[tuple[str, str, str]]:
+    properties = need.active_root(context).objectgs
+    _other_objects.shown = [  # Blender keeps no reference to the texts.
+        (str(index), item.name, "") for index, item in enumerate(properties.marked) if index != properties.active_marked
+    ] or [("-1", "None", "")]
+    return _other_objects.shown
+
+
+class MergeMarked(_OfMarks, bpy.types.Operator):
+    bl_idname = "objectgs.merge_marked"
+    bl_label = "Merge Marked Objects"
+    bl_description = "Make the active object of the list a part of another one"
+    bl_options = {"REGISTER", "UNDO"}
+    bl_property = "into"
+
+    into: EnumProperty(name="Into", items=_other_objects, description="Object that the active one is a part of")
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not super().poll(context):
+            return False
+        if marks.active_object(need.active_root(context)) and len(need.active_root(context).objectgs.marked) > 1:
+            return True
+        cls.poll_message_set("Two marked objects are needed")
+        return False
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        context.window_manager.invoke_search_popup(self)
+        return {"FINISHED"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        root = need.active_root(context)
+        marks.merge_object(root, root.objectgs.active_marked, int(self.into))
+        return {"FINISHED"}
+
+
 class ClearMarks(_OfMarks, bpy.types.Operator):
     bl_idname = "objectgs.clear_marks"
     bl_label = "Remove All Marks"
@@ -91,4 +128,4 @@ class SeparateMarked(_OfMarks, bpy.types.Operator):
         return background.submit(job, context.scene, self.report)
 
 
-CLASSES = (AddMarkedObject, RemoveMarkedObject, ClearMarks, SeparateMarked)
+CLASSES = (AddMarkedObject, RemoveMarkedObject, MergeMarked, ClearMarks, SeparateMarked)

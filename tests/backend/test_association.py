@@ -9,7 +9,7 @@ from scipy import sparse
 
 from backend.capture.files import read_mask
 from backend.labels.association import Seen, associate, consistency, object_mask
-from backend.labels.regions import merge_regions
+from backend.labels.regions import merge_regions, merge_tree, stable_regions
 from backend.shared.errors import EXIT_DONE
 
 from .command_result import assert_rejected
@@ -30,6 +30,17 @@ def test_regions_are_merged_by_the_mean_of_their_borders():
     total = symmetric({(0, 1): 10.0, (1, 2): 10.0, (0, 2): 10.0, (3, 4): 10.0}, 5)
     assert partition(merge_regions(shared, total, 0.5)) == {frozenset({0, 1}), *(frozenset({i}) for i in (2, 3, 4))}
     assert partition(merge_regions(shared, total, 0.25)) == {frozenset({0, 1, 2}), frozenset({3}), frozenset({4})}
+
+
+def test_stable_regions_are_those_that_last_longest():
+    """Two pairs of parts, each of which merges early, a bridge between the pairs, and a speck."""
+    pairs = {(0, 1): 0.8, (2, 3): 0.7, (1, 2): 0.1, (3, 4): 0.05, (4, 5): 0.04}
+    tree = merge_tree(symmetric(pairs, 6), symmetric(dict.fromkeys(pairs, 1.0), 6), 1e-3)
+    sizes = np.array([5.0, 5.0, 6.0, 4.0, 0.1, 7.0])
+    found = stable_regions(tree, sizes, 1.0, 0.04)
+    assert partition(found[:4]) == {frozenset({0, 1}), frozenset({2, 3})} and (found[4:] == -1).all()
+    assert stable_regions(tree, sizes, 1.0, 1e-3).tolist() == [0] * 6, "the whole lasts longest"
+    assert stable_regions(tree, sizes, 12.0, 0.04).tolist() == [0] * 6, "the pairs are too small"
 
 
 def greedy(shared, total, least):

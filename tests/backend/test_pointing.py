@@ -14,14 +14,16 @@ import pytest
 import torch
 from PIL import Image
 from scipy import sparse
+from scipy.spatial import cKDTree
 
 from backend.capture import load_capture
 from backend.export.ply import read_splats
 from backend.model.checkpoint import save_checkpoint
 from backend.model.draw import draw
 from backend.pointing.mask_edges import follow_edges
+from backend.pointing.proposals import find_objects
 from backend.pointing.random_walker import random_walker
-from backend.pointing.splat_graph import SplatGraph, contributions
+from backend.pointing.splat_graph import Edges, SplatGraph, contributions
 from backend.pointing.strokes import Stroke, read_strokes
 from backend.raster import rasterize
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError
@@ -204,9 +206,10 @@ def test_borders_of_masks_follow_the_photo() -> None:
 
 def test_far_splats_belong_to_nothing_unless_everything_is_an_object() -> None:
     """Two plates far apart; the stroke is on one of them. A part with a similar color elsewhere is not the object's."""
+    none, flat = np.zeros(0), np.zeros((9, 3))
     graph = SplatGraph(
         np.arange(9), np.arange(9), np.zeros(9, bool), np.repeat([[50.0, 0, 0], [80.0, 0, 0], [50.0, 0, 0]], 3, axis=0),
-        chain([1, 1, 1e-4, 1, 1, 1e-4, 1, 1]),
+        chain([1, 1, 1e-4, 1, 1, 1e-4, 1, 1]), Edges(none, none, none, none, none), flat, np.ones(9), flat,
     )  # fmt: skip
     seeds = {7: np.eye(9)[0]}
     assert graph.solve(seeds).ids.tolist() == [7, 7, 7, 0, 0, 0, 0, 0, 0]
@@ -263,8 +266,76 @@ def test_point_answers_strokes(unlabeled) -> None:
     process.stdin.write(json.dumps({"request": 2, "strokes": [{**ONE, "view": "gone.png"}]}) + "\n")
     process.stdin.flush()
     assert "gone.png" in answer()["problem"]
+    process.stdin.write(json.dumps({"request": 3, "propose": True}) + "\n")
+    process.stdin.flush()
+    assert len({stroke["object"] for stroke in answer()["proposed"]["strokes"]}) >= 3
     process.stdin.close()
     assert process.wait(timeout=20) == EXIT_DONE
+
+
+def table_with_balls(balls: int) -> tuple[SplatGraph, np.ndarray]:
+    """A graph of splats on a square table with balls on it, and the true object of each splat: 0 the table."""
+    rng = np.random.default_rng(0)
+    centers = np.array([(0.9 * np.cos(turn), 0.9 * np.sin(turn)) for turn in 2 * np.pi * np.arange(balls) / balls])
+    table = rng.uniform(-2, 2, (12_000, 2))
+    table = table[(np.linalg.norm(table[:, None] - centers, axis=2) > 0.1).all(1)]
+    points, normals, true = (
+        [np.column_stack([table, np.zeros(len(table))])],
+        [np.tile([0, 0, 1.0], (len(table), 1))],
+        [0],
+    )
+    counts = [len(table)]
+    for number, center in enumerate(centers, 1):
+        normal = rng.normal(size=(1500, 3))
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        points.append([*center, 0.28] + 0.3 * normal)
+        normals.append(normal)
+        true.append(number)
+        counts.append(1500)
+    xyz, truth = np.concatenate(points), np.repeat(true, counts)
+    above = xyz[:, 2] > -1e-9
+    xyz, truth, normal = xyz[above], truth[above], np.concatenate(normals)[above]
+    xyz = xyz + rng.normal(0, 0.004, xyz.shape)
+    distance, neighbor = cKDTree(xyz).query(xyz, k=11)
+    first, second = np.repeat(np.arange(len(xyz)), 10), neighbor[:, 1:].ravel()
+    spacing = distance[:, 1:6].mean(1)
+    gap = distance[:, 1:].ravel() / np.minimum(spacing[first], spacing[second])
+    color = rng.uniform(0, 3, len(first))  # Everything has a texture.
+    nodes, ones = np.arange(len(xyz)), np.ones(len(xyz))
+    weights = sparse.csr_array((len(xyz), len(xyz)))
+    edges = Edges(first, second, gap, color, color)
+    return SplatGraph(nodes, nodes, ones < 0, np.zeros((len(xyz), 3)), weights, edges, xyz, ones, normal), truth
+
+
+@pytest.mark.parametrize("balls", [1, 5])
+def test_things_on_a_table_are_found_without_strokes(balls) -> None:
+    graph, truth = table_with_balls(balls)
+    calls = []
+    found = find_objects(graph, lambda done, total: calls.append((done, total)))
+    assert calls[-1][0] == calls[-1][1] > 1
+    for number in range(balls + 1):
+        ids, counts = np.unique(found[(truth == number) & (found > 0)], return_counts=True)
+        best = ids[counts.argmax()]
+        both = ((found == best) & (truth == number)).sum()
+        assert both / ((found == best) | (truth == number)).sum() > 0.85, number
+    assert found.max() <= balls + 3 and (np.diff(np.bincount(found)[1:]) <= 0).all(), "the largest is the first"
+
+
+def test_proposed_objects_are_separated_by_label(unlabeled, tmp_path, run_command) -> None:
+    scene, out = unlabeled
+    result = run_command("propose", out, "--json")
+    assert result.code == EXIT_DONE and result.events[-1]["objects"] >= 3
+    content = json.loads((out / "strokes.json").read_text())
+    assert {stroke["view"] for stroke in content["strokes"]} <= set(scene.names)
+    assert run_command("label", out, "--strokes", out / "strokes.json").code == EXIT_DONE
+    capture = load_capture(scene.folder, tmp_path / "again")
+    shown = np.zeros((100, 6))
+    for index in capture.train_indices:
+        np.add.at(shown, (capture.mask(index), scene.ids[index]), 1)
+    balls = shown[1:, [1, 2, 5]]
+    iou = balls / (shown[:, [1, 2, 5]].sum(0) + shown[1:].sum(1, keepdims=True) - balls)
+    assert (iou.max(0) > 0.7).sum() >= 2, iou.round(2)
+    assert balls.max(1).sum() > 0.9 * balls.sum(), "hardly any proposal is on two balls"
 
 
 def test_label_refuses_foreign_masks_and_strokes_on_nothing(unlabeled, tmp_path, run_command, monkeypatch) -> None:

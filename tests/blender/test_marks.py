@@ -201,6 +201,45 @@ def test_answers_are_shown_and_end_with_the_strokes(root, session):
     assert pointing.share_of_splats() == {0: count} and not pointing.state()[1]
 
 
+PROPOSED = {
+    "everything": True,
+    "strokes": [
+        {"object": number, "view": "a.png", "points": [[0.1, 0.2], [0.3, 0.2]]} for number in (1, 2, 2, 3)
+    ],
+}  # fmt: skip
+
+
+def test_proposed_objects_replace_the_marked_ones_and_can_be_merged(root, session):
+    root.objectgs.objects.clear()
+    root.objectgs.objects.add().object_id = 2
+    marks.add_object(root)
+    marks.add_stroke(root, 1, views(root)[0], [(1, 1)], area=False)
+    pointing.propose(root)
+    assert not any("propose" in each for each in session.process.sent), "the process is not ready"
+    session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
+    session.propose()
+    assert session.process.sent[-1] == {"request": session.asked, "propose": True} and pointing.state()[1]
+    session.take({"type": "answer", "request": session.asked, "proposed": PROPOSED})
+    pointing._show_proposed(root, session)
+    assert [item.object_id for item in root.objectgs.marked] == [1, 3, 4], "2 is taken"
+    content = marks.content(root)
+    assert content["everything"] is True and [each["object"] for each in content["strokes"]] == [1, 3, 3, 4]
+    assert session.process.sent[-1]["strokes"] == content["strokes"], "their splats are asked for"
+    root.objectgs.active_marked = 0
+    bpy.ops.objectgs.merge_marked(into="2")
+    assert [item.object_id for item in root.objectgs.marked] == [3, 4]
+    assert [each["object"] for each in marks.strokes_of(root)] == [4, 3, 3, 4]
+    assert marks.active_object(root).object_id == 4
+
+
+def test_invalid_proposals_end_the_process_with_a_sentence(root, session):
+    session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
+    session.propose()
+    session.take({"type": "answer", "request": session.asked, "proposed": {"strokes": [{}]}})
+    pointing._show_proposed(root, session)
+    assert "not valid" in session.failure
+
+
 def test_answers_to_earlier_strokes_are_ignored(root, session):
     session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
     for _ in range(2):

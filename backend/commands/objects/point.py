@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...pointing.pointer import Pointer, StrokeOnNothing
-from ...pointing.strokes import strokes_of
+from ...pointing.strokes import content_of, strokes_of
 from ...shared.errors import InputError
 from ...shared.stopping import StoppingReporter
 from ..folder import READ, Trained, open_trained
@@ -48,6 +48,10 @@ def point(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         if content is None:
             continue
         request: Any = content.get("request")
+        if content.get("propose"):
+            proposed = content_of(pointer.propose(reporter.progress))
+            reporter.answer(request=request, proposed=proposed)
+            continue
         try:
             ids = pointer.solve(strokes_of(content, "the request", views))[in_file]
         except InputError as error:

@@ -63,9 +63,13 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
             draw_job_of(layout, job)
         is_active = pointing.is_active(root)
         if not is_active:
-            layout.operator("objectgs.start_marking", icon="GREASEPENCIL")
+            column = layout.column(align=True)
+            column.operator("objectgs.start_marking", icon="GREASEPENCIL")
+            column.operator("objectgs.suggest_objects", icon="LIGHT")
             if not properties.marked:
-                write(layout, "Draw over each object in the viewport to separate it from the scene.")
+                write(
+                    layout, "Draw over each object in the viewport to separate it from the scene, or let them be found."
+                )
                 return
         else:
             self._draw_state(layout, root)
@@ -74,8 +78,11 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
         column = row.column(align=True)
         column.operator("objectgs.add_marked_object", text="", icon="ADD")
         column.operator("objectgs.remove_marked_object", text="", icon="REMOVE")
+        column.operator("objectgs.merge_marked", text="", icon="AUTOMERGE_ON")
         column.separator()
         column.operator("objectgs.clear_marks", text="", icon="TRASH")
+        if is_active and not marks.strokes_of(root):
+            layout.operator("objectgs.suggest_objects", icon="LIGHT")
         layout.prop(properties, "everything")
         layout.operator("objectgs.separate_marked", icon="CHECKMARK")
         if is_active:
