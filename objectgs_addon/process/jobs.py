@@ -53,7 +53,8 @@ class Job:
 
     Attributes:
         title: name shown to the user.
-        kind: sfm, import, import-splats, plan, vote, train, label, mesh, export, film, fill, demo, setup or doctor.
+        kind: sfm, import, masks, import-splats, plan, vote, train, label, mesh, export, film, fill, demo, setup or
+            doctor.
         folder: the reconstruction folder, or None.
         command: program and arguments.
         cwd: working directory.

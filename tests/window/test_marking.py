@@ -101,6 +101,30 @@ def test_marking_is_the_step_after_a_training_without_masks(window):
     assert asked(window, "[item.name for item in root.objectgs.marked]") == ["Object 1"]
 
 
+def test_suggested_objects_are_shown_merged_and_undone(window):
+    window.run(script("result = call(bpy.ops.objectgs.suggest_objects)"))
+    wait(window, "len(root.objectgs.marked) > 4", 120)
+    found = settled(window)
+    shown = [number for object_id, number in found.items() if object_id]
+    assert len(shown) == asked(window, "len(root.objectgs.marked)") and min(shown) > 20
+    window.shot("suggested")
+    count = len(shown)
+    window.run(
+        script("""
+        root.objectgs.active_marked = 0
+        with bpy.context.temp_override(**window_context()):
+            result = list(bpy.ops.objectgs.merge_marked("EXEC_DEFAULT", True, into="1"))
+    """)
+    )
+    assert len([i for i in settled(window) if i]) == count - 1
+    window.run(script("result = call(bpy.ops.objectgs.clear_marks)"))
+    window.key("ctrl+z")
+    wait(window, f"len(root.objectgs.marked) == {count - 1}")
+    window.run(script("result = call(bpy.ops.objectgs.clear_marks)"))
+    window.run(script("result = call(bpy.ops.objectgs.add_marked_object)"))
+    assert asked(window, "[item.name for item in root.objectgs.marked]") == ["Object 1"]
+
+
 def test_strokes_show_objects_at_once_and_are_undone(window, centers):
     draw_over(window, centers[VASE])
     first = settled(window)

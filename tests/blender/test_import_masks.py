@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Import Masks: what the backend is asked for, and what follows."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from objectgs.objectgs_addon.process.jobs import Job
+from objectgs.objectgs_addon.running import background, results
+from objectgs.operators.capture import import_masks
+
+import headless
+
+from .building import look_at, write_cameras, write_folder
+
+
+@pytest.fixture
+def root(fresh, tmp_path, monkeypatch):
+    """A reconstruction whose capture has no masks; jobs are collected instead of run."""
+    folder = write_folder(tmp_path / "table")
+    write_cameras(folder, [look_at(np.array([3.0, 0.0, 1.0]), np.zeros(3))])
+    monkeypatch.setenv("OBJECTGS_PYTHON", __import__("sys").executable)
+    extension = headless.extension()
+    extension.register()
+    bpy.ops.objectgs.open_reconstruction(directory=str(folder))
+    yield bpy.context.scene.objectgs.active
+    extension.unregister()
+
+
+@pytest.fixture
+def submitted(monkeypatch):
+    jobs: list[Job] = []
+    monkeypatch.setattr(import_masks.background, "submit", lambda job, *_: jobs.append(job) or {"FINISHED"})
+    return jobs
+
+
+def test_job_has_the_capture_and_the_chosen_masks(root, submitted, tmp_path):
+    given = tmp_path / "annotations.json"
+    given.write_text("{}")
+    assert bpy.ops.objectgs.import_masks("EXEC_DEFAULT", filepath=str(given), objects="find") == {"FINISHED"}
+    (job,) = submitted
+    at = job.command.index("masks")
+    assert job.command[at + 1 : at + 5] == [str(tmp_path / "table"), str(given), "--objects", "find"]
+    assert job.kind == "masks" and job.folder == tmp_path / "table"
+
+
+def test_folder_is_chosen_with_or_without_a_name_in_it(root, submitted, tmp_path):
+    given = tmp_path / "segments"
+    given.mkdir()
+    for path in (f"{given}/", f"{given}/untitled"):
+        bpy.ops.objectgs.import_masks("EXEC_DEFAULT", filepath=path)
+        assert str(given) in submitted[-1].command
+    with pytest.raises(RuntimeError, match="does not exist"):
+        bpy.ops.objectgs.import_masks("EXEC_DEFAULT", filepath=str(tmp_path / "gone" / "a.json"))
+
+
+def test_result_is_told_and_points_get_their_objects(root, tmp_path, monkeypatch):
+    told, asked = [], []
+    monkeypatch.setattr(results.messages, "show", lambda text, *_: told.append(text))
+    monkeypatch.setattr(background, "submit", lambda job, *_: asked.append(job.kind))
+    (tmp_path / "table" / "masks").mkdir(exist_ok=True)
+    root.objectgs.objects.clear()
+    job = Job("Import masks", "masks", Path(tmp_path / "table"), ["python"], tmp_path)
+    job.result = {"photos": 42, "masks": "/table/masks", "result": {"objects": [{}, {}, {}]}}
+    monkeypatch.setitem(background._submitted_in, job, bpy.context.scene.session_uid)
+    background.finish(job)
+    assert told == ["The masks show 3 objects in 42 photos; /table/masks has a picture"]
+    # With a window, `finish` does this, too.
+    background._assign_objects(job, bpy.context.scene)
+    assert asked == ["vote"]
