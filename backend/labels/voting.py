@@ -34,6 +34,10 @@ background, and by its standard deviations below the mean. Unlabeled votes have 
 _ENOUGH_POINTS = 20
 """Points from which on the rate of gaps is estimated; with fewer, masks are taken to have none."""
 
+_ENOUGH_VOTES, _CONSISTENT = 3, 0.4
+"""Votes from which on a point tells whether IDs are consistent, and mean margin below which they are not: where half of
+the objects in each photo have a wrong ID it is 0.25, and where each photo has numbers of its own it is below 0.2."""
+
 _SLOTS = 6
 _MERGE_AT = 1 << 23
 
@@ -122,6 +126,12 @@ def vote(
     won = np.bincount(chosen[chosen >= 0], minlength=len(classes))
     counts = {int(i): int(n) for i, n in zip(classes.ids, won)}
     warnings = _describe_problems(capture, counts, int((ids == 0).sum()) if len(classes) else 0, len(ids))
+    judged = (ids != 0) & (ballots.visible >= _ENOUGH_VOTES)
+    if judged.sum() >= _ENOUGH_POINTS and margins[judged].mean() < _CONSISTENT:
+        warnings.append(
+            "The masks give most points another ID in each photo; if the segments of each photo are numbered on their "
+            "own, read them with Import Masks (`masks`), which finds the objects."
+        )
     for sentence in warnings:
         reporter.warning(sentence)
     return Votes(ids, margins, counts, ballots.visible, warnings)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from backend.capture import Keypoints, Points, View, load_capture
 from backend.labels import read_points, vote, write_points
@@ -373,3 +374,15 @@ def test_bad_masks_do_not_make_objects():
     background = unlabeled > needed_to_be_unlabeled(unlabeled, votes) * votes
     assert not background[on_object].any() and background[~on_object].mean() > 0.99
     assert (needed_to_be_unlabeled(np.array([0, 1, 3]), np.array([0, 1, 3])) >= 0.5).all()
+
+
+def test_ids_that_differ_in_each_photo_are_warned_about(write_capture, tmp_path):
+    scene = write_capture(views=12, points=200)
+    right = vote(load_capture(scene.folder, tmp_path / "right"))
+    assert not any("another ID" in text for text in right.warnings)
+    for turn, (name, ids) in enumerate(zip(scene.names, scene.ids, strict=True)):
+        number = np.zeros(6, np.uint8)
+        number[[1, 2, 5]] = np.roll([1, 2, 5], turn)
+        Image.fromarray(number[ids]).save(scene.folder / "masks" / name)
+    wrong = vote(load_capture(scene.folder, tmp_path / "wrong"))
+    assert any("another ID in each photo" in text and "Import Masks" in text for text in wrong.warnings)
