@@ -1,14 +1,15 @@
 """Objects from strokes: held-out mIoU over the number of photos with strokes, with the true masks as the user.
 
     python benchmarks/pointing.py [--photos 1 2 3] [--minutes 2.4] [--seeds 1] [--capture NAME ...]
-    python benchmarks/pointing.py --write
+    python benchmarks/pointing.py --write [--proposals]
 
 Captures are the demo (`make demo`), and the real tabletop of ../shared/data if it is there. Each is trained without its
 masks. In each of the photos, one stroke then marks each object that shows there: along the row through the middle of
 the object's largest inscribed circle, without a fifth at both ends. If the masks leave pixels unlabeled, one such
 stroke in one photo marks them, too. `label` separates the objects, and the IDs of its renders are compared with the
 true masks of the held-out views. Before, `propose` finds objects without any stroke. --write saves the figures of two
-seeds to docs/figures/pointing.json and the table to docs/pointing.md.
+seeds to docs/figures/pointing.json and the table to docs/pointing.md; with --proposals, only `propose` is measured, and
+the document keeps its other figures.
 """
 
 from __future__ import annotations
@@ -206,7 +207,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--capture", nargs="+", choices=CAPTURES, default=list(CAPTURES))
     parser.add_argument("--write", action="store_true", help="all captures and two seeds, for the document")
+    parser.add_argument("--proposals", action="store_true", help="measure `propose` alone")
     options = parser.parse_args()
+    options.photos = [] if options.proposals else options.photos
     seeds = 2 if options.write else options.seeds
     folders = {name: CAPTURES[name] for name in (CAPTURES if options.write else options.capture)}
     folders = {name: folder for name, folder in folders.items() if folder.is_dir()}
@@ -228,6 +231,10 @@ def main() -> None:
     if results.failures:
         sys.exit("\n".join(f"{name}: {why}" for name, why in results.failures.items()))
     if options.write:
+        if options.proposals:
+            for name, rows in documents.load("pointing")["captures"].items():
+                for new, kept in zip(found["captures"].get(name, ()), rows, strict=True):
+                    new.update({key: row for key, row in kept.items() if key not in ("0", "proposed")})
         documents.save("pointing", found)
     print(document(found))
 

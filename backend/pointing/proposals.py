@@ -23,13 +23,14 @@ GAP, STEPS, LEAST = 1 / 3, 0.36, 1e-4
 
 AGREEING = 0.6
 """Two regions are one if this fraction of all trials has them in one, on average over their border. A single trial is
-sensitive to its weights: it finds 72% of the objects of nine scenes of the suite, and all together 84%."""
+sensitive to its weights: it finds 72% of the objects of ten synthetic scenes, and all together 84%."""
 
 SMALLEST = 0.003
 """Size of the smallest object, as a fraction of all photos' pixels."""
 
-APART = 0.1
-"""Regions whose border has a smaller weight on average are never one object."""
+APART = 0.15
+"""Regions whose border has a smaller weight on average are never one object: with less, a table may be one with the
+things on it, and with more, walls fall into parts."""
 
 
 def find_objects(graph: SplatGraph, progress: Callable[[int, int], object]) -> np.ndarray:
