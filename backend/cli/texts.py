@@ -40,7 +40,7 @@ Make masks/ and labels.json of a capture of masks that another program wrote. MA
   a folder of black and white images for each object, or for each photo.
 Segments that are numbered in each photo on their own, as by Segment Anything, get one
 ID for each object: segments that show the same points are the same object. Segments
-that show several objects are divided. masks/masks.png shows the result. Masks that are
+that show several objects are divided. masks/masks.jpg shows the result. Masks that are
 in masks/ already are kept in masks-given/.
 """
 

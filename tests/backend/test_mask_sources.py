@@ -242,7 +242,9 @@ def test_objects_of_every_format_are_those_that_were_written(write, photos, tmp_
         found, true = read_mask(photos / "masks" / f"{photo(n)}.png"), masks_of(n)
         for i, name in NAMES.items():
             assert ((found == number[name]) == (true == i)).all(), (n, name)
-    assert (photos / "masks" / "masks.json").exists() and not list(photos.glob(".objectgs*"))
+    assert {"masks.json", "masks.jpg"} <= {each.name for each in (photos / "masks").iterdir()} and not list(
+        photos.glob(".objectgs*")
+    )
 
 
 def test_black_and_white_masks_beside_the_photos_become_those_of_the_capture(photos, tmp_path):
@@ -285,6 +287,7 @@ def damaged(content, change):
         lambda c: c["images"][0].pop("file_name"),
         lambda c: c.update(categories=[3]),
         lambda c: c["images"][0].update(width=20),
+        lambda c: c.update(annotations=[]),
     ],
 )
 def test_damaged_files_are_refused_and_leave_nothing(change, photos, tmp_path, run_command):

@@ -16,7 +16,7 @@ from ...capture.colmap import Model
 from ...capture.files import encode_mask, image_size, read_image
 from ...capture.mask_sources import MaskSource, Segments, open_source
 from ...capture.models import Photos, read_capture_model, with_observations
-from ...evaluation import contact_sheet, save_image
+from ...evaluation import contact_sheet
 from ...evaluation.images import id_image, thumbnail
 from ...labels.association import Association, Seen, associate, consistency, object_mask
 from ...shared.class_table import LARGEST_ID
@@ -27,7 +27,7 @@ from ...shared.reconstruction.objects import default_name
 from ...shared.stopping import StoppingReporter
 from ..folder import READ
 
-RECORD, OVERVIEW = "masks.json", "masks.png"
+RECORD, OVERVIEW = "masks.json", "masks.jpg"
 """Files in masks/ with where the masks are from, and how well they agree; and a picture of some."""
 
 _FIND, _WRITE = "find", "write"
@@ -62,7 +62,10 @@ def masks(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     source = open_source(given, capture, names)
     _require_replaceable(capture, given)
     photos = [name for name in source.photos if name in set(names)]
-    segments = {name: _checked(source, name, capture, given) for name in _counted(photos, reporter)}
+    images = Photos(capture).folder
+    segments = {name: _checked(source, name, images, given) for name in _counted(photos, reporter)}
+    if not any(found.objects for found in segments.values()):
+        raise InputError(f"{given} shows no object in the {len(photos)} photos that it has masks of; check the masks.")
     reporter.begin(_FIND, "Comparing the segments of the photos")
     found, association, seen = _objects(segments, model, options.objects, reporter)
     reporter.begin(_WRITE, f"Writing masks of {len(photos)} photos")
@@ -107,11 +110,11 @@ def _counted(photos: Sequence[str], reporter: StoppingReporter) -> Any:
         reporter.progress(done, len(photos), what="photos")
 
 
-def _checked(source: MaskSource, name: str, capture: Path, given: Path) -> Segments:
+def _checked(source: MaskSource, name: str, images: Path, given: Path) -> Segments:
     """Read the segments of a photo; raises InputError if their size does not fit it."""
     found = source.read(name)
     height, width = found.numbers.shape
-    size = image_size(Photos(capture).folder / name)
+    size = image_size(images / name)
     expected = height * size[0] / size[1]
     if abs(width - expected) > max(1.0, _ASPECT * expected):
         raise InputError(
@@ -246,7 +249,8 @@ def _write(capture: Path, given: Path, drawn: Any, found: _Found, record: dict[s
             path.write_bytes(data)
             if number % every == 0 and len(pictures) < _PICTURES:
                 pictures.append((name, _overlay(photos / name, mask)))
-        save_image(contact_sheet([image for _, image in pictures], [name for name, _ in pictures]), part / OVERVIEW)
+        sheet = contact_sheet([image for _, image in pictures], [name for name, _ in pictures])
+        sheet.save(part / OVERVIEW, quality=88)
         if given.resolve() == folder.resolve():
             folder.rename(_kept(capture))
             record["source"] = str(_kept(capture).resolve())
