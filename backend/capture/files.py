@@ -26,6 +26,7 @@ MASK_SUFFIXES = (".png", ".npy", ".npz", ".tif", ".tiff", ".bmp")
 LOSSY_SUFFIXES = (".jpg", ".jpeg")
 _MASK_WORDS = ("mask", "seg", "id")
 """Words that the names of masks may have before or after that of the photo, as in `photo_mask.png`."""
+_ASPECT_TOLERANCE = 0.01
 _OPENING_ERRORS = (OSError, ValueError, SyntaxError, EOFError, MemoryError, PilImage.DecompressionBombError)
 
 
@@ -167,6 +168,12 @@ def mask_size(path: Path) -> tuple[int, int]:
     with _opened_array(path) as file:
         height, width = _array_size(path, file)
     return width, height
+
+
+def same_shape(size: tuple[int, int], of: tuple[int, int]) -> bool:
+    """Return whether a mask's size (width, height) has the proportions of another; one pixel may be due to rounding."""
+    expected = size[1] * of[0] / of[1]
+    return abs(size[0] - expected) <= max(1.0, _ASPECT_TOLERANCE * expected)
 
 
 def read_mask(path: Path, color: bool | None = None) -> np.ndarray:

@@ -35,6 +35,7 @@ from .files import (
     read_image,
     read_mask,
     read_names,
+    same_shape,
 )
 from .models import none_found, photos_folder, read_capture_model
 from .undistort import Pinhole, is_pinhole, pinhole_for
@@ -42,7 +43,6 @@ from .undistort import Pinhole, is_pinhole, pinhole_for
 Problem = Callable[[str], None]
 """Handler of a problem, given as a sentence; either raises or collects it."""
 
-_ASPECT_TOLERANCE = 0.01
 _PIXELS_AT_ONCE = 100_000_000
 """Number of pixels that may be processed at a time, with about 15 bytes for each."""
 _LARGEST_MASK = 4
@@ -253,10 +253,8 @@ def check_mask_size(source: Source) -> tuple[int, int]:
     assert source.mask_path is not None
     camera = source.camera
     width, height = mask_size(source.mask_path)
-    # A difference of one pixel is due to rounding.
-    expected = height * camera.width / camera.height
     is_larger = max(width, height) > _LARGEST_MASK * max(camera.width, camera.height, _SMALL)
-    if is_larger or abs(width - expected) > max(1.0, _ASPECT_TOLERANCE * expected):
+    if is_larger or not same_shape((width, height), (camera.width, camera.height)):
         raise InputError(
             f"{source.mask_path} is {width}x{height} pixels, but its image {source.image_path.name} is "
             f"{camera.width}x{camera.height}; make the mask the image's size."

@@ -17,7 +17,7 @@ from ...shared.errors import InputError
 from ...shared.formats.json_file import read_json
 from ..files import Files, read_mask
 from ..models.photos import Photos
-from .segments import Segments, Shape, checked_size, draw_shapes, polygon, run_lengths, text_of
+from .segments import Segments, Shape, checked_size, draw_shapes, identity_of, polygon, run_lengths
 
 _TRACK = ("track_id", "instance_id", "object_id", "tracking_id")
 _WHERE_PANOPTIC = ("", "panoptic", "masks", "annotations")
@@ -66,7 +66,10 @@ class CocoMasks:
         self._is_panoptic = any("segments_info" in each for found in self._annotations.values() for each in found)
         self.what = "COCO panoptic masks" if self._is_panoptic else "COCO annotations"
         self._pictures = Files(file.parent) if self._is_panoptic else None
-        self._is_unique = self._categories_are_unique()
+        try:
+            self._is_unique = self._categories_are_unique()
+        except (AttributeError, TypeError) as error:
+            raise self._invalid(error) from error
 
     def read(self, photo: str) -> Segments:
         """Return the segments of a photo; raises InputError."""
@@ -111,7 +114,7 @@ class CocoMasks:
 
     def _object(self, annotation: Mapping[str, Any], name: str) -> Hashable:
         attributes = annotation.get("attributes")
-        found = text_of({**(attributes if isinstance(attributes, Mapping) else {}), **annotation}, _TRACK)
+        found = identity_of({**(attributes if isinstance(attributes, Mapping) else {}), **annotation}, _TRACK)
         if found is not None:
             return found
         return name if name and self._is_unique else None
@@ -133,7 +136,7 @@ class PhotoJson:
     """A JSON file for each photo with the masks of Segment Anything, as in its dataset SA-1B.
 
     Args:
-        folder: the folder of the files: `annotations` with COCO's run lengths, and optionally `image` with `file_name`.
+        folder: the folder of the files, named like the photos: a list `annotations` of masks as COCO's run lengths.
         photos: the photos of the capture.
     """
 

@@ -17,11 +17,6 @@ from .segments import Segments, Shape, checked_size, draw_shapes, polygon
 _SHAPES = ("polygon", "box", "ellipse", "mask")
 
 
-def recognizes(head: bytes) -> bool:
-    """Return whether a file that starts with these bytes is of CVAT."""
-    return b"<annotations" in head
-
-
 class CvatMasks:
     """The masks of a file of CVAT.
 

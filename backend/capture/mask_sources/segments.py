@@ -110,7 +110,7 @@ def _check_compressed(data: bytes, pixels: int) -> None:
         raise ValueError(f"run lengths of {sum(runs)} pixels, expected {pixels}")
 
 
-def text_of(values: Mapping[str, Any], keys: Iterable[str]) -> Hashable:
+def identity_of(values: Mapping[str, Any], keys: Iterable[str]) -> Hashable:
     """Return the first of the keys' values that identifies something: text or a whole number, or None."""
     for key in keys:
         value = values.get(key)

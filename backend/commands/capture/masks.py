@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import shutil
 from collections import Counter
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...capture.colmap import Model
-from ...capture.files import encode_mask, image_size, read_image
+from ...capture.files import image_size, read_image, same_shape
 from ...capture.mask_sources import MaskSource, Segments, open_source
 from ...capture.models import Photos, read_capture_model, with_observations
 from ...evaluation import contact_sheet
@@ -21,11 +20,11 @@ from ...evaluation.images import id_image, thumbnail
 from ...labels.association import Association, Seen, associate, consistency, object_mask
 from ...shared.class_table import LARGEST_ID
 from ...shared.errors import InputError
-from ...shared.formats.atomic import PART_PREFIX, PART_SUFFIX
 from ...shared.formats.json_file import write_json
 from ...shared.reconstruction.objects import default_name
 from ...shared.stopping import StoppingReporter
 from ..folder import READ
+from ..mask_files import new_masks, write_mask
 
 RECORD, OVERVIEW = "masks.json", "masks.jpg"
 """Files in masks/ with where the masks are from, and how well they agree; and a picture of some."""
@@ -38,7 +37,6 @@ _CONSISTENT = 0.6
 """IDs that agree on a smaller part of the points are not taken for those of objects."""
 
 _PICTURES = 12
-_ASPECT = 0.01
 
 
 class _Found(NamedTuple):
@@ -103,7 +101,7 @@ def _kept(capture: Path) -> Path:
     return capture / "masks-given"
 
 
-def _counted(photos: Sequence[str], reporter: StoppingReporter) -> Any:
+def _counted(photos: Sequence[str], reporter: StoppingReporter) -> Iterator[str]:
     """Yield the photos, and report the progress."""
     for done, name in enumerate(photos, 1):
         yield name
@@ -115,8 +113,7 @@ def _checked(source: MaskSource, name: str, images: Path, given: Path) -> Segmen
     found = source.read(name)
     height, width = found.numbers.shape
     size = image_size(images / name)
-    expected = height * size[0] / size[1]
-    if abs(width - expected) > max(1.0, _ASPECT * expected):
+    if not same_shape((width, height), size):
         raise InputError(
             f"{given} has a mask of {width}x{height} pixels for {name}, which is {size[0]}x{size[1]}; make masks of "
             "the capture's photos."
@@ -208,7 +205,7 @@ def _drawn(
     association: Association | None,
     seen: dict[str, Seen],
     reporter: StoppingReporter,
-) -> Any:
+) -> Iterator[tuple[str, np.ndarray]]:
     """Yield the name and the mask of each photo."""
     for done, (name, own) in enumerate(segments.items(), 1):
         if association is None:
@@ -233,33 +230,23 @@ def _record(source: MaskSource, given: Path, found: _Found, association: Associa
     }
 
 
-def _write(capture: Path, given: Path, drawn: Any, found: _Found, record: dict[str, Any]) -> None:
+def _write(
+    capture: Path, given: Path, drawn: Iterable[tuple[str, np.ndarray]], found: _Found, record: dict[str, Any]
+) -> None:
     """Write the masks, which replace those of an earlier run when they are complete, and labels.json."""
-    folder, part = capture / "masks", capture / f"{PART_PREFIX}masks{PART_SUFFIX}"
-    photos = Photos(capture).folder
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir()
-    try:
+    photos, is_kept = Photos(capture).folder, given.resolve() == (capture / "masks").resolve()
+    if is_kept:
+        record["source"] = str(_kept(capture).resolve())
+    with new_masks(capture, _kept(capture) if is_kept else None) as folder:
         pictures: list[tuple[str, np.ndarray]] = []
         every = max(len(found.ids) // _PICTURES, 1)
         for number, (name, mask) in enumerate(drawn):
-            suffix, data = encode_mask(mask)
-            path = part / (name + suffix)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
+            write_mask(folder, name, mask)
             if number % every == 0 and len(pictures) < _PICTURES:
                 pictures.append((name, _overlay(photos / name, mask)))
         sheet = contact_sheet([image for _, image in pictures], [name for name, _ in pictures])
-        sheet.save(part / OVERVIEW, quality=88)
-        if given.resolve() == folder.resolve():
-            folder.rename(_kept(capture))
-            record["source"] = str(_kept(capture).resolve())
-        elif folder.exists():
-            shutil.rmtree(folder)
-        write_json(part / RECORD, record)
-        part.rename(folder)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+        sheet.save(folder / OVERVIEW, quality=88)
+        write_json(folder / RECORD, record)
     write_json(capture / "labels.json", {str(i): name for i, name in found.names.items()})
 
 

@@ -9,13 +9,11 @@ from dataclasses import replace
 import numpy as np
 
 from ...capture import Capture, load_capture
-from ...capture.files import encode_mask
 from ...planning.decisions import Choices, decide, planned_capture
 from ...pointing.pointer import Pointer
 from ...pointing.strokes import Strokes, read_strokes
 from ...shared.errors import Cancelled, InputError
 from ...shared.events import Reporter
-from ...shared.formats.atomic import PART_PREFIX, PART_SUFFIX
 from ...shared.formats.json_file import write_json
 from ...shared.formats.points_ply import read_points
 from ...shared.reconstruction.checkpoint import PREVIOUS
@@ -30,6 +28,7 @@ from ...training.settings import Settings
 from ...training.trainer import Trainer
 from ..exported import EXPORT, export_model
 from ..folder import READ, Trained, memory_for_files, memory_for_planes, open_trained, plan_of
+from ..mask_files import new_masks, write_mask
 from ..planning import build_context, find_requested_objects
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
@@ -90,23 +89,11 @@ def _write_masks(
     reporter: StoppingReporter,
 ) -> None:
     """Write masks of the training photos, which replace those of earlier strokes when complete, and labels.json."""
-    folder = capture.folder / "masks"
-    part = capture.folder / f"{PART_PREFIX}masks{PART_SUFFIX}"
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir()
-    try:
+    with new_masks(capture.folder) as folder:
         for done, (index, mask) in enumerate(pointer.masks(ids), 1):
-            suffix, data = encode_mask(capture.photo_mask(index, mask))
-            path = part / (capture.views[index].name + suffix)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
+            write_mask(folder, capture.views[index].name, capture.photo_mask(index, mask))
             reporter.progress(done, len(capture.train_indices), what="photos")
-        shutil.copyfile(options.strokes, part / STROKES)
-        if folder.exists():
-            shutil.rmtree(folder)
-        part.rename(folder)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+        shutil.copyfile(options.strokes, folder / STROKES)
     names = {str(i): strokes.names.get(i) or default_name(i) for i in np.unique(ids).tolist() if i}
     write_json(capture.folder / "labels.json", names)
 

@@ -1,0 +1,43 @@
+"""The masks/ of a capture, written as a whole."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from ..capture.files import encode_mask
+from ..shared.formats.atomic import PART_PREFIX, PART_SUFFIX
+
+
+@contextmanager
+def new_masks(capture: Path, kept: Path | None = None) -> Iterator[Path]:
+    """Yield an empty folder that becomes the masks/ of a capture when the body is done; on errors, nothing changes.
+
+    Args:
+        capture: the capture's folder.
+        kept: where masks/ is moved to that was there before; None: it is deleted.
+    """
+    folder, part = capture / "masks", capture / f"{PART_PREFIX}masks{PART_SUFFIX}"
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir()
+    try:
+        yield part
+        if kept is not None:
+            folder.rename(kept)
+        elif folder.exists():
+            shutil.rmtree(folder)
+        part.rename(folder)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def write_mask(folder: Path, name: str, mask: np.ndarray) -> None:
+    """Write the mask (h, w) of the photo `name` to a folder of masks."""
+    suffix, data = encode_mask(mask)
+    path = folder / (name + suffix)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
