@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Masks of another program in a real window: the job, and the objects that follow it by themselves."""
+
+import shutil
+
+from .test_workflow import IDLE, capture, script, wait  # noqa: F401
+
+
+def test_masks_of_a_folder_become_objects(blender, capture):  # noqa: F811
+    plain, given, folder = (blender.folder / name for name in ("plain", "given-masks", "plain-splats"))
+    shutil.copytree(capture, plain, ignore=shutil.ignore_patterns("masks", "labels.json", "truth"))
+    shutil.copytree(capture / "masks", given)
+    blender.run(
+        script(f"""
+        with bpy.context.temp_override(**window_context()):
+            result = list(bpy.ops.objectgs.import_capture(
+                "EXEC_DEFAULT", directory={str(plain)!r}, folder={str(folder)!r}))
+    """)
+    )
+    blender.run("window_context()['area'].spaces.active.show_region_ui = True")
+    wait(blender, f"owner.objectgs.active is not None and {IDLE}")
+    blender.run("""
+        for region in window_context()["area"].regions:
+            if region.type == "UI":
+                region.active_panel_category = "ObjectGS"
+    """)
+    blender.run(
+        script(f"""
+        with bpy.context.temp_override(**window_context()):
+            result = list(bpy.ops.objectgs.import_masks("EXEC_DEFAULT", filepath={str(given)!r}))
+    """)
+    )
+    wait(blender, f"len(root.objectgs.objects) > 4 and {IDLE}", 120)
+    blender.shot("masks-imported")
+    assert (plain / "masks" / "masks.json").is_file()
