@@ -1,7 +1,7 @@
 """Objects from strokes: held-out mIoU over the number of photos with strokes, with the true masks as the user.
 
     python benchmarks/pointing.py [--photos 1 2 3] [--minutes 2.4] [--seeds 1] [--capture NAME ...]
-    python benchmarks/pointing.py --write [--proposals]
+    python benchmarks/pointing.py --write [--proposals [--capture NAME ...]]
 
 Captures are the demo (`make demo`), and the real tabletop of ../shared/data if it is there. Each is trained without its
 masks. In each of the photos, one stroke then marks each object that shows there: along the row through the middle of
@@ -211,7 +211,9 @@ def main() -> None:
     options = parser.parse_args()
     options.photos = [] if options.proposals else options.photos
     seeds = 2 if options.write else options.seeds
-    folders = {name: CAPTURES[name] for name in (CAPTURES if options.write else options.capture)}
+    folders = {
+        name: CAPTURES[name] for name in (CAPTURES if options.write and not options.proposals else options.capture)
+    }
     folders = {name: folder for name, folder in folders.items() if folder.is_dir()}
     shared.compile_everything()
     results = shared.Results(
@@ -233,8 +235,8 @@ def main() -> None:
     if options.write:
         if options.proposals:
             for name, rows in documents.load("pointing")["captures"].items():
-                for new, kept in zip(found["captures"].get(name, ()), rows, strict=True):
-                    new.update({key: row for key, row in kept.items() if key not in ("0", "proposed")})
+                for new, kept in zip(found["captures"].setdefault(name, [{} for _ in rows]), rows, strict=True):
+                    new.update({key: row for key, row in kept.items() if key not in new})
         documents.save("pointing", found)
     print(document(found))
 
