@@ -28,8 +28,11 @@ _WORTH = 0.98
 """Median residual with a further term of distortion, relative to that without, below which it is used."""
 _FARTHEST = (10.0, 6.0, 5.0)
 """Distances of observations, relative to the median, above which they are removed, one adjustment after another."""
-_TYPICAL, _FINEST = 2.0, 0.05
+_SPREAD, _FINEST = 2.0, 0.05
 """Scale of the loss relative to the median distance, and its least value in pixels."""
+_SETTLED = 1e-5
+"""Relative decrease of the loss in a step below which an adjustment ends. Without such a limit it goes on for a
+hundred steps, which move poses by less than a hundredth of their errors."""
 _BLOCK = 64
 """Number of pairs after which matches are written to the database."""
 _ERRORS = 2
@@ -107,40 +110,45 @@ def refine(model: str, out: str) -> None:
             values = [*camera.params[:3], *([camera.params[3], 0.0] if len(camera.params) == 4 else [0.0, 0.0])]
             camera.model = getattr(pycolmap.CameraModelId, kind)
             camera.params = values[: {"SIMPLE_PINHOLE": 3, "SIMPLE_RADIAL": 4, "RADIAL": 5}[kind]]
-        reached = adjust(found)
+        adjust(found)
+        reached = _typical(residuals(found))
         if chosen is None or reached < _WORTH * error:
             chosen, error = found, reached
     assert chosen is not None
+    remove_outliers(chosen)
     chosen.write(out)
 
 
-def adjust(model: pycolmap.Reconstruction) -> float:
-    """Adjust a model and remove observations that are far from where it expects them, in turns.
+def remove_outliers(model: pycolmap.Reconstruction) -> None:
+    """Remove observations that are far from where an adjusted model expects them, and adjust it again, in turns.
 
     Matches that are wrong by a few pixels, at edges of objects or on repeated textures, pass COLMAP's filter of 4
-    pixels and move poses by several times the error of the others. The loss is Cauchy's, which hardly counts them.
-
-    Returns:
-        The median distance in pixels of the observations that were there at first.
+    pixels and move poses by several times the error of the others.
     """
-    observed = residuals(model)
-    for most in (None, *_FARTHEST):
-        typical = float(np.median([distance for distance, _, _ in observed]))
-        if most is not None:
-            for distance, image, index in observed:
-                # Of a point with two observations, the first that goes takes the other with it.
-                if distance > most * typical and model.image(image).points2D[index].has_point3D():
-                    model.delete_observation(image, index)
-        options = pycolmap.BundleAdjustmentOptions()
-        options.refine_principal_point = options.ceres.use_gpu = options.print_summary = False
-        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        options.ceres.loss_function_scale = max(_TYPICAL * typical, _FINEST)
-        pycolmap.bundle_adjustment(model, options)
+    for most in _FARTHEST:
         observed = residuals(model)
-        if most is None:
-            first = float(np.median([distance for distance, _, _ in observed]))
+        typical = _typical(observed)
+        for distance, image, index in observed:
+            # Of a point with two observations, the first that goes takes the other with it.
+            if distance > most * typical and model.image(image).points2D[index].has_point3D():
+                model.delete_observation(image, index)
+        adjust(model)
     model.update_point_3d_errors()
-    return first
+
+
+def adjust(model: pycolmap.Reconstruction) -> None:
+    """Adjust poses, points and lenses, under Cauchy's loss, which hardly counts wrong matches."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_principal_point = options.ceres.use_gpu = options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = max(_SPREAD * _typical(residuals(model)), _FINEST)
+    options.ceres.solver_options.function_tolerance = _SETTLED
+    pycolmap.bundle_adjustment(model, options)
+
+
+def _typical(observed: list[tuple[float, int, int]]) -> float:
+    """Return the median distance of observations."""
+    return float(np.median([distance for distance, _, _ in observed]))
 
 
 def residuals(model: pycolmap.Reconstruction) -> list[tuple[float, int, int]]:
