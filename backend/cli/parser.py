@@ -91,9 +91,9 @@ def _add_capture_commands(commands: _Commands) -> None:
         help="which photos share a camera and its focal length: auto, by size and EXIF; one, all; each, none (auto)",
     )  # fmt: skip
     poses.add_argument(
-        "--features", choices=("all", "objects"), default="all",
-        help="where features are: all, everywhere; objects, on the objects of the masks, which may turn before a "
-        "background at rest (all)",
+        "--features", choices=("auto", "objects"), default="auto",
+        help="where features are: auto, everywhere, unless the background stands still while the objects turn; "
+        "objects, on the objects of the masks (auto)",
     )  # fmt: skip
     poses.add_argument(
         "--frames", type=types.count, metavar="N", help="number of frames of each video (by how far the picture moves)"

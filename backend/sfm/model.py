@@ -71,8 +71,8 @@ def drop_untrusted(candidate: Candidate) -> list[str]:
     return names
 
 
-def require_parallax(model: pycolmap.Reconstruction, photos: Path, masks: Path) -> None:
-    """Raise InputError if the photos of a model, which may have masks, were taken from one spot."""
+def require_parallax(model: pycolmap.Reconstruction, photos: Path) -> None:
+    """Raise InputError if the photos of a model were taken from one spot."""
     centers = {number: model.image(number).projection_center() for number in model.reg_image_ids()}
     angles = []
     for point in model.points3D.values():
@@ -81,17 +81,22 @@ def require_parallax(model: pycolmap.Reconstruction, photos: Path, masks: Path) 
         rays = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
         angles.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0))) if len(rays) else 0.0)
     if not angles or float(np.median(angles)) < _LEAST_ANGLE:
-        raise InputError(one_spot(photos, masks))
+        raise InputError(one_spot(photos))
 
 
-def one_spot(photos: Path, masks: Path) -> str:
-    """Return the sentence about photos without parallax, which may have masks."""
-    turntable = (
-        "use --features objects" if masks.is_dir() else "add masks of them and use --features objects, or a plain wall"
-    )
+def one_spot(photos: Path) -> str:
+    """Return the sentence about photos without parallax."""
     return (
         f"The photos in {photos} were taken from one spot, so they show no depth; take them from different places, a "
-        f"step apart. If the objects turned before a background at rest, {turntable}."
+        "step apart."
+    )
+
+
+def still_background(photos: Path) -> str:
+    """Return the sentence about objects that turn before a background at rest."""
+    return (
+        f"The background in the photos in {photos} stands still, so they do not tell from where the objects are seen; "
+        "if these turned, add masks of them as IDs in masks/, or put them before a plain wall; else move the camera."
     )
 
 

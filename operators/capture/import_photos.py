@@ -50,8 +50,8 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
         name="Features",
         description="Where the photos are compared",
         items=[
-            ("all", "Everywhere", "In the whole photos"),
-            ("objects", "On Objects", "On the objects of the masks alone, which turn before a background at rest"),
+            ("auto", "Automatic", "In the whole photos, unless the background stands still while the objects turn"),
+            ("objects", "On Objects", "On the objects of the masks alone"),
         ],
     )
     frames: IntProperty(

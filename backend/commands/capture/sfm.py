@@ -13,6 +13,7 @@ import pycolmap
 from ...capture import load_capture
 from ...sfm import database, model
 from ...sfm.agreement import measure_agreement
+from ...sfm.background import stands_still
 from ...sfm.check import figures_of, weak_photos, write_picture
 from ...sfm.pairs import choose_pairs
 from ...sfm.sources.photos import IMAGES, MASKS, Photo, take_photos, write_object_masks
@@ -86,8 +87,6 @@ def _run(sources: list[Path], capture: Path, options: argparse.Namespace, report
     started = time.monotonic()
     work = capture / WORK
     images, log = capture / IMAGES, work / "colmap.log"
-    on_objects = options.features == "objects"
-    path = work / (OBJECTS_DATABASE if on_objects else database.NAME)
     reporter.expect({
         "photos": ("Photos", 2.0), "extract": ("Features", 30.0), "pairs": ("Pairs", 0.1), "match": ("Matching", 30.0),
         "global": ("Poses", 10.0), "incremental": ("Poses", 5.0), "refine": ("Poses", 2.0), "dense": ("Points", 10.0),
@@ -108,27 +107,10 @@ def _run(sources: list[Path], capture: Path, options: argparse.Namespace, report
         "refine": ("Poses", 0.2 * _MAP * count), "dense": ("Points", _DENSE * count),
     })  # fmt: skip
 
-    groups, listed_names = work / "groups.json", work / "names.json"
-    write_json(groups, _groups(photos, options.cameras))
+    write_json(work / "groups.json", _groups(photos, options.cameras))
+    listed_names = work / "names.json"
     write_json(listed_names, names)
-    reporter.begin("extract", f"Finding features in {count} photos")
-    arguments = ["extract", str(path), str(images), str(groups)]
-    if on_objects:
-        write_object_masks(capture, names, work / "masks")
-        arguments.append(str(work / "masks"))
-    if not run_stage(reporter, log, arguments, lambda _: database.count_features(path), count):
-        raise InputError(f"COLMAP could not find features in the photos; see {log}.")
-    reporter.begin("pairs", "Comparing the photos")
-    pairs = choose_pairs(path, names, in_order, reporter.progress)
-    listed = work / "pairs.txt"
-    if pairs is not None:
-        write_atomic(listed, "".join(f"{first} {second}\n" for first, second in pairs).encode())
-    total = count * (count - 1) // 2 if pairs is None else len(pairs)
-    arguments = ["match", str(path), *([] if pairs is None else [str(listed)])]
-    reporter.begin("match", f"Matching {total:,} pairs of photos")
-    if not run_stage(reporter, log, arguments, lambda _: database.count_pairs(path), total):
-        raise InputError(f"COLMAP could not match the photos; see {log}.")
-    _require_matches(path, source, capture)
+    path = _match(source, capture, names, in_order, options.features == "objects", reporter)
 
     candidates: list[model.Candidate] = []
     for mapper in ("global", "incremental"):
@@ -150,7 +132,7 @@ def _run(sources: list[Path], capture: Path, options: argparse.Namespace, report
             "with enough detail; take more photos, each overlapping the one before by two thirds."
         )
     wrong = model.drop_untrusted(best)
-    model.require_parallax(best.model, source, capture / MASKS)
+    model.require_parallax(best.model, source)
     best = best._replace(model=_refined(best.model, work, log, reporter))
     best = best._replace(agreement=measure_agreement(best.model, path))
     figures = figures_of(best.model, best.agreement)
@@ -176,6 +158,42 @@ def _run(sources: list[Path], capture: Path, options: argparse.Namespace, report
     }
     write_json(work / REPORT, report)
     _tell(report, capture, reporter)
+
+
+def _match(
+    source: Path, capture: Path, names: list[str], in_order: bool, on_objects: bool, reporter: StoppingReporter
+) -> Path:
+    """Find features of the photos and match them; return the database.
+
+    Where the background stands still while the objects turn, only features on objects are used, if there are masks.
+    """
+    work, count = capture / WORK, len(names)
+    log = work / "colmap.log"
+    path = work / (OBJECTS_DATABASE if on_objects else database.NAME)
+    reporter.begin("extract", f"Finding features in {count} photos")
+    arguments = ["extract", str(path), str(capture / IMAGES), str(work / "groups.json")]
+    if on_objects:
+        write_object_masks(capture, names, work / "masks")
+        arguments.append(str(work / "masks"))
+    if not run_stage(reporter, log, arguments, lambda _: database.count_features(path), count):
+        raise InputError(f"COLMAP could not find features in the photos; see {log}.")
+    reporter.begin("pairs", "Comparing the photos")
+    pairs = choose_pairs(path, names, in_order, reporter.progress)
+    listed = work / "pairs.txt"
+    if pairs is not None:
+        write_atomic(listed, "".join(f"{first} {second}\n" for first, second in pairs).encode())
+    total = count * (count - 1) // 2 if pairs is None else len(pairs)
+    arguments = ["match", str(path), *([] if pairs is None else [str(listed)])]
+    reporter.begin("match", f"Matching {total:,} pairs of photos")
+    if not run_stage(reporter, log, arguments, lambda _: database.count_pairs(path), total):
+        raise InputError(f"COLMAP could not match the photos; see {log}.")
+    if not on_objects and stands_still(path):
+        if not (capture / MASKS).is_dir():
+            raise InputError(model.still_background(source))
+        reporter.warning("The background stands still while the objects turn: only features on objects are used.")
+        return _match(source, capture, names, in_order, True, reporter)
+    _require_matches(path, source)
+    return path
 
 
 def _refined(
@@ -216,7 +234,7 @@ def _groups(photos: list[Photo], cameras: str) -> list[list[str]]:
     return list(groups.values())
 
 
-def _require_matches(path: Path, source: Path, capture: Path) -> None:
+def _require_matches(path: Path, source: Path) -> None:
     """Raise InputError if no photos match, or all that do were taken from one spot."""
     pairs = database.verified_pairs(path)
     if not pairs:
@@ -229,7 +247,7 @@ def _require_matches(path: Path, source: Path, capture: Path) -> None:
         int(pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC),
     }
     if all(config in still for _, _, config, _ in pairs):
-        raise InputError(model.one_spot(source, capture / MASKS))
+        raise InputError(model.one_spot(source))
 
 
 def _tell(report: dict[str, Any], capture: Path, reporter: StoppingReporter) -> None:

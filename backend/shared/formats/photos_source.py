@@ -39,14 +39,14 @@ class PhotosSource:
         cameras: which photos share a camera.
         frames: wanted number of frames of each video, or None.
         leave_out: names of photos that are not used.
-        features: where features are found, "all" or "objects".
+        features: where features are found, "auto" or "objects".
     """
 
     photos: list[Path]
     cameras: str = "auto"
     frames: int | None = None
     leave_out: list[str] = field(default_factory=list)
-    features: str = "all"
+    features: str = "auto"
 
 
 def write_source(capture: Path, source: PhotosSource) -> None:
@@ -73,7 +73,7 @@ def read_source(capture: Path) -> PhotosSource | None:
             str(stored.get("cameras", "auto")),
             None if frames is None else int(frames),
             [str(name) for name in stored.get("leave_out", [])],
-            str(stored.get("features", "all")),
+            "objects" if stored.get("features") == "objects" else "auto",
         )
     except (InputError, AttributeError, KeyError, TypeError, ValueError):
         return None
