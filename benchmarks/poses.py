@@ -229,7 +229,7 @@ def ours(case: Case) -> dict[str, Any]:
         stages[current] += time.monotonic() - since
         row = {"seconds": time.monotonic() - started, "stages": stages}
         if code:
-            return {**row, "refused": str(last.get("message", "")), "registered": 0}
+            return {**row, "refused": str(last.get("message", "")).replace(f"{ROOT}/", ""), "registered": 0}
         report = json.loads((out / "sfm" / "sfm.json").read_text())
         found = model_poses(out / "sparse" / "0")
         return {

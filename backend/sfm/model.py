@@ -100,17 +100,26 @@ def still_background(photos: Path) -> str:
     )
 
 
-def to_common_size(model: pycolmap.Reconstruction) -> None:
-    """Scale a model, which has no size of its own, so that points are `DISTANCE` from their cameras in the median."""
+def centers_of(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
+    """Return the centers (3,) of the posed cameras by name of the photo."""
+    images = (model.image(number) for number in model.reg_image_ids())
+    return {image.name: image.projection_center() for image in images}
+
+
+def common_size(model: pycolmap.Reconstruction) -> float:
+    """Return the factor that puts points `DISTANCE` from their cameras in the median, for models of unknown size."""
     distances = [
         np.linalg.norm(model.points3D[point.point3D_id].xyz - image.projection_center())
         for image in (model.image(number) for number in model.reg_image_ids())
         for point in image.get_observation_points2D()
     ]
-    middle = float(np.median(distances)) if distances else 1.0
-    if middle > 0:
-        scaled = np.column_stack([np.eye(3) * (DISTANCE / middle), np.zeros(3)])
-        model.transform(pycolmap.Sim3d(scaled))
+    middle = float(np.median(distances)) if distances else 0.0
+    return DISTANCE / middle if middle > 0 else 1.0
+
+
+def scale(model: pycolmap.Reconstruction, factor: float) -> None:
+    """Scale a model about its origin."""
+    model.transform(pycolmap.Sim3d(np.column_stack([np.eye(3) * factor, np.zeros(3)])))
 
 
 def add_points(model: pycolmap.Reconstruction, xyz: np.ndarray, rgb: np.ndarray) -> None:

@@ -15,6 +15,7 @@ from ...sfm import database, model
 from ...sfm.agreement import measure_agreement
 from ...sfm.background import stands_still
 from ...sfm.check import figures_of, weak_photos, write_picture
+from ...sfm.location import meters_per_unit, positions_in_meters
 from ...sfm.pairs import choose_pairs
 from ...sfm.sources.photos import IMAGES, MASKS, Photo, take_photos, write_object_masks
 from ...sfm.stages import run_stage
@@ -137,7 +138,8 @@ def _run(sources: list[Path], capture: Path, options: argparse.Namespace, report
     best = best._replace(agreement=measure_agreement(best.model, path))
     figures = figures_of(best.model, best.agreement)
     weak = weak_photos(figures)
-    model.to_common_size(best.model)
+    by_gps = meters_per_unit(model.centers_of(best.model), positions_in_meters(images, figures))
+    model.scale(best.model, by_gps or model.common_size(best.model))
     model.write_model(best.model, capture)
     _densify(best.model, capture, reporter)
     write_picture(work / PICTURE, best.model, figures, path, list(weak))
@@ -151,6 +153,7 @@ def _run(sources: list[Path], capture: Path, options: argparse.Namespace, report
         "mapper": best.mapper,
         "cameras": best.model.num_cameras(),
         "separate_sets": best.others,
+        "size_by_gps": by_gps is not None,
         "figures": {name: own._asdict() for name, own in figures.items()},
         "weak": weak,
         "left_out": left_out,
@@ -269,7 +272,8 @@ def _tell(report: dict[str, Any], capture: Path, reporter: StoppingReporter) -> 
         )
     reporter.done(
         message="{registered} of {photos} photos have a pose, with {points:,} points and a mean reprojection error of "
-        "{reprojection_error:.2f} pixels.".format(**report),
+        "{reprojection_error:.2f} pixels.".format(**report)
+        + (" The scene has its true size, by GPS." if report["size_by_gps"] else ""),
         capture=str(capture),
         picture=str(capture / WORK / PICTURE),
         weak=list(weak),

@@ -9,6 +9,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pillow_heif
 from PIL import ExifTags, ImageCms, ImageOps
 from PIL import Image as PilImage
@@ -53,6 +54,28 @@ def camera_of(path: Path, turned: bool) -> str:
     details = exif.get_ifd(ExifTags.IFD.Exif)
     maker = [str(exif.get(tag, "")).strip("\0 ") for tag in (ExifTags.Base.Make, ExifTags.Base.Model)]
     return " ".join([f"{size[0]}x{size[1]}", *maker, str(details.get(ExifTags.Base.FocalLength, ""))])
+
+
+def gps_position(path: Path) -> tuple[float, float, float] | None:
+    """Return latitude and longitude in degrees and altitude in meters (0 if unknown) by EXIF; None without them."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with PilImage.open(path) as image:
+                tags = image.getexif().get_ifd(ExifTags.IFD.GPSInfo)
+        angles = []
+        for tag, reference, negative in (
+            (ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLatitudeRef, "S"),
+            (ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSLongitudeRef, "W"),
+        ):
+            degrees, minutes, seconds = (float(part) for part in tags[tag])
+            angle = degrees + minutes / 60 + seconds / 3600
+            angles.append(-angle if str(tags.get(reference, "")).strip("\0 ") == negative else angle)
+        altitude = float(tags.get(ExifTags.GPS.GPSAltitude, 0.0))
+    except (OSError, KeyError, TypeError, ValueError, ZeroDivisionError):
+        return None
+    position = (*angles, altitude)
+    return position if np.isfinite(position).all() and position[:2] != (0.0, 0.0) else None
 
 
 def copy_photo(path: Path, target: Path, turn: bool) -> Path:
