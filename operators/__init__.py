@@ -17,11 +17,11 @@ def _classes() -> list[type]:
         import_capture,
         import_masks,
         import_photos,
-        leave_out_photos,
         make_demo,
         open_reconstruction,
         orient,
         override_decision,
+        recompute_poses,
     )
     from .film import cameras, film_frames, set_up_compositor, set_up_render
     from .marking import mark_object, marked_objects
@@ -56,7 +56,7 @@ def _classes() -> list[type]:
         import_capture,
         import_photos,
         import_masks,
-        leave_out_photos,
+        recompute_poses,
         make_demo,
         assign_objects,
         analyze_capture,

@@ -101,6 +101,10 @@ def _add_capture_commands(commands: _Commands) -> None:
     poses.add_argument(
         "--leave-out", nargs="+", default=[], metavar="NAME", help="photos to leave out, named as in images/"
     )
+    poses.add_argument(
+        "--set", type=types.count, default=1, metavar="N",
+        help="which set of photos to use if nothing connects several: 1, the largest; 2, the next (1)",
+    )  # fmt: skip
     masks = commands.add(
         "masks", "Make masks of those of another program", texts.MASKS, "garden segmentation/annotations.json"
     )

@@ -29,26 +29,35 @@ class Candidate(NamedTuple):
         mapper: "global" or "incremental".
         model: the cameras, poses and points.
         agreement: how it agrees with the matches.
-        others: numbers of photos of the mapper's other, separate models.
+        sets: numbers of trusted photos of all the mapper's models, which are separate, the largest first.
     """
 
     mapper: str
     model: pycolmap.Reconstruction
     agreement: Agreement
-    others: list[int]
+    sets: list[int]
 
 
-def read_candidate(mapper: str, folder: Path, path: Path) -> Candidate | None:
-    """Return the largest model that a mapper wrote to the subfolders of `folder`, or None without any."""
+def read_candidate(mapper: str, folder: Path, path: Path, number: int) -> Candidate | None:
+    """Return the model with most trusted photos that a mapper wrote to the subfolders of `folder`, or one after it.
+
+    Args:
+        mapper: its name.
+        folder: contains a folder for each model.
+        path: the database with the matches.
+        number: 1 for the largest model, 2 for the next, and so on.
+
+    Returns:
+        The model, or None if there are fewer.
+    """
     models = []
     for each in sorted(folder.iterdir()) if folder.is_dir() else ():
         if (each / "images.bin").exists():
             models.append(pycolmap.Reconstruction(each))
     measured = [(model, measure_agreement(model, path)) for model in models if model.num_reg_images() > 1]
-    if not measured:
-        return None
     measured.sort(key=lambda found: (len(found[1].trusted), found[0].num_points3D()), reverse=True)
-    return Candidate(mapper, *measured[0], [len(agreement.trusted) for _, agreement in measured[1:]])
+    sets = [len(agreement.trusted) for _, agreement in measured]
+    return Candidate(mapper, *measured[number - 1], sets) if number <= len(measured) else None
 
 
 def best_of(candidates: Iterable[Candidate]) -> Candidate | None:

@@ -132,8 +132,8 @@ def backend_job(title: str, kind: str, folder: Path | None, *arguments: str) -> 
     )
 
 
-def sfm_job(capture: Path, source: PhotosSource, leave_out: Sequence[str] = ()) -> Job:
-    """Return a job that computes the poses of photos, without those to leave out, and writes a capture."""
+def sfm_job(capture: Path, source: PhotosSource) -> Job:
+    """Return a job that computes the poses of photos, and writes a capture."""
     return backend_job(
         f"Photos of {name_of_photos(source.photos)}",
         "sfm",
@@ -147,7 +147,8 @@ def sfm_job(capture: Path, source: PhotosSource, leave_out: Sequence[str] = ()) 
         "--features",
         source.features,
         *(["--frames", str(source.frames)] if source.frames else []),
-        *(["--leave-out", *leave_out] if leave_out else []),
+        *(["--set", str(source.set)] if source.set > 1 else []),
+        *(["--leave-out", *source.leave_out] if source.leave_out else []),
     )
 
 

@@ -251,19 +251,18 @@ def _import_made(job: Job, owner: bpy.types.Scene | None) -> bool:
 
 
 def _show_poses(job: Job) -> None:
-    """Show how many photos have a pose, with a button to leave out those whose poses are weak."""
+    """Show how many photos have a pose, with a button to use another set of them, or to leave out the weak ones."""
     text = " ".join([f"{job.title}: {job.message}", *job.warnings[:_SHOWN_WARNINGS]])
-    weak = job.result.get("weak")
-    if not (isinstance(weak, list) and weak):
+    weak, sets, number = (job.result.get(key) for key in ("weak", "separate_sets", "set"))
+    again = {"operator": "objectgs.recompute_poses", "capture": str(job.folder)}
+    if isinstance(sets, list) and len(sets) > 1 and isinstance(number, int):
+        following = number % len(sets) + 1
+        messages.show(text, label=f"Use Set {following} ({sets[following - 1]} Photos)", photo_set=following, **again)
+    elif isinstance(weak, list) and weak:
+        label = f"Leave Out {len(weak)} Weak Photo{'s' if len(weak) > 1 else ''}"
+        messages.show(text, label=label, leave_out=json.dumps(weak), **again)
+    else:
         messages.show(text)
-        return
-    messages.show(
-        text,
-        operator="objectgs.leave_out_photos",
-        label=f"Leave Out {len(weak)} Weak Photo{'s' if len(weak) > 1 else ''}",
-        capture=str(job.folder),
-        names=json.dumps(weak),
-    )
 
 
 def _assign_objects(job: Job, owner: bpy.types.Scene) -> None:

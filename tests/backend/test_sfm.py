@@ -295,6 +295,27 @@ def test_objects_that_turn_before_a_background_at_rest(photos, tmp_path, run_com
     assert database.count_features(path) == VIEWS, "only features on objects are used"
 
 
+def test_separate_sets_of_photos(photos, tmp_path, run_command):
+    """Five photos of another room have nothing in common with the seven of the first; each set can be used."""
+    folder = shutil.copytree(photos / "images", tmp_path / "rooms")
+    for number, matrix in enumerate(ring()[:5]):
+        Image.fromarray(photo(matrix, seed=100)).save(folder / f"other {number}.png")
+    capture = tmp_path / "capture"
+    result = run_command("sfm", folder, "--out", capture)
+    assert result.code == EXIT_DONE and "2 separate sets, of 7, 5 photos; set 1 is used" in result.out + result.err
+    assert len(posed_photos(capture)) == VIEWS
+    assert run_command("sfm", folder, "--out", capture, "--set", "2").code == EXIT_DONE
+    assert posed_photos(capture) == {f"other {number}.png" for number in range(5)}
+    result = run_command("sfm", folder, "--out", capture, "--set", "3")
+    assert result.code == EXIT_BAD_INPUT and "fewer than 3 separate sets" in result.err
+    assert len(posed_photos(capture)) == 5, "what was there is kept"
+
+
+def posed_photos(capture) -> set[str]:
+    model = pycolmap.Reconstruction(capture / "sparse" / "0")
+    return {model.image(number).name for number in model.reg_image_ids()}
+
+
 def test_photos_from_one_spot_are_refused(tmp_path, run_command):
     targets = [(0.1 + 0.12 * step, 0.05 * step, 0.3) for step in range(6)]
     write_photos(tmp_path / "spot", [pose((2.0, -0.8, 1.2), target) for target in targets])

@@ -60,26 +60,50 @@ def test_same_sources_continue_in_their_capture(submitted, tmp_path):
     assert submitted[0].folder == first and "--frames" not in submitted[0].command
 
 
-def test_weak_photos_are_left_out(submitted, tmp_path):
+@pytest.fixture
+def shown(monkeypatch):
+    """Options of the messages that are shown."""
+    found = []
+    monkeypatch.setattr(background.messages, "show", lambda _text, **options: found.append(options))
+    return found
+
+
+def test_weak_photos_are_left_out(submitted, shown, tmp_path):
     """The button of the message computes the poses again, also without those that were left out before."""
     capture = tmp_path / "capture"
     (capture / "sfm").mkdir(parents=True)
-    write_source(capture, PhotosSource([tmp_path / "trip"], "one", 12, ["1.jpg"], "objects"))
+    write_source(capture, PhotosSource([tmp_path / "trip"], "one", 12, ["1.jpg"], "objects", 3))
     job = locations.sfm_job(capture, PhotosSource([tmp_path / "trip"]))
-    job.result = {"weak": ["a b.jpg", "2.jpg"]}
-    shown = []
-    background.messages.show, before = lambda text, **options: shown.append(options), background.messages.show
+    job.result = {"weak": ["a b.jpg", "2.jpg"], "separate_sets": [], "set": 1}
     background._show_poses(job)
-    background.messages.show = before
     (options,) = shown
-    assert options.pop("label") == "Leave Out 2 Weak Photos" and options.pop("operator") == "objectgs.leave_out_photos"
-    bpy.ops.objectgs.leave_out_photos("EXEC_DEFAULT", **options)
+    assert options.pop("label") == "Leave Out 2 Weak Photos" and options.pop("operator") == "objectgs.recompute_poses"
+    bpy.ops.objectgs.recompute_poses("EXEC_DEFAULT", **options)
     command = submitted[0].command
     assert command[command.index("--leave-out") + 1 :][:3] == ["1.jpg", "a b.jpg", "2.jpg"]
     assert command[command.index("--cameras") + 1] == "one" and command[command.index("--frames") + 1] == "12"
-    assert command[command.index("--features") + 1] == "objects"
+    assert command[command.index("--features") + 1] == "objects" and command[command.index("--set") + 1] == "3"
     with pytest.raises(RuntimeError, match="was not made by Import Photos"):
-        bpy.ops.objectgs.leave_out_photos("EXEC_DEFAULT", capture=str(tmp_path), names="[]")
+        bpy.ops.objectgs.recompute_poses("EXEC_DEFAULT", capture=str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("used", "label", "number"), [(1, "Use Set 2 (12 Photos)", "2"), (2, "Use Set 1 (40 Photos)", "")]
+)
+def test_another_set_of_photos_is_used(submitted, shown, tmp_path, used, label, number):
+    """Separate sets are offered one after another, before weak photos."""
+    capture = tmp_path / "capture"
+    (capture / "sfm").mkdir(parents=True)
+    write_source(capture, PhotosSource([tmp_path / "trip"], set=used))
+    job = locations.sfm_job(capture, PhotosSource([tmp_path / "trip"]))
+    job.result = {"weak": ["2.jpg"], "separate_sets": [40, 12], "set": used}
+    background._show_poses(job)
+    (options,) = shown
+    assert options.pop("label") == label
+    bpy.ops.objectgs.recompute_poses("EXEC_DEFAULT", **{key: options[key] for key in ("capture", "photo_set")})
+    command = submitted[0].command
+    assert "--leave-out" not in command
+    assert command[command.index("--set") + 1] == number if number else "--set" not in command
 
 
 def test_missing_folder_is_refused(submitted, tmp_path):

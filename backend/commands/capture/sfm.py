@@ -48,7 +48,10 @@ def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             make_folder(capture / WORK)
             with locked(capture / WORK):
                 write_source(
-                    capture, PhotosSource(sources, options.cameras, options.frames, options.leave_out, options.features)
+                    capture,
+                    PhotosSource(
+                        sources, options.cameras, options.frames, options.leave_out, options.features, options.set
+                    ),
                 )
                 _run(sources, capture, options, reporter)
         except InputError:
@@ -123,10 +126,12 @@ def _run(sources: list[Path], capture: Path, options: argparse.Namespace, report
         make_folder(out)
         arguments = [mapper, str(path), str(images), str(out), str(listed_names)]
         run_stage(reporter, log, arguments, lambda lines: lines, count)
-        candidate = model.read_candidate(mapper, out, path)
+        candidate = model.read_candidate(mapper, out, path, options.set)
         if candidate is not None:
             candidates.append(candidate)
     best = model.best_of(candidates)
+    if best is None and options.set > 1:
+        raise InputError(f"The photos in {source} form fewer than {options.set} separate sets; choose a smaller --set.")
     if best is None or len(best.agreement.trusted) < 2:
         raise InputError(
             f"The photos in {source} do not fit together: no two of them show the same scene from different places "
@@ -152,7 +157,8 @@ def _run(sources: list[Path], capture: Path, options: argparse.Namespace, report
         "reprojection_error": round(float(best.model.compute_mean_reprojection_error()), 4),
         "mapper": best.mapper,
         "cameras": best.model.num_cameras(),
-        "separate_sets": best.others,
+        "set": options.set,
+        "separate_sets": best.sets if len(best.sets) > 1 else [],
         "size_by_gps": by_gps is not None,
         "figures": {name: own._asdict() for name, own in figures.items()},
         "weak": weak,
@@ -264,11 +270,11 @@ def _tell(report: dict[str, Any], capture: Path, reporter: StoppingReporter) -> 
         reporter.warning(f"{name} is weak: {why}; --leave-out {name} computes the poses without it.")
     if len(weak) > _WORST:
         reporter.warning(f"{len(weak) - _WORST} more photos are weak; {path} lists them.")
-    others = report["separate_sets"]
-    if others and max(others) > 2:
+    number, sets = report["set"], report["separate_sets"]
+    if sets:
         reporter.warning(
-            f"The photos form separate sets, of {report['registered']} and {', '.join(map(str, others))} photos; the "
-            "largest is used. Photos that show both sets would connect them."
+            f"The photos form {len(sets)} separate sets, of {', '.join(map(str, sets))} photos; set {number} is used. "
+            f"Photos that show several sets would connect them; --set {number % len(sets) + 1} uses the next."
         )
     reporter.done(
         message="{registered} of {photos} photos have a pose, with {points:,} points and a mean reprojection error of "
@@ -277,5 +283,7 @@ def _tell(report: dict[str, Any], capture: Path, reporter: StoppingReporter) -> 
         capture=str(capture),
         picture=str(capture / WORK / PICTURE),
         weak=list(weak),
+        set=number,
+        separate_sets=sets,
         **{key: report[key] for key in ("photos", "registered", "points", "reprojection_error")},
     )

@@ -74,8 +74,9 @@ def gps_position(path: Path) -> tuple[float, float, float] | None:
         altitude = float(tags.get(ExifTags.GPS.GPSAltitude, 0.0))
     except (OSError, KeyError, TypeError, ValueError, ZeroDivisionError):
         return None
-    position = (*angles, altitude)
-    return position if np.isfinite(position).all() and position[:2] != (0.0, 0.0) else None
+    latitude, longitude = angles
+    is_known = bool(np.isfinite([latitude, longitude, altitude]).all()) and (latitude, longitude) != (0.0, 0.0)
+    return (latitude, longitude, altitude) if is_known else None
 
 
 def copy_photo(path: Path, target: Path, turn: bool) -> Path:

@@ -40,6 +40,7 @@ class PhotosSource:
         frames: wanted number of frames of each video, or None.
         leave_out: names of photos that are not used.
         features: where features are found, "auto" or "objects".
+        set: which of the sets of photos that nothing connects is used, 1 for the largest.
     """
 
     photos: list[Path]
@@ -47,6 +48,7 @@ class PhotosSource:
     frames: int | None = None
     leave_out: list[str] = field(default_factory=list)
     features: str = "auto"
+    set: int = 1
 
 
 def write_source(capture: Path, source: PhotosSource) -> None:
@@ -59,6 +61,7 @@ def write_source(capture: Path, source: PhotosSource) -> None:
             "frames": source.frames,
             "leave_out": source.leave_out,
             "features": source.features,
+            "set": source.set,
         },
     )
 
@@ -74,6 +77,7 @@ def read_source(capture: Path) -> PhotosSource | None:
             None if frames is None else int(frames),
             [str(name) for name in stored.get("leave_out", [])],
             "objects" if stored.get("features") == "objects" else "auto",
+            max(int(stored.get("set", 1)), 1),
         )
     except (InputError, AttributeError, KeyError, TypeError, ValueError):
         return None

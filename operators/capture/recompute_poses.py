@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Compute the poses of a capture again: without the photos whose poses are weak, or of another set of photos."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import bpy
+from bpy.props import IntProperty, StringProperty
+
+from ...backend.shared.errors import InputError
+from ...backend.shared.formats.photos_source import read_source
+from ...objectgs_addon.environment import locations
+from ...objectgs_addon.running import background
+from ..common import need
+from ..common.reporting import reports_errors
+
+
+class RecomputePoses(bpy.types.Operator):
+    bl_idname = "objectgs.recompute_poses"
+    bl_label = "Compute Poses Again"
+    bl_description = "Compute the poses of other photos of this capture. Features and matches are kept"
+    bl_options = {"REGISTER", "INTERNAL"}
+
+    capture: StringProperty(name="Capture", subtype="DIR_PATH", options={"SKIP_SAVE"})
+    leave_out: StringProperty(
+        name="Leave Out", description="Further photos to leave out, a JSON list of names", default="[]",
+        options={"SKIP_SAVE"},
+    )  # fmt: skip
+    photo_set: IntProperty(
+        name="Set", description="Set of photos to use if nothing connects several, 1 for the largest. 0: as before",
+        min=0, options={"SKIP_SAVE"},
+    )  # fmt: skip
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        return need.backend(cls)
+
+    @reports_errors
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        capture = Path(self.capture)
+        source = read_source(capture)
+        if source is None:
+            raise InputError(f"{capture} was not made by Import Photos or Video; import the photos again")
+        need.require_unused(capture)
+        source = replace(
+            source,
+            leave_out=[*source.leave_out, *json.loads(self.leave_out)],
+            set=self.photo_set or source.set,
+        )
+        return background.submit(locations.sfm_job(capture, source), context.scene, self.report)
+
+
+CLASSES = (RecomputePoses,)
