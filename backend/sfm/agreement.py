@@ -40,12 +40,11 @@ class Agreement(NamedTuple):
 def measure_agreement(model: pycolmap.Reconstruction, path: Path) -> Agreement:
     """Compare the poses of a model with the matches in the database that they were computed from.
 
-    Each pair of posed photos has verified matches, whose distances from the epipolar lines of the poses are measured
-    (Sampson's approximation).
+    Each pair of posed photos has verified matches, whose angles to the epipolar planes of the poses are measured.
     """
     posed = {number: model.image(number) for number in model.reg_image_ids()}
     fits, matches = dict.fromkeys(posed, 0), dict.fromkeys(posed, 0)
-    keypoints: dict[int, np.ndarray] = {}
+    rays: dict[int, np.ndarray] = {}
     with pycolmap.Database.open(path) as stored:
         for first, second, _, _ in database.verified_pairs(path):
             if first not in posed or second not in posed:
@@ -53,12 +52,12 @@ def measure_agreement(model: pycolmap.Reconstruction, path: Path) -> Agreement:
             inliers = stored.read_two_view_geometry(first, second).inlier_matches
             cameras = [model.camera(posed[number].camera_id) for number in (first, second)]
             for number, camera in zip((first, second), cameras, strict=True):
-                if number not in keypoints:
+                if number not in rays:
                     pixels = np.asarray(stored.read_keypoints(number), np.float64)[:, :2]
-                    keypoints[number] = np.asarray(camera.cam_from_img(pixels))
+                    rays[number] = np.asarray(camera.cam_ray_from_img(pixels))
             errors = epipolar_errors(
                 posed[first].cam_from_world().matrix(), posed[second].cam_from_world().matrix(),
-                keypoints[first][inliers[:, 0]], keypoints[second][inliers[:, 1]],
+                rays[first][inliers[:, 0]], rays[second][inliers[:, 1]],
             )  # fmt: skip
             close = errors * np.mean([camera.mean_focal_length() for camera in cameras]) < CLOSE
             for number in (first, second):
@@ -72,24 +71,22 @@ def measure_agreement(model: pycolmap.Reconstruction, path: Path) -> Agreement:
 
 
 def epipolar_errors(first: np.ndarray, second: np.ndarray, at_first: np.ndarray, at_second: np.ndarray) -> np.ndarray:
-    """Return the distances of matches from their epipolar lines, in units of the focal length.
+    """Return the angles between the rays of matches and their epipolar planes, in radians.
 
     Args:
         first: world-to-camera matrix (3, 4) of the first photo.
         second: that of the second photo.
-        at_first: (n, 2) undistorted, normalized positions in the first photo.
-        at_second: those in the second photo; NaN for positions that cannot be undistorted.
+        at_first: (n, 3) unit rays in the first camera.
+        at_second: those in the second one; NaN where a pixel has no ray.
 
     Returns:
-        (n,) distances, by Sampson's approximation; infinite where positions are NaN.
+        (n,) angles, by Sampson's approximation; infinite where rays are NaN.
     """
     rotation = second[:, :3] @ first[:, :3].T
     x, y, z = second[:, 3] - rotation @ first[:, 3]
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
-    points = np.column_stack([at_first, np.ones(len(at_first))])
-    others = np.column_stack([at_second, np.ones(len(at_second))])
-    lines, back = points @ essential.T, others @ essential
-    residual = np.abs((others * lines).sum(1))
-    gradient = np.sqrt((lines[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1))
+    normals, back = at_first @ essential.T, at_second @ essential
+    residual = np.abs((at_second * normals).sum(1))
+    gradient = np.sqrt((normals**2).sum(1) + (back**2).sum(1))
     errors = residual / np.maximum(gradient, 1e-12)
     return np.where(np.isfinite(errors), errors, np.inf)

@@ -47,6 +47,13 @@ def figures_of(model: pycolmap.Reconstruction, agreement: Agreement) -> dict[str
     return dict(sorted(found.items()))
 
 
+def mean_error(model: pycolmap.Reconstruction) -> float:
+    """Return the mean reprojection error in pixels of the points that are seen where the lens allows."""
+    found = np.array([distance for distance, _, _ in residuals(model)])
+    found = found[np.isfinite(found)]
+    return float(found.mean()) if len(found) else 0.0
+
+
 def weak_photos(figures: Mapping[str, PhotoFigures]) -> dict[str, str]:
     """Return the photos whose poses are less certain than those of the others: name -> reason, worst first."""
     typical = float(np.median([each.error for each in figures.values()])) if figures else 0.0

@@ -15,6 +15,7 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -24,8 +25,15 @@ LONGEST_SIDE = 1600
 """Side in pixels to which larger photos are scaled for the search of features."""
 MOST_FEATURES = 4096
 FEWEST_POSES = 3
+_LENSES = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+_FISHEYE_LENSES = ("SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+"""COLMAP's lenses with none, one and two terms of distortion."""
 _WORTH = 0.98
 """Median residual with a further term of distortion, relative to that without, below which it is used."""
+_WORTH_FISHEYE = 0.8
+"""Median residual of a fisheye lens, relative to that of another, below which it is used; 0.96 or more for others."""
+_SAMPLES = 64
+"""Number of pixels to which a fisheye lens is fitted."""
 _FARTHEST = (10.0, 6.0, 5.0)
 """Distances of observations, relative to the median, above which they are removed, one adjustment after another."""
 _SPREAD, _FINEST = 2.0, 0.05
@@ -99,24 +107,68 @@ def map_globally(database: str, images: str, out: str, names: str) -> None:
 
 
 def refine(model: str, out: str) -> None:
-    """Refine poses and points without wrong matches, with as many terms of radial distortion as the photos show.
+    """Refine poses and points without wrong matches, with the lens that the photos show.
 
-    A term that the photos do not determine bends the whole scene a little, and without any, photos are used unchanged.
+    That is a pinhole with as few terms of radial distortion as suffice: a term that the photos do not determine bends
+    the whole scene a little, and without any, photos are used unchanged. Mappers approximate a fisheye lens by strong
+    distortion; it is recognized where a fisheye lens with one term fits better than a pinhole with one.
     """
-    chosen, error = None, float("inf")
-    for kind in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
-        found = pycolmap.Reconstruction(model)
-        for camera in found.cameras.values():
-            values = [*camera.params[:3], *([camera.params[3], 0.0] if len(camera.params) == 4 else [0.0, 0.0])]
-            camera.model = getattr(pycolmap.CameraModelId, kind)
-            camera.params = values[: {"SIMPLE_PINHOLE": 3, "SIMPLE_RADIAL": 4, "RADIAL": 5}[kind]]
-        adjust(found)
-        reached = _typical(residuals(found))
-        if chosen is None or reached < _WORTH * error:
-            chosen, error = found, reached
-    assert chosen is not None
-    remove_outliers(chosen)
-    chosen.write(out)
+    start = pycolmap.Reconstruction(model)
+    fits = [_with_lens(start, kind, no_distortion, terms) for terms, kind in enumerate(_LENSES)]
+    distorted = fits[-1].model
+    one_term = _with_lens(distorted, _FISHEYE_LENSES[1], equidistant, 1)
+    if one_term.typical < min(_WORTH_FISHEYE * fits[1].typical, fits[-1].typical):
+        fits = [_with_lens(distorted, kind, equidistant, terms) for terms, kind in enumerate(_FISHEYE_LENSES)]
+    chosen = fits[0]
+    for fit in fits[1:]:
+        if fit.typical < _WORTH * chosen.typical:
+            chosen = fit
+    remove_outliers(chosen.model)
+    chosen.model.write(out)
+
+
+class _Fit(NamedTuple):
+    """A model that was adjusted, and the median distance of its observations in pixels."""
+
+    model: pycolmap.Reconstruction
+    typical: float
+
+
+def _with_lens(
+    model: pycolmap.Reconstruction, kind: str, first_params: Callable[[pycolmap.Camera, int], list[float]], terms: int
+) -> _Fit:
+    """Return a model with a lens of another kind, adjusted."""
+    found = pycolmap.Reconstruction(model)
+    for camera in found.cameras.values():
+        params = first_params(camera, terms)
+        camera.model, camera.params = getattr(pycolmap.CameraModelId, kind), params
+    adjust(found)
+    return _Fit(found, _typical(residuals(found)))
+
+
+def no_distortion(camera: pycolmap.Camera, terms: int) -> list[float]:
+    """Return focal length, principal point, the first term of distortion if there is one, and zeros for others."""
+    return [*camera.params, 0.0, 0.0][: 3 + terms]
+
+
+def equidistant(camera: pycolmap.Camera, terms: int) -> list[float]:
+    """Return the fisheye lens nearest to a camera with radial distortion.
+
+    A ray at the angle a to the optical axis is seen f (a + k1 a^3 + k2 a^5) from the principal point, in pixels. The
+    coefficients are fitted to pixels from there to the corner.
+
+    Args:
+        camera: whose params begin with the focal length and the principal point (2).
+        terms: number of terms k.
+    """
+    center = np.array(camera.params[1:3])
+    radii = np.linspace(0.0, np.hypot(camera.width, camera.height) / 2, _SAMPLES + 1)[1:]
+    slopes = np.asarray(camera.cam_from_img(center + radii[:, None] * [1.0, 0.0]))[:, 0]
+    is_seen = np.isfinite(slopes) & (slopes > 0)
+    angles = np.arctan(slopes[is_seen])
+    powers = angles[:, None] ** (1 + 2 * np.arange(1 + terms))
+    found = np.linalg.lstsq(powers, radii[is_seen], rcond=None)[0]
+    return [found[0], *center, *(found[1:] / found[0])]
 
 
 def remove_outliers(model: pycolmap.Reconstruction) -> None:

@@ -40,10 +40,17 @@ def pose(center, target) -> np.ndarray:
     return np.column_stack([rotation, -rotation @ center])
 
 
-def photo(matrix: np.ndarray, seed: int = 0) -> np.ndarray:
-    """Render a textured floor, two walls and two boxes as (HEIGHT, WIDTH, 3) uint8."""
+def photo(matrix: np.ndarray, seed: int = 0, fisheye: float = 0.0) -> np.ndarray:
+    """Render a textured floor, two walls and two boxes as (HEIGHT, WIDTH, 3) uint8.
+
+    Each pixel's distance from the center is `fisheye` times the angle to the axis, unless that is 0.
+    """
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    rays = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL, np.ones_like(x)], -1) @ matrix[:, :3]
+    rays = np.stack([x - WIDTH / 2, y - HEIGHT / 2, np.full_like(x, FOCAL)], -1)
+    if fisheye:
+        radii = np.linalg.norm(rays[..., :2], axis=2)
+        rays[..., 2] = radii / np.tan(radii / fisheye)
+    rays = rays @ matrix[:, :3]
     center = -matrix[:, :3].T @ matrix[:, 3]
     nearest, image = np.full(x.shape, np.inf), np.zeros((*x.shape, 3))
     planes = [(2, 0.0, None), (1, 2.5, None), (0, -2.5, None)]
@@ -316,6 +323,21 @@ def posed_photos(capture) -> set[str]:
     return {model.image(number).name for number in model.reg_image_ids()}
 
 
+def test_fisheye_lens_is_recognized(tmp_path, run_command):
+    """122 degrees wide, 160 from corner to corner."""
+    (tmp_path / "photos").mkdir()
+    for number, matrix in enumerate(ring()):
+        image = Image.fromarray(photo(matrix, fisheye=150.0))
+        image.save(tmp_path / "photos" / f"photo {number + 1}.png")
+    capture = tmp_path / "capture"
+    assert run_command("sfm", tmp_path / "photos", "--out", capture).code == EXIT_DONE
+    (camera,) = pycolmap.Reconstruction(capture / "sparse" / "0").cameras.values()
+    assert camera.model_name.endswith("FISHEYE") and camera.params[0] == pytest.approx(150.0, rel=0.01)
+    degrees, positions = pose_errors(capture, ring())
+    assert len(degrees) == VIEWS and np.median(degrees) < 0.4 and np.median(positions) < 0.003
+    assert run_command("import", capture, "--out", tmp_path / "out").code == EXIT_DONE
+
+
 def test_photos_from_one_spot_are_refused(tmp_path, run_command):
     targets = [(0.1 + 0.12 * step, 0.05 * step, 0.3) for step in range(6)]
     write_photos(tmp_path / "spot", [pose((2.0, -0.8, 1.2), target) for target in targets])
@@ -389,17 +411,19 @@ def test_wrong_pose_is_not_trusted(made, tmp_path):
     assert len(found.trusted) == VIEWS - 1
 
 
-def test_epipolar_errors_are_zero_for_exact_matches():
+def test_epipolar_errors_are_angles():
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.5, 0.5, (50, 3))
     first, second = ring()[0], ring()[3]
 
     def seen(matrix):
         local = points @ matrix[:, :3].T + matrix[:, 3]
-        return local[:, :2] / local[:, 2:]
+        return local / np.linalg.norm(local, axis=1, keepdims=True)
 
     assert agreement.epipolar_errors(first, second, seen(first), seen(second)).max() < 1e-9
     assert np.median(agreement.epipolar_errors(first, ring()[5], seen(first), seen(second))) > 0.005
+    turned = seen(second) + 0.01 * np.cross(seen(second), second[:, :3] @ first[:, :3].T @ [0.0, 0.0, 1.0])
+    assert 0 < np.median(agreement.epipolar_errors(first, second, seen(first), turned)) < 0.01, "in radians"
     assert np.isinf(agreement.epipolar_errors(first, second, seen(first)[:1] * np.nan, seen(second)[:1])).all()
 
 

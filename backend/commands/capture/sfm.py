@@ -11,10 +11,9 @@ from typing import Any
 import pycolmap
 
 from ...capture import load_capture
-from ...sfm import database, model
+from ...sfm import check, database, model
 from ...sfm.agreement import measure_agreement
 from ...sfm.background import stands_still
-from ...sfm.check import figures_of, weak_photos, write_picture
 from ...sfm.location import meters_per_unit, positions_in_meters
 from ...sfm.pairs import choose_pairs
 from ...sfm.sources.photos import IMAGES, MASKS, Photo, take_photos, write_object_masks
@@ -141,20 +140,20 @@ def _run(sources: list[Path], capture: Path, options: argparse.Namespace, report
     model.require_parallax(best.model, source)
     best = best._replace(model=_refined(best.model, work, log, reporter))
     best = best._replace(agreement=measure_agreement(best.model, path))
-    figures = figures_of(best.model, best.agreement)
-    weak = weak_photos(figures)
+    figures = check.figures_of(best.model, best.agreement)
+    weak = check.weak_photos(figures)
     by_gps = meters_per_unit(model.centers_of(best.model), positions_in_meters(images, figures))
     model.scale(best.model, by_gps or model.common_size(best.model))
     model.write_model(best.model, capture)
     _densify(best.model, capture, reporter)
-    write_picture(work / PICTURE, best.model, figures, path, list(weak))
+    check.write_picture(work / PICTURE, best.model, figures, path, list(weak))
     posed = list(figures)
     left_out = {**unreadable, **unwanted, **model.reasons(path, names, posed, wrong)}
     report = {
         "photos": len(names) + len(unreadable) + len(unwanted),
         "registered": len(posed),
         "points": best.model.num_points3D(),
-        "reprojection_error": round(float(best.model.compute_mean_reprojection_error()), 4),
+        "reprojection_error": round(check.mean_error(best.model), 4),
         "mapper": best.mapper,
         "cameras": best.model.num_cameras(),
         "set": options.set,
