@@ -54,6 +54,7 @@ from .result import Shown, result_is_newer, show_label, show_objects, show_resul
 from .shading.materials import SHADINGS
 from .shading.render_settings import is_untouched, prepare_render, render_problem, set_up_render
 from .splats import splat_keys
+from .uncertain_cameras import uncertain_cameras
 
 __all__ = [
     "SHADINGS",
@@ -128,6 +129,7 @@ __all__ = [
     "splat_keys",
     "store_placements",
     "to_stored",
+    "uncertain_cameras",
     "unobserved_splats",
     "use_camera",
     "warnings_of",

@@ -12,6 +12,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...backend.shared.errors import InputError
+from ...backend.shared.formats.photos_source import read_photo_errors
 from ...backend.shared.reconstruction.cameras import read_cameras
 from . import carrier
 from .cameras import show_cameras, use_camera
@@ -35,6 +36,7 @@ from .kinds import (
 )
 from .object_display import Objects
 from .points import read_points, show_points
+from .uncertain_cameras import mark_uncertain
 
 ORIGIN = "objectgs_origin"
 UPRIGHT = "objectgs_upright"
@@ -92,6 +94,7 @@ def show_capture(
         mark(capture, CAPTURE)
         adopt(capture, root, (CAMERA, POINTS))
     root[WARNINGS] = "\n".join(show_cameras(capture, parent, cameras))
+    mark_uncertain(capture, {} if cameras.capture is None else read_photo_errors(cameras.capture))
     show_points(capture, parent, f"{root.name} points", points, cameras.origin, objects)
 
     # Linked last, since Blender updates all view layers for each link below a scene.

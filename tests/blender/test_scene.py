@@ -132,6 +132,28 @@ def test_pixel_aspect_and_missing_photos_are_reported(fresh, folder):
     assert len(cameras_of(shown)[5].data.background_images) == 0
 
 
+def test_uncertain_cameras_are_marked(root, folder):
+    """Errors of 1 pixel are typical; twice that is a third of the way to 3, and weak photos are at the end."""
+    view_layer = bpy.context.view_layer
+    assert not list(blender_scene.uncertain_cameras(view_layer, None))
+    pixels = {"002.png": 2.0, "003.png": 4.0, "005.png": 1.4}
+    report = {
+        "figures": {f"{i:03}.png": {"error": pixels.get(f"{i:03}.png", 1.0)} for i in range(7)},
+        "weak": {"006.png": "only 30 points determine its pose"},
+    }
+    (folder / "sfm").mkdir()
+    (folder / "sfm" / "sfm.json").write_text(json.dumps(report))
+    shown = blender_scene.show_capture(bpy.context.scene, folder, root)
+    cameras = {camera.name: camera for camera in cameras_of(shown)}
+    cameras["003.png"].hide_set(True)
+    found = {camera.name: uncertainty for camera, uncertainty in blender_scene.uncertain_cameras(view_layer, None)}
+    assert found == {"002.png": pytest.approx(1 / 3), "006.png": 1.0}
+    assert "only 30 points" in cameras["006.png"]["weak_because"]
+    (folder / "sfm" / "sfm.json").write_text('{"figures": {"002.png": 3}, "weak": []}')
+    blender_scene.show_capture(bpy.context.scene, folder, root)
+    assert not list(blender_scene.uncertain_cameras(view_layer, None)), "an invalid report tells nothing"
+
+
 def test_removed_capture_cameras_are_deleted(root, folder):
     write_cameras(folder, [look_at((3, 0, 1)), look_at((0, 3, 1))])
     before = len(bpy.data.cameras)

@@ -21,12 +21,12 @@ from ...sfm.stages import run_stage
 from ...shared.errors import InputError
 from ...shared.formats.atomic import make_folder, recorded, write_atomic
 from ...shared.formats.json_file import write_json
-from ...shared.formats.photos_source import PHOTOS, VIDEOS, WORK, PhotosSource, write_source
+from ...shared.formats.photos_source import PHOTOS, REPORT, VIDEOS, WORK, PhotosSource, write_source
 from ...shared.reconstruction.lock import locked
 from ...shared.stopping import StoppingReporter
 from ...stereo.dense_points import find_dense_points
 
-REPORT, PICTURE = "sfm.json", "sfm.png"
+PICTURE = "sfm.png"
 OBJECTS_DATABASE = "objects.db"
 """Database in sfm/ with the features on objects alone."""
 

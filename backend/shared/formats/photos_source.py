@@ -1,16 +1,23 @@
-"""Photos and videos: suffixes of their files, and what a capture was computed from, in its sfm/source.json."""
+"""Photos and videos: suffixes of their files; what a capture was computed from, and how certain its poses are.
+
+These are stored in its sfm/source.json and sfm/sfm.json.
+"""
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from ..errors import InputError
 from .json_file import read_json, write_json
 
 WORK = "sfm"
 """Folder in the capture for what the computation of poses keeps."""
+REPORT = "sfm.json"
+"""File there about the poses that were found."""
 _SOURCE = "source.json"
 
 # Suffixes in lower case
@@ -81,3 +88,29 @@ def read_source(capture: Path) -> PhotosSource | None:
         )
     except (InputError, AttributeError, KeyError, TypeError, ValueError):
         return None
+
+
+class PhotoError(NamedTuple):
+    """Error of a photo's pose.
+
+    Attributes:
+        pixels: median reprojection error of its points.
+        weak: why its pose is less certain than those of others, or "".
+    """
+
+    pixels: float
+    weak: str
+
+
+def read_photo_errors(capture: Path) -> dict[str, PhotoError]:
+    """Return the errors of the photos by name; {} if the capture's poses are given, or sfm/sfm.json is invalid."""
+    try:
+        report = read_json(capture / WORK / REPORT)
+        weak = report["weak"]
+        found = {
+            str(name): PhotoError(float(each["error"]), str(weak.get(name, "")))
+            for name, each in report["figures"].items()
+        }
+    except (InputError, AttributeError, KeyError, TypeError, ValueError):
+        return {}
+    return {name: each for name, each in found.items() if math.isfinite(each.pixels)}
