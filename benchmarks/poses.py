@@ -155,7 +155,7 @@ CASES = {
         "135 photos of a statue by many people, 800x1200", _images(DATA / "liberty"),
         lambda: llff_poses(
             DATA / "liberty/poses_bounds.npy", sorted(path.name for path in (DATA / "liberty/images").iterdir())
-        ), ("--cameras", "each"),
+        ),
     ),
 }  # fmt: skip
 

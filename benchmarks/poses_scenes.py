@@ -1,4 +1,4 @@
-"""Photos of `benchmarks/poses.py` with exact poses: a walk through a room, a turntable, and a panorama.
+"""Photos of `benchmarks/poses.py` with exact poses: a walk, a turntable, a panorama, and many large photos.
 
     .venv-bpy/bin/python benchmarks/poses_scenes.py OUT [NAME ...]
 
@@ -21,7 +21,7 @@ from benchmarks import suite_scenes
 from benchmarks.suite_scenes import Stage, scene
 
 SEED = 300
-SIZE = (640, 480)
+SIZE, LARGE = (640, 480), (1000, 750)
 
 
 def walk(seed: int) -> Stage:
@@ -63,7 +63,13 @@ def panorama(seed: int) -> Stage:
     return stage._replace(views=views)
 
 
-SCENES = {make.__name__: make for make in (walk, turntable, panorama)}
+def large(seed: int) -> Stage:
+    """200 photos of 24 objects on a table, from two rings around it."""
+    built, objs = scene.build(24, seed)
+    return Stage(built, objs, scene.cameras(200, seed))
+
+
+SCENES = {make.__name__: make for make in (walk, turntable, panorama, large)}
 
 
 def main() -> None:
@@ -73,7 +79,8 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="NAME")
     options = parser.parse_args()
     for name in options.names or SCENES:
-        suite_scenes.make_stage(SCENES[name], options.out / name / "capture", SEED, samples=8, size=SIZE)
+        size, samples = (LARGE, 4) if name == "large" else (SIZE, 8)
+        suite_scenes.make_stage(SCENES[name], options.out / name / "capture", SEED, samples=samples, size=size)
 
 
 if __name__ == "__main__":

@@ -118,6 +118,17 @@ def open_startup_scene(blender) -> None:
         for region in window_context()["area"].regions:
             if region.type == "UI":
                 region.active_panel_category = "ObjectGS"
+                region.tag_redraw()
+    """)
+
+
+def sidebar(blender) -> tuple[float, float, float]:
+    """Return the middle, the top and the bottom of the sidebar in pixels of the window, from its upper left."""
+    return blender.run("""
+        context = window_context()
+        region = next(region for region in context["area"].regions if region.type == "UI")
+        height = context["window"].height
+        result = [region.x + region.width / 2 - 10, height - region.y - region.height, height - region.y]
     """)
 
 

@@ -13,6 +13,7 @@ from backend.model.splats import Splats
 from tests.backend.conftest import write_scene
 
 from . import harness
+from .first_show import sidebar
 from .test_workflow import IDLE, script, wait
 
 PREFERENCES = f'bpy.context.preferences.addons["{harness.PACKAGE}"].preferences'
@@ -57,12 +58,7 @@ def test_online_access_is_allowed_where_the_backend_is_missing(window):
                 bpy.ops.wm.window_close()
         """)
         time.sleep(1)
-        x, top, bottom = window.run("""
-            context = window_context()
-            region = next(region for region in context["area"].regions if region.type == "UI")
-            height = context["window"].height
-            result = [region.x + region.width / 2 - 10, height - region.y - region.height, height - region.y]
-        """)
+        x, top, bottom = sidebar(window)
         # The first button below the text; clicks on the text do nothing.
         for y in range(round(top) + 60, round(bottom), 10):
             window.click(x, y)
