@@ -319,7 +319,7 @@ def main() -> None:
         except FileNotFoundError as error:
             print(f"{name} is left out: {error.filename} does not exist")
             continue
-        if options.defaults and case.truth() and name != "walk":
+        if options.defaults and case.truth() and name not in ("walk", "turntable"):
             found[name]["defaults"] = defaults(case)
         print(name, json.dumps(found[name]), flush=True)
     if options.write:
