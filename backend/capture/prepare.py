@@ -7,6 +7,9 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from PIL import Image as PilImage
+
 from ..shared.defaults import MAX_SIZE
 from ..shared.errors import InputError
 from ..shared.events import Reporter
@@ -19,6 +22,8 @@ from .survey import Source, Survey, check_mask, check_size, distinct_ids, refuse
 from .undistort import resample_image, resample_mask
 
 _CACHE_VERSION = 1
+_BACKGROUND = (128, 128, 128)
+"""Color behind objects that turned before a background at rest."""
 
 
 def load_capture(
@@ -85,8 +90,12 @@ def load_capture(
         survey.color_masks,
         memory_mb,
         prepared=cache is not None
-        or all(
-            needs_no_resampling(source.camera, source.target.width, source.target.height) for source in survey.sources
+        or (
+            not survey.on_objects
+            and all(
+                needs_no_resampling(source.camera, source.target.width, source.target.height)
+                for source in survey.sources
+            )
         ),
         held_out=survey.held_out,
     )
@@ -126,6 +135,8 @@ def _prepare_view(source: Source, survey: Survey, cache: Path) -> tuple[View, tu
         "camera": [camera.model, camera.width, camera.height, list(camera.params)],
         "target": [target.width, target.height, target.K.tolist()],
     }
+    if survey.on_objects:
+        made_from["on_objects"] = True
     stamp = _read_stamp(stamp_path, made_from, cache)
     if stamp is None:
         try:
@@ -172,11 +183,14 @@ def _resample(source: Source, survey: Survey, cache: Path, stem: str, made_from:
     check_size(source, image_size(source.image_path), survey.model.file("cameras"))
     pixels = read_image(source.image_path)
     in_place = needs_no_resampling(camera, target.width, target.height)
-    if not in_place:
+    ids = None if source.mask_path is None else check_mask(source, survey.color_masks)
+    is_cut_out = survey.on_objects and ids is not None
+    if is_cut_out:
+        pixels = _cut_out(pixels, ids)
+    if is_cut_out or not in_place:
         files["image_file"] = f"{stem}.png"
-        write_image(cache / f"{stem}.png", resample_image(pixels, camera, target))
-    if source.mask_path is not None:
-        ids = check_mask(source, survey.color_masks)
+        write_image(cache / f"{stem}.png", pixels if in_place else resample_image(pixels, camera, target))
+    if ids is not None:
         if not in_place or ids.shape != (target.height, target.width):
             ids = resample_mask(ids, camera, target)
             suffix, data = encode_mask(ids)
@@ -187,3 +201,9 @@ def _resample(source: Source, survey: Survey, cache: Path, stem: str, made_from:
         stamp[key] = name
         stamp[f"{key}_bytes"] = (cache / name).stat().st_size if name else None
     return stamp
+
+
+def _cut_out(image: PilImage.Image, ids: np.ndarray) -> PilImage.Image:
+    """Return an image with objects before one color; what stands still behind them contradicts the poses."""
+    shape = PilImage.fromarray((ids > 0).astype(np.uint8) * 255).resize(image.size, PilImage.Resampling.NEAREST)
+    return PilImage.composite(image.convert("RGB"), PilImage.new("RGB", image.size, _BACKGROUND), shape)

@@ -18,7 +18,7 @@ from PIL import Image as PilImage
 from ..shared.defaults import MAX_SIZE
 from ..shared.errors import InputError
 from ..shared.events import Reporter
-from ..shared.formats.photos_source import IMAGES
+from ..shared.formats.photos_source import IMAGES, read_source
 from ..shared.reconstruction.folder import STROKES
 from ..shared.reconstruction.objects import default_name
 from .capture import MIN_VIEWS_TO_HOLD_OUT
@@ -66,7 +66,12 @@ class Source:
 
 @dataclass
 class Survey:
-    """The contents of a capture before its images are read; held_out are the views that test.txt names, if any."""
+    """The contents of a capture before its images are read.
+
+    Attributes:
+        held_out: the views that test.txt names, if any.
+        on_objects: whether only objects belong to the scene, since these turned before a background at rest.
+    """
 
     folder: Path
     model: Model
@@ -76,6 +81,7 @@ class Survey:
     counts: dict[str, Any]
     color_masks: bool
     held_out: frozenset[str] | None
+    on_objects: bool
 
 
 def refuse(sentence: str) -> NoReturn:
@@ -187,7 +193,11 @@ def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Repo
         "points": len(model.xyz),
         "cameras": dict(Counter(model.cameras[i].model for i in sorted(targets))),
     }
-    return Survey(folder, model, sources, names, warnings, counts, _is_color_coded(sources, problem), held_out)
+    made_from = read_source(folder)
+    return Survey(
+        folder, model, sources, names, warnings, counts, _is_color_coded(sources, problem), held_out,
+        on_objects=made_from is not None and made_from.features == "objects",
+    )  # fmt: skip
 
 
 def _held_out(folder: Path, model: Model, sources: list[Source]) -> frozenset[str] | None:

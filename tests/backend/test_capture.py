@@ -437,6 +437,29 @@ def test_cache_is_reused_and_updated_with_sources(write_capture, tmp_path):
     assert {path.suffix for path in (cache / "views").iterdir()} <= {".png", ".json"}
 
 
+@pytest.mark.parametrize("max_size", [0, 48])
+def test_objects_before_a_background_at_rest_are_cut_out(write_capture, tmp_path, max_size):
+    """What is no object has one color, also in photos that need no resampling; the photos themselves are kept."""
+    scene = write_capture(views=4)
+    photos = {path: path.read_bytes() for path in (scene.folder / "images").iterdir()}
+    before = load_capture(scene.folder, tmp_path / "cache", max_size=max_size)
+    assert load_capture(scene.folder, None, max_size=0).prepared
+    (scene.folder / "sfm").mkdir()
+    (scene.folder / "sfm" / "source.json").write_text(json.dumps({"photos": ["turntable"], "features": "objects"}))
+    after = load_capture(scene.folder, tmp_path / "cache", max_size=max_size)
+    assert not load_capture(scene.folder, None, max_size=0).prepared
+    for view in range(4):
+        is_object = after.mask(view) > 0
+        assert 0.02 < is_object.mean() < 0.98
+        inner, outer = is_object, ~is_object
+        for axis in (0, 1):
+            for step in (-1, 1):
+                inner, outer = inner & np.roll(inner, step, axis), outer & np.roll(outer, step, axis)
+        np.testing.assert_array_equal(after.image(view)[inner], before.image(view)[inner])
+        np.testing.assert_array_equal(after.image(view)[outer], 128)
+    assert photos == {path: path.read_bytes() for path in (scene.folder / "images").iterdir()}
+
+
 def test_interrupted_load_leaves_no_partial_files_and_resumes(write_capture, tmp_path, monkeypatch):
     import backend.capture.prepare as module
 

@@ -13,6 +13,7 @@ from PIL import Image, ImageFilter
 from backend.cli import main as command_line
 from backend.sfm import agreement, check, database, pairs, stages
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE
+from backend.shared.formats import photos_source
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 VIEWS = 7
@@ -300,6 +301,8 @@ def test_objects_that_turn_before_a_background_at_rest(photos, tmp_path, run_com
     run_command("sfm", folder, "--out", tmp_path / "capture")
     path = tmp_path / "capture" / "sfm" / "objects.db"
     assert database.count_features(path) == VIEWS, "only features on objects are used"
+    source = photos_source.read_source(tmp_path / "capture")
+    assert source.features == "objects", "which later steps know, too"
 
 
 def test_separate_sets_of_photos(photos, tmp_path, run_command):

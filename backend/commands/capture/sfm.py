@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,13 +47,11 @@ def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         try:
             make_folder(capture / WORK)
             with locked(capture / WORK):
-                write_source(
-                    capture,
-                    PhotosSource(
-                        sources, options.cameras, options.frames, options.leave_out, options.features, options.set
-                    ),
+                made_from = PhotosSource(
+                    sources, options.cameras, options.frames, options.leave_out, options.features, options.set
                 )
-                _run(sources, capture, options, reporter)
+                write_source(capture, made_from)
+                _run(made_from, capture, reporter)
         except InputError:
             if not any((capture / WORK / name).exists() for name in (database.NAME, OBJECTS_DATABASE)):
                 created.remove_files()
@@ -86,7 +85,7 @@ def _require_own(source: Path, capture: Path) -> None:
         raise InputError(f"{capture} contains other files; choose a new folder as --out.")
 
 
-def _run(sources: list[Path], capture: Path, options: argparse.Namespace, reporter: StoppingReporter) -> None:
+def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> None:
     started = time.monotonic()
     work = capture / WORK
     images, log = capture / IMAGES, work / "colmap.log"
@@ -95,9 +94,9 @@ def _run(sources: list[Path], capture: Path, options: argparse.Namespace, report
         "global": ("Poses", 10.0), "incremental": ("Poses", 5.0), "refine": ("Poses", 2.0), "dense": ("Points", 10.0),
     })  # fmt: skip
     reporter.begin("photos", "Reading the photos")
-    photos, unreadable, in_order = take_photos(sources, capture, options.frames, reporter)
-    source = sources[0] if len(sources) == 1 else sources[0].parent
-    unwanted = {name: "it was left out by request" for name in options.leave_out}
+    photos, unreadable, in_order = take_photos(made_from.photos, capture, made_from.frames, reporter)
+    source = made_from.photos[0] if len(made_from.photos) == 1 else made_from.photos[0].parent
+    unwanted = {name: "it was left out by request" for name in made_from.leave_out}
     photos = [photo for photo in photos if photo.name not in unwanted]
     names = [photo.name for photo in photos]
     count = len(photos)
@@ -110,10 +109,12 @@ def _run(sources: list[Path], capture: Path, options: argparse.Namespace, report
         "refine": ("Poses", 0.2 * _MAP * count), "dense": ("Points", _DENSE * count),
     })  # fmt: skip
 
-    write_json(work / "groups.json", _groups(photos, options.cameras))
+    write_json(work / "groups.json", _groups(photos, made_from.cameras))
     listed_names = work / "names.json"
     write_json(listed_names, names)
-    path = _match(source, capture, names, in_order, options.features == "objects", reporter)
+    path = _match(source, capture, names, in_order, made_from.features == "objects", reporter)
+    if path.name == OBJECTS_DATABASE:
+        write_source(capture, replace(made_from, features="objects"))
 
     candidates: list[model.Candidate] = []
     for mapper in ("global", "incremental"):
@@ -125,12 +126,12 @@ def _run(sources: list[Path], capture: Path, options: argparse.Namespace, report
         make_folder(out)
         arguments = [mapper, str(path), str(images), str(out), str(listed_names)]
         run_stage(reporter, log, arguments, lambda lines: lines, count)
-        candidate = model.read_candidate(mapper, out, path, options.set)
+        candidate = model.read_candidate(mapper, out, path, made_from.set)
         if candidate is not None:
             candidates.append(candidate)
     best = model.best_of(candidates)
-    if best is None and options.set > 1:
-        raise InputError(f"The photos in {source} form fewer than {options.set} separate sets; choose a smaller --set.")
+    if best is None and made_from.set > 1:
+        raise InputError(f"The photos in {source} form fewer than {made_from.set} separate sets; use a smaller --set.")
     if best is None or len(best.agreement.trusted) < 2:
         raise InputError(
             f"The photos in {source} do not fit together: no two of them show the same scene from different places "
@@ -156,7 +157,7 @@ def _run(sources: list[Path], capture: Path, options: argparse.Namespace, report
         "reprojection_error": round(check.mean_error(best.model), 4),
         "mapper": best.mapper,
         "cameras": best.model.num_cameras(),
-        "set": options.set,
+        "set": made_from.set,
         "separate_sets": best.sets if len(best.sets) > 1 else [],
         "size_by_gps": by_gps is not None,
         "figures": {name: own._asdict() for name, own in figures.items()},
