@@ -184,10 +184,9 @@ def _resample(source: Source, survey: Survey, cache: Path, stem: str, made_from:
     pixels = read_image(source.image_path)
     in_place = needs_no_resampling(camera, target.width, target.height)
     ids = None if source.mask_path is None else check_mask(source, survey.color_masks)
-    is_cut_out = survey.on_objects and ids is not None
-    if is_cut_out:
+    if survey.on_objects and ids is not None:
         pixels = _cut_out(pixels, ids)
-    if is_cut_out or not in_place:
+    if survey.on_objects or not in_place:
         files["image_file"] = f"{stem}.png"
         write_image(cache / f"{stem}.png", pixels if in_place else resample_image(pixels, camera, target))
     if ids is not None:
