@@ -12,6 +12,7 @@ docs/poses.md.
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import shutil
 import subprocess
@@ -128,6 +129,18 @@ def _panorama() -> list[str]:
     return [str(_made("panorama") / "capture" / "images")]
 
 
+def _some(count: int) -> list[str]:
+    """Return a folder with as many of the large photos, evenly chosen."""
+    folder = _made("large")
+    out = folder / f"{count} photos"
+    if not out.exists():
+        out.mkdir()
+        photos = sorted((folder / "capture" / "images").iterdir())
+        for number in np.linspace(0, len(photos) - 1, count).round().astype(int):
+            shutil.copy(photos[number], out)
+    return [str(out)]
+
+
 CASES = {
     "demo": Case(
         "the demo's photos, 320x240", _images(ROOT / "build/demo/capture"),
@@ -135,6 +148,13 @@ CASES = {
     ),
     "walk": Case("a film of a walk through a room, 15 s, 640x480, H.264", _film, _film_poses),
     "panorama": Case("a room from one spot, to be refused", _panorama, dict),
+    **{
+        f"{count} photos": Case(
+            f"{count} photos of a table with 24 objects, 1000x750", functools.partial(_some, count),
+            lambda: model_poses(BUILD / "large/capture/sparse/0"),
+        )
+        for count in (42, 100, 200)
+    },
     "turntable": Case(
         "72 photos of a turntable before a background at rest, with masks", _turntable,
         lambda: model_poses(BUILD / "turntable/capture/sparse/0"),
