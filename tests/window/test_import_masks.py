@@ -3,27 +3,14 @@
 
 import shutil
 
-from .test_workflow import IDLE, capture, script, wait  # noqa: F401
+from .test_workflow import IDLE, capture, import_capture, script, wait  # noqa: F401
 
 
 def test_masks_of_a_folder_become_objects(blender, capture):  # noqa: F811
     plain, given, folder = (blender.folder / name for name in ("plain", "given-masks", "plain-splats"))
     shutil.copytree(capture, plain, ignore=shutil.ignore_patterns("masks", "labels.json", "truth"))
     shutil.copytree(capture / "masks", given)
-    blender.run(
-        script(f"""
-        with bpy.context.temp_override(**window_context()):
-            result = list(bpy.ops.objectgs.import_capture(
-                "EXEC_DEFAULT", directory={str(plain)!r}, folder={str(folder)!r}))
-    """)
-    )
-    blender.run("window_context()['area'].spaces.active.show_region_ui = True")
-    wait(blender, f"owner.objectgs.active is not None and {IDLE}")
-    blender.run("""
-        for region in window_context()["area"].regions:
-            if region.type == "UI":
-                region.active_panel_category = "ObjectGS"
-    """)
+    import_capture(blender, plain, folder)
     blender.run(
         script(f"""
         with bpy.context.temp_override(**window_context()):

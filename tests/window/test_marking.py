@@ -11,7 +11,7 @@ from backend.capture import load_capture
 from backend.labels import vote
 
 from .test_splat_edits import trace
-from .test_workflow import IDLE, capture, next_step, script, wait  # noqa: F401
+from .test_workflow import IDLE, capture, import_capture, next_step, script, wait  # noqa: F401
 
 MARKING = """
 from bl_ext.user_default.objectgs.objectgs_addon.running import pointing
@@ -34,20 +34,7 @@ def window(blender, capture):  # noqa: F811
     """Blender with a short training of the capture without its masks, seen through its first camera."""
     unlabeled, folder = blender.folder / "unlabeled", blender.folder / "unlabeled-splats"
     shutil.copytree(capture, unlabeled, ignore=shutil.ignore_patterns("masks", "labels.json", "truth"))
-    blender.run(
-        script(f"""
-        with bpy.context.temp_override(**window_context()):
-            result = list(bpy.ops.objectgs.import_capture(
-                "EXEC_DEFAULT", directory={str(unlabeled)!r}, folder={str(folder)!r}))
-    """)
-    )
-    blender.run("window_context()['area'].spaces.active.show_region_ui = True")
-    wait(blender, f"owner.objectgs.active is not None and {IDLE}")
-    blender.run("""
-        for region in window_context()["area"].regions:
-            if region.type == "UI":
-                region.active_panel_category = "ObjectGS"
-    """)
+    import_capture(blender, unlabeled, folder)
     blender.run(
         script("""
         root.objectgs.length, root.objectgs.minutes = "minutes", 0.2

@@ -52,7 +52,7 @@ def click_until(window, happened: str) -> None:
     raise AssertionError(f"no button led to: {happened}")
 
 
-def test_three_clicks_from_photos_to_splats(blender, source, tmp_path):
+def test_three_clicks_from_photos_to_splats(blender, source):
     """The buttons are those of the panel and of the file browser; only its folder is set by a script."""
     open_startup_scene(blender)
     time.sleep(2)

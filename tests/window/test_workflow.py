@@ -48,7 +48,12 @@ def capture(tmp_path_factory):
 @pytest.fixture(scope="module")
 def window(blender, capture):
     """Blender with the backend set and the capture imported."""
-    folder = blender.folder / "reconstruction"
+    import_capture(blender, capture, blender.folder / "reconstruction")
+    return blender
+
+
+def import_capture(blender, capture: Path, folder: Path) -> None:
+    """Import a capture, wait for the jobs that follow, and show the tab."""
     blender.run(
         script(f"""
         with bpy.context.temp_override(**window_context()):
@@ -57,13 +62,12 @@ def window(blender, capture):
     """)
     )
     blender.run("window_context()['area'].spaces.active.show_region_ui = True")
-    wait(blender, "owner.objectgs.active is not None")
+    wait(blender, f"owner.objectgs.active is not None and {IDLE}")
     blender.run("""
         for region in window_context()["area"].regions:
             if region.type == "UI":
                 region.active_panel_category = "ObjectGS"
     """)
-    return blender
 
 
 def wait(blender, expression: str, timeout: float = 120.0):
