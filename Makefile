@@ -30,6 +30,8 @@ export NUMBA_CACHE_DIR ?= $(abspath .venv/kernels)
 GPU_PYTHONS = $(if $(filter command environment,$(firstword $(origin PYTHON))),$(PYTHON),$(BACKEND) python3)
 # Two processes of the tests; one that has nothing left to do takes tests from the other.
 WORKERS = -n 2 --dist worksteal
+# Further options for the window tests, such as -m "not slow".
+WINDOW ?=
 # How long `make fuzz` tries random cases.
 MINUTES ?= 10
 # The capture that benchmarks/gpu.py trains on, where there is one.
@@ -96,7 +98,7 @@ test: .venv/ready .venv-bpy/ready
 	$(BLENDER) -m pytest $(WORKERS) tests/blender
 
 test-window: .venv/ready .venv-bpy/ready
-	$(BACKEND) -m pytest tests/window
+	$(BACKEND) -m pytest $(WINDOW) tests/window
 
 test-blenders: .venv/ready .venv-bpy-4.2/ready
 	.venv-bpy-4.2/$(BIN)/python -m pytest $(WORKERS) tests/blender

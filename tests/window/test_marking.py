@@ -13,6 +13,8 @@ from backend.labels import vote
 from .test_splat_edits import trace
 from .test_workflow import IDLE, capture, import_capture, next_step, script, wait  # noqa: F401
 
+pytestmark = pytest.mark.slow
+
 MARKING = """
 from bl_ext.user_default.objectgs.objectgs_addon.running import pointing
 from bl_ext.user_default.objectgs.objectgs_addon.picking import marks

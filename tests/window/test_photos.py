@@ -13,6 +13,8 @@ from tests.backend.test_sfm import photo, ring
 from .first_show import open_startup_scene, sidebar
 from .test_workflow import IDLE, script, wait
 
+pytestmark = pytest.mark.slow
+
 VIEWS = 12
 
 
