@@ -18,6 +18,8 @@ SPARSE = Path("sparse") / "0"
 DISTANCE = 2.0
 """Median distance of points from the cameras that see them in a finished model, in units that are meters on average."""
 FEWEST_FEATURES = 100
+_LEAST_SET = 0.05
+"""Number of photos of a separate set relative to the largest, below which they are photos without a pose."""
 _LEAST_ANGLE = 1.5
 """Median angle in degrees between the rays of a point, below which photos show no parallax."""
 
@@ -29,7 +31,8 @@ class Candidate(NamedTuple):
         mapper: "global" or "incremental".
         model: the cameras, poses and points.
         agreement: how it agrees with the matches.
-        sets: numbers of trusted photos of all the mapper's models, which are separate, the largest first.
+        sets: numbers of trusted photos of the mapper's models, which are separate, the largest first; without those
+            that are too small to be a scene.
     """
 
     mapper: str
@@ -56,8 +59,9 @@ def read_candidate(mapper: str, folder: Path, path: Path, number: int) -> Candid
             models.append(pycolmap.Reconstruction(each))
     measured = [(model, measure_agreement(model, path)) for model in models if model.num_reg_images() > 1]
     measured.sort(key=lambda found: (len(found[1].trusted), found[0].num_points3D()), reverse=True)
-    sets = [len(agreement.trusted) for _, agreement in measured]
-    return Candidate(mapper, *measured[number - 1], sets) if number <= len(measured) else None
+    sizes = [len(agreement.trusted) for _, agreement in measured]
+    sets = [size for size in sizes if size > 0 and size >= _LEAST_SET * sizes[0]]
+    return Candidate(mapper, *measured[number - 1], sets) if number <= max(len(sets), 1) and measured else None
 
 
 def best_of(candidates: Iterable[Candidate]) -> Candidate | None:

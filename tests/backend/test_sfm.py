@@ -305,7 +305,7 @@ def test_objects_that_turn_before_a_background_at_rest(photos, tmp_path, run_com
     assert source.features == "objects", "which later steps know, too"
 
 
-def test_separate_sets_of_photos(photos, tmp_path, run_command):
+def test_separate_sets_of_photos(photos, tmp_path, run_command, monkeypatch):
     """Five photos of another room have nothing in common with the seven of the first; each set can be used."""
     folder = shutil.copytree(photos / "images", tmp_path / "rooms")
     for number, matrix in enumerate(ring()[:5]):
@@ -319,6 +319,10 @@ def test_separate_sets_of_photos(photos, tmp_path, run_command):
     result = run_command("sfm", folder, "--out", capture, "--set", "3")
     assert result.code == EXIT_BAD_INPUT and "fewer than 3 separate sets" in result.err
     assert len(posed_photos(capture)) == 5, "what was there is kept"
+    monkeypatch.setattr("backend.sfm.model._LEAST_SET", 0.8)
+    result = run_command("sfm", folder, "--out", capture)
+    assert result.code == EXIT_DONE and "separate sets" not in result.out + result.err, "five are too few to be a scene"
+    assert len(posed_photos(capture)) == VIEWS
 
 
 def posed_photos(capture) -> set[str]:
