@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..capture import Capture
-from .depth_maps import GRID, balance, find_depth_maps
+from .depth_maps import balance, find_depth_maps
 
 MOST = 40_000
 """Largest number of points that are added; with more, they are farther apart."""
@@ -20,12 +20,16 @@ MOST = 40_000
 MOST_VIEWS = 400
 """Largest number of photos that are compared; of more, some at equal distances are."""
 
+_FINER = 1.5
+"""Factor between the sizes of the cubes in which points are counted."""
+
 
 class DensePoints(NamedTuple):
     """Points of the surfaces that the photos of a capture agree on.
 
     Attributes:
-        xyz: (n, 3) float64, at most one in each cube of the spacing, and none where the capture has one.
+        xyz: (n, 3) float64, about as far apart as the pixels that show them from nearest, and none where the capture
+            has one.
         rgb: (n, 3) uint8.
         in_front: (M,) bool, the points of the capture that are in front of the surfaces of more photos than agree.
     """
@@ -50,33 +54,35 @@ def find_dense_points(
     """
     views = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(len(views), MOST_VIEWS)).astype(int))]
     maps = find_depth_maps(capture, views, progress)
-    found, colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
+    found, colors, sizes = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0)]
     for index, each in maps.items():
         xyz, at = each.points(capture.views[index])
         found.append(xyz)
         colors.append(capture.image(index)[at[:, 1], at[:, 0]])
-    xyz, rgb, known = np.concatenate(found), np.concatenate(colors), capture.points.xyz
+        sizes.append(each.depths[each.depths > 0] * each.stride / each.K[0, 0])
+    xyz, rgb, size, known = np.concatenate(found), np.concatenate(colors), np.concatenate(sizes), capture.points.xyz
     in_front = balance(capture, maps, known) < 0
-    size = _spacing(capture, views)
-    new = _thinned(xyz, known[~in_front], size)
+    new = _thinned(xyz, size, known[~in_front])
     while len(new) > MOST:
         size *= max(np.sqrt(len(new) / MOST), 1.05)
-        new = _thinned(xyz, known[~in_front], size)
+        new = _thinned(xyz, size, known[~in_front])
     return DensePoints(xyz[new], rgb[new], in_front)
 
 
-def _spacing(capture: Capture, views: Sequence[int]) -> float:
-    """Return the typical distance between the points of neighboring pixels of the grid."""
-    sizes: list[float] = []
-    for view in (capture.views[index] for index in views):
-        depths = capture.points.xyz @ view.viewmat[2, :3] + view.viewmat[2, 3]
-        if (depths > 0).any():
-            sizes.append(np.median(depths[depths > 0]) / view.K[0, 0] * np.sqrt(view.width * view.height / GRID))
-    return float(np.median(sizes)) if sizes else 1.0
+def _thinned(xyz: np.ndarray, size: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return the indices of points that are about as far apart as their sizes, and none near a known one.
 
-
-def _thinned(xyz: np.ndarray, known: np.ndarray, size: float) -> np.ndarray:
-    """Return the indices of points (n, 3), at most one in each cube of a side, and none where a known one (m, 3) is."""
-    cells = np.floor(np.concatenate([known, xyz]) / size).astype(np.int64)
-    _, first = np.unique(cells, axis=0, return_index=True)
-    return np.sort(first[first >= len(known)]) - len(known)
+    Args:
+        xyz: (n, 3) points.
+        size: (n,) distance to keep from others; of points nearby, those with the smallest are returned.
+        known: (m, 3) other points.
+    """
+    level = np.floor(np.log(np.maximum(size, np.finfo(float).tiny)) / np.log(_FINER)).astype(np.int64)
+    kept = np.zeros(0, np.int64)
+    for each in np.unique(level):
+        here = np.flatnonzero(level == each)
+        before = np.concatenate([known, xyz[kept]])
+        cells = np.floor(np.concatenate([before, xyz[here]]) / _FINER ** float(each)).astype(np.int64)
+        _, first = np.unique(cells, axis=0, return_index=True)
+        kept = np.concatenate([kept, here[first[first >= len(before)] - len(before)]])
+    return np.sort(kept)

@@ -12,7 +12,7 @@ from PIL import Image
 
 from backend.capture.capture import Points, View
 from backend.shared.errors import EXIT_DONE
-from backend.stereo.dense_points import find_dense_points
+from backend.stereo.dense_points import _thinned, find_dense_points
 from backend.stereo.depth_maps import AGREES, balance, find_depth_maps
 from backend.training.state import model_from_checkpoint, read_checkpoint
 
@@ -135,6 +135,18 @@ def test_points_are_on_the_surfaces_and_evenly_spread(scene):
     assert 0.05 < on_box.mean() < 0.6
     gray = texture(found.xyz[on_box, 0], found.xyz[on_box, 1], 1)
     assert np.median(np.abs(found.rgb[on_box, 0] - gray)) < 4
+
+
+def test_points_are_as_far_apart_as_the_pixels_that_show_them():
+    """Without points near others that are finer, or known."""
+    rng = np.random.default_rng(0)
+    near, far = rng.uniform(0, 1, (20000, 3)) * [1, 1, 0], rng.uniform(0, 8, (20000, 3)) * [1, 1, 0]
+    xyz, size = np.concatenate([near, far]), np.repeat([0.1, 0.8], 20000)
+    kept = _thinned(xyz, size, np.zeros((0, 3)))
+    assert 80 < (kept < 20000).sum() < 250 and 80 < (kept >= 20000).sum() < 250
+    inside = (xyz[kept[kept >= 20000]] < 0.5).all(1)
+    assert not inside.any(), "a coarse point beside fine ones"
+    assert len(_thinned(xyz, size, xyz[kept])) == 0, "where points are known"
 
 
 def test_many_views_are_thinned(scene, monkeypatch):
