@@ -1,4 +1,4 @@
-"""The center of a capture's cameras and the distance of its points."""
+"""The center of a capture's cameras, the distance of its points, and the size of its pixels."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ if TYPE_CHECKING:
 
 SURROUNDINGS = 10.0
 """Distance of surroundings without points, such as the sky, relative to the radius; parallax is negligible there."""
+
+_VIEWS = 60
+"""Largest number of views in which the size of pixels is measured."""
 
 _PERCENTILE = 98
 """Percentile of the points' distances that is the radius; few points beyond it are on a surface."""
@@ -29,3 +32,18 @@ def extent_of(capture: Capture) -> Extent:
     center = -np.einsum("nji,nj->ni", matrices[:, :3, :3], matrices[:, :3, 3]).mean(0)
     distances = np.linalg.norm(capture.points.xyz - center, axis=1)
     return Extent(center, float(np.percentile(distances, _PERCENTILE)) if len(distances) else 1.0)
+
+
+def pixel_size(capture: Capture) -> float:
+    """Return the median side of a pixel at the points that it shows, in world units; infinite if none shows any."""
+    xyz, sizes = capture.points.xyz, []
+    for index in np.unique(np.linspace(0, len(capture.views) - 1, min(len(capture.views), _VIEWS)).astype(int)):
+        view = capture.views[index]
+        local = xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        depth = local[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            at = local @ view.K.T / depth[:, None]
+            shown = (depth > 0) & (at[:, :2] >= 0).all(1) & (at[:, 0] < view.width) & (at[:, 1] < view.height)
+        sizes.append(depth[shown] / view.K[0, 0])
+    together = np.concatenate(sizes) if sizes else np.zeros(0)
+    return float(np.median(together)) if len(together) else np.inf

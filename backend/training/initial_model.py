@@ -11,10 +11,15 @@ from ..model.anchors import median_spacing, seed_anchors, with_surroundings
 from ..model.heads import Heads
 from ..model.object_model import Normalization, ObjectModel
 from ..shared.class_table import ClassTable
+from .extent import pixel_size
 from .settings import Settings
 
 if TYPE_CHECKING:
     from ..capture import Capture
+
+
+FINEST = 2.0
+"""Edge in pixels of the finest cells that anchors grow into, where the points are farther apart."""
 
 
 class DistantPoints(NamedTuple):
@@ -51,7 +56,8 @@ def initial_model(
     classes = ClassTable(np.concatenate([[0], point_ids, *([] if more is None else [more[2]])]))
     if more is not None:
         xyz, rgb, ids = (np.concatenate(pair) for pair in zip((xyz, rgb, ids), more, strict=True))
-    voxel = settings.voxel * normalization.scale if settings.voxel else median_spacing(normalization.to_scene(xyz))
+    finest = min(median_spacing(normalization.to_scene(xyz)), FINEST * pixel_size(capture) * normalization.scale)
+    voxel = settings.voxel * normalization.scale if settings.voxel else finest
     anchors = seed_anchors(
         normalization.to_scene(xyz), rgb / 255.0, classes.classes_of(ids), voxel, settings.layout, rng
     )

@@ -22,7 +22,8 @@ class Settings:
             from the heads alone, as in ObjectGS section 3.2.
         sh_degree: degree of the colors' spherical harmonics in explicit mode.
         offsets: number of splats per anchor.
-        voxel: edge length of an anchor's cell in world units; None: the median spacing of the points.
+        voxel: edge length of an anchor's cell in world units; None: the median spacing of the points, or two
+            pixels if that is less.
         max_anchors: largest number of anchors.
         background: `learned`, `black` or `white`.
         semantic_weight, ssim_weight, volume_weight: weights of the terms of the loss. For discs, half of volume_weight

@@ -167,7 +167,7 @@ def test_wrong_matches_do_not_move_poses(made, tmp_path):
     model = pycolmap.Reconstruction(made / "sparse" / "0")
     for number in model.reg_image_ids():
         for point in model.image(number).points2D:
-            if point.has_point3D() and rng.random() < 0.1:
+            if point.has_point3D() and rng.random() < 0.15:
                 point.xy = np.array(point.xy) + rng.choice([-1, 1], 2) * rng.uniform(1.0, 4.0, 2)
     plain = pycolmap.Reconstruction(model)
     options = pycolmap.BundleAdjustmentOptions()
@@ -180,7 +180,7 @@ def test_wrong_matches_do_not_move_poses(made, tmp_path):
         (tmp_path / str(number) / "sparse" / "0").mkdir(parents=True)
         each.write(tmp_path / str(number) / "sparse" / "0")
         errors.append(np.median(pose_errors(tmp_path / str(number), ring())[0]))
-    assert errors[1] < 0.12 and errors[0] > 2 * errors[1]
+    assert errors[1] < 0.15 and errors[0] > 2 * errors[1]
 
 
 def test_capture_can_be_imported_and_is_kept_by_a_second_run(made, run_command, tmp_path):

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,6 +25,8 @@ from backend.shared.errors import Cancelled, InputError
 from backend.shared.events import Reporter
 from backend.shared.stopping import StopRequest
 from backend.training.budget import Budget
+from backend.training.extent import pixel_size
+from backend.training.initial_model import initial_model
 from backend.training.losses.on_cpu import PROBABILITY_FLOOR, image_loss, normal_loss, volume_loss
 from backend.training.optimizer.adam import BETA1, BETA2, step_rows
 from backend.training.optimizer.average import EVERY, FRACTION, MAX_STEPS, Average
@@ -419,6 +422,26 @@ def mean_loss(trainer, steps, progress=0.3):
 
 
 FLAT = dataclasses.replace(SMALL, primitive="2d")
+
+
+def test_finest_cells_are_no_larger_than_two_pixels(tiny):
+    """Where points are farther apart than that; else as large as the points are apart."""
+    capture, ids = tiny()
+    xyz, finest = capture.points.xyz, 2 * pixel_size(capture)
+    few = np.arange(len(ids)) % (len(ids) // 6) == 0
+    assert median_spacing(xyz) < finest < median_spacing(xyz[few])
+    for seeds, expected in ((np.ones(len(ids), bool), median_spacing(xyz)), (few, finest)):
+        model = initial_model(capture, ids, SMALL, np.random.default_rng(0), seeds)
+        assert model.anchors.voxel / model.normalization.scale == pytest.approx(expected)
+
+
+def test_pixels_are_measured_where_they_show_points(tiny):
+    capture, _ = tiny()
+    view = capture.views[0]
+    pixel = dataclasses.replace(view, viewmat=np.eye(4), K=np.array([[50.0, 0, 8], [0, 50.0, 6], [0, 0, 1]]))
+    at = np.array([[0, 0, 2.0], [0, 0, 4.0], [0, 0, 6.0], [0, 0, -1.0], [90.0, 0, 9.0], [0, -9.0, 9.0]])
+    assert pixel_size(SimpleNamespace(views=[pixel], points=SimpleNamespace(xyz=at))) == pytest.approx(4.0 / 50.0)
+    assert pixel_size(SimpleNamespace(views=[pixel], points=SimpleNamespace(xyz=at[3:]))) == np.inf
 
 
 @pytest.mark.parametrize("settings", [SMALL, FLAT], ids=["3d", "2d"])
