@@ -42,6 +42,15 @@ class View:
     height: int
     camera_id: int
 
+    def pixels_of(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Project positions or directions (n, 3) in camera space: indices of those in the image, columns and rows."""
+        x, y, z = xyz.T
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            u = x / z * self.K[0, 0] + self.K[0, 2]
+            v = y / z * self.K[1, 1] + self.K[1, 2]
+            inside = np.flatnonzero((z > 0) & (u >= 0) & (v >= 0) & (u < self.width) & (v < self.height))
+        return inside, u[inside].astype(np.int64), v[inside].astype(np.int64)
+
 
 @dataclass(frozen=True)
 class Points:

@@ -10,7 +10,6 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from ..capture import Capture
-from .coverage import pixels_in_view
 
 _PHOTOS = 16
 """Largest number of photos that are compared with their neighbors."""
@@ -67,7 +66,7 @@ def _agreement_of(capture: Capture, views: Sequence[int], place: int) -> float |
     xyz = capture.points.xyz[observed] if len(observed) >= _FEWEST // 5 else capture.points.xyz
     xyz = xyz[:: max(len(xyz) // _MOST_POINTS, 1)]
     positions = xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-    inside, _, _ = pixels_in_view(view, positions)
+    inside, _, _ = view.pixels_of(positions)
     positions = positions[inside]
     if len(positions) < _FEWEST // 5:
         return None

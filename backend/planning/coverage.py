@@ -195,19 +195,9 @@ def occupied_cells(view: View, xyz: np.ndarray) -> np.ndarray:
     cell = max(view.width, view.height) / _CELLS
     rows, columns = max(round(view.height / cell), 1), max(round(view.width / cell), 1)
     occupied = np.zeros((rows, columns), np.bool_)
-    _, x, y = pixels_in_view(view, xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3])
+    _, x, y = view.pixels_of(xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3])
     occupied[y * rows // view.height, x * columns // view.width] = True
     return occupied
-
-
-def pixels_in_view(view: View, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Project positions or directions (n, 3) in camera space: indices of those in the image, columns and rows."""
-    x, y, z = xyz.T
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        u = x / z * view.K[0, 0] + view.K[0, 2]
-        v = y / z * view.K[1, 1] + view.K[1, 2]
-        inside = np.flatnonzero((z > 0) & (u >= 0) & (v >= 0) & (u < view.width) & (v < view.height))
-    return inside, u[inside].astype(np.int64), v[inside].astype(np.int64)
 
 
 def _inside(capture: Capture, index: int, xyz: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from ..capture import Capture
 from ..training.extent import SURROUNDINGS, extent_of
-from .coverage import occupied_cells, pixels_in_view
+from .coverage import occupied_cells
 
 SPACING = float(np.radians(2.0))
 """Angle between neighboring directions."""
@@ -71,7 +71,7 @@ def find_surroundings(capture: Capture) -> Surroundings:
     shown = []
     for index in views:
         view, free = capture.views[index], _vacant_cells(capture, index)
-        seen, x, y = pixels_in_view(view, directions @ view.viewmat[:3, :3].T)
+        seen, x, y = view.pixels_of(directions @ view.viewmat[:3, :3].T)
         here = free[y * free.shape[0] // view.height, x * free.shape[1] // view.width]
         inside[seen] += 1
         vacant[seen[here]] += 1

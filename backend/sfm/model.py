@@ -61,7 +61,9 @@ def read_candidate(mapper: str, folder: Path, path: Path, number: int) -> Candid
     measured.sort(key=lambda found: (len(found[1].trusted), found[0].num_points3D()), reverse=True)
     sizes = [len(agreement.trusted) for _, agreement in measured]
     sets = [size for size in sizes if size > 0 and size >= _LEAST_SET * sizes[0]]
-    return Candidate(mapper, *measured[number - 1], sets) if number <= max(len(sets), 1) and measured else None
+    if not measured or number > max(len(sets), 1):
+        return None
+    return Candidate(mapper, *measured[number - 1], sets)
 
 
 def best_of(candidates: Iterable[Candidate]) -> Candidate | None:

@@ -40,10 +40,6 @@ def pixel_size(capture: Capture) -> float:
     for index in np.unique(np.linspace(0, len(capture.views) - 1, min(len(capture.views), _VIEWS)).astype(int)):
         view = capture.views[index]
         local = xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-        depth = local[:, 2]
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            at = local @ view.K.T / depth[:, None]
-            shown = (depth > 0) & (at[:, :2] >= 0).all(1) & (at[:, 0] < view.width) & (at[:, 1] < view.height)
-        sizes.append(depth[shown] / view.K[0, 0])
+        sizes.append(local[view.pixels_of(local)[0], 2] / view.K[0, 0])
     together = np.concatenate(sizes) if sizes else np.zeros(0)
     return float(np.median(together)) if len(together) else np.inf
