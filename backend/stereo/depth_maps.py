@@ -11,7 +11,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from ..capture import Capture, View
-from .patch_match import RADIUS, Others, match
+from .patch_match import RADIUS, Others, match, match_planes
+from .scene_planes import ScenePlane, find_planes
 
 GRID = 6000
 """Number of pixels of each photo whose depth is looked for."""
@@ -19,8 +20,14 @@ LONGEST_SIDE = 640
 """Side in pixels to which larger photos are scaled."""
 NEIGHBORS = 8
 """Largest number of other photos that a photo is matched with."""
+NEIGHBORS_ON_PLANES = 32
+"""The same where a photo shows one of the scene's large planes, which only few others may."""
 CORRELATES = 0.6
 """Least correlation of patches that match."""
+CORRELATES_ON_PLANES = 0.8
+"""The same on a large plane of the scene."""
+_BEYOND = 1.2
+"""Distance from the center of a plane up to which it may go on, relative to its reach."""
 AGREES = 0.015
 """Largest relative difference between the depths that two photos find at a point."""
 IN_FRONT = 0.05
@@ -68,6 +75,14 @@ class DepthMap(NamedTuple):
         at = np.clip(at, 0, [view.width - 1, view.height - 1])
         return (local - view.viewmat[:3, 3]) @ view.viewmat[:3, :3], at
 
+    def normals(self, view: View) -> np.ndarray:
+        """Return the unit normals (m, 3) of the surfaces in the pixels with a depth, of either sign."""
+        found = np.flatnonzero(self.depths > 0)
+        planes = self.planes[found].astype(np.float64)
+        constant = planes[:, 0] - (planes[:, 1:] * (self.pixels[found] + 0.5)).sum(1)
+        local = np.column_stack([planes[:, 1:], constant]) @ self.K
+        return local / np.linalg.norm(local, axis=1, keepdims=True) @ view.viewmat[:3, :3]
+
     def compare(self, view: View, xyz: np.ndarray) -> np.ndarray:
         """Return, for points (n, 3), 1 where the view shows a surface there, -1 where it shows one behind, else 0."""
         local = xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
@@ -101,13 +116,14 @@ def find_depth_maps(
 
     Returns:
         The depth maps of the views that others overlap. Depths that fewer than FEWEST others find are left out, as are
-        those in front of what more views show than agree, and small islands of depths.
+        those in front of what more views show than agree, and small islands of depths. Where large planes of the scene,
+        such as its floor, go on to the borders of photos, other photos must match there, but need not find them.
 
     Raises:
         InputError: a photo cannot be read.
     """
     scaled = {index: _gray(capture, index) for index in views}
-    neighbors = _neighbors(capture, views)
+    neighbors = _neighbors(capture, views, NEIGHBORS)
     raw: dict[int, DepthMap] = {}
     for number, index in enumerate(views):
         progress(number, len(views))
@@ -123,7 +139,7 @@ def find_depth_maps(
     for index, found in agreed.items():
         xyz, _ = found.points(capture.views[index])
         result[index] = _restricted(found, balance(capture, agreed, xyz, without=index) > 0)
-    return result
+    return _with_planes(capture, scaled, result)
 
 
 def balance(capture: Capture, maps: dict[int, DepthMap], xyz: np.ndarray, without: int | None = None) -> np.ndarray:
@@ -143,6 +159,70 @@ def balance(capture: Capture, maps: dict[int, DepthMap], xyz: np.ndarray, withou
         if other != without:
             total += found.compare(capture.views[other], xyz)
     return total
+
+
+def _with_planes(
+    capture: Capture, scaled: dict[int, tuple[np.ndarray, float]], maps: dict[int, DepthMap]
+) -> dict[int, DepthMap]:
+    """Return depth maps with more depths, on the large planes of the scene."""
+    if not maps:
+        return maps
+    views = capture.views
+    planes = find_planes(
+        np.concatenate([found.points(views[index])[0] for index, found in maps.items()]),
+        np.concatenate([found.normals(views[index]) for index, found in maps.items()]),
+        np.concatenate([found.depths[found.depths > 0] for found in maps.values()]),
+    )
+    if not planes:
+        return maps
+    neighbors = _neighbors(capture, list(maps), NEIGHBORS_ON_PLANES)
+    filled = {
+        index: _without_speckles(_on_planes(capture, scaled, index, found, planes, neighbors[index]))
+        for index, found in maps.items()
+    }
+    result = {}
+    for index, found in filled.items():
+        before = maps[index]
+        added = found._replace(depths=np.where(before.depths > 0, 0.0, found.depths))
+        xyz, _ = added.points(views[index])
+        depths_there = _restricted(added, balance(capture, filled, xyz, without=index) > 0).depths
+        result[index] = found._replace(depths=np.where(before.depths > 0, before.depths, depths_there))
+    return result
+
+
+def _on_planes(
+    capture: Capture,
+    scaled: dict[int, tuple[np.ndarray, float]],
+    index: int,
+    found: DepthMap,
+    planes: Sequence[ScenePlane],
+    neighbors: list[int],
+) -> DepthMap:
+    """Return a depth map with the depths of planes where it has none, and patches on these match in other photos."""
+    view, missing = capture.views[index], np.flatnonzero(found.depths == 0)
+    if not neighbors or not len(missing):
+        return found
+    # n . x = d in the world is m . x = 1 before the camera, so that 1 / z = m . K^-1 (u, v, 1).
+    local = np.array([view.viewmat[:3, :3] @ plane.normal for plane in planes])
+    offsets = np.array([plane.offset for plane in planes]) + local @ view.viewmat[:3, 3]
+    local /= np.where(np.abs(offsets) > 1e-12, offsets, 1e-12)[:, None]
+    pixels = np.column_stack([found.pixels[missing] + 0.5, np.ones(len(missing))])
+    rays = pixels @ np.linalg.inv(found.K).T
+    inverse = rays @ local.T
+    near, far = _depth_range(capture, view)
+    allowed = (inverse > 1.0 / far) & (inverse < 1.0 / near)
+    xyz = (rays[:, None] / np.where(allowed, inverse, 1.0)[:, :, None] - view.viewmat[:3, 3]) @ view.viewmat[:3, :3]
+    distances = np.linalg.norm(xyz - [plane.center for plane in planes], axis=2)
+    allowed &= distances < _BEYOND * np.array([plane.reach for plane in planes])
+    matches = match_planes(
+        scaled[index][0], found.pixels[missing], _others(capture, scaled, index, neighbors, found.K),
+        local @ np.linalg.inv(found.K), allowed,
+    )  # fmt: skip
+    good = missing[matches.scores >= CORRELATES_ON_PLANES]
+    depths, slopes = found.depths.copy(), found.planes.copy()
+    slopes[good] = matches.planes[matches.scores >= CORRELATES_ON_PLANES]
+    depths[good] = 1.0 / slopes[good, 0].astype(np.float64)
+    return found._replace(depths=depths, planes=slopes)
 
 
 def _agreeing(capture: Capture, others: dict[int, DepthMap], xyz: np.ndarray) -> np.ndarray:
@@ -192,8 +272,8 @@ def _gray(capture: Capture, index: int) -> tuple[np.ndarray, float]:
     return np.asarray(image, np.float32), factor
 
 
-def _neighbors(capture: Capture, views: Sequence[int]) -> dict[int, list[int]]:
-    """Return, for each view, the others that show the same from a little aside, the best angle first."""
+def _neighbors(capture: Capture, views: Sequence[int], most: int) -> dict[int, list[int]]:
+    """Return, for each view, at most as many others that show the same from a little aside, the best angle first."""
     matrices = np.array([capture.views[index].viewmat for index in views]).reshape(-1, 4, 4)
     centers = -np.einsum("nij,ni->nj", matrices[:, :3, :3], matrices[:, :3, 3])
     axes = matrices[:, 2, :3]
@@ -206,7 +286,7 @@ def _neighbors(capture: Capture, views: Sequence[int]) -> dict[int, list[int]]:
         angles = np.arccos(np.clip(rays @ rays[place], -1.0, 1.0))
         usable = (angles > _LEAST_ANGLE) & (angles < _LARGEST_ANGLE) & (axes @ axes[place] > 0.5)
         order = np.argsort(np.where(usable, np.abs(angles - _BEST_ANGLE), np.inf), kind="stable")
-        found[index] = [views[other] for other in order[:NEIGHBORS] if usable[other]]
+        found[index] = [views[other] for other in order[:most] if usable[other]]
     return found
 
 
@@ -216,29 +296,46 @@ def _depth_map(
     """Return the depths of a view, not compared with others; None without neighbors, points, or room for a patch."""
     image, scale = scaled[index]
     view, (height, width) = capture.views[index], image.shape
-    known = capture.points.xyz @ view.viewmat[2, :3] + view.viewmat[2, 3]
     stride = max(int(np.ceil(np.sqrt(height * width / GRID))), 1)
     rows, columns = (np.arange(RADIUS, side - RADIUS, stride) for side in (height, width))
-    if not neighbors or not (known > 0).any() or min(len(rows), len(columns)) < 2:
+    near, far = _depth_range(capture, view)
+    if not neighbors or not far > 0 or min(len(rows), len(columns)) < 2:
         return None
-    near, far = np.percentile(known[known > 0], _NEAREST_FARTHEST) * (_NEARER, _FARTHER)
     pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
     K = _scaled_intrinsics(view, image)
-    theirs = np.array([_scaled_intrinsics(capture.views[other], scaled[other][0]) for other in neighbors])
-    between = np.array([capture.views[other].viewmat for other in neighbors]) @ np.linalg.inv(view.viewmat)
-    sizes = np.array([scaled[other][0].shape for other in neighbors], np.int64)
-    images = np.zeros((len(neighbors), *sizes.max(0)), np.float32)
-    for number, other in enumerate(neighbors):
-        images[number, : sizes[number, 0], : sizes[number, 1]] = scaled[other][0]
-    others = Others(
-        np.ascontiguousarray(theirs @ between[:, :3, :3] @ np.linalg.inv(K), np.float32),
-        np.einsum("nij,nj->ni", theirs, between[:, :3, 3]).astype(np.float32), images, sizes,
-    )  # fmt: skip
+    others = _others(capture, scaled, index, neighbors, K)
     matches = match(image, pixels, len(columns), others, near, far, K[0, 0])
     inverse = matches.planes[:, 0].astype(np.float64)
     good = (matches.scores >= CORRELATES) & (inverse > 1.0 / far) & (inverse < 1.0 / near)
     depths = np.where(good, 1.0 / np.where(good, inverse, 1.0), 0.0)
     return DepthMap(pixels, matches.planes, depths, (len(rows), len(columns)), stride, K, scale)
+
+
+def _depth_range(capture: Capture, view: View) -> tuple[float, float]:
+    """Return the range of depths in which surfaces are looked for; 0 if no point is in front of the camera."""
+    known = capture.points.xyz @ view.viewmat[2, :3] + view.viewmat[2, 3]
+    if not (known > 0).any():
+        return 0.0, 0.0
+    near, far = np.percentile(known[known > 0], _NEAREST_FARTHEST) * (_NEARER, _FARTHER)
+    return float(near), float(far)
+
+
+def _others(
+    capture: Capture, scaled: dict[int, tuple[np.ndarray, float]], index: int, neighbors: list[int], K: np.ndarray
+) -> Others:
+    """Return the photos that a view is matched with; K: (3, 3) of its scaled photo."""
+    theirs = np.array([_scaled_intrinsics(capture.views[other], scaled[other][0]) for other in neighbors])
+    between = np.array([capture.views[other].viewmat for other in neighbors]) @ np.linalg.inv(
+        capture.views[index].viewmat
+    )
+    sizes = np.array([scaled[other][0].shape for other in neighbors], np.int64)
+    images = np.zeros((len(neighbors), *sizes.max(0)), np.float32)
+    for number, other in enumerate(neighbors):
+        images[number, : sizes[number, 0], : sizes[number, 1]] = scaled[other][0]
+    return Others(
+        np.ascontiguousarray(theirs @ between[:, :3, :3] @ np.linalg.inv(K), np.float32),
+        np.einsum("nij,nj->ni", theirs, between[:, :3, 3]).astype(np.float32), images, sizes,
+    )  # fmt: skip
 
 
 def _scaled_intrinsics(view: View, image: np.ndarray) -> np.ndarray:

@@ -27,6 +27,9 @@ _FLATTEST = 1.5
 _SIMILAR = np.float32(20.0)
 """Difference in gray levels from the middle pixel at which a pixel of a patch weighs 1 / e: a patch across the border
 of an object is matched by the side that its middle is on."""
+_ASIDE, _DISTINCT = np.float32(0.1), np.float32(0.1)
+"""Relative difference of the depth at which a patch must correlate less than on a given plane, and by how much. Smooth
+shades, as of the sky, correlate at any depth."""
 _TRIALS = 6
 """Number of random changes in a round."""
 _SMALLEST, _LARGEST = np.float32(0.08), np.float32(12.0)
@@ -93,6 +96,26 @@ def match(
             turn,
         )  # fmt: skip
     return Matches(planes, scores)
+
+
+def match_planes(
+    image: np.ndarray, pixels: np.ndarray, others: Others, planes: np.ndarray, allowed: np.ndarray
+) -> Matches:
+    """Match the patches around pixels with other photos, on given planes alone.
+
+    Args:
+        image, pixels, others: as in `match`.
+        planes: (p, 3) float64, which have the inverse depth p . (u, v, 1) at (u, v).
+        allowed: (n, p) bool, the planes to try for each pixel.
+
+    Returns:
+        The plane of each pixel that matches best.
+    """
+    found, scores = np.zeros((len(pixels), 3), np.float32), np.full(len(pixels), -1.0, np.float32)
+    textured = _deviation(image)[pixels[:, 1], pixels[:, 0]] >= _FLATTEST
+    image = np.ascontiguousarray(image, np.float32)
+    _try_planes(image, pixels, allowed & textured[:, None], *others, planes, found, scores)
+    return Matches(found, scores)
 
 
 def _deviation(image: np.ndarray) -> np.ndarray:
@@ -199,6 +222,28 @@ def _sweep(image, pixels, textured, turns, steps, images, sizes, inverse, planes
             score = _score(values, weights, deviation, middle, beside, steps, images, sizes, w, flat, flat)
             if score > scores[n]:
                 scores[n], planes[n, 0] = score, w
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
+def _try_planes(image, pixels, allowed, turns, steps, images, sizes, planes, found, scores):  # type: ignore[no-untyped-def]
+    """Try given planes (p, 3) where they are allowed (n, p); fills the best planes (n, 3) and scores (n,)."""
+    for n in numba.prange(len(pixels)):
+        if not allowed[n].any():
+            continue
+        values, weights, deviation, middle, beside = _read_patch(image, pixels[n, 0], pixels[n, 1], turns)
+        for p in range(len(planes)):
+            if not allowed[n, p]:
+                continue
+            w = planes[p, 0] * (pixels[n, 0] + 0.5) + planes[p, 1] * (pixels[n, 1] + 0.5) + planes[p, 2]
+            near, a, b = np.float32(w), np.float32(planes[p, 0]), np.float32(planes[p, 1])
+            score = _score(values, weights, deviation, middle, beside, steps, images, sizes, near, a, b)
+            if score > scores[n]:
+                scores[n], found[n, 0], found[n, 1], found[n, 2] = score, near, a, b
+        for factor in (np.float32(1.0) - _ASIDE, np.float32(1.0) + _ASIDE):
+            near, a, b = factor * found[n, 0], factor * found[n, 1], factor * found[n, 2]
+            aside = _score(values, weights, deviation, middle, beside, steps, images, sizes, near, a, b)
+            if aside > scores[n] - _DISTINCT:
+                scores[n] = -1.0
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)

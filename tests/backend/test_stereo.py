@@ -12,8 +12,11 @@ from PIL import Image
 
 from backend.capture.capture import Points, View
 from backend.shared.errors import EXIT_DONE
+from backend.stereo import depth_maps
 from backend.stereo.dense_points import _thinned, find_dense_points
 from backend.stereo.depth_maps import AGREES, balance, find_depth_maps
+from backend.stereo.patch_match import Others, match_planes
+from backend.stereo.scene_planes import find_planes
 from backend.training.state import model_from_checkpoint, read_checkpoint
 
 SIZE = (160, 120)
@@ -103,6 +106,56 @@ def test_planes_follow_the_surface(scene, maps):
     down = truth[y + 1, x] - truth[y, x]
     assert box.sum() > 20
     assert np.median(np.abs(found.planes[box, 2] / down[box] - 1)) < 0.1
+
+
+def test_large_planes_are_found_among_points():
+    """A floor and a wall with noise, and a ball, on which no plane has as many points."""
+    rng = np.random.default_rng(0)
+    flat = rng.uniform(-1, 1, (2000, 3))
+    normals = rng.normal(size=(2000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    ball = normals + np.array([5.0, 0, 0])
+    for axis, rows in ((2, slice(0, 1000)), (0, slice(1000, 1600))):
+        flat[rows, axis] = rng.normal(0.5, 0.005, len(flat[rows]))
+        normals[rows] = np.eye(3)[axis] * rng.choice([-1, 1], len(flat[rows]))[:, None]
+    xyz = np.concatenate([flat[:1600], ball[1600:]])
+    floor, wall, *others = find_planes(xyz, normals, np.full(2000, 2.0))
+    for plane, axis in ((floor, 2), (wall, 0)):
+        sign = np.sign(plane.normal[axis])
+        np.testing.assert_allclose(sign * plane.normal, np.eye(3)[axis], atol=0.01)
+        assert sign * plane.offset == pytest.approx(0.5, abs=0.01) and 1.2 < plane.reach < 1.5
+    assert all(plane.reach < 0.5 for plane in others)
+    assert find_planes(xyz[:0], normals[:0], np.zeros(0)) == []
+
+
+def test_floor_goes_on_where_few_photos_show_it(scene, maps, monkeypatch):
+    monkeypatch.setattr(depth_maps, "find_planes", lambda *_: [])
+    before = find_depth_maps(scene, range(9))
+    errors = []
+    for index, found in maps.items():
+        known = before[index].depths > 0
+        assert np.array_equal(found.depths[known], before[index].depths[known])
+        added = (found.depths > 0) & ~known
+        truth = scene.depths[index][found.pixels[added, 1], found.pixels[added, 0]]
+        errors.append(np.abs(found.depths[added] / truth - 1))
+    errors = np.concatenate(errors)
+    assert len(errors) > 0.02 * sum(len(found.depths) for found in maps.values())
+    assert (errors < AGREES).mean() > 0.95
+
+
+def test_smooth_shades_do_not_match_on_planes():
+    """The shade of a sky correlates with itself at any depth, a texture at its own alone."""
+    shade = np.tile(np.linspace(0, 255, SIZE[0], dtype=np.float32), (SIZE[1], 1))
+    grain = np.random.default_rng(0).uniform(0, 255, SIZE[::-1]).astype(np.float32)
+    pixels = np.stack(np.meshgrid(np.arange(40, 120, 10), np.arange(30, 90, 10)), -1).reshape(-1, 2)
+    steps = np.array([[10, 0, 0], [0, 10, 0]], np.float32)
+    for image, matches in ((shade, False), (grain, True)):
+        moved = np.stack([np.roll(image, 10, 1), np.roll(image, 10, 0)])
+        others = Others(np.tile(np.eye(3, dtype=np.float32), (2, 1, 1)), steps, moved, np.tile(SIZE[::-1], (2, 1)))
+        found = match_planes(image, pixels, others, np.array([[0, 0, 1.0]]), np.ones((len(pixels), 1), bool))
+        assert ((found.scores > 0.9) == matches).all()
+        none = match_planes(image, pixels, others, np.array([[0, 0, 1.0]]), np.zeros((len(pixels), 1), bool))
+        assert (none.scores == -1).all()
 
 
 def test_threads_do_not_matter(scene, maps):
