@@ -247,12 +247,14 @@ def test_objects_of_every_format_are_those_that_were_written(write, photos, tmp_
     )
 
 
-def test_black_and_white_masks_beside_the_photos_become_those_of_the_capture(photos, tmp_path):
-    images = photos / "images"
+@pytest.mark.parametrize("masks", ["images/photo {}_mask.jpg", "masks/photo {}.jpg"])
+def test_black_and_white_jpegs_become_masks_of_the_capture(photos, tmp_path, masks):
+    (photos / "masks").mkdir()
     for n in (0, 1):
-        Image.fromarray(255 * (masks_of(n) > 0).astype(np.uint8)).save(images / f"photo {n}_mask.jpg", quality=90)
-    taken = take_photos([images], tmp_path / "new", None, Reporter())
+        Image.fromarray(255 * (masks_of(n) > 0).astype(np.uint8)).save(photos / masks.format(n), quality=90)
+    taken = take_photos([photos], tmp_path / "new", None, Reporter())
     assert [each.name for each in taken.photos] == [photo(0), photo(1)]
+    assert not list((tmp_path / "new" / "masks").glob("*.jpg"))
     for n in (0, 1):
         assert (read_mask(tmp_path / "new" / "masks" / f"{photo(n)}.png") == (masks_of(n) > 0)).all()
 

@@ -43,6 +43,7 @@ class MaskFiles:
             if (found := files.first(accepted) or files.first(lossy)) is not None:
                 self._files[name] = found
         self.photos: Sequence[str] = sorted(self._files)
+        self.lossy = [name for name in self.photos if self._files[name].suffix.lower() in LOSSY_SUFFIXES]
         self.what = "ID masks"
         self._labels = {**read_names(folder.parent), **read_names(folder)} if self._files else {}
         color = [path for path in self._files.values() if path.suffix.lower() not in LOSSY_SUFFIXES]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from ...capture.files import Files, encode_mask, image_size, mask_names, read_mask, write_image
+from ...capture.files import LOSSY_SUFFIXES, Files, encode_mask, image_size, mask_names, read_mask, write_image
 from ...capture.mask_sources import MaskFiles, ids_of
 from ...shared.errors import InputError
 from ...shared.formats.atomic import atomic_path, make_folder, write_atomic
@@ -61,7 +61,7 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
     Args:
         sources: a folder with photos and videos, also in subfolders, or with a folder images/ and, optionally, masks/
             and files with names, which are copied, too; or files of photos and videos. Photos named like another one
-            with `_mask` are its masks.
+            with `_mask` are its masks. Masks that are JPEGs in black and white are written as PNG.
         capture: the capture's folder.
         frames: wanted number of frames of each video; None: by its motion.
         reporter: receives progress and warnings.
@@ -114,10 +114,14 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
     if len(photos) < 2:
         why = next(iter(unreadable.values()), "a single photo has no pose.")
         raise InputError(f"Of the photos in {base}, {len(photos)} can be read; {why}")
-    if not in_place and base != source and source.is_dir():
-        _copy_rest(source, capture)
+    if base != source and source.is_dir():
+        if not in_place:
+            _copy_rest(source, capture)
+        masks = MaskFiles(source / MASKS, names, base)
+        _write_masks(masks, masks.lossy, names, capture)
     if masked:
-        _write_masks(MaskFiles(base, names, base), names, capture)
+        masks = MaskFiles(base, names, base)
+        _write_masks(masks, masks.photos, names, capture)
     return Taken(photos, unreadable, not files)
 
 
@@ -130,9 +134,9 @@ def _without_masks(paths: Sequence[Path]) -> tuple[list[Path], bool]:
     return [path for path in paths if path.as_posix() not in masks], bool(masks)
 
 
-def _write_masks(masks: MaskFiles, names: Mapping[str, str], capture: Path) -> None:
+def _write_masks(masks: MaskFiles, photos: Sequence[str], names: Mapping[str, str], capture: Path) -> None:
     """Write the masks of photos to the masks/ of a capture, unless they are there; names: of the photos there."""
-    for photo in masks.photos:
+    for photo in photos:
         suffix, data = encode_mask(ids_of(masks.read(photo)))
         target = capture / MASKS / (names[photo] + suffix)
         if not target.exists():
@@ -221,10 +225,12 @@ def write_object_masks(capture: Path, names: Sequence[str], folder: Path) -> Non
 
 
 def _copy_rest(source: Path, capture: Path) -> None:
-    """Copy masks and files with names that are beside the photos."""
+    """Copy masks that are not JPEGs, and files with names, that are beside the photos."""
     masks = source / MASKS
     others = [path for path in source.iterdir() if path.is_file() and _OTHER_FILES.fullmatch(path.name)]
     for path in [*others, *(path for path in (masks.rglob("*") if masks.is_dir() else ()) if path.is_file())]:
+        if path.suffix.lower() in LOSSY_SUFFIXES:
+            continue
         target = capture / path.relative_to(source)
         if not target.exists():
             make_folder(target.parent)
