@@ -15,6 +15,8 @@ NAME = "database.db"
 FEWEST_INLIERS = 15
 """Number of matches in agreement from which on COLMAP takes two photos to show the same."""
 
+_INSTEAD_OF_SPACE = "\ue020"
+"""A character for private use, which names in COLMAP's lists of pairs have for spaces."""
 _MOST_IMAGES = 2**31 - 1
 """COLMAP's pair ID is this times the smaller image ID, plus the larger one."""
 
@@ -28,6 +30,32 @@ def _reading(path: Path) -> Iterator[sqlite3.Connection]:
         raise InputError(
             f"{path} cannot be read ({error}); delete its folder and run the same command again."
         ) from error
+
+
+def listed_name(name: str) -> str:
+    """Return the name of a photo as COLMAP's lists of pairs can have it."""
+    return name.replace(" ", _INSTEAD_OF_SPACE)
+
+
+@contextmanager
+def listed_names(path: Path) -> Iterator[None]:
+    """Give the photos in the database the names that are in lists; call `restore_names` first if this was killed."""
+    _rename(path, " ", _INSTEAD_OF_SPACE)
+    try:
+        yield
+    finally:
+        restore_names(path)
+
+
+def restore_names(path: Path) -> None:
+    """Give the photos in the database their own names, if it exists."""
+    if path.exists():
+        _rename(path, _INSTEAD_OF_SPACE, " ")
+
+
+def _rename(path: Path, old: str, new: str) -> None:
+    with closing(sqlite3.connect(path, timeout=30.0)) as database, database:
+        database.execute("UPDATE images SET name = replace(name, ?, ?) WHERE instr(name, ?)", (old, new, old))
 
 
 def count_features(path: Path) -> int:

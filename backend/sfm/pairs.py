@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from . import database
 
-ALL_UP_TO = 150
+ALL_UP_TO = 60
 """Number of photos up to which all pairs are matched."""
 NEIGHBORS = 30
 """Number of most similar photos that each photo of a larger set is matched with."""
@@ -39,8 +38,7 @@ def choose_pairs(
     Returns:
         Pairs of names, the smaller first in the order of `names`.
     """
-    # COLMAP's lists of pairs have no names with spaces.
-    if len(names) <= ALL_UP_TO or any(re.search(r"\s", name) for name in names):
+    if len(names) <= ALL_UP_TO:
         return None
     ids = database.image_ids(path)
     features = [_unit(database.largest_features(path, ids[name], FEATURES)) for name in names]

@@ -20,6 +20,8 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
+from .database import listed_names, restore_names
+
 SEED = 0
 LONGEST_SIDE = 1600
 """Side in pixels to which larger photos are scaled for the search of features."""
@@ -58,6 +60,7 @@ def extract(database: str, images: str, groups: str, masks: str = "") -> None:
 
     With masks, features are where MASKS/NAME.png is not black.
     """
+    restore_names(Path(database))
     reader = pycolmap.ImageReaderOptions()
     if masks:
         reader.mask_path = masks
@@ -82,7 +85,8 @@ def match(database: str, pairs: str = "") -> None:
     if pairs:
         listed = pycolmap.ImportedPairingOptions()
         listed.match_list_path, listed.block_size = pairs, _BLOCK
-        pycolmap.match_image_pairs(database, options, listed, verification)
+        with listed_names(Path(database)):
+            pycolmap.match_image_pairs(database, options, listed, verification)
     else:
         every = pycolmap.ExhaustivePairingOptions()
         every.block_size = int(_BLOCK**0.5)

@@ -3,7 +3,9 @@
 import functools
 import json
 import shutil
+import sqlite3
 import threading
+from contextlib import closing
 
 import numpy as np
 import pycolmap
@@ -439,9 +441,25 @@ def test_pairs_of_large_sets_are_those_that_show_the_same(made, monkeypatch):
     names = sorted(database.image_ids(path))
     assert pairs.choose_pairs(path, names) is None, "all pairs of a small set"
     monkeypatch.setattr(pairs, "ALL_UP_TO", 2)
-    assert pairs.choose_pairs(path, names) is None, "COLMAP's lists have no names with spaces"
     monkeypatch.setattr(pairs, "NEIGHBORS", 1)
-    monkeypatch.setattr(pairs.database, "image_ids", lambda _: {f"{i}": i for i in database.feature_counts(path)})
-    chosen = pairs.choose_pairs(path, [str(number) for number in range(1, VIEWS + 1)])
-    assert len(chosen) < VIEWS and {name for pair in chosen for name in pair} == {str(i) for i in range(1, VIEWS + 1)}
-    assert all(abs(int(first) - int(second)) <= 2 for first, second in chosen), "neighbors of the ring"
+    chosen = [[int(name.split()[1].partition(".")[0]) for name in pair] for pair in pairs.choose_pairs(path, names)]
+    assert len(chosen) < VIEWS and {number for pair in chosen for number in pair} == set(range(1, VIEWS + 1))
+    assert all(abs(first - second) <= 2 for first, second in chosen), "neighbors of the ring"
+
+
+def test_pairs_of_photos_with_spaces_in_their_names_are_matched(made, photos, tmp_path, run_command, monkeypatch):
+    """COLMAP's lists have no such names, so the database has others meanwhile, also after the process was killed."""
+    monkeypatch.setattr(pairs, "ALL_UP_TO", 2)
+    out = tmp_path / "capture"
+    (out / "sfm").mkdir(parents=True)
+    path = out / "sfm" / database.NAME
+    shutil.copy(made / "sfm" / database.NAME, path)
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("DELETE FROM matches")
+        connection.execute("DELETE FROM two_view_geometries")
+    killed = database.listed_names(path)
+    killed.__enter__()
+    assert not any(" " in name for name in database.image_ids(path))
+    assert run_command("sfm", photos, "--out", out).code == EXIT_DONE
+    assert set(database.image_ids(path)) == posed_photos(out) == {f"photo {i}.png" for i in range(1, VIEWS + 1)}
+    assert len(database.verified_pairs(path)) >= VIEWS - 1

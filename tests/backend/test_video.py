@@ -247,7 +247,7 @@ def test_videos_beside_photos(walk, tmp_path, run_command, no_dense_points):
     assert result.code == EXIT_DONE
     report = json.loads((tmp_path / "capture" / "sfm" / "sfm.json").read_text())
     assert report["registered"] >= 12 and report["cameras"] == 2 and set(report["left_out"]) >= {"broken.mov"}
-    assert (tmp_path / "capture" / "images" / "my_walk").is_dir() and (
+    assert (tmp_path / "capture" / "images" / "my walk").is_dir() and (
         tmp_path / "capture" / "images" / "0.png"
     ).exists()
 

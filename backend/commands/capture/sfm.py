@@ -16,7 +16,7 @@ from ...sfm import check, database, model
 from ...sfm.agreement import measure_agreement
 from ...sfm.background import stands_still
 from ...sfm.location import meters_per_unit, positions_in_meters
-from ...sfm.pairs import choose_pairs
+from ...sfm.pairs import NEIGHBORS, choose_pairs
 from ...sfm.sources.photos import IMAGES, MASKS, Photo, take_photos, write_object_masks
 from ...sfm.stages import run_stage
 from ...shared.errors import InputError
@@ -31,7 +31,7 @@ PICTURE = "sfm.png"
 OBJECTS_DATABASE = "objects.db"
 """Database in sfm/ with the features on objects alone."""
 
-_EXTRACT, _MATCH, _MAP, _DENSE = 0.5, 0.03, 0.3, 0.3
+_EXTRACT, _MATCH, _MAP, _DENSE = 0.5, 0.03, 0.3, 0.6
 """Expected seconds of the stages for each photo, pair, photo and photo on two cores, until the pace is known."""
 _ENOUGH = 0.95
 """Fraction of photos with trusted poses from which on the result of the first mapper is kept."""
@@ -102,7 +102,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     count = len(photos)
     if count < 2:
         raise InputError(f"Too few photos are left in {source}; leave out fewer.")
-    pairs_expected = count * (count - 1) / 2
+    pairs_expected = min(count * (count - 1) / 2, NEIGHBORS * count)
     reporter.expect({
         "extract": ("Features", _EXTRACT * count), "match": ("Matching", _MATCH * pairs_expected),
         "global": ("Poses", _MAP * count), "incremental": ("Poses", 0.1 * _MAP * count),
@@ -190,7 +190,8 @@ def _match(
     pairs = choose_pairs(path, names, in_order, reporter.progress)
     listed = work / "pairs.txt"
     if pairs is not None:
-        write_atomic(listed, "".join(f"{first} {second}\n" for first, second in pairs).encode())
+        lines = (" ".join(map(database.listed_name, pair)) + "\n" for pair in pairs)
+        write_atomic(listed, "".join(lines).encode())
     total = count * (count - 1) // 2 if pairs is None else len(pairs)
     arguments = ["match", str(path), *([] if pairs is None else [str(listed)])]
     reporter.begin("match", f"Matching {total:,} pairs of photos")

@@ -102,8 +102,7 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
         except InputError as error:
             unreadable[relative.as_posix()] = str(error)
     for path in videos:
-        # COLMAP's lists of pairs have no names with spaces.
-        folder = "" if found == [source] else re.sub(r"\s+", "_", path.relative_to(base).with_suffix("").as_posix())
+        folder = "" if found == [source] else path.relative_to(base).with_suffix("").as_posix()
         try:
             taken = _frames_of(path, capture, folder, frames, reporter)
             photos += [Photo((Path(folder) / name).as_posix(), f"video {folder}") for name in taken]
