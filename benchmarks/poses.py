@@ -41,6 +41,8 @@ LONGEST = 600.0
 """Seconds after which COLMAP with its default options is ended."""
 _STAGES = ("Photos", "Features", "Pairs", "Matching", "Poses", "Points")
 _FRAMES_A_SECOND = 15
+_SIZES = (42, 100, 200)
+"""Numbers of photos of the same table."""
 
 
 class Case(NamedTuple):
@@ -153,7 +155,7 @@ CASES = {
             f"{count} photos of a table with 24 objects, 1000x750", functools.partial(_some, count),
             lambda: model_poses(BUILD / "large/capture/sparse/0"),
         )
-        for count in (42, 100, 200)
+        for count in _SIZES
     },
     "turntable": Case(
         "72 photos of a turntable before a background at rest, with masks", _turntable,
@@ -315,7 +317,27 @@ def document(found: Mapping[str, Any]) -> str:
         lines += ["Refused:", "", *(f"- *{name}*: {' '.join(text.split())}" for name, text in refused), ""]
     stages = [(name, *(f"{entry['ours']['stages'][stage]:.0f}" for stage in _STAGES)) for name, entry in found.items()]
     lines += ["Seconds of the stages:", "", *shared.table(("set", *_STAGES), stages)]
+    lines += growth(found)
     return "\n".join(lines).rstrip() + "\n"
+
+
+def growth(found: Mapping[str, Any]) -> list[str]:
+    """Return a sentence on how the seconds grow with the number of photos of the same table, if there are several."""
+    sizes = {count: found[name]["ours"] for count in _SIZES if (name := f"{count} photos") in found}
+    if len(sizes) < 2:
+        return []
+    powers = {
+        stage: float(np.polyfit(np.log(list(sizes)), np.log([row["stages"][stage] for row in sizes.values()]), 1)[0])
+        for stage in _STAGES
+        if all(row["stages"][stage] >= 1.0 for row in sizes.values())
+    }
+    total = float(np.polyfit(np.log(list(sizes)), np.log([row["seconds"] for row in sizes.values()]), 1)[0])
+    each = ", ".join(f"{stage.lower()} {power:.1f}" for stage, power in powers.items())
+    return [
+        "",
+        f"From {min(sizes)} to {max(sizes)} photos, the seconds grow with their number to the power of {total:.1f} "
+        f"({each}).",
+    ]
 
 
 def _cell(value: Any, form: str) -> str:
