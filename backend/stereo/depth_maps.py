@@ -218,10 +218,10 @@ def _on_planes(
         scaled[index][0], found.pixels[missing], _others(capture, scaled, index, neighbors, found.K),
         local @ np.linalg.inv(found.K), allowed,
     )  # fmt: skip
-    good = missing[matches.scores >= CORRELATES_ON_PLANES]
+    good = matches.scores >= CORRELATES_ON_PLANES
     depths, slopes = found.depths.copy(), found.planes.copy()
-    slopes[good] = matches.planes[matches.scores >= CORRELATES_ON_PLANES]
-    depths[good] = 1.0 / slopes[good, 0].astype(np.float64)
+    slopes[missing[good]] = matches.planes[good]
+    depths[missing[good]] = 1.0 / matches.planes[good, 0].astype(np.float64)
     return found._replace(depths=depths, planes=slopes)
 
 
