@@ -91,6 +91,11 @@ def _add_capture_commands(commands: _Commands) -> None:
         help="which photos share a camera and its focal length: auto, by size and EXIF; one, all; each, none (auto)",
     )  # fmt: skip
     poses.add_argument(
+        "--calibration", type=Path, metavar="FILE",
+        help="COLMAP's cameras.bin or cameras.txt, or its folder, with a camera for each size of photos; lenses are "
+        "kept as they are there",
+    )  # fmt: skip
+    poses.add_argument(
         "--features", choices=("auto", "objects"), default="auto",
         help="where features are: auto, everywhere, unless the background stands still while the objects turn; "
         "objects, on the objects of the masks (auto)",

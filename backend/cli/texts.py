@@ -29,7 +29,9 @@ points of the scene. Photos are copied to CAPTURE/images, unless PHOTOS is that 
 HEIC becomes JPEG. Of a video, sharp frames are taken, evenly in how far the picture
 moves. The cameras are written to CAPTURE/sparse/0, and what was found to CAPTURE/sfm/sfm.json.
 Photos that do not fit are named with the reason. If PHOTOS has folders images/ and
-masks/, both are copied. After a stop, the same command goes on.
+masks/, both are copied. Cameras that are fixed to each other, with a folder each and the
+same names for the photos of a moment, are recognized. After a stop, the same command
+goes on.
 """
 
 MASKS = """\

@@ -2,8 +2,11 @@
 
     worker extract DATABASE IMAGES GROUPS.json [MASKS]   features of the photos in each group, which share a camera
     worker match DATABASE [PAIRS.txt]   matches of the pairs, or of all
-    worker incremental|global DATABASE IMAGES OUT NAMES.json   camera poses of the named photos, and points
-    worker refine MODEL OUT   the same without wrong matches, and with the lens that photos show
+    worker incremental|global DATABASE IMAGES OUT NAMES.json [calibrated]   poses of the named photos, and points
+    worker refine MODEL OUT [calibrated]   the same without wrong matches, and with the lens that photos show
+
+Each group is {"names": [...], "camera": null or {"model": ..., "params": [...]}}, the lens if it is known. Lenses that
+are calibrated are kept.
 
 Photos and pairs whose results are in the database are skipped. Each line on standard output is one more photo with a
 pose.
@@ -15,12 +18,13 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
 
 from .database import listed_names, restore_names
+from .rig import tie_rigs
 
 SEED = 0
 LONGEST_SIDE = 1600
@@ -61,19 +65,36 @@ def extract(database: str, images: str, groups: str, masks: str = "") -> None:
     With masks, features are where MASKS/NAME.png is not black.
     """
     restore_names(Path(database))
-    reader = pycolmap.ImageReaderOptions()
-    if masks:
-        reader.mask_path = masks
     for group in json.loads(Path(groups).read_text(encoding="utf-8")):
+        names, camera = group["names"], group["camera"]
+        reader = pycolmap.ImageReaderOptions()
+        if masks:
+            reader.mask_path = masks
+        if camera:
+            reader.camera_model, reader.camera_params = camera["model"], ",".join(map(repr, camera["params"]))
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu = False
         options.max_image_size = LONGEST_SIDE
         options.sift.max_num_features = MOST_FEATURES
         options.sift.peak_threshold = _FAINT
         pycolmap.extract_features(
-            database, images, image_names=group, camera_mode=pycolmap.CameraMode.SINGLE,
+            database, images, image_names=names, camera_mode=pycolmap.CameraMode.SINGLE,
             reader_options=reader, extraction_options=options,
         )  # fmt: skip
+        if camera:
+            _calibrate(database, names[0], camera)
+
+
+def _calibrate(database: str, name: str, known: dict[str, Any]) -> None:
+    """Give the camera of a photo in the database a known lens, also if its features were found without."""
+    with pycolmap.Database.open(database) as opened:
+        image = opened.read_image_with_name(name)
+        if image is None:
+            return  # It cannot be read.
+        camera = opened.read_camera(image.camera_id)
+        camera.model, camera.params = getattr(pycolmap.CameraModelId, known["model"]), known["params"]
+        camera.has_prior_focal_length = True
+        opened.update_camera(camera)
 
 
 def match(database: str, pairs: str = "") -> None:
@@ -93,9 +114,12 @@ def match(database: str, pairs: str = "") -> None:
         pycolmap.match_exhaustive(database, options, every, verification)
 
 
-def map_incrementally(database: str, images: str, out: str, names: str) -> None:
+def map_incrementally(database: str, images: str, out: str, names: str, calibrated: str = "") -> None:
     """Add one photo after another to the model."""
     options = pycolmap.IncrementalPipelineOptions()
+    if calibrated:
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
     options.image_names = json.loads(Path(names).read_text(encoding="utf-8"))
     options.random_seed, options.min_model_size = SEED, FEWEST_POSES
 
@@ -105,22 +129,32 @@ def map_incrementally(database: str, images: str, out: str, names: str) -> None:
     pycolmap.incremental_mapping(database, images, out, options=options, next_image_callback=tell)
 
 
-def map_globally(database: str, images: str, out: str, names: str) -> None:
+def map_globally(database: str, images: str, out: str, names: str, calibrated: str = "") -> None:
     """Solve for all rotations, then all positions at once (GLOMAP)."""
     options = pycolmap.GlobalPipelineOptions()
+    if calibrated:
+        adjustment = options.mapper.bundle_adjustment
+        adjustment.refine_focal_length = adjustment.refine_extra_params = False
     options.image_names = json.loads(Path(names).read_text(encoding="utf-8"))
     options.random_seed, options.min_model_size = SEED, FEWEST_POSES
     pycolmap.global_mapping(database, images, out, options=options)
 
 
-def refine(model: str, out: str) -> None:
-    """Refine poses and points without wrong matches, with the lens that the photos show.
+def refine(model: str, out: str, calibrated: str = "") -> None:
+    """Refine poses and points without wrong matches, with the lens that the photos show unless it is calibrated.
 
-    That is a pinhole with as few terms of radial distortion as suffice: a term that the photos do not determine bends
-    the whole scene a little, and without any, photos are used unchanged. Mappers approximate a fisheye lens by strong
-    distortion; it is recognized where a fisheye lens with one term fits better than a pinhole with one.
+    Cameras that are fixed to each other keep their relative poses. The lens is a pinhole with as few terms of radial
+    distortion as suffice: a term that the photos do not determine bends the whole scene a little, and without any,
+    photos are used unchanged. Mappers approximate a fisheye lens by strong distortion; it is recognized where a fisheye
+    lens with one term fits better than a pinhole with one.
     """
     start = pycolmap.Reconstruction(model)
+    tie_rigs(start)
+    if calibrated:
+        adjust(start, keep_lens=True)
+        remove_outliers(start, keep_lens=True)
+        start.write(out)
+        return
     fits = [_with_lens(start, kind, no_distortion, terms) for terms, kind in enumerate(_LENSES)]
     distorted = fits[-1].model
     one_term = _with_lens(distorted, _FISHEYE_LENSES[1], equidistant, 1)
@@ -178,7 +212,7 @@ def equidistant(camera: pycolmap.Camera, terms: int) -> list[float]:
     return [found[0], *center, *(found[1:] / found[0])]
 
 
-def remove_outliers(model: pycolmap.Reconstruction) -> None:
+def remove_outliers(model: pycolmap.Reconstruction, keep_lens: bool = False) -> None:
     """Remove observations that are far from where an adjusted model expects them, and adjust it again, in turns.
 
     Matches that are wrong by a few pixels, at edges of objects or on repeated textures, pass COLMAP's filter of 4
@@ -191,13 +225,14 @@ def remove_outliers(model: pycolmap.Reconstruction) -> None:
             # Of a point with two observations, the first that goes takes the other with it.
             if distance > most * typical and model.image(image).points2D[index].has_point3D():
                 model.delete_observation(image, index)
-        adjust(model)
+        adjust(model, keep_lens)
     model.update_point_3d_errors()
 
 
-def adjust(model: pycolmap.Reconstruction) -> None:
-    """Adjust poses, points and lenses, under Cauchy's loss, which hardly counts wrong matches."""
+def adjust(model: pycolmap.Reconstruction, keep_lens: bool = False) -> None:
+    """Adjust poses, points and, unless kept, lenses, under Cauchy's loss, which hardly counts wrong matches."""
     options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = options.refine_extra_params = not keep_lens
     options.refine_principal_point = options.ceres.use_gpu = options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = max(_SPREAD * _typical(residuals(model)), _FINEST)

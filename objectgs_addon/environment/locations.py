@@ -148,6 +148,7 @@ def sfm_job(capture: Path, source: PhotosSource) -> Job:
         source.features,
         *(["--frames", str(source.frames)] if source.frames else []),
         *(["--set", str(source.set)] if source.set > 1 else []),
+        *(["--calibration", str(source.calibration)] if source.calibration else []),
         *(["--leave-out", *source.leave_out] if source.leave_out else []),
     )
 

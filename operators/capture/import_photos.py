@@ -46,6 +46,11 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
             ("each", "One per Photo", "None, as for photos by many people or a zoom lens"),
         ],
     )
+    calibration: StringProperty(
+        name="Calibration",
+        description="Path of COLMAP's cameras.bin or cameras.txt, or of its folder, if the lenses are known: a camera "
+        "for each size of photos. If empty, lenses are computed, too",
+    )
     features: EnumProperty(
         name="Features",
         description="Where the photos are compared",
@@ -64,7 +69,9 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
     def draw(self, _context: bpy.types.Context) -> None:
         self.layout.use_property_split = True
         self.layout.prop(self, "folder", placeholder="Automatic")
-        self.layout.prop(self, "cameras")
+        self.layout.prop(self, "calibration", placeholder="None")
+        if not self.calibration:
+            self.layout.prop(self, "cameras")
         self.layout.prop(self, "features")
         self.layout.prop(self, "frames")
         names = [file.name for file in self.files if file.name]
@@ -75,8 +82,12 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
         sources = self._sources()
         capture = Path(bpy.path.abspath(self.folder)).resolve() if self.folder else locations.new_capture(sources)
         need.require_unused(capture)
+        calibration = Path(bpy.path.abspath(self.calibration)).resolve() if self.calibration else None
+        if calibration is not None and not calibration.exists():
+            raise InputError(f"{calibration} does not exist; choose another calibration")
         job = locations.sfm_job(
-            capture, PhotosSource(sources, self.cameras, self.frames or None, features=self.features)
+            capture,
+            PhotosSource(sources, self.cameras, self.frames or None, features=self.features, calibration=calibration),
         )
         return background.submit(job, context.scene, self.report)
 

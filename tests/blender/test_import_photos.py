@@ -50,6 +50,21 @@ def test_job_has_the_chosen_sources(submitted, tmp_path, chosen, sources, name):
     assert job.folder == tmp_path / "user" / "captures" / name and job.kind == "sfm"
 
 
+def test_calibration_must_exist_and_is_used_again(submitted, tmp_path):
+    lenses = tmp_path / "cameras.txt"
+    with pytest.raises(RuntimeError, match=r"cameras\.txt does not exist; choose another calibration"):
+        bpy.ops.objectgs.import_photos("EXEC_DEFAULT", directory=str(tmp_path / "trip"), calibration=str(lenses))
+    lenses.write_text("1 SIMPLE_PINHOLE 640 480 600 320 240")
+    bpy.ops.objectgs.import_photos("EXEC_DEFAULT", directory=str(tmp_path / "trip"), calibration=str(lenses))
+    capture = tmp_path / "capture"
+    (capture / "sfm").mkdir(parents=True)
+    write_source(capture, PhotosSource([tmp_path / "trip"], calibration=lenses))
+    bpy.ops.objectgs.recompute_poses("EXEC_DEFAULT", capture=str(capture))
+    for job in submitted:
+        assert job.command[job.command.index("--calibration") + 1] == str(lenses)
+    assert len(submitted) == 2
+
+
 def test_same_sources_continue_in_their_capture(submitted, tmp_path):
     folder, first = tmp_path / "trip", tmp_path / "user" / "captures" / "trip"
     (first / "sfm").mkdir(parents=True)

@@ -13,9 +13,9 @@ from pathlib import Path
 from ...shared.errors import InputError
 from ...shared.formats.regular_file import open_regular
 from .binary import read_cameras_binary, read_images_binary, read_points_binary
-from .model import FILE_STEMS, Model
+from .model import COLMAP, FILE_STEMS, Camera, Model, export_again
 from .text import read_cameras_text, read_images_text, read_points_text
-from .validate import validate
+from .validate import check_camera, validate
 
 
 def find_model(folder: Path) -> tuple[Path, list[str]]:
@@ -81,6 +81,24 @@ def read_model(folder: Path) -> Model:
     return validate(
         Model(folder, paths, cameras, [], points.xyz, points.rgb, points.error, points.ids, warnings), images
     )
+
+
+def read_cameras(file: Path) -> dict[int, Camera]:
+    """Read and check the cameras of a COLMAP model by ID.
+
+    Args:
+        file: cameras.bin, or text.
+
+    Raises:
+        InputError: The file is damaged.
+    """
+    try:
+        cameras = read_cameras_binary(file) if file.suffix == ".bin" else read_cameras_text(file)
+    except OSError as error:
+        raise InputError(f"{file} cannot be read ({error.strerror}); check the file.") from error
+    for camera in cameras.values():
+        check_camera(camera, file, export_again(COLMAP))
+    return cameras
 
 
 def has_model(folder: Path) -> bool:

@@ -49,7 +49,7 @@ def validate(model: Model, raw: list[RawImage]) -> Model:
         names.add(image.name)
         used.add(image.camera_id)
     for camera_id in sorted(used):
-        _check_camera(model.cameras[camera_id], model.file("cameras"), again)
+        check_camera(model.cameras[camera_id], model.file("cameras"), again)
 
     with np.errstate(invalid="ignore"):
         finite = (np.abs(model.xyz) <= _FARTHEST).all(1)
@@ -75,7 +75,14 @@ def validate(model: Model, raw: list[RawImage]) -> Model:
     return replace(model, images=images, xyz=xyz, rgb=model.rgb[finite], error=error, ids=ids)
 
 
-def _check_camera(camera: Camera, path: Path, again: str) -> None:
+def check_camera(camera: Camera, path: Path, again: str) -> None:
+    """Raise InputError if a camera of the file `path` has an impossible size or parameters that are not finite.
+
+    Args:
+        camera: The camera.
+        path: The file, for messages.
+        again: What the user should do.
+    """
     who = f"{path} gives camera {camera.id} ({camera.model})"
     if not (0 < camera.width <= _LARGEST_SIDE and 0 < camera.height <= _LARGEST_SIDE):
         raise InputError(f"{who} the impossible size {camera.width}x{camera.height}; {again}.")

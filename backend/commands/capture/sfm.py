@@ -17,6 +17,8 @@ from ...sfm.agreement import measure_agreement
 from ...sfm.background import stands_still
 from ...sfm.location import meters_per_unit, positions_in_meters
 from ...sfm.pairs import NEIGHBORS, choose_pairs
+from ...sfm.rig import rigs_of
+from ...sfm.sources.calibration import photos_by_camera, read_calibration
 from ...sfm.sources.photos import IMAGES, MASKS, Photo, take_photos, write_object_masks
 from ...sfm.stages import run_stage
 from ...shared.errors import InputError
@@ -42,14 +44,17 @@ def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Find features, match the photos, compute poses and points, and write CAPTURE/sparse/0 and sfm/sfm.json."""
     sources, capture = options.photos, options.out
     _require_sources(sources)
+    if options.calibration is not None:
+        read_calibration(options.calibration)
     _require_own(sources[0], capture)
     with recorded() as created:
         try:
             make_folder(capture / WORK)
             with locked(capture / WORK):
                 made_from = PhotosSource(
-                    sources, options.cameras, options.frames, options.leave_out, options.features, options.set
-                )
+                    sources, options.cameras, options.frames, options.leave_out, options.features, options.set,
+                    options.calibration,
+                )  # fmt: skip
                 write_source(capture, made_from)
                 _run(made_from, capture, reporter)
         except InputError:
@@ -109,7 +114,8 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
         "refine": ("Poses", 0.2 * _MAP * count), "dense": ("Points", _DENSE * count),
     })  # fmt: skip
 
-    write_json(work / "groups.json", _groups(photos, made_from.cameras))
+    write_json(work / "groups.json", _groups(photos, images, made_from))
+    calibrated = ["calibrated"] if made_from.calibration else []
     listed_names = work / "names.json"
     write_json(listed_names, names)
     path = _match(source, capture, names, in_order, made_from.features == "objects", reporter)
@@ -124,7 +130,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
         reporter.begin(mapper, f"Computing poses ({mapper})")
         out = work / mapper
         make_folder(out)
-        arguments = [mapper, str(path), str(images), str(out), str(listed_names)]
+        arguments = [mapper, str(path), str(images), str(out), str(listed_names), *calibrated]
         run_stage(reporter, log, arguments, lambda lines: lines, count)
         candidate = model.read_candidate(mapper, out, path, made_from.set)
         if candidate is not None:
@@ -139,7 +145,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
         )
     wrong = model.drop_untrusted(best)
     model.require_parallax(best.model, source)
-    best = best._replace(model=_refined(best.model, work, log, reporter))
+    best = best._replace(model=_refined(best.model, work, log, calibrated, reporter))
     best = best._replace(agreement=measure_agreement(best.model, path))
     figures = check.figures_of(best.model, best.agreement)
     weak = check.weak_photos(figures)
@@ -157,6 +163,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
         "reprojection_error": round(check.mean_error(best.model), 4),
         "mapper": best.mapper,
         "cameras": best.model.num_cameras(),
+        "rigs": rigs_of(best.model),
         "set": made_from.set,
         "separate_sets": best.sets if len(best.sets) > 1 else [],
         "size_by_gps": by_gps is not None,
@@ -207,7 +214,7 @@ def _match(
 
 
 def _refined(
-    found: pycolmap.Reconstruction, work: Path, log: Path, reporter: StoppingReporter
+    found: pycolmap.Reconstruction, work: Path, log: Path, calibrated: list[str], reporter: StoppingReporter
 ) -> pycolmap.Reconstruction:
     """Return a model after a last adjustment, or the model itself if that fails."""
     reporter.begin("refine", "Refining lenses and poses")
@@ -216,7 +223,7 @@ def _refined(
         shutil.rmtree(folder, ignore_errors=True)
         make_folder(folder)
     found.write(before)
-    if run_stage(reporter, log, ["refine", str(before), str(after)], lambda lines: lines, 1):
+    if run_stage(reporter, log, ["refine", str(before), str(after), *calibrated], lambda lines: lines, 1):
         return pycolmap.Reconstruction(after)
     return found
 
@@ -236,12 +243,18 @@ def _densify(found: pycolmap.Reconstruction, capture: Path, reporter: StoppingRe
         shutil.rmtree(scratch, ignore_errors=True)
 
 
-def _groups(photos: list[Photo], cameras: str) -> list[list[str]]:
-    """Return the names of the photos of each camera."""
+def _groups(photos: list[Photo], images: Path, made_from: PhotosSource) -> list[dict[str, Any]]:
+    """Return the names of the photos of each camera, and its lens if that is known."""
+    if made_from.calibration is not None:
+        known = photos_by_camera(photos, images, read_calibration(made_from.calibration), made_from.calibration)
+        return [
+            {"names": names, "camera": {"model": camera.model, "params": list(camera.params)}}
+            for names, camera in known
+        ]
     groups: dict[str, list[str]] = {}
     for photo in photos:
-        groups.setdefault({"one": "", "each": photo.name}.get(cameras, photo.camera), []).append(photo.name)
-    return list(groups.values())
+        groups.setdefault({"one": "", "each": photo.name}.get(made_from.cameras, photo.camera), []).append(photo.name)
+    return [{"names": names, "camera": None} for names in groups.values()]
 
 
 def _require_matches(path: Path, source: Path) -> None:
@@ -267,6 +280,8 @@ def _tell(report: dict[str, Any], capture: Path, reporter: StoppingReporter) -> 
         reporter.warning(f"{name} has no pose: {why}.")
     if len(left_out) > _WORST:
         reporter.warning(f"{len(left_out) - _WORST} more photos have no pose; {path} lists them.")
+    for folders in report["rigs"]:
+        reporter.status(f"The cameras of {', '.join(folders)} are a rig: they keep their relative poses.")
     for name, why in list(weak.items())[:_WORST]:
         reporter.warning(f"{name} is weak: {why}; --leave-out {name} computes the poses without it.")
     if len(weak) > _WORST:

@@ -48,6 +48,7 @@ class PhotosSource:
         leave_out: names of photos that are not used.
         features: where features are found, "auto" or "objects".
         set: which of the sets of photos that nothing connects is used, 1 for the largest.
+        calibration: file or folder with the photos' cameras, or None where these are not known.
     """
 
     photos: list[Path]
@@ -56,6 +57,7 @@ class PhotosSource:
     leave_out: list[str] = field(default_factory=list)
     features: str = "auto"
     set: int = 1
+    calibration: Path | None = None
 
 
 def write_source(capture: Path, source: PhotosSource) -> None:
@@ -69,6 +71,7 @@ def write_source(capture: Path, source: PhotosSource) -> None:
             "leave_out": source.leave_out,
             "features": source.features,
             "set": source.set,
+            "calibration": None if source.calibration is None else str(source.calibration.resolve()),
         },
     )
 
@@ -77,7 +80,7 @@ def read_source(capture: Path) -> PhotosSource | None:
     """Read sfm/source.json of a capture; return None if it is missing or invalid."""
     try:
         stored = read_json(capture / WORK / _SOURCE)
-        frames = stored.get("frames")
+        frames, calibration = stored.get("frames"), stored.get("calibration")
         return PhotosSource(
             [Path(path) for path in stored["photos"]],
             str(stored.get("cameras", "auto")),
@@ -85,6 +88,7 @@ def read_source(capture: Path) -> PhotosSource | None:
             [str(name) for name in stored.get("leave_out", [])],
             "objects" if stored.get("features") == "objects" else "auto",
             max(int(stored.get("set", 1)), 1),
+            None if calibration is None else Path(calibration),
         )
     except (InputError, AttributeError, KeyError, TypeError, ValueError):
         return None
