@@ -2,10 +2,12 @@
 
 from .capture import Capture, Keypoints, Points, View, default_split
 from .prepare import load_capture
+from .sharpness import BLURRED, measure_contrasts
 from .survey import check_capture
 from .upright import Upright, compute_upright
 
 __all__ = [
+    "BLURRED",
     "Capture",
     "Keypoints",
     "Points",
@@ -15,4 +17,5 @@ __all__ = [
     "compute_upright",
     "default_split",
     "load_capture",
+    "measure_contrasts",
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..capture import Capture, View
+from ..capture import BLURRED, Capture, View, measure_contrasts
 
 SAME_PIXELS = 0.5
 """Two views have the same position if the points of one move by at most this many pixels in the other."""
@@ -21,6 +21,9 @@ MARGIN = 0.1
 
 VACANT = 0.35
 """Fraction of the training views' area without points from which on points are looked for there."""
+
+_SHOWN_ELSEWHERE = 0.8
+"""Fraction of a blurred view's points that two other views must show."""
 
 _CELLS = 40
 """Number of cells along the longer side of a view in which points are counted."""
@@ -142,6 +145,31 @@ def blind_views(capture: Capture) -> list[int]:
     views = capture.train_indices
     blind = [i for i in views if not len(capture.observed(i)) and not _inside(capture, i, capture.points.xyz).any()]
     return blind if len(blind) < len(views) else []
+
+
+def blurred_views(capture: Capture) -> dict[int, float]:
+    """Find training views that are blurred, if other views show almost all of what they show.
+
+    Args:
+        capture: The capture; must be prepared.
+
+    Returns:
+        Indices of the views, the most blurred first, with the contrast of their details relative to other views.
+    """
+    views = capture.train_indices
+    contrasts = measure_contrasts(capture, views)
+    seen_in = np.zeros(len(capture.points.xyz), np.int64)
+    for index in views:
+        seen_in[np.unique(capture.observed(index))] += 1
+    found = {}
+    for place in np.argsort(contrasts, kind="stable"):
+        if contrasts[place] >= BLURRED:
+            break
+        observed = np.unique(capture.observed(views[place]))
+        if float(np.mean(seen_in[observed] > 2)) >= _SHOWN_ELSEWHERE:
+            found[views[place]] = float(contrasts[place])
+            seen_in[observed] -= 1
+    return found
 
 
 def views_without_objects(capture: Capture) -> list[int]:

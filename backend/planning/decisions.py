@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..capture import Capture
+from ..capture import BLURRED, Capture
 from ..shared.defaults import MAX_SIZE
 from ..shared.reconstruction.objects import SceneObject, default_name, merged
 from ..shared.reconstruction.plan import KEYS, Decision, Plan
@@ -21,6 +21,7 @@ from ..training.settings import Settings, background_is_masked, downscale_at
 from .coverage import (
     VACANT,
     blind_views,
+    blurred_views,
     duplicate_views,
     unseen_points,
     vacancy,
@@ -265,6 +266,23 @@ def _blind_views(context: PlanningContext) -> Decision | None:
     return Decision("blind-views", f"training on {_views(len(found))}", False, why, views=context.names(found))
 
 
+def _blurred_views(context: PlanningContext) -> Decision | None:
+    if context.resumed is not None:
+        return context.resumed.planned("blurred-views")
+    if not _may_read_photos(context):
+        return None
+    found = blurred_views(planned_capture(context.capture, context.plan))
+    if not found:
+        return None
+    names = context.names(list(found))
+    shares = [f"{name} ({share:.0%})" for name, share in zip(names, found.values(), strict=True)]
+    why = (
+        f"details have less than {BLURRED:.0%} of the contrast that other views show at the same points: "
+        f"{_listed(shares)}"
+    )
+    return Decision("blurred-views", f"training on {_views(len(found))}", False, why, views=names)
+
+
 def _other_views(context: PlanningContext) -> Decision | None:
     """Keep these views: they show the rest of the scene, and constrain where the objects are not."""
     if not (context.labeled and len(context.capture.left_out)):
@@ -348,7 +366,8 @@ def _surface(context: PlanningContext) -> Decision | None:
 
 DECISIONS: tuple[Callable[[PlanningContext], Decision | None], ...] = (
     _votes, _objects, _groups, _surroundings, _rest, _labels, _undistortion, _duplicate_views, _blind_views,
-    _other_views, _validation_views, _unseen_points, _dense_points, _exposure, _pyramid, _meshes, _surface,
+    _blurred_views, _other_views, _validation_views, _unseen_points, _dense_points, _exposure, _pyramid, _meshes,
+    _surface,
 )  # fmt: skip
 """In the order of `KEYS`; a decision may depend on earlier ones. None if a decision does not apply to the capture."""
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pycolmap
 
-from ...capture import load_capture
+from ...capture import BLURRED, load_capture, measure_contrasts
 from ...sfm import check, database, model
 from ...sfm.agreement import measure_agreement
 from ...sfm.background import stands_still
@@ -152,7 +152,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     by_gps = meters_per_unit(model.centers_of(best.model), positions_in_meters(images, figures))
     model.scale(best.model, by_gps or model.common_size(best.model))
     model.write_model(best.model, capture)
-    _densify(best.model, capture, reporter)
+    weak |= _densify(best.model, capture, reporter)
     check.write_picture(work / PICTURE, best.model, figures, path, list(weak))
     posed = list(figures)
     left_out = {**unreadable, **unwanted, **model.reasons(path, names, posed, wrong)}
@@ -228,8 +228,12 @@ def _refined(
     return found
 
 
-def _densify(found: pycolmap.Reconstruction, capture: Path, reporter: StoppingReporter) -> None:
-    """Add points where features are few, from patches of the photos, and remove those in front of surfaces."""
+def _densify(found: pycolmap.Reconstruction, capture: Path, reporter: StoppingReporter) -> dict[str, str]:
+    """Add points where features are few, from patches of the photos, and remove those in front of surfaces.
+
+    Returns:
+        The photos that are blurred: name -> reason.
+    """
     reporter.begin("dense", "Finding points on plain surfaces")
     scratch = capture / WORK / "undistorted"
     shutil.rmtree(scratch, ignore_errors=True)
@@ -239,8 +243,14 @@ def _densify(found: pycolmap.Reconstruction, capture: Path, reporter: StoppingRe
         model.remove_points(found, photos.points.ids[points.in_front])
         model.add_points(found, points.xyz, points.rgb)
         model.write_model(found, capture)
+        contrasts = measure_contrasts(photos, range(len(photos.views)))
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+    return {
+        view.name: f"it is blurred, its details have {contrast:.0%} of the contrast that they have in other photos"
+        for view, contrast in zip(photos.views, contrasts, strict=True)
+        if contrast < BLURRED
+    }
 
 
 def _groups(photos: list[Photo], images: Path, made_from: PhotosSource) -> list[dict[str, Any]]:
