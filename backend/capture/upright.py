@@ -1,7 +1,7 @@
 """Estimation of the up direction and ground of a capture: COLMAP's frame is arbitrary, whereas Blender has Z up.
 
 The up direction is estimated from the cameras, since most photos are taken level, and refined by the largest
-horizontal plane of the points if there is one, such as a floor or a table top.
+horizontal plane of the points if there is one, such as a floor or a table top, unless the photos tell it.
 """
 
 from __future__ import annotations
@@ -44,12 +44,13 @@ class Upright:
     translation: np.ndarray
 
 
-def compute_upright(viewmats: np.ndarray, xyz: np.ndarray) -> Upright:
+def compute_upright(viewmats: np.ndarray, xyz: np.ndarray, known: np.ndarray | None = None) -> Upright:
     """Compute the transform that makes a capture upright.
 
     Args:
         viewmats: (V, 4, 4), world to camera, OpenCV axes.
         xyz: (M, 3), points.
+        known: (3,), what is up, if it was measured; only the ground's height is then that of a plane.
 
     Returns:
         The transform. Its rotation is the smallest one that rotates up to +Z, which keeps the heading, or the identity
@@ -64,9 +65,9 @@ def compute_upright(viewmats: np.ndarray, xyz: np.ndarray) -> Upright:
     size = max(2 * reach, float(np.median(np.linalg.norm(centers - middle, axis=1))))
     origin = _origin(middle, size)
     near = xyz[distances <= 3 * reach] - origin
-    up = _cameras_up(viewmats)
+    up = _cameras_up(viewmats) if known is None else known / np.linalg.norm(known)
     plane = _level_plane(near, up, PLANE_THICKNESS * size, centers - origin)
-    if plane is not None:
+    if plane is not None and known is None:
         up = plane[0]
     rotation = _smallest_rotation(up)
     if np.arccos(np.clip(up[2], -1, 1)) <= UPRIGHT_WITHIN:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..capture import Capture, Upright, compute_upright
+from ..shared.formats.photos_source import read_up
 from ..shared.reconstruction.cameras import NAME, Cameras, CameraView, read_cameras, write_cameras
 from ..shared.reconstruction.folder import Reconstruction
 
@@ -18,7 +19,8 @@ def write_capture_cameras(folder: Reconstruction, capture: Capture) -> None:
         )
         for i, view in enumerate(capture.views)
     ]
-    upright = compute_upright(np.array([view.viewmat for view in capture.views]), capture.points.xyz)
+    viewmats, up = np.array([view.viewmat for view in capture.views]), read_up(capture.folder)
+    upright = compute_upright(viewmats, capture.points.xyz, None if up is None else np.array(up))
     write_cameras(folder.folder, Cameras(capture.folder.resolve(), upright.origin, _matrix(upright), views))
 
 

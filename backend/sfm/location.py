@@ -1,4 +1,4 @@
-"""The true size of a scene from where the photos were taken, which their EXIF data may tell by GPS."""
+"""The true size of a scene and what is up, where photos tell positions by GPS, or how far cameras looked up."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from .sources.photo_files import gps_position
+from .sources.photo_files import camera_elevation, gps_position
 
 _FEWEST = 5
 """Number of photos with a position from which on these are used."""
@@ -16,6 +16,11 @@ _NEAREST = 5.0
 """Meters that distant cameras are apart at least, which is the precision of a phone outdoors."""
 _SPREAD = 0.2
 """Largest range of the middle half of the sizes that pairs of cameras give, relative to their median."""
+
+_FEWEST_LEVEL = 3
+"""Number of photos that tell their elevation from which on these are used."""
+_TILT = 3.0
+"""Largest median angle in degrees between up as these photos tell it and their common direction."""
 
 
 def positions_in_meters(images: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
@@ -48,3 +53,33 @@ def meters_per_unit(centers: Mapping[str, np.ndarray], places: Mapping[str, np.n
         return None
     low, middle, high = np.percentile(meters[far] / units[far], (25, 50, 75))
     return float(middle) if high - low < _SPREAD * middle else None
+
+
+def elevations(images: Path, names: Iterable[str]) -> dict[str, float]:
+    """Return by how many degrees cameras looked above the horizon, for the photos of a folder that tell."""
+    return {name: angle for name in names if (angle := camera_elevation(images / name)) is not None}
+
+
+def up_by_elevations(rotations: Mapping[str, np.ndarray], angles: Mapping[str, float]) -> np.ndarray | None:
+    """Return what is up in a model, or None where the photos do not tell or contradict each other.
+
+    Args:
+        rotations: name of the photo -> (3, 3) rotation from the world to the camera, with y down and z forward.
+        angles: name of the photo -> elevation of the camera in degrees; its x axis is horizontal.
+
+    Returns:
+        (3,) unit vector in the world.
+    """
+    both = [name for name in rotations if name in angles]
+    if len(both) < _FEWEST_LEVEL:
+        return None
+    radians = np.radians([angles[name] for name in both])
+    in_cameras = np.stack([np.zeros(len(both)), -np.cos(radians), np.sin(radians)], 1)
+    ups = np.einsum("nji,nj->ni", np.array([rotations[name] for name in both]), in_cameras)
+    up = np.median(ups, axis=0)
+    length = float(np.linalg.norm(up))
+    if length < 0.5:
+        return None
+    up /= length
+    apart = np.degrees(np.arccos(np.clip(ups @ up, -1.0, 1.0)))
+    return up if float(np.median(apart)) < _TILT else None

@@ -121,6 +121,12 @@ def centers_of(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
     return {image.name: image.projection_center() for image in images}
 
 
+def rotations_of(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
+    """Return the rotations (3, 3) from the world to the posed cameras by name of the photo."""
+    images = (model.image(number) for number in model.reg_image_ids())
+    return {image.name: image.cam_from_world().matrix()[:, :3] for image in images}
+
+
 def common_size(model: pycolmap.Reconstruction) -> float:
     """Return the factor that puts points `DISTANCE` from their cameras in the median, for models of unknown size."""
     distances = [

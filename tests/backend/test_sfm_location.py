@@ -1,10 +1,17 @@
-"""The size of a scene by GPS: from EXIF data, with noise and wrong positions, and where it does not tell the size."""
+"""The size of a scene by GPS and what is up by elevations: of EXIF and XMP data, with noise and wrong values."""
+
+import json
 
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
+from backend.capture import compute_upright, load_capture
+from backend.commands.cameras import read_upright, write_capture_cameras
 from backend.sfm import location
+from backend.shared.reconstruction.folder import Reconstruction
+
+from .rendered_photos import pose
 
 
 def degrees_minutes_seconds(value: float) -> tuple[float, float, float]:
@@ -49,3 +56,65 @@ def test_size_is_unknown_indoors_and_for_few_photos():
     assert location.meters_per_unit(dict(enumerate(centers)), dict(enumerate(1.5 * centers))) is None, "too near"
     assert location.meters_per_unit(dict(enumerate(centers)), dict(enumerate(20 * centers[:4]))) is None
     assert location.meters_per_unit(dict(enumerate(centers)), {}) is None
+
+
+def test_elevations_are_read_from_exif_and_from_gimbals(tmp_path):
+    def save(name, xmp=None, elevation=None, orientation=1):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = orientation
+        if elevation is not None:
+            exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.CameraElevationAngle] = elevation
+        Image.new("RGB", (64, 48)).save(tmp_path / name, exif=exif, **({"xmp": xmp} if xmp else {}))
+
+    gimbal = 'drone-dji:GimbalRollDegree="{}"\n drone-dji:GimbalPitchDegree="{}"'
+    save("exif.jpg", elevation=-30.5)
+    save("drone.jpg", gimbal.format("+0.00", "-89.90").encode())
+    save("element.jpg", b"<drone-dji:GimbalPitchDegree>+12.5</drone-dji:GimbalPitchDegree>")
+    save("rolled.jpg", gimbal.format("+15.00", "-20.00").encode())
+    save("turned.jpg", elevation=-30.5, orientation=6)
+    save("wrong.jpg", elevation=400.0)
+    save("plain.jpg")
+    names = sorted(path.name for path in tmp_path.iterdir())
+    found = location.elevations(tmp_path, [*names, "missing.jpg"])
+    assert found == pytest.approx({"exif.jpg": -30.5, "drone.jpg": -89.9, "element.jpg": 12.5})
+
+
+@pytest.fixture
+def flight():
+    """Rotations and elevations of cameras around a slope, in a world that is tilted by 35 degrees."""
+    rng = np.random.default_rng(3)
+    centers = np.stack([rng.uniform(-5, 5, 30), rng.uniform(-5, 5, 30), rng.uniform(3, 6, 30)], 1)
+    level = [pose(center, rng.normal(0, 0.5, 3))[:, :3] for center in centers]
+    angles = {str(i): float(np.degrees(np.arcsin(each[2, 2]))) for i, each in enumerate(level)}
+    cosine, sine = np.cos(np.radians(35)), np.sin(np.radians(35))
+    tilt = np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
+    return {str(i): each @ tilt.T for i, each in enumerate(level)}, angles, tilt[:, 2]
+
+
+def test_elevations_tell_what_is_up(flight):
+    rotations, angles, up = flight
+    rng = np.random.default_rng(4)
+    noisy = {name: angle + rng.normal(0, 1.0) for name, angle in angles.items()}
+    noisy |= {str(i): -noisy[str(i)] for i in range(5)}
+    found = location.up_by_elevations(rotations, noisy)
+    assert np.degrees(np.arccos(found @ up)) < 0.7
+    assert location.up_by_elevations(rotations, dict(list(angles.items())[:2])) is None
+    assert location.up_by_elevations(rotations, {name: rng.uniform(-80, 80) for name in angles}) is None
+
+
+def test_up_that_photos_told_is_used(write_capture, tmp_path):
+    scene = write_capture(views=6)
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    up = np.array([0.1, -0.9, 0.3])
+    (scene.folder / "sfm").mkdir()
+    (scene.folder / "sfm" / "sfm.json").write_text(json.dumps({"up": up.tolist()}))
+    folder = Reconstruction(tmp_path / "out")
+    folder.folder.mkdir()
+    write_capture_cameras(folder, capture)
+    np.testing.assert_allclose(read_upright(folder).rotation @ up / np.linalg.norm(up), [0, 0, 1], atol=1e-6)
+    for wrong in ([0, 0, 0], ["a", 0, 1], None, [0, float("nan"), 1]):
+        (scene.folder / "sfm" / "sfm.json").write_text(json.dumps({"up": wrong}))
+        write_capture_cameras(folder, capture)
+        viewmats = np.array([view.viewmat for view in capture.views])
+        expected = compute_upright(viewmats, capture.points.xyz).rotation
+        np.testing.assert_allclose(read_upright(folder).rotation, expected)

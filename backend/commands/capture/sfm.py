@@ -15,7 +15,7 @@ from ...capture import BLURRED, load_capture, measure_contrasts
 from ...sfm import check, database, model
 from ...sfm.agreement import measure_agreement
 from ...sfm.background import stands_still
-from ...sfm.location import meters_per_unit, positions_in_meters
+from ...sfm.location import elevations, meters_per_unit, positions_in_meters, up_by_elevations
 from ...sfm.pairs import NEIGHBORS, choose_pairs
 from ...sfm.rig import rigs_of
 from ...sfm.sources.calibration import photos_by_camera, read_calibration
@@ -150,6 +150,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     figures = check.figures_of(best.model, best.agreement)
     weak = check.weak_photos(figures)
     by_gps = meters_per_unit(model.centers_of(best.model), positions_in_meters(images, figures))
+    up = up_by_elevations(model.rotations_of(best.model), elevations(images, figures))
     model.scale(best.model, by_gps or model.common_size(best.model))
     model.write_model(best.model, capture)
     weak |= _densify(best.model, capture, reporter)
@@ -167,6 +168,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
         "set": made_from.set,
         "separate_sets": best.sets if len(best.sets) > 1 else [],
         "size_by_gps": by_gps is not None,
+        "up": None if up is None else up.tolist(),
         "figures": {name: own._asdict() for name, own in figures.items()},
         "weak": weak,
         "left_out": left_out,

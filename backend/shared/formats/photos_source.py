@@ -118,3 +118,12 @@ def read_photo_errors(capture: Path) -> dict[str, PhotoError]:
     except (InputError, AttributeError, KeyError, TypeError, ValueError):
         return {}
     return {name: each for name, each in found.items() if math.isfinite(each.pixels)}
+
+
+def read_up(capture: Path) -> list[float] | None:
+    """Return what is up in a capture's world, (3,), if its photos told that to `sfm`; else None."""
+    try:
+        x, y, z = (float(value) for value in read_json(capture / WORK / REPORT)["up"])
+    except (InputError, KeyError, TypeError, ValueError):
+        return None
+    return [x, y, z] if math.isfinite(x * x + y * y + z * z) and x * x + y * y + z * z > 0 else None
