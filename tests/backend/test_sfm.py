@@ -99,10 +99,11 @@ def test_wrong_matches_do_not_move_poses(made, tmp_path):
     assert errors[1] < 0.15 and errors[0] > 2 * errors[1]
 
 
-def test_capture_can_be_imported_and_is_kept_by_a_second_run(made, run_command, tmp_path):
+def test_capture_can_be_imported_and_is_kept_by_a_second_run(made, run_command, tmp_path, monkeypatch):
     assert run_command("import", made, "--out", tmp_path / "out").code == EXIT_DONE
     before = pycolmap.Reconstruction(made / "sparse" / "0").num_reg_images()
-    result = run_command("sfm", made, "--out", made)
+    monkeypatch.chdir(made.parent)  # COLMAP's processes run elsewhere.
+    result = run_command("sfm", made.name, "--out", made.name)
     assert result.code == EXIT_DONE and pycolmap.Reconstruction(made / "sparse" / "0").num_reg_images() == before
 
 

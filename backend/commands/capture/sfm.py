@@ -42,7 +42,7 @@ _WORST = 10
 
 def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Find features, match the photos, compute poses and points, and write CAPTURE/sparse/0 and sfm/sfm.json."""
-    sources, capture = options.photos, options.out
+    sources, capture = options.photos, options.out.absolute()  # COLMAP's processes run in another folder.
     _require_sources(sources)
     if options.calibration is not None:
         read_calibration(options.calibration)
