@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
@@ -82,6 +82,16 @@ def image_ids(path: Path) -> dict[str, int]:
     """Map the names of the photos in the database to their IDs."""
     with _reading(path) as database:
         return {name: int(number) for number, name in database.execute("SELECT image_id, name FROM images")}
+
+
+def camera_of(path: Path, names: Iterable[str]) -> int:
+    """Return the ID of the camera of the first of some photos that is in the database, or -1.
+
+    After a stop, COLMAP would give the photos of a group that are left a camera of their own.
+    """
+    with _reading(path) as database:
+        cameras = dict(database.execute("SELECT name, camera_id FROM images"))
+    return next((int(cameras[name]) for name in names if name in cameras), -1)
 
 
 def feature_counts(path: Path) -> dict[int, int]:

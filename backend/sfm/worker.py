@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pycolmap
 
-from .database import listed_names, restore_names
+from .database import camera_of, listed_names, restore_names
 from .rig import tie_rigs
 
 SEED = 0
@@ -64,37 +64,47 @@ def extract(database: str, images: str, groups: str, masks: str = "") -> None:
 
     With masks, features are where MASKS/NAME.png is not black.
     """
+    pycolmap.Database.open(database).close()
     restore_names(Path(database))
-    for group in json.loads(Path(groups).read_text(encoding="utf-8")):
-        names, camera = group["names"], group["camera"]
+    for group in _read_groups(groups):
         reader = pycolmap.ImageReaderOptions()
         if masks:
             reader.mask_path = masks
-        if camera:
-            reader.camera_model, reader.camera_params = camera["model"], ",".join(map(repr, camera["params"]))
+        reader.existing_camera_id = camera_of(Path(database), group.names)
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu = False
         options.max_image_size = LONGEST_SIDE
         options.sift.max_num_features = MOST_FEATURES
         options.sift.peak_threshold = _FAINT
         pycolmap.extract_features(
-            database, images, image_names=names, camera_mode=pycolmap.CameraMode.SINGLE,
+            database, images, image_names=group.names, camera_mode=pycolmap.CameraMode.SINGLE,
             reader_options=reader, extraction_options=options,
         )  # fmt: skip
-        if camera:
-            _calibrate(database, names[0], camera)
+        _calibrate(database, group)
 
 
-def _calibrate(database: str, name: str, known: dict[str, Any]) -> None:
-    """Give the camera of a photo in the database a known lens, also if its features were found without."""
+class _Group(NamedTuple):
+    """Photos that share a camera, and its lens if that is known: {"model": ..., "params": [...]}."""
+
+    names: list[str]
+    camera: dict[str, Any] | None
+
+
+def _read_groups(path: str) -> list[_Group]:
+    return [_Group(**each) for each in json.loads(Path(path).read_text(encoding="utf-8"))]
+
+
+def _calibrate(database: str, group: _Group) -> None:
+    """Give the photos of a group their lens if it is known, also if their features were found without."""
+    if group.camera is None:
+        return
     with pycolmap.Database.open(database) as opened:
-        image = opened.read_image_with_name(name)
-        if image is None:
-            return  # It cannot be read.
-        camera = opened.read_camera(image.camera_id)
-        camera.model, camera.params = getattr(pycolmap.CameraModelId, known["model"]), known["params"]
-        camera.has_prior_focal_length = True
-        opened.update_camera(camera)
+        names = set(group.names)
+        for number in {image.camera_id for image in opened.read_all_images() if image.name in names}:
+            camera = opened.read_camera(number)
+            camera.model, camera.params = getattr(pycolmap.CameraModelId, group.camera["model"]), group.camera["params"]
+            camera.has_prior_focal_length = True
+            opened.update_camera(camera)
 
 
 def match(database: str, pairs: str = "") -> None:

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image, ImageFilter
 
 from backend.cli import main as command_line
-from backend.sfm import agreement, check, database, pairs, stages
+from backend.sfm import agreement, check, database, pairs, stages, worker
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE
 from backend.shared.formats import photos_source
 
@@ -77,8 +77,6 @@ def test_points_of_patches_lie_on_the_surfaces(made):
 
 
 def test_wrong_matches_do_not_move_poses(made, tmp_path):
-    from backend.sfm import worker
-
     rng = np.random.default_rng(1)
     model = pycolmap.Reconstruction(made / "sparse" / "0")
     for number in model.reg_image_ids():
@@ -125,6 +123,16 @@ def test_stopped_command_goes_on(photos, tmp_path, run_command, monkeypatch):
     monkeypatch.undo()
     assert run_command("sfm", photos, "--out", capture).code == EXIT_DONE
     assert (capture / "sparse" / "0" / "images.bin").exists()
+
+
+def test_photos_share_a_camera_after_a_stop_among_them(photos, tmp_path):
+    path, listed = tmp_path / database.NAME, tmp_path / "groups.json"
+    names = sorted(path.name for path in (photos / "images").iterdir())
+    for count in (2, 3):
+        listed.write_text(json.dumps([{"names": names[:count], "camera": None}]))
+        worker.extract(str(path), str(photos / "images"), str(listed))
+    with pycolmap.Database.open(path) as stored:
+        assert stored.num_images() == 3 and stored.num_cameras() == stored.num_rigs() == 1
 
 
 def test_killed_mapper_leaves_the_earlier_model(made, photos, tmp_path, monkeypatch, run_command):
