@@ -101,6 +101,10 @@ def _add_capture_commands(commands: _Commands) -> None:
         "objects, on the objects of the masks (auto)",
     )  # fmt: skip
     poses.add_argument(
+        "--matcher", type=Path, metavar="FOLDER",
+        help="find and match features by the networks of a checkpoint of LightGlue; see above (SIFT)",
+    )  # fmt: skip
+    poses.add_argument(
         "--frames", type=types.count, metavar="N", help="number of frames of each video (by how far the picture moves)"
     )
     poses.add_argument(

@@ -10,13 +10,17 @@ from pathlib import Path
 import numpy as np
 
 from ..shared.errors import InputError
+from ..shared.formats.atomic import write_atomic
 
-NAME = "database.db"
+NAME, ON_OBJECTS = "database.db", "objects.db"
+"""Databases in sfm/ with features everywhere, and on objects alone."""
 FEWEST_INLIERS = 15
 """Number of matches in agreement from which on COLMAP takes two photos to show the same."""
 
 _INSTEAD_OF_SPACE = "\ue020"
 """A character for private use, which names in COLMAP's lists of pairs have for spaces."""
+_UNDEFINED = -1
+"""COLMAP's type of descriptors that it does not know."""
 _MOST_IMAGES = 2**31 - 1
 """COLMAP's pair ID is this times the smaller image ID, plus the larger one."""
 
@@ -32,9 +36,23 @@ def _reading(path: Path) -> Iterator[sqlite3.Connection]:
         ) from error
 
 
-def listed_name(name: str) -> str:
-    """Return the name of a photo as COLMAP's lists of pairs can have it."""
-    return name.replace(" ", _INSTEAD_OF_SPACE)
+def name_of(on_objects: bool, network: str = "") -> str:
+    """Return the name of a database: of features on objects alone, or everywhere; of a network's by its fingerprint."""
+    name = ON_OBJECTS if on_objects else NAME
+    return f"learned-{network}-{name}" if network else name
+
+
+def write_pairs(path: Path, pairs: Iterable[tuple[str, str]]) -> None:
+    """Write pairs of names as one of COLMAP's lists; the database needs `listed_names` for it."""
+    lines = (" ".join(name.replace(" ", _INSTEAD_OF_SPACE) for name in pair) + "\n" for pair in pairs)
+    write_atomic(path, "".join(lines).encode())
+
+
+def read_pairs(path: Path) -> list[tuple[str, str]]:
+    """Read a list that `write_pairs` has written."""
+    lines = path.read_text(encoding="utf-8").split("\n")[:-1]
+    split = (line.split(" ") for line in lines)
+    return [(first.replace(_INSTEAD_OF_SPACE, " "), second.replace(_INSTEAD_OF_SPACE, " ")) for first, second in split]
 
 
 @contextmanager
@@ -101,13 +119,17 @@ def feature_counts(path: Path) -> dict[int, int]:
 
 
 def largest_features(path: Path, image_id: int, most: int) -> np.ndarray:
-    """Return the descriptors (n, 128) uint8 of the photo's features with the largest scales, n <= `most`.
+    """Return the descriptors (n, d) of the photo's features with the largest scales, n <= `most`.
 
-    Large features are seen from afar and nearby, so a few of them tell whether two photos show the same.
+    Large features are seen from afar and nearby, so a few of them tell whether two photos show the same. Features of
+    networks have no scale; those that were written first are returned, which are the most certain. Descriptors are
+    uint8, or float32 if their type is UNDEFINED.
     """
     with _reading(path) as database:
         points = database.execute("SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (image_id,)).fetchone()
-        found = database.execute("SELECT rows, cols, data FROM descriptors WHERE image_id = ?", (image_id,)).fetchone()
+        found = database.execute(
+            "SELECT rows, cols, data, type FROM descriptors WHERE image_id = ?", (image_id,)
+        ).fetchone()
     if not points or not found or not found[0]:
         return np.zeros((0, 128), np.uint8)
     shapes = np.frombuffer(points[2], np.float32).reshape(points[0], points[1])
@@ -116,7 +138,8 @@ def largest_features(path: Path, image_id: int, most: int) -> np.ndarray:
         size = np.abs(shapes[:, 2] * shapes[:, 5] - shapes[:, 3] * shapes[:, 4])
     else:
         size = shapes[:, 2] if points[1] > 2 else np.zeros(len(shapes))
-    rows = np.frombuffer(found[2], np.uint8).reshape(found[0], found[1])
+    kind = np.float32 if found[3] == _UNDEFINED else np.uint8
+    rows = np.frombuffer(found[2], kind).reshape(found[0], -1)
     return rows[np.argsort(-size, kind="stable")[:most]]
 
 

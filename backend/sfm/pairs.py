@@ -58,7 +58,7 @@ def choose_pairs(
 
 
 def count_matches(first: np.ndarray, second: np.ndarray) -> int:
-    """Return how many unit descriptors (n, 128) of a photo have a match among those (m, 128) of another.
+    """Return how many unit descriptors (n, d) of a photo have a match among those (m, d) of another.
 
     A match passes the ratio test and is the best one in both directions.
     """

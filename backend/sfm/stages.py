@@ -67,7 +67,7 @@ def run_stage(
             reading.join()
     if process.returncode in _KILLED:
         raise InputError(
-            f"The system ended COLMAP ({arguments[0]}), as happens when memory runs out; close other programs, or use "
+            f"The system ended the stage {arguments[0]}, as happens when memory runs out; close other programs, or use "
             "fewer photos. The same command continues."
         )
     return process.returncode == 0

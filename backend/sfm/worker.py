@@ -2,6 +2,8 @@
 
     worker extract DATABASE IMAGES GROUPS.json [MASKS]   features of the photos in each group, which share a camera
     worker match DATABASE [PAIRS.txt]   matches of the pairs, or of all
+    worker extract-learned MODEL DATABASE IMAGES GROUPS.json [MASKS]   as extract, by the networks of a checkpoint
+    worker match-learned MODEL DATABASE [PAIRS.txt]   as match, of features by extract-learned
     worker incremental|global DATABASE IMAGES OUT NAMES.json [calibrated]   poses of the named photos, and points
     worker refine MODEL OUT [calibrated]   the same without wrong matches, and with the lens that photos show
 
@@ -23,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pycolmap
 
-from .database import camera_of, listed_names, restore_names
+from .database import camera_of, listed_names, read_pairs, restore_names
 from .rig import tie_rigs
 
 SEED = 0
@@ -111,17 +113,43 @@ def match(database: str, pairs: str = "") -> None:
     """Match and verify pairs of photos, those in a file or all."""
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed, verification.ransac.max_num_trials = SEED, _TRIALS
     if pairs:
         listed = pycolmap.ImportedPairingOptions()
         listed.match_list_path, listed.block_size = pairs, _BLOCK
         with listed_names(Path(database)):
-            pycolmap.match_image_pairs(database, options, listed, verification)
+            pycolmap.match_image_pairs(database, options, listed, verification())
     else:
         every = pycolmap.ExhaustivePairingOptions()
         every.block_size = int(_BLOCK**0.5)
-        pycolmap.match_exhaustive(database, options, every, verification)
+        pycolmap.match_exhaustive(database, options, every, verification())
+
+
+def verification() -> pycolmap.TwoViewGeometryOptions:
+    """Return how the matches of a pair are verified."""
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed, options.ransac.max_num_trials = SEED, _TRIALS
+    return options
+
+
+def extract_learned(checkpoint: str, database: str, images: str, groups: str, masks: str = "") -> None:
+    """Find features as `extract`, by the networks of a checkpoint."""
+    from . import learned  # It imports torch, which takes seconds.
+
+    listed = _read_groups(groups)
+    detect = learned.LightGlue(Path(checkpoint)).detect
+    learned.find_features(
+        Path(database), Path(images), [group.names for group in listed], Path(masks) if masks else None, detect
+    )
+    for group in listed:
+        _calibrate(database, group)
+
+
+def match_learned(checkpoint: str, database: str, pairs: str = "") -> None:
+    """Match and verify pairs of photos, those in a file or all, by the networks of a checkpoint."""
+    from . import learned
+
+    listed = read_pairs(Path(pairs)) if pairs else None
+    learned.match_pairs(Path(database), listed, learned.LightGlue(Path(checkpoint)).match, verification())
 
 
 def map_incrementally(database: str, images: str, out: str, names: str, calibrated: str = "") -> None:
@@ -275,6 +303,8 @@ def residuals(model: pycolmap.Reconstruction) -> list[tuple[float, int, int]]:
 STAGES: dict[str, Callable[..., None]] = {
     "extract": extract,
     "match": match,
+    "extract-learned": extract_learned,
+    "match-learned": match_learned,
     "incremental": map_incrementally,
     "global": map_globally,
     "refine": refine,

@@ -149,6 +149,7 @@ def sfm_job(capture: Path, source: PhotosSource) -> Job:
         *(["--frames", str(source.frames)] if source.frames else []),
         *(["--set", str(source.set)] if source.set > 1 else []),
         *(["--calibration", str(source.calibration)] if source.calibration else []),
+        *(["--matcher", str(source.matcher)] if source.matcher else []),
         *(["--leave-out", *source.leave_out] if source.leave_out else []),
     )
 

@@ -15,6 +15,7 @@ from ...capture import BLURRED, load_capture, measure_contrasts
 from ...sfm import check, database, model
 from ...sfm.agreement import measure_agreement
 from ...sfm.background import stands_still
+from ...sfm.learned import LightGlue, fingerprint
 from ...sfm.location import elevations, meters_per_unit, positions_in_meters, up_by_elevations
 from ...sfm.pairs import NEIGHBORS, choose_pairs
 from ...sfm.rig import rigs_of
@@ -22,7 +23,7 @@ from ...sfm.sources.calibration import photos_by_camera, read_calibration
 from ...sfm.sources.photos import IMAGES, MASKS, Photo, take_photos, write_object_masks
 from ...sfm.stages import run_stage
 from ...shared.errors import InputError
-from ...shared.formats.atomic import make_folder, recorded, write_atomic
+from ...shared.formats.atomic import make_folder, recorded
 from ...shared.formats.json_file import write_json
 from ...shared.formats.photos_source import PHOTOS, REPORT, VIDEOS, WORK, PhotosSource, write_source
 from ...shared.reconstruction.lock import locked
@@ -30,11 +31,11 @@ from ...shared.stopping import StoppingReporter
 from ...stereo.dense_points import find_dense_points
 
 PICTURE = "sfm.png"
-OBJECTS_DATABASE = "objects.db"
-"""Database in sfm/ with the features on objects alone."""
 
 _EXTRACT, _MATCH, _MAP, _DENSE = 0.5, 0.03, 0.3, 0.6
 """Expected seconds of the stages for each photo, pair, photo and photo on two cores, until the pace is known."""
+_EXTRACT_LEARNED, _MATCH_LEARNED = 1.0, 1.5
+"""Those of networks."""
 _ENOUGH = 0.95
 """Fraction of photos with trusted poses from which on the result of the first mapper is kept."""
 _WORST = 10
@@ -47,6 +48,8 @@ def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     if options.calibration is not None:
         read_calibration(options.calibration)
     _require_own(sources[0], capture)
+    if options.matcher is not None:
+        LightGlue(options.matcher)  # Before anything is written, it says what is wrong with the folder.
     with recorded() as created:
         try:
             make_folder(capture / WORK)
@@ -54,11 +57,12 @@ def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
                 made_from = PhotosSource(
                     sources, options.cameras, options.frames, options.leave_out, options.features, options.set,
                     options.calibration,
+                    options.matcher,
                 )  # fmt: skip
                 write_source(capture, made_from)
                 _run(made_from, capture, reporter)
         except InputError:
-            if not any((capture / WORK / name).exists() for name in (database.NAME, OBJECTS_DATABASE)):
+            if not any((capture / WORK).glob("*.db")):
                 created.remove_files()
                 created.remove_folders()
             raise
@@ -108,8 +112,9 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     if count < 2:
         raise InputError(f"Too few photos are left in {source}; leave out fewer.")
     pairs_expected = min(count * (count - 1) / 2, NEIGHBORS * count)
+    per_photo, per_pair = (_EXTRACT, _MATCH) if made_from.matcher is None else (_EXTRACT_LEARNED, _MATCH_LEARNED)
     reporter.expect({
-        "extract": ("Features", _EXTRACT * count), "match": ("Matching", _MATCH * pairs_expected),
+        "extract": ("Features", per_photo * count), "match": ("Matching", per_pair * pairs_expected),
         "global": ("Poses", _MAP * count), "incremental": ("Poses", 0.1 * _MAP * count),
         "refine": ("Poses", 0.2 * _MAP * count), "dense": ("Points", _DENSE * count),
     })  # fmt: skip
@@ -118,8 +123,8 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     calibrated = ["calibrated"] if made_from.calibration else []
     listed_names = work / "names.json"
     write_json(listed_names, names)
-    path = _match(source, capture, names, in_order, made_from.features == "objects", reporter)
-    if path.name == OBJECTS_DATABASE:
+    path = _match(source, capture, names, in_order, made_from.features == "objects", made_from.matcher, reporter)
+    if path.name.endswith(database.ON_OBJECTS):
         write_source(capture, replace(made_from, features="objects"))
 
     candidates: list[model.Candidate] = []
@@ -179,38 +184,46 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
 
 
 def _match(
-    source: Path, capture: Path, names: list[str], in_order: bool, on_objects: bool, reporter: StoppingReporter
+    source: Path,
+    capture: Path,
+    names: list[str],
+    in_order: bool,
+    on_objects: bool,
+    matcher: Path | None,
+    reporter: StoppingReporter,
 ) -> Path:
-    """Find features of the photos and match them; return the database.
+    """Find features of the photos and match them, by SIFT or the networks of a checkpoint; return the database.
 
     Where the background stands still while the objects turn, only features on objects are used, if there are masks.
     """
     work, count = capture / WORK, len(names)
     log = work / "colmap.log"
-    path = work / (OBJECTS_DATABASE if on_objects else database.NAME)
+    path = work / database.name_of(on_objects, "" if matcher is None else fingerprint(matcher))
+    extract, match = ["extract"], ["match"]
+    if matcher is not None:
+        extract, match = ([f"{stage}-learned", str(matcher.resolve())] for stage in ("extract", "match"))
     reporter.begin("extract", f"Finding features in {count} photos")
-    arguments = ["extract", str(path), str(capture / IMAGES), str(work / "groups.json")]
+    arguments = [*extract, str(path), str(capture / IMAGES), str(work / "groups.json")]
     if on_objects:
         write_object_masks(capture, names, work / "masks")
         arguments.append(str(work / "masks"))
     if not run_stage(reporter, log, arguments, lambda _: database.count_features(path), count):
-        raise InputError(f"COLMAP could not find features in the photos; see {log}.")
+        raise InputError(f"Features could not be found in the photos; see {log}.")
     reporter.begin("pairs", "Comparing the photos")
     pairs = choose_pairs(path, names, in_order, reporter.progress)
     listed = work / "pairs.txt"
     if pairs is not None:
-        lines = (" ".join(map(database.listed_name, pair)) + "\n" for pair in pairs)
-        write_atomic(listed, "".join(lines).encode())
+        database.write_pairs(listed, pairs)
     total = count * (count - 1) // 2 if pairs is None else len(pairs)
-    arguments = ["match", str(path), *([] if pairs is None else [str(listed)])]
+    arguments = [*match, str(path), *([] if pairs is None else [str(listed)])]
     reporter.begin("match", f"Matching {total:,} pairs of photos")
     if not run_stage(reporter, log, arguments, lambda _: database.count_pairs(path), total):
-        raise InputError(f"COLMAP could not match the photos; see {log}.")
+        raise InputError(f"The photos could not be matched; see {log}.")
     if not on_objects and stands_still(path):
         if not (capture / MASKS).is_dir():
             raise InputError(model.still_background(source))
         reporter.warning("The background stands still while the objects turn: only features on objects are used.")
-        return _match(source, capture, names, in_order, True, reporter)
+        return _match(source, capture, names, in_order, True, matcher, reporter)
     _require_matches(path, source)
     return path
 

@@ -49,6 +49,7 @@ class PhotosSource:
         features: where features are found, "auto" or "objects".
         set: which of the sets of photos that nothing connects is used, 1 for the largest.
         calibration: file or folder with the photos' cameras, or None where these are not known.
+        matcher: folder with a checkpoint of LightGlue, as an absolute path; None for SIFT.
     """
 
     photos: list[Path]
@@ -58,6 +59,7 @@ class PhotosSource:
     features: str = "auto"
     set: int = 1
     calibration: Path | None = None
+    matcher: Path | None = None
 
 
 def write_source(capture: Path, source: PhotosSource) -> None:
@@ -72,6 +74,7 @@ def write_source(capture: Path, source: PhotosSource) -> None:
             "features": source.features,
             "set": source.set,
             "calibration": None if source.calibration is None else str(source.calibration.resolve()),
+            "matcher": None if source.matcher is None else str(source.matcher.resolve()),
         },
     )
 
@@ -80,7 +83,7 @@ def read_source(capture: Path) -> PhotosSource | None:
     """Read sfm/source.json of a capture; return None if it is missing or invalid."""
     try:
         stored = read_json(capture / WORK / _SOURCE)
-        frames, calibration = stored.get("frames"), stored.get("calibration")
+        frames, calibration, matcher = stored.get("frames"), stored.get("calibration"), stored.get("matcher")
         return PhotosSource(
             [Path(path) for path in stored["photos"]],
             str(stored.get("cameras", "auto")),
@@ -89,6 +92,7 @@ def read_source(capture: Path) -> PhotosSource | None:
             "objects" if stored.get("features") == "objects" else "auto",
             max(int(stored.get("set", 1)), 1),
             None if calibration is None else Path(calibration),
+            None if matcher is None else Path(matcher),
         )
     except (InputError, AttributeError, KeyError, TypeError, ValueError):
         return None
