@@ -371,7 +371,7 @@ def test_command_goes_on_and_poses_are_right(networks, tmp_path, run_command, mo
         (camera,) = stored.read_all_cameras()
     assert camera.has_prior_focal_length and camera.mean_focal_length() == pytest.approx(2 * FOCAL, rel=0.02)
     assert [each.name for each in path.parent.glob("*.db")] == [path.name]
-    assert photos_source.read_source(tmp_path / "capture").matcher == networks
+    assert photos_source.read_source(tmp_path / "capture").matcher == networks.resolve()
     posed = pycolmap.Reconstruction(tmp_path / "capture" / "sparse" / "0")
     found = [posed.find_image_with_name(name).cam_from_world().matrix()[:, :3] for name in names]
     for here, there in zip(found, matrices, strict=True):
