@@ -18,7 +18,7 @@ from backend.shared.errors import EXIT_DONE, InputError
 from backend.shared.formats import photos_source
 
 from .command_result import assert_rejected
-from .test_sfm import FOCAL, HEIGHT, WIDTH, photo, ring, write_photos
+from .rendered_photos import FOCAL, HEIGHT, WIDTH, photo, ring, write_photos
 
 REQUIREMENTS = Path(__file__).parents[2] / "requirements"
 STEP = 12
@@ -99,7 +99,7 @@ def test_database_has_features_and_cameras_as_those_of_sift(photos, tmp_path, st
     images, names = photos
     path, groups = tmp_path / "d.db", [names[:2], names[2:]]
     learned.find_features(path, images, groups, None, stand_in.detect)
-    (tmp_path / "groups.json").write_text(json.dumps(groups))
+    (tmp_path / "groups.json").write_text(json.dumps([{"names": each, "camera": None} for each in groups]))
     worker.extract(str(tmp_path / "sift.db"), str(images), str(tmp_path / "groups.json"))
     assert set(database.image_ids(path)) == set(database.image_ids(tmp_path / "sift.db")) == set(names)
     assert database.count_features(path) == len(names) == len(stand_in.images)
@@ -362,7 +362,7 @@ def test_command_goes_on_and_poses_are_right(networks, tmp_path, run_command, mo
 
     before = {table: rows(table) for table in ("keypoints", "descriptors", "matches", "two_view_geometries")}
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("backend.commands.capture.sfm._densify", lambda *_: None)
+    monkeypatch.setattr("backend.commands.capture.sfm._densify", lambda *_: {})
     result = run_command("sfm", "photos", "--out", "capture", "--matcher", networks)
     assert result.code == EXIT_DONE, result.err
     assert all(before[table] and before[table] < rows(table) for table in before)

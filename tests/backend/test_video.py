@@ -13,7 +13,7 @@ from backend.shared.errors import EXIT_BAD_INPUT, EXIT_DONE, InputError
 from backend.shared.events import Reporter
 from backend.shared.stopping import StoppingReporter, StopRequest
 
-from .test_sfm import HEIGHT, WIDTH, photo, pose, texture
+from .rendered_photos import HEIGHT, WIDTH, photo, pose, texture
 
 PAN = 4
 """Pixels by which the picture of `pan` moves from frame to frame."""
@@ -222,7 +222,7 @@ def walk(tmp_path_factory):
 @pytest.fixture
 def no_dense_points(monkeypatch):
     """Leave out the points on plain surfaces, which `test_sfm` covers, to save time."""
-    monkeypatch.setattr("backend.commands.capture.sfm._densify", lambda *_: None)
+    monkeypatch.setattr("backend.commands.capture.sfm._densify", lambda *_: {})
 
 
 def test_poses_of_a_video(walk, tmp_path, run_command, no_dense_points):
