@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks import poses
 
-from .test_sfm import ring
+from .rendered_photos import ring
 
 
 def moved(matrix: np.ndarray, scale: float, turn: np.ndarray, shift: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.backend.test_sfm import photo, ring
+from tests.backend.rendered_photos import photo, ring
 
 from .first_show import open_startup_scene, sidebar
 from .test_workflow import IDLE, script, wait
