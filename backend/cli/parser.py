@@ -151,7 +151,7 @@ def _add_training_commands(commands: _Commands) -> None:
 
 
 def _add_label(commands: _Commands) -> None:
-    """Add `propose`, `label` and `point`."""
+    """Add `propose`, `label`, `clean-labels` and `point`."""
     propose = commands.add_for_result(
         "propose", "Find objects without strokes or masks", texts.PROPOSE, "garden-splats"
     )
@@ -164,6 +164,9 @@ def _add_label(commands: _Commands) -> None:
     )  # fmt: skip
     label.add_argument(
         "--strokes", type=Path, required=True, metavar="FILE", help="strokes on the objects, as JSON; see above"
+    )
+    commands.add_for_result(
+        "clean-labels", "Correct masks and splats by the masks of all photos", texts.CLEAN_LABELS, "garden-splats"
     )
     commands.add_for_result("point", "Answer the strokes of another program", texts.POINT, "garden-splats --json")
 

@@ -102,6 +102,14 @@ have "viewmat" (4 x 4, world to camera), "intrinsics" (fx, fy, cx, cy), "width" 
 unless the file has "everything": true.
 """
 
+CLEAN_LABELS = """\
+Correct the objects of a training by the masks of all photos together. Regions of masks
+that the other photos contradict get the IDs that the splats show, and so do photos
+without masks; the rest is kept. Then the splats get their objects anew, and their
+borders are trained for a short time. masks/ is replaced, repair.json in it says what was
+changed, and the given masks are kept in masks-given/.
+"""
+
 POINT = """\
 Answer strokes with the object of each splat, for programs such as Blender. Each line of
 standard input is a JSON object as for `label`, with a number `request` for the answer.

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from ..shared.stopping import StoppingReporter
 from .capture import check, import_capture, import_splats, masks, plan, sfm, vote
-from .objects import edit, export, film, label, mesh, point, propose
+from .objects import clean_labels, edit, export, film, label, mesh, point, propose
 from .setup import doctor
 from .training import evaluate, render, report, train
 
@@ -24,6 +24,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace, StoppingReporter], None]] = {
     "train": train.train,
     "propose": propose.propose,
     "label": label.label,
+    "clean-labels": clean_labels.clean_labels,
     "point": point.point,
     "render": render.render,
     "mesh": mesh.mesh,

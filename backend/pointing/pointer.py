@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -94,7 +94,7 @@ class Pointer:
         train = self._scene.capture.train_indices
         places = np.unique(np.linspace(0, len(train) - 1, min(len(train), _PHOTOS)).round().astype(int))
         best: dict[int, list[tuple[int, Stroke]]] = {}
-        for index, shown in self._shown_ids(found, [train[place] for place in places.tolist()]):
+        for index, shown in self.shown_ids(found, [train[place] for place in places.tolist()]):
             name = self._scene.capture.views[index].name
             for object_id, pixels in zip(*np.unique(shown[shown > 0], return_counts=True), strict=True):
                 if pixels >= _FEWEST_PIXELS:
@@ -109,7 +109,35 @@ class Pointer:
         everything = bool(seen[known].sum() >= _EVERYTHING * seen.sum())
         return Strokes(strokes, {object_id: default_name(object_id) for object_id in best}, everything)
 
-    def _shown_ids(self, ids: np.ndarray, views: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+    def votes(
+        self, masks: Mapping[int, np.ndarray], objects: np.ndarray, progress: Callable[[int], object]
+    ) -> np.ndarray:
+        """Sum how much each splat contributes to the pixels of each object in masks.
+
+        Args:
+            masks: masks (H, W) by the index of the view; pixels of other IDs than those of the objects do not count.
+            objects: (C,) object IDs.
+            progress: receives the number of finished masks.
+
+        Returns:
+            (N, C) float64, in pixels.
+        """
+        found = np.zeros((len(self.splats.means), len(objects)))
+        for done, (index, mask) in enumerate(masks.items(), 1):
+            camera = self._scene.camera(index)
+            shown = [column for column, object_id in enumerate(objects.tolist()) if (mask == object_id).any()]
+            for columns in (shown[first : first + 3] for first in range(0, len(shown), 3)):
+                planes = np.zeros((3, camera.height, camera.width), np.float32)
+                planes[: len(columns)] = mask == objects[columns, None, None]
+                found[:, columns] += contributions(self.splats, camera, planes, self._primitive)[:, : len(columns)]
+            progress(done)
+        return found
+
+    def settle(self, objects: np.ndarray, votes: np.ndarray) -> np.ndarray:
+        """Return the object ID (N,) of each splat by votes (N, C) on the objects (C,), as from `votes`."""
+        return self._graph.settle(objects, votes)
+
+    def shown_ids(self, ids: np.ndarray, views: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         """Yield each of the views and the object (H, W) that most of a pixel shows, for the splats' objects (N,)."""
         objects, classes = np.unique(ids, return_inverse=True)
         labeled = self.splats._replace(ids=torch.from_numpy(classes.astype(np.int32)).to(self.splats.means.device))

@@ -42,6 +42,9 @@ PRIOR, SIMILAR = 1e-3, 4.0
 NOTHING = 2e-4
 """Weight of belonging to no object, relative to all edges of a node, unless everything belongs to one."""
 
+VOTES = 0.3
+"""Weight of the votes of masks where these agree, relative to all edges of a node."""
+
 SEEDED = 0.8
 """The splats that make up this part of what a stroke shows are its seeds; the rest shines through from behind."""
 
@@ -151,6 +154,25 @@ class SplatGraph:
         found = self._joined(probabilities.argmax(1), labels, everything)
         ids = objects[found][self.nearest]
         return Solution(objects, probabilities, ids if everything else np.where(self.is_alone, 0, ids))
+
+    def settle(self, objects: np.ndarray, votes: np.ndarray) -> np.ndarray:
+        """Find the object of each splat by votes that may be wrong.
+
+        Where votes contradict each other, they count less than what the neighbors are.
+
+        Args:
+            objects: (C,) object IDs.
+            votes: (N, C), not negative.
+
+        Returns:
+            (N,) int64, an object ID for each splat.
+        """
+        parts = votes[self.nodes] / np.maximum(votes[self.nodes].sum(1, keepdims=True), 1.0)
+        ordered = np.sort(np.column_stack([np.zeros(len(parts)), parts]), axis=1)
+        certain = (ordered[:, -1] - ordered[:, -2]) ** 2
+        weight = VOTES * certain * np.asarray(self.weights.sum(axis=1)).ravel()
+        probabilities = random_walker(self.weights, np.full(len(parts), -1), weight[:, None] * parts, 1.0)
+        return objects[probabilities.argmax(1)][self.nearest]
 
     def _joined(self, found: np.ndarray, seeds: np.ndarray, everything: bool) -> np.ndarray:
         """Give the parts of an object that are not connected to any of its seeds to the objects around them.

@@ -53,7 +53,7 @@ def label(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     _require_own_masks(capture)
     strokes = read_strokes(options.strokes, [view.name for view in capture.views])
     device = trained.model.device
-    reporter.expect({KERNELS: ("Preparing", kernel_seconds(device)), _TRAIN: ("Training", _seconds(trained))})
+    reporter.expect({KERNELS: ("Preparing", kernel_seconds(device)), _TRAIN: ("Training", border_seconds(trained))})
     ensure_kernels(reporter, device)
     with locked(trained.folder.folder):
         reporter.begin(GRAPH, "Comparing the splats with their neighbors")
@@ -62,8 +62,8 @@ def label(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             ids = pointer.solve(strokes)
             reporter.begin(_MASKS, f"Making masks of {len(capture.train_indices)} photos")
             _write_masks(capture, pointer, ids, strokes, options, reporter)
-        trainer = _begin(trained, pointer.splats.source.cpu().numpy(), ids, options, reporter)
-        _train(trained, trainer, reporter)
+        trainer = begin_border_training(trained, pointer.splats.source.cpu().numpy(), ids, options, reporter)
+        train_borders(trained, trainer, reporter)
     objects = sorted({stroke.object for stroke in strokes.strokes} - {0})
     reporter.done(
         masks=str(capture.folder / "masks"), objects=len(objects), views=len(capture.train_indices),
@@ -98,7 +98,7 @@ def _write_masks(
     write_json(capture.folder / "labels.json", names)
 
 
-def _begin(
+def begin_border_training(
     trained: Trained, source: np.ndarray, ids: np.ndarray, options: argparse.Namespace, reporter: StoppingReporter
 ) -> Trainer:
     """Vote with the masks, plan anew, give the splats their IDs, and save that as the folder's training."""
@@ -126,7 +126,7 @@ def _begin(
     return trainer
 
 
-def _train(trained: Trained, trainer: Trainer, reporter: StoppingReporter) -> None:
+def train_borders(trained: Trained, trainer: Trainer, reporter: StoppingReporter) -> None:
     """Train with the masks, and export the model; also if the training is stopped."""
     folder, before = trained.folder, trainer.progress.seconds
     budget = budget_of_labels(trainer.progress.step)
@@ -140,7 +140,7 @@ def _train(trained: Trained, trainer: Trainer, reporter: StoppingReporter) -> No
     export_model(trainer.shown, trainer.scene, folder, reporter)
 
 
-def _seconds(trained: Trained) -> float:
+def border_seconds(trained: Trained) -> float:
     """Return the expected duration of the training in seconds."""
     done = trained.progress
     return ((budget_of_labels(done.step).steps or 0) - done.step) * done.seconds / max(done.step, 1)

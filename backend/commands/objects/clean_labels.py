@@ -1,0 +1,121 @@
+"""`clean-labels`: the masks of all photos together correct those that they contradict, and the splats' objects."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from ...capture import Capture
+from ...pointing.mask_repair import Repair, repair_masks
+from ...pointing.pointer import Pointer
+from ...shared.errors import InputError
+from ...shared.formats.json_file import write_json
+from ...shared.reconstruction.lock import locked
+from ...shared.reconstruction.objects import default_name
+from ...shared.stopping import StoppingReporter
+from ..exported import EXPORT
+from ..folder import READ, Trained, open_trained
+from ..mask_files import new_masks, write_mask
+from ..setup.kernels import PART as KERNELS
+from ..setup.kernels import ensure_kernels, kernel_seconds
+from ..stages import stage
+from .label import begin_border_training, border_seconds, train_borders
+from .point import GRAPH, require_explicit
+
+RECORD = "repair.json"
+"""File in masks/ with what was changed."""
+KEPT = "masks-given"
+"""Folder in the capture for the masks before the first repair."""
+
+_VOTE, _MASKS, _TRAIN = "vote", "masks", "train"
+_WORST = 5
+_MOVED = 0.01
+"""Fraction of an object's splats that another object gets, or more, from which on this is told."""
+
+
+def clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> None:
+    """Repair the masks, give the splats their objects anew, and train their borders."""
+    reporter.expect(
+        {
+            READ: ("Preparing", 5.0), KERNELS: ("Preparing", 0.0), GRAPH: ("Preparing", 5.0),
+            _VOTE: ("Comparing masks", 20.0), _MASKS: ("Making masks", 5.0), _TRAIN: ("Training", 25.0),
+            EXPORT: ("Saving", 5.0),
+        }
+    )  # fmt: skip
+    trained = open_trained(options, reporter)
+    capture = trained.capture
+    require_explicit(trained)
+    given = {index: mask for index in capture.train_indices if (mask := capture.uncorrected_mask(index)) is not None}
+    if not any(mask.any() for mask in given.values()):
+        raise InputError(f"{capture.folder} has no masks of the training's photos; import masks, or mark objects.")
+    device = trained.model.device
+    reporter.expect({KERNELS: ("Preparing", kernel_seconds(device)), _TRAIN: ("Training", border_seconds(trained))})
+    ensure_kernels(reporter, device)
+    with locked(trained.folder.folder):
+        reporter.begin(GRAPH, "Comparing the splats with their neighbors")
+        with stage(trained.folder, "label cleanup"):
+            pointer = Pointer(trained.model, trained.scene, reporter.progress)
+            reporter.begin(_VOTE, f"Comparing the splats with {len(given)} masks")
+            zero_votes = trained.scene.supervise_background or trained.scene.zero_is_object
+            repair = repair_masks(pointer, given, zero_votes, reporter.progress)
+            reporter.begin(_MASKS, f"Writing masks of {len(capture)} photos")
+            moved = _moved(trained, pointer, repair)
+            _write(capture, repair, moved, reporter)
+        trainer = begin_border_training(trained, pointer.splats.source.cpu().numpy(), repair.ids, options, reporter)
+        train_borders(trained, trainer, reporter)
+    _tell(capture, repair, moved, reporter)
+    reporter.done(
+        masks=str(capture.folder / "masks"),
+        views=len(repair.masks),
+        changed=round(float(np.mean(list(repair.changed.values()))), 4),
+        moved=moved,
+        splats=str(trained.folder.splats),
+        steps=trainer.progress.step,
+    )
+
+
+def _moved(trained: Trained, pointer: Pointer, repair: Repair) -> list[dict[str, float | str]]:
+    """Return for each object the fraction of its splats that other objects get, the largest first."""
+    before = trained.model.classes.ids_of(pointer.splats.ids.cpu().numpy()).astype(np.int64)
+    total, gone = Counter(before.tolist()), Counter(before[before != repair.ids].tolist())
+    names = trained.capture.names
+    found: list[dict[str, float | str]] = [
+        {"object": names.get(i, default_name(i)) if i else "no object", "moved": round(gone[i] / total[i], 4)}
+        for i in total
+    ]
+    return sorted(found, key=lambda entry: -float(entry["moved"]))
+
+
+def _write(capture: Capture, repair: Repair, moved: list[dict[str, float | str]], reporter: StoppingReporter) -> None:
+    """Write masks of all photos with IDs, which replace the given ones; those of held-out photos are unchanged."""
+    kept: Path | None = capture.folder / KEPT
+    if (capture.folder / "masks" / RECORD).is_file() or (capture.folder / KEPT).exists():
+        kept = None
+    with new_masks(capture.folder, kept if (capture.folder / "masks").is_dir() else None) as folder:
+        whole = capture.edited({}, ())
+        for index, view in enumerate(capture.views):
+            mask, file = repair.masks.get(index), whole.uncorrected_mask(index)
+            if mask is None:
+                mask = file
+            elif file is not None:
+                # Objects that are left out of the training are still in the file.
+                mask = np.where((mask == 0) & np.isin(file, capture.left_out), file, mask)
+            if mask is not None:
+                write_mask(folder, view.name, capture.photo_mask(index, mask))
+            reporter.progress(index + 1, len(capture), what="photos")
+        changed = {capture.views[index].name: round(part, 4) for index, part in repair.changed.items()}
+        write_json(folder / RECORD, {"changed": changed, "moved": moved})
+
+
+def _tell(capture: Capture, repair: Repair, moved: list[dict[str, float | str]], reporter: StoppingReporter) -> None:
+    """Report in which masks most has changed, and which objects have lost splats."""
+    worst = sorted(repair.changed, key=lambda index: -repair.changed[index])[:_WORST]
+    parts = [f"{capture.views[i].name} ({repair.changed[i]:.0%})" for i in worst if repair.changed[i] >= _MOVED]
+    if parts:
+        reporter.status(f"The masks that changed most: {', '.join(parts)}")
+    for entry in moved:
+        if float(entry["moved"]) >= _MOVED:
+            reporter.status(f"{float(entry['moved']):.0%} of the splats of {entry['object']} belong to another object")
