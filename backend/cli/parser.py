@@ -115,15 +115,17 @@ def _add_capture_commands(commands: _Commands) -> None:
         help="which set of photos to use if nothing connects several: 1, the largest; 2, the next (1)",
     )  # fmt: skip
     masks = commands.add(
-        "masks", "Make masks of those of another program", texts.MASKS, "garden segmentation/annotations.json"
-    )
+        "masks", "Make masks of those of another program, or of a model", texts.MASKS,
+        "garden segmentation/annotations.json",
+    )  # fmt: skip
     masks.add_argument("capture", type=Path, metavar="CAPTURE", help=options.CAPTURE)
-    masks.add_argument("masks", type=Path, metavar="MASKS", help="file or folder of masks; see above")
+    masks.add_argument("masks", type=Path, metavar="MASKS", help="file or folder of masks, or model; see above")
     masks.add_argument(
         "--objects", choices=("auto", "given", "find"), default="auto",
         help="which segments show the same object: given, as the masks say; find, by the points that they show; auto, "
         "find if the masks do not say, or contradict the points (auto)",
     )  # fmt: skip
+    options.add_device(masks)
     check = commands.add("check", "Check a capture and list its contents", texts.CHECK, "garden")
     options.add_capture(check)
     prepare = commands.add(

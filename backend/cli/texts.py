@@ -40,11 +40,15 @@ photos takes seconds.
 """
 
 MASKS = """\
-Make masks/ and labels.json of a capture of masks that another program wrote. MASKS is
+Make masks/ and labels.json of a capture of masks that another program wrote, or of the
+segments that a model finds. MASKS is
   a file of COCO (instances or panoptic), CVAT (for images or videos) or Label Studio;
   a folder with a file for each photo, named like it: PNG or NumPy with IDs, black and
   white PNG or JPEG, EXR with Cryptomatte or object indices, or JSON with run lengths;
-  a folder of black and white images for each object, or for each photo.
+  a folder of black and white images for each object, or for each photo;
+  a folder with a checkpoint of SAM, SAM 2.1 or EdgeTAM for the package transformers
+  (config.json and weights), by which every photo is segmented. Nothing is downloaded.
+  Results are kept in masks-segments/, so that the same command goes on after a stop.
 Segments that are numbered in each photo on their own, as by Segment Anything, get one
 ID for each object: segments that show the same points are the same object. Segments
 that show several objects are divided. masks/masks.jpg shows the result. Masks that are

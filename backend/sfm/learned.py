@@ -6,13 +6,10 @@ as those of SIFT, except that descriptors are float32, which their type UNDEFINE
 
 from __future__ import annotations
 
-import hashlib
-import importlib
-import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -20,19 +17,24 @@ import torch
 from PIL import Image
 
 from ..capture.files import read_image, read_mask
+from ..networks.checkpoint_folder import (
+    CONFIG,
+    digest_of,
+    import_transformers,
+    not_a_config,
+    read_config,
+    require_all_weights,
+    unfit,
+)
 from ..shared.errors import InputError
-from ..shared.formats.json_file import parse_json
 from .database import camera_of
 
 LONGEST_SIDE = 1024
 """Side in pixels to which larger photos are scaled for the search of corners, as for LightGlue's training."""
 MOST_FEATURES = 2048
 """Most features of a photo. The time of a pair grows with their square."""
-PACKAGE = "transformers>=5,<6"
 
-_CONFIG = "config.json"
-_WEIGHTS = ("*.safetensors", "*.bin")
-"""Files with weights, of one of these kinds; of both, those of the first are used."""
+_NAME, _OPTION = "LightGlue", "--matcher"
 _MOST_CORNERS = 1 << 14
 """Most corners that are described before masks and scores leave out some: about one in each cell of 8 x 8 pixels."""
 _KEPT = 64
@@ -81,7 +83,7 @@ class LightGlue:
 
     def __init__(self, folder: Path) -> None:
         _require_lightglue(folder)
-        transformers = _transformers()
+        transformers = import_transformers("LightGlueForKeypointMatching", _OPTION)
         try:
             config = transformers.LightGlueConfig.from_pretrained(folder, local_files_only=True)
             corners = config.keypoint_detector_config
@@ -93,10 +95,8 @@ class LightGlue:
                 folder, config=config, dtype=torch.float32, local_files_only=True, output_loading_info=True
             )
         except Exception as error:  # Files may be damaged in any way.
-            raise _unfit(folder, str(error).strip().partition("\n")[0]) from error
-        for kind in ("missing", "mismatched"):
-            if names := sorted(map(str, loaded[f"{kind}_keys"])):
-                raise _unfit(folder, f"{names[0]} is {kind}")
+            raise unfit(folder, str(error).strip().partition("\n")[0]) from error
+        require_all_weights(folder, loaded)
         self._detector, self._given = self._network.eval().keypoint_detector, _Given()
         self._network.keypoint_detector = self._given
 
@@ -132,58 +132,25 @@ class LightGlue:
 
 def _require_lightglue(folder: Path) -> None:
     """Raise InputError unless a folder has the files of a LightGlue with SuperPoint."""
-    if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder; choose one with a checkpoint of LightGlue as --matcher.")
-    path = folder / _CONFIG
-    if not path.is_file():
-        raise InputError(f"{folder} has no {_CONFIG}; choose a folder with a checkpoint of LightGlue as --matcher.")
-    if not _weights(folder):
-        raise InputError(f"{folder} has no weights ({' or '.join(_WEIGHTS)}); copy those of LightGlue there, too.")
-    try:
-        config = parse_json(path.read_bytes())
-        kind, detector = config["model_type"], (config.get("keypoint_detector_config") or {}).get("model_type")
-    except (OSError, ValueError, AttributeError, KeyError, TypeError) as error:
-        raise InputError(f"{path} is not the config of a model; copy the checkpoint of LightGlue again.") from error
-    if kind != "lightglue":
-        raise InputError(f"{path} is of a model of the type {kind}; choose a checkpoint of LightGlue as --matcher.")
+    config, path = read_config(folder, _NAME, _OPTION), folder / CONFIG
+    if config["model_type"] != "lightglue":
+        raise InputError(
+            f"{path} is of a model of the type {config['model_type']}; choose a checkpoint of LightGlue as --matcher."
+        )
+    corners = config.get("keypoint_detector_config") or {}
+    if not isinstance(corners, dict):
+        raise not_a_config(path, _NAME)
+    detector = corners.get("model_type")
     if detector not in ("superpoint", None):
         raise InputError(
             f"{path} is of a LightGlue for features of {detector}; choose a checkpoint with those of SuperPoint."
         )
 
 
-def _weights(folder: Path) -> list[Path]:
-    return next((found for kind in _WEIGHTS if (found := sorted(folder.glob(kind)))), [])
-
-
-def _transformers() -> Any:
-    try:
-        transformers: Any = importlib.import_module("transformers")
-        transformers.LightGlueForKeypointMatching  # noqa: B018  Imported when it is asked for.
-    except (ImportError, AttributeError) as error:
-        raise InputError(
-            f'--matcher needs the package transformers; run {sys.executable} -m pip install "{PACKAGE}" before it.'
-        ) from error
-    transformers.utils.logging.set_verbosity_error()
-    transformers.utils.logging.disable_progress_bar()
-    return transformers
-
-
-def _unfit(folder: Path, why: str) -> InputError:
-    return InputError(f"The weights in {folder} do not fit its {_CONFIG} ({why}); copy the checkpoint again.")
-
-
 def fingerprint(folder: Path) -> str:
     """Return 8 hexadecimal digits that identify the checkpoint in a folder; raises InputError if there is none."""
     _require_lightglue(folder)
-    digest = hashlib.sha256()
-    for path in (folder / _CONFIG, *_weights(folder)):
-        try:
-            with path.open("rb") as file:
-                digest.update(hashlib.file_digest(file, "sha256").digest())
-        except OSError as error:
-            raise InputError(f"{path} cannot be read ({error.strerror}); check its permissions.") from error
-    return digest.hexdigest()[:8]
+    return digest_of(folder)
 
 
 def find_features(

@@ -13,6 +13,7 @@ import pytest
 import torch
 from PIL import ExifTags, Image
 
+from backend.networks.checkpoint_folder import PACKAGE
 from backend.sfm import database, learned, pairs, worker
 from backend.shared.errors import EXIT_DONE, InputError
 from backend.shared.formats import photos_source
@@ -236,8 +237,8 @@ def test_missing_package_is_named_with_its_command(photos, tmp_path, run_command
     monkeypatch.setitem(sys.modules, "transformers", None)
     folder = write_checkpoint(tmp_path / "networks")
     result = run_command("sfm", photos[0], "--out", tmp_path / "capture", "--matcher", folder)
-    assert_rejected(result, "needs the package transformers; run ", f'pip install "{learned.PACKAGE}"')
-    assert learned.PACKAGE in (REQUIREMENTS / "models.txt").read_text().splitlines()
+    assert_rejected(result, "needs the package transformers; run ", f'pip install "{PACKAGE}"')
+    assert PACKAGE in (REQUIREMENTS / "models.txt").read_text().splitlines()
 
 
 def test_checkpoints_are_told_apart_by_their_content(tmp_path):

@@ -21,7 +21,8 @@ from .segments import MaskSource
 _LARGEST = 1 << 30
 _ACCEPTED = (
     "expected a file of COCO, CVAT or Label Studio; or a folder with files named like the photos: PNG or NumPy files "
-    "with IDs, black and white images, EXR with Cryptomatte or object indices, or folders of black and white images"
+    "with IDs, black and white images, EXR with Cryptomatte or object indices, or folders of black and white images; "
+    "or a folder with a checkpoint of SAM"
 )
 
 

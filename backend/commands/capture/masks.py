@@ -1,4 +1,7 @@
-"""`masks`: makes the masks of a capture from those of another program, with one ID for each object in all photos."""
+"""`masks`: makes the masks of a capture, with one ID for each object in all photos.
+
+They are made of those of another program, or of the segments that a model finds in each photo.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +21,8 @@ from ...capture.models import Photos, read_capture_model, with_observations
 from ...evaluation import contact_sheet
 from ...evaluation.images import id_image, thumbnail
 from ...labels.association import Association, Seen, associate, consistency, object_mask
+from ...raster import devices
+from ...segmentation import PhotoSegments, Segmenter, fingerprint, is_checkpoint
 from ...shared.class_table import LARGEST_ID
 from ...shared.errors import InputError
 from ...shared.formats.json_file import write_json
@@ -29,7 +34,11 @@ from ..mask_files import new_masks, write_mask
 RECORD, OVERVIEW = "masks.json", "masks.jpg"
 """Files in masks/ with where the masks are from, and how well they agree; and a picture of some."""
 
-_FIND, _WRITE = "find", "write"
+_SEGMENT, _FIND, _WRITE = "segment", "find", "write"
+_SEGMENTS = "masks-segments"
+"""Folder of the capture with the segments that models have found, so that a stopped command goes on."""
+_PER_PHOTO = 30.0
+"""Expected seconds in which a model segments a photo, until its pace is known."""
 _POINTS = 20_000
 """Largest number of points that segments are compared on."""
 
@@ -47,18 +56,27 @@ class _Found(NamedTuple):
 
 
 def masks(options: argparse.Namespace, reporter: StoppingReporter) -> None:
-    """Read the masks of another program, find the objects where IDs differ between photos, and write masks/."""
-    reporter.expect({READ: ("Reading", 5.0), _FIND: ("Comparing", 5.0), _WRITE: ("Writing", 5.0)})
+    """Read or find the segments of the photos, find the objects where IDs differ between photos, and write masks/."""
     capture, given = options.capture, options.masks
+    segments_by_model = is_checkpoint(given)
+    reporter.expect({
+        **({_SEGMENT: ("Segmenting", 600.0)} if segments_by_model else {}),
+        READ: ("Reading", 5.0), _FIND: ("Comparing", 5.0), _WRITE: ("Writing", 5.0),
+    })  # fmt: skip
     if not capture.is_dir():
         raise InputError(f"The capture {capture} does not exist; expected a folder with images/.")
-    reporter.begin(READ, "Reading the masks")
-    model = _model(capture, needed=options.objects == "find")
+    if not segments_by_model:
+        reporter.begin(READ, "Reading the masks")
+    model = _model(capture, needed=options.objects == "find" or segments_by_model)
     names = sorted(image.name for image in model.images) if model is not None else Photos(capture).names
     if not names:
         raise InputError(f"{capture / 'images'} contains no photos; put them there.")
-    source = open_source(given, capture, names)
     _require_replaceable(capture, given)
+    if segments_by_model:
+        source: MaskSource = _segmented(options, names, reporter)
+        reporter.begin(READ, "Reading the segments")
+    else:
+        source = open_source(given, capture, names)
     photos = [name for name in source.photos if name in set(names)]
     images = Photos(capture).folder
     segments = {name: _checked(source, name, images, given) for name in _counted(photos, reporter)}
@@ -81,6 +99,26 @@ def _model(capture: Path, needed: bool) -> Model | None:
         if needed:
             raise InputError(f"Objects are found by the points of the photos: {error}") from error
         return None
+
+
+def _segmented(options: argparse.Namespace, names: Sequence[str], reporter: StoppingReporter) -> MaskSource:
+    """Return the segments that a model finds in the photos; those that were found before are kept."""
+    if options.objects == "given":
+        raise InputError("Segments do not say which of them show the same object; use --objects find.")
+    images = Photos(options.capture).folder
+    segmenter = Segmenter(options.masks, "MASKS", devices.pick(options.device))
+    source = PhotoSegments(
+        segmenter,
+        images,
+        [name for name in names if (images / name).is_file()],
+        options.capture / _SEGMENTS,
+        fingerprint(options.masks, "MASKS"),
+    )
+    missing = len(source.missing())
+    reporter.expect({_SEGMENT: ("Segmenting", max(_PER_PHOTO * missing, 1.0))})
+    reporter.begin(_SEGMENT, f"Segmenting {missing} photos")
+    source.find(lambda done, total: reporter.progress(done, total, what="photos"))
+    return source
 
 
 def _require_replaceable(capture: Path, given: Path) -> None:

@@ -1,0 +1,1 @@
+"""Checkpoints of networks, which the user has in a folder."""

@@ -1,0 +1,102 @@
+"""Folders of the user with a checkpoint of the package transformers: config.json and weights. Nothing is downloaded."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import sys
+from pathlib import Path
+from typing import Any
+
+from ..shared.errors import InputError
+from ..shared.formats.json_file import parse_json
+
+PACKAGE = "transformers>=5,<6"
+CONFIG = "config.json"
+_WEIGHTS = ("*.safetensors", "*.bin")
+"""Files with weights, of one of these kinds; of both, those of the first are used."""
+
+
+def read_config(folder: Path, what: str, option: str) -> dict[str, Any]:
+    """Read the config of a checkpoint.
+
+    Args:
+        folder: the folder of the checkpoint.
+        what: the networks that are expected, for errors, such as "LightGlue".
+        option: the argument of the command that names the folder, for errors.
+
+    Returns:
+        The content of config.json, with text as `model_type`.
+
+    Raises:
+        InputError: The folder lacks a file, or its config.json is not that of a model.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder; choose one with a checkpoint of {what} as {option}.")
+    path = folder / CONFIG
+    if not path.is_file():
+        raise InputError(f"{folder} has no {CONFIG}; choose a folder with a checkpoint of {what} as {option}.")
+    if not _weights(folder):
+        raise InputError(f"{folder} has no weights ({' or '.join(_WEIGHTS)}); copy those of {what} there, too.")
+    try:
+        config = parse_json(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise not_a_config(path, what) from error
+    if not isinstance(config, dict) or not isinstance(config.get("model_type"), str):
+        raise not_a_config(path, what)
+    return config
+
+
+def not_a_config(path: Path, what: str) -> InputError:
+    """Return the error for a config.json that cannot be understood."""
+    return InputError(f"{path} is not the config of a model; copy the checkpoint of {what} again.")
+
+
+def unfit(folder: Path, why: str) -> InputError:
+    """Return the error for weights that cannot be loaded."""
+    return InputError(f"The weights in {folder} do not fit its {CONFIG} ({why}); copy the checkpoint again.")
+
+
+def require_all_weights(folder: Path, loaded: dict[str, Any]) -> None:
+    """Raise InputError unless the loading info of `from_pretrained` says that every weight was in the files."""
+    for kind in ("missing", "mismatched"):
+        if names := sorted(map(str, loaded[f"{kind}_keys"])):
+            raise unfit(folder, f"{names[0]} is {kind}")
+
+
+def import_transformers(needed: str, option: str) -> Any:
+    """Import the package transformers, silently.
+
+    Args:
+        needed: a class that it must have.
+        option: the argument of the command that needs it, for the error.
+
+    Raises:
+        InputError: It is not installed, or too old.
+    """
+    try:
+        transformers: Any = importlib.import_module("transformers")
+        getattr(transformers, needed)  # Imported when it is asked for.
+    except (ImportError, AttributeError) as error:
+        raise InputError(
+            f'{option} needs the package transformers; run {sys.executable} -m pip install "{PACKAGE}" before it.'
+        ) from error
+    transformers.utils.logging.set_verbosity_error()
+    transformers.utils.logging.disable_progress_bar()
+    return transformers
+
+
+def digest_of(folder: Path) -> str:
+    """Return 8 hexadecimal digits that identify the files of a checkpoint; raises InputError if one is unreadable."""
+    digest = hashlib.sha256()
+    for path in (folder / CONFIG, *_weights(folder)):
+        try:
+            with path.open("rb") as file:
+                digest.update(hashlib.file_digest(file, "sha256").digest())
+        except OSError as error:
+            raise InputError(f"{path} cannot be read ({error.strerror}); check its permissions.") from error
+    return digest.hexdigest()[:8]
+
+
+def _weights(folder: Path) -> list[Path]:
+    return next((found for kind in _WEIGHTS if (found := sorted(folder.glob(kind)))), [])

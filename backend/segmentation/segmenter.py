@@ -1,0 +1,241 @@
+"""Segmentation of photos by prompts: SAM (Kirillov et al. 2023), SAM 2 (Ravi et al. 2024), EdgeTAM (Zhou et al. 2025).
+
+The networks are those of a folder with a checkpoint of the package transformers. Its own preparation of photos needs
+torchvision, so it is done here: SAM's input is the photo scaled to its longer side and padded at the right and bottom,
+and that of the others is the photo scaled to a square.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from PIL import Image
+from torch.nn.functional import interpolate
+
+from ..networks.checkpoint_folder import (
+    CONFIG,
+    digest_of,
+    import_transformers,
+    read_config,
+    require_all_weights,
+    unfit,
+)
+from ..shared.errors import InputError
+from ..shared.formats.json_file import parse_json
+from .selection import distinct, grid_points, is_segment
+
+NAME = "SAM, SAM 2.1 or EdgeTAM"
+
+_CLASSES = {"sam": "Sam", "sam2": "Sam2", "sam2_video": "Sam2", "edgetam": "EdgeTam", "edgetam_video": "EdgeTam"}
+"""Types of checkpoints, and the beginning of the names of their classes; those for videos contain the image's model."""
+_COLORS = "preprocessor_config.json"
+_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Those of ImageNet, unless the checkpoint has others."""
+_BATCH = 16
+"""Number of prompts at once; each takes some 10 MB."""
+
+
+class Encoded(NamedTuple):
+    """A photo that is ready for prompts.
+
+    Attributes:
+        features: those of the model.
+        size: width and height of the photo in pixels.
+        content: width and height of the photo in the model's input, in pixels of the input.
+    """
+
+    features: Any
+    size: tuple[int, int]
+    content: tuple[int, int]
+
+
+class Segmenter:
+    """A model that segments photos, of a folder with a checkpoint of transformers.
+
+    Args:
+        folder: with config.json and weights, *.safetensors or *.bin.
+        option: the argument of the command that names the folder, for errors.
+        device: where the model runs.
+
+    Attributes:
+        kind: the type of the model, such as "sam2".
+
+    Raises:
+        InputError: The folder lacks a file, is of another architecture, or its weights do not fit its config.json; or
+            a package is not installed.
+    """
+
+    def __init__(self, folder: Path, option: str = "--segmenter", device: torch.device | str = "cpu") -> None:
+        self.kind = _kind_of(folder, option)
+        name = _CLASSES[self.kind]
+        self._is_padded = self.kind == "sam"
+        transformers = import_transformers(f"{name}Model", option)
+        self._mean, self._deviation = _colors(folder / _COLORS)
+        try:
+            config = getattr(transformers, f"{name}Config").from_pretrained(folder, local_files_only=True)
+            self._side = int(config.prompt_encoder_config.image_size)
+            network, loaded = getattr(transformers, f"{name}Model").from_pretrained(
+                folder, config=config, dtype=torch.float32, local_files_only=True, output_loading_info=True
+            )
+        except ImportError as error:
+            raise InputError(
+                f"The model in {folder} needs the package timm; run {sys.executable} -m pip install timm before it."
+            ) from error
+        except Exception as error:  # Files may be damaged in any way.
+            raise unfit(folder, str(error).strip().partition("\n")[0]) from error
+        require_all_weights(folder, loaded)
+        self._device = torch.device(device)
+        self._network: Any = network.eval().to(self._device)
+
+    @torch.inference_mode()
+    def encode(self, image: np.ndarray) -> Encoded:
+        """Prepare a photo (H, W, 3) uint8 for prompts, which takes most of the time."""
+        height, width = image.shape[:2]
+        content = (self._side, self._side)
+        if self._is_padded:
+            scale = self._side / max(width, height)
+            content = max(round(scale * width), 1), max(round(scale * height), 1)
+        scaled = np.array(Image.fromarray(image).resize(content, Image.Resampling.BILINEAR), np.float32)
+        pixels = torch.zeros(1, 3, self._side, self._side)
+        colors = (scaled / 255 - self._mean) / self._deviation
+        pixels[0, :, : content[1], : content[0]] = torch.from_numpy(colors.astype(np.float32)).permute(2, 0, 1)
+        features = self._network.get_image_embeddings(pixels.to(self._device))
+        return Encoded(features, (width, height), content)
+
+    @torch.inference_mode()
+    def segment(
+        self, encoded: Encoded, points: np.ndarray, labels: np.ndarray, box: np.ndarray | None = None
+    ) -> tuple[np.ndarray, float]:
+        """Segment what points and a box mark.
+
+        Args:
+            encoded: the photo.
+            points: (n, 2) x and y in pixels, with the center of the first pixel at (0.5, 0.5); may be empty with a box.
+            labels: (n,) 1 for points on the object, 0 for points that are not on it.
+            box: (4,) left, top, right and bottom of the object in pixels, or None.
+
+        Returns:
+            The mask (H, W) bool, and the IoU with the true one that the model predicts.
+        """
+        # A single point may mean a part or the whole, for which the model has an answer each.
+        is_ambiguous = len(points) == 1 and box is None
+        logits, scores = self._predict(
+            encoded, np.asarray(points, float)[None], np.asarray(labels)[None], None if box is None else box[None],
+            is_ambiguous,
+        )  # fmt: skip
+        best = int(scores[0].argmax())
+        return self._masks(encoded, logits[0, best : best + 1])[0], float(scores[0, best])
+
+    @torch.inference_mode()
+    def everything(
+        self, image: np.ndarray, progress: Callable[[int, int], object] = lambda _done, _total: None
+    ) -> list[np.ndarray]:
+        """Find the segments of a photo by prompts all over it.
+
+        Args:
+            image: (H, W, 3) uint8.
+            progress: receives the number of finished steps, and of all.
+
+        Returns:
+            Masks (H, W) bool, large to small; they may overlap, as parts do with the whole.
+        """
+        encoded = self.encode(image)
+        points = grid_points(encoded.size)
+        steps = 1 + -(-len(points) // _BATCH)
+        progress(1, steps)
+        candidates, qualities = [], []
+        for step, first in enumerate(range(0, len(points), _BATCH), 2):
+            batch = points[first : first + _BATCH, None]
+            logits, scores = self._predict(encoded, batch, np.ones(batch.shape[:2], int), None, True)
+            logits, scores = logits.flatten(0, 1), scores.flatten()
+            kept = is_segment(self._cropped(encoded, logits), scores)
+            candidates.append(logits[kept].half().cpu())
+            qualities.append(scores[kept].cpu())
+            progress(step, steps)
+        logits, scores = torch.cat(candidates), torch.cat(qualities)
+        chosen = distinct((self._cropped(encoded, logits) > 0).numpy(), scores.numpy())
+        return [self._masks(encoded, logits[index : index + 1].float())[0] for index in chosen]
+
+    def _predict(
+        self, encoded: Encoded, points: np.ndarray, labels: np.ndarray, boxes: np.ndarray | None, several: bool
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the logits (p, m, h, w) and predicted IoUs (p, m) of masks for p prompts.
+
+        Args:
+            encoded: the photo.
+            points, labels: (p, n, 2) in pixels and (p, n).
+            boxes: (p, 4) in pixels, or None.
+            several: whether there are three masks for each prompt instead of one.
+        """
+        scale = np.divide(encoded.content, encoded.size)
+        given: dict[str, Any] = {}
+        # The model adds half a pixel, which is in the points already.
+        if points.shape[1]:
+            given["input_points"] = torch.from_numpy((points * scale - 0.5).astype(np.float32))[None].to(self._device)
+            given["input_labels"] = torch.from_numpy(labels.astype(np.int32))[None].to(self._device)
+        if boxes is not None:
+            corners = np.asarray(boxes, float).reshape(-1, 2, 2) * scale - 0.5
+            given["input_boxes"] = torch.from_numpy(corners.reshape(1, -1, 4).astype(np.float32)).to(self._device)
+        found = self._network(image_embeddings=encoded.features, multimask_output=several, **given)
+        return found.pred_masks[0], found.iou_scores[0]
+
+    def _cropped(self, encoded: Encoded, logits: torch.Tensor) -> torch.Tensor:
+        """Return logits (n, h, w) without the padding of the input."""
+        width, height = (
+            -(-side * pixels // self._side)
+            for side, pixels in zip(encoded.content, (logits.shape[2], logits.shape[1]), strict=True)
+        )
+        return logits[:, :height, :width]
+
+    def _masks(self, encoded: Encoded, logits: torch.Tensor) -> np.ndarray:
+        """Return the masks (n, H, W) bool of logits (n, h, w), in the photo's pixels."""
+        width, height = encoded.content
+        if (width, height) != (self._side, self._side):
+            size = (self._side, self._side)
+            logits = interpolate(logits[None], size, mode="bilinear", align_corners=False)[0, :, :height, :width]
+        scaled = interpolate(logits[None], encoded.size[::-1], mode="bilinear", align_corners=False)[0]
+        return (scaled > 0).cpu().numpy()
+
+
+def _kind_of(folder: Path, option: str) -> str:
+    """Return the type of the model in a folder; raises InputError if it has none that is known."""
+    kind = str(read_config(folder, NAME, option)["model_type"])
+    if kind not in _CLASSES:
+        raise InputError(
+            f"{folder / CONFIG} is of a model of the type {kind}; choose a checkpoint of {NAME} as {option}."
+        )
+    return kind
+
+
+def _colors(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean and the standard deviation (3,) of the colors that a model expects, from 0 to 1."""
+    mean: Any = _MEAN
+    deviation: Any = _DEVIATION
+    if path.is_file():
+        try:
+            content = parse_json(path.read_bytes())
+            mean, deviation = content.get("image_mean", mean), content.get("image_std", deviation)
+        except (OSError, ValueError, AttributeError) as error:
+            raise _invalid_colors(path) from error
+    try:
+        found = np.array(mean, np.float32), np.array(deviation, np.float32)
+    except (TypeError, ValueError) as error:
+        raise _invalid_colors(path) from error
+    if any(values.shape != (3,) or not np.isfinite(values).all() for values in found) or (found[1] <= 0).any():
+        raise _invalid_colors(path)
+    return found
+
+
+def _invalid_colors(path: Path) -> InputError:
+    return InputError(f"{path} has no valid image_mean and image_std; copy the checkpoint again.")
+
+
+def fingerprint(folder: Path, option: str = "--segmenter") -> str:
+    """Return 8 hexadecimal digits that identify the checkpoint in a folder; raises InputError if there is none."""
+    _kind_of(folder, option)
+    return digest_of(folder)

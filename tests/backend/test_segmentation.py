@@ -1,0 +1,390 @@
+"""Segmentation models: with stand-ins for their networks, and with small ones that are made with transformers."""
+
+import json
+import os
+import shutil
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from backend.capture.files import read_mask
+from backend.networks.checkpoint_folder import PACKAGE
+from backend.segmentation import KeptEncodings, PhotoSegments, Segmenter, fingerprint, is_checkpoint
+from backend.segmentation.selection import distinct, grid_points, is_segment
+from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, InputError
+
+from .command_result import assert_rejected
+from .small_segmenters import KINDS, SIDE, write_small_model
+
+
+@pytest.fixture(scope="module")
+def checkpoints(tmp_path_factory):
+    """Checkpoints of small models: kind -> folder."""
+    pytest.importorskip("transformers")
+    place = tmp_path_factory.mktemp("checkpoints")
+    for kind in KINDS:
+        write_small_model(place / kind, kind)
+    return {kind: place / kind for kind in KINDS}
+
+
+def picture(width, height):
+    return np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_masks_are_those_of_transformers(checkpoints, kind):
+    """A photo of the input's size needs no scaling, so the network can be asked directly."""
+    transformers = pytest.importorskip("transformers")
+    segmenter, image = Segmenter(checkpoints[kind]), picture(SIDE, SIDE)
+    network = {"sam": "SamModel", "edgetam": "EdgeTamModel", "sam2_video": "Sam2VideoModel"}.get(kind, "Sam2Model")
+    reference = getattr(transformers, network).from_pretrained(checkpoints[kind]).eval()
+    colors = (image / 255 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
+    pixels = torch.tensor(colors, dtype=torch.float32).permute(2, 0, 1)[None]
+    encoded = segmenter.encode(image)
+    with torch.inference_mode():
+        features = reference.get_image_embeddings(pixels)
+    for ours, theirs in zip(encoded.features, features):
+        assert torch.allclose(ours, theirs, atol=1e-4)
+    if kind == "sam2_video":
+        return  # It has no prompts for single photos.
+    points = np.array([[10.5, 20.5], [40.5, 30.5]])
+    for given, several in ((points[:1], True), (points, False)):
+        mask, score = segmenter.segment(encoded, given, np.array([1, 0])[: len(given)])
+        with torch.inference_mode():
+            expected = reference(
+                pixel_values=pixels, input_points=torch.tensor(given - 0.5, dtype=torch.float32)[None, None],
+                input_labels=torch.tensor([[[1, 0][: len(given)]]]), multimask_output=several,
+            )  # fmt: skip
+        best = expected.iou_scores[0, 0].argmax()
+        assert score == pytest.approx(float(expected.iou_scores[0, 0, best]), abs=1e-4)
+        scaled = torch.nn.functional.interpolate(
+            expected.pred_masks[0, :, best : best + 1], (SIDE, SIDE), mode="bilinear"
+        )
+        assert (mask == (scaled[0, 0] > 0).numpy()).mean() > 0.99
+    boxed, _ = segmenter.segment(encoded, np.zeros((0, 2)), np.zeros(0), np.array([8.0, 8, 40, 40]))
+    assert boxed.shape == (SIDE, SIDE)
+
+
+def test_weights_of_videos_are_those_of_photos(checkpoints):
+    """A checkpoint for videos contains the model of single photos, of which all weights are used."""
+    transformers = pytest.importorskip("transformers")
+    video = transformers.Sam2VideoModel.from_pretrained(checkpoints["sam2_video"]).state_dict()
+    own = Segmenter(checkpoints["sam2_video"])._network.state_dict()
+    assert own.keys() <= video.keys() and all(torch.equal(own[name], video[name]) for name in own)
+
+
+class Discs:
+    """Stands in for a network: the mask of a prompt is a disc around its first point, or fills its box."""
+
+    def __init__(self, radius):
+        self.radius = radius
+
+    def get_image_embeddings(self, pixels):
+        return pixels
+
+    def __call__(self, image_embeddings, multimask_output, input_points=None, input_labels=None, input_boxes=None):
+        side = image_embeddings.shape[-1]
+        along = torch.arange(side // 4) * 4 + 2.0
+        y, x = torch.meshgrid(along, along, indexing="ij")
+        if input_points is None:
+            left, top, right, bottom = (input_boxes[0, :, k, None, None] + 0.5 for k in range(4))
+            logits = torch.minimum(torch.minimum(x - left, right - x), torch.minimum(y - top, bottom - y))
+        else:
+            centers = input_points[0, :, 0] + 0.5
+            logits = self.radius - torch.hypot(x - centers[:, 0, None, None], y - centers[:, 1, None, None])
+        count = 3 if multimask_output else 1
+        scores = torch.tensor([0.5, 0.9, 0.7][:count]).expand(len(logits), count)
+        return SimpleNamespace(pred_masks=logits[None, :, None].repeat(1, 1, count, 1, 1), iou_scores=scores[None])
+
+
+@pytest.mark.parametrize("kind", ["sam", "sam2"])
+@pytest.mark.parametrize("size", [(160, 90), (90, 160), (64, 64), (48, 20)])
+def test_prompts_and_masks_are_in_pixels_of_the_photo(checkpoints, kind, size, monkeypatch):
+    segmenter = Segmenter(checkpoints[kind])
+    monkeypatch.setattr(segmenter, "_network", Discs(9.0))
+    encoded = segmenter.encode(picture(*size))
+    scale = np.divide(encoded.content, size)
+    for place in (0.3, 0.6):
+        point = np.multiply(size, [place, 1 - place])
+        mask, score = segmenter.segment(encoded, point[None], np.ones(1))
+        assert mask.shape == size[::-1] and score == pytest.approx(0.9)
+        rows, columns = np.nonzero(mask)
+        assert columns.mean() + 0.5 == pytest.approx(point[0], abs=0.5 / scale[0])
+        assert rows.mean() + 0.5 == pytest.approx(point[1], abs=0.5 / scale[1])
+        assert np.ptp(columns) + 1 == pytest.approx(18 / scale[0], abs=3 / scale[0])
+    box = np.array([0.25, 0.25, 0.75, 0.75]) * [*size, *size]
+    mask, _ = segmenter.segment(encoded, np.zeros((0, 2)), np.zeros(0), box)
+    rows, columns = np.nonzero(mask)
+    assert (columns.min(), rows.min()) == pytest.approx(box[:2], abs=1.5 / scale.min())
+    assert (columns.max() + 1, rows.max() + 1) == pytest.approx(box[2:], abs=1.5 / scale.min())
+
+
+class SameColor(Discs):
+    """Stands in for a network: the mask of a prompt is all that has the color of its point, of three qualities."""
+
+    def __call__(self, image_embeddings, multimask_output, input_points, input_labels):
+        at = (input_points[0, :, 0] + 0.5).long()
+        colors = image_embeddings[0, :, at[:, 1], at[:, 0]].T
+        shown = image_embeddings[:, :, 2::4, 2::4]
+        same = (shown - colors[:, :, None, None]).abs().sum(1) < 0.1
+        logits = torch.where(same, 9.0, -9.0)
+        noise = torch.where(torch.rand(logits.shape) < 0.5, 0.5, -0.5)
+        masks = torch.stack([logits, logits, noise], 1)
+        return SimpleNamespace(pred_masks=masks[None], iou_scores=torch.tensor([0.9, 0.5, 0.99]).expand(1, len(at), 3))
+
+
+@pytest.mark.parametrize("kind", ["sam", "sam2"])
+def test_everything_is_segmented_once(checkpoints, kind, monkeypatch):
+    segmenter = Segmenter(checkpoints[kind])
+    monkeypatch.setattr(segmenter, "_network", SameColor(0))
+    ids = np.zeros((32, 64), np.uint8)
+    ids[4:28, 4:20], ids[8:16, 32:56], ids[20:28, 32:40] = 1, 2, 3
+    image = np.array([[10, 10, 10], [250, 0, 0], [0, 250, 0], [0, 0, 250]], np.uint8)[ids]
+    steps = []
+    masks = segmenter.everything(image, lambda done, total: steps.append(done / total))
+    assert [np.bincount(ids[mask]).argmax() for mask in masks] == [0, 1, 2, 3], "large to small"
+    assert all((mask == (ids == number)).mean() > 0.97 for number, mask in enumerate(masks))
+    assert steps == sorted(steps) and steps[-1] == 1 and len(steps) == 17
+
+
+def test_segments_are_good_stable_and_neither_tiny_nor_the_photo():
+    square = torch.full((6, 50, 50), -5.0)
+    square[:, 10:30, 10:30] = 5.0
+    square[1] = torch.where(square[1] > 0, 0.5, -0.5)
+    square[2] = -5.0
+    square[2, 0, 0] = 5.0
+    square[3] = 5.0
+    square[4] = -5.0
+    found = is_segment(square, torch.tensor([0.9, 0.9, 0.9, 0.9, 0.9, 0.7]))
+    assert found.tolist() == [True, False, False, False, False, False]
+
+
+def test_duplicates_leave_the_better_mask():
+    masks = np.zeros((4, 10, 10), bool)
+    masks[0, :5], masks[1, :5, :9], masks[2, 7:], masks[3, :2] = True, True, True, True
+    assert distinct(masks, np.array([0.8, 0.9, 0.7, 0.95])) == [1, 2, 3]
+    assert distinct(np.zeros((0, 10, 10), bool), np.zeros(0)) == []
+
+
+def test_grid_covers_the_photo():
+    points = grid_points((320, 160))
+    assert points.shape == (256, 2) and points[0].tolist() == [10, 5] and points[-1].tolist() == [310, 155]
+
+
+def test_pictures_are_encoded_once(checkpoints, monkeypatch):
+    segmenter = Segmenter(checkpoints["sam2"])
+    monkeypatch.setattr(segmenter, "_network", Discs(9.0))
+    kept, asked = KeptEncodings(segmenter), []
+
+    def ask(key):
+        def given():
+            asked.append(key)
+            return picture(96, 72)
+
+        return kept(key, given, np.array([[30.0, 20.0]]), np.ones(1))
+
+    assert ask("a")[20, 30] and ask("a").shape == (72, 96) and asked == ["a"]
+    for number in range(16):
+        ask(number)
+    ask(15)
+    ask("a")
+    assert asked == ["a", *range(16), "a"]
+
+
+# --- checkpoints -----------------------------------------------------------------------------------------------------
+
+
+def write_checkpoint(folder, **config):
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_text(json.dumps({"model_type": "sam2", **config}))
+    (folder / "model.safetensors").write_bytes(b"")
+    return folder
+
+
+def refused(folder, words):
+    with pytest.raises(InputError, match=words) as error:
+        Segmenter(folder)
+    assert str(folder) in str(error.value) and "\n" not in str(error.value) and str(error.value).endswith(".")
+
+
+def test_other_folders_are_refused(tmp_path):
+    refused(
+        tmp_path / "none", "is not a folder; choose one with a checkpoint of SAM, SAM 2.1 or EdgeTAM as --segmenter"
+    )
+    (tmp_path / "empty").mkdir()
+    refused(tmp_path / "empty", "has no config.json; choose")
+    refused(write_checkpoint(tmp_path / "bert", model_type="bert"), "is of a model of the type bert; choose")
+    for number, text in enumerate(("[]", "{", "{}", '{"model_type": 3}')):
+        folder = write_checkpoint(tmp_path / f"damaged {number}")
+        (folder / "config.json").write_text(text)
+        refused(folder, "is not the config of a model; copy")
+    folder = write_checkpoint(tmp_path / "no weights")
+    (folder / "model.safetensors").unlink()
+    refused(folder, r"has no weights \(\*.safetensors or \*.bin\); copy")
+
+
+def test_missing_packages_are_named_with_their_command(tmp_path, monkeypatch):
+    transformers = pytest.importorskip("transformers")
+    if not transformers.utils.is_timm_available():
+        folder = write_checkpoint(tmp_path / "edgetam", model_type="edgetam")
+        refused(folder, "needs the package timm; run .* -m pip install timm before it")
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(InputError, match="--segmenter needs the package transformers; run ") as error:
+        Segmenter(write_checkpoint(tmp_path / "sam2"))
+    assert f'pip install "{PACKAGE}"' in str(error.value)
+
+
+def test_weights_that_do_not_fit_are_refused(checkpoints, tmp_path):
+    folder = shutil.copytree(checkpoints["sam2"], tmp_path / "sam2")
+    before = json.loads((folder / "config.json").read_text())
+    for part, change in (
+        ("mask_decoder_config", {"iou_head_depth": 4}),
+        ("mask_decoder_config", {"mlp_dim": 16}),
+        ("prompt_encoder_config", {"image_size": "x"}),
+    ):
+        (folder / "config.json").write_text(json.dumps(before | {part: before[part] | change}))
+        refused(folder, r"^The weights in .* do not fit its config.json \(.*\); copy")
+    (folder / "config.json").write_text(json.dumps(before))
+    (folder / "model.safetensors").write_bytes(b"damaged")
+    refused(folder, "do not fit its config.json")
+
+
+def test_colors_are_those_of_the_checkpoint(checkpoints, tmp_path, monkeypatch):
+    folder = shutil.copytree(checkpoints["sam"], tmp_path / "sam")
+    path = folder / "preprocessor_config.json"
+    path.write_text(json.dumps({"image_mean": [0.5, 0.5, 0.5], "image_std": [0.25, 0.5, 1.0]}))
+    segmenter = Segmenter(folder)
+    monkeypatch.setattr(segmenter, "_network", Discs(9.0))
+    pixels = segmenter.encode(np.full((32, SIDE, 3), 255, np.uint8)).features[0]
+    assert pixels[:, 0, 0].tolist() == [2.0, 1.0, 0.5] and (pixels[:, 32:] == 0).all() and (pixels[:, 31] > 0).all()
+    for text in ("{", "[]", '{"image_mean": [1, 2]}', '{"image_std": "x"}', '{"image_std": [0, 1, 1]}'):
+        path.write_text(text)
+        with pytest.raises(InputError, match="has no valid image_mean and image_std; copy"):
+            Segmenter(folder)
+
+
+def test_folders_with_models_are_told_from_those_with_masks(tmp_path):
+    folder = write_checkpoint(tmp_path / "model")
+    assert is_checkpoint(folder) and not is_checkpoint(tmp_path) and not is_checkpoint(folder / "config.json")
+    (folder / "config.json").unlink()
+    assert is_checkpoint(folder), "of which the config is missing"
+    (tmp_path / "config.json").write_text("[1]")
+    assert not is_checkpoint(tmp_path) and not is_checkpoint(tmp_path / "none")
+
+
+# --- the command -----------------------------------------------------------------------------------------------------
+
+
+class Shades:
+    """Stands in for a segmenter: each object of the synthetic captures has a value of green of its own."""
+
+    kind = "sam2"
+
+    def __init__(self):
+        self.calls, self.fails_at = 0, None
+
+    def __call__(self, *_):
+        return self
+
+    def everything(self, image, progress):
+        progress(1, 2)
+        if self.calls == self.fails_at:
+            raise KeyboardInterrupt
+        self.calls += 1
+        masks = [image[..., 1] == green for green in np.unique(image[..., 1]) if green]
+        progress(2, 2)
+        return sorted(masks, key=lambda mask: -mask.sum())
+
+
+@pytest.fixture
+def shades(monkeypatch):
+    stand_in = Shades()
+    monkeypatch.setattr("backend.commands.capture.masks.Segmenter", stand_in)
+    return stand_in
+
+
+@pytest.fixture
+def scene(write_capture):
+    """A capture without masks."""
+    return write_capture(views=6, masks=False)
+
+
+def test_segments_of_a_model_become_objects(scene, shades, tmp_path, run_command):
+    model = write_checkpoint(tmp_path / "model")
+    result = run_command("masks", scene.folder, model, "--json")
+    assert result.code == EXIT_DONE, result
+    record = result.events[-1]["result"]
+    assert record["kind"] == "segments by a model of the type sam2" and record["source"] == str(model.resolve())
+    assert len(record["objects"]) == 3 and shades.calls == 6
+    found = [read_mask(scene.folder / "masks" / f"{name}.png") for name in scene.names]
+    assert all(mask.shape == truth.shape for mask, truth in zip(found, scene.ids))
+    numbers = {}
+    for truth in (1, 2, 5):
+        given = np.concatenate([mask[ids == truth] for mask, ids in zip(found, scene.ids)])
+        numbers[truth] = np.bincount(given).argmax()
+        assert (given == numbers[truth]).mean() > 0.95
+    assert len({0, *numbers.values()}) == 4
+    assert next(event["stage"] for event in result.events if event["type"] == "status") == "Segmenting"
+
+
+def test_masks_go_on_after_a_stop(scene, shades, tmp_path, run_command):
+    model = write_checkpoint(tmp_path / "model")
+    shades.fails_at = 4
+    assert run_command("masks", scene.folder, model).code == EXIT_CANCELLED
+    assert shades.calls == 4 and not (scene.folder / "masks").exists()
+    shades.fails_at = None
+    assert run_command("masks", scene.folder, model).code == EXIT_DONE
+    assert shades.calls == 6
+    assert run_command("masks", scene.folder, model).code == EXIT_DONE
+    assert shades.calls == 6, "everything is kept"
+    kept = next((scene.folder / "masks-segments").rglob(f"{scene.names[0]}.npz"))
+    os.utime(kept, (1, 1))
+    assert run_command("masks", scene.folder, model).code == EXIT_DONE
+    assert shades.calls == 7, "a newer photo is segmented again"
+    (model / "model.safetensors").write_bytes(b"other weights")
+    assert run_command("masks", scene.folder, model).code == EXIT_DONE
+    assert shades.calls == 13, "by another model, all are"
+
+
+def test_models_are_refused_before_photos_are_segmented(scene, shades, tmp_path, run_command):
+    model = write_checkpoint(tmp_path / "model")
+    assert_rejected(run_command("masks", scene.folder, model, "--objects", "given"), "use --objects find")
+    shutil.rmtree(scene.folder / "sparse")
+    assert_rejected(run_command("masks", scene.folder, model), "by the points of the photos")
+    assert shades.calls == 0 and not (scene.folder / "masks-segments").exists()
+
+
+def test_masks_tell_what_is_wrong_with_a_model(scene, tmp_path, run_command):
+    folder = write_checkpoint(tmp_path / "model", model_type="lightglue")
+    assert_rejected(run_command("masks", scene.folder, folder), "of the type lightglue; choose", "as MASKS")
+    (folder / "config.json").unlink()
+    assert_rejected(run_command("masks", scene.folder, folder), "has no config.json")
+
+
+def test_segments_are_drawn_small_over_large(tmp_path):
+    """Segments that others cover completely are left out, and their numbers are without gaps."""
+    (tmp_path / "images").mkdir()
+    Image.new("RGB", (40, 30)).save(tmp_path / "images" / "a.png")
+    masks = np.zeros((4, 30, 40), bool)
+    masks[0], masks[1, :15], masks[2, :15, :20], masks[3, :15, 20:] = True, True, True, True
+    model = SimpleNamespace(kind="sam", everything=lambda image, progress: list(masks))
+    source = PhotoSegments(model, tmp_path / "images", ["a.png"], tmp_path / "kept", "00")
+    calls = []
+    source.find(lambda done, total: calls.append((done, total)))
+    found = source.read("a.png")
+    assert found.numbers[20, 5] == 1 and found.numbers[5, 5] == 2 and found.numbers[5, 30] == 3
+    assert list(found.objects) == [None] * 3 and calls == [(1, 1)] and not source.missing()
+
+
+def test_small_models_segment_a_capture(checkpoints, scene, run_command, monkeypatch):
+    """The whole command with a network of random weights, whose segments are no objects."""
+    monkeypatch.setattr("backend.segmentation.selection.LEAST_IOU", -9.0)
+    monkeypatch.setattr("backend.segmentation.selection.LEAST_STABILITY", 0.0)
+    result = run_command("masks", scene.folder, checkpoints["sam2"])
+    assert result.code == EXIT_DONE or (result.code == EXIT_BAD_INPUT and "check the masks" in result.err), result
+    kept = scene.folder / "masks-segments" / f"{fingerprint(checkpoints['sam2'])}-1"
+    assert sorted(path.name for path in kept.iterdir()) == [f"{name}.npz" for name in scene.names]
