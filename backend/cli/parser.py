@@ -170,7 +170,14 @@ def _add_label(commands: _Commands) -> None:
     commands.add_for_result(
         "clean-labels", "Correct masks and splats by the masks of all photos", texts.CLEAN_LABELS, "garden-splats"
     )
-    commands.add_for_result("point", "Answer the strokes of another program", texts.POINT, "garden-splats --json")
+    point = commands.add_for_result(
+        "point", "Answer the strokes of another program", texts.POINT, "garden-splats --json"
+    )
+    for command in (label, point):
+        command.add_argument(
+            "--segmenter", type=Path, metavar="FOLDER",
+            help="take what a model segments by each stroke for the stroke: a checkpoint of SAM, SAM 2.1 or EdgeTAM",
+        )  # fmt: skip
 
 
 def _add_render(commands: _Commands) -> None:

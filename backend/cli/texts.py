@@ -104,6 +104,10 @@ corner. With "area": true, the line encloses an area. Instead of "view", a "came
 have "viewmat" (4 x 4, world to camera), "intrinsics" (fx, fy, cx, cy), "width" and
 "height". Object 0 is what belongs to no object, like all that is far from the strokes,
 unless the file has "everything": true.
+
+With --segmenter, each stroke stands for all that SAM, SAM 2.1 or EdgeTAM segments by it,
+so that a few strokes tell more. FOLDER is a checkpoint of the package transformers:
+config.json and weights. Nothing is downloaded.
 """
 
 CLEAN_LABELS = """\
@@ -118,6 +122,7 @@ POINT = """\
 Answer strokes with the object of each splat, for programs such as Blender. Each line of
 standard input is a JSON object as for `label`, with a number `request` for the answer.
 With "propose": true, the answer has strokes on proposed objects, as `propose` finds.
+--segmenter is as for `label`.
 """
 
 RENDER = """\

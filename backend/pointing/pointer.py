@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 
 from ..evaluation.images import as_bytes
+from ..model.draw import draw
 from ..raster import Camera, devices, object_ranks, rasterize
 from ..shared.errors import InputError
 from ..shared.reconstruction.objects import default_name
 from .mask_edges import follow_edges
 from .proposals import find_objects
 from .splat_graph import Solution, SplatGraph, build_graph, contributions
+from .stroke_masks import Segment, stroke_pixels
 from .strokes import Stroke, Strokes, stroke_through
 
 if TYPE_CHECKING:
@@ -45,6 +47,20 @@ class StrokeOnNothing(InputError):
         self.number = number
 
 
+class _Drawn(NamedTuple):
+    """A stroke, and those on other objects from the same viewpoint, on which the pixels depend that it stands for."""
+
+    stroke: Stroke
+    others: tuple[Stroke, ...]
+
+
+class _Shown(NamedTuple):
+    """The (N,) contributions of the splats to a stroke, and the part of the picture of a mask in its place, or None."""
+
+    splats: np.ndarray
+    area: float | None
+
+
 class Pointer:
     """Finds the objects of a model's splats.
 
@@ -52,18 +68,25 @@ class Pointer:
         model: an explicit model.
         scene: its capture; masks are not used.
         progress: receives the number of prepared photos, and of all.
+        segment: the segmentation model by which a stroke stands for more than it covers, if there is one.
     """
 
-    def __init__(self, model: ObjectModel, scene: Scene, progress: Callable[[int, int], object]) -> None:
+    def __init__(
+        self,
+        model: ObjectModel,
+        scene: Scene,
+        progress: Callable[[int, int], object],
+        segment: Segment | None = None,
+    ) -> None:
         self.splats = model.generate()
-        self._primitive, self._scene = model.primitive, scene
+        self._model, self._primitive, self._scene, self._segment = model, model.primitive, scene, segment
         self._index_of = {view.name: index for index, view in enumerate(scene.capture.views)}
         indices = list(scene.capture.train_indices)
         self._graph: SplatGraph = build_graph(
             self.splats, model.primitive, [scene.camera(index) for index in indices],
             lambda number: as_bytes(scene.capture.image(indices[number])), progress,
         )  # fmt: skip
-        self._shown: dict[Stroke, np.ndarray] = {}
+        self._shown: dict[_Drawn, _Shown] = {}
         self._latest: Solution | None = None
 
     def solve(self, strokes: Strokes) -> np.ndarray:
@@ -75,11 +98,15 @@ class Pointer:
         Raises:
             StrokeOnNothing: a stroke shows no splats.
         """
-        self._shown = {stroke: self._contributions(n, stroke) for n, stroke in enumerate(strokes.strokes, 1)}
+        drawn = [_Drawn(stroke, self._others(stroke, strokes.strokes)) for stroke in strokes.strokes]
+        self._shown = {each: self._contributions(n, each) for n, each in enumerate(drawn, 1)}
+        areas = [shown.area for shown in self._shown.values() if shown.area]
         seeds: dict[int, np.ndarray] = {}
-        for stroke, shown in self._shown.items():
-            # So that each stroke counts as much, however long it is.
-            seeds[stroke.object] = seeds.get(stroke.object, 0.0) + shown / shown.sum()
+        for (stroke, _), shown in self._shown.items():
+            # So that each stroke counts as much, however long it is; and each mask as much as it covers, since a splat
+            # across the border of two masks belongs to the one that shows more of it.
+            weight = shown.area / np.mean(areas) if shown.area else 1.0
+            seeds[stroke.object] = seeds.get(stroke.object, 0.0) + weight * shown.splats / shown.splats.sum()
         self._latest = self._graph.solve(seeds, strokes.everything, self._latest)
         return self._latest.ids
 
@@ -163,16 +190,30 @@ class Pointer:
                 shown[..., 0] += 1.0 - shown.sum(2)
             yield index, objects[follow_edges(as_bytes(self._scene.capture.image(index)), shown)]
 
-    def _contributions(self, number: int, stroke: Stroke) -> np.ndarray:
-        """Return the (N,) contributions of the splats to a stroke; number: its number, for errors."""
-        if stroke in self._shown:
-            return self._shown[stroke]
-        camera = self._camera(stroke)
-        pixels = stroke.pixels(camera.width, camera.height)
+    def _others(self, stroke: Stroke, strokes: Sequence[Stroke]) -> tuple[Stroke, ...]:
+        """Return the strokes on other objects from the same viewpoint, if they matter for what a stroke stands for."""
+        if self._segment is None:
+            return ()
+        return tuple(other for other in strokes if other.view == stroke.view and other.object != stroke.object)
+
+    def _contributions(self, number: int, drawn: _Drawn) -> _Shown:
+        """Return the splats that a stroke shows; number: its number, for errors."""
+        if drawn in self._shown:
+            return self._shown[drawn]
+        stroke, camera = drawn.stroke, self._camera(drawn.stroke)
+        pixels, is_mask = stroke_pixels(
+            stroke, drawn.others, (camera.width, camera.height), self._segment, lambda: self._picture(stroke, camera)
+        )
         found = contributions(self.splats, camera, np.stack([pixels] * 3), self._primitive)[:, 0]
         if not found.sum() > 0.5:
             raise StrokeOnNothing(number, stroke.view if isinstance(stroke.view, str) else "the viewport")
-        return found
+        return _Shown(found, float(pixels.mean()) if is_mask else None)
+
+    def _picture(self, stroke: Stroke, camera: Camera) -> np.ndarray:
+        """Return what the user saw while drawing a stroke, (H, W, 3) uint8: the photo, or the splats."""
+        if isinstance(stroke.view, str):
+            return as_bytes(self._scene.capture.image(self._index_of[stroke.view]))
+        return as_bytes(draw(self._model, camera, want_ids=False).image)
 
     def _camera(self, stroke: Stroke) -> Camera:
         """Return the camera that a stroke was drawn through, in scene units."""

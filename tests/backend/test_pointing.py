@@ -21,16 +21,21 @@ from backend.export.ply import read_splats
 from backend.model.checkpoint import save_checkpoint
 from backend.model.draw import draw
 from backend.pointing.mask_edges import follow_edges
+from backend.pointing.pointer import Pointer
 from backend.pointing.proposals import find_objects
 from backend.pointing.random_walker import random_walker
 from backend.pointing.splat_graph import Edges, SplatGraph, contributions
-from backend.pointing.strokes import Stroke, read_strokes
+from backend.pointing.stroke_masks import points_on, stroke_pixels
+from backend.pointing.strokes import Stroke, Strokes, Viewpoint, read_strokes, strokes_of
 from backend.raster import rasterize
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError
 from backend.training.fine_tuning.relabel import relabeled
 from backend.training.scene import Scene
 from backend.training.state import load_model, read_checkpoint
 from backend.training.trainer import Trainer
+
+from .command_result import assert_rejected
+from .small_segmenters import write_small_model
 
 ONE = {"object": 1, "view": "a.png", "points": [[0.5, 0.5]]}
 
@@ -363,3 +368,123 @@ def test_masks_of_views_become_masks_of_distorted_photos(write_capture, tmp_path
     Image.fromarray(photo.astype(np.uint8)).save(scene.folder / "masks" / "view_000.png")
     after = load_capture(scene.folder, tmp_path / "other").mask(0)
     assert (before > 0).sum() > 200 and np.mean(before != after) < 0.03
+
+
+class TrueMasks:
+    """Stands in for a segmentation model: the mask of a prompt is the object under its first point."""
+
+    def __init__(self, ids):
+        self.ids, self.pictures, self.prompts = ids, {}, []
+
+    def __call__(self, key, picture, points, labels):
+        if key not in self.pictures:
+            self.pictures[key] = picture()
+        self.prompts.append((key, points, labels))
+        column, row = points[0].astype(int)
+        ids = self.ids(key)
+        return ids == ids[row, column]
+
+
+def test_masks_of_strokes_separate_better_than_strokes(unlabeled) -> None:
+    """One click on each object, in one view."""
+    scene, out = unlabeled
+    capture = load_capture(scene.folder, out / "cache")
+    model, _, _ = load_model(out / "checkpoint")
+    cameras = Scene(capture, model.classes, model.normalization)
+    strokes = strokes_of(strokes_on(scene, (1,)), "the test", scene.names)
+    stand_in = TrueMasks(lambda key: scene.ids[scene.names.index(key)])
+    right = []
+    for segment in (None, stand_in):
+        pointer = Pointer(model, cameras, lambda done, total: None, segment)
+        found = dict(pointer.masks(pointer.solve(strokes)))
+        agrees = [(mask == scene.ids[index])[scene.ids[index] > 0] for index, mask in found.items()]
+        right.append(np.concatenate(agrees).mean())
+    assert right[1] > right[0] + 0.05 and right[1] > 0.9, right
+    photo = np.asarray(Image.open(scene.folder / "images" / scene.names[1]))
+    assert np.array_equal(stand_in.pictures[scene.names[1]], photo)
+    _, points, labels = stand_in.prompts[0]
+    assert labels.tolist() == [1, 0, 0] and len(points) == 3, "strokes on others in the view are not on it"
+
+
+def middle_of(mask):
+    """The pixel (x, y) of a mask next to its mean, as fractions of the size."""
+    places = np.argwhere(mask)
+    row, column = places[np.linalg.norm(places - places.mean(0), axis=1).argmin()] + 0.5
+    return float(column / mask.shape[1]), float(row / mask.shape[0])
+
+
+def test_strokes_on_splats_are_prompts_in_their_picture(unlabeled) -> None:
+    """From a viewpoint that is no photo's, the model sees the splats, scaled like the stroke's pixels."""
+    scene, out = unlabeled
+    capture = load_capture(scene.folder, out / "cache")
+    model, _, _ = load_model(out / "checkpoint")
+    viewmat = tuple(map(tuple, scene.viewmats[1].tolist()))
+    view = Viewpoint(viewmat, (960.0, 960.0, 480.0, 360.0), 960, 720)
+    large = np.kron(scene.ids[1], np.ones((10, 10), int))[:720, :960]
+    point = middle_of(scene.ids[1] == 2)
+    scaled = np.asarray(Image.fromarray(large.astype(np.uint8)).resize((640, 480), Image.Resampling.NEAREST))
+    stand_in = TrueMasks(lambda key: scaled if key == view else scene.ids[1])
+    cameras = Scene(capture, model.classes, model.normalization)
+    pointer = Pointer(model, cameras, lambda done, total: None, stand_in)
+    strokes = Strokes((Stroke(2, view, (point,)), Stroke(1, scene.names[1], (middle_of(scene.ids[1] == 1),))), {})
+    first = pointer.solve(strokes)
+    seen, photo = stand_in.pictures[view], np.asarray(Image.open(scene.folder / "images" / scene.names[1]))
+    assert seen.shape == (480, 640, 3)
+    small = np.asarray(Image.fromarray(seen).resize((96, 72), Image.Resampling.BOX))
+    assert np.abs(small.astype(float) - photo)[scene.ids[1] == 2].mean() < 40
+    assert np.array_equal(pointer.solve(strokes), first) and len(stand_in.prompts) == 2, (
+        "known strokes are not asked again"
+    )
+
+
+def pixels_of(mask, others=()):
+    """The pixels that a stroke stands for in a picture of 200 x 100, with a model that answers with a mask."""
+    stroke = Stroke(1, "a.png", ((0.25, 0.5), (0.45, 0.5)))
+    pixels, is_mask = stroke_pixels(
+        stroke, others, (200, 100), lambda *_: mask, lambda: pytest.fail("the picture was not needed")
+    )
+    assert is_mask != np.array_equal(pixels, stroke.pixels(200, 100))
+    return stroke, pixels
+
+
+def test_bad_masks_leave_the_strokes() -> None:
+    half = np.zeros((100, 200), bool)
+    half[20:80, 30:110] = True
+    stroke, found = pixels_of(half)
+    assert found.sum() == 58 * 78 and found[21:79, 31:109].all(), "without its border"
+    own = stroke.pixels(200, 100)
+    beside = half & (np.arange(200) < 60)
+    most = np.arange(200) < 130
+    for mask in (~half, beside, np.broadcast_to(most, half.shape), np.zeros_like(half)):
+        assert np.array_equal(pixels_of(mask)[1], own)
+    assert np.array_equal(pixels_of(half, [Stroke(0, "a.png", ((0.2, 0.3), (0.3, 0.3)))])[1], own)
+    beyond = Stroke(2, "a.png", ((0.5, 0.3), (0.9, 0.3)))
+    assert np.array_equal(pixels_of(half, [beyond])[1], found & ~beyond.pixels(200, 100))
+    thin = np.zeros_like(half)
+    thin[49:52, 40:100] = True
+    assert np.array_equal(pixels_of(thin)[1], thin), "it has hardly anything but a border"
+
+
+def test_prompts_are_on_strokes_and_inside_areas() -> None:
+    line = Stroke(1, "a.png", ((0.1, 0.5), (0.5, 0.5), (0.5, 0.9)))
+    points = points_on(line, (200, 100), 6)
+    assert len(points) == 6 and points[0] == pytest.approx([30, 50]) and points[1] == pytest.approx([50, 50])
+    assert points_on(Stroke(1, "a.png", ((0.3, 0.2),)), (200, 100), 6).tolist() == [[60, 20]]
+    area = Stroke(1, "a.png", ((0.1, 0.1), (0.5, 0.1), (0.5, 0.8), (0.1, 0.8)), area=True)
+    points = points_on(area, (200, 100), 6)
+    inside = area.pixels(200, 100)
+    assert len(points) == 6 and len(np.unique(points, axis=0)) == 6
+    assert all(inside[int(y) - 9 : int(y) + 10, int(x) - 9 : int(x) + 10].all() for x, y in points)
+
+
+def test_label_takes_a_model(unlabeled, tmp_path, run_command) -> None:
+    scene, out = unlabeled
+    strokes = strokes_file(tmp_path, strokes_on(scene, (1,)))
+    result = run_command("label", out, "--strokes", strokes, "--segmenter", tmp_path / "none")
+    assert_rejected(result, "none is not a folder; choose one with a checkpoint of SAM", "--segmenter")
+    assert not (scene.folder / "masks").exists()
+    pytest.importorskip("transformers")
+    model = tmp_path / "model"
+    write_small_model(model, "sam2")
+    result = run_command("label", out, "--strokes", strokes, "--segmenter", model)
+    assert result.code == EXIT_DONE and (scene.folder / "masks").is_dir(), result.err

@@ -34,7 +34,7 @@ from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import finish_stage, stage
 from ..votes import cast_votes, votes_key
-from .point import GRAPH, require_explicit
+from .point import GRAPH, require_explicit, segmentation
 
 _MASKS, _TRAIN = "masks", "train"
 
@@ -52,13 +52,14 @@ def label(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     require_explicit(trained)
     _require_own_masks(capture)
     strokes = read_strokes(options.strokes, [view.name for view in capture.views])
+    segment = segmentation(options, trained)
     device = trained.model.device
     reporter.expect({KERNELS: ("Preparing", kernel_seconds(device)), _TRAIN: ("Training", border_seconds(trained))})
     ensure_kernels(reporter, device)
     with locked(trained.folder.folder):
         reporter.begin(GRAPH, "Comparing the splats with their neighbors")
         with stage(trained.folder, "label"):
-            pointer = Pointer(trained.model, trained.scene, reporter.progress)
+            pointer = Pointer(trained.model, trained.scene, reporter.progress, segment)
             ids = pointer.solve(strokes)
             reporter.begin(_MASKS, f"Making masks of {len(capture.train_indices)} photos")
             _write_masks(capture, pointer, ids, strokes, options, reporter)

@@ -13,6 +13,7 @@ import numpy as np
 
 from ...pointing.pointer import Pointer, StrokeOnNothing
 from ...pointing.strokes import content_of, strokes_of
+from ...segmentation import KeptEncodings, Segmenter
 from ...shared.errors import InputError
 from ...shared.stopping import StoppingReporter
 from ..folder import READ, Trained, open_trained
@@ -36,10 +37,11 @@ def point(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     reporter.expect({READ: ("Preparing", 3.0), KERNELS: ("Preparing", 0.0), GRAPH: ("Preparing", 3.0)})
     trained = open_trained(options, reporter)
     require_explicit(trained)
+    segment = segmentation(options, trained)
     ensure_kernels(reporter, trained.model.device)
     views = [view.name for view in trained.capture.views]
     reporter.begin(GRAPH, "Comparing the splats with their neighbors")
-    pointer = Pointer(trained.model, trained.scene, reporter.progress)
+    pointer = Pointer(trained.model, trained.scene, reporter.progress, segment)
     # Splats that cannot be drawn are not in splats.ply.
     in_file = np.isin(pointer.splats.source.cpu().numpy(), trained.model.splats()[1])
     reporter.answer(ready=True, splats=int(in_file.sum()))
@@ -76,6 +78,13 @@ def require_explicit(trained: Trained) -> None:
         raise InputError(
             f"{trained.folder.folder} has a view-dependent model; train it with --mode explicit to label it."
         )
+
+
+def segmentation(options: argparse.Namespace, trained: Trained) -> KeptEncodings | None:
+    """Return the model of --segmenter, if it is given; raises InputError if its folder has none."""
+    return (
+        None if options.segmenter is None else KeptEncodings(Segmenter(options.segmenter, device=trained.model.device))
+    )
 
 
 def _latest(reporter: StoppingReporter) -> dict[str, Any] | None:
