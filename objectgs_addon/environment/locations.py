@@ -132,6 +132,18 @@ def backend_job(title: str, kind: str, folder: Path | None, *arguments: str) -> 
     )
 
 
+def segmenter() -> Path | None:
+    """Return the folder of the segmentation model that the user has chosen, which may be missing, or None."""
+    chosen = preferences().segmenter if preferences() else ""
+    return Path(bpy.path.abspath(chosen)) if chosen else None
+
+
+def segmenter_options() -> list[str]:
+    """Return the options of `point` and `label` for the segmentation model."""
+    folder = segmenter()
+    return [] if folder is None else ["--segmenter", str(folder)]
+
+
 def sfm_job(capture: Path, source: PhotosSource) -> Job:
     """Return a job that computes the poses of photos, and writes a capture."""
     return backend_job(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The preferences of the extension: the compute backend, and the folder of reconstructions."""
+"""The preferences of the extension: the compute backend, and folders of reconstructions and of a model."""
 
 import bpy
 from bpy.props import EnumProperty, StringProperty
@@ -37,6 +37,13 @@ class Preferences(bpy.types.AddonPreferences):
         description="Default folder of reconstructions. If empty, they are saved in the user folder of the extension",
     )
 
+    segmenter: StringProperty(
+        name="Segmentation Model",
+        subtype="DIR_PATH",
+        description="Folder with a checkpoint of SAM, SAM 2.1 or EdgeTAM for the package transformers, config.json and "
+        "weights. Strokes of Mark Objects then mark all that it segments by them. If empty, they mark what they cover",
+    )
+
     def draw(self, _context: bpy.types.Context) -> None:
         layout = self.layout
         box = layout.box()
@@ -56,6 +63,7 @@ class Preferences(bpy.types.AddonPreferences):
         column = layout.column()
         column.use_property_split = True
         column.prop(self, "reconstructions")
+        column.prop(self, "segmenter")
 
 
 def draw_online_access(layout: bpy.types.UILayout) -> None:

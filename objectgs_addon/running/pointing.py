@@ -32,7 +32,7 @@ class _Session:
     def __init__(self, root: bpy.types.Collection) -> None:
         self.root, self.folder = root.session_uid, scene.folder_of(root)
         self.keys = scene.splat_keys(self.folder)
-        job = locations.backend_job("", "point", self.folder, "point", str(self.folder))
+        job = locations.backend_job("", "point", self.folder, "point", str(self.folder), *locations.segmenter_options())
         self.process = BackendProcess(job.command, job.cwd, job.environment, in_background=False)
         self.ready, self.progress, self.message, self.failure = False, 0.0, "Starting", ""
         self.asked = self.answered = 0

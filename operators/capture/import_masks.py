@@ -23,7 +23,8 @@ class ImportMasks(ImportDialog, bpy.types.Operator):
     bl_label = "Import Masks"
     bl_description = (
         "Import masks of the photos that another program made: a file of COCO, CVAT or Label Studio, or a folder of "
-        "images, EXR with Cryptomatte, or run lengths. Segments of each photo are joined to objects"
+        "images, EXR with Cryptomatte, or run lengths. Segments of each photo are joined to objects. A folder with a "
+        "checkpoint of SAM, SAM 2.1 or EdgeTAM makes the segments itself"
     )
     bl_options = {"REGISTER"}
 

@@ -123,7 +123,14 @@ class SeparateMarked(_OfMarks, bpy.types.Operator):
         strokes: Path = Reconstruction(folder).strokes
         write_json(strokes, content)
         job = locations.backend_job(
-            f"Objects of {root.name}", "label", folder, "label", str(folder), "--strokes", str(strokes)
+            f"Objects of {root.name}",
+            "label",
+            folder,
+            "label",
+            str(folder),
+            "--strokes",
+            str(strokes),
+            *locations.segmenter_options(),
         )
         return background.submit(job, context.scene, self.report)
 

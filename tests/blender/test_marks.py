@@ -5,6 +5,7 @@ import base64
 import json
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -16,6 +17,7 @@ from objectgs.objectgs_addon import drawing
 from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.drawing import splat_arrays
 from objectgs.objectgs_addon.drawing.gather import gather, placed_parts
+from objectgs.objectgs_addon.environment import locations
 from objectgs.objectgs_addon.picking import marks
 from objectgs.objectgs_addon.running import pointing
 from objectgs.objectgs_addon.scene import kinds
@@ -165,8 +167,8 @@ def test_marking_needs_a_training(root):
 class _Process:
     """Stands in for the backend's process."""
 
-    def __init__(self, *_, **__):
-        self.sent: list[dict] = []
+    def __init__(self, command, *_, **__):
+        self.command, self.sent = command, []
 
     def send(self, line: str) -> bool:
         self.sent.append(json.loads(line))
@@ -199,6 +201,17 @@ def test_answers_are_shown_and_end_with_the_strokes(root, session):
     assert pointing.share_of_splats() == {3: count} and pointing.state() == (1.0, False)
     marks.clear(root)
     assert pointing.share_of_splats() == {0: count} and not pointing.state()[1]
+
+
+def test_strokes_are_answered_with_the_model_of_the_preferences(root, monkeypatch, tmp_path):
+    monkeypatch.setattr(pointing, "BackendProcess", _Process)
+    for chosen, options in (("", []), (str(tmp_path / "sam2"), ["--segmenter", str(tmp_path / "sam2")])):
+        own = SimpleNamespace(segmenter=chosen, backend_python="", reconstructions="")
+        monkeypatch.setattr(locations, "preferences", lambda own=own: own)
+        pointing.start(root)
+        command = pointing._session.process.command
+        pointing.stop()
+        assert command[command.index("point") + 2 :] == [*options, "--json"]
 
 
 PROPOSED = {

@@ -7,6 +7,7 @@ from typing import Any
 
 import bpy
 
+from ...environment import locations
 from ...picking import marks
 from ...running import background, pointing
 from ...running.job_display import write
@@ -73,6 +74,8 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
                 return
         else:
             self._draw_state(layout, root)
+        if (model := locations.segmenter()) is not None:
+            write(layout, f"A stroke marks all that {model.name} segments by it.", "INFO")
         row = layout.row()
         row.template_list("OBJECTGS_UL_marked", "", properties, "marked", properties, "active_marked", rows=4)
         column = row.column(align=True)
