@@ -81,6 +81,8 @@ def masks(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     images = Photos(capture).folder
     segments = {name: _checked(source, name, images, given) for name in _counted(photos, reporter)}
     if not any(found.objects for found in segments.values()):
+        if segments_by_model:
+            raise InputError(f"The model in {given} finds no segments in the {len(photos)} photos; use another one.")
         raise InputError(f"{given} shows no object in the {len(photos)} photos that it has masks of; check the masks.")
     reporter.begin(_FIND, "Comparing the segments of the photos")
     found, association, seen = _objects(segments, model, options.objects, reporter)
