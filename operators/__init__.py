@@ -24,7 +24,7 @@ def _classes() -> list[type]:
         recompute_poses,
     )
     from .film import cameras, film_frames, set_up_compositor, set_up_render
-    from .marking import mark_object, marked_objects
+    from .marking import clean_labels, mark_object, marked_objects
     from .meshes import export_meshes, extract_meshes
     from .objects import (
         choose_objects,
@@ -59,6 +59,7 @@ def _classes() -> list[type]:
         recompute_poses,
         make_demo,
         assign_objects,
+        clean_labels,
         analyze_capture,
         override_decision,
         group_objects,

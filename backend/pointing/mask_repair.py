@@ -23,9 +23,6 @@ _AGREES = 0.5
 _SMALLEST = 5e-4
 """Size of regions that are judged, relative to the image: smaller ones may be finer than the splats."""
 
-_LARGEST_GAP = 0.02
-"""Size of an unlabeled region, relative to the image, from which on it is no gap."""
-
 _NO_VOTE = -1
 
 
@@ -43,39 +40,32 @@ class Repair(NamedTuple):
     changed: dict[int, float]
 
 
-def repair_masks(
-    pointer: Pointer, given: Mapping[int, np.ndarray], zero_votes: bool, progress: Callable[[int, int], object]
-) -> Repair:
+def repair_masks(pointer: Pointer, given: Mapping[int, np.ndarray], progress: Callable[[int, int], object]) -> Repair:
     """Find the object of each splat by masks, and repair the masks by what the splats then show.
+
+    Unlabeled pixels vote, too: gaps that other masks do not have are contradicted as wrong IDs are.
 
     Args:
         pointer: the splats.
         given: the masks (H, W) of training views by index, with an object at least.
-        zero_votes: whether ID 0 is what belongs to no object; otherwise, small regions of it are gaps, which are filled.
         progress: receives the number of masks that have voted, and of all in all votes.
     """
     objects = np.unique([0, *(value for mask in given.values() for value in np.unique(mask).tolist())])
-    unlabeled = {index: np.zeros(mask.shape, bool) if zero_votes else mask == 0 for index, mask in given.items()}
-    wrong = unlabeled
+    wrong = {index: np.zeros(mask.shape, bool) for index, mask in given.items()}
     for number in range(_ROUNDS):
         voting = {index: np.where(wrong[index], _NO_VOTE, mask) for index, mask in given.items()}
 
         def tell(done: int, before: int = number * len(given)) -> None:
             progress(before + done, _ROUNDS * len(given))
 
-        votes = pointer.votes(voting, objects, tell)
-        ids = pointer.settle(objects, votes)
-        before, wrong = wrong, {}
-        for index, shown in pointer.shown_ids(ids, list(given)):
-            wrong[index] = contradicted(given[index], shown) | unlabeled[index]
+        ids = pointer.settle(objects, pointer.votes(voting, objects, tell))
+        before = wrong
+        wrong = {index: contradicted(given[index], shown) for index, shown in pointer.shown_ids(ids, list(given))}
         if all(np.array_equal(before[index], wrong[index]) for index in given):
             break
     masks, changed = {}, {}
     for index, shown in pointer.masks(ids):
-        masks[index] = shown
-        if index in given:
-            replaced = wrong[index] & ~(unlabeled[index] & ~_gaps(unlabeled[index]))
-            masks[index] = np.where(replaced, shown, given[index])
+        masks[index] = np.where(wrong[index], shown, given[index]) if index in given else shown
         changed[index] = float(np.mean(masks[index] != given[index])) if index in given else 1.0
     return Repair(ids, masks, changed)
 
@@ -94,10 +84,3 @@ def contradicted(mask: np.ndarray, shown: np.ndarray) -> np.ndarray:
         is_large = np.bincount(regions.ravel(), minlength=count + 1) >= _SMALLEST * mask.size
         found |= ((agrees < _AGREES) & is_large)[regions] & (regions > 0)
     return found
-
-
-def _gaps(unlabeled: np.ndarray) -> np.ndarray:
-    """Return the pixels (H, W) bool of the unlabeled regions that are small."""
-    regions, count = ndimage.label(unlabeled)
-    is_small = np.bincount(regions.ravel(), minlength=count + 1) < _LARGEST_GAP * unlabeled.size
-    return is_small[regions] & unlabeled

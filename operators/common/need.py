@@ -17,7 +17,7 @@ from ...objectgs_addon.picking import selection
 from ...objectgs_addon.running import background
 from ...objectgs_addon.state import folder_trust, object_list
 from ...objectgs_addon.state.folder_state import folder_state
-from ...objectgs_addon.state.next_step import can_mark
+from ...objectgs_addon.state.next_step import can_mark, has_masks
 
 
 def active_root(context: bpy.types.Context) -> Any:
@@ -123,6 +123,16 @@ def markable(cls: Any, context: bpy.types.Context) -> bool:
     cls.poll_message_set(
         "The capture has masks of its own, which strokes would replace; move its folder masks elsewhere"
     )
+    return False
+
+
+def masked(cls: Any, context: bpy.types.Context) -> bool:
+    """Return whether a job on the active reconstruction could start that is trained and whose capture has masks."""
+    if not (work_on_capture(cls, context) and training(cls, context)):
+        return False
+    if has_masks(folder_state(scene.folder_of(active_root(context)))):
+        return True
+    cls.poll_message_set("The capture has no masks; import some, or mark objects")
     return False
 
 

@@ -19,8 +19,9 @@ from objectgs.objectgs_addon.drawing import splat_arrays
 from objectgs.objectgs_addon.drawing.gather import gather, placed_parts
 from objectgs.objectgs_addon.environment import locations
 from objectgs.objectgs_addon.picking import marks
-from objectgs.objectgs_addon.running import pointing
+from objectgs.objectgs_addon.running import background, pointing
 from objectgs.objectgs_addon.scene import kinds
+from objectgs.operators.common import need
 
 import headless
 
@@ -162,6 +163,23 @@ def test_marking_needs_a_training(root):
     with pytest.raises(RuntimeError, match="train first"):
         bpy.ops.objectgs.separate_marked()
     assert not (folder / "strokes.json").exists()
+    with pytest.raises(RuntimeError, match="train first"):
+        bpy.ops.objectgs.clean_up_labels()
+
+
+def test_labels_of_a_training_with_masks_are_cleaned_up(root, monkeypatch):
+    submitted = []
+    monkeypatch.setattr(background, "submit", lambda job, *_: submitted.append(job) or {"FINISHED"})
+    monkeypatch.setattr(need, "work_on_capture", lambda *_: True)
+    monkeypatch.setattr(need, "training", lambda *_: True)
+    monkeypatch.setattr(need, "has_masks", lambda _: False)
+    with pytest.raises(RuntimeError, match="no masks"):
+        bpy.ops.objectgs.clean_up_labels()
+    monkeypatch.setattr(need, "has_masks", lambda _: True)
+    assert bpy.ops.objectgs.clean_up_labels() == {"FINISHED"}
+    folder = str(blender_scene.folder_of(root))
+    command = submitted[0].command
+    assert command[command.index("clean-labels") + 1] == folder and submitted[0].kind == "label"
 
 
 class _Process:

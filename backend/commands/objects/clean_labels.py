@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 from collections import Counter
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from ...pointing.mask_repair import Repair, repair_masks
 from ...pointing.pointer import Pointer
 from ...shared.errors import InputError
 from ...shared.formats.json_file import write_json
+from ...shared.reconstruction.folder import STROKES
 from ...shared.reconstruction.lock import locked
 from ...shared.reconstruction.objects import default_name
 from ...shared.stopping import StoppingReporter
@@ -59,8 +61,7 @@ def clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> Non
         with stage(trained.folder, "label cleanup"):
             pointer = Pointer(trained.model, trained.scene, reporter.progress)
             reporter.begin(_VOTE, f"Comparing the splats with {len(given)} masks")
-            zero_votes = trained.scene.supervise_background or trained.scene.zero_is_object
-            repair = repair_masks(pointer, given, zero_votes, reporter.progress)
+            repair = repair_masks(pointer, given, reporter.progress)
             reporter.begin(_MASKS, f"Writing masks of {len(capture)} photos")
             moved = _moved(trained, pointer, repair)
             _write(capture, repair, moved, reporter)
@@ -106,6 +107,9 @@ def _write(capture: Capture, repair: Repair, moved: list[dict[str, float | str]]
             if mask is not None:
                 write_mask(folder, view.name, capture.photo_mask(index, mask))
             reporter.progress(index + 1, len(capture), what="photos")
+        strokes = capture.folder / "masks" / STROKES
+        if strokes.is_file():
+            shutil.copyfile(strokes, folder / STROKES)
         changed = {capture.views[index].name: round(part, 4) for index, part in repair.changed.items()}
         write_json(folder / RECORD, {"changed": changed, "moved": moved})
 

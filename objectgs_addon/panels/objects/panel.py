@@ -11,7 +11,7 @@ from ... import scene
 from ...running import background
 from ...running.job_display import write
 from ...state import folder_trust, visibility
-from ...state.next_step import has_masks
+from ...state.next_step import can_mark, has_masks
 from ..tab import WithReconstruction, draw_job_of, draw_without_objects
 
 
@@ -79,13 +79,16 @@ class ObjectsPanel(WithReconstruction, bpy.types.Panel):
         root = context.scene.objectgs.active
         properties = root.objectgs
         job = background.job_of(root)
-        if job is not None and job.kind in ("vote", "masks") and not (properties.objects and job.is_finished):
+        state = folder_trust.state_of(root)
+        kinds = ("vote", "masks") if can_mark(state) else ("vote", "masks", "label")
+        if job is not None and job.kind in kinds and not (properties.objects and job.is_finished):
             draw_job_of(layout, job)
         if not properties.objects:
             draw_without_objects(layout, root)
-        state = folder_trust.state_of(root)
         if has_masks(state):
             layout.operator("objectgs.assign_objects", icon="GROUP_VERTEX")
+            if state.steps:
+                layout.operator("objectgs.clean_up_labels", icon="BRUSH_DATA")
         elif state.capture is not None and not properties.objects:
             layout.operator("objectgs.import_masks", icon="IMAGE_ALPHA")
         if not properties.objects:
