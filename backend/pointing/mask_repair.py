@@ -23,6 +23,9 @@ _AGREES = 0.5
 _SMALLEST = 5e-4
 """Size of regions that are judged, relative to the image: smaller ones may be finer than the splats."""
 
+_GAPS = 0.75
+"""Weight of the votes of unlabeled pixels that may be gaps: with half of the pixels in gaps, objects still win."""
+
 _NO_VOTE = -1
 
 
@@ -40,7 +43,9 @@ class Repair(NamedTuple):
     changed: dict[int, float]
 
 
-def repair_masks(pointer: Pointer, given: Mapping[int, np.ndarray], progress: Callable[[int, int], object]) -> Repair:
+def repair_masks(
+    pointer: Pointer, given: Mapping[int, np.ndarray], zero_is_known: bool, progress: Callable[[int, int], object]
+) -> Repair:
     """Find the object of each splat by masks, and repair the masks by what the splats then show.
 
     Unlabeled pixels vote, too: gaps that other masks do not have are contradicted as wrong IDs are.
@@ -48,6 +53,8 @@ def repair_masks(pointer: Pointer, given: Mapping[int, np.ndarray], progress: Ca
     Args:
         pointer: the splats.
         given: the masks (H, W) of training views by index, with an object at least.
+        zero_is_known: whether unlabeled pixels are known to show no object; otherwise, they count less, since they may
+            be gaps.
         progress: receives the number of masks that have voted, and of all in all votes.
     """
     objects = np.unique([0, *(value for mask in given.values() for value in np.unique(mask).tolist())])
@@ -58,7 +65,10 @@ def repair_masks(pointer: Pointer, given: Mapping[int, np.ndarray], progress: Ca
         def tell(done: int, before: int = number * len(given)) -> None:
             progress(before + done, _ROUNDS * len(given))
 
-        ids = pointer.settle(objects, pointer.votes(voting, objects, tell))
+        votes = pointer.votes(voting, objects, tell)
+        if not zero_is_known:
+            votes[:, 0] *= _GAPS
+        ids = pointer.settle(objects, votes)
         before = wrong
         wrong = {index: contradicted(given[index], shown) for index, shown in pointer.shown_ids(ids, list(given))}
         if all(np.array_equal(before[index], wrong[index]) for index in given):

@@ -61,7 +61,8 @@ def clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> Non
         with stage(trained.folder, "label cleanup"):
             pointer = Pointer(trained.model, trained.scene, reporter.progress)
             reporter.begin(_VOTE, f"Comparing the splats with {len(given)} masks")
-            repair = repair_masks(pointer, given, reporter.progress)
+            zero_is_known = trained.scene.supervise_background or trained.scene.zero_is_object
+            repair = repair_masks(pointer, given, zero_is_known, reporter.progress)
             reporter.begin(_MASKS, f"Writing masks of {len(capture)} photos")
             moved = _moved(trained, pointer, repair)
             _write(capture, repair, moved, reporter)
