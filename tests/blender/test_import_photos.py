@@ -87,7 +87,8 @@ def test_weak_photos_are_left_out(submitted, shown, tmp_path):
     """The button of the message computes the poses again, also without those that were left out before."""
     capture = tmp_path / "capture"
     (capture / "sfm").mkdir(parents=True)
-    write_source(capture, PhotosSource([tmp_path / "trip"], "one", 12, ["1.jpg"], "objects", 3, tmp_path / "networks"))
+    networks = tmp_path / "networks"
+    write_source(capture, PhotosSource([tmp_path / "trip"], "one", 12, ["1.jpg"], "objects", 3, matcher=networks))
     job = locations.sfm_job(capture, PhotosSource([tmp_path / "trip"]))
     job.result = {"weak": ["a b.jpg", "2.jpg"], "separate_sets": [], "set": 1}
     background._show_poses(job)
@@ -98,7 +99,7 @@ def test_weak_photos_are_left_out(submitted, shown, tmp_path):
     assert command[command.index("--leave-out") + 1 :][:3] == ["1.jpg", "a b.jpg", "2.jpg"]
     assert command[command.index("--cameras") + 1] == "one" and command[command.index("--frames") + 1] == "12"
     assert command[command.index("--features") + 1] == "objects" and command[command.index("--set") + 1] == "3"
-    assert command[command.index("--matcher") + 1] == str(tmp_path / "networks")
+    assert command[command.index("--matcher") + 1] == str(networks)
     with pytest.raises(RuntimeError, match="was not made by Import Photos"):
         bpy.ops.objectgs.recompute_poses("EXEC_DEFAULT", capture=str(tmp_path))
 
