@@ -10,8 +10,8 @@ from scipy.ndimage import gaussian_filter, uniform_filter
 from .capture import Capture
 
 BLURRED = 0.5
-"""Contrast of a view's details, relative to that in other views, below which it is blurred. Training on views with 0.29
-to 0.48 made sharp held-out views worse by 0.3 to 1.8 dB; leaving out one with 0.64 cost 2.7 dB of a small capture."""
+"""Contrast of a view's details, relative to that in other views, below which it is blurred: training is better without
+such views, but becomes worse where softer ones are left out of a small capture."""
 
 _POINTS = 1000
 """Largest number of points of a view at which its details are compared."""

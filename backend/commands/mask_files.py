@@ -13,6 +13,11 @@ from ..capture.files import encode_mask
 from ..shared.formats.atomic import PART_PREFIX, PART_SUFFIX
 
 
+def kept_masks(capture: Path) -> Path:
+    """Return the folder in which the given masks of a capture are kept when others, made of them, replace them."""
+    return capture / "masks-given"
+
+
 @contextmanager
 def new_masks(capture: Path, kept: Path | None = None) -> Iterator[Path]:
     """Yield an empty folder that becomes the masks/ of a capture when the body is done; on errors, nothing changes.

@@ -29,7 +29,7 @@ from ...shared.formats.json_file import write_json
 from ...shared.reconstruction.objects import default_name
 from ...shared.stopping import StoppingReporter
 from ..folder import READ
-from ..mask_files import new_masks, write_mask
+from ..mask_files import kept_masks, new_masks, write_mask
 
 RECORD, OVERVIEW = "masks.json", "masks.jpg"
 """Files in masks/ with where the masks are from, and how well they agree; and a picture of some."""
@@ -130,15 +130,10 @@ def _require_replaceable(capture: Path, given: Path) -> None:
     if given.resolve() == folder.resolve():
         if is_own:
             raise InputError(f"{folder} was made of other masks, which {folder / RECORD} names; give those.")
-        if _kept(capture).exists():
-            raise InputError(f"{_kept(capture)} exists, where the given masks would be kept; move it elsewhere.")
+        if kept_masks(capture).exists():
+            raise InputError(f"{kept_masks(capture)} exists, where the given masks would be kept; move it elsewhere.")
     elif folder.exists() and not is_own:
         raise InputError(f"{folder} exists; move it elsewhere, or give it as the masks.")
-
-
-def _kept(capture: Path) -> Path:
-    """Return the folder in which masks are kept that are replaced by those made of them."""
-    return capture / "masks-given"
 
 
 def _counted(photos: Sequence[str], reporter: StoppingReporter) -> Iterator[str]:
@@ -276,8 +271,8 @@ def _write(
     """Write the masks, which replace those of an earlier run when they are complete, and labels.json."""
     photos, is_kept = Photos(capture).folder, given.resolve() == (capture / "masks").resolve()
     if is_kept:
-        record["source"] = str(_kept(capture).resolve())
-    with new_masks(capture, _kept(capture) if is_kept else None) as folder:
+        record["source"] = str(kept_masks(capture).resolve())
+    with new_masks(capture, kept_masks(capture) if is_kept else None) as folder:
         pictures: list[tuple[str, np.ndarray]] = []
         every = max(len(found.ids) // _PICTURES, 1)
         for number, (name, mask) in enumerate(drawn):

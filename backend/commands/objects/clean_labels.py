@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import shutil
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from ...shared.reconstruction.objects import default_name
 from ...shared.stopping import StoppingReporter
 from ..exported import EXPORT
 from ..folder import READ, Trained, open_trained
-from ..mask_files import new_masks, write_mask
+from ..mask_files import kept_masks, new_masks, write_mask
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import stage
@@ -29,8 +28,6 @@ from .point import GRAPH, require_explicit
 
 RECORD = "repair.json"
 """File in masks/ with what was changed."""
-KEPT = "masks-given"
-"""Folder in the capture for the masks before the first repair."""
 
 _VOTE, _MASKS, _TRAIN = "vote", "masks", "train"
 _WORST = 5
@@ -93,10 +90,10 @@ def _moved(trained: Trained, pointer: Pointer, repair: Repair) -> list[dict[str,
 
 def _write(capture: Capture, repair: Repair, moved: list[dict[str, float | str]], reporter: StoppingReporter) -> None:
     """Write masks of all photos with IDs, which replace the given ones; those of held-out photos are unchanged."""
-    kept: Path | None = capture.folder / KEPT
-    if (capture.folder / "masks" / RECORD).is_file() or (capture.folder / KEPT).exists():
-        kept = None
-    with new_masks(capture.folder, kept if (capture.folder / "masks").is_dir() else None) as folder:
+    before, kept = capture.folder / "masks", kept_masks(capture.folder)
+    # Masks that were repaired already are not given ones.
+    is_given = before.is_dir() and not (before / RECORD).is_file() and not kept.exists()
+    with new_masks(capture.folder, kept if is_given else None) as folder:
         whole = capture.edited({}, ())
         for index, view in enumerate(capture.views):
             mask, file = repair.masks.get(index), whole.uncorrected_mask(index)
@@ -108,7 +105,7 @@ def _write(capture: Capture, repair: Repair, moved: list[dict[str, float | str]]
             if mask is not None:
                 write_mask(folder, view.name, capture.photo_mask(index, mask))
             reporter.progress(index + 1, len(capture), what="photos")
-        strokes = capture.folder / "masks" / STROKES
+        strokes = before / STROKES
         if strokes.is_file():
             shutil.copyfile(strokes, folder / STROKES)
         changed = {capture.views[index].name: round(part, 4) for index, part in repair.changed.items()}
