@@ -1,4 +1,4 @@
-"""The true size of a scene and what is up, where photos tell positions by GPS, or how far cameras looked up."""
+"""The true size of a scene and what is up, where photos tell positions by GPS, or what the cameras' sensors felt."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from .sources.photo_files import camera_elevation, gps_position
+from .sources.photo_files import gps_position
+from .sources.upright import up_in_camera
 
 _FEWEST = 5
 """Number of photos with a position from which on these are used."""
@@ -17,8 +18,8 @@ _NEAREST = 5.0
 _SPREAD = 0.2
 """Largest range of the middle half of the sizes that pairs of cameras give, relative to their median."""
 
-_FEWEST_LEVEL = 3
-"""Number of photos that tell their elevation from which on these are used."""
+_FEWEST_UPRIGHT = 3
+"""Number of photos that tell what is up from which on these are used."""
 _TILT = 3.0
 """Largest median angle in degrees between up as these photos tell it and their common direction."""
 
@@ -55,31 +56,29 @@ def meters_per_unit(centers: Mapping[str, np.ndarray], places: Mapping[str, np.n
     return float(middle) if high - low < _SPREAD * middle else None
 
 
-def elevations(images: Path, names: Iterable[str]) -> dict[str, float]:
-    """Return by how many degrees cameras looked above the horizon, for the photos of a folder that tell."""
-    return {name: angle for name in names if (angle := camera_elevation(images / name)) is not None}
+def ups_in_cameras(images: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """Return what is up in photos of a folder, of those that tell: name -> (3,) unit vector in the camera."""
+    return {name: up for name in names if (up := up_in_camera(images / name)) is not None}
 
 
-def up_by_elevations(rotations: Mapping[str, np.ndarray], angles: Mapping[str, float]) -> np.ndarray | None:
+def common_up(rotations: Mapping[str, np.ndarray], ups: Mapping[str, np.ndarray]) -> np.ndarray | None:
     """Return what is up in a model, or None where the photos do not tell or contradict each other.
 
     Args:
         rotations: name of the photo -> (3, 3) rotation from the world to the camera, with y down and z forward.
-        angles: name of the photo -> elevation of the camera in degrees; its x axis is horizontal.
+        ups: name of the photo -> (3,) unit vector in the camera.
 
     Returns:
         (3,) unit vector in the world.
     """
-    both = [name for name in rotations if name in angles]
-    if len(both) < _FEWEST_LEVEL:
+    both = [name for name in rotations if name in ups]
+    if len(both) < _FEWEST_UPRIGHT:
         return None
-    radians = np.radians([angles[name] for name in both])
-    in_cameras = np.stack([np.zeros(len(both)), -np.cos(radians), np.sin(radians)], 1)
-    ups = np.einsum("nji,nj->ni", np.array([rotations[name] for name in both]), in_cameras)
-    up = np.median(ups, axis=0)
+    told = np.array([ups[name] @ rotations[name] for name in both])
+    up = np.median(told, axis=0)
     length = float(np.linalg.norm(up))
     if length < 0.5:
         return None
     up /= length
-    apart = np.degrees(np.arccos(np.clip(ups @ up, -1.0, 1.0)))
+    apart = np.degrees(np.arccos(np.clip(told @ up, -1.0, 1.0)))
     return up if float(np.median(apart)) < _TILT else None

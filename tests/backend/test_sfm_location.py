@@ -1,10 +1,11 @@
-"""The size of a scene by GPS and what is up by elevations: of EXIF and XMP data, with noise and wrong values."""
+"""The size of a scene by GPS and what is up by sensors: of EXIF and XMP data, with noise and wrong values."""
 
 import json
+import struct
 
 import numpy as np
 import pytest
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageOps
 
 from backend.capture import compute_upright, load_capture
 from backend.commands.cameras import read_upright, write_capture_cameras
@@ -75,31 +76,103 @@ def test_elevations_are_read_from_exif_and_from_gimbals(tmp_path):
     save("wrong.jpg", elevation=400.0)
     save("plain.jpg")
     names = sorted(path.name for path in tmp_path.iterdir())
-    found = location.elevations(tmp_path, [*names, "missing.jpg"])
-    assert found == pytest.approx({"exif.jpg": -30.5, "drone.jpg": -89.9, "element.jpg": 12.5})
+    found = location.ups_in_cameras(tmp_path, [*names, "missing.jpg"])
+    angles = {name: float(np.degrees(np.arctan2(up[2], -up[1]))) for name, up in found.items()}
+    assert angles == pytest.approx({"exif.jpg": -30.5, "drone.jpg": -89.9, "element.jpg": 12.5})
+    assert all(up[0] == 0 for up in found.values())
+
+
+def maker_notes(gravity, order: str = ">") -> bytes:
+    """Return maker notes of an Apple phone with a version and gravity, as its cameras write them."""
+    entries = ((1, 9, 1, 14), (8, 10, 3, 14 + 2 + 2 * 12 + 4))
+    directory = struct.pack(f"{order}H", 2) + b"".join(struct.pack(f"{order}HHII", *entry) for entry in entries)
+    values = [number for value in gravity for number in (round(value * 1e6), 1_000_000)]
+    head = b"Apple iOS\0\0\1" + {">": b"MM", "<": b"II"}[order]
+    return head + directory + struct.pack(f"{order}I", 0) + struct.pack(f"{order}6i", *values)
+
+
+def test_gravity_of_phones_is_read_however_they_were_held(tmp_path):
+    """Phones hold gravity to their right, to their top and out of their screen, and stand on any of their sides."""
+
+    def save(name, gravity, orientation=1, size=(64, 48), lens="back camera", turn=False, order=">"):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = orientation
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.MakerNote] = maker_notes(gravity, order)
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.LensModel] = f"iPhone {lens}"
+        Image.new("RGB", size).save(tmp_path / name, exif=exif)
+        if turn:
+            turned = ImageOps.exif_transpose(Image.open(tmp_path / name))
+            turned.save(tmp_path / name, exif=turned.getexif())
+
+    save("landscape.jpg", (-1, 0, 0))
+    save("landscape-little-endian.jpg", (-1, 0, 0), order="<")
+    save("landscape-down.jpg", (-0.8, 0, -0.6))
+    save("landscape-rolled.jpg", (-0.8, 0.6, 0))
+    save("portrait-stored.jpg", (0, -1, 0), 6)
+    save("portrait-turned.jpg", (0, -0.8, -0.6), 6, turn=True)
+    save("portrait-turned-rolled.jpg", (0.6, -0.8, 0), 6, turn=True)
+    save("other-portrait-turned.jpg", (0, 0.8, 0.6), 8, turn=True)
+    save("other-landscape-turned.jpg", (1, 0, 0), 3, turn=True)
+    save("other-landscape-stored.jpg", (1, 0, 0), 3)
+    save("flat.jpg", (-0.1, 0.1, -0.99))
+    save("moved.jpg", (-1.3, 0, 0))
+    save("front.jpg", (-1, 0, 0), lens="front camera")
+    save("square.jpg", (-1, 0, 0), size=(48, 48))
+    save("zero.jpg", (0, 0, 0))
+    found = location.ups_in_cameras(tmp_path, sorted(path.name for path in tmp_path.iterdir()))
+    expected = {
+        "landscape.jpg": (0, -1, 0),
+        "landscape-little-endian.jpg": (0, -1, 0),
+        "landscape-down.jpg": (0, -0.8, -0.6),
+        "landscape-rolled.jpg": (0.6, -0.8, 0),
+        "portrait-stored.jpg": (-1, 0, 0),
+        "portrait-turned.jpg": (0, -0.8, -0.6),
+        "portrait-turned-rolled.jpg": (-0.6, -0.8, 0),
+        "other-portrait-turned.jpg": (0, -0.8, 0.6),
+        "other-landscape-turned.jpg": (0, -1, 0),
+        "other-landscape-stored.jpg": (0, 1, 0),
+    }
+    assert set(found) == set(expected)
+    for name, up in expected.items():
+        np.testing.assert_allclose(found[name], up, atol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    "notes", [b"Apple iOS\0\0\1", b"Apple iOS\0\0\1XX\0\0", maker_notes((-1, 0, 0))[:40], b"Canon"]
+)
+def test_damaged_maker_notes_tell_nothing(notes, tmp_path):
+    exif = Image.Exif()
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.MakerNote] = notes
+    Image.new("RGB", (64, 48)).save(tmp_path / "a.jpg", exif=exif)
+    assert not location.ups_in_cameras(tmp_path, ["a.jpg"])
 
 
 @pytest.fixture
 def flight():
-    """Rotations and elevations of cameras around a slope, in a world that is tilted by 35 degrees."""
+    """Rotations of cameras around a slope, in a world that is tilted by 35 degrees, and what is up in each of them."""
     rng = np.random.default_rng(3)
     centers = np.stack([rng.uniform(-5, 5, 30), rng.uniform(-5, 5, 30), rng.uniform(3, 6, 30)], 1)
     level = [pose(center, rng.normal(0, 0.5, 3))[:, :3] for center in centers]
-    angles = {str(i): float(np.degrees(np.arcsin(each[2, 2]))) for i, each in enumerate(level)}
+    ups = {str(i): each[:, 2] for i, each in enumerate(level)}
     cosine, sine = np.cos(np.radians(35)), np.sin(np.radians(35))
     tilt = np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
-    return {str(i): each @ tilt.T for i, each in enumerate(level)}, angles, tilt[:, 2]
+    return {str(i): each @ tilt.T for i, each in enumerate(level)}, ups, tilt[:, 2]
 
 
-def test_elevations_tell_what_is_up(flight):
-    rotations, angles, up = flight
+def test_photos_tell_what_is_up(flight):
+    rotations, ups, up = flight
     rng = np.random.default_rng(4)
-    noisy = {name: angle + rng.normal(0, 1.0) for name, angle in angles.items()}
-    noisy |= {str(i): -noisy[str(i)] for i in range(5)}
-    found = location.up_by_elevations(rotations, noisy)
+
+    def about(direction, deviation):
+        moved = direction + rng.normal(0, deviation, 3)
+        return moved / np.linalg.norm(moved)
+
+    noisy = {name: about(direction, np.radians(1.0)) for name, direction in ups.items()}
+    noisy |= {str(i): about(ups[str(i)], 3.0) for i in range(5)}
+    found = location.common_up(rotations, noisy)
     assert np.degrees(np.arccos(found @ up)) < 0.7
-    assert location.up_by_elevations(rotations, dict(list(angles.items())[:2])) is None
-    assert location.up_by_elevations(rotations, {name: rng.uniform(-80, 80) for name in angles}) is None
+    assert location.common_up(rotations, dict(list(ups.items())[:2])) is None
+    assert location.common_up(rotations, {name: about(np.zeros(3), 1.0) for name in ups}) is None
 
 
 def test_up_that_photos_told_is_used(write_capture, tmp_path):

@@ -16,7 +16,7 @@ from ...sfm import check, database, model
 from ...sfm.agreement import measure_agreement
 from ...sfm.background import stands_still
 from ...sfm.learned import LightGlue, fingerprint
-from ...sfm.location import elevations, meters_per_unit, positions_in_meters, up_by_elevations
+from ...sfm.location import common_up, meters_per_unit, positions_in_meters, ups_in_cameras
 from ...sfm.pairs import NEIGHBORS, choose_pairs
 from ...sfm.rig import rigs_of
 from ...sfm.sources.calibration import photos_by_camera, read_calibration
@@ -155,7 +155,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     figures = check.figures_of(best.model, best.agreement)
     weak = check.weak_photos(figures)
     by_gps = meters_per_unit(model.centers_of(best.model), positions_in_meters(images, figures))
-    up = up_by_elevations(model.rotations_of(best.model), elevations(images, figures))
+    up = common_up(model.rotations_of(best.model), ups_in_cameras(images, figures))
     model.scale(best.model, by_gps or model.common_size(best.model))
     model.write_model(best.model, capture)
     weak |= _densify(best.model, capture, reporter)

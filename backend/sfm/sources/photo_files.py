@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import io
-import re
 import shutil
 import warnings
 from pathlib import Path
@@ -25,11 +24,6 @@ COPIED = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"}
 formats become PNG."""
 _QUALITY = 97
 """JPEG quality of photos that are converted or turned."""
-
-_GIMBAL = re.compile(rb"Gimbal(Roll|Pitch)Degree[^-+0-9.]{1,4}([-+]?[0-9.]+)")
-"""Roll and pitch in degrees in a drone's XMP data, as an attribute or an element."""
-_LEVEL = 3.0
-"""Largest roll of a camera that counts as level, in degrees."""
 
 pillow_heif.register_heif_opener()
 
@@ -83,32 +77,6 @@ def gps_position(path: Path) -> tuple[float, float, float] | None:
     latitude, longitude = angles
     is_known = bool(np.isfinite([latitude, longitude, altitude]).all()) and (latitude, longitude) != (0.0, 0.0)
     return (latitude, longitude, altitude) if is_known else None
-
-
-def camera_elevation(path: Path) -> float | None:
-    """Return by how many degrees the camera looked above the horizon, or None where the photo does not tell.
-
-    That is in the EXIF data, or in the XMP data of drones, as the pitch of the gimbal. Only photos of level cameras
-    count, that is those that are neither rolled nor turned.
-    """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with PilImage.open(path) as image:
-                exif, xmp = image.getexif(), image.info.get("xmp", b"")
-        if _orientation(exif) > 1:
-            return None
-        stored = exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.CameraElevationAngle)
-        if stored is not None:
-            angle = float(stored)
-        else:
-            told = {name: float(value) for name, value in _GIMBAL.findall(xmp if isinstance(xmp, bytes) else b"")}
-            if abs(told.get(b"Roll", 0.0)) > _LEVEL:
-                return None
-            angle = told[b"Pitch"]
-    except (OSError, KeyError, TypeError, ValueError, ZeroDivisionError):
-        return None
-    return angle if -90.0 <= angle <= 90.0 else None
 
 
 def copy_photo(path: Path, target: Path, turn: bool) -> Path:
