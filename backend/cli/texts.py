@@ -86,17 +86,19 @@ keeps the mean of its latest steps. To train longer, run the command again with 
 """
 
 PROPOSE = """\
-Find the objects of a training without masks: splats with concave borders or gaps around
+Find the objects of splats without masks: splats with concave borders or gaps around
 them, such as things on a table, the table and the walls. Flat things that lie on others,
 and things that touch smoothly, are not told apart. Writes strokes that mark the objects
-in three photos each, for `label`; they may be changed before.
+in three photos each, for `label`; they may be changed before. Splats that were imported
+without a capture are looked at through cameras around them.
 """
 
 LABEL = """\
-Separate the objects of a training without masks, by strokes on them in one or more
-photos. Writes masks/, for the training views, and labels.json to the capture's folder,
-gives the splats the IDs of their objects, and trains their borders for a short time.
-Repeat the command with more strokes to correct the result. FILE is JSON:
+Separate the objects of splats without masks, by strokes on them in one or more photos.
+Gives the splats the IDs of their objects. After a training, it writes masks/, for the
+training views, and labels.json to the capture's folder, and trains the objects' borders
+for a short time; imported splats stay as they are. Repeat the command with more strokes
+to correct the result. FILE is JSON:
   {"objects": {"1": "mug"},
    "strokes": [{"object": 1, "view": "photo.jpg", "points": [[0.42, 0.5], [0.48, 0.5]]}]}
 Points are fractions of the undistorted photo's width and height, from its top left

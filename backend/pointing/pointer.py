@@ -1,15 +1,15 @@
-"""Objects of a trained model from strokes, which may be added one by one."""
+"""Objects of splats from strokes, which may be added one by one."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from ..evaluation.images import as_bytes
-from ..model.draw import draw
+from ..model.generate import Generated
 from ..raster import Camera, devices, object_ranks, rasterize
 from ..shared.errors import InputError
 from ..shared.reconstruction.objects import default_name
@@ -18,10 +18,7 @@ from .proposals import find_objects
 from .splat_graph import Solution, SplatGraph, build_graph, contributions
 from .stroke_masks import Segment, stroke_pixels
 from .strokes import Stroke, Strokes, stroke_through
-
-if TYPE_CHECKING:
-    from ..model.object_model import ObjectModel
-    from ..training.scene import Scene
+from .views import Views
 
 LONGEST = 640
 """Longer side in pixels of the images from viewpoints that are not those of photos."""
@@ -62,29 +59,31 @@ class _Shown(NamedTuple):
 
 
 class Pointer:
-    """Finds the objects of a model's splats.
+    """Finds the objects of splats.
 
     Args:
-        model: an explicit model.
-        scene: its capture; masks are not used.
-        progress: receives the number of prepared photos, and of all.
+        splats: the splats, in scene units.
+        primitive: "3d" or "2d".
+        views: views of them.
+        progress: receives the number of prepared views, and of all.
         segment: the segmentation model by which a stroke stands for more than it covers, if there is one.
     """
 
     def __init__(
         self,
-        model: ObjectModel,
-        scene: Scene,
+        splats: Generated,
+        primitive: str,
+        views: Views,
         progress: Callable[[int, int], object],
         segment: Segment | None = None,
     ) -> None:
-        self.splats = model.generate()
-        self._model, self._primitive, self._scene, self._segment = model, model.primitive, scene, segment
-        self._index_of = {view.name: index for index, view in enumerate(scene.capture.views)}
-        indices = list(scene.capture.train_indices)
+        self.splats = splats
+        self._primitive, self._views, self._segment = primitive, views, segment
+        self._index_of = {name: index for index, name in enumerate(views.names)}
+        used = views.used
         self._graph: SplatGraph = build_graph(
-            self.splats, model.primitive, [scene.camera(index) for index in indices],
-            lambda number: as_bytes(scene.capture.image(indices[number])), progress,
+            splats, primitive, [views.camera(index) for index in used],
+            lambda number: self._picture(used[number]), progress,
         )  # fmt: skip
         self._shown: dict[_Drawn, _Shown] = {}
         self._latest: Solution | None = None
@@ -118,14 +117,14 @@ class Pointer:
         """
         found = find_objects(self._graph, progress)[self._graph.nearest]
         found[self._graph.is_alone] = 0
-        train = self._scene.capture.train_indices
-        places = np.unique(np.linspace(0, len(train) - 1, min(len(train), _PHOTOS)).round().astype(int))
+        used = self._views.used
+        places = np.unique(np.linspace(0, len(used) - 1, min(len(used), _PHOTOS)).round().astype(int))
         best: dict[int, list[tuple[int, Stroke]]] = {}
-        for index, shown in self.shown_ids(found, [train[place] for place in places.tolist()]):
-            name = self._scene.capture.views[index].name
+        for index, shown in self.shown_ids(found, [used[place] for place in places.tolist()]):
+            view = self._views.reference(index)
             for object_id, pixels in zip(*np.unique(shown[shown > 0], return_counts=True), strict=True):
                 if pixels >= _FEWEST_PIXELS:
-                    stroke = Stroke(int(object_id), name, stroke_through(shown == object_id))
+                    stroke = Stroke(int(object_id), view, stroke_through(shown == object_id))
                     best.setdefault(int(object_id), []).append((int(pixels), stroke))
         strokes = tuple(
             stroke
@@ -151,7 +150,7 @@ class Pointer:
         """
         found = np.zeros((len(self.splats.means), len(objects)))
         for done, (index, mask) in enumerate(masks.items(), 1):
-            camera = self._scene.camera(index)
+            camera = self._views.camera(index)
             shown = [column for column, object_id in enumerate(objects.tolist()) if (mask == object_id).any()]
             for columns in (shown[first : first + 3] for first in range(0, len(shown), 3)):
                 planes = np.zeros((3, camera.height, camera.width), np.float32)
@@ -170,16 +169,16 @@ class Pointer:
         labeled = self.splats._replace(ids=torch.from_numpy(classes.astype(np.int32)).to(self.splats.means.device))
         for index in views:
             with torch.no_grad():
-                drawn = rasterize(*labeled[:6], self._scene.camera(index), primitive=self._primitive)
+                drawn = rasterize(*labeled[:6], self._views.camera(index), primitive=self._primitive)
             ranks, parts = (devices.host(plane) for plane in object_ranks(drawn, 1))
             yield index, np.where((ranks[0] >= 0) & (parts[0] > 0.5), objects[np.maximum(ranks[0], 0)], 0)
 
     def masks(self, ids: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield each training view and its mask (H, W) int64, for the objects (N,) of the splats."""
+        """Yield each used view and its mask (H, W) int64, for the objects (N,) of the splats."""
         objects, classes = np.unique(ids, return_inverse=True)
         labeled = self.splats._replace(ids=torch.from_numpy(classes.astype(np.int32)).to(self.splats.means.device))
-        for index in self._scene.capture.train_indices:
-            camera = self._scene.camera(index)
+        for index in self._views.used:
+            camera = self._views.camera(index)
             with torch.no_grad():
                 drawn = rasterize(*labeled[:6], camera, primitive=self._primitive)
             shown = np.zeros((camera.height, camera.width, len(objects)), np.float32)
@@ -188,7 +187,7 @@ class Pointer:
                 shown[row, column, found[row, column]] += part[row, column]
             if objects[0] == 0:
                 shown[..., 0] += 1.0 - shown.sum(2)
-            yield index, objects[follow_edges(as_bytes(self._scene.capture.image(index)), shown)]
+            yield index, objects[follow_edges(self._picture(index), shown)]
 
     def _others(self, stroke: Stroke, strokes: Sequence[Stroke]) -> tuple[Stroke, ...]:
         """Return the strokes on other objects from the same viewpoint, if they matter for what a stroke stands for."""
@@ -202,28 +201,36 @@ class Pointer:
             return self._shown[drawn]
         stroke, camera = drawn.stroke, self._camera(drawn.stroke)
         pixels, is_mask = stroke_pixels(
-            stroke, drawn.others, (camera.width, camera.height), self._segment, lambda: self._picture(stroke, camera)
+            stroke, drawn.others, (camera.width, camera.height), self._segment, lambda: self._seen(stroke, camera)
         )
         found = contributions(self.splats, camera, np.stack([pixels] * 3), self._primitive)[:, 0]
         if not found.sum() > 0.5:
             raise StrokeOnNothing(number, stroke.view if isinstance(stroke.view, str) else "the viewport")
         return _Shown(found, float(pixels.mean()) if is_mask else None)
 
-    def _picture(self, stroke: Stroke, camera: Camera) -> np.ndarray:
+    def _seen(self, stroke: Stroke, camera: Camera) -> np.ndarray:
         """Return what the user saw while drawing a stroke, (H, W, 3) uint8: the photo, or the splats."""
-        if isinstance(stroke.view, str):
-            return as_bytes(self._scene.capture.image(self._index_of[stroke.view]))
-        return as_bytes(draw(self._model, camera, want_ids=False).image)
+        return self._picture(self._index_of[stroke.view]) if isinstance(stroke.view, str) else self._drawn(camera)
+
+    def _picture(self, index: int) -> np.ndarray:
+        """Return the picture (H, W, 3) uint8 of a view: its photo, or else the splats."""
+        return self._drawn(self._views.camera(index)) if self._views.photo is None else self._views.photo(index)
+
+    def _drawn(self, camera: Camera) -> np.ndarray:
+        """Draw the splats over black, (H, W, 3) uint8."""
+        with torch.no_grad():
+            drawn = rasterize(*self.splats[:6], camera, primitive=self._primitive)
+        return as_bytes(devices.host(drawn.color.clamp(0, 1).permute(1, 2, 0).contiguous()))
 
     def _camera(self, stroke: Stroke) -> Camera:
         """Return the camera that a stroke was drawn through, in scene units."""
         if isinstance(stroke.view, str):
-            return self._scene.camera(self._index_of[stroke.view])
+            return self._views.camera(self._index_of[stroke.view])
         view = stroke.view
         factor = min(1.0, LONGEST / max(view.width, view.height))
         fx, fy, cx, cy = (factor * value for value in view.intrinsics)
         return Camera(
-            self._scene.normalization.viewmat(np.array(view.viewmat)),
+            self._views.normalization.viewmat(np.array(view.viewmat)),
             np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]),
             max(round(factor * view.width), 1), max(round(factor * view.height), 1),
         )  # fmt: skip

@@ -95,15 +95,23 @@ def stroke_through(mask: np.ndarray) -> tuple[tuple[float, float], tuple[float, 
 
 
 def content_of(strokes: Strokes) -> dict[str, Any]:
-    """Return the content of a file of strokes on photos, as `strokes_of` reads it."""
+    """Return the content of a file of strokes, as `strokes_of` reads it."""
     return {
         "objects": {str(object_id): name for object_id, name in strokes.names.items()},
         "everything": strokes.everything,
         "strokes": [
-            {"object": stroke.object, "view": stroke.view, "points": [list(point) for point in stroke.points]}
+            {"object": stroke.object, **_place(stroke.view), "points": [list(point) for point in stroke.points]}
             for stroke in strokes.strokes
         ],
     }
+
+
+def _place(view: str | Viewpoint) -> dict[str, Any]:
+    """Return the entry of a stroke that says where it was drawn."""
+    if isinstance(view, str):
+        return {"view": view}
+    camera = {"viewmat": [list(row) for row in view.viewmat], "intrinsics": list(view.intrinsics)}
+    return {"camera": {**camera, "width": view.width, "height": view.height}}
 
 
 def read_strokes(path: Path, views: Sequence[str]) -> Strokes:

@@ -89,15 +89,14 @@ def set_proposed(root: bpy.types.Collection, proposed: dict[str, Any]) -> None:
 
     Args:
         root: the reconstruction's collection.
-        proposed: the content of a file of strokes on photos.
+        proposed: the content of a file of strokes.
 
     Raises:
         KeyError, TypeError, ValueError: it is not valid.
     """
     properties = root.objectgs
     strokes = [
-        {"object": int(each["object"]), "view": str(each["view"]), "points": each["points"]}
-        for each in proposed["strokes"]
+        {"object": int(each["object"]), **_place_of(each), "points": each["points"]} for each in proposed["strokes"]
     ]
     taken = {item.object_id for item in properties.objects}
     free = (number for number in itertools.count(1) if number not in taken)
@@ -108,6 +107,11 @@ def set_proposed(root: bpy.types.Collection, proposed: dict[str, Any]) -> None:
     properties.active_marked = 0
     properties.everything = bool(proposed["everything"])
     _store(root, [{**stroke, "object": ids[stroke["object"]]} for stroke in strokes])
+
+
+def _place_of(stroke: dict[str, Any]) -> dict[str, Any]:
+    """Return the entry of a stroke that says where it was drawn: in a photo, or through a camera."""
+    return {"view": str(stroke["view"])} if "view" in stroke else {"camera": dict(stroke["camera"])}
 
 
 def merge_object(root: bpy.types.Collection, index: int, into: int) -> None:

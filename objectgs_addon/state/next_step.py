@@ -54,7 +54,7 @@ SEPARATE = Step(
     "objectgs.separate_marked",
     "Separate Objects",
     "CHECKMARK",
-    "The marked objects get collections of their own; their borders are trained for half a minute.",
+    "The marked objects get collections of their own; after a training, their borders are trained for half a minute.",
 )
 MESHES = Step(
     "objectgs.extract_meshes", "Extract Meshes", "MESH_DATA", "Meshes are for physics, shadows and other programs."
@@ -99,10 +99,15 @@ def next_step(root: bpy.types.Collection | None, owner: bpy.types.Scene) -> Step
 
 
 def can_mark(state: FolderState) -> bool:
-    """Return whether objects can be marked: there is a training, and the capture has no masks but those of strokes."""
-    if not state.steps or state.capture is None:
+    """Return whether objects can be marked: there are splats, and the capture has no masks but those of strokes.
+
+    A training needs its capture, and imported splats do not.
+    """
+    if not state.trained or (state.steps and state.capture is None):
         return False
-    return not has_masks(state) or (state.capture / "masks" / STROKES).is_file()
+    if state.capture is None or not has_masks(state):
+        return True
+    return bool(state.steps) and (state.capture / "masks" / STROKES).is_file()
 
 
 def has_masks(state: FolderState) -> bool:

@@ -115,10 +115,13 @@ def training(cls: Any, context: bpy.types.Context) -> bool:
 
 
 def markable(cls: Any, context: bpy.types.Context) -> bool:
-    """Return whether objects of the active reconstruction can be marked: it is trained, without masks of others."""
-    if not (work_on_capture(cls, context) and training(cls, context)):
+    """Return whether objects of the active reconstruction can be marked: it has splats, and no masks of others."""
+    if not (backend(cls) and reconstruction(cls, context) and idle(cls, context) and splats(cls, context)):
         return False
-    if can_mark(folder_state(scene.folder_of(active_root(context)))):
+    state = folder_state(scene.folder_of(active_root(context)))
+    if state.steps and not capture(cls, context):
+        return False
+    if can_mark(state):
         return True
     cls.poll_message_set(
         "The capture has masks of its own, which strokes would replace; move its folder masks elsewhere"

@@ -104,8 +104,8 @@ class SeparateMarked(_OfMarks, bpy.types.Operator):
     bl_idname = "objectgs.separate_marked"
     bl_label = "Separate Objects"
     bl_description = (
-        "Give each marked object a collection of its own, and train the borders of the objects for half a minute. "
-        "Masks of the photos are made, too"
+        "Give each marked object a collection of its own. After a training, the borders of the objects are trained "
+        "for half a minute, and masks of the photos are made"
     )
     bl_options = {"REGISTER"}
 

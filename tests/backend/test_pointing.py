@@ -20,6 +20,7 @@ from backend.capture import load_capture
 from backend.export.ply import read_splats
 from backend.model.checkpoint import save_checkpoint
 from backend.model.draw import draw
+from backend.model.object_model import Normalization
 from backend.pointing.mask_edges import follow_edges
 from backend.pointing.pointer import Pointer
 from backend.pointing.proposals import find_objects
@@ -27,7 +28,8 @@ from backend.pointing.random_walker import random_walker
 from backend.pointing.splat_graph import Edges, SplatGraph, contributions
 from backend.pointing.stroke_masks import points_on, stroke_pixels
 from backend.pointing.strokes import Stroke, Strokes, Viewpoint, read_strokes, strokes_of
-from backend.raster import rasterize
+from backend.pointing.views import views_around, views_of_photos
+from backend.raster import Camera, object_ranks, rasterize
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError
 from backend.training.fine_tuning.relabel import relabeled
 from backend.training.scene import Scene
@@ -166,6 +168,97 @@ def test_label_separates_the_objects_that_are_clicked(unlabeled, tmp_path, run_c
     assert run_command("train", scene.folder, "--out", out, "--steps", 230, "--offsets", 4).code == EXIT_DONE
     entries = json.loads((out / "objects.json").read_text())["objects"]
     assert [entry["name"] for entry in entries] == ["ball", "object 2", "object 5"]
+
+
+def through_cameras(scene, capture, content: dict) -> dict:
+    """Return strokes that name the cameras of photos instead of the photos."""
+    by_name = dict(zip(scene.names, capture.views, strict=True))
+    strokes = []
+    for stroke in content["strokes"]:
+        view = by_name[stroke["view"]]
+        intrinsics = [float(view.K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2))]
+        size = {"width": view.width, "height": view.height}
+        camera = {"viewmat": view.viewmat.tolist(), "intrinsics": intrinsics, **size}
+        strokes.append({"object": stroke["object"], "camera": camera, "points": stroke["points"]})
+    return {**content, "strokes": strokes}
+
+
+def shown_of_file(path, capture) -> list[np.ndarray]:
+    """Return the objects (H, W) that each view of a capture shows of the splats in a file."""
+    splats = read_splats(path)[0]
+    objects, classes = np.unique(np.append(splats.object_ids, 0), return_inverse=True)
+    tensors = [
+        torch.tensor(part, dtype=torch.float32)
+        for part in (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
+    ]
+    found = []
+    for view in capture.views:
+        with torch.no_grad():
+            drawn = rasterize(
+                *tensors, torch.tensor(classes[:-1], dtype=torch.int32),
+                Camera(view.viewmat, view.K, view.width, view.height),
+            )  # fmt: skip
+        ranks, _ = object_ranks(drawn, 1)
+        found.append(np.where(ranks[0] >= 0, objects[np.maximum(ranks[0], 0)], 0))
+    return found
+
+
+@pytest.mark.parametrize("photos", [False, True])
+def test_imported_splats_are_separated_by_strokes(unlabeled, tmp_path, run_command, photos: bool) -> None:
+    """Without photos, the splats are compared by cameras around them, and strokes are drawn through cameras."""
+    scene, out = unlabeled
+    capture = load_capture(scene.folder, out / "cache")
+    content = strokes_on(scene, (1, 5, 9))
+    if not photos:
+        content = through_cameras(scene, capture, content)
+    before, imported = read_splats(out / "splats.ply")[0], tmp_path / "imported"
+    options = ("--capture", scene.folder) if photos else ()
+    assert run_command("import-splats", out / "splats.ply", "--out", imported, *options).code == EXIT_DONE
+    result = run_command("label", imported, "--strokes", strokes_file(tmp_path, content), "--json")
+    assert result.code == EXIT_DONE and result.events[-1]["objects"] == 3
+    after = read_splats(imported / "splats.ply")[0]
+    assert np.array_equal(after.means, before.means) and np.array_equal(after.sh, before.sh)
+    assert {1, 2, 5} <= set(after.object_ids.tolist()) <= {0, 1, 2, 5}
+    shown = shown_of_file(imported / "splats.ply", capture)
+    right = [(found == truth)[truth > 0].mean() for found, truth in zip(shown, scene.ids, strict=True)]
+    assert np.median(right) > 0.85, right
+    entries = json.loads((imported / "objects.json").read_text())["objects"]
+    assert [entry["name"] for entry in entries] == ["ball", "object 2", "object 5"]
+    assert not (scene.folder / "masks").exists() and not (imported / "checkpoint").exists()
+
+
+def test_objects_of_imported_splats_are_proposed(unlabeled, tmp_path, run_command) -> None:
+    """Proposals on splats without photos are strokes through cameras, which `label` takes."""
+    _, out = unlabeled
+    imported = tmp_path / "imported"
+    assert run_command("import-splats", out / "splats.ply", "--out", imported).code == EXIT_DONE
+    result = run_command("propose", imported, "--json")
+    assert result.code == EXIT_DONE and result.events[-1]["objects"] >= 2
+    strokes = imported / "strokes.json"
+    assert all("camera" in stroke for stroke in json.loads(strokes.read_text())["strokes"])
+    assert run_command("label", imported, "--strokes", strokes).code == EXIT_DONE
+    assert len(set(read_splats(imported / "splats.ply")[0].object_ids.tolist())) >= 3
+
+
+def test_cameras_around_splats_show_them_from_above_and_from_free_places() -> None:
+    rng = np.random.default_rng(0)
+    walls = rng.uniform(-1, 1, (6000, 3))
+    side = rng.integers(0, 3, 6000)
+    walls[np.arange(6000), side] = np.sign(rng.normal(size=6000))
+    up, normalization = np.array([0.0, -1.0, 0.0]), Normalization((1.0, 2.0, 3.0), 0.5)
+    views = views_around(walls, up, normalization)
+    centers = np.array([views.camera(index).center for index in views.used])
+    outside = np.abs(centers).max(1) > 1
+    assert outside.sum() == 24 and (centers[outside] @ up > 0).all()
+    assert (~outside).sum() == 36 and np.abs(centers[~outside]).max() < 0.9
+    for index in np.flatnonzero(outside).tolist():
+        in_camera = walls @ views.camera(index).viewmat[:3, :3].T + views.camera(index).viewmat[:3, 3]
+        assert (in_camera[:, 2] > 0).all()
+    solid = rng.uniform(-1, 1, (60_000, 3))
+    assert len(views_around(solid, up, normalization).used) == 24, "there is no free place within"
+    # A stroke in such a view refers to the camera in the splats' own coordinates.
+    camera, reference = views.camera(3), views.reference(3)
+    np.testing.assert_allclose(normalization.viewmat(np.array(reference.viewmat)), camera.viewmat, atol=1e-9)
 
 
 def test_label_that_is_stopped_keeps_the_objects(unlabeled, tmp_path, run_command, monkeypatch) -> None:
@@ -385,17 +478,22 @@ class TrueMasks:
         return ids == ids[row, column]
 
 
+def pointer_of(capture, model, segment) -> Pointer:
+    scene = Scene(capture, model.classes, model.normalization)
+    views = views_of_photos(capture, scene.camera, model.normalization)
+    return Pointer(model.generate(), model.primitive, views, lambda done, total: None, segment)
+
+
 def test_masks_of_strokes_separate_better_than_strokes(unlabeled) -> None:
     """One click on each object, in one view."""
     scene, out = unlabeled
     capture = load_capture(scene.folder, out / "cache")
     model, _, _ = load_model(out / "checkpoint")
-    cameras = Scene(capture, model.classes, model.normalization)
     strokes = strokes_of(strokes_on(scene, (1,)), "the test", scene.names)
     stand_in = TrueMasks(lambda key: scene.ids[scene.names.index(key)])
     right = []
     for segment in (None, stand_in):
-        pointer = Pointer(model, cameras, lambda done, total: None, segment)
+        pointer = pointer_of(capture, model, segment)
         found = dict(pointer.masks(pointer.solve(strokes)))
         agrees = [(mask == scene.ids[index])[scene.ids[index] > 0] for index, mask in found.items()]
         right.append(np.concatenate(agrees).mean())
@@ -424,8 +522,7 @@ def test_strokes_on_splats_are_prompts_in_their_picture(unlabeled) -> None:
     point = middle_of(scene.ids[1] == 2)
     scaled = np.asarray(Image.fromarray(large.astype(np.uint8)).resize((640, 480), Image.Resampling.NEAREST))
     stand_in = TrueMasks(lambda key: scaled if key == view else scene.ids[1])
-    cameras = Scene(capture, model.classes, model.normalization)
-    pointer = Pointer(model, cameras, lambda done, total: None, stand_in)
+    pointer = pointer_of(capture, model, stand_in)
     strokes = Strokes((Stroke(2, view, (point,)), Stroke(1, scene.names[1], (middle_of(scene.ids[1] == 1),))), {})
     first = pointer.solve(strokes)
     seen, photo = stand_in.pictures[view], np.asarray(Image.open(scene.folder / "images" / scene.names[1]))

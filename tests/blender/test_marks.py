@@ -4,6 +4,7 @@
 import base64
 import json
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,6 +22,8 @@ from objectgs.objectgs_addon.environment import locations
 from objectgs.objectgs_addon.picking import marks
 from objectgs.objectgs_addon.running import background, pointing
 from objectgs.objectgs_addon.scene import kinds
+from objectgs.objectgs_addon.state.folder_state import UNKNOWN
+from objectgs.objectgs_addon.state.next_step import can_mark
 from objectgs.operators.common import need
 
 import headless
@@ -158,13 +161,45 @@ def test_labels_color_visible_splats(root):
     assert all(obj.labels is None for obj in gather(placed_parts(bpy.context.view_layer)))
 
 
-def test_marking_needs_a_training(root):
+def test_splats_without_a_training_are_marked(root, monkeypatch):
+    """They need neither a capture nor a training; cleaning up labels needs both."""
+    submitted = []
+    monkeypatch.setattr(background, "submit", lambda job, *_: submitted.append(job) or {"FINISHED"})
     folder = Path(blender_scene.folder_of(root))
-    with pytest.raises(RuntimeError, match="train first"):
+    with pytest.raises(RuntimeError, match="No object is marked"):
         bpy.ops.objectgs.separate_marked()
     assert not (folder / "strokes.json").exists()
-    with pytest.raises(RuntimeError, match="train first"):
+    item = marks.add_object(root)
+    marks.add_stroke(root, item.object_id, views(root)[0], [(100, 100), (120, 110)], area=False)
+    assert bpy.ops.objectgs.separate_marked() == {"FINISHED"}
+    (stroke,) = json.loads((folder / "strokes.json").read_text())["strokes"]
+    assert "camera" in stroke and submitted[0].command[submitted[0].command.index("label") + 1] == str(folder)
+    with pytest.raises(RuntimeError, match=r"capture|train first"):
         bpy.ops.objectgs.clean_up_labels()
+
+
+@pytest.mark.parametrize(
+    ("steps", "capture", "masks", "of_strokes", "can"),
+    [
+        (0, False, False, False, True),
+        (0, True, False, False, True),
+        (0, True, True, False, False),
+        (0, True, True, True, False),
+        (100, False, False, False, False),
+        (100, True, False, False, True),
+        (100, True, True, False, False),
+        (100, True, True, True, True),
+    ],
+)
+def test_what_can_be_marked(tmp_path, steps, capture, masks, of_strokes, can):
+    """A training needs its capture; masks that were not made of strokes are in the way."""
+    if masks:
+        (tmp_path / "masks").mkdir()
+    if of_strokes:
+        (tmp_path / "masks" / "strokes.json").write_text("{}")
+    state = replace(UNKNOWN, trained=True, steps=steps, capture=tmp_path if capture else None)
+    assert can_mark(state) is can
+    assert not can_mark(replace(state, trained=False, steps=0))
 
 
 def test_labels_of_a_training_with_masks_are_cleaned_up(root, monkeypatch):
@@ -235,7 +270,8 @@ def test_strokes_are_answered_with_the_model_of_the_preferences(root, monkeypatc
 PROPOSED = {
     "everything": True,
     "strokes": [
-        {"object": number, "view": "a.png", "points": [[0.1, 0.2], [0.3, 0.2]]} for number in (1, 2, 2, 3)
+        *({"object": number, "view": "a.png", "points": [[0.1, 0.2], [0.3, 0.2]]} for number in (1, 2, 2)),
+        {"object": 3, "camera": {"width": 400}, "points": [[0.1, 0.2], [0.3, 0.2]]},
     ],
 }  # fmt: skip
 
@@ -255,6 +291,8 @@ def test_proposed_objects_replace_the_marked_ones_and_can_be_merged(root, sessio
     assert [item.object_id for item in root.objectgs.marked] == [1, 3, 4], "2 is taken"
     content = marks.content(root)
     assert content["everything"] is True and [each["object"] for each in content["strokes"]] == [1, 3, 3, 4]
+    assert [each.get("view") for each in content["strokes"]] == ["a.png"] * 3 + [None]
+    assert content["strokes"][3]["camera"] == {"width": 400}
     assert session.process.sent[-1]["strokes"] == content["strokes"], "their splats are asked for"
     root.objectgs.active_marked = 0
     bpy.ops.objectgs.merge_marked(into="2")

@@ -13,15 +13,14 @@ from ...labels import Votes
 from ...labels import vote as vote_points
 from ...labels.points import write_points
 from ...model.splats import Splats
-from ...shared.color.palette import object_colors
 from ...shared.errors import InputError
 from ...shared.events import Reporter
 from ...shared.reconstruction.folder import Reconstruction
-from ...shared.reconstruction.objects import default_name, write_objects
 from ...shared.reconstruction.record import ImportRecord, update_record
 from ...shared.stopping import StoppingReporter
 from ..cameras import write_splat_cameras
 from ..folder import READ, capture_record, open_output, read_capture
+from ..imported import write_objects_of
 from ..votes import VOTE, object_name
 
 _LEAST_VISIBLE = 0.5
@@ -64,15 +63,9 @@ def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> No
         reporter.begin("write", f"Writing {folder.splats.name}")
         for sentence in write_splats(folder.splats, splats):
             reporter.warning(sentence)
-        found, counts = np.unique(splats.object_ids[splats.object_ids > 0], return_counts=True)
-        colors = object_colors(found)
-        objects = [
-            {"id": i, "name": names.get(i, default_name(i)), "color": list(colors[i]), "points": n}
-            for i, n in zip(found.tolist(), counts.tolist())
-        ]
-        write_objects(folder.objects, objects)
+        objects = write_objects_of(folder, splats, names)
         update_record(folder, imported=ImportRecord(str(options.splats.resolve()), len(splats)))
-    reporter.done(splats=len(splats), objects=len(objects), reconstruction=str(folder.folder))
+    reporter.done(splats=len(splats), objects=objects, reconstruction=str(folder.folder))
 
 
 def _vote_on_splats(capture: Capture, splats: Splats, reporter: Reporter) -> np.ndarray:

@@ -24,7 +24,7 @@ from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import stage
 from .label import begin_border_training, border_seconds, train_borders
-from .point import GRAPH, require_explicit
+from .pointable import GRAPH, pointable_of
 
 RECORD = "repair.json"
 """File in masks/ with what was changed."""
@@ -46,7 +46,7 @@ def clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> Non
     )  # fmt: skip
     trained = open_trained(options, reporter)
     capture = trained.capture
-    require_explicit(trained)
+    opened = pointable_of(trained)
     given = {index: mask for index in capture.train_indices if (mask := capture.uncorrected_mask(index)) is not None}
     if not any(mask.any() for mask in given.values()):
         raise InputError(f"{capture.folder} has no masks of the training's photos; import masks, or mark objects.")
@@ -56,7 +56,7 @@ def clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> Non
     with locked(trained.folder.folder):
         reporter.begin(GRAPH, "Comparing the splats with their neighbors")
         with stage(trained.folder, "label cleanup"):
-            pointer = Pointer(trained.model, trained.scene, reporter.progress)
+            pointer = opened.pointer(reporter.progress)
             reporter.begin(_VOTE, f"Comparing the splats with {len(given)} masks")
             zero_is_known = trained.scene.supervise_background or trained.scene.zero_is_object
             repair = repair_masks(pointer, given, zero_is_known, reporter.progress)

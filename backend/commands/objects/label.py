@@ -9,6 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from ...capture import Capture, load_capture
+from ...export import write_splats
+from ...model.splats import Splats
 from ...planning.decisions import Choices, decide, planned_capture
 from ...pointing.pointer import Pointer
 from ...pointing.strokes import Strokes, read_strokes
@@ -27,16 +29,19 @@ from ...training.fine_tuning.relabel import begin_with_labels, budget_of_labels
 from ...training.settings import Settings
 from ...training.trainer import Trainer
 from ..exported import EXPORT, export_model
-from ..folder import READ, Trained, memory_for_files, memory_for_planes, open_trained, plan_of
+from ..folder import READ, Trained, memory_for_files, memory_for_planes, plan_of
+from ..imported import write_objects_of
 from ..mask_files import new_masks, write_mask
 from ..planning import build_context, find_requested_objects
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import finish_stage, stage
 from ..votes import cast_votes, votes_key
-from .point import GRAPH, require_explicit, segmentation
+from .pointable import GRAPH, Pointable, open_pointable, segmentation
 
 _MASKS, _TRAIN = "masks", "train"
+_UNTRAINED = {GRAPH: ("Preparing", 5.0), EXPORT: ("Saving", 5.0)}
+"""Parts of the command for splats without a training."""
 
 
 def label(options: argparse.Namespace, reporter: StoppingReporter) -> None:
@@ -47,29 +52,58 @@ def label(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             _MASKS: ("Making masks", 5.0), _TRAIN: ("Training", 25.0), EXPORT: ("Saving", 5.0),
         }
     )  # fmt: skip
-    trained = open_trained(options, reporter)
-    capture = trained.capture
-    require_explicit(trained)
+    opened = open_pointable(options, reporter)
+    if isinstance(opened.source, Splats):
+        _label_plain(opened, opened.source, options, reporter)
+    else:
+        _label_trained(opened, opened.source, options, reporter)
+
+
+def _label_trained(
+    opened: Pointable, trained: Trained, options: argparse.Namespace, reporter: StoppingReporter
+) -> None:
+    """Find the objects, write masks of the photos, and train the objects' borders."""
+    capture, device = trained.capture, opened.device
     _require_own_masks(capture)
-    strokes = read_strokes(options.strokes, [view.name for view in capture.views])
-    segment = segmentation(options, trained)
-    device = trained.model.device
+    strokes = read_strokes(options.strokes, opened.views.names)
+    segment = segmentation(options, device)
     reporter.expect({KERNELS: ("Preparing", kernel_seconds(device)), _TRAIN: ("Training", border_seconds(trained))})
     ensure_kernels(reporter, device)
     with locked(trained.folder.folder):
         reporter.begin(GRAPH, "Comparing the splats with their neighbors")
         with stage(trained.folder, "label"):
-            pointer = Pointer(trained.model, trained.scene, reporter.progress, segment)
+            pointer = opened.pointer(reporter.progress, segment)
             ids = pointer.solve(strokes)
             reporter.begin(_MASKS, f"Making masks of {len(capture.train_indices)} photos")
             _write_masks(capture, pointer, ids, strokes, options, reporter)
         trainer = begin_border_training(trained, pointer.splats.source.cpu().numpy(), ids, options, reporter)
         train_borders(trained, trainer, reporter)
-    objects = sorted({stroke.object for stroke in strokes.strokes} - {0})
     reporter.done(
-        masks=str(capture.folder / "masks"), objects=len(objects), views=len(capture.train_indices),
+        masks=str(capture.folder / "masks"), objects=_number_of(strokes), views=len(capture.train_indices),
         splats=str(trained.folder.splats), steps=trainer.progress.step,
     )  # fmt: skip
+
+
+def _label_plain(opened: Pointable, splats: Splats, options: argparse.Namespace, reporter: StoppingReporter) -> None:
+    """Find the objects, and write them to splats.ply; there are no masks, and nothing is trained."""
+    reporter.expect({READ: ("Preparing", 5.0), KERNELS: ("Preparing", kernel_seconds(opened.device)), **_UNTRAINED})
+    strokes = read_strokes(options.strokes, opened.views.names)
+    segment = segmentation(options, opened.device)
+    ensure_kernels(reporter, opened.device)
+    with locked(opened.folder.folder):
+        reporter.begin(GRAPH, "Comparing the splats with their neighbors")
+        with stage(opened.folder, "label"):
+            splats.object_ids = opened.pointer(reporter.progress, segment).solve(strokes)
+        reporter.begin(EXPORT, f"Writing {opened.folder.splats.name}")
+        for sentence in write_splats(opened.folder.splats, splats):
+            reporter.warning(sentence)
+        write_objects_of(opened.folder, splats, strokes.names)
+    reporter.done(objects=_number_of(strokes), splats=str(opened.folder.splats))
+
+
+def _number_of(strokes: Strokes) -> int:
+    """Return how many objects strokes mark."""
+    return len({stroke.object for stroke in strokes.strokes} - {0})
 
 
 def _require_own_masks(capture: Capture) -> None:

@@ -11,17 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from ...pointing.pointer import Pointer, StrokeOnNothing
+from ...pointing.pointer import StrokeOnNothing
 from ...pointing.strokes import content_of, strokes_of
-from ...segmentation import KeptEncodings, Segmenter
 from ...shared.errors import InputError
 from ...shared.stopping import StoppingReporter
-from ..folder import READ, Trained, open_trained
+from ..folder import READ
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels
-
-GRAPH = "graph"
-"""Name of the preparation among the parts of a command."""
+from .pointable import GRAPH, open_pointable, segmentation
 
 _WAIT = 0.2
 """Interval in seconds at which a stop is noticed."""
@@ -35,16 +32,12 @@ def point(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     if not options.json:
         raise InputError("`point` answers another program; run it with --json, or use `label` with a file of strokes.")
     reporter.expect({READ: ("Preparing", 3.0), KERNELS: ("Preparing", 0.0), GRAPH: ("Preparing", 3.0)})
-    trained = open_trained(options, reporter)
-    require_explicit(trained)
-    segment = segmentation(options, trained)
-    ensure_kernels(reporter, trained.model.device)
-    views = [view.name for view in trained.capture.views]
+    opened = open_pointable(options, reporter)
+    segment = segmentation(options, opened.device)
+    ensure_kernels(reporter, opened.device)
     reporter.begin(GRAPH, "Comparing the splats with their neighbors")
-    pointer = Pointer(trained.model, trained.scene, reporter.progress, segment)
-    # Splats that cannot be drawn are not in splats.ply.
-    in_file = np.isin(pointer.splats.source.cpu().numpy(), trained.model.splats()[1])
-    reporter.answer(ready=True, splats=int(in_file.sum()))
+    pointer = opened.pointer(reporter.progress, segment)
+    reporter.answer(ready=True, splats=int(opened.in_file.sum()))
     while not reporter.stop():
         content = _latest(reporter)
         if content is None:
@@ -55,7 +48,7 @@ def point(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             reporter.answer(request=request, proposed=proposed)
             continue
         try:
-            ids = pointer.solve(strokes_of(content, "the request", views))[in_file]
+            ids = pointer.solve(strokes_of(content, "the request", opened.views.names))[opened.in_file]
         except InputError as error:
             number = error.number if isinstance(error, StrokeOnNothing) else None
             reporter.answer(request=request, problem=str(error), stroke=number)
@@ -70,21 +63,6 @@ def point(options: argparse.Namespace, reporter: StoppingReporter) -> None:
                 classes=base64.b64encode(zlib.compress(part, 1)).decode(),
             )  # fmt: skip
     reporter.done()
-
-
-def require_explicit(trained: Trained) -> None:
-    """Raise InputError if the model's splats depend on the view."""
-    if not trained.model.explicit:
-        raise InputError(
-            f"{trained.folder.folder} has a view-dependent model; train it with --mode explicit to label it."
-        )
-
-
-def segmentation(options: argparse.Namespace, trained: Trained) -> KeptEncodings | None:
-    """Return the model of --segmenter, if it is given; raises InputError if its folder has none."""
-    return (
-        None if options.segmenter is None else KeptEncodings(Segmenter(options.segmenter, device=trained.model.device))
-    )
 
 
 def _latest(reporter: StoppingReporter) -> dict[str, Any] | None:

@@ -4,36 +4,34 @@ from __future__ import annotations
 
 import argparse
 
-from ...pointing.pointer import Pointer
 from ...pointing.strokes import content_of
 from ...shared.errors import InputError
 from ...shared.formats.json_file import write_json
 from ...shared.stopping import StoppingReporter
-from ..folder import READ, open_trained
+from ..folder import READ
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels
-from .point import GRAPH, require_explicit
+from .pointable import GRAPH, open_pointable
 
 _DRAW = "draw"
 
 
 def propose(options: argparse.Namespace, reporter: StoppingReporter) -> None:
-    """Find the objects of a training without masks, and write a file of strokes on them."""
+    """Find the objects of splats without masks, and write a file of strokes on them."""
     reporter.expect(
         {
             READ: ("Preparing", 3.0), KERNELS: ("Preparing", 0.0), GRAPH: ("Preparing", 3.0),
             _DRAW: ("Finding objects", 3.0),
         }
     )  # fmt: skip
-    trained = open_trained(options, reporter)
-    require_explicit(trained)
-    ensure_kernels(reporter, trained.model.device)
+    opened = open_pointable(options, reporter)
+    ensure_kernels(reporter, opened.device)
     reporter.begin(GRAPH, "Comparing the splats with their neighbors")
-    pointer = Pointer(trained.model, trained.scene, reporter.progress)
+    pointer = opened.pointer(reporter.progress)
     reporter.begin(_DRAW, "Finding objects")
     found = pointer.propose(reporter.progress)
     if not found.strokes:
-        raise InputError(f"No objects were found in {trained.folder.folder}; mark them by strokes.")
-    path = options.strokes or trained.folder.strokes
+        raise InputError(f"No objects were found in {opened.folder.folder}; mark them by strokes.")
+    path = options.strokes or opened.folder.strokes
     write_json(path, content_of(found))
     reporter.done(objects=len(found.names), strokes=str(path))

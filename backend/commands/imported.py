@@ -1,0 +1,33 @@
+"""Files of reconstructions whose splats are those of another program."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..model.splats import Splats
+from ..shared.color.palette import object_colors
+from ..shared.reconstruction.folder import Reconstruction
+from ..shared.reconstruction.objects import default_name, write_objects
+
+
+def write_objects_of(folder: Reconstruction, splats: Splats, names: Mapping[int, str]) -> int:
+    """Write objects.json for the objects that splats have.
+
+    Args:
+        folder: the reconstruction.
+        splats: the splats with their objects' IDs.
+        names: names of objects by ID; others get a default name.
+
+    Returns:
+        The number of objects.
+    """
+    found, counts = np.unique(splats.object_ids[splats.object_ids > 0], return_counts=True)
+    colors = object_colors(found)
+    objects = [
+        {"id": i, "name": names.get(i) or default_name(i), "color": list(colors[i]), "points": n}
+        for i, n in zip(found.tolist(), counts.tolist(), strict=True)
+    ]
+    write_objects(folder.objects, objects)
+    return len(objects)
