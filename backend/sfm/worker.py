@@ -133,11 +133,11 @@ def verification() -> pycolmap.TwoViewGeometryOptions:
 
 def extract_learned(checkpoint: str, database: str, images: str, groups: str, masks: str = "") -> None:
     """Find features as `extract`, by the networks of a checkpoint."""
-    from . import learned  # It imports torch, which takes seconds.
+    from .learned import lightglue  # It imports torch, which takes seconds.
 
     listed = _read_groups(groups)
-    detect = learned.LightGlue(Path(checkpoint)).detect
-    learned.find_features(
+    detect = lightglue.LightGlue(Path(checkpoint)).detect
+    lightglue.find_features(
         Path(database), Path(images), [group.names for group in listed], Path(masks) if masks else None, detect
     )
     for group in listed:
@@ -146,10 +146,10 @@ def extract_learned(checkpoint: str, database: str, images: str, groups: str, ma
 
 def match_learned(checkpoint: str, database: str, pairs: str = "") -> None:
     """Match and verify pairs of photos, those in a file or all, by the networks of a checkpoint."""
-    from . import learned
+    from .learned import lightglue
 
     listed = read_pairs(Path(pairs)) if pairs else None
-    learned.match_pairs(Path(database), listed, learned.LightGlue(Path(checkpoint)).match, verification())
+    lightglue.match_pairs(Path(database), listed, lightglue.LightGlue(Path(checkpoint)).match, verification())
 
 
 def map_incrementally(database: str, images: str, out: str, names: str, calibrated: str = "") -> None:

@@ -14,7 +14,9 @@ import torch
 from PIL import ExifTags, Image
 
 from backend.networks.checkpoint_folder import PACKAGE
-from backend.sfm import database, learned, pairs, worker
+from backend.sfm import database, pairs, worker
+from backend.sfm.learned import checkpoint, lightglue
+from backend.sfm.learned.photos import LONGEST_SIDE
 from backend.shared.errors import EXIT_DONE, InputError
 from backend.shared.formats import photos_source
 
@@ -44,7 +46,7 @@ class StandIn:
                 patch = values[top + y - 8 : top + y + 9, left + x - 8 : left + x + 9].ravel()
                 points.append((left + x + 0.5, top + y + 0.5))
                 descriptors.append((patch - patch.mean()) / max(np.linalg.norm(patch - patch.mean()), 1e-6))
-        return learned.Features(np.float32(points), np.float32(descriptors), gray.shape[::-1])
+        return lightglue.Features(np.float32(points), np.float32(descriptors), gray.shape[::-1])
 
     def match(self, first, second):
         self.pairs.append((len(first.points), len(second.points)))
@@ -71,35 +73,35 @@ def photos(tmp_path_factory):
 def test_points_are_pixels_of_the_full_photo(stand_in):
     """A photo of twice the longest side, with a border between black and white at one column of the small image."""
     column = 300
-    pixels = np.zeros((1536, 2 * learned.LONGEST_SIDE), np.uint8)
+    pixels = np.zeros((1536, 2 * LONGEST_SIDE), np.uint8)
     pixels[:, 2 * column :] = 255
-    found = learned.features_of(Image.fromarray(pixels), None, stand_in.detect)
-    assert stand_in.images == [(768, learned.LONGEST_SIDE)] and found.size == (2048, 1536)
+    found = lightglue.features_of(Image.fromarray(pixels), None, stand_in.detect)
+    assert stand_in.images == [(768, LONGEST_SIDE)] and found.size == (2048, 1536)
     at_edge = found.points[np.abs(found.points[:, 0] - 2 * column) < STEP]
     centers = {2 * (column - 0.5), 2 * (column + 0.5)}
     assert len(at_edge) > 20 and set(at_edge[:, 0]) == centers, "of the pixels beside it, doubled"
-    small = learned.features_of(Image.fromarray(pixels[:300, 400:800]), None, stand_in.detect)
+    small = lightglue.features_of(Image.fromarray(pixels[:300, 400:800]), None, stand_in.detect)
     assert stand_in.images[-1] == (300, 400), "small photos are not enlarged"
     assert len(small.points) == len(small.descriptors) and small.points.dtype == small.descriptors.dtype == np.float32
 
 
 def test_masks_hide_features_before_the_best_are_taken(stand_in, monkeypatch):
-    everywhere = learned.features_of(Image.fromarray(photo(ring()[0])), None, stand_in.detect)
+    everywhere = lightglue.features_of(Image.fromarray(photo(ring()[0])), None, stand_in.detect)
     mask = np.zeros((HEIGHT // 2, WIDTH // 2), bool)  # Of half the size.
     mask[:, 100:] = True
-    found = learned.features_of(Image.fromarray(photo(ring()[0])), mask, stand_in.detect)
+    found = lightglue.features_of(Image.fromarray(photo(ring()[0])), mask, stand_in.detect)
     expected = everywhere.points[:, 0] >= 200
     assert np.array_equal(found.points, everywhere.points[expected]) and 0 < expected.sum() < len(expected)
     assert np.array_equal(found.descriptors, everywhere.descriptors[expected])
-    monkeypatch.setattr(learned, "MOST_FEATURES", 10)
-    best = learned.features_of(Image.fromarray(photo(ring()[0])), mask, stand_in.detect)
+    monkeypatch.setattr(lightglue, "MOST_FEATURES", 10)
+    best = lightglue.features_of(Image.fromarray(photo(ring()[0])), mask, stand_in.detect)
     assert np.array_equal(best.points, found.points[:10])
 
 
 def test_database_has_features_and_cameras_as_those_of_sift(photos, tmp_path, stand_in):
     images, names = photos
     path, groups = tmp_path / "d.db", [names[:2], names[2:]]
-    learned.find_features(path, images, groups, None, stand_in.detect)
+    lightglue.find_features(path, images, groups, None, stand_in.detect)
     (tmp_path / "groups.json").write_text(json.dumps([{"names": each, "camera": None} for each in groups]))
     worker.extract(str(tmp_path / "sift.db"), str(images), str(tmp_path / "groups.json"))
     assert set(database.image_ids(path)) == set(database.image_ids(tmp_path / "sift.db")) == set(names)
@@ -108,7 +110,7 @@ def test_database_has_features_and_cameras_as_those_of_sift(photos, tmp_path, st
         cameras = [[str(camera) for camera in stored.read_all_cameras()] for stored in (ours, sift)]
         assert cameras[0] == cameras[1] and len(cameras[0]) == len(groups)
         assert ours.num_rigs() == sift.num_rigs() == 2 and ours.num_frames() == sift.num_frames()
-        expected = learned.features_of(Image.open(images / names[0]), None, stand_in.detect)
+        expected = lightglue.features_of(Image.open(images / names[0]), None, stand_in.detect)
         number = database.image_ids(path)[names[0]]
         assert np.array_equal(ours.read_keypoints(number), expected.points)
     assert np.array_equal(database.largest_features(path, number, 20), expected.descriptors[:20])
@@ -118,13 +120,13 @@ def test_known_features_are_not_searched_again(photos, tmp_path, stand_in):
     """Neither after a stop between two photos, nor for photos that were left out since; photos still share a camera."""
     images, names = photos
     path = tmp_path / "d.db"
-    learned.find_features(path, images, [names[:2]], None, stand_in.detect)
-    learned.find_features(path, images, [names], None, stand_in.detect)
+    lightglue.find_features(path, images, [names[:2]], None, stand_in.detect)
+    lightglue.find_features(path, images, [names], None, stand_in.detect)
     assert len(stand_in.images) == len(names)
     with closing(sqlite3.connect(path)) as connection, connection:
         for table in ("keypoints", "descriptors"):
             connection.execute(f"DELETE FROM {table} WHERE image_id < 3")
-    learned.find_features(path, images, [names[1:]], None, stand_in.detect)
+    lightglue.find_features(path, images, [names[1:]], None, stand_in.detect)
     assert len(stand_in.images) == len(names) + 1 and database.count_features(path) == len(names) - 1
     with pycolmap.Database.open(path) as stored:
         assert stored.num_cameras() == 1
@@ -133,13 +135,13 @@ def test_known_features_are_not_searched_again(photos, tmp_path, stand_in):
 def test_pairs_are_matched_and_verified_once(photos, tmp_path, stand_in):
     images, names = photos
     path = tmp_path / "d.db"
-    learned.find_features(path, images, [names], None, stand_in.detect)
+    lightglue.find_features(path, images, [names], None, stand_in.detect)
     chosen = [(names[1], names[0]), (names[1], names[2])]
-    learned.match_pairs(path, chosen, stand_in.match, worker.verification())
+    lightglue.match_pairs(path, chosen, stand_in.match, worker.verification())
     assert database.count_pairs(path) == len(stand_in.pairs) == 2
-    learned.match_pairs(path, None, stand_in.match, worker.verification())
+    lightglue.match_pairs(path, None, stand_in.match, worker.verification())
     assert database.count_pairs(path) == len(stand_in.pairs) == len(names) * (len(names) - 1) // 2
-    learned.match_pairs(path, None, stand_in.match, worker.verification())
+    lightglue.match_pairs(path, None, stand_in.match, worker.verification())
     assert len(stand_in.pairs) == database.count_pairs(path)
     ids = database.image_ids(path)
     verified = {frozenset(pair[:2]) for pair in database.verified_pairs(path)}
@@ -167,8 +169,8 @@ def epipolar_distances(matrices, points) -> np.ndarray:
 def test_verification_is_that_of_colmap(photos, tmp_path, stand_in):
     images, names = photos
     ours, theirs = tmp_path / "ours.db", tmp_path / "theirs.db"
-    learned.find_features(ours, images, [names], None, stand_in.detect)
-    learned.match_pairs(ours, None, stand_in.match, worker.verification())
+    lightglue.find_features(ours, images, [names], None, stand_in.detect)
+    lightglue.match_pairs(ours, None, stand_in.match, worker.verification())
     shutil.copy(ours, theirs)
     with pycolmap.Database.open(theirs) as stored:
         stored.clear_two_view_geometries()
@@ -182,7 +184,7 @@ def test_verification_is_that_of_colmap(photos, tmp_path, stand_in):
 def test_pairs_of_large_sets_are_chosen_by_signed_descriptors(photos, tmp_path, stand_in, monkeypatch):
     images, names = photos
     path = tmp_path / "d.db"
-    learned.find_features(path, images, [names], None, stand_in.detect)
+    lightglue.find_features(path, images, [names], None, stand_in.detect)
     monkeypatch.setattr(pairs, "ALL_UP_TO", 2)
     monkeypatch.setattr(pairs, "NEIGHBORS", 1)
     chosen = pairs.choose_pairs(path, names)
@@ -244,10 +246,10 @@ def test_missing_package_is_named_with_its_command(photos, tmp_path, run_command
 def test_checkpoints_are_told_apart_by_their_content(tmp_path):
     first = write_checkpoint(tmp_path / "first")
     copied = shutil.copytree(first, tmp_path / "copied")
-    assert learned.fingerprint(first) == learned.fingerprint(copied)
+    assert checkpoint.fingerprint(first) == checkpoint.fingerprint(copied)
     (copied / "model.safetensors").write_bytes(b"others")
     other = write_checkpoint(tmp_path / "other", filter_threshold=0.2)
-    assert len({learned.fingerprint(folder) for folder in (first, copied, other)}) == 3
+    assert len({checkpoint.fingerprint(folder) for folder in (first, copied, other)}) == 3
 
 
 @pytest.fixture(scope="module")
@@ -293,7 +295,7 @@ def test_features_and_matches_are_those_of_transformers(networks):
     ]
     to_first = expected.matches[0, 0].numpy()
     wanted = {(*corners[0][i].round(1), *corners[1][j].round(1)) for i, j in enumerate(to_first) if j >= 0}
-    model = learned.LightGlue(networks)
+    model = lightglue.LightGlue(networks)
     found = [model.detect(gray) for gray in grays]
     for each, points in zip(found, corners, strict=True):
         assert np.allclose(sorted(map(tuple, each.points)), sorted(map(tuple, points)), atol=1e-3)
@@ -304,7 +306,7 @@ def test_features_and_matches_are_those_of_transformers(networks):
 
 def test_photos_of_other_sizes_match(networks):
     """Places are relative to each photo's own size: a photo on its side matches one that is not."""
-    model = learned.LightGlue(networks)
+    model = lightglue.LightGlue(networks)
     gray = np.asarray(Image.fromarray(photo(ring()[0])).convert("L"))
     whole, part = model.detect(gray), model.detect(np.ascontiguousarray(gray[:, 80:240]))
     matches = model.match(whole, part)
@@ -315,14 +317,14 @@ def test_photos_of_other_sizes_match(networks):
 
 
 def test_plain_and_tiny_images_have_no_features(networks, tmp_path):
-    model = learned.LightGlue(networks)
+    model = lightglue.LightGlue(networks)
     assert model.detect(np.zeros((12, 400), np.uint8)).points.shape == (0, 2)
     assert model.detect(np.zeros((12, 400), np.uint8)).descriptors.shape == (0, 64)
     strict = shutil.copytree(networks, tmp_path / "strict")
     config = json.loads((strict / "config.json").read_text())
     config["keypoint_detector_config"]["keypoint_threshold"] = 2.0
     (strict / "config.json").write_text(json.dumps(config))
-    assert len(learned.LightGlue(strict).detect(np.full((96, 96), 128, np.uint8)).points) == 0
+    assert len(lightglue.LightGlue(strict).detect(np.full((96, 96), 128, np.uint8)).points) == 0
 
 
 def test_weights_that_do_not_fit_are_refused(networks, tmp_path):
@@ -331,11 +333,11 @@ def test_weights_that_do_not_fit_are_refused(networks, tmp_path):
     for change in ({"num_hidden_layers": 3}, {"descriptor_dim": 32}, {"descriptor_dim": "x"}):
         (folder / "config.json").write_text(json.dumps(before | change))
         with pytest.raises(InputError, match=r"^The weights in .* do not fit its config.json \(.*\); copy .*\.$"):
-            learned.LightGlue(folder)
+            lightglue.LightGlue(folder)
     (folder / "config.json").write_text(json.dumps(before))
     (folder / "model.safetensors").write_bytes(b"damaged")
     with pytest.raises(InputError, match="do not fit its config"):
-        learned.LightGlue(folder)
+        lightglue.LightGlue(folder)
 
 
 def test_command_goes_on_and_poses_are_right(networks, tmp_path, run_command, monkeypatch):
@@ -351,11 +353,11 @@ def test_command_goes_on_and_poses_are_right(networks, tmp_path, run_command, mo
     for name, matrix in zip(names, matrices, strict=True):
         image = Image.fromarray(photo(matrix)).resize((2 * WIDTH, 2 * HEIGHT), Image.Resampling.BICUBIC)
         image.save(tmp_path / "photos" / name, quality=95, exif=exif)
-    path = tmp_path / "capture" / "sfm" / f"learned-{learned.fingerprint(networks)}-database.db"
+    path = tmp_path / "capture" / "sfm" / f"learned-{checkpoint.fingerprint(networks)}-database.db"
     path.parent.mkdir(parents=True)
-    model = learned.LightGlue(networks)
-    learned.find_features(path, tmp_path / "photos", [names[:3]], None, model.detect)
-    learned.match_pairs(path, [(names[0], names[1])], model.match, worker.verification())
+    model = lightglue.LightGlue(networks)
+    lightglue.find_features(path, tmp_path / "photos", [names[:3]], None, model.detect)
+    lightglue.match_pairs(path, [(names[0], names[1])], model.match, worker.verification())
 
     def rows(table):
         with closing(sqlite3.connect(path)) as connection:

@@ -15,7 +15,8 @@ from ...capture import BLURRED, load_capture, measure_contrasts
 from ...sfm import check, database, model
 from ...sfm.agreement import measure_agreement
 from ...sfm.background import stands_still
-from ...sfm.learned import LightGlue, fingerprint
+from ...sfm.learned.checkpoint import fingerprint
+from ...sfm.learned.lightglue import LightGlue
 from ...sfm.location import common_up, meters_per_unit, positions_in_meters, ups_in_cameras
 from ...sfm.pairs import NEIGHBORS, choose_pairs
 from ...sfm.rig import rigs_of

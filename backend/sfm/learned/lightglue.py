@@ -9,32 +9,20 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
 import torch
 from PIL import Image
 
-from ..capture.files import read_image, read_mask
-from ..networks.checkpoint_folder import (
-    CONFIG,
-    digest_of,
-    import_transformers,
-    not_a_config,
-    read_config,
-    require_all_weights,
-    unfit,
-)
-from ..shared.errors import InputError
-from .database import camera_of
+from ...capture.files import read_image, read_mask
+from .checkpoint import load_network
+from .photos import add_photos, scaled_gray, write_pair
 
-LONGEST_SIDE = 1024
-"""Side in pixels to which larger photos are scaled for the search of corners, as for LightGlue's training."""
 MOST_FEATURES = 2048
 """Most features of a photo. The time of a pair grows with their square."""
 
-_NAME, _OPTION = "LightGlue", "--matcher"
 _MOST_CORNERS = 1 << 14
 """Most corners that are described before masks and scores leave out some: about one in each cell of 8 x 8 pixels."""
 _KEPT = 64
@@ -82,23 +70,16 @@ class LightGlue:
     """
 
     def __init__(self, folder: Path) -> None:
-        _require_lightglue(folder)
-        transformers = import_transformers("LightGlueForKeypointMatching", _OPTION)
-        try:
-            config = transformers.LightGlueConfig.from_pretrained(folder, local_files_only=True)
-            corners = config.keypoint_detector_config
-            self._least_score, self._border = corners.keypoint_threshold, corners.border_removal_distance
-            self._dimensions = corners.descriptor_decoder_dim
-            # Corners are left out here: masks do so before the best are taken, and transformers fails on none at all.
-            corners.keypoint_threshold, corners.max_keypoints = -1.0, _MOST_CORNERS
-            self._network, loaded = transformers.LightGlueForKeypointMatching.from_pretrained(
-                folder, config=config, dtype=torch.float32, local_files_only=True, output_loading_info=True
-            )
-        except Exception as error:  # Files may be damaged in any way.
-            raise unfit(folder, str(error).strip().partition("\n")[0]) from error
-        require_all_weights(folder, loaded)
-        self._detector, self._given = self._network.eval().keypoint_detector, _Given()
+        self._network = load_network(folder, self._keep_corners)
+        self._detector, self._given = self._network.keypoint_detector, _Given()
         self._network.keypoint_detector = self._given
+
+    def _keep_corners(self, config: Any) -> None:
+        """Have all corners found; masks leave some out before the best are taken, and transformers fails on none."""
+        corners = config.keypoint_detector_config
+        self._least_score, self._border = corners.keypoint_threshold, corners.border_removal_distance
+        self._dimensions = corners.descriptor_decoder_dim
+        corners.keypoint_threshold, corners.max_keypoints = -1.0, _MOST_CORNERS
 
     @torch.inference_mode()
     def detect(self, gray: np.ndarray) -> Features:
@@ -130,29 +111,6 @@ class LightGlue:
         return np.column_stack([of_first, matched[of_first]]).astype(np.int64)
 
 
-def _require_lightglue(folder: Path) -> None:
-    """Raise InputError unless a folder has the files of a LightGlue with SuperPoint."""
-    config, path = read_config(folder, _NAME, _OPTION), folder / CONFIG
-    if config["model_type"] != "lightglue":
-        raise InputError(
-            f"{path} is of a model of the type {config['model_type']}; choose a checkpoint of LightGlue as --matcher."
-        )
-    corners = config.get("keypoint_detector_config") or {}
-    if not isinstance(corners, dict):
-        raise not_a_config(path, _NAME)
-    detector = corners.get("model_type")
-    if detector not in ("superpoint", None):
-        raise InputError(
-            f"{path} is of a LightGlue for features of {detector}; choose a checkpoint with those of SuperPoint."
-        )
-
-
-def fingerprint(folder: Path) -> str:
-    """Return 8 hexadecimal digits that identify the checkpoint in a folder; raises InputError if there is none."""
-    _require_lightglue(folder)
-    return digest_of(folder)
-
-
 def find_features(
     path: Path, images: Path, groups: Sequence[Sequence[str]], masks: Path | None, detect: Detect
 ) -> None:
@@ -168,13 +126,7 @@ def find_features(
     Raises:
         InputError: A photo or a mask cannot be read.
     """
-    pycolmap.Database.open(path).close()
-    for group in groups:
-        reader = pycolmap.ImageReaderOptions()
-        reader.existing_camera_id = camera_of(path, group)
-        pycolmap.import_images(
-            path, images, image_names=list(group), camera_mode=pycolmap.CameraMode.SINGLE, options=reader
-        )
+    add_photos(path, images, groups)
     wanted = {name for group in groups for name in group}
     with pycolmap.Database.open(path) as stored:
         for image in stored.read_all_images():
@@ -191,14 +143,13 @@ def find_features(
 
 def features_of(photo: Image.Image, mask: np.ndarray | None, detect: Detect) -> Features:
     """Return the features of a photo in its own pixels, where a mask (h, w) of its proportions is True."""
-    scale = min(1.0, LONGEST_SIDE / max(photo.size))
-    scaled = photo.convert("L").resize([max(round(scale * side), 1) for side in photo.size], Image.Resampling.BILINEAR)
-    found = detect(np.array(scaled))
+    scaled = scaled_gray(photo)
+    found = detect(scaled)
     kept = np.arange(len(found.points))[:MOST_FEATURES]
     if mask is not None:
-        columns, rows = (found.points * np.divide(mask.shape[::-1], scaled.size)).astype(int).T
+        columns, rows = (found.points * np.divide(mask.shape[::-1], scaled.shape[::-1])).astype(int).T
         kept = np.flatnonzero(mask[rows, columns])[:MOST_FEATURES]
-    points = (found.points[kept] * np.divide(photo.size, scaled.size)).astype(np.float32)
+    points = (found.points[kept] * np.divide(photo.size, scaled.shape[::-1])).astype(np.float32)
     return Features(points, found.descriptors[kept], photo.size)
 
 
@@ -233,12 +184,4 @@ def match_pairs(
                 continue
             one, other = (features(image.image_id, image.camera_id) for image in (first, second))
             indices = match(one, other) if len(one.points) and len(other.points) else np.zeros((0, 2))
-            matches = indices.astype(np.uint32)
-            geometry = pycolmap.TwoViewGeometry()
-            if len(matches) >= verification.min_num_inliers:
-                geometry = pycolmap.estimate_two_view_geometry(
-                    cameras[first.camera_id], one.points, cameras[second.camera_id], other.points, matches, verification
-                )
-            with pycolmap.DatabaseTransaction(stored):
-                stored.write_matches(first.image_id, second.image_id, matches)
-                stored.write_two_view_geometry(first.image_id, second.image_id, geometry)
+            write_pair(stored, (first, second), (one.points, other.points), indices, verification)

@@ -1,0 +1,1 @@
+"""Features and matches by networks, of folders with a checkpoint of the package transformers."""
