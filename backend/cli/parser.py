@@ -102,7 +102,7 @@ def _add_capture_commands(commands: _Commands) -> None:
     )  # fmt: skip
     poses.add_argument(
         "--matcher", type=Path, metavar="FOLDER",
-        help="find and match features by the networks of a checkpoint of LightGlue; see above (SIFT)",
+        help="match by the networks of a checkpoint of LightGlue or EfficientLoFTR; see above (SIFT)",
     )  # fmt: skip
     poses.add_argument(
         "--frames", type=types.count, metavar="N", help="number of frames of each video (by how far the picture moves)"

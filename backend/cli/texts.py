@@ -33,10 +33,11 @@ masks/, both are copied. Cameras that are fixed to each other, with a folder eac
 same names for the photos of a moment, are recognized. After a stop, the same command
 goes on.
 
-With --matcher, SuperPoint finds features and LightGlue matches them, for photos that
-differ too much in light or place for SIFT. FOLDER is a checkpoint of the package
-transformers with both: config.json and weights. Nothing is downloaded. Each pair of
-photos takes seconds.
+With --matcher, networks match the photos, for those that differ too much in light or
+place for SIFT. FOLDER is a checkpoint of the package transformers, config.json and
+weights, of LightGlue, which matches features that SuperPoint finds, or EfficientLoFTR,
+which needs no features. Nothing is downloaded. Each pair of photos takes seconds, by
+EfficientLoFTR ten or more.
 """
 
 MASKS = """\

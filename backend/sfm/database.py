@@ -14,6 +14,8 @@ from ..shared.formats.atomic import write_atomic
 
 NAME, ON_OBJECTS = "database.db", "objects.db"
 """Databases in sfm/ with features everywhere, and on objects alone."""
+POSITIONS = "positions"
+"""Table with a row for each pair of photos, in the files of `learned.positions`."""
 FEWEST_INLIERS = 15
 """Number of matches in agreement from which on COLMAP takes two photos to show the same."""
 
@@ -84,6 +86,11 @@ def count_features(path: Path) -> int:
 def count_pairs(path: Path) -> int:
     """Return the number of pairs of photos that were matched and verified; 0 if the database does not exist yet."""
     return _count(path, "SELECT COUNT(*) FROM two_view_geometries")
+
+
+def count_positions(path: Path) -> int:
+    """Return the number of pairs of photos in a file of matched places; 0 if it does not exist yet."""
+    return _count(path, f"SELECT COUNT(*) FROM {POSITIONS}")
 
 
 def _count(path: Path, query: str) -> int:

@@ -4,6 +4,8 @@
     worker match DATABASE [PAIRS.txt]   matches of the pairs, or of all
     worker extract-learned MODEL DATABASE IMAGES GROUPS.json [MASKS]   as extract, by the networks of a checkpoint
     worker match-learned MODEL DATABASE [PAIRS.txt]   as match, of features by extract-learned
+    worker match-places MODEL MATCHED IMAGES PAIRS.txt   places that the pairs show in common, by a network
+    worker join-pairs MATCHED DATABASE IMAGES GROUPS.json [MASKS]   features at these places, and verified matches
     worker incremental|global DATABASE IMAGES OUT NAMES.json [calibrated]   poses of the named photos, and points
     worker refine MODEL OUT [calibrated]   the same without wrong matches, and with the lens that photos show
 
@@ -150,6 +152,26 @@ def match_learned(checkpoint: str, database: str, pairs: str = "") -> None:
 
     listed = read_pairs(Path(pairs)) if pairs else None
     lightglue.match_pairs(Path(database), listed, lightglue.LightGlue(Path(checkpoint)).match, verification())
+
+
+def match_places(checkpoint: str, matched: str, images: str, pairs: str) -> None:
+    """Find what pairs of photos show in common, by a network without a search for features."""
+    from .learned import loftr, positions
+
+    network = loftr.EfficientLoFTR(Path(checkpoint))
+    positions.match_photos(Path(matched), Path(images), read_pairs(Path(pairs)), network.match, loftr.MULTIPLE)
+
+
+def join_pairs(matched: str, database: str, images: str, groups: str, masks: str = "") -> None:
+    """Make features of what pairs show in common, as `extract`, and verify the pairs' matches."""
+    from .learned import joining, photos
+
+    listed = _read_groups(groups)
+    photos.add_photos(Path(database), Path(images), [group.names for group in listed])
+    for group in listed:
+        _calibrate(database, group)
+    names = {name for group in listed for name in group.names}
+    joining.join_pairs(Path(database), Path(matched), names, Path(masks) if masks else None, verification())
 
 
 def map_incrementally(database: str, images: str, out: str, names: str, calibrated: str = "") -> None:
@@ -305,6 +327,8 @@ STAGES: dict[str, Callable[..., None]] = {
     "match": match,
     "extract-learned": extract_learned,
     "match-learned": match_learned,
+    "match-places": match_places,
+    "join-pairs": join_pairs,
     "incremental": map_incrementally,
     "global": map_globally,
     "refine": refine,

@@ -33,7 +33,12 @@ def pose(center, target) -> np.ndarray:
 
 
 def photo(matrix: np.ndarray, seed: int = 0, fisheye: float = 0.0) -> np.ndarray:
-    """Render a textured floor, two walls and two boxes as (HEIGHT, WIDTH, 3) uint8.
+    """Render a textured floor, two walls and two boxes as (HEIGHT, WIDTH, 3) uint8; see `photo_and_places`."""
+    return photo_and_places(matrix, seed, fisheye)[0]
+
+
+def photo_and_places(matrix: np.ndarray, seed: int = 0, fisheye: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return a photo, and the place in the world (HEIGHT, WIDTH, 3) that each of its pixels shows.
 
     Each pixel's distance from the center is `fisheye` times the angle to the axis, unless that is 0.
     """
@@ -45,6 +50,7 @@ def photo(matrix: np.ndarray, seed: int = 0, fisheye: float = 0.0) -> np.ndarray
     rays = rays @ matrix[:, :3]
     center = -matrix[:, :3].T @ matrix[:, 3]
     nearest, image = np.full(x.shape, np.inf), np.zeros((*x.shape, 3))
+    places = np.zeros((*x.shape, 3))
     planes = [(2, 0.0, None), (1, 2.5, None), (0, -2.5, None)]
     for low, high in (((-0.6, -0.3, 0.0), (0.0, 0.4, 0.7)), ((0.4, -0.7, 0.0), (0.9, 0.0, 0.4))):
         planes += [(axis, side, (low, high)) for axis in range(3) for side in (low[axis], high[axis])]
@@ -59,8 +65,9 @@ def photo(matrix: np.ndarray, seed: int = 0, fisheye: float = 0.0) -> np.ndarray
         across = np.nan_to_num(place[..., [other for other in range(3) if other != axis]], posinf=0, neginf=0)
         cells = (np.clip(across, -50, 50) * 160).astype(int) % 512
         nearest = np.where(hit, distance, nearest)
+        places = np.where(hit[..., None], place, places)
         image = np.where(hit[..., None], texture(seed + number)[cells[..., 0], cells[..., 1]], image)
-    return image.astype(np.uint8)
+    return image.astype(np.uint8), places
 
 
 def write_photos(folder, matrices, seed: int = 0, names=None) -> None:

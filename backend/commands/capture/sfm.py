@@ -14,14 +14,14 @@ import pycolmap
 from ...capture import BLURRED, load_capture, measure_contrasts
 from ...sfm import check, database, model
 from ...sfm.agreement import measure_agreement
-from ...sfm.background import stands_still
-from ...sfm.learned.checkpoint import fingerprint
+from ...sfm.learned.checkpoint import LOFTR, kind_of
 from ...sfm.learned.lightglue import LightGlue
+from ...sfm.learned.loftr import EfficientLoFTR
 from ...sfm.location import common_up, meters_per_unit, positions_in_meters, ups_in_cameras
-from ...sfm.pairs import NEIGHBORS, choose_pairs
+from ...sfm.pairs import ALL_UP_TO, NEIGHBORS
 from ...sfm.rig import rigs_of
 from ...sfm.sources.calibration import photos_by_camera, read_calibration
-from ...sfm.sources.photos import IMAGES, MASKS, Photo, take_photos, write_object_masks
+from ...sfm.sources.photos import IMAGES, Photo, take_photos
 from ...sfm.stages import run_stage
 from ...shared.errors import InputError
 from ...shared.formats.atomic import make_folder, recorded
@@ -30,13 +30,16 @@ from ...shared.formats.photos_source import PHOTOS, REPORT, VIDEOS, WORK, Photos
 from ...shared.reconstruction.lock import locked
 from ...shared.stopping import StoppingReporter
 from ...stereo.dense_points import find_dense_points
+from .photo_matches import GROUPS, LOG, Wanted, match_photos
 
 PICTURE = "sfm.png"
 
 _EXTRACT, _MATCH, _MAP, _DENSE = 0.5, 0.03, 0.3, 0.6
 """Expected seconds of the stages for each photo, pair, photo and photo on two cores, until the pace is known."""
 _EXTRACT_LEARNED, _MATCH_LEARNED = 1.0, 1.5
-"""Those of networks."""
+"""Those of SuperPoint and LightGlue."""
+_MATCH_LOFTR, _JOIN = 12.0, 0.02
+"""Those of a pair by EfficientLoFTR."""
 _ENOUGH = 0.95
 """Fraction of photos with trusted poses from which on the result of the first mapper is kept."""
 _WORST = 10
@@ -50,7 +53,8 @@ def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         read_calibration(options.calibration)
     _require_own(sources[0], capture)
     if options.matcher is not None:
-        LightGlue(options.matcher)  # Before anything is written, it says what is wrong with the folder.
+        # Before anything is written, it says what is wrong with the folder.
+        (EfficientLoFTR if kind_of(options.matcher) == LOFTR else LightGlue)(options.matcher)
     with recorded() as created:
         try:
             make_folder(capture / WORK)
@@ -98,9 +102,12 @@ def _require_own(source: Path, capture: Path) -> None:
 def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> None:
     started = time.monotonic()
     work = capture / WORK
-    images, log = capture / IMAGES, work / "colmap.log"
+    images, log = capture / IMAGES, work / LOG
+    kind = None if made_from.matcher is None else kind_of(made_from.matcher)
+    joining = {"join": ("Matching", 1.0)} if kind == LOFTR else {}
     reporter.expect({
         "photos": ("Photos", 2.0), "extract": ("Features", 30.0), "pairs": ("Pairs", 0.1), "match": ("Matching", 30.0),
+        **joining,
         "global": ("Poses", 10.0), "incremental": ("Poses", 5.0), "refine": ("Poses", 2.0), "dense": ("Points", 10.0),
     })  # fmt: skip
     reporter.begin("photos", "Reading the photos")
@@ -113,18 +120,22 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     if count < 2:
         raise InputError(f"Too few photos are left in {source}; leave out fewer.")
     pairs_expected = min(count * (count - 1) / 2, NEIGHBORS * count)
-    per_photo, per_pair = (_EXTRACT, _MATCH) if made_from.matcher is None else (_EXTRACT_LEARNED, _MATCH_LEARNED)
+    per_photo, per_pair = (_EXTRACT, _MATCH) if kind is None else (_EXTRACT_LEARNED, _MATCH_LEARNED)
+    if kind == LOFTR:
+        per_photo, per_pair = _EXTRACT if count > ALL_UP_TO else 0.0, _MATCH_LOFTR
+        reporter.expect({"join": ("Matching", _JOIN * pairs_expected)})
     reporter.expect({
         "extract": ("Features", per_photo * count), "match": ("Matching", per_pair * pairs_expected),
         "global": ("Poses", _MAP * count), "incremental": ("Poses", 0.1 * _MAP * count),
         "refine": ("Poses", 0.2 * _MAP * count), "dense": ("Points", _DENSE * count),
     })  # fmt: skip
 
-    write_json(work / "groups.json", _groups(photos, images, made_from))
+    write_json(work / GROUPS, _groups(photos, images, made_from))
     calibrated = ["calibrated"] if made_from.calibration else []
     listed_names = work / "names.json"
     write_json(listed_names, names)
-    path = _match(source, capture, names, in_order, made_from.features == "objects", made_from.matcher, reporter)
+    wanted = Wanted(capture, names, in_order, made_from.matcher)
+    path = match_photos(wanted, source, made_from.features == "objects", reporter)
     if path.name.endswith(database.ON_OBJECTS):
         write_source(capture, replace(made_from, features="objects"))
 
@@ -184,51 +195,6 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     _tell(report, capture, reporter)
 
 
-def _match(
-    source: Path,
-    capture: Path,
-    names: list[str],
-    in_order: bool,
-    on_objects: bool,
-    matcher: Path | None,
-    reporter: StoppingReporter,
-) -> Path:
-    """Find features of the photos and match them, by SIFT or the networks of a checkpoint; return the database.
-
-    Where the background stands still while the objects turn, only features on objects are used, if there are masks.
-    """
-    work, count = capture / WORK, len(names)
-    log = work / "colmap.log"
-    path = work / database.name_of(on_objects, "" if matcher is None else fingerprint(matcher))
-    extract, match = ["extract"], ["match"]
-    if matcher is not None:
-        extract, match = ([f"{stage}-learned", str(matcher.resolve())] for stage in ("extract", "match"))
-    reporter.begin("extract", f"Finding features in {count} photos")
-    arguments = [*extract, str(path), str(capture / IMAGES), str(work / "groups.json")]
-    if on_objects:
-        write_object_masks(capture, names, work / "masks")
-        arguments.append(str(work / "masks"))
-    if not run_stage(reporter, log, arguments, lambda _: database.count_features(path), count):
-        raise InputError(f"Features could not be found in the photos; see {log}.")
-    reporter.begin("pairs", "Comparing the photos")
-    pairs = choose_pairs(path, names, in_order, reporter.progress)
-    listed = work / "pairs.txt"
-    if pairs is not None:
-        database.write_pairs(listed, pairs)
-    total = count * (count - 1) // 2 if pairs is None else len(pairs)
-    arguments = [*match, str(path), *([] if pairs is None else [str(listed)])]
-    reporter.begin("match", f"Matching {total:,} pairs of photos")
-    if not run_stage(reporter, log, arguments, lambda _: database.count_pairs(path), total):
-        raise InputError(f"The photos could not be matched; see {log}.")
-    if not on_objects and stands_still(path):
-        if not (capture / MASKS).is_dir():
-            raise InputError(model.still_background(source))
-        reporter.warning("The background stands still while the objects turn: only features on objects are used.")
-        return _match(source, capture, names, in_order, True, matcher, reporter)
-    _require_matches(path, source)
-    return path
-
-
 def _refined(
     found: pycolmap.Reconstruction, work: Path, log: Path, calibrated: list[str], reporter: StoppingReporter
 ) -> pycolmap.Reconstruction:
@@ -281,22 +247,6 @@ def _groups(photos: list[Photo], images: Path, made_from: PhotosSource) -> list[
     for photo in photos:
         groups.setdefault({"one": "", "each": photo.name}.get(made_from.cameras, photo.camera), []).append(photo.name)
     return [{"names": names, "camera": None} for names in groups.values()]
-
-
-def _require_matches(path: Path, source: Path) -> None:
-    """Raise InputError if no photos match, or all that do were taken from one spot."""
-    pairs = database.verified_pairs(path)
-    if not pairs:
-        raise InputError(
-            f"No two photos in {source} show the same: they are of different scenes, blurred, or without texture; take "
-            "sharp photos that overlap by two thirds."
-        )
-    still = {
-        int(pycolmap.TwoViewGeometryConfiguration.PANORAMIC),
-        int(pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC),
-    }
-    if all(config in still for _, _, config, _ in pairs):
-        raise InputError(model.one_spot(source))
 
 
 def _tell(report: dict[str, Any], capture: Path, reporter: StoppingReporter) -> None:

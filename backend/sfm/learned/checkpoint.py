@@ -19,16 +19,16 @@ from ...networks.checkpoint_folder import (
 )
 from ...shared.errors import InputError
 
-LIGHTGLUE = "lightglue"
-"""Types of models that can match photos."""
+LIGHTGLUE, LOFTR = "lightglue", "efficientloftr"
+"""Types of models that can match photos: of features that SuperPoint finds, and without a search for features."""
 
-_CLASSES = {LIGHTGLUE: "LightGlue"}
+_CLASSES = {LIGHTGLUE: "LightGlue", LOFTR: "EfficientLoFTR"}
 """Their names in transformers."""
 _NAMES, _OPTION = " or ".join(_CLASSES.values()), "--matcher"
 
 
 def kind_of(folder: Path) -> str:
-    """Return the type of the model in a folder with a checkpoint, `LIGHTGLUE`.
+    """Return the type of the model in a folder with a checkpoint, `LIGHTGLUE` or `LOFTR`.
 
     Raises:
         InputError: The folder lacks a file, or is of another model.

@@ -49,7 +49,7 @@ class PhotosSource:
         features: where features are found, "auto" or "objects".
         set: which of the sets of photos that nothing connects is used, 1 for the largest.
         calibration: file or folder with the photos' cameras, or None where these are not known.
-        matcher: folder with a checkpoint of LightGlue, as an absolute path; None for SIFT.
+        matcher: folder with a checkpoint of LightGlue or EfficientLoFTR, as an absolute path; None for SIFT.
     """
 
     photos: list[Path]
