@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from ..shared.errors import InputError
 from ..shared.formats.json_file import parse_json
 
@@ -84,6 +86,36 @@ def import_transformers(needed: str, option: str) -> Any:
     transformers.utils.logging.set_verbosity_error()
     transformers.utils.logging.disable_progress_bar()
     return transformers
+
+
+def load_network(folder: Path, network: str, config: str, option: str) -> Any:
+    """Load a network of transformers.
+
+    Args:
+        folder: the folder of the checkpoint.
+        network, config: the classes of the network and of its config.
+        option: the argument of the command that names the folder, for errors.
+
+    Returns:
+        The network on the CPU, in float32, for inference.
+
+    Raises:
+        InputError: The weights do not fit config.json, some are missing, or a package is not installed.
+    """
+    transformers = import_transformers(network, option)
+    try:
+        settings = getattr(transformers, config).from_pretrained(folder, local_files_only=True)
+        loaded, info = getattr(transformers, network).from_pretrained(
+            folder, config=settings, dtype=torch.float32, local_files_only=True, output_loading_info=True
+        )
+    except ImportError as error:
+        raise InputError(
+            f"The model in {folder} needs the package timm; run {sys.executable} -m pip install timm before it."
+        ) from error
+    except Exception as error:  # Files may be damaged in any way.
+        raise unfit(folder, str(error).strip().partition("\n")[0]) from error
+    require_all_weights(folder, info)
+    return loaded.eval()
 
 
 def digest_of(folder: Path) -> str:

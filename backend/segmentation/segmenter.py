@@ -7,35 +7,23 @@ and that of the others is the photo scaled to a square.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from PIL import Image
 from torch.nn.functional import interpolate
 
-from ..networks.checkpoint_folder import (
-    CONFIG,
-    digest_of,
-    import_transformers,
-    read_config,
-    require_all_weights,
-    unfit,
-)
+from ..networks.checkpoint_folder import CONFIG, digest_of, load_network, read_config
 from ..shared.errors import InputError
-from ..shared.formats.json_file import parse_json
+from .colors import read_colors, scaled_pixels
 from .selection import distinct, grid_points, is_segment
 
 NAME = "SAM, SAM 2.1 or EdgeTAM"
 
 _CLASSES = {"sam": "Sam", "sam2": "Sam2", "sam2_video": "Sam2", "edgetam": "EdgeTam", "edgetam_video": "EdgeTam"}
 """Types of checkpoints, and the beginning of the names of their classes; those for videos contain the image's model."""
-_COLORS = "preprocessor_config.json"
-_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Those of ImageNet, unless the checkpoint has others."""
 _BATCH = 16
 """Number of prompts at once; each takes some 10 MB."""
 
@@ -74,23 +62,10 @@ class Segmenter:
         self.kind = _kind_of(folder, option)
         name = _CLASSES[self.kind]
         self._is_padded = self.kind == "sam"
-        transformers = import_transformers(f"{name}Model", option)
-        self._mean, self._deviation = _colors(folder / _COLORS)
-        try:
-            config = getattr(transformers, f"{name}Config").from_pretrained(folder, local_files_only=True)
-            self._side = int(config.prompt_encoder_config.image_size)
-            network, loaded = getattr(transformers, f"{name}Model").from_pretrained(
-                folder, config=config, dtype=torch.float32, local_files_only=True, output_loading_info=True
-            )
-        except ImportError as error:
-            raise InputError(
-                f"The model in {folder} needs the package timm; run {sys.executable} -m pip install timm before it."
-            ) from error
-        except Exception as error:  # Files may be damaged in any way.
-            raise unfit(folder, str(error).strip().partition("\n")[0]) from error
-        require_all_weights(folder, loaded)
         self._device = torch.device(device)
-        self._network: Any = network.eval().to(self._device)
+        self._network: Any = load_network(folder, f"{name}Model", f"{name}Config", option).to(self._device)
+        self._colors = read_colors(folder)
+        self._side = int(self._network.config.prompt_encoder_config.image_size)
 
     @torch.inference_mode()
     def encode(self, image: np.ndarray) -> Encoded:
@@ -100,10 +75,8 @@ class Segmenter:
         if self._is_padded:
             scale = self._side / max(width, height)
             content = max(round(scale * width), 1), max(round(scale * height), 1)
-        scaled = np.array(Image.fromarray(image).resize(content, Image.Resampling.BILINEAR), np.float32)
         pixels = torch.zeros(1, 3, self._side, self._side)
-        colors = (scaled / 255 - self._mean) / self._deviation
-        pixels[0, :, : content[1], : content[0]] = torch.from_numpy(colors.astype(np.float32)).permute(2, 0, 1)
+        pixels[0, :, : content[1], : content[0]] = scaled_pixels(image, content, self._colors)
         features = self._network.get_image_embeddings(pixels.to(self._device))
         return Encoded(features, (width, height), content)
 
@@ -210,29 +183,6 @@ def _kind_of(folder: Path, option: str) -> str:
             f"{folder / CONFIG} is of a model of the type {kind}; choose a checkpoint of {NAME} as {option}."
         )
     return kind
-
-
-def _colors(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean and the standard deviation (3,) of the colors that a model expects, from 0 to 1."""
-    mean: Any = _MEAN
-    deviation: Any = _DEVIATION
-    if path.is_file():
-        try:
-            content = parse_json(path.read_bytes())
-            mean, deviation = content.get("image_mean", mean), content.get("image_std", deviation)
-        except (OSError, ValueError, AttributeError) as error:
-            raise _invalid_colors(path) from error
-    try:
-        found = np.array(mean, np.float32), np.array(deviation, np.float32)
-    except (TypeError, ValueError) as error:
-        raise _invalid_colors(path) from error
-    if any(values.shape != (3,) or not np.isfinite(values).all() for values in found) or (found[1] <= 0).any():
-        raise _invalid_colors(path)
-    return found
-
-
-def _invalid_colors(path: Path) -> InputError:
-    return InputError(f"{path} has no valid image_mean and image_std; copy the checkpoint again.")
 
 
 def fingerprint(folder: Path, option: str = "--segmenter") -> str:
