@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
+import zipfile
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -12,14 +14,11 @@ from PIL import Image
 from ..capture.files import read_image, read_mask
 from ..capture.mask_sources.segments import Segments, Shape, draw_shapes
 from ..networks.checkpoint_folder import CONFIG
+from ..shared.errors import InputError
 from ..shared.formats.atomic import make_folder, write_atomic
 from ..shared.formats.json_file import parse_json
-from .segmenter import Segmenter
 
-LONGEST_SIDE = 1024
-"""Longer side in pixels of the photos that are segmented, which is that of the models' inputs."""
-
-_VERSION = 1
+_VERSION = 2
 """Number to be raised with changes of what is found in a photo, so that kept results are not used any more."""
 
 
@@ -34,22 +33,38 @@ def is_checkpoint(folder: Path) -> bool:
     return isinstance(content, dict) and "model_type" in content
 
 
+class Finder(NamedTuple):
+    """What finds the segments of a photo.
+
+    Attributes:
+        what: the kind of segments, such as "segments by a model of the type sam2".
+        key: identifies the models and what they look for; results of others are not used.
+        longest_side: the longer side in pixels to which larger photos are reduced before.
+        find: takes a photo (H, W, 3) uint8, and what receives the number of finished steps, and of all; returns the
+            mask (H, W) bool and the name of each segment, or "".
+    """
+
+    what: str
+    key: str
+    longest_side: int
+    find: Callable[[np.ndarray, Callable[[int, int], object]], Iterable[tuple[np.ndarray, str]]]
+
+
 class PhotoSegments:
-    """The segments of photos, found by a model and kept in files; a `MaskSource`.
+    """The segments of photos, found by models and kept in files; a `MaskSource`.
 
     Args:
-        segmenter: the model.
+        finder: what finds them.
         images: the folder of the photos.
         photos: their names.
         kept: the folder in which results are kept.
-        fingerprint: that of the model's checkpoint; results of others are not used.
     """
 
-    def __init__(self, segmenter: Segmenter, images: Path, photos: Sequence[str], kept: Path, fingerprint: str) -> None:
-        self.what = f"segments by a model of the type {segmenter.kind}"
+    def __init__(self, finder: Finder, images: Path, photos: Sequence[str], kept: Path) -> None:
+        self.what = finder.what
         self.photos: Sequence[str] = photos
-        self._segmenter, self._images = segmenter, images
-        self._kept = kept / f"{fingerprint}-{_VERSION}"
+        self._finder, self._images = finder, images
+        self._kept = kept / f"{finder.key}-{_VERSION}"
 
     def missing(self) -> list[str]:
         """Return the photos that have no kept results, or older ones than the photo."""
@@ -67,23 +82,29 @@ class PhotoSegments:
         missing = self.missing()
         for done, name in enumerate(missing):
             photo = read_image(self._images / name)
-            photo.thumbnail((LONGEST_SIDE, LONGEST_SIDE), Image.Resampling.BOX)
+            photo.thumbnail((self._finder.longest_side,) * 2, Image.Resampling.BOX)
 
             def report(step: int, steps: int, done: int = done) -> None:
                 progress(done + step / (steps + 1), len(missing))
 
-            masks = self._segmenter.everything(np.array(photo), report)
-            self._keep(name, draw_shapes((Shape(mask, None, "") for mask in masks), photo.size).numbers)
+            found = self._finder.find(np.array(photo), report)
+            self._keep(name, draw_shapes((Shape(mask, None, text) for mask, text in found), photo.size))
             progress(done + 1, len(missing))
 
     def read(self, photo: str) -> Segments:
         """Return the segments of a photo that `find` has found; raises InputError if their file cannot be read."""
-        numbers = read_mask(self._path(photo))
+        path = self._path(photo)
+        numbers = read_mask(path)
+        try:
+            with np.load(path) as arrays:
+                names = arrays["names"].tolist()
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            raise InputError(f"{path} cannot be read; delete it, and it is made again.") from error
         # Segments that smaller ones cover completely are not numbered.
         found, numbered = np.unique(numbers[numbers > 0], return_inverse=True)
         renumbered = np.zeros(numbers.shape, np.int32)
         renumbered[numbers > 0] = numbered + 1
-        return Segments(renumbered, [None] * len(found), [""] * len(found))
+        return Segments(renumbered, [None] * len(found), [names[number - 1] for number in found])
 
     def _path(self, name: str) -> Path:
         return self._kept / f"{name}.npz"
@@ -92,8 +113,8 @@ class PhotoSegments:
         path = self._path(name)
         return path.is_file() and path.stat().st_mtime >= (self._images / name).stat().st_mtime
 
-    def _keep(self, name: str, numbers: np.ndarray) -> None:
+    def _keep(self, name: str, found: Segments) -> None:
         stream = io.BytesIO()
-        np.savez_compressed(stream, numbers.astype(np.uint16))
+        np.savez_compressed(stream, ids=found.numbers.astype(np.uint16), names=np.array(found.names, np.str_))
         make_folder(self._path(name).parent)
         write_atomic(self._path(name), stream.getvalue())

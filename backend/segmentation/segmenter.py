@@ -21,6 +21,8 @@ from .colors import read_colors, scaled_pixels
 from .selection import distinct, grid_points, is_segment
 
 NAME = "SAM, SAM 2.1 or EdgeTAM"
+LONGEST_SIDE = 1024
+"""Longer side in pixels of the photos that are segmented, which is that of the models' inputs."""
 
 _CLASSES = {"sam": "Sam", "sam2": "Sam2", "sam2_video": "Sam2", "edgetam": "EdgeTam", "edgetam_video": "EdgeTam"}
 """Types of checkpoints, and the beginning of the names of their classes; those for videos contain the image's model."""

@@ -13,7 +13,7 @@ from PIL import Image
 
 from backend.capture.files import read_mask
 from backend.networks.checkpoint_folder import PACKAGE
-from backend.segmentation import KeptEncodings, PhotoSegments, Segmenter, fingerprint, is_checkpoint
+from backend.segmentation import Finder, KeptEncodings, PhotoSegments, Segmenter, fingerprint, is_checkpoint
 from backend.segmentation.selection import distinct, grid_points, is_segment
 from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE, InputError
 
@@ -303,7 +303,7 @@ class Shades:
 @pytest.fixture
 def shades(monkeypatch):
     stand_in = Shades()
-    monkeypatch.setattr("backend.commands.capture.masks.Segmenter", stand_in)
+    monkeypatch.setattr("backend.segmentation.finders.Segmenter", stand_in)
     return stand_in
 
 
@@ -371,18 +371,23 @@ def test_segments_are_drawn_small_over_large(tmp_path):
     Image.new("RGB", (40, 30)).save(tmp_path / "images" / "a.png")
     masks = np.zeros((4, 30, 40), bool)
     masks[0], masks[1, :15], masks[2, :15, :20], masks[3, :15, 20:] = True, True, True, True
-    model = SimpleNamespace(kind="sam", everything=lambda image, progress: list(masks))
-    source = PhotoSegments(model, tmp_path / "images", ["a.png"], tmp_path / "kept", "00")
+    names = ["wall", "shelf", "book", "cup"]
+    finder = Finder("segments", "00", 1024, lambda image, progress: list(zip(masks, names)))
+    source = PhotoSegments(finder, tmp_path / "images", ["a.png"], tmp_path / "kept")
     calls = []
     source.find(lambda done, total: calls.append((done, total)))
     found = source.read("a.png")
     assert found.numbers[20, 5] == 1 and found.numbers[5, 5] == 2 and found.numbers[5, 30] == 3
     assert list(found.objects) == [None] * 3 and calls == [(1, 1)] and not source.missing()
+    assert list(found.names) == ["wall", "book", "cup"]
+    (tmp_path / "kept" / "00-2" / "a.png.npz").write_bytes(b"damaged")
+    with pytest.raises(InputError, match=r"a.png.npz"):
+        source.read("a.png")
 
 
 def test_small_models_segment_a_capture(checkpoints, scene, run_command):
     """The whole command with a network of random weights, which finds nothing."""
     result = run_command("masks", scene.folder, checkpoints["sam2"])
     assert_rejected(result, f"The model in {checkpoints['sam2']} finds no segments in the 6 photos; use another")
-    kept = scene.folder / "masks-segments" / f"{fingerprint(checkpoints['sam2'])}-1"
+    kept = scene.folder / "masks-segments" / f"{fingerprint(checkpoints['sam2'])}-2"
     assert sorted(path.name for path in kept.iterdir()) == [f"{name}.npz" for name in scene.names]

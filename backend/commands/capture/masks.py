@@ -22,7 +22,7 @@ from ...evaluation import contact_sheet
 from ...evaluation.images import id_image, thumbnail
 from ...labels.association import Association, Seen, associate, consistency, object_mask
 from ...raster import devices
-from ...segmentation import PhotoSegments, Segmenter, fingerprint, is_checkpoint
+from ...segmentation import PhotoSegments, finders, is_checkpoint
 from ...shared.class_table import LARGEST_ID
 from ...shared.errors import InputError
 from ...shared.formats.json_file import write_json
@@ -108,14 +108,9 @@ def _segmented(options: argparse.Namespace, names: Sequence[str], reporter: Stop
     if options.objects == "given":
         raise InputError("Segments do not say which of them show the same object; use --objects find.")
     images = Photos(options.capture).folder
-    segmenter = Segmenter(options.masks, "MASKS", devices.pick(options.device))
-    source = PhotoSegments(
-        segmenter,
-        images,
-        [name for name in names if (images / name).is_file()],
-        options.capture / _SEGMENTS,
-        fingerprint(options.masks, "MASKS"),
-    )
+    finder = finders.everything(options.masks, "MASKS", devices.pick(options.device))
+    present = [name for name in names if (images / name).is_file()]
+    source = PhotoSegments(finder, images, present, options.capture / _SEGMENTS)
     missing = len(source.missing())
     reporter.expect({_SEGMENT: ("Segmenting", max(_PER_PHOTO * missing, 1.0))})
     reporter.begin(_SEGMENT, f"Segmenting {missing} photos")
