@@ -125,6 +125,14 @@ def _add_capture_commands(commands: _Commands) -> None:
         help="which segments show the same object: given, as the masks say; find, by the points that they show; auto, "
         "find if the masks do not say, or contradict the points (auto)",
     )  # fmt: skip
+    masks.add_argument(
+        "--text", type=types.names, metavar="NAMES",
+        help='names of the objects that a model is to find, such as "red cup; book"; see above (all segments)',
+    )  # fmt: skip
+    masks.add_argument(
+        "--detector", type=Path, metavar="FOLDER",
+        help="checkpoint of Grounding DINO, which finds what --text names, unless MASKS is SAM 3",
+    )  # fmt: skip
     options.add_device(masks)
     check = commands.add("check", "Check a capture and list its contents", texts.CHECK, "garden")
     options.add_capture(check)

@@ -54,6 +54,10 @@ Segments that are numbered in each photo on their own, as by Segment Anything, g
 ID for each object: segments that show the same points are the same object. Segments
 that show several objects are divided. masks/masks.jpg shows the result. Masks that are
 in masks/ already are kept in masks-given/.
+
+With --text, objects are those that it names, in English, and labels.json has the names.
+--detector is a folder with a checkpoint of Grounding DINO, tokenizer included, which
+finds them in each photo for the model of MASKS. SAM 3 as MASKS needs no detector.
 """
 
 CHECK = """\

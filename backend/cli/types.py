@@ -37,6 +37,19 @@ def named_set(text: str) -> tuple[str, list[str]]:
     return name.strip(), found
 
 
+def names(text: str) -> list[str]:
+    """Split NAME; NAME."""
+    found: dict[str, str] = {}
+    for part in text.split(";"):
+        if name := " ".join(part.split()):
+            found.setdefault(name.lower(), name)
+    if not found:
+        raise argparse.ArgumentTypeError(f"{text!r} names no object; write names such as 'red cup; book'")
+    if wordless := [name for name in found.values() if not any(map(str.isalnum, name))]:
+        raise argparse.ArgumentTypeError(f"{wordless[0]!r} is not a name of objects")
+    return list(found.values())
+
+
 def keys(text: str, known: Sequence[str]) -> tuple[str, dict[str, str]]:
     """Split OBJECT:KEY=VALUE,KEY=VALUE."""
     word, _, rest = text.rpartition(":")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +117,28 @@ def load_network(folder: Path, network: str, config: str, option: str) -> Any:
         raise unfit(folder, str(error).strip().partition("\n")[0]) from error
     require_all_weights(folder, info)
     return loaded.eval()
+
+
+def read_tokenizer(folder: Path, what: str, option: str, files: Sequence[str]) -> Any:
+    """Return the tokenizer of a checkpoint.
+
+    Args:
+        folder: the folder of the checkpoint.
+        what: its network, for errors.
+        option: the argument of the command that names the folder, for errors.
+        files: those of which one is enough.
+
+    Raises:
+        InputError: They are missing or damaged, or a package is not installed.
+    """
+    if not any((folder / name).is_file() for name in files):
+        raise InputError(f"{folder} has no {' or '.join(files)}; copy all files of the checkpoint of {what} there.")
+    tokenizers = import_transformers("AutoTokenizer", option).AutoTokenizer
+    try:
+        return tokenizers.from_pretrained(folder, local_files_only=True)
+    except Exception as error:  # Files may be damaged in any way.
+        why = str(error).strip().partition("\n")[0]
+        raise InputError(f"The tokenizer in {folder} cannot be read ({why}); copy the checkpoint again.") from error
 
 
 def digest_of(folder: Path) -> str:

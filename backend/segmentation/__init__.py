@@ -3,6 +3,7 @@
 from . import finders
 from .kept_encodings import KeptEncodings
 from .photo_segments import Finder, PhotoSegments, is_checkpoint
+from .sam3 import is_sam3
 from .segmenter import Encoded, Segmenter, fingerprint
 
 __all__ = [
@@ -14,4 +15,5 @@ __all__ = [
     "finders",
     "fingerprint",
     "is_checkpoint",
+    "is_sam3",
 ]

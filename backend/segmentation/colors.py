@@ -23,6 +23,7 @@ class Colors(NamedTuple):
 
 
 IMAGENET = Colors(np.array([0.485, 0.456, 0.406], np.float32), np.array([0.229, 0.224, 0.225], np.float32))
+HALVES = Colors(np.full(3, 0.5, np.float32), np.full(3, 0.5, np.float32))
 
 
 def read_colors(folder: Path, usual: Colors = IMAGENET) -> Colors:

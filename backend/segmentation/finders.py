@@ -1,15 +1,24 @@
-"""What finds the segments of photos."""
+"""What finds the segments of photos: a segmenter alone, or by names together with a detector, or a SAM 3."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from ..networks.checkpoint_folder import digest_of
+from . import detector as detectors
+from . import sam3
+from .detector import Detector
 from .photo_segments import Finder
+from .sam3 import Sam3
 from .segmenter import LONGEST_SIDE, Segmenter, fingerprint
+from .selection import distinct
+
+_NO_POINTS = np.zeros((0, 2)), np.zeros(0)
 
 
 def everything(folder: Path, option: str, device: torch.device | str) -> Finder:
@@ -29,3 +38,56 @@ def everything(folder: Path, option: str, device: torch.device | str) -> Finder:
         return [(mask, "") for mask in segmenter.everything(image, progress)]
 
     return Finder(f"segments by a model of the type {segmenter.kind}", fingerprint(folder, option), LONGEST_SIDE, find)
+
+
+def boxed(folder: Path, option: str, detector: Path, names: Sequence[str], device: torch.device | str) -> Finder:
+    """Return what segments the boxes of what names name.
+
+    Args:
+        folder: with a checkpoint of a segmenter.
+        option: the argument of the command that names the folder, for errors.
+        detector: folder with a checkpoint of a detector.
+        names: of objects.
+        device: where the models run.
+
+    Raises:
+        InputError: As of `Segmenter` and `Detector`.
+    """
+    detect, segmenter = Detector(detector, names, device), Segmenter(folder, option, device)
+
+    def find(image: np.ndarray, progress: Callable[[int, int], object]) -> list[tuple[np.ndarray, str]]:
+        found = detect.find(image)
+        progress(1, 2)
+        if not found:
+            return []
+        encoded = segmenter.encode(image)
+        progress(2, 2)
+        masks = np.stack([segmenter.segment(encoded, *_NO_POINTS, each.box)[0] for each in found])
+        # Boxes of one object may differ by what they contain beside it.
+        return [(masks[i], found[i].name) for i in distinct(masks, np.array([each.score for each in found]))]
+
+    what = f"segments of {', '.join(names)} by models of the types grounding-dino and {segmenter.kind}"
+    key = f"{fingerprint(folder, option)}-{digest_of(detector)}-{_digest(names)}"
+    return Finder(what, key, detectors.LONGEST_SIDE, find)
+
+
+def by_words(folder: Path, option: str, names: Sequence[str], device: torch.device | str) -> Finder:
+    """Return what segments what names name.
+
+    Args:
+        folder: with a checkpoint of SAM 3.
+        option: the argument of the command that names the folder, for errors.
+        names: of objects.
+        device: where the model runs.
+
+    Raises:
+        InputError: As of `Sam3`.
+    """
+    what = f"segments of {', '.join(names)} by a model of the type sam3"
+    model = Sam3(folder, names, option, device)
+    return Finder(what, f"{digest_of(folder)}-{_digest(names)}", sam3.LONGEST_SIDE, model.find)
+
+
+def _digest(names: Sequence[str]) -> str:
+    """Return 8 hexadecimal digits that identify names."""
+    return hashlib.sha256("\n".join(names).encode()).hexdigest()[:8]

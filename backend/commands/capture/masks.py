@@ -22,7 +22,7 @@ from ...evaluation import contact_sheet
 from ...evaluation.images import id_image, thumbnail
 from ...labels.association import Association, Seen, associate, consistency, object_mask
 from ...raster import devices
-from ...segmentation import PhotoSegments, finders, is_checkpoint
+from ...segmentation import Finder, PhotoSegments, finders, is_checkpoint, is_sam3
 from ...shared.class_table import LARGEST_ID
 from ...shared.errors import InputError
 from ...shared.formats.json_file import write_json
@@ -34,6 +34,8 @@ from ..mask_files import kept_masks, new_masks, write_mask
 RECORD, OVERVIEW = "masks.json", "masks.jpg"
 """Files in masks/ with where the masks are from, and how well they agree; and a picture of some."""
 
+_MASKS = "MASKS"
+"""The argument with the masks, for errors."""
 _SEGMENT, _FIND, _WRITE = "segment", "find", "write"
 _SEGMENTS = "masks-segments"
 """Folder of the capture with the segments that models have found, so that a stopped command goes on."""
@@ -63,6 +65,7 @@ def masks(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         **({_SEGMENT: ("Segmenting", 600.0)} if segments_by_model else {}),
         READ: ("Reading", 5.0), _FIND: ("Comparing", 5.0), _WRITE: ("Writing", 5.0),
     })  # fmt: skip
+    _require_fitting_options(options, segments_by_model)
     if not capture.is_dir():
         raise InputError(f"The capture {capture} does not exist; expected a folder with images/.")
     if not segments_by_model:
@@ -81,11 +84,15 @@ def masks(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     images = Photos(capture).folder
     segments = {name: _checked(source, name, images, given) for name in _counted(photos, reporter)}
     if not any(found.objects for found in segments.values()):
+        if options.text is not None:
+            raise InputError(f"No photo shows {_listed(options.text)} as far as the model finds; use other words.")
         if segments_by_model:
             raise InputError(f"The model in {given} finds no segments in the {len(photos)} photos; use another one.")
         raise InputError(f"{given} shows no object in the {len(photos)} photos that it has masks of; check the masks.")
     reporter.begin(_FIND, "Comparing the segments of the photos")
     found, association, seen = _objects(segments, model, options.objects, reporter)
+    if options.text is not None:
+        _warn_of_missing(options.text, segments, found, reporter)
     reporter.begin(_WRITE, f"Writing masks of {len(photos)} photos")
     record = _record(source, given, found, association)
     _write(capture, given, _drawn(segments, found, association, seen, reporter), found, record)
@@ -108,14 +115,44 @@ def _segmented(options: argparse.Namespace, names: Sequence[str], reporter: Stop
     if options.objects == "given":
         raise InputError("Segments do not say which of them show the same object; use --objects find.")
     images = Photos(options.capture).folder
-    finder = finders.everything(options.masks, "MASKS", devices.pick(options.device))
     present = [name for name in names if (images / name).is_file()]
-    source = PhotoSegments(finder, images, present, options.capture / _SEGMENTS)
+    source = PhotoSegments(_finder(options), images, present, options.capture / _SEGMENTS)
     missing = len(source.missing())
     reporter.expect({_SEGMENT: ("Segmenting", max(_PER_PHOTO * missing, 1.0))})
     reporter.begin(_SEGMENT, f"Segmenting {missing} photos")
     source.find(lambda done, total: reporter.progress(done, total, what="photos"))
     return source
+
+
+def _finder(options: argparse.Namespace) -> Finder:
+    """Return what finds the segments of a photo."""
+    given, device = options.masks, devices.pick(options.device)
+    if options.text is None:
+        return finders.everything(given, _MASKS, device)
+    if options.detector is None:
+        return finders.by_words(given, _MASKS, options.text, device)
+    return finders.boxed(given, _MASKS, options.detector, options.text, device)
+
+
+def _require_fitting_options(options: argparse.Namespace, segments_by_model: bool) -> None:
+    """Raise InputError if the options for names do not fit each other or the masks."""
+    if not segments_by_model:
+        if options.text is not None or options.detector is not None:
+            raise InputError(
+                f"{options.masks} has no model, which --text and --detector are for; choose a folder with one as MASKS."
+            )
+        return
+    finds_words = is_sam3(options.masks, _MASKS)
+    if finds_words and options.detector is not None:
+        raise InputError(f"The SAM 3 in {options.masks} finds what --text names itself; leave out --detector.")
+    if options.text is None and (finds_words or options.detector is not None):
+        model = options.masks if finds_words else options.detector
+        raise InputError(f'The model in {model} finds objects by their names; add --text, such as --text "cup; book".')
+    if options.text is not None and not finds_words and options.detector is None:
+        raise InputError(
+            f"The model in {options.masks} does not find objects by their names; add --detector, a folder with a "
+            "checkpoint of Grounding DINO."
+        )
 
 
 def _require_replaceable(capture: Path, given: Path) -> None:
@@ -183,6 +220,24 @@ def _objects(
     if not any(part.any() for part in ids.values()):
         raise InputError("No segments of two photos show the same points, so no object was found; check the masks.")
     return _Found(ids, _names(segments, ids)), association, seen
+
+
+def _warn_of_missing(
+    names: Sequence[str], segments: dict[str, Segments], found: _Found, reporter: StoppingReporter
+) -> None:
+    """Warn of names that no segment has, and of those that segments have, but no object."""
+    shown = {name for own in segments.values() for name in own.names}
+    if missing := [name for name in names if name not in shown]:
+        reporter.warning(f"No photo shows {_listed(missing)} as far as the model finds; other words may help.")
+    if lost := [name for name in names if name in shown and name not in found.names.values()]:
+        reporter.warning(
+            f"No object is named {_listed(lost)}, since only single photos show it, or most show it by another name."
+        )
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return names as a part of a sentence."""
+    return " or ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 def _given(segments: dict[str, Segments]) -> _Found:
