@@ -144,6 +144,14 @@ def segmenter_options() -> list[str]:
     return [] if folder is None else ["--segmenter", str(folder)]
 
 
+def naming_options(names: str) -> list[str]:
+    """Return the options of `masks` for objects with names, which semicolons separate; none without names."""
+    if not names.strip():
+        return []
+    chosen = preferences().detector if preferences() else ""
+    return ["--text", names, *(["--detector", bpy.path.abspath(chosen)] if chosen else [])]
+
+
 def sfm_job(capture: Path, source: PhotosSource) -> Job:
     """Return a job that computes the poses of photos, and writes a capture."""
     return backend_job(

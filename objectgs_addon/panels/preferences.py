@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The preferences of the extension: the compute backend, and folders of reconstructions and of a model."""
+"""The preferences of the extension: the compute backend, and folders of reconstructions and of models."""
 
 import bpy
 from bpy.props import EnumProperty, StringProperty
@@ -44,6 +44,13 @@ class Preferences(bpy.types.AddonPreferences):
         "weights. Strokes of Mark Objects then mark all that it segments by them. If empty, they mark what they cover",
     )
 
+    detector: StringProperty(
+        name="Detection Model",
+        subtype="DIR_PATH",
+        description="Folder with a checkpoint of Grounding DINO for the package transformers, with all its files. "
+        "Import Masks finds objects by their names with it, unless the masks are made by SAM 3, which needs no other",
+    )
+
     def draw(self, _context: bpy.types.Context) -> None:
         layout = self.layout
         box = layout.box()
@@ -64,6 +71,7 @@ class Preferences(bpy.types.AddonPreferences):
         column.use_property_split = True
         column.prop(self, "reconstructions")
         column.prop(self, "segmenter")
+        column.prop(self, "detector")
 
 
 def draw_online_access(layout: bpy.types.UILayout) -> None:

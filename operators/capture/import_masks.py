@@ -24,7 +24,7 @@ class ImportMasks(ImportDialog, bpy.types.Operator):
     bl_description = (
         "Import masks of the photos that another program made: a file of COCO, CVAT or Label Studio, or a folder of "
         "images, EXR with Cryptomatte, or run lengths. Segments of each photo are joined to objects. A folder with a "
-        "checkpoint of SAM, SAM 2.1 or EdgeTAM makes the segments itself"
+        "checkpoint of SAM, SAM 2.1, EdgeTAM or SAM 3 makes the segments itself"
     )
     bl_options = {"REGISTER"}
 
@@ -40,6 +40,13 @@ class ImportMasks(ImportDialog, bpy.types.Operator):
         ],
     )
 
+    names: StringProperty(
+        name="Names",
+        description="For a folder with a checkpoint: names of the objects to find, in English, with semicolons between "
+        "them, such as red cup; book. SAM 3 finds them itself, and for others the Detection Model of the preferences "
+        "does. If empty, all segments are found, without names",
+    )
+
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         return need.work_on_capture(cls, context)
@@ -47,6 +54,7 @@ class ImportMasks(ImportDialog, bpy.types.Operator):
     def draw(self, _context: bpy.types.Context) -> None:
         self.layout.use_property_split = True
         self.layout.prop(self, "objects")
+        self.layout.prop(self, "names")
 
     @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
@@ -68,6 +76,7 @@ class ImportMasks(ImportDialog, bpy.types.Operator):
             str(given),
             "--objects",
             self.objects,
+            *locations.naming_options(self.names),
         )
         return background.submit(job, context.scene, self.report)
 

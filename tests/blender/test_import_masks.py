@@ -2,12 +2,14 @@
 """Import Masks: what the backend is asked for, and what follows."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
 
+from objectgs.objectgs_addon.environment import locations
 from objectgs.objectgs_addon.process.jobs import Job
 from objectgs.objectgs_addon.running import background, results
 from objectgs.operators.capture import import_masks
@@ -45,6 +47,21 @@ def test_job_has_the_capture_and_the_chosen_masks(root, submitted, tmp_path):
     at = job.command.index("masks")
     assert job.command[at + 1 : at + 5] == [str(tmp_path / "table"), str(given), "--objects", "find"]
     assert job.kind == "masks" and job.folder == tmp_path / "table"
+
+
+def test_names_are_asked_for_with_the_model_of_the_preferences(root, submitted, tmp_path, monkeypatch):
+    given, detector = tmp_path / "sam2", str(tmp_path / "dino")
+    given.mkdir()
+    for names, chosen, options in (
+        ("red cup; book", detector, ["--text", "red cup; book", "--detector", detector]),
+        ("red cup; book", "", ["--text", "red cup; book"]),
+        (" ", detector, []),
+    ):
+        own = SimpleNamespace(detector=chosen, backend_python="", reconstructions="")
+        monkeypatch.setattr(locations, "preferences", lambda own=own: own)
+        bpy.ops.objectgs.import_masks("EXEC_DEFAULT", filepath=str(given), names=names)
+        command = submitted[-1].command
+        assert command[command.index("--objects") + 2 :] == [*options, "--json"]
 
 
 def test_folder_is_chosen_with_or_without_a_name_in_it(root, submitted, tmp_path):
