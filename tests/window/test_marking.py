@@ -168,8 +168,9 @@ def test_splats_of_another_program_are_marked(window, centers):
         script(f"""
         for layer in bpy.context.view_layer.layer_collection.children:
             layer.exclude = True
+        paths = {{"filepath": {str(file)!r}, "folder": {str(folder)!r}}}
         with bpy.context.temp_override(**window_context()):
-            result = list(bpy.ops.objectgs.import_splats("EXEC_DEFAULT", filepath={str(file)!r}, folder={str(folder)!r}))
+            result = list(bpy.ops.objectgs.import_splats("EXEC_DEFAULT", **paths))
     """)
     )
     wait(window, f"scene.folder_of(root).name == 'foreign-splats' and {IDLE}")
