@@ -17,10 +17,8 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -110,17 +108,6 @@ def matched(checkpoint: Path, truth: Capture) -> dict[str, float]:
     return {**found, "psnr": float(np.mean(images))}
 
 
-def run(*words: object) -> float:
-    """Run a command of the backend; return the seconds it took."""
-    started = time.monotonic()
-    done = subprocess.run(
-        [sys.executable, "-m", "backend", *map(str, words)], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        raise RuntimeError(done.stderr.strip() or done.stdout)
-    return time.monotonic() - started
-
-
 def measured(folder: Path, photos: Sequence[int], minutes: float, seed: int) -> dict[str, Any]:
     """Train a capture without its masks, and return the scores by the number of photos with strokes."""
     rows: dict[str, Any] = {}
@@ -129,11 +116,12 @@ def measured(folder: Path, photos: Sequence[int], minutes: float, seed: int) -> 
         truth = load_capture(folder, scratch / "cache")
         capture, unlabeled = scratch / "capture", scratch / "unlabeled"
         shutil.copytree(folder, capture, ignore=shutil.ignore_patterns("masks", "labels.json", "objects.json"))
-        run("train", capture, "--out", unlabeled, "--minutes", minutes, "--seed", seed)
+        shared.run_backend("train", capture, "--out", unlabeled, "--minutes", minutes, "--seed", seed)
         rows["0"] = {"psnr": scores(unlabeled / "checkpoint", truth)["psnr"]}
         file, out = scratch / "proposed.json", scratch / "proposed"
         shutil.copytree(unlabeled, out)
-        seconds = run("propose", out, "--strokes", file) + run("label", out, "--strokes", file)
+        seconds = shared.run_backend("propose", out, "--strokes", file)
+        seconds += shared.run_backend("label", out, "--strokes", file)
         rows["proposed"] = {**matched(out / "checkpoint", truth), "seconds": seconds}
         for count in photos:
             file, out = scratch / "strokes.json", scratch / f"labeled-{count}"
@@ -141,7 +129,7 @@ def measured(folder: Path, photos: Sequence[int], minutes: float, seed: int) -> 
             shutil.rmtree(capture / "masks", ignore_errors=True)
             (capture / "labels.json").unlink(missing_ok=True)
             shutil.copytree(unlabeled, out)
-            seconds = run("label", out, "--strokes", file)
+            seconds = shared.run_backend("label", out, "--strokes", file)
             rows[str(count)] = {**scores(out / "checkpoint", truth), "seconds": seconds}
     return rows
 

@@ -177,6 +177,17 @@ def train_and_measure(trainer: Any, capture: Any, budget: Any) -> dict[str, Any]
     }
 
 
+def run_backend(*words: object) -> float:
+    """Run a command of the backend; return the seconds it took. Raises RuntimeError with its message if it fails."""
+    started = time.monotonic()
+    done = subprocess.run(
+        [sys.executable, "-m", "backend", *map(str, words)], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise RuntimeError(done.stderr.strip() or done.stdout)
+    return time.monotonic() - started
+
+
 def from_photos_to_report(capture: Path, *options: object, meshes: bool = True) -> dict[str, Any]:
     """Train, mesh and evaluate with the user's commands and return figures of the report.
 
@@ -191,9 +202,7 @@ def from_photos_to_report(capture: Path, *options: object, meshes: bool = True) 
             ("evaluate", out),
             ("report", out),
         ):
-            subprocess.run(
-                [sys.executable, "-m", "backend", *map(str, words)], cwd=ROOT, check=True, stdout=subprocess.DEVNULL
-            )
+            run_backend(*words)
         report = json.loads((out / "report.json").read_text())
     seconds_of = {stage["name"]: stage["seconds"] for stage in report["stages"]}
     made = [entry["mesh"] for entry in report["objects"] if entry["mesh"]]

@@ -12,7 +12,7 @@ from types import ModuleType
 def _modules() -> tuple[ModuleType, ...]:
     from . import drawing, panels
     from .blender import older_files, writing
-    from .drawing import camera_errors, splat_arrays
+    from .drawing import camera_errors, point_labels, splat_arrays
     from .film import properties as film
     from .panels import preferences
     from .running import file_preview, handlers, pointing
@@ -31,6 +31,7 @@ def _modules() -> tuple[ModuleType, ...]:
         splat_arrays,
         drawing,
         camera_errors,
+        point_labels,
         panels,
     )
 

@@ -27,17 +27,16 @@ SFM = """\
 Make a capture of photos or a video alone: compute by COLMAP where they were taken, and
 points of the scene. Photos are copied to CAPTURE/images, unless PHOTOS is that folder;
 HEIC becomes JPEG. Of a video, sharp frames are taken, evenly in how far the picture
-moves. The cameras are written to CAPTURE/sparse/0, and what was found to CAPTURE/sfm/sfm.json.
-Photos that do not fit are named with the reason. If PHOTOS has folders images/ and
-masks/, both are copied. Cameras that are fixed to each other, with a folder each and the
-same names for the photos of a moment, are recognized. After a stop, the same command
-goes on.
+moves. The cameras are written to CAPTURE/sparse/0, and what was found to
+CAPTURE/sfm/sfm.json. Photos that do not fit are named with the reason. If PHOTOS has
+folders images/ and masks/, both are copied. Cameras that are fixed to each other, with
+a folder each and the same names for the photos of a moment, are recognized. After a
+stop, the same command goes on.
 
 With --matcher, networks match the photos, for those that differ too much in light or
 place for SIFT. FOLDER is a checkpoint of the package transformers, config.json and
 weights, of LightGlue, which matches features that SuperPoint finds, or EfficientLoFTR,
-which needs no features. Nothing is downloaded. Each pair of photos takes seconds, by
-EfficientLoFTR ten or more.
+which needs no features. Nothing is downloaded. Each pair of photos takes seconds.
 """
 
 MASKS = """\
@@ -118,18 +117,19 @@ config.json and weights. Nothing is downloaded.
 """
 
 CLEAN_LABELS = """\
-Correct the objects of a training by the masks of all photos together. Regions of masks
-that the other photos contradict get the IDs that the splats show, and so do photos
-without masks; the rest is kept. Then the splats get their objects anew, and their
+Correct the objects of a training by the masks of all photos together. Where photos give
+the same points different IDs, regions that show the same points get one ID. Regions that
+the other photos contradict get the IDs that the splats show, and so do photos without
+masks; the rest is kept. Then the splats get their objects anew, and their
 borders are trained for a short time. masks/ is replaced, repair.json in it says what was
 changed, and the given masks are kept in masks-given/.
 """
 
 POINT = """\
-Answer strokes with the object of each splat, for programs such as Blender. Each line of
-standard input is a JSON object as for `label`, with a number `request` for the answer.
-With "propose": true, the answer has strokes on proposed objects, as `propose` finds.
---segmenter is as for `label`.
+Answer strokes with the object of each splat, or before a training of each point, for
+programs such as Blender. Each line of standard input is a JSON object as for `label`,
+with a number `request` for the answer. With "propose": true, the answer has strokes on
+proposed objects, as `propose` finds. --segmenter is as for `label`.
 """
 
 RENDER = """\

@@ -112,13 +112,13 @@ def vote(
             assert observed is not None
             cast(index, *observed)
         else:
-            cast(index, *_project(capture, xyz, index, observed[0] if observed else None))
+            cast(index, *find_visible_points(capture, xyz, index, observed[0] if observed else None))
         reporter.progress(done, len(indices), what="views")
     if occlusion and strategy != "correspondence" and not ballots.visible.all():
         # Points that the occlusion test hides from every view are voted on without it.
         silent = ballots.visible == 0
         for index in indices:
-            points, x, y = _project(capture, xyz, index, None)
+            points, x, y = find_visible_points(capture, xyz, index, None)
             keep = silent[points]
             cast(index, points[keep], x[keep], y[keep])
     chosen, margins = ballots.count(np.random.default_rng(seed) if strategy == "probability" else None)
@@ -179,10 +179,10 @@ def _describe_problems(capture: Capture, counts: dict[int, int], unlabeled: int,
     return warnings
 
 
-def _project(
+def find_visible_points(
     capture: Capture, xyz: np.ndarray, index: int, observed: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Project the points xyz (3, M): indices of those inside the view, their pixels' columns and rows, all (n,).
+    """Project points xyz (3, M): indices of those inside the view, their pixels' columns and rows, all (n,).
 
     If the indices of observed points are given, hidden points are omitted, except for observed ones.
     """

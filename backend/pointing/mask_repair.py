@@ -35,12 +35,10 @@ class Repair(NamedTuple):
     Attributes:
         ids: (N,) int64, the object of each splat.
         masks: the mask (H, W) int64 of each training view by its index.
-        changed: fraction of the pixels of each of these whose ID has changed; 1 where there was no mask.
     """
 
     ids: np.ndarray
     masks: dict[int, np.ndarray]
-    changed: dict[int, float]
 
 
 def repair_masks(
@@ -73,11 +71,11 @@ def repair_masks(
         wrong = {index: contradicted(given[index], shown) for index, shown in pointer.shown_ids(ids, list(given))}
         if all(np.array_equal(before[index], wrong[index]) for index in given):
             break
-    masks, changed = {}, {}
-    for index, shown in pointer.masks(ids):
-        masks[index] = np.where(wrong[index], shown, given[index]) if index in given else shown
-        changed[index] = float(np.mean(masks[index] != given[index])) if index in given else 1.0
-    return Repair(ids, masks, changed)
+    masks = {
+        index: np.where(wrong[index], shown, given[index]) if index in given else shown
+        for index, shown in pointer.masks(ids)
+    }
+    return Repair(ids, masks)
 
 
 def contradicted(mask: np.ndarray, shown: np.ndarray) -> np.ndarray:

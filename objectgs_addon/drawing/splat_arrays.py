@@ -115,11 +115,18 @@ def labels_of(mesh: bpy.types.Mesh) -> Labels | None:
     return known[1]
 
 
+def point_labels(mesh: bpy.types.Mesh) -> Labels | None:
+    """Return the labels of a mesh of points, as `show_labels` has set them; None if there are none."""
+    labels = _labels.get(mesh.session_uid)
+    return labels if labels is not None and len(labels.of_splats) == len(mesh.vertices) else None
+
+
 def show_labels(labels: dict[bpy.types.Mesh, np.ndarray], colors: np.ndarray) -> None:
-    """Draw splats in other colors than their own, until this is called again.
+    """Draw splats or points in other colors than their own, until this is called again.
 
     Args:
-        labels: for each carrier (n,) the number of the color of each of its splats, from 1; 0 for their own color.
+        labels: for each carrier (n,) the number of the color of each of its splats or points, from 1; 0 for their own
+            color.
         colors: (L, 3) sRGB-encoded.
     """
     _labels.clear()

@@ -30,7 +30,7 @@ def draw_without_objects(layout: bpy.types.UILayout, root: bpy.types.Collection)
         text = "Objects are listed once the folder is used."
     elif has_masks(folder_trust.state_of(root)):
         text = "Assign Objects finds the objects by the masks."
-    elif can_mark(folder_trust.state_of(root)):
+    elif folder_trust.state_of(root).trained and can_mark(folder_trust.state_of(root)):
         text = "Objects are listed once they are marked and separated."
     else:
         text = (

@@ -27,6 +27,7 @@ from ..state import folder_trust, object_edits, object_list
 from ..state.folder_state import reconstruction_for
 from ..state.next_step import has_masks
 from . import pointing, previews, results
+from .wording import in_blender
 
 INTERVAL = 0.1
 """Time in seconds between two polls of the queue."""
@@ -167,7 +168,7 @@ def redraw() -> None:
 def _handle_end(job: Job) -> None:
     operator, label, options = _REMEDIES.get(job.kind, ("objectgs.retry_job", "Try Again", {"number": job.number}))
     if job.state is State.FAILED:
-        messages.show(f"{job.title}: {job.error}", "ERROR", operator, label, **options)
+        messages.show(f"{job.title}: {in_blender(job.error or job.message)}", "ERROR", operator, label, **options)
     elif job.state is State.DONE:
         messages.settle(job.title, operator if job.kind in _REMEDIES else None)
     if job.state is State.DONE or (job.state is State.STOPPED and job.kind in ("train", "label", "mesh")):
@@ -252,7 +253,7 @@ def _import_made(job: Job, owner: bpy.types.Scene | None) -> bool:
 
 def _show_poses(job: Job) -> None:
     """Show how many photos have a pose, with a button to use another set of them, or to leave out the weak ones."""
-    text = " ".join([f"{job.title}: {job.message}", *job.warnings[:_SHOWN_WARNINGS]])
+    text = " ".join([f"{job.title}: {job.message}", *map(in_blender, job.warnings[:_SHOWN_WARNINGS])])
     weak, sets, number = (job.result.get(key) for key in ("weak", "separate_sets", "set"))
     again = {"operator": "objectgs.recompute_poses", "capture": str(job.folder)}
     if isinstance(sets, list) and len(sets) > 1 and isinstance(number, int):

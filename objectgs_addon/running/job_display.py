@@ -11,6 +11,7 @@ import bpy
 from ...backend.shared.durations import time_left
 from ...backend.shared.reconstruction.report import MIOU_LABELS, lead_miou
 from ..process.jobs import Job, State
+from .wording import in_blender
 
 CHARACTER = 6.6
 """Average width of a character in pixels at a UI scale of 1."""
@@ -91,13 +92,13 @@ def draw_figures(
 def draw_over(layout: bpy.types.UILayout, job: Job) -> None:
     """Draw the outcome of a finished job and up to three warnings."""
     if job.state is State.FAILED:
-        write(layout, f"{job.title} failed. {job.error}", "ERROR")
+        write(layout, f"{job.title} failed. {in_blender(job.error or job.message)}", "ERROR")
     elif job.state is State.STOPPED:
         write(layout, f"{job.title}: stopped.{_AFTER_STOP.get(job.kind, '')}", "INFO")
     else:
         write(layout, f"{job.title}: done", "CHECKMARK")
     for sentence in job.warnings[:3]:
-        write(layout, sentence, "ERROR")
+        write(layout, in_blender(sentence), "ERROR")
 
 
 def write(layout: bpy.types.UILayout, text: str, icon: str = "NONE", inset: float = 0.0) -> None:

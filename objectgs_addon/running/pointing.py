@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A backend process that answers strokes on objects with the object of each splat, which is shown at once.
+"""A backend process that answers strokes on objects with the object of each splat or point, which is shown at once.
 
 There is at most one, for one reconstruction; it reads the training and ends before a job changes it.
 """
@@ -16,11 +16,13 @@ import bpy
 import numpy as np
 
 from ...backend.shared.errors import InputError
+from ...backend.shared.reconstruction.folder import Reconstruction
 from .. import drawing, scene
 from ..blender import messages, writing
 from ..environment import locations
 from ..picking import marks
 from ..process.backend_process import BackendProcess
+from .wording import in_blender
 
 INTERVAL = 0.05
 """Time in seconds between two polls of the process."""
@@ -31,7 +33,9 @@ class _Session:
 
     def __init__(self, root: bpy.types.Collection) -> None:
         self.root, self.folder = root.session_uid, scene.folder_of(root)
-        self.keys = scene.splat_keys(self.folder)
+        has_splats = Reconstruction(self.folder).splats.is_file()
+        self.keys = scene.splat_keys(self.folder) if has_splats else scene.point_numbers(self.folder)
+        self.kind = "splats" if has_splats else "points"
         job = locations.backend_job("", "point", self.folder, "point", str(self.folder), *locations.segmenter_options())
         self.process = BackendProcess(job.command, job.cwd, job.environment, in_background=False)
         self.ready, self.progress, self.message, self.failure = False, 0.0, "Starting", ""
@@ -75,7 +79,7 @@ class _Session:
         elif kind == "status":
             self.message = str(event.get("message"))
         elif kind == "error":
-            self.failure = str(event.get("message"))
+            self.failure = in_blender(str(event.get("message")))
         elif kind == "answer" and event.get("ready"):
             self.ready = event.get("splats") == len(self.keys)
             if not self.ready:
@@ -251,7 +255,11 @@ def show() -> None:
     order = np.argsort(session.keys)
     found: dict[bpy.types.Mesh, np.ndarray] = {}
     for part in root.all_objects:
-        if scene.kind_of(part) == "splats" and not part.data.is_editmode:
+        if scene.kind_of(part) != session.kind or part.data.is_editmode:
+            continue
+        if session.kind == "points":
+            found[part.data] = numbers
+        else:
             keys = scene.keys_of(part.data)
             at = np.minimum(np.searchsorted(session.keys, keys, sorter=order), len(order) - 1)
             own = order[at]

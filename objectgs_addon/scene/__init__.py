@@ -49,7 +49,7 @@ from .meshes.show import (
 )
 from .object_display import Objects
 from .orientation import orient_to_ground, scale_to_distance
-from .points import color_points_by
+from .points import color_points_by, point_numbers, shown_points
 from .result import Shown, result_is_newer, show_label, show_objects, show_result
 from .shading.materials import SHADINGS
 from .shading.render_settings import is_untouched, prepare_render, render_problem, set_up_render
@@ -99,6 +99,7 @@ __all__ = [
     "orient_to_ground",
     "parts_of",
     "placement_of",
+    "point_numbers",
     "prepare_render",
     "recolor",
     "recolor_of",
@@ -126,6 +127,7 @@ __all__ = [
     "show_result",
     "shown_edits",
     "shown_kinds",
+    "shown_points",
     "splat_keys",
     "store_placements",
     "to_stored",

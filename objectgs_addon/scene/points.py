@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The capture's point cloud: a mesh carrier whose vertices are shown as points in one of two colorings."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
@@ -11,7 +12,7 @@ from ...backend.shared.formats.points_ply import LabeledPoints, read_shown_point
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.splats.floaters import far
 from . import carrier
-from .kinds import POINTS, mark, part_of, points_of
+from .kinds import POINTS, kind_of, mark, part_of, points_of
 from .object_display import Objects, linear_colors
 from .shading.materials import points_material
 from .shading.modifiers import modifier_of, set_input
@@ -33,6 +34,11 @@ def read_points(folder: Path) -> LabeledPoints:
     if not path.is_file():
         raise InputError(f"{folder} has no points.ply; run Import again.")
     return read_shown_points(path)
+
+
+def point_numbers(folder: Path) -> np.ndarray:
+    """Return the numbers (M,) of the points of a reconstruction folder, which are those of the shown vertices."""
+    return np.arange(len(read_points(folder).xyz))
 
 
 def show_points(
@@ -71,6 +77,13 @@ def show_points(
         },
     )
     _activate(obj, active if active in COLORINGS else "photo")
+
+
+def shown_points(view_layer: bpy.types.ViewLayer, space: bpy.types.SpaceView3D) -> Iterator[bpy.types.Object]:
+    """Yield the point clouds that a view layer shows in one of its viewports."""
+    for obj in view_layer.objects:
+        if kind_of(obj) == POINTS and obj.visible_get(view_layer=view_layer, viewport=space):
+            yield obj
 
 
 def color_points_by(root: bpy.types.Collection, by: str) -> None:

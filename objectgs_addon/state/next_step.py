@@ -99,11 +99,11 @@ def next_step(root: bpy.types.Collection | None, owner: bpy.types.Scene) -> Step
 
 
 def can_mark(state: FolderState) -> bool:
-    """Return whether objects can be marked: there are splats, and the capture has no masks but those of strokes.
+    """Return whether objects can be marked: the capture has no masks but those of strokes.
 
-    A training needs its capture, and imported splats do not.
+    Points and trainings need their capture, and splats of other programs do not.
     """
-    if not state.trained or (state.steps and state.capture is None):
+    if not state.imported or (state.capture is None and (state.steps or not state.trained)):
         return False
     if state.capture is None or not has_masks(state):
         return True

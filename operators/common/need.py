@@ -115,11 +115,11 @@ def training(cls: Any, context: bpy.types.Context) -> bool:
 
 
 def markable(cls: Any, context: bpy.types.Context) -> bool:
-    """Return whether objects of the active reconstruction can be marked: it has splats, and no masks of others."""
-    if not (backend(cls) and reconstruction(cls, context) and idle(cls, context) and splats(cls, context)):
+    """Return whether objects can be marked on the splats or points of the active reconstruction."""
+    if not (backend(cls) and reconstruction(cls, context) and idle(cls, context)):
         return False
     state = folder_state(scene.folder_of(active_root(context)))
-    if state.steps and not capture(cls, context):
+    if (state.steps or not state.trained) and not capture(cls, context):
         return False
     if can_mark(state):
         return True

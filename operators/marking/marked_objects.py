@@ -111,7 +111,7 @@ class SeparateMarked(_OfMarks, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return need.markable(cls, context)
+        return need.markable(cls, context) and need.splats(cls, context)
 
     @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:

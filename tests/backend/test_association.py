@@ -7,9 +7,11 @@ import pytest
 from PIL import Image
 from scipy import sparse
 
+from backend.capture import load_capture
 from backend.capture.files import read_mask
 from backend.labels.association import Seen, associate, consistency, object_mask
 from backend.labels.regions import merge_regions, merge_tree, stable_regions
+from backend.labels.renumbering import renumber_masks
 from backend.shared.errors import EXIT_DONE
 
 from .command_result import assert_rejected
@@ -160,3 +162,26 @@ def test_ids_of_each_photo_become_those_of_objects(write_capture, tmp_path, run_
     assert_rejected(run_command("masks", folder, folder / "masks"), "was made of other masks")
     again = run_command("masks", folder, folder / "masks-given", "--objects", "given", "--json")
     assert again.code == EXIT_DONE and again.events[-1]["result"]["found"] is False
+
+
+def test_regions_get_the_id_that_most_of_their_objects_regions_have(write_capture, tmp_path):
+    """IDs are exchanged in seven of eighteen photos; a region without points keeps its ID."""
+    scene = write_capture(views=18, size=(96, 72))
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    exchanged = np.array([0, 2, 5, 3, 4, 1])
+    given = {index: exchanged[ids] if index % 5 in (1, 3) else ids for index, ids in enumerate(scene.ids)}
+    given[0] = given[0].copy()
+    given[0][:2, :2] = 9
+    found = renumber_masks(capture, given, 0.9)
+    assert found.agreement < 0.8
+    right = {index: (mask == scene.ids[index])[scene.ids[index] > 0].mean() for index, mask in found.masks.items()}
+    assert min(right.values()) > 0.95, right
+    assert (found.masks[0][:2, :2] == 9).all() and (found.masks[1][scene.ids[1] == 0] == 0).all()
+
+
+def test_masks_that_agree_are_kept(write_capture, tmp_path):
+    scene = write_capture(views=9, size=(64, 48))
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    found = renumber_masks(capture, dict(enumerate(scene.ids)), 0.9)
+    assert found.agreement > 0.9
+    assert all(np.array_equal(found.masks[index], ids) for index, ids in enumerate(scene.ids))

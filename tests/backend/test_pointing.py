@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import base64
 import json
 import shutil
@@ -17,6 +18,7 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from backend.capture import load_capture
+from backend.commands.objects.pointable import open_pointable
 from backend.export.ply import read_splats
 from backend.model.checkpoint import save_checkpoint
 from backend.model.draw import draw
@@ -31,6 +33,8 @@ from backend.pointing.strokes import Stroke, Strokes, Viewpoint, read_strokes, s
 from backend.pointing.views import views_around, views_of_photos
 from backend.raster import Camera, object_ranks, rasterize
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError
+from backend.shared.events import Reporter
+from backend.shared.formats.points_ply import read_points
 from backend.training.fine_tuning.relabel import relabeled
 from backend.training.scene import Scene
 from backend.training.state import load_model, read_checkpoint
@@ -238,6 +242,23 @@ def test_objects_of_imported_splats_are_proposed(unlabeled, tmp_path, run_comman
     assert all("camera" in stroke for stroke in json.loads(strokes.read_text())["strokes"])
     assert run_command("label", imported, "--strokes", strokes).code == EXIT_DONE
     assert len(set(read_splats(imported / "splats.ply")[0].object_ids.tolist())) >= 3
+
+
+def test_points_are_marked_before_the_training(write_capture, tmp_path, run_command) -> None:
+    """`point` answers with the object of each point; `label` asks for the training."""
+    scene = write_capture(views=12, size=(96, 72), masks=False)
+    out = tmp_path / "out"
+    assert run_command("import", scene.folder, "--out", out).code == EXIT_DONE
+    options = argparse.Namespace(folder=out, capture=None, device="cpu", memory_mb=2000)
+    opened = open_pointable(options, Reporter())
+    pointer = opened.pointer(lambda done, total: None)
+    ids = pointer.solve(strokes_of(strokes_on(scene, (1, 5, 9)), "the test", opened.views.names))
+    points = read_points(out / "points.ply")
+    assert len(ids) == len(points.xyz) == opened.in_file.sum()
+    truth = scene.point_objects[cKDTree(scene.xyz).query(points.xyz)[1]]
+    assert (ids == truth)[truth > 0].mean() > 0.85
+    strokes = strokes_file(tmp_path, strokes_on(scene, (1,)))
+    assert_rejected(run_command("label", out, "--strokes", strokes), "no splats yet", "train first")
 
 
 def test_cameras_around_splats_show_them_from_above_and_from_free_places() -> None:

@@ -15,7 +15,8 @@ from objectgs.objectgs_addon.process import jobs
 from objectgs.objectgs_addon.process.backend_process import BackendProcess, backend_command, backend_environment
 from objectgs.objectgs_addon.process.blocking import run_blocking
 from objectgs.objectgs_addon.process.jobs import Job, JobQueue, State
-from objectgs.objectgs_addon.running import job_display
+from objectgs.objectgs_addon.running import job_display, wording
+from objectgs.objectgs_addon.running.wording import in_blender
 
 posix = pytest.mark.skipif(os.name != "posix", reason="signals and niceness are POSIX's")
 WAIT = 30.0
@@ -484,3 +485,23 @@ def test_backend_command_line():
         "b",
         "--json",
     ]
+
+
+def test_sentences_have_the_names_that_blender_shows():
+    """Options without a name, those of other words and commands for a terminal stay."""
+    assert in_blender("The folder a--out is full; choose another --out, or --restart.") == (
+        "The folder a--out is full; choose another Save To, or Retrain."
+    )
+    assert in_blender("It was trained with --max-size 800; choose a checkpoint as --segmenter.") == (
+        "It was trained with Image Size 800; choose a checkpoint as Segmentation Model."
+    )
+    for kept in ("--mode explicit", "run pip install torch --out x", "--text-file", "--per-object"):
+        assert in_blender(kept) == kept
+
+
+def test_names_of_options_are_those_of_blender():
+    """Each name is a literal of the add-on's properties, operators or preferences."""
+    root = Path(__file__).resolve().parents[2]
+    paths = [path for name in ("operators", "objectgs_addon") for path in (root / name).rglob("*.py")]
+    code = "".join(path.read_text() for path in paths if path.name != "wording.py")
+    assert [name for name in wording._NAMES.values() if f'"{name}"' not in code] == []

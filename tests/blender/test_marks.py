@@ -197,9 +197,10 @@ def test_what_can_be_marked(tmp_path, steps, capture, masks, of_strokes, can):
         (tmp_path / "masks").mkdir()
     if of_strokes:
         (tmp_path / "masks" / "strokes.json").write_text("{}")
-    state = replace(UNKNOWN, trained=True, steps=steps, capture=tmp_path if capture else None)
+    state = replace(UNKNOWN, imported=True, trained=True, steps=steps, capture=tmp_path if capture else None)
     assert can_mark(state) is can
-    assert not can_mark(replace(state, trained=False, steps=0))
+    assert can_mark(replace(state, trained=False, steps=0)) is (capture and not masks), "points need their capture"
+    assert not can_mark(replace(state, imported=False, trained=False, steps=0))
 
 
 def test_labels_of_a_training_with_masks_are_cleaned_up(root, monkeypatch):

@@ -32,19 +32,25 @@ def centers(capture, tmp_path_factory):  # noqa: F811
 
 
 @pytest.fixture(scope="module")
-def window(blender, capture):  # noqa: F811
-    """Blender with a short training of the capture without its masks, seen through its first camera."""
+def imported(blender, capture):  # noqa: F811
+    """Blender with the capture without its masks, seen through its first camera."""
     unlabeled, folder = blender.folder / "unlabeled", blender.folder / "unlabeled-splats"
     shutil.copytree(capture, unlabeled, ignore=shutil.ignore_patterns("masks", "labels.json", "truth"))
     import_capture(blender, unlabeled, folder)
-    blender.run(
+    return blender
+
+
+@pytest.fixture(scope="module")
+def window(imported):
+    """The same, with a short training."""
+    imported.run(
         script("""
         root.objectgs.length, root.objectgs.minutes = "minutes", 0.2
         call(bpy.ops.objectgs.train)
     """)
     )
-    wait(blender, f"scene.object_collections(root) and {IDLE}", 240)
-    return blender
+    wait(imported, f"scene.object_collections(root) and {IDLE}", 240)
+    return imported
 
 
 def asked(window, expression: str):
@@ -79,6 +85,20 @@ def at(window, center) -> tuple[float, float]:
 def draw_over(window, center) -> None:
     x, y = at(window, center)
     trace(window, [(x - 8, y), (x + 8, y)])
+
+
+def test_points_are_marked_before_the_training(imported, centers):
+    """The strokes are kept for after it."""
+    assert next_step(imported) == "objectgs.train"
+    imported.run(script("result = call(bpy.ops.objectgs.start_marking)"))
+    points = settled(imported)[0]
+    draw_over(imported, centers[VASE])
+    found = settled(imported)
+    assert found[1] > 10 and sum(found.values()) == points
+    imported.shot("marked-points")
+    assert not asked(imported, "bpy.ops.objectgs.separate_marked.poll()")
+    imported.run(script("call(bpy.ops.objectgs.clear_marks); call(bpy.ops.objectgs.stop_marking)"))
+    assert not asked(imported, "pointing.is_active(root)")
 
 
 def test_marking_is_the_step_after_a_training_without_masks(window):

@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import shutil
 from collections import Counter
+from typing import Any
 
 import numpy as np
 
 from ...capture import Capture
+from ...labels.renumbering import renumber_masks
 from ...pointing.mask_repair import Repair, repair_masks
 from ...pointing.pointer import Pointer
 from ...shared.errors import InputError
@@ -30,6 +32,9 @@ RECORD = "repair.json"
 """File in masks/ with what was changed."""
 
 _VOTE, _MASKS, _TRAIN = "vote", "masks", "train"
+_CONSISTENT = 0.9
+"""Agreement of the IDs of points between photos from which on the masks' IDs are taken as they are."""
+
 _WORST = 5
 _MOVED = 0.01
 """Fraction of an object's splats that another object gets, or more, from which on this is told."""
@@ -59,21 +64,32 @@ def clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> Non
             pointer = opened.pointer(reporter.progress)
             reporter.begin(_VOTE, f"Comparing the splats with {len(given)} masks")
             zero_is_known = trained.scene.supervise_background or trained.scene.zero_is_object
-            repair = repair_masks(pointer, given, zero_is_known, reporter.progress)
+            anew = renumber_masks(capture, given, _CONSISTENT)
+            if anew.agreement < _CONSISTENT:
+                reporter.status(f"Masks agree on the ID of {anew.agreement:.0%} of what they show; IDs are found anew")
+            repair = repair_masks(pointer, anew.masks, zero_is_known, reporter.progress)
             reporter.begin(_MASKS, f"Writing masks of {len(capture)} photos")
-            moved = _moved(trained, pointer, repair)
-            _write(capture, repair, moved, reporter)
+            changed, moved = _changed(capture, given, repair), _moved(trained, pointer, repair)
+            _write(capture, repair.masks, {"changed": changed, "moved": moved}, reporter)
         trainer = begin_border_training(trained, pointer.splats.source.cpu().numpy(), repair.ids, options, reporter)
         train_borders(trained, trainer, reporter)
-    _tell(capture, repair, moved, reporter)
+    _tell(changed, moved, reporter)
     reporter.done(
         masks=str(capture.folder / "masks"),
         views=len(repair.masks),
-        changed=round(float(np.mean(list(repair.changed.values()))), 4),
+        changed=round(float(np.mean(list(changed.values()))), 4),
         moved=moved,
         splats=str(trained.folder.splats),
         steps=trainer.progress.step,
     )
+
+
+def _changed(capture: Capture, given: dict[int, np.ndarray], repair: Repair) -> dict[str, float]:
+    """Return the fraction of each photo's pixels whose ID has changed; 1 where there was no mask."""
+    return {
+        capture.views[index].name: round(float(np.mean(mask != given[index])), 4) if index in given else 1.0
+        for index, mask in repair.masks.items()
+    }
 
 
 def _moved(trained: Trained, pointer: Pointer, repair: Repair) -> list[dict[str, float | str]]:
@@ -88,7 +104,7 @@ def _moved(trained: Trained, pointer: Pointer, repair: Repair) -> list[dict[str,
     return sorted(found, key=lambda entry: -float(entry["moved"]))
 
 
-def _write(capture: Capture, repair: Repair, moved: list[dict[str, float | str]], reporter: StoppingReporter) -> None:
+def _write(capture: Capture, masks: dict[int, np.ndarray], record: dict[str, Any], reporter: StoppingReporter) -> None:
     """Write masks of all photos with IDs, which replace the given ones; those of held-out photos are unchanged."""
     before, kept = capture.folder / "masks", kept_masks(capture.folder)
     # Masks that were repaired already are not given ones.
@@ -96,7 +112,7 @@ def _write(capture: Capture, repair: Repair, moved: list[dict[str, float | str]]
     with new_masks(capture.folder, kept if is_given else None) as folder:
         whole = capture.edited({}, ())
         for index, view in enumerate(capture.views):
-            mask, file = repair.masks.get(index), whole.uncorrected_mask(index)
+            mask, file = masks.get(index), whole.uncorrected_mask(index)
             if mask is None:
                 mask = file
             elif file is not None:
@@ -108,14 +124,13 @@ def _write(capture: Capture, repair: Repair, moved: list[dict[str, float | str]]
         strokes = before / STROKES
         if strokes.is_file():
             shutil.copyfile(strokes, folder / STROKES)
-        changed = {capture.views[index].name: round(part, 4) for index, part in repair.changed.items()}
-        write_json(folder / RECORD, {"changed": changed, "moved": moved})
+        write_json(folder / RECORD, record)
 
 
-def _tell(capture: Capture, repair: Repair, moved: list[dict[str, float | str]], reporter: StoppingReporter) -> None:
+def _tell(changed: dict[str, float], moved: list[dict[str, float | str]], reporter: StoppingReporter) -> None:
     """Report in which masks most has changed, and which objects have lost splats."""
-    worst = sorted(repair.changed, key=lambda index: -repair.changed[index])[:_WORST]
-    parts = [f"{capture.views[i].name} ({repair.changed[i]:.0%})" for i in worst if repair.changed[i] >= _MOVED]
+    worst = sorted(changed, key=lambda name: -changed[name])[:_WORST]
+    parts = [f"{name} ({changed[name]:.0%})" for name in worst if changed[name] >= _MOVED]
     if parts:
         reporter.status(f"The masks that changed most: {', '.join(parts)}")
     for entry in moved:

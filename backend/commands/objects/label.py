@@ -17,7 +17,7 @@ from ...pointing.strokes import Strokes, read_strokes
 from ...shared.errors import Cancelled, InputError
 from ...shared.events import Reporter
 from ...shared.formats.json_file import write_json
-from ...shared.formats.points_ply import read_points
+from ...shared.formats.points_ply import LabeledPoints, read_points
 from ...shared.reconstruction.checkpoint import PREVIOUS
 from ...shared.reconstruction.folder import STROKES
 from ...shared.reconstruction.lock import locked
@@ -53,6 +53,8 @@ def label(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         }
     )  # fmt: skip
     opened = open_pointable(options, reporter)
+    if isinstance(opened.source, LabeledPoints):
+        raise InputError(f"{opened.folder.folder} has no splats yet; train first, and run this again.")
     if isinstance(opened.source, Splats):
         _label_plain(opened, opened.source, options, reporter)
     else:

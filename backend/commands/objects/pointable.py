@@ -1,4 +1,4 @@
-"""Splats that objects can be pointed at: those of a trained model, or those of another program."""
+"""What objects can be pointed at: the splats of a trained model or of another program, or else the capture's points."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from ...capture import Capture, load_capture
 from ...export import read_splats
@@ -23,13 +24,21 @@ from ...segmentation import KeptEncodings, Segmenter
 from ...shared.defaults import MAX_SIZE
 from ...shared.errors import InputError
 from ...shared.events import Reporter
+from ...shared.formats.points_ply import LabeledPoints, read_points
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.record import read_record
+from ...shared.splats.spherical_harmonics import C0
 from ..cameras import read_upright
 from ..folder import READ, Trained, memory_for_files, open_trained
 
 GRAPH = "graph"
 """Name of the preparation among the parts of a command."""
+
+_FEWEST_POINTS = 20
+"""Number of points from which on objects are looked for among them."""
+_BALL, _LARGEST, _OPACITY = 0.5, 3.0, 0.9
+"""Deviation of the ball of a point relative to the mean distance of the three nearest others, and at most relative to
+the median of these distances; and its opacity."""
 
 
 class Pointable(NamedTuple):
@@ -37,15 +46,15 @@ class Pointable(NamedTuple):
 
     Attributes:
         folder: the reconstruction.
-        source: what they are: a trained model, or the content of splats.ply.
-        splats: the splats, in scene units.
-        in_file: (N,) bool, which of them are in splats.ply; those that cannot be drawn are not.
+        source: what they are: a trained model, the content of splats.ply, or that of points.ply.
+        splats: the splats, in scene units; a point is a ball.
+        in_file: (N,) bool, which of them are in the file that is shown; those that cannot be drawn are not.
         primitive: "3d" or "2d".
         views: views of them.
     """
 
     folder: Reconstruction
-    source: Trained | Splats
+    source: Trained | Splats | LabeledPoints
     splats: Generated
     in_file: np.ndarray
     primitive: str
@@ -62,7 +71,7 @@ class Pointable(NamedTuple):
 
 
 def open_pointable(options: argparse.Namespace, reporter: Reporter) -> Pointable:
-    """Open the splats of a reconstruction.
+    """Open the splats of a reconstruction, or its points where there are no splats yet.
 
     Args:
         options: Options with the folder, and the device to load the splats on; `capture` replaces a recorded folder.
@@ -72,9 +81,11 @@ def open_pointable(options: argparse.Namespace, reporter: Reporter) -> Pointable
         InputError: They are missing, cannot be read or depend on the view, or the capture of a training is missing.
     """
     folder = Reconstruction(options.folder)
-    if folder.splats.exists() and not folder.checkpoint.exists():
-        return _without_training(folder, options, reporter)
-    return pointable_of(open_trained(options, reporter))
+    if folder.checkpoint.exists() or not (folder.splats.exists() or folder.points.exists()):
+        return pointable_of(open_trained(options, reporter))
+    if folder.splats.exists():
+        return _of_splats(folder, options, reporter)
+    return _of_points(folder, options, reporter)
 
 
 def pointable_of(trained: Trained) -> Pointable:
@@ -95,7 +106,7 @@ def segmentation(options: argparse.Namespace, device: torch.device) -> KeptEncod
     return None if options.segmenter is None else KeptEncodings(Segmenter(options.segmenter, device=device))
 
 
-def _without_training(folder: Reconstruction, options: argparse.Namespace, reporter: Reporter) -> Pointable:
+def _of_splats(folder: Reconstruction, options: argparse.Namespace, reporter: Reporter) -> Pointable:
     """Open splats of another program, with the photos of their capture if it is known and exists."""
     reporter.begin(READ, "Reading the splats")
     splats, warnings = read_splats(folder.splats)
@@ -103,17 +114,55 @@ def _without_training(folder: Reconstruction, options: argparse.Namespace, repor
         reporter.warning(sentence)
     if not len(splats):
         raise InputError(f"{folder.splats} contains no splats.")
-    recorded = read_record(folder).capture
-    source = options.capture or (None if recorded is None else Path(recorded.folder))
     normalization = Normalization.of(splats.means, splats.means)
-    generated = _in_scene_units(splats, normalization, devices.pick(options.device))
-    if source is not None and source.is_dir():
-        max_size = MAX_SIZE if recorded is None else recorded.max_size
-        capture = load_capture(source, folder.cache, memory_for_files(options), max_size, reporter)
-        views = views_of_photos(capture, lambda index: _camera(capture, index, normalization), normalization)
-    else:
+    capture = _capture_of(folder, options, reporter)
+    if capture is None:
         views = views_around(normalization.to_scene(splats.means), read_upright(folder).rotation[2], normalization)
+    else:
+        views = _views_of(capture, normalization)
+    generated = _in_scene_units(splats, normalization, devices.pick(options.device))
     return Pointable(folder, splats, generated, np.ones(len(splats), bool), "3d", views)
+
+
+def _of_points(folder: Reconstruction, options: argparse.Namespace, reporter: Reporter) -> Pointable:
+    """Open the points of a capture, each as a ball that reaches about half way to the nearest others."""
+    reporter.begin(READ, "Reading the points")
+    points = read_points(folder.points)
+    capture = _capture_of(folder, options, reporter)
+    if capture is None or len(points.xyz) < _FEWEST_POINTS:
+        raise InputError(f"{folder.folder} has no splats yet; train first.")
+    distance, _ = cKDTree(points.xyz).query(points.xyz, k=4, workers=-1)
+    spacing = distance[:, 1:].mean(1)
+    radii = np.clip(_BALL * spacing, 0.0, _LARGEST * np.median(spacing))
+    balls = Splats(
+        means=points.xyz,
+        quats=np.tile(np.array([1.0, 0, 0, 0], np.float32), (len(radii), 1)),
+        scales=np.repeat(np.maximum(radii, 1e-12)[:, None], 3, 1),
+        opacities=np.full(len(radii), _OPACITY),
+        sh=((points.rgb / 255.0 - 0.5) / C0)[:, None].astype(np.float32),
+        object_ids=points.ids,
+    )
+    normalization = Normalization.of(points.xyz, points.xyz)
+    generated = _in_scene_units(balls, normalization, devices.pick(options.device))
+    return Pointable(folder, points, generated, np.ones(len(radii), bool), "3d", _views_of(capture, normalization))
+
+
+def _capture_of(folder: Reconstruction, options: argparse.Namespace, reporter: Reporter) -> Capture | None:
+    """Return the capture of --capture or of the record; None if it is not known, or does not exist."""
+    recorded = read_record(folder).capture
+    if options.capture is None and (recorded is None or not Path(recorded.folder).is_dir()):
+        return None
+    source = options.capture or Path(recorded.folder if recorded else "")
+    max_size = MAX_SIZE if recorded is None else recorded.max_size
+    return load_capture(source, folder.cache, memory_for_files(options), max_size, reporter)
+
+
+def _views_of(capture: Capture, normalization: Normalization) -> Views:
+    def camera(index: int) -> Camera:
+        view = capture.views[index]
+        return Camera(normalization.viewmat(view.viewmat), view.K, view.width, view.height)
+
+    return views_of_photos(capture, camera, normalization)
 
 
 def _in_scene_units(splats: Splats, normalization: Normalization, device: torch.device) -> Generated:
@@ -125,8 +174,3 @@ def _in_scene_units(splats: Splats, normalization: Normalization, device: torch.
         tensor(splats.opacities), tensor(splats.sh), torch.zeros(len(splats), dtype=torch.int32, device=device),
         torch.arange(len(splats), device=device),
     )  # fmt: skip
-
-
-def _camera(capture: Capture, index: int, normalization: Normalization) -> Camera:
-    view = capture.views[index]
-    return Camera(normalization.viewmat(view.viewmat), view.K, view.width, view.height)

@@ -88,6 +88,8 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
             layout.operator("objectgs.suggest_objects", icon="LIGHT")
         layout.prop(properties, "everything")
         layout.operator("objectgs.separate_marked", icon="CHECKMARK")
+        if not folder_trust.state_of(root).trained:
+            write(layout, "The strokes are kept. Train, and separate the objects then.", "INFO")
         if is_active:
             layout.operator("objectgs.stop_marking", icon="X")
 

@@ -1,0 +1,89 @@
+"""IDs of masks anew, where photos give an object different ones.
+
+The regions of all photos that show the same points are one object, whatever their IDs, see `association`. Then each
+object gets the ID that most of its regions have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from ..capture import Capture
+from .association import Association, Seen, associate, consistency, object_mask
+from .voting import find_observed_points, find_visible_points
+
+
+class Renumbered(NamedTuple):
+    """Masks with new IDs.
+
+    Attributes:
+        masks: the masks (H, W) int64 by the index of their view.
+        agreement: how often photos give a point the ID that most of them give it, in the masks as they were.
+    """
+
+    masks: dict[int, np.ndarray]
+    agreement: float
+
+
+class _Regions(NamedTuple):
+    """The regions of a mask: their numbers (H, W), from 1, 0 for no ID; their IDs, from that of no region."""
+
+    numbers: np.ndarray
+    ids: np.ndarray
+
+
+def renumber_masks(capture: Capture, masks: Mapping[int, np.ndarray], consistent: float) -> Renumbered:
+    """Give the regions of masks the IDs of the objects that points show there.
+
+    A region that shows several objects is divided, and one without points keeps its ID.
+
+    Args:
+        capture: the capture.
+        masks: masks (H, W) by the index of their view.
+        consistent: agreement from which on the masks are kept as they are.
+    """
+    regions = {index: _regions_of(mask) for index, mask in masks.items()}
+    seen = {index: _seen(capture, index, own) for index, own in regions.items()}
+    agreement = consistency([regions[index].ids[own.segments] for index, own in seen.items()], list(seen.values()))
+    if agreement >= consistent:
+        return Renumbered(dict(masks), agreement)
+    found = associate(list(seen.values()), len(capture.points.xyz))
+    ids = _ids_of(found, list(seen.values()), list(regions.values()))
+    anew = {}
+    for index, objects in zip(masks, found.objects, strict=True):
+        numbers, own = regions[index]
+        shown = object_mask(numbers, seen[index], objects, found.points)
+        anew[index] = np.where(shown > 0, ids[shown], own[numbers])
+    return Renumbered(anew, agreement)
+
+
+def _regions_of(mask: np.ndarray) -> _Regions:
+    ids, numbers = np.unique(np.append(mask, 0), return_inverse=True)
+    return _Regions(numbers[:-1].reshape(mask.shape), ids)
+
+
+def _seen(capture: Capture, index: int, regions: _Regions) -> Seen:
+    observed = find_observed_points(capture, index)[0]
+    points, x, y = find_visible_points(capture, np.ascontiguousarray(capture.points.xyz.T, np.float64), index, observed)
+    is_certain = np.isin(points, observed)
+    return Seen(points, np.stack([x, y], 1), regions.numbers[y, x], is_certain, len(regions.ids) - 1)
+
+
+def _ids_of(found: Association, seen: list[Seen], regions: list[_Regions]) -> np.ndarray:
+    """Return the ID of each object, 0 first: each ID once, so that most points keep theirs, and further objects the
+    most frequent ID of their own."""
+    known = np.unique(np.concatenate([own.ids for own in regions]))[1:]
+    count = 1 + max(int(objects.max()) for objects in found.objects)
+    points = np.zeros((count, len(known)))
+    for photo, own, objects in zip(seen, regions, found.objects, strict=True):
+        sizes = np.bincount(photo.segments, minlength=len(own.ids))[1:]
+        np.add.at(points, (objects[1:], np.searchsorted(known, own.ids[1:])), sizes)
+    ids = known[points.argmax(1)]
+    objects, columns = linear_sum_assignment(-points[1:])
+    ids[objects + 1] = known[columns]
+    ids[0] = 0
+    return ids

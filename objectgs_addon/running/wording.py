@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The backend's sentences with the names that Blender shows in place of the command line's options."""
+
+from __future__ import annotations
+
+import re
+
+_NAMES = {
+    "--capture": "Capture",
+    "--detector": "Detection Model",
+    "--frames": "Video Frames",
+    "--max-size": "Image Size",
+    "--objects": "Objects",
+    "--out": "Save To",
+    "--restart": "Retrain",
+    "--segmenter": "Segmentation Model",
+    "--strategy": "Assignment",
+    "--text": "Names",
+}
+"""Options, and the names of their properties or operators."""
+
+_OPTION = re.compile(r"(?<![\w`-])--[a-z]+(?:-[a-z]+)*(?![\w=-])")
+
+
+def in_blender(sentence: str) -> str:
+    """Return a sentence of the backend with the names of Blender's properties for options that have one.
+
+    A sentence with a command to be run in a terminal stays as it is.
+    """
+    if "pip install" in sentence:
+        return sentence
+    return _OPTION.sub(lambda found: _NAMES.get(found.group(), found.group()), sentence)
