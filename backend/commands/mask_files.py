@@ -11,6 +11,15 @@ import numpy as np
 
 from ..capture.files import encode_mask
 from ..shared.formats.atomic import PART_PREFIX, PART_SUFFIX
+from ..shared.reconstruction.folder import STROKES
+
+RECORD, REPAIRED = "masks.json", "repair.json"
+"""Files in masks/ with how they were made of other masks, and with what was changed in them."""
+
+
+def is_made(folder: Path) -> bool:
+    """Return whether masks/ was made here, of other masks or of strokes, so that it can be replaced."""
+    return any((folder / name).is_file() for name in (RECORD, REPAIRED, STROKES))
 
 
 def kept_masks(capture: Path) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,6 +17,8 @@ from ..shared.formats.json_file import parse_json
 
 PACKAGE = "transformers>=5,<6"
 CONFIG = "config.json"
+MODEL_FILES = (CONFIG, "model.safetensors")
+"""Files that stand for the folder of a checkpoint when one of them is chosen."""
 _WEIGHTS = ("*.safetensors", "*.bin")
 """Files with weights, of one of these kinds; of both, those of the first are used."""
 
@@ -81,9 +84,7 @@ def import_transformers(needed: str, option: str) -> Any:
         transformers: Any = importlib.import_module("transformers")
         getattr(transformers, needed)  # Imported when it is asked for.
     except (ImportError, AttributeError) as error:
-        raise InputError(
-            f'{option} needs the package transformers; run {sys.executable} -m pip install "{PACKAGE}" before it.'
-        ) from error
+        raise InputError(f"{option} needs the package transformers; run {_install(PACKAGE)} in a terminal.") from error
     transformers.utils.logging.set_verbosity_error()
     transformers.utils.logging.disable_progress_bar()
     return transformers
@@ -111,7 +112,7 @@ def load_network(folder: Path, network: str, config: str, option: str) -> Any:
         )
     except ImportError as error:
         raise InputError(
-            f"The model in {folder} needs the package timm; run {sys.executable} -m pip install timm before it."
+            f"The model in {folder} needs the package timm; run {_install('timm')} in a terminal."
         ) from error
     except Exception as error:  # Files may be damaged in any way.
         raise unfit(folder, str(error).strip().partition("\n")[0]) from error
@@ -139,6 +140,12 @@ def read_tokenizer(folder: Path, what: str, option: str, files: Sequence[str]) -
     except Exception as error:  # Files may be damaged in any way.
         why = str(error).strip().partition("\n")[0]
         raise InputError(f"The tokenizer in {folder} cannot be read ({why}); copy the checkpoint again.") from error
+
+
+def _install(package: str) -> str:
+    """Return the command that installs a package for this Python, as PowerShell takes it, or another shell."""
+    call = "& " if os.name == "nt" else ""
+    return f'{call}"{sys.executable}" -m pip install "{package}"'
 
 
 def digest_of(folder: Path) -> str:

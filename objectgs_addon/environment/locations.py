@@ -39,9 +39,12 @@ def environment_folder() -> Path:
 
 
 def reconstructions_folder() -> Path:
-    """Return the default folder for new reconstructions."""
+    """Return the default folder for new reconstructions.
+
+    It is not in the folder of the extension, which Blender deletes when the extension is uninstalled.
+    """
     chosen = preferences().reconstructions if preferences() else ""
-    return Path(bpy.path.abspath(chosen)) if chosen else user_folder() / "reconstructions"
+    return Path(bpy.path.abspath(chosen)) if chosen else Path.home() / "ObjectGS"
 
 
 def new_reconstruction(name: str, is_free: Callable[[Path], bool]) -> Path:
@@ -66,8 +69,7 @@ def name_of_photos(sources: Sequence[Path]) -> str:
 
 def new_capture(sources: Sequence[Path]) -> Path:
     """Return the folder for the capture of photos or a video: a new one, or that where its computation has begun."""
-    chosen = preferences().reconstructions if preferences() else ""
-    captures = (Path(bpy.path.abspath(chosen)) if chosen else user_folder()) / "captures"
+    captures = reconstructions_folder() / "captures"
     name = name_of_photos(sources)
     numbered = (captures / (name if number == 1 else f"{name}-{number}") for number in itertools.count(1))
 

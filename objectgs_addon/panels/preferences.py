@@ -34,7 +34,8 @@ class Preferences(bpy.types.AddonPreferences):
     reconstructions: StringProperty(
         name="Reconstructions",
         subtype="DIR_PATH",
-        description="Default folder of reconstructions. If empty, they are saved in the user folder of the extension",
+        description="Default folder of reconstructions, and of captures of photos in it. If empty, it is the folder "
+        "ObjectGS in your home folder",
     )
 
     segmenter: StringProperty(

@@ -267,20 +267,22 @@ def _show_poses(job: Job) -> None:
 
 
 def _assign_objects(job: Job, owner: bpy.types.Scene) -> None:
-    """Let the masks of a newly imported capture vote on its objects, which takes seconds."""
+    """Let new masks decide on the objects of a capture's points, which takes seconds, or on those of trained splats."""
     root = next(iter(results.roots_of(job.folder)), None)
     state = None if root is None else folder_trust.state_of(root)
-    if state is None or root.objectgs.objects or not has_masks(state) or locations.backend_python() is None:
+    if state is None or not has_masks(state) or locations.backend_python() is None:
         return
-    options = ("--strategy", root.objectgs.strategy, "--max-size", str(root.objectgs.max_size))
-    submit(
-        locations.backend_job(
+    if root.objectgs.objects and job.kind != "masks":
+        return
+    if state.steps:
+        follow = locations.backend_job(f"Objects of {root.name}", "label", job.folder, "clean-labels", str(job.folder))
+    else:
+        options = ("--strategy", root.objectgs.strategy, "--max-size", str(root.objectgs.max_size))
+        follow = locations.backend_job(
             f"Assign objects of {root.name}", "vote", job.folder, "vote", str(state.capture), "--out", str(job.folder),
             *options,
-        ),
-        owner,
-        lambda _kind, text: messages.show(text, "ERROR"),
-    )  # fmt: skip
+        )  # fmt: skip
+    submit(follow, owner, lambda _kind, text: messages.show(text, "ERROR"))
 
 
 def _push_undo(title: str) -> None:

@@ -19,6 +19,7 @@ from ..process.jobs import Job
 from ..state import object_edits, object_list
 from ..state import viewports as view
 from ..state.folder_state import folder_state
+from .wording import in_blender
 
 
 def _folder_of(job: Job) -> Path:
@@ -156,9 +157,9 @@ def _show_masks(job: Job, _owner: bpy.types.Scene | None) -> bool:
     """Tell what was found in imported masks; return False."""
     result = job.result.get("result")
     found = len(result.get("objects", ())) if isinstance(result, dict) else 0
-    messages.show(
-        f"The masks show {found} objects in {job.result.get('photos')} photos; {job.result.get('masks')} has a picture"
-    )
+    photos, folder = (job.result.get(key) for key in ("photos", "masks"))
+    lines = [f"The masks show {found} objects in {photos} photos; {folder} has a picture.", *job.warnings]
+    messages.show(" ".join(map(in_blender, lines)))
     return False
 
 

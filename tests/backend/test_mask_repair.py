@@ -84,6 +84,18 @@ def test_wrong_masks_and_labels_are_corrected(trained, tmp_path, run_command) ->
     assert sorted(path.name for path in (scene.folder / "masks-given").iterdir()) == kept
 
 
+def test_masks_made_after_the_training_give_splats_their_objects(write_capture, tmp_path, run_command) -> None:
+    scene = write_capture(views=18, size=(96, 72))
+    out, later = tmp_path / "out", tmp_path / "later"
+    (scene.folder / "masks").rename(later)
+    (scene.folder / "labels.json").unlink()
+    assert run_command("train", scene.folder, "--out", out, "--steps", STEPS, "--offsets", 4).code == EXIT_DONE
+    assert_rejected(run_command("clean-labels", out), "has no masks")
+    later.rename(scene.folder / "masks")
+    assert run_command("clean-labels", out).code == EXIT_DONE
+    assert rendered(scene, out) > 0.95
+
+
 def test_captures_without_masks_are_refused(write_capture, tmp_path, run_command) -> None:
     scene = write_capture(views=9, size=(64, 48), masks=False)
     out = tmp_path / "out"

@@ -376,8 +376,10 @@ def test_words_of_sam3_become_named_objects(scene, stand_ins, tmp_path, run_comm
     assert_rejected(
         run_command("masks", scene.folder, tmp_path / "sam3"), "finds objects by their names; add --text", "sam3"
     )
+    # It needs no detector, and its config.json may stand for its folder.
     arguments = ("--text", "cup", "--detector", tmp_path / "dino")
-    assert_rejected(run_command("masks", scene.folder, tmp_path / "sam3", *arguments), "leave out --detector")
+    assert run_command("masks", scene.folder, tmp_path / "sam3" / "config.json", *arguments).code == EXIT_DONE
+    assert labels_of(scene) == {"cup": 1}
 
 
 def test_found_words_are_kept(scene, stand_ins, tmp_path, run_command):

@@ -52,6 +52,7 @@ def extension(fresh, tmp_path, monkeypatch):
     """The extension, registered in an empty file, with its folders in tmp_path."""
     root = headless.extension()
     monkeypatch.setattr(locations, "user_folder", lambda: tmp_path / "user")
+    monkeypatch.setattr(locations.Path, "home", lambda: tmp_path / "home")
     monkeypatch.setattr(locations, "backend_environment", lambda _cache: {})  # reuse compiled kernels
     monkeypatch.delenv("OBJECTGS_PYTHON", raising=False)
     root.register()

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Import Masks: what the backend is asked for, and what follows."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,6 +13,7 @@ bpy = pytest.importorskip("bpy")
 from objectgs.objectgs_addon.environment import locations
 from objectgs.objectgs_addon.process.jobs import Job
 from objectgs.objectgs_addon.running import background, results
+from objectgs.objectgs_addon.state.folder_state import folder_state
 from objectgs.operators.capture import import_masks
 
 import headless
@@ -82,9 +84,23 @@ def test_result_is_told_and_points_get_their_objects(root, tmp_path, monkeypatch
     root.objectgs.objects.clear()
     job = Job("Import masks", "masks", Path(tmp_path / "table"), ["python"], tmp_path)
     job.result = {"photos": 42, "masks": "/table/masks", "result": {"objects": [{}, {}, {}]}}
+    job.warnings.append("No photo shows book; --text may have other words.")
     monkeypatch.setitem(background._submitted_in, job, bpy.context.scene.session_uid)
     background.finish(job)
-    assert told == ["The masks show 3 objects in 42 photos; /table/masks has a picture"]
+    assert told == [
+        "The masks show 3 objects in 42 photos; /table/masks has a picture. No photo shows book; Names may have other "
+        "words."
+    ]
     # With a window, `finish` does this, too.
     background._assign_objects(job, bpy.context.scene)
     assert asked == ["vote"]
+    # Later masks replace the objects, and splats of a training get them at once.
+    root.objectgs.objects.add().object_id = 1
+    background._assign_objects(job, bpy.context.scene)
+    state = replace(folder_state(tmp_path / "table"), steps=100)
+    monkeypatch.setattr(background.folder_trust, "state_of", lambda _root: state)
+    background._assign_objects(job, bpy.context.scene)
+    assert asked == ["vote", "vote", "label"]
+    imported = Job("Import", "import", Path(tmp_path / "table"), ["python"], tmp_path)
+    background._assign_objects(imported, bpy.context.scene)
+    assert len(asked) == 3, "an import keeps the objects"

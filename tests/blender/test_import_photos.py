@@ -20,6 +20,7 @@ def submitted(fresh, tmp_path, monkeypatch):
     jobs = []
     extension.register()
     monkeypatch.setattr(locations, "user_folder", lambda: tmp_path / "user")
+    monkeypatch.setattr(locations, "reconstructions_folder", lambda: tmp_path / "user")
     monkeypatch.setattr(locations, "backend_python", lambda: Path("/python"))
     monkeypatch.setattr(import_photos.background, "submit", lambda job, *_: jobs.append(job) or {"FINISHED"})
     for name in ("b.jpg", "a.heic", "walk.mov", "notes.txt"):

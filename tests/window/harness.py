@@ -92,6 +92,7 @@ class Blender:
                 filepath={str(archive)!r}, repo="user_default", enable_on_install=True)
             preferences = bpy.context.preferences.addons["{PACKAGE}"].preferences
             preferences.backend_python = {str(backend_python)!r}
+            preferences.reconstructions = {str(self.folder / "reconstructions")!r}
             for obj in list(bpy.data.objects):
                 bpy.data.objects.remove(obj)
         """,

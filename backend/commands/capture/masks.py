@@ -21,6 +21,7 @@ from ...capture.models import Photos, read_capture_model, with_observations
 from ...evaluation import contact_sheet
 from ...evaluation.images import id_image, thumbnail
 from ...labels.association import Association, Seen, associate, consistency, object_mask
+from ...networks.checkpoint_folder import MODEL_FILES
 from ...raster import devices
 from ...segmentation import Finder, PhotoSegments, finders, is_checkpoint, is_sam3
 from ...shared.class_table import LARGEST_ID
@@ -29,10 +30,10 @@ from ...shared.formats.json_file import write_json
 from ...shared.reconstruction.objects import default_name
 from ...shared.stopping import StoppingReporter
 from ..folder import READ
-from ..mask_files import kept_masks, new_masks, write_mask
+from ..mask_files import RECORD, is_made, kept_masks, new_masks, write_mask
 
-RECORD, OVERVIEW = "masks.json", "masks.jpg"
-"""Files in masks/ with where the masks are from, and how well they agree; and a picture of some."""
+OVERVIEW = "masks.jpg"
+"""File in masks/ with a picture of some of them."""
 
 _MASKS = "MASKS"
 """The argument with the masks, for errors."""
@@ -59,6 +60,8 @@ class _Found(NamedTuple):
 
 def masks(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Read or find the segments of the photos, find the objects where IDs differ between photos, and write masks/."""
+    if options.masks.is_file() and options.masks.name in MODEL_FILES and is_checkpoint(options.masks.parent):
+        options.masks = options.masks.parent
     capture, given = options.capture, options.masks
     segments_by_model = is_checkpoint(given)
     reporter.expect({
@@ -129,7 +132,7 @@ def _finder(options: argparse.Namespace) -> Finder:
     given, device = options.masks, devices.pick(options.device)
     if options.text is None:
         return finders.everything(given, _MASKS, device)
-    if options.detector is None:
+    if is_sam3(given, _MASKS):
         return finders.by_words(given, _MASKS, options.text, device)
     return finders.boxed(given, _MASKS, options.detector, options.text, device)
 
@@ -143,8 +146,6 @@ def _require_fitting_options(options: argparse.Namespace, segments_by_model: boo
             )
         return
     finds_words = is_sam3(options.masks, _MASKS)
-    if finds_words and options.detector is not None:
-        raise InputError(f"The SAM 3 in {options.masks} finds what --text names itself; leave out --detector.")
     if options.text is None and (finds_words or options.detector is not None):
         model = options.masks if finds_words else options.detector
         raise InputError(f'The model in {model} finds objects by their names; add --text, such as --text "cup; book".')
@@ -156,15 +157,14 @@ def _require_fitting_options(options: argparse.Namespace, segments_by_model: boo
 
 
 def _require_replaceable(capture: Path, given: Path) -> None:
-    """Raise InputError if the capture has masks that are neither the given ones nor made by this command."""
+    """Raise InputError if the capture has masks that are neither the given ones nor made here."""
     folder = capture / "masks"
-    is_own = (folder / RECORD).is_file()
     if given.resolve() == folder.resolve():
-        if is_own:
+        if (folder / RECORD).is_file():
             raise InputError(f"{folder} was made of other masks, which {folder / RECORD} names; give those.")
         if kept_masks(capture).exists():
             raise InputError(f"{kept_masks(capture)} exists, where the given masks would be kept; move it elsewhere.")
-    elif folder.exists() and not is_own:
+    elif folder.exists() and not is_made(folder):
         raise InputError(f"{folder} exists; move it elsewhere, or give it as the masks.")
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...capture import Capture
+from ...capture import Capture, load_capture
 from ...labels.renumbering import renumber_masks
 from ...pointing.mask_repair import Repair, repair_masks
 from ...pointing.pointer import Pointer
@@ -20,16 +20,13 @@ from ...shared.reconstruction.lock import locked
 from ...shared.reconstruction.objects import default_name
 from ...shared.stopping import StoppingReporter
 from ..exported import EXPORT
-from ..folder import READ, Trained, open_trained
-from ..mask_files import kept_masks, new_masks, write_mask
+from ..folder import READ, Trained, memory_for_files, open_trained
+from ..mask_files import REPAIRED, kept_masks, new_masks, write_mask
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import stage
 from .label import begin_border_training, border_seconds, train_borders
 from .pointable import GRAPH, pointable_of
-
-RECORD = "repair.json"
-"""File in masks/ with what was changed."""
 
 _VOTE, _MASKS, _TRAIN = "vote", "masks", "train"
 _CONSISTENT = 0.9
@@ -50,7 +47,7 @@ def clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> Non
         }
     )  # fmt: skip
     trained = open_trained(options, reporter)
-    capture = trained.capture
+    capture = _with_masks(trained, options, reporter)
     opened = pointable_of(trained)
     given = {index: mask for index in capture.train_indices if (mask := capture.uncorrected_mask(index)) is not None}
     if not any(mask.any() for mask in given.values()):
@@ -69,7 +66,7 @@ def clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> Non
                 reporter.status(f"Masks agree on the ID of {anew.agreement:.0%} of what they show; IDs are found anew")
             repair = repair_masks(pointer, anew.masks, zero_is_known, reporter.progress)
             reporter.begin(_MASKS, f"Writing masks of {len(capture)} photos")
-            changed, moved = _changed(capture, given, repair), _moved(trained, pointer, repair)
+            changed, moved = _changed(capture, given, repair), _moved(trained, capture, pointer, repair)
             _write(capture, repair.masks, {"changed": changed, "moved": moved}, reporter)
         trainer = begin_border_training(trained, pointer.splats.source.cpu().numpy(), repair.ids, options, reporter)
         train_borders(trained, trainer, reporter)
@@ -84,6 +81,16 @@ def clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> Non
     )
 
 
+def _with_masks(trained: Trained, options: argparse.Namespace, reporter: StoppingReporter) -> Capture:
+    """Return the capture of a training with its masks, which may have been made since."""
+    capture = trained.capture
+    if capture.has_masks:
+        return capture
+    size = trained.training.votes.max_size
+    fresh = load_capture(capture.folder, trained.folder.cache, memory_for_files(options), size, reporter)
+    return fresh.excluding_from_training(trained.plan.views_left_out).validating_on(trained.plan.validation_views)
+
+
 def _changed(capture: Capture, given: dict[int, np.ndarray], repair: Repair) -> dict[str, float]:
     """Return the fraction of each photo's pixels whose ID has changed; 1 where there was no mask."""
     return {
@@ -92,11 +99,11 @@ def _changed(capture: Capture, given: dict[int, np.ndarray], repair: Repair) -> 
     }
 
 
-def _moved(trained: Trained, pointer: Pointer, repair: Repair) -> list[dict[str, float | str]]:
+def _moved(trained: Trained, capture: Capture, pointer: Pointer, repair: Repair) -> list[dict[str, float | str]]:
     """Return for each object the fraction of its splats that other objects get, the largest first."""
     before = trained.model.classes.ids_of(pointer.splats.ids.cpu().numpy()).astype(np.int64)
     total, gone = Counter(before.tolist()), Counter(before[before != repair.ids].tolist())
-    names = trained.capture.names
+    names = capture.names
     found: list[dict[str, float | str]] = [
         {"object": names.get(i, default_name(i)) if i else "no object", "moved": round(gone[i] / total[i], 4)}
         for i in total
@@ -108,7 +115,7 @@ def _write(capture: Capture, masks: dict[int, np.ndarray], record: dict[str, Any
     """Write masks of all photos with IDs, which replace the given ones; those of held-out photos are unchanged."""
     before, kept = capture.folder / "masks", kept_masks(capture.folder)
     # Masks that were repaired already are not given ones.
-    is_given = before.is_dir() and not (before / RECORD).is_file() and not kept.exists()
+    is_given = before.is_dir() and not (before / REPAIRED).is_file() and not kept.exists()
     with new_masks(capture.folder, kept if is_given else None) as folder:
         whole = capture.edited({}, ())
         for index, view in enumerate(capture.views):
@@ -124,7 +131,7 @@ def _write(capture: Capture, masks: dict[int, np.ndarray], record: dict[str, Any
         strokes = before / STROKES
         if strokes.is_file():
             shutil.copyfile(strokes, folder / STROKES)
-        write_json(folder / RECORD, record)
+        write_json(folder / REPAIRED, record)
 
 
 def _tell(changed: dict[str, float], moved: list[dict[str, float | str]], reporter: StoppingReporter) -> None:

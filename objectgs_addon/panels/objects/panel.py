@@ -89,7 +89,7 @@ class ObjectsPanel(WithReconstruction, bpy.types.Panel):
             layout.operator("objectgs.assign_objects", icon="GROUP_VERTEX")
             if state.steps:
                 layout.operator("objectgs.clean_up_labels", icon="BRUSH_DATA")
-        elif state.capture is not None and not properties.objects:
+        if state.capture is not None:
             layout.operator("objectgs.import_masks", icon="IMAGE_ALPHA")
         if not properties.objects:
             return
