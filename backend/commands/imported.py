@@ -6,10 +6,30 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ..export import write_splats
 from ..model.splats import Splats
 from ..shared.color.palette import object_colors
+from ..shared.events import Reporter
 from ..shared.reconstruction.folder import Reconstruction
 from ..shared.reconstruction.objects import default_name, write_objects
+
+
+def write_labeled(
+    folder: Reconstruction, splats: Splats, ids: np.ndarray, names: Mapping[int, str], reporter: Reporter
+) -> None:
+    """Write splats.ply with other objects, and objects.json.
+
+    Args:
+        folder: the reconstruction.
+        splats: the splats, which get the objects.
+        ids: (N,) the ID of each splat's object.
+        names: names of objects by ID.
+        reporter: receives warnings.
+    """
+    splats.object_ids = ids
+    for sentence in write_splats(folder.splats, splats):
+        reporter.warning(sentence)
+    write_objects_of(folder, splats, names)
 
 
 def write_objects_of(folder: Reconstruction, splats: Splats, names: Mapping[int, str]) -> int:

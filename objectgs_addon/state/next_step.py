@@ -54,7 +54,7 @@ SEPARATE = Step(
     "objectgs.separate_marked",
     "Separate Objects",
     "CHECKMARK",
-    "The marked objects get collections of their own; after a training, their borders are trained for half a minute.",
+    "The marked objects get collections of their own; after a training, their borders are trained for a short time.",
 )
 MESHES = Step(
     "objectgs.extract_meshes", "Extract Meshes", "MESH_DATA", "Meshes are for physics, shadows and other programs."

@@ -10,9 +10,7 @@ from ...objectgs_addon.running import background
 class MakeDemo(bpy.types.Operator):
     bl_idname = "objectgs.make_demo"
     bl_label = "Make Demo Capture"
-    bl_description = (
-        "Render objects on a table as a capture, in the background, and import it. This takes a minute or two"
-    )
+    bl_description = "Render objects on a table as a capture, in the background, and import it. This takes minutes"
     bl_options = {"REGISTER"}
 
     @classmethod

@@ -130,8 +130,8 @@ def markable(cls: Any, context: bpy.types.Context) -> bool:
 
 
 def masked(cls: Any, context: bpy.types.Context) -> bool:
-    """Return whether a job on the active reconstruction could start that is trained and whose capture has masks."""
-    if not (work_on_capture(cls, context) and training(cls, context)):
+    """Return whether a job on the active reconstruction could start that has splats and whose capture has masks."""
+    if not (work_on_capture(cls, context) and splats(cls, context)):
         return False
     if has_masks(folder_state(scene.folder_of(active_root(context)))):
         return True

@@ -105,7 +105,7 @@ class SeparateMarked(_OfMarks, bpy.types.Operator):
     bl_label = "Separate Objects"
     bl_description = (
         "Give each marked object a collection of its own. After a training, the borders of the objects are trained "
-        "for half a minute, and masks of the photos are made"
+        "for a short time, and masks of the photos are made"
     )
     bl_options = {"REGISTER"}
 

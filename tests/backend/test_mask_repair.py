@@ -7,6 +7,8 @@ import pytest
 from PIL import Image
 
 from backend.capture import load_capture
+from backend.export import read_splats
+from backend.labels import vote
 from backend.model.draw import draw
 from backend.pointing.mask_repair import contradicted
 from backend.shared.errors import EXIT_DONE
@@ -94,6 +96,29 @@ def test_masks_made_after_the_training_give_splats_their_objects(write_capture, 
     later.rename(scene.folder / "masks")
     assert run_command("clean-labels", out).code == EXIT_DONE
     assert rendered(scene, out) > 0.95
+
+
+def test_splats_of_another_program_get_objects_by_later_masks(write_capture, tmp_path, run_command) -> None:
+    """Only their objects change; there is nothing to train."""
+    scene = write_capture(views=18, size=(96, 72))
+    out, imported, later = tmp_path / "out", tmp_path / "imported", tmp_path / "later"
+    (scene.folder / "masks").rename(later)
+    assert run_command("train", scene.folder, "--out", out, "--steps", STEPS, "--offsets", 4).code == EXIT_DONE
+    before = read_splats(out / "splats.ply")[0]
+    options = ("--out", imported, "--capture", scene.folder)
+    assert run_command("import-splats", out / "splats.ply", *options).code == EXIT_DONE
+    later.rename(scene.folder / "masks")
+    result = run_command("clean-labels", imported, "--json")
+    assert result.code == EXIT_DONE and "steps" not in result.events[-1]
+    after = read_splats(imported / "splats.ply")[0]
+    assert np.array_equal(after.means, before.means) and np.array_equal(after.opacities, before.opacities)
+    voted = vote(load_capture(scene.folder, tmp_path / "cache"), positions=after.means).ids
+    assert (after.object_ids == voted)[voted > 0].mean() > 0.8
+    assert {1, 2, 5} <= set(after.object_ids.tolist()) and (imported / "objects.json").exists()
+    assert not (imported / "checkpoint").exists()
+    alone = tmp_path / "alone"
+    assert run_command("import-splats", out / "splats.ply", "--out", alone).code == EXIT_DONE
+    assert_rejected(run_command("clean-labels", alone), "has no capture with masks", "import the splats again")
 
 
 def test_captures_without_masks_are_refused(write_capture, tmp_path, run_command) -> None:

@@ -207,7 +207,7 @@ def test_labels_of_a_training_with_masks_are_cleaned_up(root, monkeypatch):
     submitted = []
     monkeypatch.setattr(background, "submit", lambda job, *_: submitted.append(job) or {"FINISHED"})
     monkeypatch.setattr(need, "work_on_capture", lambda *_: True)
-    monkeypatch.setattr(need, "training", lambda *_: True)
+    monkeypatch.setattr(need, "splats", lambda *_: True)
     monkeypatch.setattr(need, "has_masks", lambda _: False)
     with pytest.raises(RuntimeError, match="no masks"):
         bpy.ops.objectgs.clean_up_labels()

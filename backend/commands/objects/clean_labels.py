@@ -11,22 +11,24 @@ import numpy as np
 
 from ...capture import Capture, load_capture
 from ...labels.renumbering import renumber_masks
+from ...model.splats import Splats
 from ...pointing.mask_repair import Repair, repair_masks
-from ...pointing.pointer import Pointer
 from ...shared.errors import InputError
 from ...shared.formats.json_file import write_json
+from ...shared.formats.points_ply import LabeledPoints
 from ...shared.reconstruction.folder import STROKES
 from ...shared.reconstruction.lock import locked
 from ...shared.reconstruction.objects import default_name
 from ...shared.stopping import StoppingReporter
 from ..exported import EXPORT
-from ..folder import READ, Trained, memory_for_files, open_trained
+from ..folder import READ, Trained, memory_for_files
+from ..imported import write_labeled
 from ..mask_files import REPAIRED, kept_masks, new_masks, write_mask
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import stage
 from .label import begin_border_training, border_seconds, train_borders
-from .pointable import GRAPH, pointable_of
+from .pointable import GRAPH, Pointable, open_pointable
 
 _VOTE, _MASKS, _TRAIN = "vote", "masks", "train"
 _CONSISTENT = 0.9
@@ -38,7 +40,7 @@ _MOVED = 0.01
 
 
 def clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> None:
-    """Repair the masks, give the splats their objects anew, and train their borders."""
+    """Repair the masks, give the splats their objects anew, and after a training, train their borders."""
     reporter.expect(
         {
             READ: ("Preparing", 5.0), KERNELS: ("Preparing", 0.0), GRAPH: ("Preparing", 5.0),
@@ -46,38 +48,50 @@ def clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> Non
             EXPORT: ("Saving", 5.0),
         }
     )  # fmt: skip
-    trained = open_trained(options, reporter)
-    capture = _with_masks(trained, options, reporter)
-    opened = pointable_of(trained)
+    opened = open_pointable(options, reporter)
+    if isinstance(opened.source, LabeledPoints):
+        raise InputError(f"{opened.folder.folder} has no splats yet; train first, and run this again.")
+    trained = None if isinstance(opened.source, Splats) else opened.source
+    capture = opened.capture if trained is None else _with_masks(trained, options, reporter)
+    if capture is None:
+        raise InputError(f"{opened.folder.folder} has no capture with masks; import the splats again with --capture.")
     given = {index: mask for index in capture.train_indices if (mask := capture.uncorrected_mask(index)) is not None}
     if not any(mask.any() for mask in given.values()):
         raise InputError(f"{capture.folder} has no masks of the training's photos; import masks, or mark objects.")
-    device = trained.model.device
-    reporter.expect({KERNELS: ("Preparing", kernel_seconds(device)), _TRAIN: ("Training", border_seconds(trained))})
-    ensure_kernels(reporter, device)
-    with locked(trained.folder.folder):
+    reporter.expect({
+        KERNELS: ("Preparing", kernel_seconds(opened.device)),
+        _TRAIN: ("Training", 0.0 if trained is None else border_seconds(trained)),
+    })  # fmt: skip
+    ensure_kernels(reporter, opened.device)
+    with locked(opened.folder.folder):
         reporter.begin(GRAPH, "Comparing the splats with their neighbors")
-        with stage(trained.folder, "label cleanup"):
+        with stage(opened.folder, "label cleanup"):
             pointer = opened.pointer(reporter.progress)
             reporter.begin(_VOTE, f"Comparing the splats with {len(given)} masks")
-            zero_is_known = trained.scene.supervise_background or trained.scene.zero_is_object
+            scene = None if trained is None else trained.scene
+            zero_is_known = scene is not None and (scene.supervise_background or scene.zero_is_object)
             anew = renumber_masks(capture, given, _CONSISTENT)
             if anew.agreement < _CONSISTENT:
                 reporter.status(f"Masks agree on the ID of {anew.agreement:.0%} of what they show; IDs are found anew")
             repair = repair_masks(pointer, anew.masks, zero_is_known, reporter.progress)
             reporter.begin(_MASKS, f"Writing masks of {len(capture)} photos")
-            changed, moved = _changed(capture, given, repair), _moved(trained, capture, pointer, repair)
+            changed, moved = _changed(capture, given, repair), _moved(opened, capture, repair)
             _write(capture, repair.masks, {"changed": changed, "moved": moved}, reporter)
-        trainer = begin_border_training(trained, pointer.splats.source.cpu().numpy(), repair.ids, options, reporter)
-        train_borders(trained, trainer, reporter)
+        if isinstance(opened.source, Splats):
+            reporter.begin(EXPORT, f"Writing {opened.folder.splats.name}")
+            write_labeled(opened.folder, opened.source, repair.ids, capture.names, reporter)
+        else:
+            source = pointer.splats.source.cpu().numpy()
+            trainer = begin_border_training(opened.source, source, repair.ids, options, reporter)
+            train_borders(opened.source, trainer, reporter)
     _tell(changed, moved, reporter)
     reporter.done(
         masks=str(capture.folder / "masks"),
         views=len(repair.masks),
         changed=round(float(np.mean(list(changed.values()))), 4),
         moved=moved,
-        splats=str(trained.folder.splats),
-        steps=trainer.progress.step,
+        splats=str(opened.folder.splats),
+        **({} if trained is None else {"steps": trainer.progress.step}),
     )
 
 
@@ -99,9 +113,12 @@ def _changed(capture: Capture, given: dict[int, np.ndarray], repair: Repair) -> 
     }
 
 
-def _moved(trained: Trained, capture: Capture, pointer: Pointer, repair: Repair) -> list[dict[str, float | str]]:
+def _moved(opened: Pointable, capture: Capture, repair: Repair) -> list[dict[str, float | str]]:
     """Return for each object the fraction of its splats that other objects get, the largest first."""
-    before = trained.model.classes.ids_of(pointer.splats.ids.cpu().numpy()).astype(np.int64)
+    if isinstance(opened.source, Trained):
+        before = opened.source.model.classes.ids_of(opened.splats.ids.cpu().numpy()).astype(np.int64)
+    else:
+        before = opened.source.object_ids if isinstance(opened.source, Splats) else opened.source.ids
     total, gone = Counter(before.tolist()), Counter(before[before != repair.ids].tolist())
     names = capture.names
     found: list[dict[str, float | str]] = [

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from ...capture import Capture, load_capture
-from ...export import write_splats
 from ...model.splats import Splats
 from ...planning.decisions import Choices, decide, planned_capture
 from ...pointing.pointer import Pointer
@@ -30,7 +29,7 @@ from ...training.settings import Settings
 from ...training.trainer import Trainer
 from ..exported import EXPORT, export_model
 from ..folder import READ, Trained, memory_for_files, memory_for_planes, plan_of
-from ..imported import write_objects_of
+from ..imported import write_labeled
 from ..mask_files import new_masks, write_mask
 from ..planning import build_context, find_requested_objects
 from ..setup.kernels import PART as KERNELS
@@ -95,11 +94,9 @@ def _label_plain(opened: Pointable, splats: Splats, options: argparse.Namespace,
     with locked(opened.folder.folder):
         reporter.begin(GRAPH, "Comparing the splats with their neighbors")
         with stage(opened.folder, "label"):
-            splats.object_ids = opened.pointer(reporter.progress, segment).solve(strokes)
+            ids = opened.pointer(reporter.progress, segment).solve(strokes)
         reporter.begin(EXPORT, f"Writing {opened.folder.splats.name}")
-        for sentence in write_splats(opened.folder.splats, splats):
-            reporter.warning(sentence)
-        write_objects_of(opened.folder, splats, strokes.names)
+        write_labeled(opened.folder, splats, ids, strokes.names, reporter)
     reporter.done(objects=_number_of(strokes), splats=str(opened.folder.splats))
 
 

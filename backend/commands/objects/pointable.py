@@ -51,6 +51,7 @@ class Pointable(NamedTuple):
         in_file: (N,) bool, which of them are in the file that is shown; those that cannot be drawn are not.
         primitive: "3d" or "2d".
         views: views of them.
+        capture: the capture, without masks that the training does not use; None if it is not known.
     """
 
     folder: Reconstruction
@@ -59,6 +60,7 @@ class Pointable(NamedTuple):
     in_file: np.ndarray
     primitive: str
     views: Views
+    capture: Capture | None
 
     @property
     def device(self) -> torch.device:
@@ -98,7 +100,7 @@ def pointable_of(trained: Trained) -> Pointable:
     splats = model.generate()
     in_file = np.isin(devices.host(splats.source), model.splats()[1])
     views = views_of_photos(trained.capture, scene.camera, scene.normalization)
-    return Pointable(trained.folder, trained, splats, in_file, model.primitive, views)
+    return Pointable(trained.folder, trained, splats, in_file, model.primitive, views, trained.capture)
 
 
 def segmentation(options: argparse.Namespace, device: torch.device) -> KeptEncodings | None:
@@ -121,7 +123,7 @@ def _of_splats(folder: Reconstruction, options: argparse.Namespace, reporter: Re
     else:
         views = _views_of(capture, normalization)
     generated = _in_scene_units(splats, normalization, devices.pick(options.device))
-    return Pointable(folder, splats, generated, np.ones(len(splats), bool), "3d", views)
+    return Pointable(folder, splats, generated, np.ones(len(splats), bool), "3d", views, capture)
 
 
 def _of_points(folder: Reconstruction, options: argparse.Namespace, reporter: Reporter) -> Pointable:
@@ -144,7 +146,8 @@ def _of_points(folder: Reconstruction, options: argparse.Namespace, reporter: Re
     )
     normalization = Normalization.of(points.xyz, points.xyz)
     generated = _in_scene_units(balls, normalization, devices.pick(options.device))
-    return Pointable(folder, points, generated, np.ones(len(radii), bool), "3d", _views_of(capture, normalization))
+    views = _views_of(capture, normalization)
+    return Pointable(folder, points, generated, np.ones(len(radii), bool), "3d", views, capture)
 
 
 def _capture_of(folder: Reconstruction, options: argparse.Namespace, reporter: Reporter) -> Capture | None:

@@ -87,7 +87,7 @@ class ObjectsPanel(WithReconstruction, bpy.types.Panel):
             draw_without_objects(layout, root)
         if has_masks(state):
             layout.operator("objectgs.assign_objects", icon="GROUP_VERTEX")
-            if state.steps:
+            if state.trained:
                 layout.operator("objectgs.clean_up_labels", icon="BRUSH_DATA")
         if state.capture is not None:
             layout.operator("objectgs.import_masks", icon="IMAGE_ALPHA")
