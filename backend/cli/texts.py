@@ -117,12 +117,13 @@ config.json and weights. Nothing is downloaded.
 """
 
 CLEAN_LABELS = """\
-Correct the objects of a training by the masks of all photos together. Where photos give
-the same points different IDs, regions that show the same points get one ID. Regions that
-the other photos contradict get the IDs that the splats show, and so do photos without
-masks; the rest is kept. Then the splats get their objects anew, and their
+Correct the objects of splats by the masks of all photos together. Where photos give the
+same points different IDs, regions that show the same points get one ID. Regions that the
+other photos contradict get the IDs that the splats show, and so do photos without masks;
+the rest is kept. Then the splats get their objects anew, and after a training, their
 borders are trained for a short time. masks/ is replaced, repair.json in it says what was
-changed, and the given masks are kept in masks-given/.
+changed, and the given masks are kept in masks-given/. Masks may also be made after the
+training, such as by `masks`.
 """
 
 POINT = """\
