@@ -17,8 +17,6 @@ from ..shared.formats.json_file import parse_json
 
 PACKAGE = "transformers>=5,<6"
 CONFIG = "config.json"
-MODEL_FILES = (CONFIG, "model.safetensors")
-"""Files that stand for the folder of a checkpoint when one of them is chosen."""
 _WEIGHTS = ("*.safetensors", "*.bin")
 """Files with weights, of one of these kinds; of both, those of the first are used."""
 

@@ -2,7 +2,7 @@
 
 from . import finders
 from .kept_encodings import KeptEncodings
-from .photo_segments import Finder, PhotoSegments, is_checkpoint
+from .photo_segments import Finder, PhotoSegments, chosen_checkpoint, is_checkpoint
 from .sam3 import is_sam3
 from .segmenter import Encoded, Segmenter, fingerprint
 
@@ -12,6 +12,7 @@ __all__ = [
     "KeptEncodings",
     "PhotoSegments",
     "Segmenter",
+    "chosen_checkpoint",
     "finders",
     "fingerprint",
     "is_checkpoint",

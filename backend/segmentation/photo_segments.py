@@ -50,6 +50,12 @@ class Finder(NamedTuple):
     find: Callable[[np.ndarray, Callable[[int, int], object]], Iterable[tuple[np.ndarray, str]]]
 
 
+def chosen_checkpoint(path: Path) -> Path:
+    """Return the folder of a checkpoint if its config.json or weights were chosen in place of it, or else the path."""
+    is_part = path.is_file() and (path.name == CONFIG or path.suffix == ".safetensors")
+    return path.parent if is_part and is_checkpoint(path.parent) else path
+
+
 class PhotoSegments:
     """The segments of photos, found by models and kept in files; a `MaskSource`.
 

@@ -91,7 +91,7 @@ def test_masks_made_after_the_training_give_splats_their_objects(write_capture, 
     out, later = tmp_path / "out", tmp_path / "later"
     (scene.folder / "masks").rename(later)
     (scene.folder / "labels.json").unlink()
-    assert run_command("train", scene.folder, "--out", out, "--steps", STEPS, "--offsets", 4).code == EXIT_DONE
+    assert run_command("train", scene.folder, "--out", out, "--steps", 2 * STEPS, "--offsets", 4).code == EXIT_DONE
     assert_rejected(run_command("clean-labels", out), "has no masks")
     later.rename(scene.folder / "masks")
     assert run_command("clean-labels", out).code == EXIT_DONE
@@ -103,7 +103,7 @@ def test_splats_of_another_program_get_objects_by_later_masks(write_capture, tmp
     scene = write_capture(views=18, size=(96, 72))
     out, imported, later = tmp_path / "out", tmp_path / "imported", tmp_path / "later"
     (scene.folder / "masks").rename(later)
-    assert run_command("train", scene.folder, "--out", out, "--steps", STEPS, "--offsets", 4).code == EXIT_DONE
+    assert run_command("train", scene.folder, "--out", out, "--steps", 2 * STEPS, "--offsets", 4).code == EXIT_DONE
     before = read_splats(out / "splats.ply")[0]
     options = ("--out", imported, "--capture", scene.folder)
     assert run_command("import-splats", out / "splats.ply", *options).code == EXIT_DONE

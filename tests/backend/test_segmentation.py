@@ -231,7 +231,7 @@ def test_missing_packages_are_named_with_their_command(tmp_path, monkeypatch):
     transformers = pytest.importorskip("transformers")
     if not transformers.utils.is_timm_available():
         folder = write_checkpoint(tmp_path / "edgetam", model_type="edgetam")
-        refused(folder, "needs the package timm; run .* -m pip install timm before it")
+        refused(folder, "needs the package timm; run .* -m pip install .timm. in a terminal")
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(InputError, match="--segmenter needs the package transformers; run ") as error:
         Segmenter(write_checkpoint(tmp_path / "sam2"))

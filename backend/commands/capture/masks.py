@@ -21,9 +21,8 @@ from ...capture.models import Photos, read_capture_model, with_observations
 from ...evaluation import contact_sheet
 from ...evaluation.images import id_image, thumbnail
 from ...labels.association import Association, Seen, associate, consistency, object_mask
-from ...networks.checkpoint_folder import MODEL_FILES
 from ...raster import devices
-from ...segmentation import Finder, PhotoSegments, finders, is_checkpoint, is_sam3
+from ...segmentation import Finder, PhotoSegments, chosen_checkpoint, finders, is_checkpoint, is_sam3
 from ...shared.class_table import LARGEST_ID
 from ...shared.errors import InputError
 from ...shared.formats.json_file import write_json
@@ -60,8 +59,7 @@ class _Found(NamedTuple):
 
 def masks(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Read or find the segments of the photos, find the objects where IDs differ between photos, and write masks/."""
-    if options.masks.is_file() and options.masks.name in MODEL_FILES and is_checkpoint(options.masks.parent):
-        options.masks = options.masks.parent
+    options.masks = chosen_checkpoint(options.masks)
     capture, given = options.capture, options.masks
     segments_by_model = is_checkpoint(given)
     reporter.expect({

@@ -36,7 +36,7 @@ GRAPH = "graph"
 
 _FEWEST_POINTS = 20
 """Number of points from which on objects are looked for among them."""
-_BALL, _LARGEST, _OPACITY = 0.5, 3.0, 0.9
+_BALL, _LARGEST, _OPACITY = 0.7, 3.0, 0.9
 """Deviation of the ball of a point relative to the mean distance of the three nearest others, and at most relative to
 the median of these distances; and its opacity."""
 
