@@ -39,7 +39,8 @@ class _Regions(NamedTuple):
 def renumber_masks(capture: Capture, masks: Mapping[int, np.ndarray], consistent: float) -> Renumbered:
     """Give the regions of masks the IDs of the objects that points show there.
 
-    A region that shows several objects is divided, and one without points keeps its ID.
+    A region that shows several objects is divided, and one without points keeps its ID. Points that most photos show
+    without an ID belong to no object.
 
     Args:
         capture: the capture.
@@ -53,10 +54,13 @@ def renumber_masks(capture: Capture, masks: Mapping[int, np.ndarray], consistent
         return Renumbered(dict(masks), agreement)
     found = associate(list(seen.values()), len(capture.points.xyz))
     ids = _ids_of(found, list(seen.values()), list(regions.values()))
+    # As one more object, whose ID is 0.
+    points = np.where(_without_id(list(seen.values()), len(found.points)), len(ids), found.points)
+    ids = np.append(ids, 0)
     anew = {}
     for index, objects in zip(masks, found.objects, strict=True):
         numbers, own = regions[index]
-        shown = object_mask(numbers, seen[index], objects, found.points)
+        shown = object_mask(numbers, seen[index], _shown_most(seen[index], objects, points), points)
         anew[index] = np.where(shown > 0, ids[shown], own[numbers])
     return Renumbered(anew, agreement)
 
@@ -71,6 +75,30 @@ def _seen(capture: Capture, index: int, regions: _Regions) -> Seen:
     points, x, y = find_visible_points(capture, np.ascontiguousarray(capture.points.xyz.T, np.float64), index, observed)
     is_certain = np.isin(points, observed)
     return Seen(points, np.stack([x, y], 1), regions.numbers[y, x], is_certain, len(regions.ids) - 1)
+
+
+def _without_id(seen: list[Seen], count: int) -> np.ndarray:
+    """Return which points (M,) most photos show without an ID."""
+    votes = np.zeros(count)
+    for photo in seen:
+        votes[photo.points] += np.where(photo.segments == 0, 1, -1)
+    return votes > 0
+
+
+def _shown_most(photo: Seen, objects: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the object of each region (count + 1,) that most of its points belong to; as before without such points.
+
+    Args:
+        photo: the points that the photo shows.
+        objects: (count + 1,) the objects of its regions.
+        points: (M,) the object of each point, 0 if it is not known.
+    """
+    known = points[photo.points] > 0
+    found = np.zeros((len(objects), int(points.max(initial=0)) + 1), np.int64)
+    np.add.at(found, (photo.segments[known], points[photo.points[known]]), 1)
+    most = np.where(found.any(1), found.argmax(1), objects)
+    most[0] = 0
+    return most
 
 
 def _ids_of(found: Association, seen: list[Seen], regions: list[_Regions]) -> np.ndarray:
