@@ -31,7 +31,7 @@ from .label import begin_border_training, border_seconds, train_borders
 from .pointable import GRAPH, Pointable, open_pointable
 
 _VOTE, _MASKS, _TRAIN = "vote", "masks", "train"
-_CONSISTENT = 0.9
+_CONSISTENT = 0.8
 """Agreement of the IDs of points between photos from which on the masks' IDs are taken as they are."""
 
 _WORST = 5
