@@ -2,9 +2,9 @@
 
     python benchmarks/mask_noise.py [--capture build/demo/capture] [--steps 200] [--restart] [--json]
 
---capture is the demo capture, with exact masks in truth/masks. They get errors of several kinds, from none to half of
-the labels, and the demo is trained with each for --steps. Masks and rendered IDs are compared on the training views,
-and rendered IDs also on the held-out views; and both again after `clean-labels`. Writes docs/figures/mask-noise.json,
+--capture is the demo capture, with exact masks in truth/masks. They get errors of four kinds, from none to about half
+of the labels, and the demo is trained with each for --steps. Masks and rendered IDs are compared on the training views,
+and rendered IDs also on the held-out views. Writes docs/figures/mask-noise.json,
 docs/mask-noise.md and its plot; results are kept in build/mask-noise.
 """
 
@@ -187,38 +187,36 @@ def measured(capture: str, kind: str, level: float, steps: int) -> dict[str, Any
     """Train with erroneous masks; must run in a separate process.
 
     Returns the scores of the masks and of the rendered IDs on the training views, and of the rendered IDs on the
-    held-out views; and under "cleaned" the same after `clean-labels`.
+    held-out views.
     """
+    from backend.capture import load_capture
+    from backend.labels import correct_masks, vote
+    from backend.model.draw import draw
+    from backend.raster import compile_kernels
+    from backend.shared.events import Reporter
+    from backend.training.budget import Budget
+    from backend.training.settings import Settings, background_is_masked
+    from backend.training.trainer import Trainer
+
+    compile_kernels()
     source = Path(capture)
     with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as scratch:
-        folder, out = Path(scratch) / "capture", Path(scratch) / "out"
+        folder = Path(scratch) / "capture"
         disturbed_capture(source, kind, level, folder)
-        shared.run_backend("train", folder, "--out", out, "--steps", steps)
-        found: dict[str, Any] = compared(source, kind, folder, out)
-        shared.run_backend("clean-labels", out)
-        return {**found, "cleaned": compared(source, kind, folder, out)}
-
-
-def compared(source: Path, kind: str, folder: Path, out: Path) -> dict[str, Any]:
-    """Compare the masks of a capture, and the IDs rendered by a training of it, with the exact masks."""
-    from backend.capture import load_capture
-    from backend.model.draw import draw
-    from backend.shared.reconstruction.folder import Reconstruction
-    from backend.training.scene import Scene
-    from backend.training.state import load_model
-
-    capture = load_capture(folder, Reconstruction(out).cache)
-    model, _, _ = load_model(Reconstruction(out).checkpoint)
-    scene = Scene(capture, model.classes, model.normalization)
-    given, rendered, held_out = Tally(), Tally(), Tally()
-    for index, view in enumerate(capture.views):
-        true = exact_mask(source, view.name, kind).astype(np.int64)
-        found = draw(model, scene.camera(index)).ids
-        if index in capture.test_indices:
-            held_out.add(found, true)
-        else:
-            given.add(capture.mask(index), true)
-            rendered.add(found, true)
+        loaded = load_capture(folder, Path(scratch) / "cache")
+        ids = vote(loaded).ids
+        corrected, _ = correct_masks(loaded, ids, ignore_gaps=background_is_masked(ids == 0))
+        trainer = Trainer.start(corrected, ids, Settings())
+        trainer.run(Budget(steps=steps), Path(scratch) / "checkpoint", Reporter())
+        given, rendered, held_out = Tally(), Tally(), Tally()
+        for index, view in enumerate(loaded.views):
+            true = exact_mask(source, view.name, kind).astype(np.int64)
+            found = draw(trainer.shown, trainer.scene.camera(index)).ids
+            if index in loaded.test_indices:
+                held_out.add(found, true)
+            else:
+                given.add(loaded.mask(index), true)
+                rendered.add(found, true)
     return {"masks": given.result(), "rendered": rendered.result(), "held_out": held_out.result()}
 
 
@@ -241,12 +239,8 @@ def plot(found: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Any:
                 ("masks", "masks given", shared.GRAY, "o--"),
                 ("rendered", "rendered, same views", shared.MARKED, "o-"),
                 ("held_out", "rendered, held-out views", shared.COLORS[0], "o-"),
-                ("cleaned", "the same, cleaned", shared.COLORS[1], "s--"),
             ):
-                y = [
-                    factor * (entry["cleaned"]["held_out"] if who == "cleaned" else entry[who])[name]
-                    for entry in levels.values()
-                ]
+                y = [factor * entry[who][name] for entry in levels.values()]
                 ax.plot(x, y, style, color=color, label=label, markersize=4, linewidth=1.8)
             ax.set_ylim(bottom=0 if row else None)
             if not row:
@@ -269,21 +263,18 @@ def document(figures: Mapping[str, Any]) -> str:
     closer = [e for e in entries if e[2]["rendered"]["miou_all"] > e[2]["masks"]["miou_all"]]
     with_holes = [e for e in entries if e[2]["masks"]["holes"] > 0]
     fewer = [e for e in with_holes if e[2]["rendered"]["holes"] < e[2]["masks"]["holes"]]
-    repaired = [e for e in entries if e[2]["cleaned"]["masks"]["miou_all"] > e[2]["masks"]["miou_all"]]
     lines = [
         "# Errors in masks",
         "",
         "Made by `python benchmarks/mask_noise.py`; all figures here are its output. The demo's exact masks get",
         f"errors before each training of {figures['steps']} steps; then masks and rendered IDs are compared with the",
         f"exact masks on the {views['training']} training views, and rendered IDs also on the {views['held_out']}"
-        " held-out views. *Cleaned* is after `clean-labels`, which corrects masks and splats by all masks together.",
+        " held-out views.",
         "",
         f"- The rendered IDs are closer to the truth than the masks (mIoU) in {len(closer)} of {len(entries)} cases"
         f"{_named(entries, closer)}.",
         f"- The paper states that its results have fewer holes than the masks. This holds in {len(fewer)} of"
         f" {len(with_holes)} cases whose masks have holes{_named(with_holes, fewer)}.",
-        f"- `clean-labels` brings the masks closer to the truth in {len(repaired)} of {len(entries)} cases"
-        f"{_named(entries, repaired)}.",
         *_ranking(found),
         "",
         "![mIoU and holes of masks and rendered IDs over the level of errors](mask-noise.png)",
@@ -293,10 +284,7 @@ def document(figures: Mapping[str, Any]) -> str:
         " that of the exact masks. mIoU is over all pixels.",
         "",
     ]
-    head = (
-        "level", "masks: mIoU", "wrong", "holes", "rendered: mIoU", "wrong", "holes", "held out: mIoU", "wrong",
-        "cleaned masks: mIoU", "wrong", "held out: mIoU", "wrong",
-    )  # fmt: skip
+    head = ("level", "masks: mIoU", "wrong", "holes", "rendered: mIoU", "wrong", "holes", "held out: mIoU", "wrong")
     for kind, levels in found.items():
         rows = []
         for level, entry in levels.items():
@@ -304,9 +292,6 @@ def document(figures: Mapping[str, Any]) -> str:
             for who in ("masks", "rendered", "held_out"):
                 of = entry[who]
                 cells += [f"{of['miou_all']:.4f}", f"{of['error']:.1%}"] + [f"{of['holes']:.1f}"] * (who != "held_out")
-            for who in ("masks", "held_out"):
-                of = entry["cleaned"][who]
-                cells += [f"{of['miou_all']:.4f}", f"{of['error']:.1%}"]
             rows.append(cells)
         text = KINDS[kind][1]
         lines += [f"## {kind[0].upper()}{kind[1:]}", "", f"{text[0].upper()}{text[1:]}.", "", *shared.table(head, rows)]
@@ -363,8 +348,8 @@ def main() -> None:
                 shared.in_child, "benchmarks.mask_noise:measured",
                 capture=str(capture), kind=kind, level=level, steps=options.steps,
             ),
-            lambda row: "mIoU of masks {:.4f}, held-out views {:.4f}; cleaned {:.4f}, {:.4f}".format(
-                *(of[who]["miou_all"] for of in (row, row["cleaned"]) for who in ("masks", "held_out"))
+            lambda row: "mIoU of masks {:.4f}, rendered {:.4f}; holes {:.1f}, rendered {:.1f}".format(
+                *(row[who][name] for name in ("miou_all", "holes") for who in ("masks", "rendered"))
             ),
         )  # fmt: skip
 
