@@ -91,16 +91,15 @@ def test_result_is_told_and_points_get_their_objects(root, tmp_path, monkeypatch
         "The masks show 3 objects in 42 photos; /table/masks has a picture. No photo shows book; Names may have other "
         "words."
     ]
-    # With a window, `finish` does this, too.
+    # With a window, `finish` does this, too: at once on splats, and before a training on points.
+    state = folder_state(tmp_path / "table")
     background._assign_objects(job, bpy.context.scene)
-    assert asked == ["vote"]
-    # Later masks replace the objects, and splats of a training get them at once.
+    monkeypatch.setattr(background.folder_trust, "state_of", lambda _root: replace(state, trained=False))
+    background._assign_objects(job, bpy.context.scene)
+    assert state.trained and asked == ["label", "vote"]
     root.objectgs.objects.add().object_id = 1
     background._assign_objects(job, bpy.context.scene)
-    state = replace(folder_state(tmp_path / "table"), steps=100)
-    monkeypatch.setattr(background.folder_trust, "state_of", lambda _root: state)
-    background._assign_objects(job, bpy.context.scene)
-    assert asked == ["vote", "vote", "label"]
+    assert asked == ["label", "vote", "vote"], "later masks replace the objects"
     imported = Job("Import", "import", Path(tmp_path / "table"), ["python"], tmp_path)
     background._assign_objects(imported, bpy.context.scene)
     assert len(asked) == 3, "an import keeps the objects"
