@@ -711,7 +711,7 @@ def test_stopping_other_commands_leaves_no_partial_files(write_capture, trained,
 
     capture, out = trained
     with monkeypatch.context() as patch:
-        signal_at(patch, voting, "_project", 3)
+        signal_at(patch, voting, "find_visible_points", 3)
         assert run_command("vote", capture, "--out", tmp_path / "voted").code == EXIT_CANCELLED
     assert not (tmp_path / "voted/points.ply").exists() and not (tmp_path / "voted/objects.json").exists()
     for words in (("render", out, "--views", "all", "--ids"), ("evaluate", out), ("report", out)):
