@@ -11,11 +11,11 @@ import numpy as np
 
 from ...capture import Capture, load_capture
 from ...labels.renumbering import renumber_masks
+from ...model.generate import Generated
 from ...model.splats import Splats
 from ...pointing.mask_repair import Repair, repair_masks
 from ...shared.errors import InputError
 from ...shared.formats.json_file import write_json
-from ...shared.formats.points_ply import LabeledPoints
 from ...shared.reconstruction.folder import STROKES
 from ...shared.reconstruction.lock import locked
 from ...shared.reconstruction.objects import default_name
@@ -28,7 +28,7 @@ from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import stage
 from .label import begin_border_training, border_seconds, train_borders
-from .pointable import GRAPH, Pointable, open_pointable
+from .pointable import GRAPH, open_pointable, require_splats
 
 _VOTE, _MASKS, _TRAIN = "vote", "masks", "train"
 _CONSISTENT = 0.8
@@ -49,9 +49,8 @@ def clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> Non
         }
     )  # fmt: skip
     opened = open_pointable(options, reporter)
-    if isinstance(opened.source, LabeledPoints):
-        raise InputError(f"{opened.folder.folder} has no splats yet; train first, and run this again.")
-    trained = None if isinstance(opened.source, Splats) else opened.source
+    source = require_splats(opened)
+    trained = None if isinstance(source, Splats) else source
     capture = opened.capture if trained is None else _with_masks(trained, options, reporter)
     if capture is None:
         raise InputError(f"{opened.folder.folder} has no capture with masks; import the splats again with --capture.")
@@ -75,15 +74,15 @@ def clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> Non
                 reporter.status(f"Masks agree on the ID of {anew.agreement:.0%} of what they show; IDs are found anew")
             repair = repair_masks(pointer, anew.masks, zero_is_known, reporter.progress)
             reporter.begin(_MASKS, f"Writing masks of {len(capture)} photos")
-            changed, moved = _changed(capture, given, repair), _moved(opened, capture, repair)
+            changed, moved = _changed(capture, given, repair), _moved(source, opened.splats, capture, repair)
             _write(capture, repair.masks, {"changed": changed, "moved": moved}, reporter)
-        if isinstance(opened.source, Splats):
+        if isinstance(source, Splats):
             reporter.begin(EXPORT, f"Writing {opened.folder.splats.name}")
-            write_labeled(opened.folder, opened.source, repair.ids, capture.names, reporter)
+            write_labeled(opened.folder, source, repair.ids, capture.names, reporter)
         else:
-            source = pointer.splats.source.cpu().numpy()
-            trainer = begin_border_training(opened.source, source, repair.ids, options, reporter)
-            train_borders(opened.source, trainer, reporter)
+            offsets = opened.splats.source.cpu().numpy()
+            trainer = begin_border_training(source, offsets, repair.ids, options, reporter)
+            train_borders(source, trainer, reporter)
     _tell(changed, moved, reporter)
     reporter.done(
         masks=str(capture.folder / "masks"),
@@ -113,12 +112,14 @@ def _changed(capture: Capture, given: dict[int, np.ndarray], repair: Repair) -> 
     }
 
 
-def _moved(opened: Pointable, capture: Capture, repair: Repair) -> list[dict[str, float | str]]:
+def _moved(
+    source: Trained | Splats, splats: Generated, capture: Capture, repair: Repair
+) -> list[dict[str, float | str]]:
     """Return for each object the fraction of its splats that other objects get, the largest first."""
-    if isinstance(opened.source, Trained):
-        before = opened.source.model.classes.ids_of(opened.splats.ids.cpu().numpy()).astype(np.int64)
+    if isinstance(source, Splats):
+        before = source.object_ids
     else:
-        before = opened.source.object_ids if isinstance(opened.source, Splats) else opened.source.ids
+        before = source.model.classes.ids_of(splats.ids.cpu().numpy()).astype(np.int64)
     total, gone = Counter(before.tolist()), Counter(before[before != repair.ids].tolist())
     names = capture.names
     found: list[dict[str, float | str]] = [

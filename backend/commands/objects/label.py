@@ -16,7 +16,7 @@ from ...pointing.strokes import Strokes, read_strokes
 from ...shared.errors import Cancelled, InputError
 from ...shared.events import Reporter
 from ...shared.formats.json_file import write_json
-from ...shared.formats.points_ply import LabeledPoints, read_points
+from ...shared.formats.points_ply import read_points
 from ...shared.reconstruction.checkpoint import PREVIOUS
 from ...shared.reconstruction.folder import STROKES
 from ...shared.reconstruction.lock import locked
@@ -36,7 +36,7 @@ from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import finish_stage, stage
 from ..votes import cast_votes, votes_key
-from .pointable import GRAPH, Pointable, open_pointable, segmentation
+from .pointable import GRAPH, Pointable, open_pointable, require_splats, segmentation
 
 _MASKS, _TRAIN = "masks", "train"
 _UNTRAINED = {GRAPH: ("Preparing", 5.0), EXPORT: ("Saving", 5.0)}
@@ -52,12 +52,11 @@ def label(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         }
     )  # fmt: skip
     opened = open_pointable(options, reporter)
-    if isinstance(opened.source, LabeledPoints):
-        raise InputError(f"{opened.folder.folder} has no splats yet; train first, and run this again.")
-    if isinstance(opened.source, Splats):
-        _label_plain(opened, opened.source, options, reporter)
+    source = require_splats(opened)
+    if isinstance(source, Splats):
+        _label_plain(opened, source, options, reporter)
     else:
-        _label_trained(opened, opened.source, options, reporter)
+        _label_trained(opened, source, options, reporter)
 
 
 def _label_trained(

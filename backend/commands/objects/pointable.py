@@ -84,13 +84,20 @@ def open_pointable(options: argparse.Namespace, reporter: Reporter) -> Pointable
     """
     folder = Reconstruction(options.folder)
     if folder.checkpoint.exists() or not (folder.splats.exists() or folder.points.exists()):
-        return pointable_of(open_trained(options, reporter))
+        return _of_training(open_trained(options, reporter))
     if folder.splats.exists():
         return _of_splats(folder, options, reporter)
     return _of_points(folder, options, reporter)
 
 
-def pointable_of(trained: Trained) -> Pointable:
+def require_splats(opened: Pointable) -> Trained | Splats:
+    """Return what opened splats are; raises InputError if there are only points."""
+    if isinstance(opened.source, LabeledPoints):
+        raise InputError(f"{opened.folder.folder} has no splats yet; train first, and run this again.")
+    return opened.source
+
+
+def _of_training(trained: Trained) -> Pointable:
     """Return the splats of a trained model; raises InputError if they depend on the view."""
     model, scene = trained.model, trained.scene
     if not model.explicit:
@@ -127,7 +134,7 @@ def _of_splats(folder: Reconstruction, options: argparse.Namespace, reporter: Re
 
 
 def _of_points(folder: Reconstruction, options: argparse.Namespace, reporter: Reporter) -> Pointable:
-    """Open the points of a capture, each as a ball that reaches about half way to the nearest others."""
+    """Open the points of a capture, each as a ball that overlaps with the nearest others."""
     reporter.begin(READ, "Reading the points")
     points = read_points(folder.points)
     capture = _capture_of(folder, options, reporter)
