@@ -121,7 +121,10 @@ def _photo_of(
     camera = whole.crop(x, y, width, height)
     depth, _, _ = draw_mesh(vertices, faces, camera)
     image, labels = views.scene.target(index)
-    allowed = _allowed(views, index, None if labels is None else devices.host(labels), classes, box)
+    # Contiguous, as the kernel would be compiled once more for other arrays.
+    allowed = np.ascontiguousarray(
+        _allowed(views, index, None if labels is None else devices.host(labels), classes, box)
+    )
     clearance = np.empty((height, width), np.float32)
     focal = (camera.K[0, 0] + camera.K[1, 1]) / 2
     _measure_clearance(depth, allowed, _STEP / focal, clearance)
