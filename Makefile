@@ -34,6 +34,8 @@ WORKERS = -n 2 --dist worksteal
 WINDOW ?=
 # How long `make fuzz` tries random cases.
 MINUTES ?= 10
+# The longest time of the tests, and of the measurements, on a GPU.
+GPU_SECONDS ?= 240
 # The capture that benchmarks/gpu.py trains on, where there is one.
 CAPTURE ?= $(wildcard build/demo/capture)
 
@@ -136,8 +138,10 @@ gpu:
 
 gpu-with:
 	$(GPU_PYTHON) -c "import sys; from backend.raster import devices; sys.exit(devices.why_not_cuda())"
-	$(GPU_PYTHON) -m pytest tests/gpu
-	$(GPU_PYTHON) benchmarks/gpu.py $(if $(CAPTURE),--demo "$(CAPTURE)")
+	@# A failing test does not end the measurements, of which build/gpu.json keeps those that are done.
+	@timeout $(GPU_SECONDS) $(GPU_PYTHON) -m pytest tests/gpu; tests=$$?; \
+	timeout $(GPU_SECONDS) $(GPU_PYTHON) benchmarks/gpu.py --out build/gpu.json $(if $(CAPTURE),--demo "$(CAPTURE)") \
+	&& exit $$tests
 
 clean:
 	rm -rf .venv .venv-bpy .venv-bpy-4.2 .venv-bpy-5.2 build

@@ -8,23 +8,25 @@ The GPU's limits are measured in the same run: a copy within GPU memory, and a f
 cores. A blending kernel's share of arithmetic counts the operations for every pixel of a tile and every splat that the
 tile processes (FORWARD_FLOPS, BACKWARD_FLOPS); its share of memory counts the data that must be read and written once.
 
-    python benchmarks/gpu.py [--json] [--repeats 10] [--demo build/demo/capture]
+    python benchmarks/gpu.py [--json] [--repeats 10] [--demo build/demo/capture] [--out FILE]
 
---demo names a capture to train on; the default is the demo capture, if `make demo` has created it. If gsplat is
-installed, it renders the same splats in the same run. If there is no GPU, or packages for training are missing, the
-benchmark reports this and exits normally.
+--demo names a capture to train on; the default is the demo capture, if `make demo` has created it. A step of its
+training is profiled, too. If gsplat is installed, it renders the same splats in the same run. If there is no GPU, or
+packages for training are missing, the benchmark reports this and exits normally.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib.util
 import json
 import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -189,7 +191,7 @@ def kernels_alone(scene: Scene, repeats: int) -> dict[str, float]:
 def gsplat_step(scene: Scene) -> tuple[Callable[[], object], Callable[[], object]] | None:
     """Return gsplat's forward pass, and its forward and backward pass, on the scene's splats (color and alpha only).
 
-    None if gsplat is not installed.
+    None if gsplat is not installed, or if its wheel has no kernels for this GPU and they cannot be compiled here.
     """
     try:
         from gsplat import rasterization
@@ -212,6 +214,11 @@ def gsplat_step(scene: Scene) -> tuple[Callable[[], object], Callable[[], object
         for leaf in leaves:
             leaf.grad = None
 
+    try:
+        step()
+    except Exception as error:  # Whatever fails in it must not end the other measurements.
+        print(f"gsplat is left out, as it failed: {str(error).splitlines()[0]}", file=sys.stderr)
+        return None
     return forward, step
 
 
@@ -239,24 +246,52 @@ def lacking_for_training() -> list[str]:
     return [name for name in packages if importlib.util.find_spec(name) is None]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", action="store_true", help="print one JSON object as the last line, and no table")
-    parser.add_argument("--repeats", type=int, default=10, help="how often each measurement is repeated")
-    parser.add_argument("--demo", type=Path, help="capture to train on")
-    options = parser.parse_args()
-    say = (lambda *_: None) if options.json else print
-    why_not = why_not_cuda()
-    if why_not:
-        print(json.dumps({"gpu": None, "why": why_not}) if options.json else f"Nothing was measured. {why_not}")
-        return
-    gpu = torch.cuda.get_device_name()
-    can = limits(options.repeats)
-    say(f"{gpu}: {can['gb_per_s']:.0f} GB/s, {can['tflops']:.1f} TFLOP/s in float32.")
+def training_profile(folder: Path, device: torch.device, warm_up: int = 300, steps: int = 30) -> dict[str, float]:
+    """Train on a capture and return, for one step: ms of the host, ms until the GPU is done, the part of the time in
+    which the GPU computes, and the number of kernels and copies that it runs."""
+    from torch.profiler import ProfilerActivity, profile
 
+    from backend.capture import load_capture
+    from backend.labels import vote
+    from backend.shared.events import Reporter
+    from backend.training.budget import Budget
+    from backend.training.settings import Settings
+    from backend.training.trainer import Trainer
+
+    on_gpu = device.type == "cuda"
+    wait = torch.cuda.synchronize if on_gpu else lambda: None
+    with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as place:
+        quiet = Reporter()
+        capture = load_capture(folder, Path(place) / "cache", reporter=quiet)
+        trainer = Trainer.start(capture, vote(capture, reporter=quiet).ids, Settings(), device=device)
+        trainer.run(Budget(steps=warm_up), Path(place) / "checkpoint", quiet)
+        wait()
+        begin = time.perf_counter()
+        for _ in range(steps):
+            trainer.step(0.6)
+        queued = time.perf_counter()
+        wait()
+        end = time.perf_counter()
+        with profile(activities=[ProfilerActivity.CUDA if on_gpu else ProfilerActivity.CPU]) as profiler:
+            for _ in range(steps):
+                trainer.step(0.6)
+            wait()
+    events = profiler.key_averages()
+    busy = sum(event.self_device_time_total for event in events) / 1e3 / steps
+    step_ms = 1e3 * (end - begin) / steps
+    return {
+        "host_ms": 1e3 * (queued - begin) / steps,
+        "step_ms": step_ms,
+        "gpu_busy": busy / step_ms,
+        "launches": sum(event.count for event in events if event.self_device_time_total > 0) / steps,
+        "anchors": len(trainer.model.anchors),
+    }
+
+
+def measure_sizes(repeats: int, can: Mapping[str, float], say: Callable[..., None]) -> Iterator[dict[str, Any]]:
+    """Yield the times of forward and backward passes for each of SIZES; can: see `limits`."""
     say(f"\n{'splats':>9} {'image':>10} {'splats per pixel':>16} {'forward ms':>10} {'backward':>9}"
         f" {'ns per pair':>11} {'MB':>7} {'as discs':>9} {'gsplat ms':>10} {'step over gsplat':>17}")  # fmt: skip
-    sizes = []
     for size in SIZES:
         scene = Scene(*size)
         jobs: dict[str, Callable[[], object]] = {
@@ -266,9 +301,9 @@ def main() -> None:
         other = gsplat_step(scene)
         if other:
             jobs |= {"gsplat_forward": other[0], "gsplat_step": other[1]}
-        times = timed(jobs, options.repeats)
+        times = timed(jobs, repeats)
         pairs = scene.pairs
-        alone, work = kernels_alone(scene, options.repeats), scene.work()
+        alone, work = kernels_alone(scene, repeats), scene.work()
         shares = {
             name: {
                 "ms": ms,
@@ -284,7 +319,6 @@ def main() -> None:
             "forward_ns_per_pair": 1e6 * times["forward"] / pairs,
             "backward_ns_per_pair": 1e6 * times["backward"] / pairs, "mb": peak_mb(scene.step),
         }  # fmt: skip
-        sizes.append(row)
         both = row["forward_ns_per_pair"] + row["backward_ns_per_pair"]
         beside = f"{times['gsplat_step']:10.2f} {times['step'] / times['gsplat_step']:17.2f}" if other else f"{'-':>10}"
         say(
@@ -294,31 +328,70 @@ def main() -> None:
         for name, share in shares.items():
             say(f"{name:>30}: {share['ms']:.2f} ms, {share['of_arithmetic']:.0%} of arithmetic,"
                 f" {share['of_memory']:.0%} of memory")  # fmt: skip
+        yield row
         del scene, jobs, other
 
+
+def measure_objects(repeats: int, say: Callable[..., None]) -> dict[str, dict[str, float]]:
+    """Return the time of a step and of a render of IDs for each of OBJECTS."""
     say(f"\n{'objects':>9} {'step ms':>9} {'ID render ms':>13} {'MB':>7}")
     scenes = {n: Scene(*MIDDLE, objects=n) for n in OBJECTS}
     jobs = {f"step {n}": s.step for n, s in scenes.items()} | {f"ids {n}": s.id_render for n, s in scenes.items()}
-    times = timed(jobs, options.repeats)
+    times = timed(jobs, repeats)
     objects = {}
     for n, scene in scenes.items():
         objects[str(n)] = {"step_ms": times[f"step {n}"], "id_render_ms": times[f"ids {n}"], "mb": peak_mb(scene.step)}
         say(f"{n:9d} {times[f'step {n}']:9.2f} {times[f'ids {n}']:13.2f} {objects[str(n)]['mb']:7.0f}")
-    over_one = objects["1000"]["step_ms"] / objects["1"]["step_ms"]
-    say(f"A step at 1,000 objects takes {over_one:.2f} times what it takes at one.")
+    return objects
 
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="print one JSON object as the last line, and no table")
+    parser.add_argument("--repeats", type=int, default=10, help="how often each measurement is repeated")
+    parser.add_argument("--demo", type=Path, help="capture to train on")
+    parser.add_argument("--out", type=Path, help="JSON file for the figures, written again after each measurement")
+    options = parser.parse_args()
+    say = (lambda *_: None) if options.json else functools.partial(print, flush=True)
+    found: dict[str, Any] = {"gpu": None}
+
+    def keep(**figures: Any) -> None:
+        found.update(figures)
+        if options.out:
+            options.out.parent.mkdir(parents=True, exist_ok=True)
+            options.out.write_text(json.dumps(found, indent=1) + "\n")
+
+    why_not = why_not_cuda()
+    if why_not:
+        print(json.dumps({"gpu": None, "why": why_not}) if options.json else f"Nothing was measured. {why_not}")
+        return
+    can = limits(options.repeats)
+    keep(gpu=torch.cuda.get_device_name(), limits=can, sizes=[])
+    say(f"{found['gpu']}: {can['gb_per_s']:.0f} GB/s, {can['tflops']:.1f} TFLOP/s in float32.")
     capture = options.demo or (DEMO if DEMO.exists() else None)
     lacking = lacking_for_training()
-    curve = demo_quality(capture) if capture and not lacking else None
+    if capture and not lacking:
+        step = training_profile(capture, torch.device("cuda"))
+        keep(training_step=step)
+        say(
+            f"A step of training on {step['anchors']} anchors takes {step['step_ms']:.2f} ms, {step['host_ms']:.2f} ms "
+            f"of them on the host; the GPU computes for {step['gpu_busy']:.0%}, in {step['launches']:.0f} launches."
+        )
+    for row in measure_sizes(options.repeats, can, say):
+        keep(sizes=[*found["sizes"], row])
+    objects = measure_objects(options.repeats, say)
+    keep(objects=objects, thousand_objects_over_one=objects["1000"]["step_ms"] / objects["1"]["step_ms"])
+    say(f"A step at 1,000 objects takes {found['thousand_objects_over_one']:.2f} times what it takes at one.")
+    keep(demo=None)
     if capture and lacking:
         say(f"\nNothing was trained: this Python lacks {', '.join(lacking)}.")
-    elif curve:
-        say("\n" + "\n".join(f"{c['seconds']:4.0f} s: {c['psnr']:.1f} dB, mIoU {c['miou']:.3f}" for c in curve))
+    elif capture:
+        keep(demo=demo_quality(capture))
+        say("\n" + "\n".join(f"{c['seconds']:4.0f} s: {c['psnr']:.1f} dB, mIoU {c['miou']:.3f}" for c in found["demo"]))
     else:
         say("\nThere is no capture to train on: `make demo` makes one, --demo names another.")
     if options.json:
-        print(json.dumps({"gpu": gpu, "limits": can, "sizes": sizes, "objects": objects,
-                          "thousand_objects_over_one": over_one, "demo": curve}))  # fmt: skip
+        print(json.dumps(found))
 
 
 if __name__ == "__main__":

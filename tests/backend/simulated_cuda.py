@@ -77,11 +77,27 @@ def test_insufficient_intersection_capacity_is_increased(primitive, monkeypatch)
     scene = as_float32(random_scene(0, count=40))
     pictures = []
     for last in (10_000, 30):
-        monkeypatch.setattr(cuda_bin, "_last_total", {torch.device("cpu"): last})
+        monkeypatch.setattr(cuda_bin, "_largest_total", {torch.device("cpu"): last})
         pictures.append(draw(scene, camera(), primitive=primitive))
     assert_same_bits(*pictures)
-    needed = cuda_bin._last_total[torch.device("cpu")]
+    needed = cuda_bin._largest_total[torch.device("cpu")]
     assert 40 < needed < 10_000 and made == [int(10_000 * 1.125), int(30 * 1.125), needed]
+
+
+def test_room_for_intersections_is_that_of_the_largest_of_the_last_images(monkeypatch):
+    monkeypatch.setattr(cuda_bin, "_largest_total", {})
+
+    def draw_one(count):
+        total = cuda_bin.IntersectionCount(torch.tensor([count]))
+        room = total.expected_capacity()
+        assert total.wait() == count
+        return room
+
+    draw_one(1000)
+    assert all(draw_one(count) > 1000 for count in (10, 500, 900, 20))
+    for _ in range(500):
+        draw_one(10)
+    assert draw_one(10) == int(10 * 1.125)
 
 
 @pytest.mark.parametrize(

@@ -43,7 +43,15 @@ PART = "kernels"
 
 _SECONDS = 100.0
 """Typical time of a compilation."""
-_PROGRESS_FRACTIONS = {"render": 0.3, "step": 0.3, "train": 0.14, "fuse": 0.04, "refine": 0.02, "bake": 0.1, "match": 0.1}
+_PROGRESS_FRACTIONS = {
+    "render": 0.3,
+    "step": 0.3,
+    "train": 0.14,
+    "fuse": 0.04,
+    "refine": 0.02,
+    "bake": 0.1,
+    "match": 0.1,
+}
 """Fractions of its time, for the progress."""
 
 

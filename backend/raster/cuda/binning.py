@@ -4,9 +4,10 @@ The splats are sorted by depth once. In this order, the tiles that each splat in
 by tile (two passes, as tiles have few bits) preserves the depth order in each tile. Ties of the first sort are broken
 as on the CPU (tile_intersection.py), so that images do not depend on the order of the input.
 
-The number of intersections is computed on the GPU. The arrays have capacity for slightly more than in the last image,
+The number of intersections is computed on the GPU. The arrays have capacity for slightly more than in the last images,
 and the number is copied to the host asynchronously: the host reads it after the whole image is queued. The
-intersections and the image are computed again only if the capacity was too small.
+intersections and the image are computed again only if the capacity was too small. Training takes views in random order,
+so the largest of the last images counts.
 """
 
 from __future__ import annotations
@@ -26,10 +27,11 @@ TILE = 16
 
 _UNSEEN = 2**63 - 1
 _SIGN = 2**31
-_SPARE = 1.125
-"""Ratio of the capacity to the number of intersections in the last image."""
+_SPARE, _DECAY = 1.125, 0.99
+"""Ratio of the capacity to the largest number of intersections in the last images, and the factor by which a number
+counts less for each image after it."""
 
-_last_total: dict[torch.device, int] = {}
+_largest_total: dict[torch.device, float] = {}
 
 
 @dataclass
@@ -189,14 +191,14 @@ class IntersectionCount:
 
     def expected_capacity(self) -> int:
         """Return the capacity to use before the number is available."""
-        return max(int(_last_total.get(self._device, 0) * _SPARE), 1)
+        return max(int(_largest_total.get(self._device, 0) * _SPARE), 1)
 
     def wait(self) -> int:
         """Wait for the number of intersections and return it."""
         if self._event is not None:
             self._event.synchronize()
         total = int(self._host[0])
-        _last_total[self._device] = total
+        _largest_total[self._device] = max(total, _DECAY * _largest_total.get(self._device, 0))
         return total
 
 
