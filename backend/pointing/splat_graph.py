@@ -36,14 +36,11 @@ COLOR, CONCAVE, GAP, PHOTO_EDGE, LEAST = 0.7, 8.0, 1 / 3, 0.25, 1e-4
 of the distance in units of the local spacing, and of a tenth of the largest CIELAB step in the photos. The weight of an
 edge is exp(-sum of the squares), but at least the last value."""
 
-PRIOR, SIMILAR = 3e-4, 4.0
-"""Weight of the colors of the strokes for each marked object, and the CIELAB distance at which a color hardly counts as
-one of these. The more objects are marked, the more their colors tell; one object alone would take all that resembles
-it."""
+PRIOR, SIMILAR = 1e-3, 4.0
+"""Weight of the colors of the strokes, and the CIELAB distance at which a color hardly counts as one of these."""
 
-NOTHING = 1e-4
-"""Weight of belonging to no object, relative to all edges of a node and to the fourth root of the number of marked
-objects, unless everything belongs to one."""
+NOTHING = 2e-4
+"""Weight of belonging to no object, relative to all edges of a node, unless everything belongs to one."""
 
 VOTES = 0.3
 """Weight of the votes of masks where these agree, relative to all edges of a node."""
@@ -145,10 +142,9 @@ class SplatGraph:
         objects = np.array(sorted({0, *seeds}))
         nothing = np.zeros(len(self.nearest))
         labels = _seed_labels(np.stack([seeds.get(object_id, nothing)[self.nodes] for object_id in objects.tolist()]))
-        marked = len(seeds)
-        prior = PRIOR * marked * self._prior(labels, len(objects))
+        prior = PRIOR * self._prior(labels, len(objects))
         if not everything:
-            prior[:, 0] += NOTHING * marked**0.25 * np.asarray(self.weights.sum(axis=1)).ravel()
+            prior[:, 0] += NOTHING * np.asarray(self.weights.sum(axis=1)).ravel()
         start = None
         if before is not None:
             start = np.zeros_like(prior)
