@@ -15,7 +15,7 @@ from ..shared.errors import InputError
 from ..shared.reconstruction.objects import default_name
 from .mask_edges import follow_edges
 from .proposals import find_objects
-from .splat_graph import Solution, SplatGraph, build_graph, contributions
+from .splat_graph import Solution, SplatGraph, Weights, build_graph, contributions
 from .stroke_masks import Segment, stroke_pixels
 from .strokes import Stroke, Strokes, stroke_through
 from .views import Views
@@ -65,6 +65,7 @@ class Pointer:
         splats: the splats, in scene units.
         primitive: "3d" or "2d".
         views: views of them.
+        weights: what edges between splats are weighed by.
         progress: receives the number of prepared views, and of all.
         segment: the segmentation model by which a stroke stands for more than it covers, if there is one.
     """
@@ -74,6 +75,7 @@ class Pointer:
         splats: Generated,
         primitive: str,
         views: Views,
+        weights: Weights,
         progress: Callable[[int, int], object],
         segment: Segment | None = None,
     ) -> None:
@@ -83,7 +85,7 @@ class Pointer:
         used = views.used
         self._graph: SplatGraph = build_graph(
             splats, primitive, [views.camera(index) for index in used],
-            lambda number: self._picture(used[number]), progress,
+            lambda number: self._picture(used[number]), weights, progress,
         )  # fmt: skip
         self._shown: dict[_Drawn, _Shown] = {}
         self._latest: Solution | None = None

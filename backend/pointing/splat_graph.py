@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -24,23 +24,22 @@ from .random_walker import random_walker
 if TYPE_CHECKING:
     from ..model.generate import Generated
 
-NEIGHBORS, SURFACE_NEIGHBORS = 10, 17
-"""Number of neighbors of a splat in the graph, and of those that its normal is measured on, itself included."""
+NEIGHBORS = 10
+"""Number of neighbors of a splat in the graph."""
 
 SEEN, ALONE = 1.0, 4.0
 """Splats that cover less than the first number of pixels in all photos together get the object of the nearest other, or
 none, if that is farther away than the second number times the local spacing."""
 
-COLOR, CONCAVE, GAP, PHOTO_EDGE, LEAST = 0.7, 8.0, 1 / 3, 0.25, 1e-4
-"""Weights of a tenth of the CIELAB distance of two splats, of the concavity (the change of the normals along the edge),
-of the distance in units of the local spacing, and of a tenth of the largest CIELAB step in the photos. The weight of an
-edge is exp(-sum of the squares), but at least the last value."""
+LEAST = 1e-4
+"""Least weight of an edge."""
 
-PRIOR, SIMILAR = 1e-3, 4.0
-"""Weight of the colors of the strokes, and the CIELAB distance at which a color hardly counts as one of these."""
+SIMILAR = 4.0
+"""CIELAB distance at which a color hardly counts as one of those of the strokes."""
 
-NOTHING = 2e-4
-"""Weight of belonging to no object, relative to all edges of a node, unless everything belongs to one."""
+NOTHING = 1e-4
+"""Weight of belonging to no object, relative to all edges of a node and to the fourth root of the number of marked
+objects, unless everything belongs to one."""
 
 VOTES = 0.3
 """Weight of the votes of masks where these agree, relative to all edges of a node."""
@@ -49,6 +48,34 @@ SEEDED = 0.8
 """The splats that make up this part of what a stroke shows are its seeds; the rest shines through from behind."""
 
 _PHOTOS, _SAMPLES, _VISIBLE = 16, 5, 0.3
+
+
+class Weights(NamedTuple):
+    """What the edges between splats are weighed by: the weight of an edge is exp(-sum of the squares).
+
+    Attributes:
+        color: weight of a tenth of the CIELAB distance of two splats.
+        concave: weight of the concavity (the change of the normals along the edge).
+        gap: weight of the distance in units of the local spacing.
+        steps: weight of a tenth of the largest CIELAB step in the photos.
+        neighbors: number of splats that a normal is measured on, itself included.
+        prior: weight of the colors of the strokes for each marked object. The more objects are marked, the more their
+            colors tell; one object alone would take all that resembles it.
+    """
+
+    color: float
+    concave: float
+    gap: float
+    steps: float
+    neighbors: int
+    prior: float
+
+
+OF_SPLATS = Weights(color=0.5, concave=12.0, gap=0.5, steps=0.4, neighbors=33, prior=3e-4)
+"""Weights for trained splats."""
+
+OF_POINTS = Weights(color=0.7, concave=8.0, gap=1 / 3, steps=0.25, neighbors=17, prior=1e-4)
+"""Weights for the points of a capture, which are fewer and farther apart."""
 
 
 def contributions(splats: Generated, camera: Camera, planes: np.ndarray, primitive: str) -> np.ndarray:
@@ -114,6 +141,7 @@ class SplatGraph:
         is_alone: (N,) bool, splats that are no nodes and far from all of them.
         lab: (n, 3) CIELAB color of each node, the mean over its neighborhood.
         weights: (n, n) weights of the edges.
+        prior: weight of the colors of the strokes for each marked object.
         edges: what the weights are made of.
         xyz: (n, 3) positions of the nodes.
         seen: (n,) pixels that each node covers in all photos together.
@@ -125,6 +153,7 @@ class SplatGraph:
     is_alone: np.ndarray
     lab: np.ndarray
     weights: sparse.csr_array
+    prior: float
     edges: Edges
     xyz: np.ndarray
     seen: np.ndarray
@@ -142,9 +171,9 @@ class SplatGraph:
         objects = np.array(sorted({0, *seeds}))
         nothing = np.zeros(len(self.nearest))
         labels = _seed_labels(np.stack([seeds.get(object_id, nothing)[self.nodes] for object_id in objects.tolist()]))
-        prior = PRIOR * self._prior(labels, len(objects))
+        prior = self.prior * len(seeds) * self._similarity(labels, len(objects))
         if not everything:
-            prior[:, 0] += NOTHING * np.asarray(self.weights.sum(axis=1)).ravel()
+            prior[:, 0] += NOTHING * len(seeds) ** 0.25 * np.asarray(self.weights.sum(axis=1)).ravel()
         start = None
         if before is not None:
             start = np.zeros_like(prior)
@@ -195,7 +224,7 @@ class SplatGraph:
         # Parts that are connected to nothing keep their labels.
         return np.where(loose & (around.max(1) > 0), around.argmax(1), found)
 
-    def _prior(self, labels: np.ndarray, count: int) -> np.ndarray:
+    def _similarity(self, labels: np.ndarray, count: int) -> np.ndarray:
         """Return (n, count) how similar each node's color is to that of each label's seeds."""
         fit = np.zeros((len(self.lab), count))
         for label in range(count):
@@ -222,6 +251,7 @@ def build_graph(
     primitive: str,
     cameras: Sequence[Camera],
     photo: Callable[[int], np.ndarray],
+    weights: Weights,
     progress: Callable[[int, int], object],
 ) -> SplatGraph:
     """Build the graph of a model's splats.
@@ -231,6 +261,7 @@ def build_graph(
         primitive: "3d" or "2d".
         cameras: the cameras of the training views, in scene units.
         photo: returns the photo (H, W, 3) uint8 of the camera with an index.
+        weights: what the edges are weighed by.
         progress: receives the number of finished cameras, and of all.
 
     Returns:
@@ -250,7 +281,7 @@ def build_graph(
             in_photos[number] = weight.astype(np.float32)
         progress(number + 1, len(cameras))
     nodes = np.flatnonzero(seen > SEEN)
-    if len(nodes) <= SURFACE_NEIGHBORS:
+    if len(nodes) <= weights.neighbors:
         nodes = np.arange(len(means))
     xyz = means[nodes]
     tree = cKDTree(xyz)
@@ -259,7 +290,7 @@ def build_graph(
     hidden = np.setdiff1d(np.arange(len(means)), nodes)
     away, nearest[hidden] = tree.query(means[hidden], workers=-1)
 
-    distance, neighbor = tree.query(xyz, k=min(SURFACE_NEIGHBORS, len(nodes)), workers=-1)
+    distance, neighbor = tree.query(xyz, k=min(weights.neighbors, len(nodes)), workers=-1)
     normal = measure_normals(xyz[neighbor], facing[nodes])
     rgb = np.clip(0.5 + C0 * devices.host(splats.sh[:, 0])[nodes].astype(np.float64), 0, 1)
     lab = rgb2lab(rgb[None])[0][neighbor[:, :6]].mean(1)
@@ -274,13 +305,12 @@ def build_graph(
     color = np.linalg.norm(lab[first] - lab[second], axis=1) / 10
     steps = _steps_in_photos(xyz, (first, second), {n: w[nodes] for n, w in in_photos.items()}, cameras, photo) / 10
     concave = concavity(xyz, normal, first, second)
-    weight = LEAST + np.exp(
-        -((COLOR * color) ** 2) - (CONCAVE * concave) ** 2 - (GAP * gap) ** 2 - (PHOTO_EDGE * steps) ** 2
-    )
-    weights = sparse.coo_array((weight, (first, second)), shape=(len(nodes), len(nodes))).tocsr()
+    unlike = (weights.color * color) ** 2 + (weights.concave * concave) ** 2
+    unlike += (weights.gap * gap) ** 2 + (weights.steps * steps) ** 2
+    between = sparse.coo_array((LEAST + np.exp(-unlike), (first, second)), shape=(len(nodes), len(nodes))).tocsr()
+    between = between.maximum(between.T).tocsr()
     edges = Edges(first, second, gap, color, steps)
-    weights = weights.maximum(weights.T).tocsr()
-    return SplatGraph(nodes, nearest, is_alone, lab, weights, edges, xyz, seen[nodes], facing[nodes])
+    return SplatGraph(nodes, nearest, is_alone, lab, between, weights.prior, edges, xyz, seen[nodes], facing[nodes])
 
 
 def concavity(xyz: np.ndarray, normal: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ from backend.pointing.mask_edges import follow_edges
 from backend.pointing.pointer import Pointer
 from backend.pointing.proposals import find_objects
 from backend.pointing.random_walker import random_walker
-from backend.pointing.splat_graph import Edges, SplatGraph, contributions
+from backend.pointing.splat_graph import OF_SPLATS, Edges, SplatGraph, contributions
 from backend.pointing.stroke_masks import points_on, stroke_pixels
 from backend.pointing.strokes import Stroke, Strokes, Viewpoint, read_strokes, strokes_of
 from backend.pointing.views import views_around, views_of_photos
@@ -328,7 +328,8 @@ def test_far_splats_belong_to_nothing_unless_everything_is_an_object() -> None:
     none, flat = np.zeros(0), np.zeros((9, 3))
     graph = SplatGraph(
         np.arange(9), np.arange(9), np.zeros(9, bool), np.repeat([[50.0, 0, 0], [80.0, 0, 0], [50.0, 0, 0]], 3, axis=0),
-        chain([1, 1, 1e-4, 1, 1, 1e-4, 1, 1]), Edges(none, none, none, none, none), flat, np.ones(9), flat,
+        chain([1, 1, 1e-4, 1, 1, 1e-4, 1, 1]), OF_SPLATS.prior, Edges(none, none, none, none, none), flat, np.ones(9),
+        flat,
     )  # fmt: skip
     seeds = {7: np.eye(9)[0]}
     assert graph.solve(seeds).ids.tolist() == [7, 7, 7, 0, 0, 0, 0, 0, 0]
@@ -423,7 +424,9 @@ def table_with_balls(balls: int) -> tuple[SplatGraph, np.ndarray]:
     nodes, ones = np.arange(len(xyz)), np.ones(len(xyz))
     weights = sparse.csr_array((len(xyz), len(xyz)))
     edges = Edges(first, second, gap, color, color)
-    return SplatGraph(nodes, nodes, ones < 0, np.zeros((len(xyz), 3)), weights, edges, xyz, ones, normal), truth
+    return SplatGraph(
+        nodes, nodes, ones < 0, np.zeros((len(xyz), 3)), weights, OF_SPLATS.prior, edges, xyz, ones, normal
+    ), truth
 
 
 @pytest.mark.parametrize("balls", [1, 5])
@@ -502,7 +505,7 @@ class TrueMasks:
 def pointer_of(capture, model, segment) -> Pointer:
     scene = Scene(capture, model.classes, model.normalization)
     views = views_of_photos(capture, scene.camera, model.normalization)
-    return Pointer(model.generate(), model.primitive, views, lambda done, total: None, segment)
+    return Pointer(model.generate(), model.primitive, views, OF_SPLATS, lambda done, total: None, segment)
 
 
 def test_masks_of_strokes_separate_better_than_strokes(unlabeled) -> None:

@@ -17,6 +17,7 @@ from ...model.generate import Generated
 from ...model.object_model import Normalization
 from ...model.splats import Splats
 from ...pointing.pointer import Pointer
+from ...pointing.splat_graph import OF_POINTS, OF_SPLATS
 from ...pointing.stroke_masks import Segment
 from ...pointing.views import Views, views_around, views_of_photos
 from ...raster import Camera, devices
@@ -69,7 +70,8 @@ class Pointable(NamedTuple):
 
     def pointer(self, progress: Callable[[int, int], object], segment: Segment | None = None) -> Pointer:
         """Compare the splats with their neighbors; the arguments are those of `Pointer`."""
-        return Pointer(self.splats, self.primitive, self.views, progress, segment)
+        weights = OF_POINTS if isinstance(self.source, LabeledPoints) else OF_SPLATS
+        return Pointer(self.splats, self.primitive, self.views, weights, progress, segment)
 
 
 def open_pointable(options: argparse.Namespace, reporter: Reporter) -> Pointable:
