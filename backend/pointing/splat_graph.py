@@ -6,6 +6,7 @@ where an object stands on a table, if they are far apart for where they are, or 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -19,6 +20,7 @@ from skimage.color import rgb2lab
 
 from ..raster import Camera, devices, rasterize
 from ..shared.splats.spherical_harmonics import C0
+from .color_model import ColorModel
 from .random_walker import random_walker
 
 if TYPE_CHECKING:
@@ -36,6 +38,10 @@ LEAST = 1e-4
 
 SIMILAR = 4.0
 """CIELAB distance at which a color hardly counts as one of those of the strokes."""
+
+FOUND, CERTAIN = 2e-3, 0.5
+"""Weight of the colors of what was found for each marked object, and the probability from which on a node counts as
+found."""
 
 NOTHING = 1e-4
 """Weight of belonging to no object, relative to all edges of a node and to the fourth root of the number of marked
@@ -104,13 +110,22 @@ class Solution:
 
     Attributes:
         objects: (C,) int64, ascending: the object IDs that were to be found, and 0.
-        probabilities: (n, C) float32, for each node of the graph.
+        rough: (n, C) float32, probabilities of the nodes of the graph by the colors of the strokes.
+        probabilities: (n, C) float32, those by the colors of what was found with the strokes' colors.
         ids: (N,) int64, the object ID of each splat.
     """
 
     objects: np.ndarray
+    rough: np.ndarray
     probabilities: np.ndarray
     ids: np.ndarray
+
+    def among(self, objects: np.ndarray) -> Solution:
+        """Return the solution with the columns of other objects (C,); those of objects that it lacks are 0."""
+        _, now, then = np.intersect1d(objects, self.objects, return_indices=True)
+        columns = np.zeros((2, len(self.rough), len(objects)), np.float32)
+        columns[0][:, now], columns[1][:, now] = self.rough[:, then], self.probabilities[:, then]
+        return Solution(objects, columns[0], columns[1], self.ids)
 
 
 @dataclass(frozen=True)
@@ -159,6 +174,11 @@ class SplatGraph:
     seen: np.ndarray
     facing: np.ndarray
 
+    @functools.cached_property
+    def colors(self) -> ColorModel:
+        """The colors of the nodes, to be counted."""
+        return ColorModel(self.lab)
+
     def solve(self, seeds: dict[int, np.ndarray], everything: bool = False, before: Solution | None = None) -> Solution:
         """Find the object of each splat.
 
@@ -171,18 +191,21 @@ class SplatGraph:
         objects = np.array(sorted({0, *seeds}))
         nothing = np.zeros(len(self.nearest))
         labels = _seed_labels(np.stack([seeds.get(object_id, nothing)[self.nodes] for object_id in objects.tolist()]))
-        prior = self.prior * len(seeds) * self._similarity(labels, len(objects))
+        marked, outside = len(seeds), np.zeros((len(self.nodes), len(objects)))
         if not everything:
-            prior[:, 0] += NOTHING * len(seeds) ** 0.25 * np.asarray(self.weights.sum(axis=1)).ravel()
-        start = None
-        if before is not None:
-            start = np.zeros_like(prior)
-            _, now, then = np.intersect1d(objects, before.objects, return_indices=True)
-            start[:, now] = before.probabilities[:, then]
-        probabilities = random_walker(self.weights, labels, prior, 1.0, start)
+            outside[:, 0] = NOTHING * marked**0.25 * np.asarray(self.weights.sum(axis=1)).ravel()
+        prior = self.prior * marked * self._similarity(labels, len(objects)) + outside
+        start = None if before is None else before.among(objects)
+        rough = random_walker(self.weights, labels, prior, 1.0, None if start is None else start.rough)
+        found = self._joined(rough.argmax(1), labels, everything)
+        # As in GrabCut, what was found tells more about an object's colors than strokes do.
+        known = np.where(rough.max(1) > CERTAIN, found, -1)
+        prior = FOUND * marked * self.colors.likeness(known, len(objects)) + outside
+        again = rough if start is None else start.probabilities
+        probabilities = random_walker(self.weights, labels, prior, 1.0, again)
         found = self._joined(probabilities.argmax(1), labels, everything)
         ids = objects[found][self.nearest]
-        return Solution(objects, probabilities, ids if everything else np.where(self.is_alone, 0, ids))
+        return Solution(objects, rough, probabilities, ids if everything else np.where(self.is_alone, 0, ids))
 
     def settle(self, objects: np.ndarray, votes: np.ndarray) -> np.ndarray:
         """Find the object of each splat by votes that may be wrong.

@@ -23,6 +23,7 @@ from backend.export.ply import read_splats
 from backend.model.checkpoint import save_checkpoint
 from backend.model.draw import draw
 from backend.model.object_model import Normalization
+from backend.pointing.color_model import SPREAD, ColorModel
 from backend.pointing.mask_edges import follow_edges
 from backend.pointing.pointer import Pointer
 from backend.pointing.proposals import find_objects
@@ -341,6 +342,34 @@ def test_far_splats_belong_to_nothing_unless_everything_is_an_object() -> None:
 
 
 CAMERA = {"viewmat": np.eye(4).tolist(), "intrinsics": [90, 90, 48, 36], "width": 96, "height": 72}
+
+
+def test_colors_of_what_was_found_decide_where_strokes_do_not() -> None:
+    """A chain whose third part has weaker edges to the first, but its color, which the stroke on the first lacks."""
+    none, flat = np.zeros(0), np.zeros((12, 3))
+    colors = np.repeat([[20.0, 0, 0], [60.0, 0, 0], [90.0, 0, 0]], [1, 8, 3], axis=0)
+    graph = SplatGraph(
+        np.arange(12), np.arange(12), np.zeros(12, bool), colors, chain([1, 1, 1, 1, 1, 3e-4, 1, 1, 1e-3, 1, 1]),
+        OF_SPLATS.prior, Edges(none, none, none, none, none), flat, np.ones(12), flat,
+    )  # fmt: skip
+    found = graph.solve({7: np.eye(12)[0], 8: np.eye(12)[11]}, everything=True)
+    assert found.objects[found.rough.argmax(1)].tolist() == [7] * 6 + [8] * 6
+    assert found.ids.tolist() == [7] * 9 + [8] * 3
+
+
+def test_likeness_is_the_part_of_a_label_that_has_a_color() -> None:
+    rng = np.random.default_rng(0)
+    lab = np.concatenate([rng.normal(center, 6, (4000, 3)) for center in (0.0, 15.0)])
+    labels = np.repeat([0, 2], 4000)
+    labels[::3] = -1
+    found = ColorModel(lab).likeness(labels, 3)
+    density = [np.exp(-((lab - center) ** 2).sum(1) / 2 / (6**2 + SPREAD**2)) for center in (0.0, 15.0)]
+    common = np.maximum(*density) > 0.1
+    expected = density[0] / np.sum(density, axis=0)
+    assert np.abs(found[common, 0] - expected[common]).mean() < 0.03
+    assert (found[:, 1] == 0).all() and (found.sum(1) <= 1 + 1e-9).all()
+    far = ColorModel(np.concatenate([lab, [[90.0, 90, 90]]])).likeness(np.append(labels, -1), 3)
+    assert (far[-1] == 0).all()
 
 
 @pytest.mark.parametrize(
