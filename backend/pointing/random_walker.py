@@ -14,7 +14,7 @@ from scipy import sparse
 from ..raster import simd
 from ..raster.kernel import kernel
 
-ITERATIONS, ITERATIONS_AGAIN, TOLERANCE = 300, 100, 1e-4
+ITERATIONS, ITERATIONS_AGAIN, TOLERANCE = 300, 100, 1e-3
 """The solution ends after the first number of iterations, or after the second if it begins with an earlier one, or when
 every residual is the third number relative to its right-hand side."""
 

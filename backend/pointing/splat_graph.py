@@ -36,12 +36,9 @@ none, if that is farther away than the second number times the local spacing."""
 LEAST = 1e-4
 """Least weight of an edge."""
 
-SIMILAR = 4.0
-"""CIELAB distance at which a color hardly counts as one of those of the strokes."""
-
-FOUND, CERTAIN = 2e-3, 0.5
-"""Weight of the colors of what was found for each marked object, and the probability from which on a node counts as
-found."""
+STROKES, FOUND, CERTAIN = 1e-4, 2e-3, 0.5
+"""Weights of the colors of the strokes, and of what was found with these, for each marked object: the more objects are
+marked, the more their colors tell. The last number is the probability from which on a node counts as found."""
 
 NOTHING = 1e-4
 """Weight of belonging to no object, relative to all edges of a node and to the fourth root of the number of marked
@@ -65,8 +62,6 @@ class Weights(NamedTuple):
         gap: weight of the distance in units of the local spacing.
         steps: weight of a tenth of the largest CIELAB step in the photos.
         neighbors: number of splats that a normal is measured on, itself included.
-        prior: weight of the colors of the strokes for each marked object. The more objects are marked, the more their
-            colors tell; one object alone would take all that resembles it.
     """
 
     color: float
@@ -74,13 +69,12 @@ class Weights(NamedTuple):
     gap: float
     steps: float
     neighbors: int
-    prior: float
 
 
-OF_SPLATS = Weights(color=0.5, concave=12.0, gap=0.5, steps=0.4, neighbors=33, prior=3e-4)
+OF_SPLATS = Weights(color=0.5, concave=12.0, gap=0.5, steps=0.4, neighbors=33)
 """Weights for trained splats."""
 
-OF_POINTS = Weights(color=0.7, concave=8.0, gap=1 / 3, steps=0.25, neighbors=17, prior=1e-4)
+OF_POINTS = Weights(color=0.7, concave=8.0, gap=1 / 3, steps=0.25, neighbors=17)
 """Weights for the points of a capture, which are fewer and farther apart."""
 
 
@@ -156,7 +150,6 @@ class SplatGraph:
         is_alone: (N,) bool, splats that are no nodes and far from all of them.
         lab: (n, 3) CIELAB color of each node, the mean over its neighborhood.
         weights: (n, n) weights of the edges.
-        prior: weight of the colors of the strokes for each marked object.
         edges: what the weights are made of.
         xyz: (n, 3) positions of the nodes.
         seen: (n,) pixels that each node covers in all photos together.
@@ -168,7 +161,6 @@ class SplatGraph:
     is_alone: np.ndarray
     lab: np.ndarray
     weights: sparse.csr_array
-    prior: float
     edges: Edges
     xyz: np.ndarray
     seen: np.ndarray
@@ -194,12 +186,12 @@ class SplatGraph:
         marked, outside = len(seeds), np.zeros((len(self.nodes), len(objects)))
         if not everything:
             outside[:, 0] = NOTHING * marked**0.25 * np.asarray(self.weights.sum(axis=1)).ravel()
-        prior = self.prior * marked * self._similarity(labels, len(objects)) + outside
         start = None if before is None else before.among(objects)
+        prior = STROKES * marked * self.colors.likeness(labels, len(objects)) + outside
         rough = random_walker(self.weights, labels, prior, 1.0, None if start is None else start.rough)
-        found = self._joined(rough.argmax(1), labels, everything)
+        found = rough.argmax(1)
         # As in GrabCut, what was found tells more about an object's colors than strokes do.
-        known = np.where(rough.max(1) > CERTAIN, found, -1)
+        known = np.where((rough.max(1) > CERTAIN) & ~self._loose(found, labels, everything), found, -1)
         prior = FOUND * marked * self.colors.likeness(known, len(objects)) + outside
         again = rough if start is None else start.probabilities
         probabilities = random_walker(self.weights, labels, prior, 1.0, again)
@@ -227,7 +219,17 @@ class SplatGraph:
         return objects[probabilities.argmax(1)][self.nearest]
 
     def _joined(self, found: np.ndarray, seeds: np.ndarray, everything: bool) -> np.ndarray:
-        """Give the parts of an object that are not connected to any of its seeds to the objects around them.
+        """Give the loose parts of objects to the objects around them; found, seeds: (n,) labels."""
+        loose = self._loose(found, seeds, everything)
+        if not loose.any() or loose.all():
+            return found
+        known = np.where(loose, -1, found)
+        around = random_walker(self.weights, known, np.zeros((len(found), found.max() + 1)), 0.0)
+        # Parts that are connected to nothing keep their labels.
+        return np.where(loose & (around.max(1) > 0), around.argmax(1), found)
+
+    def _loose(self, found: np.ndarray, seeds: np.ndarray, everything: bool) -> np.ndarray:
+        """Return which nodes (n,) belong to parts of an object that are not connected to any of its seeds.
 
         Such a part only has a similar color. found, seeds: (n,) labels; seeds are -1 where there is none.
         """
@@ -238,24 +240,7 @@ class SplatGraph:
         is_seeded = np.zeros(parts, bool)
         is_seeded[part_of[(seeds >= 0) & (seeds == found)]] = True
         loose = ~is_seeded[part_of]
-        if not everything:
-            loose &= found > 0
-        if not loose.any() or loose.all():
-            return found
-        known = np.where(loose, -1, found)
-        around = random_walker(self.weights, known, np.zeros((len(found), found.max() + 1)), 0.0)
-        # Parts that are connected to nothing keep their labels.
-        return np.where(loose & (around.max(1) > 0), around.argmax(1), found)
-
-    def _similarity(self, labels: np.ndarray, count: int) -> np.ndarray:
-        """Return (n, count) how similar each node's color is to that of each label's seeds."""
-        fit = np.zeros((len(self.lab), count))
-        for label in range(count):
-            seeds = self.lab[labels == label]
-            if len(seeds):
-                distance, _ = cKDTree(seeds).query(self.lab, workers=-1)
-                fit[:, label] = np.exp(-0.5 * (distance / SIMILAR) ** 2)
-        return fit / (fit.sum(1, keepdims=True) + 0.05)
+        return loose if everything else loose & (found > 0)
 
 
 def _seed_labels(shown: np.ndarray) -> np.ndarray:
@@ -333,7 +318,7 @@ def build_graph(
     between = sparse.coo_array((LEAST + np.exp(-unlike), (first, second)), shape=(len(nodes), len(nodes))).tocsr()
     between = between.maximum(between.T).tocsr()
     edges = Edges(first, second, gap, color, steps)
-    return SplatGraph(nodes, nearest, is_alone, lab, between, weights.prior, edges, xyz, seen[nodes], facing[nodes])
+    return SplatGraph(nodes, nearest, is_alone, lab, between, edges, xyz, seen[nodes], facing[nodes])
 
 
 def concavity(xyz: np.ndarray, normal: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -329,7 +329,7 @@ def test_far_splats_belong_to_nothing_unless_everything_is_an_object() -> None:
     none, flat = np.zeros(0), np.zeros((9, 3))
     graph = SplatGraph(
         np.arange(9), np.arange(9), np.zeros(9, bool), np.repeat([[50.0, 0, 0], [80.0, 0, 0], [50.0, 0, 0]], 3, axis=0),
-        chain([1, 1, 1e-4, 1, 1, 1e-4, 1, 1]), OF_SPLATS.prior, Edges(none, none, none, none, none), flat, np.ones(9),
+        chain([1, 1, 1e-4, 1, 1, 1e-4, 1, 1]), Edges(none, none, none, none, none), flat, np.ones(9),
         flat,
     )  # fmt: skip
     seeds = {7: np.eye(9)[0]}
@@ -350,7 +350,7 @@ def test_colors_of_what_was_found_decide_where_strokes_do_not() -> None:
     colors = np.repeat([[20.0, 0, 0], [60.0, 0, 0], [90.0, 0, 0]], [1, 8, 3], axis=0)
     graph = SplatGraph(
         np.arange(12), np.arange(12), np.zeros(12, bool), colors, chain([1, 1, 1, 1, 1, 3e-4, 1, 1, 1e-3, 1, 1]),
-        OF_SPLATS.prior, Edges(none, none, none, none, none), flat, np.ones(12), flat,
+        Edges(none, none, none, none, none), flat, np.ones(12), flat,
     )  # fmt: skip
     found = graph.solve({7: np.eye(12)[0], 8: np.eye(12)[11]}, everything=True)
     assert found.objects[found.rough.argmax(1)].tolist() == [7] * 6 + [8] * 6
@@ -453,9 +453,7 @@ def table_with_balls(balls: int) -> tuple[SplatGraph, np.ndarray]:
     nodes, ones = np.arange(len(xyz)), np.ones(len(xyz))
     weights = sparse.csr_array((len(xyz), len(xyz)))
     edges = Edges(first, second, gap, color, color)
-    return SplatGraph(
-        nodes, nodes, ones < 0, np.zeros((len(xyz), 3)), weights, OF_SPLATS.prior, edges, xyz, ones, normal
-    ), truth
+    return SplatGraph(nodes, nodes, ones < 0, np.zeros((len(xyz), 3)), weights, edges, xyz, ones, normal), truth
 
 
 @pytest.mark.parametrize("balls", [1, 5])
