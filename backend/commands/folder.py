@@ -35,12 +35,12 @@ READ = "read"
 
 
 def memory_for_files(options: argparse.Namespace) -> float:
-    """Return the part of --memory-mb, in MB, for decoded uint8 images; their float32 planes take four times as much."""
+    """Return the part of --memory-mb, in MB, for decoded files, each of which most commands need only a few times."""
     return options.memory_mb / 5
 
 
-def memory_for_planes(options: argparse.Namespace) -> float:
-    """Return the part of --memory-mb, in MB, for the float32 planes of the same images, which are training targets."""
+def memory_for_targets(options: argparse.Namespace) -> float:
+    """Return the part of --memory-mb, in MB, for targets, which a training needs in each step."""
     return options.memory_mb - memory_for_files(options)
 
 
@@ -202,7 +202,7 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
     gains = None if exposure is None else measure_gains(capture) if exposure.done else np.ones((len(capture), 3))
     zero_is_object = state["settings"]["zero_is_object"]
     scene = Scene(
-        capture, model.classes, model.normalization, zero_is_object, memory_for_planes(options),
+        capture, model.classes, model.normalization, zero_is_object, memory_for_targets(options),
         supervise_background=state["supervise_background"], gains=gains,
     )  # fmt: skip
     return Trained(folder, capture, model, scene, progress_of(state), plan, training)

@@ -81,7 +81,7 @@ def drive(request):
 @pytest.fixture
 def endless(write_capture, tmp_path):
     """Command of a training that does not end and saves only when it is stopped; and its folder."""
-    scene, out = write_capture(views=9, size=(160, 120)), tmp_path / "out"
+    scene, out = write_capture(views=9, size=(240, 180)), tmp_path / "out"
     train = ("train", scene.folder, "--out", out, "--offsets", 4, "--minutes", 1000, "--checkpoint-seconds", 1000)
     return train, out
 

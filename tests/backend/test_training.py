@@ -21,6 +21,7 @@ from backend.model.growth import MIN_VISITS, GrowthStatistics, grow_and_prune
 from backend.model.heads import Heads
 from backend.model.object_model import Normalization, anchors_in_view
 from backend.raster import Camera, rasterize
+from backend.shared.class_table import ClassTable
 from backend.shared.errors import Cancelled, InputError
 from backend.shared.events import Reporter
 from backend.shared.stopping import StopRequest
@@ -30,6 +31,7 @@ from backend.training.initial_model import initial_model
 from backend.training.losses.on_cpu import PROBABILITY_FLOOR, image_loss, normal_loss, volume_loss
 from backend.training.optimizer.adam import BETA1, BETA2, step_rows
 from backend.training.optimizer.average import EVERY, FRACTION, MAX_STEPS, Average
+from backend.training.scene import Scene
 from backend.training.settings import Settings
 from backend.training.state import load_model
 from backend.training.trainer import Trainer
@@ -630,6 +632,23 @@ def test_capture_without_masks_trains_as_one_class(tiny):
         trainer.step(i / 60)
     assert mean_loss(trainer, 8, 1.0) < before
     assert trainer.model.classes.ids.tolist() == [0]
+
+
+def test_targets_are_held_in_a_quarter_of_their_size(tiny, monkeypatch):
+    capture, _ = tiny()
+    memory = 4 * sum(view.width * view.height for view in capture.views) / 1e6
+    gains = np.linspace(0.5, 2.0, 3 * len(capture)).reshape(-1, 3)
+    classes = ClassTable(capture.object_ids)
+    normalization = Normalization.of(capture.points.xyz, capture.points.xyz)
+    scene = Scene(capture, classes, normalization, memory_mb=memory, gains=gains)
+    read, image_of = [], capture.image
+    monkeypatch.setattr(capture, "image", lambda *key: read.append(key) or image_of(*key))
+    for index in (*range(len(capture)), *range(len(capture))):
+        image, labels = scene.target(index)
+        mask, true = capture.mask(index), image_of(index) / (255 * gains[index])
+        assert np.allclose(image.permute(1, 2, 0), true, atol=1e-6)
+        assert np.array_equal(labels, np.where(mask > 0, classes.classes_of(mask), -1))
+    assert len(read) == len(capture)
 
 
 def test_unlabeled_pixels_are_supervised_if_many_points_are_unlabeled(tiny):

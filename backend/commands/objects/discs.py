@@ -15,7 +15,7 @@ from ...shared.formats.points_ply import read_points
 from ...shared.stopping import StoppingReporter
 from ...training.fine_tuning.fit_discs import begin_discs, budget_of_discs, digest_of_model
 from ...training.trainer import Trainer
-from ..folder import Trained, memory_for_planes
+from ..folder import Trained, memory_for_targets
 from ..stages import finish_stage
 
 DISCS = "discs"
@@ -57,7 +57,7 @@ def model_of_discs(trained: Trained, options: argparse.Namespace, reporter: Stop
         # As in the training itself, where ID 0 may be an object.
         gaps = trained.scene.supervise_background and not trained.scene.zero_is_object
         capture, _ = correct_masks(capture, read_points(trained.folder.points).ids, ignore_gaps=gaps)
-    memory, gains = memory_for_planes(options), trained.scene.gains
+    memory, gains = memory_for_targets(options), trained.scene.gains
     try:
         resumed = Trainer.resume(capture, folder, None, memory, model.device, gains)
     except InputError:

@@ -28,7 +28,7 @@ from ...training.fine_tuning.relabel import begin_with_labels, budget_of_labels
 from ...training.settings import Settings
 from ...training.trainer import Trainer
 from ..exported import EXPORT, export_model
-from ..folder import READ, Trained, memory_for_files, memory_for_planes, plan_of
+from ..folder import READ, Trained, memory_for_files, memory_for_targets, plan_of
 from ..imported import write_labeled
 from ..mask_files import new_masks, write_mask
 from ..planning import build_context, find_requested_objects
@@ -148,7 +148,7 @@ def begin_border_training(
     plan = decide(context).settled_by(plan_of(before))
     planned = planned_capture(context.capture, plan)
     trainer = begin_with_labels(
-        source, ids, planned, folder.checkpoint, memory_for_planes(options), trained.model.device,
+        source, ids, planned, folder.checkpoint, memory_for_targets(options), trained.model.device,
         trained.scene.gains, planned.has_masks and plan.does("rest"),
     )  # fmt: skip
     trainer.save(folder.checkpoint)

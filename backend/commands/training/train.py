@@ -35,7 +35,7 @@ from ..folder import (
     READ,
     capture_record,
     digest,
-    memory_for_planes,
+    memory_for_targets,
     open_reconstruction,
     plan_of,
     recorded_agreement,
@@ -148,7 +148,7 @@ def _begin(
         planned, regions = correct_masks(planned, points.ids, ignore_gaps=supervised)
         if regions:
             reporter.status(f"{regions} regions of masks contradict those of other views and are corrected")
-    memory = memory_for_planes(options)
+    memory = memory_for_targets(options)
     if resuming:
         resumed = Trainer.resume(planned, folder.checkpoint, wanted, memory, device, gains)
         assert resumed is not None
