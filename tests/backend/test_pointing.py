@@ -329,8 +329,7 @@ def test_far_splats_belong_to_nothing_unless_everything_is_an_object() -> None:
     none, flat = np.zeros(0), np.zeros((9, 3))
     graph = SplatGraph(
         np.arange(9), np.arange(9), np.zeros(9, bool), np.repeat([[50.0, 0, 0], [80.0, 0, 0], [50.0, 0, 0]], 3, axis=0),
-        chain([1, 1, 1e-4, 1, 1, 1e-4, 1, 1]), Edges(none, none, none, none, none), flat, np.ones(9),
-        flat,
+        chain([1, 1, 1e-4, 1, 1, 1e-4, 1, 1]), Edges(none, none, none, none, none), flat, np.ones(9), flat,
     )  # fmt: skip
     seeds = {7: np.eye(9)[0]}
     assert graph.solve(seeds).ids.tolist() == [7, 7, 7, 0, 0, 0, 0, 0, 0]
@@ -339,9 +338,6 @@ def test_far_splats_belong_to_nothing_unless_everything_is_an_object() -> None:
     assert both.ids.tolist() == [7, 7, 7, 8, 8, 8, 8, 8, 8], "the last three only have the color of the first"
     again = graph.solve({**seeds, 8: np.eye(9)[4], 9: np.eye(9)[8]}, True, both)
     assert again.ids.tolist() == [7, 7, 7, 8, 8, 8, 9, 9, 9]
-
-
-CAMERA = {"viewmat": np.eye(4).tolist(), "intrinsics": [90, 90, 48, 36], "width": 96, "height": 72}
 
 
 def test_colors_of_what_was_found_decide_where_strokes_do_not() -> None:
@@ -370,6 +366,9 @@ def test_likeness_is_the_part_of_a_label_that_has_a_color() -> None:
     assert (found[:, 1] == 0).all() and (found.sum(1) <= 1 + 1e-9).all()
     far = ColorModel(np.concatenate([lab, [[90.0, 90, 90]]])).likeness(np.append(labels, -1), 3)
     assert (far[-1] == 0).all()
+
+
+CAMERA = {"viewmat": np.eye(4).tolist(), "intrinsics": [90, 90, 48, 36], "width": 96, "height": 72}
 
 
 @pytest.mark.parametrize(

@@ -58,8 +58,11 @@ def asked(window, expression: str):
 
 
 def settled(window) -> dict[int, int]:
-    """Return the number of splats of each marked object, when the strokes are answered."""
-    deadline = time.monotonic() + 120
+    """Return the number of splats of each marked object, when the strokes are answered.
+
+    The first answer waits for kernels, which are compiled for each place of the extension; users get them by set-up.
+    """
+    deadline = time.monotonic() + 480
     while asked(window, "pointing.state() != (1.0, False)"):
         assert time.monotonic() < deadline, "the strokes are not answered"
         time.sleep(0.3)
