@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import functools
 import io
 import os
 import sys
@@ -19,6 +20,7 @@ from ..shared.errors import (
     EXIT_FAILED,
     Cancelled,
     InputError,
+    MissingPackage,
     describe_missing_package,
 )
 from ..shared.events import JsonReporter, Reporter, StagedReporter
@@ -102,7 +104,8 @@ def _run(arguments: list[str], reporter: Reporter) -> int:
             COMMANDS[options.command](options, StoppingReporter(StagedReporter(reporter), stop))
         return EXIT_DONE
     except (InputError, UsageError) as error:
-        _tell(reporter.error, _shortened(str(error)))
+        fields = error.fields if isinstance(error, MissingPackage) else {}
+        _tell(functools.partial(reporter.error, **fields), _shortened(str(error)))
         return EXIT_BAD_INPUT
     except (Cancelled, KeyboardInterrupt) as error:
         _tell(reporter.stopped, str(error) or "Stopped immediately.")

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from ..shared.errors import InputError
+from ..shared.errors import InputError, MissingPackage
 from ..shared.formats.json_file import parse_json
 
 PACKAGE = "transformers>=5,<6"
@@ -76,13 +76,13 @@ def import_transformers(needed: str, option: str) -> Any:
         option: the argument of the command that needs it, for the error.
 
     Raises:
-        InputError: It is not installed, or too old.
+        MissingPackage: It is not installed, or too old.
     """
     try:
         transformers: Any = importlib.import_module("transformers")
         getattr(transformers, needed)  # Imported when it is asked for.
     except (ImportError, AttributeError) as error:
-        raise InputError(f"{option} needs the package transformers; run {_install(PACKAGE)} in a terminal.") from error
+        raise MissingPackage(option, "transformers", _install(PACKAGE)) from error
     transformers.utils.logging.set_verbosity_error()
     transformers.utils.logging.disable_progress_bar()
     return transformers

@@ -93,7 +93,7 @@ class ConsoleReporter(Reporter):
     def warning(self, message: str) -> None:
         self._print(f"warning: {message}", self.errors)
 
-    def error(self, message: str) -> None:
+    def error(self, message: str, **_fields: Any) -> None:
         self.close()
         self._print(f"error: {message}", self.errors)
 

@@ -14,6 +14,14 @@ class InputError(Exception):
     """Invalid user input; the message is one plain sentence that names the file."""
 
 
+class MissingPackage(InputError):
+    """An option needs a Python package that is not part of the backend's environment."""
+
+    def __init__(self, option: str, package: str, install: str) -> None:
+        super().__init__(f"{option} needs the package {package}; run {install} in a terminal.")
+        self.fields = {"lacks": package, "option": option}
+
+
 class Cancelled(Exception):
     """The user stopped the command; all results worth keeping are on disk."""
 

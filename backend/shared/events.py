@@ -48,7 +48,7 @@ class Reporter:
 
     def warning(self, message: str) -> None: ...
 
-    def error(self, message: str) -> None: ...
+    def error(self, message: str, **fields: Any) -> None: ...
 
     def stopped(self, message: str) -> None: ...
 
@@ -131,8 +131,8 @@ class StagedReporter(Reporter):
     def warning(self, message: str) -> None:
         self._reporter.warning(message)
 
-    def error(self, message: str) -> None:
-        self._reporter.error(message)
+    def error(self, message: str, **fields: Any) -> None:
+        self._reporter.error(message, **fields)
 
     def stopped(self, message: str) -> None:
         self._reporter.stopped(message)
@@ -174,8 +174,8 @@ class JsonReporter(Reporter):
     def warning(self, message: str) -> None:
         self._emit("warning", message=message)
 
-    def error(self, message: str) -> None:
-        self._emit("error", message=message)
+    def error(self, message: str, **fields: Any) -> None:
+        self._emit("error", message=message, **fields)
 
     def stopped(self, message: str) -> None:
         self._emit("done", stopped=True, message=message)

@@ -135,8 +135,8 @@ class StoppingReporter(Reporter):
     def warning(self, message: str) -> None:
         self.reporter.warning(message)
 
-    def error(self, message: str) -> None:
-        self.reporter.error(message)
+    def error(self, message: str, **fields: Any) -> None:
+        self.reporter.error(message, **fields)
 
     def stopped(self, message: str) -> None:
         self.reporter.stopped(message)

@@ -139,6 +139,11 @@ def probe_job(python: str | Path, folder: str | Path) -> Job:
     return _job("Check backend", "doctor", python, folder, "probe")
 
 
+def add_models_job(python: str | Path, folder: str | Path) -> Job:
+    """Return a job that installs the packages for models in a Python; `folder` is as for `probe_job`."""
+    return _job("Install Transformers", "packages", python, folder, "add")
+
+
 def _job(title: str, kind: str, python: str | Path, folder: str | Path, *arguments: str) -> Job:
     silent = (
         f"{python} is not a Python, or it is older than {layout.OLDEST[0]}.{layout.OLDEST[1]}; choose a Python "

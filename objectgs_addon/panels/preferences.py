@@ -73,6 +73,9 @@ class Preferences(bpy.types.AddonPreferences):
         column.prop(self, "reconstructions")
         column.prop(self, "segmenter")
         column.prop(self, "detector")
+        row = column.row()
+        row.alignment = "RIGHT"
+        row.operator("objectgs.install_transformers", icon="IMPORT")
 
 
 def draw_online_access(layout: bpy.types.UILayout) -> None:

@@ -53,8 +53,8 @@ class Job:
 
     Attributes:
         title: name shown to the user.
-        kind: sfm, import, masks, import-splats, plan, vote, train, label, mesh, export, film, fill, demo, setup or
-            doctor.
+        kind: sfm, import, masks, import-splats, plan, vote, train, label, mesh, export, film, fill, demo, setup,
+            packages or doctor.
         folder: the reconstruction folder, or None.
         command: program and arguments.
         cwd: working directory.
@@ -63,10 +63,10 @@ class Job:
 
     The other attributes change while the job runs: progress from 0 to 1, which never decreases, seconds_left
     (reported or estimated), stage (such as "Preparing (1 of 3)", or empty), message (the current step), statuses
-    (all messages so far), warnings and error (sentences), training figures (step, splats, anchors, psnr, miou,
-    miou_all, zero_is_background), preview (path of the newest image), curve (quality events: seconds, step, psnr,
-    miou, miou_all, mbiou), result (fields of the `done` event), exit_code and log (most recent lines that are not
-    events). number identifies the job in this process.
+    (all messages so far), warnings and error (sentences), lacks (a missing package and the option that needs it),
+    training figures (step, splats, anchors, psnr, miou, miou_all, zero_is_background), preview (path of the newest
+    image), curve (quality events: seconds, step, psnr, miou, miou_all, mbiou), result (fields of the `done` event),
+    exit_code and log (most recent lines that are not events). number identifies the job in this process.
     """
 
     title: str
@@ -85,6 +85,7 @@ class Job:
     statuses: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     error: str | None = None
+    lacks: tuple[str, str] | None = None
     step: int | None = None
     splats: int | None = None
     anchors: int | None = None
@@ -243,6 +244,8 @@ class Job:
                 self.warnings.append(message)
         elif kind == "error":
             self.error = message
+            if "lacks" in event:
+                self.lacks = str(event["lacks"]), str(event.get("option", ""))
         elif kind == "done":
             self._done = True
             self.result = {name: value for name, value in event.items() if name not in ("type", "time")}

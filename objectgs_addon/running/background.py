@@ -20,14 +20,14 @@ from ...backend.shared.console import ConsoleReporter
 from ...backend.shared.errors import InputError
 from .. import scene
 from ..blender import messages, writing
-from ..environment import locations
+from ..environment import environment, locations
 from ..process.blocking import run_blocking
 from ..process.jobs import Job, JobQueue, State
 from ..state import folder_trust, object_edits, object_list
 from ..state.folder_state import reconstruction_for
 from ..state.next_step import has_masks
 from . import pointing, previews, results
-from .wording import in_blender
+from .wording import INSTALL, TRANSFORMERS, in_blender, lacking
 
 INTERVAL = 0.1
 """Time in seconds between two polls of the queue."""
@@ -52,6 +52,8 @@ _results: list[Job] = []
 """Finished jobs whose results are not shown yet."""
 _requested_fills: dict[Path, Path] = {}
 """Reconstruction folder -> file requested from its latest fill job."""
+_then: dict[Job, int] = {}
+"""Job that installs packages -> number of the failed job that is run again after it; 0: none."""
 _announced: set[Job] = set()
 """Jobs in `_results` whose delay was reported to the user."""
 
@@ -112,6 +114,24 @@ def fill_holes(root: bpy.types.Collection, again: bool = True) -> None:
         submit(locations.backend_job(f"Fill of {root.name}", "fill", folder, "edit", str(folder)), owner, show_error)
 
 
+def install_transformers(owner: bpy.types.Scene, report: Callable[[set[str], str], Any], then: int) -> set[str]:
+    """Start a job that installs the package transformers for the backend.
+
+    Args:
+        owner, report: as for `submit`.
+        then: number of the failed job to run again afterwards; 0: none.
+
+    Returns:
+        The return value for the operator's `execute`.
+    """
+    python = locations.backend_python()
+    assert python is not None
+    job = environment.add_models_job(python, locations.environment_folder())
+    messages.settle(job.title, INSTALL[0])
+    _then[job] = then
+    return submit(job, owner, report)
+
+
 def job_of(root: bpy.types.Collection) -> Job | None:
     """Return the latest job in the queue for a reconstruction's folder, or None."""
     return queue.of_folder(scene.folder_of(root))
@@ -167,7 +187,11 @@ def redraw() -> None:
 
 def _handle_end(job: Job) -> None:
     operator, label, options = _REMEDIES.get(job.kind, ("objectgs.retry_job", "Try Again", {"number": job.number}))
-    if job.state is State.FAILED:
+    if job.state is State.FAILED and job.lacks is not None and job.lacks[0] == TRANSFORMERS:
+        messages.show(f"{job.title}: {lacking(*job.lacks)}", "ERROR", *INSTALL, number=job.number)
+    elif job.state is State.FAILED:
+        if job in _then:
+            operator, options = INSTALL[0], {"number": _then[job]}
         messages.show(f"{job.title}: {in_blender(job.error or job.message)}", "ERROR", operator, label, **options)
     elif job.state is State.DONE:
         messages.settle(job.title, operator if job.kind in _REMEDIES else None)
@@ -175,6 +199,7 @@ def _handle_end(job: Job) -> None:
         _results.append(job)
     else:
         _submitted_in.pop(job, None)
+        _then.pop(job, None)
 
 
 def _show_results() -> None:
@@ -224,10 +249,21 @@ def finish(job: Job) -> None:
     show = _import_made if job.kind in ("demo", "sfm") else results.SHOW_BY_KIND.get(job.kind)
     if show is not None and show(job, owner):
         _push_undo(job.title)
+    if job.kind == "packages":
+        _go_on(job, owner)
     if job.kind in ("import", "masks") and owner is not None and not bpy.app.background:
         _assign_objects(job, owner)
     for root in results.roots_of(job.folder):
         fill_holes(root, again=False)
+
+
+def _go_on(job: Job, owner: bpy.types.Scene | None) -> None:
+    """Run the job again that lacked the packages which a job has installed."""
+    failed = failed_job(_then.pop(job, 0))
+    if failed is None or owner is None:
+        messages.show(job.message)
+    else:
+        submit(failed.again(), owner, lambda _kind, text: messages.show(text, "ERROR"))
 
 
 def _import_made(job: Job, owner: bpy.types.Scene | None) -> bool:
@@ -298,7 +334,7 @@ def stop() -> None:
     if bpy.app.timers.is_registered(_tick):
         bpy.app.timers.unregister(_tick)
     queue.stop_all(timeout=10.0)
-    for known in (_results, _announced, _submitted_in, _requested_fills):
+    for known in (_results, _announced, _submitted_in, _requested_fills, _then):
         known.clear()
     previews.clear()
     messages.clear()

@@ -22,7 +22,7 @@ from ..blender import messages, writing
 from ..environment import locations
 from ..picking import marks
 from ..process.backend_process import BackendProcess
-from .wording import in_blender
+from .wording import INSTALL, TRANSFORMERS, in_blender, lacking
 
 INTERVAL = 0.05
 """Time in seconds between two polls of the process."""
@@ -40,7 +40,7 @@ class _Session:
         self.process = BackendProcess(job.command, job.cwd, job.environment, in_background=False)
         self.ready, self.progress, self.message, self.failure = False, 0.0, "Starting", ""
         self.asked = self.answered = 0
-        self.wants_proposals = False
+        self.wants_proposals = self.lacks = False
         self.proposed: dict[str, Any] | None = None
         self._parts: list[np.ndarray] = []
         self.objects: np.ndarray = np.zeros(1, np.int64)
@@ -79,7 +79,9 @@ class _Session:
         elif kind == "status":
             self.message = str(event.get("message"))
         elif kind == "error":
-            self.failure = in_blender(str(event.get("message")))
+            self.lacks = event.get("lacks") == TRANSFORMERS
+            lacks = lacking(TRANSFORMERS, str(event.get("option"))) if self.lacks else None
+            self.failure = lacks or in_blender(str(event.get("message")))
         elif kind == "answer" and event.get("ready"):
             self.ready = event.get("splats") == len(self.keys)
             if not self.ready:
@@ -213,7 +215,8 @@ def _tick() -> float | None:
     if session.failure or session.process.exit_code is not None:
         lines = session.process.log
         why = session.failure or (lines[-1] if lines else "it gave no reason")
-        messages.show(f"The objects of strokes cannot be found: {why}", "ERROR")
+        button = INSTALL if session.lacks else (None, "")
+        messages.show(f"The objects of strokes cannot be found: {why}", "ERROR", *button)
         stop()
         redraw()
         return None

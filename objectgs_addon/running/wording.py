@@ -19,7 +19,16 @@ _NAMES = {
 }
 """Options, and the names of their properties or operators."""
 
+TRANSFORMERS = "transformers"
+INSTALL = ("objectgs.install_transformers", "Install Transformers")
+"""A package, the operator that installs it, and the label of its button."""
+
 _OPTION = re.compile(r"(?<![\w`-])--[a-z]+(?:-[a-z]+)*(?![\w=-])")
+
+
+def lacking(package: str, option: str) -> str:
+    """Return what to say where an option of the backend needs a package that is not installed."""
+    return f"{_NAMES.get(option, option)} needs the package {package}, which is not installed yet"
 
 
 def in_blender(sentence: str) -> str:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Set up the compute backend in its own environment, check it, and remove it."""
+"""Set up the compute backend in its own environment, check it, add packages to it, and remove it."""
 
 from typing import Any
 
 import bpy
+from bpy.props import IntProperty
 
 from ...backend.shared.errors import InputError
 from ...objectgs_addon.environment import environment, locations, online_access
@@ -14,6 +15,14 @@ from ..common.reporting import reports_errors
 def _idle(cls: Any) -> bool:
     if background.busy(locations.environment_folder()):
         cls.poll_message_set("The backend is being set up or checked")
+        return False
+    return True
+
+
+def _online(cls: Any) -> bool:
+    if not bpy.app.online_access:
+        how = "Allow online access" if online_access.can_be_allowed() else "Start Blender without --offline-mode"
+        cls.poll_message_set(f"{how} first; packages are downloaded")
         return False
     return True
 
@@ -50,11 +59,7 @@ class SetUpBackend(bpy.types.Operator):
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        if not bpy.app.online_access:
-            how = "Allow online access" if online_access.can_be_allowed() else "Start Blender without --offline-mode"
-            cls.poll_message_set(f"{how} first; packages are downloaded")
-            return False
-        return _idle(cls)
+        return _online(cls) and _idle(cls)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         preferences = locations.preferences()
@@ -78,6 +83,27 @@ class CheckBackend(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         job = environment.probe_job(locations.backend_python(), locations.environment_folder())
         return background.submit(job, context.scene, self.report)
+
+
+class InstallTransformers(bpy.types.Operator):
+    bl_idname = "objectgs.install_transformers"
+    bl_label = "Install Transformers"
+    bl_description = (
+        "Download the package transformers for the backend (about 40 MB), which segmentation and detection models "
+        "need. The models are not part of it"
+    )
+
+    number: IntProperty(name="Job", description="The failed job that is run again", options={"HIDDEN", "SKIP_SAVE"})
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        if locations.backend_python() is None:
+            cls.poll_message_set("Set up the backend first")
+            return False
+        return _online(cls) and _idle(cls)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        return background.install_transformers(context.scene, self.report, self.number)
 
 
 class RemoveBackend(bpy.types.Operator):
@@ -106,4 +132,4 @@ class RemoveBackend(bpy.types.Operator):
             ) from error
 
 
-CLASSES = (AllowOnlineAccess, SetUpBackend, CheckBackend, RemoveBackend)
+CLASSES = (AllowOnlineAccess, SetUpBackend, CheckBackend, InstallTransformers, RemoveBackend)

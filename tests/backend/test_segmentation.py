@@ -15,7 +15,7 @@ from backend.capture.files import read_mask
 from backend.networks.checkpoint_folder import PACKAGE
 from backend.segmentation import Finder, KeptEncodings, PhotoSegments, Segmenter, fingerprint, is_checkpoint
 from backend.segmentation.selection import distinct, grid_points, is_segment
-from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE, InputError
+from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE, InputError, MissingPackage
 
 from .command_result import assert_rejected
 from .small_segmenters import KINDS, SIDE, write_small_model
@@ -233,9 +233,10 @@ def test_missing_packages_are_named_with_their_command(tmp_path, monkeypatch):
         folder = write_checkpoint(tmp_path / "edgetam", model_type="edgetam")
         refused(folder, "needs the package timm; run .* -m pip install .timm. in a terminal")
     monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(InputError, match="--segmenter needs the package transformers; run ") as error:
+    with pytest.raises(MissingPackage, match="--segmenter needs the package transformers; run ") as error:
         Segmenter(write_checkpoint(tmp_path / "sam2"))
     assert f'pip install "{PACKAGE}"' in str(error.value)
+    assert error.value.fields == {"lacks": "transformers", "option": "--segmenter"}
 
 
 def test_weights_that_do_not_fit_are_refused(checkpoints, tmp_path):

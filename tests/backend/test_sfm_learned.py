@@ -241,6 +241,9 @@ def test_missing_package_is_named_with_its_command(photos, tmp_path, run_command
     result = run_command("sfm", photos[0], "--out", tmp_path / "capture", "--matcher", folder)
     assert_rejected(result, "needs the package transformers; run ", f'pip install "{PACKAGE}"')
     assert PACKAGE in (REQUIREMENTS / "models.txt").read_text().splitlines()
+    result = run_command("sfm", photos[0], "--out", tmp_path / "capture", "--matcher", folder, "--json")
+    told = json.loads(result.out.splitlines()[-1])
+    assert (told["type"], told["lacks"], told["option"]) == ("error", "transformers", "--matcher")
 
 
 def test_checkpoints_are_told_apart_by_their_content(tmp_path):

@@ -420,6 +420,29 @@ def test_probe_checks_packages_and_backend(root, monkeypatch):
     )
 
 
+def test_packages_for_models_are_added_and_others_keep_their_versions(root):
+    folder = root / "environment"
+    run(environment.set_up_job(sys.executable, folder, "cpu"))
+    python = environment.inspect(folder).python
+    models = root / "requirements" / layout.MODELS
+    models.write_text("smallmodels>=5,<6\n")
+    run(job := environment.add_models_job(python, folder))
+    assert job.state is State.FAILED and "no ready-made package smallmodels" in job.error
+
+    wheel(root / "wheels", "smallnumba", "0.69")
+    wheel(root / "wheels", "smallmodels", "5.1", requires="smallnumba")
+    run(job := environment.add_models_job(python, folder))
+    assert job.state is State.DONE and job.message == "Installed smallmodels 5.1.", (job.error, job.log)
+    wheel(root / "wheels", "smallmodels", "5.2", requires="smallnumba>=0.69")
+    models.write_text("smallmodels==5.2\n")
+    run(job := environment.add_models_job(python, folder))
+    assert job.state is State.FAILED, job.log
+    names = "import smallnumba, smallmodels; print(smallnumba.__version__, smallmodels.__version__)"
+    found = subprocess.run([python, "-c", names], capture_output=True, text=True, check=True)
+    assert found.stdout == "0.68 5.1\n"
+    assert environment.inspect(folder).state == "ready"
+
+
 @pytest.mark.skipif(os.name != "posix", reason="POSIX programs")
 @pytest.mark.parametrize("program", ["/bin/ls", "/bin/true", "/bin/sh"])
 def test_probe_rejects_other_programs(root, program):

@@ -124,6 +124,18 @@ def test_figures_lead_with_miou_all_where_zero_is_background(make, monkeypatch, 
     assert written == [f"PSNR 30.0 dB   {shown}   1,200 splats"]
 
 
+def test_job_knows_which_package_is_missing(make):
+    job = run(
+        make("""
+say("error", message="--text needs the package transformers; run x.", lacks="transformers", option="--text")
+sys.exit(2)
+""")
+    )
+    assert job.state is State.FAILED and job.lacks == (wording.TRANSFORMERS, "--text")
+    assert wording.lacking(*job.lacks) == "Names needs the package transformers, which is not installed yet"
+    assert run(make('say("error", message="Other.")\nsys.exit(2)')).lacks is None
+
+
 def test_jobs_run_in_order_and_changes_are_reported(make):
     queue, order = JobQueue(), []
     first, second = make('say("done")', title="first"), make('say("done")', title="second")

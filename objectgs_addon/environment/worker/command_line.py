@@ -7,6 +7,7 @@ import argparse
 import traceback
 from pathlib import Path
 
+from .additions import add
 from .checks import probe
 from .events import Refused, Stopped, StopRequest, emit
 from .setup import set_up
@@ -20,11 +21,14 @@ def main() -> int:
     setup.add_argument("--folder", type=Path, required=True, help="its folder: new, empty or an earlier environment")
     setup.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     check = commands.add_parser("probe", help="check this Python")
-    for command in (setup, check):
-        command.add_argument("--requirements", type=Path, required=True, help="folder of torch.txt and backend.txt")
+    more = commands.add_parser("add", help="install the packages for models in this Python")
+    for command in (setup, check, more):
+        command.add_argument(
+            "--requirements", type=Path, required=True, help="folder of torch.txt, backend.txt and models.txt"
+        )
     options = parser.parse_args()
     try:
-        {"setup": set_up, "probe": probe}[options.command](options, StopRequest())
+        {"setup": set_up, "probe": probe, "add": add}[options.command](options, StopRequest())
         return 0
     except Refused as refusal:
         emit("error", message=str(refusal))

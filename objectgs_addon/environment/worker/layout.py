@@ -25,6 +25,8 @@ REMOVED = ".removed-"
 OLDEST, NEWEST = (3, 11), (3, 13)
 VERSIONS = "3.11, 3.12 or 3.13"
 REQUIREMENTS = ("torch.txt", "backend.txt")
+MODELS = "models.txt"
+"""File of the requirements with the packages for models in folders of the user."""
 LOCKED = "locked"
 """Folder in that of the requirements with the packages of each system and their hashes."""
 

@@ -19,13 +19,29 @@ PROBE_SECONDS = 8
 
 
 class Pip:
-    """The pip of the environment in `folder`."""
+    """The pip of a Python of the same version as this one.
 
-    def __init__(self, folder: Path, progress: Progress, stop: Callable[[], bool]) -> None:
-        self.folder, self.progress, self.stop = folder, progress, stop
-        self.temporary = folder / TEMPORARY
-        self.temporary.mkdir()
+    Args:
+        python: the Python.
+        site: its folder of packages.
+        temporary: an existing folder for temporary files.
+        progress: receives what pip does.
+        stop: returns whether to stop.
+    """
+
+    def __init__(self, python: Path, site: Path, temporary: Path, progress: Progress, stop: Callable[[], bool]) -> None:
+        self.python, self.site, self.temporary = python, site, temporary
+        self.progress, self.stop = progress, stop
         self.lines: list[str] = []
+
+    @classmethod
+    def of_environment(cls, folder: Path, progress: Progress, stop: Callable[[], bool]) -> Pip:
+        """Return the pip of the environment in `folder`."""
+        version = f"python{sys.version_info[0]}.{sys.version_info[1]}"
+        site = folder / VENV / ("Lib" if os.name == "nt" else f"lib/{version}") / "site-packages"
+        temporary = folder / TEMPORARY
+        temporary.mkdir()
+        return cls(environment_python(folder), site, temporary, progress, stop)
 
     @property
     def packages(self) -> dict[str, str]:
@@ -34,12 +50,6 @@ class Pip:
             found.metadata["Name"].lower(): found.version
             for found in importlib.metadata.distributions(path=[str(self.site)])
         }
-
-    @property
-    def site(self) -> Path:
-        """The folder of installed packages."""
-        version = f"python{sys.version_info[0]}.{sys.version_info[1]}"
-        return self.folder / VENV / ("Lib" if os.name == "nt" else f"lib/{version}") / "site-packages"
 
     def install(self, arguments: list[str], megabytes: float) -> None:
         """Run `pip install` with wheels only and the user's pip configuration.
@@ -82,9 +92,7 @@ class Pip:
             "PIP_USER": "0",
             "PIP_DISABLE_PIP_VERSION_CHECK": "1",
         }
-        return run(
-            guarded(environment_python(self.folder), "pip", *arguments), self.stop, self._line, on_tick, environment
-        )
+        return run(guarded(self.python, "pip", *arguments), self.stop, self._line, on_tick, environment)
 
     def _line(self, line: str) -> None:
         print_error(line)
@@ -129,11 +137,11 @@ def why_pip_failed(lines: list[str]) -> str:
     lacking = re.search(r"No matching distribution found for (\S+)", text)
     unreached = re.search(r"Retrying \(|Could not fetch URL|connection error|Connection to \S+ timed out", text)
     if "No space left on device" in text or "not enough space on the disk" in text:
-        return "The disk is full; make room and set the backend up again."
+        return "The disk is full; make room and try again."
     if (lacking and unreached) or "ReadTimeoutError" in text or "ConnectionResetError" in text:
         return (
             "Python's package index could not be reached; check the network connection (or pip's proxy or "
-            "mirror settings) and set the backend up again."
+            "mirror settings) and try again."
         )
     if lacking:
         system = f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"
@@ -141,13 +149,13 @@ def why_pip_failed(lines: list[str]) -> str:
     if "Windows Long Path" in text:
         return (
             "Windows refuses paths as long as the packages need; allow long paths in Windows "
-            "(LongPathsEnabled) and set the backend up again."
+            "(LongPathsEnabled) and try again."
         )
     if "DO NOT MATCH THE HASHES" in text:
         other = re.search(r"DO NOT MATCH THE HASHES.*\n\s+(\S+)", text)
         return (
             f"{other[1] if other else 'A package'} is not the file that ObjectGS was tested with (its hash differs), "
-            "so nothing was installed; set the backend up again or, if that does not help, check pip's mirror settings."
+            "so nothing was installed; try again or, if that does not help, check pip's mirror settings."
         )
     errors = [line for line in lines if line.startswith("ERROR: ")] or lines or ["it said nothing"]
     return f"The packages could not be installed: {errors[-1].replace('ERROR: ', '', 1).rstrip('.')}."

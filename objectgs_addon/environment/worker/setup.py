@@ -52,7 +52,7 @@ def set_up(options: argparse.Namespace, stop: Callable[[], bool]) -> None:
         progress.begin("venv", "Making an environment")
         if run(guarded(Path(sys.executable), "venv", str(short / layout.VENV)), stop, print_error) != 0:
             raise Refused(f"{sys.executable} could not make an environment in {folder}; choose another Python.")
-        pip = Pip(short, progress, stop)
+        pip = Pip.of_environment(short, progress, stop)
         progress.begin("packages", "Resolving the packages")
         chosen = choose(pip, options.requirements, device, GIGABYTES["cuda"])
         digest = layout.requirements_digest(options.requirements, chosen.device, layout.system())
