@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import NoReturn
 
+from ..shared.defaults import DETAIL
 from ..shared.version import __version__
 from . import options, texts, types
 
@@ -168,6 +169,10 @@ def _add_label(commands: _Commands) -> None:
     propose.add_argument(
         "--strokes", type=Path, metavar="FILE", help="file of strokes to write (default: strokes.json in the folder)"
     )
+    propose.add_argument(
+        "--detail", type=types.fraction, default=DETAIL, metavar="NUMBER",
+        help=f"from 0 to 1; more divides the scene into more objects ({DETAIL:g})",
+    )  # fmt: skip
     label = commands.add_for_result(
         "label", "Separate objects by strokes on them in a few photos", texts.LABEL,
         "garden-splats --strokes strokes.json",

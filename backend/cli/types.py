@@ -114,6 +114,13 @@ def weight(text: str) -> float:
     return value
 
 
+def fraction(text: str) -> float:
+    value = weight(text)
+    if value > 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number from 0 to 1")
+    return value
+
+
 def amount(text: str) -> float:
     value = weight(text)
     if value == 0:

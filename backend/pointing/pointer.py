@@ -14,7 +14,7 @@ from ..raster import Camera, devices, object_ranks, rasterize
 from ..shared.errors import InputError
 from ..shared.reconstruction.objects import default_name
 from .mask_edges import follow_edges
-from .proposals import find_objects
+from .proposals import find_objects, try_regions
 from .splat_graph import Solution, SplatGraph, Weights, build_graph, contributions
 from .stroke_masks import Segment, stroke_pixels
 from .strokes import Stroke, Strokes, stroke_through
@@ -89,6 +89,7 @@ class Pointer:
         )  # fmt: skip
         self._shown: dict[_Drawn, _Shown] = {}
         self._latest: Solution | None = None
+        self._agreement: np.ndarray | None = None
 
     def solve(self, strokes: Strokes) -> np.ndarray:
         """Find the object of each splat.
@@ -111,13 +112,16 @@ class Pointer:
         self._latest = self._graph.solve(seeds, strokes.everything, self._latest)
         return self._latest.ids
 
-    def propose(self, progress: Callable[[int, int], object]) -> Strokes:
+    def propose(self, detail: float, progress: Callable[[int, int], object]) -> Strokes:
         """Find the objects without strokes, and return strokes that mark them, in up to three photos each.
 
         Args:
+            detail: as for `find_objects`. After the first call, others are answered sooner.
             progress: receives the number of finished trials, and of all.
         """
-        found = find_objects(self._graph, progress)[self._graph.nearest]
+        if self._agreement is None:
+            self._agreement = try_regions(self._graph, progress)
+        found = find_objects(self._graph, self._agreement, detail)[self._graph.nearest]
         found[self._graph.is_alone] = 0
         used = self._views.used
         places = np.unique(np.linspace(0, len(used) - 1, min(len(used), _PHOTOS)).round().astype(int))

@@ -9,6 +9,7 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from ..labels.regions import merge_regions, merge_tree, stable_regions
+from ..shared.defaults import DETAIL
 from .splat_graph import Edges, SplatGraph, concavity, measure_normals
 
 NEIGHBORS = (35, 45, 55, 65)
@@ -16,14 +17,11 @@ NEIGHBORS = (35, 45, 55, 65)
 
 CONCAVE_AND_COLOR = ((4.0, 0.16), (5.0, 0.2))
 """Weights of the concavity and of a tenth of the CIELAB distance of two splats, as for strokes. Colors hardly count,
-since objects have several. Each pair is tried with each number of neighbors."""
+since objects have several. Each pair is tried with each number of neighbors, since a single trial is sensitive to its
+weights: it finds 72% of the objects of ten synthetic scenes, and all together 84%."""
 
 GAP, STEPS, LEAST = 1 / 3, 0.36, 1e-4
 """Weights of the distance and, relative to that of the color, of the step in the photos; least weight of an edge."""
-
-AGREEING = 0.6
-"""Two regions are one if this fraction of all trials has them in one, on average over their border. A single trial is
-sensitive to its weights: it finds 72% of the objects of ten synthetic scenes, and all together 84%."""
 
 SMALLEST = 0.003
 """Size of the smallest object, as a fraction of all photos' pixels."""
@@ -33,8 +31,8 @@ APART = 0.15
 things on it, and with more, walls fall into parts."""
 
 
-def find_objects(graph: SplatGraph, progress: Callable[[int, int], object]) -> np.ndarray:
-    """Find the objects of a graph's nodes.
+def try_regions(graph: SplatGraph, progress: Callable[[int, int], object]) -> np.ndarray:
+    """Divide a graph's nodes into regions in several ways.
 
     In each trial, neighboring regions of splats are merged where their border, on average over all of it, is least
     concave and has the smallest gaps and steps of color; of the tree, the regions are taken that last longest.
@@ -44,7 +42,7 @@ def find_objects(graph: SplatGraph, progress: Callable[[int, int], object]) -> n
         progress: receives the number of finished trials, and of all.
 
     Returns:
-        (n,) int64, the number of each node's object, from 1 by size; 0: none.
+        (m,) float64, for each edge of the graph, the fraction of the trials in which its nodes are in one region.
     """
     edges, count, whole = graph.edges, len(graph.xyz), float(graph.seen.sum())
     _, near = cKDTree(graph.xyz).query(graph.xyz, k=min(max(NEIGHBORS), count), workers=-1)
@@ -62,8 +60,24 @@ def find_objects(graph: SplatGraph, progress: Callable[[int, int], object]) -> n
             found = stable_regions(tree, graph.seen, SMALLEST * whole, APART)
             agreeing += (found[edges.first] == found[edges.second]) & (found[edges.first] >= 0)
             progress(len(CONCAVE_AND_COLOR) * done + number + 1, len(NEIGHBORS) * len(CONCAVE_AND_COLOR))
-    trials = len(NEIGHBORS) * len(CONCAVE_AND_COLOR)
-    found = merge_regions(_symmetric(edges, agreeing / trials, count), ones, AGREEING)
+    return agreeing / (len(NEIGHBORS) * len(CONCAVE_AND_COLOR))
+
+
+def find_objects(graph: SplatGraph, agreement: np.ndarray, detail: float = DETAIL) -> np.ndarray:
+    """Find the objects of a graph's nodes.
+
+    Args:
+        graph: the graph.
+        agreement: (m,) as from `try_regions`.
+        detail: the fraction of the trials that must agree that two regions are one, from 0 to 1: more gives more and
+            smaller objects.
+
+    Returns:
+        (n,) int64, the number of each node's object, from 1 by size; 0: none.
+    """
+    edges, count, whole = graph.edges, len(graph.xyz), float(graph.seen.sum())
+    ones = _symmetric(edges, np.ones(len(edges.first)), count)
+    found = merge_regions(_symmetric(edges, agreement, count), ones, detail)
     sizes = np.bincount(found, graph.seen)
     number_of = np.zeros(len(sizes), np.int64)
     kept = [region for region in np.argsort(-sizes, kind="stable").tolist() if sizes[region] >= SMALLEST * whole]

@@ -40,7 +40,8 @@ class _Session:
         self.process = BackendProcess(job.command, job.cwd, job.environment, in_background=False)
         self.ready, self.progress, self.message, self.failure = False, 0.0, "Starting", ""
         self.asked = self.answered = 0
-        self.wants_proposals = self.lacks = False
+        self.wanted_detail: float | None = None
+        self.lacks = False
         self.proposed: dict[str, Any] | None = None
         self._parts: list[np.ndarray] = []
         self.objects: np.ndarray = np.zeros(1, np.int64)
@@ -57,12 +58,12 @@ class _Session:
         self.asked += 1
         self.process.send(json.dumps({"request": self.asked, **content}))
 
-    def propose(self) -> None:
-        """Ask for objects without strokes, now or as soon as the process is ready."""
-        self.wants_proposals = not self.ready
+    def propose(self, detail: float) -> None:
+        """Ask for objects without strokes, now or as soon as the process is ready; detail: how finely to divide."""
+        self.wanted_detail = None if self.ready else detail
         if self.ready:
             self.asked += 1
-            self.process.send(json.dumps({"request": self.asked, "propose": True}))
+            self.process.send(json.dumps({"request": self.asked, "propose": True, "detail": detail}))
 
     def take(self, event: dict[str, Any]) -> int | None:
         """Process an event; return the number of a stroke that shows no splats."""
@@ -146,7 +147,7 @@ def propose(root: bpy.types.Collection) -> None:
     """Ask for objects without strokes, which replace those that are marked; starts the process if it does not run."""
     start(root)
     assert _session is not None
-    _session.propose()
+    _session.propose(root.objectgs.detail)
 
 
 def release(folder: Path | None) -> None:
@@ -204,8 +205,8 @@ def _tick() -> float | None:
             marks.remove_stroke(root, number)
     if session.ready and not was_ready:
         session.ask(marks.content(root))
-        if session.wants_proposals:
-            session.propose()
+        if session.wanted_detail is not None:
+            session.propose(session.wanted_detail)
     if session.proposed is not None:
         _show_proposed(root, session)
     if session.answered != before:
@@ -235,10 +236,10 @@ def _show_proposed(root: bpy.types.Collection, session: _Session) -> None:
     if count:
         messages.show(
             f"{count} objects were found. Remove those that are none, merge parts, and draw over what is missing; then "
-            "press Separate Objects"
+            "press Separate Objects. Another Detail gives more or fewer"
         )
     else:
-        messages.show("No objects were found by their shape; draw over them instead")
+        messages.show("No objects were found by their shape; try another Detail, or draw over them")
     windows = bpy.context.window_manager.windows
     if windows and not bpy.app.background:
         with bpy.context.temp_override(window=windows[0]):

@@ -7,6 +7,7 @@ import re
 
 _NAMES = {
     "--capture": "Capture",
+    "--detail": "Detail",
     "--detector": "Detection Model",
     "--frames": "Video Frames",
     "--max-size": "Image Size",

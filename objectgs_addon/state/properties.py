@@ -19,7 +19,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from ...backend.shared.defaults import MAX_SIZE
+from ...backend.shared.defaults import DETAIL, MAX_SIZE
 from ...backend.shared.expectation import PRESET_STEPS
 from ...backend.shared.formats.splat_ply import UNOBSERVED
 from .. import drawing
@@ -148,6 +148,16 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
         description="Every part of the scene belongs to one of the marked objects. Otherwise, what is far from all "
         "strokes belongs to none",
         update=marks.strokes_changed,
+    )
+    detail: FloatProperty(
+        name="Detail",
+        default=DETAIL,
+        min=0.1,
+        max=0.9,
+        precision=2,
+        subtype="FACTOR",
+        description="How finely Suggest Objects divides the scene: lower it if things are in parts, and raise it if "
+        "several are one",
     )
     active_object: IntProperty(name="Active Object", default=0, update=object_edits.active_changed, options=set())
     length: EnumProperty(

@@ -26,7 +26,7 @@ from backend.model.object_model import Normalization
 from backend.pointing.color_model import SPREAD, ColorModel
 from backend.pointing.mask_edges import follow_edges
 from backend.pointing.pointer import Pointer
-from backend.pointing.proposals import find_objects
+from backend.pointing.proposals import find_objects, try_regions
 from backend.pointing.random_walker import random_walker
 from backend.pointing.splat_graph import OF_SPLATS, Edges, SplatGraph, contributions
 from backend.pointing.stroke_masks import points_on, stroke_pixels
@@ -414,9 +414,15 @@ def test_point_answers_strokes(unlabeled) -> None:
     process.stdin.write(json.dumps({"request": 2, "strokes": [{**ONE, "view": "gone.png"}]}) + "\n")
     process.stdin.flush()
     assert "gone.png" in answer()["problem"]
-    process.stdin.write(json.dumps({"request": 3, "propose": True}) + "\n")
+    counts = []
+    for request, detail in enumerate((0.6, 0.0), 3):
+        process.stdin.write(json.dumps({"request": request, "propose": True, "detail": detail}) + "\n")
+        process.stdin.flush()
+        counts.append(len({stroke["object"] for stroke in answer()["proposed"]["strokes"]}))
+    assert counts[0] >= 3 and counts[1] == 1
+    process.stdin.write(json.dumps({"request": 5, "propose": True, "detail": "fine"}) + "\n")
     process.stdin.flush()
-    assert len({stroke["object"] for stroke in answer()["proposed"]["strokes"]}) >= 3
+    assert "0 to 1" in answer()["problem"]
     process.stdin.close()
     assert process.wait(timeout=20) == EXIT_DONE
 
@@ -459,7 +465,8 @@ def table_with_balls(balls: int) -> tuple[SplatGraph, np.ndarray]:
 def test_things_on_a_table_are_found_without_strokes(balls) -> None:
     graph, truth = table_with_balls(balls)
     calls = []
-    found = find_objects(graph, lambda done, total: calls.append((done, total)))
+    agreement = try_regions(graph, lambda done, total: calls.append((done, total)))
+    found = find_objects(graph, agreement)
     assert calls[-1][0] == calls[-1][1] > 1
     for number in range(balls + 1):
         ids, counts = np.unique(found[(truth == number) & (found > 0)], return_counts=True)
@@ -467,6 +474,11 @@ def test_things_on_a_table_are_found_without_strokes(balls) -> None:
         both = ((found == best) & (truth == number)).sum()
         assert both / ((found == best) | (truth == number)).sum() > 0.85, number
     assert found.max() <= balls + 3 and (np.diff(np.bincount(found)[1:]) <= 0).all(), "the largest is the first"
+    pairs = [find_objects(graph, agreement, detail) for detail in (0.3, 0.9)]
+    assert pairs[0].max() <= found.max() <= pairs[1].max()
+    coarse, fine = ((each[graph.edges.first], each[graph.edges.second]) for each in pairs)
+    both = (fine[0] == fine[1]) & (fine[0] > 0)
+    assert both.any() and (coarse[0] == coarse[1])[both].all(), "finer objects divide the coarser ones"
 
 
 def test_proposed_objects_are_separated_by_label(unlabeled, tmp_path, run_command) -> None:

@@ -282,11 +282,13 @@ def test_proposed_objects_replace_the_marked_ones_and_can_be_merged(root, sessio
     root.objectgs.objects.add().object_id = 2
     marks.add_object(root)
     marks.add_stroke(root, 1, views(root)[0], [(1, 1)], area=False)
+    root.objectgs.detail = 0.5
     pointing.propose(root)
     assert not any("propose" in each for each in session.process.sent), "the process is not ready"
     session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
-    session.propose()
-    assert session.process.sent[-1] == {"request": session.asked, "propose": True} and pointing.state()[1]
+    session.propose(0.5)
+    assert session.process.sent[-1] == {"request": session.asked, "propose": True, "detail": 0.5}
+    assert pointing.state()[1]
     session.take({"type": "answer", "request": session.asked, "proposed": PROPOSED})
     pointing._show_proposed(root, session)
     assert [item.object_id for item in root.objectgs.marked] == [1, 3, 4], "2 is taken"
@@ -304,7 +306,7 @@ def test_proposed_objects_replace_the_marked_ones_and_can_be_merged(root, sessio
 
 def test_invalid_proposals_end_the_process_with_a_sentence(root, session):
     session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
-    session.propose()
+    session.propose(0.6)
     session.take({"type": "answer", "request": session.asked, "proposed": {"strokes": [{}]}})
     pointing._show_proposed(root, session)
     assert "not valid" in session.failure

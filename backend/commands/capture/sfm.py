@@ -259,9 +259,11 @@ def _tell(report: dict[str, Any], capture: Path, reporter: StoppingReporter) -> 
     for folders in report["rigs"]:
         reporter.status(f"The cameras of {', '.join(folders)} are a rig: they keep their relative poses.")
     for name, why in list(weak.items())[:_WORST]:
-        reporter.warning(f"{name} is weak: {why}; --leave-out {name} computes the poses without it.")
+        reporter.warning(f"{name} is weak: {why}.")
     if len(weak) > _WORST:
         reporter.warning(f"{len(weak) - _WORST} more photos are weak; {path} lists them.")
+    if weak:
+        reporter.warning("If the result looks wrong, compute the poses again without the weak photos.")
     number, sets = report["set"], report["separate_sets"]
     if sets:
         reporter.warning(

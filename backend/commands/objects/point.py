@@ -13,6 +13,7 @@ import numpy as np
 
 from ...pointing.pointer import StrokeOnNothing
 from ...pointing.strokes import content_of, strokes_of
+from ...shared.defaults import DETAIL
 from ...shared.errors import InputError
 from ...shared.stopping import StoppingReporter
 from ..folder import READ
@@ -44,8 +45,11 @@ def point(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             continue
         request: Any = content.get("request")
         if content.get("propose"):
-            proposed = content_of(pointer.propose(reporter.progress))
-            reporter.answer(request=request, proposed=proposed)
+            detail = content.get("detail", DETAIL)
+            if not (isinstance(detail, int | float) and 0 <= detail <= 1):
+                reporter.answer(request=request, problem=f"The detail {detail!r} is not a number from 0 to 1.")
+                continue
+            reporter.answer(request=request, proposed=content_of(pointer.propose(detail, reporter.progress)))
             continue
         try:
             ids = pointer.solve(strokes_of(content, "the request", opened.views.names))[opened.in_file]

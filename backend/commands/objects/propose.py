@@ -29,9 +29,11 @@ def propose(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     reporter.begin(GRAPH, "Comparing the splats with their neighbors")
     pointer = opened.pointer(reporter.progress)
     reporter.begin(_DRAW, "Finding objects")
-    found = pointer.propose(reporter.progress)
+    found = pointer.propose(options.detail, reporter.progress)
     if not found.strokes:
-        raise InputError(f"No objects were found in {opened.folder.folder}; mark them by strokes.")
+        raise InputError(
+            f"No objects were found in {opened.folder.folder}; try another --detail, or mark them by strokes."
+        )
     path = options.strokes or opened.folder.strokes
     write_json(path, content_of(found))
     reporter.done(objects=len(found.names), strokes=str(path))

@@ -66,7 +66,7 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
         if not is_active:
             column = layout.column(align=True)
             column.operator("objectgs.start_marking", icon="GREASEPENCIL")
-            column.operator("objectgs.suggest_objects", icon="LIGHT")
+            _draw_suggesting(column, properties)
             if not properties.marked:
                 write(
                     layout, "Draw over each object in the viewport to separate it from the scene, or let them be found."
@@ -84,8 +84,8 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
         column.operator("objectgs.merge_marked", text="", icon="AUTOMERGE_ON")
         column.separator()
         column.operator("objectgs.clear_marks", text="", icon="TRASH")
-        if is_active and not marks.strokes_of(root):
-            layout.operator("objectgs.suggest_objects", icon="LIGHT")
+        if is_active:
+            _draw_suggesting(layout, properties)
         layout.prop(properties, "everything")
         layout.operator("objectgs.separate_marked", icon="CHECKMARK")
         if not folder_trust.state_of(root).trained:
@@ -109,3 +109,11 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
         else:
             text = f"Press Tab for the next object. {nothing} stroke{'s' if nothing != 1 else ''} on no object."
         write(layout, text, "INFO")
+
+
+def _draw_suggesting(layout: bpy.types.UILayout, properties: Any) -> None:
+    row = layout.row(align=True)
+    row.operator("objectgs.suggest_objects", icon="LIGHT")
+    detail = row.row(align=True)
+    detail.ui_units_x = 4.5
+    detail.prop(properties, "detail", slider=True)
