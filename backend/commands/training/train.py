@@ -60,7 +60,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         {
             READ: ("Preparing", 5.0), VOTE: ("Preparing", 5.0), "plan": ("Preparing", 5.0),
             DENSE: ("Preparing", 0.0), KERNELS: ("Preparing", kernel_seconds(device)),
-            "train": ("Training", budget.seconds or DEFAULT_SECONDS), EXPORT: ("Saving", 5.0),
+            "train": ("Training", budget.seconds or DEFAULT_SECONDS), EXPORT: ("Saving", 10.0),
         }
     )  # fmt: skip
     with open_reconstruction(options, reporter) as (output, capture):
