@@ -39,13 +39,14 @@ GPU_SECONDS ?= 240
 # The capture that benchmarks/gpu.py trains on, where there is one.
 CAPTURE ?= $(wildcard build/demo/capture)
 
-.PHONY: help venv lock demo demo-photos zip test test-window test-blenders lint benchmarks gpu gpu-with clean
+.PHONY: help venv lock demo demo-photos zip test test-slow test-window test-blenders lint benchmarks gpu gpu-with clean
 
 help:
 	@echo "make demo           a capture made by Blender becomes objects in a .blend, with a report, in $(DEMO)"
 	@echo "make demo-photos    the same from the photos alone, in $(DEMO)-photos"
 	@echo "make zip            the extension to install in Blender, in build/"
 	@echo "make test           the tests"
+	@echo "make test-slow      tests that take minutes: trainings in the simulator of a GPU"
 	@echo "make test-window    the tests that drive a Blender with a window, where there is one"
 	@echo "make test-blenders  the tests of the Blender side in more versions of Blender"
 	@echo "make lint           what a change must pass beside the tests"
@@ -96,8 +97,11 @@ zip: .venv-bpy/ready
 	$(BLENDER_EXT) validate build/objectgs-*.zip
 
 test: .venv/ready .venv-bpy/ready
-	$(BACKEND) -m pytest $(WORKERS) tests/backend tests/fuzz
+	$(BACKEND) -m pytest $(WORKERS) -m "not slow" tests/backend tests/fuzz
 	$(BLENDER) -m pytest $(WORKERS) tests/blender
+
+test-slow: .venv/ready
+	$(BACKEND) -m pytest $(WORKERS) -m slow tests/backend
 
 test-window: .venv/ready .venv-bpy/ready
 	$(BACKEND) -m pytest $(WINDOW) tests/window

@@ -294,6 +294,7 @@ def quality(trainer):
     return float(np.mean(found)), float(np.mean(right))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [SMALL, FLAT], ids=["3d", "2d"])
 def test_training_quality_matches(tiny, both, settings):
     capture, ids = tiny()
@@ -486,6 +487,7 @@ FULL = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", FULL, ids=["torch", "numba"])
 def test_out_of_memory_warns_once_and_continues_in_parts(tiny, tmp_path, as_on_gpu, monkeypatch, error):
     as_on_gpu(True)
