@@ -14,7 +14,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from PIL import Image
+from PIL import Image, ImageFilter
 
 from . import harness, screenshots
 from .test_workflow import IDLE, script, wait
@@ -23,9 +23,11 @@ IMAGES = harness.ROOT / "docs" / "manual" / "images"
 SIZE = (1320, 880)
 WIDEST = 1000
 QUALITY = 82
+BLURRED = (11, 30)
+"""Photos of the demo, by number, that are blurred for the picture of weak poses."""
 AWAY = (300, 862)
 """A mouse position without effect on the image."""
-PREFERENCES = (260, 200, 980, 500)
+PREFERENCES = (260, 200, 980, 585)
 """Where the window of the preferences, which opens over the other one, shows those of the extension."""
 
 
@@ -233,7 +235,7 @@ def marking(window: Window) -> None:
     window.do("call(bpy.ops.objectgs.start_marking)")
     pointing = f"sys.modules['{harness.PACKAGE}.objectgs_addon.running.pointing'].state()"
     for name in ("monkey", "vase"):
-        wait(blender, f"{pointing} == (1.0, False)")
+        wait(blender, f"{pointing} == (1.0, False)", timeout=480)
         x, y = spots[name]
         blender.drag((x - 25, y - 30), (x + 25, y + 30))
         blender.key("Tab")
@@ -314,17 +316,52 @@ def rendering(window: Window) -> None:
         image.convert("RGB").save(IMAGES / "film-frame.jpg", quality=QUALITY, optimize=True)
 
 
-def exporting(window: Window) -> None:
-    """Save the options of the export of splats."""
+def browser(window: Window, call: str, name: str, box: tuple[int, int, int, int]) -> None:
+    """Save a part of the file browser that a script opens, and close it."""
     blender = window.blender
-    window.panels("ExportPanel")
     blender.run('bpy.context.preferences.view.filebrowser_display_type = "SCREEN"')
-    window.do("call(bpy.ops.objectgs.export_splats)")
+    window.do(call)
     time.sleep(3.0)
-    window.save("export", (SIZE[0] - 270, 58, SIZE[0], 190))
+    window.save(name, box)
     blender.move(SIZE[0] / 2, SIZE[1] / 2)
     blender.key("Escape")
     time.sleep(2.0)
+
+
+def exporting(window: Window) -> None:
+    """Save the options of the export of splats."""
+    window.panels("ExportPanel")
+    browser(window, "call(bpy.ops.objectgs.export_splats)", "export", (SIZE[0] - 270, 58, SIZE[0], 190))
+
+
+def from_photos(window: Window) -> None:
+    """Save the file browser of photos, and their import, in which two photos of the demo are blurred."""
+    blender, place = window.blender, window.folder.parent
+    photos = place / "photos"
+    photos.mkdir(parents=True)
+    for number, path in enumerate(sorted((window.demo / "capture" / "images").iterdir())):
+        with Image.open(path) as image:
+            blurred = number in BLURRED
+            (image.filter(ImageFilter.GaussianBlur(3.0)) if blurred else image).save(photos / path.name)
+    window.panels()
+    window.do("""
+    with bpy.context.temp_override(**window_context()):
+        bpy.ops.wm.read_homefile(use_empty=True, app_template="")
+    """)
+    opened = f"call(bpy.ops.objectgs.import_photos, directory={f'{photos}/'!r})"
+    browser(window, opened, "import-photos", (0, 0, *SIZE))
+    window.do(
+        f"""
+    with bpy.context.temp_override(**window_context()):
+        bpy.ops.objectgs.import_photos(
+            "EXEC_DEFAULT", directory={str(photos)!r}, folder={str(place / "posed")!r})
+    """,
+        timeout=600,
+    )
+    wait(blender, f"{IDLE} and root is not None")
+    screenshots.show_sidebar(blender)
+    view(blender, 3.4, tilt=60.0)
+    window.save("posed")
 
 
 def from_capture(window: Window) -> None:
@@ -364,6 +401,7 @@ PARTS = {
     "render": rendering,
     "export": exporting,
     "capture": from_capture,
+    "photos": from_photos,
 }
 
 
