@@ -92,10 +92,10 @@ keeps the mean of its latest steps. To train longer, run the command again with 
 PROPOSE = """\
 Find the objects of splats without masks: splats with concave borders or gaps around
 them, such as things on a table, the table and the walls. Flat things that lie on others,
-and things that touch smoothly, are not told apart. If things are in parts, lower --detail;
-if several are one, raise it. Writes strokes that mark the objects
-in three photos each, for `label`; they may be changed before. Splats that were imported
-without a capture are looked at through cameras around them.
+and things that touch smoothly, are not told apart. If things are in parts, lower
+--detail; if several are one, raise it. Writes strokes that mark the objects in three
+photos each, for `label`; they may be changed before. Splats that were imported without a
+capture are looked at through cameras around them.
 """
 
 LABEL = """\
@@ -131,7 +131,8 @@ POINT = """\
 Answer strokes with the object of each splat, or before a training of each point, for
 programs such as Blender. Each line of standard input is a JSON object as for `label`,
 with a number `request` for the answer. With "propose": true, the answer has strokes on
-proposed objects, as `propose` finds with the number `detail`. --segmenter is as for `label`.
+proposed objects, as `propose` finds with the number `detail`. --segmenter is as for
+`label`.
 """
 
 RENDER = """\
