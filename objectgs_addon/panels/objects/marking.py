@@ -112,8 +112,6 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
 
 
 def _draw_suggesting(layout: bpy.types.UILayout, properties: Any) -> None:
-    row = layout.row(align=True)
-    row.operator("objectgs.suggest_objects", icon="LIGHT")
-    detail = row.row(align=True)
-    detail.ui_units_x = 4.5
-    detail.prop(properties, "detail", slider=True)
+    column = layout.column(align=True)
+    column.operator("objectgs.suggest_objects", icon="LIGHT")
+    column.prop(properties, "detail", slider=True)
