@@ -59,11 +59,11 @@ class LearnableStep(_WithoutLabels):
         self._optimizer = torch.optim.Adam([*self.encoder.parameters(), *self.decoder.parameters()], RATE)
 
     def compute(
-        self, index: int, progress: float, dropout: overfitting.Dropout | None = None
+        self, index: int, progress: float, dropout: overfitting.Dropout | None = None, alone: bool = False
     ) -> step.ViewGradients | None:
         """Compute the gradients of a view, and update encoder and decoder."""
         self._optimizer.zero_grad()
-        found = super().compute(index, progress, dropout)
+        found = super().compute(index, progress, dropout, alone)
         if found is not None:
             self._optimizer.step()
         return found

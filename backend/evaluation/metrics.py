@@ -1,4 +1,4 @@
-"""Metrics of renders and object IDs: PSNR, SSIM, IoU, boundary IoU, Dice and pixel accuracy."""
+"""Metrics of renders, object IDs and objects alone: PSNR, SSIM, IoU, boundary IoU, Dice and pixel accuracy."""
 
 from __future__ import annotations
 
@@ -226,6 +226,33 @@ class IdScores:
             "accuracy": right / labeled if labeled else None,
             "objects": {row["id"]: row["iou"] for row in rows},
         }
+
+
+class AloneScores:
+    """Accumulator of the agreement of objects that are rendered alone with their masks, where 0 means background.
+
+    A render of the whole scene does not show the parts of an object that other splats hide, but moving the object does.
+    The IoU alone of an object is |P and T| / |T or (P and B)|, with the pixels P where it is opaque if rendered alone,
+    its true pixels T and the background B, summed over the views. Pixels of other objects do not count, since these may
+    hide it.
+    """
+
+    _OPAQUE = 0.5
+
+    def __init__(self) -> None:
+        self._sums: dict[int, NDArray[np.int64]] = {}
+
+    def add(self, object_id: int, alpha: NDArray, truth: NDArray) -> None:
+        """Add the render of an object in one view: its alpha (h, w), and the integer IDs (h, w) of all objects."""
+        if alpha.shape != truth.shape or alpha.ndim != 2:
+            raise ValueError(f"two images (h, w) of one size were expected, not {alpha.shape} and {truth.shape}")
+        shown, true = alpha > self._OPAQUE, truth == object_id
+        found = np.array([np.sum(shown & true), np.sum(true) + np.sum(shown & (truth == 0))])
+        self._sums[object_id] = self._sums.get(object_id, 0) + found
+
+    def result(self) -> dict[int, float]:
+        """Return the IoU alone, 0 .. 1, of each object that is rendered or true on any counted pixel."""
+        return {object_id: int(same) / int(union) for object_id, (same, union) in self._sums.items() if union}
 
 
 class ImageScores:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..shared.events import Reporter
 from .lpips import load_lpips
-from .metrics import IdScores, ImageScores
+from .metrics import AloneScores, IdScores, ImageScores
 
 
 class _View(Protocol):
@@ -41,6 +41,7 @@ def evaluate(
     reporter: Reporter | None = None,
     zero_is_class: bool = False,
     zero_is_background: bool = False,
+    alone: Callable[[int], Iterable[tuple[int, NDArray]]] | None = None,
 ) -> dict[str, Any]:
     """Compare renders with the images and masks of a capture.
 
@@ -51,18 +52,20 @@ def evaluate(
         reporter: Receives the progress, and a warning for each render with NaN or Inf.
         zero_is_class: Count the ID 0 as an object, instead of as unlabeled.
         zero_is_background: Whether 0 means background, so that `miou_all` is shown as the progress instead of `miou`.
+        alone: Function that returns the IDs and the alphas (h, w) of the objects in a view, each rendered alone; used
+            if 0 means background.
 
     Returns:
-        {"quality": {psnr, psnr_corrected, ssim, lpips, miou, miou_all, mbiou, dice, accuracy}, "objects": [{id, name,
-        iou, iou_all, biou, dice, pixels}], "views": [{name, psnr, psnr_corrected, ssim, miou, miou_all}]}, see
-        `ImageScores` and `IdScores`. Scores of a view are those of its pixels and objects alone. The ID
-        scores are None if no pixel is labeled, and lpips, the mean over the views, is None if it cannot be computed,
-        see `load_lpips`.
+        {"quality": {psnr, psnr_corrected, ssim, lpips, miou, miou_all, miou_alone, mbiou, dice, accuracy}, "objects":
+        [{id, name, iou, iou_all, iou_alone, biou, dice, pixels}], "views": [{name, psnr, psnr_corrected, ssim, miou,
+        miou_all}]}, see `ImageScores`, `IdScores` and `AloneScores`. Scores of a view are those of its pixels and
+        objects only. The ID scores are None if no pixel is labeled, those of objects alone unless 0 means background,
+        and lpips, the mean over the views, if it cannot be computed, see `load_lpips`.
     """
     reporter = reporter or Reporter()
     images = ImageScores()
     lpips, distances = load_lpips(), []
-    ids = IdScores(zero_is_class)
+    ids, of_objects_alone = IdScores(zero_is_class), AloneScores()
     views = []
     for done, i in enumerate(indices):
         image, found = render(i)
@@ -81,13 +84,24 @@ def evaluate(
             ids.merge(view_ids)
             found_scores = view_ids.result()
             of_view = {key: found_scores[key] for key in of_view}
+            for object_id, alpha in alone(i) if alone and zero_is_background and not zero_is_class else ():
+                of_objects_alone.add(object_id, alpha, truth)
         views.append({"name": name, **of_image, **of_view})
         reporter.progress(
             done + 1, len(indices), psnr=of_image["psnr"], **of_view, zero_is_background=zero_is_background
         )
 
     perceptual = float(np.mean(distances)) if distances else None
-    quality: dict[str, Any] = {**images.result(), "lpips": perceptual, **ids.result()}
+    iou_alone = of_objects_alone.result()
+    objects = [
+        {"id": row["id"], "name": capture.names.get(row["id"], str(row["id"])), **row,
+         "iou_alone": iou_alone.get(row["id"])}
+        for row in ids.table()
+    ]  # fmt: skip
+    measured = [entry["iou_alone"] for entry in objects if entry["iou_alone"] is not None]
+    miou_alone = float(np.mean(measured)) if measured else None
+    quality: dict[str, Any] = {
+        **images.result(), "lpips": perceptual, **ids.result(), "miou_alone": miou_alone
+    }  # fmt: skip
     del quality["objects"]
-    objects = [{"id": row["id"], "name": capture.names.get(row["id"], str(row["id"])), **row} for row in ids.table()]
     return {"quality": quality, "objects": objects, "views": views}

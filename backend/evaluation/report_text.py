@@ -39,6 +39,12 @@ _MEANINGS = {
         "",
         "the same overlap over all pixels: an object that is rendered where no label is counts as an error",
     ),
+    "miou_alone": (
+        "mIoU alone",
+        "",
+        "overlap of the objects' masks with objects that are rendered without what hides them: parts that reach over "
+        "the background count as errors",
+    ),
     "mbiou": ("mBIoU", "", "the overlap on labeled pixels, but only along the outlines of the objects"),
     "dice": ("Dice", "", "overlap on labeled pixels as the Dice score, mean over the objects"),
     "accuracy": ("Pixel accuracy", "", "fraction of the labeled pixels that show the right object"),
@@ -70,6 +76,8 @@ def quality_section(report: Report) -> list[str]:
     order = [key for key in QUALITY if key not in MIOU_LABELS]
     order[order.index("mbiou") : order.index("mbiou")] = sorted(MIOU_LABELS, key=lambda key: key != lead)
     for key in order:
+        if key == "miou_alone" and report.quality[key] is None:
+            continue
         label, unit, meaning = _MEANINGS[key]
         value = report.quality[key]
         text = "—" if value is None else f"{value:.2f} {unit}" if unit else f"{value:.4f}"
@@ -143,17 +151,15 @@ def choose_objects(objects: list[dict[str, Any]], iou: str = "iou") -> tuple[lis
 
 
 def objects_table(objects: list[dict[str, Any]], swatches: Mapping[int, str], iou: str = "iou") -> str:
+    columns = [(IOU_LABELS[iou], iou, "{:.3f}"), ("Anchors", "anchors", "{:,.0f}")]
+    if any(entry["iou_alone"] is not None for entry in objects):
+        columns.insert(1, ("IoU alone", "iou_alone", "{:.3f}"))
     rows = [
-        (
-            f"![]({swatches[entry['id']]})",
-            str(entry["id"]),
-            escape(entry["name"]),
-            _number(entry[iou], "{:.3f}"),
-            _number(entry["anchors"], "{:,.0f}"),
-        )
+        [f"![]({swatches[entry['id']]})", str(entry["id"]), escape(entry["name"])]
+        + [_number(entry[key], how) for _, key, how in columns]
         for entry in objects
     ]
-    return table(("", "ID", "Name", IOU_LABELS[iou], "Anchors"), rows, right=(1, 3, 4))
+    return table(["", "ID", "Name", *(head for head, _, _ in columns)], rows, right=(1, *range(3, 3 + len(columns))))
 
 
 _MESH_COLUMNS = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -59,3 +60,23 @@ def draw(model: ObjectModel, camera: Camera, want_ids: bool = True, want_depth: 
         classes, probability = (devices.host(plane) for plane in object_map(drawn))
         ids = model.classes.ids_of(classes)
     return RenderedView(pixels, ids, probability, alpha, depth)
+
+
+def objects_alone(model: ObjectModel, camera: Camera) -> Iterator[tuple[int, np.ndarray]]:
+    """Render each object of a model without the others.
+
+    Args:
+        model: the model.
+        camera: the view, in scene units.
+
+    Yields:
+        The ID of each object but 0, and its alpha (H, W) float32, which is 0 for an object out of view.
+    """
+    viewmat, intrinsics = camera.arrays()
+    seen = anchors_in_view(model.anchors, viewmat, intrinsics, camera.width, camera.height, camera.near)
+    with torch.no_grad():
+        splats = model.generate(seen, camera.center).only_valid()
+        for number, object_id in enumerate(model.classes.ids.tolist()):
+            if object_id:
+                alone = splats.select(splats.ids == number)
+                yield object_id, devices.host(rasterize(*alone[:6], camera, primitive=model.primitive).alpha)

@@ -24,10 +24,17 @@ from .check_finite import FiniteCheck
 from .exposure.photo_colors import PhotoColors, corrected
 from .growth_strategy import GrowthStrategy, ViewStatistics
 from .losses.on_cpu import image_loss, normal_loss, volume_loss
+from .losses.silhouettes import silhouette_loss
 from .optimizer.adam import take_rows
 from .overfitting import Dropout
 from .scene import Scene
 from .settings import SURFACE_FROM, Settings, downscale_at
+
+ALONE_EVERY = 4
+"""Number of steps of which one also renders the objects alone, where masks show the background."""
+
+_ALONE = 0.1
+"""Weight of the loss of objects alone, relative to that of the label loss."""
 
 MOST_PARTS = 16
 """Largest number of parts in which an image is rendered if it does not fit into the GPU's memory."""
@@ -155,6 +162,7 @@ class ViewStep:
         )
         self._limits = _Limits()
         self._dropout: Dropout | None = None
+        self._alone = False
         self._splats: int | torch.Tensor = 0
 
     @property
@@ -162,18 +170,28 @@ class ViewStep:
         """Number of splats generated in the latest step; synchronizes with the GPU."""
         return int(self._splats)
 
+    @property
+    def has_silhouettes(self) -> bool:
+        """Whether unlabeled pixels show the background, so that no object may be drawn there."""
+        scene, settings = self.scene, self.settings
+        supervised = scene.supervise_background and not scene.zero_is_object
+        return supervised and settings.semantic_weight > 0 and settings.mode != "paper"
+
     def restore(self, tensors: Mapping[str, np.ndarray]) -> None:
         """Restore the corrections of the photos' colors from a checkpoint's tensors."""
         if self.colors is not None:
             self.colors.restore(tensors)
 
-    def compute(self, index: int, progress: float, dropout: Dropout | None = None) -> ViewGradients | None:
+    def compute(
+        self, index: int, progress: float, dropout: Dropout | None = None, alone: bool = False
+    ) -> ViewGradients | None:
         """Compute the loss and gradients of a view.
 
         Args:
             index: index of the view in the capture.
             progress: progress of the training, 0 .. 1.
             dropout: leaves out some of the splats.
+            alone: also render the objects alone, if this view has a mask that shows the background.
 
         Returns:
             The loss and gradients; None if no anchor is in view or the loss is not finite.
@@ -182,6 +200,7 @@ class ViewStep:
             InputError: the GPU's memory is too small for the smallest parts, or the view's image cannot be read.
         """
         self._dropout = dropout
+        self._alone = alone and self.has_silhouettes
         gradients, full = self._compute_if_it_fits(index, progress)
         while full:
             self._make_room()
@@ -305,6 +324,13 @@ class ViewStep:
             want_distortion=distortion_weight > 0,
         )  # fmt: skip
         terms = {_IMAGE: self._image_loss(part, drawn, drawn.label_probability, correction)}
+        if self._alone and part.labels is not None:
+            terms["the silhouette loss"] = (
+                _ALONE
+                * settings.semantic_weight
+                * part.more_labels
+                * self._silhouette_loss(g, part.camera, part.labels)
+            )
         if settings.volume_weight and len(g.scales):
             terms["the volume loss"] = (
                 settings.volume_weight * (0.5 if flat else 1.0) * volume_loss(g.scales, flat, g.valid)
@@ -327,6 +353,13 @@ class ViewStep:
             color, drawn.alpha, label_probability, background, part.image, part.labels,
             self.settings.ssim_weight, self.settings.semantic_weight * part.more_labels,
         )  # fmt: skip
+
+    def _silhouette_loss(self, g: Generated, camera: Camera, labels: torch.Tensor) -> torch.Tensor:
+        """Render the splats of objects without those of the background (class 0), and return the silhouette loss ()."""
+        of_objects = g.ids > 0
+        # On the GPU, selecting them would synchronize.
+        g = g.select(of_objects) if g.valid is None else g._replace(opacities=g.opacities * of_objects)
+        return silhouette_loss(rasterize(*g[:6], camera, primitive=self.settings.primitive).alpha, labels)
 
     def _total(self, terms: dict[str, torch.Tensor], part: _Part) -> torch.Tensor:
         """Return the total loss of a part, weighted by its size."""

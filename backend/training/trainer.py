@@ -42,7 +42,7 @@ from .state import (
     training_state,
     training_tensors,
 )
-from .step import IN_PARTS, ViewGradients, ViewStep
+from .step import ALONE_EVERY, IN_PARTS, ViewGradients, ViewStep
 
 if TYPE_CHECKING:
     from ..capture import Capture
@@ -350,7 +350,9 @@ class Trainer:
         if not p.queue:
             views = [index for index in self.scene.capture.train_indices if index not in p.watched]
             p.queue = self.rng.permutation(views).tolist()
-        gradients = self.view_step.compute(p.queue[-1], progress, overfitting.dropout_at(p, progress))
+        gradients = self.view_step.compute(
+            p.queue[-1], progress, overfitting.dropout_at(p, progress), alone=p.step % ALONE_EVERY == 0
+        )
         # Remove the view only now, so that it remains the next one if its image cannot be read.
         index = p.queue.pop()
         p.step += 1

@@ -12,7 +12,7 @@ import torch
 
 from backend.evaluation import IdScores, ImageScores, evaluate, psnr, ssim
 from backend.evaluation.lpips import PACKAGE, WEIGHTS, load_lpips
-from backend.evaluation.metrics import boundaries, boundary_distance, color_corrected
+from backend.evaluation.metrics import AloneScores, boundaries, boundary_distance, color_corrected
 from backend.shared.events import Reporter
 
 
@@ -387,6 +387,36 @@ def test_evaluate_scores_each_view_by_itself():
     assert [view["miou_all"] for view in result["views"]] == pytest.approx([1.0, (8 / 12 + 1) / 2])
     assert result["quality"]["miou_all"] == pytest.approx((16 / 20 + 1) / 2), "unions over all views, not their mean"
     assert [entry["iou_all"] for entry in result["objects"]] == [16 / 20, 1.0]
+
+
+def test_iou_alone_by_hand():
+    """Object 1 is hidden behind object 2 and reaches over the background; a view without it counts, too."""
+    truth = np.array([[1, 1, 2, 2, 0, 0, 0, 0]])
+    alone = AloneScores()
+    alone.add(1, np.array([[0.9, 0.4, 0.9, 0.9, 0.9, 0.51, 0.5, 0.0]]), truth)
+    alone.add(1, np.array([[0.0, 0.0, 0.0, 0.9]]), np.array([[2, 2, 2, 0]]))
+    alone.add(2, np.array([[0.0, 0.9, 0.9, 0.9, 0.0, 0.0, 0.0, 0.0]]), truth)
+    alone.add(3, np.zeros((1, 8)), truth)
+    assert alone.result() == {1: 1 / 5, 2: 1.0}
+    with pytest.raises(ValueError, match="one size"):
+        alone.add(1, np.zeros((2, 8)), truth)
+
+
+@pytest.mark.parametrize(("background", "is_class"), [(True, False), (False, False), (True, True)])
+def test_evaluate_measures_objects_alone_where_zero_is_background(background, is_class):
+    masks = [np.array([[1, 1, 0, 0], [2, 2, 2, 2]])] * 2
+    capture = _Capture([np.zeros((2, 4, 3), np.uint8)] * 2, masks)
+
+    def alone(index):
+        yield 1, np.array([[1.0, 1.0, float(index), 0.0], [0.0, 0.0, 0.0, 0.0]])
+        yield 2, np.array([[0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0]])
+
+    result = evaluate(capture, lambda i: (np.zeros((2, 4, 3)), masks[i]), [0, 1], None, is_class, background, alone)
+    of_objects = {entry["id"]: entry["iou_alone"] for entry in result["objects"]}
+    if background and not is_class:
+        assert of_objects == {1: 4 / 5, 2: 0.5} and result["quality"]["miou_alone"] == pytest.approx(0.65)
+    else:
+        assert set(of_objects.values()) == {None} and result["quality"]["miou_alone"] is None
 
 
 def test_evaluate_without_masks_has_no_id_scores():

@@ -66,6 +66,7 @@ def test_report_json_has_all_keys_and_null_if_unmeasured(reconstruction):
         "lpips": None,
         "miou": 0.97,
         "miou_all": None,
+        "miou_alone": None,
         "mbiou": None,
         "dice": None,
         "accuracy": None,
@@ -114,6 +115,18 @@ def test_report_leads_with_all_pixels_where_zero_is_background(reconstruction, b
     assert rows == (["| mIoU (all)", "| mIoU (labeled)"] if background else ["| mIoU (labeled)", "| mIoU (all)"])
     mug = next(line for line in text.splitlines() if "| mug |" in line)
     assert f"| {iou} |" in mug and ("| IoU (all) |" in text) is background
+
+
+def test_report_has_objects_alone_where_they_were_measured(reconstruction):
+    def table_of(report):
+        write_report(reconstruction, report)
+        text = reconstruction.report_md.read_text(encoding="utf-8")
+        return "| mIoU alone |" in text, "| IoU alone |" in text, "| 0.875 |" in text
+
+    report = with_background(True)
+    assert table_of(report) == (False, False, False)
+    report.quality["miou_alone"] = report.objects[0]["iou_alone"] = 0.875
+    assert table_of(report) == (True, True, True)
 
 
 def test_report_of_earlier_version_has_no_miou_all(reconstruction):

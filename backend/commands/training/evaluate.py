@@ -10,7 +10,7 @@ import numpy as np
 from ...evaluation import evaluate as evaluate_views
 from ...evaluation.meshes import evaluate_mesh, mesh_entries
 from ...evaluation.truth import load_truth
-from ...model.draw import draw
+from ...model.draw import draw, objects_alone
 from ...shared.errors import InputError
 from ...shared.reconstruction.report import Evaluation, write_evaluation
 from ...shared.stopping import StoppingReporter
@@ -37,6 +37,7 @@ def evaluate(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         found = evaluate_views(
             capture, drawn, capture.test_indices, reporter, trained.scene.zero_is_object,
             trained.scene.supervise_background,
+            lambda index: objects_alone(trained.model, trained.scene.camera(index)),
         )  # fmt: skip
         meshes = _meshes(trained, reporter)
     write_evaluation(folder.folder, Evaluation(trained.progress.step, **found, meshes=meshes))

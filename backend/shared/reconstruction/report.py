@@ -17,7 +17,9 @@ from ..formats.json_file import plain, read_json, write_json
 EVALUATION = "evaluation.json"
 REPORT = "report.json"
 
-QUALITY = ("psnr", "psnr_corrected", "ssim", "lpips", "miou", "miou_all", "mbiou", "dice", "accuracy")
+QUALITY = (
+    "psnr", "psnr_corrected", "ssim", "lpips", "miou", "miou_all", "miou_alone", "mbiou", "dice", "accuracy"
+)  # fmt: skip
 """Metrics over the held-out views; `backend/evaluation/metrics.py` defines them."""
 
 MIOU_LABELS = {"miou_all": "mIoU (all)", "miou": "mIoU (labeled)"}
@@ -44,7 +46,7 @@ _ENTRIES = {
     "left_out": ("what", "why"),
     "stages": ("name", "seconds", "peak_rss_mb"),
     "curve": ("seconds", "step", "psnr", "miou", "miou_all"),
-    "objects": ("id", "name", "iou", "iou_all", "anchors", "mesh"),
+    "objects": ("id", "name", "iou", "iou_all", "iou_alone", "anchors", "mesh"),
 }
 _REQUIRED = {"left_out": ("what", "why"), "stages": ("name",), "curve": ("seconds",), "objects": ("id",)}
 _TEXTS = ("what", "why", "name")
@@ -109,8 +111,8 @@ class Report:
         curve: {"seconds", "step", "psnr", "miou", "miou_all"} on held-out views over the training.
         model: numbers of anchors and Gaussians, size in bytes, trained steps.
         quality: means over the held-out views by metric name, with all of `QUALITY`.
-        objects: {"id", "name", "iou", "iou_all", "anchors", "mesh"} and other metrics of each object; "mesh" has all of
-            `MESH_FIGURES`.
+        objects: {"id", "name", "iou", "iou_all", "iou_alone", "anchors", "mesh"} and other metrics of each object;
+            "mesh" has all of `MESH_FIGURES`.
         plan: the decisions of plan.json.
         views: metrics of each held-out view, with its miou and miou_all.
         meshes: figures of the meshes that are not of one object.
