@@ -2,18 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
-
-import numpy as np
-import torch
-
 from ..capture import Capture
 from ..export import agreement, fit_splats, write_anchors, write_splats
 from ..model.object_model import ObjectModel
-from ..model.splats import Splats
-from ..pointing.silhouettes import outside_silhouettes
-from ..raster import Camera, devices
 from ..shared.events import Reporter
 from ..shared.formats.json_file import plain
 from ..shared.reconstruction.folder import Reconstruction
@@ -33,9 +24,6 @@ _CHECKED_VIEWS = 5
 _COMPARED_VIEWS = 20
 """Largest number of views on which exported splats that are not exactly the model are compared with it."""
 
-_MASKS, _MASK_SIZE = 24, 640
-"""Largest number of masks that objects are compared with, and of the pixels of their longer side."""
-
 
 def export_model(
     model: ObjectModel, scene: Scene, folder: Reconstruction, reporter: Reporter, compare: bool = True
@@ -47,7 +35,7 @@ def export_model(
         scene: The capture that it was trained on.
         folder: The reconstruction, locked by this process.
         reporter: Receives messages.
-        compare: Also measure their PSNR to the model, and compare objects with their masks; this takes seconds.
+        compare: Also measure their PSNR to the model.
 
     Returns:
         Their sizes and PSNR.
@@ -65,8 +53,6 @@ def _write_export(
     capture = scene.capture
     if model.explicit:
         splats, source = model.splats()
-        if compare and scene.supervise_background and not scene.zero_is_object:
-            _release_hidden(model, scene, splats, source, reporter)
     else:
         splats, source = fit_splats(model, [scene.camera(i) for i in capture.train_indices], reporter)
     background = [round(float(value), 4) for value in model.background.detach().cpu()]
@@ -81,33 +67,6 @@ def _write_export(
         reporter.warning(sentence)
     write_anchors(folder.anchors, model, splats, source)
     return ExportRecord(len(splats), len(model.anchors), _rounded(psnr), _rounded(on_black), background)
-
-
-def _release_hidden(model: ObjectModel, scene: Scene, splats: Splats, source: np.ndarray, reporter: Reporter) -> None:
-    """Give those splats to no object that are outside the silhouettes of theirs, where the photos do not show them."""
-    indices = np.array(scene.capture.train_indices)
-    used = np.unique(np.linspace(0, len(indices) - 1, min(len(indices), _MASKS)).round().astype(int))
-
-    def views() -> Iterator[tuple[Camera, np.ndarray]]:
-        for index in indices[used].tolist():
-            view = scene.capture.views[index]
-            downscale = math.ceil(max(view.width, view.height) / _MASK_SIZE)
-            if (mask := scene.capture.mask(index, downscale)) is not None:
-                yield scene.camera(index, downscale), mask
-
-    with torch.no_grad():
-        generated = model.generate().only_valid()
-    ids = model.classes.ids_of(devices.host(generated.ids))
-    outside = outside_silhouettes(
-        generated, ids, model.primitive, views(), lambda done: reporter.progress(done, len(used) + 1)
-    )
-    released = np.isin(source, devices.host(generated.source)[outside])
-    if released.any():
-        splats.object_ids[released] = 0
-        reporter.status(
-            f"{int(released.sum()):,} splats that the photos do not show reach beyond the masks of their object, and "
-            "belong to none"
-        )
 
 
 def _is_approximate(model: ObjectModel) -> bool:

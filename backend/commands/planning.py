@@ -6,6 +6,7 @@ import argparse
 
 from ..capture import Capture
 from ..planning.decisions import Choices, PlanningContext, decide
+from ..raster import devices
 from ..shared.events import Reporter
 from ..shared.formats.points_ply import LabeledPoints, read_points
 from ..shared.grouping import Changes, changed, chosen, grouped, read_groups
@@ -60,10 +61,12 @@ def build_context(
 
 def choices(options: argparse.Namespace) -> Choices:
     """Return the choices that the options of `train` make."""
-    until_converged = budget_of(options).until_converged
+    budget = budget_of(options)
+    on_cpu = devices.pick(options.device).type == "cpu"
     return Choices(
-        settings(options), options.max_size, not options.no_meshes, options.keep, options.leave_out, until_converged
-    )
+        settings(options), options.max_size, not options.no_meshes, options.keep, options.leave_out,
+        budget.until_converged, budget.seconds if on_cpu else None,
+    )  # fmt: skip
 
 
 def settings(options: argparse.Namespace) -> Settings:

@@ -27,7 +27,7 @@ from ...shared.reconstruction.plan import Plan, write_plan
 from ...shared.reconstruction.record import TrainingRecord, read_record, update_record
 from ...shared.stopping import StoppingReporter
 from ...training.budget import Budget, TrainingProgress
-from ...training.initial_model import DistantPoints
+from ...training.initial_model import DistantPoints, affordable_anchors
 from ...training.scene import Scene
 from ...training.trainer import Evaluate, Trainer
 from ..exported import EXPORT, export_model
@@ -60,7 +60,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         {
             READ: ("Preparing", 5.0), VOTE: ("Preparing", 5.0), "plan": ("Preparing", 5.0),
             DENSE: ("Preparing", 0.0), KERNELS: ("Preparing", kernel_seconds(device)),
-            "train": ("Training", budget.seconds or DEFAULT_SECONDS), EXPORT: ("Saving", 10.0),
+            "train": ("Training", budget.seconds or DEFAULT_SECONDS), EXPORT: ("Saving", 5.0),
         }
     )  # fmt: skip
     with open_reconstruction(options, reporter) as (output, capture):
@@ -159,10 +159,13 @@ def _begin(
     else:
         assert context.point_ids is not None
         far = DistantPoints(*context.surroundings[:3]) if plan.does("surroundings") else None
+        seconds = choices(options).seconds
+        most = None if seconds is None or plan.does("all-points") else affordable_anchors(seconds, planned)
         seeds, more = starting_points(planned, context.point_ids, plan, options.seed, reporter)
         trainer = Trainer.start(
             planned, context.point_ids, wanted, memory, device, seeds=seeds,
             supervise_background=planned.has_masks and plan.does("rest"), gains=gains, more=more, surroundings=far,
+            most_anchors=most,
         )  # fmt: skip
     if options.restart:
         # The new training's first checkpoint replaces that of the old one before anything refers to it.
