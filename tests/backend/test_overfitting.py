@@ -90,10 +90,10 @@ def test_training_spares_views_and_then_drops_splats(tiny, tmp_path, monkeypatch
     trained, rates, reporter = [], [], Silent()
     measured, compute = iter([20.0, 21.0, 20.0]), trainer.view_step.compute
 
-    def recorded(index, progress, dropout=None):
+    def recorded(index, progress, dropout=None, **options):
         trained.append(index)
         rates.append(0.0 if dropout is None else dropout.rate)
-        return compute(index, progress, dropout)
+        return compute(index, progress, dropout, **options)
 
     def evaluate(model, scene, progress):
         return {"watched_psnr": next(measured)} if progress.watched else {}
