@@ -331,8 +331,8 @@ def _all_points(context: PlanningContext) -> Decision | None:
     if count <= most:
         return None
     why = (
-        f"a training of {clock(choices.seconds)} minutes on the CPU has time to begin with about {most:,}; more grow "
-        "where they are missing"
+        f"a training of {clock(choices.seconds)} minutes on the CPU has time to begin with about {round(most, -2):,}; "
+        "more grow where they are missing"
     )
     return Decision("all-points", f"anchors at each of the {count:,} points", False, why)
 

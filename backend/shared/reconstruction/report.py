@@ -18,7 +18,7 @@ EVALUATION = "evaluation.json"
 REPORT = "report.json"
 
 QUALITY = (
-    "psnr", "psnr_corrected", "ssim", "lpips", "miou", "miou_all", "miou_alone", "mbiou", "dice", "accuracy"
+    "psnr", "psnr_corrected", "ssim", "lpips", "miou", "miou_all", "mbiou", "miou_alone", "dice", "accuracy"
 )  # fmt: skip
 """Metrics over the held-out views; `backend/evaluation/metrics.py` defines them."""
 
