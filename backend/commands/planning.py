@@ -6,7 +6,6 @@ import argparse
 
 from ..capture import Capture
 from ..planning.decisions import Choices, PlanningContext, decide
-from ..raster import devices
 from ..shared.events import Reporter
 from ..shared.formats.points_ply import LabeledPoints, read_points
 from ..shared.grouping import Changes, changed, chosen, grouped, read_groups
@@ -61,12 +60,10 @@ def build_context(
 
 def choices(options: argparse.Namespace) -> Choices:
     """Return the choices that the options of `train` make."""
-    budget = budget_of(options)
-    on_cpu = devices.pick(options.device).type == "cpu"
+    until_converged = budget_of(options).until_converged
     return Choices(
-        settings(options), options.max_size, not options.no_meshes, options.keep, options.leave_out,
-        budget.until_converged, budget.seconds if on_cpu else None,
-    )  # fmt: skip
+        settings(options), options.max_size, not options.no_meshes, options.keep, options.leave_out, until_converged
+    )
 
 
 def settings(options: argparse.Namespace) -> Settings:

@@ -13,12 +13,10 @@ import numpy as np
 
 from ..capture import BLURRED, Capture
 from ..shared.defaults import MAX_SIZE
-from ..shared.durations import clock
 from ..shared.reconstruction.objects import SceneObject, default_name, merged
 from ..shared.reconstruction.plan import KEYS, Decision, Plan
 from ..training.budget import choose_validation_views
 from ..training.exposure.gains import VARIES_FROM, differences, measure_gains
-from ..training.initial_model import affordable_anchors
 from ..training.settings import Settings, background_is_masked, downscale_at
 from .coverage import (
     VACANT,
@@ -45,8 +43,7 @@ class Choices:
     """The user's choices that decisions depend on.
 
     settings: of the training, before the plan changes them. meshes: whether meshes are wanted. keep, leave_out: keys
-    of the decisions to override. until_converged: whether the training ends when it has converged. seconds: time limit
-    of a training on the CPU, or None.
+    of the decisions to override. until_converged: whether the training ends when it has converged.
     """
 
     settings: Settings = field(default_factory=Settings)
@@ -55,7 +52,6 @@ class Choices:
     keep: Collection[str] = ()
     leave_out: Collection[str] = ()
     until_converged: bool = False
-    seconds: float | None = None
 
 
 @dataclass
@@ -321,22 +317,6 @@ def _unseen_points(context: PlanningContext) -> Decision | None:
     return Decision("unseen-points", "anchors outside every view", False, why)
 
 
-def _all_points(context: PlanningContext) -> Decision | None:
-    capture, choices = context.capture, context.choices
-    if context.resumed is not None:
-        return context.resumed.planned("all-points")
-    if choices.seconds is None or choices.settings.voxel is not None:
-        return None
-    count, most = len(capture.points.xyz), affordable_anchors(choices.seconds, capture)
-    if count <= most:
-        return None
-    why = (
-        f"a training of {clock(choices.seconds)} minutes on the CPU has time to begin with about {round(most, -2):,}; "
-        "more grow where they are missing"
-    )
-    return Decision("all-points", f"anchors at each of the {count:,} points", False, why)
-
-
 def _dense_points(context: PlanningContext) -> Decision | None:
     what = "points on surfaces without features, from patches of the photos"
     if context.resumed is not None:
@@ -386,8 +366,8 @@ def _surface(context: PlanningContext) -> Decision | None:
 
 DECISIONS: tuple[Callable[[PlanningContext], Decision | None], ...] = (
     _votes, _objects, _groups, _surroundings, _rest, _labels, _undistortion, _duplicate_views, _blind_views,
-    _blurred_views, _other_views, _validation_views, _unseen_points, _all_points, _dense_points, _exposure, _pyramid,
-    _meshes, _surface,
+    _blurred_views, _other_views, _validation_views, _unseen_points, _dense_points, _exposure, _pyramid, _meshes,
+    _surface,
 )  # fmt: skip
 """In the order of `KEYS`; a decision may depend on earlier ones. None if a decision does not apply to the capture."""
 

@@ -171,7 +171,7 @@ class ViewStep:
         return int(self._splats)
 
     @property
-    def has_silhouettes(self) -> bool:
+    def _has_silhouettes(self) -> bool:
         """Whether unlabeled pixels show the background, so that no object may be drawn there."""
         scene, settings = self.scene, self.settings
         supervised = scene.supervise_background and not scene.zero_is_object
@@ -200,7 +200,7 @@ class ViewStep:
             InputError: the GPU's memory is too small for the smallest parts, or the view's image cannot be read.
         """
         self._dropout = dropout
-        self._alone = alone and self.has_silhouettes
+        self._alone = alone and self._has_silhouettes
         gradients, full = self._compute_if_it_fits(index, progress)
         while full:
             self._make_room()
@@ -325,12 +325,8 @@ class ViewStep:
         )  # fmt: skip
         terms = {_IMAGE: self._image_loss(part, drawn, drawn.label_probability, correction)}
         if self._alone and part.labels is not None:
-            terms["the silhouette loss"] = (
-                _ALONE
-                * settings.semantic_weight
-                * part.more_labels
-                * self._silhouette_loss(g, part.camera, part.labels)
-            )
+            weight = _ALONE * settings.semantic_weight * part.more_labels
+            terms["the silhouette loss"] = weight * self._silhouette_loss(g, part.camera, part.labels)
         if settings.volume_weight and len(g.scales):
             terms["the volume loss"] = (
                 settings.volume_weight * (0.5 if flat else 1.0) * volume_loss(g.scales, flat, g.valid)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,8 +27,6 @@ from backend.shared.errors import EXIT_DONE, InputError
 from backend.shared.grouping import changed, chosen, grouped, read_groups
 from backend.shared.reconstruction.objects import edit_objects, merged, read_objects
 from backend.shared.reconstruction.plan import KEYS, Decision, Plan, read_plan, write_plan
-from backend.training import initial_model
-from backend.training.initial_model import affordable_anchors
 from backend.training.settings import Settings, downscale_at
 from backend.training.step import ViewStep
 from backend.training.trainer import Trainer
@@ -215,61 +211,6 @@ def test_blind_views_and_unseen_points_are_found(write_capture, tmp_path):
 
     nothing = capture.excluding_from_training(set(scene.names) - {"view_003.png"})
     assert blind_views(nothing) == [] and not unseen_points(nothing).any(), "at least one view and point remain"
-
-
-def many_points(write_capture, tmp_path, count=11_000):
-    """A capture in which `count` points, far apart, would each get an anchor."""
-    scene = write_capture(views=9, size=(64, 48))
-    scene.xyz = np.random.default_rng(0).uniform(-1.0, 1.0, (count, 3))
-    scene.rgb = np.zeros((count, 3), np.uint8)
-    scene.seen, scene.pixels = [np.zeros(0, int)] * 9, [np.zeros((0, 2))] * 9
-    write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
-    return loaded(scene, tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("choices", "done"),
-    [
-        ({"seconds": 60.0}, False), ({"seconds": 60.0, "keep": ["all-points"]}, True), ({"seconds": 3600.0}, None),
-        ({}, None), ({"seconds": 60.0, "settings": Settings(voxel=0.1)}, None),
-    ],
-    ids=["short", "kept", "long", "without limit", "voxel given"],
-)  # fmt: skip
-def test_short_training_does_not_begin_at_every_point(write_capture, tmp_path, choices, done):
-    decision = planned(many_points(write_capture, tmp_path), **choices)["all-points"]
-    assert (None if decision is None else decision.done) is done
-    if done is False:
-        assert decision.what == "anchors at each of the 11,000 points" and "1:00" in decision.why
-
-
-def test_largest_number_of_anchors_follows_time_and_pixels(write_capture, tmp_path):
-    def affordable(seconds, width, height):
-        return affordable_anchors(seconds, SimpleNamespace(views=[SimpleNamespace(width=width, height=height)] * 2))
-
-    assert affordable(360.0, 800, 1200) == pytest.approx((0.72 - 0.384) / 1.7e-5, abs=1)
-    assert affordable(720.0, 800, 1200) > 2 * affordable(360.0, 800, 1200) > 2 * affordable(360.0, 1000, 1200)
-    assert affordable(60.0, 4000, 3000) == affordable(1.0, 8, 8) == 10_000
-    capture = many_points(write_capture, tmp_path)
-    ids = np.zeros(len(capture.points.xyz), np.int64)
-    every, some = (
-        Trainer.start(capture, ids, Settings(offsets=2), most_anchors=most).model.anchors for most in (None, 3000)
-    )
-    assert len(every) > 9000 and 1500 < len(some) <= 3000 and some.voxel > every.voxel
-    assert not some.positions.isnan().any() and some.rows.isfinite().all()
-
-
-def test_command_begins_a_short_training_with_fewer_anchors(write_capture, tmp_path, run_command, monkeypatch):
-    capture, out = many_points(write_capture, tmp_path), tmp_path / "out"
-    monkeypatch.setattr(initial_model, "_FEWEST_ANCHORS", 2000)
-    command = ("train", capture.folder, "--out", out, "--minutes", 0.02, *SMALL, "--device", "cpu", "--json")
-    result = run_command(*command)
-    assert result.code == EXIT_DONE
-    assert any("anchors at each of the 11,000 points" in message for message in result.messages("status"))
-    begun = next(message for message in result.messages("status") if re.fullmatch(r"Training [\d,]+ anchors", message))
-    assert 0 < int(begun.split()[1].replace(",", "")) <= 2000
-    assert not read_plan(out / "plan.json").does("all-points")
-    longer = run_command(*command[:4], "--minutes", 0.04, *command[6:])
-    assert longer.code == EXIT_DONE, "a longer training goes on with the same anchors"
 
 
 def test_unseen_points_do_not_affect_scene(write_capture, tmp_path):

@@ -27,7 +27,7 @@ from ...shared.reconstruction.plan import Plan, write_plan
 from ...shared.reconstruction.record import TrainingRecord, read_record, update_record
 from ...shared.stopping import StoppingReporter
 from ...training.budget import Budget, TrainingProgress
-from ...training.initial_model import DistantPoints, affordable_anchors
+from ...training.initial_model import DistantPoints
 from ...training.scene import Scene
 from ...training.trainer import Evaluate, Trainer
 from ..exported import EXPORT, export_model
@@ -159,13 +159,10 @@ def _begin(
     else:
         assert context.point_ids is not None
         far = DistantPoints(*context.surroundings[:3]) if plan.does("surroundings") else None
-        seconds = choices(options).seconds
-        most = None if seconds is None or plan.does("all-points") else affordable_anchors(seconds, planned)
         seeds, more = starting_points(planned, context.point_ids, plan, options.seed, reporter)
         trainer = Trainer.start(
             planned, context.point_ids, wanted, memory, device, seeds=seeds,
             supervise_background=planned.has_masks and plan.does("rest"), gains=gains, more=more, surroundings=far,
-            most_anchors=most,
         )  # fmt: skip
     if options.restart:
         # The new training's first checkpoint replaces that of the old one before anything refers to it.

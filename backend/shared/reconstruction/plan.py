@@ -17,8 +17,8 @@ from ..formats.json_file import read_json, write_json
 
 KEYS = (
     "votes", "objects", "groups", "surroundings", "rest", "labels", "undistortion", "duplicate-views", "blind-views",
-    "blurred-views", "other-views", "validation-views", "unseen-points", "all-points", "dense-points", "exposure",
-    "pyramid", "meshes", "surface",
+    "blurred-views", "other-views", "validation-views", "unseen-points", "dense-points", "exposure", "pyramid",
+    "meshes", "surface",
 )  # fmt: skip
 """Keys of the decisions, in the order in which they are made."""
 
