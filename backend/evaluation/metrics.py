@@ -101,6 +101,23 @@ def boundary_distance(height: int, width: int) -> int:
     return max(1, round(BOUNDARY_FRACTION * math.hypot(height, width)))
 
 
+def compacted(labels: NDArray) -> tuple[NDArray, NDArray[np.int64]]:
+    """Return the values that occur in an integer array, ascending, and the index of each element's value among them.
+
+    As `np.unique`, but without sorting where the values are close together.
+    """
+    if labels.size == 0:
+        return np.zeros(0, np.int64), np.zeros(labels.shape, np.int64)
+    lowest, highest = int(labels.min()), int(labels.max())
+    if highest - lowest > labels.size:
+        values, index = np.unique(labels, return_inverse=True)
+        return values, index.reshape(labels.shape)
+    shifted = labels.astype(np.int64) - lowest
+    occurs = np.zeros(highest - lowest + 1, bool)
+    occurs[shifted] = True
+    return np.flatnonzero(occurs) + lowest, (np.cumsum(occurs) - 1)[shifted]
+
+
 def boundaries(labels: NDArray, distance: int) -> NDArray[np.bool_]:
     """Find the pixels in the boundary band of their label's mask, (h, w) bool (Cheng et al. 2021).
 
@@ -110,8 +127,7 @@ def boundaries(labels: NDArray, distance: int) -> NDArray[np.bool_]:
     of all masks at once.
     """
     size = 2 * distance + 1
-    _, compact = np.unique(labels, return_inverse=True)
-    compact = compact.reshape(labels.shape).astype(np.int32)
+    compact = compacted(labels)[1].astype(np.int32)
     lowest = ndimage.minimum_filter(compact, size, mode="constant", cval=-1)
     highest = ndimage.maximum_filter(compact, size, mode="constant", cval=-1)
     return lowest != highest
@@ -149,8 +165,8 @@ class IdScores:
         if predicted.dtype.kind not in "iub" or truth.dtype.kind not in "iub":
             raise ValueError(f"integer IDs were expected, not {predicted.dtype} and {truth.dtype}")
         both = np.stack([predicted.astype(np.int64), truth.astype(np.int64)])
-        ids, compact = np.unique(both, return_inverse=True)
-        found, true = compact.reshape(both.shape)
+        ids, compact = compacted(both)
+        found, true = compact
         if self.zero_is_class:
             counted = np.ones(truth.shape, bool)
         else:
@@ -172,7 +188,7 @@ class IdScores:
             count(true, right & found_band & true_band),
             count(found, found_band),
             count(true, true_band),
-            count(compact.reshape(both.shape)[0], np.ones_like(counted)),
+            count(compact[0], np.ones_like(counted)),
         ]
         self._add_sums(ids, np.stack(columns, axis=1))
 

@@ -61,7 +61,8 @@ class TrainingProgress:
         grown: whether growth has ended.
         converged_at: step at which the training converged and the learning rate decay began; 0 before.
         curve: for each evaluation, the seconds, step, number of anchors, loss (dB) and measured quality, on held-out
-            views, as `validation_psnr` on validation views, and as `watched_psnr` on those of `watched`.
+            views unless they are left for later, as `validation_psnr` on validation views, and as `watched_psnr` on
+            those of `watched`.
         watched: training views that are spared, as `overfitting` describes.
         dropped: fraction of the splats that each step leaves out.
     """
@@ -78,6 +79,11 @@ class TrainingProgress:
     curve: list[dict[str, Any]] = field(default_factory=list)
     watched: list[int] = field(default_factory=list)
     dropped: float = 0.0
+
+    @property
+    def latest(self) -> dict[str, Any]:
+        """The latest entry of the curve with figures of held-out views, or an empty one."""
+        return next((entry for entry in reversed(self.curve) if entry.get("psnr") is not None), {})
 
     @property
     def causes(self) -> str:

@@ -223,7 +223,7 @@ class Trainer:
             budget: total length of the training.
             checkpoints: folder for checkpoints, which are written at the end, before a pause, and at intervals.
             reporter: receives progress, quality and warnings.
-            evaluate: function that measures the model on held-out and validation views.
+            evaluate: function that measures the model on held-out and validation views, and may leave out the former.
             stop: stop and pause request, checked before each step.
             checkpoint_seconds: interval between checkpoints.
 
@@ -307,11 +307,12 @@ class Trainer:
         loss_db = round(-20 * math.log10(loss), 3) if 0 < loss < math.inf else None
         reached = {"seconds": round(p.seconds, 2), "step": p.step, "anchors": len(self.model.anchors)}
         p.curve.append({**reached, "loss_db": loss_db, **quality})
-        reporter.quality(**p.curve[-1], zero_is_background=self.scene.supervise_background)
+        if "psnr" in quality:
+            reporter.quality(**p.curve[-1], zero_is_background=self.scene.supervise_background)
 
     def _report(self, budget: Budget, reporter: Reporter, loss: float, pace: float) -> None:
         p, left = self.progress, budget.remaining(self.progress, pace)
-        latest = p.curve[-1] if p.curve else {}
+        latest = p.latest
         reporter.progress(
             round(budget.displayed_progress(p), 5),
             1.0,

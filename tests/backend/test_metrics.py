@@ -12,7 +12,7 @@ import torch
 
 from backend.evaluation import IdScores, ImageScores, evaluate, psnr, ssim
 from backend.evaluation.lpips import PACKAGE, WEIGHTS, load_lpips
-from backend.evaluation.metrics import AloneScores, boundaries, boundary_distance, color_corrected
+from backend.evaluation.metrics import AloneScores, boundaries, boundary_distance, color_corrected, compacted
 from backend.shared.events import Reporter
 
 
@@ -186,6 +186,17 @@ def test_boundary_iou_of_shifted_square():
     row = next(row for row in result.table() if row["id"] == 2)
     # Two frames of 36 pixels: their top and bottom rows share 2 x 8; columns 7 and 14 are inside the other square.
     assert row["biou"] == pytest.approx(16 / (36 + 36 - 16))
+
+
+@pytest.mark.parametrize(
+    "labels",
+    [[[3, -1], [3, 7]], [[0, 2**40], [5, 0]], [[True, False]], np.zeros((0, 2), int), np.full((2, 2), 255, np.uint8)],
+)
+def test_labels_are_compacted_as_by_unique(labels):
+    labels = np.array(labels)
+    values, index = np.unique(labels, return_inverse=True)
+    found, where = compacted(labels)
+    assert np.array_equal(found, values) and np.array_equal(where, index.reshape(labels.shape))
 
 
 def test_image_border_counts_as_mask_boundary():

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
 import numpy as np
 import torch
 
 from ...capture import Capture
-from ...evaluation import IdScores, color_corrected, comparison, curve_image, psnr, save_image, thumbnail
 from ...labels import correct_masks
 from ...model.checkpoint import has_checkpoint
-from ...model.draw import draw
-from ...model.object_model import ObjectModel
 from ...planning.agreement import measure_agreement
 from ...planning.decisions import OF_TRAINING, decide, planned_capture, planned_settings
 from ...raster import devices
@@ -28,8 +24,7 @@ from ...shared.reconstruction.record import TrainingRecord, read_record, update_
 from ...shared.stopping import StoppingReporter
 from ...training.budget import Budget, TrainingProgress
 from ...training.initial_model import DistantPoints
-from ...training.scene import Scene
-from ...training.trainer import Evaluate, Trainer
+from ...training.trainer import Trainer
 from ..exported import EXPORT, export_model
 from ..folder import (
     READ,
@@ -46,10 +41,8 @@ from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import finish_stage
 from ..votes import VOTE, cast_votes, votes_are_current, votes_key
+from .measuring import Measuring
 from .points import DENSE, starting_points
-
-CURVE_VIEWS = 20
-"""Largest number of held-out views that are measured during training; `evaluate` measures all."""
 
 
 def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
@@ -104,7 +97,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
                     export_model(trainer.shown, trainer.scene, folder, reporter, compare=False)
                 raise
         export = export_model(trainer.shown, trainer.scene, folder, reporter)
-    latest = progress.curve[-1] if progress.curve else {}
+    latest = progress.latest
     reporter.done(
         steps=progress.step, seconds=round(progress.seconds, 1), anchors=len(trainer.model.anchors),
         splats=str(folder.splats), psnr=latest.get("psnr"), miou=latest.get("miou"), miou_all=latest.get("miou_all"),
@@ -214,60 +207,10 @@ def _run(
     begun = f"Resuming after step {step} with" if step else "Training"
     where = "" if trainer.model.device.type == "cpu" else f", on {devices.name_of(trainer.model.device)}"
     reporter.begin("train", f"{begun} {len(trainer.model.anchors):,} anchors{where}")
-    measure = _measure(folder, reporter)
+    measure = Measuring(folder, budget, reporter)
     try:
         trainer.run(budget, folder.checkpoint, reporter.reporter, measure, reporter.stop, checkpoint_seconds)
     except Cancelled:
         finish_stage(folder, "train", trainer.progress.seconds)
         raise
     finish_stage(folder, "train", trainer.progress.seconds)
-
-
-def _measure(folder: Reconstruction, reporter: StoppingReporter) -> Evaluate:
-    """Return a function that measures held-out views, and writes previews of the first one and of the curve.
-
-    It also measures the validation views and the spared views, if any. Held-out views are for the user; they do not
-    decide anything.
-    """
-
-    def measure(model: ObjectModel, scene: Scene, progress: TrainingProgress) -> dict[str, Any]:
-        # Without SSIM, which would take most of the time, since measuring counts as training time.
-        found, ids = [], IdScores(scene.zero_is_object)
-        capture = scene.capture
-        every = max(len(capture.test_indices) // CURVE_VIEWS, 1)
-        for number, index in enumerate(capture.test_indices[::every][:CURVE_VIEWS] or (0,)):
-            photo, truth = capture.image(index), capture.mask(index)
-            rendered = draw(model, scene.camera(index), want_ids=truth is not None or number == 0)
-            if number == 0:
-                assert rendered.ids is not None
-                preview = comparison(photo, rendered.image, truth, rendered.ids, None, capture.names)
-                render = save_image(thumbnail(rendered.image), folder.previews / "render.png", quick=True)
-                latest = save_image(preview, folder.previews / "latest.png", quick=True)
-                reporter.preview(latest, render=render)
-            if capture.test_indices:
-                found.append(psnr(rendered.image, photo))
-                if truth is not None and rendered.ids is not None:
-                    ids.add(rendered.ids, truth)
-        scores = ids.result()
-        figures = {
-            "psnr": float(np.mean(found)) if found else None,
-            **{name: scores[name] for name in ("miou", "miou_all", "mbiou")},
-        }
-        if capture.validation_indices:
-            validated = [
-                psnr(draw(model, scene.camera(index), want_ids=False).image, capture.image(index))
-                for index in capture.validation_indices
-            ]
-            figures["validation_psnr"] = float(np.mean(validated))
-        if progress.watched:
-            watched = []
-            for index in progress.watched:
-                photo, drawn = capture.image(index), draw(model, scene.camera(index), want_ids=False).image
-                watched.append(psnr(color_corrected(drawn, photo), photo))
-            figures["watched_psnr"] = float(np.mean(watched))
-        curve = curve_image([*progress.curve, {"seconds": progress.seconds, **figures}])
-        if curve is not None:
-            save_image(curve, folder.previews / "curve.png", quick=True)
-        return figures
-
-    return measure

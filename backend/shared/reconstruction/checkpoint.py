@@ -63,8 +63,9 @@ def read_header(folder: Path) -> CheckpointHeader | None:
 
 
 def _latest(progress: Mapping[str, Any]) -> dict[str, float]:
-    """Return the finite metrics of the last entry of the training curve."""
+    """Return the finite metrics of the last entry of the training curve that has any."""
     curve = progress.get("curve")
-    last = curve[-1] if isinstance(curve, list) and curve and isinstance(curve[-1], dict) else {}
+    entries = [entry for entry in curve if isinstance(entry, dict)] if isinstance(curve, list) else []
+    last = next((entry for entry in reversed(entries) if isinstance(entry.get("psnr"), float)), {})
     found = {name: last.get(name) for name in ("psnr", "miou", "miou_all")}
     return {name: value for name, value in found.items() if isinstance(value, float) and math.isfinite(value)}

@@ -1,0 +1,91 @@
+"""Quality during a training, on the views that it is not trained on, and previews of it."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+
+from ...evaluation import IdScores, color_corrected, comparison, curve_image, psnr, save_image, thumbnail
+from ...model.draw import draw
+from ...model.object_model import ObjectModel
+from ...shared.events import Reporter
+from ...shared.reconstruction.folder import Reconstruction
+from ...training.budget import Budget, TrainingProgress
+from ...training.scene import Scene
+
+CURVE_VIEWS = 20
+"""Largest number of held-out views that are measured during training; `evaluate` measures all."""
+
+SHARE = 0.1
+"""Largest fraction of the training time for measurements of held-out views, except for the one at the end."""
+
+
+class Measuring:
+    """Measures a model in training, and writes previews of the first held-out view and of the curve.
+
+    Held-out views are for the user; they do not decide anything. Where they would take more than `SHARE` of the time,
+    as with many large photos on a CPU, they are left for later, and only the preview is written. Views that decide on
+    the training (validation and spared views) are measured each time.
+    """
+
+    def __init__(self, folder: Reconstruction, budget: Budget, reporter: Reporter) -> None:
+        self._folder = folder
+        self._budget = budget
+        self._reporter = reporter
+        self._spent = 0.0
+
+    def __call__(self, model: ObjectModel, scene: Scene, progress: TrainingProgress) -> dict[str, Any]:
+        """Return the figures of the views that are measured now."""
+        started = time.monotonic()
+        allowed = SHARE * progress.seconds - self._spent
+        if self._budget.progress(progress) >= 1.0:
+            allowed = float("inf")
+        figures = self._held_out(model, scene, allowed)
+        self._spent += time.monotonic() - started
+        capture = scene.capture
+        if capture.validation_indices:
+            validated = [
+                psnr(draw(model, scene.camera(index), want_ids=False).image, capture.image(index))
+                for index in capture.validation_indices
+            ]
+            figures["validation_psnr"] = float(np.mean(validated))
+        if progress.watched:
+            watched = []
+            for index in progress.watched:
+                photo, drawn = capture.image(index), draw(model, scene.camera(index), want_ids=False).image
+                watched.append(psnr(color_corrected(drawn, photo), photo))
+            figures["watched_psnr"] = float(np.mean(watched))
+        curve = curve_image([*progress.curve, {"seconds": progress.seconds, **figures}])
+        if curve is not None:
+            save_image(curve, self._folder.previews / "curve.png", quick=True)
+        return figures
+
+    def _held_out(self, model: ObjectModel, scene: Scene, allowed: float) -> dict[str, Any]:
+        """Measure the held-out views, or only draw the first if all would take more than `allowed` seconds."""
+        # Without SSIM, which would take most of the time.
+        started, capture = time.monotonic(), scene.capture
+        every = max(len(capture.test_indices) // CURVE_VIEWS, 1)
+        indices = capture.test_indices[::every][:CURVE_VIEWS]
+        found, ids = [], IdScores(scene.zero_is_object)
+        for number, index in enumerate(indices or (0,)):
+            photo, truth = capture.image(index), capture.mask(index)
+            rendered = draw(model, scene.camera(index), want_ids=truth is not None or number == 0)
+            if indices:
+                found.append(psnr(rendered.image, photo))
+                if truth is not None and rendered.ids is not None:
+                    ids.add(rendered.ids, truth)
+            if number == 0:
+                assert rendered.ids is not None
+                preview = comparison(photo, rendered.image, truth, rendered.ids, None, capture.names)
+                render = save_image(thumbnail(rendered.image), self._folder.previews / "render.png", quick=True)
+                latest = save_image(preview, self._folder.previews / "latest.png", quick=True)
+                self._reporter.preview(latest, render=render)
+                if (time.monotonic() - started) * len(indices) > allowed:
+                    return {}
+        scores = ids.result()
+        return {
+            "psnr": float(np.mean(found)) if found else None,
+            **{name: scores[name] for name in ("miou", "miou_all", "mbiou")},
+        }
