@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 
-from ..model.anchors import median_spacing, seed_anchors, with_surroundings
+from ..model.anchors import cell_keys, median_spacing, seed_anchors, with_surroundings
 from ..model.heads import Heads
 from ..model.object_model import Normalization, ObjectModel
 from ..shared.class_table import ClassTable
@@ -22,12 +22,34 @@ FINEST = 2.0
 """Edge in pixels of the finest cells that anchors grow into, where the points are farther apart."""
 
 
+_PASSES, FEWEST_ANCHORS = 8, 15_000
+"""How often a training shows each view at least, if it begins with fewer anchors for that, but not with fewer than the
+second number."""
+
+_COARSER = 1.1
+"""Least factor by which cells grow until few enough points are left, one in each."""
+
+
 class DistantPoints(NamedTuple):
     """Points of distant surroundings: xyz (n, 3) in world units, rgb (n, 3) uint8, distance between neighbors."""
 
     xyz: np.ndarray
     rgb: np.ndarray
     spacing: float
+
+
+def affordable_anchors(anchors: int, steps: float, views: int) -> int:
+    """Return the number of anchors that a training of limited time should begin with.
+
+    A model in which each point has an anchor is of no use if there is no time to show each view several times. More
+    anchors grow where they are missing.
+
+    Args:
+        anchors: number of anchors if all points are used.
+        steps: number of steps that there is time for with all of them.
+        views: number of views to train on.
+    """
+    return min(anchors, max(round(anchors * steps / (_PASSES * views)), FEWEST_ANCHORS))
 
 
 def initial_model(
@@ -38,6 +60,7 @@ def initial_model(
     seeds: np.ndarray,
     more: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     surroundings: DistantPoints | None = None,
+    most_anchors: int | None = None,
 ) -> ObjectModel:
     """Return a model with anchors at the capture's points.
 
@@ -49,6 +72,8 @@ def initial_model(
         seeds: (M,) bool, the points that are used for anchors and to measure the scene's extent.
         more: xyz (n, 3), rgb (n, 3) uint8 and IDs (n,) of further points.
         surroundings: points of distant surroundings, which belong to no object.
+        most_anchors: largest number of anchors without those of the surroundings, for which points are left out; None:
+            no limit.
     """
     xyz, rgb, ids = capture.points.xyz[seeds], capture.points.rgb[seeds], point_ids[seeds]
     camera_centers = np.array([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in capture.views])
@@ -58,6 +83,9 @@ def initial_model(
         xyz, rgb, ids = (np.concatenate(pair) for pair in zip((xyz, rgb, ids), more, strict=True))
     finest = min(median_spacing(normalization.to_scene(xyz)), FINEST * pixel_size(capture) * normalization.scale)
     voxel = settings.voxel * normalization.scale if settings.voxel else finest
+    if most_anchors is not None:
+        kept = _thinned(normalization.to_scene(xyz), ids, voxel, most_anchors)
+        xyz, rgb, ids = xyz[kept], rgb[kept], ids[kept]
     anchors = seed_anchors(
         normalization.to_scene(xyz), rgb / 255.0, classes.classes_of(ids), voxel, settings.layout, rng
     )
@@ -72,3 +100,17 @@ def initial_model(
     shade = {"learned": rgb.mean(axis=0) / 255.0, "black": np.zeros(3), "white": np.ones(3)}
     background = torch.from_numpy(shade[settings.background].astype(np.float32))
     return ObjectModel(anchors, heads, background, classes, normalization, settings.primitive)
+
+
+def _thinned(xyz: np.ndarray, ids: np.ndarray, voxel: float, most: int) -> np.ndarray:
+    """Return the indices of points that give about `most` anchors, evenly spread, with some of each object.
+
+    At most one point of an object is kept in each cell, of a size at which there are few enough.
+    """
+    edge, most = voxel, max(most, len(np.unique(ids)))
+    while True:
+        kept = np.unique(np.column_stack([cell_keys(xyz, edge), ids]), axis=0, return_index=True)[1]
+        if len(kept) <= most:
+            return kept
+        # Their number falls with the cube of the edge at most.
+        edge *= max(_COARSER, float(np.cbrt(len(kept) / most)))

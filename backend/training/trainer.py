@@ -95,6 +95,7 @@ class Trainer:
         gains: np.ndarray | None = None,
         more: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
         surroundings: DistantPoints | None = None,
+        most_anchors: int | None = None,
     ) -> Trainer:
         """Start a training with anchors at the capture's points.
 
@@ -104,7 +105,7 @@ class Trainer:
             settings: settings of the training.
             memory_mb: memory limit for cached targets.
             device: device to train on.
-            seeds, more, surroundings: as in `initial_model`; seeds may be None for all points.
+            seeds, more, surroundings, most_anchors: as in `initial_model`; seeds may be None for all points.
             supervise_background: as in `Scene`; None: decided by `background_is_masked` for the points without object.
             gains: as in `Scene`.
 
@@ -113,7 +114,7 @@ class Trainer:
         """
         rng = np.random.default_rng(settings.seed)
         seeds = np.ones(len(capture.points.xyz), np.bool_) if seeds is None else seeds
-        model = initial_model(capture, point_ids, settings, rng, seeds, more, surroundings)
+        model = initial_model(capture, point_ids, settings, rng, seeds, more, surroundings, most_anchors)
         if supervise_background is None:
             supervise_background = capture.has_masks and background_is_masked(point_ids[seeds] == 0)
         scene = Scene(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import functools
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -23,7 +25,7 @@ from ...shared.reconstruction.plan import Plan, write_plan
 from ...shared.reconstruction.record import TrainingRecord, read_record, update_record
 from ...shared.stopping import StoppingReporter
 from ...training.budget import Budget, TrainingProgress
-from ...training.initial_model import DistantPoints
+from ...training.initial_model import FEWEST_ANCHORS, DistantPoints, affordable_anchors
 from ...training.trainer import Trainer
 from ..exported import EXPORT, export_model
 from ..folder import (
@@ -44,6 +46,9 @@ from ..votes import VOTE, cast_votes, votes_are_current, votes_key
 from .measuring import Measuring
 from .points import DENSE, starting_points
 
+_TIMED_VIEWS = 3
+"""Number of views on which the time of a step is measured."""
+
 
 def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Begin, resume or extend a training, and write a checkpoint, previews, splats.ply and anchors.ply."""
@@ -59,7 +64,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     with open_reconstruction(options, reporter) as (output, capture):
         folder = output.folder
         _expect_training(budget, capture, device, TrainingProgress(), reporter)
-        trainer, plan = _begin(folder, capture, options, reporter, device)
+        trainer, plan = _begin(folder, capture, options, budget, reporter, device)
         output.accept()
         progress = trainer.progress
         if progress.step and budget.progress(progress) >= 1:
@@ -117,6 +122,7 @@ def _begin(
     folder: Reconstruction,
     capture: Capture,
     options: argparse.Namespace,
+    budget: Budget,
     reporter: StoppingReporter,
     device: torch.device,
 ) -> tuple[Trainer, Plan]:
@@ -153,10 +159,13 @@ def _begin(
         assert context.point_ids is not None
         far = DistantPoints(*context.surroundings[:3]) if plan.does("surroundings") else None
         seeds, more = starting_points(planned, context.point_ids, plan, options.seed, reporter)
-        trainer = Trainer.start(
-            planned, context.point_ids, wanted, memory, device, seeds=seeds,
+        start = functools.partial(
+            Trainer.start, planned, context.point_ids, wanted, memory, device, seeds=seeds,
             supervise_background=planned.has_masks and plan.does("rest"), gains=gains, more=more, surroundings=far,
         )  # fmt: skip
+        trainer = start()
+        if not budget.until_converged and device.type == "cpu" and wanted.mode != "paper" and wanted.voxel is None:
+            trainer = _affordable(trainer, start, 0 if far is None else len(far.xyz), budget, reporter)
     if options.restart:
         # The new training's first checkpoint replaces that of the old one before anything refers to it.
         trainer.save(folder.checkpoint)
@@ -165,6 +174,38 @@ def _begin(
     write_plan(folder.plan, plan)
     report_plan(plan, reporter)
     return trainer, plan
+
+
+def _affordable(
+    trainer: Trainer,
+    start: Callable[..., Trainer],
+    distant: int,
+    budget: Budget,
+    reporter: StoppingReporter,
+) -> Trainer:
+    """Return a trainer that begins with as many anchors as its time allows: `trainer`, or a new one.
+
+    Args:
+        trainer: a trainer that begins with all anchors.
+        start: starts one with `most_anchors`, besides those in the distance.
+        distant: number of anchors in the distance.
+        budget: length of the training.
+        reporter: receives progress and a message.
+    """
+    views, anchors = trainer.scene.capture.train_indices, len(trainer.model.anchors) - distant
+    if budget.seconds is None or anchors <= FEWEST_ANCHORS:
+        return trainer
+    ensure_kernels(reporter, trainer.model.device)
+    timed = views[:: max(len(views) // _TIMED_VIEWS, 1)][:_TIMED_VIEWS]
+    steps = budget.seconds / trainer.view_step.measure_seconds(timed)
+    most = affordable_anchors(anchors, steps, len(views))
+    if most == anchors:
+        return trainer
+    reporter.status(
+        f"The time is enough for about {steps:,.0f} steps with {anchors:,} anchors, so the training begins with "
+        f"{most:,} of them for more steps; more grow where they are missing"
+    )
+    return start(most_anchors=most)
 
 
 def _check_same_training(folder: Reconstruction, capture: Capture, plan: Plan, options: argparse.Namespace) -> None:
