@@ -69,7 +69,7 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         left_out=_left_out(trained, evaluation),
         plan=trained.plan.as_list(),
         stages=[asdict(stage) for stage in record.stages],
-        curve=progress.curve,
+        curve=[entry for entry in progress.curve if "psnr" in entry],
         model={
             "anchors": len(model.anchors),
             "gaussians": len(model.generate().source) if model.explicit else (export and export.splats),
