@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import itertools
 import math
-import statistics
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -184,25 +183,23 @@ class ViewStep:
         if self.colors is not None:
             self.colors.restore(tensors)
 
-    def measure_seconds(self, indices: Iterable[int]) -> float:
+    def measure_seconds(self, index: int) -> float:
         """Measure how long the gradients of a view take at the start of the training; nothing is changed.
 
         Args:
-            indices: indices of the views to measure on; the median counts.
+            index: index of the view in the capture.
 
         Raises:
             InputError: as `compute`.
         """
         colors, self.colors = self.colors, None
-        found = []
-        for index in indices:
-            self.compute(index, 0.0)  # Read the images.
-            started = time.monotonic()
-            self.compute(index, 0.0)
-            found.append(time.monotonic() - started)
+        self.compute(index, 0.0)  # Read the image.
+        started = time.monotonic()
+        self.compute(index, 0.0)
+        seconds = time.monotonic() - started
         self.colors = colors
         self._head_optimizer.zero_grad(set_to_none=True)
-        return statistics.median(found)
+        return seconds
 
     def compute(
         self, index: int, progress: float, dropout: Dropout | None = None, alone: bool = False

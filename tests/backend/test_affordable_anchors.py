@@ -56,7 +56,7 @@ def test_points_are_thinned_evenly_and_cells_stay_fine(write_capture, tmp_path):
 def test_measuring_a_step_changes_nothing(tiny):
     capture, ids = tiny()
     trainer, same = (Trainer.start(capture, ids, Settings(offsets=2, fit_colors=True)) for _ in range(2))
-    assert trainer.view_step.measure_seconds(capture.train_indices[:3]) > 0
+    assert all(trainer.view_step.measure_seconds(index) > 0 for index in capture.train_indices[:3])
     for _ in range(3):
         assert torch.equal(trainer.step(0.5), same.step(0.5))
     assert torch.equal(trainer.model.anchors.rows, same.model.anchors.rows)
@@ -75,7 +75,7 @@ def test_measuring_a_step_changes_nothing(tiny):
 def test_only_short_trainings_begin_with_fewer(write_capture, tmp_path, run_command, monkeypatch, length, fewer):
     for module in (initial_model, train):
         monkeypatch.setattr(module, "FEWEST_ANCHORS", 2000)
-    monkeypatch.setattr(ViewStep, "measure_seconds", lambda self, indices: 1.0)
+    monkeypatch.setattr(ViewStep, "measure_seconds", lambda self, index: 1.0)
     if 600 in length:
         monkeypatch.setattr(Trainer, "run", lambda *args, **options: None)
     folder = many_points(write_capture)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import functools
+import statistics
 from collections.abc import Callable
 
 import numpy as np
@@ -46,6 +47,9 @@ from ..votes import VOTE, cast_votes, votes_are_current, votes_key
 from .measuring import Measuring
 from .points import DENSE, starting_points
 
+PACE = "pace"
+"""Name of the measurement of a step's time among the parts of a command."""
+
 _TIMED_VIEWS = 3
 """Number of views on which the time of a step is measured."""
 
@@ -57,7 +61,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     reporter.expect(
         {
             READ: ("Preparing", 5.0), VOTE: ("Preparing", 5.0), "plan": ("Preparing", 5.0),
-            DENSE: ("Preparing", 0.0), KERNELS: ("Preparing", kernel_seconds(device)),
+            DENSE: ("Preparing", 0.0), KERNELS: ("Preparing", kernel_seconds(device)), PACE: ("Preparing", 0.0),
             "train": ("Training", budget.seconds or DEFAULT_SECONDS), EXPORT: ("Saving", 5.0),
         }
     )  # fmt: skip
@@ -196,8 +200,12 @@ def _affordable(
     if budget.seconds is None or anchors <= FEWEST_ANCHORS:
         return trainer
     ensure_kernels(reporter, trainer.model.device)
-    timed = views[:: max(len(views) // _TIMED_VIEWS, 1)][:_TIMED_VIEWS]
-    steps = budget.seconds / trainer.view_step.measure_seconds(timed)
+    reporter.begin(PACE, "Measuring the time of a step")
+    seconds = []
+    for index in views[:: max(len(views) // _TIMED_VIEWS, 1)][:_TIMED_VIEWS]:
+        seconds.append(trainer.view_step.measure_seconds(index))
+        reporter.progress(len(seconds), _TIMED_VIEWS)
+    steps = budget.seconds / statistics.median(seconds)
     most = affordable_anchors(anchors, steps, len(views))
     if most == anchors:
         return trainer
