@@ -210,7 +210,7 @@ def _affordable(
     if most == anchors:
         return trainer
     reporter.status(
-        f"The time is enough for about {steps:,.0f} steps with {anchors:,} anchors, so the training begins with "
+        f"The time is enough for about {steps:,.0f} steps with {anchors:,} anchors, so the training begins with about "
         f"{most:,} of them for more steps; more grow where they are missing"
     )
     return start(most_anchors=most)
