@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -213,7 +213,11 @@ _KINDS: tuple[tuple[str, bool, dict[str, bool]], ...] = (
 On the CPU, all variants of a primitive use the same kernel."""
 
 
-def compile_kernels(device: torch.device | None = None, progress: Callable[[int, int], object] | None = None) -> float:
+def compile_kernels(
+    device: torch.device | None = None,
+    progress: Callable[[int, int], object] | None = None,
+    primitives: Sequence[str] = ("3d", "2d"),
+) -> float:
     """Compile all rendering kernels that are used in training, or load them from numba's cache on disk.
 
     Afterwards, this process compiles no rendering kernels in training, and on the CPU for any request. Later processes
@@ -223,6 +227,7 @@ def compile_kernels(device: torch.device | None = None, progress: Callable[[int,
     Args:
         device: the device to compile for; None: the CPU.
         progress: called as progress(done, total) before the first and after each kernel.
+        primitives: what is rendered.
 
     Returns:
         The elapsed seconds.
@@ -232,13 +237,14 @@ def compile_kernels(device: torch.device | None = None, progress: Callable[[int,
     ids = torch.zeros(1, dtype=torch.int32, device=device)
     labels = torch.zeros((2, 2), dtype=torch.int32, device=device)
     camera = Camera(np.eye(4), np.eye(3), 2, 2)
+    kinds = [kind for kind in _KINDS if kind[0] in primitives]
 
     def report(done: int) -> None:
         if progress:
-            progress(done, 2 * len(_KINDS))
+            progress(done, 2 * len(kinds))
 
     report(0)
-    for index, (primitive, labeled, wanted) in enumerate(_KINDS):
+    for index, (primitive, labeled, wanted) in enumerate(kinds):
         means = ones[:, :3].clone().requires_grad_(labeled)
         drawn = rasterize(
             means, ones, ones[:, :3], 0.5 * ones[:, 0], 0 * ones[:, None, :3], ids, camera,

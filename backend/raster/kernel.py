@@ -14,9 +14,11 @@ from pathlib import Path
 from types import CodeType
 from typing import Any, cast
 
+from filelock import FileLock
 from numba import njit
+from numba.core.caching import IndexDataCacheFile
 
-_LAYERS = ("raster", "model", "training", "mesh", "pointing")
+_LAYERS = ("raster", "model", "training", "mesh", "pointing", "stereo")
 """The packages that contain kernels; each one may depend on itself and on those before it."""
 _SHARED = ("blending.py", "spherical_harmonics.py")
 """The files of `backend.shared.splats` whose constants are compiled into kernels."""
@@ -74,6 +76,18 @@ def digest_up_to(layer: str) -> str:
     return digest.hexdigest()
 
 
+class CacheFile(IndexDataCacheFile):
+    """The index of a function's compiled variants and their files, which processes may add to at the same time."""
+
+    def save(self, key: Any, data: Any) -> None:
+        """Add a variant; without the lock, two processes could give the same file to different variants."""
+        with contextlib.ExitStack() as held:
+            # Some network file systems have no locks.
+            with contextlib.suppress(OSError, NotImplementedError):
+                held.enter_context(FileLock(f"{self._index_path}.locked"))
+            super().save(key, data)
+
+
 def renew_with_layer(dispatcher: Any, function: Callable[..., Any]) -> None:
     """Tie the disk cache of a compiled function to `digest_up_to` of its layer instead of its file.
 
@@ -88,7 +102,7 @@ def renew_with_layer(dispatcher: Any, function: Callable[..., Any]) -> None:
     with contextlib.suppress(AttributeError):
         cache = dispatcher._cache
         name = cache._impl.filename_base.replace(f"-{function.__code__.co_firstlineno}.py", ".py")
-        cache._cache_file = type(cache._cache_file)(cache._cache_path, name, digest_up_to(layer))
+        cache._cache_file = CacheFile(cache._cache_path, name, digest_up_to(layer))
 
 
 def kernel(

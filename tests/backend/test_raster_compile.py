@@ -5,12 +5,15 @@ import re
 import shutil
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from numba.core.caching import IndexDataCacheFile
 
-from backend.raster import compile_kernels
-from backend.raster.kernel import digest_of_code
+from backend.raster import compile_kernels, kernel
+from backend.raster.kernel import CacheFile, digest_of_code
 
 ROOT = Path(__file__).parents[2]
 
@@ -115,6 +118,31 @@ print(tangent_limits(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 2.0, 2.0)[1], sum(tangent_lim
     constants = tmp_path / "backend" / "shared" / "splats" / "blending.py"
     constants.write_text(constants.read_text().replace("TAN_MARGIN = 0.3", "TAN_MARGIN = 0.5"))
     assert [limit(), limit()] == [[2.5, 0], [2.5, 1]]
+
+
+def test_variants_that_are_saved_at_the_same_time_are_all_kept(tmp_path, monkeypatch):
+    """Each has a file of its own, although all are saved after the index was read without any."""
+
+    def read_slowly(self):
+        found = IndexDataCacheFile._load_index(self)
+        time.sleep(0.1)
+        return found
+
+    monkeypatch.setattr(CacheFile, "_load_index", read_slowly)
+    files = [CacheFile(str(tmp_path), "kernel", "stamp") for _ in range(4)]
+    with ThreadPoolExecutor(len(files)) as pool:
+        list(pool.map(lambda number: files[number].save(number, f"code {number}"), range(len(files))))
+    assert [files[0].load(number) for number in range(len(files))] == [f"code {number}" for number in range(len(files))]
+
+
+def test_variants_are_saved_where_files_cannot_be_locked(tmp_path, monkeypatch):
+    def refused(_path):
+        raise NotImplementedError
+
+    monkeypatch.setattr(kernel, "FileLock", refused)
+    file = CacheFile(str(tmp_path), "kernel", "stamp")
+    file.save(1, "code")
+    assert file.load(1) == "code"
 
 
 def test_model_kernels_depend_only_on_lower_layers(tmp_path):
