@@ -136,6 +136,35 @@ def load_i(typingctx, array, index):
 
 
 @intrinsic
+def gather_i(typingctx, array, index, lanes):
+    """Load the elements `index` + lanes of a contiguous int32 array; no bounds check."""
+
+    def codegen(context, builder, signature, args):
+        view = context.make_array(signature.args[0])(context, builder, args[0])
+        pointers = builder.gep(builder.gep(view.data, [args[1]]), [args[2]], source_etype=ir.IntType(32))
+        # llvmlite takes a vector of addresses for a single one.
+        pointers.type = ir.VectorType(ir.PointerType(), LANES)
+        all_lanes, undefined = ir.Constant(_BOOLS, [1] * LANES), ir.Constant(_INTS, ir.Undefined)
+        kind = ir.FunctionType(_INTS, [pointers.type, ir.IntType(32), _BOOLS, _INTS])
+        function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.masked.gather.v{LANES}i32.v{LANES}p0")
+        return builder.call(function, [pointers, ir.Constant(ir.IntType(32), 4), all_lanes, undefined])
+
+    return Ints(array, types.intp, lanes), codegen
+
+
+@intrinsic
+def byte(typingctx, lanes, number):
+    """Return byte `number`, 0 .. 3 and 0 the lowest, of each lane."""
+
+    def codegen(context, builder, signature, args):
+        bits = builder.mul(args[1], ir.Constant(ir.IntType(32), 8))
+        shifted = builder.lshr(args[0], _broadcast(builder, bits, _INTS))
+        return builder.uitofp(builder.and_(shifted, ir.Constant(_INTS, [255] * LANES)), _FLOATS)
+
+    return Floats(lanes, types.int32), codegen
+
+
+@intrinsic
 def store(typingctx, array, index, value):
     """Store to LANES consecutive elements of a contiguous float32 or int32 array, from `index` on; no bounds check."""
 
@@ -287,16 +316,21 @@ minimum = _minmax("<")
 maximum = _minmax(">")
 
 
-@intrinsic
-def sqrt(typingctx, a):
-    """Return the square root of each lane."""
+def _unary(name, doc):
+    def operation(typingctx, a):
+        def codegen(context, builder, signature, args):
+            kind = ir.FunctionType(_FLOATS, [_FLOATS])
+            function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f32")
+            return builder.call(function, args)
 
-    def codegen(context, builder, signature, args):
-        kind = ir.FunctionType(_FLOATS, [_FLOATS])
-        function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.sqrt.v{LANES}f32")
-        return builder.call(function, args)
+        return Floats(Floats), codegen
 
-    return Floats(Floats), codegen
+    operation.__doc__ = doc
+    return intrinsic(operation)
+
+
+sqrt = _unary("sqrt", "Return the square root of each lane.")
+whole = _unary("trunc", "Round each lane towards 0.")
 
 
 @intrinsic

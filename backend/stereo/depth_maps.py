@@ -11,7 +11,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from ..capture import Capture, View
-from .patch_match import RADIUS, Others, match, match_planes
+from .patch_match import RADIUS, Others, match, match_planes, packed
 from .scene_planes import ScenePlane, find_planes
 
 GRID = 6000
@@ -264,12 +264,12 @@ def _without_speckles(found: DepthMap) -> DepthMap:
 
 
 def _gray(capture: Capture, index: int) -> tuple[np.ndarray, float]:
-    """Return a photo in gray (h, w), scaled down if it is large, and the factor."""
+    """Return the packed gray levels (h, w) of a photo, scaled down if it is large, and the factor."""
     image = PilImage.fromarray(capture.image(index)).convert("F")
     factor = min(1.0, LONGEST_SIDE / max(image.size))
     if factor < 1.0:
         image = image.resize([max(round(side * factor), 1) for side in image.size], PilImage.Resampling.BOX)
-    return np.asarray(image, np.float32), factor
+    return packed(np.asarray(image)), factor
 
 
 def _neighbors(capture: Capture, views: Sequence[int], most: int) -> dict[int, list[int]]:
@@ -329,7 +329,7 @@ def _others(
         capture.views[index].viewmat
     )
     sizes = np.array([scaled[other][0].shape for other in neighbors], np.int64)
-    images = np.zeros((len(neighbors), *sizes.max(0)), np.float32)
+    images = np.zeros((len(neighbors), *sizes.max(0)), np.int32)
     for number, other in enumerate(neighbors):
         images[number, : sizes[number, 0], : sizes[number, 1]] = scaled[other][0]
     return Others(

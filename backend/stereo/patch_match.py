@@ -10,9 +10,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
+from numba import prange
 from scipy import ndimage
+
+from ..raster import simd
+from ..raster.kernel import kernel
 
 RADIUS = 4
 """Radius of the patches in pixels."""
@@ -37,6 +40,13 @@ _SMALLEST, _LARGEST = np.float32(0.08), np.float32(12.0)
 _AROUND = np.array([(0, 1), (0, -1), (1, 0), (-1, 0), (0, 3), (0, -3), (3, 0), (-3, 0)])
 """Rows and columns from a pixel of the grid to those whose planes it tries."""
 
+_SIDE = 2 * RADIUS + 1
+_PADDED = -(-(_SIDE**2) // simd.LANES) * simd.LANES
+"""Number of pixels of a patch, rounded up; the additional ones are its middle, without any weight."""
+_RIGHT, _DOWN = np.zeros((2, _PADDED), np.float32)
+_DOWN[: _SIDE**2], _RIGHT[: _SIDE**2] = np.indices((_SIDE, _SIDE)).reshape(2, -1) - RADIUS
+"""Columns and rows of the pixels of a patch from its middle."""
+
 
 class Others(NamedTuple):
     """The photos that a photo is matched with.
@@ -46,7 +56,7 @@ class Others(NamedTuple):
     Attributes:
         turns: (k, 3, 3) float32.
         steps: (k, 3) float32.
-        images: (k, H, W) float32 gray levels.
+        images: (k, H, W) int32, see `packed`.
         sizes: (k, 2) int64 heights and widths that are used of them.
     """
 
@@ -54,6 +64,17 @@ class Others(NamedTuple):
     steps: np.ndarray
     images: np.ndarray
     sizes: np.ndarray
+
+
+def packed(image: np.ndarray) -> np.ndarray:
+    """Return gray levels (H, W) with their neighbors, int32.
+
+    The bytes of a pixel, from the lowest, are the rounded levels of itself and of those to the right, below, and to the
+    right below, so that a level between four pixels takes one access to the memory.
+    """
+    levels = np.pad(np.clip(np.rint(image), 0, 255).astype(np.uint8), ((0, 1), (0, 1)), "edge")
+    four = np.stack([levels[:-1, :-1], levels[:-1, 1:], levels[1:, :-1], levels[1:, 1:]], -1)
+    return np.ascontiguousarray(four).view("<i4")[..., 0].astype(np.int32)
 
 
 class Matches(NamedTuple):
@@ -74,7 +95,7 @@ def match(
     """Match the patches around pixels with other photos.
 
     Args:
-        image: (H, W) float32 gray levels.
+        image: (H, W) int32 gray levels, see `packed`.
         pixels: (n, 2) int64 columns and rows of a regular grid, row by row.
         columns: number of columns of the grid.
         others: at least one other photo.
@@ -86,13 +107,13 @@ def match(
     """
     inverse = np.linspace(1.0 / farthest, 1.0 / nearest, DEPTHS).astype(np.float32)
     planes, scores = np.zeros((len(pixels), 3), np.float32), np.full(len(pixels), -1.0, np.float32)
-    textured = _deviation(image)[pixels[:, 1], pixels[:, 0]] >= _FLATTEST
-    image = np.ascontiguousarray(image, np.float32)
-    _sweep(image, pixels, textured, *others, inverse, planes, scores)
+    levels = (image & 255).astype(np.float32)
+    textured = _deviation(levels)[pixels[:, 1], pixels[:, 0]] >= _FLATTEST
+    _sweep(levels, pixels, textured, *others, inverse, planes, scores)
     stride = int(pixels[1, 0] - pixels[0, 0]) if columns > 1 else 1
     for turn in range(ROUNDS):
         planes, scores = _spread(
-            image, pixels, textured, *others, planes, scores, columns, stride, inverse, np.float32(STEEPEST / focal),
+            levels, pixels, textured, *others, planes, scores, columns, stride, inverse, np.float32(STEEPEST / focal),
             turn,
         )  # fmt: skip
     return Matches(planes, scores)
@@ -112,9 +133,9 @@ def match_planes(
         The plane of each pixel that matches best.
     """
     found, scores = np.zeros((len(pixels), 3), np.float32), np.full(len(pixels), -1.0, np.float32)
-    textured = _deviation(image)[pixels[:, 1], pixels[:, 0]] >= _FLATTEST
-    image = np.ascontiguousarray(image, np.float32)
-    _try_planes(image, pixels, allowed & textured[:, None], *others, planes, found, scores)
+    levels = (image & 255).astype(np.float32)
+    textured = _deviation(levels)[pixels[:, 1], pixels[:, 0]] >= _FLATTEST
+    _try_planes(levels, pixels, allowed & textured[:, None], *others, planes, found, scores)
     return Matches(found, scores)
 
 
@@ -125,30 +146,27 @@ def _deviation(image: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(ndimage.uniform_filter(exact**2, side) - mean**2, 0.0))
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _read_patch(image, column, row, turns):  # type: ignore[no-untyped-def]
     """Return what the correlation of a patch with others needs.
 
     Returns:
-        Its values (side, side) less their weighted mean, their weights, which sum to 1, their standard deviation, the
+        Its values (_PADDED,) less their weighted mean, their weights, which sum to 1, their standard deviation, the
         direction of its middle pixel in the other photos (k, 3), and its change to the right and below (k, 2, 3).
     """
-    side, radius = 2 * RADIUS + 1, RADIUS
-    values, weights = np.empty((side, side), np.float32), np.empty((side, side), np.float32)
+    values, weights = np.zeros(_PADDED, np.float32), np.zeros(_PADDED, np.float32)
     total, mean, square = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    for i in range(side):
-        for j in range(side):
-            value = image[row + i - radius, column + j - radius]
-            weight = np.exp(-abs(value - image[row, column]) / _SIMILAR)
-            values[i, j], weights[i, j] = value, weight
-            total += weight
-            mean += weight * value
+    for i in range(_SIDE**2):
+        value = image[row + int(_DOWN[i]), column + int(_RIGHT[i])]
+        weight = np.exp(-abs(value - image[row, column]) / _SIMILAR)
+        values[i], weights[i] = value, weight
+        total += weight
+        mean += weight * value
     mean /= total
-    for i in range(side):
-        for j in range(side):
-            weights[i, j] /= total
-            values[i, j] -= mean
-            square += weights[i, j] * values[i, j] * values[i, j]
+    for i in range(_SIDE**2):
+        weights[i] /= total
+        values[i] -= mean
+        square += weights[i] * values[i] * values[i]
     deviation = np.sqrt(max(square, np.float32(1e-6)))
     middle, beside = np.empty((len(turns), 3), np.float32), np.empty((len(turns), 2, 3), np.float32)
     u, v = np.float32(column + 0.5), np.float32(row + 0.5)
@@ -159,15 +177,15 @@ def _read_patch(image, column, row, turns):  # type: ignore[no-untyped-def]
     return values, weights, deviation, middle, beside
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _score(values, weights, deviation, middle, beside, steps, images, sizes, w, a, b):  # type: ignore[no-untyped-def]
     """Return the mean of the two best correlations of a patch with other photos; with one photo, its correlation."""
-    side = values.shape[0]
-    radius, edge = side // 2, np.float32(0.01)
+    radius, edge, half = np.float32(RADIUS), np.float32(0.01), np.float32(0.5)
+    packed, width = images.reshape(-1), simd.splat(np.float32(images.shape[2]))
     first, second = np.float32(-1.0), np.float32(-1.0)
     for k in range(len(steps)):
         z = middle[k, 2] + steps[k, 2] * w
-        if z <= 1e-9:
+        if z <= np.float32(1e-9):
             continue
         u, v = (middle[k, 0] + steps[k, 0] * w) / z, (middle[k, 1] + steps[k, 1] * w) / z
         right, below = beside[k, 0, 2] + steps[k, 2] * a, beside[k, 1, 2] + steps[k, 2] * b
@@ -179,30 +197,32 @@ def _score(values, weights, deviation, middle, beside, steps, images, sizes, w, 
         if area < _SMALLEST or area > _LARGEST:
             continue
         across, down = radius * (abs(ux) + abs(uy)), radius * (abs(vx) + abs(vy))
-        u, v = u - np.float32(0.5), v - np.float32(0.5)
+        u, v = u - half, v - half
         if min(u - across, v - down) < edge:
             continue
         if u + across > sizes[k, 1] - 1 - edge or v + down > sizes[k, 0] - 1 - edge:
             continue
-        total, squares, product = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        for i in range(side):
-            x = u - radius * ux + (i - radius) * uy
-            y = v - radius * vx + (i - radius) * vy
-            for j in range(side):
-                column, row = int(x), int(y)
-                p, q = x - column, y - row
-                upper = images[k, row, column] + p * (images[k, row, column + 1] - images[k, row, column])
-                lower = images[k, row + 1, column] + p * (images[k, row + 1, column + 1] - images[k, row + 1, column])
-                seen = upper + q * (lower - upper)
-                weighted = weights[i, j] * seen
-                total += weighted
-                squares += weighted * seen
-                product += weighted * values[i, j]
-                x += ux
-                y += vx
-        square = squares - total * total
-        if square > 0.25:
-            correlation = product / (deviation * np.sqrt(square))
+        begin = k * images.shape[1] * images.shape[2]
+        total, squares, product = simd.splat(np.float32(0.0)), simd.splat(np.float32(0.0)), simd.splat(np.float32(0.0))
+        for i in range(0, _PADDED, simd.LANES):
+            x = simd.splat(u) + simd.load(_RIGHT, i) * simd.splat(ux) + simd.load(_DOWN, i) * simd.splat(uy)
+            y = simd.splat(v) + simd.load(_RIGHT, i) * simd.splat(vx) + simd.load(_DOWN, i) * simd.splat(vy)
+            column, row = simd.whole(x), simd.whole(y)
+            # Exact, since a photo has fewer than 2**24 pixels.
+            four = simd.gather_i(packed, begin, simd.truncate(row * width + column))
+            left = simd.byte(four, 0)
+            upper = left + (x - column) * (simd.byte(four, 1) - left)
+            left = simd.byte(four, 2)
+            lower = left + (x - column) * (simd.byte(four, 3) - left)
+            seen = upper + (y - row) * (lower - upper)
+            weighted = simd.load(weights, i) * seen
+            total = total + weighted
+            squares = squares + weighted * seen
+            product = product + weighted * simd.load(values, i)
+        mean = simd.total(total)
+        square = simd.total(squares) - mean * mean
+        if square > np.float32(0.25):
+            correlation = simd.total(product) / (deviation * np.sqrt(square))
             if correlation > first:
                 first, second = correlation, first
             elif correlation > second:
@@ -210,11 +230,11 @@ def _score(values, weights, deviation, middle, beside, steps, images, sizes, w, 
     return first if len(steps) == 1 else np.float32(0.5) * (first + second)
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
+@kernel(parallel=True, fastmath=True)
 def _sweep(image, pixels, textured, turns, steps, images, sizes, inverse, planes, scores):  # type: ignore[no-untyped-def]
     """Try fronto-parallel planes; fills the best planes (n, 3) and scores (n,)."""
     flat = np.float32(0.0)
-    for n in numba.prange(len(pixels)):
+    for n in prange(len(pixels)):
         if not textured[n]:
             continue
         values, weights, deviation, middle, beside = _read_patch(image, pixels[n, 0], pixels[n, 1], turns)
@@ -224,10 +244,10 @@ def _sweep(image, pixels, textured, turns, steps, images, sizes, inverse, planes
                 scores[n], planes[n, 0] = score, w
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
+@kernel(parallel=True, fastmath=True)
 def _try_planes(image, pixels, allowed, turns, steps, images, sizes, planes, found, scores):  # type: ignore[no-untyped-def]
     """Try given planes (p, 3) where they are allowed (n, p); fills the best planes (n, 3) and scores (n,)."""
-    for n in numba.prange(len(pixels)):
+    for n in prange(len(pixels)):
         if not allowed[n].any():
             continue
         values, weights, deviation, middle, beside = _read_patch(image, pixels[n, 0], pixels[n, 1], turns)
@@ -246,7 +266,7 @@ def _try_planes(image, pixels, allowed, turns, steps, images, sizes, planes, fou
                 scores[n] = -1.0
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
+@kernel(parallel=True, fastmath=True)
 def _spread(  # type: ignore[no-untyped-def]
     image, pixels, textured, turns, steps, images, sizes, planes, scores, columns, stride, inverse, tilt, turn
 ):
@@ -256,7 +276,7 @@ def _spread(  # type: ignore[no-untyped-def]
     least, most = inverse[0], inverse[-1]
     step = np.float32(2.0) * (inverse[1] - inverse[0]) * np.float32(0.5) ** turn
     lean = tilt * np.float32(0.5) ** turn
-    for n in numba.prange(len(pixels)):
+    for n in prange(len(pixels)):
         if not textured[n]:
             continue
         values, weights, deviation, middle, beside = _read_patch(image, pixels[n, 0], pixels[n, 1], turns)
@@ -294,7 +314,7 @@ def _spread(  # type: ignore[no-untyped-def]
     return new, new_scores
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _random(seed):  # type: ignore[no-untyped-def]
     """Return the next seed and a number in [-1, 1) (xorshift, Marsaglia 2003)."""
     seed = np.uint32(seed ^ (seed << np.uint32(13)))

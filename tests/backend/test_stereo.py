@@ -15,7 +15,7 @@ from backend.shared.errors import EXIT_DONE
 from backend.stereo import depth_maps
 from backend.stereo.dense_points import _thinned, find_dense_points
 from backend.stereo.depth_maps import AGREES, balance, find_depth_maps
-from backend.stereo.patch_match import Others, match_planes
+from backend.stereo.patch_match import Others, match_planes, packed
 from backend.stereo.scene_planes import find_planes
 from backend.training.state import model_from_checkpoint, read_checkpoint
 
@@ -143,6 +143,14 @@ def test_floor_goes_on_where_few_photos_show_it(scene, maps, monkeypatch):
     assert (errors < AGREES).mean() > 0.95
 
 
+def test_packed_pixels_have_their_neighbors():
+    image = np.arange(20, dtype=np.float32).reshape(4, 5) * 13.4
+    levels = np.pad(np.minimum(np.rint(image), 255), ((0, 1), (0, 1)), "edge")
+    four = packed(image)
+    for place, (down, right) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
+        assert np.array_equal(four >> 8 * place & 255, levels[down : down + 4, right : right + 5])
+
+
 def test_smooth_shades_do_not_match_on_planes():
     """The shade of a sky correlates with itself at any depth, a texture at its own alone."""
     shade = np.tile(np.linspace(0, 255, SIZE[0], dtype=np.float32), (SIZE[1], 1))
@@ -150,11 +158,11 @@ def test_smooth_shades_do_not_match_on_planes():
     pixels = np.stack(np.meshgrid(np.arange(40, 120, 10), np.arange(30, 90, 10)), -1).reshape(-1, 2)
     steps = np.array([[10, 0, 0], [0, 10, 0]], np.float32)
     for image, matches in ((shade, False), (grain, True)):
-        moved = np.stack([np.roll(image, 10, 1), np.roll(image, 10, 0)])
+        moved = np.stack([packed(np.roll(image, 10, 1)), packed(np.roll(image, 10, 0))])
         others = Others(np.tile(np.eye(3, dtype=np.float32), (2, 1, 1)), steps, moved, np.tile(SIZE[::-1], (2, 1)))
-        found = match_planes(image, pixels, others, np.array([[0, 0, 1.0]]), np.ones((len(pixels), 1), bool))
+        found = match_planes(packed(image), pixels, others, np.array([[0, 0, 1.0]]), np.ones((len(pixels), 1), bool))
         assert ((found.scores > 0.9) == matches).all()
-        none = match_planes(image, pixels, others, np.array([[0, 0, 1.0]]), np.zeros((len(pixels), 1), bool))
+        none = match_planes(packed(image), pixels, others, np.array([[0, 0, 1.0]]), np.zeros((len(pixels), 1), bool))
         assert (none.scores == -1).all()
 
 
