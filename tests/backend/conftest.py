@@ -223,6 +223,12 @@ def run_command(capsys):
 
 
 @pytest.fixture
+def no_dense_points(monkeypatch):
+    """Leave out the points on plain surfaces, which `test_sfm` covers, to save time."""
+    monkeypatch.setattr("backend.commands.capture.sfm._densify", lambda *_: {})
+
+
+@pytest.fixture
 def tiny(write_capture, tmp_path):
     """Function that writes a capture of nine small views and returns it with the object IDs of its points."""
 

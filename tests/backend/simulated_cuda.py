@@ -74,14 +74,14 @@ def test_insufficient_intersection_capacity_is_increased(primitive, monkeypatch)
     monkeypatch.setattr(
         "backend.raster.cuda.renderer.tile_intersections", lambda *a: made.append(a[-1]) or tile_intersections(*a)
     )
-    scene = as_float32(random_scene(0, count=40))
+    scene = as_float32(random_scene(0, count=12))
     pictures = []
-    for last in (10_000, 30):
+    for last in (10_000, 10):
         monkeypatch.setattr(cuda_bin, "_largest_total", {torch.device("cpu"): last})
         pictures.append(draw(scene, camera(), primitive=primitive))
     assert_same_bits(*pictures)
     needed = cuda_bin._largest_total[torch.device("cpu")]
-    assert 40 < needed < 10_000 and made == [int(10_000 * 1.125), int(30 * 1.125), needed]
+    assert 12 < needed < 10_000 and made == [int(10_000 * 1.125), int(10 * 1.125), needed]
 
 
 def test_room_for_intersections_is_that_of_the_largest_of_the_last_images(monkeypatch):

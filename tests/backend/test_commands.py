@@ -751,7 +751,7 @@ def test_process_stops_on_signal_and_closed_stdout(write_capture, tmp_path):
     lines = []
     for line in process.stdout:
         lines.append(line)
-        if '"preview"' in line and len(lines) > 3:
+        if '"step"' in line:
             process.send_signal(signal.SIGTERM)
             break
     rest, err = process.communicate(timeout=60)
@@ -780,7 +780,7 @@ def test_folder_is_locked_by_training_process(write_capture, tmp_path, run_comma
     )  # fmt: skip
     with process:
         try:
-            assert any('"preview"' in line for line in process.stdout)
+            assert any('"step"' in line for line in process.stdout)
             for words in (train, ("vote", capture, "--out", out), (*train, "--restart")):
                 sentence = assert_rejected(run_command(*words))
                 assert sentence == (

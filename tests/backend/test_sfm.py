@@ -144,7 +144,7 @@ def test_killed_mapper_leaves_the_earlier_model(made, photos, tmp_path, monkeypa
     assert (capture / "sparse" / "0" / "images.bin").read_bytes() == before
 
 
-def test_photos_that_do_not_fit_are_named_with_the_reason(photos, tmp_path, run_command):
+def test_photos_that_do_not_fit_are_named_with_the_reason(photos, tmp_path, run_command, no_dense_points):
     folder = shutil.copytree(photos / "images", tmp_path / "mixed")
     Image.fromarray(photo(ring()[0], seed=900)).save(folder / "zz other room.png")
     Image.fromarray(np.full((HEIGHT, WIDTH, 3), 128, np.uint8)).save(folder / "zz plain.png")
@@ -191,7 +191,7 @@ def test_weak_photos_are_those_unlike_the_others():
     assert "far.jpg" not in check.weak_photos(small), "a fiftieth of a pixel is no error"
 
 
-def test_features_can_be_on_objects_alone(photos, tmp_path, run_command):
+def test_features_can_be_on_objects_alone(photos, tmp_path, run_command, no_dense_points):
     """Half of each mask is an object, and one photo has no mask; another set of photos has none at all."""
     folder = shutil.copytree(photos, tmp_path / "turntable")
     for path in (folder / "masks").iterdir():
@@ -211,7 +211,7 @@ def test_features_can_be_on_objects_alone(photos, tmp_path, run_command):
     assert result.code == EXIT_BAD_INPUT and "has no mask of any photo" in result.err
 
 
-def test_objects_that_turn_before_a_background_at_rest(photos, tmp_path, run_command):
+def test_objects_that_turn_before_a_background_at_rest(photos, tmp_path, run_command, no_dense_points):
     """The background is that of the first photo; without masks it would say that the camera stands still."""
     folder = shutil.copytree(photos, tmp_path / "turntable")
     first = np.asarray(Image.open(folder / "images" / "photo 1.png"))
@@ -230,7 +230,7 @@ def test_objects_that_turn_before_a_background_at_rest(photos, tmp_path, run_com
     assert source.features == "objects", "which later steps know, too"
 
 
-def test_separate_sets_of_photos(photos, tmp_path, run_command, monkeypatch):
+def test_separate_sets_of_photos(photos, tmp_path, run_command, monkeypatch, no_dense_points):
     """Five photos of another room have nothing in common with the seven of the first; each set can be used."""
     folder = shutil.copytree(photos / "images", tmp_path / "rooms")
     for number, matrix in enumerate(ring()[:5]):
@@ -255,7 +255,7 @@ def posed_photos(capture) -> set[str]:
     return {model.image(number).name for number in model.reg_image_ids()}
 
 
-def test_fisheye_lens_is_recognized(tmp_path, run_command):
+def test_fisheye_lens_is_recognized(tmp_path, run_command, no_dense_points):
     """122 degrees wide, 160 from corner to corner."""
     (tmp_path / "photos").mkdir()
     for number, matrix in enumerate(ring()):
@@ -370,6 +370,7 @@ def test_pairs_of_large_sets_are_those_that_show_the_same(made, monkeypatch):
     assert all(abs(first - second) <= 2 for first, second in chosen), "neighbors of the ring"
 
 
+@pytest.mark.usefixtures("no_dense_points")
 def test_pairs_of_photos_with_spaces_in_their_names_are_matched(made, photos, tmp_path, run_command, monkeypatch):
     """COLMAP's lists have no such names, so the database has others meanwhile, also after the process was killed."""
     monkeypatch.setattr(pairs, "ALL_UP_TO", 2)

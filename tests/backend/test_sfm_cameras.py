@@ -34,7 +34,7 @@ def write_lenses(folder, *lenses: str):
     return folder / "cameras.txt"
 
 
-def test_calibrated_lens_is_kept(photos, tmp_path):
+def test_calibrated_lens_is_kept(photos, tmp_path, no_dense_points):
     lenses = write_lenses(tmp_path / "lenses", "OPENCV 640 480 600 600 320 240 0 0 0 0", LENS)
     capture = tmp_path / "room"
     # First without: features and matches are kept, and the lens is what counts from then on.

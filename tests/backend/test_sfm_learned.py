@@ -343,7 +343,7 @@ def test_weights_that_do_not_fit_are_refused(networks, tmp_path):
         lightglue.LightGlue(folder)
 
 
-def test_command_goes_on_and_poses_are_right(networks, tmp_path, run_command, monkeypatch):
+def test_command_goes_on_and_poses_are_right(networks, tmp_path, run_command, monkeypatch, no_dense_points):
     """The whole command in its processes, with paths from another folder, after a stop with three photos and a pair.
 
     The photos are enlarged, since corners are found to a pixel, and EXIF tells their focal length.
@@ -368,7 +368,6 @@ def test_command_goes_on_and_poses_are_right(networks, tmp_path, run_command, mo
 
     before = {table: rows(table) for table in ("keypoints", "descriptors", "matches", "two_view_geometries")}
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("backend.commands.capture.sfm._densify", lambda *_: {})
     result = run_command("sfm", "photos", "--out", "capture", "--matcher", networks)
     assert result.code == EXIT_DONE, result.err
     assert all(before[table] and before[table] < rows(table) for table in before)

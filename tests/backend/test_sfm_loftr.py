@@ -366,12 +366,11 @@ def prepare(capture, network, photos, stand_in, left=()):
 
 
 def test_command_matches_what_is_left_and_poses_are_right(
-    network, photos, tmp_path, stand_in, run_command, monkeypatch
+    network, photos, tmp_path, stand_in, run_command, no_dense_points
 ):
     """The whole command in its processes; all pairs but one were matched before."""
     images, names = photos
     matched, path = prepare(tmp_path / "capture", network, photos, stand_in, [(names[0], names[1])])
-    monkeypatch.setattr("backend.commands.capture.sfm._densify", lambda *_: {})
     result = run_command("sfm", images, "--out", tmp_path / "capture", "--matcher", network)
     assert result.code == EXIT_DONE, result.err
     assert database.count_positions(matched) == database.count_pairs(path) == stand_in.pairs + 1

@@ -219,12 +219,6 @@ def walk(tmp_path_factory):
     return path
 
 
-@pytest.fixture
-def no_dense_points(monkeypatch):
-    """Leave out the points on plain surfaces, which `test_sfm` covers, to save time."""
-    monkeypatch.setattr("backend.commands.capture.sfm._densify", lambda *_: {})
-
-
 def test_poses_of_a_video(walk, tmp_path, run_command, no_dense_points):
     result = run_command("sfm", walk, "--out", tmp_path / "capture", "--frames", 12)
     assert result.code == EXIT_DONE
