@@ -26,7 +26,7 @@ def use_private_cache() -> str | None:
     for folder in _candidates():
         why = _why_not(folder)
         if why is None:
-            os.environ[_VARIABLE] = str(folder)
+            os.environ[_VARIABLE] = str(folder.absolute())
             return sentence
         sentence = sentence or (
             f"{folder} {why}, so it is not used for compiled kernels, which run as code; delete it, or name another "

@@ -7,6 +7,7 @@ import dis
 import functools
 import hashlib
 import inspect
+import itertools
 from collections.abc import Callable
 from importlib.machinery import SourceFileLoader
 from itertools import pairwise
@@ -16,7 +17,6 @@ from typing import Any, cast
 
 from filelock import FileLock
 from numba import njit
-from numba.core.caching import IndexDataCacheFile
 
 _LAYERS = ("raster", "model", "training", "mesh", "pointing", "stereo")
 """The packages that contain kernels; each one may depend on itself and on those before it."""
@@ -76,16 +76,30 @@ def digest_up_to(layer: str) -> str:
     return digest.hexdigest()
 
 
-class CacheFile(IndexDataCacheFile):
-    """The index of a function's compiled variants and their files, which processes may add to at the same time."""
+class _Locked:
+    """A function's compiled variants on disk, which several processes may add to at the same time."""
 
-    def save(self, key: Any, data: Any) -> None:
-        """Add a variant; without the lock, two processes could give the same file to different variants."""
+    def save(self: Any, key: Any, data: Any) -> None:
+        """Add a variant: its file first, and then its entry in the index, which is right at any moment.
+
+        Without the lock, two processes could give the same file to different variants.
+        """
         with contextlib.ExitStack() as held:
             # Some network file systems have no locks.
             with contextlib.suppress(OSError, NotImplementedError):
-                held.enter_context(FileLock(f"{self._index_path}.locked"))
-            super().save(key, data)
+                held.enter_context(FileLock(f"{self._index_path}.locked", timeout=10, fallback_to_soft=False))
+            names = self._load_index()
+            taken = set(names.values())
+            free = (name for name in map(self._data_name, itertools.count(1)) if name not in taken)
+            name = names.get(key) or next(free)
+            self._save_data(name, data)
+            self._save_index({**names, key: name})
+
+
+@functools.cache
+def locked(kind: Any) -> Any:
+    """Return a class of cache files, of numba or of numba-cuda, whose variants processes may save at the same time."""
+    return type("LockedCacheFile", (_Locked, kind), {})
 
 
 def renew_with_layer(dispatcher: Any, function: Callable[..., Any]) -> None:
@@ -102,7 +116,8 @@ def renew_with_layer(dispatcher: Any, function: Callable[..., Any]) -> None:
     with contextlib.suppress(AttributeError):
         cache = dispatcher._cache
         name = cache._impl.filename_base.replace(f"-{function.__code__.co_firstlineno}.py", ".py")
-        cache._cache_file = CacheFile(cache._cache_path, name, digest_up_to(layer))
+        kind: Any = type(cache._cache_file)
+        cache._cache_file = locked(kind)(cache._cache_path, name, digest_up_to(layer))
 
 
 def kernel(

@@ -13,7 +13,7 @@ import pytest
 from numba.core.caching import IndexDataCacheFile
 
 from backend.raster import compile_kernels, kernel
-from backend.raster.kernel import CacheFile, digest_of_code
+from backend.raster.kernel import digest_of_code, locked
 
 ROOT = Path(__file__).parents[2]
 
@@ -128,19 +128,20 @@ def test_variants_that_are_saved_at_the_same_time_are_all_kept(tmp_path, monkeyp
         time.sleep(0.1)
         return found
 
-    monkeypatch.setattr(CacheFile, "_load_index", read_slowly)
-    files = [CacheFile(str(tmp_path), "kernel", "stamp") for _ in range(4)]
+    kind = locked(IndexDataCacheFile)
+    monkeypatch.setattr(kind, "_load_index", read_slowly)
+    files = [kind(str(tmp_path), "kernel", "stamp") for _ in range(4)]
     with ThreadPoolExecutor(len(files)) as pool:
         list(pool.map(lambda number: files[number].save(number, f"code {number}"), range(len(files))))
     assert [files[0].load(number) for number in range(len(files))] == [f"code {number}" for number in range(len(files))]
 
 
 def test_variants_are_saved_where_files_cannot_be_locked(tmp_path, monkeypatch):
-    def refused(_path):
+    def refused(*_, **_options):
         raise NotImplementedError
 
     monkeypatch.setattr(kernel, "FileLock", refused)
-    file = CacheFile(str(tmp_path), "kernel", "stamp")
+    file = locked(IndexDataCacheFile)(str(tmp_path), "kernel", "stamp")
     file.save(1, "code")
     assert file.load(1) == "code"
 

@@ -6,31 +6,33 @@ part, with its files in a folder that is empty or does not exist.
 
 from __future__ import annotations
 
+import contextlib
 import subprocess
 import sys
 import time
 from pathlib import Path
 from types import TracebackType
 
+import numba
 import psutil
 import torch
 
 from ...raster import compile_kernels
 from ...shared.events import Reporter
-from .machine import cores
 from .small_scene import SmallScene
 
 DISCS, MESHES = "discs", "meshes"
 """The parts: what needs no other kernels, and what needs those of 3D Gaussians."""
 
-_ROOT = Path(__file__).resolve().parents[3]
+_ROOT = Path(__file__).parents[3]
 _MEMORY = 3e9
 """Bytes that two helpers need, with some room for others."""
-_POLLED_EVERY = 0.3
+_POLLED_EVERY, _LONGEST = 0.3, 900.0
+"""Seconds between two looks at a helper, and after which it is not waited for."""
 
 
 class Helpers:
-    """Helper processes, which are ended with the context; without a second core or enough memory, there are none.
+    """Helper processes, which are ended with the context; without a second thread or enough memory, there are none.
 
     Args:
         scratch: A folder for their files.
@@ -38,7 +40,7 @@ class Helpers:
 
     def __init__(self, scratch: Path) -> None:
         self._scratch = scratch
-        self._useful = cores() > 1 and psutil.virtual_memory().available > _MEMORY
+        self._useful = numba.get_num_threads() > 1 and psutil.virtual_memory().available > _MEMORY
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def __enter__(self) -> Helpers:
@@ -54,7 +56,8 @@ class Helpers:
         if self._useful:
             command = [sys.executable, "-m", "backend.commands.setup.helpers", part, str(self._scratch / part)]
             quiet = subprocess.DEVNULL
-            self._processes[part] = subprocess.Popen(command, cwd=_ROOT, stdin=quiet, stdout=quiet, stderr=quiet)
+            with contextlib.suppress(OSError):
+                self._processes[part] = subprocess.Popen(command, cwd=_ROOT, stdin=quiet, stdout=quiet, stderr=quiet)
 
     def wait(self, part: str, reporter: Reporter) -> None:
         """Wait until a part is compiled, if it was begun; what a helper fails at is left to this process.
@@ -63,8 +66,8 @@ class Helpers:
             part: The part.
             reporter: Its progress is called repeatedly, so that it can stop the command.
         """
-        process = self._processes.get(part)
-        while process is not None and process.poll() is None:
+        process, until = self._processes.get(part), time.monotonic() + _LONGEST
+        while process is not None and process.poll() is None and time.monotonic() < until:
             reporter.progress(0, 1)
             time.sleep(_POLLED_EVERY)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -60,8 +61,13 @@ def try_kernels(reporter: StoppingReporter, device: torch.device) -> None:
     """Compile all kernels of a device and run them in a training of a few splats."""
     reporter.begin(PART, "Compiling kernels, which later jobs use, too")
     steps = _Steps(reporter)
-    with tempfile.TemporaryDirectory(prefix="objectgs-kernels-") as folder, Helpers(Path(folder)) as helpers:
-        helped = device.type == "cpu" and not _are_ready(device)
+    mark = _mark(device)
+    # Without a writable cache the mark is not needed, and helpers are of no use.
+    with contextlib.suppress(OSError):
+        mark.parent.mkdir(parents=True, exist_ok=True)
+    helped = device.type == "cpu" and not _are_ready(device) and os.access(mark.parent, os.W_OK)
+    scratch = tempfile.TemporaryDirectory(prefix="objectgs-kernels-", ignore_cleanup_errors=True)
+    with scratch as folder, Helpers(Path(folder)) as helpers:
         if helped:
             helpers.begin(DISCS)
         compile_kernels(device, steps.step("gaussians").progress, ("3d",))
@@ -75,10 +81,7 @@ def try_kernels(reporter: StoppingReporter, device: torch.device) -> None:
         scene.match(steps.step("match").progress)
         helpers.wait(MESHES, steps.step("meshes"))
         scene.mesh(trainer, steps.step)
-    # Without a writable cache the mark is not needed.
     with contextlib.suppress(OSError):
-        mark = _mark(device)
-        mark.parent.mkdir(parents=True, exist_ok=True)
         mark.touch()
 
 

@@ -38,7 +38,7 @@ class SmallScene:
     """A capture of two clusters of points, and the kinds of work that have kernels of their own.
 
     Args:
-        scratch: An empty folder for it.
+        scratch: A folder for it, which is empty or does not exist.
         device: The device to train on.
     """
 

@@ -20,7 +20,7 @@ from .programs import run
 
 GIGABYTES = {"cpu": 2.5, "cuda": 9.0}
 """Free disk space in GB that the setup requires for the packages and their wheels."""
-KERNEL_SECONDS = 90.0
+KERNEL_SECONDS = 60.0
 """Typical time of the compilation of the backend's kernels."""
 
 
