@@ -291,6 +291,8 @@ def build_graph(
     nodes = np.flatnonzero(seen > SEEN)
     if len(nodes) <= weights.neighbors:
         nodes = np.arange(len(means))
+    # Neighbors in space should be close in memory, too, where a solution reads them again and again.
+    nodes = nodes[cKDTree(means[nodes]).indices]
     xyz = means[nodes]
     tree = cKDTree(xyz)
     nearest = np.empty(len(means), np.int64)
