@@ -20,6 +20,7 @@ from skimage.color import rgb2lab
 
 from ..raster import Camera, devices, rasterize
 from ..shared.splats.spherical_harmonics import C0
+from .clusters import Clusters, nested_clusters
 from .color_model import ColorModel
 from .random_walker import random_walker
 
@@ -150,6 +151,7 @@ class SplatGraph:
         is_alone: (N,) bool, splats that are no nodes and far from all of them.
         lab: (n, 3) CIELAB color of each node, the mean over its neighborhood.
         weights: (n, n) weights of the edges.
+        clusters: clusters of the nodes by these weights.
         edges: what the weights are made of.
         xyz: (n, 3) positions of the nodes.
         seen: (n,) pixels that each node covers in all photos together.
@@ -161,6 +163,7 @@ class SplatGraph:
     is_alone: np.ndarray
     lab: np.ndarray
     weights: sparse.csr_array
+    clusters: Clusters
     edges: Edges
     xyz: np.ndarray
     seen: np.ndarray
@@ -188,13 +191,13 @@ class SplatGraph:
             outside[:, 0] = NOTHING * marked**0.25 * np.asarray(self.weights.sum(axis=1)).ravel()
         start = None if before is None else before.among(objects)
         prior = STROKES * marked * self.colors.likeness(labels, len(objects)) + outside
-        rough = random_walker(self.weights, labels, prior, 1.0, None if start is None else start.rough)
+        rough = self._walk(labels, prior, 1.0, None if start is None else start.rough)
         found = rough.argmax(1)
         # As in GrabCut, what was found tells more about an object's colors than strokes do.
         known = np.where((rough.max(1) > CERTAIN) & ~self._loose(found, labels, everything), found, -1)
         prior = FOUND * marked * self.colors.likeness(known, len(objects)) + outside
         again = rough if start is None else start.probabilities
-        probabilities = random_walker(self.weights, labels, prior, 1.0, again)
+        probabilities = self._walk(labels, prior, 1.0, again)
         found = self._joined(probabilities.argmax(1), labels, everything)
         ids = objects[found][self.nearest]
         return Solution(objects, rough, probabilities, ids if everything else np.where(self.is_alone, 0, ids))
@@ -215,8 +218,13 @@ class SplatGraph:
         ordered = np.sort(np.column_stack([np.zeros(len(parts)), parts]), axis=1)
         certain = (ordered[:, -1] - ordered[:, -2]) ** 2
         weight = VOTES * certain * np.asarray(self.weights.sum(axis=1)).ravel()
-        probabilities = random_walker(self.weights, np.full(len(parts), -1), weight[:, None] * parts, 1.0)
+        probabilities = self._walk(np.full(len(parts), -1), weight[:, None] * parts, 1.0)
         return objects[probabilities.argmax(1)][self.nearest]
+
+    def _walk(
+        self, seeds: np.ndarray, prior: np.ndarray, strength: float, start: np.ndarray | None = None
+    ) -> np.ndarray:
+        return random_walker(self.weights, seeds, prior, strength, start, self.clusters)
 
     def _joined(self, found: np.ndarray, seeds: np.ndarray, everything: bool) -> np.ndarray:
         """Give the loose parts of objects to the objects around them; found, seeds: (n,) labels."""
@@ -224,7 +232,7 @@ class SplatGraph:
         if not loose.any() or loose.all():
             return found
         known = np.where(loose, -1, found)
-        around = random_walker(self.weights, known, np.zeros((len(found), found.max() + 1)), 0.0)
+        around = self._walk(known, np.zeros((len(found), found.max() + 1)), 0.0)
         # Parts that are connected to nothing keep their labels.
         return np.where(loose & (around.max(1) > 0), around.argmax(1), found)
 
@@ -320,7 +328,8 @@ def build_graph(
     between = sparse.coo_array((LEAST + np.exp(-unlike), (first, second)), shape=(len(nodes), len(nodes))).tocsr()
     between = between.maximum(between.T).tocsr()
     edges = Edges(first, second, gap, color, steps)
-    return SplatGraph(nodes, nearest, is_alone, lab, between, edges, xyz, seen[nodes], facing[nodes])
+    clusters = nested_clusters(between)
+    return SplatGraph(nodes, nearest, is_alone, lab, between, clusters, edges, xyz, seen[nodes], facing[nodes])
 
 
 def concavity(xyz: np.ndarray, normal: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:

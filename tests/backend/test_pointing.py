@@ -23,6 +23,7 @@ from backend.export.ply import read_splats
 from backend.model.checkpoint import save_checkpoint
 from backend.model.draw import draw
 from backend.model.object_model import Normalization
+from backend.pointing.clusters import FEW, nested_clusters
 from backend.pointing.color_model import SPREAD, ColorModel
 from backend.pointing.mask_edges import follow_edges
 from backend.pointing.pointer import Pointer
@@ -108,6 +109,54 @@ def test_walker_follows_the_prior_where_no_seed_is_near() -> None:
     prior[4, 1] = 1.0
     found = random_walker(chain([1, 1, 1e-6, 1]), np.array([0, -1, -1, -1, -1]), prior, 1e-3)
     assert found.argmax(1).tolist() == [0, 0, 0, 1, 1]
+
+
+def random_graph(count: int) -> sparse.csr_array:
+    """Return a graph of random points whose weights differ by orders of magnitude, and a chain connected to nothing."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(size=(count, 3))
+    _, neighbor = cKDTree(points).query(points, k=7)
+    first, second = np.repeat(np.arange(count), 6), neighbor[:, 1:].ravel()
+    other = first != second
+    weights = 10 ** rng.uniform(-4, 0, other.sum())
+    one = sparse.coo_array((weights, (first[other], second[other])), shape=(count, count)).tocsr()
+    return sparse.block_diag([one.maximum(one.T), chain([1.0] * 20)], format="csr")
+
+
+@pytest.mark.parametrize("count", [100, 5000, 30_000])
+def test_clusters_are_nested_connected_and_few(count) -> None:
+    weights = random_graph(count)
+    clusters = nested_clusters(weights)
+    assert clusters.levels[:2].tolist() == [0, count + 21]
+    sizes = np.diff(clusters.levels)
+    assert 0 < sizes[-1] <= FEW and (sizes[:-1] > FEW)[1:].all()
+    members = clusters.members, clusters.starts
+    assert sorted(members[0].tolist()) == list(range(clusters.levels[-2]))
+    for cluster in range(0, sizes[1:].sum(), 7):
+        inside = members[0][members[1][cluster] : members[1][cluster + 1]]
+        assert (clusters.parent[inside] == cluster + count + 21).all() and 1 <= len(inside) <= 8
+        if inside.max() < count + 21:
+            assert sparse.csgraph.connected_components(weights[inside][:, inside])[0] == 1
+
+
+@pytest.mark.parametrize("strength", [0.0, 1e-4])
+def test_walker_with_clusters_solves_the_same_equations_in_fewer_steps(strength, monkeypatch) -> None:
+    count, rng = 5000, np.random.default_rng(1)
+    weights = random_graph(count)
+    seeds = np.full(count + 21, -1)
+    seeds[rng.choice(count, 6, replace=False)] = np.arange(6) % 3
+    prior = rng.uniform(size=(count + 21, 3)) * (np.arange(count + 21) < count)[:, None]
+    free = seeds < 0
+    laplacian = sparse.diags_array(weights.sum(axis=1) + strength * prior.sum(1) + 1e-12) - weights
+    right = strength * prior[free] + weights[free][:, ~free] @ np.eye(3)[seeds[~free]]
+    exact = sparse.linalg.spsolve(laplacian.tocsc()[free][:, free], right)
+    monkeypatch.setattr("backend.pointing.random_walker.ITERATIONS", 30)
+    monkeypatch.setattr("backend.pointing.random_walker.TOLERANCE", 1e-5)
+    errors = [
+        np.abs(random_walker(weights, seeds, prior, strength, None, clusters)[free] - exact).max()
+        for clusters in (nested_clusters(weights), None)
+    ]
+    assert errors[0] < 2e-3 and errors[0] < 0.1 * errors[1], errors
 
 
 @pytest.fixture
@@ -209,6 +258,7 @@ def shown_of_file(path, capture) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("photos", [False, True])
+@pytest.mark.long
 def test_imported_splats_are_separated_by_strokes(unlabeled, tmp_path, run_command, photos: bool) -> None:
     """Without photos, the splats are compared by cameras around them, and strokes are drawn through cameras."""
     scene, out = unlabeled
@@ -232,6 +282,7 @@ def test_imported_splats_are_separated_by_strokes(unlabeled, tmp_path, run_comma
     assert not (scene.folder / "masks").exists() and not (imported / "checkpoint").exists()
 
 
+@pytest.mark.long
 def test_objects_of_imported_splats_are_proposed(unlabeled, tmp_path, run_command) -> None:
     """Proposals on splats without photos are strokes through cameras, which `label` takes."""
     _, out = unlabeled
@@ -327,9 +378,10 @@ def test_borders_of_masks_follow_the_photo() -> None:
 def test_far_splats_belong_to_nothing_unless_everything_is_an_object() -> None:
     """Two plates far apart; the stroke is on one of them. A part with a similar color elsewhere is not the object's."""
     none, flat = np.zeros(0), np.zeros((9, 3))
+    weights = chain([1, 1, 1e-4, 1, 1, 1e-4, 1, 1])
     graph = SplatGraph(
         np.arange(9), np.arange(9), np.zeros(9, bool), np.repeat([[50.0, 0, 0], [80.0, 0, 0], [50.0, 0, 0]], 3, axis=0),
-        chain([1, 1, 1e-4, 1, 1, 1e-4, 1, 1]), Edges(none, none, none, none, none), flat, np.ones(9), flat,
+        weights, nested_clusters(weights), Edges(none, none, none, none, none), flat, np.ones(9), flat,
     )  # fmt: skip
     seeds = {7: np.eye(9)[0]}
     assert graph.solve(seeds).ids.tolist() == [7, 7, 7, 0, 0, 0, 0, 0, 0]
@@ -344,8 +396,9 @@ def test_colors_of_what_was_found_decide_where_strokes_do_not() -> None:
     """A chain whose third part has weaker edges to the first, but its color, which the stroke on the first lacks."""
     none, flat = np.zeros(0), np.zeros((12, 3))
     colors = np.repeat([[20.0, 0, 0], [60.0, 0, 0], [90.0, 0, 0]], [1, 8, 3], axis=0)
+    weights = chain([1, 1, 1, 1, 1, 3e-4, 1, 1, 1e-3, 1, 1])
     graph = SplatGraph(
-        np.arange(12), np.arange(12), np.zeros(12, bool), colors, chain([1, 1, 1, 1, 1, 3e-4, 1, 1, 1e-3, 1, 1]),
+        np.arange(12), np.arange(12), np.zeros(12, bool), colors, weights, nested_clusters(weights),
         Edges(none, none, none, none, none), flat, np.ones(12), flat,
     )  # fmt: skip
     found = graph.solve({7: np.eye(12)[0], 8: np.eye(12)[11]}, everything=True)
@@ -458,10 +511,14 @@ def table_with_balls(balls: int) -> tuple[SplatGraph, np.ndarray]:
     nodes, ones = np.arange(len(xyz)), np.ones(len(xyz))
     weights = sparse.csr_array((len(xyz), len(xyz)))
     edges = Edges(first, second, gap, color, color)
-    return SplatGraph(nodes, nodes, ones < 0, np.zeros((len(xyz), 3)), weights, edges, xyz, ones, normal), truth
+    graph = SplatGraph(
+        nodes, nodes, ones < 0, np.zeros((len(xyz), 3)), weights, nested_clusters(weights), edges, xyz, ones, normal
+    )
+    return graph, truth
 
 
 @pytest.mark.parametrize("balls", [1, 5])
+@pytest.mark.long
 def test_things_on_a_table_are_found_without_strokes(balls) -> None:
     graph, truth = table_with_balls(balls)
     calls = []

@@ -21,6 +21,7 @@ from ...mesh.texture.bake import bake_texture
 from ...mesh.texture.unwrap import unwrap
 from ...mesh.views import Views
 from ...model.draw import draw
+from ...pointing.clusters import nested_clusters
 from ...pointing.random_walker import random_walker
 from ...shared.events import Reporter
 from ...shared.reconstruction.folder import Reconstruction
@@ -76,7 +77,8 @@ class SmallScene:
     def match(self, progress: Callable[[int, int], None] = lambda _done, _total: None) -> None:
         """Find depths in the photos, and label a graph."""
         find_depth_maps(self._capture, range(len(self._capture.views)), progress)
-        random_walker(sparse.csr_array(np.eye(2)[::-1]), np.array([0, -1]), np.zeros((2, 2)), 0.0)
+        graph = sparse.csr_array(np.eye(2)[::-1])
+        random_walker(graph, np.array([0, -1]), np.zeros((2, 2)), 0.0, clusters=nested_clusters(graph))
 
     def mesh(self, trainer: Trainer, reporter: Callable[[str], Reporter] = lambda _step: Reporter()) -> None:
         """Extract a mesh of the first object, if it has a surface, and bake the texture of a tetrahedron.
