@@ -39,13 +39,14 @@ GPU_SECONDS ?= 240
 # The capture that benchmarks/gpu.py trains on, where there is one.
 CAPTURE ?= $(wildcard build/demo/capture)
 
-.PHONY: help venv lock demo demo-photos zip test test-slow test-window test-blenders lint benchmarks gpu gpu-with clean
+.PHONY: help venv lock demo demo-photos zip test test-long test-slow test-window test-blenders lint benchmarks gpu gpu-with clean
 
 help:
 	@echo "make demo           a capture made by Blender becomes objects in a .blend, with a report, in $(DEMO)"
 	@echo "make demo-photos    the same from the photos alone, in $(DEMO)-photos"
 	@echo "make zip            the extension to install in Blender, in build/"
-	@echo "make test           the tests"
+	@echo "make test           the tests, within ten minutes"
+	@echo "make test-long      the other tests of CI: each takes many seconds"
 	@echo "make test-slow      tests that take minutes: trainings in the simulator of a GPU"
 	@echo "make test-window    the tests that drive a Blender with a window, where there is one"
 	@echo "make test-blenders  the tests of the Blender side in more versions of Blender"
@@ -97,8 +98,12 @@ zip: .venv-bpy/ready
 	$(BLENDER_EXT) validate build/objectgs-*.zip
 
 test: .venv/ready .venv-bpy/ready
-	$(BACKEND) -m pytest $(WORKERS) -m "not slow" tests/backend tests/fuzz
-	$(BLENDER) -m pytest $(WORKERS) tests/blender
+	$(BACKEND) -m pytest $(WORKERS) -m "not long and not slow" tests/backend tests/fuzz
+	$(BLENDER) -m pytest $(WORKERS) -m "not long" tests/blender
+
+test-long: .venv/ready .venv-bpy/ready
+	$(BACKEND) -m pytest $(WORKERS) -m "long and not slow" tests/backend tests/fuzz
+	$(BLENDER) -m pytest $(WORKERS) -m long tests/blender
 
 test-slow: .venv/ready
 	$(BACKEND) -m pytest $(WORKERS) -m slow tests/backend

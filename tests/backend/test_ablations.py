@@ -23,6 +23,7 @@ def started(capture, name, monkeypatch, **settings):
     return Trainer.start(capture, vote(capture).ids, Settings(offsets=4, **settings))
 
 
+@pytest.mark.long
 def test_learnable_features_learn_the_masks(capture, monkeypatch):
     trainer = started(capture, "learnable", monkeypatch)
     for i in range(150):

@@ -72,6 +72,7 @@ def test_measuring_a_step_changes_nothing(tiny):
     ],
     ids=["short", "long", "steps", "voxel given", "paper"],
 )  # fmt: skip
+@pytest.mark.long
 def test_only_short_trainings_begin_with_fewer(write_capture, tmp_path, run_command, monkeypatch, length, fewer):
     for module in (initial_model, train):
         monkeypatch.setattr(module, "FEWEST_ANCHORS", 2000)

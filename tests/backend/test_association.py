@@ -62,6 +62,7 @@ def greedy(shared, total, least):
 
 
 @pytest.mark.parametrize("count", [12, 40, 90])
+@pytest.mark.long
 def test_merging_agrees_with_its_definition(count):
     rng = np.random.default_rng(count)
     total = np.where(rng.random((count, count)) < 8 / count, rng.uniform(1, 5, (count, count)), 0.0)

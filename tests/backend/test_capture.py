@@ -324,6 +324,7 @@ def test_undistorted_images_have_no_blank_pixels(name):
 
 
 @pytest.mark.parametrize("name", LENSES)
+@pytest.mark.long
 def test_keypoints_are_undistorted(write_capture, tmp_path, name):
     camera = lens_of(name)
     scene = write_capture(views=2, size=(640, 480), model=camera.model, params=list(camera.params))

@@ -148,6 +148,7 @@ def test_terminal_output_has_no_duplicate_lines(write_capture, tmp_path, run_com
 
 
 @pytest.mark.parametrize(("mode", "far"), [("explicit", 0), ("explicit", 1e6), ("view", 0), ("paper", 0)])
+@pytest.mark.long
 def test_anchors_file_matches_splats(write_capture, tmp_path, run_command, mode, far):
     scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
     for viewmat in scene.viewmats:
@@ -371,6 +372,7 @@ def test_training_does_not_resume_with_other_held_out_views(trained, tmp_path, r
     assert_rejected(run_command("train", capture, "--out", out, "--steps", 40, *SMALL), "held-out", "--restart")
 
 
+@pytest.mark.long
 def test_votes_are_reused_until_inputs_change(write_capture, tmp_path, run_command, monkeypatch):
     scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
     cast = []
@@ -743,6 +745,7 @@ def test_second_signal_stops_immediately(trained, run_command, monkeypatch):
     assert result.code == EXIT_CANCELLED and "Stopped immediately" in result.out and step_of(out) == 20
 
 
+@pytest.mark.long
 def test_process_stops_on_signal_and_closed_stdout(write_capture, tmp_path):
     scene, out = write_capture(views=9, size=(64, 48)), tmp_path / "out"
     train = [sys.executable, "-m", "backend", "train", str(scene.folder), "--out", str(out), "--steps", "100000",
@@ -771,6 +774,7 @@ def test_process_stops_on_signal_and_closed_stdout(write_capture, tmp_path):
 # --- locking ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_folder_is_locked_by_training_process(write_capture, tmp_path, run_command):
     capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"
     train = ("train", str(capture), "--out", str(out), *SMALL)

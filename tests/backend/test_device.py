@@ -413,6 +413,7 @@ for primitive in ("3d", "2d"):
 """
 
 
+@pytest.mark.long
 def test_training_in_simulator_matches_cpu(write_capture, tmp_path):
     """With the CUDA kernels, losses and images equal those of the CPU."""
     folder = write_capture(views=3, size=(24, 18), points=20).folder

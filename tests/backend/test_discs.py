@@ -94,6 +94,7 @@ def steps(monkeypatch):
     return taken, recorded
 
 
+@pytest.mark.long
 def test_meshes_are_made_of_discs_that_are_fitted_once(write_capture, run_command, tmp_path, steps) -> None:
     taken, recorded = steps
     out = tmp_path / "out"

@@ -239,6 +239,7 @@ def with_box_on_ground(place=HERE):
 
 
 @pytest.mark.parametrize("place", [HERE, affine(3 * TURN, (50, -20, 9))])
+@pytest.mark.long
 def test_fill_continues_ground_under_removed_object(place):
     splats, hidden = with_box_on_ground(place)
     objects = [scene_object(1, removed=True, fill=True), scene_object(5), scene_object(6)]

@@ -37,6 +37,7 @@ def peak_bytes() -> int:
 @posix
 @pytest.mark.parametrize("command", ["check", "import"])
 @pytest.mark.parametrize("kind", ["png", "npz", "photo"])
+@pytest.mark.long
 def test_decompression_bomb_is_rejected_by_its_header(write_capture, run_command, tmp_path, command, kind):
     capture = write_capture(views=4, size=(64, 48)).folder
     mask, photo = capture / "masks" / "view_001.png", capture / "images" / "view_001.png"
@@ -193,6 +194,7 @@ def run_shell(script: str, *words: object, **environment: str) -> subprocess.Com
         ("", {"PYTHONIOENCODING": "ascii"}, {EXIT_BAD_INPUT}),
     ],
 )
+@pytest.mark.long
 def test_lost_output_leaves_exit_code_and_no_traceback(tmp_path, script, environment, codes):
     if "/dev/full" in script and not Path("/dev/full").exists():
         pytest.skip("there is no /dev/full here")
@@ -205,6 +207,7 @@ def test_lost_output_leaves_exit_code_and_no_traceback(tmp_path, script, environ
 
 @posix
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.long
 def test_signal_during_imports_stops_the_command(write_capture, number):
     capture = write_capture(views=4).folder
     command = [sys.executable, "-m", "backend", "check", str(capture)]

@@ -86,6 +86,7 @@ def test_a_user_without_a_home(home, monkeypatch):
 
 
 @posix
+@pytest.mark.long
 def test_a_command_says_so_and_goes_on(home, monkeypatch):
     (home / "kernels").mkdir()
     (home / "kernels").chmod(0o777)

@@ -272,6 +272,7 @@ def test_ballots_stay_exact_beyond_their_slots(monkeypatch):
         assert margins[point] == pytest.approx((counter[best] - others) / counter.total(), abs=1e-6)
 
 
+@pytest.mark.long
 def test_large_votes_limit_time_and_memory():
     import tracemalloc
 

@@ -48,6 +48,7 @@ def entries(out) -> dict:
     return json.loads((out / "meshes" / "meshes.json").read_text())["meshes"]
 
 
+@pytest.mark.long
 def test_objects_become_meshes_of_correct_position_and_size(trained, run_command, write_capture):
     result = run_command("mesh", trained, "--faces", 2000, "--texture-size", 256, "--json")
     assert result.code == EXIT_DONE and result.events[-1]["made"] == 3
@@ -70,6 +71,7 @@ def test_objects_become_meshes_of_correct_position_and_size(trained, run_command
     assert not list(trained.rglob("*.part")) and not (trained / ".lock").exists()
 
 
+@pytest.mark.long
 def test_merged_objects_sets_and_scene_are_meshed(trained, run_command):
     edit_objects(trained / "objects.json", {2: {"merged_into": 1}, 5: {"left_out": True}})
     quick = ("--faces", 1000, "--texture-size", 256)

@@ -555,6 +555,7 @@ def test_sheet_shows_all_meshes_within_size_limit(true_capture, tmp_path):
 # --- the commands ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_evaluate_and_report_measure_meshes(write_capture, tmp_path, run_command):
     scene, out = write_capture(views=9, size=(64, 48), spheres=SPHERES), tmp_path / "out"
     write_truth(scene, write_capture, SPHERES)

@@ -100,6 +100,7 @@ def test_an_object_under_two_names_keeps_the_better():
     assert found_in([[-9] * 5]) == []
 
 
+@pytest.mark.long
 def test_small_detector_finds_what_transformers_finds(checkpoints, small_input):
     transformers = pytest.importorskip("transformers")
     processor = pytest.importorskip("transformers.models.grounding_dino.image_processing_pil_grounding_dino")

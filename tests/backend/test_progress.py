@@ -69,6 +69,7 @@ def words_of(kind: str, place: Path) -> list[str | Path]:
 
 
 @pytest.mark.parametrize("kind", STAGES)
+@pytest.mark.long
 def test_progress_of_each_kind_of_job(folders, run_command, kind):
     began = time.time()
     result = run_command(*words_of(kind, folders), "--json")
@@ -98,6 +99,7 @@ def stages_of(found: list[dict]) -> list[str]:
     return list(dict.fromkeys(names))
 
 
+@pytest.mark.long
 def test_compilation_is_a_part_of_its_own(folders, run_command, monkeypatch):
     """A job in a new Python compiles first, as preparation, and training does not begin at 0 again."""
     monkeypatch.setattr(kernels, "_are_ready", lambda _device: False)
@@ -113,6 +115,7 @@ def test_compilation_is_a_part_of_its_own(folders, run_command, monkeypatch):
     assert len(shares) > 8 and max(shares) - min(shares) > 0.3, "the compilation has progress of its own"
 
 
+@pytest.mark.long
 def test_set_up_compiles_what_jobs_need(folders, run_command):
     """After `doctor`, which Set Up Backend runs, the kernels of all jobs are in the cache."""
     assert run_command("doctor", "--json").code == 0

@@ -97,6 +97,7 @@ def test_wrong_matches_do_not_move_poses(made, tmp_path):
     assert errors[1] < 0.15 and errors[0] > 2 * errors[1]
 
 
+@pytest.mark.long
 def test_capture_can_be_imported_and_is_kept_by_a_second_run(made, run_command, tmp_path, monkeypatch):
     assert run_command("import", made, "--out", tmp_path / "out").code == EXIT_DONE
     before = pycolmap.Reconstruction(made / "sparse" / "0").num_reg_images()
@@ -105,6 +106,7 @@ def test_capture_can_be_imported_and_is_kept_by_a_second_run(made, run_command, 
     assert result.code == EXIT_DONE and pycolmap.Reconstruction(made / "sparse" / "0").num_reg_images() == before
 
 
+@pytest.mark.long
 def test_stopped_command_goes_on(photos, tmp_path, run_command, monkeypatch):
     """Features and matches are kept; the pairs that are known are not matched again."""
     capture = tmp_path / "capture"
@@ -144,6 +146,7 @@ def test_killed_mapper_leaves_the_earlier_model(made, photos, tmp_path, monkeypa
     assert (capture / "sparse" / "0" / "images.bin").read_bytes() == before
 
 
+@pytest.mark.long
 def test_photos_that_do_not_fit_are_named_with_the_reason(photos, tmp_path, run_command, no_dense_points):
     folder = shutil.copytree(photos / "images", tmp_path / "mixed")
     Image.fromarray(photo(ring()[0], seed=900)).save(folder / "zz other room.png")
@@ -157,6 +160,7 @@ def test_photos_that_do_not_fit_are_named_with_the_reason(photos, tmp_path, run_
     assert "too few details" in left_out["zz plain.png"] and "damaged" in left_out["zz broken.jpg"]
 
 
+@pytest.mark.long
 def test_weak_photos_are_named_and_left_out_by_request(photos, tmp_path, run_command):
     folder = shutil.copytree(photos / "images", tmp_path / "mixed")
     blurred = Image.fromarray(photo(ring(count=13)[5])).filter(ImageFilter.GaussianBlur(3.0))
@@ -191,6 +195,7 @@ def test_weak_photos_are_those_unlike_the_others():
     assert "far.jpg" not in check.weak_photos(small), "a fiftieth of a pixel is no error"
 
 
+@pytest.mark.long
 def test_features_can_be_on_objects_alone(photos, tmp_path, run_command, no_dense_points):
     """Half of each mask is an object, and one photo has no mask; another set of photos has none at all."""
     folder = shutil.copytree(photos, tmp_path / "turntable")
@@ -211,6 +216,7 @@ def test_features_can_be_on_objects_alone(photos, tmp_path, run_command, no_dens
     assert result.code == EXIT_BAD_INPUT and "has no mask of any photo" in result.err
 
 
+@pytest.mark.long
 def test_objects_that_turn_before_a_background_at_rest(photos, tmp_path, run_command, no_dense_points):
     """The background is that of the first photo; without masks it would say that the camera stands still."""
     folder = shutil.copytree(photos, tmp_path / "turntable")
@@ -230,6 +236,7 @@ def test_objects_that_turn_before_a_background_at_rest(photos, tmp_path, run_com
     assert source.features == "objects", "which later steps know, too"
 
 
+@pytest.mark.long
 def test_separate_sets_of_photos(photos, tmp_path, run_command, monkeypatch, no_dense_points):
     """Five photos of another room have nothing in common with the seven of the first; each set can be used."""
     folder = shutil.copytree(photos / "images", tmp_path / "rooms")
@@ -255,6 +262,7 @@ def posed_photos(capture) -> set[str]:
     return {model.image(number).name for number in model.reg_image_ids()}
 
 
+@pytest.mark.long
 def test_fisheye_lens_is_recognized(tmp_path, run_command, no_dense_points):
     """122 degrees wide, 160 from corner to corner."""
     (tmp_path / "photos").mkdir()
@@ -371,6 +379,7 @@ def test_pairs_of_large_sets_are_those_that_show_the_same(made, monkeypatch):
 
 
 @pytest.mark.usefixtures("no_dense_points")
+@pytest.mark.long
 def test_pairs_of_photos_with_spaces_in_their_names_are_matched(made, photos, tmp_path, run_command, monkeypatch):
     """COLMAP's lists have no such names, so the database has others meanwhile, also after the process was killed."""
     monkeypatch.setattr(pairs, "ALL_UP_TO", 2)

@@ -34,6 +34,7 @@ def write_lenses(folder, *lenses: str):
     return folder / "cameras.txt"
 
 
+@pytest.mark.long
 def test_calibrated_lens_is_kept(photos, tmp_path, no_dense_points):
     lenses = write_lenses(tmp_path / "lenses", "OPENCV 640 480 600 600 320 240 0 0 0 0", LENS)
     capture = tmp_path / "room"
@@ -94,6 +95,7 @@ def pairs(tmp_path_factory):
     return folder / "capture"
 
 
+@pytest.mark.long
 def test_cameras_of_a_rig_keep_their_relative_pose(pairs):
     model = pycolmap.Reconstruction(pairs / "sparse" / "0")
     poses = {model.image(i).name: model.image(i).cam_from_world().matrix() for i in model.reg_image_ids()}

@@ -343,6 +343,7 @@ def test_weights_that_do_not_fit_are_refused(networks, tmp_path):
         lightglue.LightGlue(folder)
 
 
+@pytest.mark.long
 def test_command_goes_on_and_poses_are_right(networks, tmp_path, run_command, monkeypatch, no_dense_points):
     """The whole command in its processes, with paths from another folder, after a stop with three photos and a pair.
 

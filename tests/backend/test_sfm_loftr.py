@@ -101,6 +101,7 @@ def rows_of(path, *tables):
         return {table: set(connection.execute(f"SELECT * FROM {table}")) for table in tables}
 
 
+@pytest.mark.long
 def test_poses_follow_from_joined_matches(photos, tmp_path, stand_in):
     images, names = photos
     match_all(tmp_path / "p.db", photos, stand_in)
@@ -336,6 +337,7 @@ def test_other_weights_are_refused(network, photos, tmp_path, run_command):
     rejected("is of a model of the type loftr; choose a checkpoint of LightGlue or EfficientLoFTR as --matcher")
 
 
+@pytest.mark.long
 def test_killed_matching_goes_on(network, photos, tmp_path):
     """Killed at any moment, it keeps all pairs that were matched before."""
     images, names = photos
@@ -365,6 +367,7 @@ def prepare(capture, network, photos, stand_in, left=()):
     return matched, work / database.name_of(False, digest)
 
 
+@pytest.mark.long
 def test_command_matches_what_is_left_and_poses_are_right(
     network, photos, tmp_path, stand_in, run_command, no_dense_points
 ):
@@ -379,6 +382,7 @@ def test_command_matches_what_is_left_and_poses_are_right(
     assert len(degrees) == len(names) and degrees.max() < 1.0 and places.max() < 0.01
 
 
+@pytest.mark.long
 def test_pairs_of_large_sets_are_chosen_by_sift(network, photos, tmp_path, stand_in, monkeypatch):
     for module in (pairs, photo_matches):
         monkeypatch.setattr(module, "ALL_UP_TO", 2)

@@ -70,6 +70,7 @@ def test_blurred_views_that_alone_show_something_are_kept(spheres, tmp_path):
     assert blurred_views(capture.excluding_from_training(near | {scene.names[0], scene.names[4]})) == {}
 
 
+@pytest.mark.long
 def test_sharp_views_and_captures_without_points_in_common_are_not_blurred(spheres, tmp_path):
     scene, images = spheres
     write_images(scene, images)

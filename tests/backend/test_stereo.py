@@ -128,6 +128,7 @@ def test_large_planes_are_found_among_points():
     assert find_planes(xyz[:0], normals[:0], np.zeros(0)) == []
 
 
+@pytest.mark.long
 def test_floor_goes_on_where_few_photos_show_it(scene, maps, monkeypatch):
     monkeypatch.setattr(depth_maps, "find_planes", lambda *_: [])
     before = find_depth_maps(scene, range(9))
@@ -166,6 +167,7 @@ def test_smooth_shades_do_not_match_on_planes():
         assert (none.scores == -1).all()
 
 
+@pytest.mark.long
 def test_threads_do_not_matter(scene, maps):
     before = numba.get_num_threads()
     try:
@@ -244,6 +246,7 @@ def write_capture(folder, scene):
     )
 
 
+@pytest.mark.long
 def test_training_begins_with_them(scene, tmp_path, run_command):
     """Through the command: the points that float are left out, and those found on surfaces have their objects."""
     folder = tmp_path / "capture"

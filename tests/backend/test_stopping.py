@@ -90,6 +90,7 @@ def progress_of(out: Path) -> dict:
     return load_checkpoint(out / "checkpoint")[1]["progress"]
 
 
+@pytest.mark.long
 def test_closed_stdin_stops_attached_training(drive, endless):
     train, out = endless
     driven = drive(*train)
@@ -103,6 +104,7 @@ def test_closed_stdin_stops_attached_training(drive, endless):
 
 
 @pytest.mark.parametrize("paused", [False, True])
+@pytest.mark.long
 def test_closed_pipes_stop_training_with_checkpoint(drive, endless, paused):
     train, out = endless
     driven = drive(*train)
@@ -119,6 +121,7 @@ def test_closed_pipes_stop_training_with_checkpoint(drive, endless, paused):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="kills a process group's leader")
+@pytest.mark.long
 def test_killed_parent_stops_training_with_checkpoint(endless, tmp_path):
     train, out = endless
     driver = tmp_path / "driver.py"
@@ -139,6 +142,7 @@ def test_killed_parent_stops_training_with_checkpoint(endless, tmp_path):
 
 
 @pytest.mark.parametrize("attached", [True, False])
+@pytest.mark.long
 def test_command_ends_with_open_stdin(drive, endless, attached):
     train, out = endless
     driven = drive(*train[:6], "--steps", 5)
@@ -149,6 +153,7 @@ def test_command_ends_with_open_stdin(drive, endless, attached):
     assert driven.end() == EXIT_DONE and progress_of(out)["step"] == 5
 
 
+@pytest.mark.long
 def test_closed_stdin_without_attaching_is_ignored(drive, endless):
     train, out = endless
     driven = drive(*train[:6], "--steps", 5)
@@ -156,6 +161,7 @@ def test_closed_stdin_without_attaching_is_ignored(drive, endless):
     assert driven.end() == EXIT_DONE and progress_of(out)["step"] == 5
 
 
+@pytest.mark.long
 def test_pause_saves_and_excludes_time(drive, endless):
     train, out = endless
     driven = drive(*train)
@@ -241,6 +247,7 @@ def test_other_commands_can_be_paused(monkeypatch):
 
 
 @pytest.mark.parametrize("masks", [True, False])
+@pytest.mark.long
 def test_deleted_capture_ends_training_with_checkpoint(drive, endless, masks):
     train, out = endless
     driven = drive(*train, "--memory-mb", 1)

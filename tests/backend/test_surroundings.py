@@ -98,6 +98,7 @@ def test_training_starts_with_distant_anchors_of_no_object(outdoors):
     assert np.allclose(extents.exp().numpy(), found.spacing * model.normalization.scale, rtol=1e-5)
 
 
+@pytest.mark.long
 def test_distant_splats_make_held_out_skies_better(outdoors):
     capture, scene = outdoors()
     far = DistantPoints(*find_surroundings(capture)[:3])

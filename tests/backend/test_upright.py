@@ -176,6 +176,7 @@ def test_distant_coordinates_get_rounded_origin():
 
 
 @pytest.mark.parametrize(("name", "held"), [("tabletop", 0.3), ("banana", 0.6)])
+@pytest.mark.long
 def test_real_captures_are_placed_on_table(tmp_path, name, held):
     if not (DATA / name).is_dir():
         pytest.skip(f"{name} is absent")

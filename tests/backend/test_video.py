@@ -219,6 +219,7 @@ def walk(tmp_path_factory):
     return path
 
 
+@pytest.mark.long
 def test_poses_of_a_video(walk, tmp_path, run_command, no_dense_points):
     result = run_command("sfm", walk, "--out", tmp_path / "capture", "--frames", 12)
     assert result.code == EXIT_DONE
@@ -228,6 +229,7 @@ def test_poses_of_a_video(walk, tmp_path, run_command, no_dense_points):
     assert np.mean([int(name[6:12]) % 4 == 2 for name in names]) > 0.7
 
 
+@pytest.mark.long
 def test_videos_beside_photos(walk, tmp_path, run_command, no_dense_points):
     """A folder with a video and photos: both are used, and each has a camera of its own."""
     folder = tmp_path / "both"
@@ -246,6 +248,7 @@ def test_videos_beside_photos(walk, tmp_path, run_command, no_dense_points):
     ).exists()
 
 
+@pytest.mark.long
 def test_video_that_cannot_work_is_refused(tmp_path, run_command):
     write_video(tmp_path / "still.mp4", [texture(9)[:HEIGHT, :WIDTH].astype(np.uint8)] * 25)
     result = run_command("sfm", tmp_path / "still.mp4", "--out", tmp_path / "capture")

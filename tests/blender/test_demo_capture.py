@@ -219,6 +219,7 @@ def run(*arguments):
     return subprocess.run(command, capture_output=True, text=True, timeout=300)
 
 
+@pytest.mark.long
 def test_demo_command_reports_existing_and_foreign_files(tiny, tmp_path):
     same = run("demo", str(tiny), "--objects=7", "--views=4", "--width=64", "--height=48", "--samples=2")
     assert same.returncode == 0 and "already" in same.stdout

@@ -307,6 +307,7 @@ def test_object_is_removed_and_restored(root, folder):
     assert not bpy.ops.objectgs.restore_object.poll()
 
 
+@pytest.mark.long
 def test_floaters_match_backend_and_are_restored(root, folder, backend_python):
     activate(root, 1)
     bpy.ops.objectgs.remove_object(floaters=True)
@@ -365,6 +366,7 @@ def independent(root, local) -> np.ndarray:
     return moved + ORIGIN
 
 
+@pytest.mark.long
 def test_transform_is_stored_in_capture_coordinates(root, folder, backend_python, tmp_path):
     parent = next(obj for obj in root.objects if blender_scene.kind_of(obj) == "parent")
     parent.matrix_world = Matrix.Scale(2.5, 4) @ parent.matrix_world  # as after setting a distance
@@ -640,6 +642,7 @@ def test_headless_build_shows_edits(fresh, folder):
     assert blender_scene.placement_of(root, collection_of(root, HUGE)) == pytest.approx(place, abs=1e-4)
 
 
+@pytest.mark.long
 def test_exported_splats_have_edits_and_can_be_imported(root, folder, backend_python, tmp_path):
     activate(root, 1)
     bpy.ops.objectgs.remove_object()
@@ -656,6 +659,7 @@ def test_exported_splats_have_edits_and_can_be_imported(root, folder, backend_py
 
 
 @pytest.mark.parametrize("kind", ["spz", "splat"])
+@pytest.mark.long
 def test_splats_of_other_formats_can_be_imported(root, folder, backend_python, tmp_path, kind):
     assert bpy.ops.objectgs.export_splats(filepath=str(tmp_path / "all"), format=kind) == {"FINISHED"}
     path = tmp_path / f"all.{kind}"
@@ -805,6 +809,7 @@ def test_hole_is_filled_and_reopened(ground, filled_ground, root):
     assert surface(root) == captured and blender_scene.UNOBSERVED_COUNT not in collection_of(root)
 
 
+@pytest.mark.long
 def test_outdated_fill_is_hidden_until_recomputed(ground, root, monkeypatch):
     """An object's fill disappears with its edit at once; other fills stay until newer ones exist."""
     captured = surface(root)

@@ -107,6 +107,7 @@ def run(job, until=lambda: False, after=None):
     return shares
 
 
+@pytest.mark.long
 def test_setup_succeeds_after_killed_setup(root):
     folder = root / "user" / "environment"
     assert environment.inspect(folder).state == "absent"
@@ -142,6 +143,7 @@ def test_setup_succeeds_after_killed_setup(root):
     assert environment.inspect(folder).state == "absent" and not folder.exists()
 
 
+@pytest.mark.long
 def test_cuda_packages_are_installed_only_for_cuda(root):
     for device in ("cpu", "cuda"):
         folder = root / f"environment-{device}"
@@ -155,6 +157,7 @@ def test_cuda_packages_are_installed_only_for_cuda(root):
     assert environment.inspect(root / "environment-cpu").state == "ready"
 
 
+@pytest.mark.long
 def test_failed_setup_leaves_no_files(root):
     folder = root / "environment"
     lock(root, layout.system(), "smallnumba==0.69")
@@ -180,6 +183,7 @@ def installed_torch(root, device):
     return job, packages["torch"], "smallcuda" in packages
 
 
+@pytest.mark.long
 def test_wheel_with_other_hash_is_rejected(root):
     """The file that an index serves is replaced; the packages before it in the list are not installed either."""
     with zipfile.ZipFile(root / "wheels" / "torch-2.13.0-py3-none-any.whl", "a") as archive:
@@ -192,6 +196,7 @@ def test_wheel_with_other_hash_is_rejected(root):
     assert not folder.exists() and list((root / "user").iterdir()) == []
 
 
+@pytest.mark.long
 def test_package_that_is_not_locked_is_rejected(root):
     wheel(root / "wheels", "smallnumba", "0.68", requires="extra")
     wheel(root / "wheels", "extra", "1.0")
@@ -201,6 +206,7 @@ def test_package_that_is_not_locked_is_rejected(root):
     assert job.state is State.FAILED and "hash" in job.error and not (root / "environment").exists()
 
 
+@pytest.mark.long
 def test_build_from_another_index_brings_no_other_package(root):
     """Its version names the build, it brings no other package, and the locked packages are checked as always."""
     (root / "requirements" / "locked" / f"{layout.system()}-cpu.txt").unlink()
@@ -211,6 +217,7 @@ def test_build_from_another_index_brings_no_other_package(root):
     assert "extra" not in json.loads((root / "environment-cpu" / "ready.json").read_text())["packages"]
 
 
+@pytest.mark.long
 def test_other_build_is_installed_if_index_is_unreachable(root):
     (root / "requirements" / "locked" / f"{layout.system()}-cpu.txt").unlink()
     job, torch, for_gpus = installed_torch(root, "cpu")
@@ -420,6 +427,7 @@ def test_probe_checks_packages_and_backend(root, monkeypatch):
     )
 
 
+@pytest.mark.long
 def test_packages_for_models_are_added_and_others_keep_their_versions(root):
     folder = root / "environment"
     run(environment.set_up_job(sys.executable, folder, "cpu"))

@@ -200,6 +200,7 @@ def test_python_without_packages_is_reported(extension, monkeypatch, capture, tm
 @pytest.mark.parametrize(
     "name", ["cameras_only", "truncated", "degenerate_two_images", "missing_cameras_subfolders_txt"]
 )
+@pytest.mark.long
 def test_invalid_model_is_rejected(extension, backend_python, monkeypatch, tmp_path, name):
     if not (FIXTURES / name).is_dir():
         pytest.skip(f"{FIXTURES / name} is not here")
@@ -218,6 +219,7 @@ def test_invalid_model_is_rejected(extension, backend_python, monkeypatch, tmp_p
         (lambda place: place.write_text("a file"), "does not exist"),
     ],
 )
+@pytest.mark.long
 def test_folder_without_capture_is_rejected(extension, backend_python, monkeypatch, tmp_path, make, sentence):
     monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
     make(tmp_path / "capture")
@@ -272,6 +274,7 @@ with locked(Path({str(folder)!r})):
 # Files that disappear or break while in use
 
 
+@pytest.mark.long
 def test_deleted_capture_is_reported(extension, backend_python, capture, tmp_path, monkeypatch):
     """A running training keeps its result or reports an error; the Train operator then reports the missing capture."""
     monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
@@ -305,6 +308,7 @@ def tiny_disk(tmp_path):
     subprocess.run(["umount", "-l", place], check=True)
 
 
+@pytest.mark.long
 def test_full_disk_is_reported(extension, backend_python, capture, tiny_disk, monkeypatch):
     monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
     (tiny_disk / "filler").write_bytes(bytes(88 * 1024))

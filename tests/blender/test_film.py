@@ -504,6 +504,7 @@ def test_compositor_setup_keeps_existing_nodes(shot_blend, filmed):
     assert sum(node.type == "R_LAYERS" for node in tree.nodes) == 1
 
 
+@pytest.mark.long
 def test_film_command_applies_edits_and_reports_errors(shot_blend, backend_python):
     out = shot_blend.parent / "edited"
 
@@ -543,6 +544,7 @@ def registered():
     extension.unregister()
 
 
+@pytest.mark.long
 def test_film_operators_use_panel_settings(shot_blend, backend_python, registered, monkeypatch, tmp_path):
     """Operators for film frames and the compositor use the panel's folder, and report why they fail."""
     monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)

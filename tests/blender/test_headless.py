@@ -115,6 +115,7 @@ def test_build_contains_reconstruction(blend, trained):
     bpy.ops.wm.read_factory_settings(use_empty=True)
 
 
+@pytest.mark.long
 def test_build_and_render_reject_invalid_input(trained, blend, tmp_path):
     assert "no reconstruction" in error_report("build", tmp_path)
     assert "build" in error_report("render", tmp_path, "--out", tmp_path / "a.png")
@@ -128,6 +129,7 @@ def test_build_and_render_reject_invalid_input(trained, blend, tmp_path):
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["broken.blend", "file"]
 
 
+@pytest.mark.long
 def test_render_uses_chosen_camera(blend, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(blend))
     camera = next(
@@ -250,6 +252,7 @@ echo "$3" >> '{calls}'
     return python, calls
 
 
+@pytest.mark.long
 def test_run_makes_meshes_before_evaluation(capture, trained, meshed, backend_python, tmp_path):
     folder = shutil.copytree(trained, tmp_path / "out")
     python, calls = fake_python(
@@ -271,6 +274,7 @@ def test_run_makes_meshes_before_evaluation(capture, trained, meshed, backend_py
     assert "mesh" not in calls.read_text().split() and not (folder / "pulled-apart.png").exists()
 
 
+@pytest.mark.long
 def test_make_demo_reconstructs_around_its_capture(capture, backend_python, tmp_path):
     recipe = (headless.ROOT / "Makefile").read_text(encoding="utf-8")
     assert "run $(DEMO)/capture --out $(DEMO) " in recipe
@@ -283,6 +287,7 @@ def test_make_demo_reconstructs_around_its_capture(capture, backend_python, tmp_
     assert (folder / "report.md").exists() and (folder / "objectgs.blend").exists()
 
 
+@pytest.mark.long
 def test_run_succeeds_without_meshes(capture, trained, backend_python, tmp_path):
     folder = shutil.copytree(trained, tmp_path / "out")
     python, _ = fake_python(
@@ -295,6 +300,7 @@ def test_run_succeeds_without_meshes(capture, trained, backend_python, tmp_path)
     assert "No mesh can be made" in error_report("mesh", folder, "--backend-python", python)
 
 
+@pytest.mark.long
 def test_missing_backend_is_reported(capture, tmp_path):
     user = {"OBJECTGS_PYTHON": "", "BLENDER_USER_RESOURCES": str(tmp_path / "user")}
     for command in ("import", "vote", "train", "run"):
@@ -319,6 +325,7 @@ def test_backend_commands_run(capture, backend_python, tmp_path):
     assert not (tmp_path / "x").exists()
 
 
+@pytest.mark.long
 def test_paths_are_relative_to_working_directory(capture, backend_python, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     here = os.path.relpath(capture)
@@ -344,6 +351,7 @@ def wait_for(path, process):
     raise AssertionError(f"{path} was not written")
 
 
+@pytest.mark.long
 def test_stopped_training_keeps_checkpoint(capture, backend_python, tmp_path):
     process = start(
         "run",
@@ -365,6 +373,7 @@ def test_stopped_training_keeps_checkpoint(capture, backend_python, tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.long
 def test_stopped_demo_leaves_no_files(tmp_path, number):
     process = start("demo", tmp_path / "demo", "--views", "500")
     wait_for_any(tmp_path, ".demo-*.part", process)
@@ -399,6 +408,7 @@ def test_demo_stops_when_stdin_closes(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.long
 def test_stopped_rendering_ends_quickly(blend, tmp_path):
     process = start(
         "render", blend, "--out", tmp_path / "a.png", "--engine", "CYCLES", "--size", "4000x3000", "--samples", "4000"
@@ -438,6 +448,7 @@ def test_batch_continues_after_invalid_capture(batch):
     assert (out / "good" / "objectgs.blend").is_file() and size_of(out / "good" / "render.png") == (48, 36)
 
 
+@pytest.mark.long
 def test_batch_resumes_unfinished_captures(batch, capture, backend_python):
     captures, out, arguments, _ = batch
     first = summary(out)
@@ -464,6 +475,7 @@ def test_batch_rejects_invalid_arguments(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.long
 def test_stopped_batch_writes_summary(capture, backend_python, tmp_path):
     shutil.copytree(capture, tmp_path / "captures" / "a")
     process = start(

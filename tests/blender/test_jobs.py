@@ -216,6 +216,7 @@ def test_stop_all_waits_for_saving_and_kills_unresponsive_jobs(make):
 
 
 @posix
+@pytest.mark.long
 def test_crash_reports_last_message(make):
     job = run(
         make("""
@@ -269,6 +270,7 @@ out.write(b'{"type": "done", "message": "without an end of line"}')
     assert len(job.log) == 40 and job.log[-1] == "line 99" and job.step is None
 
 
+@pytest.mark.long
 def test_many_events_are_processed_in_parts(make):
     job = make('[say("progress", done=i, total=5000, step=i) for i in range(5000)]; say("done")')
     queue, longest = started(make('say("done", message="first")')), 0.0

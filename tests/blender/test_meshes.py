@@ -159,6 +159,7 @@ def test_moved_file_finds_its_textures(root, folder, tmp_path):
     assert all(tuple(image.size) == (4, 4) for image in found)
 
 
+@pytest.mark.long
 def test_mesh_asset_can_be_used_in_another_file(root, folder, tmp_path):
     """As when dropped from the asset browser, which appends the collection and adds an instance of it."""
     bpy.context.view_layer.update()

@@ -291,6 +291,7 @@ def test_duplicates_share_the_selection(root):
 # Edits.
 
 
+@pytest.mark.long
 def test_deleted_splats_are_hidden_and_restored(root, folder, backend_python, tmp_path):
     before = shown(1)
     select(1, range(8))
@@ -361,6 +362,7 @@ def test_renders_leave_out_deleted_splats(root):
     )
 
 
+@pytest.mark.long
 def test_assigned_splats_move_to_the_object_and_follow_it(root, folder, backend_python, tmp_path):
     mug = shown(1)
     select(1, range(12))
@@ -387,6 +389,7 @@ def list_of(object_id) -> list[list[float]]:
     return np.round(arrays_of(obj.data).means.astype(float) + center + ORIGIN, 3).tolist()
 
 
+@pytest.mark.long
 def test_separated_splats_become_an_object(root, folder, backend_python, tmp_path):
     select(1, range(6))
     select(2, range(7), "ADD")
@@ -428,6 +431,7 @@ def test_crop_box_is_around_the_objects(root, folder):
     assert max(blender_scene.crop_box_of(active()).scale) < 50.0
 
 
+@pytest.mark.long
 def test_crop_keeps_the_inside_of_the_box_and_survives_new_splats(root, folder, backend_python, tmp_path):
     assert not bpy.ops.objectgs.apply_crop.poll()
     assert bpy.ops.objectgs.add_crop_box() == {"FINISHED"}
@@ -474,6 +478,7 @@ def test_crop_box_surrounds_selected_splats(root):
     assert np.abs(np.linalg.inv(box) @ np.column_stack([points, np.ones(3)]).T)[:3].max() == pytest.approx(1, abs=1e-3)
 
 
+@pytest.mark.long
 def test_edits_agree_with_floaters_and_fills(root, folder, backend_python, tmp_path):
     """Floaters are in the hull of the splats that an object has after the edits."""
     select(1, range(5))
@@ -639,6 +644,7 @@ def test_folders_of_others_are_not_edited(root, folder, known, monkeypatch):
     assert not bpy.ops.objectgs.restore_splats.poll() and not bpy.ops.objectgs.add_crop_box.poll()
 
 
+@pytest.mark.long
 def test_merged_object_takes_assigned_splats(root, folder, backend_python, tmp_path):
     object_edits.merge(root, [2], 1)
     select(HUGE, range(5))

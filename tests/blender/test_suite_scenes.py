@@ -46,6 +46,7 @@ def test_sky_has_no_object_and_no_points(tmp_path, fresh):
     assert (np.load(tmp_path / "truth" / "points.npz")["object_id"] > 0).all()
 
 
+@pytest.mark.long
 def test_every_scene_is_built_and_described(fresh):
     assert list(suite_scenes.SCENES) == list(SYNTHETIC)
     assert {name for name in DEVELOP if name in SYNTHETIC} < set(SYNTHETIC)
