@@ -21,44 +21,57 @@ FEW = 400
 
 
 class Clusters(NamedTuple):
-    """Nested clusters of n nodes, numbered on: the nodes first, then the clusters of each level.
+    """Two levels or more of clusters of n nodes, numbered on: the nodes first, then the clusters of each level.
 
     Attributes:
         levels: (L + 1,) int64, the number of the first member of each level, of which the nodes are the first, and the
             number of all.
-        parent: (levels[-2],) int32, the cluster of each member below the top level.
-        starts: (levels[-1] - n + 1,) int64, where the members of each cluster begin in `members`.
-        members: int32, the members of one cluster after the other, ascending.
+        parent: (levels[-2],) int32, ascending: the cluster of each member below the top level.
+        starts: (levels[-1] - n + 1,) int64, the first member of each cluster, and levels[-2]; those of a cluster have
+            successive numbers.
     """
 
     levels: np.ndarray
     parent: np.ndarray
     starts: np.ndarray
-    members: np.ndarray
 
 
 def no_clusters(count: int) -> Clusters:
-    """Return the clusters of a graph of `count` nodes without any."""
-    return Clusters(np.array([0, count]), np.empty(0, np.int32), np.zeros(1, np.int64), np.empty(0, np.int32))
+    """Return the clusters of `count` nodes where none are known: each node by itself, and all of them together."""
+    parent = np.append(np.arange(count, 2 * count), np.full(count, 2 * count)).astype(np.int32)
+    return Clusters(np.array([0, count, 2 * count, 2 * count + 1]), parent, np.append(np.arange(count + 1), 2 * count))
 
 
-def nested_clusters(weights: sparse.csr_array) -> Clusters:
-    """Find the clusters of a graph; weights: (n, n), symmetric, >= 0, without a diagonal."""
-    levels, parents = [0, weights.shape[0]], []
-    while weights.shape[0] > FEW or len(levels) == 2:
-        count = weights.shape[0]
-        of_member = np.arange(count)
+def nested_clusters(weights: sparse.csr_array) -> tuple[np.ndarray, Clusters]:
+    """Find the clusters of a graph.
+
+    Args:
+        weights: (n, n), symmetric, >= 0, without a diagonal.
+
+    Returns:
+        An order (n,) of the nodes, and their clusters in this order.
+    """
+    of_member: list[np.ndarray] = []
+    while weights.shape[0] > FEW or len(of_member) < 2:
+        cluster = np.arange(weights.shape[0])
         for _ in range(PAIRINGS):
             pair, weights = _paired(weights)
-            of_member = pair[of_member]
-        if weights.shape[0] == count:
+            cluster = pair[cluster]
+        if weights.shape[0] == len(cluster) and len(of_member) >= 2:
             break
-        parents.append(of_member + levels[-1])
-        levels.append(levels[-1] + weights.shape[0])
-    parent = np.concatenate(parents or [np.empty(0, np.int64)]).astype(np.int32)
-    sizes = np.bincount(parent, minlength=levels[-1])[levels[1] :]
-    starts = np.concatenate([[0], np.cumsum(sizes)])
-    return Clusters(np.array(levels), parent, starts, np.argsort(parent, kind="stable").astype(np.int32))
+        of_member.append(cluster)
+    # From the top down, the members of the clusters in the order of these.
+    order, parents, sizes = np.arange(weights.shape[0]), [], []
+    for cluster in reversed(of_member):
+        place = np.empty_like(order)
+        place[order] = np.arange(len(order))
+        order = np.argsort(place[cluster], kind="stable")
+        parents.append(place[cluster][order])
+        sizes.append(len(place))
+    levels = np.concatenate([[0], np.cumsum([len(order), *reversed(sizes)])])
+    parent = np.concatenate([part + first for part, first in zip(reversed(parents), levels[1:], strict=False)])
+    starts = np.searchsorted(parent, np.arange(levels[1], levels[-1] + 1))
+    return order, Clusters(levels, parent.astype(np.int32), starts)
 
 
 def _paired(weights: sparse.csr_array) -> tuple[np.ndarray, sparse.csr_array]:
@@ -78,13 +91,16 @@ def _paired(weights: sparse.csr_array) -> tuple[np.ndarray, sparse.csr_array]:
 @kernel()
 def _match(order, first, second, count):
     """Pair the ends of edges in order where both are free; return the pair of each node, and the number of pairs."""
-    pair, pairs = np.full(count, -1), 0
+    other = np.arange(count)
     for edge in order:
-        if pair[first[edge]] < 0 and pair[second[edge]] < 0:
-            pair[first[edge]] = pair[second[edge]] = pairs
-            pairs += 1
+        if other[first[edge]] == first[edge] and other[second[edge]] == second[edge]:
+            other[first[edge]], other[second[edge]] = second[edge], first[edge]
+    # Nodes that are close in memory should remain so.
+    pair, pairs = np.empty(count, np.int64), 0
     for node in range(count):
-        if pair[node] < 0:
+        if other[node] < node:
+            pair[node] = pair[other[node]]
+        else:
             pair[node] = pairs
             pairs += 1
     return pair, pairs

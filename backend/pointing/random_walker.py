@@ -15,12 +15,14 @@ from ..raster import simd
 from ..raster.kernel import kernel
 from .clusters import FEW, Clusters, no_clusters
 
-ITERATIONS, ITERATIONS_AGAIN, TOLERANCE = 300, 100, 1e-3
-"""The solution ends after the first number of iterations, or after the second if it begins with an earlier one, or when
-every residual is the third number relative to its right-hand side."""
+ITERATIONS, ITERATIONS_AGAIN = 300, 100
+"""The solution ends after the first number of iterations, or after the second if it begins with an earlier one."""
 
 LEAST = 1e-6
 """Added to what is outside of a cluster, relative to all edges of its nodes."""
+
+TINY = np.float32(1e-11)
+"""Values that are much smaller are rounded to zero: products of these are denormal, for which processors take long."""
 
 _PARTS = 64
 """Number of parts of the nodes whose sums are added in order, so that results do not depend on the threads."""
@@ -28,69 +30,66 @@ _PARTS = 64
 
 @kernel(parallel=True)
 def _solve(starts, neighbors, weights, diagonal, right, free, x, iterations, tolerance, tree, scale, inverse):
-    """Solve (diagonal - weights) x = right for the free rows in place, beginning with x; x is 0 in the others.
+    """Solve (diagonal - weights) x = right for the free rows of x in place, beginning with x; the others are known.
 
     The rows of right and x are those of one block of `simd.LANES` labels; all arrays but the inverse have one
     dimension. tree: clusters of the rows; scale and inverse: as from `_coarse`.
     """
-    levels, parent, firsts, members = tree
+    levels, parent, firsts = tree
     n, lanes = len(diagonal), simd.LANES
-    clusters, lowest = levels[-1] - n, levels[2] - n if len(levels) > 2 else 0
-    # Of the rows and their clusters: the sum of the residuals, and the correction.
-    residual, direction = np.zeros((n + clusters) * lanes, np.float32), np.zeros(n * lanes, np.float32)
-    correction = np.zeros((n + clusters) * lanes, np.float32)
-    image = np.zeros(n * lanes, np.float32)
-    sums = np.zeros((3, _PARTS * lanes), np.float32)
+    lowest = levels[2] - n
+    # The residuals of the rows, and their sums over clusters.
+    residual, correction = np.zeros(levels[-1] * lanes, np.float32), np.zeros((levels[-1] - n) * lanes, np.float32)
+    direction, image = np.zeros(n * lanes, np.float32), np.zeros(n * lanes, np.float32)
+    sums = np.zeros((2, _PARTS * lanes), np.float32)
     for part in prange(_PARTS):
         size = simd.splat(np.float32(0))
         for i in range(part * n // _PARTS, (part + 1) * n // _PARTS):
             if free[i]:
                 row = i * lanes
-                wanted = simd.load(right, row)
-                left = wanted - simd.splat(diagonal[i]) * simd.load(x, row)
+                wanted, left = simd.load(right, row), simd.splat(-diagonal[i]) * simd.load(x, row)
                 for e in range(starts[i], starts[i + 1]):
-                    left = left + simd.splat(weights[e]) * simd.load(x, neighbors[e] * lanes)
-                simd.store(residual, row, left)
-                size = size + wanted * wanted
+                    near = simd.splat(weights[e]) * simd.load(x, neighbors[e] * lanes)
+                    if free[neighbors[e]]:
+                        left = left + near
+                    else:
+                        wanted = wanted + near
+                simd.store(residual, row, left + wanted)
+                size = size + simd.splat(scale[i]) * wanted * wanted
         simd.store(sums[0], part * lanes, size)
     stop = np.maximum(tolerance * tolerance * _added(sums[0]), 1e-30)
-    product = np.full(lanes, np.inf)
-    step = np.zeros(lanes, np.float32)
+    product, step = np.full(lanes, np.inf), np.zeros(lanes, np.float32)
     for iteration in range(iterations + 1):
         for part in prange(_PARTS):
-            forward, scaled, size = simd.load(step, 0), simd.splat(np.float32(0)), simd.splat(np.float32(0))
-            for i in range(part * n // _PARTS, (part + 1) * n // _PARTS):
-                if free[i]:
-                    row = i * lanes
-                    left = simd.load(residual, row) - forward * simd.load(image, row)
-                    simd.store(residual, row, left)
-                    simd.store(x, row, simd.load(x, row) + forward * simd.load(direction, row))
-                    scaled = scaled + simd.splat(scale[i]) * left * left
-                    size = size + left * left
-            simd.store(sums[1], part * lanes, scaled)
-            simd.store(sums[2], part * lanes, size)
-        if iteration == iterations or (_added(sums[2]) <= stop).all():
-            break
-        for part in prange(_PARTS):
+            forward, scaled, tiny = simd.load(step, 0), simd.splat(np.float32(0)), simd.splat(TINY)
             for c in range(part * lowest // _PARTS, (part + 1) * lowest // _PARTS):
                 total = simd.splat(np.float32(0))
-                for m in range(firsts[c], firsts[c + 1]):
-                    total = total + simd.load(residual, members[m] * lanes)
+                for i in range(firsts[c], firsts[c + 1]):
+                    if free[i]:
+                        row = i * lanes
+                        left = simd.load(residual, row) - forward * simd.load(image, row) + tiny - tiny
+                        simd.store(residual, row, left)
+                        simd.store(x, row, simd.load(x, row) + forward * simd.load(direction, row))
+                        scaled = scaled + simd.splat(scale[i]) * left * left
+                        total = total + left
                 simd.store(residual, (n + c) * lanes, total)
-        following = _added(sums[1])
-        if clusters:
-            following += _correct(tree, scale, inverse, residual, correction)
+                scaled = scaled + simd.splat(scale[n + c]) * total * total
+            simd.store(sums[1], part * lanes, scaled)
+        following = _added(sums[1]) + _correct(tree, scale, inverse, residual, correction)
+        if iteration == iterations or (following <= stop).all():
+            break
         turn = (following / np.maximum(product, 1e-30)).astype(np.float32)
         product = following
         for part in prange(_PARTS):
-            back = simd.load(turn, 0)
-            for i in range(part * n // _PARTS, (part + 1) * n // _PARTS):
-                if free[i]:
-                    row = i * lanes
-                    here = simd.splat(scale[i]) * simd.load(residual, row) + back * simd.load(direction, row)
-                    if clusters:
-                        here = here + simd.load(correction, parent[i] * lanes)
-                    simd.store(direction, row, here)
+            back, tiny = simd.load(turn, 0), simd.splat(TINY)
+            for c in range(part * lowest // _PARTS, (part + 1) * lowest // _PARTS):
+                own = simd.splat(scale[n + c]) * simd.load(residual, (n + c) * lanes)
+                shared = own + simd.load(correction, (parent[n + c] - n) * lanes)
+                for i in range(firsts[c], firsts[c + 1]):
+                    if free[i]:
+                        row = i * lanes
+                        here = simd.splat(scale[i]) * simd.load(residual, row) + shared
+                        simd.store(direction, row, here + back * simd.load(direction, row) + tiny - tiny)
         for part in prange(_PARTS):
             along = simd.splat(np.float32(0))
             for i in range(part * n // _PARTS, (part + 1) * n // _PARTS):
@@ -108,40 +107,34 @@ def _solve(starts, neighbors, weights, diagonal, right, free, x, iterations, tol
 
 @kernel()
 def _correct(tree, scale, inverse, residual, correction):
-    """Fill the corrections of clusters by their residuals, of which the lowest level is given, from the top down.
+    """Fill the corrections of all clusters but the lowest by the residuals of the lowest, from the top level down.
 
     Return the products (simd.LANES,) of residuals and corrections, where that of a level counts by itself.
     """
-    levels, parent, firsts, members = tree
+    levels, parent, firsts = tree
     n, first, lanes = levels[1], levels[-2], simd.LANES
     for c in range(levels[2], levels[-1]):
         total = simd.splat(np.float32(0))
-        for m in range(firsts[c - n], firsts[c - n + 1]):
-            total = total + simd.load(residual, members[m] * lanes)
+        for member in range(firsts[c - n], firsts[c - n + 1]):
+            total = total + simd.load(residual, member * lanes)
         simd.store(residual, c * lanes, total)
-    parts = np.zeros(lanes, np.float32)
-    products = np.zeros(lanes)
-    below = levels[-1]
-    if len(inverse):
-        below = first
-        for c in range(len(inverse)):
-            total = simd.splat(np.float32(0))
-            for other in range(len(inverse)):
-                total = total + simd.splat(inverse[c, other]) * simd.load(residual, (below + other) * lanes)
-            row = (below + c) * lanes
-            simd.store(correction, row, total)
-            simd.store(parts, 0, total * simd.load(residual, row))
-            products += parts
-    for c in range(below - 1, n - 1, -1):
-        row = c * lanes
-        left = simd.load(residual, row)
+    products = simd.splat(np.float32(0))
+    for c in range(len(inverse)):
+        total = simd.splat(np.float32(0))
+        for other in range(len(inverse)):
+            total = total + simd.splat(inverse[c, other]) * simd.load(residual, (first + other) * lanes)
+        simd.store(correction, (first + c - n) * lanes, total)
+        products = products + total * simd.load(residual, (first + c) * lanes)
+    for c in range(first - 1 if len(inverse) else levels[-1] - 1, levels[2] - 1, -1):
+        left = simd.load(residual, c * lanes)
         own = simd.splat(scale[c]) * left
-        simd.store(parts, 0, own * left)
-        products += parts
+        products = products + own * left
         if c < first:
-            own = own + simd.load(correction, parent[c] * lanes)
-        simd.store(correction, row, own)
-    return products
+            own = own + simd.load(correction, (parent[c] - n) * lanes)
+        simd.store(correction, (c - n) * lanes, own)
+    found = np.zeros(lanes, np.float32)
+    simd.store(found, 0, products)
+    return found
 
 
 @kernel()
@@ -189,6 +182,38 @@ def _added(parts):
     return total
 
 
+@kernel()
+def _reach(starts, neighbors, labels, reached, queue, count):
+    """Mark what is connected with the first `count` nodes of the queue through nodes of the same label."""
+    while count > 0:
+        count -= 1
+        node = queue[count]
+        for e in range(starts[node], starts[node + 1]):
+            other = neighbors[e]
+            if not reached[other] and labels[other] == labels[node]:
+                reached[other] = True
+                queue[count] = other
+                count += 1
+
+
+def connected_with(weights: sparse.csr_array, labels: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Find what is connected with some nodes through nodes that have the same label.
+
+    Args:
+        weights: (N, N) symmetric weights of the edges.
+        labels: (N,) int64.
+        nodes: (N,) bool, where to begin.
+
+    Returns:
+        (N,) bool.
+    """
+    reached, queue = nodes.copy(), np.empty(len(nodes), np.int64)
+    first = np.flatnonzero(nodes)
+    queue[: len(first)] = first
+    _reach(weights.indptr.astype(np.int32), weights.indices.astype(np.int32), labels, reached, queue, len(first))
+    return reached
+
+
 def random_walker(
     weights: sparse.csr_array,
     seeds: np.ndarray,
@@ -196,6 +221,7 @@ def random_walker(
     strength: float,
     start: np.ndarray | None = None,
     clusters: Clusters | None = None,
+    tolerance: float = 1e-3,
 ) -> np.ndarray:
     """Find the probability of each label at each node.
 
@@ -206,29 +232,29 @@ def random_walker(
         strength: weight of the prior, relative to the edges' weights.
         start: (N, labels) an earlier result for similar seeds, from which the solution begins; None: none.
         clusters: clusters of the nodes, which make the solution faster.
+        tolerance: the solution ends when every residual is this number relative to its right-hand side, in the norm of
+            the corrections: a small residual of what is hardly connected is a large error.
 
     Returns:
         (N, labels) float32, which adds up to 1 where a seed or the prior is reached.
     """
     count, labels = prior.shape
     free = seeds < 0
-    known = np.zeros((count, labels), np.float32)
-    known[~free, seeds[~free]] = 1.0
+    found = np.zeros((count, labels), np.float32) if start is None else start.astype(np.float32)
+    found[~free] = seeds[~free, None] == np.arange(labels)
     diagonal = np.asarray(weights.sum(axis=1)).ravel() + strength * prior.sum(1) + 1e-12
-    right = weights @ known + strength * prior
-    found = known.copy() if start is None else np.where(free[:, None], start, known)
-    graph = weights.indptr, weights.indices, weights.data.astype(np.float32), diagonal.astype(np.float32)
+    starts, neighbors = weights.indptr.astype(np.int32), weights.indices.astype(np.int32)
+    graph = starts, neighbors, weights.data.astype(np.float32), diagonal.astype(np.float32)
     tree = no_clusters(count) if clusters is None else clusters
     scale, matrix = _coarse(*graph, free, tree)
     inverse = np.linalg.inv(matrix).astype(np.float32)
     for first in range(0, labels, simd.LANES):
         block = slice(first, min(first + simd.LANES, labels))
-        x, wanted = np.zeros((count, simd.LANES), np.float32), np.zeros((count, simd.LANES), np.float32)
-        wanted[:, : block.stop - first] = right[:, block]
-        x[:, : block.stop - first] = np.where(free[:, None], found[:, block], 0.0)
+        x, right = np.zeros((count, simd.LANES), np.float32), np.zeros((count, simd.LANES), np.float32)
+        x[:, : block.stop - first], right[:, : block.stop - first] = found[:, block], strength * prior[:, block]
         _solve(
-            *graph, wanted.ravel(), free, x.ravel(), ITERATIONS if start is None else ITERATIONS_AGAIN, TOLERANCE,
+            *graph, right.ravel(), free, x.ravel(), ITERATIONS if start is None else ITERATIONS_AGAIN, tolerance,
             tree, scale, inverse,
         )  # fmt: skip
-        found[:, block] = np.where(free[:, None], x[:, : block.stop - first], known[:, block])
+        found[:, block] = x[:, : block.stop - first]
     return found

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from skimage.color import rgb2lab
 
@@ -22,7 +21,7 @@ from ..raster import Camera, devices, rasterize
 from ..shared.splats.spherical_harmonics import C0
 from .clusters import Clusters, nested_clusters
 from .color_model import ColorModel
-from .random_walker import random_walker
+from .random_walker import connected_with, random_walker
 
 if TYPE_CHECKING:
     from ..model.generate import Generated
@@ -151,7 +150,7 @@ class SplatGraph:
         is_alone: (N,) bool, splats that are no nodes and far from all of them.
         lab: (n, 3) CIELAB color of each node, the mean over its neighborhood.
         weights: (n, n) weights of the edges.
-        clusters: clusters of the nodes by these weights.
+        clusters: clusters of the nodes by these weights, in whose order the nodes are.
         edges: what the weights are made of.
         xyz: (n, 3) positions of the nodes.
         seen: (n,) pixels that each node covers in all photos together.
@@ -241,13 +240,7 @@ class SplatGraph:
 
         Such a part only has a similar color. found, seeds: (n,) labels; seeds are -1 where there is none.
         """
-        edges = self.weights.tocoo()
-        same = found[edges.row] == found[edges.col]
-        inside = sparse.coo_array((same[same], (edges.row[same], edges.col[same])), shape=self.weights.shape)
-        parts, part_of = connected_components(inside, directed=False)
-        is_seeded = np.zeros(parts, bool)
-        is_seeded[part_of[(seeds >= 0) & (seeds == found)]] = True
-        loose = ~is_seeded[part_of]
+        loose = ~connected_with(self.weights, found, (seeds >= 0) & (seeds == found))
         return loose if everything else loose & (found > 0)
 
 
@@ -327,8 +320,11 @@ def build_graph(
     unlike += (weights.gap * gap) ** 2 + (weights.steps * steps) ** 2
     between = sparse.coo_array((LEAST + np.exp(-unlike), (first, second)), shape=(len(nodes), len(nodes))).tocsr()
     between = between.maximum(between.T).tocsr()
-    edges = Edges(first, second, gap, color, steps)
-    clusters = nested_clusters(between)
+    order, clusters = nested_clusters(between)
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    nodes, nearest, lab, xyz = nodes[order], place[nearest], lab[order], xyz[order]
+    between, edges = between[order][:, order], Edges(place[first], place[second], gap, color, steps)
     return SplatGraph(nodes, nearest, is_alone, lab, between, clusters, edges, xyz, seen[nodes], facing[nodes])
 
 

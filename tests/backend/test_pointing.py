@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import zlib
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -23,12 +24,12 @@ from backend.export.ply import read_splats
 from backend.model.checkpoint import save_checkpoint
 from backend.model.draw import draw
 from backend.model.object_model import Normalization
-from backend.pointing.clusters import FEW, nested_clusters
+from backend.pointing.clusters import FEW, Clusters, nested_clusters, no_clusters
 from backend.pointing.color_model import SPREAD, ColorModel
 from backend.pointing.mask_edges import follow_edges
 from backend.pointing.pointer import Pointer
 from backend.pointing.proposals import find_objects, try_regions
-from backend.pointing.random_walker import random_walker
+from backend.pointing.random_walker import connected_with, random_walker
 from backend.pointing.splat_graph import OF_SPLATS, Edges, SplatGraph, contributions
 from backend.pointing.stroke_masks import points_on, stroke_pixels
 from backend.pointing.strokes import Stroke, Strokes, Viewpoint, read_strokes, strokes_of
@@ -97,11 +98,31 @@ def chain(weights: list[float]) -> sparse.csr_array:
     return (upper + upper.T).tocsr()
 
 
+def clustered_chain(weights: list[float]) -> tuple[sparse.csr_array, Clusters]:
+    """Return the graph of a chain, and its clusters, in the order of the chain."""
+    graph = chain(weights)
+    order, clusters = nested_clusters(graph)
+    assert (order == np.arange(len(order))).all()
+    return graph, clusters
+
+
 def test_walker_on_a_chain_has_the_probabilities_of_resistors() -> None:
     found = random_walker(chain([1, 1, 0.1, 1]), np.array([0, -1, -1, -1, 1]), np.zeros((5, 2)), 0.0)
     total = 1 + 1 + 10 + 1
     assert found[:, 1] == pytest.approx(np.array([0, 1, 2, 12, 13]) / total, abs=1e-6)
     assert found.sum(1) == pytest.approx(np.ones(5), abs=1e-6)
+
+
+def test_nodes_are_connected_through_nodes_of_the_same_label_alone() -> None:
+    weights, labels = random_graph(2000), np.random.default_rng(1).integers(0, 2, 2021)
+    begin = np.zeros(2021, bool)
+    begin[[0, 5, 2005]] = True
+    edges = weights.tocoo()
+    same = labels[edges.row] == labels[edges.col]
+    inside = sparse.coo_array((same[same], (edges.row[same], edges.col[same])), shape=weights.shape)
+    part_of = sparse.csgraph.connected_components(inside, directed=False)[1]
+    found = connected_with(weights, labels, begin)
+    assert (found == np.isin(part_of, part_of[begin])).all() and 3 < found.sum() < 2021
 
 
 def test_walker_follows_the_prior_where_no_seed_is_near() -> None:
@@ -126,35 +147,35 @@ def random_graph(count: int) -> sparse.csr_array:
 @pytest.mark.parametrize("count", [100, 5000, 30_000])
 def test_clusters_are_nested_connected_and_few(count) -> None:
     weights = random_graph(count)
-    clusters = nested_clusters(weights)
+    order, clusters = nested_clusters(weights)
+    weights = weights[order][:, order]
+    assert sorted(order.tolist()) == list(range(count + 21))
     assert clusters.levels[:2].tolist() == [0, count + 21]
     sizes = np.diff(clusters.levels)
-    assert 0 < sizes[-1] <= FEW and (sizes[:-1] > FEW)[1:].all()
-    members = clusters.members, clusters.starts
-    assert sorted(members[0].tolist()) == list(range(clusters.levels[-2]))
-    for cluster in range(0, sizes[1:].sum(), 7):
-        inside = members[0][members[1][cluster] : members[1][cluster + 1]]
-        assert (clusters.parent[inside] == cluster + count + 21).all() and 1 <= len(inside) <= 8
-        if inside.max() < count + 21:
-            assert sparse.csgraph.connected_components(weights[inside][:, inside])[0] == 1
+    assert len(sizes) >= 3 and 0 < sizes[-1] <= FEW and (sizes[1:-2] > FEW).all()
+    assert (np.diff(clusters.parent) >= 0).all() and clusters.starts[-1] == clusters.levels[-2]
+    for cluster, (first, last) in enumerate(pairwise(clusters.starts.tolist()), count + 21):
+        assert (clusters.parent[first:last] == cluster).all() and 1 <= last - first <= 8
+        if last <= count + 21:
+            assert sparse.csgraph.connected_components(weights[first:last][:, first:last])[0] == 1
 
 
 @pytest.mark.parametrize("strength", [0.0, 1e-4])
 def test_walker_with_clusters_solves_the_same_equations_in_fewer_steps(strength, monkeypatch) -> None:
     count, rng = 5000, np.random.default_rng(1)
-    weights = random_graph(count)
+    order, nested = nested_clusters(random_graph(count))
+    weights = random_graph(count)[order][:, order]
     seeds = np.full(count + 21, -1)
-    seeds[rng.choice(count, 6, replace=False)] = np.arange(6) % 3
-    prior = rng.uniform(size=(count + 21, 3)) * (np.arange(count + 21) < count)[:, None]
+    seeds[rng.choice(np.flatnonzero(order < count), 6, replace=False)] = np.arange(6) % 3
+    prior = rng.uniform(size=(count + 21, 3)) * (order < count)[:, None]
     free = seeds < 0
     laplacian = sparse.diags_array(weights.sum(axis=1) + strength * prior.sum(1) + 1e-12) - weights
     right = strength * prior[free] + weights[free][:, ~free] @ np.eye(3)[seeds[~free]]
     exact = sparse.linalg.spsolve(laplacian.tocsc()[free][:, free], right)
     monkeypatch.setattr("backend.pointing.random_walker.ITERATIONS", 30)
-    monkeypatch.setattr("backend.pointing.random_walker.TOLERANCE", 1e-5)
     errors = [
-        np.abs(random_walker(weights, seeds, prior, strength, None, clusters)[free] - exact).max()
-        for clusters in (nested_clusters(weights), None)
+        np.abs(random_walker(weights, seeds, prior, strength, None, clusters, 1e-5)[free] - exact).max()
+        for clusters in (nested, None)
     ]
     assert errors[0] < 2e-3 and errors[0] < 0.1 * errors[1], errors
 
@@ -378,10 +399,9 @@ def test_borders_of_masks_follow_the_photo() -> None:
 def test_far_splats_belong_to_nothing_unless_everything_is_an_object() -> None:
     """Two plates far apart; the stroke is on one of them. A part with a similar color elsewhere is not the object's."""
     none, flat = np.zeros(0), np.zeros((9, 3))
-    weights = chain([1, 1, 1e-4, 1, 1, 1e-4, 1, 1])
     graph = SplatGraph(
         np.arange(9), np.arange(9), np.zeros(9, bool), np.repeat([[50.0, 0, 0], [80.0, 0, 0], [50.0, 0, 0]], 3, axis=0),
-        weights, nested_clusters(weights), Edges(none, none, none, none, none), flat, np.ones(9), flat,
+        *clustered_chain([1, 1, 1e-4, 1, 1, 1e-4, 1, 1]), Edges(none, none, none, none, none), flat, np.ones(9), flat,
     )  # fmt: skip
     seeds = {7: np.eye(9)[0]}
     assert graph.solve(seeds).ids.tolist() == [7, 7, 7, 0, 0, 0, 0, 0, 0]
@@ -396,9 +416,9 @@ def test_colors_of_what_was_found_decide_where_strokes_do_not() -> None:
     """A chain whose third part has weaker edges to the first, but its color, which the stroke on the first lacks."""
     none, flat = np.zeros(0), np.zeros((12, 3))
     colors = np.repeat([[20.0, 0, 0], [60.0, 0, 0], [90.0, 0, 0]], [1, 8, 3], axis=0)
-    weights = chain([1, 1, 1, 1, 1, 3e-4, 1, 1, 1e-3, 1, 1])
     graph = SplatGraph(
-        np.arange(12), np.arange(12), np.zeros(12, bool), colors, weights, nested_clusters(weights),
+        np.arange(12), np.arange(12), np.zeros(12, bool), colors,
+        *clustered_chain([1, 1, 1, 1, 1, 3e-4, 1, 1, 1e-3, 1, 1]),
         Edges(none, none, none, none, none), flat, np.ones(12), flat,
     )  # fmt: skip
     found = graph.solve({7: np.eye(12)[0], 8: np.eye(12)[11]}, everything=True)
@@ -512,7 +532,7 @@ def table_with_balls(balls: int) -> tuple[SplatGraph, np.ndarray]:
     weights = sparse.csr_array((len(xyz), len(xyz)))
     edges = Edges(first, second, gap, color, color)
     graph = SplatGraph(
-        nodes, nodes, ones < 0, np.zeros((len(xyz), 3)), weights, nested_clusters(weights), edges, xyz, ones, normal
+        nodes, nodes, ones < 0, np.zeros((len(xyz), 3)), weights, no_clusters(len(xyz)), edges, xyz, ones, normal
     )
     return graph, truth
 

@@ -22,7 +22,7 @@ from ...mesh.texture.unwrap import unwrap
 from ...mesh.views import Views
 from ...model.draw import draw
 from ...pointing.clusters import nested_clusters
-from ...pointing.random_walker import random_walker
+from ...pointing.random_walker import connected_with, random_walker
 from ...shared.events import Reporter
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.stopping import StopRequest
@@ -78,7 +78,9 @@ class SmallScene:
         """Find depths in the photos, and label a graph."""
         find_depth_maps(self._capture, range(len(self._capture.views)), progress)
         graph = sparse.csr_array(np.eye(2)[::-1])
-        random_walker(graph, np.array([0, -1]), np.zeros((2, 2)), 0.0, clusters=nested_clusters(graph))
+        _, clusters = nested_clusters(graph)
+        random_walker(graph, np.array([0, -1]), np.zeros((2, 2)), 0.0, clusters=clusters)
+        connected_with(graph, np.array([0, 0]), np.array([True, False]))
 
     def mesh(self, trainer: Trainer, reporter: Callable[[str], Reporter] = lambda _step: Reporter()) -> None:
         """Extract a mesh of the first object, if it has a surface, and bake the texture of a tetrahedron.
