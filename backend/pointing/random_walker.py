@@ -143,12 +143,12 @@ def _coarse(starts, neighbors, weights, diagonal, free, tree):
 
     Returns:
         The inverse diagonal of each row and cluster, and the matrix of the top level's clusters, (0, 0) where these are
-        no clusters or too many.
+        too many.
     """
     levels, parent = tree[0], tree[1]
     n, count, first = levels[1], levels[-1], levels[-2]
     total, within = np.zeros(count), np.zeros(count)
-    few = count - first if first > 0 and count - first <= FEW else 0
+    few = count - first if count - first <= FEW else 0
     matrix = np.zeros((few, few))
     for i in range(n):
         if free[i]:
