@@ -98,7 +98,7 @@ zip: .venv-bpy/ready
 	$(BLENDER_EXT) validate build/objectgs-*.zip
 
 test: .venv/ready .venv-bpy/ready
-	$(BACKEND) -m pytest $(WORKERS) -m "not long and not slow" tests/backend tests/fuzz
+	$(BACKEND) -m pytest $(WORKERS) -m "not long and not slow" tests/backend
 	$(BLENDER) -m pytest $(WORKERS) -m "not long" tests/blender
 
 test-long: .venv/ready .venv-bpy/ready

@@ -188,6 +188,7 @@ def test_pause_saves_and_excludes_time(drive, endless):
 
 
 @pytest.mark.parametrize("how", ["stop", "one signal", "two signals"])
+@pytest.mark.long
 def test_paused_training_can_be_stopped(drive, endless, how):
     train, out = endless
     driven = drive(*train)

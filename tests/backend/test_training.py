@@ -706,6 +706,7 @@ def test_normalization_is_invariant_to_scale_and_offset(scale, offset):
     np.testing.assert_allclose(a.viewmat(viewmat), b.viewmat(moved), atol=1e-6)
 
 
+@pytest.mark.long
 def test_killed_training_resumes_to_same_model(write_capture, tmp_path):
     """A run that is killed between two checkpoints and resumed gives the same model as an uninterrupted run."""
     scene = write_capture(views=9, size=(64, 48))

@@ -148,6 +148,7 @@ def test_render_uses_chosen_camera(blend, tmp_path):
     assert len(list(tmp_path.iterdir())) == 3
 
 
+@pytest.mark.long
 def test_edit_export_and_import_commands(trained, backend_python, tmp_path, monkeypatch):
     folder = shutil.copytree(trained, tmp_path / "made")
     monkeypatch.chdir(tmp_path)
@@ -312,6 +313,7 @@ def test_missing_backend_is_reported(capture, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 def test_backend_commands_run(capture, backend_python, tmp_path):
     for command in ("import", "vote"):
         out = tmp_path / command

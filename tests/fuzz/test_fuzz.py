@@ -12,7 +12,10 @@ from .running import Runner
 from .session import run_cases
 from .templates import make_templates
 
-pytestmark = pytest.mark.skipif(os.name != "posix", reason="commands are forked, which Windows cannot")
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.skipif(os.name != "posix", reason="commands are forked, which Windows cannot"),
+]
 CASES = 20
 
 
@@ -28,7 +31,6 @@ def templates(runner, tmp_path_factory):
     return make_templates(tmp_path_factory.mktemp("templates"), runner)
 
 
-@pytest.mark.long
 def test_random_cases_have_no_faults(templates, runner, tmp_path):
     tally = run_cases(range(CASES), tmp_path, templates, runner)
     assert not tally.failures, "\n\n".join(map(str, tally.failures))
@@ -41,7 +43,6 @@ def test_interrupted_commands_lose_nothing(templates, runner, tmp_path):
     assert run_deletions(2, 1, tmp_path, templates, runner) == []
 
 
-@pytest.mark.long
 def test_competing_processes_take_turns(templates, tmp_path):
     assert race_for_lock(40, tmp_path / "lock")[0] == 0
     assert edit_at_once(4, tmp_path, templates)[1] == []
