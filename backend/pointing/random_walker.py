@@ -15,8 +15,10 @@ from ..raster import simd
 from ..raster.kernel import kernel
 from .clusters import FEW, Clusters, no_clusters
 
-ITERATIONS, ITERATIONS_AGAIN = 300, 100
-"""The solution ends after the first number of iterations, or after the second if it begins with an earlier one."""
+ITERATIONS, ITERATIONS_AGAIN, TOLERANCE = 300, 100, 1e-3
+"""The solution ends after the first number of iterations, or after the second if it begins with an earlier one, or when
+every residual is the third number relative to its right-hand side, in the norm of the corrections: a small residual of
+what is hardly connected is a large error."""
 
 LEAST = 1e-6
 """Added to what is outside of a cluster, relative to all edges of its nodes."""
@@ -221,7 +223,6 @@ def random_walker(
     strength: float,
     start: np.ndarray | None = None,
     clusters: Clusters | None = None,
-    tolerance: float = 1e-3,
 ) -> np.ndarray:
     """Find the probability of each label at each node.
 
@@ -231,9 +232,7 @@ def random_walker(
         prior: (N, labels) how well each node fits each label, >= 0.
         strength: weight of the prior, relative to the edges' weights.
         start: (N, labels) an earlier result for similar seeds, from which the solution begins; None: none.
-        clusters: clusters of the nodes, which make the solution faster.
-        tolerance: the solution ends when every residual is this number relative to its right-hand side, in the norm of
-            the corrections: a small residual of what is hardly connected is a large error.
+        clusters: clusters of the nodes, which make the solution faster; None: only the nodes are corrected.
 
     Returns:
         (N, labels) float32, which adds up to 1 where a seed or the prior is reached.
@@ -245,15 +244,19 @@ def random_walker(
     diagonal = np.asarray(weights.sum(axis=1)).ravel() + strength * prior.sum(1) + 1e-12
     starts, neighbors = weights.indptr.astype(np.int32), weights.indices.astype(np.int32)
     graph = starts, neighbors, weights.data.astype(np.float32), diagonal.astype(np.float32)
-    tree = no_clusters(count) if clusters is None else clusters
-    scale, matrix = _coarse(*graph, free, tree)
-    inverse = np.linalg.inv(matrix).astype(np.float32)
+    if clusters is None:
+        tree, inverse = no_clusters(count), np.zeros((1, 1), np.float32)
+        scale = np.append(1 / graph[3], np.zeros(count + 1, np.float32))
+    else:
+        tree = clusters
+        scale, matrix = _coarse(*graph, free, tree)
+        inverse = np.linalg.inv(matrix).astype(np.float32)
     for first in range(0, labels, simd.LANES):
         block = slice(first, min(first + simd.LANES, labels))
         x, right = np.zeros((count, simd.LANES), np.float32), np.zeros((count, simd.LANES), np.float32)
         x[:, : block.stop - first], right[:, : block.stop - first] = found[:, block], strength * prior[:, block]
         _solve(
-            *graph, right.ravel(), free, x.ravel(), ITERATIONS if start is None else ITERATIONS_AGAIN, tolerance,
+            *graph, right.ravel(), free, x.ravel(), ITERATIONS if start is None else ITERATIONS_AGAIN, TOLERANCE,
             tree, scale, inverse,
         )  # fmt: skip
         found[:, block] = x[:, : block.stop - first]
