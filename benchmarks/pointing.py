@@ -2,6 +2,7 @@
 
     python benchmarks/pointing.py [--photos 1 2 3] [--minutes 2.4] [--seeds 1] [--capture NAME ...]
     python benchmarks/pointing.py --write [--proposals [--capture NAME ...]]
+    python benchmarks/pointing.py --write --meshes [--photos 2] [--minutes 2.4]
 
 Captures are the demo (`make demo`), and the real tabletop of ../shared/data if it is there. Each is trained without its
 masks. In each of the photos, one stroke then marks each object that shows there: along the row through the middle of
@@ -9,7 +10,8 @@ the object's largest inscribed circle, without a fifth at both ends. If the mask
 stroke in one photo marks them, too. `label` separates the objects, and the IDs of its renders are compared with the
 true masks of the held-out views. Before, `propose` finds objects without any stroke. --write saves the figures of two
 seeds to docs/figures/pointing.json and the table to docs/pointing.md; with --proposals, only `propose` is measured, and
-the document keeps its other figures.
+with --meshes, meshes of the demo's objects from strokes and from the true masks are compared with its true ones. The
+document then keeps its other figures.
 """
 
 from __future__ import annotations
@@ -68,6 +70,14 @@ def strokes_of(truth: Capture, photos: int) -> dict[str, Any]:
     return {"strokes": strokes, "everything": everything}
 
 
+def copy_without_masks(folder: Path, copy: Path) -> None:
+    """Copy a capture without what says which objects it has; its ground truth remains for comparison."""
+    shutil.copytree(
+        folder, copy,
+        ignore=lambda path, _: {"masks", "labels.json", "objects.json"} if Path(path) == folder else set(),
+    )  # fmt: skip
+
+
 def scores(checkpoint: Path, truth: Capture) -> dict[str, float]:
     """Return the scores of a trained model's IDs and images in the held-out views."""
     model, _, _ = load_model(checkpoint)
@@ -115,7 +125,7 @@ def measured(folder: Path, photos: Sequence[int], minutes: float, seed: int) -> 
         scratch = Path(place)
         truth = load_capture(folder, scratch / "cache")
         capture, unlabeled = scratch / "capture", scratch / "unlabeled"
-        shutil.copytree(folder, capture, ignore=shutil.ignore_patterns("masks", "labels.json", "objects.json"))
+        copy_without_masks(folder, capture)
         shared.run_backend("train", capture, "--out", unlabeled, "--minutes", minutes, "--seed", seed)
         rows["0"] = {"psnr": scores(unlabeled / "checkpoint", truth)["psnr"]}
         file, out = scratch / "proposed.json", scratch / "proposed"
@@ -131,6 +141,35 @@ def measured(folder: Path, photos: Sequence[int], minutes: float, seed: int) -> 
             shutil.copytree(unlabeled, out)
             seconds = shared.run_backend("label", out, "--strokes", file)
             rows[str(count)] = {**scores(out / "checkpoint", truth), "seconds": seconds}
+    return rows
+
+
+def mesh_scores(out: Path) -> dict[str, float | None]:
+    """Make the meshes of a reconstruction, and return the medians over the objects."""
+    for words in (("mesh", out), ("evaluate", out), ("report", out)):
+        shared.run_backend(*words)
+    report = json.loads((out / "report.json").read_text())
+    return {name: shared.over_objects(report, name) for name in ("f1", "f1_005", "texture_psnr")}
+
+
+def measured_meshes(folder: Path, photos: Sequence[int], minutes: float, seed: int) -> dict[str, Any]:
+    """Return the scores of meshes from the true masks, "masks", and from strokes, by the number of photos with them."""
+    rows: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory(prefix="objectgs-benchmark-") as place:
+        scratch = Path(place)
+        truth = load_capture(folder, scratch / "cache")
+        length = ("--minutes", minutes, "--seed", seed)
+        shared.run_backend("train", folder, "--out", scratch / "masks", *length)
+        rows["masks"] = mesh_scores(scratch / "masks")
+        capture, unlabeled = scratch / "capture", scratch / "unlabeled"
+        copy_without_masks(folder, capture)
+        shared.run_backend("train", capture, "--out", unlabeled, *length)
+        for count in photos:
+            file, out = scratch / "strokes.json", scratch / f"labeled-{count}"
+            file.write_text(json.dumps(strokes_of(truth, count)))
+            shutil.copytree(unlabeled, out)
+            shared.run_backend("label", out, "--strokes", file)
+            rows[str(count)] = mesh_scores(out)
     return rows
 
 
@@ -184,6 +223,24 @@ def document(found: Mapping[str, Any]) -> str:
             "",
             *shared.table(("capture", "proposed", "found", "mIoU", "with unlabeled", "PSNR, dB", "seconds"), proposals),
         ]
+    if meshes := found.get("meshes"):
+        rows = []
+        for name in sorted(meshes[0], key=lambda name: name == "masks"):
+            of = "true masks" if name == "masks" else f"strokes in {name} photo{'s' if name != '1' else ''}"
+            cells = [
+                shared.spread([seed[name][key] for seed in meshes], form)
+                for key, form in (("f1", "{:.4f}"), ("f1_005", "{:.3f}"), ("texture_psnr", "{:.1f}"))
+            ]
+            rows.append((of, *cells))
+        lines += [
+            "",
+            "## Meshes",
+            "",
+            "The demo's meshes from strokes and from its true masks, compared with the true surface where training "
+            "views see it. Medians over the objects.",
+            "",
+            *shared.table(("objects by", "F1 at 2 cm", "F1 at 5 mm", "texture, dB"), rows),
+        ]
     return "\n".join(lines) + "\n"
 
 
@@ -196,35 +253,44 @@ def main() -> None:
     parser.add_argument("--capture", nargs="+", choices=CAPTURES, default=list(CAPTURES))
     parser.add_argument("--write", action="store_true", help="all captures and two seeds, for the document")
     parser.add_argument("--proposals", action="store_true", help="measure `propose` alone")
+    parser.add_argument("--meshes", action="store_true", help="measure the demo's meshes alone")
     options = parser.parse_args()
     options.photos = [] if options.proposals else options.photos
     seeds = 2 if options.write else options.seeds
-    folders = {
-        name: CAPTURES[name] for name in (CAPTURES if options.write and not options.proposals else options.capture)
-    }
-    folders = {name: folder for name, folder in folders.items() if folder.is_dir()}
+    names = CAPTURES if options.write and not options.proposals else options.capture
+    folders = {name: CAPTURES[name] for name in (["demo"] if options.meshes else names) if CAPTURES[name].is_dir()}
     shared.compile_everything()
     results = shared.Results(
         ROOT / "build" / "pointing-results",
         shared.digest(shared.sources(), options.photos, options.minutes), len(folders) * seeds,
     )  # fmt: skip
-    found: dict[str, Any] = {"seeds": seeds, "captures": {}}
-    for name, folder in folders.items():
-        found["captures"][name] = [
+    measure, kind = (measured_meshes, "meshes of ") if options.meshes else (measured, "")
+    by_name = {
+        name: [
             results.get(
-                f"{name}, seed {seed}",
-                lambda folder=folder, seed=seed: measured(folder, options.photos, options.minutes, seed),
-                lambda rows: ", ".join(f"{n} photos {row['miou']:.4f}" for n, row in rows.items() if "miou" in row),
+                f"{kind}{name}, seed {seed}",
+                lambda folder=folder, seed=seed: measure(folder, options.photos, options.minutes, seed),
+                lambda rows: ", ".join(f"{n}: {row.get('miou') or row.get('f1')}" for n, row in rows.items()),
             )
             for seed in range(seeds)
         ]
+        for name, folder in folders.items()
+    }
     if results.failures:
         sys.exit("\n".join(f"{name}: {why}" for name, why in results.failures.items()))
+    found = {"seeds": seeds, "captures": by_name}
+    if options.meshes:
+        found = {"seeds": seeds, "captures": {}, "meshes": by_name["demo"]}
     if options.write:
+        kept = documents.load("pointing")
+        if options.meshes:
+            found["captures"] = kept["captures"]
+        elif "meshes" in kept:
+            found["meshes"] = kept["meshes"]
         if options.proposals:
-            for name, rows in documents.load("pointing")["captures"].items():
-                for new, kept in zip(found["captures"].setdefault(name, [{} for _ in rows]), rows, strict=True):
-                    new.update({key: row for key, row in kept.items() if key not in new})
+            for name, rows in kept["captures"].items():
+                for new, old in zip(by_name.setdefault(name, [{} for _ in rows]), rows, strict=True):
+                    new.update({key: row for key, row in old.items() if key not in new})
         documents.save("pointing", found)
     print(document(found))
 

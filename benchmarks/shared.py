@@ -188,6 +188,15 @@ def run_backend(*words: object) -> float:
     return time.monotonic() - started
 
 
+def over_objects(
+    report: Mapping[str, Any], name: str, of: Callable[[list[float]], float] = statistics.median
+) -> float | None:
+    """Return the median, or another figure, of a measure of a report's meshes; None if none of them has it."""
+    meshes = [entry["mesh"] for entry in report["objects"] if entry["mesh"]]
+    known = [mesh[name] for mesh in meshes if mesh.get(name) is not None]
+    return of(known) if known else None
+
+
 def from_photos_to_report(capture: Path, *options: object, meshes: bool = True) -> dict[str, Any]:
     """Train, mesh and evaluate with the user's commands and return figures of the report.
 
@@ -205,12 +214,6 @@ def from_photos_to_report(capture: Path, *options: object, meshes: bool = True) 
             run_backend(*words)
         report = json.loads((out / "report.json").read_text())
     seconds_of = {stage["name"]: stage["seconds"] for stage in report["stages"]}
-    made = [entry["mesh"] for entry in report["objects"] if entry["mesh"]]
-
-    def over_objects(name: str, of: Callable[[list[float]], float] = statistics.median) -> float | None:
-        known = [mesh[name] for mesh in made if mesh.get(name) is not None]
-        return of(known) if known else None
-
     return {
         "steps": report["model"]["trained_steps"],
         "psnr": report["quality"]["psnr"],
@@ -219,10 +222,10 @@ def from_photos_to_report(capture: Path, *options: object, meshes: bool = True) 
         "mbiou": report["quality"]["mbiou"],
         "seconds": sum(seconds_of.values()),
         "mesh_mb": max((stage["peak_rss_mb"] for stage in report["stages"] if stage["name"] == "mesh"), default=None),
-        "f1": over_objects("f1"),
-        "f1_least": over_objects("f1", min),
-        "f1_005": over_objects("f1_005"),
-        "texture_psnr": over_objects("texture_psnr"),
+        "f1": over_objects(report, "f1"),
+        "f1_least": over_objects(report, "f1", min),
+        "f1_005": over_objects(report, "f1_005"),
+        "texture_psnr": over_objects(report, "texture_psnr"),
         "train_seconds": seconds_of["train"],
         "mesh_seconds": seconds_of.get("mesh"),
         "curve": report["curve"],

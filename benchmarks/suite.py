@@ -129,24 +129,23 @@ def measured(code: Path, capture: Path, minutes: float, seed: int) -> dict[str, 
         sizes = [view.width * view.height for view in read_cameras(out).views]
     views, quality = report["views"], report["quality"]
 
-    def over(rows: Sequence[Mapping[str, Any]], key: str) -> float | None:
-        known = [row[key] for row in rows if row.get(key) is not None]
+    def over(key: str) -> float | None:
+        known = [view[key] for view in views if view.get(key) is not None]
         return statistics.median(known) if known else None
 
-    meshes = [entry["mesh"] for entry in report["objects"] if entry["mesh"]]
     return {
         "steps": report["model"]["trained_steps"],
         "splats": report["model"]["gaussians"],
-        "psnr": over(views, "psnr"),
+        "psnr": over("psnr"),
         "psnr_worst": min(view["psnr"] for view in views),
-        "psnr_corrected": over(views, "psnr_corrected"),
+        "psnr_corrected": over("psnr_corrected"),
         "psnr_corrected_mean": quality["psnr_corrected"],
         "agreement": agreement,
         "pixels": statistics.mean(sizes),
         "ssim": quality["ssim"],
         "miou": quality["miou"],
         "miou_all": quality["miou_all"],
-        **{key: over(meshes, key) for key in ("f1", "f1_005", "f1_005_all", "texture_psnr")},
+        **{key: shared.over_objects(report, key) for key in ("f1", "f1_005", "f1_005_all", "texture_psnr")},
     }
 
 

@@ -14,7 +14,6 @@ import numpy as np
 from ..capture import Capture, default_split, load_capture
 from ..model.object_model import ObjectModel
 from ..planning.decisions import planned_capture
-from ..raster import devices
 from ..shared.errors import InputError
 from ..shared.events import Reporter
 from ..shared.formats.atomic import recorded, remove_abandoned
@@ -28,6 +27,7 @@ from ..training.exposure.gains import measure_gains
 from ..training.scene import Scene
 from ..training.state import load_model, progress_of
 from .cameras import write_capture_cameras
+from .setup.device import choose_device
 from .stages import stage
 
 READ = "read"
@@ -161,7 +161,7 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
         InputError: The folder, its model or its capture is missing, or the capture is not that of the training.
     """
     reporter.begin(READ, "Reading the reconstruction")
-    device = devices.pick(options.device)
+    device = choose_device(options.device, reporter)
     folder = Reconstruction(options.folder)
     if not folder.folder.is_dir():
         raise InputError(f"{folder.folder} does not exist; specify the folder given to `train --out`.")

@@ -76,6 +76,11 @@ def dismiss() -> None:
         _messages.pop()
 
 
+def withdraw(text: str) -> None:
+    """Remove a message that no longer applies."""
+    _messages[:] = [message for message in _messages if message.text != text]
+
+
 def settle(title: str, operator: str | None) -> None:
     """Remove the messages about failures that a later success has settled.
 

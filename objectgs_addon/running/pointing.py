@@ -39,6 +39,7 @@ class _Session:
         job = locations.backend_job("", "point", self.folder, "point", str(self.folder), *locations.segmenter_options())
         self.process = BackendProcess(job.command, job.cwd, job.environment, in_background=False)
         self.ready, self.progress, self.message, self.failure = False, 0.0, "Starting", ""
+        self.problem, self.said, self.said_problem = "", "", False
         self.asked = self.answered = 0
         self.wanted_detail: float | None = None
         self.lacks = False
@@ -93,7 +94,7 @@ class _Session:
                 return None
             if "problem" in event:
                 self.answered = self.asked
-                messages.show(str(event["problem"]), "ERROR")
+                self.problem = str(event["problem"])
                 number = event.get("stroke")
                 return number if isinstance(number, int) else None
             self._take_classes(event)
@@ -109,6 +110,13 @@ class _Session:
             if len(classes) != len(self.keys) or classes.max(initial=0) >= len(objects):
                 raise ValueError("its objects are not those of the splats")
             self.objects, self.classes, self.answered = objects, classes, self.asked
+
+    def say(self, text: str, is_problem: bool = False) -> None:
+        """Show a message on the marks instead of the earlier one; "" for none."""
+        messages.withdraw(self.said)
+        self.said, self.said_problem = text, is_problem
+        if text:
+            messages.show(text, "ERROR" if is_problem else "INFO")
 
 
 _session: _Session | None = None
@@ -138,6 +146,7 @@ def stop() -> None:
     if _session is None:
         return
     _session.process.kill()
+    _session.say("")
     _session = None
     drawing.show_labels({}, np.zeros((0, 3)))
     drawing.redraw()
@@ -182,8 +191,10 @@ def share_of_splats() -> dict[int, int]:
 
 
 def refresh(root: bpy.types.Collection) -> None:
-    """Ask for the objects of changed strokes."""
+    """Ask for the objects of changed strokes, which may settle a problem of earlier ones."""
     if _session is not None and _session.root == root.session_uid:
+        if _session.said_problem:
+            _session.say("")
         _session.ask(marks.content(root))
         show()
 
@@ -203,6 +214,9 @@ def _tick() -> float | None:
         number = session.take(event)
         if number is not None:
             marks.remove_stroke(root, number)
+        if session.problem:
+            session.say(session.problem, is_problem=True)
+            session.problem = ""
     if session.ready and not was_ready:
         session.ask(marks.content(root))
         if session.wanted_detail is not None:
@@ -234,12 +248,12 @@ def _show_proposed(root: bpy.types.Collection, session: _Session) -> None:
         return
     count = len(root.objectgs.marked)
     if count:
-        messages.show(
+        session.say(
             f"{count} objects were found. Remove those that are none, merge parts, and draw over what is missing; then "
             "press Separate Objects. Another Detail gives more or fewer"
         )
     else:
-        messages.show("No objects were found by their shape; try another Detail, or draw over them")
+        session.say("No objects were found by their shape; try another Detail, or draw over them")
     windows = bpy.context.window_manager.windows
     if windows and not bpy.app.background:
         with bpy.context.temp_override(window=windows[0]):

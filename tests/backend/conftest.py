@@ -222,9 +222,17 @@ def run_command(capsys):
     torch.set_num_threads(threads[1])
 
 
+@pytest.fixture(scope="module")
+def module_without_dense_points():
+    """Leave out the points on plain surfaces, which `test_sfm` covers, to save time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("backend.commands.capture.sfm._densify", lambda *_: {})
+        yield
+
+
 @pytest.fixture
 def no_dense_points(monkeypatch):
-    """Leave out the points on plain surfaces, which `test_sfm` covers, to save time."""
+    """As `module_without_dense_points`, for one test."""
     monkeypatch.setattr("backend.commands.capture.sfm._densify", lambda *_: {})
 
 

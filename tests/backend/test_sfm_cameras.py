@@ -84,7 +84,7 @@ def both(matrices) -> dict[str, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def pairs(tmp_path_factory):
+def pairs(tmp_path_factory, module_without_dense_points):
     """The capture of a rig of two cameras."""
     folder = tmp_path_factory.mktemp("rig")
     for name, matrix in both(ring(5)).items():

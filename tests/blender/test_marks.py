@@ -16,6 +16,7 @@ from objectgs.backend.shared.formats.ply import write_vertices
 from objectgs.backend.shared.splats.picking import View
 from objectgs.objectgs_addon import drawing
 from objectgs.objectgs_addon import scene as blender_scene
+from objectgs.objectgs_addon.blender import messages
 from objectgs.objectgs_addon.drawing import splat_arrays
 from objectgs.objectgs_addon.drawing.gather import gather, placed_parts
 from objectgs.objectgs_addon.environment import locations
@@ -221,8 +222,14 @@ def test_labels_of_a_training_with_masks_are_cleaned_up(root, monkeypatch):
 class _Process:
     """Stands in for the backend's process."""
 
+    exit_code = None
+
     def __init__(self, command, *_, **__):
-        self.command, self.sent = command, []
+        self.command, self.sent, self.events = command, [], []
+
+    def poll(self):
+        events, self.events = self.events, []
+        return events
 
     def send(self, line: str) -> bool:
         self.sent.append(json.loads(line))
@@ -319,6 +326,36 @@ def test_answers_to_earlier_strokes_are_ignored(root, session):
     answer(session, [3], [0] * len(session.keys), request=1)
     assert pointing.state()[1] and pointing.share_of_splats() == {0: len(session.keys)}
     assert session.take({"type": "answer", "request": 2, "problem": "Stroke 2 shows no splats", "stroke": 2}) == 2
+
+
+def test_a_problem_is_shown_until_the_marks_change(root, session, monkeypatch):
+    shown = {}
+    monkeypatch.setattr(messages, "show", lambda text, kind: shown.update({text: kind}))
+    monkeypatch.setattr(messages, "withdraw", lambda text: shown.pop(text, None))
+    session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
+
+    def draw():
+        marks.add_stroke(root, 3, views(root)[0], [(1, 1)], area=False)
+
+    def refuse():
+        problem = "Stroke 1 shows no splats"
+        session.process.events = [{"type": "answer", "request": session.asked, "problem": problem, "stroke": 1}]
+        pointing._tick()
+
+    draw()
+    refuse()
+    assert shown == {"Stroke 1 shows no splats": "ERROR"} and not marks.strokes_of(root)
+    draw()
+    assert not shown
+    refuse()
+    session.propose(0.5)
+    session.process.events = [{"type": "answer", "request": session.asked, "proposed": PROPOSED}]
+    pointing._tick()
+    assert list(shown.values()) == ["INFO"]
+    draw()
+    assert len(shown) == 1, "what to do with proposed objects is of use for longer"
+    pointing.stop()
+    assert not shown
 
 
 @pytest.mark.parametrize(

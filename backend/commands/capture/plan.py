@@ -8,20 +8,20 @@ from contextlib import ExitStack
 from ...capture import load_capture
 from ...planning.agreement import measure_agreement
 from ...planning.decisions import decide, planned_capture
-from ...raster import devices
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.plan import write_plan
 from ...shared.stopping import StoppingReporter
 from ..folder import READ, memory_for_files, open_output
 from ..length import budget_of, expected_of
 from ..planning import build_context, choices, find_requested_objects, voted_points
+from ..setup.device import choose_device
 
 
 def plan(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Report the steps that training would do and omit; with --out, use and write the files of that folder."""
     reporter.expect({READ: ("Preparing", 5.0), "plan": ("Planning", 5.0)})
     reporter.begin(READ, "Reading the capture")
-    device, budget = devices.pick(options.device), budget_of(options)
+    device, budget = choose_device(options.device, reporter), budget_of(options)
     folder = Reconstruction(options.out) if options.out else None
     with ExitStack() as held:
         if folder is not None:

@@ -13,7 +13,6 @@ from PIL import Image
 from ...film import cryptomatte, exr
 from ...film.render import FilmImage, draw_frame, to_srgb_8bit
 from ...film.stage import Stage
-from ...raster import devices
 from ...shared.errors import InputError
 from ...shared.formats.atomic import write_atomic
 from ...shared.reconstruction.folder import Reconstruction
@@ -21,6 +20,7 @@ from ...shared.reconstruction.record import read_record
 from ...shared.reconstruction.shot import Frame, Shot, chosen_frames, read_shot
 from ...shared.stopping import StoppingReporter
 from ..folder import READ
+from ..setup.device import choose_device
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
 
@@ -33,7 +33,7 @@ _SECONDS_A_FRAME = 3.0
 
 def film(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Render the missing frames of a shot into the folder of --out."""
-    device = devices.pick(options.device)
+    device = choose_device(options.device, reporter)
     folder = Reconstruction(options.folder)
     if not folder.splats.is_file():
         raise InputError(f"{folder.folder} has no {folder.splats.name}; give the --out folder of a training.")

@@ -20,7 +20,6 @@ from ...mesh.texture.bake import bake_texture, texture_size
 from ...mesh.texture.unwrap import unwrap
 from ...mesh.views import Views
 from ...model.object_model import ObjectModel
-from ...raster import devices
 from ...shared.errors import InputError
 from ...shared.events import Reporter
 from ...shared.formats.atomic import write_atomic
@@ -32,6 +31,7 @@ from ...shared.reconstruction.meshes import MeshEntry, read_meshes, write_meshes
 from ...shared.reconstruction.objects import find_object, members_of, read_objects, shown_as
 from ...shared.stopping import StoppingReporter
 from ..folder import READ, Trained, open_trained
+from ..setup.device import choose_device
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import finish_stage
@@ -57,7 +57,7 @@ class Target:
 
 def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Make the selected meshes that do not exist yet; each is written as soon as it is complete."""
-    device = devices.pick(options.device)
+    device = choose_device(options.device, reporter)
     reporter.expect(
         {
             READ: ("Preparing", 5.0), KERNELS: ("Preparing", kernel_seconds(device)),

@@ -31,6 +31,7 @@ from ...shared.reconstruction.record import read_record
 from ...shared.splats.spherical_harmonics import C0
 from ..cameras import read_upright
 from ..folder import READ, Trained, memory_for_files, open_trained
+from ..setup.device import choose_device
 
 GRAPH = "graph"
 """Name of the preparation among the parts of a command."""
@@ -131,7 +132,7 @@ def _of_splats(folder: Reconstruction, options: argparse.Namespace, reporter: Re
         views = views_around(normalization.to_scene(splats.means), read_upright(folder).rotation[2], normalization)
     else:
         views = _views_of(capture, normalization)
-    generated = _in_scene_units(splats, normalization, devices.pick(options.device))
+    generated = _in_scene_units(splats, normalization, choose_device(options.device, reporter))
     return Pointable(folder, splats, generated, np.ones(len(splats), bool), "3d", views, capture)
 
 
@@ -154,7 +155,7 @@ def _of_points(folder: Reconstruction, options: argparse.Namespace, reporter: Re
         object_ids=points.ids,
     )
     normalization = Normalization.of(points.xyz, points.xyz)
-    generated = _in_scene_units(balls, normalization, devices.pick(options.device))
+    generated = _in_scene_units(balls, normalization, choose_device(options.device, reporter))
     views = _views_of(capture, normalization)
     return Pointable(folder, points, generated, np.ones(len(radii), bool), "3d", views, capture)
 

@@ -7,6 +7,7 @@ import time
 
 from ...raster import devices
 from ...shared.stopping import StoppingReporter
+from .device import choose_device
 from .kernels import PART, kernel_seconds, try_kernels
 from .machine import machine_facts
 
@@ -16,7 +17,7 @@ _SECONDS = 10.0
 
 def doctor(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Report versions and devices, compile the kernels and run a short training."""
-    device = devices.pick(options.device)
+    device = choose_device(options.device, reporter, again=True)
     reporter.expect({PART: ("Compiling kernels", kernel_seconds(device) or _SECONDS)})
     found = machine_facts(device)
     for key, value in found.items():

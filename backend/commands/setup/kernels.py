@@ -108,12 +108,14 @@ def _are_ready(device: torch.device) -> bool:
 
 
 def _mark(device: torch.device) -> Path:
-    """Return the path of the file, beside numba's cache, that marks the kernels of these sources as compiled.
-
-    Its name depends on the sources, their folder (as numba's cache does), numba's version and the device.
-    """
-    sources = Path(__file__).resolve().parents[2]
+    """Return the path of the file that marks the kernels of these sources as compiled for a device."""
     processor = f"{llvmlite.binding.get_host_cpu_name()} {devices.name_of(device)}"
-    kernels = f"{sources} {digest_up_to('stereo')} {numba.__version__} {processor}"
+    return path_beside_kernels(".ready", digest_up_to("stereo"), numba.__version__, processor)
+
+
+def path_beside_kernels(suffix: str, *parts: str) -> Path:
+    """Return the path of a file beside numba's cache, whose name depends on the folder of the sources, as numba's cache
+    does, and on `parts`."""
+    sources = Path(__file__).resolve().parents[2]
     folder = Path(numba.config.CACHE_DIR or sources / "raster" / "__pycache__")
-    return folder / f"objectgs-{hashlib.sha256(kernels.encode()).hexdigest()[:16]}.ready"
+    return folder / f"objectgs-{hashlib.sha256(' '.join((str(sources), *parts)).encode()).hexdigest()[:16]}{suffix}"

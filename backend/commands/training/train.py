@@ -40,6 +40,7 @@ from ..folder import (
 )
 from ..length import budget_of, expected_of, expected_psnr_of, training_seconds
 from ..planning import build_context, change_objects, choices, find_requested_objects, report_plan, settings
+from ..setup.device import choose_device
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import finish_stage
@@ -56,7 +57,7 @@ _TIMED_VIEWS = 3
 
 def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Begin, resume or extend a training, and write a checkpoint, previews, splats.ply and anchors.ply."""
-    device = devices.pick(options.device)
+    device = choose_device(options.device, reporter)
     budget = budget_of(options)
     reporter.expect(
         {

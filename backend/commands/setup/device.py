@@ -1,0 +1,117 @@
+"""The device that a command computes on: a GPU only where it computes what the CPU computes.
+
+Before a GPU is used for the first time, and again after a change of its driver, of PyTorch or of the kernels, a process
+of its own tests it (see `self_test`). The outcome is kept beside the compiled kernels.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import json
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import torch
+
+from ...raster import devices
+from ...raster.kernel import digest_up_to
+from ...shared.errors import InputError
+from ...shared.events import Reporter
+from ...shared.formats.json_file import read_json, write_json
+from .kernels import path_beside_kernels
+
+_ROOT = Path(__file__).parents[3]
+_TEST = (sys.executable, "-m", "backend.commands.setup.self_test")
+_LONGEST, _POLLED_EVERY = 900.0, 0.3
+"""Seconds after which the test has failed, as it compiles kernels, too, and between two looks at it."""
+_OUT_OF_MEMORY = re.compile("out.of.memory", re.IGNORECASE)
+
+
+def choose_device(requested: str, reporter: Reporter, again: bool = False) -> torch.device:
+    """Choose the device to compute on, and test it if it is a GPU that was not tested before.
+
+    Args:
+        requested: "cpu", "cuda", or "auto": CUDA if it is available and passes the test, otherwise the CPU.
+        reporter: Receives status and a warning if the GPU fails; its progress is called repeatedly during the test, so
+            that it can stop the command.
+        again: Whether to repeat the test.
+
+    Returns:
+        The torch device.
+
+    Raises:
+        InputError: `requested` is "cuda", and CUDA is not available or fails the test.
+    """
+    device = devices.pick(requested)
+    if device.type == "cpu":
+        return device
+    problem = None if again else _known_problem(device)
+    if problem is None:
+        reporter.status(f"Testing {devices.name_of(device)}, once")
+        problem = _test(reporter)
+        # Other programs may have used the memory. Without a writable folder, the next command tests again, too.
+        if not _OUT_OF_MEMORY.search(problem):
+            with contextlib.suppress(OSError):
+                write_json(_outcome(device), {"problem": problem})
+    if not problem:
+        return device
+    failure = f"{devices.name_of(device)} fails a test ({problem})"
+    if requested == "cuda":
+        raise InputError(f"{failure}; choose --device cpu, or install a newer driver from nvidia.com.")
+    reporter.warning(f"{failure}, so the CPU is used; a newer driver from nvidia.com may help.")
+    return devices.CPU
+
+
+def _known_problem(device: torch.device) -> str | None:
+    """Return the outcome of an earlier test, "" for a GPU that passed; None if there was none."""
+    with contextlib.suppress(InputError, KeyError, TypeError):
+        return str(read_json(_outcome(device))["problem"])
+    return None
+
+
+def _outcome(device: torch.device) -> Path:
+    """Return the path of the outcome, which changes with all that the results depend on."""
+    versions = (torch.__version__, digest_up_to("training"), _driver())
+    return path_beside_kernels(".device.json", *versions, devices.name_of(device))
+
+
+def _driver() -> str:
+    """Return the versions of NVIDIA's driver and of numba-cuda, as far as they can be found out."""
+    found = []
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        found.append(importlib.metadata.version("numba-cuda"))
+    with contextlib.suppress(Exception):  # The package or the driver may be without it.
+        from cuda.core import system
+
+        found.append(str(system.get_kernel_mode_driver_version()))
+    return " ".join(found)
+
+
+def _test(reporter: Reporter) -> str:
+    """Test the GPU in a process of its own, and return its problem, for a sentence; "" if there is none."""
+    with tempfile.TemporaryDirectory(prefix="objectgs-device-", ignore_cleanup_errors=True) as scratch:
+        errors = Path(scratch) / "errors.txt"
+        with errors.open("wb") as stream:
+            process = subprocess.Popen(
+                [*_TEST, str(Path(scratch) / "files")], cwd=_ROOT,
+                stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=stream,
+            )  # fmt: skip
+            try:
+                until = time.monotonic() + _LONGEST
+                while process.poll() is None:
+                    if time.monotonic() > until:
+                        return f"it did not end in {_LONGEST / 60:.0f} minutes"
+                    reporter.progress(0, 1)
+                    time.sleep(_POLLED_EVERY)
+            finally:
+                process.kill()
+                printed, _ = process.communicate()
+        with contextlib.suppress(ValueError, IndexError, KeyError, TypeError):
+            return str(json.loads(printed.splitlines()[-1])["problem"])
+        lines = errors.read_text(errors="replace").strip().splitlines()
+        return lines[-1].strip().rstrip(".") if lines else f"it ended with exit code {process.returncode}"
