@@ -59,6 +59,7 @@ def _docstring_indices(code: CodeType) -> set[int]:
     return {before.arg for before in stores if before.arg is not None}
 
 
+@functools.cache
 def _digest_of_file(path: Path) -> bytes:
     """Return `digest_of_code` of a source file, using Python's cache of compiled files."""
     return digest_of_code(cast(CodeType, SourceFileLoader(path.stem, str(path)).get_code(path.stem)))

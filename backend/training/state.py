@@ -24,10 +24,10 @@ from ..shared.reconstruction.objects import LARGEST_ID
 from .budget import TrainingProgress
 from .exposure.photo_colors import PhotoColors
 from .optimizer.average import Average
+from .optimizer.head_adam import MOMENTS, STEP, HeadAdam, checkpoint_name
 from .settings import HEAD_RATES, MODES, Settings
 
 _GROWTH = ("gradient", "visits", "opacity", "views")
-_HEAD_ADAM = ("step", "exp_avg", "exp_avg_sq")
 
 Expected = dict[str, tuple[type, tuple[int, ...]]]
 """Type and shape of tensors by name."""
@@ -68,7 +68,7 @@ def training_tensors(
     exp_avg_sq: torch.Tensor,
     statistics: GrowthStatistics,
     average: Average,
-    head_optimizer: torch.optim.Optimizer,
+    head_optimizer: HeadAdam,
     colors: PhotoColors | None,
 ) -> dict[str, np.ndarray]:
     """Return all tensors that the next step depends on, by their names in a checkpoint.
@@ -86,11 +86,10 @@ def training_tensors(
         "object_ids": model.classes.ids,
         "background": model.background,
         **average.tensors(),
+        **head_optimizer.tensors(),
         **({} if colors is None else colors.tensors()),
         **{f"heads.{name}": value for name, value in model.heads.state_dict().items()},
     }
-    for i, state in head_optimizer.state_dict()["state"].items():
-        tensors |= {f"head_adam.{i}.{name}": state[name] for name in _HEAD_ADAM}
     return {name: devices.host(value) for name, value in tensors.items()}
 
 
@@ -122,20 +121,6 @@ def require_settings(wanted: Settings, state: dict[str, Any], folder: Path) -> N
 def restore_statistics(tensors: dict[str, np.ndarray], device: torch.device) -> GrowthStatistics:
     """Return the growth statistics in a checkpoint's tensors."""
     return GrowthStatistics(*(restore_tensor(tensors, f"growth.{name}", device) for name in _GROWTH))
-
-
-def restore_head_optimizer(
-    optimizer: torch.optim.Optimizer, tensors: dict[str, np.ndarray], device: torch.device
-) -> None:
-    """Load the state of the heads' optimizer from a checkpoint."""
-    saved = optimizer.state_dict()
-    count = sum(len(group["params"]) for group in saved["param_groups"])
-    saved["state"] = {
-        i: {name: restore_tensor(tensors, f"head_adam.{i}.{name}", device) for name in _HEAD_ADAM}
-        for i in range(count)
-        if f"head_adam.{i}.step" in tensors
-    }
-    optimizer.load_state_dict(saved)
 
 
 def restore_tensor(tensors: dict[str, np.ndarray], name: str, device: torch.device) -> torch.Tensor:
@@ -269,7 +254,7 @@ def _check_tensors(tensors: Mapping[str, np.ndarray], expected: Expected) -> Non
 def _check_head_moments(tensors: Mapping[str, np.ndarray], shapes: Sequence[tuple[int, ...]]) -> None:
     """Check the state of the heads' optimizer; shapes: those of its parameters, in order."""
     for i, shape in enumerate(shapes):
-        if f"head_adam.{i}.step" in tensors:
+        if checkpoint_name(i, STEP) in tensors:
             # A scalar is stored with one dimension.
-            kinds: Expected = {f"head_adam.{i}.{name}": (np.float32, shape) for name in _HEAD_ADAM[1:]}
-            _check_tensors(tensors, {**kinds, f"head_adam.{i}.step": (np.float32, (1,))})
+            kinds: Expected = {checkpoint_name(i, name): (np.float32, shape) for name in MOMENTS}
+            _check_tensors(tensors, {**kinds, checkpoint_name(i, STEP): (np.float32, (1,))})

@@ -27,6 +27,7 @@ from .growth_strategy import GrowthStrategy, ViewStatistics
 from .losses.on_cpu import image_loss, normal_loss, volume_loss
 from .losses.silhouettes import silhouette_loss
 from .optimizer.adam import take_rows
+from .optimizer.head_adam import HeadAdam
 from .overfitting import Dropout
 from .scene import Scene
 from .settings import SURFACE_FROM, Settings, downscale_at
@@ -147,7 +148,7 @@ class ViewStep:
         scene: Scene,
         settings: Settings,
         model: ObjectModel,
-        head_optimizer: torch.optim.Optimizer,
+        head_optimizer: HeadAdam,
         growth: GrowthStrategy,
         check: FiniteCheck,
     ) -> None:
@@ -198,7 +199,7 @@ class ViewStep:
         self.compute(index, 0.0)
         seconds = time.monotonic() - started
         self.colors = colors
-        self._head_optimizer.zero_grad(set_to_none=True)
+        self._head_optimizer.zero_grad()
         return seconds
 
     def compute(
@@ -240,7 +241,7 @@ class ViewStep:
         if self.parts >= MOST_PARTS:
             raise InputError(_NO_ROOM)
         self.parts *= 2
-        self._head_optimizer.zero_grad(set_to_none=True)
+        self._head_optimizer.zero_grad()
         self.scene.forget(shrink=0.5)
         if self.model.device.type == "cuda":
             torch.cuda.empty_cache()
@@ -261,7 +262,7 @@ class ViewStep:
             seen = anchors_in_view(anchors, *frustum(camera))
         if len(seen) == 0:
             return None
-        self._head_optimizer.zero_grad(set_to_none=True)
+        self._head_optimizer.zero_grad()
         rows = take_rows(anchors.rows, seen).requires_grad_()
         correction = None if self.colors is None else self.colors.of(index)
         loss = torch.zeros((), device=rows.device)

@@ -30,13 +30,13 @@ from .growth_strategy import GrowthStrategy
 from .initial_model import DistantPoints, initial_model
 from .optimizer.adam import BETA1, BETA2, step_rows
 from .optimizer.average import Average
+from .optimizer.head_adam import HeadAdam
 from .scene import Scene
 from .settings import HEAD_RATES, Settings, background_is_masked, rate, row_rates
 from .state import (
     model_from_checkpoint,
     read_checkpoint,
     require_settings,
-    restore_head_optimizer,
     restore_statistics,
     restore_tensor,
     training_state,
@@ -70,13 +70,9 @@ class Trainer:
         self._keeps_current = False
         self._average = Average(model)
         model.background.requires_grad_(settings.background == "learned")
-        groups: list[dict[str, Any]] = [
-            {"params": list(getattr(model.heads, name).parameters()), "name": name, "lr": ends[0]}
-            for name, ends in HEAD_RATES.items()
-            if name != "background"
-        ]
-        groups.append({"params": [model.background], "name": "background", "lr": HEAD_RATES["background"][0]})
-        self._head_optimizer = torch.optim.Adam(groups, betas=(BETA1, BETA2), eps=1e-15, fused=True)
+        names = [name for name in HEAD_RATES if name != "background"]
+        heads = {name: list(getattr(model.heads, name).parameters()) for name in names}
+        self._head_optimizer = HeadAdam({**heads, "background": [model.background]})
         self._check = FiniteCheck(model.device)
         self._growth = GrowthStrategy(settings, model)
         self.view_step = ViewStep(scene, settings, model, self._head_optimizer, self._growth, self._check)
@@ -201,7 +197,7 @@ class Trainer:
         trainer._exp_avg = restore_tensor(tensors, "adam.exp_avg", device)
         trainer._exp_avg_sq = restore_tensor(tensors, "adam.exp_avg_sq", device)
         trainer._growth.statistics = restore_statistics(tensors, device)
-        restore_head_optimizer(trainer._head_optimizer, tensors, device)
+        trainer._head_optimizer.restore(tensors)
         trainer._average = Average.from_checkpoint(tensors, trainer.model)
         trainer.view_step.restore(tensors)
         trainer.progress = TrainingProgress(**state["progress"])
@@ -395,18 +391,14 @@ class Trainer:
 
     def _update(self, gradients: ViewGradients, progress: float) -> None:
         step, optimizer = self.progress.step, self._head_optimizer
-        for group in optimizer.param_groups:
-            group["lr"] = rate(HEAD_RATES[group["name"]], progress)
         of_heads = {
-            group["name"]: [parameter.grad.flatten() for parameter in group["params"] if parameter.grad is not None]
-            for group in optimizer.param_groups
+            name: [parameter.grad.flatten() for parameter in group if parameter.grad is not None]
+            for name, group in optimizer.groups.items()
         }
         finite = torch.cat([part for parts in of_heads.values() for part in parts]).isfinite().all()
         if gradients.finite is not None:
             finite = finite & gradients.finite
-        # As in torch's gradient scaler: if set, the optimizer skips the update without synchronization.
-        optimizer.found_inf = (~finite).float()  # type: ignore[attr-defined]
-        optimizer.step()
+        optimizer.step({name: rate(HEAD_RATES[name], progress) for name in optimizer.groups}, (~finite).float())
         assert gradients.rows.grad is not None
         skipped = ~finite + step_rows(
             self.model.anchors.rows, self._exp_avg, self._exp_avg_sq, gradients.seen, gradients.rows.grad,
