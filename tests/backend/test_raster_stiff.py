@@ -614,7 +614,7 @@ def test_screen_gradient_matches_moving_footprint():
 
 
 @pytest.mark.skipif(SIMULATED, reason="tests only the reference")
-@pytest.mark.parametrize(("primitive", "coefficients"), [("3d", 1), ("3d", 4), ("3d", 9), ("3d", 16), ("2d", 4)])
+@pytest.mark.parametrize(("primitive", "coefficients"), [("3d", 1), ("3d", 16), ("2d", 4)])
 @pytest.mark.long
 def test_reference_passes_gradcheck(primitive, coefficients):
     scene = random_scene(2, count=4, coefficients=coefficients, size=0.3)
