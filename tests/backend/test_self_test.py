@@ -2,6 +2,7 @@
 
 import sys
 import time
+from threading import Event
 
 import numpy as np
 import pytest
@@ -15,6 +16,9 @@ from backend.shared.events import Reporter
 from backend.shared.stopping import StoppingReporter, StopRequest
 
 GPU = torch.device("cuda")
+
+wait = Event().wait
+"""As time.sleep, which tests replace."""
 
 
 @pytest.fixture(scope="module")
@@ -154,6 +158,16 @@ def test_the_test_can_be_stopped(with_gpu, tmp_path):
         chosen.choose_device("auto", StoppingReporter(Reporter(), stop))
     assert not list(tmp_path.glob("*.json"))
     assert choose.runs() <= 1
+
+
+def test_an_interrupt_that_also_ends_the_test_is_no_failure_of_it(with_gpu, tmp_path, monkeypatch):
+    with_gpu("raise KeyboardInterrupt")
+    stop = StopRequest()
+    # The test ends in the first sleep, before the stop is noticed.
+    monkeypatch.setattr(chosen.time, "sleep", lambda _: (wait(2.0), setattr(stop, "_stopped", True)))
+    with pytest.raises(Cancelled):
+        chosen.choose_device("auto", StoppingReporter(Reporter(), stop))
+    assert (tmp_path / "runs.txt").exists() and not list(tmp_path.glob("*.json"))
 
 
 def test_without_a_place_for_the_outcome_a_gpu_is_tested_each_time(with_gpu, tmp_path, monkeypatch):
