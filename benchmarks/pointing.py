@@ -149,7 +149,7 @@ def mesh_scores(out: Path) -> dict[str, float | None]:
     for words in (("mesh", out), ("evaluate", out), ("report", out)):
         shared.run_backend(*words)
     report = json.loads((out / "report.json").read_text())
-    return {name: shared.over_objects(report, name) for name in ("f1", "f1_005", "texture_psnr")}
+    return {name: shared.over_objects(report, name) for name in ("f1", "f1_005")}
 
 
 def measured_meshes(folder: Path, photos: Sequence[int], minutes: float, seed: int) -> dict[str, Any]:
@@ -229,17 +229,17 @@ def document(found: Mapping[str, Any]) -> str:
             of = "true masks" if name == "masks" else f"strokes in {name} photo{'s' if name != '1' else ''}"
             cells = [
                 shared.spread([seed[name][key] for seed in meshes], form)
-                for key, form in (("f1", "{:.4f}"), ("f1_005", "{:.3f}"), ("texture_psnr", "{:.1f}"))
+                for key, form in (("f1", "{:.4f}"), ("f1_005", "{:.3f}"))
             ]
             rows.append((of, *cells))
         lines += [
             "",
             "## Meshes",
             "",
-            "The demo's meshes from strokes and from its true masks, compared with the true surface where training "
-            "views see it. Medians over the objects.",
+            "Made with `--meshes`: the demo's meshes from strokes and from its true masks, compared with the true "
+            "surface where training views see it. Medians over the objects.",
             "",
-            *shared.table(("objects by", "F1 at 2 cm", "F1 at 5 mm", "texture, dB"), rows),
+            *shared.table(("objects by", "F1 at 2 cm", "F1 at 5 mm"), rows),
         ]
     return "\n".join(lines) + "\n"
 
