@@ -222,18 +222,21 @@ def run_command(capsys):
     torch.set_num_threads(threads[1])
 
 
+_NO_DENSE_POINTS = ("backend.commands.capture.sfm._densify", lambda *_: {})
+
+
 @pytest.fixture(scope="module")
 def module_without_dense_points():
     """Leave out the points on plain surfaces, which `test_sfm` covers, to save time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("backend.commands.capture.sfm._densify", lambda *_: {})
+        patch.setattr(*_NO_DENSE_POINTS)
         yield
 
 
 @pytest.fixture
 def no_dense_points(monkeypatch):
     """As `module_without_dense_points`, for one test."""
-    monkeypatch.setattr("backend.commands.capture.sfm._densify", lambda *_: {})
+    monkeypatch.setattr(*_NO_DENSE_POINTS)
 
 
 @pytest.fixture
