@@ -109,8 +109,9 @@ to correct the result. FILE is JSON:
 Points are fractions of the undistorted photo's width and height, from its top left
 corner. With "area": true, the line encloses an area. Instead of "view", a "camera" may
 have "viewmat" (4 x 4, world to camera), "intrinsics" (fx, fy, cx, cy), "width" and
-"height". Object 0 is what belongs to no object, like all that is far from the strokes,
-unless the file has "everything": true.
+"height". A "part" of 1 or more finds the strokes' part of the object as if it were an
+object of its own; Blender merges marked objects so. Object 0 is what belongs to no
+object, like all that is far from the strokes, unless the file has "everything": true.
 
 With --segmenter, each stroke stands for all that SAM, SAM 2.1 or EdgeTAM segments by it,
 so that a few strokes tell more. FOLDER is a checkpoint of the package transformers:

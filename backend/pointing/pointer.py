@@ -17,7 +17,7 @@ from .mask_edges import follow_edges
 from .proposals import find_objects, try_regions
 from .splat_graph import Solution, SplatGraph, Weights, build_graph, contributions
 from .stroke_masks import Segment, stroke_pixels
-from .strokes import Stroke, Strokes, stroke_through
+from .strokes import PARTS, Stroke, Strokes, stroke_through
 from .views import Views
 
 LONGEST = 640
@@ -108,9 +108,10 @@ class Pointer:
             # So that each stroke counts as much, however long it is; and each mask as much as it covers, since a splat
             # across the border of two masks belongs to the one that shows more of it.
             weight = shown.area / np.mean(areas) if shown.area else 1.0
-            seeds[stroke.object] = seeds.get(stroke.object, 0.0) + weight * shown.splats / shown.splats.sum()
+            label = _label(stroke)
+            seeds[label] = seeds.get(label, 0.0) + weight * shown.splats / shown.splats.sum()
         self._latest = self._graph.solve(seeds, strokes.everything, self._latest)
-        return self._latest.ids
+        return self._latest.ids // PARTS
 
     def propose(self, detail: float, progress: Callable[[int, int], object]) -> Strokes:
         """Find the objects without strokes, and return strokes that mark them, in up to three photos each.
@@ -240,3 +241,8 @@ class Pointer:
             np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]),
             max(round(factor * view.width), 1), max(round(factor * view.height), 1),
         )  # fmt: skip
+
+
+def _label(stroke: Stroke) -> int:
+    """Return the label of the part of an object that a stroke is on; 0 for what belongs to none."""
+    return PARTS * stroke.object + (stroke.part if stroke.object else 0)

@@ -177,8 +177,8 @@ class SplatGraph:
         """Find the object of each splat.
 
         Args:
-            seeds: for each object, the (N,) contributions of the splats to its strokes, as from `contributions`; those
-                of 0 belong to no object.
+            seeds: for each object or part of one, by ID, the (N,) contributions of the splats to its strokes, as from
+                `contributions`; those of 0 belong to no object.
             everything: whether every splat belongs to an object; otherwise, splats far from the strokes have none.
             before: an earlier solution for similar strokes, from which this one begins.
         """

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -14,6 +14,9 @@ from scipy.ndimage import distance_transform_edt
 from ..shared.errors import InputError
 from ..shared.formats.json_file import read_json
 from ..shared.reconstruction.objects import LARGEST_ID
+
+PARTS = 2**16
+"""Largest number of parts of an object."""
 
 _LARGEST = 16384
 """Largest width and height of a viewpoint's image in pixels."""
@@ -45,12 +48,14 @@ class Stroke:
         points: the corners (x, y) of the stroke, as fractions of the undistorted photo's width and height from its top
             left corner; one point is a click.
         area: whether everything inside of the line is meant, which is closed then.
+        part: number of the object's part that it is on. Parts were objects once, and merging these left each as it was.
     """
 
     object: int
     view: str | Viewpoint
     points: tuple[tuple[float, float], ...]
     area: bool = False
+    part: int = 0
 
     def pixels(self, width: int, height: int) -> np.ndarray:
         """Return the pixels that the stroke covers in an image of this size, (height, width) bool."""
@@ -119,8 +124,8 @@ def read_strokes(path: Path, views: Sequence[str]) -> Strokes:
 
     The file is a JSON object. `strokes` is a list of objects with `object` (an ID), `points` (a list of [x, y],
     fractions of the image's width and height) and either `view` (the name of a photo, undistorted) or `camera` (with
-    `viewmat` (4, 4), `intrinsics` fx, fy, cx and cy, `width` and `height`); `area` may be true. `objects` may name the
-    IDs, and `everything` may be true.
+    `viewmat` (4, 4), `intrinsics` fx, fy, cx and cy, `width` and `height`); `area` may be true, and `part` the
+    number of a part of the object. `objects` may name the IDs, and `everything` may be true.
 
     Args:
         path: the file.
@@ -155,8 +160,11 @@ def _stroke(entry: Any, where: str, views: set[str]) -> Stroke:
     if not isinstance(entry, Mapping):
         raise InputError(f"{where} is no JSON object; it needs `object`, `points`, and `view` or `camera`.")
     object_id, points, area = entry.get("object"), entry.get("points"), entry.get("area", False)
-    if not isinstance(object_id, int) or isinstance(object_id, bool) or not 0 <= object_id <= LARGEST_ID:
+    part = entry.get("part", 0)
+    if not _is_number(object_id, LARGEST_ID):
         raise InputError(f"{where} has the object {object_id!r}; an ID is a whole number from 0 to {LARGEST_ID}.")
+    if not _is_number(part, PARTS - 1):
+        raise InputError(f"{where} has the part {part!r}; it must be a whole number from 0 to {PARTS - 1}.")
     if not isinstance(points, list) or not points or not all(map(_is_point, points)):
         raise InputError(f"{where} needs `points`, a list of [x, y] with fractions from 0 to 1 of the image's size.")
     if not isinstance(area, bool):
@@ -166,7 +174,7 @@ def _stroke(entry: Any, where: str, views: set[str]) -> Stroke:
         raise InputError(f"{where} is on the photo {seen_from!r}, which the capture lacks; name one of its photos.")
     if not isinstance(seen_from, str | Viewpoint):
         raise InputError(f"{where} needs `view`, the name of a photo, or `camera`.")
-    return Stroke(object_id, seen_from, tuple((float(x), float(y)) for x, y in points), area)
+    return Stroke(object_id, seen_from, tuple((float(x), float(y)) for x, y in points), area, part)
 
 
 def _viewpoint(camera: Any, where: str) -> Viewpoint:
@@ -191,6 +199,10 @@ def _viewpoint(camera: Any, where: str) -> Viewpoint:
         )
     fx, fy, cx, cy = intrinsics.tolist()
     return Viewpoint(tuple(map(tuple, viewmat.tolist())), (fx, fy, cx, cy), width, height)
+
+
+def _is_number(value: Any, largest: int) -> TypeGuard[int]:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= largest
 
 
 def _is_point(point: Any) -> bool:

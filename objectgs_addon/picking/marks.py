@@ -115,13 +115,21 @@ def _place_of(stroke: dict[str, Any]) -> dict[str, Any]:
 
 
 def merge_object(root: bpy.types.Collection, index: int, into: int) -> None:
-    """Make an object of the list a part of another one; index, into: their rows."""
+    """Make an object of the list a part of another one, which gets what both are now; index, into: their rows."""
     properties = root.objectgs
     object_id, other = properties.marked[index].object_id, properties.marked[into].object_id
-    strokes = [{**stroke, "object": other} if stroke["object"] == object_id else stroke for stroke in strokes_of(root)]
+    first = 1 + max((_part_of(stroke) for stroke in strokes_of(root) if stroke["object"] == other), default=0)
+    strokes = [
+        {**stroke, "object": other, "part": first + _part_of(stroke)} if stroke["object"] == object_id else stroke
+        for stroke in strokes_of(root)
+    ]
     properties.marked.remove(index)
     properties.active_marked = into - (index < into)
     _store(root, strokes)
+
+
+def _part_of(stroke: dict[str, Any]) -> int:
+    return int(stroke.get("part", 0))
 
 
 def remove_object(root: bpy.types.Collection, index: int) -> None:

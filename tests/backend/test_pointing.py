@@ -76,6 +76,7 @@ def test_strokes_are_read_with_names(tmp_path) -> None:
         ({"strokes": [{**ONE, "object": -1}]}, "Stroke 1"),
         ({"strokes": [{**ONE, "object": True}]}, "Stroke 1"),
         ({"strokes": [ONE, {**ONE, "object": 2**32}]}, "Stroke 2"),
+        ({"strokes": [{**ONE, "part": -1}]}, "the part -1"),
         ({"strokes": [{**ONE, "view": "b.png"}]}, "b.png"),
         ({"strokes": [{**ONE, "view": ["a.png"]}]}, "Stroke 1"),
         ({"strokes": [{**ONE, "points": []}]}, "points"),
@@ -643,6 +644,24 @@ def test_masks_of_strokes_separate_better_than_strokes(unlabeled) -> None:
     assert np.array_equal(stand_in.pictures[scene.names[1]], photo)
     _, points, labels = stand_in.prompts[0]
     assert labels.tolist() == [1, 0, 0] and len(points) == 3, "strokes on others in the view are not on it"
+
+
+def test_merged_objects_are_what_they_were(unlabeled) -> None:
+    """Three clicks on one ball: merging two of these objects, which have its color, leaves the third as it is."""
+    scene, out = unlabeled
+    model, _, _ = load_model(out / "checkpoint")
+    capture = load_capture(scene.folder, out / "cache")
+    places = np.argwhere(scene.ids[0] == 1)[:, ::-1] + 0.5
+    near = [places[(places * way).sum(1).argmax()] for way in ((-1, 0), (1, -1), (1, 1))]
+    points = [((0.6 * place + 0.4 * places.mean(0)) / (96, 72)).tolist() for place in near]
+    separate = [{"object": number, "view": scene.names[0], "points": [point]} for number, point in enumerate(points, 1)]
+    merged = [{**stroke, "object": 1, "part": 1} if stroke["object"] == 2 else stroke for stroke in separate]
+    found = [
+        pointer_of(capture, model, None).solve(strokes_of({"strokes": strokes}, "the test", scene.names))
+        for strokes in (separate, merged)
+    ]
+    assert set(found[0].tolist()) >= {1, 2, 3}
+    assert np.array_equal(found[1], np.where(found[0] == 2, 1, found[0]))
 
 
 def middle_of(mask):

@@ -309,6 +309,9 @@ def test_proposed_objects_replace_the_marked_ones_and_can_be_merged(root, sessio
     assert [item.object_id for item in root.objectgs.marked] == [3, 4]
     assert [each["object"] for each in marks.strokes_of(root)] == [4, 3, 3, 4]
     assert marks.active_object(root).object_id == 4
+    bpy.ops.objectgs.merge_marked(into="0")
+    parts = [(each["object"], each.get("part", 0)) for each in marks.strokes_of(root)]
+    assert parts == [(3, 2), (3, 0), (3, 0), (3, 1)], "what was an object stays a part of its own"
 
 
 def test_invalid_proposals_end_the_process_with_a_sentence(root, session):
