@@ -42,6 +42,18 @@ def no_clusters(count: int) -> Clusters:
     return Clusters(np.array([0, count, 2 * count, 2 * count + 1]), parent, np.append(np.arange(count + 1), 2 * count))
 
 
+class Coarse(NamedTuple):
+    """The clusters of the lowest level as the nodes of a graph.
+
+    Attributes:
+        weights: (m, m) sums of the weights between the clusters.
+        clusters: the higher levels, as clusters of them.
+    """
+
+    weights: sparse.csr_array
+    clusters: Clusters
+
+
 def nested_clusters(weights: sparse.csr_array) -> tuple[np.ndarray, Clusters]:
     """Find the clusters of a graph.
 
@@ -72,6 +84,26 @@ def nested_clusters(weights: sparse.csr_array) -> tuple[np.ndarray, Clusters]:
     parent = np.concatenate([part + first for part, first in zip(reversed(parents), levels[1:], strict=False)])
     starts = np.searchsorted(parent, np.arange(levels[1], levels[-1] + 1))
     return order, Clusters(levels, parent.astype(np.int32), starts)
+
+
+def between_clusters(weights: sparse.csr_array, clusters: Clusters) -> Coarse | None:
+    """Return the graph of the lowest level's clusters, or None if there are less than three levels.
+
+    Args:
+        weights: (n, n), symmetric, >= 0.
+        clusters: clusters of its nodes.
+    """
+    levels, parent, starts = clusters
+    if len(levels) < 5:
+        return None
+    n, count = levels[1], levels[2] - levels[1]
+    edges, cluster = weights.tocoo(), parent[:n] - n
+    ends = cluster[edges.row], cluster[edges.col]
+    outside = ends[0] != ends[1]
+    between = sparse.coo_array(
+        (edges.data[outside], (ends[0][outside], ends[1][outside])), shape=(count, count)
+    ).tocsr()
+    return Coarse(between, Clusters(levels[1:] - n, (parent[n:] - n).astype(np.int32), starts[count:] - n))
 
 
 def _paired(weights: sparse.csr_array) -> tuple[np.ndarray, sparse.csr_array]:

@@ -19,9 +19,9 @@ from skimage.color import rgb2lab
 
 from ..raster import Camera, devices, rasterize
 from ..shared.splats.spherical_harmonics import C0
-from .clusters import Clusters, nested_clusters
+from .clusters import Clusters, Coarse, between_clusters, nested_clusters
 from .color_model import ColorModel
-from .random_walker import connected_with, random_walker
+from .random_walker import connected_with, random_walker, rough_walker
 
 if TYPE_CHECKING:
     from ..model.generate import Generated
@@ -104,22 +104,20 @@ class Solution:
 
     Attributes:
         objects: (C,) int64, ascending: the object IDs that were to be found, and 0.
-        rough: (n, C) float32, probabilities of the nodes of the graph by the colors of the strokes.
-        probabilities: (n, C) float32, those by the colors of what was found with the strokes' colors.
+        probabilities: (n, C) float32, probabilities of the nodes of the graph.
         ids: (N,) int64, the object ID of each splat.
     """
 
     objects: np.ndarray
-    rough: np.ndarray
     probabilities: np.ndarray
     ids: np.ndarray
 
-    def among(self, objects: np.ndarray) -> Solution:
-        """Return the solution with the columns of other objects (C,); those of objects that it lacks are 0."""
+    def among(self, objects: np.ndarray) -> np.ndarray:
+        """Return the probabilities (n, C) of other objects (C,); those of objects that it lacks are 0."""
         _, now, then = np.intersect1d(objects, self.objects, return_indices=True)
-        columns = np.zeros((2, len(self.rough), len(objects)), np.float32)
-        columns[0][:, now], columns[1][:, now] = self.rough[:, then], self.probabilities[:, then]
-        return Solution(objects, columns[0], columns[1], self.ids)
+        columns = np.zeros((len(self.probabilities), len(objects)), np.float32)
+        columns[:, now] = self.probabilities[:, then]
+        return columns
 
 
 @dataclass(frozen=True)
@@ -173,6 +171,11 @@ class SplatGraph:
         """The colors of the nodes, to be counted."""
         return ColorModel(self.lab)
 
+    @functools.cached_property
+    def coarse(self) -> Coarse | None:
+        """The graph of the clusters, if there are many."""
+        return between_clusters(self.weights, self.clusters)
+
     def solve(self, seeds: dict[int, np.ndarray], everything: bool = False, before: Solution | None = None) -> Solution:
         """Find the object of each splat.
 
@@ -188,18 +191,19 @@ class SplatGraph:
         marked, outside = len(seeds), np.zeros((len(self.nodes), len(objects)))
         if not everything:
             outside[:, 0] = NOTHING * marked**0.25 * np.asarray(self.weights.sum(axis=1)).ravel()
-        start = None if before is None else before.among(objects)
         prior = STROKES * marked * self.colors.likeness(labels, len(objects)) + outside
-        rough = self._walk(labels, prior, 1.0, None if start is None else start.rough)
+        if self.coarse is None:
+            rough = self._walk(labels, prior, 1.0)
+        else:
+            rough = rough_walker(self.weights, labels, prior, self.clusters, self.coarse)
         found = rough.argmax(1)
         # As in GrabCut, what was found tells more about an object's colors than strokes do.
         known = np.where((rough.max(1) > CERTAIN) & ~self._loose(found, labels, everything), found, -1)
         prior = FOUND * marked * self.colors.likeness(known, len(objects)) + outside
-        again = rough if start is None else start.probabilities
-        probabilities = self._walk(labels, prior, 1.0, again)
+        probabilities = self._walk(labels, prior, 1.0, rough if before is None else before.among(objects))
         found = self._joined(probabilities.argmax(1), labels, everything)
         ids = objects[found][self.nearest]
-        return Solution(objects, rough, probabilities, ids if everything else np.where(self.is_alone, 0, ids))
+        return Solution(objects, probabilities, ids if everything else np.where(self.is_alone, 0, ids))
 
     def settle(self, objects: np.ndarray, votes: np.ndarray) -> np.ndarray:
         """Find the object of each splat by votes that may be wrong.

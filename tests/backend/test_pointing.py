@@ -24,12 +24,12 @@ from backend.export.ply import read_splats
 from backend.model.checkpoint import save_checkpoint
 from backend.model.draw import draw
 from backend.model.object_model import Normalization
-from backend.pointing.clusters import FEW, Clusters, nested_clusters, no_clusters
+from backend.pointing.clusters import FEW, Clusters, between_clusters, nested_clusters, no_clusters
 from backend.pointing.color_model import SPREAD, ColorModel
 from backend.pointing.mask_edges import follow_edges
 from backend.pointing.pointer import Pointer
 from backend.pointing.proposals import find_objects, try_regions
-from backend.pointing.random_walker import connected_with, random_walker
+from backend.pointing.random_walker import connected_with, random_walker, rough_walker
 from backend.pointing.splat_graph import OF_SPLATS, Edges, SplatGraph, contributions
 from backend.pointing.stroke_masks import points_on, stroke_pixels
 from backend.pointing.strokes import Stroke, Strokes, Viewpoint, read_strokes, strokes_of
@@ -181,6 +181,28 @@ def test_walker_with_clusters_solves_the_same_equations_in_fewer_steps(strength,
         errors.append(np.abs(found[free] - exact).max())
         assert not found[order >= count].any(), "nothing reaches what is not connected"
     assert errors[0] < 2e-3 and errors[0] < 0.1 * errors[1], errors
+
+
+def test_rough_walker_solves_the_equations_of_clusters(monkeypatch) -> None:
+    """Those in which all nodes of a cluster have the same probabilities."""
+    rng = np.random.default_rng(1)
+    order, nested = nested_clusters(random_graph(30_000))
+    weights, count = random_graph(30_000)[order][:, order], len(order)
+    seeds = np.full(count, -1)
+    seeds[rng.choice(count, 60, replace=False)] = np.arange(60) % 3
+    prior = 1e-3 * rng.uniform(size=(count, 3))
+    free = seeds < 0
+    laplacian = sparse.diags_array(weights.sum(axis=1) + prior.sum(1)) - weights
+    right = prior[free] + weights[free][:, ~free] @ np.eye(3)[seeds[~free]]
+    member = sparse.coo_array((np.ones(count), (np.arange(count), nested.parent[:count] - count))).tocsr()[free]
+    small = (member.T @ laplacian.tocsr()[free][:, free] @ member).tocsc()
+    exact = member @ sparse.linalg.spsolve(small, member.T @ right)
+    monkeypatch.setattr("backend.pointing.random_walker.TOLERANCE", 1e-5)
+    coarse = between_clusters(weights, nested)
+    assert coarse is not None and between_clusters(weights, no_clusters(count)) is None
+    found = rough_walker(weights, seeds, prior, nested, coarse)
+    assert np.abs(found[free] - exact).max() < 1e-3
+    assert (found[~free] == np.eye(3)[seeds[~free]]).all()
 
 
 @pytest.fixture
@@ -415,7 +437,7 @@ def test_far_splats_belong_to_nothing_unless_everything_is_an_object() -> None:
     assert again.ids.tolist() == [7, 7, 7, 8, 8, 8, 9, 9, 9]
 
 
-def test_colors_of_what_was_found_decide_where_strokes_do_not() -> None:
+def test_colors_of_what_was_found_decide_where_strokes_do_not(monkeypatch) -> None:
     """A chain whose third part has weaker edges to the first, but its color, which the stroke on the first lacks."""
     none, flat = np.zeros(0), np.zeros((12, 3))
     colors = np.repeat([[20.0, 0, 0], [60.0, 0, 0], [90.0, 0, 0]], [1, 8, 3], axis=0)
@@ -424,9 +446,10 @@ def test_colors_of_what_was_found_decide_where_strokes_do_not() -> None:
         *clustered_chain([1, 1, 1, 1, 1, 3e-4, 1, 1, 1e-3, 1, 1]),
         Edges(none, none, none, none, none), flat, np.ones(12), flat,
     )  # fmt: skip
-    found = graph.solve({7: np.eye(12)[0], 8: np.eye(12)[11]}, everything=True)
-    assert found.objects[found.rough.argmax(1)].tolist() == [7] * 6 + [8] * 6
-    assert found.ids.tolist() == [7] * 9 + [8] * 3
+    seeds = {7: np.eye(12)[0], 8: np.eye(12)[11]}
+    assert graph.solve(seeds, everything=True).ids.tolist() == [7] * 9 + [8] * 3
+    monkeypatch.setattr("backend.pointing.splat_graph.FOUND", 0.0)
+    assert graph.solve(seeds, everything=True).ids.tolist() == [7] * 6 + [8] * 6
 
 
 def test_likeness_is_the_part_of_a_label_that_has_a_color() -> None:
