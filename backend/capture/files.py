@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from PIL import ExifTags
 from PIL import Image as PilImage
 
 from ..shared.class_table import LARGEST_ID
@@ -27,6 +28,9 @@ LOSSY_SUFFIXES = (".jpg", ".jpeg")
 _MASK_WORDS = ("mask", "seg", "id")
 """Words that the names of masks may have before or after that of the photo, as in `photo_mask.png`."""
 _ASPECT_TOLERANCE = 0.01
+# Photos of phones have up to 200 million pixels; Pillow refuses images of more than twice this number.
+PilImage.MAX_IMAGE_PIXELS = 200_000_000
+
 _OPENING_ERRORS = (OSError, ValueError, SyntaxError, EOFError, MemoryError, PilImage.DecompressionBombError)
 
 
@@ -124,9 +128,21 @@ def _opened(path: Path) -> PilImage.Image:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", PilImage.DecompressionBombWarning)
-            return PilImage.open(require_regular(path))
+            image = PilImage.open(require_regular(path))
+            if image.format == "TIFF":
+                _ignore_orientation(image)
+            return image
     except _OPENING_ERRORS as error:
         raise _unreadable(path, error) from error
+
+
+def _ignore_orientation(image: Any) -> None:
+    """Keep the pixels of a TIFF as they are stored; Pillow would turn them, unlike those of other formats."""
+    exif = image.getexif()
+    if exif.get(ExifTags.Base.Orientation, 1) != 1:
+        del exif[ExifTags.Base.Orientation]
+        image.tag_v2.pop(ExifTags.Base.Orientation, None)
+        image._size = image._tile_size
 
 
 def _unreadable(path: Path, error: BaseException) -> InputError:

@@ -32,6 +32,7 @@ def load_capture(
     memory_mb: float = 2000,
     max_size: int = MAX_SIZE,
     reporter: Reporter | None = None,
+    photos_only: bool = False,
 ) -> Capture:
     """Load a capture.
 
@@ -47,6 +48,7 @@ def load_capture(
         memory_mb: Memory limit for decoded images, in megabytes.
         max_size: Largest longer side of the views, in pixels; 0 for no limit.
         reporter: Receives status, progress and warnings.
+        photos_only: Whether masks, names of objects and held-out views do not count, and may be wrong.
 
     Returns:
         The capture; its images and masks are decoded on demand.
@@ -56,7 +58,7 @@ def load_capture(
     """
     reporter = reporter or Reporter()
     folder, cache = Path(folder), None if cache is None else Path(cache) / "views"
-    survey = survey_capture(folder, max_size, refuse, reporter)
+    survey = survey_capture(folder, max_size, refuse, reporter, photos_only)
     if cache is None:
         reporter.status("Reading the masks")
     else:

@@ -89,7 +89,9 @@ def refuse(sentence: str) -> NoReturn:
     raise InputError(sentence)
 
 
-def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Reporter) -> Survey:
+def survey_capture(
+    folder: Path, max_size: int, problem: Problem, reporter: Reporter, photos_only: bool = False
+) -> Survey:
     """List the contents of a capture.
 
     Args:
@@ -97,6 +99,7 @@ def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Repo
         max_size: Largest longer side of the views, in pixels; 0 for no limit.
         problem: Called with each problem that makes the capture unusable; may raise or collect it.
         reporter: Receives the status.
+        photos_only: Whether masks, names of objects and held-out views do not count.
 
     Returns:
         The survey; if `problem` only collects, the survey of the usable parts.
@@ -111,7 +114,7 @@ def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Repo
     model = read_capture_model(folder)
     warnings = list(model.warnings)
     no_names: dict[int, str] = {}
-    names = _tolerate(problem, lambda: read_names(folder), no_names)
+    names = no_names if photos_only else _tolerate(problem, lambda: read_names(folder), no_names)
 
     targets: dict[int, Pinhole | None] = {}
     for camera_id in sorted({image.camera_id for image in model.images}):
@@ -127,7 +130,7 @@ def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Repo
     elif not images_folder.is_dir():
         raise InputError(f"{images_folder} does not exist; put the images that the COLMAP model names there.")
     files = Files(images_folder, without=(masks_folder.name,) if images_folder == folder else ())
-    masks = Files(masks_folder) if masks_folder.is_dir() else None
+    masks = Files(masks_folder) if masks_folder.is_dir() and not photos_only else None
     total, absent = len(model.images) + len(model.absent), list(model.absent)
     sources, unmasked = [], []
     for image in sorted(model.images, key=lambda image: image.name):
@@ -176,7 +179,7 @@ def survey_capture(folder: Path, max_size: int, problem: Problem, reporter: Repo
             )
         elif not (masks_folder / STROKES).is_file():
             warnings.append(f"{len(unmasked)} of {present} images have no mask, for instance {first} is missing.")
-    held_out = _tolerate(problem, partial(_held_out, folder, model, sources), None)
+    held_out = None if photos_only else _tolerate(problem, partial(_held_out, folder, model, sources), None)
     if held_out is None and present < MIN_VIEWS_TO_HOLD_OUT:
         warnings.append(f"Only {present} images can be used, so none is held out and quality cannot be measured.")
     centers = np.array([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in model.images])

@@ -153,6 +153,8 @@ def _draw_errors(axes, figures: Mapping[str, PhotoFigures], weak: Sequence[str])
     for name in list(weak)[:_NAMED]:
         if name in numbers:
             at = numbers[name]
-            axes.annotate(name, (at, values[at]), rotation=30, fontsize=7, ha="left", va="bottom", color=_WEAK)
+            axes.annotate(
+                name, (at, values[at]), rotation=30, fontsize=7, ha="left", va="bottom", color=_WEAK, parse_math=False
+            )
     axes.set(xlabel="photo, by name", ylabel="pixels")
     axes.set_title("Median reprojection error of each photo; weak ones in orange")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 
@@ -27,10 +27,16 @@ _MOST_IMAGES = 2**31 - 1
 """COLMAP's pair ID is this times the smaller image ID, plus the larger one."""
 
 
+def _uri(path: PurePath) -> str:
+    """Return the URI of an absolute path; SQLite refuses the usual form for shared folders of other computers."""
+    uri = path.as_uri()
+    return uri if uri.startswith("file:///") else uri.replace("file://", "file:////", 1)
+
+
 @contextmanager
 def _reading(path: Path) -> Iterator[sqlite3.Connection]:
     try:
-        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=30.0)) as connection:
+        with closing(sqlite3.connect(f"{_uri(path.resolve())}?mode=ro", uri=True, timeout=30.0)) as connection:
             yield connection
     except sqlite3.Error as error:
         raise InputError(
@@ -42,6 +48,12 @@ def name_of(on_objects: bool, network: str = "") -> str:
     """Return the name of a database: of features on objects alone, or everywhere; of a network's by its fingerprint."""
     name = ON_OBJECTS if on_objects else NAME
     return f"learned-{network}-{name}" if network else name
+
+
+def remove_all(work: Path) -> None:
+    """Remove all databases of a capture's folder sfm/, since what they hold is of other photos or cameras."""
+    for path in work.glob("*.db*"):
+        path.unlink(missing_ok=True)
 
 
 def write_pairs(path: Path, pairs: Iterable[tuple[str, str]]) -> None:

@@ -193,7 +193,9 @@ def reasons(path: Path, names: Sequence[str], posed: Iterable[str], wrong: Itera
             continue
         if name in is_wrong:
             found[name] = "its matches contradict each other"
-        elif identity is None or features.get(identity, 0) < FEWEST_FEATURES:
+        elif identity is None:
+            found[name] = "COLMAP cannot read it with the camera of the others; save it as JPEG, or use a camera each"
+        elif features.get(identity, 0) < FEWEST_FEATURES:
             found[name] = "it shows too few details, as when it is blurred or plain"
         elif not partners.get(identity):
             found[name] = "it shows nothing that another photo shows"

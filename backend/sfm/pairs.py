@@ -41,6 +41,7 @@ def choose_pairs(
     if len(names) <= ALL_UP_TO:
         return None
     ids = database.image_ids(path)
+    names = [name for name in names if name in ids]
     features = [_unit(database.largest_features(path, ids[name], FEATURES)) for name in names]
     alike = np.zeros((len(names), len(names)), np.int32)
     for first in range(len(names)):

@@ -16,6 +16,7 @@ from ..shared.stopping import StoppingReporter
 _ROOT = Path(__file__).resolve().parents[2]
 _POLLED_EVERY = 0.3
 _KILLED = (-9, 137)
+_STOPPED = "Stopped; features and matches are kept. Run the same command again to continue."
 
 
 def run_stage(
@@ -47,7 +48,7 @@ def run_stage(
     with log.open("ab") as errors:
         process = subprocess.Popen(
             [sys.executable, "-m", "backend.sfm.worker", *arguments],
-            cwd=_ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors,
+            cwd=_ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors,
         )  # fmt: skip
         reading = threading.Thread(target=read, args=(process.stdout,), daemon=True)
         reading.start()
@@ -65,6 +66,10 @@ def run_stage(
         finally:
             process.wait()
             reading.join()
+            assert process.stdin is not None
+            process.stdin.close()
+    if process.returncode and reporter.stop():
+        raise Cancelled(_STOPPED)  # An interrupt from the keyboard has reached the process first.
     if process.returncode in _KILLED:
         raise InputError(
             f"The system ended the stage {arguments[0]}, as happens when memory runs out; close other programs, or use "
@@ -77,7 +82,7 @@ def _wait_while_paused(process: subprocess.Popen, reporter: StoppingReporter) ->
     """Suspend the process while the user has paused; raises Cancelled if the user has stopped it."""
     if not reporter.stop.paused:
         if reporter.stop():
-            raise Cancelled("Stopped; features and matches are kept. Run the same command again to continue.")
+            raise Cancelled(_STOPPED)
         return
     child = psutil.Process(process.pid)
     child.suspend()

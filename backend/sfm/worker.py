@@ -13,13 +13,15 @@ Each group is {"names": [...], "camera": null or {"model": ..., "params": [...]}
 are calibrated are kept.
 
 Photos and pairs whose results are in the database are skipped. Each line on standard output is one more photo with a
-pose.
+pose. The process ends when its standard input is closed.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -334,6 +336,21 @@ STAGES: dict[str, Callable[..., None]] = {
     "refine": refine,
 }
 
-if __name__ == "__main__":
+
+def _end_with_parent() -> None:
+    """End this process when the one that began it is gone, so that the next one does not find the database in use."""
+    # Without Python's buffer, whose lock would be held when the process ends by itself.
+    while os.read(0, 1):
+        pass
+    os._exit(1)
+
+
+def main(name: str, *arguments: str) -> None:
+    """Run a stage."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     pycolmap.logging.minloglevel = _ERRORS
-    STAGES[sys.argv[1]](*sys.argv[2:])
+    STAGES[name](*arguments)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

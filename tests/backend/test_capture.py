@@ -16,7 +16,7 @@ from PIL import Image
 from backend.capture import check_capture, load_capture
 from backend.capture.capture import HOLDOUT_EVERY
 from backend.capture.colmap import CAMERA_MODELS, Camera, read_model
-from backend.capture.files import mask_names, read_mask
+from backend.capture.files import image_size, mask_names, read_image, read_mask
 from backend.capture.undistort import distort, pinhole_for, source_pixels, to_pycolmap
 from backend.commands.folder import digest
 from backend.shared.errors import InputError
@@ -197,6 +197,17 @@ def test_digest_depends_on_held_out_views(write_capture, tmp_path):
             (scene.folder / "test.txt").write_text(content)
         found[name] = digest(load_capture(scene.folder, tmp_path / "cache"))
     assert found["default"] == found["same"] and len(set(found.values())) == 3
+
+
+@pytest.mark.parametrize("compression", ["raw", "tiff_lzw"])
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+def test_pixels_of_tiffs_are_taken_as_stored(tmp_path, orientation, compression):
+    """As COLMAP takes them, whatever their orientation tags say."""
+    pixels = np.random.default_rng(0).integers(0, 256, (20, 30, 3)).astype(np.uint8)
+    path = tmp_path / "a.tif"
+    Image.fromarray(pixels).save(path, compression=compression, tiffinfo={274: orientation})
+    assert image_size(path) == (30, 20)
+    assert np.array_equal(np.asarray(read_image(path)), pixels)
 
 
 def test_image_cache_limits_memory_across_threads(write_capture, tmp_path):

@@ -3,17 +3,22 @@
 import json
 import shutil
 import sqlite3
+import subprocess
+import sys
 import threading
 from contextlib import closing
+from pathlib import PureWindowsPath
 
 import numpy as np
 import pycolmap
 import pytest
 from PIL import Image, ImageFilter
 
+from backend.capture import load_capture
 from backend.cli import main as command_line
+from backend.commands.capture import sfm as sfm_command
 from backend.sfm import agreement, check, database, pairs, stages, worker
-from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE
+from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, InputError
 from backend.shared.formats import photos_source
 
 from .rendered_photos import HEIGHT, VIEWS, WIDTH, photo, pose, pose_errors, ring, write_photos
@@ -77,24 +82,28 @@ def test_points_of_patches_lie_on_the_surfaces(made):
 
 
 def test_wrong_matches_do_not_move_poses(made, tmp_path):
-    rng = np.random.default_rng(1)
-    model = pycolmap.Reconstruction(made / "sparse" / "0")
-    for number in model.reg_image_ids():
-        for point in model.image(number).points2D:
-            if point.has_point3D() and rng.random() < 0.15:
-                point.xy = np.array(point.xy) + rng.choice([-1, 1], 2) * rng.uniform(1.0, 4.0, 2)
-    plain = pycolmap.Reconstruction(model)
+    """On average over several sets of wrong matches, since one may happen to move few poses."""
     options = pycolmap.BundleAdjustmentOptions()
     options.ceres.use_gpu = options.print_summary = options.refine_principal_point = False
-    pycolmap.bundle_adjustment(plain, options)
-    worker.adjust(model)
-    worker.remove_outliers(model)
     errors = []
-    for number, each in enumerate((plain, model)):
-        (tmp_path / str(number) / "sparse" / "0").mkdir(parents=True)
-        each.write(tmp_path / str(number) / "sparse" / "0")
-        errors.append(np.median(pose_errors(tmp_path / str(number), ring())[0]))
-    assert errors[1] < 0.15 and errors[0] > 2 * errors[1]
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        model = pycolmap.Reconstruction(made / "sparse" / "0")
+        for number in model.reg_image_ids():
+            for point in model.image(number).points2D:
+                if point.has_point3D() and rng.random() < 0.15:
+                    point.xy = np.array(point.xy) + rng.choice([-1, 1], 2) * rng.uniform(1.0, 4.0, 2)
+        plain = pycolmap.Reconstruction(model)
+        pycolmap.bundle_adjustment(plain, options)
+        worker.adjust(model)
+        worker.remove_outliers(model)
+        for each in (plain, model):
+            folder = tmp_path / str(len(errors))
+            (folder / "sparse" / "0").mkdir(parents=True)
+            each.write(folder / "sparse" / "0")
+            errors.append(np.median(pose_errors(folder, ring())[0]))
+    plain, robust = np.mean(errors[::2]), np.mean(errors[1::2])
+    assert robust < 0.15 and plain > 3 * robust, (plain, robust)
 
 
 @pytest.mark.long
@@ -396,3 +405,51 @@ def test_pairs_of_photos_with_spaces_in_their_names_are_matched(made, photos, tm
     assert run_command("sfm", photos, "--out", out).code == EXIT_DONE
     assert set(database.image_ids(path)) == posed_photos(out) == {f"photo {i}.png" for i in range(1, VIEWS + 1)}
     assert len(database.verified_pairs(path)) >= VIEWS - 1
+
+
+def test_cameras_are_others_if_photos_share_them_in_another_way():
+    def groups(*names: str, lens=None):
+        return [{"names": list(each), "camera": lens} for each in names]
+
+    def differ(before, now):
+        return sfm_command._have_other_cameras(before, now)
+
+    assert not differ(groups("ab", "c"), groups("ab", "c"))
+    assert not differ(groups("ab", "c"), groups("c", "abd", "e")), "photos may come"
+    assert not differ(groups("ab", "c"), groups("a")), "and go"
+    assert differ(groups("ab", "c"), groups("abc")) and differ(groups("abc"), groups("ab", "c"))
+    known = {"model": "PINHOLE", "params": []}
+    assert differ(groups("ab", lens=known), groups("ab")), "the lens of a calibration is forgotten"
+    assert not differ(groups("ab"), groups("ab", lens=known))
+
+
+def test_databases_in_shared_folders_can_be_named():
+    assert database._uri(PureWindowsPath("C:/a b/d.db")) == "file:///C:/a%20b/d.db"
+    assert database._uri(PureWindowsPath(r"\\server\share\d.db")) == "file:////server/share/d.db", "no authority"
+
+
+def test_stage_ends_with_the_process_that_began_it():
+    """Or the next one would find its database in use."""
+    program = "import time; from backend.sfm import worker; worker.STAGES['wait'] = lambda: time.sleep(60); "
+    process = subprocess.Popen(
+        [sys.executable, "-c", f"{program}print(1, flush=True); worker.main('wait')"],
+        cwd=stages._ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    )  # fmt: skip
+    assert process.stdin is not None and process.stdout is not None
+    assert process.stdout.readline() == b"1\n"
+    with pytest.raises(subprocess.TimeoutExpired):
+        process.wait(1.0)
+    process.stdin.close()
+    assert process.wait(10) == 1
+    process.stdout.close()
+
+
+def test_masks_and_names_that_cannot_be_used_do_not_stop_the_search_for_points(write_capture, tmp_path):
+    scene = write_capture(views=6, size=(48, 36))
+    for path in sorted((scene.folder / "masks").iterdir())[1:]:
+        path.unlink()
+    (scene.folder / "labels.json").write_text("one name a line")
+    (scene.folder / "test.txt").write_text("IMG_1.HEIC")
+    with pytest.raises(InputError):
+        load_capture(scene.folder, tmp_path / "cache")
+    assert not load_capture(scene.folder, tmp_path / "cache", photos_only=True).has_masks

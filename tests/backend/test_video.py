@@ -5,7 +5,7 @@ import json
 import av
 import numpy as np
 import pytest
-from PIL import Image, ImageFilter
+from PIL import Image, ImageCms, ImageFilter
 
 from backend.sfm.sources import motion, photo_files, photos, video
 from backend.shared.color import hdr
@@ -275,6 +275,68 @@ def test_heic_becomes_jpeg_with_its_data(tmp_path):
         assert np.abs(np.asarray(image, float) - pixels).mean() < 4
         assert image.getexif()[0x010F] == "Maker" and image.getexif().get_ifd(0x8769)[0x920A] == pytest.approx(4.25)
     assert "Maker" in photo_files.camera_of(tmp_path / "a.heic", True) and "4.25" in photo_files.camera_of(made, True)
+
+
+def test_heic_of_phones_has_a_profile(tmp_path):
+    """Its EXIF data have parts of their own, and its colors are those of a display."""
+    pixels = heic(tmp_path / "a.heic")
+    with Image.open(tmp_path / "a.heic") as image:
+        profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+        image.save(tmp_path / "b.heic", quality=95, exif=image.info["exif"], icc_profile=profile)
+        image.save(tmp_path / "c.heic", quality=95, exif=image.info["exif"], icc_profile=b"no profile")
+    for name in ("b", "c"):
+        made = photo_files.copy_photo(tmp_path / f"{name}.heic", tmp_path / f"{name}.heic.part", True)
+        with Image.open(made) as image:
+            assert np.abs(np.asarray(image, float) - pixels).mean() < 5 and image.format == "JPEG"
+            assert image.getexif().get_ifd(0x8769)[0x920A] == pytest.approx(4.25)
+
+
+def test_photos_of_another_format_than_their_name_says_are_converted(tmp_path):
+    heic(tmp_path / "a.heic")
+    (tmp_path / "a.heic").rename(tmp_path / "a.jpg")
+    assert not photo_files.is_read_by_colmap(tmp_path / "a.jpg")
+    made = photo_files.copy_photo(tmp_path / "a.jpg", tmp_path / "images" / "a.jpg", False)
+    with Image.open(made) as image:
+        assert made.name == "a.jpg" and image.format == "JPEG"
+    Image.fromarray(texture(2)[:60, :80].astype(np.uint8)).save(tmp_path / "b.webp")
+    (tmp_path / "b.webp").rename(tmp_path / "b.png")
+    made = photo_files.copy_photo(tmp_path / "b.png", tmp_path / "images" / "b.png", False)
+    with Image.open(made) as image:
+        assert image.format == "PNG"
+    (tmp_path / "d.heic").write_bytes(b"damaged")
+    with pytest.raises(InputError, match=r"d\.heic cannot be read"):
+        photo_files.copy_photo(tmp_path / "d.heic", tmp_path / "images" / "d.heic", False)
+
+
+def test_photos_that_changed_are_copied_again(tmp_path):
+    """Their features are forgotten with those of all others."""
+    folder, capture = tmp_path / "trip", tmp_path / "capture"
+    folder.mkdir()
+    (capture / "sfm").mkdir(parents=True)
+    for name in ("a.jpg", "b.jpg"):
+        heic(folder / name)
+    photos.take_photos([folder], capture, None, reporter())
+    (capture / "sfm" / "database.db").write_bytes(b"features")
+    photos.take_photos([folder], capture, None, reporter())
+    assert (capture / "sfm" / "database.db").exists()
+    Image.fromarray(texture(5)[:120, :160].astype(np.uint8)).save(folder / "a.jpg")
+    photos.take_photos([folder], capture, None, reporter())
+    assert not (capture / "sfm" / "database.db").exists()
+    for name in ("a.jpg", "b.jpg"):
+        assert (capture / "images" / name).read_bytes() == (folder / name).read_bytes()
+
+
+def test_videos_of_one_name_have_folders_of_their_own(tmp_path):
+    folder = tmp_path / "trip"
+    folder.mkdir()
+    (tmp_path / "capture" / "sfm").mkdir(parents=True)
+    write_video(folder / "a.mp4", pan(20))
+    write_video(folder / "A.mov", pan(30, 8))
+    (folder / ".thumbnails").mkdir()
+    heic(folder / ".thumbnails" / "1.jpg")
+    taken = photos.take_photos([folder], tmp_path / "capture", 5, reporter())
+    assert {photo.name.split("/")[0] for photo in taken.photos} == {"a.mp4", "A.mov"} and len(taken.photos) == 10
+    assert all((tmp_path / "capture" / "images" / photo.name).is_file() for photo in taken.photos)
 
 
 def test_photos_are_turned_as_exif_says(tmp_path):

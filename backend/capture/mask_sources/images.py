@@ -79,7 +79,8 @@ class MaskFolders:
         by_photo: dict[str, list[tuple[Path, str]]] = {}
         by_object: dict[str, list[tuple[Path, str]]] = {}
         for path in sorted(folder.rglob("*")):
-            if path.suffix.lower() not in (*MASK_SUFFIXES, *LOSSY_SUFFIXES) or path.parent == folder:
+            is_image = path.suffix.lower() in (*MASK_SUFFIXES, *LOSSY_SUFFIXES) and not path.name.startswith(".")
+            if not is_image or path.parent == folder:
                 continue
             within = PurePosixPath(path.relative_to(folder).as_posix())
             if (name := photos.find(within.parent.as_posix())) is not None:

@@ -54,7 +54,11 @@ def find_point_cloud(file: Path, named: str | None, program: str, export: str) -
         if (folder / name).exists():
             return folder / name
     try:
-        found = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+        found = sorted(
+            path
+            for path in folder.iterdir()
+            if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
+        )
     except OSError as error:
         raise InputError(f"{folder} cannot be read ({error.strerror}); check it.") from error
     if len(found) > 1:

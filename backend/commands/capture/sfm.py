@@ -23,10 +23,12 @@ from ...sfm.rig import rigs_of
 from ...sfm.sources.calibration import photos_by_camera, read_calibration
 from ...sfm.sources.photos import IMAGES, Photo, take_photos
 from ...sfm.stages import run_stage
-from ...shared.errors import InputError
+from ...shared.errors import Cancelled, InputError
+from ...shared.events import Reporter
 from ...shared.formats.atomic import make_folder, recorded
-from ...shared.formats.json_file import write_json
+from ...shared.formats.json_file import read_json, write_json
 from ...shared.formats.photos_source import PHOTOS, REPORT, VIDEOS, WORK, PhotosSource, write_source
+from ...shared.reconstruction.folder import IGNORED
 from ...shared.reconstruction.lock import locked
 from ...shared.stopping import StoppingReporter
 from ...stereo.dense_points import find_dense_points
@@ -95,7 +97,7 @@ def _require_own(source: Path, capture: Path) -> None:
         raise InputError(f"{capture} has a COLMAP model already, {capture / 'sparse'}; choose another --out.")
     if is_source and (capture / IMAGES).is_dir():
         return
-    if any(capture.iterdir()):
+    if any(path.name not in IGNORED for path in capture.iterdir()):
         raise InputError(f"{capture} contains other files; choose a new folder as --out.")
 
 
@@ -130,7 +132,10 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
         "refine": ("Poses", 0.2 * _MAP * count), "dense": ("Points", _DENSE * count),
     })  # fmt: skip
 
-    write_json(work / GROUPS, _groups(photos, images, made_from))
+    groups = _groups(photos, images, made_from)
+    if (work / GROUPS).exists() and _have_other_cameras(read_json(work / GROUPS), groups):
+        database.remove_all(work)
+    write_json(work / GROUPS, groups)
     calibrated = ["calibrated"] if made_from.calibration else []
     listed_names = work / "names.json"
     write_json(listed_names, names)
@@ -146,6 +151,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
             break
         reporter.begin(mapper, f"Computing poses ({mapper})")
         out = work / mapper
+        shutil.rmtree(out, ignore_errors=True)
         make_folder(out)
         arguments = [mapper, str(path), str(images), str(out), str(listed_names), *calibrated]
         run_stage(reporter, log, arguments, lambda lines: lines, count)
@@ -170,7 +176,8 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     up = common_up(model.rotations_of(best.model), ups_in_cameras(images, figures))
     model.scale(best.model, by_gps or model.common_size(best.model))
     model.write_model(best.model, capture)
-    weak |= _densify(best.model, capture, reporter)
+    on_objects = path.name.endswith(database.ON_OBJECTS)
+    weak |= _densify(best.model, capture, on_objects, reporter)
     check.write_picture(work / PICTURE, best.model, figures, path, list(weak))
     posed = list(figures)
     left_out = {**unreadable, **unwanted, **model.reasons(path, names, posed, wrong)}
@@ -210,8 +217,16 @@ def _refined(
     return found
 
 
-def _densify(found: pycolmap.Reconstruction, capture: Path, reporter: StoppingReporter) -> dict[str, str]:
+def _densify(
+    found: pycolmap.Reconstruction, capture: Path, on_objects: bool, reporter: StoppingReporter
+) -> dict[str, str]:
     """Add points where features are few, from patches of the photos, and remove those in front of surfaces.
+
+    Args:
+        found: the model.
+        capture: the capture, which has it.
+        on_objects: whether only what masks show as objects belongs to the scene.
+        reporter: receives progress.
 
     Returns:
         The photos that are blurred: name -> reason.
@@ -220,7 +235,7 @@ def _densify(found: pycolmap.Reconstruction, capture: Path, reporter: StoppingRe
     scratch = capture / WORK / "undistorted"
     shutil.rmtree(scratch, ignore_errors=True)
     try:
-        photos = load_capture(capture, scratch)
+        photos = load_capture(capture, scratch, reporter=_StopsOnly(reporter), photos_only=not on_objects)
         points = find_dense_points(photos, range(len(photos.views)), reporter.progress)
         model.remove_points(found, photos.points.ids[points.in_front])
         model.add_points(found, points.xyz, points.rgb)
@@ -235,6 +250,17 @@ def _densify(found: pycolmap.Reconstruction, capture: Path, reporter: StoppingRe
     }
 
 
+class _StopsOnly(Reporter):
+    """Says nothing, but ends what reports its progress when the user has stopped the command."""
+
+    def __init__(self, reporter: StoppingReporter) -> None:
+        self._reporter = reporter
+
+    def progress(self, *_: Any, **_fields: Any) -> None:
+        if self._reporter.stop():
+            raise Cancelled("Stopped; features, matches and poses are kept. Run the same command again to continue.")
+
+
 def _groups(photos: list[Photo], images: Path, made_from: PhotosSource) -> list[dict[str, Any]]:
     """Return the names of the photos of each camera, and its lens if that is known."""
     if made_from.calibration is not None:
@@ -245,8 +271,20 @@ def _groups(photos: list[Photo], images: Path, made_from: PhotosSource) -> list[
         ]
     groups: dict[str, list[str]] = {}
     for photo in photos:
-        groups.setdefault({"one": "", "each": photo.name}.get(made_from.cameras, photo.camera), []).append(photo.name)
+        key = {"one": photo.size, "each": photo.name}.get(made_from.cameras, photo.camera)
+        groups.setdefault(key, []).append(photo.name)
     return [{"names": names, "camera": None} for names in groups.values()]
+
+
+def _have_other_cameras(before: list[dict[str, Any]], now: list[dict[str, Any]]) -> bool:
+    """Return whether photos share cameras in another way than in an earlier run, or have lost a known lens."""
+    common = {name for group in before for name in group["names"]} & {name for group in now for name in group["names"]}
+
+    def shared(groups: list[dict[str, Any]]) -> dict[frozenset[str], bool]:
+        return {frozenset(common.intersection(each["names"])): each["camera"] is not None for each in groups}
+
+    earlier, later = shared(before), shared(now)
+    return any(earlier.get(names) is None or earlier[names] > is_known for names, is_known in later.items() if names)
 
 
 def _tell(report: dict[str, Any], capture: Path, reporter: StoppingReporter) -> None:

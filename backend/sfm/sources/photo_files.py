@@ -6,6 +6,7 @@ import importlib
 import io
 import shutil
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,13 @@ from PIL import Image as PilImage
 from ...capture.files import read_image, write_image
 from ...shared.errors import InputError
 from ...shared.formats.atomic import atomic_path, make_folder, write_atomic
-from ...shared.formats.photos_source import HEIC, RAW
+from ...shared.formats.photos_source import RAW
 
 COPIED = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"}
 """Suffixes of files that COLMAP reads. HEIC becomes JPEG with its EXIF data, which may tell the focal length; other
 formats become PNG."""
+_COPIED_FORMATS, _HEIC_FORMATS = {"JPEG", "MPO", "PNG", "TIFF", "BMP"}, {"HEIF", "AVIF"}
+"""Pillow's names of their formats, and of those of HEIC."""
 _QUALITY = 97
 """JPEG quality of photos that are converted or turned."""
 
@@ -79,13 +82,14 @@ def gps_position(path: Path) -> tuple[float, float, float] | None:
     return (latitude, longitude, altitude) if is_known else None
 
 
-def copy_photo(path: Path, target: Path, turn: bool) -> Path:
+def copy_photo(path: Path, target: Path, turn: bool, again: bool = False) -> Path:
     """Copy a photo, or convert it to JPEG or PNG, unless that was done.
 
     Args:
         path: the photo.
         target: the copy, whose suffix may change.
         turn: whether to turn it as its EXIF orientation says, so that it stands upright; the pixels of others are kept.
+        again: whether to do so even if it was done, as the photo has changed.
 
     Returns:
         The copy.
@@ -94,29 +98,52 @@ def copy_photo(path: Path, target: Path, turn: bool) -> Path:
         InputError: it cannot be read.
     """
     suffix = path.suffix.lower()
-    target = target if suffix in COPIED else target.with_suffix(".jpg" if suffix in HEIC else ".png")
-    if target.exists():
+    is_heic = suffix not in RAW and _format_of(path) in _HEIC_FORMATS
+    is_kept = is_read_by_colmap(path)
+    target = target if is_kept else target.with_suffix(".jpg" if is_heic else ".png")
+    if target.exists() and not again:
         return target
     make_folder(target.parent)
     if suffix in RAW:
         write_image(target, _developed(path))
-    elif suffix in HEIC:
-        _save(target, _with_colors(PilImage.open(path)))
-    elif suffix not in COPIED:
+    elif is_heic:
+        write_atomic(target, _as_jpeg(path, _with_colors))
+    elif not is_kept:
         write_image(target, read_image(path))
     elif turn and suffix in (".jpg", ".jpeg") and _is_turned(path):
-        _save(target, ImageOps.exif_transpose(PilImage.open(path)))
+        write_atomic(target, _as_jpeg(path, ImageOps.exif_transpose))
     else:
         with atomic_path(target) as part:
             shutil.copyfile(path, part)
     return target
 
 
-def _save(target: Path, image: PilImage.Image) -> None:
-    """Write a JPEG atomically, with the image's EXIF data."""
+def is_read_by_colmap(path: Path) -> bool:
+    """Return whether COLMAP reads a photo as it is, by its suffix and what is in it, which may be of another format."""
+    return path.suffix.lower() in COPIED and _format_of(path) in _COPIED_FORMATS
+
+
+def _format_of(path: Path) -> str | None:
+    """Return Pillow's name of the format of a photo that is not raw; None if it cannot be told."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with PilImage.open(path) as image:
+                return image.format
+    except Exception:
+        return None
+
+
+def _as_jpeg(path: Path, change: Callable[[PilImage.Image], PilImage.Image]) -> bytes:
+    """Return a changed photo as JPEG with its EXIF data; raises InputError if it is damaged."""
     buffer = io.BytesIO()
-    image.convert("RGB").save(buffer, "JPEG", quality=_QUALITY, subsampling=0, exif=image.getexif())
-    write_atomic(target, buffer.getvalue())
+    try:
+        with PilImage.open(path) as image:
+            changed = change(image)
+            changed.convert("RGB").save(buffer, "JPEG", quality=_QUALITY, subsampling=0, exif=changed.getexif())
+    except Exception as error:
+        raise InputError(f"{path.name} cannot be read as an image: it is damaged.") from error
+    return buffer.getvalue()
 
 
 def _orientation(exif: PilImage.Exif) -> int:
@@ -137,10 +164,11 @@ def _with_colors(image: PilImage.Image) -> PilImage.Image:
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         shown = ImageCms.profileToProfile(image.convert("RGB"), source, ImageCms.createProfile("sRGB"))
-    except ImageCms.PyCMSError:
+    except (ImageCms.PyCMSError, OSError):
         return image
     assert shown is not None
-    shown.getexif().update(image.getexif())
+    # Its EXIF data refer to places in themselves, so they are not copied entry by entry.
+    shown.info["exif"] = image.info.get("exif", b"")
     return shown
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -19,11 +20,12 @@ from ...shared.formats.atomic import atomic_path, make_folder, write_atomic
 from ...shared.formats.json_file import read_json, write_json
 from ...shared.formats.photos_source import PHOTOS, VIDEOS, WORK, natural_order
 from ...shared.stopping import StoppingReporter
+from .. import database
 from . import photo_files, video
 
 IMAGES, MASKS = "images", "masks"
-FRAMES = "frames.json"
-"""File in sfm/ with the frames that were taken of each video."""
+FRAMES, _FILES = "frames.json", "photos.json"
+"""Files in sfm/ with the frames that were taken of each video, and with the size and time of each photo's file."""
 _OTHER_FILES = re.compile(r"(labels?|classes|names|test)[\w.-]*\.(json|txt|csv)", re.IGNORECASE)
 _LEAST_FREE = 1.2
 """Free space on the disk, relative to the size of the photos, below which they are not copied."""
@@ -35,10 +37,12 @@ class Photo(NamedTuple):
     Attributes:
         name: path within images/, with slashes.
         camera: what photos of one camera with one focal length have in common.
+        size: what photos of one size have in common.
     """
 
     name: str
     camera: str
+    size: str
 
 
 class Taken(NamedTuple):
@@ -74,9 +78,13 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
         base = source / IMAGES if (source / IMAGES).is_dir() else source
         found = _listed(base, capture)
     else:
-        base = Path(os.path.commonpath([path.parent for path in sources]))
-        found = sorted(sources, key=lambda path: natural_order(path.as_posix()))
+        found = sorted({path.absolute() for path in sources}, key=lambda path: natural_order(path.as_posix()))
+        try:
+            base = Path(os.path.commonpath([path.parent for path in found]))
+        except ValueError as error:
+            raise InputError(f"{found[0]} and {found[-1]} are on two disks; copy the photos to one folder.") from error
     found, masked = _without_masks(found)
+    is_alone = len(found) == 1 and not source.is_dir()
     in_place = base.resolve() == (capture / IMAGES).resolve()
     videos = [] if in_place else [path for path in found if path.suffix.lower() in VIDEOS]
     files = [path for path in found if path.suffix.lower() in PHOTOS]
@@ -89,25 +97,40 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
     turn = not in_place and not (source / MASKS).is_dir() and not masked
     photos, unreadable = [], {}
     names: dict[str, str] = {}
+    listed = capture / WORK / _FILES
+    known, files_now = read_json(listed) if listed.exists() else {}, {}
     for number, path in enumerate(files):
         reporter.progress(number, len(files))
         relative = path.relative_to(base)
+        name = relative.as_posix()
         try:
-            camera = f"{relative.parent} {photo_files.camera_of(path, turn)}"
+            camera = photo_files.camera_of(path, turn)
+            if in_place and not photo_files.is_read_by_colmap(path):
+                raise InputError(f"{path.name} would have to be converted; choose another folder as --out.")
+            status = path.stat()
+            files_now[name] = [status.st_size, status.st_mtime_ns, turn]
+            is_changed = name in known and known[name] != files_now[name]
+            if is_changed:
+                database.remove_all(capture / WORK)
             if not in_place:
-                copied = photo_files.copy_photo(path, capture / IMAGES / relative, turn)
+                copied = photo_files.copy_photo(path, capture / IMAGES / relative, turn, again=is_changed)
                 relative = copied.relative_to(capture / IMAGES)
-            photos.append(Photo(relative.as_posix(), camera))
-            names[path.relative_to(base).as_posix()] = relative.as_posix()
+            photos.append(Photo(relative.as_posix(), f"{Path(name).parent} {camera}", camera.split(" ")[0]))
+            names[name] = relative.as_posix()
         except InputError as error:
-            unreadable[relative.as_posix()] = str(error)
+            unreadable[name] = str(error)
+    make_folder(listed.parent)
+    write_json(listed, {**known, **files_now})
+    stems = Counter(_stem_in(base, path).casefold() for path in videos)
     for path in videos:
-        folder = "" if found == [source] else path.relative_to(base).with_suffix("").as_posix()
+        folder = "" if is_alone else _stem_in(base, path)
+        if stems[folder.casefold()] > 1:
+            folder = path.relative_to(base).as_posix()
         try:
             taken = _frames_of(path, capture, folder, frames, reporter)
-            photos += [Photo((Path(folder) / name).as_posix(), f"video {folder}") for name in taken]
+            photos += [Photo((Path(folder) / name).as_posix(), f"video {folder}", folder) for name in taken]
         except InputError as error:
-            if found == [source]:
+            if is_alone:
                 raise
             unreadable[path.relative_to(base).as_posix()] = str(error)
     if len(photos) < 2:
@@ -122,6 +145,11 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
         masks = MaskFiles(base, names, base)
         _write_masks(masks, masks.photos, names, capture)
     return Taken(photos, unreadable, not files)
+
+
+def _stem_in(base: Path, path: Path) -> str:
+    """Return the path of a file from a folder on, without its suffix."""
+    return path.relative_to(base).with_suffix("").as_posix()
 
 
 def _without_masks(paths: Sequence[Path]) -> tuple[list[Path], bool]:
@@ -173,7 +201,7 @@ def _listed(base: Path, capture: Path) -> list[Path]:
             path
             for path in base.rglob("*")
             if path.suffix.lower() in PHOTOS | VIDEOS
-            and not path.name.startswith(".")
+            and not any(part.startswith(".") for part in path.relative_to(base).parts)
             and path.is_file()
             and (base.resolve().is_relative_to(inside) or not path.resolve().is_relative_to(inside))
         ]

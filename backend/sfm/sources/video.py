@@ -89,8 +89,9 @@ def analyze(video: Path, reporter: StoppingReporter) -> Analysis:
     with _opened(video) as (container, stream):
         expected = float(container.duration or 0) / av.time_base
         for frame in _decoded(container, stream, problems):
-            if frame.time is not None and expected > 0:
-                reporter.progress(0.6 * min(frame.time / expected, 1.0), 1.0)
+            # Also where the duration is not known, since a request to stop is noticed here.
+            is_known = frame.time is not None and expected > 0
+            reporter.progress(0.6 * min(frame.time / expected, 1.0) if is_known else 0.0, 1.0)
             gray = _gray(frame, _SHARPNESS_SIDE)
             sharp.append(sharpness(gray))
             positions.append(tracker.add(_gray(frame, ANALYZED)))

@@ -34,7 +34,7 @@ VIDEOS = {".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mp
 
 def natural_order(name: str) -> list[tuple[int, str]]:
     """Return a sort key by which photo 10 follows photo 9."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name.lower())]
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name.lower())]
 
 
 @dataclass(frozen=True)

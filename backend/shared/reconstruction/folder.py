@@ -13,7 +13,7 @@ STROKES = "strokes.json"
 """Strokes on objects: of a reconstruction, and in the folder masks of a capture whose masks were made of them. Such
 masks are those of training views alone."""
 
-_IGNORED = (lock.NAME, ".DS_Store", "Thumbs.db", "desktop.ini")
+IGNORED = (lock.NAME, ".DS_Store", "Thumbs.db", "desktop.ini")
 """Files that a folder without content may contain."""
 
 
@@ -64,7 +64,7 @@ class Reconstruction:
             names = sorted(entry.name for entry in os.scandir(self.folder))
         except OSError as error:
             raise InputError(f"The folder {self.folder} cannot be read ({error.strerror}).") from error
-        ignored = set(_IGNORED)
+        ignored = set(IGNORED)
         if capture is not None and capture.resolve().is_relative_to(self.folder.resolve()):
             parts = capture.resolve().relative_to(self.folder.resolve()).parts
             own = {path.name for path in vars(self).values() if path != self.folder}
