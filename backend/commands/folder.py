@@ -19,6 +19,7 @@ from ..shared.events import Reporter
 from ..shared.formats.atomic import recorded, remove_abandoned
 from ..shared.reconstruction.folder import Reconstruction
 from ..shared.reconstruction.lock import locked
+from ..shared.reconstruction.meshes import outdate_meshes
 from ..shared.reconstruction.objects import read_objects
 from ..shared.reconstruction.plan import Plan
 from ..shared.reconstruction.record import CaptureRecord, TrainingRecord, read_record, update_record
@@ -206,6 +207,12 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
         supervise_background=state["supervise_background"], gains=gains,
     )  # fmt: skip
     return Trained(folder, capture, model, scene, progress_of(state), plan, training)
+
+
+def outdate_results(folder: Reconstruction) -> None:
+    """Mark meshes as those of an earlier model, and remove its evaluation: another one takes its place."""
+    outdate_meshes(folder.meshes)
+    folder.evaluation.unlink(missing_ok=True)
 
 
 def plan_of(training: TrainingRecord | None) -> Plan:

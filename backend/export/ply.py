@@ -129,6 +129,16 @@ def position_kind(splats: Splats) -> str:
     return "f8" if float(np.abs(splats.means).max()) * FLOAT32_RELATIVE_ERROR > 1e-6 * extent else "f4"
 
 
+def rounding_warnings(path: Path, splats: Splats, step: float) -> list[str]:
+    """Return a warning if a file whose positions are multiples of `step` cannot hold those of splats."""
+    if len(splats) == 0 or step <= float(np.median(splats.scales.max(1))):
+        return []
+    return [
+        f"{path.name} rounds positions to {step:.2g} units, which is more than the size of the splats, since some are "
+        "far from the origin; hide floaters, export in Blender's coordinates, or as PLY."
+    ]
+
+
 def read_splats(path: Path) -> tuple[Splats, list[str]]:
     """Read a PLY file of splats, written by this or another program.
 

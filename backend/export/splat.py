@@ -11,7 +11,7 @@ from ..shared.errors import InputError
 from ..shared.formats.atomic import write_atomic
 from ..shared.formats.regular_file import read_regular
 from ..shared.splats.spherical_harmonics import C0
-from .ply import cleaned
+from .ply import cleaned, rounding_warnings
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
@@ -24,7 +24,7 @@ def write_splat(path: Path, splats: Splats) -> list[str]:
         splats: The splats.
 
     Returns:
-        A warning if view-dependent colors are lost.
+        Warnings if positions are rounded, and if view-dependent colors are lost.
     """
     order = np.argsort(-splats.opacities * splats.scales.astype(np.float64).prod(1) ** (1 / 3), kind="stable")
     splats = splats.select(order)
@@ -34,9 +34,10 @@ def write_splat(path: Path, splats: Splats) -> list[str]:
     rows["rgba"] = np.clip(np.rint(color * 255.0), 0, 255)
     rows["quat"] = np.clip(np.rint(splats.quats * 128.0 + 128.0), 0, 255)
     write_atomic(path, rows.tobytes())
+    warnings = rounding_warnings(path, splats, float(np.spacing(np.float32(np.abs(splats.means).max(initial=0.0)))))
     if splats.degree:
-        return [f"{path.name} stores one color for each splat; its change with the view direction is lost."]
-    return []
+        warnings.append(f"{path.name} stores one color for each splat; its change with the view direction is lost.")
+    return warnings
 
 
 def read_splat(path: Path) -> tuple[Splats, list[str]]:

@@ -19,7 +19,7 @@ from ..model.splats import Splats
 from ..shared.errors import InputError
 from ..shared.formats.atomic import write_atomic
 from ..shared.formats.regular_file import read_regular
-from .ply import cleaned
+from .ply import cleaned, rounding_warnings
 
 DOWN_TO_UP = np.diag([1.0, -1.0, -1.0, 1.0])
 """From the axes of COLMAP (x right, y down, z forward) to those of SPZ (x right, y up, z back), and back."""
@@ -49,7 +49,7 @@ def write_spz(path: Path, splats: Splats) -> list[str]:
         splats: The splats, Y up.
 
     Returns:
-        A warning about splats whose scales were clamped.
+        Warnings about positions that were rounded, and about splats whose scales were clamped.
 
     Raises:
         InputError: The splats are too far from the origin.
@@ -74,12 +74,13 @@ def write_spz(path: Path, splats: Splats) -> list[str]:
     ]
     # No time stamp, so that the same splats produce the same file.
     write_atomic(path, gzip.compress(header + b"".join(part.tobytes() for part in sections), 9, mtime=0))
+    warnings = rounding_warnings(path, splats, 2.0**-bits)
     extreme = int(((logs.max(1) < _SMALLEST_LOG) | (logs.max(1) > _LARGEST_LOG)).sum())
     if extreme:
-        return [
+        warnings.append(
             f"{extreme} of {len(splats)} splats are too small or too large for {path.name}; their scales were clamped."
-        ]
-    return []
+        )
+    return warnings
 
 
 def _bytes(values: NDArray) -> NDArray[np.uint8]:

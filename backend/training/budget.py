@@ -163,7 +163,11 @@ class Budget:
 
     def begin(self, p: TrainingProgress) -> None:
         """Initialize `p` for this budget; the training may have been started with a different one."""
-        p.evaluated = p.step if self.until_converged else bisect_right(_EVALUATIONS, self.progress(p))
+        if self.until_converged:
+            # Stops must not delay evaluations, which decide when the training ends.
+            p.evaluated = int(p.curve[-1]["step"]) if p.curve else 0
+        else:
+            p.evaluated = bisect_right(_EVALUATIONS, self.progress(p))
 
     def evaluation_is_due(self, p: TrainingProgress) -> bool:
         """Return whether an evaluation is due, and mark it as done."""

@@ -79,6 +79,23 @@ def test_loss_is_used_without_validation_views():
     assert convergence_step([{**entry, "loss_db": None} for entry in entries]) is None
 
 
+def test_stops_do_not_delay_the_end_of_a_training_until_convergence():
+    """However often it is stopped, it is evaluated as often."""
+    ends = []
+    for stop_every in (10**9, 300):
+        budget, p = PRESETS["final"], TrainingProgress()
+        budget.begin(p)
+        while budget.progress(p) < 1 and p.step < 20_000:
+            if budget.evaluation_is_due(p):
+                p.curve.append({"step": p.step, "validation_psnr": math.log2(min(p.step + 1, 3000)), "anchors": 5})
+                budget.check_convergence(p)
+            p.step += 1
+            if p.step % stop_every == 0:
+                budget.begin(p)
+        ends.append(p.step)
+    assert ends[0] == ends[1] < 20_000
+
+
 @pytest.mark.parametrize("held_out", [lambda step: 30.0, lambda step: step, lambda step: None])
 def test_held_out_views_do_not_decide_the_end(held_out):
     budget, ends = PRESETS["final"], []

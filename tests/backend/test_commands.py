@@ -356,6 +356,17 @@ def test_training_again_skips_resumes_or_restarts(trained, run_command):
     assert step_of(out) == 0, "the previous checkpoint belongs to the new training"
 
 
+def test_masks_that_changed_count_when_a_training_resumes(trained, tmp_path, run_command):
+    capture, out = shutil.copytree(trained[0], tmp_path / "changed"), trained[1]
+    for path in (capture / "masks").iterdir():
+        ids = np.array(Image.open(path))
+        Image.fromarray(np.where(ids == 1, 77, ids).astype(ids.dtype)).save(path)
+    result = run_command("train", capture, "--out", out, "--steps", 30, *SMALL, "--json")
+    assert result.code == EXIT_DONE and step_of(out) == 30
+    assert any("objects that this training does not have (77)" in sentence for sentence in result.messages("warning"))
+    assert 77 in {entry.id for entry in read_objects(out / "objects.json")}
+
+
 def test_training_does_not_resume_with_another_capture(trained, write_capture, run_command):
     _, out = trained
     other = write_capture(name="other", views=9, size=(64, 48), seed=1).folder

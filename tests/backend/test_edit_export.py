@@ -333,7 +333,8 @@ def test_spz_matches_gsply_reader(tmp_path):
 def test_spz_limits_are_reported(tmp_path):
     splats = some_splats()
     splats.means += 1e6
-    write_spz(tmp_path / "far.spz", splats)
+    (warning,) = write_spz(tmp_path / "far.spz", splats)
+    assert "rounds positions" in warning
     assert np.abs(read_spz(tmp_path / "far.spz").means - splats.means).max() < 0.6
     splats.means += 1e8
     with pytest.raises(InputError, match="PLY"):
@@ -343,6 +344,13 @@ def test_spz_limits_are_reported(tmp_path):
     splats.scales[:3] *= 1e-6
     assert "3 of 60" in write_spz(tmp_path / "small.spz", splats)[0]
     assert write_spz(tmp_path / "none.spz", Splats.empty(1)) == []
+
+
+def test_positions_far_away_are_reported_where_they_are_rounded(tmp_path):
+    splats = some_splats(degree=0)
+    splats.means = splats.means.astype(np.float64) + 5e6
+    (warning,) = write_splat(tmp_path / "a.splat", splats)
+    assert "rounds positions to 0.5 units" in warning
 
 
 def test_splat_file_has_32_bytes_per_splat(tmp_path):

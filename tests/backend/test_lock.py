@@ -1,5 +1,6 @@
 """Lock of a reconstruction folder, which one process at a time can hold."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -123,3 +124,13 @@ def test_concurrent_edits_are_all_applied(tmp_path):
     assert [int(editor.communicate(timeout=120)[0]) for editor in editors] == [0] * 6
     assert [entry.name for entry in read_objects(path)] == [f"name {i}" for i in range(1, 301)]
     assert [entry.name for entry in tmp_path.iterdir()] == ["objects.json"]
+
+
+@pytest.mark.skipif(lock.fcntl is None, reason="Windows has locks of another kind")
+def test_file_systems_without_locks_can_be_used(tmp_path, monkeypatch):
+    def refuse(_descriptor, _operation):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(lock.fcntl, "flock", refuse)
+    with locked(tmp_path):
+        assert lock_holder(tmp_path) is None

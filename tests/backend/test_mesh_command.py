@@ -152,6 +152,17 @@ def test_further_training_outdates_meshes(trained, kept, run_command, monkeypatc
     assert entries(trained)["1"]["trained_steps"] == 252
 
 
+def test_new_training_of_as_many_steps_outdates_meshes_and_evaluation(trained, kept, run_command, monkeypatch):
+    made = Stub(monkeypatch).made
+    assert run_command("mesh", trained, "--objects", "1").code == EXIT_DONE
+    (trained / "evaluation.json").write_text("{}")
+    anew = run_command("train", kept / "capture", "--out", trained, "--steps", 250, *TRAINING, "--restart")
+    assert anew.code == EXIT_DONE and not (trained / "evaluation.json").exists()
+    assert entries(trained)["1"]["trained_steps"] is None
+    assert run_command("mesh", trained, "--objects", "1").code == EXIT_DONE and made == ["1", "1"]
+    assert entries(trained)["1"]["trained_steps"] == 250
+
+
 def test_object_without_surface_is_reported(trained, run_command, monkeypatch):
     Stub(monkeypatch, without={"2"})
     result = run_command("mesh", trained, "--json")

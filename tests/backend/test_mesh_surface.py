@@ -312,6 +312,14 @@ def errors(surface, shape, seen_only=True):
     return np.abs(shape(surface.vertices[keep]))
 
 
+def test_field_is_the_same_where_memory_for_observations_ends(monkeypatch):
+    views = ExactViews([ball((0.0, 0.0, 0.0), 0.5)], around(6))
+    kept = fuse(views, [0])
+    monkeypatch.setattr("backend.mesh.field.fusion._KEPT_BYTES", 1e6)
+    again = fuse(views, [0])
+    assert np.array_equal(kept.values, again.values) and np.array_equal(kept.seen, again.seen)
+
+
 def test_ball_is_reconstructed_accurately():
     shape = ball((0.03, -0.02, 0.05), 0.5)
     field = fuse(ExactViews([shape], around(12)), [0])

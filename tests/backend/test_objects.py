@@ -73,13 +73,25 @@ def test_recolor_transform_and_copies_are_stored(path):
 
 @pytest.mark.parametrize("edit", [
     {"recolor": 3}, {"recolor": {"hue": "red"}}, {"transform": [[1, 0], [0, 1]]},
-    {"transform": [[0] * 4] * 3 + [[0, 0, 0, 1]]},
     {"copies": [1]}, {"transform": [*MOVED[:3], [0, 0, 1, 1]]},
 ])  # fmt: skip
 def test_invalid_edits_are_reported(path, edit):
     edit_objects(path, {1: edit})
     with pytest.raises(InputError, match=r"objects\.json"):
         read_objects(path)
+
+
+def test_objects_scaled_to_nothing_keep_the_file_usable(path):
+    flat = [[0.0] * 4, *map(list, MOVED[1:])]
+    before = path.read_text()
+    for edit in ({"transform": flat}, {"copies": [MOVED, flat]}):
+        with pytest.raises(InputError, match="scaled to nothing"):
+            edit_objects(path, {1: edit})
+    assert path.read_text() == before
+    # Earlier versions have written them.
+    path.write_text(json.dumps({**json.loads(before), "edits": {"1": {"transform": flat, "copies": [MOVED, flat]}}}))
+    mug = read_objects(path)[0]
+    assert mug.transform is None and mug.copies == (MOVED,)
 
 
 def test_only_editable_fields_are_changed(path):

@@ -28,7 +28,7 @@ from ...training.fine_tuning.relabel import begin_with_labels, budget_of_labels
 from ...training.settings import Settings
 from ...training.trainer import Trainer
 from ..exported import EXPORT, export_model
-from ..folder import READ, Trained, memory_for_files, memory_for_targets, plan_of
+from ..folder import READ, Trained, memory_for_files, memory_for_targets, outdate_results, plan_of
 from ..imported import write_labeled
 from ..mask_files import new_masks, write_mask
 from ..planning import build_context, find_requested_objects
@@ -153,9 +153,10 @@ def begin_border_training(
     )  # fmt: skip
     trainer.save(folder.checkpoint)
     (folder.checkpoint / PREVIOUS).unlink(missing_ok=True)
+    outdate_results(folder)
     write_plan(folder.plan, plan)
     key = votes_key(planned, votes.max_size, votes.strategy, settings.seed)
-    update_record(folder, training=replace(before, left_out=[], votes=key, plan=plan.as_list()))
+    update_record(folder, training=replace(before, left_out=planned.left_out.tolist(), votes=key, plan=plan.as_list()))
     return trainer
 
 

@@ -20,6 +20,7 @@ from ...mesh.texture.bake import bake_texture, texture_size
 from ...mesh.texture.unwrap import unwrap
 from ...mesh.views import Views
 from ...model.object_model import ObjectModel
+from ...raster import devices
 from ...shared.errors import InputError
 from ...shared.events import Reporter
 from ...shared.formats.atomic import write_atomic
@@ -132,7 +133,7 @@ def _make(target: Target, options: argparse.Namespace, trained: Trained, views: 
         classes = model.classes.classes_among(target.ids)
     budget = options.faces * (SCENE_BUDGET if target.key == SCENE else 1)
     try:
-        if not np.isin(model.anchors.ids, classes).any():
+        if not np.isin(devices.host(model.anchors.ids), classes).any():
             raise NoSurface(
                 f"{target.name} has no splats, so it has no mesh; was it left out of training or separated?"
             )

@@ -66,8 +66,9 @@ class Measuring:
         """Measure the held-out views, or only draw the first if all would take more than `allowed` seconds."""
         # Without SSIM, which would take most of the time.
         started, capture = time.monotonic(), scene.capture
-        every = max(len(capture.test_indices) // CURVE_VIEWS, 1)
-        indices = capture.test_indices[::every][:CURVE_VIEWS]
+        held_out = capture.test_indices
+        places = np.linspace(0, len(held_out) - 1, min(len(held_out), CURVE_VIEWS)).round().astype(int)
+        indices = [held_out[place] for place in places]
         found, ids = [], IdScores(scene.zero_is_object)
         for number, index in enumerate(indices or (0,)):
             photo, truth = capture.image(index), capture.mask(index)

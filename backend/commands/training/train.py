@@ -35,6 +35,7 @@ from ..folder import (
     digest,
     memory_for_targets,
     open_reconstruction,
+    outdate_results,
     plan_of,
     recorded_agreement,
 )
@@ -134,20 +135,22 @@ def _begin(
     """Resume the folder's training or start one, with a new vote if necessary; return the trainer and the plan."""
     resuming = not options.restart and has_checkpoint(folder.checkpoint)
     voters = capture.without_masks() if "votes" in options.leave_out else capture
-    current = votes_are_current(folder, voters, options.max_size, options.strategy, options.seed)
-    if not (current or resuming):
+    if resuming:
+        _check_same_capture(folder, capture, options)
+    if not votes_are_current(folder, voters, options.max_size, options.strategy, options.seed):
         cast_votes(folder, voters, options, reporter)
     reporter.begin("plan", "Planning the training")
-    points = read_points(folder.points) if current or not resuming else None
+    points = read_points(folder.points)
     objects, _ = find_requested_objects(folder, capture, options)
     before = plan_of(read_record(folder).training) if resuming else None
     context = build_context(capture, choices(options), objects, points, thorough=True, resumed=before)
+    assert context.point_ids is not None
     plan = decide(context)
     if before is not None:
         plan = plan.settled_by(before)
     gains = context.gains if plan.does("exposure") else np.ones_like(context.gains)
     planned, wanted = planned_capture(context.capture, plan), planned_settings(settings(options), plan)
-    if points is not None and planned.has_masks:
+    if planned.has_masks:
         supervised = plan.does("rest") and not options.unlabeled_is_object
         planned, regions = correct_masks(planned, points.ids, ignore_gaps=supervised)
         if regions:
@@ -159,9 +162,13 @@ def _begin(
         trainer, warning = resumed
         if warning:
             reporter.warning(warning)
-        _check_same_training(folder, planned, plan, options)
+        _check_same_plan(folder, planned, plan)
+        if unknown := sorted({*context.point_ids.tolist()} - {0, *trainer.model.classes.ids.tolist()}):
+            reporter.warning(
+                f"The masks show objects that this training does not have ({', '.join(map(str, unknown))}); use "
+                "--restart to train them."
+            )
     else:
-        assert context.point_ids is not None
         far = DistantPoints(*context.surroundings[:3]) if plan.does("surroundings") else None
         seeds, more = starting_points(planned, context.point_ids, plan, options.seed, reporter)
         start = functools.partial(
@@ -175,6 +182,8 @@ def _begin(
         # The new training's first checkpoint replaces that of the old one before anything refers to it.
         trainer.save(folder.checkpoint)
         (folder.checkpoint / PREVIOUS).unlink(missing_ok=True)
+    if not resuming:
+        outdate_results(folder)
     change_objects(folder, voters, options)
     write_plan(folder.plan, plan)
     report_plan(plan, reporter)
@@ -217,8 +226,8 @@ def _affordable(
     return start(most_anchors=most)
 
 
-def _check_same_training(folder: Reconstruction, capture: Capture, plan: Plan, options: argparse.Namespace) -> None:
-    """Raise InputError if the folder has a training of another capture or with other settings."""
+def _check_same_capture(folder: Reconstruction, capture: Capture, options: argparse.Namespace) -> None:
+    """Raise InputError if the folder has a training of another capture, or of images of another size."""
     training = read_record(folder).training
     otherwise = "use the same one, a different --out, or --restart to start over."
     if training is None:
@@ -233,6 +242,12 @@ def _check_same_training(folder: Reconstruction, capture: Capture, plan: Plan, o
         raise InputError(f"{folder.checkpoint} was trained with --max-size {votes.max_size}; {otherwise}")
     if votes.strategy != options.strategy:
         raise InputError(f"{folder.checkpoint} was trained with --strategy {votes.strategy}; {otherwise}")
+
+
+def _check_same_plan(folder: Reconstruction, capture: Capture, plan: Plan) -> None:
+    """Raise InputError if the folder has a training without the same objects, or with another plan."""
+    training = read_record(folder).training
+    assert training is not None
     before, left_out = training.left_out, capture.left_out.tolist()
     if before != left_out:
         without = f"without {', '.join(map(str, before))}" if before else "with all objects"

@@ -33,6 +33,8 @@ _REACH_VOXELS, _REACH_PIXELS = 5.0, 3.5
 _BACK_VOXELS, _BACK_PIXELS = 3.0, 2.0
 _BYTES_PER_BLOCK = 8 * SAMPLES * 4
 """Largest memory of a block: sums, values, flags and the triangles in it."""
+_KEPT_BYTES = 1.5e9
+"""Memory of views' observations that are kept; the others are made again each time, as with many large photos."""
 _COARSEST, _FEW = 16, 1000
 """Smallest number of voxels along the longest side, regardless of memory; additional blocks allowed in this case."""
 _FILLING = 8
@@ -183,6 +185,7 @@ class _Fusion:
         self.back = max(_BACK_VOXELS * voxel, _BACK_PIXELS * extent.pixel)
         self.origin = (extent.low + extent.high) / 2
         self.observations: dict[int, Observation] = {}
+        self.room = _KEPT_BYTES
         # The object lies within this box; no blocks are added outside it.
         pad = (extent.high - extent.low).max() * 0.5 + 4 * self.reach
         self.box = np.stack([extent.low - pad - self.origin, extent.high + pad - self.origin]) / (SIDE * voxel)
@@ -226,14 +229,18 @@ class _Fusion:
         return coords[((coords >= np.floor(self.box[0])) & (coords <= self.box[1])).all(1)]
 
     def _observation(self, index: int) -> Observation:
-        if index not in self.observations:
-            scene = self.views.scene_map(index)
-            view = self.views.object_view(index, self.classes)
-            margin = 0
-            if view is not None:
-                margin = int(np.ceil(self.reach * scene.camera.K[0, 0] / max(self.extent.nearest, 1e-9))) + 1
-            self.observations[index] = prepare_observation(scene, view, min(margin, 64), 2 * self.reach)
-        return self.observations[index]
+        if index in self.observations:
+            return self.observations[index]
+        scene = self.views.scene_map(index)
+        view = self.views.object_view(index, self.classes)
+        margin = 0
+        if view is not None:
+            margin = int(np.ceil(self.reach * scene.camera.K[0, 0] / max(self.extent.nearest, 1e-9))) + 1
+        found = prepare_observation(scene, view, min(margin, 64), 2 * self.reach)
+        if found.nbytes <= self.room:
+            self.room -= found.nbytes
+            self.observations[index] = found
+        return found
 
     def _integrated(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         total = np.zeros((len(coords), SAMPLES), np.float32)

@@ -46,6 +46,11 @@ class Observation:
     weight: np.ndarray
     silhouette_distance: np.ndarray
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of the arrays."""
+        return sum(value.nbytes for value in vars(self).values() if isinstance(value, np.ndarray))
+
 
 def visible_depth(view: ObjectView) -> np.ndarray:
     """Return the object's depth (h, w), 0 where the object is not visible."""

@@ -1,4 +1,4 @@
-"""Opening of files for reading; pipes and devices are refused, since they may block or never end."""
+"""Files and folders: whether they exist, and opening for reading. Pipes and devices are refused; they may block."""
 
 from __future__ import annotations
 
@@ -30,3 +30,13 @@ def read_regular(path: Path, largest: int | None = None) -> bytes:
         if largest is not None and os.fstat(file.fileno()).st_size > largest:
             raise ValueError(f"it is larger than {largest >> 20} MB")
         return file.read()
+
+
+def is_file(path: Path) -> bool:
+    """Return whether a file exists; False, too, where access is denied."""
+    return os.path.isfile(path)  # noqa: PTH113 - Path.is_file raises then
+
+
+def is_folder(path: Path) -> bool:
+    """Return whether a folder exists; False, too, where access is denied."""
+    return os.path.isdir(path)  # noqa: PTH112 - Path.is_dir raises then

@@ -6,6 +6,7 @@ ID, which is used only in messages.
 
 from __future__ import annotations
 
+import errno
 import os
 import time
 from collections.abc import Iterator
@@ -23,6 +24,8 @@ except ImportError:  # Windows
 NAME = ".lock"
 _PATIENCE = 0.5
 """Time in seconds to retry for, since `lock_holder` briefly acquires the lock to test whether it is free."""
+_NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
+"""Errors of file systems without locks, as some networks have; nothing is excluded there."""
 _LOCKED_BYTE = 1 << 30
 """Offset of the byte that is locked on Windows; it is beyond the content, which therefore stays readable."""
 
@@ -111,8 +114,8 @@ def _try_lock(descriptor: int) -> bool:
             os.lseek(descriptor, _LOCKED_BYTE, os.SEEK_SET)
             msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
             os.lseek(descriptor, 0, os.SEEK_SET)
-    except OSError:
-        return False
+    except OSError as error:
+        return error.errno in _NO_LOCKS
     return True
 
 

@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -90,10 +90,21 @@ def read_meshes(folder: Path) -> dict[str, MeshEntry]:
         ) from error
 
 
-def write_meshes(folder: Path, entries: Mapping[str, MeshEntry], trained_steps: int) -> None:
-    """Write meshes.json to `folder`; trained_steps: training steps of the model that the latest meshes are from."""
+def write_meshes(folder: Path, entries: Mapping[str, MeshEntry], trained_steps: int | None) -> None:
+    """Write meshes.json to `folder`; trained_steps: training steps of the model of the latest meshes, if known."""
     meshes = {key: entries[key].as_dict() for key in sorted(entries)}
     write_json(folder / NAME, plain({"trained_steps": trained_steps, "meshes": meshes}))
+
+
+def outdate_meshes(folder: Path) -> None:
+    """Mark the meshes in `folder` as those of an earlier model, whose number of steps the present one may have, too."""
+    try:
+        entries = read_meshes(folder)
+    except InputError:
+        return  # It is created anew.
+    if entries:
+        outdated = {key: replace(entry, trained_steps=None) for key, entry in entries.items()}
+        write_meshes(folder, outdated, None)
 
 
 def _entry(key: str, values: dict[str, Any]) -> MeshEntry:

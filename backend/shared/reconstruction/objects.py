@@ -120,7 +120,8 @@ def edit_objects(path: Path, changes: Changes | Callable[[list[SceneObject]], Ch
             change the file.
 
     Raises:
-        InputError: The file is missing or invalid, or another process keeps changing it.
+        InputError: The file is missing or invalid, an object would be scaled to nothing, or another process keeps
+            changing the file.
         ValueError: A field is not editable.
     """
     read_objects(path)  # Fail before the lock is created if the file is missing.
@@ -132,6 +133,10 @@ def edit_objects(path: Path, changes: Changes | Callable[[list[SceneObject]], Ch
             raise ValueError(f"{', '.join(sorted(unknown))} cannot be edited")
         if not changes:
             return
+        for object_id, change in changes.items():
+            places = [*filter(None, [change.get("transform")]), *(change.get("copies") or ())]
+            if any(map(_flattens, places)):
+                raise InputError(f"{path} is not changed, since object {object_id} would be scaled to nothing.")
         content = read_json(path)
         edits = _edits(content, path)
         for object_id, change in changes.items():
@@ -241,8 +246,8 @@ def _object(entry: Mapping[str, Any]) -> SceneObject:
         fill=bool(entry.get("fill", False)),
         cleaned=bool(entry.get("cleaned", False)),
         recolor=None if (recolor := entry.get("recolor")) is None else Recolor.of(recolor),
-        transform=None if (transform := entry.get("transform")) is None else affine_map(transform),
-        copies=tuple(affine_map(copy) for copy in entry.get("copies") or ()),
+        transform=_placement(entry.get("transform")),
+        copies=tuple(place for copy in entry.get("copies") or () if (place := _placement(copy)) is not None),
         separated=bool(entry["separated"]),
     )
 
@@ -254,6 +259,34 @@ def _integer(value: Any, largest: int) -> int:
     return number
 
 
+class _Singular(ValueError):
+    """A map flattens what it moves."""
+
+
+def _placement(value: Any) -> Matrix | None:
+    """Convert a stored map; None if there is none, or a singular one, which earlier versions wrote."""
+    try:
+        return None if value is None else affine_map(value)
+    except _Singular:
+        return None
+
+
+def _flattens(value: Any) -> bool:
+    """Return whether a map to be stored is singular."""
+    try:
+        affine_map(value)
+    except _Singular:
+        return True
+    except (TypeError, ValueError):
+        pass  # The next reading reports it.
+    return False
+
+
+def is_singular(matrix: np.ndarray) -> bool:
+    """Return whether a map (4, 4) flattens what it moves, such as that of an object which is scaled to nothing."""
+    return bool(abs(np.linalg.det(matrix[:3, :3])) < 1e-30)
+
+
 def affine_map(value: Any) -> Matrix:
     """Convert four rows of four numbers to an affine map.
 
@@ -263,8 +296,8 @@ def affine_map(value: Any) -> Matrix:
     matrix = np.array(value, np.float64)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.array_equal(matrix[3], (0, 0, 0, 1)):
         raise ValueError(f"{value} is not an affine map with four rows")
-    if abs(np.linalg.det(matrix[:3, :3])) < 1e-30:
-        raise ValueError(f"{value} is a singular map")
+    if is_singular(matrix):
+        raise _Singular(f"{value} is a singular map")
     first, second, third, last = (tuple(row) for row in matrix.tolist())
     return first, second, third, last
 
